@@ -1,0 +1,8 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Entry point of ``python -m selfcal_ros``."""
+
+import sys
+
+from selfcal_ros.cli.main import main
+
+sys.exit(main())

@@ -1,0 +1,61 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The ``selfcal`` command: finds the verbs, runs one, turns errors into exit codes.
+
+A verb is a module of this package with ``HELP`` (one line), ``configure(parser)`` and
+``run(args) -> int``; ``step_diagonal.py`` is the verb ``step-diagonal``. Verb modules import
+what is slow inside ``run``.
+"""
+
+import argparse
+import importlib
+import os
+import pkgutil
+import signal
+import sys
+from types import ModuleType
+
+from selfcal_ros import __version__, cli
+from selfcal_ros.errors import ExitCode, SelfcalError
+
+
+def verbs() -> dict[str, ModuleType]:
+    """Return name -> module of every verb."""
+    modules = {}
+    for info in pkgutil.iter_modules(cli.__path__):
+        module = importlib.import_module(f"{cli.__name__}.{info.name}")
+        if hasattr(module, "HELP"):
+            modules[info.name.replace("_", "-")] = module
+    return modules
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """Return the parser with one sub-parser a verb."""
+    parser = argparse.ArgumentParser(
+        prog="selfcal", description="Self-calibration of XY-theta stages.",
+        epilog="exit codes: 0 done, 2 bad usage or input, 3 the measured plan does not identify "
+               "the stage, 4 no usable data, 1 our own fault")
+    parser.add_argument("--version", action="version", version=f"selfcal {__version__}")
+    group = parser.add_subparsers(dest="verb", metavar="VERB", required=True)
+    for name, module in verbs().items():
+        sub = group.add_parser(name, help=module.HELP, description=module.HELP)
+        module.configure(sub)
+        sub.set_defaults(run=module.run)
+    return parser
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run one verb and return its exit code."""
+    args = build_parser().parse_args(argv)
+    try:
+        code = int(args.run(args))
+        sys.stdout.flush()
+        return code
+    except SelfcalError as error:
+        print(f"selfcal {args.verb}: {error}", file=sys.stderr)
+        return int(error.exit_code)
+    except KeyboardInterrupt:
+        print(f"selfcal {args.verb}: interrupted", file=sys.stderr)
+        return 128 + signal.SIGINT
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return int(ExitCode.DONE)

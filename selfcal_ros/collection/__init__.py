@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From encoder samples and detections to readings, without ROS."""

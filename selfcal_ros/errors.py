@@ -1,0 +1,68 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The exceptions of the package and the exit code that each one stands for.
+
+A message is one line that names the place, what is wrong, and how to mend it.
+The same codes are the ``error_code`` of services and actions.
+"""
+
+from enum import IntEnum
+
+
+class ExitCode(IntEnum):
+    """Exit codes of ``selfcal`` and error codes of services and actions."""
+
+    DONE = 0
+    INTERNAL = 1
+    BAD_INPUT = 2
+    NOT_IDENTIFIABLE = 3
+    NO_DATA = 4
+
+
+class SelfcalError(Exception):
+    """Base of every error that the package raises on purpose."""
+
+    exit_code = ExitCode.INTERNAL
+
+
+class InputError(SelfcalError):
+    """Raised for a file, message, parameter or argument that cannot be used as it is.
+
+    Parameters
+    ----------
+    where : str
+        File, topic, view or parameter, with line or index where there is one.
+    what : str
+        What is wrong.
+    mend : str, optional
+        What the user can do about it.
+    """
+
+    exit_code = ExitCode.BAD_INPUT
+
+    def __init__(self, where: str, what: str, mend: str = "") -> None:
+        self.where, self.what, self.mend = where, what, mend
+        super().__init__(f"{where}: {what}" + (f"; {mend}" if mend else ""))
+
+
+class NotIdentifiableError(SelfcalError):
+    """Raised when the marks that were read do not identify the stage error.
+
+    Parameters
+    ----------
+    message : str
+        One line: what is missing and which view would cure it.
+    observability : object, optional
+        The `selfcal_ros.model.result.Observability` found, with its unseen modes.
+    """
+
+    exit_code = ExitCode.NOT_IDENTIFIABLE
+
+    def __init__(self, message: str, observability: object = None) -> None:
+        self.observability = observability
+        super().__init__(message)
+
+
+class NoDataError(InputError):
+    """Raised when the input is well formed but holds nothing to calibrate from."""
+
+    exit_code = ExitCode.NO_DATA

@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Estimators: joint least squares, Hu's law, datum, identifiability, uncertainty."""

@@ -1,0 +1,87 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The artifact plate: a grid of marks and a circle of angular lines."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from selfcal_ros.errors import InputError
+
+MAX_GRID_SIZE = 4001
+MAX_ANGULAR_COUNT = 1_000_000
+
+
+@dataclass(frozen=True)
+class Artifact:
+    """Nominal geometry of the plate, which is also the lattice of the stage's field.
+
+    Attributes
+    ----------
+    grid_size : int
+        N, number of marks along x; odd. The plate is square unless `grid_size_y` is given.
+    grid_pitch_m : float
+        Distance between neighbouring marks, m.
+    angular_count : int
+        K, number of angular lines; a multiple of 4, or 0 for a plate without them.
+    grid_size_y : int
+        Number of marks along y; 0 means `grid_size`.
+
+    Raises
+    ------
+    InputError
+        If a size is even, out of range, or K is not a multiple of 4.
+    """
+
+    grid_size: int
+    grid_pitch_m: float
+    angular_count: int = 0
+    grid_size_y: int = 0
+
+    def __post_init__(self) -> None:
+        """Refuse sizes that have no centre mark and counts that have no quarter turn."""
+        for name, size in (("grid_size", self.grid_size), ("grid_size_y", self.shape[1])):
+            if not 3 <= size <= MAX_GRID_SIZE or size % 2 == 0:
+                raise InputError(f"artifact {name}", f"{size} is not an odd number from 3 to "
+                                 f"{MAX_GRID_SIZE}", "the plate needs a mark at its centre")
+        if not (np.isfinite(self.grid_pitch_m) and self.grid_pitch_m > 0):
+            raise InputError("artifact grid_pitch", f"{self.grid_pitch_m} m is not a length",
+                             "give the distance between marks in metres")
+        if self.angular_count % 4 or not 0 <= self.angular_count <= MAX_ANGULAR_COUNT:
+            raise InputError("artifact angular_count", f"{self.angular_count} is not a multiple "
+                             "of 4", "give 0 for a plate without angular lines")
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Number of marks along x and y."""
+        return self.grid_size, self.grid_size_y or self.grid_size
+
+    @property
+    def half(self) -> tuple[int, int]:
+        """Largest index along x and y: h = (N-1)/2."""
+        return (self.shape[0] - 1) // 2, (self.shape[1] - 1) // 2
+
+    @cached_property
+    def m(self) -> np.ndarray:
+        """Index m of every site, int array (nx, ny)."""
+        return np.repeat(np.arange(self.shape[0])[:, None] - self.half[0], self.shape[1], axis=1)
+
+    @cached_property
+    def n(self) -> np.ndarray:
+        """Index n of every site, int array (nx, ny)."""
+        return np.repeat(np.arange(self.shape[1])[None, :] - self.half[1], self.shape[0], axis=0)
+
+    @property
+    def x_m(self) -> np.ndarray:
+        """Nominal x of every site in m, (nx, ny)."""
+        return self.m * self.grid_pitch_m
+
+    @property
+    def y_m(self) -> np.ndarray:
+        """Nominal y of every site in m, (nx, ny)."""
+        return self.n * self.grid_pitch_m
+
+    @property
+    def theta_rad(self) -> np.ndarray:
+        """Nominal angle of every line in rad, (K,), from 0 counter-clockwise."""
+        return np.arange(self.angular_count) * (2 * np.pi / max(self.angular_count, 1))

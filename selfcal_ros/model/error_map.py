@@ -1,0 +1,56 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The calibrated error map of the stage, with its datum and its uncertainty."""
+
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+import numpy as np
+
+from selfcal_ros.model.artifact import Artifact
+
+
+class ThetaDatum(StrEnum):
+    """What fixes the free constant of the angular map (method, section 3)."""
+
+    XY_AXES = "xy_axes"
+    ZERO_MEAN = "zero_mean"
+
+
+@dataclass(frozen=True, eq=False)
+class ErrorMap:
+    """Stage error G = indicated - true at the sites, stage frame.
+
+    Its datum: no translation, rotation or magnification (Hu eq. 5), except where a reference
+    length sets the scale; theta by `datum_theta`.
+
+    Attributes
+    ----------
+    artifact : Artifact
+        Lattice of the sites.
+    gx, gy : float array (nx, ny)
+        Error at site m = i - hx, n = j - hy, m; NaN where not known.
+    u_gx, u_gy : float array (nx, ny)
+        Standard uncertainties (k=1), m.
+    g_theta, u_g_theta : float array (K,)
+        Angular error at line k and its standard uncertainty, rad; NaN where not known.
+    nonorthogonality, scale_difference : float
+        O and R of Hu eq. 6: Gx = O y + R x + Fx, Gy = O x - R y + Fy.
+    datum_theta : ThetaDatum
+        Convention behind `g_theta`.
+    """
+
+    artifact: Artifact
+    gx: np.ndarray
+    gy: np.ndarray
+    u_gx: np.ndarray
+    u_gy: np.ndarray
+    g_theta: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    u_g_theta: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    nonorthogonality: float = 0.0
+    scale_difference: float = 0.0
+    datum_theta: ThetaDatum = ThetaDatum.XY_AXES
+
+    @property
+    def valid(self) -> np.ndarray:
+        """Sites whose error is known, bool (nx, ny)."""
+        return np.isfinite(self.gx) & np.isfinite(self.gy)

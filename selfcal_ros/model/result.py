@@ -1,0 +1,220 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The result of a calibration and its JSON form, schema ``selfcal.result/1``."""
+
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import numpy as np
+
+from selfcal_ros.errors import InputError
+from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.error_map import ErrorMap, ThetaDatum
+
+SCHEMA = "selfcal.result/1"
+
+
+@dataclass(frozen=True)
+class ViewResult:
+    """One view as it was found: nominal pose, misalignment, detections used and rejected.
+
+    Lengths in m, angles in rad, stage frame. `phi` is the rotation about the plate centre,
+    `tx`, `ty` the offset; NaN where the view was not measured.
+    """
+
+    name: str
+    rotation: float
+    translation_x: float
+    translation_y: float
+    phi: float
+    tx: float
+    ty: float
+    used: int = 0
+    rejected: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class ArtifactMap:
+    """Plate error A = true - nominal, plate frame: ax, ay (nx, ny) in m, a_theta (K,) in rad."""
+
+    ax: np.ndarray
+    ay: np.ndarray
+    a_theta: np.ndarray
+
+
+@dataclass(frozen=True)
+class Observability:
+    """What the marks that were read can tell.
+
+    Attributes
+    ----------
+    rank, unknowns : int
+        Rank of the grid readings with the 7 datum rows, and number of unknowns (Qiao).
+    deficiency : int
+        Unseen modes in XY and theta together; 0 means identifiable.
+    identifiable : bool
+        Whether the stage error is determined.
+    modes : tuple of str
+        The unseen modes in words.
+    advice : tuple of str
+        Views or marks that would cure a deficiency.
+    """
+
+    rank: int
+    unknowns: int
+    deficiency: int
+    identifiable: bool
+    modes: tuple[str, ...] = ()
+    advice: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Standard deviation of one reading, pooled over views: m and rad, NaN where unknown.
+
+    `sigma_xy`, `sigma_theta` are the values behind the uncertainties; `*_repeats` come from the
+    scatter of repeats, `*_residuals` from the residuals of the fit; `dof_*` are their degrees of
+    freedom.
+    """
+
+    sigma_xy: float
+    sigma_theta: float
+    sigma_xy_repeats: float = float("nan")
+    sigma_theta_repeats: float = float("nan")
+    sigma_xy_residuals: float = float("nan")
+    sigma_theta_residuals: float = float("nan")
+    dof_xy_repeats: int = 0
+    dof_theta_repeats: int = 0
+    dof_xy_residuals: int = 0
+    dof_theta_residuals: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class CalibrationResult:
+    """Everything that one calibration found."""
+
+    plan_id: str
+    error_map: ErrorMap
+    artifact_map: ArtifactMap
+    views: tuple[ViewResult, ...]
+    observability: Observability
+    noise: Noise
+    rejected: dict[str, int] = field(default_factory=dict)
+    input: dict[str, str] = field(default_factory=dict)
+    warnings: tuple[str, ...] = ()
+    method: str = "joint"
+    sense: str = "microscope_moves"
+    extra: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def artifact(self) -> Artifact:
+        """The plate."""
+        return self.error_map.artifact
+
+
+def result_to_dict(result: CalibrationResult) -> dict[str, Any]:
+    """Return the JSON form of a result; NaN becomes null."""
+    emap, amap, artifact = result.error_map, result.artifact_map, result.artifact
+    return {
+        "schema": SCHEMA,
+        "plan_id": result.plan_id,
+        "method": result.method,
+        "measurement_sense": result.sense,
+        "artifact": {"grid_size": artifact.grid_size, "grid_pitch": artifact.grid_pitch_m,
+                     "angular_count": artifact.angular_count,
+                     **({"grid_size_y": artifact.grid_size_y} if artifact.grid_size_y else {})},
+        "views": [{"name": v.name, "rotation": v.rotation, "translation_x": v.translation_x,
+                   "translation_y": v.translation_y,
+                   "misalignment": {key: plain(getattr(v, key)) for key in ("phi", "tx", "ty")},
+                   "used": v.used, "rejected": v.rejected} for v in result.views],
+        "error_map": {**{key: plain(getattr(emap, key)) for key in _MAP_ARRAYS},
+                      "nonorthogonality": plain(emap.nonorthogonality),
+                      "scale_difference": plain(emap.scale_difference),
+                      "datum_theta": str(emap.datum_theta)},
+        "artifact_map": {key: plain(getattr(amap, key)) for key in ("ax", "ay", "a_theta")},
+        "observability": plain(asdict(result.observability)),
+        "noise": plain(asdict(result.noise)),
+        "rejected": dict(result.rejected),
+        "warnings": list(result.warnings),
+        "input": dict(result.input),
+        **{key: plain(value) for key, value in result.extra.items()},
+    }
+
+
+_MAP_ARRAYS = ("gx", "gy", "u_gx", "u_gy", "g_theta", "u_g_theta")
+_KNOWN = {"schema", "plan_id", "method", "measurement_sense", "artifact", "views", "error_map",
+          "artifact_map", "observability", "noise", "rejected", "warnings", "input"}
+
+
+def plain(value: Any) -> Any:
+    """Return `value` as JSON types: arrays as lists, NaN and infinities as None."""
+    if isinstance(value, dict):
+        return {key: plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    if isinstance(value, np.ndarray):
+        return plain(value.tolist())
+    if isinstance(value, np.generic):
+        return plain(value.item())
+    if isinstance(value, float):
+        return value if np.isfinite(value) else None
+    return value
+
+
+def result_from_dict(data: object, where: str) -> CalibrationResult:
+    """Return the result in the JSON form `data`, which came from the file `where`.
+
+    Raises
+    ------
+    InputError
+        If the schema is another one, or a key is missing or has the wrong shape.
+    """
+    if not isinstance(data, dict) or data.get("schema") != SCHEMA:
+        raise InputError(where, f"not a result of schema {SCHEMA}",
+                         "give a RESULT.json that `selfcal solve` wrote")
+    try:
+        return _parse(data)
+    except (KeyError, TypeError, ValueError) as error:
+        reason = f"the key {error} is missing" if isinstance(error, KeyError) else str(error)
+        raise InputError(where, f"damaged result ({reason})",
+                         "write it anew with `selfcal solve`") from error
+
+
+def _parse(data: dict) -> CalibrationResult:
+    raw = data["artifact"]
+    artifact = Artifact(raw["grid_size"], float(raw["grid_pitch"]), raw["angular_count"],
+                        raw.get("grid_size_y", 0))
+    emap, amap = data["error_map"], data["artifact_map"]
+    shapes = dict.fromkeys(_MAP_ARRAYS[:4], artifact.shape)
+    shapes |= dict.fromkeys(_MAP_ARRAYS[4:], (artifact.angular_count,))
+    error_map = ErrorMap(
+        artifact, **{key: _array(emap[key], shape, key) for key, shape in shapes.items()},
+        nonorthogonality=_number(emap["nonorthogonality"]),
+        scale_difference=_number(emap["scale_difference"]),
+        datum_theta=ThetaDatum(emap["datum_theta"]))
+    views = tuple(
+        ViewResult(v["name"], v["rotation"], v["translation_x"], v["translation_y"],
+                   **{key: _number(v["misalignment"][key]) for key in ("phi", "tx", "ty")},
+                   used=v["used"], rejected=v["rejected"]) for v in data["views"])
+    seen = {**data["observability"]}
+    seen |= {key: tuple(seen.get(key, ())) for key in ("modes", "advice")}
+    return CalibrationResult(
+        data["plan_id"], error_map,
+        ArtifactMap(_array(amap["ax"], artifact.shape, "ax"),
+                    _array(amap["ay"], artifact.shape, "ay"),
+                    _array(amap["a_theta"], (artifact.angular_count,), "a_theta")),
+        views, Observability(**seen),
+        Noise(**{key: _number(value) for key, value in data["noise"].items()}),
+        data["rejected"], data["input"], tuple(data.get("warnings", ())),
+        data.get("method", "joint"), data.get("measurement_sense", "microscope_moves"),
+        {key: value for key, value in data.items() if key not in _KNOWN})
+
+
+def _array(value: Any, shape: tuple[int, ...], name: str) -> np.ndarray:
+    array = np.array(value, dtype=float)
+    if array.shape != shape:
+        raise ValueError(f"{name} has the shape {array.shape}, not {shape}")
+    return array
+
+
+def _number(value: float | None) -> float:
+    return float("nan") if value is None else value

@@ -1,0 +1,193 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Views: how the plate lies on the stage, and plans: which views are measured."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from selfcal_ros.errors import InputError
+from selfcal_ros.model.artifact import Artifact
+
+LATTICE_TOLERANCE = 1e-3
+"""Largest distance of a commanded pose from the lattice, in pitches or lines."""
+
+
+@dataclass(frozen=True)
+class LatticePose:
+    """A plate pose in whole steps of the lattice.
+
+    Attributes
+    ----------
+    quarter_turns : int or None
+        q in 0..3, counter-clockwise; None if the turn is not a whole quarter.
+    shift : tuple of int
+        (a, b), translation along stage x and y in pitches.
+    turn_lines : int or None
+        s in 0..K-1, the total turn in angular lines; None on a plate without lines.
+    """
+
+    quarter_turns: int | None
+    shift: tuple[int, int]
+    turn_lines: int | None
+
+    def site_of(self, m: np.ndarray, n: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the site (i, j) on which mark (m, n) lies: R^q (m, n) + (a, b).
+
+        Raises
+        ------
+        ValueError
+            If the turn is not a whole quarter.
+        """
+        if self.quarter_turns is None:
+            raise ValueError("a grid mark lies on a site only after whole quarter turns")
+        x, y = ((m, n), (-n, m), (-m, -n), (n, -m))[self.quarter_turns]
+        return x + self.shift[0], y + self.shift[1]
+
+
+@dataclass(frozen=True)
+class View:
+    """One placement of the plate, in the stage frame.
+
+    Attributes
+    ----------
+    name : str
+        Name in the plan.
+    rotation_rad : float
+        Nominal turn of the plate, counter-clockwise, rad.
+    translation_m : tuple of float
+        Nominal position of the plate's centre, m.
+    grid, angular : bool
+        Which marks are measured.
+    repeats : int
+        Times that every mark is measured.
+    """
+
+    name: str
+    rotation_rad: float = 0.0
+    translation_m: tuple[float, float] = (0.0, 0.0)
+    grid: bool = True
+    angular: bool = True
+    repeats: int = 1
+
+    def lattice_pose(self, artifact: Artifact) -> LatticePose:
+        """Return the pose in whole steps of the artifact's lattice.
+
+        Raises
+        ------
+        InputError
+            If the pose lies off the lattice, or grid marks are wanted at a turn that is
+            not a whole quarter.
+        """
+        where = f"view '{self.name}'"
+        steps = [value / artifact.grid_pitch_m for value in self.translation_m]
+        shift = [_whole(step, f"{where} translation", "pitch") for step in steps]
+        turns = self.rotation_rad / (math.pi / 2)
+        quarter = round(turns) % 4 if abs(turns - round(turns)) <= LATTICE_TOLERANCE else None
+        if self.grid and quarter is None:
+            raise InputError(where, f"grid marks cannot be measured at a turn of "
+                             f"{math.degrees(self.rotation_rad):.6g} deg",
+                             "turn by a multiple of 90 deg or set grid to false")
+        lines = None
+        if artifact.angular_count:
+            turn = self.rotation_rad * artifact.angular_count / (2 * math.pi)
+            lines = _whole(turn, f"{where} rotation", "angular line") % artifact.angular_count
+        elif quarter is None:
+            raise InputError(where, "a turn that is not a quarter needs angular lines",
+                             "turn by a multiple of 90 deg")
+        return LatticePose(quarter, (shift[0], shift[1]), lines)
+
+
+def _whole(value: float, where: str, unit: str) -> int:
+    if not math.isfinite(value) or abs(value - round(value)) > LATTICE_TOLERANCE:
+        raise InputError(where, f"{value:.6g} is not a whole number of {unit} steps",
+                         "place the plate on the lattice")
+    return round(value)
+
+
+@dataclass(frozen=True)
+class Plan:
+    """An artifact and the views in which it is to be measured, in their order."""
+
+    plan_id: str
+    artifact: Artifact
+    views: tuple[View, ...]
+
+
+def plan_from_dict(data: object, where: str) -> Plan:
+    """Return the plan in a PLAN.yaml mapping.
+
+    Parameters
+    ----------
+    data : object
+        Parsed YAML: ``plan_id``, ``artifact {grid_size, grid_pitch, angular_count}`` (m) and
+        ``views [{name, rotation_deg, translation_pitch, grid, angular, repeats}]``.
+    where : str
+        File name, for messages.
+
+    Raises
+    ------
+    InputError
+        For a missing or unknown key, a wrong type, or a pose off the lattice.
+    """
+    fields = _fields(data, where, {"plan_id": str, "artifact": dict, "views": list})
+    raw = _fields(fields["artifact"], f"{where}: artifact",
+                  {"grid_size": int, "grid_pitch": float, "angular_count": int},
+                  {"grid_size_y": (int, 0)})
+    artifact = Artifact(raw["grid_size"], raw["grid_pitch"], raw["angular_count"],
+                        raw["grid_size_y"])
+    views = tuple(_view_from_dict(view, f"{where}: views[{index}]", artifact)
+                  for index, view in enumerate(fields["views"]))
+    if not views:
+        raise InputError(where, "the plan has no views", "add at least one view")
+    for index, view in enumerate(views):
+        if view.name in [other.name for other in views[:index]]:
+            raise InputError(f"{where}: views[{index}]", f"the name '{view.name}' is used twice",
+                             "give every view its own name")
+    return Plan(fields["plan_id"], artifact, views)
+
+
+def _view_from_dict(data: object, where: str, artifact: Artifact) -> View:
+    raw = _fields(data, where, {"name": str},
+                  {"rotation_deg": (float, 0.0), "translation_pitch": (list, [0, 0]),
+                   "grid": (bool, True), "angular": (bool, artifact.angular_count > 0),
+                   "repeats": (int, 1)})
+    shift = raw["translation_pitch"]
+    if len(shift) != 2 or not all(isinstance(s, int | float) for s in shift):
+        raise InputError(f"{where}: translation_pitch", "not two numbers", "give [a, b]")
+    if raw["repeats"] < 1:
+        raise InputError(f"{where}: repeats", f"{raw['repeats']} is not positive", "give 1 or more")
+    if raw["angular"] and not artifact.angular_count:
+        raise InputError(where, "angular marks are wanted but the plate has none",
+                         "set angular to false")
+    if not (raw["grid"] or raw["angular"]):
+        raise InputError(where, "neither grid nor angular marks are wanted", "set one to true")
+    view = View(raw["name"], math.radians(raw["rotation_deg"]),
+                (shift[0] * artifact.grid_pitch_m, shift[1] * artifact.grid_pitch_m),
+                raw["grid"], raw["angular"], raw["repeats"])
+    view.lattice_pose(artifact)
+    return view
+
+
+def _fields(data: object, where: str, required: dict, optional: dict | None = None) -> dict:
+    """Return the fields of a mapping with their types checked and defaults filled in."""
+    if not isinstance(data, dict):
+        raise InputError(where, "not a mapping of keys to values", "see config/plans for examples")
+    optional = optional or {}
+    for key in data:
+        if key not in required and key not in optional:
+            raise InputError(f"{where}: {key}", "unknown key",
+                             "known are " + ", ".join([*required, *optional]))
+    out = {key: default for key, (_, default) in optional.items()}
+    for key in required:
+        if key not in data:
+            raise InputError(where, f"the key '{key}' is missing", "add it")
+    for key, value in data.items():
+        kind = required[key] if key in required else optional[key][0]
+        if kind is float and isinstance(value, int) and not isinstance(value, bool):
+            value = float(value)
+        if not isinstance(value, kind) or (kind is int and isinstance(value, bool)):
+            raise InputError(f"{where}: {key}", f"{value!r} is not of type {kind.__name__}",
+                             "mend the value")
+        out[key] = value
+    return out

@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Plots, tables and reports: the only place that imports matplotlib."""

@@ -1,0 +1,76 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The rules of the house: layers, where libraries may be imported, and room per file."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PACKAGE = ROOT / "selfcal_ros"
+SOURCES = sorted(PACKAGE.rglob("*.py"))
+BASE = {"errors", "files"}
+DOMAIN = {"model"} | BASE
+ESTIMATION = {"estimation", "compensation", "laser"}
+MIDDLE = {"bagio", "reporting", "collection", "simulation"}
+MAY_IMPORT = {
+    "errors": set(),
+    "files": {"errors"},
+    "model": BASE,
+    **{name: DOMAIN | ESTIMATION for name in ESTIMATION},
+    **{name: DOMAIN | ESTIMATION | MIDDLE for name in MIDDLE},
+    "nodes": DOMAIN | ESTIMATION | MIDDLE,
+    "cli": DOMAIN | ESTIMATION | MIDDLE,
+}
+ONLY_IN = {
+    "rclpy": "nodes", "mcap": "bagio", "rosbags": "bagio", "matplotlib": "reporting",
+    "selfcal_msgs": "nodes", "sensor_msgs": "nodes", "diagnostic_msgs": "nodes",
+    "std_srvs": "nodes", "std_msgs": "nodes",
+}
+
+
+def imports(path: Path) -> set[str]:
+    """Return the dotted names that a module imports, wherever in the file."""
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: relative import"
+            found.add(node.module)
+            found |= {f"{node.module}.{alias.name}" for alias in node.names}
+    return found
+
+
+def layer_of(path: Path) -> str:
+    return path.relative_to(PACKAGE).parts[0].removesuffix(".py")
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=lambda p: str(p.relative_to(PACKAGE)))
+def test_imports_follow_the_layers(path):
+    layer = layer_of(path)
+    for name in imports(path):
+        first, *rest = name.split(".")
+        if first == "selfcal_ros" and rest and layer in MAY_IMPORT:
+            allowed = MAY_IMPORT[layer] | {layer}
+            assert rest[0] in allowed or rest[0] in ("__version__", "cli"), f"{layer} -> {name}"
+        assert layer == ONLY_IN.get(first, layer), f"{name} belongs in {ONLY_IN.get(first)}/"
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=lambda p: str(p.relative_to(PACKAGE)))
+def test_files_and_functions_keep_their_room(path):
+    text = path.read_text()
+    limit = 200 if layer_of(path) == "nodes" else 400
+    assert len(text.splitlines()) <= limit
+    assert text.startswith("# SPDX-License-Identifier: Apache-2.0\n")
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            body = node.end_lineno - node.body[0].lineno
+            assert body <= 60, f"{path.name}:{node.lineno} {node.name} has {body} lines"
+
+
+def test_no_stub_is_left():
+    words = ("TO" + "DO", "FIX" + "ME", "NotImplemented" + "Error", "XX" + "X")
+    for path in SOURCES:
+        for word in words:
+            assert word not in path.read_text(), f"{path}: {word}"
