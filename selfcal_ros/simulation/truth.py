@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A stage and a plate with known errors, and the readings that they give (method, section 2)."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
