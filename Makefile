@@ -1,0 +1,22 @@
+# SPDX-License-Identifier: Apache-2.0
+# Every target builds what it needs; `make setup` takes a moment when nothing has changed.
+SHELL := /bin/bash
+BIN := .venv/bin
+
+.PHONY: setup demo test lint bench clean help
+help:
+	@echo "make setup | demo | test | lint | bench | clean"
+setup:
+	@tools/setup.sh
+demo: setup
+	@$(BIN)/python tools/demo.py
+lint: setup
+	@$(BIN)/ruff check .
+test: lint
+	@$(BIN)/python -m pytest
+bench: setup
+	@mkdir -p build
+	@$(BIN)/python test/bench/run.py
+clean:
+	rm -rf .venv build install log selfcal_ros.egg-info
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

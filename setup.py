@@ -1,0 +1,43 @@
+# SPDX-License-Identifier: Apache-2.0
+from pathlib import Path
+
+from setuptools import find_packages, setup
+
+NAME = "selfcal_ros"
+NODES = ("measurement_collector", "pose_sequencer", "solver", "compensator", "bag_player",
+         "bag_recorder", "stage_simulator")
+
+
+def share(folder: str) -> list[tuple[str, list[str]]]:
+    """Return the data files below a folder, one entry a folder, under share/selfcal_ros."""
+    folders = sorted({path.parent for path in Path(folder).rglob("*") if path.is_file()})
+    return [(f"share/{NAME}/{place}", sorted(str(p) for p in place.iterdir() if p.is_file()))
+            for place in folders]
+
+
+setup(
+    name=NAME,
+    version="0.1.0",
+    packages=find_packages(include=[NAME, f"{NAME}.*"]),
+    data_files=[
+        ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
+        (f"share/{NAME}", ["package.xml"]),
+        *share("launch"),
+        *share("config"),
+    ],
+    install_requires=["setuptools", "numpy>=1.26", "scipy>=1.11", "pyyaml", "mcap>=1.1",
+                      "rosbags>=0.10", "matplotlib>=3.6", "rich>=13"],
+    python_requires=">=3.12",
+    zip_safe=True,
+    maintainer="selfcal_ros maintainers",
+    maintainer_email="maintainers@selfcal-ros.example",
+    description="Self-calibration of precision XY-theta stages in the machine, "
+                "without a better standard.",
+    license="Apache-2.0",
+    entry_points={
+        "console_scripts": [
+            "selfcal = selfcal_ros.cli.main:main",
+            *(f"{node} = {NAME}.nodes.{node}:main" for node in NODES),
+        ],
+    },
+)

@@ -1,0 +1,71 @@
+#!/usr/bin/env bash
+# SPDX-License-Identifier: Apache-2.0
+# Build the environment .venv of a user without ROS 2; does nothing when nothing has changed.
+set -euo pipefail
+cd "$(dirname "$0")/.."
+venv="$PWD/.venv"
+die() { echo "setup: $*" >&2; exit 2; }
+
+suitable() {  # runs, and is a version for which the ROS 2 wheels exist and the code is written
+  "$1" -c 'import sys, venv, ensurepip; sys.exit(not (3, 12) <= sys.version_info[:2] <= (3, 13))' 2>/dev/null
+}
+
+find_python() {
+  local candidate
+  for candidate in "${PYTHON:-}" python3.12 "$HOME"/.pyenv/versions/3.12.*/bin/python \
+                   python3.13 "$HOME"/.pyenv/versions/3.13.*/bin/python python3; do
+    if [ -n "$candidate" ] && suitable "$candidate"; then echo "$candidate"; return; fi
+  done
+  return 1
+}
+
+digest() { cat "$@" | sha256sum | cut -d' ' -f1; }
+fresh() { [ -f "$venv/.stamp-$1" ] && [ "$(cat "$venv/.stamp-$1")" = "$2" ]; }
+stamp() { echo "$2" > "$venv/.stamp-$1"; }
+log="$PWD/build/setup.log"
+mkdir -p build
+step() {  # say what is done; show the log only when it fails
+  echo "setup: $1"; shift
+  if ! "$@" >> "$log" 2>&1; then
+    tail -n 40 "$log" >&2
+    die "failed; the whole log is in build/setup.log"
+  fi
+}
+
+wheels=$(digest tools/requirements.txt tools/mend_wheels.py)
+if ! fresh wheels "$wheels"; then
+  : > "$log"
+  [ "$(uname -sm)" = "Linux x86_64" ] || die "the ROS 2 wheels are for Linux on x86_64; on other machines use a ROS 2 Jazzy installation and colcon (README)"
+  command -v g++ > /dev/null || die "no C++ compiler; install one, e.g. 'apt install build-essential'"
+  if ! { [ -x "$venv/bin/python" ] && suitable "$venv/bin/python"; }; then
+    python=$(find_python) || die "no Python 3.12 or 3.13 with venv; install one, e.g. 'apt install python3.12 python3.12-venv python3.12-dev', or set PYTHON to its path"
+    rm -rf "$venv"
+    step "creating .venv with $("$python" --version)" "$python" -m venv "$venv"
+  fi
+  include=$("$venv/bin/python" -c 'import sysconfig; print(sysconfig.get_path("include"))')
+  [ -f "$include/Python.h" ] || die "Python.h is missing; install the headers, e.g. 'apt install python3.12-dev'"
+  step "installing the pinned wheels (about a minute)" "$venv/bin/python" -m pip install \
+    --disable-pip-version-check --no-deps --only-binary :all: -r tools/requirements.txt
+  step "mending the wheels' CMake paths" "$venv/bin/python" tools/mend_wheels.py
+  rm -f "$venv/.stamp-messages"
+  stamp wheels "$wheels"
+fi
+
+messages=$(find msg_defs -type f | LC_ALL=C sort | xargs sha256sum | sha256sum | cut -d' ' -f1)
+if ! fresh messages "$messages"; then
+  rm -rf build/selfcal_msgs
+  step "building selfcal_msgs" env PATH="$venv/bin:$PATH" LD_LIBRARY_PATH="$venv/lib" \
+    AMENT_PREFIX_PATH="$venv" CMAKE_PREFIX_PATH="$venv" \
+    "$venv/bin/colcon" --log-base build/colcon_log build --base-paths msg_defs --build-base build \
+    --merge-install --install-base "$venv" --cmake-args -G Ninja -DBUILD_TESTING=OFF \
+    "-DPython3_EXECUTABLE=$venv/bin/python" --no-warn-unused-cli
+  stamp messages "$messages"
+fi
+
+package=$( { cat setup.py setup.cfg package.xml; find launch config resource -type f | LC_ALL=C sort | xargs sha256sum; } | sha256sum | cut -d' ' -f1)
+if ! fresh package "$package"; then
+  step "installing selfcal_ros" "$venv/bin/python" -m pip install --disable-pip-version-check \
+    --no-deps --no-build-isolation --config-settings editable_mode=compat --editable .
+  step "installing its share files" "$venv/bin/python" tools/install_share.py "$venv"
+  stamp package "$package"
+fi
