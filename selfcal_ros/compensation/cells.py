@@ -1,0 +1,167 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Piecewise polynomials on a uniform grid, evaluated fast: bilinear cells and bicubic splines.
+
+Every cell keeps its own coefficients side by side in memory, so that one evaluation is one
+gather of a row and a short Horner scheme; positions go through in blocks that stay in cache.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+
+BLOCK = 8192
+"""Positions handled at once: small enough for the second-level cache."""
+MAX_ITERATIONS = 60
+REST = 4 * float(np.finfo(float).eps)
+"""Step, in pitches, at which a fixed point has come to rest."""
+SNAP = 1e-9
+"""Distance to a node, in pitches, below which a position counts as lying on it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Cells:
+    """Two fields on a uniform grid as one polynomial a cell.
+
+    Attributes
+    ----------
+    shape : tuple of int
+        Number of nodes (nx, ny).
+    degree : int
+        Largest power along each direction: 1 or 3.
+    coefficients : float array ((nx-1)(ny-1), 2, degree+1, degree+1)
+        Of u^p v^q at [cell, field, p, q]; u, v in 0..1 inside the cell.
+    nodes : float array (2, nx, ny)
+        Values at the nodes.
+    """
+
+    shape: tuple[int, int]
+    degree: int
+    coefficients: np.ndarray
+    nodes: np.ndarray
+
+    def at(self, s: np.ndarray, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return both fields at grid coordinates `s`, `t` (0..nx-1, 0..ny-1; clamped), (P,).
+
+        A bilinear value that needs an unknown (NaN) node with a weight other than zero is NaN.
+        """
+        (i, j), (u, v) = self._locate(s, t)
+        first, second = self._polynomials(self._rows(i, j), u, v)
+        unknown = np.isnan(first) | np.isnan(second)
+        if unknown.any():
+            for out, field in zip((first, second), self.nodes, strict=True):
+                out[unknown] = _known_corners(field, (i[unknown], j[unknown]),
+                                              (u[unknown], v[unknown]))
+        return first, second
+
+    def solve(self, s: np.ndarray, t: np.ndarray, scale: float,
+              ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the (a, b) with (a, b) + scale * fields(a, b) = (s, t), by fixed point.
+
+        The solution nearly always lies in the cell of (s, t) itself, so each cell's polynomial
+        is fetched once; the few positions that leave their cell are iterated in full.
+        """
+        (i, j), (u, v) = self._locate(s, t)
+        us, vt = u, v
+        rows = self._rows(i, j)
+        for _ in range(MAX_ITERATIONS):
+            first, second = self._polynomials(rows, u, v)
+            un, vn = us - scale * first, vt - scale * second
+            moved = max(np.abs(un - u).max(initial=0.0), np.abs(vn - v).max(initial=0.0))
+            u, v = un, vn
+            if not moved > REST:
+                break
+        with np.errstate(invalid="ignore"):
+            stayed = (u >= 0) & (u <= 1) & (v >= 0) & (v <= 1) & (i + us == s) & (j + vt == t)
+        a, b = i + u, j + v
+        left = ~stayed
+        if left.any():
+            a[left], b[left] = self._solve_anywhere(s[left], t[left], scale)
+        return a, b
+
+    def _solve_anywhere(self, s: np.ndarray, t: np.ndarray, scale: float,
+                        ) -> tuple[np.ndarray, np.ndarray]:
+        a, b = s, t
+        for _ in range(MAX_ITERATIONS):
+            first, second = self.at(a, b)
+            an, bn = s - scale * first, t - scale * second
+            with np.errstate(invalid="ignore"):
+                resting = ~(np.abs(an - a) + np.abs(bn - b) > REST * max(self.shape))
+            a, b = an, bn
+            if resting.all():
+                break
+        return a, b
+
+    def _locate(self, s: np.ndarray, t: np.ndarray) -> tuple[tuple, tuple]:
+        """Return cell indices and coordinates inside the cell, 0..1; NaN stays NaN."""
+        nx, ny = self.shape
+        s, t = np.clip(s, 0, nx - 1), np.clip(t, 0, ny - 1)
+        with np.errstate(invalid="ignore"):
+            # A NaN position turns into some integer; u stays NaN and so does the result.
+            i = np.clip(s.astype(np.int64), 0, nx - 2)
+            j = np.clip(t.astype(np.int64), 0, ny - 2)
+        return (i, j), (s - i, t - j)
+
+    def _rows(self, i: np.ndarray, j: np.ndarray) -> np.ndarray:
+        flat = self.coefficients.reshape(len(self.coefficients), -1)
+        return np.ascontiguousarray(flat.take(i * (self.shape[1] - 1) + j, axis=0).T)
+
+    def _polynomials(self, rows: np.ndarray, u: np.ndarray, v: np.ndarray,
+                     ) -> tuple[np.ndarray, np.ndarray]:
+        side = self.degree + 1
+        return (_horner(rows[:side * side], u, v, side), _horner(rows[side * side:], u, v, side))
+
+
+def _horner(rows: np.ndarray, u: np.ndarray, v: np.ndarray, side: int) -> np.ndarray:
+    """Sum of rows[p * side + q] u^p v^q, in place where it can be."""
+    out = np.zeros(0)
+    for p in reversed(range(side)):
+        inner = rows[p * side + side - 1] * v
+        for q in reversed(range(1, side - 1)):
+            inner += rows[p * side + q]
+            inner *= v
+        inner += rows[p * side]
+        if p == side - 1:
+            out = inner
+        else:
+            out *= u
+            out += inner
+    return out
+
+
+def _known_corners(field: np.ndarray, cell: tuple[np.ndarray, np.ndarray],
+                   inside: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+    """Bilinear value that leaves out corners of zero weight, (P,)."""
+    (i, j), (u, v) = cell, inside
+    u, v = (np.where(abs(w - np.round(w)) < SNAP, np.round(w), w) for w in (u, v))
+    out = np.zeros(len(u))
+    for di, wx in ((0, 1 - u), (1, u)):
+        for dj, wy in ((0, 1 - v), (1, v)):
+            weight = wx * wy
+            out += np.where(weight == 0, 0.0, weight * field[i + di, j + dj])
+    return out
+
+
+def bilinear_cells(fields: np.ndarray) -> Cells:
+    """Return the bilinear interpolant of `fields` (2, nx, ny); NaN nodes are allowed."""
+    f00, f10 = fields[:, :-1, :-1], fields[:, 1:, :-1]
+    f01, f11 = fields[:, :-1, 1:], fields[:, 1:, 1:]
+    c = np.stack([f00, f01 - f00, f10 - f00, f11 - f10 - f01 + f00], axis=-1)
+    return Cells(fields.shape[1:], 1, _by_cell(c, 2), fields)
+
+
+def bicubic_cells(fields: np.ndarray) -> Cells:
+    """Return the interpolating bicubic spline of `fields` (2, nx, ny), without NaN.
+
+    Not-a-knot ends; along a direction of three nodes that spline is a parabola.
+    """
+    nx, ny = fields.shape[1:]
+    along_x = CubicSpline(np.arange(nx), fields, axis=1).c[::-1]
+    both = CubicSpline(np.arange(ny), along_x, axis=3).c[::-1]
+    # Axes now: q, j, p, i, field.
+    return Cells((nx, ny), 3, _by_cell(both.transpose(4, 3, 1, 2, 0), 4), fields)
+
+
+def _by_cell(c: np.ndarray, side: int) -> np.ndarray:
+    cells = c.shape[1] * c.shape[2]
+    return np.ascontiguousarray(c.reshape(2, cells, side, side).transpose(1, 0, 2, 3))

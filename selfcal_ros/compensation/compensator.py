@@ -1,0 +1,272 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The compensator: a calibrated error map put to use (method, section 1).
+
+The error map holds G = indicated - true at the true position of the marks, hence
+
+    indicated to command for a true position p:   p + G(p)                  (direct)
+    true position of an indicated position q:     the p with p + G(p) = q   (fixed point)
+"""
+
+from collections.abc import Callable
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.interpolate import CubicSpline
+
+from selfcal_ros.compensation.cells import (
+    BLOCK,
+    MAX_ITERATIONS,
+    REST,
+    SNAP,
+    Cells,
+    bicubic_cells,
+    bilinear_cells,
+)
+from selfcal_ros.errors import InputError
+from selfcal_ros.model.error_map import ErrorMap
+
+MAX_GRADIENT = 0.5
+"""Largest slope of the error that the inverse accepts: the fixed point then halves each step."""
+
+_Field = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
+
+
+class Compensator:
+    """Evaluate an error map and its inverse at any position of the stage frame.
+
+    Parameters
+    ----------
+    error_map : ErrorMap
+        Stage error G at the sites, and Gtheta at the angular lines.
+    method : {"bilinear", "bicubic"}
+        Interpolation between the sites. ``bilinear`` is what the controller does with an
+        exported table. ``bicubic`` is the interpolating cubic spline (periodic for theta); it
+        refuses a map with unknown sites, because each of them would spoil the whole field.
+    outside : {"clamp", "refuse"}
+        Beyond the calibrated field: take the error of the nearest point of its edge, or raise.
+
+    Raises
+    ------
+    InputError
+        For an unknown word, a bicubic map with unknown sites, or a map so steep that it cannot
+        be inverted.
+
+    Notes
+    -----
+    Unknown sites (NaN) under ``bilinear``: the value is NaN wherever an unknown site would
+    have a weight, so that known sites themselves stay known. NaN positions give NaN.
+    All methods take scalars or arrays that broadcast and return float arrays of that shape.
+    """
+
+    def __init__(self, error_map: ErrorMap, *,
+                 method: Literal["bilinear", "bicubic"] = "bilinear",
+                 outside: Literal["clamp", "refuse"] = "clamp") -> None:
+        if method not in ("bilinear", "bicubic"):
+            raise InputError("compensator method", f"'{method}' is unknown",
+                             "take bilinear or bicubic")
+        if outside not in ("clamp", "refuse"):
+            raise InputError("compensator outside", f"'{outside}' is unknown",
+                             "take clamp or refuse")
+        self.error_map, self.method, self.outside = error_map, method, outside
+        self._pitch = error_map.artifact.grid_pitch_m
+        fields = np.stack([error_map.gx, error_map.gy])
+        if method == "bicubic" and not np.isfinite(fields).all():
+            missing = int((~error_map.valid).sum())
+            raise InputError("error map", f"{missing} sites are unknown",
+                             "bicubic needs all of them: take bilinear or measure them")
+        _refuse_steep(fields, self._pitch)
+        self._cells = bilinear_cells(fields) if method == "bilinear" else bicubic_cells(fields)
+        self._u_cells = bilinear_cells(np.stack([error_map.u_gx, error_map.u_gy]))
+        self._theta = _Circle(error_map.g_theta, cubic=method == "bicubic")
+        self._u_theta = _Circle(error_map.u_g_theta, cubic=False)
+
+    @property
+    def has_theta(self) -> bool:
+        """Whether the map knows anything about theta."""
+        return self.error_map.artifact.angular_count > 0
+
+    def inside(self, x_m: ArrayLike, y_m: ArrayLike) -> np.ndarray:
+        """Return whether positions lie in the calibrated field, edge included, bool array."""
+        half = np.array(self.error_map.artifact.half) * self._pitch + SNAP * self._pitch
+        return (np.abs(x_m) <= half[0]) & (np.abs(y_m) <= half[1])
+
+    def error(self, x_m: ArrayLike, y_m: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+        """Return G = indicated - true, m, at true positions `x_m`, `y_m`.
+
+        Raises
+        ------
+        InputError
+            With ``outside="refuse"``, if a position lies outside of the field.
+        """
+        self._refuse_outside(x_m, y_m)
+        return self._blocks(lambda x, y: self._at(self._cells, x, y), x_m, y_m)
+
+    def command(self, x_m: ArrayLike, y_m: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+        """Return the indicated position to command so that the true one is `x_m`, `y_m`.
+
+        Raises
+        ------
+        InputError
+            With ``outside="refuse"``, if a position lies outside of the field.
+        """
+        gx, gy = self.error(x_m, y_m)
+        return x_m + gx, y_m + gy
+
+    def correct(self, x_m: ArrayLike, y_m: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+        """Return the true position behind the indicated position `x_m`, `y_m`.
+
+        Raises
+        ------
+        InputError
+            With ``outside="refuse"``, if a true position lies outside of the field.
+        """
+        out = self._blocks(self._invert, x_m, y_m)
+        self._refuse_outside(*out)
+        return out
+
+    def uncertainty(self, x_m: ArrayLike, y_m: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+        """Return standard uncertainties of G, m, at true positions `x_m`, `y_m`.
+
+        The uncertainties of the sites, interpolated bilinearly: an upper bound for the bilinear
+        value whatever the correlation of the sites. What the stage does between its sites is
+        not in it.
+
+        Raises
+        ------
+        InputError
+            With ``outside="refuse"``, if a position lies outside of the field.
+        """
+        self._refuse_outside(x_m, y_m)
+        return self._blocks(lambda x, y: self._at(self._u_cells, x, y), x_m, y_m)
+
+    def error_theta(self, theta_rad: ArrayLike) -> np.ndarray:
+        """Return Gtheta = indicated - true, rad, at true angles; any number of turns.
+
+        Raises
+        ------
+        InputError
+            If the map has no angular lines.
+        """
+        self._refuse_no_theta()
+        return self._theta.at(np.asarray(theta_rad, dtype=float))
+
+    def command_theta(self, theta_rad: ArrayLike) -> np.ndarray:
+        """Return the indicated angle to command so that the true one is `theta_rad`.
+
+        Raises
+        ------
+        InputError
+            If the map has no angular lines.
+        """
+        return theta_rad + self.error_theta(theta_rad)
+
+    def correct_theta(self, theta_rad: ArrayLike) -> np.ndarray:
+        """Return the true angle behind the indicated angle `theta_rad`.
+
+        Raises
+        ------
+        InputError
+            If the map has no angular lines.
+        """
+        self._refuse_no_theta()
+        indicated = np.asarray(theta_rad, dtype=float)
+        true = indicated - self._theta.at(indicated)
+        for _ in range(MAX_ITERATIONS):
+            step = indicated - self._theta.at(true) - true
+            true = true + step
+            if not np.any(np.abs(step) > 1e-15 + REST * np.abs(true)):
+                break
+        return true
+
+    def uncertainty_theta(self, theta_rad: ArrayLike) -> np.ndarray:
+        """Return the standard uncertainty of Gtheta, rad, as `uncertainty` does.
+
+        Raises
+        ------
+        InputError
+            If the map has no angular lines.
+        """
+        self._refuse_no_theta()
+        return self._u_theta.at(np.asarray(theta_rad, dtype=float))
+
+    def _at(self, cells: Cells, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        hx, hy = self.error_map.artifact.half
+        return cells.at(x / self._pitch + hx, y / self._pitch + hy)
+
+    def _invert(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        hx, hy = self.error_map.artifact.half
+        a, b = self._cells.solve(x / self._pitch + hx, y / self._pitch + hy, 1 / self._pitch)
+        return (a - hx) * self._pitch, (b - hy) * self._pitch
+
+    def _blocks(self, field: _Field, x_m: ArrayLike, y_m: ArrayLike,
+                ) -> tuple[np.ndarray, np.ndarray]:
+        """Apply `field` block by block to broadcast positions."""
+        x, y = np.broadcast_arrays(np.asarray(x_m, dtype=float), np.asarray(y_m, dtype=float))
+        shape, x, y = x.shape, x.ravel(), y.ravel()
+        out = np.empty((2, x.size))
+        for start in range(0, x.size, BLOCK):
+            part = slice(start, start + BLOCK)
+            out[0, part], out[1, part] = field(x[part], y[part])
+        return out[0].reshape(shape), out[1].reshape(shape)
+
+    def _refuse_outside(self, x_m: ArrayLike, y_m: ArrayLike) -> None:
+        if self.outside == "clamp":
+            return
+        off = ~self.inside(x_m, y_m)
+        if np.any(off):
+            x, y = np.broadcast_arrays(x_m, y_m)
+            first = np.flatnonzero(off)[0]
+            raise InputError("position", f"({x.flat[first]:.9g}, {y.flat[first]:.9g}) m lies "
+                             "outside of the calibrated field", "stay inside or take clamp")
+
+    def _refuse_no_theta(self) -> None:
+        if not self.has_theta:
+            raise InputError("error map", "it has no angular lines",
+                             "calibrate with a plate that has them")
+
+
+class _Circle:
+    """A periodic function given at K equidistant angles from 0, linear or cubic in between."""
+
+    def __init__(self, values: np.ndarray, *, cubic: bool) -> None:
+        self._count = len(values)
+        self._holes = bool(np.isnan(values).any())
+        self._closed = np.append(values, values[:1])
+        if cubic and not np.isfinite(values).all():
+            raise InputError("error map", f"{int((~np.isfinite(values)).sum())} angular lines are "
+                             "unknown", "bicubic needs all of them: take bilinear")
+        if self._count and not np.isnan(self._closed).all() and \
+                np.nanmax(np.abs(np.diff(self._closed))) > MAX_GRADIENT * 2 * np.pi / self._count:
+            raise _steep("angular lines")
+        self._spline = (CubicSpline(np.arange(self._count + 1), self._closed, bc_type="periodic")
+                        if cubic and self._count else None)
+
+    def at(self, angle_rad: np.ndarray) -> np.ndarray:
+        """Return the values at `angle_rad`, any shape; NaN next to unknown lines."""
+        s = angle_rad * (self._count / (2 * np.pi))
+        if self._spline is not None:
+            return self._spline(np.mod(s, self._count))
+        if self._holes:
+            s = np.where(np.abs(s - np.round(s)) < SNAP, np.round(s), s)
+        below = np.floor(s)
+        u = s - below
+        with np.errstate(invalid="ignore"):
+            # A position that is not finite turns into some integer; u is NaN and so is the result.
+            i = below.astype(np.int64) % self._count
+        low, high = self._closed[i], self._closed[i + 1]
+        # A line of zero weight does not count, so that a known line stays known.
+        return np.where(u == 0, low, low + u * (high - low))
+
+
+def _refuse_steep(fields: np.ndarray, pitch: float) -> None:
+    for axis in (1, 2):
+        steps = np.abs(np.diff(fields, axis=axis))
+        if np.any(steps > MAX_GRADIENT * pitch / 2):
+            raise _steep("sites")
+
+
+def _steep(what: str) -> InputError:
+    return InputError("error map", f"the error changes between neighbouring {what} by more than "
+                      "a quarter of their distance", "such a map cannot be inverted: check its "
+                      "units (m, rad)")

@@ -1,0 +1,182 @@
+# SPDX-License-Identifier: Apache-2.0
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.interpolate import RectBivariateSpline
+
+from selfcal_ros.compensation.compensator import Compensator
+from selfcal_ros.errors import InputError
+from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.error_map import ErrorMap
+from test.support.maps import random_map
+
+ARTIFACT = Artifact(11, 0.01, 24)
+OBLONG = Artifact(7, 0.01, 8, 5)
+MAP = random_map(ARTIFACT, 1)
+METHODS = ("bilinear", "bicubic")
+inside = st.floats(-0.05, 0.05)
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("artifact", [ARTIFACT, OBLONG, Artifact(3, 0.02)])
+def test_sites_give_the_map_itself(method, artifact):
+    emap = random_map(artifact, 2)
+    gx, gy = Compensator(emap, method=method).error(artifact.x_m, artifact.y_m)
+    np.testing.assert_allclose(gx, emap.gx, rtol=0, atol=1e-20)
+    np.testing.assert_allclose(gy, emap.gy, rtol=0, atol=1e-20)
+
+
+@given(x=inside, y=inside)
+def test_bilinear_is_the_weighted_mean_of_four_corners(x, y):
+    s, t = x / 0.01 + 5, y / 0.01 + 5
+    i, j = min(int(s), 9), min(int(t), 9)
+    u, v = s - i, t - j
+    for got, field in zip(Compensator(MAP).error(x, y), (MAP.gx, MAP.gy), strict=True):
+        want = ((1 - u) * (1 - v) * field[i, j] + u * (1 - v) * field[i + 1, j]
+                + (1 - u) * v * field[i, j + 1] + u * v * field[i + 1, j + 1])
+        assert got == pytest.approx(want, rel=0, abs=1e-19)
+
+
+@given(x=inside, y=inside)
+def test_bicubic_is_the_interpolating_spline(x, y):
+    sites = np.arange(-5, 6) * 0.01
+    for got, field in zip(Compensator(MAP, method="bicubic").error(x, y), (MAP.gx, MAP.gy),
+                          strict=True):
+        assert got == pytest.approx(RectBivariateSpline(sites, sites, field).ev(x, y), abs=1e-17)
+
+
+@pytest.mark.parametrize("method", METHODS)
+@given(x=st.floats(-0.2, 0.2), y=st.floats(-0.2, 0.2))
+def test_correct_undoes_command_anywhere(method, x, y):
+    compensator = Compensator(MAP, method=method)
+    np.testing.assert_allclose(compensator.correct(*compensator.command(x, y)), (x, y),
+                               rtol=0, atol=1e-16)
+
+
+def test_correct_undoes_command_for_a_steep_map_and_at_sites():
+    steep = random_map(ARTIFACT, 3, gain=1500)
+    compensator = Compensator(steep)
+    got = compensator.correct(*compensator.command(ARTIFACT.x_m, ARTIFACT.y_m))
+    np.testing.assert_allclose(got, (ARTIFACT.x_m, ARTIFACT.y_m), rtol=0, atol=1e-15)
+
+
+def test_the_sign_is_indicated_minus_true():
+    one = np.ones(ARTIFACT.shape)
+    emap = ErrorMap(ARTIFACT, 3e-6 * one, -2e-6 * one, one, one, np.full(24, 1e-4), np.zeros(24))
+    compensator = Compensator(emap)
+    assert compensator.command(0.01, 0.02) == pytest.approx((0.010003, 0.019998), abs=1e-16)
+    assert compensator.correct(0.01, 0.02) == pytest.approx((0.009997, 0.020002), abs=1e-16)
+    assert compensator.command_theta(1.0) == pytest.approx(1.0001, abs=1e-15)
+    assert compensator.correct_theta(1.0) == pytest.approx(0.9999, abs=1e-15)
+
+
+def test_outside_is_clamped_to_the_nearest_point_of_the_edge():
+    compensator = Compensator(MAP)
+    assert compensator.error(9.0, 0.0) == compensator.error(0.05, 0.0)
+    assert compensator.error(-np.inf, -9.0) == compensator.error(-0.05, -0.05)
+    assert not compensator.inside(0.0501, 0.0) and compensator.inside(0.05, -0.05)
+
+
+@pytest.mark.parametrize("call", ["error", "command", "correct", "uncertainty"])
+def test_outside_is_refused_on_request(call):
+    compensator = Compensator(MAP, outside="refuse")
+    getattr(compensator, call)(0.0, 0.0)
+    with pytest.raises(InputError, match=r"\(0\.06.*outside of the calibrated field; stay"):
+        getattr(compensator, call)([0.0, 0.06], [0.0, 0.01])
+
+
+def test_the_edge_belongs_to_the_field_in_both_directions():
+    compensator = Compensator(MAP, outside="refuse")
+    edge = compensator.command(0.05, -0.05)
+    np.testing.assert_allclose(compensator.correct(*edge), (0.05, -0.05), rtol=0, atol=1e-16)
+
+
+def test_nan_positions_give_nan_and_leave_the_others_alone():
+    gx, _ = Compensator(MAP).error([np.nan, 0.012], 0.0)
+    tx, ty = Compensator(MAP).correct([np.nan, 0.012], 0.0)
+    assert np.isnan([gx[0], tx[0], ty[0]]).all() and np.isfinite([gx[1], tx[1], ty[1]]).all()
+
+
+def test_an_unknown_site_spoils_its_cells_but_not_its_neighbours():
+    emap = random_map(ARTIFACT, 4, unknown=[(5, 5)])
+    compensator = Compensator(emap)
+    gx, gy = compensator.error(ARTIFACT.x_m, ARTIFACT.y_m)
+    np.testing.assert_allclose(gx, emap.gx, rtol=0, atol=1e-20)
+    np.testing.assert_allclose(gy, emap.gy, rtol=0, atol=1e-20)
+    assert np.isnan(compensator.error(0.001, -0.001)).all()
+    assert np.isfinite(compensator.error(0.01, 0.005)).all()
+    assert np.isnan(compensator.correct(0.001, -0.001)).all()
+
+
+def test_bicubic_refuses_unknown_sites_and_lines():
+    with pytest.raises(InputError, match="1 sites are unknown; bicubic needs all"):
+        Compensator(random_map(ARTIFACT, 4, unknown=[(5, 5)]), method="bicubic")
+    emap = random_map(ARTIFACT, 4)
+    emap.g_theta[3] = np.nan
+    with pytest.raises(InputError, match="1 angular lines are unknown"):
+        Compensator(emap, method="bicubic")
+    at = Compensator(emap).error_theta(np.arange(24) * np.pi / 12)
+    np.testing.assert_allclose(at, emap.g_theta, rtol=1e-9)
+    assert np.isnan(Compensator(emap).error_theta(3.5 * np.pi / 12))
+
+
+@pytest.mark.parametrize("method", METHODS)
+@given(theta=st.floats(-50, 50), turns=st.integers(-3, 3))
+def test_theta_is_periodic_and_inverts(method, theta, turns):
+    compensator = Compensator(MAP, method=method)
+    assert compensator.error_theta(theta + 2 * np.pi * turns) == pytest.approx(
+        compensator.error_theta(theta), abs=1e-14)
+    assert compensator.correct_theta(compensator.command_theta(theta)) == pytest.approx(
+        theta, abs=3e-14)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_theta_gives_the_lines_themselves_and_the_mean_between_them(method):
+    compensator = Compensator(MAP, method=method)
+    lines = np.arange(-24, 48)
+    np.testing.assert_allclose(compensator.error_theta(lines * np.pi / 12), MAP.g_theta[lines % 24],
+                               rtol=0, atol=1e-16)
+    if method == "bilinear":
+        assert compensator.error_theta(-np.pi / 24) == pytest.approx(
+            (MAP.g_theta[23] + MAP.g_theta[0]) / 2, abs=1e-16)
+        assert compensator.uncertainty_theta(-np.pi / 24) == pytest.approx(
+            (MAP.u_g_theta[23] + MAP.u_g_theta[0]) / 2, abs=1e-16)
+
+
+def test_uncertainty_is_that_of_the_sites_and_a_bound_between_them():
+    compensator = Compensator(MAP)
+    ux, uy = compensator.uncertainty(ARTIFACT.x_m, ARTIFACT.y_m)
+    np.testing.assert_allclose(ux, MAP.u_gx, rtol=1e-12)
+    np.testing.assert_allclose(uy, MAP.u_gy, rtol=1e-12)
+    assert compensator.uncertainty(0.005, 0.0)[0] == pytest.approx(MAP.u_gx[5:7, 5].mean())
+
+
+def test_a_map_without_lines_says_so():
+    compensator = Compensator(random_map(Artifact(5, 0.01), 1))
+    assert not compensator.has_theta
+    for call in ("error_theta", "command_theta", "correct_theta", "uncertainty_theta"):
+        with pytest.raises(InputError, match="it has no angular lines"):
+            getattr(compensator, call)(0.0)
+
+
+@pytest.mark.parametrize("words", [{"method": "spline"}, {"outside": "extrapolate"}])
+def test_unknown_words_are_refused(words):
+    with pytest.raises(InputError, match="is unknown; take"):
+        Compensator(MAP, **words)
+
+
+def test_a_map_in_the_wrong_unit_is_refused():
+    with pytest.raises(InputError, match=r"neighbouring sites .* cannot be inverted"):
+        Compensator(random_map(ARTIFACT, 1, gain=1e6))
+    emap = random_map(ARTIFACT, 1)
+    emap.g_theta[2] = 20.0
+    with pytest.raises(InputError, match="angular lines"):
+        Compensator(emap)
+
+
+def test_scalars_and_shapes_come_back_as_they_were():
+    compensator = Compensator(MAP)
+    assert compensator.command(0.0, 0.0)[0].shape == ()
+    x, y = compensator.correct(np.zeros((3, 1)), np.zeros(4))
+    assert x.shape == y.shape == (3, 4)
