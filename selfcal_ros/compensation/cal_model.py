@@ -1,0 +1,265 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Calibration files of Aerotech controllers as values: tables, units, findings."""
+
+from dataclasses import dataclass, field, fields
+from enum import StrEnum
+
+import numpy as np
+
+
+class Kind(StrEnum):
+    """Kind of a table; a file holds tables of one kind only."""
+
+    ONE_D = "1D"
+    TWO_D = "2D"
+    GALVO = "galvo 2D"
+
+    @property
+    def start(self) -> str:
+        """The token that opens a table of this kind."""
+        return {Kind.ONE_D: ":START", Kind.TWO_D: ":START2D", Kind.GALVO: ":GALVO2D"}[self]
+
+
+class Severity(StrEnum):
+    """How bad a finding is."""
+
+    ERROR = "error"
+    WARNING = "warning"
+    TOLERATED = "tolerated"
+
+
+@dataclass(frozen=True, order=True)
+class Finding:
+    """One remark about a file: where, what and how to mend it.
+
+    Attributes
+    ----------
+    line : int
+        Line of the file, from 1; 0 means the whole file.
+    severity : Severity
+        ERROR: the file must not be loaded. WARNING: legal, but probably not what was meant.
+        TOLERATED: not the strict form, yet its meaning is plain.
+    what, mend : str
+        What is wrong, and what to do about it.
+    """
+
+    line: int
+    severity: Severity
+    what: str
+    mend: str = ""
+
+    def text(self, where: str) -> str:
+        """Return the finding as one line for the file `where`."""
+        place = f"{where}:{self.line}" if self.line else where
+        return f"{place}: {self.severity}: {self.what}" + (f"; {self.mend}" if self.mend else "")
+
+
+class UnitWord(StrEnum):
+    """Words of POSUNIT and CORUNIT."""
+
+    PRIMARY = "PRIMARY"
+    SECONDARY = "SECONDARY"
+    COUNTS = "COUNTS"
+
+
+@dataclass(frozen=True)
+class Unit:
+    """A unit word with its divisor: PRIMARY/1000 means thousandths of the primary unit."""
+
+    word: UnitWord = UnitWord.COUNTS
+    divisor: float = 1.0
+
+
+COUNTS = Unit()
+
+
+@dataclass(frozen=True, eq=False)
+class Table1D:
+    """A 1D table: `axis` is corrected from the position of `reference`.
+
+    Attributes
+    ----------
+    axis : int
+        Corrected axis, 1..32.
+    sample_dist, offset : float
+        Entry n belongs to the position n * sample_dist - offset, in `pos_unit`.
+    values : float array (n,)
+        Corrections in `cor_unit`.
+    reference_axis : int or None
+        None means `axis` itself.
+    pos_unit, cor_unit : Unit or None
+        None: counts; a missing `cor_unit` follows `pos_unit`.
+    expand_coeff, material_temp : float or None
+        Thermal expansion of the scale's carrier in 1/degC, and the temperature of the
+        measurement in degC.
+    negpos, negcor : bool
+        Change the sign of all positions, of all corrections.
+    rollover : float or None
+        Counts after which the table repeats.
+    home_direction : str or None
+        "CW" (positive end) or "CCW"; without it `home_offset` and `full_travel` are ignored.
+    home_offset, full_travel : float or None
+        Primary units.
+    absolute_feedback_offset : float or None
+        Counts.
+    serial_number : str or None
+        For reference only.
+    line, lines : int, dict
+        Line of the first start token, and keyword -> line; 0 and empty if not read from a file.
+    """
+
+    axis: int
+    sample_dist: float
+    values: np.ndarray
+    reference_axis: int | None = None
+    pos_unit: Unit | None = None
+    cor_unit: Unit | None = None
+    offset: float | None = None
+    expand_coeff: float | None = None
+    material_temp: float | None = None
+    negpos: bool = False
+    negcor: bool = False
+    rollover: float | None = None
+    home_direction: str | None = None
+    home_offset: float | None = None
+    absolute_feedback_offset: float | None = None
+    full_travel: float | None = None
+    serial_number: str | None = None
+    line: int = 0
+    lines: dict[str, int] = field(default_factory=dict)
+
+    kind = Kind.ONE_D
+
+    @property
+    def reference(self) -> int:
+        """Axis whose position selects the entry."""
+        return self.axis if self.reference_axis is None else self.reference_axis
+
+    @property
+    def outputs(self) -> tuple[int, ...]:
+        """Corrected axes."""
+        return (self.axis,)
+
+    @property
+    def inputs(self) -> tuple[int, ...]:
+        """Axes whose positions are needed."""
+        return (self.reference,)
+
+    @property
+    def position_unit(self) -> Unit:
+        """Unit of `sample_dist` and `offset`, defaults applied."""
+        return self.pos_unit or COUNTS
+
+    @property
+    def correction_unit(self) -> Unit:
+        """Unit of `values`, defaults applied: CORUNIT, else POSUNIT, else counts."""
+        return self.cor_unit or self.position_unit
+
+
+@dataclass(frozen=True, eq=False)
+class Table2D:
+    """A 2D or galvo table: two or three axes are corrected from the positions of two.
+
+    Attributes
+    ----------
+    row_axis, column_axis : int
+        Input axes: rows run down the table, columns across it.
+    output_axes : tuple of int
+        Two or three corrected axes.
+    sample_row, sample_col : float
+        Row r belongs to r * sample_row - offset_row, and columns likewise, in `pos_unit`; the
+        centre of a galvo table belongs to position (0, 0).
+    values : float array (rows, columns, outputs)
+        Corrections in `cor_unit`.
+    pos_unit, cor_unit : Unit or None
+        None means counts, each for itself.
+    rollover_row, rollover_col, absolute_feedback_offset_row, absolute_feedback_offset_col
+        Counts or None.
+    galvo : bool
+        Whether the table belongs to a galvo scanner.
+    line, lines : int, dict
+        As in `Table1D`.
+    """
+
+    row_axis: int
+    column_axis: int
+    output_axes: tuple[int, ...]
+    sample_row: float
+    sample_col: float
+    values: np.ndarray
+    pos_unit: Unit | None = None
+    cor_unit: Unit | None = None
+    offset_row: float | None = None
+    offset_col: float | None = None
+    absolute_feedback_offset_row: float | None = None
+    absolute_feedback_offset_col: float | None = None
+    negcor: bool = False
+    rollover_row: float | None = None
+    rollover_col: float | None = None
+    serial_number: str | None = None
+    galvo: bool = False
+    line: int = 0
+    lines: dict[str, int] = field(default_factory=dict)
+
+    @property
+    def kind(self) -> Kind:
+        """Kind of the table."""
+        return Kind.GALVO if self.galvo else Kind.TWO_D
+
+    @property
+    def outputs(self) -> tuple[int, ...]:
+        """Corrected axes."""
+        return self.output_axes
+
+    @property
+    def inputs(self) -> tuple[int, ...]:
+        """Axes whose positions are needed."""
+        return self.row_axis, self.column_axis
+
+    @property
+    def position_unit(self) -> Unit:
+        """Unit of the sample distances and offsets, defaults applied."""
+        return self.pos_unit or COUNTS
+
+    @property
+    def correction_unit(self) -> Unit:
+        """Unit of `values`, defaults applied."""
+        return self.cor_unit or COUNTS
+
+
+Table = Table1D | Table2D
+
+
+@dataclass(frozen=True, eq=False)
+class CalFile:
+    """What a calibration file says, and what is to be said about it.
+
+    Attributes
+    ----------
+    where : str
+        File name, for messages.
+    tables : tuple of Table
+        Tables that could be understood, in their order.
+    findings : tuple of Finding
+        Sorted by line.
+    comments : tuple of str
+        Comments before the first table, without their mark.
+    """
+
+    where: str
+    tables: tuple[Table, ...]
+    findings: tuple[Finding, ...] = ()
+    comments: tuple[str, ...] = ()
+
+    def of(self, severity: Severity) -> list[Finding]:
+        """Return the findings of one severity."""
+        return [finding for finding in self.findings if finding.severity is severity]
+
+
+def same_table(a: Table, b: Table) -> bool:
+    """Return whether two tables say the same, wherever they stand in their files."""
+    if type(a) is not type(b) or a.values.shape != b.values.shape:
+        return False
+    names = [f.name for f in fields(a) if f.name not in ("values", "line", "lines")]
+    return (all(getattr(a, name) == getattr(b, name) for name in names)
+            and bool(np.array_equal(a.values, b.values)))
