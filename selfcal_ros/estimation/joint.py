@@ -1,0 +1,135 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Calibration by joint least squares: readings to result."""
+
+import numpy as np
+
+from selfcal_ros.errors import NoDataError, NotIdentifiableError
+from selfcal_ros.estimation.api import Options
+from selfcal_ros.estimation.fit import Fit, Problem, fit, repeats_of
+from selfcal_ros.estimation.lattice import PHASES
+from selfcal_ros.estimation.noise import disagreement
+from selfcal_ros.estimation.rank import measured_observability, refusal
+from selfcal_ros.estimation.readings_data import angular_data, grid_data
+from selfcal_ros.estimation.system import system_for
+from selfcal_ros.estimation.theta import conditions_for, misclosure_warning
+from selfcal_ros.estimation.uncertainty import FieldCovariance, angular_variance
+from selfcal_ros.model.error_map import ErrorMap, ThetaDatum
+from selfcal_ros.model.readings import Measurements, Sense
+from selfcal_ros.model.result import (
+    ArtifactMap,
+    CalibrationResult,
+    Noise,
+    Observability,
+    ViewResult,
+)
+
+
+def solve_joint(measurements: Measurements, options: Options) -> CalibrationResult:
+    """Calibrate by joint least squares; see `selfcal_ros.estimation.api.calibrate`."""
+    problem, seen = prepare(measurements, options)
+    solution = fit(problem, problem.grid.y)
+    return _result(measurements, options, problem=problem, found=solution, seen=seen)
+
+
+def prepare(measurements: Measurements, options: Options) -> tuple[Problem, Observability]:
+    """Return the problem that the readings pose and what it determines.
+
+    Raises
+    ------
+    NoDataError, NotIdentifiableError, InputError
+        As `selfcal_ros.estimation.api.calibrate`.
+    """
+    grid, angular = grid_data(measurements), angular_data(measurements)
+    if not grid.index:
+        raise NoDataError(f"plan '{measurements.plan_id}'", "no grid mark was read",
+                          "record detections of the plate's marks in at least three views")
+    system = system_for(grid, angular)
+    seen = measured_observability(system, measurements.artifact,
+                                  tuple(v.view for v in measurements.views))
+    if not seen.identifiable:
+        raise NotIdentifiableError(refusal(seen), seen)
+    half_width_m = measurements.artifact.grid_pitch_m * max(measurements.artifact.half)
+    conditions = conditions_for(system, options.datum_theta, measurements.sense, half_width_m)
+    return Problem(system, grid, angular, *repeats_of(measurements), half_width_m,
+                   conditions), seen
+
+
+def _result(measurements: Measurements, options: Options, *, problem: Problem, found: Fit,
+            seen: Observability) -> CalibrationResult:
+    error_map, closure = _error_map(measurements, problem, found)
+    xy, theta = found.xy, found.theta
+    noise = Noise(xy.sigma, theta.sigma, xy.repeats, theta.repeats, xy.residuals,
+                  theta.residuals, xy.dof_repeats, theta.dof_repeats, xy.dof_residuals,
+                  theta.dof_residuals)
+    warnings = (
+        disagreement(xy, "grid readings", (1e6, "µm"), 1e-13),
+        disagreement(theta, "angular readings", (np.degrees(3600), "arcsec"), 1e-13),
+        *_datum_warnings(options, problem, found, closure=closure))
+    return CalibrationResult(
+        measurements.plan_id, error_map, _artifact_map(problem, found),
+        _views(measurements, problem, found), seen, noise, measurements.all_rejected(),
+        warnings=tuple(text for text in warnings if text), method="joint",
+        sense=str(measurements.sense))
+
+
+def _error_map(measurements: Measurements, problem: Problem, found: Fit
+               ) -> tuple[ErrorMap, np.ndarray]:
+    """Return the map in the stage frame, and the covariance of the angular misclosure."""
+    system, length = problem.system, problem.half_width_m
+    cover = FieldCovariance(system, found.inverse)
+    u_x, u_y = (np.sqrt(v) * found.xy.sigma for v in cover.diagonal())
+    u_theta, closure = np.full(system.angular.n_lines, np.nan), np.zeros((0, 0))
+    if system.angular.n_views:
+        variance, closure = angular_variance(
+            cover, problem.conditions, sigma=(found.xy.sigma, found.theta.sigma),
+            half_width_m=length)
+        u_theta = np.sqrt(variance)
+    known = system.known_sites
+    field = np.where(known, found.field, complex(np.nan, np.nan))
+    g_theta = np.where(system.known_lines, found.g_theta, np.nan)
+    o, r = system.gauge.first_order(found.field)
+    if measurements.sense is Sense.PLATE_MOVES:
+        field, u_x, u_y = -field[::-1, ::-1], u_x[::-1, ::-1], u_y[::-1, ::-1]
+        back = -np.arange(len(g_theta)) % max(len(g_theta), 1)
+        g_theta, u_theta = -g_theta[back], u_theta[back]
+    return ErrorMap(measurements.artifact, field.real.copy(), field.imag.copy(), u_x, u_y,
+                    g_theta, u_theta, o / length, r / length,
+                    problem.conditions.datum), closure
+
+
+def _artifact_map(problem: Problem, found: Fit) -> ArtifactMap:
+    system = problem.system
+    plate = np.where(system.known_marks, found.plate, complex(np.nan, np.nan))
+    return ArtifactMap(plate.real.copy(), plate.imag.copy(),
+                       np.where(system.known_plate_lines, found.a_theta, np.nan))
+
+
+def _views(measurements: Measurements, problem: Problem, found: Fit) -> tuple[ViewResult, ...]:
+    system = problem.system
+    values = np.where(system.known_views, found.parameters, np.nan)
+    phi = dict(zip(system.angular_index, values[system.phi_at], strict=True))
+    offset: dict[int, complex] = {}
+    for row, i in enumerate(system.grid_index):
+        phi[i] = values[3 * row]
+        turn = PHASES[problem.grid.poses[row].q]
+        offset[i] = turn * complex(*values[3 * row + 1:3 * row + 3])
+    nan = complex(np.nan, np.nan)
+    return tuple(
+        ViewResult(v.view.name, v.view.rotation_rad, *v.view.translation_m,
+                   phi=float(phi.get(i, np.nan) / problem.half_width_m),
+                   tx=offset.get(i, nan).real, ty=offset.get(i, nan).imag, used=v.used,
+                   rejected=sum(v.rejected.values()))
+        for i, v in enumerate(measurements.views))
+
+
+def _datum_warnings(options: Options, problem: Problem, found: Fit, *,
+                    closure: np.ndarray) -> list[str]:
+    if not problem.system.angular.n_views:
+        return []
+    if problem.conditions.datum is not options.datum_theta:
+        return ["theta: no half axis has two known sites, so the datum is zero_mean"]
+    if problem.conditions.datum is ThetaDatum.ZERO_MEAN:
+        return []
+    return [misclosure_warning(found.misclosure, closure)]
+
+

@@ -1,0 +1,135 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The lattice maps of a set of views: from fields over sites to fields over marks, and back.
+
+Vectors are complex numbers, z = x + iy, so that a quarter turn is a multiplication by i. In the
+plate frame the model of method, section 2 (Hu 12-15) reads, for view v with q quarter turns,
+    y_v(m) = i^-q G(X_v(m)) + A(m) + phi_v i z(m) + tau_v,     y_v = i^-q V_v,  tau_v = i^-q t_v.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+PHASES = np.array([1, 1j, -1, -1j])
+"""i^q for q = 0..3, exact."""
+
+
+@dataclass(frozen=True)
+class GridPose:
+    """Pose of one grid view on the lattice: quarter turns q, shift (a, b) in pitches."""
+
+    q: int
+    a: int
+    b: int
+
+
+@dataclass(frozen=True)
+class Window:
+    """Where one view's marks and their sites lie: slices into the plate and into the field."""
+
+    marks: tuple[slice, slice]
+    sites: tuple[slice, slice]
+    transposed: bool
+
+
+def window(pose: GridPose, half: tuple[int, int]) -> Window:
+    """Return the marks of a view that lie in the field, and their sites, as slices.
+
+    Site = R^q (m, n) + (a, b); a field with half widths `half`.
+    """
+    (hx, hy), swap = half, pose.q % 2 == 1
+    # stage x = sx * (m or n) + a, stage y = sy * (n or m) + b
+    sx, sy = ((1, 1), (-1, 1), (-1, -1), (1, -1))[pose.q]
+    along_x, along_y = ((hy, hx) if swap else (hx, hy))
+    p = _run(sx, pose.a, along_x, hx)
+    r = _run(sy, pose.b, along_y, hy)
+    marks = (r[0], p[0]) if swap else (p[0], r[0])
+    return Window(marks, (p[1], r[1]), swap)
+
+
+def _run(sign: int, shift: int, half_mark: int, half_site: int) -> tuple[slice, slice]:
+    """Return the slices of u in [-half_mark, half_mark] with sign*u + shift in the field."""
+    ends = sorted((sign * (-half_site - shift), sign * (half_site - shift)))
+    low, high = max(ends[0], -half_mark), min(ends[1], half_mark)
+    if low > high:
+        return slice(0, 0), slice(0, 0)
+    first, last = sign * low + shift + half_site, sign * high + shift + half_site
+    stop = last + sign
+    return (slice(low + half_mark, high + half_mark + 1),
+            slice(first, None if stop < 0 else stop, sign))
+
+
+class LatticeViews:
+    """The maps between sites and marks for the grid views of one calibration.
+
+    Parameters
+    ----------
+    shape : tuple of int
+        Marks (and sites) along x and y.
+    poses : tuple of GridPose
+        One a view.
+    """
+
+    def __init__(self, shape: tuple[int, int], poses: tuple[GridPose, ...]) -> None:
+        self.shape, self.poses = shape, poses
+        self.half = (shape[0] - 1) // 2, (shape[1] - 1) // 2
+        self.windows = tuple(window(pose, self.half) for pose in poses)
+
+    @cached_property
+    def z(self) -> np.ndarray:
+        """Mark positions m + i n in units of the longer half width, complex (nx, ny)."""
+        hx, hy = self.half
+        return (np.arange(-hx, hx + 1)[:, None] + 1j * np.arange(-hy, hy + 1)) / max(hx, hy)
+
+    @cached_property
+    def in_field(self) -> np.ndarray:
+        """Marks that lie in the field, bool (views, nx, ny)."""
+        out = np.zeros((len(self.poses), *self.shape), dtype=bool)
+        for index, win in enumerate(self.windows):
+            out[index][win.marks] = True
+        return out
+
+    @cached_property
+    def site_index(self) -> np.ndarray:
+        """Flat index of the site of every mark, int (views, nx, ny); -1 off the field."""
+        flat = np.arange(self.shape[0] * self.shape[1]).reshape(self.shape)
+        out = np.full((len(self.poses), *self.shape), -1)
+        for index, win in enumerate(self.windows):
+            sites = flat[win.sites]
+            out[index][win.marks] = sites.T if win.transposed else sites
+        return out
+
+    def gather(self, field: np.ndarray) -> np.ndarray:
+        """Return i^-q G(X_v(m)), complex (views, nx, ny), 0 where the mark is off the field."""
+        out = np.zeros((len(self.poses), *self.shape), dtype=complex)
+        for index, (pose, win) in enumerate(zip(self.poses, self.windows, strict=True)):
+            sites = field[win.sites]
+            np.multiply(sites.T if win.transposed else sites, PHASES[-pose.q % 4],
+                        out=out[index][win.marks])
+        return out
+
+    def scatter(self, marks: np.ndarray) -> np.ndarray:
+        """Return the adjoint of `gather`: the sum over views at every site, complex (nx, ny)."""
+        out = np.zeros(self.shape, dtype=complex)
+        for index, (pose, win) in enumerate(zip(self.poses, self.windows, strict=True)):
+            part = marks[index][win.marks]
+            out[win.sites] += PHASES[pose.q] * (part.T if win.transposed else part)
+        return out
+
+
+def rigid_parameters(views: LatticeViews) -> np.ndarray:
+    """Return what the 7 datum modes do to the misalignments, (7, views, 3): phi, Re and Im tau.
+
+    Modes: stage translation x, y, rotation, scale; plate translation x, y, rotation; unit
+    length (or unit angle times the longer half width). A mode G, A with these misalignments
+    changes no reading (method, section 3).
+    """
+    out = np.zeros((7, len(views.poses), 3))
+    for v, pose in enumerate(views.poses):
+        back = PHASES[-pose.q % 4]
+        shift = back * (pose.a + 1j * pose.b) / max(views.half)
+        taus = (-back, -1j * back, -1j * shift, -shift, -1, -1j, 0)
+        out[:, v, 0] = (0, 0, -1, 0, 0, 0, -1)
+        out[:, v, 1], out[:, v, 2] = np.real(taus), np.imag(taus)
+    return out

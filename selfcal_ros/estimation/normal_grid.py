@@ -1,0 +1,181 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Normal equations of the grid readings with the plate eliminated (method, section 7).
+
+The plate's error at a mark is the weighted mean of what its readings leave, so eliminating it
+is exact and local. What remains couples the stage error G at sites that one mark visits, and
+three numbers a view (phi, Re tau, Im tau), which are eliminated last.
+"""
+
+from functools import cached_property
+
+import numpy as np
+from scipy.sparse import coo_matrix, csc_matrix
+
+from selfcal_ros.estimation.factor import factorise
+from selfcal_ros.estimation.graph import Components, components
+from selfcal_ros.estimation.lattice import PHASES, GridPose, LatticeViews, rigid_parameters
+
+
+class GridSystem:
+    """Everything about a set of grid readings that does not depend on their values.
+
+    Parameters
+    ----------
+    poses : tuple of GridPose
+        One a view.
+    weight : float array (views, nx, ny)
+        Weight of each reading; 0 = not read.
+    """
+
+    def __init__(self, poses: tuple[GridPose, ...], weight: np.ndarray) -> None:
+        self.weight = weight
+        self.views = LatticeViews(weight.shape[1:], poses)
+        self.read = weight > 0
+        total = weight.sum(axis=0)
+        self.mark_read = total > 0
+        self.share = weight / np.where(self.mark_read, total, 1.0)
+        """Part of each reading in the mean of its mark, (views, nx, ny)."""
+
+    @property
+    def n_views(self) -> int:
+        """Number of grid views."""
+        return len(self.views.poses)
+
+    @property
+    def n_sites(self) -> int:
+        """Number of sites of the field."""
+        return self.weight[0].size
+
+    @property
+    def n_readings(self) -> int:
+        """Number of marks read, over all views; each has two coordinates."""
+        return int(np.count_nonzero(self.read))
+
+    @cached_property
+    def edges(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Site, mark and quarter turns of every reading."""
+        view, mark = np.nonzero(self.read.reshape(self.n_views, -1))
+        site = self.views.site_index.reshape(self.n_views, -1)[view, mark]
+        return site, mark, np.array([pose.q for pose in self.views.poses])[view]
+
+    @cached_property
+    def components(self) -> Components:
+        """Components of the graph of sites and marks."""
+        site, mark, q = self.edges
+        return components(site, mark, q, n_sites=self.n_sites, n_marks=self.n_sites)
+
+    def centred(self, marks: np.ndarray) -> np.ndarray:
+        """Return `marks` (views, nx, ny) less the weighted mean of each mark over its views."""
+        return marks - np.einsum("vij,vij->ij", self.share, marks)
+
+    @cached_property
+    def matrix(self) -> csc_matrix:
+        """The eliminated matrix over the sites, Hermitian, pinned where a component is free."""
+        index = self.views.site_index.reshape(self.n_views, -1)
+        weight, share = (a.reshape(self.n_views, -1) for a in (self.weight, self.share))
+        rows, cols, values = [], [], []
+        for i, pose_i in enumerate(self.views.poses):
+            for j, pose_j in enumerate(self.views.poses):
+                both = (weight[i] > 0) & (weight[j] > 0)
+                value = -weight[i][both] * share[j][both]
+                if i == j:
+                    value = value + weight[i][both]
+                rows.append(index[i][both])
+                cols.append(index[j][both])
+                values.append(value * PHASES[(pose_i.q - pose_j.q) % 4])
+        pins = self._pins()
+        rows.append(pins)
+        cols.append(pins)
+        values.append(np.full(len(pins), self.weight.sum() / max(self.n_readings, 1)))
+        data, at = np.concatenate(values), (np.concatenate(rows), np.concatenate(cols))
+        return coo_matrix((data, at), shape=(self.n_sites, self.n_sites)).tocsc()
+
+    def _pins(self) -> np.ndarray:
+        """Return the sites that are held: never visited, and one of each free component."""
+        parts = self.components
+        held = parts.first_sites[parts.balanced]
+        return np.concatenate([np.flatnonzero(parts.of_site < 0), held])
+
+    @cached_property
+    def factor(self):
+        """Factorisation of `matrix`."""
+        return factorise(self.matrix, self.views.shape)
+
+    @cached_property
+    def shapes(self) -> np.ndarray:
+        """What phi and Re tau of a view do to its readings: i z and 1, complex (2, nx, ny)."""
+        return np.stack([1j * self.views.z, np.ones(self.views.shape)])
+
+    @cached_property
+    def columns(self) -> np.ndarray:
+        """Coupling of sites to phi and tau, complex (sites, views, 2), plate eliminated."""
+        out = np.empty((self.n_sites, self.n_views, 2), dtype=complex)
+        for v in range(self.n_views):
+            for c in range(2):
+                marks = -self.weight * (self.share[v] * self.shapes[c])
+                marks[v] += self.weight[v] * self.shapes[c]
+                out[:, v, c] = self.views.scatter(marks).ravel()
+        return out
+
+    @cached_property
+    def block(self) -> np.ndarray:
+        """Block of the misalignments, plate eliminated, real (3 views, 3 views)."""
+        f = _real_columns(self.shapes.reshape(2, -1).T).T
+        weight, share = (a.reshape(self.n_views, -1) for a in (self.weight, self.share))
+        out = np.empty((self.n_views, 3, self.n_views, 3))
+        for i in range(self.n_views):
+            for j in range(self.n_views):
+                w = (weight[i] if i == j else 0.0) - weight[i] * share[j]
+                out[i, :, j, :] = np.real((np.conj(f) * w) @ f.T)
+        return out.reshape(3 * self.n_views, -1)
+
+    @cached_property
+    def response(self) -> np.ndarray:
+        """M^-1 times `columns`: the sites' answer to phi, Re tau, Im tau, (sites, 3 views)."""
+        flat = self.columns.reshape(self.n_sites, -1)
+        solved = self.factor.solve(flat).reshape(self.n_sites, self.n_views, 2)
+        return _real_columns(solved).reshape(self.n_sites, -1)
+
+    @cached_property
+    def schur(self) -> np.ndarray:
+        """Normal matrix of the misalignments alone, real symmetric (3 views, 3 views)."""
+        c = _real_columns(self.columns).reshape(self.n_sites, -1)
+        out = self.block - np.real(c.conj().T @ self.response)
+        return (out + out.T) / 2
+
+    @cached_property
+    def rigid(self) -> np.ndarray:
+        """The datum modes in the misalignments, (7, 3 views)."""
+        return rigid_parameters(self.views).reshape(7, -1)
+
+    def right_side(self, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the right-hand sides of sites (complex) and misalignments (real)."""
+        weighted = self.weight * self.centred(y)
+        sums = np.einsum("cij,vij->vc", np.conj(self.shapes), weighted)
+        d = np.stack([sums[:, 0].real, sums[:, 1].real, sums[:, 1].imag], axis=1)
+        return self.views.scatter(weighted).ravel(), d.ravel()
+
+    def reduced(self, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return M^-1 b and the right-hand side of the misalignments with sites eliminated."""
+        b, d = self.right_side(y)
+        free = self.factor.solve(b)
+        c = self.columns.reshape(self.n_sites, -1)
+        sums = (np.conj(c).T @ free).reshape(self.n_views, 2)
+        d = d - np.stack([sums[:, 0].real, sums[:, 1].real, sums[:, 1].imag], axis=1).ravel()
+        return free, d
+
+    def misaligned(self, parameters: np.ndarray) -> np.ndarray:
+        """Return phi i z + tau at every mark, complex (views, nx, ny)."""
+        phi, re, im = parameters.reshape(self.n_views, 3).T
+        return (phi[:, None, None] * self.shapes[0] + (re + 1j * im)[:, None, None])
+
+    def plate(self, y: np.ndarray, field: np.ndarray, parameters: np.ndarray) -> tuple:
+        """Return A (nx, ny) and the residuals (views, nx, ny) for given G and misalignments."""
+        left = y - self.views.gather(field) - self.misaligned(parameters)
+        a = np.einsum("vij,vij->ij", self.share, left)
+        return a, np.where(self.read, left - a, 0.0)
+
+
+def _real_columns(pairs: np.ndarray) -> np.ndarray:
+    """Return (..., 2) columns of phi and Re tau as (..., 3): Im tau is i times Re tau."""
+    return np.concatenate([pairs, 1j * pairs[..., 1:]], axis=-1)

@@ -1,0 +1,244 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A measured plan: its normal equations, what they determine, and a cache of such plans."""
+
+import hashlib
+from collections import OrderedDict
+from functools import cached_property
+from threading import Lock
+
+import numpy as np
+
+from selfcal_ros.estimation.gauge import Gauge
+from selfcal_ros.estimation.lattice import GridPose
+from selfcal_ros.estimation.normal_grid import GridSystem
+from selfcal_ros.estimation.normal_theta import AngularSystem
+from selfcal_ros.estimation.readings_data import AngularData, GridData
+
+GAP = 1e-9
+"""Relative size below which an eigenvalue of a misalignment matrix is a zero; the true zeros lie
+near 1e-15 and the smallest others above 1e-4."""
+
+CACHED = 16
+CACHED_READINGS = 4_000_000
+"""Limits of the cache: number of plans, and readings in all of them together."""
+
+
+class JointSystem:
+    """Grid and angular equations of one measured plan, joined by the views' rotations.
+
+    Parameters
+    ----------
+    grid, angular : GridSystem, AngularSystem
+        The two sets of equations.
+    grid_index, angular_index : tuple of int
+        Position of their views in the measurement.
+    """
+
+    def __init__(self, grid: GridSystem, angular: AngularSystem, grid_index: tuple[int, ...],
+                 angular_index: tuple[int, ...]) -> None:
+        self.grid, self.angular = grid, angular
+        self.grid_index, self.angular_index = grid_index, angular_index
+        extra = [i for i in angular_index if i not in grid_index]
+        self.size = 3 * len(grid_index) + len(extra)
+        """Misalignments: (phi, Re tau, Im tau) of each grid view, phi of each other view."""
+        of_view = {i: 3 * row for row, i in enumerate(grid_index)}
+        of_view |= {i: 3 * len(grid_index) + row for row, i in enumerate(extra)}
+        self.phi_at = np.array([of_view[i] for i in angular_index], dtype=int)
+        """Place of phi of each angular view among the misalignments."""
+
+    @cached_property
+    def rigid(self) -> np.ndarray:
+        """Datum modes in all misalignments, (7, size)."""
+        out = np.zeros((7, self.size))
+        out[:, :3 * self.grid.n_views] = self.grid.rigid
+        out[[2, 6], 3 * self.grid.n_views:] = -1
+        return out
+
+    def normal(self, ratio: float) -> np.ndarray:
+        """Return the normal matrix of all misalignments; `ratio` weighs the angular readings."""
+        out = np.zeros((self.size, self.size))
+        n = 3 * self.grid.n_views
+        out[:n, :n] = self.grid.schur
+        out[np.ix_(self.phi_at, self.phi_at)] += ratio * self.angular.schur
+        return out
+
+    @cached_property
+    def spectrum_grid(self) -> tuple[np.ndarray, np.ndarray]:
+        """Eigenvalues and vectors of the grid's misalignment matrix."""
+        return np.linalg.eigh(self.grid.schur)
+
+    @cached_property
+    def rank_schur(self) -> int:
+        """Rank of the grid's misalignment matrix."""
+        return _rank(self.spectrum_grid[0])
+
+    @cached_property
+    def grid_inverse(self) -> np.ndarray:
+        """Pseudo-inverse of the grid's misalignment matrix."""
+        return pseudo_inverse(*self.spectrum_grid)
+
+    @cached_property
+    def angular_inverse(self) -> np.ndarray:
+        """Pseudo-inverse of the angular misalignment matrix."""
+        return pseudo_inverse(*np.linalg.eigh(self.angular.schur))
+
+    def inverse(self, ratio: float) -> np.ndarray:
+        """Return the pseudo-inverse of `normal`: covariance of the misalignments, unit noise."""
+        return pseudo_inverse(*np.linalg.eigh(self.normal(ratio)))
+
+    @cached_property
+    def rank_grid(self) -> int:
+        """Rank of the grid readings."""
+        parts = self.grid.components
+        nodes = np.count_nonzero(parts.of_site >= 0) + np.count_nonzero(parts.of_mark >= 0)
+        return int(2 * (nodes - np.count_nonzero(parts.balanced)) + self.rank_schur)
+
+    @cached_property
+    def rank_angular(self) -> int:
+        """Rank of the angular readings."""
+        parts = self.angular.components
+        nodes = np.count_nonzero(parts.of_site >= 0) + np.count_nonzero(parts.of_mark >= 0)
+        rank = _rank(np.linalg.eigvalsh(self.angular.schur)) if self.angular.n_views else 0
+        return int(nodes - len(parts.balanced) + rank)
+
+    @cached_property
+    def _spectrum(self) -> tuple[np.ndarray, np.ndarray]:
+        scale = np.trace(self.grid.schur) / max(np.trace(self.angular.schur), 1e-300)
+        return np.linalg.eigh(self.normal(scale))
+
+    @cached_property
+    def nullity(self) -> int:
+        """Combinations of misalignments that no reading tells, the datum's among them."""
+        return self.size - _rank(self._spectrum[0])
+
+    @cached_property
+    def unseen(self) -> np.ndarray:
+        """Misalignments that no reading tells, beside the datum, (size, modes)."""
+        values, vectors = self._spectrum
+        null = vectors[:, values <= GAP * max(values[-1], 1e-300)]
+        rigid = np.linalg.qr(self.rigid.T)[0]
+        left = null - rigid @ (rigid.T @ null)
+        u, s, _ = np.linalg.svd(left, full_matrices=False)
+        return u[:, s > 1e-6]
+
+    @cached_property
+    def known_sites(self) -> np.ndarray:
+        """Sites whose error is determined up to the datum, bool (nx, ny)."""
+        parts = self.grid.components
+        known = (parts.of_site >= 0) & ~parts.balanced[parts.of_site]
+        if self.unseen.shape[1] and known.any():
+            moved = self.grid.response @ self.unseen[:3 * self.grid.n_views]
+            gauge = Gauge(self.grid.views.z, known.reshape(self.grid.views.shape), scale=True)
+            for column in moved.T:
+                field = column.reshape(self.grid.views.shape)
+                left = gauge.remove(field, gauge.parts(field)).ravel()
+                known &= abs(left) <= 1e-6
+        return known.reshape(self.grid.views.shape)
+
+    @cached_property
+    def known_views(self) -> np.ndarray:
+        """Misalignments that are determined up to the datum, bool (size,)."""
+        return np.all(abs(self.unseen) <= 1e-6, axis=1)
+
+    @cached_property
+    def known_marks(self) -> np.ndarray:
+        """Marks whose error is determined up to the datum, bool (nx, ny)."""
+        index = self.grid.views.site_index
+        good = self.grid.read & (index >= 0) & self.known_sites.reshape(-1)[index]
+        return good.any(axis=0)
+
+    @cached_property
+    def known_lines(self) -> np.ndarray:
+        """Stage lines that are determined up to one constant, bool (K,)."""
+        parts = self.angular.components
+        known = parts.of_site == parts.largest if len(parts.balanced) else parts.of_site >= 0
+        if self.unseen.shape[1] and known.any():
+            moved = self.angular.response @ self.unseen[self.phi_at]
+            moved = moved - moved[known].mean(axis=0)
+            known = known & np.all(abs(moved) <= 1e-6, axis=1)
+        return known
+
+    @cached_property
+    def known_plate_lines(self) -> np.ndarray:
+        """Plate lines that are determined, bool (K,)."""
+        return (self.angular.read & self.known_lines[self.angular.site]).any(axis=0)
+
+    @cached_property
+    def gauge(self) -> Gauge:
+        """Datum of the stage."""
+        return Gauge(self.grid.views.z, self.known_sites, scale=True)
+
+    @cached_property
+    def plate_gauge(self) -> Gauge:
+        """Datum of the plate."""
+        return Gauge(self.grid.views.z, self.known_marks, scale=False)
+
+
+def _rank(values: np.ndarray) -> int:
+    return int(np.count_nonzero(values > GAP * max(values.max(initial=0.0), 1e-300)))
+
+
+def pseudo_inverse(values: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+    """Return the pseudo-inverse of a matrix given by its eigenvalues and vectors."""
+    good = values > GAP * max(values.max(initial=0.0), 1e-300)
+    return (vectors[:, good] / values[good]) @ vectors[:, good].T
+
+
+_cache: OrderedDict[tuple, JointSystem] = OrderedDict()
+_lock = Lock()
+
+
+def system_for(grid: GridData, angular: AngularData) -> JointSystem:
+    """Return the system of a measured plan, from the cache if the same marks were read."""
+    digest = hashlib.blake2b(grid.weight, digest_size=16)
+    digest.update(angular.weight)
+    key = (grid.weight.shape, grid.poses, grid.index, angular.weight.shape, angular.turns,
+           angular.index, digest.digest())
+    with _lock:
+        if key in _cache:
+            _cache.move_to_end(key)
+            return _cache[key]
+    system = JointSystem(GridSystem(grid.poses, grid.weight),
+                         AngularSystem(angular.turns, angular.weight), grid.index, angular.index)
+    with _lock:
+        _cache[key] = system
+        while len(_cache) > 1 and (len(_cache) > CACHED or _cached_readings() > CACHED_READINGS):
+            _cache.popitem(last=False)
+    return system
+
+
+def _cached_readings() -> int:
+    return sum(system.grid.weight.size for system in _cache.values())
+
+
+def clear_cache() -> None:
+    """Forget all systems."""
+    with _lock:
+        _cache.clear()
+
+
+def planned_system(artifact, views) -> JointSystem:
+    """Return the system of views as planned: every mark that lies in the field, unit repeats.
+
+    Parameters
+    ----------
+    artifact : Artifact
+        The plate.
+    views : sequence of View
+        The plan.
+    """
+    grid_views = [(i, v) for i, v in enumerate(views) if v.grid]
+    poses = []
+    for _, view in grid_views:
+        pose = view.lattice_pose(artifact)
+        poses.append(GridPose(pose.quarter_turns, *pose.shift))
+    angular = [(i, v) for i, v in enumerate(views) if v.angular and artifact.angular_count]
+    turns = tuple(v.lattice_pose(artifact).turn_lines for _, v in angular)
+    empty = np.zeros((len(poses), *artifact.shape))
+    field = GridSystem(tuple(poses), empty).views.in_field
+    repeats = np.array([v.repeats for _, v in grid_views], dtype=float)
+    lines = np.array([v.repeats for _, v in angular], dtype=float)
+    return JointSystem(
+        GridSystem(tuple(poses), field * repeats[:, None, None]),
+        AngularSystem(turns, np.ones((len(turns), artifact.angular_count)) * lines[:, None]),
+        tuple(i for i, _ in grid_views), tuple(i for i, _ in angular))

@@ -1,0 +1,120 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Covariance of the calibrated maps: exact, with the datum, without forming it as a whole.
+
+For unit noise the sites have the covariance S = M^-1 + Y P Y', with M the eliminated matrix,
+Y its answer to the misalignments and P their covariance; the datum projects it.
+"""
+
+from functools import cached_property
+
+import numpy as np
+
+from selfcal_ros.estimation.system import JointSystem
+from selfcal_ros.estimation.theta import Conditions
+
+
+class FieldCovariance:
+    """Covariance of the stage map G in its datum, for unit noise of one grid reading.
+
+    Parameters
+    ----------
+    system : JointSystem
+        The measured plan.
+    inverse : float array (size, size)
+        Covariance of the misalignments for unit grid noise.
+    """
+
+    def __init__(self, system: JointSystem, inverse: np.ndarray) -> None:
+        self.system, self.inverse = system, inverse
+        n = 3 * system.grid.n_views
+        self._p = inverse[:n, :n]
+
+    def _raw(self, rows: np.ndarray) -> np.ndarray:
+        """Return S times complex columns (sites, k)."""
+        response = self.system.grid.response
+        answer = self._p @ np.real(response.conj().T @ rows)
+        return self.system.grid.factor.solve(np.ascontiguousarray(rows)) + response @ answer
+
+    @cached_property
+    def _datum(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        basis = self.system.gauge.orthonormal
+        spread = self._raw(basis)
+        return basis, spread, np.real(basis.conj().T @ spread)
+
+    def project(self, rows: np.ndarray) -> np.ndarray:
+        """Return functionals (sites, k) as they act on a map that is not in its datum."""
+        basis = self.system.gauge.orthonormal
+        return rows - basis @ np.real(basis.conj().T @ rows)
+
+    def of(self, rows: np.ndarray) -> np.ndarray:
+        """Return the covariance (k, k) of functionals Re(conj(row) G), complex (k, nx, ny)."""
+        flat = self.project(rows.reshape(len(rows), -1).T)
+        out = np.real(flat.conj().T @ self._raw(flat))
+        return (out + out.T) / 2
+
+    def diagonal(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the variances of Gx and Gy at every site, (nx, ny) each; NaN if unknown."""
+        grid = self.system.grid
+        basis, spread, inner = self._datum
+        out = []
+        response = grid.response
+        common = grid.factor.inverse_diagonal()
+        for part in (np.real, np.imag):
+            b, s, y = part(basis), part(spread), part(response)
+            value = common + np.einsum("sa,ab,sb->s", y, self._p, y)
+            value += np.einsum("sk,kl,sl->s", b, inner, b) - 2 * np.einsum("sk,sk->s", b, s)
+            out.append(np.where(self.system.known_sites, np.maximum(value, 0.0).reshape(
+                grid.views.shape), np.nan))
+        return out[0], out[1]
+
+
+def angular_variance(field: FieldCovariance, conditions: Conditions, *,
+                     sigma: tuple[float, float], half_width_m: float
+                     ) -> tuple[np.ndarray, np.ndarray]:
+    """Return the variance of Gtheta (K,) in its datum and the covariance of the misclosure.
+
+    Parameters
+    ----------
+    field : FieldCovariance
+        Covariance of the XY map.
+    conditions : Conditions
+        The angular datum.
+    sigma : tuple of float
+        Noise of one grid reading, m, and of one angular reading, rad.
+    half_width_m : float
+        Length of the unit of the system's positions, m.
+    """
+    system, (sigma_xy, sigma_theta) = field.system, sigma
+    angular, rows, gain = system.angular, conditions.rows, conditions.gain
+    per_phi = sigma_xy**2 / half_width_m**2
+    p_phi = field.inverse[np.ix_(system.phi_at, system.phi_at)] * per_phi
+    y = angular.response
+
+    columns = angular.solve(np.ascontiguousarray(rows.T)) * sigma_theta**2
+    columns = columns + y @ (p_phi @ (y.T @ rows.T))
+    variance = sigma_theta**2 * _inverse_diagonal(system) + np.einsum("ka,ab,kb->k", y, p_phi, y)
+
+    flat = field.project(conditions.slopes.reshape(len(rows), -1).T)
+    n = 3 * system.grid.n_views
+    answer = np.real(system.grid.response.conj().T @ flat) * sigma_xy**2 / half_width_m
+    with_slopes = y @ (field.inverse[np.ix_(system.phi_at, np.arange(n))] @ answer)
+    of_slopes = field.of(conditions.slopes) * sigma_xy**2
+
+    cross = rows @ with_slopes
+    closure = of_slopes + rows @ columns - cross - cross.T
+    both = with_slopes - columns
+    variance = variance + np.einsum("kc,cd,kd->k", gain, closure, gain)
+    variance = variance + 2 * np.einsum("kc,kc->k", gain, both)
+    return np.where(system.known_lines, np.maximum(variance, 0.0), np.nan), closure
+
+
+def _inverse_diagonal(system: JointSystem) -> np.ndarray:
+    n = system.angular.n_lines
+    out = np.empty(n)
+    for start in range(0, n, 512):
+        stop = min(start + 512, n)
+        unit = np.zeros((n, stop - start))
+        unit[np.arange(start, stop), np.arange(stop - start)] = 1.0
+        out[start:stop] = system.angular.solve(unit)[np.arange(start, stop),
+                                                     np.arange(stop - start)]
+    return out
