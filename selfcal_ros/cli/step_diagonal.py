@@ -1,0 +1,97 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``selfcal step-diagonal``: straightness and squareness from a laser step-diagonal measurement."""
+
+import argparse
+import json
+import math
+import sys
+
+from selfcal_ros.errors import ExitCode, InputError
+
+HELP = "identify linear, straightness and squareness errors from a laser step-diagonal measurement"
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the verb."""
+    parser.add_argument("data", metavar="DATA.csv",
+                        help="columns block, rx_pp, ry_pp, rx_np, ry_np [, ex_x, ey_y], mm; "
+                             "several rows of a block are repeats; 3D: rx_ppp, ry_ppp, rz_ppp, "
+                             "rx_npp, ... [, ez_z]")
+    parser.add_argument("--method", required=True, choices=("conventional", "new"),
+                        help="conventional: nominal laser directions (Wang); new: measured linear "
+                             "errors, unknown set-up (Ibaraki)")
+    parser.add_argument("--form", default="exact", choices=("exact", "stepwise", "printed"),
+                        help="new formulation: exact geometry by least squares (default), the "
+                             "paper's equations with the exact form of eq. 5, or as printed")
+    for axis in "xyz":
+        parser.add_argument(f"--step-{axis}", type=float, default=10.0, metavar="MM",
+                            help=f"nominal step of {axis.upper()} in a block, mm (default 10)")
+    parser.add_argument("--line", default="lsq", choices=("lsq", "end"),
+                        help="reference line: least squares (default) or through the end points")
+    parser.add_argument("--diagonals", metavar="LIST",
+                        help="diagonals to use, separated by commas (default: all)")
+    parser.add_argument("--allow-equal", action="store_true",
+                        help="accept X and Y readings that are equal in every block")
+    parser.add_argument("--plot", metavar="FILE", help="draw the profiles (png, svg or pdf)")
+    parser.add_argument("-o", "--output", metavar="OUT.json",
+                        help="write the result here; otherwise it is printed")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Identify, write the result, and say what was found."""
+    from selfcal_ros.files import write_json
+    from selfcal_ros.laser.data import Form, Method
+    from selfcal_ros.laser.identify import Choice, identify
+    from selfcal_ros.laser.outcome import outcome, summary
+    from selfcal_ros.laser.profiles import Line
+
+    data, warnings, source = _measurement(args)
+    choice = Choice(Method(args.method), Form(args.form), args.allow_equal)
+    found = identify(data, choice)
+    result = outcome(found, data, line=Line(args.line), warnings=warnings)
+    result["input"] = source
+    for warning in result["warnings"]:
+        print(f"selfcal step-diagonal: warning: {warning}", file=sys.stderr)
+    if args.plot:
+        from selfcal_ros.reporting.laser_plots import plot_profiles
+        plot_profiles(found, args.plot)
+    if args.output:
+        write_json(args.output, result)
+        print(summary(result))
+    else:
+        print(json.dumps(result, indent=1, allow_nan=False))
+    return ExitCode.DONE
+
+
+def _measurement(args: argparse.Namespace) -> tuple:
+    """Return the measurement, its warnings, and where it came from."""
+    from selfcal_ros.files import sha256_of
+    from selfcal_ros.laser.table import Columns, dimension_of, read_table
+
+    dim = dimension_of(args.data)
+    steps = _steps(args, dim)
+    data, warnings = read_table(args.data, Columns(steps, _diagonals(args, dim),
+                                                   args.method == "new"))
+    return data, warnings, {"file": args.data, "sha256": sha256_of(args.data)}
+
+
+def _steps(args: argparse.Namespace, dim: int) -> tuple[float, ...]:
+    for axis in "xyz"[:dim]:
+        step = getattr(args, f"step_{axis}")
+        if not (math.isfinite(step) and step > 0):
+            raise InputError(f"--step-{axis}", f"{step:g} mm is not a length",
+                             "give the nominal step in mm, greater than 0")
+    return tuple(getattr(args, f"step_{axis}") * 1e-3 for axis in "xyz"[:dim])
+
+
+def _diagonals(args: argparse.Namespace, dim: int) -> tuple[str, ...]:
+    from selfcal_ros.laser.data import DIAGONALS
+
+    if args.diagonals is None:
+        return DIAGONALS[dim]
+    names = tuple(name.strip() for name in args.diagonals.split(","))
+    for name in names:
+        if name not in DIAGONALS[dim] or names.count(name) > 1:
+            raise InputError("--diagonals", f"'{name}' is unknown or named twice",
+                             "choose from " + ", ".join(DIAGONALS[dim]))
+    return names

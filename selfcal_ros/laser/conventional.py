@@ -1,0 +1,136 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The conventional formulation (Wang): nominal laser directions, eqs. 1 and 2 of the source.
+
+Valid only if the laser lies along the nominal diagonals and the mirror stands square to it.
+*Erratum*: eq. 1 is printed with its rows for R_y,pp and R_y,np exchanged.
+"""
+
+from collections.abc import Collection
+
+import numpy as np
+
+from selfcal_ros.errors import InputError
+from selfcal_ros.laser.data import (
+    Closure,
+    Form,
+    Identified,
+    Method,
+    StepDiagonal,
+    step_vectors,
+    turn_to_first_step,
+)
+from selfcal_ros.laser.noise import reading_covariance, reading_noise
+from selfcal_ros.laser.paper import Erratum
+
+EQUAL_RELATIVE = 1e-12
+"""Readings closer than this are the same number."""
+
+
+def laser_directions(data: StepDiagonal) -> np.ndarray:
+    """Return the nominal laser directions (eq. 2), (K, D): +-step_j over the diagonal."""
+    steps = np.array(data.steps_m)
+    return data.signs * steps / np.linalg.norm(steps)
+
+
+def refuse_equal_readings(data: StepDiagonal) -> None:
+    """Refuse readings that hold nothing but the diagonal's length.
+
+    A mirror adjusted parallel to the other diagonal makes the X and Y readings equal, and the
+    conventional formulation cannot but fail (source, "Misalignment of mirror directions").
+
+    Raises
+    ------
+    InputError
+        If the readings of all axes are equal in each of two or more blocks, with equal steps.
+    """
+    r = data.readings_m
+    same = np.ptp(r, axis=1) <= EQUAL_RELATIVE * np.abs(r).max()
+    if data.n_blocks > 1 and np.ptp(data.steps_m) == 0 and same.all():
+        raise InputError("readings", "the readings of all axes are equal in every block: they "
+                         "hold only the length of the diagonal",
+                         "turn the mirror square to the laser, or allow equal readings if the "
+                         "linear errors of the axes truly are the same")
+
+
+def solve_blocks(data: StepDiagonal, readings_m: np.ndarray,
+                 errata: Collection[Erratum] = ()) -> np.ndarray:
+    """Return the errors (D, n, D) that solve eq. 1 block by block, turned to the first X step.
+
+    In 3D the four readings of an axis give its three components by least squares, weighted by
+    the repeats.
+    """
+    if Erratum.EQ1_ROWS in errata:
+        readings_m = readings_m.copy()
+        readings_m[:, 1] = readings_m[::-1, 1]
+    directions = data.signs[:, :, None] * laser_directions(data)[:, None, :]
+    weights = np.sqrt(data.counts)
+    vectors = np.empty((data.dim, data.n_blocks, data.dim))
+    for j in range(data.dim):
+        for i in range(data.n_blocks):
+            weight = weights[:, j, i]
+            vectors[j, i] = np.linalg.lstsq(directions[:, j] * weight[:, None],
+                                            readings_m[:, j, i] * weight, rcond=None)[0]
+    return turn_to_first_step(vectors) - step_vectors(data.steps_m, np.zeros_like(vectors))
+
+
+def identify_conventional(data: StepDiagonal, *, errata: Collection[Erratum] = (),
+                          allow_equal: bool = False) -> Identified:
+    """Identify all errors from the readings alone, trusting the nominal laser directions.
+
+    Parameters
+    ----------
+    data : StepDiagonal
+        All diagonals; linear errors are not used.
+    errata : collection of Erratum
+        Errors of the printed equations to put back, for comparison.
+    allow_equal : bool
+        Whether to accept readings that are equal on all axes.
+
+    Returns
+    -------
+    Identified
+        ``closure`` has the least squares' residual in 3D; in 2D nothing is redundant.
+
+    Raises
+    ------
+    InputError
+        If a diagonal is missing, or the readings are equal on all axes.
+    """
+    if len(data.diagonals) < 2 ** (data.dim - 1):
+        raise InputError("diagonals", f"only {', '.join(data.diagonals)} measured",
+                         "the conventional formulation needs every diagonal; measure the others")
+    if not allow_equal:
+        refuse_equal_readings(data)
+    readings = data.readings_m
+    errors = solve_blocks(data, readings, errata)
+    covariance = None
+    noise = reading_noise(data)
+    if noise.dof:
+        jac = jacobian(lambda r: solve_blocks(data, r, errata), readings)
+        covariance = jac @ reading_covariance(data, noise) @ jac.T
+    return Identified(data.steps_m, errors, covariance, Method.CONVENTIONAL, Form.PRINTED, {},
+                      Closure(residual_rms_m=_residual(data, readings)))
+
+
+def _residual(data: StepDiagonal, readings_m: np.ndarray) -> float | None:
+    if data.dim == 2:
+        return None
+    directions = data.signs[:, :, None] * laser_directions(data)[:, None, :]
+    misfit = [readings_m[:, j] - directions[:, j] @ np.linalg.lstsq(
+        directions[:, j], readings_m[:, j], rcond=None)[0] for j in range(data.dim)]
+    return float(np.sqrt(np.mean(np.square(misfit))))
+
+
+def jacobian(function: object, x: np.ndarray, step_m: float = 1e-7) -> np.ndarray:
+    """Return d function / d x by central differences, (outputs, inputs) in C order.
+
+    The formulations are linear but for terms of (error / step)^2, so that the differences are
+    exact to far below what an uncertainty needs.
+    """
+    columns = []
+    for index in range(x.size):
+        shift = np.zeros(x.size)
+        shift[index] = step_m
+        up, down = (function(x + sign * shift.reshape(x.shape)) for sign in (1, -1))
+        columns.append((up - down).ravel() / (2 * step_m))
+    return np.array(columns).T

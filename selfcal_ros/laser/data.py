@@ -1,0 +1,244 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a step-diagonal measurement is: steps, diagonals, readings, and the identified errors.
+
+Vectors of a block: axis j moves by d[j, i] = step_j e_j + E[j, i] in block i. On diagonal k the
+axis runs with the sign s[k, j], so that its reading is R[k, j, i] = s[k, j] w_k . d[j, i], with
+w = n/(l . n) for the laser direction l and the mirror's normal n (method, section 8). Nominal
+readings are positive on every diagonal: in np, R_x = -l_np . dx.
+
+A block is named by its place on the axis, not by the time of its measurement: where an axis
+runs backwards (X in np), its first step in time is that of the last block.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+
+from selfcal_ros.errors import InputError
+
+AXES = "xyz"
+DIAGONALS = {2: ("pp", "np"), 3: ("ppp", "npp", "pnp", "ppn")}
+"""The diagonals of a 2D and of a 3D measurement; p: the axis runs forwards, n: backwards."""
+MAX_BLOCKS = 500
+
+
+class Method(StrEnum):
+    """Which formulation turns readings into errors."""
+
+    CONVENTIONAL = "conventional"
+    NEW = "new"
+
+
+class Form(StrEnum):
+    """How the new formulation is evaluated.
+
+    ``exact``: least squares over all diagonals of the exact geometry. ``stepwise``: the paper's
+    eqs. 3, 4, 6 with the exact form in place of eq. 5. ``printed``: eqs. 3 to 6 as printed, with
+    the errata of eqs. 4 and 6 corrected.
+    """
+
+    EXACT = "exact"
+    STEPWISE = "stepwise"
+    PRINTED = "printed"
+
+
+def signs_of(diagonals: Sequence[str]) -> np.ndarray:
+    """Return the running sense of every axis on every diagonal, +-1, (diagonals, axes)."""
+    return np.array([[-1.0 if letter == "n" else 1.0 for letter in name] for name in diagonals])
+
+
+@dataclass(frozen=True, eq=False)
+class StepDiagonal:
+    """Readings of a step-diagonal measurement, m.
+
+    Attributes
+    ----------
+    steps_m : tuple of float (D,)
+        Nominal steps a, b[, c] of the axes.
+    diagonals : tuple of str (K,)
+        Names of the measured diagonals, from `DIAGONALS`.
+    samples_m : float array (repeats, K, D, n)
+        Reading of axis j on diagonal k in block i; NaN where a block was repeated less often.
+    linear_m : float array (repeats, D, n) or None
+        Directly measured linear errors E_j(j), actual - nominal; NaN where not repeated.
+
+    Raises
+    ------
+    InputError
+        If a step is not positive, a shape does not fit, or a block has no reading.
+    """
+
+    steps_m: tuple[float, ...]
+    diagonals: tuple[str, ...]
+    samples_m: np.ndarray
+    linear_m: np.ndarray | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse steps that are no lengths and arrays that do not belong together."""
+        for axis, step in zip(AXES, self.steps_m, strict=False):
+            if not (np.isfinite(step) and step > 0):
+                raise InputError(f"step {axis}", f"{step * 1e3:g} mm is not a length",
+                                 "give the nominal step in mm, greater than 0")
+        dim = len(self.steps_m)
+        known = DIAGONALS.get(dim, ())
+        if not self.diagonals or any(name not in known for name in self.diagonals):
+            raise InputError("diagonals", f"{self.diagonals} with {dim} steps",
+                             f"name diagonals of {list(DIAGONALS.values())}")
+        shape = (len(self.diagonals), dim)
+        if self.samples_m.ndim != 4 or self.samples_m.shape[1:3] != shape:
+            raise InputError("readings", f"the shape {self.samples_m.shape} is not (repeats, "
+                             f"{shape[0]}, {shape[1]}, blocks)", "give one reading a cell")
+        if not np.isfinite(self.samples_m).any(axis=0).all():
+            raise InputError("readings", "a block has no reading", "measure every block")
+        if self.linear_m is not None and not np.isfinite(self.linear_m).any(axis=0).all():
+            raise InputError("linear errors", "a block has no value", "measure every block")
+
+    @property
+    def dim(self) -> int:
+        """Number of axes D, 2 or 3."""
+        return len(self.steps_m)
+
+    @property
+    def n_blocks(self) -> int:
+        """Number of blocks n."""
+        return self.samples_m.shape[3]
+
+    @property
+    def signs(self) -> np.ndarray:
+        """Running sense of the axes, (K, D)."""
+        return signs_of(self.diagonals)
+
+    @property
+    def counts(self) -> np.ndarray:
+        """Repeats behind each mean reading, int (K, D, n)."""
+        return np.isfinite(self.samples_m).sum(axis=0)
+
+    @property
+    def readings_m(self) -> np.ndarray:
+        """Mean readings, (K, D, n)."""
+        return np.nanmean(self.samples_m, axis=0)
+
+    @property
+    def linear_mean_m(self) -> np.ndarray:
+        """Mean linear errors, (D, n).
+
+        Raises
+        ------
+        InputError
+            If they were not measured.
+        """
+        if self.linear_m is None:
+            raise InputError("linear errors", "the new formulation needs them",
+                             "measure them directly along the axes, or use the conventional "
+                             "formulation")
+        return np.nanmean(self.linear_m, axis=0)
+
+    @property
+    def nominal_m(self) -> np.ndarray:
+        """Readings of a perfect machine with a perfect set-up, (D,): step_j^2 / diagonal."""
+        steps = np.array(self.steps_m)
+        return steps**2 / np.linalg.norm(steps)
+
+    def pick(self, diagonals: Sequence[str]) -> "StepDiagonal":
+        """Return the same measurement with only some of its diagonals."""
+        index = [self.diagonals.index(name) for name in diagonals]
+        return StepDiagonal(self.steps_m, tuple(diagonals), self.samples_m[:, index],
+                            self.linear_m)
+
+
+@dataclass(frozen=True, eq=False)
+class Closure:
+    """What a redundant measurement says about itself, m.
+
+    Attributes
+    ----------
+    lengths_m : float or None
+        rms of the measured diagonals minus what the linear errors make of it: zero for any
+        squareness (parallelogram law); a misaligned laser or linear errors that are not those
+        of the measurement show here. None without linear errors or with a missing diagonal.
+    between_m : float array (D, n, D) or None
+        2D, new formulation: errors found from pp alone minus those from np alone.
+    residual_rms_m : float or None
+        rms residual of the least squares; None where nothing is redundant.
+    """
+
+    lengths_m: float | None = None
+    between_m: np.ndarray | None = None
+    residual_rms_m: float | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Identified:
+    """Errors of every block, turned so that the first X step has no transverse error.
+
+    Attributes
+    ----------
+    steps_m : tuple of float (D,)
+        Nominal steps.
+    errors_m : float array (D, n, D)
+        E[j, i, c]: error in direction c of the i-th step of axis j, actual - nominal, m. In 3D
+        the first Y step has no Z error either.
+    covariance : float array (D*n*D, D*n*D) or None
+        Of the errors in C order, m^2; None where nothing is known of the noise.
+    method, form : str
+        How they were found.
+    mirror_rad : dict
+        Diagonal -> angles between mirror normal and diagonal (2D: one, counter-clockwise),
+        where the form finds them.
+    closure : Closure
+        Redundancy.
+    """
+
+    steps_m: tuple[float, ...]
+    errors_m: np.ndarray
+    covariance: np.ndarray | None
+    method: str
+    form: str
+    mirror_rad: dict[str, list[float]]
+    closure: Closure
+
+    @property
+    def dim(self) -> int:
+        """Number of axes."""
+        return len(self.steps_m)
+
+    @property
+    def n_blocks(self) -> int:
+        """Number of blocks."""
+        return self.errors_m.shape[1]
+
+    @property
+    def u_errors_m(self) -> np.ndarray | None:
+        """Standard uncertainties of the errors, (D, n, D), m; None where not known."""
+        if self.covariance is None:
+            return None
+        variance = np.maximum(np.diag(self.covariance), 0.0)
+        return np.sqrt(variance).reshape(self.errors_m.shape)
+
+
+def step_vectors(steps_m: Sequence[float], errors_m: np.ndarray) -> np.ndarray:
+    """Return the displacement vectors d = step e + E, (D, n, D), m."""
+    return errors_m + np.diag(steps_m)[:, None, :]
+
+
+def turn_to_first_step(vectors_m: np.ndarray) -> np.ndarray:
+    """Return displacement vectors turned so that the first X step lies along X.
+
+    In 3D the first Y step then lies in the XY plane. What is measured along diagonals whose
+    direction is unknown cannot tell a turn of the whole machine: this is the datum.
+
+    Parameters
+    ----------
+    vectors_m : float array (D, n, D)
+        d[j, i].
+    """
+    dim = len(vectors_m)
+    # QR of the first block's steps, signs chosen so that the diagonal of R is positive.
+    q, r = np.linalg.qr(vectors_m[:, 0].T)
+    q = q * np.sign(np.diag(r))
+    turned = vectors_m @ q
+    for j in range(dim):
+        turned[j, 0, j + 1:] = 0.0
+    return turned

@@ -1,0 +1,150 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The result of a step-diagonal measurement as JSON (mm) and as text."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from selfcal_ros.laser.data import AXES, Identified, Method, StepDiagonal
+from selfcal_ros.laser.noise import linear_noise, reading_noise
+from selfcal_ros.laser.profiles import (
+    Line,
+    Value,
+    axis_pairs,
+    name_of,
+    positions_m,
+    profile_m,
+    slope,
+    squareness,
+    squareness_rad,
+    straightness,
+    u_profile_m,
+)
+from selfcal_ros.model.result import plain
+
+SCHEMA = "selfcal.step_diagonal/1"
+MM = 1e-3
+CONVENTION = {
+    "error": "actual - nominal; ey_x is the error in Y of a step along X",
+    "reading": "positive on every diagonal; np: rx = -l.dx, ry = +l.dy",
+    "datum": "turned so that the first X step has no transverse error",
+    "squareness": "(slope of the X error over y + slope of the Y error over x) times the Y range; "
+                  "positive: the angle between +X and +Y is less than 90 deg",
+    "straightness": "peak to valley of the transverse profile about its line",
+}
+
+
+def outcome(found: Identified, data: StepDiagonal, *, line: Line = Line.LEAST_SQUARES,
+            warnings: Sequence[str] = ()) -> dict[str, Any]:
+    """Return the JSON form of a result, lengths in mm.
+
+    Parameters
+    ----------
+    found, data : Identified, StepDiagonal
+        Result and the measurement behind it.
+    line : Line
+        Reference line of straightness and squareness.
+    warnings : sequence of str
+        What a reader has to know.
+    """
+    kinds = [(j, c) for j in range(found.dim) for c in range(found.dim)]
+    out: dict[str, Any] = {"schema": SCHEMA, "method": str(found.method)}
+    if found.method == Method.NEW:
+        out["form"] = str(found.form)
+    out |= {"unit": "mm", "line": str(line), "n_blocks": found.n_blocks,
+            "diagonals": list(data.diagonals), "n_repeats": int(data.counts.max()),
+            **{f"step_{AXES[j]}": step / MM for j, step in enumerate(found.steps_m)}}
+    out |= {name_of(j, c): _mm(found.errors_m[j, :, c]) for j, c in kinds}
+    if found.covariance is not None:
+        u = found.u_errors_m
+        out |= {f"u_{name_of(j, c)}": _mm(u[j, :, c]) for j, c in kinds}
+    out |= _geometry(found, line)
+    out["profiles"] = {f"p{name_of(j, c)[1:]}": {
+        "position": _mm(positions_m(found, j)), "error": _mm(profile_m(found, j, c)),
+        "u": None if found.covariance is None else _mm(u_profile_m(found, j, c))}
+        for j, c in kinds}
+    out["scale"] = {AXES[j]: slope(found, j, j, line) for j in range(found.dim)}
+    out["mirror_rad"] = found.mirror_rad
+    out["closure"] = _closure(found)
+    readings, linear = reading_noise(data), linear_noise(data)
+    out["noise"] = {"reading": readings.sigma_m / MM, "reading_dof": readings.dof,
+                    "correlation": readings.correlation, "linear": linear.sigma_m / MM,
+                    "linear_dof": linear.dof}
+    out["convention"] = CONVENTION
+    out["warnings"] = [*warnings, *_advice(found)]
+    return plain(out)
+
+
+def _mm(values_m: np.ndarray) -> list:
+    return (np.asarray(values_m) / MM).tolist()
+
+
+def _value(prefix: str, value: Value) -> dict[str, float | None]:
+    return {prefix: value.value / MM, f"u_{prefix}": None if value.u is None else value.u / MM}
+
+
+def _geometry(found: Identified, line: Line) -> dict[str, Any]:
+    """Return squareness and straightness: short names in 2D, one name a pair in 3D as well."""
+    out: dict[str, Any] = _value("squareness", squareness(found, line=line))
+    out["squareness_rad"] = squareness_rad(found, line=line)
+    for axis in range(2):
+        out |= _value(f"straightness_{AXES[axis]}", straightness(found, axis, 1 - axis, line))
+    if found.dim == 2:
+        return out
+    for j, c in axis_pairs(found.dim):
+        out |= _value(f"squareness_{AXES[j]}{AXES[c]}", squareness(found, j, c, line))
+    for j in range(found.dim):
+        for c in range(found.dim):
+            if c != j:
+                name = f"straightness_{AXES[j]}_in_{AXES[c]}"
+                out |= _value(name, straightness(found, j, c, line))
+    return out
+
+
+def _closure(found: Identified) -> dict[str, Any]:
+    closure = found.closure
+    out = {key: None if value is None else value / MM for key, value in
+           (("lengths", closure.lengths_m), ("residual_rms", closure.residual_rms_m))}
+    if closure.between_m is not None:
+        out["ey_x_pp_minus_np"] = _mm(closure.between_m[0, :, 1])
+        out["ex_y_pp_minus_np"] = _mm(closure.between_m[1, :, 0])
+    return out
+
+
+CLOSURE_SHARE = 2e-6
+"""Closure of the lengths, relative to the diagonal, that a set-up off by 2 mrad can cause."""
+
+
+def _advice(found: Identified) -> list[str]:
+    out = []
+    diagonal = found.n_blocks * float(np.linalg.norm(found.steps_m))
+    lengths = found.closure.lengths_m
+    if found.method == Method.NEW and lengths is not None and \
+            abs(lengths) > CLOSURE_SHARE * diagonal:
+        out.append(f"the diagonals differ from what the linear errors make of them by "
+                   f"{lengths * 1e6:.3g} um: laser off the machine's diagonal, or linear errors "
+                   "of another state of the machine")
+    if found.covariance is not None and not found.covariance.any():
+        out.append("all repeats are identical: the uncertainty of zero is not to be believed")
+    return out
+
+
+def summary(result: dict[str, Any]) -> str:
+    """Return what a person wants to read first, in micrometres."""
+    def shown(key: str) -> str:
+        u = result.get(f"u_{key}")
+        return f"{result[key] * 1e3:+.4f} um" + ("" if u is None else f" (u = {u * 1e3:.4f})")
+
+    names = [key for key in result if key.startswith(("squareness", "straightness"))
+             and not key.endswith("_rad")]
+    if "squareness_xy" in names:
+        names = [key for key in names if key not in ("squareness", "straightness_x",
+                                                     "straightness_y")]
+    lines = [f"{result['method']} formulation, {result['n_blocks']} blocks, "
+             f"{len(result['diagonals'])} diagonals, {result['n_repeats']} repeat(s)"]
+    lines += [f"  {key:22s} {shown(key)}" for key in names]
+    lengths = result["closure"]["lengths"]
+    if lengths is not None:
+        lines.append(f"  {'closure of lengths':22s} {lengths * 1e3:+.4f} um")
+    return "\n".join(lines)

@@ -1,0 +1,115 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The new formulation as the source writes it: eqs. 3 to 6, one diagonal at a time, 2D.
+
+Here u = a + Ex(x), q = b + Ey(y) are the measured step lengths of a block, v = Ey(x) and
+p = Ex(y) the transverse errors. The np diagonal is the pp diagonal of the machine seen in a
+mirror (X reversed): v and p change their signs, nothing else does.
+"""
+
+from collections.abc import Collection
+from enum import StrEnum
+
+import numpy as np
+
+from selfcal_ros.errors import InputError
+from selfcal_ros.laser.data import Form, StepDiagonal
+
+
+class Erratum(StrEnum):
+    """Errors of the printed equations, which can be put back to see what they do."""
+
+    EQ1_ROWS = "eq1"
+    """The rows for R_y,pp and R_y,np are exchanged."""
+    EQ4_SIGN = "eq4"
+    """A minus sign that the geometry of its figure does not have."""
+    EQ6_LENGTH = "eq6"
+    """Sine and cosine exchanged: the result is a length of about b."""
+
+
+def eq3(r: np.ndarray, u: np.ndarray, q: np.ndarray) -> np.ndarray:
+    """Return Ex(y) for Ey(x) = 0 from the length of the diagonal, r = R_x + R_y (eq. 3)."""
+    if np.any(r <= q):
+        block = int(np.argmax(r <= q)) + 1
+        raise InputError(f"block {block}", "the diagonal is shorter than the Y step",
+                         "check the units and the steps")
+    return np.sqrt(r**2 - q**2) - u
+
+
+def eq4(u_first: float, half_r_less_delta: float, alpha_2: float,
+        errata: Collection[Erratum] = ()) -> float:
+    """Return sin(alpha), the mirror's angle to the laser, from the first block (eq. 4).
+
+    Parameters
+    ----------
+    u_first : float
+        a + Ex(x) of the first block.
+    half_r_less_delta : float
+        R/2 - delta(1), which is R_x of the first block.
+    alpha_2 : float
+        Angle of the mirror to the Y axis; pi/4 where a = b.
+    errata : collection of Erratum
+        `Erratum.EQ4_SIGN` puts the printed minus sign back.
+    """
+    sign = -1.0 if Erratum.EQ4_SIGN in errata else 1.0
+    return float(sign * u_first * np.cos(alpha_2) / half_r_less_delta)
+
+
+def eq5_printed(delta: np.ndarray, sin_alpha: float, alpha_2: float) -> np.ndarray:
+    """Return Ey(x) of every block from the change of delta = R/2 - R_x (eq. 5, as printed).
+
+    It takes Ex(x) and the half diagonal to be the same in every block.
+    """
+    return -(sin_alpha / np.sin(alpha_2)) * (delta - delta[0])
+
+
+def eq5_exact(r_x: np.ndarray, u: np.ndarray, sin_alpha: float, alpha_2: float) -> np.ndarray:
+    """Return Ey(x) of every block from R_x and the linear error (exact form of eq. 5)."""
+    return (r_x * sin_alpha - u * np.cos(alpha_2)) / np.sin(alpha_2)
+
+
+def eq6(p_0: np.ndarray, v: np.ndarray, u: np.ndarray, q: np.ndarray, *,
+        errata: Collection[Erratum] = ()) -> np.ndarray:
+    """Return Ex(y) after the modification by Ey(x) (eq. 6, corrected)."""
+    gamma = np.arctan2(v, u)
+    if Erratum.EQ6_LENGTH in errata:
+        return q * np.cos(gamma) + p_0 * np.sin(gamma)
+    return p_0 * np.cos(gamma) - q * np.sin(gamma)
+
+
+def solve_diagonal(data: StepDiagonal, readings_m: np.ndarray, linear_m: np.ndarray, *,
+                   form: Form, errata: Collection[Erratum] = ()) -> np.ndarray:
+    """Return the errors (K, D, n, D) that eqs. 3 to 6 give for every diagonal on its own.
+
+    Parameters
+    ----------
+    data : StepDiagonal
+        Steps and diagonals of a 2D measurement.
+    readings_m : float array (K, 2, n)
+        Readings, positive on both diagonals.
+    linear_m : float array (2, n)
+        Ex(x) and Ey(y).
+    form : Form
+        ``printed`` takes eq. 5 as printed, ``stepwise`` its exact form.
+    errata : collection of Erratum
+        Errors of the printed equations to put back.
+    """
+    if data.dim != 2:
+        raise InputError(f"form {form}", "the source gives its equations in 2D only",
+                         "use the exact form for body diagonals")
+    u, q = linear_m + np.array(data.steps_m)[:, None]
+    # The source takes pi/4 "without loss of generality", which holds for a = b.
+    alpha_2 = float(np.arctan2(data.steps_m[1], data.steps_m[0]))
+    errors = np.zeros((len(data.diagonals), 2, data.n_blocks, 2))
+    for k, (r_x, r_y) in enumerate(readings_m):
+        r = r_x + r_y
+        delta = r / 2 - r_x
+        sin_alpha = eq4(u[0], r[0] / 2 - delta[0], alpha_2, errata)
+        if form is Form.PRINTED:
+            v = eq5_printed(delta, sin_alpha, alpha_2)
+        else:
+            v = eq5_exact(r_x, u, sin_alpha, alpha_2)
+        p = eq6(eq3(r, u, q), v, u, q, errata=errata)
+        reversal = data.signs[k].prod()
+        errors[k, 0] = np.stack([linear_m[0], reversal * v], axis=-1)
+        errors[k, 1] = np.stack([reversal * p, linear_m[1]], axis=-1)
+    return errors

@@ -1,0 +1,131 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Profiles, straightness and squareness from the errors of the blocks (method, section 8).
+
+Definitions
+-----------
+Profile P[j, c]: error in direction c at the end of every block of axis j, from 0 at the start,
+over the nominal positions 0, step, ..., n step. Straightness: peak to valley of a transverse
+profile about its line. Squareness of axes j < c: (slope of P[c, j] over axis c + slope of P[j, c]
+over axis j) times the range of axis c; it is the lean of axis c towards +j against a perfect
+square on axis j, so positive means an angle of less than 90 deg. No turn of the machine changes it.
+The line is the least-squares line (default) or the line through both ends.
+"""
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+
+from selfcal_ros.laser.data import AXES, Identified
+
+
+class Line(StrEnum):
+    """Reference line of a profile."""
+
+    LEAST_SQUARES = "lsq"
+    END_POINTS = "end"
+
+
+@dataclass(frozen=True)
+class Value:
+    """A quantity with its standard uncertainty (k=1), in the same unit; None if not known."""
+
+    value: float
+    u: float | None = None
+
+
+def positions_m(found: Identified, axis: int) -> np.ndarray:
+    """Return the nominal positions of the ends of the blocks, (n+1,), m, from 0."""
+    return np.arange(found.n_blocks + 1) * found.steps_m[axis]
+
+
+def profile_m(found: Identified, axis: int, direction: int) -> np.ndarray:
+    """Return the accumulated error in `direction` along `axis`, (n+1,), m, 0 at the start."""
+    return np.concatenate([[0.0], np.cumsum(found.errors_m[axis, :, direction])])
+
+
+def u_profile_m(found: Identified, axis: int, direction: int) -> np.ndarray | None:
+    """Return the standard uncertainty of the profile, (n+1,), m; None if not known."""
+    if found.covariance is None:
+        return None
+    rows = _accumulate(found.n_blocks)
+    block = _block(found, (axis, direction), (axis, direction))
+    return np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", rows, block, rows), 0.0))
+
+
+def straightness(found: Identified, axis: int, direction: int,
+                 line: Line = Line.LEAST_SQUARES) -> Value:
+    """Return the straightness of `axis` in `direction`, m.
+
+    Its uncertainty is that of the distance between the two extreme points; as a peak-to-valley
+    value it is biased upwards where the noise is not small against it.
+    """
+    rows = _accumulate(found.n_blocks) - np.outer(np.arange(found.n_blocks + 1),
+                                                  _slope_row(found.n_blocks, line))
+    residual = rows @ found.errors_m[axis, :, direction]
+    row = rows[np.argmax(residual)] - rows[np.argmin(residual)]
+    value = float(np.ptp(residual))
+    if found.covariance is None:
+        return Value(value)
+    block = _block(found, (axis, direction), (axis, direction))
+    return Value(value, float(np.sqrt(max(row @ block @ row, 0.0))))
+
+
+def slope(found: Identified, axis: int, direction: int,
+          line: Line = Line.LEAST_SQUARES) -> float:
+    """Return the slope of a profile: rad for a transverse one, relative for a linear one."""
+    row = _slope_row(found.n_blocks, line) / found.steps_m[axis]
+    return float(row @ found.errors_m[axis, :, direction])
+
+
+def squareness(found: Identified, first: int = 0, second: int = 1,
+               line: Line = Line.LEAST_SQUARES) -> Value:
+    """Return the squareness of two axes over the range of the second, m (sign: see above)."""
+    row = _slope_row(found.n_blocks, line)
+    of_first = row * found.steps_m[second] / found.steps_m[first] * found.n_blocks
+    of_second = row * found.n_blocks
+    value = float(of_second @ found.errors_m[second, :, first]
+                  + of_first @ found.errors_m[first, :, second])
+    if found.covariance is None:
+        return Value(value)
+    a, b = (second, first), (first, second)
+    variance = (of_second @ _block(found, a, a) @ of_second
+                + of_first @ _block(found, b, b) @ of_first
+                + 2 * of_second @ _block(found, a, b) @ of_first)
+    return Value(value, float(np.sqrt(max(variance, 0.0))))
+
+
+def squareness_rad(found: Identified, first: int = 0, second: int = 1,
+                   line: Line = Line.LEAST_SQUARES) -> float:
+    """Return the squareness as an angle, rad: 90 deg less the angle between the axes."""
+    return slope(found, second, first, line) + slope(found, first, second, line)
+
+
+def axis_pairs(dim: int) -> list[tuple[int, int]]:
+    """Return the pairs of axes j < c."""
+    return [(j, c) for j in range(dim) for c in range(j + 1, dim)]
+
+
+def name_of(axis: int, direction: int) -> str:
+    """Return the name of an error: ``ey_x`` is the error in Y of the motion along X."""
+    return f"e{AXES[direction]}_{AXES[axis]}"
+
+
+def _accumulate(n: int) -> np.ndarray:
+    """Return the rows that sum block errors to profile points, (n+1, n)."""
+    return np.tri(n + 1, n, -1)
+
+
+def _slope_row(n: int, line: Line) -> np.ndarray:
+    """Return the row that takes block errors to the slope of their profile, per block."""
+    if line is Line.END_POINTS:
+        return np.full(n, 1.0 / n)
+    centred = np.arange(n + 1) - n / 2
+    return (centred / (centred @ centred)) @ _accumulate(n)
+
+
+def _block(found: Identified, one: tuple[int, int], other: tuple[int, int]) -> np.ndarray:
+    """Return the covariance between two kinds (axis, direction) of errors, (n, n)."""
+    dim, n = found.dim, found.n_blocks
+    shaped = found.covariance.reshape(dim, n, dim, dim, n, dim)
+    return shaped[one[0], :, one[1], other[0], :, other[1]]

@@ -1,0 +1,110 @@
+# SPDX-License-Identifier: Apache-2.0
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from selfcal_ros.errors import InputError
+from selfcal_ros.laser.conventional import identify_conventional, jacobian
+from selfcal_ros.laser.data import DIAGONALS, StepDiagonal, signs_of, step_vectors
+from selfcal_ros.laser.paper import Erratum
+from selfcal_ros.simulation.laser import random_machine
+from test.support.laser import MM, one_block, planar, random_errors
+
+# Table 1 of the source, mm: given and estimated Ex(x), Ey(x), Ex(y), Ey(y); a = b = 10 mm.
+TABLE_1 = {
+    "a": ((0, 0, 0, 0.1), (-0.05, 0, 0, 0.15), 2),
+    "b": ((0.1, 0, 0, 0.1), (0.1, 0, 0, 0.1), 4),
+    "c": ((0, 0, 0.1, 0), (-0.0002, 0, 0.1, 0.0002), 4),
+}
+
+
+def exact_nominal(steps, errors):
+    """Return readings of lasers along the nominal diagonals: what eq. 1 assumes."""
+    dim = len(steps)
+    signs = signs_of(DIAGONALS[dim])
+    lasers = signs * np.array(steps) / np.linalg.norm(steps)
+    readings = signs[:, :, None] * np.einsum("kc,jic->kji", lasers, step_vectors(steps, errors))
+    return StepDiagonal(tuple(steps), DIAGONALS[dim], readings[None])
+
+
+@pytest.mark.parametrize("case", TABLE_1)
+def test_table_1_of_the_source(case):
+    given_mm, estimated_mm, decimals = TABLE_1[case]
+    found = identify_conventional(planar((0.01, 0.01), one_block(*given_mm)))
+    np.testing.assert_allclose(found.errors_m.ravel() / MM, estimated_mm,
+                               atol=0.5 * 10.0**-decimals)
+
+
+def test_table_1_needs_the_corrected_rows_of_eq_1():
+    data = planar((0.01, 0.01), one_block(*TABLE_1["c"][0]))
+    wrong = identify_conventional(data, errata=[Erratum.EQ1_ROWS])
+    assert abs(wrong.errors_m[1, 0, 0] / MM - 0.1) > 0.05
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.floats(1e-3, 0.1), st.floats(1e-3, 0.1), st.integers(1, 8))
+def test_nominal_lasers_give_the_truth_for_any_steps_and_blocks(seed, a, b, n):
+    errors = random_errors(n, np.random.default_rng(seed))
+    found = identify_conventional(exact_nominal((a, b), errors), allow_equal=True)
+    np.testing.assert_allclose(found.errors_m, errors, atol=1e-15)
+
+
+def test_body_diagonals_give_all_18_errors_at_nominal_lasers():
+    machine = random_machine((0.01, 0.008, 0.006), 5, np.random.default_rng(3))
+    found = identify_conventional(exact_nominal(machine.steps_m, machine.errors_m))
+    np.testing.assert_allclose(found.errors_m, machine.errors_m, atol=1e-15)
+    assert found.closure.residual_rms_m < 1e-16
+
+
+def test_the_exchanged_rows_of_eq_1_change_the_sign_of_ex_y():
+    errors = random_errors(4, np.random.default_rng(5))
+    data = exact_nominal((0.01, 0.01), errors)
+    wrong = identify_conventional(data, errata=[Erratum.EQ1_ROWS])
+    np.testing.assert_allclose(wrong.errors_m[1, :, 0], -errors[1, :, 0], atol=1e-15)
+    right = identify_conventional(data)
+    np.testing.assert_allclose(right.errors_m[1, :, 0], errors[1, :, 0], atol=1e-15)
+
+
+def test_a_turn_of_the_whole_machine_changes_nothing():
+    rng = np.random.default_rng(8)
+    errors = random_errors(5, rng)
+    turn = 1e-4
+    rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+    turned = step_vectors((0.01, 0.01), errors) @ rotation.T - np.diag((0.01, 0.01))[:, None]
+    np.testing.assert_allclose(identify_conventional(exact_nominal((0.01, 0.01), turned)).errors_m,
+                               errors, atol=1e-15)
+
+
+def test_equal_readings_of_several_blocks_are_refused():
+    samples = np.full((1, 2, 2, 3), 7.0711e-3)
+    data = StepDiagonal((0.01, 0.01), DIAGONALS[2], samples)
+    with pytest.raises(InputError, match="readings of all axes are equal in every block"):
+        identify_conventional(data)
+    assert np.isfinite(identify_conventional(data, allow_equal=True).errors_m).all()
+
+
+def test_one_diagonal_is_refused():
+    data = planar((0.01, 0.01), random_errors(3, np.random.default_rng(0))).pick(["pp"])
+    with pytest.raises(InputError, match="only pp measured; the conventional formulation needs "
+                                         "every diagonal"):
+        identify_conventional(data)
+
+
+def test_no_uncertainty_without_repeats_and_the_propagated_one_with_them():
+    rng = np.random.default_rng(11)
+    data = planar((0.01, 0.01), random_errors(6, rng))
+    assert identify_conventional(data).covariance is None
+    samples = data.samples_m + rng.normal(0, 1e-8, (400, 2, 2, 6))
+    found = identify_conventional(StepDiagonal(data.steps_m, data.diagonals, samples))
+    # v = s (Rx_pp - Rx_np) / (2b), s = sqrt(2) a, less the turn by the first block's v.
+    expected = 1e-8 / np.sqrt(400)
+    np.testing.assert_allclose(found.u_errors_m[0, :, 0], expected, rtol=0.05)
+    np.testing.assert_allclose(found.u_errors_m[0, 1:, 1], np.sqrt(2) * expected, rtol=0.05)
+    assert found.u_errors_m[0, 0, 1] < 1e-12
+
+
+def test_jacobian_of_a_product():
+    at = np.array([[2.0, 3.0]])
+    np.testing.assert_allclose(jacobian(lambda x: np.array([x[0, 0] * x[0, 1]]), at),
+                               [[3.0, 2.0]], rtol=1e-7)

@@ -1,0 +1,74 @@
+# SPDX-License-Identifier: Apache-2.0
+import numpy as np
+import pytest
+
+from selfcal_ros.laser.data import DIAGONALS, StepDiagonal
+from selfcal_ros.laser.noise import (
+    linear_covariance,
+    linear_noise,
+    reading_covariance,
+    reading_noise,
+    time_order,
+)
+from selfcal_ros.simulation.laser import (
+    LaserNoise,
+    Measurement,
+    case_study_machine,
+    simulate_step_diagonal,
+)
+
+NM = 1e-9
+
+
+def simulated(noise, seed=3):
+    return simulate_step_diagonal(case_study_machine(), Measurement({}, noise),
+                                  np.random.default_rng(seed))
+
+
+def test_time_order_of_np_starts_with_the_last_block_of_x():
+    np.testing.assert_array_equal(time_order(np.array([1.0, 1.0]), 3), [0, 3, 1, 4, 2, 5])
+    np.testing.assert_array_equal(time_order(np.array([-1.0, 1.0]), 3), [2, 3, 1, 4, 0, 5])
+
+
+def test_noise_of_distances_shows_as_a_correlation_of_minus_one_half():
+    noise = reading_noise(simulated(LaserNoise(distance_m=10 * NM, repeats=40)))
+    assert noise.sigma_m == pytest.approx(np.sqrt(2) * 10 * NM, rel=0.05)
+    assert noise.correlation == pytest.approx(-0.5, abs=0.01)
+    assert noise.dof == 39 * 24
+
+
+def test_noise_of_readings_shows_no_correlation():
+    noise = reading_noise(simulated(LaserNoise(reading_m=10 * NM, repeats=40)))
+    assert noise.sigma_m == pytest.approx(10 * NM, rel=0.06)
+    assert noise.correlation > -0.1
+
+
+def test_the_covariance_is_that_of_the_mean_readings():
+    noise = LaserNoise(distance_m=10 * NM, reading_m=5 * NM, linear_m=8 * NM, repeats=2)
+    # A variance of 400 draws has a relative standard error of 7 %: five of them.
+    several = [simulated(noise, seed) for seed in range(400)]
+    expected = np.cov(np.array([d.readings_m.ravel() for d in several]).T)
+    many = simulated(LaserNoise(10 * NM, 5 * NM, 8 * NM, repeats=200))
+    model = reading_covariance(many, reading_noise(many)) * 200 / 2
+    np.testing.assert_allclose(model, expected, atol=7 * expected.max() / np.sqrt(400))
+    expected = np.cov(np.array([d.linear_mean_m.ravel() for d in several]).T)
+    model = linear_covariance(many, linear_noise(many)) * 200 / 2
+    np.testing.assert_allclose(model, expected, atol=7 * expected.max() / np.sqrt(400))
+
+
+def test_without_repeats_nothing_is_known():
+    noise = reading_noise(simulated(LaserNoise(distance_m=1 * NM)))
+    assert np.isnan(noise.sigma_m) and noise.dof == 0
+
+
+def test_unequal_repeats_are_pooled_without_correlation():
+    samples = np.full((3, 2, 2, 2), 7e-3)
+    samples[1:, :, :, 1] = np.nan
+    samples[1, :, :, 0] += 6 * NM
+    data = StepDiagonal((0.01, 0.01), DIAGONALS[2], samples)
+    noise = reading_noise(data)
+    # Block 1: 7, 7 + 6 nm, 7; mean +2 nm; squares 4 + 16 + 4 = 24 nm^2 on 2 degrees of freedom.
+    assert noise.sigma_m == pytest.approx(np.sqrt(12) * NM)
+    assert (noise.correlation, noise.dof) == (0.0, 8)
+    variance = np.diag(reading_covariance(data, noise))
+    np.testing.assert_allclose(variance[:2], [4 * NM**2, 12 * NM**2])
