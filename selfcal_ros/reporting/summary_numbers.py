@@ -1,0 +1,191 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The few numbers that describe an error map, and its comparison with a known truth."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from selfcal_ros.errors import InputError
+from selfcal_ros.estimation.datum import datum_modes, remove_modes
+from selfcal_ros.model.error_map import ErrorMap
+from selfcal_ros.model.result import CalibrationResult
+from selfcal_ros.reporting.summary_format import ARCSEC, UM
+
+NAN = float("nan")
+
+
+@dataclass(frozen=True)
+class SummaryNumbers:
+    """The numbers of ``selfcal_msgs/CalibrationSummary``, by the names of its fields.
+
+    Lengths in um, angles in arcsec, NaN where not known. `max_error_um` is the longest error
+    vector |G|, `rms_error_um` and `rms_uncertainty_um` (k=1) are per axis.
+    """
+
+    max_error_um: float
+    rms_error_um: float
+    rms_uncertainty_um: float
+    max_theta_error_arcsec: float
+    rms_theta_uncertainty_arcsec: float
+
+
+@dataclass(frozen=True)
+class MapFigures:
+    """What a person asks of an error map, SI units, NaN where not known.
+
+    Attributes
+    ----------
+    n_sites, n_known : int
+        Sites of the field, and those whose error is known.
+    max_error_m : float
+        Longest error vector |G|.
+    max_site : tuple of int or None
+        Its site (m, n).
+    rms_error_m, rms_u_m, max_u_m : float
+        Error per axis, and standard uncertainty (k=1) per axis.
+    n_lines, n_lines_known, max_theta_rad, max_line, rms_theta_rad, rms_u_theta_rad,
+    max_u_theta_rad
+        The same for the angular lines; `max_line` is k or None.
+    """
+
+    n_sites: int
+    n_known: int
+    max_error_m: float
+    max_site: tuple[int, int] | None
+    rms_error_m: float
+    rms_u_m: float
+    max_u_m: float
+    n_lines: int
+    n_lines_known: int
+    max_theta_rad: float
+    max_line: int | None
+    rms_theta_rad: float
+    rms_u_theta_rad: float
+    max_u_theta_rad: float
+
+
+@dataclass(frozen=True)
+class TruthFigures:
+    """Map minus truth after the datum difference is removed, SI units, NaN where not known.
+
+    `largest_m` is the longest difference vector, `site` where, `rms_m` per axis. `rms_in_u`
+    and `largest_in_u` are in units of the predicted standard uncertainty; `within_2u` is the
+    share of values within 2 u. The `*_theta*` fields are the same for the angular lines.
+    """
+
+    largest_m: float
+    site: tuple[int, int] | None
+    rms_m: float
+    rms_in_u: float
+    largest_in_u: float
+    within_2u: float
+    largest_theta_rad: float = NAN
+    line: int | None = None
+    rms_theta_rad: float = NAN
+    rms_theta_in_u: float = NAN
+    largest_theta_in_u: float = NAN
+    theta_within_2u: float = NAN
+
+
+def rms(values: np.ndarray) -> float:
+    """Return the root mean square of the finite values; NaN if there is none."""
+    finite = values[np.isfinite(values)]
+    return float(np.sqrt(np.mean(finite ** 2))) if finite.size else NAN
+
+
+def largest(values: np.ndarray) -> tuple[float, tuple[int, ...] | None]:
+    """Return the largest magnitude among the finite values and its index; NaN, None if none."""
+    sizes = np.abs(values)
+    if not np.isfinite(sizes).any():
+        return NAN, None
+    flat = int(np.nanargmax(np.where(np.isfinite(sizes), sizes, np.nan)))
+    return float(sizes.flat[flat]), tuple(int(i) for i in np.unravel_index(flat, sizes.shape))
+
+
+def summary_numbers(result: CalibrationResult) -> SummaryNumbers:
+    """Return the numbers of a CalibrationSummary message."""
+    figures = map_figures(result.error_map)
+    return SummaryNumbers(figures.max_error_m * UM, figures.rms_error_m * UM,
+                          figures.rms_u_m * UM, figures.max_theta_rad * ARCSEC,
+                          figures.rms_u_theta_rad * ARCSEC)
+
+
+def map_figures(emap: ErrorMap) -> MapFigures:
+    """Return the figures of an error map; unknown sites and lines do not count."""
+    known = emap.valid
+    g = np.stack([emap.gx, emap.gy])[:, known]
+    u = np.stack([emap.u_gx, emap.u_gy])[:, known]
+    max_error, index = largest(np.where(known, np.hypot(emap.gx, emap.gy), np.nan))
+    max_theta, line = largest(emap.g_theta)
+    return MapFigures(
+        known.size, int(known.sum()), max_error, _site(emap, index), rms(g), rms(u),
+        largest(u)[0], emap.g_theta.size, int(np.isfinite(emap.g_theta).sum()), max_theta,
+        line[0] if line else None, rms(emap.g_theta), rms(emap.u_g_theta),
+        largest(emap.u_g_theta)[0])
+
+
+def _site(emap: ErrorMap, index: tuple[int, ...] | None) -> tuple[int, int] | None:
+    if index is None:
+        return None
+    half = emap.artifact.half
+    return index[0] - half[0], index[1] - half[1]
+
+
+def truth_figures(emap: ErrorMap, truth: Mapping[str, np.ndarray]) -> TruthFigures:
+    """Return how far `emap` lies from `truth`, after removing the datum difference.
+
+    Translation, rotation and magnification of the difference (Hu eq. 5) and the mean of the
+    angular difference belong to no view's readings and are removed by least squares.
+
+    Parameters
+    ----------
+    emap : ErrorMap
+        The map found.
+    truth : mapping
+        ``gx``, ``gy`` (nx, ny) in m and, with angular lines, ``g_theta`` (K,) in rad.
+
+    Raises
+    ------
+    InputError
+        If an array is missing or of another shape.
+    """
+    artifact = emap.artifact
+    true_g = np.stack([_truth_array(truth, key, artifact.shape) for key in ("gx", "gy")])
+    difference = np.stack([emap.gx, emap.gy]) - true_g
+    if np.isfinite(difference).all(axis=0).any():
+        difference = remove_modes(difference, datum_modes(artifact, scale=True))
+    difference[:, ~np.isfinite(difference).all(axis=0)] = np.nan
+    longest, index = largest(np.hypot(*difference))
+    xy = (longest, _site(emap, index), rms(difference),
+          *_in_units(difference, np.stack([emap.u_gx, emap.u_gy])))
+    if not artifact.angular_count or truth.get("g_theta") is None:
+        return TruthFigures(*xy)
+    theta = emap.g_theta - _truth_array(truth, "g_theta", (artifact.angular_count,))
+    if np.isfinite(theta).any():
+        theta = theta - theta[np.isfinite(theta)].mean()
+    largest_theta, line = largest(theta)
+    return TruthFigures(*xy, largest_theta, line[0] if line else None, rms(theta),
+                        *_in_units(theta, emap.u_g_theta))
+
+
+def _in_units(difference: np.ndarray, u: np.ndarray) -> tuple[float, float, float]:
+    """Return rms and largest of difference/u and the share within 2; where u is positive."""
+    usable = np.isfinite(difference) & np.isfinite(u) & (u > 0)
+    ratio = difference[usable] / u[usable]
+    share = float(np.mean(np.abs(ratio) <= 2)) if ratio.size else NAN
+    return rms(ratio), largest(ratio)[0], share
+
+
+def _truth_array(truth: Mapping[str, np.ndarray], key: str, shape: tuple[int, ...]) -> np.ndarray:
+    if key not in truth:
+        raise InputError(f"truth {key}", "missing", "give gx, gy (m) and g_theta (rad)")
+    try:
+        array = np.array(truth[key], dtype=float)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"truth {key}", "not an array of numbers", "give lists of numbers "
+                         "and null") from error
+    if array.shape != shape:
+        raise InputError(f"truth {key}", f"has the shape {array.shape}, the map has {shape}",
+                         "give the truth on the lattice of the map")
+    return array

@@ -1,0 +1,240 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a summary says, section by section, before it becomes text or HTML."""
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import fdtr, fdtrc
+
+from selfcal_ros.model.error_map import ErrorMap
+from selfcal_ros.model.result import CalibrationResult, Noise, ViewResult
+from selfcal_ros.reporting.summary_format import (
+    ARCSEC,
+    MM,
+    UM,
+    UNKNOWN,
+    counted,
+    fixed_column,
+    printable,
+    significant,
+)
+from selfcal_ros.reporting.summary_numbers import map_figures, truth_figures
+
+CHANCE = 1e-3
+"""Probability below which residuals and repeats are said to disagree."""
+
+
+@dataclass(frozen=True)
+class Section:
+    """A titled part of a summary: labelled facts, one table with a header, and notes."""
+
+    title: str
+    facts: tuple[tuple[str, str], ...] = ()
+    table: tuple[tuple[str, ...], ...] = ()
+    notes: tuple[str, ...] = ()
+
+
+def all_sections(result: CalibrationResult,
+                 truth: Mapping[str, np.ndarray] | None = None) -> list[Section]:
+    """Return the sections of a summary in the order in which a person reads them."""
+    sections = [measurement_section(result), views_section(result), error_section(result),
+                noise_section(result.noise)]
+    if truth is not None:
+        sections.append(truth_section(result.error_map, truth))
+    sections += [rejected_section(result), attention_section(result)]
+    return [s for s in sections if s.facts or s.table or s.notes]
+
+
+def measurement_section(result: CalibrationResult) -> Section:
+    """Return plan, plate, method and input."""
+    artifact = result.artifact
+    (nx, ny), pitch = artifact.shape, artifact.grid_pitch_m * MM
+    plate = (f"{nx} × {ny} marks, pitch {pitch:.6g} mm, "
+             f"field {(nx - 1) * pitch:.6g} × {(ny - 1) * pitch:.6g} mm, "
+             + (f"{artifact.angular_count} angular lines" if artifact.angular_count
+                else "no angular lines"))
+    seen = result.observability
+    views = f"{counted(len(result.views), 'view')}, {views_done(result)} measured"
+    facts = [("plan", f"{printable(result.plan_id) or UNKNOWN}: {views}"),
+             ("plate", plate),
+             ("method", f"{printable(result.method)}, {printable(result.sense).replace('_', ' ')}"),
+             ("identifiable", f"{'yes' if seen.identifiable else 'NO'} (rank {seen.rank} of "
+              f"{seen.unknowns} unknowns, {counted(seen.deficiency, 'unseen mode')})")]
+    if result.input.get("file"):
+        digest = printable(result.input.get("sha256") or "")
+        facts.append(("input", printable(result.input["file"])
+                      + (f" (sha256 {digest[:16]})" if digest else "")))
+    return Section("Measurement", tuple(facts))
+
+
+def measured(view: ViewResult) -> bool:
+    """Return whether anything was measured in a view."""
+    return view.used > 0 or math.isfinite(view.phi)
+
+
+def views_done(result: CalibrationResult) -> int:
+    """Return the number of views that were measured."""
+    return sum(measured(view) for view in result.views)
+
+
+def views_section(result: CalibrationResult) -> Section:
+    """Return the table of views: nominal pose, misalignment, detections."""
+    pitch, views = result.artifact.grid_pitch_m, result.views
+    columns = [[printable(v.name) for v in views], [pose_text(v, pitch) for v in views],
+               fixed_column([v.phi * MM for v in views]),
+               fixed_column([math.degrees(v.phi) for v in views]),
+               fixed_column([v.tx * UM for v in views]), fixed_column([v.ty * UM for v in views]),
+               [str(v.used) for v in views], [str(v.rejected) for v in views]]
+    header = ("view", "pose (pitches)", "φ mrad", "φ °", "tx µm", "ty µm", "used", "rejected")
+    return Section("Views and their misalignment",
+                   table=(header, *zip(*columns, strict=True)) if views else ())
+
+
+def pose_text(view: ViewResult, pitch_m: float) -> str:
+    """Return the nominal pose as ``90° (+1, 0)``: turn and translation in pitches."""
+    steps = [f"{value / pitch_m:+.6g}" for value in (view.translation_x, view.translation_y)]
+    x, y = (step if float(step) else "0" for step in steps)
+    return f"{math.degrees(view.rotation):.6g}° ({x}, {y})"
+
+
+def place_text(emap: ErrorMap, site: tuple[int, int] | None) -> str:
+    """Return a site and its position as ``at x 40 mm, y -20 mm (site 4, -2)``."""
+    if site is None:
+        return ""
+    x, y = (f"{index * emap.artifact.grid_pitch_m * MM:.6g}" for index in site)
+    return f"at x {x} mm, y {y} mm (site {site[0]}, {site[1]})"
+
+
+def error_section(result: CalibrationResult) -> Section:
+    """Return errors and uncertainties of the XY map and of the angular map."""
+    emap = result.error_map
+    figures = map_figures(emap)
+    facts = [("largest error", f"{um(figures.max_error_m)} {place_text(emap, figures.max_site)}"),
+             ("rms error", f"{um(figures.rms_error_m)} per axis")]
+    if figures.n_known < figures.n_sites:
+        facts.append(("sites known", f"{figures.n_known} of {figures.n_sites}"))
+    facts += [*_spread_facts("uncertainty", um, figures.rms_u_m, figures.max_u_m),
+              ("non-orthogonality", _slope_text(emap, emap.nonorthogonality, "O", "µrad",
+                                                "axes out of square by 2|O|")),
+              ("scale difference", _slope_text(emap, emap.scale_difference, "R", "ppm",
+                                               "scales of X and Y differ by 2|R|"))]
+    if emap.artifact.angular_count:
+        facts += _theta_facts(emap)
+    return Section("Stage error (indicated − true)", tuple(facts))
+
+
+def _slope_text(emap: ErrorMap, value: float, symbol: str, unit: str, meaning: str) -> str:
+    length = (max(emap.artifact.shape) - 1) * emap.artifact.grid_pitch_m
+    return (f"{symbol} {significant(value * UM)} {unit} = {um(value * length)} over "
+            f"{length * MM:.6g} mm; {meaning} = {significant(2 * abs(value) * UM)} "
+            f"{unit}")
+
+
+def _theta_facts(emap: ErrorMap) -> list[tuple[str, str]]:
+    figures = map_figures(emap)
+    at = ""
+    if figures.max_line is not None:
+        degrees = figures.max_line * 360 / emap.artifact.angular_count
+        at = f" at line {figures.max_line}, {degrees:.6g}°"
+    facts = [("largest θ error", arcsec(figures.max_theta_rad) + at),
+             ("rms θ error", arcsec(figures.rms_theta_rad))]
+    if figures.n_lines_known < figures.n_lines:
+        facts.append(("lines known", f"{figures.n_lines_known} of {figures.n_lines}"))
+    return [*facts, *_spread_facts("θ uncertainty", arcsec, figures.rms_u_theta_rad,
+                                   figures.max_u_theta_rad),
+            ("θ datum", str(emap.datum_theta))]
+
+
+def _spread_facts(label: str, unit: Callable[[float], str], rms_u: float, max_u: float,
+                  ) -> list[tuple[str, str]]:
+    if not math.isfinite(rms_u):
+        return [(label, "not known")]
+    return [(label, f"u {unit(rms_u)} rms, {unit(max_u)} largest (k=1)"),
+            ("", f"U {unit(2 * rms_u)} rms, {unit(2 * max_u)} largest (k=2)")]
+
+
+def noise_section(noise: Noise) -> Section:
+    """Return the noise of one reading: used, from repeats, from residuals, and their ratio."""
+    rows, notes = [], []
+    for label, name, scale, unit in (("x, y", "xy", UM, "µm"), ("θ", "theta", ARCSEC, "arcsec")):
+        used, repeats, residuals = (getattr(noise, f"sigma_{name}{suffix}")
+                                    for suffix in ("", "_repeats", "_residuals"))
+        if not any(map(math.isfinite, (used, repeats, residuals))):
+            continue
+        dofs = [getattr(noise, f"dof_{name}_{kind}") for kind in ("repeats", "residuals")]
+        ratio = residuals / repeats if repeats > 0 else float("nan")
+        rows.append((f"{label} ({unit})", significant(used * scale),
+                     *(significant(v * scale) + (f" (dof {dof})" if dof else "")
+                       for v, dof in zip((repeats, residuals), dofs, strict=True)),
+                     significant(ratio)))
+        notes += _disagreement(label, ratio, dofs)
+    header = ("one reading", "σ used", "repeats", "residuals", "residuals/repeats")
+    if not rows:
+        return Section("Noise", notes=("not known: no mark was read twice and no detection "
+                                       "declared its uncertainty",))
+    return Section("Noise", table=(header, *rows), notes=tuple(notes))
+
+
+def _disagreement(label: str, ratio: float, dofs: list[int]) -> list[str]:
+    """Return a note if an F-test finds residuals and repeats in disagreement."""
+    if not math.isfinite(ratio) or min(dofs) <= 0:
+        return []
+    chance = 2 * min(fdtr(dofs[1], dofs[0], ratio ** 2), fdtrc(dofs[1], dofs[0], ratio ** 2))
+    if chance >= CHANCE:
+        return []
+    cause = ("something moved or drifted between the views, or a view lies askew" if ratio > 1
+             else "the repeats scatter for a reason that averages out within a view")
+    return [f"{label}: residuals are {significant(ratio)} times the repeats, by chance once in "
+            f"{significant(1 / max(chance, 1e-12), 1)}: {cause}"]
+
+
+def truth_section(emap: ErrorMap, truth: Mapping[str, np.ndarray]) -> Section:
+    """Return the comparison with a known truth, after removing the datum difference."""
+    f = truth_figures(emap, truth)
+    facts = [("largest |G − truth|", f"{um(f.largest_m)} {place_text(emap, f.site)}"),
+             ("rms", f"{um(f.rms_m)} per axis"), *_in_u(f.rms_in_u, f.largest_in_u, f.within_2u)]
+    if emap.artifact.angular_count and truth.get("g_theta") is not None:
+        at = "" if f.line is None else f" at line {f.line}"
+        facts += [("largest θ difference", arcsec(f.largest_theta_rad) + at),
+                  ("rms θ difference", arcsec(f.rms_theta_rad)),
+                  *_in_u(f.rms_theta_in_u, f.largest_theta_in_u, f.theta_within_2u)]
+    return Section("Against the known truth (datum difference removed)", tuple(facts))
+
+
+def _in_u(in_u: float, largest_in_u: float, within: float) -> list[tuple[str, str]]:
+    if not math.isfinite(in_u):
+        return []
+    return [("", f"{significant(in_u)} u rms, {significant(largest_in_u)} u largest, "
+             f"{100 * within:.1f} % within 2 u")]
+
+
+def rejected_section(result: CalibrationResult) -> Section:
+    """Return rejected detections by reason, most frequent first."""
+    counts = sorted(result.rejected.items(), key=lambda item: (-item[1], item[0]))
+    total, used = sum(result.rejected.values()), sum(v.used for v in result.views)
+    facts = [("detections", f"{used} used, {total} rejected"),
+             *((printable(reason).replace("_", " "), str(count)) for reason, count in counts)]
+    return Section("Rejected detections", tuple(facts))
+
+
+def attention_section(result: CalibrationResult) -> Section:
+    """Return unseen modes, advice and warnings: what a person should act on."""
+    seen = result.observability
+    lines = [f"unseen mode: {printable(mode)}" for mode in seen.modes]
+    lines += [f"advice: {printable(advice)}" for advice in seen.advice]
+    lines += [f"warning: {printable(warning)}" for warning in result.warnings]
+    return Section("Attention", notes=tuple(lines))
+
+
+def um(value_m: float) -> str:
+    """Return a length in µm with its unit, or ``not known``."""
+    return f"{significant(value_m * UM)} µm" if math.isfinite(value_m) else "not known"
+
+
+def arcsec(value_rad: float) -> str:
+    """Return an angle in arcseconds with its unit, or ``not known``."""
+    if not math.isfinite(value_rad):
+        return "not known"
+    return f"{significant(value_rad * ARCSEC)} arcsec"

@@ -1,0 +1,289 @@
+# SPDX-License-Identifier: Apache-2.0
+import io
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from selfcal_ros.errors import InputError
+from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.error_map import ErrorMap
+from selfcal_ros.model.result import Noise, Observability, result_from_dict, result_to_dict
+from selfcal_ros.reporting.summary import (
+    can_print_symbols,
+    state_sentence,
+    summary_numbers,
+    summary_text,
+)
+from selfcal_ros.reporting.summary_format import aligned, fixed_column, significant, to_ascii
+from selfcal_ros.reporting.summary_numbers import map_figures, truth_figures
+from selfcal_ros.reporting.summary_sections import noise_section, place_text, pose_text
+from test.support.results import known_result
+
+UNSEEN = Observability(5, 7, 2, False, ("non-orthogonality", "scale difference"),
+                       ("add a view turned by 90 deg",))
+
+
+def line_with(text, label):
+    return next(line for line in text.splitlines() if line.strip().startswith(label))
+
+
+def small_map(gx, gy, u=1e-8, g_theta=(), u_theta=1e-7):
+    gx = np.asarray(gx, dtype=float)
+    g_theta = np.asarray(g_theta, dtype=float)
+    artifact = Artifact(gx.shape[0], 0.01, len(g_theta))
+    return ErrorMap(artifact, gx, np.asarray(gy, dtype=float), np.full(gx.shape, u),
+                    np.full(gx.shape, u), g_theta, np.full(len(g_theta), u_theta))
+
+
+def test_numbers_of_a_map_by_hand():
+    gx, gy = np.zeros((2, 3, 3))
+    gx[2, 0], gy[2, 0] = 3e-6, -4e-6
+    emap = small_map(gx, gy, u=2e-8, g_theta=[0, -np.deg2rad(2 / 3600), 0, 0],
+                     u_theta=np.deg2rad(0.5 / 3600))
+    result = replace(known_result(3, 4)[0], error_map=emap)
+    numbers = summary_numbers(result)
+    assert numbers.max_error_um == pytest.approx(5.0, rel=1e-14)
+    assert numbers.rms_error_um == pytest.approx(np.sqrt(25 / 18), rel=1e-14)
+    assert numbers.rms_uncertainty_um == pytest.approx(0.02, rel=1e-14)
+    assert numbers.max_theta_error_arcsec == pytest.approx(2.0, rel=1e-14)
+    assert numbers.rms_theta_uncertainty_arcsec == pytest.approx(0.5, rel=1e-14)
+    assert map_figures(emap).max_site == (1, -1)
+    assert place_text(emap, (1, -1)) == "at x 10 mm, y -10 mm (site 1, -1)"
+    assert "at x 10 mm, y -10 mm (site 1, -1)" in line_with(summary_text(result), "largest error")
+
+
+def test_unknown_sites_do_not_count():
+    gx = np.array([[np.nan, 1e-6, 0], [0, 9e-6, 0], [0, 0, 0]])
+    gy = np.array([[1e-3, 0, 0], [0, np.nan, 0], [0, 0, 0]])
+    figures = map_figures(small_map(gx, gy))
+    assert (figures.n_sites, figures.n_known) == (9, 7)
+    assert figures.max_error_m == pytest.approx(1e-6)
+    assert figures.rms_error_m == pytest.approx(1e-6 / np.sqrt(14))
+
+
+def test_state_sentence_says_what_was_found():
+    result, _ = known_result()
+    sentence = state_sentence(result)
+    assert sentence.startswith("Calibrated from 4 views: largest error 0.")
+    assert "every site known to ±0.0" in sentence and sentence.endswith("arcsec.")
+    assert state_sentence(replace(result, warnings=("a", "b"))).endswith("; 2 warnings.")
+
+
+def test_state_sentence_of_a_deficient_plan_names_the_missing_view():
+    result = replace(known_result()[0], observability=UNSEEN)
+    assert state_sentence(result) == (
+        "Not a calibration: 2 modes of the stage error cannot be seen from the marks that were "
+        "read; add a view turned by 90 deg.")
+    text = summary_text(result)
+    assert "identifiable  NO (rank 5 of 7 unknowns, 2 unseen modes)" in text
+    assert "unseen mode: scale difference" in text
+    assert "advice: add a view turned by 90 deg" in text
+
+
+def test_state_sentence_without_one_known_site():
+    result, _ = known_result(3, 0)
+    nothing = small_map(np.full((3, 3), np.nan), np.full((3, 3), np.nan), u=np.nan)
+    empty = replace(result, error_map=nothing)
+    assert state_sentence(empty) == "No calibration: not one site of the error map is known."
+    assert "largest error      not known" in summary_text(empty)
+    assert np.isnan(summary_numbers(empty).max_error_um)
+
+
+def test_summary_shows_every_part():
+    result, truth = known_result()
+    text = summary_text(result, truth=truth)
+    assert "plate         11 × 11 marks, pitch 10 mm, field 100 × 100 mm, 24 angular lines" in text
+    assert "input         bags/hu.mcap (sha256 abababababababab)" in text
+    row = line_with(text, "shift_x").split()
+    assert row[:4] == ["shift_x", "0°", "(+1,", "0)"] and row[-2:] == ["603", "3"]
+    assert float(row[4]) == pytest.approx(1e3 * result.views[3].phi, abs=0.005)
+    assert float(row[5]) == pytest.approx(np.rad2deg(result.views[3].phi), abs=0.0005)
+    assert float(row[6]) == pytest.approx(1e6 * result.views[3].tx, abs=0.05)
+    assert float(row[7]) == pytest.approx(1e6 * result.views[3].ty, abs=0.05)
+    u_um = 1e6 * np.sqrt(np.mean(result.error_map.u_gx ** 2))
+    assert f"u {u_um:.4f} µm rms, 0.0238 µm largest (k=1)" in text
+    assert f"U {2 * u_um:.4f} µm rms, 0.0476 µm largest (k=2)" in text
+    assert line_with(text, "x, y").split() == [
+        "x,", "y", "(µm)", "0.0200", "0.0200", "(dof", "2904)", "0.0204", "(dof", "220)", "1.02"]
+    assert line_with(text, "outlier").split() == ["outlier", "12"]
+    assert text.index("outlier") < text.index("no encoder sample")
+    assert max(map(len, text.splitlines()[1:])) <= 110
+    assert len(text.splitlines()) <= 52
+
+
+def test_orthogonality_and_scale_keep_their_signs_and_lengths():
+    result, _ = known_result(11, 0)
+    emap = replace(result.error_map, nonorthogonality=2e-6, scale_difference=-3e-6)
+    text = summary_text(replace(result, error_map=emap))
+    assert "O 2.00 µrad = 0.200 µm over 100 mm; axes out of square by 2|O| = 4.00 µrad" in text
+    assert "R -3.00 ppm = -0.300 µm over 100 mm; scales of X and Y differ by 2|R| = 6.00" in text
+
+
+def test_ascii_summary_is_ascii_and_still_aligned():
+    result, truth = known_result()
+    views = (replace(result.views[0], name="Ansicht-ä-°"), *result.views[1:])
+    text = summary_text(replace(result, views=views), truth=truth, ascii_only=True)
+    assert text.isascii()
+    header = line_with(text, "view ")
+    assert header.split()[3:6] == ["phi", "mrad", "phi"]
+    rows = [line_with(text, name) for name in ("Ansicht-?", "rot90", "line", "shift_x")]
+    assert {len(row) for row in rows} == {len(header)}
+
+
+def test_names_cannot_steer_the_terminal():
+    result, _ = known_result()
+    views = (replace(result.views[0], name="a\x1b[2J\nb"), *result.views[1:])
+    hostile = replace(result, views=views, plan_id="p\rq", warnings=("w\x07",),
+                      rejected={"r\x1b": 1})
+    text = summary_text(hostile)
+    assert all(char.isprintable() or char == "\n" for char in text)
+    assert "a?[2J?b" in text and "p?q" in text
+
+
+def test_residuals_that_contradict_the_repeats_are_named():
+    result, _ = known_result()
+    loud = replace(result.noise, sigma_xy_residuals=1.5 * result.noise.sigma_xy_repeats)
+    quiet = replace(result.noise, sigma_xy_residuals=0.5 * result.noise.sigma_xy_repeats)
+    assert "something moved or drifted" in summary_text(replace(result, noise=loud))
+    assert "averages out within a view" in summary_text(replace(result, noise=quiet))
+    assert "by chance" not in summary_text(result)
+
+
+def test_f_test_of_the_noise_raises_a_false_alarm_once_in_a_thousand():
+    rng = np.random.default_rng(5)
+    alarms, draws, dofs = 0, 4000, (40, 12)
+    for repeats, residuals in zip(*(np.sqrt(rng.chisquare(d, draws) / d) for d in dofs),
+                                  strict=True):
+        noise = Noise(1e-8, float("nan"), repeats * 1e-8, sigma_xy_residuals=residuals * 1e-8,
+                      dof_xy_repeats=dofs[0], dof_xy_residuals=dofs[1])
+        alarms += bool(noise_section(noise).notes)
+    assert alarms <= 13, "binomial(4000, 0.001) stays below 13 except once in 10,000"
+
+
+def test_no_repeats_and_no_noise_at_all():
+    result, _ = known_result()
+    once = replace(result, noise=Noise(1e-8, float("nan"), sigma_xy_residuals=1e-8,
+                                       dof_xy_residuals=10))
+    assert line_with(summary_text(once), "x, y").split() == [
+        "x,", "y", "(µm)", "0.0100", "–", "0.0100", "(dof", "10)", "–"]
+    silent = replace(result, noise=Noise(float("nan"), float("nan")))
+    assert "not known: no mark was read twice" in summary_text(silent)
+
+
+def test_a_view_that_was_not_measured_shows_dashes():
+    result, _ = known_result()
+    nan = float("nan")
+    views = (*result.views[:3], replace(result.views[3], phi=nan, tx=nan, ty=nan, used=0))
+    text = summary_text(replace(result, views=views))
+    assert line_with(text, "shift_x").split()[4:] == ["–", "–", "–", "–", "0", "3"]
+    assert "4 views, 3 measured" in text
+
+
+def test_pose_is_in_degrees_and_pitches():
+    view = replace(known_result()[0].views[0], rotation=-np.pi / 2, translation_x=-0.02,
+                   translation_y=0.01)
+    assert pose_text(view, 0.01) == "-90° (-2, +1)"
+
+
+def test_plate_without_angular_lines_has_no_theta():
+    result, truth = known_result(5, 0)
+    text = summary_text(result, truth=truth)
+    assert "no angular lines" in text and "θ" not in text
+    assert "θ" not in state_sentence(result)
+
+
+def test_truth_recovery_in_units_of_the_uncertainty():
+    result, truth = known_result(21, 72, seed=3)
+    figures = truth_figures(result.error_map, truth)
+    assert figures.rms_in_u == pytest.approx(1, abs=4 / np.sqrt(2 * 882))
+    assert 0.92 < figures.within_2u < 0.985
+    assert figures.rms_theta_in_u == pytest.approx(1, abs=4 / np.sqrt(2 * 72))
+    exact, truth = known_result(noisy=False)
+    assert truth_figures(exact.error_map, truth).largest_m < 1e-20
+
+
+@given(st.tuples(*[st.floats(-1e-5, 1e-5)] * 5))
+@settings(max_examples=40, deadline=None)
+def test_datum_difference_does_not_change_the_comparison(shift):
+    result, truth = known_result(7, 8)
+    artifact = result.artifact
+    tx, ty, turn, scale, theta = shift
+    moved = {"gx": truth["gx"] + tx - turn * artifact.y_m + scale * artifact.x_m,
+             "gy": truth["gy"] + ty + turn * artifact.x_m + scale * artifact.y_m,
+             "g_theta": truth["g_theta"] + theta}
+    before = truth_figures(result.error_map, truth)
+    after = truth_figures(result.error_map, moved)
+    for name in ("largest_m", "rms_m", "rms_in_u", "largest_theta_rad", "rms_theta_rad"):
+        assert getattr(after, name) == pytest.approx(getattr(before, name), rel=1e-6)
+
+
+def test_shear_is_not_taken_for_a_datum_difference():
+    result, truth = known_result(7, 0, noisy=False)
+    sheared = {"gx": truth["gx"] + 1e-6 * result.artifact.y_m,
+               "gy": truth["gy"] + 1e-6 * result.artifact.x_m}
+    corner = 1e-6 * np.hypot(0.03, 0.03)
+    assert truth_figures(result.error_map, sheared).largest_m == pytest.approx(corner)
+
+
+def test_truth_with_unknown_sites():
+    result, truth = known_result(5, 8)
+    emap = result.error_map
+    gx = emap.gx.copy()
+    gx[0, 0] = np.nan
+    figures = truth_figures(replace(emap, gx=gx), truth)
+    assert np.isfinite(figures.largest_m)
+    nothing = replace(emap, gx=np.full((5, 5), np.nan), g_theta=np.full(8, np.nan))
+    assert np.isnan(truth_figures(nothing, truth).largest_m)
+    assert "not known" in summary_text(replace(result, error_map=nothing), truth=truth)
+
+
+@pytest.mark.parametrize(("truth", "message"), [
+    ({}, "truth gx: missing; give gx, gy (m) and g_theta (rad)"),
+    ({"gx": np.zeros((3, 3)), "gy": np.zeros((5, 5))},
+     "truth gx: has the shape (3, 3), the map has (5, 5); give the truth on the lattice of the "
+     "map"),
+    ({"gx": [[1], [2, 3]], "gy": 0},
+     "truth gx: not an array of numbers; give lists of numbers and null"),
+])
+def test_unusable_truth_is_refused(truth, message):
+    with pytest.raises(InputError) as caught:
+        summary_text(known_result(5, 0)[0], truth=truth)
+    assert str(caught.value) == message
+
+
+def test_summary_is_the_same_after_a_round_trip_through_json():
+    result, truth = known_result()
+    again = result_from_dict(result_to_dict(result), "r.json")
+    assert summary_text(again, truth=truth) == summary_text(result, truth=truth)
+
+
+@pytest.mark.parametrize(("value", "text"), [
+    (0.5806, "0.581"), (12.345, "12.3"), (1234.5, "1234"), (0, "0"), (-0.0099996, "-0.0100"),
+    (1e-12, "1.00e-12"), (2.5e7, "2.50e+07"), (float("nan"), "–"), (float("inf"), "–"),
+    (9.996, "10.0"), (999.6, "1000"),
+])
+def test_significant_digits(value, text):
+    assert significant(value) == text
+
+
+def test_columns_share_their_decimals():
+    assert fixed_column([30.12, -0.004, float("nan")]) == ["30.1", "0.0", "–"]
+    assert aligned([("a", "1"), ("長", "10")], indent="") == ["a    1", "長  10"]
+
+
+def test_symbols_only_where_the_stream_has_them():
+    assert can_print_symbols(io.TextIOWrapper(io.BytesIO(), encoding="utf-8"))
+    assert not can_print_symbols(io.TextIOWrapper(io.BytesIO(), encoding="latin-1"))
+    assert not can_print_symbols(io.StringIO())
+    assert to_ascii("φ ° 90° 2×3 ±1 µm ☃") == "phi deg 90 deg 2x3 +/-1 um ?"
+
+
+def test_summary_does_not_load_matplotlib():
+    code = ("import sys, selfcal_ros.reporting.summary; "
+            "sys.exit('matplotlib' in sys.modules)")
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

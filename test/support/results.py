@@ -1,0 +1,50 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Calibration results with known content for the tests of reports."""
+
+import numpy as np
+
+from selfcal_ros.estimation.datum import first_order
+from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.error_map import ErrorMap
+from selfcal_ros.model.result import (
+    ArtifactMap,
+    CalibrationResult,
+    Noise,
+    Observability,
+    ViewResult,
+)
+from selfcal_ros.simulation.truth import hu_plan, random_truth
+
+SIGMA_M, SIGMA_RAD = 0.02e-6, np.deg2rad(0.001)
+
+
+def noise_of(lines: int) -> Noise:
+    """Return the noise of five repeats; nothing is known of theta on a plate without lines."""
+    theta = (SIGMA_RAD, 384, 44) if lines else (float("nan"), 0, 0)
+    return Noise(SIGMA_M, theta[0], SIGMA_M, theta[0], 1.02 * SIGMA_M, 0.98 * theta[0],
+                 2904, theta[1], 220, theta[2])
+
+
+def known_result(size: int = 11, lines: int = 24, *, seed: int = 1, size_y: int = 0,
+                 noisy: bool = True) -> tuple[CalibrationResult, dict[str, np.ndarray]]:
+    """Return a result whose map is a random truth plus noise of its stated uncertainty."""
+    artifact = Artifact(size, 0.01, lines, size_y)
+    rng = np.random.default_rng(seed)
+    plan = hu_plan(artifact, 5)
+    truth = random_truth(artifact, len(plan.views), rng)
+    u = 0.9 * SIGMA_M * (1 + 0.5 * np.hypot(artifact.m, artifact.n) / size)
+    u_theta = np.full(lines, 0.75 * SIGMA_RAD)
+    noise = rng.normal(0, 1, (2, *artifact.shape)) * (u if noisy else 0)
+    gx, gy = truth.g + noise
+    g_theta = truth.g_theta + rng.normal(0, 1, lines) * (u_theta if noisy else 0)
+    nonorthogonality, scale = first_order(artifact, gx, gy)
+    emap = ErrorMap(artifact, gx, gy, u, u.copy(), g_theta, u_theta, nonorthogonality, scale)
+    views = tuple(ViewResult(v.name, v.rotation_rad, *v.translation_m, truth.phi_rad[i],
+                             *truth.t_m[i], used=600 + i, rejected=i)
+                  for i, v in enumerate(plan.views))
+    result = CalibrationResult(
+        plan.plan_id, emap, ArtifactMap(*truth.a, truth.a_theta), views,
+        Observability(9, 9, 0, True),
+        noise_of(lines),
+        {"no_encoder_sample": 3, "outlier": 12}, {"file": "bags/hu.mcap", "sha256": "ab" * 32})
+    return result, {"gx": truth.g[0], "gy": truth.g[1], "g_theta": truth.g_theta}
