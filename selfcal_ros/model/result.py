@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The result of a calibration and its JSON form, schema ``selfcal.result/1``."""
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -9,6 +9,7 @@ import numpy as np
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ErrorMap, ThetaDatum
+from selfcal_ros.model.readings import Measurements
 
 SCHEMA = "selfcal.result/1"
 
@@ -109,6 +110,27 @@ class CalibrationResult:
     def artifact(self) -> Artifact:
         """The plate."""
         return self.error_map.artifact
+
+
+def with_input(result: CalibrationResult, source: dict[str, str],
+               lost: list[str]) -> CalibrationResult:
+    """Return `result` with the file it came from, and what was lost of it as warnings."""
+    return replace(result, input=source, warnings=(*result.warnings, *lost))
+
+
+def unidentified_result(measurements: Measurements,
+                        observability: Observability) -> CalibrationResult:
+    """Return the result of a plan that does not identify the stage: all maps unknown."""
+    artifact = measurements.artifact
+    grid, circle = np.full(artifact.shape, np.nan), np.full(artifact.angular_count, np.nan)
+    nan = float("nan")
+    views = tuple(ViewResult(v.view.name, v.view.rotation_rad, *v.view.translation_m, nan, nan, nan,
+                             v.used, sum(v.rejected.values())) for v in measurements.views)
+    return CalibrationResult(
+        measurements.plan_id,
+        ErrorMap(artifact, grid, grid, grid, grid, circle, circle, nan, nan),
+        ArtifactMap(grid, grid, circle), views, observability, Noise(nan, nan),
+        measurements.all_rejected(), sense=str(measurements.sense))
 
 
 def result_to_dict(result: CalibrationResult) -> dict[str, Any]:

@@ -1,0 +1,124 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From messages to the model. Messages of rclpy and of rosbags have the same fields."""
+
+from typing import Any
+
+import numpy as np
+
+from selfcal_ros.collection.messages import Command, Detection, EncoderSample, Phase
+from selfcal_ros.errors import InputError
+from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.error_map import ErrorMap, ThetaDatum
+from selfcal_ros.model.readings import Sense, ViewReadings
+from selfcal_ros.model.view import View
+
+
+def stamp_ns(message: Any) -> int:
+    """Return the stamp in the header of a message, integer ns."""
+    stamp = message.header.stamp
+    return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
+
+
+def encoder_sample(message: Any) -> EncoderSample:
+    """Return the sample in a sensor_msgs/JointState."""
+    return EncoderSample(stamp_ns(message), tuple(message.name), tuple(_floats(message.position)),
+                         tuple(_floats(getattr(message, "velocity", ()))))
+
+
+def _floats(values: Any) -> list[float]:
+    return values.tolist() if hasattr(values, "tolist") else list(values)
+
+
+def detection(message: Any) -> Detection:
+    """Return the detection in a selfcal_msgs/MarkDetection."""
+    return Detection(
+        stamp_ns(message), int(message.kind), bool(message.has_id), int(message.m),
+        int(message.n), int(message.k), float(message.offset_x), float(message.offset_y),
+        float(message.offset_theta), float(message.sigma), float(message.score))
+
+
+def command(message: Any) -> Command:
+    """Return the command in a selfcal_msgs/ViewCommand.
+
+    Raises
+    ------
+    InputError
+        For an unknown phase, or a plate that cannot be.
+    """
+    try:
+        phase = Phase(int(message.phase))
+    except ValueError as error:
+        raise InputError("selfcal/view_command", f"unknown phase {message.phase}",
+                         "use PLACE, MEASURE, DONE or ABORT") from error
+    base = (stamp_ns(message), phase, str(message.plan_id), int(message.view_index))
+    planned = int(getattr(message, "views_planned", 0))
+    if phase not in (Phase.PLACE, Phase.MEASURE):
+        return Command(*base, views_planned=planned)
+    return Command(*base, view_of(message, repeats=max(1, int(message.repeats)),
+                                  grid=bool(message.grid), angular=bool(message.angular)),
+                   artifact_of(message), planned)
+
+
+def artifact_of(message: Any) -> Artifact:
+    """Return the plate that a ViewCommand, ViewMeasurement or ErrorMap describes."""
+    return Artifact(int(message.grid_size), float(message.grid_pitch),
+                    int(message.angular_count), int(getattr(message, "grid_size_y", 0)))
+
+
+def view_of(message: Any, *, repeats: int, grid: bool, angular: bool) -> View:
+    """Return the view that a ViewCommand or ViewMeasurement describes."""
+    return View(str(message.view_name), float(message.rotation),
+                (float(message.translation_x), float(message.translation_y)), grid, angular,
+                repeats)
+
+
+def view_readings(message: Any) -> ViewReadings:
+    """Return the readings in a selfcal_msgs/ViewMeasurement.
+
+    Raises
+    ------
+    InputError
+        If arrays that belong together differ in length.
+    """
+    table = {name: np.array(getattr(message, name), dtype=kind)
+             for name, kind in (("m", np.int64), ("n", np.int64), ("dx", float), ("dy", float),
+                                ("count", np.int64), ("u", float), ("k", np.int64),
+                                ("dtheta", float), ("count_theta", np.int64),
+                                ("u_theta", float))}
+    for names in (("m", "n", "dx", "dy", "count"), ("k", "dtheta", "count_theta")):
+        if len({len(table[name]) for name in names}) > 1:
+            raise InputError(f"selfcal/view_measurement of '{message.view_name}'",
+                             f"{', '.join(names)} differ in length", "mend the publisher")
+    return ViewReadings(
+        view_of(message, repeats=int(message.repeats), grid=bool(message.grid),
+                angular=bool(message.angular)), **table,
+        sigma_xy=float(message.sigma_xy), sigma_theta=float(message.sigma_theta),
+        dof_xy=int(message.dof_xy), dof_theta=int(message.dof_theta),
+        used=int(message.detections_used), rejected=counts(message, "reject"))
+
+
+def counts(message: Any, prefix: str) -> dict[str, int]:
+    """Return reason -> count from a pair of arrays ``<prefix>_reasons``, ``<prefix>_counts``."""
+    return {str(reason): int(count) for reason, count in
+            zip(getattr(message, f"{prefix}_reasons"), getattr(message, f"{prefix}_counts"),
+                strict=True)}
+
+
+def sense_of(message: Any) -> Sense:
+    """Return the sense of measurement behind a ViewMeasurement."""
+    return Sense(message.measurement_sense or Sense.MICROSCOPE_MOVES)
+
+
+def error_map(message: Any) -> ErrorMap:
+    """Return the map in a selfcal_msgs/ErrorMap."""
+    artifact = artifact_of(message)
+    grids = {name: np.array(getattr(message, name), dtype=float).reshape(artifact.shape)
+             for name in ("gx", "gy", "u_gx", "u_gy")}
+    unknown = ~np.array(message.valid, dtype=bool).reshape(artifact.shape)
+    for values in grids.values():
+        values[unknown] = np.nan
+    return ErrorMap(artifact, **grids, g_theta=np.array(message.g_theta, dtype=float),
+                    u_g_theta=np.array(message.u_g_theta, dtype=float),
+                    nonorthogonality=float(message.nonorthogonality),
+                    scale_difference=float(message.scale_difference),
+                    datum_theta=ThetaDatum(message.datum_theta))

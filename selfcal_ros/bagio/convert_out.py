@@ -1,0 +1,140 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From the model to the fields of messages, as plain nested dicts.
+
+`build` makes a rosbags message of them; nodes fill rclpy messages from the same dicts.
+"""
+
+from typing import Any
+
+import numpy as np
+from rosbags.interfaces import Nodetype
+from rosbags.typesys.store import Typestore
+
+from selfcal_ros.collection.collector import ViewProgress
+from selfcal_ros.collection.messages import Command, Detection, EncoderSample
+from selfcal_ros.collection.timeline import Timeline
+from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.readings import Measurements
+from selfcal_ros.model.result import CalibrationResult
+from selfcal_ros.model.view import View
+
+Fields = dict[str, Any]
+
+
+def header(stamp_ns: int, frame_id: str) -> Fields:
+    """Return the fields of a std_msgs/Header."""
+    sec, nanosec = divmod(stamp_ns, 1_000_000_000)
+    return {"stamp": {"sec": sec, "nanosec": nanosec}, "frame_id": frame_id}
+
+
+def joint_state(sample: EncoderSample, frame_id: str) -> Fields:
+    """Return the fields of a sensor_msgs/JointState."""
+    return {"header": header(sample.stamp_ns, frame_id), "name": list(sample.names),
+            "position": list(sample.positions), "velocity": list(sample.velocities), "effort": []}
+
+
+def detection(d: Detection, frame_id: str) -> Fields:
+    """Return the fields of a selfcal_msgs/MarkDetection."""
+    names = ("kind", "has_id", "m", "n", "k", "offset_x", "offset_y", "offset_theta", "sigma",
+             "score")
+    return {"header": header(d.stamp_ns, frame_id), **{name: getattr(d, name) for name in names}}
+
+
+def _artifact(artifact: Artifact) -> Fields:
+    return {"grid_size": artifact.grid_size, "grid_pitch": artifact.grid_pitch_m,
+            "angular_count": artifact.angular_count, "grid_size_y": artifact.grid_size_y}
+
+
+def _view(view: View) -> Fields:
+    return {"view_name": view.name, "rotation": view.rotation_rad,
+            "translation_x": view.translation_m[0], "translation_y": view.translation_m[1],
+            "grid": view.grid, "angular": view.angular, "repeats": view.repeats}
+
+
+def command(c: Command, frame_id: str) -> Fields:
+    """Return the fields of a selfcal_msgs/ViewCommand."""
+    view = _view(c.view or View("", grid=False, angular=False, repeats=0))
+    plate = _artifact(c.artifact) if c.artifact else {
+        "grid_size": 0, "grid_pitch": 0.0, "angular_count": 0, "grid_size_y": 0}
+    return {"header": header(c.stamp_ns, frame_id), "phase": int(c.phase), "plan_id": c.plan_id,
+            "view_index": c.view_index, **view, **plate, "views_planned": c.views_planned}
+
+
+def view_status(progress: ViewProgress, plan_id: str, stamp_ns: int, frame_id: str) -> Fields:
+    """Return the fields of a selfcal_msgs/ViewStatus."""
+    readings = progress.readings
+    return {
+        "header": header(stamp_ns, frame_id), "plan_id": plan_id,
+        "view_index": progress.view_index, "view_name": progress.view.name,
+        "grid_expected": progress.grid_expected, "grid_done": progress.grid_done,
+        "angular_expected": progress.angular_expected, "angular_done": progress.angular_done,
+        "detections_used": readings.used,
+        "detections_rejected": sum(readings.rejected.values()),
+        **_rejected(readings.rejected, "reject"),
+        "sigma_xy": readings.sigma_xy, "sigma_theta": readings.sigma_theta,
+        "complete": progress.complete}
+
+
+def view_measurement(progress: ViewProgress, measurements: Measurements, stamp_ns: int,
+                     frame_id: str) -> Fields:
+    """Return the fields of a selfcal_msgs/ViewMeasurement."""
+    readings = progress.readings
+    arrays = ("m", "n", "dx", "dy", "count", "k", "dtheta", "count_theta", "u", "u_theta")
+    return {
+        "header": header(stamp_ns, frame_id), "plan_id": measurements.plan_id,
+        "view_index": progress.view_index, **_view(progress.view),
+        **_artifact(measurements.artifact),
+        **{name: getattr(readings, name) for name in arrays},
+        "sigma_xy": readings.sigma_xy, "sigma_theta": readings.sigma_theta,
+        "dof_xy": readings.dof_xy, "dof_theta": readings.dof_theta,
+        "detections_used": readings.used,
+        **_rejected(readings.rejected, "reject"),
+        "measurement_sense": str(measurements.sense),
+        **_rejected(measurements.rejected, "session_reject")}
+
+
+def _rejected(rejected: dict[str, int], prefix: str) -> Fields:
+    return {f"{prefix}_reasons": list(rejected), f"{prefix}_counts": list(rejected.values())}
+
+
+def error_map(result: CalibrationResult, stamp_ns: int, frame_id: str) -> Fields:
+    """Return the fields of a selfcal_msgs/ErrorMap."""
+    emap = result.error_map
+    return {
+        "header": header(stamp_ns, frame_id), "plan_id": result.plan_id,
+        "datum_theta": str(emap.datum_theta), **_artifact(emap.artifact),
+        **{name: getattr(emap, name).ravel() for name in ("gx", "gy", "u_gx", "u_gy")},
+        "valid": emap.valid.ravel().tolist(), "g_theta": emap.g_theta,
+        "u_g_theta": emap.u_g_theta, "nonorthogonality": emap.nonorthogonality,
+        "scale_difference": emap.scale_difference, "sigma_xy": result.noise.sigma_xy,
+        "sigma_theta": result.noise.sigma_theta,
+        "identifiable": result.observability.identifiable}
+
+
+def session_stamp_ns(timeline: Timeline, progress: ViewProgress) -> int:
+    """Return the end of a view, or the last command while the view is still open."""
+    return min(progress.end_ns, timeline.last_stamp_ns)
+
+
+def build(store: Typestore, typename: str, fields: Fields) -> object:
+    """Return a rosbags message of type `typename` with these fields.
+
+    Raises
+    ------
+    KeyError
+        If a field of the type is not given.
+    """
+    values = {}
+    for name, (kind, argument) in store.fielddefs[typename][1]:
+        value = fields[name]
+        if kind == Nodetype.NAME:
+            values[name] = build(store, argument, value)
+        elif kind == Nodetype.BASE:
+            values[name] = value
+        else:
+            element = argument[0]
+            if element[0] == Nodetype.BASE and element[1][0] != "string":
+                values[name] = np.array(value, dtype=element[1][0])
+            else:
+                values[name] = list(value)
+    return store.types[typename](**values)

@@ -1,0 +1,161 @@
+# SPDX-License-Identifier: Apache-2.0
+"""MCAP as a stream of messages that survives a truncated or damaged file.
+
+The mcap library reads the records. This module adds what a recorder that died leaves behind:
+a missing end, a damaged chunk, and the readable front part of a chunk that was cut off.
+"""
+
+import io
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import BinaryIO
+
+import lz4.frame
+import zstandard
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import EndOfFile, InvalidMagic, McapError
+from mcap.opcode import Opcode
+from mcap.records import Channel, Chunk, Footer, Message, Schema
+from mcap.stream_reader import StreamReader, breakup_chunk
+
+from selfcal_ros.errors import InputError
+
+MAGIC = b"\x89MCAP0\r\n"
+
+
+@dataclass
+class McapStream:
+    """Messages of one MCAP file, in the order of the file.
+
+    Attributes
+    ----------
+    path : Path
+        The file.
+    schemas, channels : dict
+        Filled while the messages are read.
+    lost : list of str
+        What could not be read, one line each.
+    """
+
+    path: Path
+    schemas: dict[int, Schema] = field(default_factory=dict)
+    channels: dict[int, Channel] = field(default_factory=dict)
+    lost: list[str] = field(default_factory=list)
+
+    def messages(self) -> Iterator[tuple[Channel, Message]]:
+        """Yield channel and message of every message that can be read.
+
+        Raises
+        ------
+        InputError
+            If the file is empty or no MCAP file.
+        """
+        size = self.path.stat().st_size
+        with self.path.open("rb") as file:
+            head = file.read(len(MAGIC))
+            if not head:
+                raise InputError(str(self.path), "the file is empty", "record the bag anew")
+            if head != MAGIC:
+                raise InputError(str(self.path), "not an MCAP file",
+                                 "give an .mcap file or a rosbag2 folder")
+            file.seek(0)
+            yield from self._records(file, size)
+
+    def _records(self, file: BinaryIO, size: int) -> Iterator[tuple[Channel, Message]]:
+        records = iter(StreamReader(file, emit_chunks=True, record_size_limit=size).records)
+        good_until, ended = len(MAGIC), False
+        while True:
+            try:
+                record = next(records)
+            except StopIteration:
+                return
+            except (EndOfFile, InvalidMagic, McapError, struct.error, ValueError,
+                    UnicodeDecodeError) as error:
+                if not ended:
+                    yield from self._salvage(file, good_until, size, error)
+                return
+            ended = ended or isinstance(record, Footer)
+            good_until = file.tell()
+            if isinstance(record, Chunk):
+                yield from self._chunk(record, good_until)
+            else:
+                yield from self._take(record)
+
+    def _chunk(self, chunk: Chunk, position: int) -> Iterator[tuple[Channel, Message]]:
+        try:
+            records = breakup_chunk(chunk, validate_crc=True)
+        except Exception as error:
+            self.lost.append(f"the chunk that ends at byte {position} is damaged "
+                             f"({str(error).splitlines()[0][:80]}): its messages are lost")
+            return
+        for record in records:
+            yield from self._take(record)
+
+    def _take(self, record: object) -> Iterator[tuple[Channel, Message]]:
+        if isinstance(record, Schema):
+            self.schemas[record.id] = record
+        elif isinstance(record, Channel):
+            self.channels[record.id] = record
+        elif isinstance(record, Message):
+            channel = self.channels.get(record.channel_id)
+            if channel is None:
+                self.lost.append(f"a message of the undeclared channel {record.channel_id}")
+            else:
+                yield channel, record
+
+    def _salvage(self, file: BinaryIO, start: int, size: int,
+                 error: Exception) -> Iterator[tuple[Channel, Message]]:
+        """Yield what is readable of the record that was cut off at the end of the file."""
+        file.seek(start)
+        rest = file.read()
+        count = 0
+        for record in _front_of_chunk(rest):
+            for item in self._take(record):
+                count += 1
+                yield item
+        reason = "truncated" if isinstance(error, EndOfFile) else f"damaged ({error})"
+        self.lost.append(f"the file is {reason} after byte {start} of {size}: {count} messages "
+                         "of the last chunk could be saved, what followed is lost")
+
+
+def _front_of_chunk(data: bytes) -> Iterator[object]:
+    """Yield the complete records in the front part of a chunk record that was cut off."""
+    if len(data) < 49 or data[0] != Opcode.CHUNK:
+        return
+    name_length = struct.unpack_from("<I", data, 37)[0]
+    begin = 41 + name_length + 8
+    compression = data[41:41 + name_length].decode(errors="replace")
+    body = _decompress_front(compression, data[begin:])
+    at = 0
+    while at + 9 <= len(body):
+        opcode, length = struct.unpack_from("<BQ", body, at)
+        at += 9
+        if at + length > len(body):
+            return
+        stream = ReadDataStream(io.BytesIO(body[at:at + length]))
+        if opcode == Opcode.SCHEMA:
+            yield Schema.read(stream)
+        elif opcode == Opcode.CHANNEL:
+            yield Channel.read(stream)
+        elif opcode == Opcode.MESSAGE:
+            yield Message.read(stream, length)
+        at += length
+
+
+def _decompress_front(compression: str, data: bytes) -> bytes:
+    """Return what can be decompressed of a stream whose end is missing."""
+    out = bytearray()
+    try:
+        if compression == "zstd":
+            decoder = zstandard.ZstdDecompressor().decompressobj()
+        elif compression == "lz4":
+            decoder = lz4.frame.LZ4FrameDecompressor()
+        else:
+            return data
+        for at in range(0, len(data), 4096):
+            out += decoder.decompress(data[at:at + 4096])
+    except (zstandard.ZstdError, RuntimeError, EOFError):
+        pass  # the cut: what came out so far is good
+    return bytes(out)

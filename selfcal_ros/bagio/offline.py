@@ -1,0 +1,87 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A bag straight into the collector, without middleware."""
+
+import hashlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from selfcal_ros.bagio import convert_in
+from selfcal_ros.bagio.reader import COMMAND_TOPIC, DETECTION_TOPIC, ENCODER_TOPIC, BagReader
+from selfcal_ros.collection.collector import Collector, ViewProgress
+from selfcal_ros.errors import InputError, NoDataError
+from selfcal_ros.model.readings import Measurements
+
+
+def collect_bag(path: str | Path, values: dict[str, Any], *, namespace: str = "",
+                progress: Callable[[int], None] = lambda count: None,
+                ) -> tuple[Measurements, dict[int, ViewProgress], list[str]]:
+    """Return the readings in a bag, how far each view came, and what could not be read.
+
+    Parameters
+    ----------
+    path : path
+        MCAP file or rosbag2 folder.
+    values : dict
+        Values of the measurement_collector's parameters.
+    namespace : str
+        Namespace of the cell's topics; empty = the only one.
+    progress : callable
+        Called now and then with the number of messages read.
+
+    Raises
+    ------
+    InputError
+        If the path is no bag of this contract.
+    NoDataError
+        If it has no commands or no detections, or no detection became a reading.
+    """
+    reader = BagReader(Path(path), namespace)
+    collector = Collector(values)
+    feed = feeder(collector, reader.lost)
+    for count, (topic, message) in enumerate(reader.messages()):
+        feed[topic](message)
+        if count % 1000 == 0:
+            progress(count)
+    received = collector.received
+    tail = f" ({reader.lost[-1]})" if reader.lost else ""
+    for kind, topic in (("command", COMMAND_TOPIC), ("detection", DETECTION_TOPIC),
+                        ("encoder", ENCODER_TOPIC)):
+        if not received[kind]:
+            raise NoDataError(str(path), f"no message on {topic}{tail}",
+                              "record this topic too, see the README")
+    measurements, views = collector.collect()
+    if not any(view.used for view in measurements.views):
+        reasons = ", ".join(f"{reason} {count}" for reason, count in
+                            sorted(measurements.all_rejected().items(), key=lambda i: -i[1])[:4])
+        raise NoDataError(str(path), f"none of {received['detection']} detections became a "
+                          f"reading (rejected: {reasons}){tail}",
+                          "mend the cause that is named first")
+    return measurements, views, reader.lost
+
+
+def feeder(collector: Collector, complaints: list[str]) -> dict[str, Callable[[Any], None]]:
+    """Return topic -> handler that converts a message and gives it to the collector.
+
+    A command that cannot be used is not fatal: it is counted, and said in `complaints`.
+    """
+    def take_command(message: Any) -> None:
+        try:
+            collector.add_command(convert_in.command(message))
+        except InputError as error:
+            collector.refuse_command()
+            complaints.append(f"a view command was not used: {error}")
+
+    return {ENCODER_TOPIC: lambda m: collector.add_encoder(convert_in.encoder_sample(m)),
+            DETECTION_TOPIC: lambda m: collector.add_detection(convert_in.detection(m)),
+            COMMAND_TOPIC: take_command}
+
+
+def bag_input(path: str | Path) -> dict[str, str]:
+    """Return the result's ``input`` entry: file name and SHA-256 of the bag's MCAP files."""
+    digest = hashlib.sha256()
+    for file in BagReader(Path(path)).files:
+        with file.open("rb") as stream:
+            while block := stream.read(1 << 20):
+                digest.update(block)
+    return {"file": Path(path).name, "sha256": digest.hexdigest()}

@@ -1,0 +1,61 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A simulation written as a bag, with its truth beside it."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+from selfcal_ros.bagio import convert_out
+from selfcal_ros.bagio.reader import COMMAND_TOPIC, DETECTION_TOPIC, ENCODER_TOPIC, INPUT_TOPICS
+from selfcal_ros.bagio.writer import BagWriter, qos_profile
+from selfcal_ros.collection.messages import Command, Detection
+from selfcal_ros.files import read_json, write_json
+from selfcal_ros.model.result import plain
+from selfcal_ros.simulation.cell import Event
+from selfcal_ros.simulation.spec import Simulation
+from selfcal_ros.simulation.truth import Truth
+
+QOS = {
+    ENCODER_TOPIC: qos_profile(reliable=True, transient_local=False, depth=1000),
+    DETECTION_TOPIC: qos_profile(reliable=True, transient_local=False, depth=1000),
+    COMMAND_TOPIC: qos_profile(reliable=True, transient_local=True, depth=64),
+}
+TRUTH_FILE = "truth.json"
+
+
+def write_simulation(simulation: Simulation, path: str | Path, *,
+                     progress: Callable[[int, int], None] = lambda done, total: None,
+                     ) -> dict[str, int]:
+    """Simulate, write the bag folder `path` with `truth.json` in it, return messages by topic."""
+    truth, arrivals, ledger = simulation.run()
+    with BagWriter(Path(path), simulation.compression) as writer:
+        for topic, typename in INPUT_TOPICS.items():
+            writer.add_topic(f"/{topic}", typename, [QOS[topic]])
+        for number, (arrival_ns, event) in enumerate(arrivals):
+            topic, fields = event_fields(event, "stage")
+            writer.write(f"/{topic}", fields, arrival_ns)
+            if number % 1000 == 0:
+                progress(number, len(arrivals))
+        write_truth(Path(path) / TRUTH_FILE, truth, seed=simulation.seed, faults=ledger)
+        return writer.counts
+
+
+def event_fields(event: Event, frame_id: str) -> tuple[str, convert_out.Fields]:
+    """Return topic and fields of a simulated message."""
+    if isinstance(event, Command):
+        return COMMAND_TOPIC, convert_out.command(event, frame_id)
+    if isinstance(event, Detection):
+        return DETECTION_TOPIC, convert_out.detection(event, frame_id)
+    return ENCODER_TOPIC, convert_out.joint_state(event, frame_id)
+
+
+def write_truth(path: Path, truth: Truth, **more: object) -> None:
+    """Write the known truth: gx, gy, ax, ay (m), g_theta, a_theta (rad), misalignments."""
+    write_json(path, plain({
+        "gx": truth.g[0], "gy": truth.g[1], "g_theta": truth.g_theta, "ax": truth.a[0],
+        "ay": truth.a[1], "a_theta": truth.a_theta, "phi": truth.phi_rad, "t": truth.t_m, **more}))
+
+
+def read_truth(bag: str | Path) -> dict | None:
+    """Return the truth that lies in a bag folder, or None."""
+    path = Path(bag) / TRUTH_FILE
+    return read_json(path) if path.is_file() else None

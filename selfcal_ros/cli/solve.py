@@ -1,0 +1,88 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``selfcal solve``: a bag in, the calibrated error map out, without any middleware."""
+
+import argparse
+import sys
+from typing import Any
+
+HELP = "calibrate from a bag: MCAP file or rosbag2 folder"
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the verb."""
+    parser.add_argument("bag", metavar="BAG", help="MCAP file or rosbag2 folder")
+    parser.add_argument("-o", "--output", metavar="RESULT.json", help="where to write the result")
+    parser.add_argument("--method", choices=("joint", "law"),
+                        help="joint least squares (default) or Hu's published law")
+    parser.add_argument("--theta-datum", choices=("xy_axes", "zero_mean"),
+                        help="what fixes the constant of the angular map (default: xy_axes)")
+    parser.add_argument("--sense", choices=("microscope_moves", "plate_moves"),
+                        help="who moves (default: microscope_moves)")
+    parser.add_argument("--params", metavar="NODES.yaml",
+                        help="ROS parameter file, the same that the nodes take")
+    parser.add_argument("--namespace", default="", help="namespace of the cell's topics, for bags "
+                        "that hold several cells")
+    parser.add_argument("--robust", action="store_true",
+                        help="find and remove outliers among the marks (docs/estimation.md)")
+    parser.add_argument("--quiet", action="store_true", help="print no summary")
+
+
+def parameters(args: argparse.Namespace) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return the collector's and the solver's parameter values; options win over the file."""
+    from selfcal_ros.collection.parameters import overrides_in, parameter_values
+    from selfcal_ros.files import read_yaml
+
+    data = read_yaml(args.params) if args.params else {}
+    where = args.params or "options"
+    options = {"measurement_collector": {"measurement_sense": args.sense},
+               "solver": {"method": args.method, "theta_datum": args.theta_datum}}
+    values = []
+    for node, given in options.items():
+        overrides = overrides_in(data, node, where)
+        overrides |= {name: value for name, value in given.items() if value is not None}
+        values.append(parameter_values(node, overrides, where))
+    return values[0], values[1]
+
+
+def run(args: argparse.Namespace) -> int:
+    """Collect, calibrate, print the summary and write the result."""
+    from selfcal_ros.bagio.offline import bag_input, collect_bag
+    from selfcal_ros.cli.progress import progress_bar
+    from selfcal_ros.collection.parameters import solver_options
+    from selfcal_ros.errors import NotIdentifiableError
+    from selfcal_ros.estimation.api import calibrate
+    from selfcal_ros.files import write_json
+    from selfcal_ros.model.result import result_to_dict, unidentified_result, with_input
+    from selfcal_ros.reporting.summary import summary_text
+
+    collector_values, solver_values = parameters(args)
+    with progress_bar("reading") as bar:
+        measurements, _, lost = collect_bag(args.bag, collector_values, namespace=args.namespace,
+                                            progress=lambda count: bar(count, None))
+    for line in lost:
+        print(f"selfcal solve: {args.bag}: {line}", file=sys.stderr)
+    options = solver_options(solver_values)
+    try:
+        if args.robust:
+            from selfcal_ros.estimation.robust import robust_calibrate
+            result = robust_calibrate(measurements, options)
+        else:
+            result = calibrate(measurements, options)
+    except NotIdentifiableError as error:
+        if args.output and error.observability is not None:
+            result = unidentified_result(measurements, error.observability)
+            write_json(args.output, result_to_dict(with_input(result, bag_input(args.bag), lost)))
+        raise
+    result = with_input(result, bag_input(args.bag), lost)
+    if args.output:
+        write_json(args.output, result_to_dict(result))
+    if not args.quiet:
+        encoding = (sys.stdout.encoding or "ascii").lower()
+        print(summary_text(result, **_plain_ascii(encoding)))
+        if args.output:
+            print(f"result: {args.output}")
+    return 0
+
+
+def _plain_ascii(encoding: str) -> dict[str, bool]:
+    return {} if "utf" in encoding else {"ascii_only": True}

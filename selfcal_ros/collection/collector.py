@@ -1,0 +1,178 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The collector: takes messages in any order, gives the readings of every view.
+
+What it gives is a function of the set of messages alone, so that live nodes, a replay and
+``selfcal solve`` cannot differ. Nothing is thrown away before it has been counted.
+"""
+
+import math
+from collections import Counter
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from selfcal_ros.collection.encoder import JointTrack, TrackLimits
+from selfcal_ros.collection.identify import IdentityRules
+from selfcal_ros.collection.messages import Command, Detection, EncoderSample
+from selfcal_ros.collection.reasons import Reason
+from selfcal_ros.collection.reduce import DETECTION, Rules, Tracks, clean, reduce_view
+from selfcal_ros.collection.timeline import Timeline, build_timeline
+from selfcal_ros.errors import NoDataError
+from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.readings import Measurements, Sense, ViewReadings
+from selfcal_ros.model.view import View
+
+
+@dataclass(frozen=True)
+class ViewProgress:
+    """How far a view has come; the fields of selfcal_msgs/ViewStatus."""
+
+    view_index: int
+    view: View
+    grid_expected: int
+    grid_done: int
+    angular_expected: int
+    angular_done: int
+    readings: ViewReadings
+    end_ns: int
+
+    @property
+    def complete(self) -> bool:
+        """Whether every expected mark has been read as often as the plan asks."""
+        return (self.grid_done >= self.grid_expected
+                and self.angular_done >= self.angular_expected)
+
+    @property
+    def coverage(self) -> float:
+        """Part of the expected marks that have been read as often as the plan asks, 0..1."""
+        expected = self.grid_expected + self.angular_expected
+        return (self.grid_done + self.angular_done) / expected if expected else 1.0
+
+
+class Collector:
+    """Collects encoder samples, detections and commands and reduces them to readings.
+
+    Parameters
+    ----------
+    values : dict
+        Values of the measurement_collector's parameters (`parameters.parameter_values`).
+    """
+
+    def __init__(self, values: dict[str, Any]) -> None:
+        gap_ns = round(values["max_encoder_gap"] * 1e9)
+        linear = TrackLimits(gap_ns, values["max_speed"], values["encoder_agreement"])
+        turn = TrackLimits(gap_ns, values["max_angular_speed"], values["encoder_agreement"], True)
+        self.sense = Sense(values["measurement_sense"])
+        self._joints = {values["joint_x"]: "x", values["joint_y"]: "y",
+                        values["joint_theta"]: "theta"}
+        self.tracks = Tracks(JointTrack(linear), JointTrack(linear), JointTrack(turn))
+        self._rules = Rules(
+            self.sense, IdentityRules(values["max_deviation"], values["ambiguity_ratio"],
+                                      values["max_rotation"]),
+            values["min_score"], values["outlier_limit"])
+        self._detections: list[tuple] = []
+        self._commands: dict[Command, None] = {}
+        self._rejected_input: Counter = Counter()
+        self._timeline: Timeline | None = None
+        self.received = {"encoder": 0, "detection": 0, "command": 0}
+
+    def add_encoder(self, sample: EncoderSample) -> None:
+        """Take one encoder message; one that cannot be used is counted under its reason."""
+        self.received["encoder"] += 1
+        velocities = sample.velocities or (math.nan,) * len(sample.positions)
+        if not len(sample.names) == len(sample.positions) == len(velocities):
+            self._rejected_input[Reason.ENCODER_MALFORMED] += 1
+            return
+        known = False
+        for name, position, speed in zip(sample.names, sample.positions, velocities, strict=True):
+            joint = self._joints.get(name)
+            if joint is None:
+                continue
+            known = True
+            if math.isfinite(position):
+                getattr(self.tracks, joint).add(sample.stamp_ns, position, speed)
+            else:
+                self._rejected_input[Reason.ENCODER_NOT_FINITE] += 1
+        if not known:
+            self._rejected_input[Reason.ENCODER_UNKNOWN_JOINT] += 1
+
+    def add_detection(self, d: Detection) -> None:
+        """Take one detection."""
+        self.received["detection"] += 1
+        self._detections.append((d.stamp_ns, d.kind, d.has_id, d.m, d.n, d.k, d.offset_x,
+                                 d.offset_y, d.offset_theta, d.sigma, d.score))
+
+    def add_command(self, command: Command) -> None:
+        """Take one view command; one whose pose lies off the lattice raises InputError."""
+        if command.view is not None and command.artifact is not None:
+            command.view.lattice_pose(command.artifact)
+        self.received["command"] += 1
+        self._commands[command] = None
+        self._timeline = None
+
+    def refuse_command(self) -> None:
+        """Count a command that could not be used."""
+        self.received["command"] += 1
+        self._rejected_input[Reason.COMMAND_BAD] += 1
+
+    @property
+    def timeline(self) -> Timeline:
+        """The commands so far, in the order of their stamps."""
+        if self._timeline is None:
+            self._timeline = build_timeline(self._commands)
+        return self._timeline
+
+    def collect(self) -> tuple[Measurements, dict[int, ViewProgress]]:
+        """Return the readings of all views so far, and how far each view has come.
+
+        Raises
+        ------
+        NoDataError
+            If no view has been commanded.
+        """
+        timeline = self.timeline
+        if timeline.artifact is None:
+            raise NoDataError("selfcal/view_command", "no MEASURE command",
+                              "readings cannot be assigned to views without one")
+        table = np.array(self._detections, dtype=DETECTION)
+        scored = bool((table["score"] > 0).any())
+        interval_of = timeline.assign(table["stamp"])
+        loose = Counter({str(reason): count for reason, count in self._rejected_input.items()})
+        view_of = np.full(len(table), -1)
+        for number in np.unique(interval_of):
+            here = interval_of == number
+            interval = timeline.intervals[number] if number >= 0 else None
+            if interval is not None and interval.view_index is not None:
+                view_of[here] = interval.view_index
+            else:
+                loose[str(interval.reason if interval else Reason.OUTSIDE_VIEWS)] += int(here.sum())
+        progress = {}
+        for index, view in timeline.views.items():
+            progress[index] = self._progress(timeline, index, view, table[view_of == index],
+                                             scored=scored)
+        views = tuple(item.readings for item in progress.values())
+        return Measurements(timeline.plan_id, timeline.artifact, views, self.sense,
+                            dict(sorted(loose.items()))), progress
+
+    def _progress(self, timeline: Timeline, index: int, view: View, detections: np.ndarray, *,
+                  scored: bool) -> ViewProgress:
+        good, reasons = clean(detections, self._rules, scored=scored)
+        readings = reduce_view(timeline.artifact, view, good, tracks=self.tracks,
+                               rules=self._rules)
+        total = Counter(readings.rejected)
+        total.update({str(reason): count for reason, count in reasons.items()})
+        readings = replace(readings, rejected=dict(sorted(total.items())))
+        grid, angular = expected_marks(timeline.artifact, view)
+        return ViewProgress(index, view, grid, int((readings.count >= view.repeats).sum()),
+                            angular, int((readings.count_theta >= view.repeats).sum()), readings,
+                            max(i.end_ns for i in timeline.of_view(index)))
+
+
+def expected_marks(artifact: Artifact, view: View) -> tuple[int, int]:
+    """Return how many grid marks and angular lines are to be read in a view."""
+    grid = 0
+    if view.grid:
+        i, j = view.lattice_pose(artifact).site_of(artifact.m, artifact.n)
+        grid = int(((abs(i) <= artifact.half[0]) & (abs(j) <= artifact.half[1])).sum())
+    return grid, artifact.angular_count if view.angular else 0

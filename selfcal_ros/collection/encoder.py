@@ -1,0 +1,138 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The encoder's story: where the stage was at the instant of an exposure."""
+
+from array import array
+from dataclasses import dataclass
+
+import numpy as np
+
+from selfcal_ros.collection.reasons import Reason
+
+
+@dataclass(frozen=True)
+class TrackLimits:
+    """When a position can be trusted: gap in ns, speed per s, agreement of equal stamps."""
+
+    max_gap_ns: int
+    max_speed: float
+    agreement: float
+    wraps: bool = False
+
+
+class JointTrack:
+    """Samples of one joint, in whatever order they arrive; queries depend on the set alone."""
+
+    def __init__(self, limits: TrackLimits) -> None:
+        self.limits = limits
+        self._stamps, self._positions, self._speeds = array("q"), array("d"), array("d")
+        self._sorted: tuple[np.ndarray, ...] | None = None
+
+    def __len__(self) -> int:
+        """Return the number of samples."""
+        return len(self._stamps)
+
+    def add(self, stamp_ns: int, position: float, speed: float) -> None:
+        """Add one sample; `speed` is NaN where the encoder does not tell it."""
+        self._stamps.append(stamp_ns)
+        self._positions.append(position)
+        self._speeds.append(speed)
+        self._sorted = None
+
+    def _difference(self, a: np.ndarray) -> np.ndarray:
+        return np.remainder(a + np.pi, 2 * np.pi) - np.pi if self.limits.wraps else a
+
+    def _series(self) -> tuple[np.ndarray, ...]:
+        """Return stamps (unique, rising), positions, speeds and which stamps contradict."""
+        if self._sorted is None:
+            stamps = np.array(self._stamps, dtype=np.int64)
+            positions = np.array(self._positions)
+            speeds = np.array(self._speeds)
+            order = np.lexsort((np.nan_to_num(speeds, nan=np.inf), positions, stamps))
+            stamps, positions, speeds = stamps[order], positions[order], speeds[order]
+            first = np.flatnonzero(np.diff(stamps, prepend=stamps[:1] - 1))
+            last = np.append(first[1:], len(stamps)) - 1
+            spread = np.abs(self._difference(positions[last] - positions[first]))
+            bad = spread > self.limits.agreement
+            self._sorted = stamps[first], positions[first], speeds[first], bad
+        return self._sorted
+
+    def query(self, stamps_ns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the interpolated positions and the reason why each cannot be used.
+
+        Parameters
+        ----------
+        stamps_ns : int64 array (Q,)
+            Instants of exposure.
+
+        Returns
+        -------
+        positions : float array (Q,)
+            m or rad; NaN where there is none.
+        reasons : object array (Q,)
+            None where the position is good, else a `Reason`.
+        """
+        reasons = np.full(len(stamps_ns), None, dtype=object)
+        if not len(self) or not len(stamps_ns):
+            reasons[:] = Reason.NO_ENCODER
+            return np.full(len(stamps_ns), np.nan), reasons
+        t, p, _, _ = self._series()
+        after = np.searchsorted(t, stamps_ns, "left")
+        outside = after >= len(t)
+        after = np.minimum(after, len(t) - 1)
+        exact = t[after] == stamps_ns
+        before = np.where(exact, after, after - 1)
+        outside |= before < 0
+        before = np.maximum(before, 0)
+        gap = t[after] - t[before]
+        outside |= gap > self.limits.max_gap_ns
+        step = self._difference(p[after] - p[before])
+        weight = (stamps_ns - t[before]) / np.where(gap > 0, gap, 1)
+        moving, reversing = self._motion(before, after, exact)
+        reasons[moving] = Reason.MOVING
+        reasons[reversing | self._contradicted(stamps_ns, before, after)] = Reason.CONTRADICTION
+        reasons[outside] = Reason.NO_ENCODER
+        return np.where(outside, np.nan, p[before] + step * weight), reasons
+
+    def _motion(self, before: np.ndarray, after: np.ndarray, exact: np.ndarray,
+                ) -> tuple[np.ndarray, np.ndarray]:
+        """Return which exposures saw the stage moving, and which saw it jump to and fro."""
+        t, p, v, _ = self._series()
+        dt = np.diff(t)
+        step = self._difference(np.diff(p))
+        speed = np.abs(step) / np.where(dt > 0, dt, 1) * 1e9
+        fast = np.concatenate([[False], speed > self.limits.max_speed, [False]])
+        move = np.concatenate([[0.0], step, [0.0]])  # move[i]: from sample i-1 to sample i
+        near = np.concatenate([[False], dt <= self.limits.max_gap_ns, [False]])
+        left, right = before, after + 1
+        # between two samples: their segment; at a sample: the calmer of the two beside it
+        calm = (near[left] & ~fast[left]) | (near[right] & ~fast[right])
+        both = ~calm & (near[left] | near[right])
+        moving = np.where(exact, both, fast[after])
+        told = np.isfinite(v[before]) & np.isfinite(v[after])
+        rate = np.maximum(np.abs(np.nan_to_num(v[before])), np.abs(np.nan_to_num(v[after])))
+        moving = np.where(told & exact, rate > self.limits.max_speed, moving)
+        moving |= told & (rate > self.limits.max_speed)
+        middle = move[after]
+        reversing = fast[after] & ~exact & (
+            (fast[left] & (move[left] * middle < 0)) | (fast[right] & (move[right] * middle < 0)))
+        reversing |= exact & fast[left] & fast[right] & (move[left] * move[right] < 0) & ~told
+        return moving, reversing
+
+    def _contradicted(self, stamps_ns: np.ndarray, before: np.ndarray,
+                      after: np.ndarray) -> np.ndarray:
+        """Return which exposures lie beside, or within half a gap of, a contradicted stamp."""
+        t, _, _, bad = self._series()
+        if not bad.any():
+            return np.zeros(len(stamps_ns), dtype=bool)
+        at = np.flatnonzero(bad)
+        where = t[at]
+        index = np.searchsorted(where, stamps_ns)
+        window = self.limits.max_gap_ns // 2
+        out = np.zeros(len(stamps_ns), dtype=bool)
+        for side in (index - 1, index):
+            inside = (side >= 0) & (side < len(at))
+            chosen = np.clip(side, 0, len(at) - 1)
+            near = np.abs(where[chosen] - stamps_ns) <= window
+            beside = (at[chosen] >= before - 1) & (at[chosen] <= after + 1)
+            out |= inside & (near | beside)
+        return out

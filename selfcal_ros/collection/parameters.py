@@ -1,0 +1,219 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Every parameter of every node, declared once: default, bounds, unit and description.
+
+The nodes declare them from here, ``selfcal solve --params`` reads a ROS parameter file against
+the same table, and the documentation is printed from it. An unknown name is an error.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+from selfcal_ros.errors import InputError
+from selfcal_ros.estimation.api import Options
+from selfcal_ros.model.error_map import ThetaDatum
+from selfcal_ros.model.readings import Sense
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One parameter: its type is the type of its default."""
+
+    name: str
+    default: Any
+    description: str
+    unit: str = ""
+    low: float | None = None
+    high: float | None = None
+    choices: tuple[str, ...] = ()
+
+    def check(self, value: Any, where: str) -> Any:
+        """Return `value` as the parameter's type, or raise InputError."""
+        kind = type(self.default)
+        if kind is float and isinstance(value, int) and not isinstance(value, bool):
+            value = float(value)
+        if not isinstance(value, kind) or (kind is int and isinstance(value, bool)):
+            raise InputError(f"{where}: {self.name}", f"{value!r} is not of type {kind.__name__}",
+                             "mend the value")
+        if self.choices and value not in self.choices:
+            raise InputError(f"{where}: {self.name}", f"{value!r} is not known",
+                             f"choose one of {', '.join(self.choices)}")
+        if kind in (int, float) and not (
+                (self.low is None or value >= self.low)
+                and (self.high is None or value <= self.high)):
+            raise InputError(f"{where}: {self.name}", f"{value} is outside {self.low} to "
+                             f"{self.high} {self.unit}".rstrip(), "mend the value")
+        return value
+
+
+_SENSE = Parameter(
+    "measurement_sense", str(Sense.MICROSCOPE_MOVES),
+    "who moves: the microscope over a resting plate, or the plate under the microscope",
+    choices=tuple(str(sense) for sense in Sense))
+_FRAME = Parameter("frame_id", "stage", "frame of published messages (REP-103)")
+_PLAN = Parameter("plan", "", "path of PLAN.yaml")
+
+COLLECTOR = (
+    _SENSE, _FRAME,
+    Parameter("joint_x", "x", "joint that indicates x"),
+    Parameter("joint_y", "y", "joint that indicates y"),
+    Parameter("joint_theta", "theta", "joint that indicates theta"),
+    Parameter("max_encoder_gap", 0.1, "largest gap between the encoder samples around an exposure",
+              "s", 1e-6, 10.0),
+    Parameter("max_speed", 5e-4, "largest speed at which the stage counts as at rest",
+              "m/s", 0.0, 1.0),
+    Parameter("max_angular_speed", 5e-3, "largest turn rate at which the stage counts as at rest",
+              "rad/s", 0.0, 10.0),
+    Parameter("encoder_agreement", 1e-9, "largest difference of two samples with one stamp",
+              "m or rad", 0.0, 1e-3),
+    Parameter("min_score", 0.4, "smallest score of a usable detection (ignored if all are 0)",
+              "", 0.0, 1.0),
+    Parameter("max_deviation", 5e-4, "largest distance of a mark from its nominal place once the "
+              "view's own rotation and offset are removed; never more than a quarter pitch",
+              "m", 1e-9, 1.0),
+    Parameter("ambiguity_ratio", 0.5, "a mark without id is ambiguous if its distance to the "
+              "nearest nominal mark exceeds this part of that to the second nearest",
+              "", 0.01, 1.0),
+    Parameter("max_rotation", 0.035, "largest misalignment in rotation to reckon with when marks "
+              "have no ids", "rad", 0.0, 0.2),
+    Parameter("outlier_limit", 6.0, "distance from the median of a mark's repeats, in standard "
+              "deviations of one reading, beyond which a repeat is an outlier; 0 = keep all",
+              "", 0.0, 1000.0),
+    Parameter("status_period", 0.5, "time between two ViewStatus messages", "s", 0.02, 60.0),
+)
+SOLVER = (
+    _FRAME,
+    Parameter("method", "joint", "estimator", choices=("joint", "law")),
+    Parameter("theta_datum", str(ThetaDatum.XY_AXES), "what fixes the constant of the angular map",
+              choices=tuple(str(datum) for datum in ThetaDatum)),
+    Parameter("misalignment_model", "linear", "linear: as published; rigid: exact rotation",
+              choices=("linear", "rigid")),
+    Parameter("save_path", "", "RESULT.json to write whenever the map changes; empty = none"),
+)
+SEQUENCER = (
+    _PLAN, _FRAME,
+    Parameter("auto_start", False, "start the plan without waiting for the start service"),
+    Parameter("auto_confirm", False, "measure without waiting for confirm_view (robot loaders)"),
+    Parameter("settle_time", 0.5, "time between PLACE and MEASURE when auto_confirm is set",
+              "s", 0.0, 3600.0),
+    Parameter("view_timeout", 0.0, "give up waiting for a view's completion; 0 = wait for ever",
+              "s", 0.0, 1e6),
+    Parameter("max_redos", 0, "times an incomplete view is redone after a time-out", "", 0, 100),
+    Parameter("result_path", "", "where run_calibration has the solver save the map"),
+)
+COMPENSATOR = (
+    _FRAME,
+    Parameter("joint_x", "x", "joint that indicates x"),
+    Parameter("joint_y", "y", "joint that indicates y"),
+    Parameter("joint_theta", "theta", "joint that indicates theta"),
+    Parameter("interpolation", "bilinear", "between nodes", choices=("bilinear", "bicubic")),
+    Parameter("outside", "clamp", "outside the field", choices=("clamp", "refuse")),
+    Parameter("map", "", "RESULT.json to start with; empty = wait for selfcal/error_map"),
+)
+PLAYER = (
+    Parameter("bag", "", "MCAP file or rosbag2 folder"),
+    Parameter("rate", 1.0, "speed of the replay; 0 = as fast as the subscribers keep up",
+              "", 0.0, 1000.0),
+    Parameter("seed", -1, "shuffle the order of arrival with this seed; -1 = as recorded",
+              "", -1, 2**31),
+    Parameter("wait_for_subscribers", 10.0, "longest wait for a subscriber of each topic",
+              "s", 0.0, 3600.0),
+    Parameter("all_topics", False, "replay what nodes of this package published as well"),
+)
+RECORDER = (
+    Parameter("bag", "", "folder to write"),
+    Parameter("all_topics", True, "record selfcal/* results beside the inputs"),
+    Parameter("joint_depth", 5000, "queue depth of the encoder subscription", "", 100, 100000),
+)
+SIMULATOR = (
+    _SENSE, _FRAME, _PLAN,
+    Parameter("seed", 0, "seed of the truth and of the noise", "", 0, 2**31),
+    Parameter("sigma_xy", 2e-8, "standard deviation of one grid reading", "m", 0.0, 1e-3),
+    Parameter("sigma_theta", 1.7453292519943296e-05, "standard deviation of one angular reading",
+              "rad", 0.0, 0.1),
+    Parameter("encoder_rate", 500.0, "encoder samples a second", "Hz", 1.0, 10000.0),
+    Parameter("exposure_period", 0.01, "time between two exposures", "s", 0.001, 10.0),
+    Parameter("with_ids", True, "detections name their marks"),
+    Parameter("truth_path", "", "JSON file for the known truth; empty = none"),
+)
+NODE_PARAMETERS: dict[str, tuple[Parameter, ...]] = {
+    "measurement_collector": COLLECTOR,
+    "solver": SOLVER,
+    "pose_sequencer": SEQUENCER,
+    "compensator": COMPENSATOR,
+    "bag_player": PLAYER,
+    "bag_recorder": RECORDER,
+    "stage_simulator": SIMULATOR,
+}
+ROS_OWN = ("use_sim_time", "start_type_description_service")
+
+
+def parameter_values(node: str, overrides: dict[str, Any], where: str) -> dict[str, Any]:
+    """Return the value of every parameter of `node`: its default or the checked override.
+
+    Raises
+    ------
+    InputError
+        For an unknown name, a wrong type or a value out of bounds.
+    """
+    table = {parameter.name: parameter for parameter in NODE_PARAMETERS[node]}
+    values = {name: parameter.default for name, parameter in table.items()}
+    for name, value in overrides.items():
+        if name in ROS_OWN or name.startswith("qos_overrides."):
+            continue
+        if name not in table:
+            raise InputError(f"{where}: {name}", f"{node} has no such parameter",
+                             "known are " + ", ".join(table))
+        values[name] = table[name].check(value, where)
+    return values
+
+
+def overrides_in(data: object, node: str, where: str) -> dict[str, Any]:
+    """Return what a parsed ROS parameter file sets for `node`, nested names joined by dots.
+
+    Sections count if they are ``/**``, ``**``, the node's name, or end with ``/`` + its name;
+    a section of a node that this package does not have is an error.
+    """
+    found: dict[str, Any] = {}
+    for name, section in _sections(data, "", where):
+        last = name.rsplit("/", 1)[-1]
+        if last not in ("**", "*") and last not in NODE_PARAMETERS:
+            raise InputError(f"{where}: {name}", "no node of this package",
+                             "known are " + ", ".join(NODE_PARAMETERS))
+        if last == node or last in ("**", "*"):
+            flat = dict(_flatten(section, ""))
+            if last != node:  # a wild-card section may hold parameters of other nodes
+                known = {parameter.name for parameter in NODE_PARAMETERS[node]}
+                everywhere = {p.name for table in NODE_PARAMETERS.values() for p in table}
+                flat = {key: value for key, value in flat.items()
+                        if key in known or key not in everywhere}
+            found |= flat
+    return found
+
+
+def _sections(data: object, prefix: str, where: str) -> list[tuple[str, dict]]:
+    if not isinstance(data, dict):
+        raise InputError(where, "not a ROS parameter file", "write 'NODE: ros__parameters: ...'")
+    out = []
+    for key, value in data.items():
+        if key == "ros__parameters":
+            if not isinstance(value, dict | None):
+                raise InputError(f"{where}: {prefix}", "ros__parameters is not a mapping",
+                                 "write 'name: value' lines below it")
+            out.append((prefix, value or {}))
+        else:
+            out += _sections(value, f"{prefix}/{key}".replace("//", "/"), where)
+    return out
+
+
+def _flatten(section: dict, prefix: str) -> list[tuple[str, Any]]:
+    out = []
+    for key, value in section.items():
+        name = f"{prefix}{key}"
+        out += _flatten(value, name + ".") if isinstance(value, dict) else [(name, value)]
+    return out
+
+
+def solver_options(values: dict[str, Any], **more: Any) -> Options:
+    """Return the estimator's options in a solver's parameter values."""
+    return Options(method=values["method"], datum_theta=ThetaDatum(values["theta_datum"]),
+                   misalignment_model=values["misalignment_model"], **more)

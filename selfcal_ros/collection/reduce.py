@@ -1,0 +1,142 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From the detections of one view to its readings: a pure function of their set."""
+
+from collections import Counter
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from selfcal_ros.collection.encoder import JointTrack
+from selfcal_ros.collection.identify import (
+    IdentityRules,
+    identify_angular,
+    identify_grid,
+)
+from selfcal_ros.collection.messages import Kind
+from selfcal_ros.collection.reasons import Reason
+from selfcal_ros.collection.repeats import reduce_repeats
+from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.readings import Sense, ViewReadings
+from selfcal_ros.model.view import View
+
+DETECTION = np.dtype([
+    ("stamp", "i8"), ("kind", "u1"), ("has_id", "?"), ("m", "i8"), ("n", "i8"), ("k", "i8"),
+    ("ox", "f8"), ("oy", "f8"), ("ot", "f8"), ("sigma", "f8"), ("score", "f8")])
+
+
+@dataclass(frozen=True)
+class Rules:
+    """Everything that decides how detections become readings."""
+
+    sense: Sense
+    identity: IdentityRules
+    min_score: float
+    outlier_limit: float
+
+
+@dataclass(frozen=True)
+class Tracks:
+    """Encoder samples of the three joints."""
+
+    x: JointTrack
+    y: JointTrack
+    theta: JointTrack
+
+
+def clean(detections: np.ndarray, rules: Rules, *, scored: bool,
+          ) -> tuple[np.ndarray, Counter]:
+    """Return the usable detections in canonical order, each once, and the reasons of the rest.
+
+    Parameters
+    ----------
+    detections : structured array of `DETECTION`
+        In any order.
+    rules : Rules
+        Limits.
+    scored : bool
+        Whether scores are reported at all (any detection of the session has one above 0).
+    """
+    rejected: Counter = Counter()
+    known = np.isin(detections["kind"], (Kind.GRID, Kind.ANGULAR))
+    rejected[Reason.UNKNOWN_KIND] = int((~known).sum())
+    d = detections[known]
+    grid, angular = d["kind"] == Kind.GRID, d["kind"] == Kind.ANGULAR
+    for field, used in (("ox", grid), ("oy", grid), ("ot", angular)):
+        d[field] = np.where(used, d[field] + 0.0, 0.0)
+    for field, used in (("m", grid), ("n", grid), ("k", angular)):
+        d[field] = np.where(used & d["has_id"], d[field], 0)
+    finite = np.all([np.isfinite(d[f]) for f in ("ox", "oy", "ot", "sigma", "score")], axis=0)
+    finite &= d["sigma"] >= 0
+    rejected[Reason.NOT_FINITE] = int((~finite).sum())
+    d = d[finite]
+    unique = np.unique(d)
+    rejected[Reason.DUPLICATE] += len(d) - len(unique)
+    if scored:
+        low = unique["score"] < rules.min_score
+        rejected[Reason.LOW_SCORE] += int(low.sum())
+        unique = unique[~low]
+    return unique, +rejected
+
+
+def reduce_view(artifact: Artifact, view: View, detections: np.ndarray, *, tracks: Tracks,
+                rules: Rules) -> ViewReadings:
+    """Return the readings of one view from its cleaned detections (see `clean`)."""
+    rejected: Counter = Counter()
+    grid = detections[detections["kind"] == Kind.GRID]
+    angular = detections[detections["kind"] == Kind.ANGULAR]
+    readings, phi = _reduce_grid(artifact, view, grid, tracks, rules, rejected)
+    part = _reduce_angular(artifact, view, angular, tracks, rules, rejected, phi)
+    used = int(readings["count"].sum() + part["count_theta"].sum())
+    return replace(ViewReadings(view), **readings, **part, used=used,
+                   rejected=dict(sorted((str(r), c) for r, c in rejected.items())))
+
+
+def _reduce_grid(artifact: Artifact, view: View, d: np.ndarray, tracks: Tracks, rules: Rules,
+                 rejected: Counter) -> tuple[dict, float | None]:
+    x, why_x = tracks.x.query(d["stamp"])
+    y, why_y = tracks.y.query(d["stamp"])
+    d, (x, y) = _keep(d, np.where(why_x == None, why_y, why_x), rejected, x, y)  # noqa: E711
+    reading = _reading(rules.sense, np.stack([x, y]), np.stack([d["ox"], d["oy"]]))
+    found = identify_grid(artifact, view, reading, ids=np.stack([d["m"], d["n"]]),
+                          has_id=d["has_id"], rules=rules.identity)
+    d, (m, n, vx, vy) = _keep(d, found.reasons, rejected, *found.index, *found.deviation)
+    hx, hy = artifact.half
+    means = reduce_repeats((m + hx) * (2 * hy + 1) + n + hy, np.stack([vx, vy]), d["sigma"],
+                           limit=rules.outlier_limit)
+    _count(rejected, Reason.OUTLIER, means.outlier)
+    mark = means.key.astype(np.int64)
+    phi = found.rigid.phi_rad if len(means.key) >= 3 else None
+    return {"m": mark // (2 * hy + 1) - hx, "n": mark % (2 * hy + 1) - hy, "dx": means.mean[0],
+            "dy": means.mean[1], "count": means.count, "u": means.u, "sigma_xy": means.sigma,
+            "dof_xy": means.dof}, phi
+
+
+def _reduce_angular(artifact: Artifact, view: View, d: np.ndarray, tracks: Tracks, rules: Rules,
+                    rejected: Counter, phi: float | None) -> dict:
+    theta, why = tracks.theta.query(d["stamp"])
+    d, (theta,) = _keep(d, why, rejected, theta)
+    found = identify_angular(artifact, view, _reading(rules.sense, theta, d["ot"]), ids=d["k"],
+                             has_id=d["has_id"], rules=rules.identity, phi_rad=phi)
+    d, (k, v) = _keep(d, found.reasons, rejected, found.index, found.deviation)
+    means = reduce_repeats(k, v[None], d["sigma"], limit=rules.outlier_limit)
+    _count(rejected, Reason.OUTLIER, means.outlier)
+    return {"k": means.key.astype(np.int64), "dtheta": means.mean[0], "count_theta": means.count,
+            "u_theta": means.u, "sigma_theta": means.sigma, "dof_theta": means.dof}
+
+
+def _reading(sense: Sense, position: np.ndarray, offset: np.ndarray) -> np.ndarray:
+    """Return where the mark lies: over a moved microscope, or on a moved plate (method 1)."""
+    return offset - position if sense is Sense.PLATE_MOVES else position + offset
+
+
+def _keep(d: np.ndarray, reasons: np.ndarray, rejected: Counter, *values: np.ndarray,
+          ) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Return detections and values without the rejected ones, whose reasons are counted."""
+    good = reasons == None  # noqa: E711
+    rejected.update(str(reason) for reason in reasons[~good])
+    return d[good], [value[good] for value in values]
+
+
+def _count(rejected: Counter, reason: Reason, mask: np.ndarray) -> None:
+    if mask.any():
+        rejected[str(reason)] += int(mask.sum())

@@ -1,0 +1,128 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From repeats of a mark to one mean: outliers out, repeatability pooled.
+
+Rule: a repeat is an outlier if it lies further from the median of its mark's repeats than
+`limit` standard deviations of one reading. The standard deviation is robust: the median of
+the absolute differences of all pairs of repeats of the view, over 0.6745 sqrt(2), so that it
+stays put while under a quarter of the pairs are spoilt. With few pairs the limit grows. Of two
+repeats that contradict each other both are outliers: neither can be believed.
+Of clean Gaussian readings fewer than 1 in 100,000 are rejected (test_repeats.py).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+MIN_PAIRS = 10
+"""Pairs of repeats below which a view is too small to tell outliers."""
+
+
+@dataclass(frozen=True)
+class Means:
+    """Means of marks: (c, marks) values, their counts and declared standard uncertainties."""
+
+    key: np.ndarray
+    mean: np.ndarray
+    count: np.ndarray
+    u: np.ndarray
+    sigma: float
+    dof: int
+    outlier: np.ndarray
+
+
+def reduce_repeats(key: np.ndarray, values: np.ndarray, sigma: np.ndarray, *,
+                   limit: float) -> Means:
+    """Reject outliers and average the repeats of every mark.
+
+    Parameters
+    ----------
+    key : int array (n,)
+        Number of the mark of each reading.
+    values : float array (c, n)
+        Readings, c components, m or rad; in canonical order, so that sums have one order.
+    sigma : float array (n,)
+        Declared standard uncertainty of each reading, 0 = not declared.
+    limit : float
+        Outlier limit in standard deviations; 0 keeps all.
+
+    Returns
+    -------
+    Means
+        Marks in rising order of key. Where all repeats of a mark declare a sigma the mean is
+        weighted by 1/sigma^2. `sigma` is the pooled repeatability (NaN without repeats),
+        `dof` its degrees of freedom, `outlier` a mask over the readings.
+    """
+    outlier = np.zeros(len(key), dtype=bool)
+    if limit > 0 and len(key):
+        outlier = _outliers(key, values, _relative(sigma), limit)
+    marks, inverse, count = np.unique(key[~outlier], return_inverse=True, return_counts=True)
+    kept, s = values[:, ~outlier], sigma[~outlier]
+    declared = np.bincount(inverse, s > 0, len(marks)) == count
+    weight = np.where(declared[inverse] & (s > 0), 1 / np.where(s > 0, s, 1) ** 2, 1.0)
+    total = np.bincount(inverse, weight, len(marks))
+    mean = _means(kept, weight, inverse, total)
+    rest = kept - mean[:, inverse]
+    dof = int(len(kept) * (count - 1).sum())
+    pooled = float(np.sqrt((rest**2).sum() / dof)) if dof else float("nan")
+    u = np.where(declared, 1 / np.sqrt(total), np.nan) if declared.any() else np.zeros(0)
+    return Means(marks, mean, count, u, pooled, dof, outlier)
+
+
+def _means(values: np.ndarray, weight: np.ndarray, inverse: np.ndarray,
+           total: np.ndarray) -> np.ndarray:
+    """Return weighted means about each mark's first repeat: exact where repeats are equal."""
+    if not len(inverse):
+        return np.zeros((len(values), 0))
+    first = np.full(len(total), len(inverse))
+    np.minimum.at(first, inverse, np.arange(len(inverse)))
+    base = values[:, first]
+    return base + np.array([np.bincount(inverse, weight * (row - b[inverse]), len(total)) / total
+                            for row, b in zip(values, base, strict=True)])
+
+
+def _relative(sigma: np.ndarray) -> np.ndarray:
+    """Return each reading's declared sigma over their median; 1 where none is declared."""
+    declared = sigma > 0
+    if not declared.any():
+        return np.ones(len(sigma))
+    return np.where(declared, sigma, np.median(sigma[declared])) / np.median(sigma[declared])
+
+
+def _outliers(key: np.ndarray, values: np.ndarray, relative: np.ndarray,
+              limit: float) -> np.ndarray:
+    groups = _groups(key)
+    scale, pairs = _pair_scale(groups, values, relative)
+    out = np.zeros(len(key), dtype=bool)
+    if pairs < MIN_PAIRS:
+        return out
+    # a robust scale from n pairs scatters by about 1.2/sqrt(n); keep three of these in hand
+    cut = limit * scale * (1 + 4 / np.sqrt(pairs))
+    floor = 16 * np.finfo(float).eps * np.abs(values).max()
+    for group in groups:
+        away = np.abs(values[:, group] - np.median(values[:, group], axis=2, keepdims=True))
+        share = np.sqrt(0.5) if group.shape[1] == 2 else 1.0  # of two, each is half-way off
+        out[group] = (away > np.maximum(cut * share * relative[group], floor)).any(axis=0)
+    return out
+
+
+def _groups(key: np.ndarray) -> list[np.ndarray]:
+    """Return the indices of the repeats of each mark: one array (marks, r) for each r > 1."""
+    order = np.argsort(key, kind="stable")
+    start = np.flatnonzero(np.diff(key[order], prepend=key[order[:1]] - 1))
+    count = np.diff(np.append(start, len(key)))
+    return [order[start[count == r][:, None] + np.arange(r)] for r in np.unique(count) if r > 1]
+
+
+def _pair_scale(groups: list[np.ndarray], values: np.ndarray,
+                relative: np.ndarray) -> tuple[float, int]:
+    """Return the robust standard deviation of one reading, and how many pairs told it."""
+    differences = []
+    for group in groups:
+        i, j = np.triu_indices(group.shape[1], 1)
+        norm = np.hypot(relative[group][:, i], relative[group][:, j])
+        differences.append((np.abs(values[:, group[:, i]] - values[:, group[:, j]]) / norm).ravel())
+    if not differences:
+        return float("nan"), 0
+    every = np.concatenate(differences)
+    independent = sum(len(group) * (group.shape[1] - 1) for group in groups) * len(values)
+    return float(np.median(every) / 0.6744897501960817), independent

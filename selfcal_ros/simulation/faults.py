@@ -1,0 +1,111 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Everything that goes wrong in a cell, with a ledger of what was done to which message."""
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from selfcal_ros.collection.messages import Command, Detection, EncoderSample, Kind
+from selfcal_ros.simulation.cell import Event
+
+
+@dataclass(frozen=True)
+class Faults:
+    """What goes wrong: parts of the detections (0..1), times in s.
+
+    Attributes
+    ----------
+    lost, duplicated, outliers : float
+        Parts of the detections that never arrive, arrive twice, or lie off by 1 to 20 um
+        (angular: by 1 to 20 mrad).
+    low_score, not_finite, unknown_mark : float
+        Parts with a score of 0.1, a NaN offset, or an id off the plate.
+    delay_s : float
+        Largest delay of arrival; messages overtake each other.
+    clock_step_s : float
+        In the middle of the recording the cell's clock steps back by this much; 0 = never.
+    encoder_gap_s : float
+        Length of a hole in the encoder stream, at a third of the recording; 0 = none.
+    """
+
+    lost: float = 0.0
+    duplicated: float = 0.0
+    outliers: float = 0.0
+    low_score: float = 0.0
+    not_finite: float = 0.0
+    unknown_mark: float = 0.0
+    delay_s: float = 0.0
+    clock_step_s: float = 0.0
+    encoder_gap_s: float = 0.0
+
+
+def apply_faults(events: Sequence[Event], faults: Faults, rng: np.random.Generator,
+                 ) -> tuple[list[tuple[int, Event]], dict[str, int]]:
+    """Return (time of arrival in ns, message) in the order of arrival, and the ledger.
+
+    Parameters
+    ----------
+    events : sequence
+        Messages in the order of their stamps.
+    faults : Faults
+        What goes wrong.
+    rng : numpy.random.Generator
+        Source of chance.
+    """
+    ledger: Counter = Counter()
+    first, last = events[0].stamp_ns, events[-1].stamp_ns
+    gap = first + (last - first) // 3
+    step_at = first + (last - first) // 2
+    step = round(faults.clock_step_s * 1e9)
+    out: list[tuple[int, Event]] = []
+    for event in events:
+        arrival = event.stamp_ns
+        if faults.delay_s:
+            arrival += round(rng.exponential(faults.delay_s / 5) * 1e9)
+        if isinstance(event, EncoderSample) and gap <= event.stamp_ns < gap + round(
+                faults.encoder_gap_s * 1e9):
+            ledger["encoder_samples_lost"] += 1
+            continue
+        if step and event.stamp_ns >= step_at:
+            event = replace(event, stamp_ns=event.stamp_ns - step)
+            ledger["stamped_by_the_stepped_clock"] += 1
+        for item in _spoil(event, faults, rng, ledger):
+            out.append((arrival, item))
+    out.sort(key=lambda item: item[0])
+    return out, dict(ledger)
+
+
+def _spoil(event: Event, faults: Faults, rng: np.random.Generator, ledger: Counter) -> list[Event]:
+    if not isinstance(event, Detection) or isinstance(event, Command):
+        return [event]
+    chance = rng.random()
+    parts = (("lost", faults.lost), ("outliers", faults.outliers),
+             ("low_score", faults.low_score), ("not_finite", faults.not_finite),
+             ("unknown_mark", faults.unknown_mark), ("duplicated", faults.duplicated))
+    for name, part in parts:
+        if chance < part:
+            ledger[name] += 1
+            return _one_fault(event, name, rng)
+        chance -= part
+    return [event]
+
+
+def _one_fault(event: Detection, name: str, rng: np.random.Generator) -> list[Event]:
+    if name == "lost":
+        return []
+    if name == "duplicated":
+        return [event, event]
+    if name == "low_score":
+        return [replace(event, score=0.1)]
+    if name == "not_finite":
+        return [replace(event, offset_x=float("nan"), offset_theta=float("nan"))]
+    if name == "unknown_mark":
+        return [replace(event, has_id=True, m=9999, n=0, k=2**31)]
+    size, angle = rng.uniform(1, 20), rng.uniform(0, 2 * np.pi)
+    if event.kind == Kind.ANGULAR:
+        return [replace(event, offset_theta=event.offset_theta
+                        + np.sign(np.cos(angle)) * size * 1e-3)]
+    return [replace(event, offset_x=event.offset_x + size * 1e-6 * np.cos(angle),
+                    offset_y=event.offset_y + size * 1e-6 * np.sin(angle))]
