@@ -63,6 +63,19 @@ class JointSystem:
         return out
 
     @cached_property
+    def grid_scale(self) -> float:
+        """Size of the grid's misalignment matrix before the sites were eliminated.
+
+        Ranks refer to it: what is left after the elimination may be nothing but rounding.
+        """
+        return float(max(np.trace(self.grid.block), np.finfo(float).tiny))
+
+    @cached_property
+    def angular_scale(self) -> float:
+        """Size of the angular misalignment matrix before the lines were eliminated."""
+        return float(max(self.angular.weight.sum(), np.finfo(float).tiny))
+
+    @cached_property
     def spectrum_grid(self) -> tuple[np.ndarray, np.ndarray]:
         """Eigenvalues and vectors of the grid's misalignment matrix."""
         return np.linalg.eigh(self.grid.schur)
@@ -70,21 +83,22 @@ class JointSystem:
     @cached_property
     def rank_schur(self) -> int:
         """Rank of the grid's misalignment matrix."""
-        return _rank(self.spectrum_grid[0])
+        return _rank(self.spectrum_grid[0], self.grid_scale)
 
     @cached_property
     def grid_inverse(self) -> np.ndarray:
         """Pseudo-inverse of the grid's misalignment matrix."""
-        return pseudo_inverse(*self.spectrum_grid)
+        return pseudo_inverse(*self.spectrum_grid, self.grid_scale)
 
     @cached_property
     def angular_inverse(self) -> np.ndarray:
         """Pseudo-inverse of the angular misalignment matrix."""
-        return pseudo_inverse(*np.linalg.eigh(self.angular.schur))
+        return pseudo_inverse(*np.linalg.eigh(self.angular.schur), self.angular_scale)
 
     def inverse(self, ratio: float) -> np.ndarray:
         """Return the pseudo-inverse of `normal`: covariance of the misalignments, unit noise."""
-        return pseudo_inverse(*np.linalg.eigh(self.normal(ratio)))
+        scale = max(self.grid_scale, ratio * self.angular_scale)
+        return pseudo_inverse(*np.linalg.eigh(self.normal(ratio)), scale)
 
     @cached_property
     def rank_grid(self) -> int:
@@ -98,25 +112,27 @@ class JointSystem:
         """Rank of the angular readings."""
         parts = self.angular.components
         nodes = np.count_nonzero(parts.of_site >= 0) + np.count_nonzero(parts.of_mark >= 0)
-        rank = _rank(np.linalg.eigvalsh(self.angular.schur)) if self.angular.n_views else 0
+        rank = _rank(np.linalg.eigvalsh(self.angular.schur), self.angular_scale)
         return int(nodes - len(parts.balanced) + rank)
 
     @cached_property
     def _spectrum(self) -> tuple[np.ndarray, np.ndarray]:
-        scale = np.trace(self.grid.schur) / max(np.trace(self.angular.schur), 1e-300)
+        scale = self.grid_scale / self.angular_scale if self.angular.n_views else 0.0
         return np.linalg.eigh(self.normal(scale))
 
     @cached_property
     def nullity(self) -> int:
         """Combinations of misalignments that no reading tells, the datum's among them."""
-        return self.size - _rank(self._spectrum[0])
+        return self.size - _rank(self._spectrum[0], self.grid_scale)
 
     @cached_property
     def unseen(self) -> np.ndarray:
         """Misalignments that no reading tells, beside the datum, (size, modes)."""
         values, vectors = self._spectrum
-        null = vectors[:, values <= GAP * max(values[-1], 1e-300)]
-        rigid = np.linalg.qr(self.rigid.T)[0]
+        null = vectors[:, values <= GAP * self.grid_scale]
+        # without turns the rigid modes depend on each other: an orthonormal basis of their span
+        rigid, size, _ = np.linalg.svd(self.rigid.T, full_matrices=False)
+        rigid = rigid[:, size > 1e-9 * size[0]]
         left = null - rigid @ (rigid.T @ null)
         u, s, _ = np.linalg.svd(left, full_matrices=False)
         return u[:, s > 1e-6]
@@ -174,13 +190,13 @@ class JointSystem:
         return Gauge(self.grid.views.z, self.known_marks, scale=False)
 
 
-def _rank(values: np.ndarray) -> int:
-    return int(np.count_nonzero(values > GAP * max(values.max(initial=0.0), 1e-300)))
+def _rank(values: np.ndarray, scale: float) -> int:
+    return int(np.count_nonzero(values > GAP * scale))
 
 
-def pseudo_inverse(values: np.ndarray, vectors: np.ndarray) -> np.ndarray:
-    """Return the pseudo-inverse of a matrix given by its eigenvalues and vectors."""
-    good = values > GAP * max(values.max(initial=0.0), 1e-300)
+def pseudo_inverse(values: np.ndarray, vectors: np.ndarray, scale: float) -> np.ndarray:
+    """Return the pseudo-inverse of a matrix of size `scale`, given its eigenvalues and vectors."""
+    good = values > GAP * scale
     return (vectors[:, good] / values[good]) @ vectors[:, good].T
 
 
