@@ -9,15 +9,17 @@ import sys
 from selfcal_ros.errors import ExitCode, InputError
 
 HELP = "identify linear, straightness and squareness errors from a laser step-diagonal measurement"
+SEED = 1
+"""Of the noise in the table of sensitivities."""
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the verb."""
-    parser.add_argument("data", metavar="DATA.csv",
+    parser.add_argument("data", metavar="DATA.csv", nargs="?",
                         help="columns block, rx_pp, ry_pp, rx_np, ry_np [, ex_x, ey_y], mm; "
                              "several rows of a block are repeats; 3D: rx_ppp, ry_ppp, rz_ppp, "
                              "rx_npp, ... [, ez_z]")
-    parser.add_argument("--method", required=True, choices=("conventional", "new"),
+    parser.add_argument("--method", choices=("conventional", "new"),
                         help="conventional: nominal laser directions (Wang); new: measured linear "
                              "errors, unknown set-up (Ibaraki)")
     parser.add_argument("--form", default="exact", choices=("exact", "stepwise", "printed"),
@@ -33,6 +35,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--allow-equal", action="store_true",
                         help="accept X and Y readings that are equal in every block")
     parser.add_argument("--plot", metavar="FILE", help="draw the profiles (png, svg or pdf)")
+    parser.add_argument("--sensitivity", action="store_true",
+                        help="without DATA.csv: simulate what each fault of the set-up does to "
+                             "both formulations; table to stdout, JSON with -o, curves with --plot")
     parser.add_argument("-o", "--output", metavar="OUT.json",
                         help="write the result here; otherwise it is printed")
 
@@ -45,6 +50,11 @@ def run(args: argparse.Namespace) -> int:
     from selfcal_ros.laser.outcome import outcome, summary
     from selfcal_ros.laser.profiles import Line
 
+    if args.sensitivity:
+        return _sensitivity(args)
+    if args.data is None or args.method is None:
+        raise InputError("arguments", "DATA.csv and --method are wanted",
+                         "give both, or --sensitivity alone")
     data, warnings, source = _measurement(args)
     choice = Choice(Method(args.method), Form(args.form), args.allow_equal)
     found = identify(data, choice)
@@ -60,6 +70,28 @@ def run(args: argparse.Namespace) -> int:
         print(summary(result))
     else:
         print(json.dumps(result, indent=1, allow_nan=False))
+    return ExitCode.DONE
+
+
+def _sensitivity(args: argparse.Namespace) -> int:
+    """Simulate every fault of the set-up on the machine of the source's case study."""
+    import numpy as np
+
+    from selfcal_ros.files import write_json
+    from selfcal_ros.simulation.laser import case_study_machine
+    from selfcal_ros.simulation.laser_sensitivity import sensitivity, sensitivity_text, sweep
+
+    if args.data is not None:
+        raise InputError("arguments", "--sensitivity simulates and reads no data",
+                         "leave DATA.csv out")
+    machine, rng = case_study_machine(), np.random.default_rng(SEED)
+    rows = sensitivity(machine, rng)
+    if args.plot:
+        from selfcal_ros.reporting.laser_plots import plot_sensitivity
+        plot_sensitivity(rows, sweep(machine, rng), args.plot)
+    if args.output:
+        write_json(args.output, {"machine": "case study, 6 blocks of 10 mm x 10 mm", "rows": rows})
+    print(sensitivity_text(rows))
     return ExitCode.DONE
 
 

@@ -1,0 +1,164 @@
+# SPDX-License-Identifier: Apache-2.0
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from selfcal_ros.cli.main import main
+from selfcal_ros.laser.table import write_table
+from selfcal_ros.simulation.laser import (
+    LaserNoise,
+    Measurement,
+    SetUp,
+    random_machine,
+    simulate_step_diagonal,
+)
+
+CONFIG = Path(__file__).parents[2] / "config" / "step_diagonal"
+EXAMPLE = CONFIG / "case_study.csv"
+
+
+def run(capsys, *args):
+    code = main(["step-diagonal", *map(str, args)])
+    captured = capsys.readouterr()
+    return code, captured.out, captured.err
+
+
+def test_table_1_case_c_through_the_command(tmp_path, capsys):
+    # Laser along the machine's own diagonals, a = b = 10 mm, Ex(y) = 0.1 mm.
+    r_pp, r_np = np.hypot(10.1, 10), np.hypot(9.9, 10)
+    row = (10.1 * 10 / r_pp, (10.1 * 0.1 + 100) / r_pp, 9.9 * 10 / r_np, (100 - 9.9 * .1) / r_np)
+    table, out = tmp_path / "c.csv", tmp_path / "out.json"
+    table.write_text("block,rx_pp,ry_pp,rx_np,ry_np\n1," + ",".join(f"{r:.9f}" for r in row))
+    code, text, _ = run(capsys, table, "--method", "conventional", "-o", out)
+    result = json.loads(out.read_text())
+    assert code == 0 and text.startswith("conventional formulation, 1 blocks")
+    found = [result[key][0] for key in ("ex_x", "ey_x", "ex_y", "ey_y")]
+    np.testing.assert_allclose(found, [-0.0002, 0, 0.1, 0.0002], atol=5e-5)
+    assert result["squareness"] == pytest.approx(0.1, abs=5e-5)
+
+
+@pytest.mark.parametrize("method", ["conventional", "new"])
+def test_the_example_gives_what_its_truth_says(method, tmp_path, capsys):
+    truth = json.loads((CONFIG / "case_study_truth.json").read_text())
+    out = tmp_path / "out.json"
+    code, _, err = run(capsys, EXAMPLE, "--method", method, "--step-x", "10", "--step-y", "10",
+                       "-o", out)
+    result = json.loads(out.read_text())
+    assert (code, err) == (0, "")
+    for key in ("squareness", "straightness_x", "straightness_y"):
+        assert abs(result[key] - truth[key]) < 20e-6
+        assert 0 < result[f"u_{key}"] < 20e-6
+    errors = {key: np.sum(result[key]) - np.sum(truth[key]) for key in ("ex_x", "ey_y")}
+    worst = 20e-6 if method == "new" else 1.0
+    assert max(map(abs, errors.values())) < worst
+    if method == "conventional":
+        assert errors["ex_x"] == pytest.approx(-errors["ey_y"], abs=50e-6)
+        assert abs(errors["ex_x"]) > 10e-3
+    for key in ("ex_x", "ey_x", "ex_y", "ey_y"):
+        assert len(result[key]) == 6 and len(result[f"u_{key}"]) == 6
+    assert result["ey_x"][0] == 0
+    assert result["input"]["file"] == str(EXAMPLE) and len(result["input"]["sha256"]) == 64
+
+
+def test_without_an_output_file_the_json_is_printed(capsys):
+    code, text, _ = run(capsys, EXAMPLE, "--method", "new", "--form", "printed", "--line", "end")
+    result = json.loads(text)
+    assert code == 0 and result["form"] == "printed" and result["line"] == "end"
+    assert len(result["profiles"]["py_x"]["error"]) == 7
+
+
+def test_body_diagonals_are_told_by_their_columns(tmp_path, capsys):
+    rng = np.random.default_rng(3)
+    machine = random_machine((0.01, 0.02, 0.005), 4, rng)
+    setups = {"npp": SetUp(mirror_rad=(1e-3, -1e-3))}
+    data = simulate_step_diagonal(machine, Measurement(setups, LaserNoise(repeats=2)), rng)
+    table, out = tmp_path / "d.csv", tmp_path / "out.json"
+    write_table(table, data)
+    code, text, err = run(capsys, table, "--method", "new", "--step-x", 10, "--step-y", 20,
+                          "--step-z", 5, "-o", out)
+    result = json.loads(out.read_text())
+    assert code == 0 and "squareness_xz" in text and "straightness_z_in_x" in text
+    assert "repeats are identical" in err
+    for j, axis in enumerate("xyz"):
+        for c, direction in enumerate("xyz"):
+            np.testing.assert_allclose(result[f"e{direction}_{axis}"],
+                                       machine.errors_m[j, :, c] * 1e3, atol=1e-6)
+
+
+def test_one_diagonal_on_request(capsys):
+    code, text, _ = run(capsys, EXAMPLE, "--method", "new", "--diagonals", "pp")
+    result = json.loads(text)
+    assert code == 0 and result["diagonals"] == ["pp"] and result["closure"]["lengths"] is None
+    code, text, err = run(capsys, EXAMPLE, "--method", "conventional", "--diagonals", "np")
+    assert code == 2 and not text
+    assert err == ("selfcal step-diagonal: diagonals: only np measured; the conventional "
+                   "formulation needs every diagonal; measure the others\n")
+
+
+@pytest.mark.parametrize(("extra", "message"), [
+    (("--step-x", "-10"), "--step-x: -10 mm is not a length; give the nominal step in mm, greater"),
+    (("--step-y", "0"), "--step-y: 0 mm is not a length"),
+    (("--step-y", "nan"), "--step-y: nan mm is not a length"),
+    (("--step-x", "20"), "case_study.csv:8: rx_pp: "),
+    (("--diagonals", "pp,qq"), "--diagonals: 'qq' is unknown or named twice"),
+    (("--diagonals", "pp,pp"), "--diagonals: 'pp' is unknown or named twice"),
+])
+def test_bad_arguments_are_one_line_and_exit_code_2(capsys, extra, message):
+    code, text, err = run(capsys, EXAMPLE, "--method", "new", *extra)
+    assert code == 2 and not text and err.count("\n") == 1
+    assert message in err
+
+
+def test_bad_tables_are_one_line_with_their_exit_code(tmp_path, capsys):
+    table = tmp_path / "d.csv"
+    for text, expected, message in (
+            ("", 4, "the table is empty"),
+            ("block,rx_pp,ry_pp,rx_np,ry_np\n1,7,7,7,7\n", 2, "'ex_x', 'ey_y' is missing"),
+            ("block,rx_pp,ry_pp,rx_np,ry_np,ex_x,ey_y\n1,7,7,7,7,0,0\n2,7,7,7,7,0,0\n", 2,
+             "equal in every block")):
+        table.write_text(text)
+        code, _, err = run(capsys, table, "--method", "new")
+        assert code == expected and err.count("\n") == 1 and message in err
+    code, _, err = run(capsys, tmp_path / "none.csv", "--method", "new")
+    assert code == 2 and "no such file" in err
+
+
+def test_a_form_belongs_to_the_new_formulation(capsys):
+    code, _, err = run(capsys, EXAMPLE, "--method", "conventional", "--form", "printed")
+    assert code == 2 and "the conventional formulation has one form only" in err
+
+
+def test_the_profiles_are_drawn(tmp_path, capsys):
+    picture = tmp_path / "profiles.png"
+    code, _, _ = run(capsys, EXAMPLE, "--method", "new", "--plot", picture,
+                     "-o", tmp_path / "o.json")
+    assert code == 0 and picture.read_bytes().startswith(b"\x89PNG")
+
+
+def test_the_sensitivity_table(tmp_path, capsys, monkeypatch):
+    from selfcal_ros.simulation import laser_sensitivity
+
+    monkeypatch.setattr(laser_sensitivity, "NOISE_DRAWS", 2)
+    monkeypatch.setattr(laser_sensitivity, "SWEEP", (1e-4, 1e-3))
+    out, picture = tmp_path / "s.json", tmp_path / "s.svg"
+    code, text, _ = run(capsys, "--sensitivity", "-o", out, "--plot", picture)
+    rows = json.loads(out.read_text())["rows"]
+    assert code == 0 and len(text.splitlines()) == len(rows) + 2
+    by_name = {row["fault"]: row for row in rows}
+    assert by_name["mirror off, pp"]["new"]["squareness_m"] < 1e-12
+    assert "<svg" in picture.read_text()
+
+
+def test_data_and_method_belong_together(capsys):
+    for arguments in ((EXAMPLE,), ("--method", "new")):
+        code, _, err = run(capsys, *arguments)
+        assert code == 2 and "DATA.csv and --method are wanted" in err
+    code, _, err = run(capsys, EXAMPLE, "--sensitivity")
+    assert code == 2 and "reads no data" in err
+
+
+def test_a_picture_has_a_known_format(tmp_path, capsys):
+    code, _, err = run(capsys, EXAMPLE, "--method", "new", "--plot", tmp_path / "p.gif")
+    assert code == 2 and "'gif' is not a picture format; name a file that ends in .png, .svg" in err
