@@ -56,7 +56,7 @@ class MachineSetup:
         counts = self.of(axis).counts_per_unit
         if counts is None:
             raise InputError(f"axis {axis}", f"{where} is in counts, whose size is not known",
-                             f"give the counts per primary unit: {axis}=...")
+                             f"give the counts per primary unit (--counts-per-unit {axis}=...)")
         return 1.0 / counts
 
     def unit(self, axis: int, unit: Unit, where: str) -> float:
@@ -69,7 +69,8 @@ class MachineSetup:
         secondary = self.of(axis).counts_per_secondary
         if secondary is None:
             raise InputError(f"axis {axis}", f"{where} is in secondary units, whose size is not "
-                             "known", f"give the counts per secondary unit: {axis}=...")
+                             "known", "give the counts per secondary unit "
+                             f"(--counts-per-secondary {axis}=...)")
         return secondary * per_count / unit.divisor
 
     def of(self, axis: int) -> AxisSetup:
@@ -283,7 +284,7 @@ class CalEvaluator:
         for axis in self.inputs:
             if axis not in positions:
                 raise InputError(f"axis {axis}", "its position is needed by a table",
-                                 f"give it: {axis}=...")
+                                 f"give it (--position {axis}=...)")
         arrays = np.broadcast_arrays(*(np.asarray(positions[axis], dtype=float)
                                        for axis in self.inputs))
         shape = arrays[0].shape

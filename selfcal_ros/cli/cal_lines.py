@@ -1,0 +1,144 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``selfcal cal orthogonality``, ``accuracy`` and ``straightness``: 1D tables."""
+
+import argparse
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from selfcal_ros.cli.cal_options import add_frame, frame_of, read_result
+from selfcal_ros.errors import ExitCode, InputError
+
+if TYPE_CHECKING:
+    from selfcal_ros.compensation.cal_lines import Line
+    from selfcal_ros.compensation.machine import MachineFrame
+
+_HOMES = {"end": "home at one end of travel", "middle": "home in the middle of travel",
+          "middle-balanced": "home in the middle of travel, balanced"}
+
+
+def add_to(group: argparse._SubParsersAction) -> None:
+    """Add the sub-verbs."""
+    square = group.add_parser(
+        "orthogonality", help="the two-point table for axes that are not perpendicular",
+        description="From a precision square: --measured, --over, --travel (lengths such as 5um; "
+                    "write a negative one as --measured=-5um). Or from a calibration: RESULT.json. "
+                    "The y axis is corrected from the position of the x axis; --along y exchanges "
+                    "them.")
+    square.add_argument("source", nargs="?", metavar="RESULT.json")
+    square.add_argument("--measured", metavar="LENGTH", help="error shown by the indicator")
+    square.add_argument("--over", metavar="LENGTH", help="length of the square")
+    square.add_argument("--travel", metavar="LENGTH", help="full travel of the reference axis")
+    square.add_argument("--home", choices=tuple(_HOMES),
+                        help="home position of the reference axis (default: show all; with -o: "
+                             "must be said)")
+    square.add_argument("--json", action="store_true", help="print as JSON, primary units and um")
+    _common(square, _orthogonality)
+    for name, what in (("accuracy", "an axis from its own position"),
+                       ("straightness", "the other axis from the position of an axis")):
+        sub = group.add_parser(
+            name, help=f"the table that corrects {what}",
+            description=f"Write the 1D table that corrects {what}, from a calibration or from "
+                        "measured errors: a CSV with the header position,error (primary units; "
+                        "um, actual - commanded).")
+        sub.add_argument("source", metavar="RESULT.json|DATA.csv")
+        _common(sub, _straightness if name == "straightness" else _accuracy)
+
+
+def _common(parser: argparse.ArgumentParser, run: object) -> None:
+    parser.add_argument("--along", choices=("x", "y"), default="x",
+                        help="reference axis (default x)")
+    parser.add_argument("-o", "--output", metavar="FILE.cal", help="write a calibration file")
+    parser.add_argument("--force", action="store_true",
+                        help="replace an existing file; the old one is kept with its date")
+    add_frame(parser, theta=False)
+    parser.set_defaults(run_sub_verb=run)
+
+
+def _orthogonality(args: argparse.Namespace) -> int:
+    from selfcal_ros.compensation import cal_lines
+    from selfcal_ros.compensation.machine import UNITS_M
+
+    frame = frame_of(args)
+    other = "y" if args.along == "x" else "x"
+    measured = (args.measured, args.over, args.travel)
+    if args.source is not None:
+        if any(measured) or args.home:
+            raise InputError("arguments", "RESULT.json and a measured square exclude each other",
+                             "give one of them; --home-x and --home-y place the home position")
+        line = cal_lines.map_orthogonality(read_result(args.source).error_map, args.along)
+        return _deliver(args, line, frame, (args.along, other))
+    if None in measured:
+        raise InputError("arguments", "the measurement is not complete",
+                         "give --measured, --over and --travel, or a RESULT.json")
+    if args.home_x is not None or args.home_y is not None:
+        raise InputError("--home-x", "it has no meaning for a measured square", "take --home")
+    lengths = [cal_lines.length_m(text, name) for text, name in
+               zip(measured, ("--measured", "--over", "--travel"), strict=True)]
+    if args.output:
+        if args.home is None:
+            raise InputError("--home", "it is not said where the home position lies",
+                             "take end, middle or middle-balanced")
+        return _deliver(args, cal_lines.orthogonality(*lengths, args.home), frame,
+                        (args.along, other))
+    homes = [args.home] if args.home else list(_HOMES)
+    found = {home: cal_lines.orthogonality(*lengths, home) for home in homes}
+    unit_m = UNITS_M[args.unit]
+    tables = {home: [[round(p / unit_m, 9), round(c / 1e-6, 9)] for p, c in
+                     zip(line.positions_m, line.corrections_m, strict=True)]
+              for home, line in found.items()}
+    if args.json:
+        print(json.dumps({"unit": args.unit, "correction_unit": "um", "tables": tables}, indent=1))
+        return int(ExitCode.DONE)
+    print(f"correction of {other} over the full travel of {args.along}: "
+          f"{-lengths[0] / lengths[1] * lengths[2] * 1e6:.9g} um")
+    for home, rows in tables.items():
+        print(f"{_HOMES[home]} (--home {home})\n  position {args.unit:<5} correction um")
+        print("\n".join(f"  {position:<14.9g} {correction:.9g}" for position, correction in rows))
+    return int(ExitCode.DONE)
+
+
+def _accuracy(args: argparse.Namespace) -> int:
+    return _line(args, args.along)
+
+
+def _straightness(args: argparse.Namespace) -> int:
+    return _line(args, "y" if args.along == "x" else "x")
+
+
+def _line(args: argparse.Namespace, corrected: str) -> int:
+    from selfcal_ros.compensation import cal_lines
+    from selfcal_ros.files import read_text
+
+    frame = frame_of(args)
+    if Path(args.source).suffix.lower() == ".csv":
+        line = cal_lines.measured_line(read_text(args.source), args.source, frame.unit_m)
+    else:
+        line = cal_lines.map_line(read_result(args.source).error_map, args.along, corrected)
+    if corrected != args.along:
+        line = cal_lines.without_slope(line)
+    return _deliver(args, line, frame, (args.along, corrected))
+
+
+def _deliver(args: argparse.Namespace, line: "Line", frame: "MachineFrame",
+             axes: tuple[str, str]) -> int:
+    """Write the table of a line to its file, or print it."""
+    from datetime import UTC, datetime
+
+    from selfcal_ros import __version__
+    from selfcal_ros.compensation.cal_export import DECIMALS
+    from selfcal_ros.compensation.cal_lines import line_table
+    from selfcal_ros.compensation.cal_write import cal_text, write_cal
+
+    source = args.source or f"{args.measured} over {args.over}, travel {args.travel}"
+    comments = [f"written by selfcal {__version__} on {datetime.now(UTC):%Y-%m-%dT%H:%M:%SZ}",
+                f"{args.sub_verb} of {axes[1]} along {axes[0]}, from {source}", frame.comment()]
+    table = line_table(line, frame, along=axes[0], corrected=axes[1])
+    text = cal_text([table], comments=comments, decimals=DECIMALS)
+    if not args.output:
+        print(text, end="")
+        return int(ExitCode.DONE)
+    backup = write_cal(args.output, text, force=args.force)
+    print(f"{args.output}: {args.sub_verb} table for {axes[1]}"
+          + (f"; the old file is {backup}" if backup else ""))
+    return int(ExitCode.DONE)

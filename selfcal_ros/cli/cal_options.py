@@ -1,0 +1,105 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the sub-verbs of ``selfcal cal`` have in common: axes, units, pairs AXIS=VALUE."""
+
+import argparse
+import math
+from typing import TYPE_CHECKING
+
+from selfcal_ros.errors import InputError
+
+if TYPE_CHECKING:
+    from selfcal_ros.compensation.machine import MachineFrame
+    from selfcal_ros.model.result import CalibrationResult
+
+
+def pairs(texts: list[str] | None, option: str) -> dict[int, str]:
+    """Return axis -> value of options AXIS=VALUE; InputError for anything else."""
+    found: dict[int, str] = {}
+    for text in texts or []:
+        axis, equals, value = text.partition("=")
+        if not (equals and axis.isascii() and axis.isdigit() and 1 <= int(axis[:9]) <= 32):
+            raise InputError(option, f"'{text}' is not AXIS=VALUE with an axis from 1 to 32",
+                             f"write {option} 1=10.5")
+        if int(axis) in found:
+            raise InputError(option, f"axis {int(axis)} is given twice", "keep one of them")
+        found[int(axis)] = value
+    return found
+
+
+def numbers(texts: list[str] | None, option: str, *, positive: bool = False) -> dict[int, float]:
+    """Return axis -> number of options AXIS=NUMBER; InputError for anything else."""
+    found = {}
+    for axis, text in pairs(texts, option).items():
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not math.isfinite(value) or (positive and not 1e-15 <= value <= 1e15):
+            raise InputError(option, f"'{text}' is not a {'positive ' * positive}number",
+                             f"write {option} {axis}=1000")
+        found[axis] = value
+    return found
+
+
+def add_frame(parser: argparse.ArgumentParser, *, theta: bool, default: bool = True) -> None:
+    """Add the options that say how the controller's axes lie in the stage frame."""
+    group = parser.add_argument_group(
+        "machine", "" if default else "default: as the comments of FILE.cal say, else columns "
+        "are x and rows are y")
+    group.add_argument("--x-axis", type=int, metavar="N", default=1 if default else None,
+                       help="index of the x axis, from 1")
+    group.add_argument("--y-axis", type=int, metavar="N", default=2 if default else None,
+                       help="index of the y axis")
+    group.add_argument("--unit", choices=("m", "mm", "um"), default="mm" if default else None,
+                       help="primary unit of the linear axes (default mm)")
+    for axis, unit in (("x", "primary unit"), ("y", "primary unit"), ("theta", "deg")):
+        if axis == "theta" and not theta:
+            continue
+        group.add_argument(f"--home-{axis}", type=float, metavar="P", default=None,
+                           help=f"place of the controller's zero in the stage frame, {unit} "
+                                "(default 0, the centre of the field)")
+        group.add_argument(f"--reverse-{axis}", action="store_true",
+                           help=f"the encoder counts against the stage frame's {axis}")
+    if theta:
+        group.add_argument("--theta-axis", type=int, metavar="N", help="index of the theta axis")
+        group.add_argument("--counts-per-unit", action="append", metavar="AXIS=COUNTS",
+                           help="encoder counts per degree of the theta axis")
+
+
+def frame_of(args: argparse.Namespace, base: "MachineFrame | None" = None) -> "MachineFrame":
+    """Return the frame that the options describe, upon `base` where they are silent."""
+    from dataclasses import replace
+
+    from selfcal_ros.compensation.machine import UNITS_M, MachineFrame
+
+    base = base or MachineFrame()
+    changes = {name: getattr(args, name) for name in ("x_axis", "y_axis", "theta_axis", "unit")
+               if getattr(args, name, None) is not None}
+    unit_m = UNITS_M[changes.get("unit", base.unit)]
+    for name in ("x", "y", "theta"):
+        home = getattr(args, f"home_{name}", None)
+        if home is not None and not math.isfinite(home):
+            raise InputError(f"--home-{name}", f"{home} is not a position", "give a number")
+        if home is not None and name == "theta":
+            changes["home_theta_rad"] = math.radians(home)
+        elif home is not None:
+            changes[f"home_{name}_m"] = home * unit_m
+        if getattr(args, f"reverse_{name}", False):
+            changes[f"reverse_{name}"] = True
+    for axis in ("x_axis", "y_axis", "theta_axis"):
+        if not 1 <= changes.get(axis, 1) <= 32:
+            raise InputError(f"--{axis.replace('_', '-')}", f"{changes[axis]} is not in 1..32",
+                             "indices in calibration files count from 1")
+    counts = numbers(getattr(args, "counts_per_unit", None), "--counts-per-unit", positive=True)
+    theta_axis = changes.get("theta_axis", base.theta_axis)
+    if counts and theta_axis in counts:
+        changes["theta_counts_per_unit"] = counts[theta_axis]
+    return replace(base, **changes)
+
+
+def read_result(path: str) -> "CalibrationResult":
+    """Return the result in a RESULT.json; InputError says what is wrong with it."""
+    from selfcal_ros.files import read_json
+    from selfcal_ros.model.result import result_from_dict
+
+    return result_from_dict(read_json(path), path)
