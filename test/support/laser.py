@@ -4,6 +4,8 @@
 import numpy as np
 
 from selfcal_ros.laser.data import DIAGONALS, StepDiagonal, signs_of, step_vectors
+from selfcal_ros.laser.zigzag import Series
+from selfcal_ros.simulation.laser import SetUp, trace
 
 MM = 1e-3
 
@@ -37,3 +39,41 @@ def random_errors(n, rng, sigma_m=1e-7):
     errors = rng.normal(0, sigma_m, (2, n, 2))
     errors[0, 0, 1] = 0.0
     return errors
+
+
+def recorded(machine, setups, *, rng, noise_m=0.0, extra=None):
+    """Return a recording (`Series`) of the diagonals and single axes of a simulated machine.
+
+    Rests of 1 s at 50 Hz with moves of 0.2 s between; `extra` maps a rest's index to a function
+    that spoils its positions.
+    """
+    steps = np.array(machine.steps_m)
+    dim, n = machine.dim, machine.n_blocks
+    places, distances = [], []
+    for name in (*DIAGONALS[dim], *"xyz"[:dim]):
+        if len(name) > 1:
+            order, along = trace(machine, name, setups.get(name, SetUp()))
+            signs = signs_of([name])[0]
+            moves = [np.eye(dim)[index // n] * signs[index // n] * steps for index in order]
+            start = np.where(signs < 0, n * steps, 0.0)
+        else:
+            axis = "xyz".index(name)
+            moves = [np.eye(dim)[axis] * steps] * n
+            along = np.concatenate([[0], np.cumsum(steps[axis] + machine.errors_m[axis, :, axis])])
+            start = np.zeros(dim)
+        places += [start + np.sum(moves[:k], axis=0) for k in range(len(moves) + 1)]
+        distances += list(along + rng.normal(0, 1e-3))
+    stamps, positions, laser = [], [], []
+    for index, (place, distance) in enumerate(zip(places, distances, strict=True)):
+        t = index * 1_200_000_000 + np.arange(60) * 20_000_000
+        share = np.clip((np.arange(60) - 49) / 11, 0, 1)[:, None]
+        ahead = places[min(index + 1, len(places) - 1)]
+        here = place + (ahead - place) * share + np.array([0.3, -0.2, 0.1])[:dim]
+        if extra and index in extra:
+            here = extra[index](here)
+        stamps.append(t)
+        positions.append(here)
+        leaving = share[:, 0] * 1e-3 * (ahead is not place)
+        laser.append(distance + leaving + rng.normal(0, noise_m, 60))
+    stamps = np.concatenate(stamps)
+    return Series(stamps + 3_000_000, np.concatenate(laser), stamps, np.concatenate(positions))
