@@ -1,0 +1,116 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pictures of a calibration: error vectors, angular error and uncertainty, as PNG or SVG."""
+
+import io
+import os
+from collections.abc import Callable, Mapping
+from textwrap import fill
+
+import numpy as np
+from matplotlib import rc_context
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.projections.polar import PolarAxes
+
+from selfcal_ros import __version__
+from selfcal_ros.files import write_bytes
+from selfcal_ros.model.result import CalibrationResult
+from selfcal_ros.reporting.map_plot_style import RC, drawable
+from selfcal_ros.reporting.map_plot_theta import draw_theta
+from selfcal_ros.reporting.map_plot_xy import draw_error_map, draw_uncertainty_map
+from selfcal_ros.reporting.summary import state_sentence
+from selfcal_ros.reporting.summary_numbers import truth_figures
+
+DPI = 150
+
+
+def save_map_plot(result: CalibrationResult, path: str | os.PathLike, *,
+                  truth: Mapping[str, np.ndarray] | None = None) -> None:
+    """Write a PNG with the XY error vectors and the polar angular error to `path`, atomically.
+
+    Parameters
+    ----------
+    result : CalibrationResult
+        What was found; unknown sites and lines are left out.
+    path : path-like
+        PNG file to write.
+    truth : mapping, optional
+        ``gx``, ``gy`` (nx, ny) in m and ``g_theta`` (K,) in rad, drawn beneath.
+
+    Raises
+    ------
+    InputError
+        If `truth` does not fit the map, or the file cannot be written.
+    """
+    if truth is not None:
+        truth_figures(result.error_map, truth)
+    with rc_context(RC):
+        figure = _whole_figure(result, truth)
+        data = _render(figure, "png")
+    write_bytes(path, data)
+
+
+def error_map_svg(result: CalibrationResult) -> bytes:
+    """Return the XY error vectors as SVG."""
+    return _single(lambda figure: draw_error_map(figure.add_subplot(), result.error_map))
+
+
+def uncertainty_map_svg(result: CalibrationResult) -> bytes:
+    """Return the map of the XY standard uncertainty as SVG."""
+    return _single(lambda figure: draw_uncertainty_map(figure.add_subplot(), result.error_map))
+
+
+def theta_svg(result: CalibrationResult) -> bytes:
+    """Return the polar angular error as SVG; the plate must have angular lines."""
+    def draw(figure: Figure) -> None:
+        axes = figure.add_subplot(projection="polar")
+        draw_theta(axes, result.error_map)
+        _legend(axes)
+    return _single(draw)
+
+
+def _single(draw: Callable[[Figure], object]) -> bytes:
+    with rc_context(RC):
+        figure = Figure(figsize=(7, 6.6), layout="constrained")
+        FigureCanvasAgg(figure)
+        draw(figure)
+        return _render(figure, "svg")
+
+
+def _whole_figure(result: CalibrationResult, truth: Mapping[str, np.ndarray] | None) -> Figure:
+    wide = result.artifact.angular_count > 0
+    figure = Figure(figsize=(14.4 if wide else 8, 7.8), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.add_subplot(1, 2 if wide else 1, 1)
+    draw_error_map(axes, result.error_map, truth=truth)
+    if wide:
+        polar = figure.add_subplot(1, 2, 2, projection="polar")
+        draw_theta(polar, result.error_map, truth=truth)
+        _legend(polar)
+    figure.get_layout_engine().set(rect=(0, 0.04, 1, 0.86))
+    figure.text(0.5, 0.985, fill(drawable(state_sentence(result)), 140 if wide else 78),
+                ha="center", va="top", fontsize=11.5, fontweight="bold", linespacing=1.35)
+    figure.text(0.01, 0.01, _footer(result), ha="left", va="bottom", fontsize=8,
+                color="#55606a")
+    return figure
+
+
+def _footer(result: CalibrationResult) -> str:
+    source = result.input.get("file", "")
+    parts = [f"plan {drawable(result.plan_id, 60)}", f"method {drawable(result.method, 20)}",
+             f"θ datum {result.error_map.datum_theta}" if result.artifact.angular_count else "",
+             f"input {drawable(os.path.basename(str(source)), 60)}" if source else "",
+             f"selfcal {__version__}"]
+    return "  ·  ".join(part for part in parts if part)
+
+
+def _legend(axes: PolarAxes) -> None:
+    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.06), ncols=4, frameon=False,
+                fontsize=9)
+
+
+def _render(figure: Figure, kind: str) -> bytes:
+    buffer = io.BytesIO()
+    metadata = {"Date": None} if kind == "svg" else {"Software": f"selfcal {__version__}"}
+    figure.savefig(buffer, format=kind, dpi=DPI, metadata=metadata)
+    return buffer.getvalue()
