@@ -113,6 +113,14 @@ class BagReader:
     def messages(self) -> Iterator[tuple[str, object]]:
         """Yield (topic, decoded message) of the three input topics, names without namespace.
 
+        Raises as `stamped_messages`.
+        """
+        for topic, _, message in self.stamped_messages():
+            yield topic, message
+
+    def stamped_messages(self) -> Iterator[tuple[str, int, object]]:
+        """Yield (topic, time of logging in ns, decoded message) of the three input topics.
+
         Raises
         ------
         InputError
@@ -133,7 +141,7 @@ class BagReader:
             except Exception:  # a damaged payload may fail anywhere in the decoder
                 bad += 1
                 continue
-            yield entry[0], decoded
+            yield entry[0], message.log_time, decoded
         if bad:
             self.lost.append(f"{bad} messages could not be decoded")
 

@@ -53,7 +53,6 @@ def run(args: argparse.Namespace) -> int:
     from selfcal_ros.estimation.api import calibrate
     from selfcal_ros.files import write_json
     from selfcal_ros.model.result import result_to_dict, unidentified_result, with_input
-    from selfcal_ros.reporting.summary import summary_text
 
     collector_values, solver_values = parameters(args)
     with progress_bar("reading") as bar:
@@ -77,12 +76,6 @@ def run(args: argparse.Namespace) -> int:
     if args.output:
         write_json(args.output, result_to_dict(result))
     if not args.quiet:
-        encoding = (sys.stdout.encoding or "ascii").lower()
-        print(summary_text(result, **_plain_ascii(encoding)))
-        if args.output:
-            print(f"result: {args.output}")
+        from selfcal_ros.cli.shown import show
+        show(result, args.bag, args.output)
     return 0
-
-
-def _plain_ascii(encoding: str) -> dict[str, bool]:
-    return {} if "utf" in encoding else {"ascii_only": True}

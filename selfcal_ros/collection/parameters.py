@@ -117,12 +117,10 @@ PLAYER = (
               "", -1, 2**31),
     Parameter("wait_for_subscribers", 10.0, "longest wait for a subscriber of each topic",
               "s", 0.0, 3600.0),
-    Parameter("all_topics", False, "replay what nodes of this package published as well"),
 )
 RECORDER = (
     Parameter("bag", "", "folder to write"),
     Parameter("all_topics", True, "record selfcal/* results beside the inputs"),
-    Parameter("joint_depth", 5000, "queue depth of the encoder subscription", "", 100, 100000),
 )
 SIMULATOR = (
     _SENSE, _FRAME, _PLAN,

@@ -1,0 +1,117 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``selfcal replay``: a bag played over DDS into the live nodes, each a process of its own."""
+
+import argparse
+import contextlib
+import fcntl
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+HELP = "play a bag into the live nodes and take the map from them"
+NODES = ("measurement_collector", "pose_sequencer", "solver")
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the verb."""
+    parser.add_argument("bag", metavar="BAG", help="MCAP file or rosbag2 folder")
+    speed = parser.add_mutually_exclusive_group()
+    speed.add_argument("--rate", type=float, default=1.0, metavar="R", help="speed (default: 1)")
+    speed.add_argument("--fast", action="store_true", help="as fast as the nodes keep up")
+    parser.add_argument("--shuffle", type=int, default=-1, metavar="SEED",
+                        help="deliver the messages in shuffled order")
+    parser.add_argument("-o", "--output", metavar="RESULT.json", help="where to write the result")
+    parser.add_argument("--params", metavar="NODES.yaml", help="ROS parameter file for the nodes")
+    parser.add_argument("--quiet", action="store_true", help="print no summary")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Start the nodes, play, collect the result, stop the nodes."""
+    from selfcal_ros.bagio.offline import bag_input
+    from selfcal_ros.errors import InputError
+    from selfcal_ros.files import read_json, write_json
+    from selfcal_ros.model.result import result_from_dict, result_to_dict, with_input
+
+    if not args.fast and not args.rate > 0:
+        raise InputError("--rate", f"{args.rate:g} is not a speed", "give a number above 0")
+    source = bag_input(args.bag)
+    with tempfile.TemporaryDirectory() as folder, domain() as environment:
+        saved = Path(folder, "result.json")
+        code, lost = _play(args, saved, environment)
+        if code or not saved.exists():
+            return code or 1
+        result = with_input(result_from_dict(read_json(saved), str(saved)), source, lost)
+    if args.output:
+        write_json(args.output, result_to_dict(result))
+    if not args.quiet:
+        from selfcal_ros.cli.shown import show
+        show(result, args.bag, args.output)
+    return 0
+
+
+def _play(args: argparse.Namespace, saved: Path, environment: dict) -> tuple[int, list[str]]:
+    from selfcal_ros.cli.progress import progress_bar
+
+    rest = ["--ros-args", "--params-file", args.params] if args.params else []
+    quiet = ["--ros-args", "--log-level", "warn"]
+    rate = 0.0 if args.fast else args.rate
+    with contextlib.ExitStack() as stack:
+        for node in NODES:
+            stack.enter_context(process(f"selfcal_ros.nodes.{node}", [*rest, *quiet], environment))
+        session = stack.enter_context(process(
+            "selfcal_ros.nodes.replay_session",
+            [args.bag, str(rate), str(args.shuffle), str(saved), *quiet], environment,
+            stdout=subprocess.PIPE, text=True))
+        bar = stack.enter_context(progress_bar("replaying"))
+        lost = []
+        for line in session.stdout:
+            word, _, tail = line.rstrip("\n").partition(" ")
+            if word == "progress":
+                done, total = tail.split()
+                bar(int(done), int(total))
+            elif word == "lost":
+                lost.append(tail)
+                print(f"selfcal replay: {args.bag}: {tail}", file=sys.stderr)
+        return session.wait(), lost
+
+
+@contextlib.contextmanager
+def process(module: str, arguments: list[str], environment: dict, **kwargs,
+            ) -> Iterator[subprocess.Popen]:
+    """Run a module as a process that is stopped, at worst killed, at the end of the block."""
+    child = subprocess.Popen([sys.executable, "-m", module, *arguments], env=environment, **kwargs)
+    try:
+        yield child
+    finally:
+        for stop in (child.terminate, child.kill):
+            if child.poll() is None:
+                stop()
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    child.wait(10)
+        if child.stdout:
+            child.stdout.close()
+
+
+@contextlib.contextmanager
+def domain() -> Iterator[dict]:
+    """Yield an environment with a ROS domain of its own on this machine.
+
+    A ROS_DOMAIN_ID that is set already is kept, so that `ros2 topic echo` can watch.
+    """
+    environment = dict(os.environ)
+    environment.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    if environment.get("ROS_DOMAIN_ID"):
+        yield environment
+        return
+    for number in range(50, 100):
+        with Path(tempfile.gettempdir(), f"selfcal_domain_{number}.lock").open("w") as lock:
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError:
+                continue
+            yield environment | {"ROS_DOMAIN_ID": str(number)}
+            return
+    raise RuntimeError("fifty replays at once")

@@ -1,0 +1,123 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The sequencer's state machine: which command comes next, without ROS and without a clock."""
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+from selfcal_ros.collection.messages import Command, Phase
+from selfcal_ros.errors import InputError
+from selfcal_ros.model.view import Plan
+
+
+class State(StrEnum):
+    """What the sequencer is doing."""
+
+    IDLE = "idle"
+    PLACING = "waiting for the plate to be placed"
+    MEASURING = "measuring"
+    DONE = "done"
+    ABORTED = "aborted"
+    FOLLOWING = "following recorded commands"
+
+
+ENDED = (State.IDLE, State.DONE, State.ABORTED)
+
+
+@dataclass
+class Sequencer:
+    """Leads through a plan: PLACE, wait for confirmation, MEASURE, wait for completion, DONE.
+
+    Every method that moves on returns the commands to publish, with stamp 0: the caller stamps
+    them. Requests that do not fit the state raise InputError and change nothing.
+
+    Attributes
+    ----------
+    plan : Plan or None
+        Plan to run.
+    state : State
+        Where it is.
+    index : int
+        Current view.
+    skipped : list of str
+        Names of views that were skipped.
+    """
+
+    plan: Plan | None = None
+    state: State = State.IDLE
+    index: int = 0
+
+    def __post_init__(self) -> None:
+        """Start with nothing skipped."""
+        self.skipped: list[str] = []
+
+    def start(self) -> list[Command]:
+        """Begin the plan with its first view."""
+        if self.state not in ENDED:
+            raise InputError("pose_sequencer", f"cannot start while {self.state}",
+                             "abort the plan first")
+        if self.plan is None:
+            raise InputError("pose_sequencer", "there is no plan", "set the parameter 'plan'")
+        self.skipped, self.index = [], 0
+        return self._place()
+
+    def confirm(self) -> list[Command]:
+        """Take the plate as placed: measure."""
+        self._need(State.PLACING, "confirm_view")
+        self.state = State.MEASURING
+        return [self._command(Phase.MEASURE)]
+
+    def status(self, plan_id: str, view_index: int, complete: bool) -> list[Command]:
+        """Move on when the current view is complete; anything else is ignored."""
+        current = (self.state is State.MEASURING and self.plan is not None
+                   and plan_id == self.plan.plan_id and view_index == self.index)
+        return self._advance() if current and complete else []
+
+    def redo(self) -> list[Command]:
+        """Place the current view again; what was read of it is superseded."""
+        if self.state not in (State.PLACING, State.MEASURING):
+            raise InputError("pose_sequencer", f"nothing to redo while {self.state}",
+                             "start a plan first")
+        return self._place()
+
+    def skip(self) -> list[Command]:
+        """Leave the current view as it is and go on with the next."""
+        if self.state not in (State.PLACING, State.MEASURING):
+            raise InputError("pose_sequencer", f"nothing to skip while {self.state}",
+                             "start a plan first")
+        self.skipped.append(self.plan.views[self.index].name)
+        return self._advance()
+
+    def abort(self) -> list[Command]:
+        """Give the plan up; what was measured stays with the collector."""
+        if self.state not in (State.PLACING, State.MEASURING):
+            raise InputError("pose_sequencer", f"nothing to abort while {self.state}",
+                             "start a plan first")
+        self.state = State.ABORTED
+        return [self._command(Phase.ABORT)]
+
+    def foreign_command(self) -> None:
+        """Yield to a command that somebody else published: recorded commands win."""
+        self.state = State.FOLLOWING
+
+    def _need(self, state: State, request: str) -> None:
+        if self.state is not state:
+            raise InputError("pose_sequencer", f"{request} does not fit while {self.state}",
+                             "see selfcal/view_command for what is expected")
+
+    def _place(self) -> list[Command]:
+        self.state = State.PLACING
+        return [self._command(Phase.PLACE)]
+
+    def _advance(self) -> list[Command]:
+        self.index += 1
+        if self.index < len(self.plan.views):
+            return self._place()
+        self.state = State.DONE
+        return [self._command(Phase.DONE)]
+
+    def _command(self, phase: Phase) -> Command:
+        plan, number = self.plan, len(self.plan.views)
+        if phase in (Phase.DONE, Phase.ABORT):
+            return Command(0, phase, plan.plan_id, self.index, views_planned=number)
+        return Command(0, phase, plan.plan_id, self.index, plan.views[self.index], plan.artifact,
+                       number)

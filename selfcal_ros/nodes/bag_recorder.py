@@ -1,0 +1,70 @@
+# SPDX-License-Identifier: Apache-2.0
+"""bag_recorder: writes the topics of this package as a rosbag2 MCAP bag."""
+
+import sys
+from functools import partial
+from typing import Any
+
+from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
+
+from selfcal_ros.bagio.writer import BagWriter, qos_profile
+from selfcal_ros.errors import InputError
+from selfcal_ros.nodes import names
+from selfcal_ros.nodes.base import SelfcalNode, run
+from selfcal_ros.nodes.names import Topic
+
+
+class BagRecorder(SelfcalNode):
+    """Records what arrives, as it arrives; what was recorded survives a crash."""
+
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__("bag_recorder", **kwargs)
+        if not self.values["bag"]:
+            raise InputError("bag_recorder", "no bag is named", "set the parameter 'bag'")
+        self._writer = BagWriter(self.values["bag"])
+        topics = [*names.INPUTS, *(names.RESULTS if self.values["all_topics"] else ())]
+        self._subscriptions_by_topic: dict[str, tuple[Topic, Any]] = {}
+        for topic in topics:
+            name = self.resolve_topic_name(topic.name)
+            typename = f"{topic.type.__module__.split('.')[0]}/msg/{topic.type.__name__}"
+            self._writer.add_topic(name, typename, [qos_profile(
+                reliable=topic.qos.reliability == ReliabilityPolicy.RELIABLE,
+                transient_local=topic.qos.durability == DurabilityPolicy.TRANSIENT_LOCAL,
+                depth=topic.qos.depth)])
+            if topic is not names.ENCODER:
+                self.subscribe(topic, partial(self._record, name), raw=True)
+        self._encoder_qos: Topic | None = None
+        self._match_encoder()
+        self.create_timer(0.1, self._match_encoder)
+        self.create_timer(1.0, self._flush)
+
+    def _match_encoder(self) -> None:
+        """Subscribe to the encoder once it is offered, reliable if it is offered so."""
+        name = self.resolve_topic_name(names.ENCODER.name)
+        offers = self.get_publishers_info_by_topic(name)
+        if not offers or self._encoder_qos is not None:
+            return
+        reliable = all(o.qos_profile.reliability == ReliabilityPolicy.RELIABLE for o in offers)
+        self._encoder_qos = names.ENCODER if reliable else names.ENCODER_BEST_EFFORT
+        self.subscribe(self._encoder_qos, partial(self._record, name), raw=True)
+
+    def _record(self, topic: str, data: bytes) -> None:
+        self._writer.write_raw(topic, bytes(data), self.get_clock().now().nanoseconds)
+
+    def _flush(self) -> None:
+        self._writer.flush()
+        self.diagnose("recording", self._writer.counts)
+
+    def close(self) -> None:
+        """Finish the bag."""
+        self._writer.close()
+        self.get_logger().info(f"{self.values['bag']}: {self._writer.counts}")
+
+
+def main() -> None:
+    """Run the node."""
+    sys.exit(run(BagRecorder))
+
+
+if __name__ == "__main__":
+    main()

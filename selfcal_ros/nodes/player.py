@@ -1,0 +1,119 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Playing a bag onto the graph: at its own pace, or as fast as the subscribers keep up."""
+
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.duration import Duration
+
+from selfcal_ros.bagio.reader import COMMAND_TOPIC, DETECTION_TOPIC, ENCODER_TOPIC, BagReader
+from selfcal_ros.errors import NoDataError
+from selfcal_ros.nodes import names
+from selfcal_ros.nodes.base import SelfcalNode, fill
+
+KINDS = {ENCODER_TOPIC: "encoder", DETECTION_TOPIC: "detection", COMMAND_TOPIC: "command"}
+WINDOW = 1500
+"""Messages that may be under way to the collector; well below the depth of its queues."""
+UNHEARD_RATE = 4000
+"""Messages a second while no collector tells how far it is."""
+
+
+class Player:
+    """Publishes the input topics of a bag from the timers of a node.
+
+    Messages are re-encoded with this package's types, so that a bag with more or fewer trailing
+    fields plays as well. `seed` shuffles the order of arrival, not the stamps.
+    """
+
+    def __init__(self, node: SelfcalNode, bag: str, *, rate: float, seed: int) -> None:
+        self.node, self.rate = node, rate
+        self.reader = BagReader(Path(bag))
+        items = list(self.reader.stamped_messages())
+        if not items:
+            raise NoDataError(bag, "no message on the topics of the contract", "see the README")
+        items.sort(key=lambda item: item[1])
+        if seed >= 0:
+            order = np.random.default_rng(seed).permutation(len(items))
+            times = [item[1] for item in items]
+            items = [(items[i][0], stamp, items[i][2])
+                     for i, stamp in zip(order, times, strict=True)]
+        self._items = items
+        self._publishers = {topic.name: node.publisher(topic) for topic in names.INPUTS}
+        self._types = {topic.name: topic.type for topic in names.INPUTS}
+        self.sent = dict.fromkeys(KINDS.values(), 0)
+        self.heard: dict[str, int] | None = None
+        self._at, self._began = 0, None
+        node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 50)
+
+    @property
+    def total(self) -> int:
+        """Messages to play."""
+        return len(self._items)
+
+    @property
+    def done(self) -> bool:
+        """Whether every message has been published."""
+        return self._at >= len(self._items)
+
+    @property
+    def played(self) -> int:
+        """Messages published so far."""
+        return self._at
+
+    def matched(self) -> list[str]:
+        """Return the topics that have messages to play but no subscriber yet."""
+        used = {topic for topic, _, _ in self._items}
+        return [topic for topic, publisher in self._publishers.items()
+                if topic in used and publisher.get_subscription_count() == 0]
+
+    def step(self) -> None:
+        """Publish what is due now."""
+        now = time.monotonic()
+        if self._began is None:
+            self._began = now
+        first = self._items[0][1]
+        stop = now + 0.02
+        while not self.done and time.monotonic() < stop:
+            topic, stamp, message = self._items[self._at]
+            if self.rate > 0 and (stamp - first) * 1e-9 / self.rate > now - self._began:
+                return
+            if not self._room():
+                return
+            self._publishers[topic].publish(_converted(message, self._types[topic]()))
+            self.sent[KINDS[topic]] += 1
+            self._at += 1
+
+    def _room(self) -> bool:
+        """Return whether the subscribers keep up."""
+        if self.heard is None:
+            return self._at < WINDOW + UNHEARD_RATE * (time.monotonic() - self._began) / 2
+        return self._at - sum(self.heard.values()) < WINDOW
+
+    def _on_diagnostics(self, message: Any) -> None:
+        for status in message.status:
+            values = {item.key: item.value for item in status.values}
+            if "encoder_received" in values:
+                self.heard = {kind: int(values[f"{kind}_received"]) for kind in self.sent}
+
+    def drain(self) -> None:
+        """Wait until everything has been acknowledged."""
+        for publisher in self._publishers.values():
+            publisher.wait_for_all_acked(Duration(seconds=10))
+
+
+def _converted(message: Any, target: Any) -> Any:
+    """Return `target` with every field that `message` has as well."""
+    return fill(target, _fields(message, target))
+
+
+def _fields(message: Any, target: Any) -> dict[str, Any]:
+    out = {}
+    for name in target.get_fields_and_field_types():
+        if hasattr(message, name):
+            value, wanted = getattr(message, name), getattr(target, name)
+            nested = hasattr(wanted, "get_fields_and_field_types")
+            out[name] = _fields(value, wanted) if nested else value
+    return out

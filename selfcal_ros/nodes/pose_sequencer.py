@@ -1,0 +1,168 @@
+# SPDX-License-Identifier: Apache-2.0
+"""pose_sequencer: leads through the views of a plan."""
+
+import sys
+import time
+from dataclasses import replace
+from typing import Any
+
+from rclpy.action import ActionServer, CancelResponse, GoalResponse
+from rclpy.task import Future
+from selfcal_msgs.action import RunCalibration
+from selfcal_msgs.srv import SaveMap
+from std_srvs.srv import Trigger
+
+from selfcal_ros.bagio import convert_in, convert_out
+from selfcal_ros.collection.messages import Command
+from selfcal_ros.collection.sequencer import ENDED, Sequencer, State
+from selfcal_ros.errors import ExitCode, SelfcalError
+from selfcal_ros.files import read_yaml
+from selfcal_ros.model.view import Plan, plan_from_dict
+from selfcal_ros.nodes import names
+from selfcal_ros.nodes.base import SelfcalNode, fill, run
+
+
+def load_plan(path: str) -> Plan:
+    """Return the plan in a PLAN.yaml."""
+    return plan_from_dict(read_yaml(path), path)
+
+
+class PoseSequencer(SelfcalNode):
+    """Publishes PLACE and MEASURE for each view; services and an action drive it."""
+
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__("pose_sequencer", **kwargs)
+        path = self.values["plan"]
+        self.machine = Sequencer(load_plan(path) if path else None)
+        self._own: set[tuple] = set()
+        self._goal: Any = None
+        self._ended: Future | None = None
+        self._deadline, self._confirm_at, self._redos = 0.0, 0.0, 0
+        self._coverage = 0.0
+        self._command = self.publisher(names.COMMAND)
+        self.subscribe(names.COMMAND, self._on_command)
+        self.subscribe(names.STATUS, self._on_status)
+        for name, act in (("start", self.machine.start), ("confirm_view", self.machine.confirm),
+                          ("redo_view", self.machine.redo), ("skip_view", self.machine.skip),
+                          ("abort", self.machine.abort)):
+            self.create_service(Trigger, f"~/{name}", lambda request, response, act=act:
+                                self.trigger(request, response, lambda: self._do(act)))
+        self._saver = self.create_client(SaveMap, "solver/save_map")
+        self._action = ActionServer(
+            self, RunCalibration, "~/run_calibration", self._execute,
+            goal_callback=lambda goal: GoalResponse.ACCEPT if self.machine.state in ENDED
+            else GoalResponse.REJECT, cancel_callback=lambda goal: CancelResponse.ACCEPT)
+        self.create_timer(0.05, self.guarded(self._on_timer))
+        self.create_timer(1.0, lambda: self.diagnose(str(self.machine.state),
+                                                     {"view": self.machine.index}))
+        if self.values["auto_start"]:
+            self._send(self.machine.start())
+
+    def _do(self, act: Any) -> str:
+        self._send(act())
+        return f"{self.machine.state}: view {self.machine.index}"
+
+    def _send(self, commands: list[Command]) -> None:
+        for command in commands:
+            command = replace(command, stamp_ns=self.get_clock().now().nanoseconds)
+            self._own.add(_key(command))
+            self._command.publish(fill(names.COMMAND.type(), convert_out.command(
+                command, self.frame_id)))
+            name = command.view.name if command.view else self.machine.plan.plan_id
+            self.get_logger().info(f"{command.phase.name} {name}")
+            self._coverage = 0.0
+            self._confirm_at = time.monotonic() + self.values["settle_time"]
+            self._deadline = time.monotonic() + self.values["view_timeout"]
+        if self.machine.state in ENDED and self._ended is not None:
+            self._ended.set_result(None)
+
+    def _on_command(self, message: Any) -> None:
+        if _key(convert_in.command(message)) in self._own:
+            return
+        if self.machine.state is not State.FOLLOWING:
+            self.get_logger().warning("another publisher sends view commands: following them")
+        self.machine.foreign_command()
+        if self._ended is not None:
+            self._ended.set_result(None)
+
+    def _on_status(self, message: Any) -> None:
+        expected = message.grid_expected + message.angular_expected
+        if message.view_index == self.machine.index and expected:
+            self._coverage = (message.grid_done + message.angular_done) / expected
+        index = self.machine.index
+        self._send(self.machine.status(message.plan_id, message.view_index, message.complete))
+        if self.machine.index != index:
+            self._redos = 0
+
+    def _on_timer(self) -> None:
+        now = time.monotonic()
+        if (self.machine.state is State.PLACING and self.values["auto_confirm"]
+                and now >= self._confirm_at):
+            self._send(self.machine.confirm())
+        timed_out = self.values["view_timeout"] > 0 and now >= self._deadline
+        if self.machine.state is State.MEASURING and timed_out:
+            view = self.machine.plan.views[self.machine.index].name
+            self.get_logger().warning(f"view {view} is not complete after "
+                                      f"{self.values['view_timeout']:g} s")
+            again = self._redos < self.values["max_redos"]
+            self._redos = self._redos + 1 if again else 0
+            self._send(self.machine.redo() if again else self.machine.skip())
+        if self._goal is not None:
+            if self._goal.is_cancel_requested and self.machine.state not in ENDED:
+                self._send(self.machine.abort())
+            self._feedback()
+
+    def _feedback(self) -> None:
+        if self.machine.state in (State.PLACING, State.MEASURING):
+            view = self.machine.plan.views[self.machine.index]
+            self._goal.publish_feedback(RunCalibration.Feedback(
+                view=view.name, view_index=self.machine.index, coverage=self._coverage))
+
+    async def _execute(self, goal: Any) -> Any:
+        """Run the plan of an action goal to its end and have the solver save the map."""
+        result = RunCalibration.Result()
+        try:
+            if goal.request.plan_path:
+                self.machine.plan = load_plan(goal.request.plan_path)
+            self._goal, self._ended = goal, Future()
+            self._send(self.machine.start())
+            await self._ended
+            await self._conclude(goal, result)
+        except SelfcalError as error:
+            result.error_code, result.message = int(error.exit_code), str(error)
+            goal.abort()
+        finally:
+            self._goal, self._ended = None, None
+        return result
+
+    async def _conclude(self, goal: Any, result: Any) -> None:
+        if self.machine.state is not State.DONE:
+            result.error_code = int(ExitCode.NO_DATA)
+            result.message = f"the plan was not measured to its end: {self.machine.state}"
+            goal.canceled() if goal.is_cancel_requested else goal.abort()
+            return
+        path = self.values["result_path"] or f"{self.machine.plan.plan_id}.json"
+        if not self._saver.service_is_ready():
+            result.error_code, result.message = int(ExitCode.NO_DATA), "no solver is running"
+            goal.abort()
+            return
+        answer = await self._saver.call_async(SaveMap.Request(path=path))
+        result.error_code, result.message = answer.error_code, answer.message
+        if answer.success:
+            result.map_path = path
+            goal.succeed()
+        else:
+            goal.abort()
+
+
+def _key(command: Command) -> tuple:
+    return (command.stamp_ns, int(command.phase), command.plan_id, command.view_index)
+
+
+def main() -> None:
+    """Run the node."""
+    sys.exit(run(PoseSequencer))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,131 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The heart of `selfcal replay`: plays a bag into live nodes and sees it through to the map.
+
+Run as a process beside measurement_collector and solver:
+``python -m selfcal_ros.nodes.replay_session BAG RATE SEED RESULT.json``. Progress goes to
+stdout, one line ``progress DONE TOTAL`` a step, for the command line to draw.
+"""
+
+import sys
+import time
+from collections.abc import Callable
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.task import Future
+from selfcal_msgs.srv import SaveMap
+from std_srvs.srv import Trigger
+
+from selfcal_ros.errors import ExitCode, SelfcalError
+from selfcal_ros.nodes.base import SelfcalNode, run
+from selfcal_ros.nodes.player import Player
+
+PATIENCE_S = 30.0
+"""Longest wait for the nodes to appear, to receive what was sent, or to answer."""
+
+
+class ReplaySession(SelfcalNode):
+    """Waits for subscribers, plays, checks that nothing was lost, has the map saved."""
+
+    def __init__(self, bag: str, rate: float, seed: int, output: str) -> None:
+        super().__init__("bag_player", parameter_overrides=[])
+        self.finished, self.exit_code = Future(), ExitCode.INTERNAL
+        self._output = output
+        self.player = Player(self, bag, rate=rate, seed=seed)
+        self._finish = self.create_client(Trigger, "measurement_collector/finish")
+        self._save = self.create_client(SaveMap, "solver/save_map")
+        self._act: Callable[[], None] = self._wait_for_nodes
+        self._deadline = time.monotonic() + PATIENCE_S
+        self._said = 0.0
+        self._digest, self._solved = "", None
+        self.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 50)
+        self.create_timer(0.002, self._step)
+
+    def _step(self) -> None:
+        if self.finished.done():
+            return
+        try:
+            self._act()
+        except SelfcalError as error:
+            self._end(str(error), error.exit_code)
+
+    def _go(self, act: Callable[[], None]) -> None:
+        self._act, self._deadline = act, time.monotonic() + PATIENCE_S
+
+    def _late(self) -> bool:
+        return time.monotonic() > self._deadline
+
+    def _wait_for_nodes(self) -> None:
+        alone = self.player.matched()
+        ready = self._finish.service_is_ready() and self._save.service_is_ready()
+        if not alone and ready:
+            self._go(self._play)
+        elif self._late():
+            self._end(f"no subscriber for {', '.join(alone) or 'the services'}",
+                      ExitCode.INTERNAL)
+
+    def _play(self) -> None:
+        self.player.step()
+        now = time.monotonic()
+        if now - self._said > 0.1 or self.player.done:
+            self._said = now
+            print(f"progress {self.player.played} {self.player.total}", flush=True)
+        if self.player.done:
+            self._go(self._wait_until_received)
+
+    def _wait_until_received(self) -> None:
+        if self.player.heard == self.player.sent:
+            self._ask(self._finish, Trigger.Request(), self._on_finished)
+        elif self._late():
+            self._end(f"messages were lost: sent {self.player.sent}, received "
+                      f"{self.player.heard}", ExitCode.INTERNAL)
+
+    def _ask(self, client: Any, request: Any, then: Callable[[Any], None]) -> None:
+        answer = client.call_async(request)
+
+        def wait() -> None:
+            if answer.done():
+                then(answer.result())
+            elif self._late():
+                self._end(f"{client.srv_name} does not answer", ExitCode.INTERNAL)
+        self._go(wait)
+
+    def _on_finished(self, response: Any) -> None:
+        if not response.success:
+            self._end(response.message, ExitCode.NO_DATA)
+            return
+        self._digest = response.message
+        self._go(self._wait_until_solved)
+
+    def _wait_until_solved(self) -> None:
+        """Wait until the solver has solved exactly the readings that the collector sent last."""
+        if self._solved == self._digest:
+            self._ask(self._save, SaveMap.Request(path=self._output), lambda response: self._end(
+                "" if response.success else response.message, ExitCode(response.error_code)))
+        elif self._late():
+            self._end("the solver did not receive the readings of all views", ExitCode.INTERNAL)
+
+    def _on_diagnostics(self, message: Any) -> None:
+        for status in message.status:
+            for item in status.values:
+                if item.key == "readings":
+                    self._solved = item.value
+
+    def _end(self, message: str, code: ExitCode) -> None:
+        if message:
+            print(f"selfcal replay: {message}", file=sys.stderr, flush=True)
+        for line in self.player.reader.lost:
+            print(f"lost {line}", flush=True)
+        self.exit_code = code
+        if not self.finished.done():
+            self.finished.set_result(None)
+
+
+def main() -> None:
+    """Run the session: BAG RATE SEED RESULT.json."""
+    bag, rate, seed, output = sys.argv[1:5]
+    sys.exit(run(lambda: ReplaySession(bag, float(rate), int(seed), output), sys.argv[5:]))
+
+
+if __name__ == "__main__":
+    main()

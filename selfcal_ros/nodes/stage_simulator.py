@@ -1,0 +1,102 @@
+# SPDX-License-Identifier: Apache-2.0
+"""stage_simulator: a cell with known truth that follows view commands."""
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from selfcal_ros.bagio import convert_in
+from selfcal_ros.bagio.simulated import event_fields, write_truth
+from selfcal_ros.collection.messages import Command, Detection, EncoderSample, Phase
+from selfcal_ros.model.readings import Sense
+from selfcal_ros.model.view import Plan, View
+from selfcal_ros.nodes import names
+from selfcal_ros.nodes.base import SelfcalNode, fill, run
+from selfcal_ros.nodes.pose_sequencer import load_plan
+from selfcal_ros.simulation.cell import JOINTS, CellSettings, Event, view_events
+from selfcal_ros.simulation.truth import Truth, random_truth
+
+LEAD_NS = 20_000_000
+"""Time between a MEASURE command and the first encoder sample of its view."""
+
+
+class StageSimulator(SelfcalNode):
+    """Publishes encoder samples at a set rate and detections while a view is measured."""
+
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__("stage_simulator", **kwargs)
+        v = self.values
+        self._settings = CellSettings(
+            Sense(v["measurement_sense"]), v["sigma_xy"], v["sigma_theta"], v["encoder_rate"],
+            v["exposure_period"], v["with_ids"])
+        self._rng = np.random.default_rng(v["seed"])
+        self._plan: Plan | None = load_plan(v["plan"]) if v["plan"] else None
+        self.truth: Truth | None = None
+        self._events: Iterator[Event] = iter(())
+        self._next: Event | None = None
+        self._idle_stamp = 0
+        self._encoder = self.publisher(names.ENCODER)
+        self._detection = self.publisher(names.DETECTIONS)
+        self.subscribe(names.COMMAND, self._on_command)
+        self.create_timer(0.005, self.guarded(self._on_timer))
+
+    def _on_command(self, message: Any) -> None:
+        command = convert_in.command(message)
+        self._next, self._events = None, iter(())
+        if command.phase == Phase.MEASURE:
+            self._measure(command)
+
+    def _measure(self, command: Command) -> None:
+        plan = self._plan_with(command)
+        if self.truth is None or self.truth.artifact != plan.artifact:
+            count = max(64, len(plan.views), command.views_planned)
+            self.truth = random_truth(plan.artifact, count,
+                                      np.random.default_rng(self.values["seed"]))
+            if self.values["truth_path"]:
+                write_truth(Path(self.values["truth_path"]), self.truth, seed=self.values["seed"])
+        self._events = view_events(self.truth, plan, command.view_index, settings=self._settings,
+                                   rng=self._rng, start_ns=command.stamp_ns + LEAD_NS)
+        self._next = next(self._events, None)
+
+    def _plan_with(self, command: Command) -> Plan:
+        """Return the plan with the commanded view in its place; commands describe themselves."""
+        known = self._plan.views if self._plan else ()
+        count = max(len(known), command.view_index + 1)
+        views = [known[i] if i < len(known) else View(f"view {i}") for i in range(count)]
+        views[command.view_index] = command.view
+        self._plan = Plan(command.plan_id, command.artifact, tuple(views))
+        return self._plan
+
+    def _on_timer(self) -> None:
+        now = self.get_clock().now().nanoseconds
+        while self._next is not None and self._next.stamp_ns <= now:
+            self._publish(self._next)
+            self._next = next(self._events, None)
+        if self._next is None:
+            self._idle(now)
+
+    def _idle(self, now_ns: int) -> None:
+        """Keep the encoder alive between views, at a tenth of the rate, the stage at home."""
+        step = round(1e10 / self.values["encoder_rate"])
+        if now_ns - self._idle_stamp >= step:
+            self._idle_stamp = now_ns
+            self._publish(EncoderSample(now_ns, JOINTS, (0.0, 0.0, 0.0)))
+
+    def _publish(self, event: Event) -> None:
+        _, fields = event_fields(event, self.frame_id)
+        if isinstance(event, Detection):
+            self._detection.publish(fill(names.DETECTIONS.type(), fields))
+        else:
+            self._encoder.publish(fill(names.ENCODER.type(), fields))
+
+
+def main() -> None:
+    """Run the node."""
+    sys.exit(run(StageSimulator))
+
+
+if __name__ == "__main__":
+    main()
