@@ -6,6 +6,7 @@ import json
 import math
 import sys
 
+from selfcal_ros.cli.cal_options import add_frame, frame_of
 from selfcal_ros.errors import ExitCode, InputError
 
 HELP = "identify linear, straightness and squareness errors from a laser step-diagonal measurement"
@@ -38,6 +39,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--sensitivity", action="store_true",
                         help="without DATA.csv: simulate what each fault of the set-up does to "
                              "both formulations; table to stdout, JSON with -o, curves with --plot")
+    parser.add_argument("--cal", metavar="FILE.cal",
+                        help="write straightness, squareness and measured linear errors as 1D "
+                             "tables; positions count from the start of the first block")
+    parser.add_argument("--force", action="store_true",
+                        help="replace an existing FILE.cal; the old one is kept with its date")
+    add_frame(parser, theta=False)
     parser.add_argument("-o", "--output", metavar="OUT.json",
                         help="write the result here; otherwise it is printed")
 
@@ -65,12 +72,32 @@ def run(args: argparse.Namespace) -> int:
     if args.plot:
         from selfcal_ros.reporting.laser_plots import plot_profiles
         plot_profiles(found, args.plot)
+    if args.cal:
+        _write_cal(args, found)
     if args.output:
         write_json(args.output, result)
         print(summary(result))
     else:
         print(json.dumps(result, indent=1, allow_nan=False))
     return ExitCode.DONE
+
+
+def _write_cal(args: argparse.Namespace, found: object) -> None:
+    """Write the corrections as 1D tables."""
+    from selfcal_ros import __version__
+    from selfcal_ros.compensation.cal_export import DECIMALS
+    from selfcal_ros.compensation.cal_write import cal_text, write_cal
+    from selfcal_ros.laser.transfer import correction_tables
+
+    frame = frame_of(args)
+    comments = [f"written by selfcal {__version__} from the step-diagonal measurement {args.data}",
+                f"{found.method} formulation; correction = -(actual - commanded)",
+                "positions count from the start of the first block; the x axis is the reference",
+                frame.comment()]
+    text = cal_text(correction_tables(found, frame), comments=comments, decimals=DECIMALS)
+    backup = write_cal(args.cal, text, force=args.force)
+    if backup:
+        print(f"selfcal step-diagonal: the old {args.cal} is {backup}", file=sys.stderr)
 
 
 def _sensitivity(args: argparse.Namespace) -> int:

@@ -21,6 +21,7 @@ from selfcal_ros.laser.profiles import (
     straightness,
     u_profile_m,
 )
+from selfcal_ros.laser.transfer import map_equivalent
 from selfcal_ros.model.result import plain
 
 SCHEMA = "selfcal.step_diagonal/1"
@@ -65,6 +66,8 @@ def outcome(found: Identified, data: StepDiagonal, *, line: Line = Line.LEAST_SQ
         "u": None if found.covariance is None else _mm(u_profile_m(found, j, c))}
         for j, c in kinds}
     out["scale"] = {AXES[j]: slope(found, j, j, line) for j in range(found.dim)}
+    if found.dim == 2:
+        out["error_map_equivalent"] = vars(map_equivalent(found))
     out["mirror_rad"] = found.mirror_rad
     out["closure"] = _closure(found)
     readings, linear = reading_noise(data), linear_noise(data)

@@ -78,6 +78,16 @@ def slope(found: Identified, axis: int, direction: int,
     return float(row @ found.errors_m[axis, :, direction])
 
 
+def u_slope(found: Identified, axis: int, direction: int,
+            line: Line = Line.LEAST_SQUARES) -> float | None:
+    """Return the standard uncertainty of `slope`; None if not known."""
+    if found.covariance is None:
+        return None
+    row = _slope_row(found.n_blocks, line) / found.steps_m[axis]
+    block = _block(found, (axis, direction), (axis, direction))
+    return float(np.sqrt(max(row @ block @ row, 0.0)))
+
+
 def squareness(found: Identified, first: int = 0, second: int = 1,
                line: Line = Line.LEAST_SQUARES) -> Value:
     """Return the squareness of two axes over the range of the second, m (sign: see above)."""

@@ -162,3 +162,22 @@ def test_data_and_method_belong_together(capsys):
 def test_a_picture_has_a_known_format(tmp_path, capsys):
     code, _, err = run(capsys, EXAMPLE, "--method", "new", "--plot", tmp_path / "p.gif")
     assert code == 2 and "'gif' is not a picture format; name a file that ends in .png, .svg" in err
+
+
+def test_the_corrections_are_written_as_tables(tmp_path, capsys):
+    from selfcal_ros.compensation.cal_read import load_cal
+
+    cal = tmp_path / "s.cal"
+    args = (EXAMPLE, "--method", "new", "--cal", cal, "--x-axis", 3, "--y-axis", 4,
+            "-o", tmp_path / "o.json")
+    assert run(capsys, *args)[0] == 0
+    tables = load_cal(cal).tables
+    assert [(t.axis, t.reference, len(t.values)) for t in tables] == [
+        (3, 3, 7), (4, 3, 7), (3, 4, 7), (4, 4, 7)]
+    result = json.loads((tmp_path / "o.json").read_text())
+    np.testing.assert_allclose(tables[0].values, [-1e3 * e for e in
+                                                  result["profiles"]["px_x"]["error"]], atol=1e-5)
+    code, _, err = run(capsys, *args)
+    assert code == 2 and "the file exists" in err
+    code, _, err = run(capsys, *args, "--force")
+    assert code == 0 and ".bak" in err

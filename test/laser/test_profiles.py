@@ -16,6 +16,7 @@ from selfcal_ros.laser.profiles import (
     squareness_rad,
     straightness,
     u_profile_m,
+    u_slope,
 )
 from selfcal_ros.simulation.laser import case_study_machine
 from test.support.laser import random_errors
@@ -95,6 +96,8 @@ def test_uncertainties_against_monte_carlo():
                        lambda d: squareness(d, line=Line.END_POINTS)),
                       (straightness(found, 1, 0).u, lambda d: straightness(d, 1, 0))):
         assert value == pytest.approx(np.std([of(d).value for d in drawn]), rel=0.05)
+    assert u_slope(found, 1, 1) == pytest.approx(np.std([slope(d, 1, 1) for d in drawn]), rel=0.05)
+    assert u_slope(drawn[0], 1, 1) is None
     profile = np.std([profile_m(d, 0, 1) for d in drawn], axis=0)
     np.testing.assert_allclose(u_profile_m(found, 0, 1), profile, rtol=0.05)
 
