@@ -45,6 +45,7 @@ class _Open:
     lines: list[int] = field(default_factory=list)
     counts: list[int] = field(default_factory=list)
     broken: bool = False
+    broken_head: bool = False
 
 
 class _Reader:
@@ -144,7 +145,7 @@ class _Reader:
                 self.findings.error(line, f"a {kind.start} line in the {self.open.kind} table of "
                                     f"line {self.open.heads[0][0]}",
                                     f"start every line of its head with {self.open.kind.start}")
-                self.open.broken = True
+                self.open.broken = self.open.broken_head = True
                 return
             self.open.heads.append((line, rest))
             return
@@ -189,6 +190,7 @@ class _Reader:
     def _close(self) -> None:
         table, self.open = self.open, None
         header = read_header(table.kind, table.heads, self.findings)
+        header.broken |= table.broken_head
         values = _numbers(table, self.findings) if not table.broken else None
         make = _table_1d if table.kind is Kind.ONE_D else _table_2d
         made = make(header, values, (table.lines, table.counts), self.findings)
@@ -262,22 +264,21 @@ def _rows_are_whole(columns: int, outputs: int, layout: tuple[list[int], list[in
     ends = np.cumsum(on_lines)
     if np.all(on_lines == width):
         return True
-    ragged = int(np.argmax(on_lines != width))
-    if 2 * np.count_nonzero(on_lines == width) <= len(on_lines):
-        # Rows are wrapped, or several share a line: then no line may straddle two rows.
-        begins = ends - on_lines
-        bad = (begins // width != (ends - 1) // width) & ((begins % width != 0)
-                                                          | (ends % width != 0))
-        if not bad.any() and ends[-1] % width == 0:
-            findings.tolerated(lines[0], "lines are not rows", "write one row a line")
-            return True
-        ragged = int(np.argmax(bad)) if bad.any() else len(lines) - 1
-        if not bad.any():
-            findings.error(lines[ragged], f"the last row has {ends[-1] % width} values; {want}",
-                           "complete the row or mend NumCols")
-            return False
-    findings.error(lines[ragged], f"{on_lines[ragged]} values on the line; {want}",
-                   "mend the line or NumCols")
+    # Rows may be wrapped, or several may share a line; but no line may straddle two rows.
+    begins = ends - on_lines
+    straddles = (begins // width != (ends - 1) // width) & ((begins % width != 0)
+                                                            | (ends % width != 0))
+    if not straddles.any() and ends[-1] % width == 0:
+        findings.tolerated(lines[0], "lines are not rows", "write one row a line")
+        return True
+    mostly_rows = 2 * np.count_nonzero(on_lines == width) >= len(on_lines)
+    if mostly_rows or straddles.any():
+        wrong = int(np.argmax(on_lines != width if mostly_rows else straddles))
+        findings.error(lines[wrong], f"{on_lines[wrong]} values on the line; {want}",
+                       "mend the line or NumCols")
+    else:
+        findings.error(lines[-1], f"the last row has {ends[-1] % width} values; {want}",
+                       "complete the row or mend NumCols")
     return False
 
 
