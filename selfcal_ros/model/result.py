@@ -2,6 +2,7 @@
 """The result of a calibration and its JSON form, schema ``selfcal.result/1``."""
 
 from dataclasses import asdict, dataclass, field, replace
+from numbers import Integral
 from typing import Any
 
 import numpy as np
@@ -195,7 +196,7 @@ def result_from_dict(data: object, where: str) -> CalibrationResult:
                          "give a RESULT.json that `selfcal solve` wrote")
     try:
         return _parse(data)
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
         reason = f"the key {error} is missing" if isinstance(error, KeyError) else str(error)
         raise InputError(where, f"damaged result ({reason})",
                          "write it anew with `selfcal solve`") from error
@@ -213,22 +214,34 @@ def _parse(data: dict) -> CalibrationResult:
         nonorthogonality=_number(emap["nonorthogonality"]),
         scale_difference=_number(emap["scale_difference"]),
         datum_theta=ThetaDatum(emap["datum_theta"]))
-    views = tuple(
-        ViewResult(v["name"], v["rotation"], v["translation_x"], v["translation_y"],
-                   **{key: _number(v["misalignment"][key]) for key in ("phi", "tx", "ty")},
-                   used=v["used"], rejected=v["rejected"]) for v in data["views"])
     seen = {**data["observability"]}
-    seen |= {key: tuple(seen.get(key, ())) for key in ("modes", "advice")}
+    seen |= {key: tuple(_of(str, mode) for mode in _of(list, seen.get(key, [])))
+             for key in ("modes", "advice")}
+    seen |= {key: _of(int, seen[key]) for key in ("rank", "unknowns", "deficiency")}
+    _of(bool, seen["identifiable"])
+    noise = {key: _of(int, value) if key.startswith("dof_") else _number(value)
+             for key, value in data["noise"].items()}
     return CalibrationResult(
-        data["plan_id"], error_map,
+        _of(str, data["plan_id"]), error_map,
         ArtifactMap(_array(amap["ax"], artifact.shape, "ax"),
                     _array(amap["ay"], artifact.shape, "ay"),
                     _array(amap["a_theta"], (artifact.angular_count,), "a_theta")),
-        views, Observability(**seen),
-        Noise(**{key: _number(value) for key, value in data["noise"].items()}),
-        data["rejected"], data["input"], tuple(data.get("warnings", ())),
-        data.get("method", "joint"), data.get("measurement_sense", "microscope_moves"),
+        tuple(map(_view, data["views"])), Observability(**seen), Noise(**noise),
+        {key: _of(int, value) for key, value in data["rejected"].items()},
+        {key: _of(str, value) for key, value in data["input"].items()},
+        tuple(_of(str, line) for line in _of(list, data.get("warnings", []))),
+        _of(str, data.get("method", "joint")),
+        _of(str, data.get("measurement_sense", "microscope_moves")),
         {key: value for key, value in data.items() if key not in _KNOWN})
+
+
+def _view(v: dict) -> ViewResult:
+    pose = [_number(v[key]) for key in ("rotation", "translation_x", "translation_y")]
+    if not np.isfinite(pose).all():
+        raise ValueError(f"the pose of view {v['name']!r} is not finite")
+    found = [_number(v["misalignment"][key]) for key in ("phi", "tx", "ty")]
+    return ViewResult(_of(str, v["name"]), *pose, *found, used=_of(int, v["used"]),
+                      rejected=_of(int, v["rejected"]))
 
 
 def _array(value: Any, shape: tuple[int, ...], name: str) -> np.ndarray:
@@ -239,4 +252,15 @@ def _array(value: Any, shape: tuple[int, ...], name: str) -> np.ndarray:
 
 
 def _number(value: float | None) -> float:
-    return float("nan") if value is None else value
+    if value is None:
+        return float("nan")
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise ValueError(f"{value!r} is not a number")
+    return value
+
+
+def _of(kind: type, value: Any) -> Any:
+    wanted = Integral if kind is int else kind
+    if not isinstance(value, wanted) or (kind is int and isinstance(value, bool)):
+        raise ValueError(f"{value!r} is not of type {kind.__name__}")
+    return value

@@ -19,7 +19,7 @@ from selfcal_ros.reporting.map_plot_style import RC, drawable
 from selfcal_ros.reporting.map_plot_theta import draw_theta
 from selfcal_ros.reporting.map_plot_xy import draw_error_map, draw_uncertainty_map
 from selfcal_ros.reporting.summary import state_sentence
-from selfcal_ros.reporting.summary_numbers import truth_figures
+from selfcal_ros.reporting.summary_numbers import truth_arrays
 
 DPI = 150
 
@@ -42,17 +42,18 @@ def save_map_plot(result: CalibrationResult, path: str | os.PathLike, *,
     InputError
         If `truth` does not fit the map, or the file cannot be written.
     """
-    if truth is not None:
-        truth_figures(result.error_map, truth)
+    truth = truth_arrays(result.error_map, truth)
     with rc_context(RC):
         figure = _whole_figure(result, truth)
         data = _render(figure, "png")
     write_bytes(path, data)
 
 
-def error_map_svg(result: CalibrationResult) -> bytes:
-    """Return the XY error vectors as SVG."""
-    return _single(lambda figure: draw_error_map(figure.add_subplot(), result.error_map))
+def error_map_svg(result: CalibrationResult, *,
+                  truth: Mapping[str, np.ndarray] | None = None) -> bytes:
+    """Return the XY error vectors as SVG, over the truth where it is given."""
+    return _single(lambda figure: draw_error_map(figure.add_subplot(), result.error_map,
+                                                 truth=truth))
 
 
 def uncertainty_map_svg(result: CalibrationResult) -> bytes:
@@ -60,11 +61,12 @@ def uncertainty_map_svg(result: CalibrationResult) -> bytes:
     return _single(lambda figure: draw_uncertainty_map(figure.add_subplot(), result.error_map))
 
 
-def theta_svg(result: CalibrationResult) -> bytes:
+def theta_svg(result: CalibrationResult, *,
+              truth: Mapping[str, np.ndarray] | None = None) -> bytes:
     """Return the polar angular error as SVG; the plate must have angular lines."""
     def draw(figure: Figure) -> None:
         axes = figure.add_subplot(projection="polar")
-        draw_theta(axes, result.error_map)
+        draw_theta(axes, result.error_map, truth=truth)
         _legend(axes)
     return _single(draw)
 

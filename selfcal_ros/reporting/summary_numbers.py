@@ -150,18 +150,17 @@ def truth_figures(emap: ErrorMap, truth: Mapping[str, np.ndarray]) -> TruthFigur
     InputError
         If an array is missing or of another shape.
     """
-    artifact = emap.artifact
-    true_g = np.stack([_truth_array(truth, key, artifact.shape) for key in ("gx", "gy")])
-    difference = np.stack([emap.gx, emap.gy]) - true_g
+    artifact, true = emap.artifact, truth_arrays(emap, truth)
+    difference = np.stack([emap.gx - true["gx"], emap.gy - true["gy"]])
     if np.isfinite(difference).all(axis=0).any():
         difference = remove_modes(difference, datum_modes(artifact, scale=True))
     difference[:, ~np.isfinite(difference).all(axis=0)] = np.nan
     longest, index = largest(np.hypot(*difference))
     xy = (longest, _site(emap, index), rms(difference),
           *_in_units(difference, np.stack([emap.u_gx, emap.u_gy])))
-    if not artifact.angular_count or truth.get("g_theta") is None:
+    if "g_theta" not in true:
         return TruthFigures(*xy)
-    theta = emap.g_theta - _truth_array(truth, "g_theta", (artifact.angular_count,))
+    theta = emap.g_theta - true["g_theta"]
     if np.isfinite(theta).any():
         theta = theta - theta[np.isfinite(theta)].mean()
     largest_theta, line = largest(theta)
@@ -175,6 +174,26 @@ def _in_units(difference: np.ndarray, u: np.ndarray) -> tuple[float, float, floa
     ratio = difference[usable] / u[usable]
     share = float(np.mean(np.abs(ratio) <= 2)) if ratio.size else NAN
     return rms(ratio), largest(ratio)[0], share
+
+
+def truth_arrays(emap: ErrorMap, truth: Mapping[str, np.ndarray] | None,
+                 ) -> dict[str, np.ndarray] | None:
+    """Return the truth as float arrays on the lattice of `emap`; None stays None.
+
+    `g_theta` is left out where the plate has no angular lines or the truth does not hold it.
+
+    Raises
+    ------
+    InputError
+        If an array is missing or of another shape.
+    """
+    if truth is None:
+        return None
+    shape = emap.artifact.shape
+    arrays = {key: _truth_array(truth, key, shape) for key in ("gx", "gy")}
+    if emap.artifact.angular_count and truth.get("g_theta") is not None:
+        arrays["g_theta"] = _truth_array(truth, "g_theta", (emap.artifact.angular_count,))
+    return arrays
 
 
 def _truth_array(truth: Mapping[str, np.ndarray], key: str, shape: tuple[int, ...]) -> np.ndarray:

@@ -1,0 +1,127 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Sections of a report for what a result carries beyond its fixed fields, and for conventions."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from selfcal_ros import __version__
+from selfcal_ros.model.error_map import ThetaDatum
+from selfcal_ros.model.result import SCHEMA, CalibrationResult
+from selfcal_ros.reporting.summary_format import ARCSEC, UM, UNKNOWN, printable, significant
+from selfcal_ros.reporting.summary_sections import Section
+
+MAX_ROWS = 200
+"""Longest table of a report; the rest is in the result file."""
+TITLES = {"budget": "Uncertainty budget (GUM)", "residuals": "Residuals of the fit",
+          "outliers": "Marks removed or weighted down", "validation": "Held-out validation",
+          "reference": "Reference length"}
+"""Known extras, in the order in which they are reported; others follow by name."""
+_UNITS = (("_m", "µm", UM), ("_rad", "arcsec", ARCSEC), ("_um", "µm", 1.0),
+          ("_arcsec", "arcsec", 1.0), ("_mm", "mm", 1.0), ("_s", "s", 1.0))
+_THETA_DATUM = {
+    ThetaDatum.XY_AXES: "xy_axes: the angular errors at 0°, 90°, 180° and 270° are tied to the "
+                        "slopes of the XY error along the four half axes (Hu eqs. 9, 27)",
+    ThetaDatum.ZERO_MEAN: "zero_mean: the angular errors add up to zero",
+}
+_SENSE = {"microscope_moves": "the microscope moves over a resting plate",
+          "plate_moves": "the plate rides on the stage under a fixed microscope"}
+
+
+def extra_sections(extra: Mapping[str, Any]) -> list[Section]:
+    """Return a section for every extra that is a set of numbers or a table.
+
+    Lengths named ``*_m`` are shown in µm and angles named ``*_rad`` in arcsec. Plain arrays
+    and deeper structures have no place on paper and stay in the result file.
+    """
+    names = [*(n for n in TITLES if n in extra), *sorted(n for n in extra if n not in TITLES)]
+    sections = [_extra_section(name, extra[name]) for name in names]
+    return [section for section in sections if section is not None]
+
+
+def _extra_section(name: str, value: Any) -> Section | None:
+    title = TITLES.get(name, _words(name).capitalize())
+    if isinstance(value, Mapping):
+        facts = tuple((_heading(key), _cell(key, item)) for key, item in value.items()
+                      if _is_plain(item))
+        tables = [item for item in value.values() if _is_table(item)]
+        if not facts and not tables:
+            return None
+        return Section(title, facts, *(_table(tables[0]) if tables else ((), ())))
+    if _is_table(value):
+        return Section(title, (), *_table(value))
+    if _is_plain(value) and value is not None:
+        return Section(title, ((_heading(name), _cell(name, value)),))
+    return None
+
+
+def _is_plain(value: Any) -> bool:
+    return value is None or isinstance(value, str | int | float)
+
+
+def _is_table(value: Any) -> bool:
+    return (isinstance(value, Sequence) and not isinstance(value, str) and len(value) > 0
+            and all(isinstance(row, Mapping) and row for row in value))
+
+
+def _table(rows: Sequence[Mapping[str, Any]]) -> tuple[tuple, tuple]:
+    """Return the rows with a header of all their plain keys, and a note if there are too many."""
+    keys = [k for k in dict.fromkeys(key for row in rows for key in row)
+            if all(_is_plain(row.get(k)) for row in rows)]
+    shown = rows[:MAX_ROWS]
+    table = (tuple(_heading(key) for key in keys),
+             *(tuple(_cell(key, row.get(key)) for key in keys) for row in shown))
+    more = len(rows) - len(shown)
+    return table, ((f"{more} more rows are in the result file",) if more else ())
+
+
+def _unit(key: str) -> tuple[str, str, float]:
+    return next(((suffix, unit, scale) for suffix, unit, scale in _UNITS
+                 if str(key).endswith(suffix)), ("", "", 1.0))
+
+
+def _words(key: str) -> str:
+    return printable(key).replace("_", " ").strip()
+
+
+def _heading(key: str) -> str:
+    suffix, unit, _ = _unit(key)
+    return _words(str(key).removesuffix(suffix)) + (f" in {unit}" if unit else "")
+
+
+def _cell(key: str, value: Any) -> str:
+    if value is None:
+        return UNKNOWN
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    scale = _unit(key)[2]
+    if isinstance(value, float) or (isinstance(value, int) and scale != 1.0):
+        return significant(value * scale)
+    return printable(value)
+
+
+def convention_section(result: CalibrationResult) -> Section:
+    """Return what the numbers mean: signs, datum, sense of measurement, coverage."""
+    facts = [
+        ("error", "G = indicated − true, stage frame; add +G to a command to reach its position"),
+        ("XY datum", "no translation, rotation or magnification over the field (Hu eq. 5), "
+                     "unless a reference length sets the scale"),
+        ("O and R", "Gx = O·y + R·x + Fx, Gy = O·x − R·y + Fy (Hu eq. 6)")]
+    if result.artifact.angular_count:
+        facts.append(("θ datum", _THETA_DATUM[result.error_map.datum_theta]))
+    facts += [("sense", _SENSE.get(result.sense, printable(result.sense))),
+              ("uncertainty", "u is the standard uncertainty (k=1), U = 2 u the expanded one "
+                              "(k=2, about 95 % for Gaussian noise)"),
+              ("misalignment", "φ is the turn of the plate about its centre, counter-clockwise, "
+                               "tx and ty its offset, beyond the nominal pose of the view")]
+    return Section("Conventions", tuple(facts))
+
+
+def provenance_section(result: CalibrationResult) -> Section:
+    """Return where the numbers come from: input and digest, method, software."""
+    source = result.input
+    facts = [(_words(key), printable(value)) for key, value in source.items() if value]
+    facts += [("method", {"joint": "joint least squares of all readings",
+                          "law": "Hu's closed-form law"}.get(result.method,
+                                                             printable(result.method))),
+              ("result schema", SCHEMA), ("software", f"selfcal_ros {__version__}")]
+    return Section("Provenance", tuple(facts))

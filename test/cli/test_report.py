@@ -1,0 +1,121 @@
+# SPDX-License-Identifier: Apache-2.0
+import copy
+import io
+import json
+import sys
+
+import numpy as np
+import pytest
+from matplotlib.image import imread
+
+from selfcal_ros.cli.main import main
+from selfcal_ros.errors import InputError
+from selfcal_ros.estimation.api import calibrate
+from selfcal_ros.files import write_json
+from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.result import result_from_dict, result_to_dict
+from selfcal_ros.reporting.summary import summary_text
+from selfcal_ros.simulation.truth import hu_plan, random_truth, simulate_measurements
+
+
+def calibrated(rng, sigma_m=2e-8, sigma_rad=2e-5):
+    """Return the JSON form of a real calibration and of its truth."""
+    artifact = Artifact(5, 0.01, 8)
+    plan = hu_plan(artifact, 3)
+    truth = random_truth(artifact, len(plan.views), rng)
+    result = calibrate(simulate_measurements(truth, plan, rng, sigma_m=sigma_m,
+                                             sigma_theta_rad=sigma_rad))
+    return result_to_dict(result), {"gx": truth.g[0].tolist(), "gy": truth.g[1].tolist(),
+                                    "g_theta": truth.g_theta.tolist()}
+
+
+@pytest.fixture
+def folder(tmp_path):
+    result, truth = calibrated(np.random.default_rng(4))
+    write_json(tmp_path / "result.json", result)
+    write_json(tmp_path / "truth.json", truth)
+    return tmp_path
+
+
+def test_report_lies_beside_the_result_by_default(folder, capsys):
+    assert main(["report", str(folder / "result.json")]) == 0
+    html = (folder / "result.html").read_text(encoding="utf-8")
+    assert html.startswith("<!DOCTYPE html>") and "Calibrated from 4 views" in html
+    assert capsys.readouterr().out == f"written: {folder / 'result.html'}\n"
+
+
+def test_report_picture_summary_and_truth(folder, capsys):
+    code = main(["report", str(folder / "result.json"), "-o", str(folder / "r.html"), "--plot",
+                 str(folder / "m.png"), "--truth", str(folder / "truth.json"), "--text"])
+    assert code == 0
+    out = capsys.readouterr().out
+    assert "Against the known truth" in out and f"written: {folder / 'm.png'}" in out
+    assert imread(folder / "m.png").shape[1] == 2160
+    assert "Against the known truth" in (folder / "r.html").read_text(encoding="utf-8")
+
+
+def test_summary_on_a_terminal_without_symbols(folder, monkeypatch):
+    stream = io.TextIOWrapper(io.BytesIO(), encoding="ascii", errors="strict")
+    monkeypatch.setattr(sys, "stdout", stream)
+    assert main(["report", str(folder / "result.json"), "--text"]) == 0
+    stream.flush()
+    assert b"tx um" in stream.buffer.getvalue()
+
+
+@pytest.mark.parametrize(("arguments", "message"), [
+    (["none.json"], "none.json: no such file; check the path"),
+    (["text.json"], "text.json:1:1: not JSON (Expecting value); give a file that `selfcal` wrote"),
+    (["list.json"], "list.json: not a result of schema selfcal.result/1; give a RESULT.json that "
+                    "`selfcal solve` wrote"),
+    (["result.json", "-o", "result.json"],
+     "result.json: would be written over; name another output file"),
+    (["result.json", "-o", "a.html", "--plot", "a.html"],
+     "a.html: would be written over; name another output file"),
+    (["result.json", "-o", "none/a.html"],
+     "none/a.html: cannot be written (No such file or directory); name a folder that exists and "
+     "that you may write"),
+    (["result.json", "--truth", "list.json"],
+     "list.json: not a mapping; give gx, gy (m) and g_theta (rad)"),
+    (["result.json", "--truth", "result.json"], "truth gx: missing; give gx, gy (m) and g_theta "
+                                                "(rad)"),
+])
+def test_unusable_input_is_one_line_and_code_2(folder, monkeypatch, capsys, arguments, message):
+    monkeypatch.chdir(folder)
+    (folder / "text.json").write_text("hello")
+    (folder / "list.json").write_text("[]")
+    before = (folder / "result.json").read_bytes()
+    assert main(["report", *arguments]) == 2
+    assert capsys.readouterr().err == f"selfcal report: {message}\n"
+    assert (folder / "result.json").read_bytes() == before
+    assert not list(folder.glob("*.html"))
+
+
+def paths(value, at=()):
+    """Yield the path of every key and of the first two items of every list."""
+    if isinstance(value, dict):
+        for key in value:
+            yield (*at, key)
+            yield from paths(value[key], (*at, key))
+    elif isinstance(value, list):
+        for index in range(min(len(value), 2)):
+            yield from paths(value[index], (*at, index))
+
+
+def test_no_damage_to_a_result_file_ends_in_a_traceback(folder):
+    """Every value replaced by others of wrong type: reported or tolerated, never a crash."""
+    whole = json.loads((folder / "result.json").read_text())
+    outcomes = {"refused": 0, "tolerated": 0}
+    for path in paths(whole):
+        for wrong in (None, "x", [], {}, -1, 1e400, True):
+            damaged = copy.deepcopy(whole)
+            holder = damaged
+            for step in path[:-1]:
+                holder = holder[step]
+            holder[path[-1]] = wrong
+            try:
+                summary_text(result_from_dict(damaged, "r.json"))
+                outcomes["tolerated"] += 1
+            except InputError as error:
+                assert "\n" not in str(error)
+                outcomes["refused"] += 1
+    assert min(outcomes.values()) > 50

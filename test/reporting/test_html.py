@@ -1,0 +1,148 @@
+# SPDX-License-Identifier: Apache-2.0
+import base64
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+
+from selfcal_ros import __version__
+from selfcal_ros.errors import InputError
+from selfcal_ros.model.result import Observability, result_from_dict, result_to_dict
+from selfcal_ros.reporting.html import report_html, save_report
+from selfcal_ros.reporting.html_extras import MAX_ROWS, convention_section, extra_sections
+from test.support.results import known_result
+
+VOID = {"meta", "img", "br"}
+
+
+class Checker(HTMLParser):
+    """Collects tags, addresses and text, and insists that elements nest."""
+
+    def __init__(self):
+        super().__init__()
+        self.open, self.addresses, self.text, self.tags = [], [], [], []
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append(tag)
+        self.addresses += [value for name, value in attrs if name in ("src", "href", "srcset")]
+        assert not any(name.startswith("on") for name, _ in attrs)
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        self.text.append(data)
+
+
+def parsed(html):
+    checker = Checker()
+    checker.feed(html)
+    checker.close()
+    assert checker.open == []
+    return checker
+
+
+def test_report_is_whole_and_needs_nothing_from_outside():
+    result, truth = known_result(5, 24)
+    html = report_html(result, truth=truth)
+    page = parsed(html)
+    assert len(page.addresses) == 3
+    assert all(a.startswith("data:image/svg+xml;base64,") for a in page.addresses)
+    assert not {"script", "link", "iframe", "object"} & set(page.tags)
+    assert "url(" not in html and "@import" not in html
+    assert "default-src 'none'" in html
+    for address in page.addresses:
+        svg = base64.b64decode(address.partition(",")[2]).decode()
+        targets = re.findall(r'href="([^"]*)"', svg)
+        assert all(target.startswith(("#", "data:")) for target in targets)
+
+
+def test_report_says_everything():
+    result, truth = known_result(5, 24)
+    text = " ".join(parsed(report_html(result, truth=truth)).text)
+    for expected in ("Stage calibration: plan hu", "Calibrated from 4 views", "shift_x",
+                     "Non-orthogonality".lower(), "scale difference", "no encoder sample",
+                     "Against the known truth", "xy_axes: the angular errors at 0°", "ab" * 32,
+                     f"selfcal_ros {__version__}", "joint least squares", "add +G to a command"):
+        assert expected in text, expected
+
+
+def test_text_from_files_is_escaped():
+    evil = '<script>alert("x")</script>'
+    result, _ = known_result(3, 0)
+    hostile = replace(
+        result, plan_id=evil, warnings=(evil,), rejected={evil: 1},
+        input={"file": evil, evil: evil}, method=evil, sense=evil,
+        extra={evil: evil, "budget": [{evil: evil}]},
+        views=(replace(result.views[0], name=evil),),
+        observability=Observability(1, 2, 1, False, (evil,), (evil,)))
+    page = parsed(report_html(hostile))
+    assert "script" not in page.tags
+    assert evil in "".join(page.text)
+
+
+def test_a_deficient_plan_is_marked_and_comes_first():
+    result, _ = known_result(3, 0)
+    seen = Observability(1, 3, 2, False, ("scale difference",), ("add a view turned by 90 deg",))
+    html = report_html(replace(result, observability=seen))
+    assert '<p class="verdict bad">Not a calibration: 2 modes' in html
+    assert html.index("advice: add a view turned by 90 deg") < html.index("<h2>Maps</h2>")
+    assert '<p class="verdict">Calibrated' in report_html(result)
+    assert '<p class="verdict bad">' in report_html(replace(result, warnings=("torn bag",)))
+
+
+def test_unknown_maps_and_plates_without_lines():
+    result, _ = known_result(3, 0)
+    nothing = np.full((3, 3), np.nan)
+    emap = replace(result.error_map, gx=nothing, gy=nothing, u_gx=nothing, u_gy=nothing,
+                   nonorthogonality=np.nan, scale_difference=np.nan)
+    page = parsed(report_html(replace(result, error_map=emap, views=())))
+    assert len(page.addresses) == 2
+    assert "not known" in " ".join(page.text)
+    assert "θ datum" not in page.text
+
+
+def test_budget_and_residuals_are_tabulated_with_units():
+    budget = [{"component": "reading noise", "u_xy_m": 1.7e-8, "dof": 220},
+              {"component": "reference", "u_xy_m": None, "active": True}]
+    sections = extra_sections({"residuals": {"largest_rad": 1e-6, "n": 968, "map": [[1.0]]},
+                               "budget": budget})
+    assert [s.title for s in sections] == ["Uncertainty budget (GUM)", "Residuals of the fit"]
+    assert sections[0].table == (("component", "u xy in µm", "dof", "active"),
+                                 ("reading noise", "0.0170", "220", "–"),
+                                 ("reference", "–", "–", "yes"))
+    assert sections[1].facts == (("largest in arcsec", "0.206"), ("n", "968"))
+
+
+def test_extras_of_other_forms_are_left_to_the_file():
+    assert extra_sections({"covariance": [[1.0]], "empty": {}, "none": None, "rows": []}) == []
+    assert extra_sections({"seed": 7})[0].facts == (("seed", "7"),)
+    views = [{"view": "a", "rms_m": 2e-8}]
+    nested = extra_sections({"validation": {"rms_m": 1e-8, "views": views}})
+    assert nested[0].facts == (("rms in µm", "0.0100"),)
+    assert nested[0].table == (("view", "rms in µm"), ("a", "0.0200"))
+    long = extra_sections({"outliers": [{"m": i} for i in range(MAX_ROWS + 5)]})[0]
+    assert len(long.table) == MAX_ROWS + 1 and long.notes == ("5 more rows are in the result file",)
+
+
+def test_conventions_follow_the_result():
+    result, _ = known_result(3, 8)
+    facts = dict(convention_section(replace(result, sense="plate_moves")).facts)
+    assert facts["sense"] == "the plate rides on the stage under a fixed microscope"
+    assert facts["error"].startswith("G = indicated − true")
+
+
+def test_report_is_repeatable_and_survives_the_json_form(tmp_path):
+    result, _ = known_result(3, 8)
+    again = result_from_dict(result_to_dict(result), "r.json")
+    save_report(result, tmp_path / "a.html")
+    assert (tmp_path / "a.html").read_text(encoding="utf-8") == report_html(again)
+
+
+def test_truth_of_another_lattice_is_refused():
+    with pytest.raises(InputError, match=r"^truth gx: has the shape \(3, 3\), the map"):
+        report_html(known_result(5, 0)[0], truth=known_result(3, 0)[1])
