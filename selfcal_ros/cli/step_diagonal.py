@@ -7,6 +7,12 @@ import math
 import sys
 
 from selfcal_ros.cli.cal_options import add_frame, frame_of
+from selfcal_ros.cli.step_diagonal_bag import (
+    add_bag_options,
+    is_bag,
+    joints_of,
+    measurement_from_bag,
+)
 from selfcal_ros.errors import ExitCode, InputError
 
 HELP = "identify linear, straightness and squareness errors from a laser step-diagonal measurement"
@@ -16,7 +22,7 @@ SEED = 1
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the verb."""
-    parser.add_argument("data", metavar="DATA.csv", nargs="?",
+    parser.add_argument("data", metavar="DATA.csv|BAG", nargs="?",
                         help="columns block, rx_pp, ry_pp, rx_np, ry_np [, ex_x, ey_y], mm; "
                              "several rows of a block are repeats; 3D: rx_ppp, ry_ppp, rz_ppp, "
                              "rx_npp, ... [, ez_z]")
@@ -45,6 +51,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--force", action="store_true",
                         help="replace an existing FILE.cal; the old one is kept with its date")
     add_frame(parser, theta=False)
+    add_bag_options(parser)
     parser.add_argument("-o", "--output", metavar="OUT.json",
                         help="write the result here; otherwise it is printed")
 
@@ -127,10 +134,14 @@ def _measurement(args: argparse.Namespace) -> tuple:
     from selfcal_ros.files import sha256_of
     from selfcal_ros.laser.table import Columns, dimension_of, read_table
 
-    dim = dimension_of(args.data)
-    steps = _steps(args, dim)
-    data, warnings = read_table(args.data, Columns(steps, _diagonals(args, dim),
-                                                   args.method == "new"))
+    if is_bag(args.data):
+        data, warnings = measurement_from_bag(args, _steps(args, len(joints_of(args))))
+        if args.diagonals is not None:
+            data = data.pick(_diagonals(args, data.dim))
+    else:
+        dim = dimension_of(args.data)
+        columns = Columns(_steps(args, dim), _diagonals(args, dim), args.method == "new")
+        data, warnings = read_table(args.data, columns)
     return data, warnings, {"file": args.data, "sha256": sha256_of(args.data)}
 
 

@@ -142,7 +142,17 @@ class StepDiagonal:
         return steps**2 / np.linalg.norm(steps)
 
     def pick(self, diagonals: Sequence[str]) -> "StepDiagonal":
-        """Return the same measurement with only some of its diagonals."""
+        """Return the same measurement with only some of its diagonals.
+
+        Raises
+        ------
+        InputError
+            If one of them was not measured.
+        """
+        for name in diagonals:
+            if name not in self.diagonals:
+                raise InputError("diagonals", f"{name} was not measured, only "
+                                 + ", ".join(self.diagonals), "choose one of these")
         index = [self.diagonals.index(name) for name in diagonals]
         return StepDiagonal(self.steps_m, tuple(diagonals), self.samples_m[:, index],
                             self.linear_m)

@@ -181,3 +181,50 @@ def test_the_corrections_are_written_as_tables(tmp_path, capsys):
     assert code == 2 and "the file exists" in err
     code, _, err = run(capsys, *args, "--force")
     assert code == 0 and ".bak" in err
+
+
+def recorded_bag(path, **options):
+    from selfcal_ros.simulation.laser import case_study_machine
+    from test.support.laser import recorded
+    from test.support.laser_bags import write_laser_bag
+
+    setups = {"pp": SetUp(mirror_rad=(5e-4,)), "np": SetUp(mirror_rad=(-5e-4,))}
+    return write_laser_bag(path, recorded(case_study_machine(), setups,
+                                          rng=np.random.default_rng(4)), **options)
+
+
+def test_a_bag_gives_the_same_as_the_table_of_its_blocks(tmp_path, capsys):
+    bag, table = recorded_bag(tmp_path / "bag"), tmp_path / "blocks.csv"
+    out, again = tmp_path / "a.json", tmp_path / "b.json"
+    code, _, err = run(capsys, bag, "--method", "new", "--laser-topic", "/cell/laser",
+                       "--position-topic", "/cell/axes", "--save-csv", table, "-o", out)
+    assert code == 0 and "complete runs: np 1, pp 1, x 1, y 1" in err
+    assert run(capsys, table, "--method", "new", "-o", again)[0] == 0
+    one, other = (json.loads(path.read_text()) for path in (out, again))
+    for key in ("ex_x", "ey_x", "ex_y", "ey_y", "squareness", "straightness_x", "straightness_y"):
+        np.testing.assert_allclose(one[key], other[key], atol=1e-7)
+    assert one["squareness"] == pytest.approx(-1.22e-3, abs=1e-8)
+    assert one["straightness_y"] == pytest.approx(0.11e-3, abs=1e-8)
+    assert len(one["input"]["sha256"]) == 64
+
+
+@pytest.mark.parametrize(("extra", "message"), [
+    ((), "--laser-topic: a bag needs it; name the topic"),
+    (("--laser-topic", "cell/laser"), "--position-topic: a bag needs it"),
+    (("--laser-topic", "a", "--position-topic", "b", "--joints", "x"), "--joints: 'x' is not two"),
+    (("--laser-topic", "a", "--position-topic", "b", "--settle", "nan"), "--settle: nan is not")])
+def test_bag_options_are_checked(tmp_path, capsys, extra, message):
+    (tmp_path / "b.mcap").write_bytes(b"")
+    code, _, err = run(capsys, tmp_path / "b.mcap", "--method", "new", *extra)
+    assert code == 2 and message in err and err.count("\n") == 1
+
+
+def test_a_diagonal_that_was_not_run_is_named(tmp_path, capsys):
+    bag = recorded_bag(tmp_path / "bag")
+    topics = ("--laser-topic", "cell/laser", "--position-topic", "cell/axes")
+    code, text, _ = run(capsys, bag, "--method", "new", *topics, "--diagonals", "np")
+    assert code == 0 and json.loads(text)["diagonals"] == ["np"]
+    code, _, err = run(capsys, bag, "--method", "new", *topics, "--diagonals", "ppp")
+    assert code == 2 and "'ppp' is unknown" in err
+    code, _, err = run(capsys, bag, "--method", "conventional", *topics, "--laser-sign", "-1")
+    assert code == 2 and "the sign is wrong" in err

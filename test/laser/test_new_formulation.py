@@ -182,16 +182,16 @@ def test_case_study_own_diagonal_alone_spoils_the_linear_errors_of_the_conventio
 def test_standard_uncertainties_match_the_scatter_of_simulated_measurements(noise):
     machine = case_study_machine()
     z, u = [], []
-    for seed in range(120):
+    for seed in range(70):
         data = simulate_step_diagonal(machine, Measurement({}, noise), np.random.default_rng(seed))
         found = identify_new(data)
         square = squareness(found)
         z.append((square.value + 1.22 * UM, found.errors_m[1, 2, 0] - machine.errors_m[1, 2, 0],
                   found.errors_m[0, 3, 1] - machine.errors_m[0, 3, 1]))
         u.append((square.u, found.u_errors_m[1, 2, 0], found.u_errors_m[0, 3, 1]))
-    # 120 draws: the rms has a relative standard error of 6.5 %; 3.5 of them, and the spread of u.
+    # 70 draws: the rms has a relative standard error of 8.5 %; 3.5 of them.
     ratio = np.sqrt(np.mean(np.square(z), axis=0) / np.mean(np.square(u), axis=0))
-    np.testing.assert_allclose(ratio, 1.0, atol=0.23)
+    np.testing.assert_allclose(ratio, 1.0, atol=0.3)
 
 
 def test_joint_use_of_both_diagonals_halves_the_variance():

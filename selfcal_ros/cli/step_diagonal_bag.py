@@ -1,0 +1,89 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The part of ``selfcal step-diagonal`` that takes the measurement from a bag."""
+
+import argparse
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from selfcal_ros.errors import InputError
+
+if TYPE_CHECKING:
+    from selfcal_ros.laser.data import StepDiagonal
+
+_UNITS_M = {"m": 1.0, "mm": 1e-3, "um": 1e-6, "nm": 1e-9}
+
+
+def add_bag_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of a bag."""
+    group = parser.add_argument_group(
+        "bag", "with an MCAP file or a rosbag2 folder in place of DATA.csv; the zig-zag is cut "
+        "into blocks at the rests of the axes")
+    group.add_argument("--laser-topic", metavar="TOPIC",
+                       help="laser distance: Float64, Float32, Range, or any type with "
+                            "--laser-field")
+    group.add_argument("--laser-field", metavar="FIELD", default="",
+                       help="field of the distance, or its joint in a JointState")
+    group.add_argument("--laser-unit", choices=tuple(_UNITS_M), default="m",
+                       help="unit of the distance (default m)")
+    group.add_argument("--laser-sign", type=int, choices=(1, -1), default=1,
+                       help="-1 if the distance shrinks along the diagonals (default 1)")
+    group.add_argument("--position-topic", metavar="TOPIC",
+                       help="axis positions: JointState, PointStamped or PoseStamped, m")
+    group.add_argument("--joints", metavar="LIST", default="x,y",
+                       help="joints of X, Y[, Z] (default x,y; three names mean 3D)")
+    group.add_argument("--rest-tolerance", type=float, default=2.0, metavar="UM",
+                       help="wandering of an axis at rest, um (default 2)")
+    group.add_argument("--min-rest", type=float, default=0.5, metavar="S",
+                       help="shortest rest, s (default 0.5)")
+    group.add_argument("--settle", type=float, default=0.1, metavar="S",
+                       help="left out at both ends of a rest, s (default 0.1)")
+    group.add_argument("--save-csv", metavar="FILE", help="write the blocks as a CSV table")
+
+
+def is_bag(path: str) -> bool:
+    """Return whether a path is a bag rather than a table."""
+    return Path(path).is_dir() or Path(path).suffix == ".mcap"
+
+
+def joints_of(args: argparse.Namespace) -> tuple[str, ...]:
+    """Return the joints named; two for face, three for body diagonals."""
+    joints = tuple(name.strip() for name in args.joints.split(","))
+    if len(joints) not in (2, 3) or len(set(joints)) < len(joints) or "" in joints:
+        raise InputError("--joints", f"'{args.joints}' is not two or three names",
+                         "write --joints x,y")
+    return joints
+
+
+def measurement_from_bag(args: argparse.Namespace,
+                         steps_m: tuple[float, ...]) -> tuple["StepDiagonal", list[str]]:
+    """Return the measurement in a bag, and warnings.
+
+    Raises
+    ------
+    InputError
+        If a topic is not named, an option is no sensible number, or the bag cannot be used.
+    """
+    from selfcal_ros.bagio.laser_series import SeriesTopics, read_series
+    from selfcal_ros.laser.table import write_table
+    from selfcal_ros.laser.zigzag import CutRule, cut_zigzag
+
+    for option, value in (("--laser-topic", args.laser_topic),
+                          ("--position-topic", args.position_topic)):
+        if not value:
+            raise InputError(option, "a bag needs it", "name the topic")
+    for option, value in (("--rest-tolerance", args.rest_tolerance), ("--min-rest", args.min_rest),
+                          ("--settle", args.settle)):
+        if not (math.isfinite(value) and value >= 0):
+            raise InputError(option, f"{value:g} is not a positive number", "give one")
+    topics = SeriesTopics(args.laser_topic, args.position_topic, joints_of(args),
+                          args.laser_field, _UNITS_M[args.laser_unit])
+    series, notes = read_series(Path(args.data), topics)
+    rule = CutRule(steps_m, args.rest_tolerance * 1e-6, args.min_rest, args.settle,
+                   laser_sign=args.laser_sign)
+    cut = cut_zigzag(series, rule)
+    if args.save_csv:
+        write_table(args.save_csv, cut.data, [f"blocks of {args.data}"])
+    runs = ", ".join(f"{name} {count}" for name, count in cut.runs.items())
+    return cut.data, [*notes, f"{args.data}: complete runs: {runs}",
+                      *(f"{args.data}: {note}" for note in cut.notes)]
