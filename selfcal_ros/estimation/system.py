@@ -64,11 +64,12 @@ class JointSystem:
 
     @cached_property
     def grid_scale(self) -> float:
-        """Size of the grid's misalignment matrix before the sites were eliminated.
+        """Size of the grid's misalignment matrix before plate and sites were eliminated.
 
         Ranks refer to it: what is left after the elimination may be nothing but rounding.
         """
-        return float(max(np.trace(self.grid.block), np.finfo(float).tiny))
+        trace = (self.grid.weight * (abs(self.grid.views.z) ** 2 + 2)).sum()
+        return float(max(trace, np.finfo(float).tiny))
 
     @cached_property
     def angular_scale(self) -> float:

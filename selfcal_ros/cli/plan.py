@@ -1,0 +1,198 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``selfcal plan``: judge a plan before anything moves, and suggest views."""
+
+import argparse
+import json
+import math
+
+HELP = "check a plan of views before it is measured, or suggest views"
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the sub-verbs ``check`` and ``suggest``."""
+    verbs = parser.add_subparsers(dest="plan_verb", metavar="check|suggest", required=True)
+    check = verbs.add_parser(
+        "check", help="rank, unseen modes, predicted uncertainty; exit 3 if deficient")
+    suggest = verbs.add_parser(
+        "suggest", help="rank the next views, or find the best plan for a number of views")
+    for sub in (check, suggest):
+        sub.add_argument("plan", metavar="PLAN.yaml")
+        sub.add_argument("--theta-datum", choices=("xy_axes", "zero_mean"), default="xy_axes",
+                         help="convention of the angular map (default xy_axes)")
+        sub.add_argument("--json", action="store_true", help="print JSON")
+    check.add_argument("--map", action="store_true",
+                       help="also print the predicted uncertainty at every site")
+    suggest.add_argument("--views", type=int, metavar="N",
+                         help="find the best plan of N views for the plan's plate")
+    suggest.add_argument("--criterion", choices=("rms", "max"), default="rms",
+                         help="which XY uncertainty is to become small (default rms)")
+    suggest.add_argument("--top", type=int, default=8, metavar="N",
+                         help="number of suggestions to show (default 8)")
+    suggest.add_argument("-o", "--output", metavar="PLAN.yaml",
+                         help="write the plan with the best suggestion")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the sub-verb and return its exit code."""
+    from selfcal_ros.files import read_yaml
+    from selfcal_ros.model.view import plan_from_dict
+
+    plan = plan_from_dict(read_yaml(args.plan), args.plan)
+    return _check(args, plan) if args.plan_verb == "check" else _suggest(args, plan)
+
+
+def _check(args: argparse.Namespace, plan) -> int:
+    from selfcal_ros.errors import ExitCode
+    from selfcal_ros.estimation.identifiability import check_plan, predict_plan
+    from selfcal_ros.model.error_map import ThetaDatum
+
+    found = check_plan(plan)
+    seen = found.observability
+    predicted = predict_plan(plan, ThetaDatum(args.theta_datum)) if seen.identifiable else None
+    if args.json:
+        print(json.dumps(_check_json(plan, seen, predicted, maps=args.map), indent=1))
+    else:
+        print("\n".join(_check_text(plan, seen, predicted, maps=args.map)))
+    return int(ExitCode.DONE if seen.identifiable else ExitCode.NOT_IDENTIFIABLE)
+
+
+def _check_json(plan, seen, predicted, *, maps: bool) -> dict:
+    from selfcal_ros.model.result import plain
+
+    out = {"plan_id": plan.plan_id, "rank": seen.rank, "unknowns": seen.unknowns,
+           "deficiency": seen.deficiency, "identifiable": seen.identifiable,
+           "modes": list(seen.modes), "advice": list(seen.advice), "predicted": None}
+    if predicted is not None:
+        out["predicted"] = plain({
+            "rms_gain_xy": predicted.rms_xy, "max_gain_xy": predicted.max_xy,
+            "rms_gain_theta": predicted.rms_theta, "note": predicted.note})
+        if maps:
+            out["predicted"] |= plain({"u_gx": predicted.ux, "u_gy": predicted.uy,
+                                       "u_g_theta": predicted.u_theta})
+    return out
+
+
+def _check_text(plan, seen, predicted, *, maps: bool) -> list[str]:
+    artifact = plan.artifact
+    lines = [f"plan {plan.plan_id}: {len(plan.views)} views of {artifact.shape[0]} x "
+             f"{artifact.shape[1]} marks, {artifact.angular_count} angular lines",
+             f"rank {seen.rank} of {seen.unknowns} unknowns, {seen.deficiency} unseen modes"]
+    if not seen.identifiable:
+        lines += ["the plan does not identify the stage; unseen are:"]
+        lines += [f"  - {text}" for text in seen.modes]
+        lines += ["it would, if you"] + [f"  - {text}" for text in seen.advice]
+        return lines
+    lines += ["the plan identifies the stage",
+              "predicted standard uncertainty, for unit noise of one averaged reading:",
+              f"  XY     rms {predicted.rms_xy:.4f}   largest {predicted.max_xy:.4f}"]
+    if len(predicted.u_theta):
+        lines.append(f"  theta  rms {predicted.rms_theta:.4f}")
+    lines += [f"  ({predicted.note})"] if predicted.note else []
+    if maps:
+        lines += ["sqrt(u_gx^2 + u_gy^2), one line for each y from the top, x to the right:"]
+        both = (predicted.ux**2 + predicted.uy**2) ** 0.5
+        lines += [" ".join(f"{value:5.2f}" for value in row) for row in both.T[::-1]]
+    return lines
+
+
+def _suggest(args: argparse.Namespace, plan) -> int:
+    from dataclasses import replace
+
+    from selfcal_ros.errors import ExitCode, InputError
+    from selfcal_ros.estimation.suggest import best_plan, rank_next
+    from selfcal_ros.model.error_map import ThetaDatum
+
+    if args.top < 1:
+        raise InputError("--top", f"{args.top} is not positive", "give 1 or more")
+    if args.views is not None:
+        angular = any(view.angular for view in plan.views) and plan.artifact.angular_count > 0
+        repeats = min(view.repeats for view in plan.views)
+        best, score, how = best_plan(plan.artifact, args.views, angular=angular,
+                                     criterion=args.criterion, repeats=repeats)
+        best = replace(best, plan_id=f"{plan.plan_id}_best{args.views}")
+        _show_best(args, best, score, how)
+    else:
+        now, ranked = rank_next(plan, criterion=args.criterion,
+                                datum=ThetaDatum(args.theta_datum))
+        best = _with(plan, ranked[0])
+        _show_ranked(args, plan, now, ranked[:args.top])
+    if args.output:
+        _write_plan(args.output, best)
+    return int(ExitCode.DONE)
+
+
+def _with(plan, suggestion):
+    from dataclasses import replace
+
+    views = list(plan.views)
+    if suggestion.repeat_of is None:
+        views.append(suggestion.view)
+    else:
+        views[suggestion.repeat_of] = suggestion.view
+    return replace(plan, views=tuple(views))
+
+
+def _show_ranked(args: argparse.Namespace, plan, now, ranked: list) -> None:
+    if args.json:
+        print(json.dumps({
+            "plan_id": plan.plan_id, "criterion": args.criterion, "now": _score_json(now),
+            "suggestions": [{"text": item.text, "view": view_to_dict(item.view, plan.artifact),
+                             "repeat_of": item.repeat_of, **_score_json(item.score)}
+                            for item in ranked]}, indent=1))
+        return
+    print(f"plan {plan.plan_id}: {_score_text(now)}")
+    print(f"next steps, the best first by {args.criterion} XY uncertainty:")
+    for item in ranked:
+        print(f"  {_score_text(item.score)}   {item.text}")
+
+
+def _show_best(args: argparse.Namespace, best, score, how: str) -> None:
+    views = [view_to_dict(view, best.artifact) for view in best.views]
+    if args.json:
+        print(json.dumps({"plan_id": best.plan_id, "criterion": args.criterion, "views": views,
+                          "how": how, **_score_json(score)}, indent=1))
+        return
+    print(f"best plan of {len(views)} views by {args.criterion} XY uncertainty ({how}):")
+    for view in views:
+        a, b = view["translation_pitch"]
+        kind = "" if view["grid"] else ", lines only"
+        print(f"  {view['name']}: turn {view['rotation_deg']:g} deg, shift [{a}, {b}]{kind}")
+    print(_score_text(score))
+
+
+def _score_json(score) -> dict:
+    def number(value: float) -> float | None:
+        return value if math.isfinite(value) else None
+
+    return {"deficiency": score.deficiency, "rms_gain_xy": number(score.rms_xy),
+            "max_gain_xy": number(score.max_xy), "rms_gain_theta": number(score.rms_theta)}
+
+
+def _score_text(score) -> str:
+    if score.deficiency:
+        return f"{score.deficiency} modes unseen"
+    theta = f"  theta rms {score.rms_theta:.3f}" if score.rms_theta else ""
+    return f"XY rms {score.rms_xy:.3f}  max {score.max_xy:.3f}{theta}"
+
+
+def view_to_dict(view, artifact) -> dict:
+    """Return a view in the form of a PLAN.yaml."""
+    a, b = view.lattice_pose(artifact).shift
+    return {"name": view.name, "rotation_deg": round(math.degrees(view.rotation_rad), 9),
+            "translation_pitch": [a, b], "grid": view.grid, "angular": view.angular,
+            "repeats": view.repeats}
+
+
+def _write_plan(path: str, plan) -> None:
+    import yaml
+
+    from selfcal_ros.files import write_text
+
+    artifact = plan.artifact
+    plate = {"grid_size": artifact.grid_size, "grid_pitch": artifact.grid_pitch_m,
+             "angular_count": artifact.angular_count}
+    if artifact.grid_size_y:
+        plate["grid_size_y"] = artifact.grid_size_y
+    write_text(path, yaml.safe_dump(
+        {"plan_id": plan.plan_id, "artifact": plate,
+         "views": [view_to_dict(view, artifact) for view in plan.views]}, sort_keys=False))
