@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from selfcal_ros.compensation.cal_keywords import SMALLEST
+from selfcal_ros.compensation.cal_keywords import LIMIT, SMALLEST
 from selfcal_ros.compensation.cal_model import Kind, Table, Table1D, Table2D, UnitWord
 from selfcal_ros.compensation.cal_text import Findings
 
@@ -44,6 +44,9 @@ def check_tables(tables: Sequence[Table], findings: Findings, *, gi4: Gi4 | None
 
 def check_table(table: Table, findings: Findings, *, gi4: Gi4 | None = None) -> None:
     """Add a finding for every rule that one table breaks."""
+    if not np.all(np.abs(table.values) <= LIMIT):
+        findings.error(table.line, "values that are not finite, or too large",
+                       f"stay within +-{LIMIT:g}")
     _axes(table, findings)
     if isinstance(table, Table1D):
         _table_1d(table, findings)

@@ -66,7 +66,8 @@ def test_strict_2d_file():
 def test_every_1d_keyword():
     head = (":START 1 REFERENCEAXIS=2 POSUNIT=SECONDARY/10 CORUNIT=COUNTS SAMPLEDIST=-5 "
             "OFFSET=-1.5 EXPANDCOEFF=1.1e-5 MATERIALTEMP=20.5 NEGPOS NEGCOR ROLLOVER=4000 "
-            'HOMEDIRECTION=CCW HOMEOFFSET=2 ABSOLUTEFEEDBACKOFFSET=77 FULLTRAVEL=300 SERIALNUMBER="A 1"')
+            'HOMEDIRECTION=CCW HOMEOFFSET=2 ABSOLUTEFEEDBACKOFFSET=77 FULLTRAVEL=300 '
+            'SERIALNUMBER="A 1"')
     (table,) = only_tolerated(f"{head}\n1\n2\n:END\n")
     assert table.reference_axis == 2 and table.pos_unit == Unit(UnitWord.SECONDARY, 10.0)
     assert table.cor_unit == Unit(UnitWord.COUNTS) and table.expand_coeff == 1.1e-5
