@@ -1,0 +1,35 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Collector, sequencer and solver of one cell: ros2 launch selfcal_ros calibrate.launch.py."""
+
+from pathlib import Path
+
+from ament_index_python.packages import get_package_share_directory
+from launch import LaunchDescription
+from launch.actions import DeclareLaunchArgument
+from launch.conditions import IfCondition
+from launch.substitutions import LaunchConfiguration
+from launch_ros.actions import Node
+
+
+def generate_launch_description() -> LaunchDescription:
+    share = Path(get_package_share_directory("selfcal_ros"))
+    argument = LaunchConfiguration
+
+    def node(name: str, *more: dict, **kwargs) -> Node:
+        return Node(package="selfcal_ros", executable=name, name=name, output="screen",
+                    namespace=argument("namespace"), parameters=[argument("params"), *more],
+                    **kwargs)
+
+    return LaunchDescription([
+        DeclareLaunchArgument("namespace", default_value="", description="namespace of the cell"),
+        DeclareLaunchArgument("params", default_value=str(share / "config/params/cell.yaml"),
+                              description="ROS parameter file for all nodes"),
+        DeclareLaunchArgument("plan", default_value=str(share / "config/plans/hu_repeated.yaml"),
+                              description="PLAN.yaml with plate and views"),
+        DeclareLaunchArgument("compensate", default_value="false",
+                              description="publish corrected joint states as well"),
+        node("measurement_collector"),
+        node("solver"),
+        node("pose_sequencer", {"plan": argument("plan")}),
+        node("compensator", condition=IfCondition(argument("compensate"))),
+    ])

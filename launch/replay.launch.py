@@ -1,0 +1,29 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A bag replayed into live nodes: ros2 launch selfcal_ros replay.launch.py bag:=FOLDER."""
+
+from pathlib import Path
+
+from ament_index_python.packages import get_package_share_directory
+from launch import LaunchDescription
+from launch.actions import DeclareLaunchArgument, IncludeLaunchDescription
+from launch.launch_description_sources import PythonLaunchDescriptionSource
+from launch.substitutions import LaunchConfiguration
+from launch_ros.actions import Node
+from launch_ros.parameter_descriptions import ParameterValue
+
+
+def generate_launch_description() -> LaunchDescription:
+    share = Path(get_package_share_directory("selfcal_ros"))
+    return LaunchDescription([
+        DeclareLaunchArgument("bag", description="MCAP file or rosbag2 folder"),
+        DeclareLaunchArgument("rate", default_value="1.0",
+                              description="speed; 0 = as fast as the nodes keep up"),
+        DeclareLaunchArgument("namespace", default_value="", description="namespace of the cell"),
+        IncludeLaunchDescription(
+            PythonLaunchDescriptionSource(str(share / "launch/calibrate.launch.py")),
+            launch_arguments={"namespace": LaunchConfiguration("namespace")}.items()),
+        Node(package="selfcal_ros", executable="bag_player", name="bag_player", output="screen",
+             namespace=LaunchConfiguration("namespace"),
+             parameters=[{"bag": LaunchConfiguration("bag"),
+                          "rate": ParameterValue(LaunchConfiguration("rate"), value_type=float)}]),
+    ])

@@ -1,0 +1,36 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`make demo`: replay a recorded bag through the live nodes and show the map that they find."""
+
+import sys
+from pathlib import Path
+
+from selfcal_ros.bagio.simulated import read_truth
+from selfcal_ros.cli.main import main as selfcal
+from selfcal_ros.files import read_json
+from selfcal_ros.model.result import result_from_dict
+from selfcal_ros.reporting.map_plot import save_map_plot
+
+ROOT = Path(__file__).parents[1]
+BAG = ROOT / "bags" / "hu_noise"
+FOLDER = ROOT / "build" / "demo"
+
+
+def main() -> int:
+    FOLDER.mkdir(parents=True, exist_ok=True)
+    output = FOLDER / "result.json"
+    print(f"Replaying {BAG.relative_to(ROOT)} over DDS through measurement_collector, "
+          "pose_sequencer and solver ...", flush=True)
+    code = selfcal(["replay", str(BAG), "--fast", "-o", str(output)])
+    if code:
+        return code
+    result = result_from_dict(read_json(output), str(output))
+    save_map_plot(result, FOLDER / "map.png", truth=read_truth(BAG))
+    selfcal(["report", str(output), "-o", str(FOLDER / "report.html")])
+    for name, what in (("result.json", "the result"), ("map.png", "picture of the map"),
+                       ("report.html", "report")):
+        print(f"{what:18} {(FOLDER / name).relative_to(ROOT)}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

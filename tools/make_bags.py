@@ -1,0 +1,93 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Make the recorded bags in bags/ and their manifest anew.
+
+hu_noise is recorded from the live topics of the simulated cell; the others are written directly.
+"""
+
+import shutil
+import subprocess
+import sys
+from contextlib import ExitStack
+from pathlib import Path
+
+import yaml
+
+from selfcal_ros.bagio.offline import bag_input, collect_bag
+from selfcal_ros.bagio.simulated import TRUTH_FILE, write_simulation
+from selfcal_ros.cli.replay import domain, process
+from selfcal_ros.collection.parameters import parameter_values
+from selfcal_ros.errors import NotIdentifiableError
+from selfcal_ros.estimation.api import calibrate
+from selfcal_ros.files import write_text
+from selfcal_ros.reporting.summary_numbers import summary_numbers
+from selfcal_ros.simulation.spec import read_simulation
+
+ROOT = Path(__file__).parents[1]
+BAGS = ROOT / "bags"
+WRITTEN = {"hu_exact": "hu_exact.yaml", "fig10_faults": "fig10_faults.yaml",
+           "deficient": "deficient.yaml"}
+RECORDED = "hu_noise"
+PARAMS = ROOT / "config" / "params" / "simulated_cell.yaml"
+PLAN = ROOT / "config" / "plans" / "hu_repeated.yaml"
+
+
+def record(bag: Path) -> None:
+    """Run the simulated cell, its collector and its sequencer live, and record them."""
+    truth = bag.parent / "truth.tmp"
+    params = ["--ros-args", "--params-file", str(PARAMS)]
+    with ExitStack() as stack:
+        environment = stack.enter_context(domain())
+
+        def start(node: str, *more: str, **kwargs):
+            return stack.enter_context(process(f"selfcal_ros.nodes.{node}", [*params, *more],
+                                               environment, **kwargs))
+
+        start("bag_recorder", "-p", f"bag:={bag}", "-p", "all_topics:=false")
+        start("stage_simulator", "-p", f"truth_path:={truth}")
+        start("measurement_collector")
+        sequencer = start("pose_sequencer", "-p", f"plan:={PLAN}", "-p", "settle_time:=3.0",
+                          stderr=subprocess.PIPE, text=True)
+        for line in sequencer.stderr:
+            print(line, end="", flush=True)
+            if "DONE" in line:
+                break
+    truth.replace(bag / TRUTH_FILE)
+
+
+def entry(name: str, made: str) -> dict:
+    """Return the manifest entry of a bag: digest, how it was made, what it must give."""
+    measurements, _, lost = collect_bag(BAGS / name, parameter_values(
+        "measurement_collector", {}, "defaults"))
+    expected: dict = {"rejected": measurements.all_rejected(), "lost": lost}
+    try:
+        result = calibrate(measurements)
+        numbers = summary_numbers(result)
+        expected |= {"identifiable": True, "max_error_um": round(numbers.max_error_um, 4),
+                     "nonorthogonality_urad": round(result.error_map.nonorthogonality * 1e6, 4),
+                     "scale_difference_ppm": round(result.error_map.scale_difference * 1e6, 4)}
+    except NotIdentifiableError as error:
+        expected |= {"identifiable": False, "deficiency": error.observability.deficiency}
+    return {"sha256": bag_input(BAGS / name)["sha256"], "made": made, "truth": f"{name}/truth.json",
+            "expected": expected}
+
+
+def main() -> None:
+    names = sys.argv[1:] or [RECORDED, *WRITTEN]
+    for name in names:
+        shutil.rmtree(BAGS / name, ignore_errors=True)
+        if name == RECORDED:
+            record(BAGS / name)
+        else:
+            write_simulation(read_simulation(ROOT / "config" / "simulations" / WRITTEN[name]),
+                             BAGS / name)
+    manifest = {RECORDED: entry(RECORDED, "recorded live by bag_recorder from stage_simulator, "
+                                "config/params/simulated_cell.yaml (seed 2020) and "
+                                "config/plans/hu_repeated.yaml; tools/make_bags.py")}
+    for name, file in WRITTEN.items():
+        manifest[name] = entry(name, f"selfcal simulate config/simulations/{file}")
+    write_text(BAGS / "manifest.yaml", "# Recorded bags: digest of the MCAP files, origin, and "
+               "what they must give.\n" + yaml.safe_dump(manifest, sort_keys=False))
+
+
+if __name__ == "__main__":
+    main()
