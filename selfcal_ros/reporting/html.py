@@ -99,7 +99,7 @@ def _pictures(result: CalibrationResult, truth: Mapping[str, np.ndarray] | None)
         f'<figure><img alt="{escape(caption)}" src="data:image/svg+xml;base64,'
         f'{base64.b64encode(svg).decode()}"><figcaption>{escape(caption)}</figcaption></figure>'
         for caption, svg in figures)
-    return f'<section><h2>Maps</h2><div class="figures">\n{images}\n</div></section>'
+    return f'<section class="maps"><h2>Maps</h2><div class="figures">\n{images}\n</div></section>'
 
 
 def _section(section: Section, kind: str = "") -> str:

@@ -19,7 +19,7 @@ h2 { font-size: 1.1rem; margin: 1.8rem 0 .5rem; border-bottom: 1px solid var(--l
 table { border-collapse: collapse; font-variant-numeric: tabular-nums; }
 th, td { padding: .2rem .8rem .2rem 0; text-align: right; vertical-align: top; }
 thead th { border-bottom: 1px solid var(--line); color: var(--soft); font-weight: 600; }
-tbody tr + tr td { border-top: 1px solid var(--line); }
+table:not(.facts) tbody tr + tr td { border-top: 1px solid var(--line); }
 th:first-child, td:first-child, .facts td { text-align: left; }
 .facts th { color: var(--soft); font-weight: 400; text-align: left; white-space: nowrap; }
 .facts td { overflow-wrap: anywhere; }
@@ -30,6 +30,8 @@ figcaption { color: var(--soft); font-size: .9rem; }
 @media print { :root { color-scheme: light; --ink: #000000; --soft: #444444; --paper: #ffffff;
   --line: #bbbbbb; --card: #ffffff; --good: #00664b; --bad: #a83a00; }
   body { max-width: none; padding: 0; font-size: 10pt; }
-  section, figure, tr { break-inside: avoid; } h2 { break-after: avoid; }
-  figure { flex-basis: 45%; } @page { margin: 15mm; } }
+  figure, tr, section:not(.maps) { break-inside: avoid; } h2 { break-after: avoid; }
+  h2 { margin: 1rem 0 .3rem; } td, th { padding-bottom: .1rem; padding-top: .1rem; }
+  .figures { display: block; } figure { display: inline-block; width: 48%; margin-right: 1%; }
+  @page { margin: 15mm; } }
 """

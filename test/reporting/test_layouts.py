@@ -1,0 +1,72 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The shipped viewer layouts: well formed, and about topics and fields that exist."""
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+import yaml
+
+ROOT = Path(__file__).parents[2]
+FOXGLOVE = ROOT / "config" / "foxglove" / "selfcal.json"
+RVIZ = ROOT / "config" / "rviz" / "selfcal.rviz"
+TYPES = {"/stage/mark_detections": "MarkDetection", "/selfcal/view_command": "ViewCommand",
+         "/selfcal/view_status": "ViewStatus", "/selfcal/view_measurement": "ViewMeasurement",
+         "/selfcal/error_map": "ErrorMap", "/selfcal/summary": "CalibrationSummary"}
+
+
+def fields_of(topic):
+    """Return the fields of the message on a topic of the contract."""
+    if topic == "/stage/joint_states":
+        return {"header", "name", "position", "velocity", "effort"}
+    text = (ROOT / "msg_defs" / "msg" / f"{TYPES[topic]}.msg").read_text()
+    return set(re.findall(r"^[a-z]\S*\s+([a-z]\w*)\s*(?:#|$)", text, flags=re.MULTILINE))
+
+
+def leaves(node):
+    """Yield the panel names in a Foxglove layout tree."""
+    if isinstance(node, str):
+        yield node
+        return
+    assert node["direction"] in ("row", "column") and 0 < node["splitPercentage"] < 100
+    yield from leaves(node["first"])
+    yield from leaves(node["second"])
+
+
+@pytest.fixture
+def foxglove():
+    return json.loads(FOXGLOVE.read_text())
+
+
+def test_every_foxglove_panel_is_placed_once(foxglove):
+    placed = list(leaves(foxglove["layout"]))
+    assert sorted(placed) == sorted(foxglove["configById"])
+    assert all(re.fullmatch(r"(Plot|RawMessages|DiagnosticSummary)!\w+", name) for name in placed)
+
+
+def test_every_foxglove_path_names_a_field_of_the_contract(foxglove):
+    paths = [p["value"] for c in foxglove["configById"].values() for p in c.get("paths", [])]
+    assert len(paths) >= 10
+    for path in paths:
+        topic, field = re.fullmatch(r"(/[\w/]+)\.(\w+)(?:\[(?:\d+|:)\])?", path).groups()
+        assert field in fields_of(topic), path
+    raw = {c["topicPath"] for c in foxglove["configById"].values() if "topicPath" in c}
+    assert raw == {"/selfcal/summary", "/selfcal/view_command"} and raw <= set(TYPES)
+
+
+def test_rviz_layout_shows_the_stage_frame_from_above():
+    layout = yaml.safe_load(RVIZ.read_text())
+    manager = layout["Visualization Manager"]
+    assert manager["Global Options"]["Fixed Frame"] == "stage"
+    classes = [display["Class"] for display in manager["Displays"]]
+    assert classes == [f"rviz_default_plugins/{name}" for name in ("Grid", "Axes", "TF")]
+    assert manager["Views"]["Current"]["Class"] == "rviz_default_plugins/TopDownOrtho"
+    assert {panel["Class"] for panel in layout["Panels"]} >= {"rviz_common/Displays"}
+
+
+def test_rviz_grid_is_the_field_of_the_shipped_plan():
+    grid = yaml.safe_load(RVIZ.read_text())["Visualization Manager"]["Displays"][0]
+    plate = yaml.safe_load((ROOT / "config" / "plans" / "hu.yaml").read_text())["artifact"]
+    assert grid["Cell Size"] == plate["grid_pitch"]
+    assert grid["Plane Cell Count"] == plate["grid_size"] - 1
