@@ -164,18 +164,20 @@ class Closure:
 
     Attributes
     ----------
-    lengths_m : float or None
+    lengths_m, u_lengths_m : float or None
         rms of the measured diagonals minus what the linear errors make of it: zero for any
         squareness (parallelogram law); a misaligned laser or linear errors that are not those
         of the measurement show here. None without linear errors or with a missing diagonal.
-    between_m : float array (D, n, D) or None
+    between_m, u_between_m : float array (D, n, D) or None
         2D, new formulation: errors found from pp alone minus those from np alone.
     residual_rms_m : float or None
         rms residual of the least squares; None where nothing is redundant.
     """
 
     lengths_m: float | None = None
+    u_lengths_m: float | None = None
     between_m: np.ndarray | None = None
+    u_between_m: np.ndarray | None = None
     residual_rms_m: float | None = None
 
 

@@ -107,11 +107,13 @@ def _geometry(found: Identified, line: Line) -> dict[str, Any]:
 
 def _closure(found: Identified) -> dict[str, Any]:
     closure = found.closure
-    out = {key: None if value is None else value / MM for key, value in
-           (("lengths", closure.lengths_m), ("residual_rms", closure.residual_rms_m))}
-    if closure.between_m is not None:
-        out["ey_x_pp_minus_np"] = _mm(closure.between_m[0, :, 1])
-        out["ex_y_pp_minus_np"] = _mm(closure.between_m[1, :, 0])
+    out = {key: None if value is None else value / MM for key, value in (
+        ("lengths", closure.lengths_m), ("u_lengths", closure.u_lengths_m),
+        ("residual_rms", closure.residual_rms_m))}
+    for prefix, values in (("", closure.between_m), ("u_", closure.u_between_m)):
+        if values is not None:
+            out[f"{prefix}ey_x_pp_minus_np"] = _mm(values[0, :, 1])
+            out[f"{prefix}ex_y_pp_minus_np"] = _mm(values[1, :, 0])
     return out
 
 
@@ -147,7 +149,8 @@ def summary(result: dict[str, Any]) -> str:
     lines = [f"{result['method']} formulation, {result['n_blocks']} blocks, "
              f"{len(result['diagonals'])} diagonals, {result['n_repeats']} repeat(s)"]
     lines += [f"  {key:22s} {shown(key)}" for key in names]
-    lengths = result["closure"]["lengths"]
+    lengths, u = result["closure"]["lengths"], result["closure"]["u_lengths"]
     if lengths is not None:
-        lines.append(f"  {'closure of lengths':22s} {lengths * 1e3:+.4f} um")
+        lines.append(f"  {'closure of lengths':22s} {lengths * 1e3:+.4f} um"
+                     + ("" if u is None else f" (u = {u * 1e3:.4f})"))
     return "\n".join(lines)
