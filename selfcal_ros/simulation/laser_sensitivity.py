@@ -145,16 +145,27 @@ def effect_of(fault: Fault, size: float, machine: StepMachine, *, method: Method
 def sensitivity(machine: StepMachine, rng: np.random.Generator) -> list[dict]:
     """Return one row for each fault: its size and the effects on both formulations, m."""
     return [{"fault": fault.name, "size": fault.size, "unit": fault.unit,
-             **{str(method): vars(effect_of(fault, fault.size, machine, method=method, rng=rng))
-                for method in Method}} for fault in FAULTS]
+             **{method: vars(found) for method, found in
+                _both(fault, fault.size, machine, rng).items()}} for fault in FAULTS]
 
 
 def sweep(machine: StepMachine, rng: np.random.Generator) -> list[dict]:
     """Return the effects of the faults of laser and mirror over angles, for a plot."""
     chosen = [fault for fault in FAULTS if fault.unit == "rad" and fault.size == 1e-3]
-    return [{"fault": fault.name, "size": list(SWEEP), **{str(method): [
-        vars(effect_of(fault, size, machine, method=method, rng=rng)) for size in SWEEP]
-        for method in Method}} for fault in chosen]
+    return [{"fault": fault.name, "size": list(SWEEP), **_columns(
+        [_both(fault, size, machine, rng) for size in SWEEP])} for fault in chosen]
+
+
+def _both(fault: Fault, size: float, machine: StepMachine,
+          rng: np.random.Generator) -> dict[str, Effect]:
+    """Return the effect on each formulation, from the same draws."""
+    seed = int(rng.integers(2**63))
+    return {str(method): effect_of(fault, size, machine, method=method,
+                                   rng=np.random.default_rng(seed)) for method in Method}
+
+
+def _columns(effects: list[dict[str, Effect]]) -> dict[str, list[dict]]:
+    return {str(method): [vars(each[str(method)]) for each in effects] for method in Method}
 
 
 def sensitivity_text(rows: list[dict]) -> str:
