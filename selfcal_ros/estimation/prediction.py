@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from selfcal_ros.estimation.system import JointSystem
-from selfcal_ros.estimation.theta import conditions_for
+from selfcal_ros.estimation.theta import Conditions, conditions_for
 from selfcal_ros.estimation.uncertainty import FieldCovariance
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ThetaDatum
@@ -88,20 +88,36 @@ def theta_variance(system: JointSystem, artifact: Artifact, datum: ThetaDatum) -
     The rotations of the grid views count as known: the grid fixes them thousands of times better
     than the lines do. So do the slopes behind the datum ``xy_axes``.
     """
+    answer, inner, spread, conditions = _theta_parts(system, artifact, datum)
+    rows, gain = conditions.rows, conditions.gain
+    n = system.angular.n_lines
+    variance = np.einsum("ka,ab,kb->k", answer, inner, answer)
+    for start in range(0, n, BLOCK):
+        at = np.arange(start, min(start + BLOCK, n))
+        variance[at] += system.angular.solve(np.eye(n, len(at), -start))[at, at - start]
+    variance += np.einsum("kc,cd,kd->k", gain, rows @ spread, gain)
+    variance -= 2 * np.einsum("kc,kc->k", gain, spread)
+    return np.where(system.known_lines, np.maximum(variance, 0.0), np.nan)
+
+
+def theta_matrix(system: JointSystem, artifact: Artifact, datum: ThetaDatum) -> np.ndarray:
+    """Return the covariance (K, K) whose diagonal `theta_variance` gives."""
+    answer, inner, _, conditions = _theta_parts(system, artifact, datum)
+    n = system.angular.n_lines
+    raw = system.angular.solve(np.eye(n)) + answer @ inner @ answer.T
+    datum_map = np.eye(n) - conditions.gain @ conditions.rows
+    return datum_map @ raw @ datum_map.T
+
+
+def _theta_parts(system: JointSystem, artifact: Artifact, datum: ThetaDatum
+                 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, Conditions]:
+    """Return the lines' answer to free rotations, their covariance, and the datum's columns."""
     angular = system.angular
     half_width_m = artifact.grid_pitch_m * max(artifact.half)
     conditions = conditions_for(system, ThetaDatum(datum), Sense.MICROSCOPE_MOVES, half_width_m)
     free = [v for v, i in enumerate(system.angular_index) if i not in system.grid_index]
     inner = np.linalg.pinv(angular.schur[np.ix_(free, free)], hermitian=True)
-    response = angular.response[:, free]
-    rows, gain = conditions.rows, conditions.gain
-    spread = angular.solve(np.ascontiguousarray(rows.T)) + response @ inner @ (response.T @ rows.T)
-    variance = np.einsum("ka,ab,kb->k", response, inner, response)
-    for start in range(0, angular.n_lines, BLOCK):
-        at = np.arange(start, min(start + BLOCK, angular.n_lines))
-        unit = np.zeros((angular.n_lines, len(at)))
-        unit[at, at - start] = 1.0
-        variance[at] += angular.solve(unit)[at, at - start]
-    variance += np.einsum("kc,cd,kd->k", gain, rows @ spread, gain)
-    variance -= 2 * np.einsum("kc,kc->k", gain, spread)
-    return np.where(system.known_lines, np.maximum(variance, 0.0), np.nan)
+    answer = angular.response[:, free]
+    columns = np.ascontiguousarray(conditions.rows.T)
+    spread = angular.solve(columns) + answer @ inner @ (answer.T @ columns)
+    return answer, inner, spread, conditions

@@ -1,0 +1,102 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``selfcal diff``: two calibrations, or a calibration and a laser measurement, compared."""
+
+import argparse
+import json
+import math
+
+HELP = "compare two results after taking out the datum difference"
+
+UM, ARCSEC = 1e6, math.degrees(1) * 3600
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the verb."""
+    parser.add_argument("a", metavar="A.json", help="RESULT.json of `selfcal solve`")
+    parser.add_argument("b", metavar="B.json", help="another RESULT.json, or the OUT.json of "
+                        "`selfcal step-diagonal`: then squareness and scale are compared")
+    parser.add_argument("--keep-scale", action="store_true",
+                        help="leave magnification in: both maps have a reference length")
+    parser.add_argument("--json", action="store_true", help="print JSON")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Compare and print."""
+    from selfcal_ros.errors import ExitCode
+    from selfcal_ros.estimation.compare import compare, compare_with_laser
+    from selfcal_ros.files import read_json
+    from selfcal_ros.model.result import result_from_dict
+
+    first, second = read_json(args.a), read_json(args.b)
+    a = result_from_dict(first, args.a)
+    if isinstance(second, dict) and "ex_x" in second:
+        rows = compare_with_laser(a, second, args.b)
+        print(json.dumps(_laser_json(rows), indent=1) if args.json else _laser_text(rows))
+        return int(ExitCode.DONE)
+    found = compare(a, result_from_dict(second, args.b), keep_scale=args.keep_scale,
+                    names=(args.a, args.b))
+    print(json.dumps(_json(found), indent=1) if args.json else _text(found))
+    return int(ExitCode.DONE)
+
+
+def _json(found) -> dict:
+    from dataclasses import asdict
+
+    from selfcal_ros.model.result import plain
+
+    return plain({
+        "rms_um": found.rms_m * UM, "max_um": found.max_m * UM,
+        "rms_theta_arcsec": found.rms_theta_rad * ARCSEC,
+        "max_theta_arcsec": found.max_theta_rad * ARCSEC,
+        "datum_difference": {"translation_x": found.translation_m[0],
+                             "translation_y": found.translation_m[1],
+                             "rotation": found.rotation_rad, "scale": found.scale,
+                             "theta": found.theta_rad},
+        "nonorthogonality": found.nonorthogonality, "scale_difference": found.scale_difference,
+        "significance_xy": None if found.xy is None else asdict(found.xy),
+        "significance_theta": None if found.theta is None else asdict(found.theta),
+        "dx": found.dx, "dy": found.dy, "d_theta": found.d_theta})
+
+
+def _text(found) -> str:
+    tx, ty = found.translation_m
+    lines = ["B less A, datum difference taken out: translation "
+             f"({tx * UM:+.4g}, {ty * UM:+.4g}) um, rotation {found.rotation_rad * ARCSEC:+.4g} "
+             f"arcsec, scale {found.scale * 1e6:+.4g} ppm"
+             + ("" if math.isnan(found.theta_rad)
+                else f", theta {found.theta_rad * ARCSEC:+.4g} arcsec"),
+             f"XY     rms {found.rms_m * UM:.5f} um   largest {found.max_m * UM:.5f} um"
+             + _significance_text(found.xy),
+             f"       non-orthogonality {found.nonorthogonality * ARCSEC:+.4g} arcsec, scale "
+             f"difference {found.scale_difference * 1e6:+.4g} ppm"]
+    if not math.isnan(found.rms_theta_rad):
+        lines.append(f"theta  rms {found.rms_theta_rad * ARCSEC:.4f} arcsec   largest "
+                     f"{found.max_theta_rad * ARCSEC:.4f} arcsec" + _significance_text(found.theta))
+    return "\n".join(lines)
+
+
+def _significance_text(test) -> str:
+    if test is None:
+        return "   (no uncertainties to test against)"
+    verdict = "significant" if test.p < 1e-3 else "not significant"
+    doubt = "" if test.correlated else "; correlations between nodes not known"
+    return (f"   chi2/dof {test.chi2_ratio:.3f}, {test.dof:.0f} dof, p = {test.p:.2g}: "
+            f"{verdict}{doubt}")
+
+
+def _laser_json(rows) -> dict:
+    from selfcal_ros.model.result import plain
+
+    return plain({row.name: {"map": row.of_map, "laser": row.of_laser,
+                             "difference": row.difference, "u": row.u, "p": row.p}
+                  for row in rows})
+
+
+def _laser_text(rows) -> str:
+    lines = ["first-order parts, map and laser:"]
+    for row in rows:
+        test = "" if math.isnan(row.u) else f"  u {row.u * ARCSEC:.4g}, p = {row.p:.2g}"
+        lines.append(f"  {row.name.replace('_', ' ')}: {row.of_map * ARCSEC:+.4g} and "
+                     f"{row.of_laser * ARCSEC:+.4g} arcsec, difference "
+                     f"{row.difference * ARCSEC:+.4g}{test}")
+    return "\n".join(lines)

@@ -1,0 +1,83 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``selfcal diff``: files in, figures out, exit codes."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from selfcal_ros.cli.main import main
+from selfcal_ros.estimation.api import Options, calibrate
+from selfcal_ros.files import read_json, write_json
+from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.result import result_to_dict
+from selfcal_ros.simulation.truth import hu_plan, random_truth, simulate_measurements
+
+
+@pytest.fixture
+def files(tmp_path):
+    artifact = Artifact(5, 0.01, 8)
+    truth = random_truth(artifact, 4, np.random.default_rng(1))
+    out = []
+    for seed in (1, 2):
+        readings = simulate_measurements(truth, hu_plan(artifact), np.random.default_rng(seed),
+                                         sigma_m=2e-8, sigma_theta_rad=2e-5)
+        result = calibrate(readings, Options())
+        if seed == 2:
+            emap = result.error_map
+            result = replace(result, error_map=replace(emap, gx=emap.gx + 1e-6))
+        out.append(str(tmp_path / f"{seed}.json"))
+        write_json(out[-1], result_to_dict(result))
+    return out
+
+
+def test_two_results_as_text_and_as_json(files, capsys):
+    assert main(["diff", *files]) == 0
+    text = capsys.readouterr().out
+    assert "translation (+1, " in text and "not significant" in text and "theta  rms" in text
+    assert main(["diff", *files, "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["datum_difference"]["translation_x"] == pytest.approx(1e-6, rel=1e-6)
+    assert 0.005 < found["rms_um"] < found["max_um"] < 0.1
+    assert found["significance_xy"]["correlated"] is True
+    assert 1e-3 < found["significance_xy"]["p"] < 1 and len(found["dx"]) == 5
+
+
+def test_keep_scale(files, capsys):
+    assert main(["diff", *files, "--keep-scale"]) == 0
+    assert "scale +0 ppm" in capsys.readouterr().out
+
+
+def test_another_lattice_is_bad_input(files, tmp_path, capsys):
+    data = read_json(files[1])
+    data["artifact"]["grid_pitch"] = 0.02
+    other = tmp_path / "other.json"
+    write_json(other, data)
+    assert main(["diff", files[0], str(other)]) == 2
+    error = capsys.readouterr().err
+    assert "the lattices differ: pitches of 10 and 20 mm" in error
+    assert str(other) in error and len(error.splitlines()) == 1
+
+
+def test_result_against_the_laser(files, tmp_path, capsys):
+    laser = tmp_path / "laser.json"
+    write_json(laser, {"ex_x": [], "error_map_equivalent": {
+        "nonorthogonality": 1e-6, "u_nonorthogonality": 1e-7, "scale_difference": None,
+        "u_scale_difference": None}})
+    assert main(["diff", files[0], str(laser)]) == 0
+    assert "nonorthogonality: " in capsys.readouterr().out
+    assert main(["diff", files[0], str(laser), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["nonorthogonality"]["laser"] == 1e-6
+    assert found["nonorthogonality"]["difference"] == pytest.approx(
+        1e-6 - found["nonorthogonality"]["map"])
+
+
+def test_files_that_are_no_results(files, tmp_path, capsys):
+    bad = tmp_path / "bad.json"
+    bad.write_text("{}")
+    assert main(["diff", files[0], str(bad)]) == 2
+    assert "not a result of schema" in capsys.readouterr().err
+    assert main(["diff", str(tmp_path / "none.json"), files[0]]) == 2
+    assert "no such file" in capsys.readouterr().err
