@@ -76,6 +76,10 @@ def draw_error_map(axes: Axes, emap: ErrorMap, *, truth: Mapping[str, np.ndarray
     _draw_size(axes, emap.artifact, np.hypot(emap.gx, emap.gy), error_colours(),
                label="length of the error |G|")
     _draw_lattice(axes, emap.artifact, arrows)
+    if not emap.valid.any():
+        axes.set_title("XY error: not one site is known")
+        _finish(axes, emap.artifact)
+        return
     entries = [_entry("measured", color=INK, linewidth=1.5)]
     if truth is not None:
         truth_g = tuple(np.where(emap.valid, truth[key], np.nan) for key in ("gx", "gy"))

@@ -135,8 +135,9 @@ def _site(emap: ErrorMap, index: tuple[int, ...] | None) -> tuple[int, int] | No
 def truth_figures(emap: ErrorMap, truth: Mapping[str, np.ndarray]) -> TruthFigures:
     """Return how far `emap` lies from `truth`, after removing the datum difference.
 
-    Translation, rotation and magnification of the difference (Hu eq. 5) and the mean of the
-    angular difference belong to no view's readings and are removed by least squares.
+    Translation, rotation and magnification of the difference (Hu eq. 5) and a constant angle
+    are seen by no view and are removed by least squares. The angles are weighted by 1/u², so
+    that lines which the datum ties to the XY map (Hu eq. 9, small u) set the constant.
 
     Parameters
     ----------
@@ -161,11 +162,20 @@ def truth_figures(emap: ErrorMap, truth: Mapping[str, np.ndarray]) -> TruthFigur
     if "g_theta" not in true:
         return TruthFigures(*xy)
     theta = emap.g_theta - true["g_theta"]
-    if np.isfinite(theta).any():
-        theta = theta - theta[np.isfinite(theta)].mean()
+    theta = theta - _common(theta, emap.u_g_theta)
     largest_theta, line = largest(theta)
     return TruthFigures(*xy, largest_theta, line[0] if line else None, rms(theta),
                         *_in_units(theta, emap.u_g_theta))
+
+
+def _common(theta_rad: np.ndarray, u_rad: np.ndarray) -> float:
+    """Return the constant of an angular difference: its mean, weighted where u is known."""
+    known = np.isfinite(theta_rad)
+    weighted = known & np.isfinite(u_rad) & (u_rad > 0)
+    if weighted.any():
+        smallest = u_rad[weighted].min()
+        return float(np.average(theta_rad[weighted], weights=(smallest / u_rad[weighted]) ** 2))
+    return float(theta_rad[known].mean()) if known.any() else 0.0
 
 
 def _in_units(difference: np.ndarray, u: np.ndarray) -> tuple[float, float, float]:

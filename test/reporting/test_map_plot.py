@@ -141,3 +141,10 @@ def test_svg_needs_nothing_from_outside():
     svg = theta_svg(known_result(3, 8)[0]).decode()
     assert "<svg" in svg and "<script" not in svg and "@import" not in svg
     assert svg.startswith("<?xml")
+
+
+def test_a_map_without_one_known_site_says_so():
+    result, _ = known_result(3, 0)
+    nothing = np.full((3, 3), np.nan)
+    axes = drawn(replace(result, error_map=replace(result.error_map, gx=nothing)), draw_error_map)
+    assert axes.get_title() == "XY error: not one site is known" and arrows_in(axes) == []

@@ -10,8 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from selfcal_ros.errors import InputError
+from selfcal_ros.estimation.api import Options, calibrate
 from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.model.error_map import ErrorMap
+from selfcal_ros.model.error_map import ErrorMap, ThetaDatum
 from selfcal_ros.model.result import Noise, Observability, result_from_dict, result_to_dict
 from selfcal_ros.reporting.summary import (
     can_print_symbols,
@@ -22,6 +23,7 @@ from selfcal_ros.reporting.summary import (
 from selfcal_ros.reporting.summary_format import aligned, fixed_column, significant, to_ascii
 from selfcal_ros.reporting.summary_numbers import map_figures, truth_figures
 from selfcal_ros.reporting.summary_sections import noise_section, place_text, pose_text
+from selfcal_ros.simulation.truth import hu_plan, random_truth, simulate_measurements
 from test.support.results import known_result
 
 UNSEEN = Observability(5, 7, 2, False, ("non-orthogonality", "scale difference"),
@@ -220,6 +222,20 @@ def test_datum_difference_does_not_change_the_comparison(shift):
     after = truth_figures(result.error_map, moved)
     for name in ("largest_m", "rms_m", "rms_in_u", "largest_theta_rad", "rms_theta_rad"):
         assert getattr(after, name) == pytest.approx(getattr(before, name), rel=1e-6)
+
+
+@pytest.mark.parametrize("datum", list(ThetaDatum))
+def test_theta_of_a_real_calibration_lies_within_its_uncertainty_in_either_datum(datum):
+    """The lines that the datum fixes have a tiny u: a plain mean would put them many u off."""
+    artifact, rng = Artifact(5, 0.01, 72), np.random.default_rng(8)
+    plan = hu_plan(artifact, 4)
+    truth = random_truth(artifact, len(plan.views), rng)
+    found = calibrate(simulate_measurements(truth, plan, rng, sigma_m=2e-9, sigma_theta_rad=2e-5),
+                      Options(datum_theta=datum))
+    figures = truth_figures(found.error_map, {"gx": truth.g[0], "gy": truth.g[1],
+                                              "g_theta": truth.g_theta})
+    assert 0.7 < figures.rms_theta_in_u < 1.5 and figures.largest_theta_in_u < 5
+    assert 0.7 < figures.rms_in_u < 1.3
 
 
 def test_shear_is_not_taken_for_a_datum_difference():
