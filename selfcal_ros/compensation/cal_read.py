@@ -67,7 +67,9 @@ class _Reader:
             end = index
             while self.open is not None and end < len(lines) and _NUMERIC.fullmatch(lines[end]):
                 end += 1
-            if end > index:
+            if not lines[index]:
+                index += 1
+            elif end > index:
                 self._numbers(lines[index:end], index + 1)
                 index = end
             else:

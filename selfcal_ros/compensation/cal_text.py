@@ -108,7 +108,7 @@ def strip_comment(line: str) -> tuple[str, str, str]:
         at = match.start()
         if match.group() == '"':
             # A quote that is never closed does not hide the rest of the line.
-            quoted = not quoted and '"' in line[at + 1:]
+            quoted = not quoted and line.find('"', at + 1) >= 0
         elif not quoted:
             return line[:at], line[at], line[at + 1:]
     return line, "", ""

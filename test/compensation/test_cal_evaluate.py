@@ -3,7 +3,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import assume, given
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from selfcal_ros.compensation.cal_evaluate import AxisSetup, CalEvaluator, MachineSetup
@@ -64,6 +64,7 @@ def test_2d_tables_agree_with_the_slow_controller(table, axes, at):
     check([table], want, at, machine(axes))
 
 
+@settings(max_examples=20)
 @given(table=tables_2d(), axes=setups())
 def test_arrays_give_what_single_positions_give(table, axes):
     evaluator = CalEvaluator([table], machine(axes))

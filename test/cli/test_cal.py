@@ -1,0 +1,301 @@
+# SPDX-License-Identifier: Apache-2.0
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from selfcal_ros.cli.main import main
+from selfcal_ros.compensation.cal_read import load_cal
+from selfcal_ros.files import write_json
+from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.result import Observability, result_to_dict
+from test.support.maps import random_map, result_of
+
+MAP = random_map(Artifact(7, 0.01, 24), 11)
+CAL_1D = """\
+:START 1 POSUNIT=PRIMARY CORUNIT=PRIMARY/1000 SAMPLEDIST=10 EXPANDCOEFF=1e-5 MATERIALTEMP=20
+:START HOMEDIRECTION=CW HOMEOFFSET=0 FULLTRAVEL=100
+0
+4
+-6
+:END
+"""
+
+
+@pytest.fixture
+def run(tmp_path, capsys, monkeypatch):
+    """Run the command in a folder with RESULT.json; return code, stdout, stderr."""
+    monkeypatch.chdir(tmp_path)
+    write_json("r.json", result_to_dict(result_of(MAP)))
+
+    def call(*args):
+        try:
+            code = main(["cal", *args])
+        except SystemExit as bad:
+            code = bad.code
+        captured = capsys.readouterr()
+        return code, captured.out, captured.err
+
+    return call
+
+
+def one_line(err, *parts):
+    assert err.startswith("selfcal cal: ") and err.count("\n") == 1
+    assert all(part in err for part in parts)
+
+
+def test_export_check_eval_verify(run):
+    code, out, err = run("export", "r.json", "-o", "f.cal", "--x-axis", "1", "--y-axis", "2")
+    assert (code, out, err) == (0, "f.cal: 2D table for x and y\n", "")
+    code, out, _ = run("check", "f.cal", "--strict")
+    assert code == 0 and out.endswith("f.cal: 1 tables, 0 errors, 0 warnings, 0 tolerated\n")
+    code, out, _ = run("eval", "f.cal", "--position", "1=10", "--position", "2=-30")
+    bias = MAP.gx[3, 3], MAP.gy[3, 3]
+    got = json.loads(out)
+    assert code == 0 and list(got) == ["1", "2"]
+    assert got["1"] == pytest.approx((MAP.gx[4, 0] - bias[0]) * 1e3, abs=1.1e-8)
+    assert got["2"] == pytest.approx((MAP.gy[4, 0] - bias[1]) * 1e3, abs=1.1e-8)
+    code, out, _ = run("verify", "r.json", "f.cal", "--plot", "f.png")
+    assert code == 0 and "49 sites, rms, um" in out and "36 cell centres" in out
+    before, after = (float(word) for word in out.splitlines()[2].split()[-2:])
+    assert after < 1e-4 < 0.1 < before
+    with open("f.png", "rb") as file:
+        assert file.read(8) == b"\x89PNG\r\n\x1a\n"
+    found = json.loads(run("verify", "r.json", "f.cal", "--json")[1])
+    assert found["sites"]["before"]["max"] == pytest.approx(before * 1e-6, abs=1e-12)
+    assert found["sites"]["after"]["max"] < 1e-10 and found["between"]["points"] == 36
+
+
+@pytest.mark.parametrize("wiring", [
+    ["--home-x", "-30", "--home-y", "-30"], ["--reverse-x", "--unit", "um", "--home-y", "5e3"],
+    ["--reverse-y", "--unit", "m", "--x-axis", "5", "--y-axis", "4"]])
+def test_verify_takes_the_wiring_from_the_file(run, wiring):
+    assert run("export", "r.json", "-o", "f.cal", *wiring)[0] == 0
+    code, out, _ = run("verify", "r.json", "f.cal", "--json")
+    assert code == 0 and json.loads(out)["sites"]["after"]["max"] < 1e-10
+
+
+def test_verify_of_a_file_without_our_comments_takes_options(run):
+    run("export", "r.json", "-o", "f.cal", "--unit", "um", "--home-x", "1000")
+    with open("f.cal") as file:
+        bare = "".join(line for line in file if not line.startswith(";"))
+    with open("bare.cal", "w") as file:
+        file.write(bare)
+    code, out, _ = run("verify", "r.json", "bare.cal", "--unit", "um", "--home-x", "1000", "--json")
+    assert code == 0 and json.loads(out)["sites"]["after"]["max"] < 1e-10
+    wrong = json.loads(run("verify", "r.json", "bare.cal", "--unit", "um", "--json")[1])
+    assert wrong["sites"]["after"]["max"] > 1e-8
+
+
+def test_a_file_with_the_wrong_sign_is_refused_by_verify(run):
+    run("export", "r.json", "-o", "f.cal")
+    with open("f.cal") as file:
+        text = file.read()
+    with open("bad.cal", "w") as file:
+        file.write(text.replace(":START2D CORUNIT", ":START2D NEGCOR\n:START2D CORUNIT"))
+    code, out, err = run("verify", "r.json", "bad.cal")
+    assert code == 2 and "49 sites" in out
+    one_line(err, "bad.cal: the tables make the machine worse; check signs")
+
+
+def test_theta_goes_into_a_file_of_its_own(run):
+    code, out, err = run("export", "r.json", "-o", "f.cal", "--theta-axis", "3")
+    assert code == 0 and out.splitlines() == ["f.cal: 2D table for x and y",
+                                              "f_theta.cal: 1D table for theta"]
+    one_line(err, "--counts-per-unit 3=COUNTS makes it roll over")
+    (table,) = load_cal("f_theta.cal").tables
+    assert table.rollover is None and len(table.values) == 49
+    code, out, err = run("export", "r.json", "-o", "g.cal", "--theta-axis", "3", "--theta-output",
+                         "t.cal", "--counts-per-unit", "3=1000")
+    assert code == 0 and err == ""
+    (table,) = load_cal("t.cal").tables
+    assert table.rollover == 360_000 and len(table.values) == 25
+    code, out, _ = run("eval", "t.cal", "--position", "3=-345", "--counts-per-unit", "3=1000")
+    want = math.degrees(MAP.g_theta[1] - MAP.g_theta[0])
+    assert code == 0 and json.loads(out) == {"3": pytest.approx(want, abs=1e-8)}
+    code, out, _ = run("verify", "r.json", "t.cal")
+    assert code == 0 and "24 angular lines, rms, arcsec" in out
+    code, _, err = run("export", "r.json", "-o", "h.cal", "--theta-axis", "3", "--theta-output",
+                       "./h.cal")
+    assert code == 2
+    one_line(err, "a 1D and a 2D table cannot share a file")
+
+
+def test_existing_files_stay_and_are_kept(run, tmp_path):
+    (tmp_path / "f_theta.cal").write_text("old")
+    code, _, err = run("export", "r.json", "-o", "f.cal", "--theta-axis", "3")
+    assert code == 2 and not (tmp_path / "f.cal").exists()
+    one_line(err, "f_theta.cal: the file exists")
+    code, out, _ = run("export", "r.json", "-o", "f.cal", "--theta-axis", "3", "--force")
+    (backup,) = tmp_path.glob("f_theta.cal.*.bak")
+    assert code == 0 and backup.read_text() == "old" and f"the old file is {backup.name}" in out
+
+
+def test_results_that_cannot_be_exported(run):
+    holes = random_map(Artifact(7, 0.01, 24), 11, unknown=[(0, 0), (3, 2)])
+    write_json("holes.json", result_to_dict(result_of(holes)))
+    code, _, err = run("export", "holes.json", "-o", "f.cal")
+    assert code == 2
+    one_line(err, "2 sites are unknown, and a table has no holes")
+    code, _, err = run("export", "holes.json", "-o", "f.cal", "--fill")
+    assert code == 0
+    one_line(err, "2 unknown sites filled")
+    assert any("2 sites were not measured" in c for c in load_cal("f.cal").comments)
+    unseen = replace(result_of(MAP), observability=Observability(1, 2, 1, False))
+    write_json("unseen.json", result_to_dict(unseen))
+    code, _, err = run("export", "unseen.json", "-o", "g.cal")
+    assert code == 3
+    one_line(err, "does not identify the stage")
+
+
+@pytest.mark.parametrize(("args", "message"), [
+    (["--x-axis", "0"], "--x-axis: 0 is not in 1..32"),
+    (["--x-axis", "2"], "the indices [2, 2] are not distinct"),
+    (["--home-x", "nan"], "--home-x: nan is not a position"),
+    (["--theta-axis", "3", "--counts-per-unit", "3=0"], "'0' is not a positive number"),
+    (["--theta-axis", "3", "--counts-per-unit", "1000"], "'1000' is not AXIS=VALUE")])
+def test_options_of_export_without_sense(run, args, message):
+    code, _, err = run("export", "r.json", "-o", "f.cal", *args)
+    assert code == 2
+    one_line(err, message)
+
+
+def test_check_prints_findings_and_exits_2_for_errors(run, tmp_path):
+    (tmp_path / "f.cal").write_text(CAL_1D.replace(":START 1", ":Start 0").replace("4", "4,0"))
+    code, out, err = run("check", "f.cal")
+    assert code == 2
+    assert out.splitlines()[0].startswith("f.cal:1: tolerated: a token in mixed case; write")
+    assert "f.cal:4: error: '4,0' is not a number; use a point as decimal mark" in out
+    one_line(err, "f.cal:4: '4,0' is not a number")
+    code, out, _ = run("check", "f.cal", "--json")
+    assert code == 2 and json.loads(out)["errors"] == 1
+
+
+def test_check_strict_refuses_what_is_tolerated(run, tmp_path):
+    (tmp_path / "f.cal").write_text(CAL_1D.replace(":START 1", ":Start 1"))
+    assert run("check", "f.cal")[0] == 0
+    code, _, err = run("check", "f.cal", "--strict")
+    assert code == 2
+    one_line(err, "f.cal:1: a token in mixed case")
+
+
+def test_check_gi4(run, tmp_path):
+    (tmp_path / "g.cal").write_text(":GALVO2D 2 1 1 2 1024 1024 65\n"
+                                    + ("0 " * 130 + "\n") * 65 + ":END\n")
+    assert run("check", "--gi4", "g.cal")[0] == 0
+    code, _, err = run("check", "g.cal", "--gi4", "--scanner-bits", "20")
+    assert code == 2
+    one_line(err, "needs 16384, 1/64 of its range")
+    assert run("check", "g.cal", "--gi4", "--scanner-bits", "99")[0] == 2
+
+
+@pytest.mark.parametrize(("args", "want"), [
+    (["1=10"], 4e-3), (["1=5"], 2e-3), (["1=99"], -6e-3),
+    (["1=10", "--temperature", "25"], 4e-3 - 10 * 1e-5 * 5),
+    (["1=110", "--home-direction", "1=CCW"], 4e-3 - 0.0),
+    (["1=7", "--home-offset", "1=3"], 4e-3 - 1.2e-3)])
+def test_eval_options(run, tmp_path, args, want):
+    (tmp_path / "f.cal").write_text(CAL_1D)
+    code, out, err = run("eval", "f.cal", "--position", *args)
+    assert (code, err) == (0, "") and json.loads(out) == {"1": pytest.approx(want, abs=1e-12)}
+
+
+def test_eval_counts(run, tmp_path):
+    (tmp_path / "f.cal").write_text(":START 2 SAMPLEDIST=100 REFERENCEAXIS=1 "
+                                    "ABSOLUTEFEEDBACKOFFSET=0\n0\n10\n:END\n")
+    code, _, err = run("eval", "f.cal", "--position", "1=1")
+    assert code == 2
+    one_line(err, "axis 1: POSUNIT of the table of line 1 is in counts")
+    counts = ["--counts-per-unit", "1=50", "--counts-per-unit", "2=1000"]
+    assert json.loads(run("eval", "f.cal", "--position", "1=1", *counts)[1]) == {"2": 0.005}
+    moved = [*counts, "--absolute-feedback-offset", "1=-100"]
+    assert json.loads(run("eval", "f.cal", "--position", "1=-1", *moved)[1]) == {
+        "2": pytest.approx(-0.005)}
+
+
+@pytest.mark.parametrize(("args", "message"), [
+    ([], "--position: no position is given"),
+    (["--position", "2=1"], "axis 1: its position is needed"),
+    (["--position", "1"], "'1' is not AXIS=VALUE"),
+    (["--position", "33=1"], "'33=1' is not AXIS=VALUE"),
+    (["--position", "1=x"], "'x' is not a number"),
+    (["--position", "1=inf"], "'inf' is not a number"),
+    (["--position", "1=1", "--position", "1=2"], "axis 1 is given twice"),
+    (["--position", "1=1", "--home-direction", "1=UP"], "'UP' is not a home direction"),
+    (["--position", "1=1", "--temperature", "nan"], "is no temperature")])
+def test_eval_without_sense(run, tmp_path, args, message):
+    (tmp_path / "f.cal").write_text(CAL_1D)
+    code, out, err = run("eval", "f.cal", *args)
+    assert (code, out) == (2, "")
+    one_line(err, message)
+
+
+def test_the_example_of_the_source(run):
+    code, out, _ = run("orthogonality", "--measured", "5um", "--over", "200mm", "--travel", "900mm")
+    rows = [line.split() for line in out.splitlines() if line.startswith("  ")]
+    assert code == 0 and "-22.5 um" in out
+    assert [row for row in rows if row[0] != "position"] == [
+        ["0", "0"], ["900", "-22.5"], ["-450", "0"], ["450", "-22.5"], ["-450", "11.25"],
+        ["450", "-11.25"]]
+    code, out, _ = run("orthogonality", "--measured=-5um", "--over", "200mm", "--travel", "900mm",
+                       "--home", "end", "--json", "--unit", "um")
+    assert json.loads(out)["tables"] == {"end": [[0.0, 0.0], [900000.0, 22.5]]}
+    square = ["orthogonality", "--measured", "5um", "--over", "200mm", "--travel", "900mm"]
+    assert run(*square, "--home", "middle", "-o", "o.cal")[0] == 0
+    (table,) = load_cal("o.cal").tables
+    assert (table.axis, table.reference, table.offset) == (2, 1, 450.0)
+    np.testing.assert_array_equal(table.values, [0, -22.5])
+    code, out, _ = run("eval", "o.cal", "--position", "1=450")
+    assert json.loads(out) == {"2": pytest.approx(-11.25e-3)}
+
+
+@pytest.mark.parametrize(("args", "message"), [
+    (["--measured", "5um"], "the measurement is not complete"),
+    (["--measured", "5", "--over", "1m", "--travel", "1m"], "'5' is not a length"),
+    (["--measured", "5um", "--over", "0m", "--travel", "1m"], "not a positive length"),
+    (["--measured", "5um", "--over", "1m", "--travel", "1m", "-o", "o.cal"], "take end, middle"),
+    (["--measured", "5um", "--over", "1m", "--travel", "1m", "--home-x", "1"], "take --home"),
+    (["r.json", "--over", "1m"], "exclude each other")])
+def test_orthogonality_without_sense(run, args, message):
+    code, _, err = run("orthogonality", *args)
+    assert code == 2
+    one_line(err, message)
+
+
+def test_lines_from_a_result_and_from_measured_errors(run, tmp_path):
+    assert run("orthogonality", "r.json", "-o", "o.cal", "--along", "y")[0] == 0
+    assert load_cal("o.cal").tables[0].reference == 2
+    code, out, _ = run("accuracy", "r.json", "--along", "y", "--y-axis", "7", "--home-y", "-30")
+    assert code == 0 and ":START 7\n" in out and ":START OFFSET=0\n" in out
+    values = [float(line) for line in out.splitlines() if line[0] not in ":;"]
+    np.testing.assert_allclose(values, MAP.gy[3] * 1e6, atol=0.6e-5)
+    code, out, _ = run("straightness", "r.json")
+    assert code == 0 and ":START 2\n:START REFERENCEAXIS=1\n" in out
+    (tmp_path / "d.csv").write_text("position,error\n0,0\n10,1\n20,3\n")
+    assert run("accuracy", "d.csv", "-o", "a.cal")[0] == 0
+    np.testing.assert_array_equal(load_cal("a.cal").tables[0].values, [0, -1, -3])
+    code, _, err = run("accuracy", "d.csv", "-o", "a.cal")
+    assert code == 2
+    one_line(err, "a.cal: the file exists")
+
+
+def test_bad_paths_and_bad_plots(run, tmp_path):
+    run("export", "r.json", "-o", "f.cal")
+    (tmp_path / "x.json").write_text("{}")
+    for args, message in ((["check", "none.cal"], "none.cal: no such file"),
+                          (["eval", ".", "--position", "1=0"], "cannot be read"),
+                          (["export", "x.json", "-o", "g.cal"], "not a result of schema"),
+                          (["export", "r.json", "-o", "no/g.cal"], "cannot be written"),
+                          (["verify", "r.json", "f.cal", "--plot", "f.gif"],
+                           "the format of a plot")):
+        code, _, err = run(*args)
+        assert code == 2
+        one_line(err, message)
+
+
+def test_help_of_every_sub_verb(run):
+    for name in ("check", "eval", "export", "verify", "orthogonality", "accuracy", "straightness"):
+        code, out, _ = run(name, "--help")
+        assert code == 0 and f"selfcal cal {name}" in out
