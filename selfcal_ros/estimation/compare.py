@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.stats import chi2, norm
+from scipy.stats import f as f_test
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.compare_covariance import first_order_u, theta_covariance, xy_covariance
@@ -14,6 +15,9 @@ from selfcal_ros.model.result import CalibrationResult
 
 PITCH_TOLERANCE = 1e-9
 """Largest relative difference of pitch between two maps of the same lattice."""
+
+MANY_DOF = 1e6
+"""Degrees of freedom from which a noise counts as known."""
 
 
 @dataclass(frozen=True)
@@ -129,7 +133,8 @@ def compare(a: CalibrationResult, b: CalibrationResult, *, keep_scale: bool = Fa
     rest = difference - np.tensordot(parts, modes, axes=1)
     d_theta = b.error_map.g_theta - a.error_map.g_theta
     constant = float(np.nanmean(d_theta)) if np.isfinite(d_theta).any() else float("nan")
-    xy = _significance(rest[:, known].ravel(), [xy_covariance(r, known) for r in (a, b)], basis)
+    xy = _significance(rest[:, known].ravel(), [xy_covariance(r, known) for r in (a, b)], basis,
+                       _noise_dof(a, b, "xy"))
     return MapDifference(
         rest[0], rest[1], d_theta - constant, (float(parts[0]), float(parts[1])), float(parts[2]),
         0.0 if keep_scale else float(parts[3]), constant,
@@ -157,18 +162,20 @@ def _theta_test(a: CalibrationResult, b: CalibrationResult,
         return None
     values = d_theta[known] - d_theta[known].mean()
     return _significance(values, [theta_covariance(r, known) for r in (a, b)],
-                         np.ones((int(known.sum()), 1)))
+                         np.ones((int(known.sum()), 1)), _noise_dof(a, b, "theta"))
 
 
 def _significance(values: np.ndarray, covariances: list[tuple[np.ndarray, bool]],
-                  removed: np.ndarray) -> Significance | None:
+                  removed: np.ndarray, noise_dof: float) -> Significance | None:
     """Test values from which the columns `removed` were taken out by least squares.
 
     The mean of the squares over their variances is compared with its own distribution,
-    approximated by a scaled chi^2 with the same mean and variance (Satterthwaite).
+    approximated by a scaled chi^2 with the same mean and variance (Satterthwaite), or F where
+    the noise itself is known from few residuals.
     """
-    total = sum(covariance for covariance, _ in covariances)
     correlated = all(flag for _, flag in covariances)
+    total = sum(covariance if correlated or covariance.ndim == 1 else np.diag(covariance)
+                for covariance, _ in covariances)
     if not np.isfinite(total).all() or not total.any():
         return None
     q = np.linalg.qr(removed)[0]
@@ -186,7 +193,22 @@ def _significance(values: np.ndarray, covariances: list[tuple[np.ndarray, bool]]
         scaled = total * np.sqrt(weights)[:, None] * np.sqrt(weights)
         twice_squares = 2 * float((scaled**2).sum())
     dof = 2 * float(good.sum()) ** 2 / twice_squares
-    return Significance(ratio, dof, float(chi2.sf(ratio * dof, dof)), correlated)
+    p = chi2.sf(ratio * dof, dof) if noise_dof > MANY_DOF else f_test.sf(ratio, dof, noise_dof)
+    return Significance(ratio, dof, float(p), correlated)
+
+
+def _noise_dof(a: CalibrationResult, b: CalibrationResult, kind: str) -> float:
+    """Return the effective degrees of freedom of the noise behind both uncertainties.
+
+    Welch and Satterthwaite; what the detections declare counts as known.
+    """
+    parts = []
+    for noise in (a.noise, b.noise):
+        sigma = getattr(noise, f"sigma_{kind}")
+        dofs = {getattr(noise, f"sigma_{kind}_{way}"): getattr(noise, f"dof_{kind}_{way}")
+                for way in ("repeats", "residuals")}
+        parts.append((sigma**2, dofs.get(sigma) or np.inf))
+    return sum(v for v, _ in parts)**2 / max(sum(v**2 / dof for v, dof in parts), 1e-300)
 
 
 @dataclass(frozen=True)
