@@ -45,7 +45,7 @@ if ! fresh wheels "$wheels"; then
   include=$("$venv/bin/python" -c 'import sysconfig; print(sysconfig.get_path("include"))')
   [ -f "$include/Python.h" ] || die "Python.h is missing; install the headers, e.g. 'apt install python3.12-dev'"
   step "installing the pinned wheels (about a minute)" "$venv/bin/python" -m pip install \
-    --disable-pip-version-check --no-deps --only-binary :all: -r tools/requirements.txt
+    --disable-pip-version-check --no-deps --only-binary :all: --no-binary empy -r tools/requirements.txt
   step "mending the wheels' CMake paths" "$venv/bin/python" tools/mend_wheels.py
   rm -f "$venv/.stamp-messages"
   stamp wheels "$wheels"
