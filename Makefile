@@ -13,7 +13,7 @@ demo: setup
 lint: setup
 	@$(BIN)/ruff check .
 test: lint
-	@$(BIN)/python -m pytest
+	@$(BIN)/python -m pytest -n 2 --dist worksteal
 bench: setup
 	@mkdir -p build
 	@$(BIN)/python test/bench/run.py

@@ -17,7 +17,7 @@ FOLDER = ROOT / "build" / "demo"
 
 def main() -> int:
     FOLDER.mkdir(parents=True, exist_ok=True)
-    output = FOLDER / "result.json"
+    output = (FOLDER / "result.json").relative_to(Path.cwd(), walk_up=True)
     print(f"Replaying {BAG.relative_to(ROOT)} over DDS through measurement_collector, "
           "pose_sequencer and solver ...", flush=True)
     code = selfcal(["replay", str(BAG), "--fast", "-o", str(output)])
@@ -25,7 +25,8 @@ def main() -> int:
         return code
     result = result_from_dict(read_json(output), str(output))
     save_map_plot(result, FOLDER / "map.png", truth=read_truth(BAG))
-    selfcal(["report", str(output), "-o", str(FOLDER / "report.html")])
+    selfcal(["report", str(output), "-o", str(FOLDER / "report.html"),
+             "--truth", str(BAG / "truth.json")])
     for name, what in (("result.json", "the result"), ("map.png", "picture of the map"),
                        ("report.html", "report")):
         print(f"{what:18} {(FOLDER / name).relative_to(ROOT)}")
