@@ -1,0 +1,171 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Hu's published simulation, run again with seeds, by his law and by joint least squares."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from selfcal_ros.estimation.api import Options, calibrate
+from selfcal_ros.estimation.law import hu_readings, hu_views, law_for
+from selfcal_ros.estimation.law_equations import HuReadings
+from selfcal_ros.estimation.prediction import predict
+from selfcal_ros.estimation.system import planned_system
+from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.error_map import ThetaDatum
+from selfcal_ros.model.readings import Measurements, Sense
+from selfcal_ros.simulation.truth import Truth, hu_plan, random_truth, simulate_measurements
+
+ARTIFACT = Artifact(11, 0.01, 24)
+"""Plate of Hu's section 4: 11 x 11 marks, 10 mm, lines every 15 deg."""
+
+
+@dataclass(frozen=True)
+class Published:
+    """One published table and the figures that belong to it; um and deg.
+
+    `table` rows are x, y, theta; columns max, min, std. The signs of the minima were lost in
+    print.
+    """
+
+    name: str
+    figures: tuple[str, str]
+    n_draws: tuple[int, int]
+    sigma_um: float
+    sigma_deg: float
+    table: tuple[tuple[float, float, float], ...]
+
+
+TABLES = (
+    Published("Table 1", ("Figure 6", "Figure 7"), (20, 20), 0.02, 0.001,
+              ((0.0541, -0.0490, 0.0195), (0.0511, -0.0506, 0.0196),
+               (1.5877e-3, -1.2065e-3, 7.1184e-4))),
+    Published("Table 2", ("Figure 8", "Figure 9"), (10, 20), 0.002, 0.0001,
+              ((0.0051, -0.0051, 0.0020), (0.0051, -0.0053, 0.0020),
+               (2.9963e-4, -6.9733e-4, 7.6657e-5))),
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Errors:
+    """Calibration errors of all draws: xy (draws, 2, N, N) in um, theta (draws, K) in deg."""
+
+    xy: np.ndarray
+    theta: np.ndarray
+
+    @property
+    def std(self) -> np.ndarray:
+        """Standard deviation of each draw's error map: x, y (um), theta (deg); (draws, 3)."""
+        xy = self.xy.reshape(len(self.xy), 2, -1).std(axis=2, ddof=1)
+        return np.column_stack([xy, self.theta.std(axis=1, ddof=1)])
+
+    @property
+    def first(self) -> np.ndarray:
+        """Return max, min, std of the first draw: rows x, y, theta, (3, 3)."""
+        parts = [*self.xy[0].reshape(2, -1), self.theta[0]]
+        return np.array([[part.max(), part.min(), part.std(ddof=1)] for part in parts])
+
+
+@dataclass(frozen=True, eq=False)
+class HuRun:
+    """All draws at one noise: by the law and by joint least squares, and the bound."""
+
+    published: Published
+    law: Errors
+    joint: Errors
+    bound: tuple[float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class HuReproduction:
+    """The whole simulation: the truth that was drawn, the noise-free error, both tables."""
+
+    truth: Truth
+    noise_free_um: float
+    noise_free_deg: float
+    runs: tuple[HuRun, ...]
+
+
+def reproduce_hu(n_draws: int, seed: int) -> HuReproduction:
+    """Run Hu's simulation: one truth, `n_draws` draws of noise at each of his two levels."""
+    rng = np.random.default_rng(seed)
+    truth = random_truth(ARTIFACT, 4, rng)
+    exact = _law_errors(truth, [simulate_measurements(truth, hu_plan(ARTIFACT), rng)])
+    runs = tuple(_run(truth, table, rng, n_draws) for table in TABLES)
+    return HuReproduction(truth, float(abs(exact.xy).max()), float(abs(exact.theta).max()), runs)
+
+
+def _run(truth: Truth, table: Published, rng: np.random.Generator, n_draws: int) -> HuRun:
+    plan = hu_plan(ARTIFACT)
+    draws = [simulate_measurements(truth, plan, rng, sigma_m=table.sigma_um * 1e-6,
+                                   sigma_theta_rad=np.deg2rad(table.sigma_deg))
+             for _ in range(n_draws)]
+    gain = predict(planned_system(ARTIFACT, plan.views), ARTIFACT, ThetaDatum.XY_AXES)
+    bound = gain.rms_xy * table.sigma_um, gain.rms_theta * table.sigma_deg
+    return HuRun(table, _law_errors(truth, draws), _joint_errors(truth, draws), bound)
+
+
+def _law_errors(truth: Truth, draws: list[Measurements]) -> Errors:
+    law = law_for(ARTIFACT, ThetaDatum.XY_AXES, Sense.MICROSCOPE_MOVES)
+    each = [hu_readings(ARTIFACT, hu_views(readings)) for readings in draws]
+    found = law.solve(HuReadings(*(np.concatenate([getattr(one, name) for one in each], axis=-1)
+                                   for name in ("v0", "v1", "v3", "vt"))))
+    xy = np.moveaxis(found.g, -1, 0) - truth.g
+    return Errors(xy * 1e6, np.rad2deg(found.g_theta.T - truth.g_theta))
+
+
+def _joint_errors(truth: Truth, draws: list[Measurements]) -> Errors:
+    maps = [calibrate(readings, Options(uncertainty=False)).error_map for readings in draws]
+    xy = np.array([[m.gx - truth.g[0], m.gy - truth.g[1]] for m in maps])
+    theta = np.array([m.g_theta - truth.g_theta for m in maps])
+    return Errors(xy * 1e6, np.rad2deg(theta))
+
+
+def hu_text(found: HuReproduction) -> str:
+    """Return Tables 1 and 2 and the series of Figures 6 to 9, side by side with the paper."""
+    n = len(found.runs[0].law.xy)
+    lines = ["Hu, Zhu, Liu: self-calibration of XY-theta stages, section 4",
+             "N = 11, 10 mm, K = 24; law = the published steps, joint = least squares of all "
+             "readings at once",
+             f"without noise the law errs by {found.noise_free_um:.1e} um, "
+             f"{found.noise_free_deg:.1e} deg",
+             "bound = smallest rms error of any unbiased method; std leaves out the mean of a "
+             "map's error, so that it may lie below"]
+    for run in found.runs:
+        lines += ["", *_table_text(run, n), "", *_series_text(run)]
+    return "\n".join(lines)
+
+
+def _table_text(run: HuRun, n_draws: int) -> list[str]:
+    table = run.published
+    lines = [f"{table.name}: noise {table.sigma_um:g} um, {table.sigma_deg:g} deg",
+             f"{'':10}{'published':^33} {'law, first draw':^33} "
+             f"{f'std of {n_draws} draws, mean +- spread':^46}",
+             f"{'':10}{'max':>11}{'min':>11}{'std':>11} {'max':>11}{'min':>11}{'std':>11} "
+             f"{'law':>22}{'joint':>22}{'bound':>11}"]
+    names = ("EGx, um", "EGy, um", "EGth, deg")
+    bounds = (run.bound[0], run.bound[0], run.bound[1])
+    first = run.law.first
+    for row, name in enumerate(names):
+        cells = [f"{value:11.4g}" for value in (*table.table[row], *first[row])]
+        spreads = [f"{errors.std[:, row].mean():.4g} +- {_spread(errors.std[:, row]):.2g}"
+                   for errors in (run.law, run.joint)]
+        lines.append(f"{name:10}{''.join(cells[:3])} {''.join(cells[3:])} "
+                     f"{spreads[0]:>22}{spreads[1]:>22}{bounds[row]:11.4g}")
+    return lines
+
+
+def _spread(values: np.ndarray) -> float:
+    return float(values.std(ddof=1)) if len(values) > 1 else float("nan")
+
+
+def _series_text(run: HuRun) -> list[str]:
+    lines = []
+    for figure, n, columns in zip(run.published.figures, run.published.n_draws,
+                                  ((0, 1), (2,)), strict=True):
+        lines.append(f"{figure}: std of the law's error in {min(n, len(run.law.xy))} draws")
+        for column in columns:
+            name = ("x, um", "y, um", "theta, deg")[column]
+            values = " ".join(f"{value:.2e}" if column == 2 else f"{value:.4f}"
+                              for value in run.law.std[:n, column])
+            lines.append(f"  {name}: {values}")
+    return lines

@@ -1,0 +1,39 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``selfcal reproduce``: prints, saves plots, refuses nonsense."""
+
+import pytest
+
+from selfcal_ros.cli.main import main
+
+PNG = b"\x89PNG\r\n\x1a\n"
+
+
+@pytest.mark.parametrize(("paper", "figures", "word"), [
+    ("hu", ["4", "5", "6", "7", "8", "9"], "Table 2"), ("qiao", ["3", "4"], "ranks as printed")])
+def test_text_and_plots(paper, figures, word, tmp_path, capsys):
+    out = tmp_path / "new" / "folder"
+    assert main(["reproduce", paper, "--draws", "3", "--seed", "5", "--out", str(out)]) == 0
+    printed = capsys.readouterr().out
+    assert word in printed
+    assert (out / f"{paper}.txt").read_text() == printed.split("wrote ")[0]
+    names = [f"{paper}_figure_{number}.png" for number in figures]
+    assert sorted(path.name for path in out.glob("*.png")) == names
+    assert all((out / name).read_bytes().startswith(PNG) for name in names)
+
+
+def test_same_seed_same_bytes(tmp_path, capsys):
+    for name in ("a", "b"):
+        assert main(["reproduce", "hu", "--draws", "2", "--out", str(tmp_path / name)]) == 0
+    for path in (tmp_path / "a").iterdir():
+        assert path.read_bytes() == (tmp_path / "b" / path.name).read_bytes()
+    assert "wrote" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("arguments", "message"), [
+    (["--draws", "0"], "--draws: 0 is not positive; give 1 or more"),
+    (["--seed", "-1"], "--seed: -1 is negative"),
+    (["--out", "/proc/nothing"], "cannot be made"),
+])
+def test_bad_arguments(arguments, message, capsys):
+    assert main(["reproduce", "qiao", *arguments]) == 2
+    assert message in capsys.readouterr().err
