@@ -18,7 +18,10 @@ def share(folder: str) -> list[tuple[str, list[str]]]:
 setup(
     name=NAME,
     version="0.1.0",
-    packages=find_packages(include=[NAME, f"{NAME}.*"]),
+    # the message definitions go along, so that bags can be read and written without ROS
+    packages=[*find_packages(include=[NAME, f"{NAME}.*"]), f"{NAME}.msg_text"],
+    package_dir={f"{NAME}.msg_text": "msg_defs/msg"},
+    package_data={f"{NAME}.msg_text": ["*.msg"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),
@@ -26,9 +29,9 @@ setup(
         *share("config"),
     ],
     install_requires=["setuptools", "numpy>=1.26", "scipy>=1.11", "pyyaml", "mcap>=1.1",
-                      "rosbags>=0.10", "matplotlib>=3.6", "rich>=13"],
+                      "rosbags>=0.10", "matplotlib>=3.6", "rich>=13", "lz4", "zstandard"],
     python_requires=">=3.12",
-    zip_safe=True,
+    zip_safe=False,
     maintainer="selfcal_ros maintainers",
     maintainer_email="maintainers@selfcal-ros.example",
     description="Self-calibration of precision XY-theta stages in the machine, "

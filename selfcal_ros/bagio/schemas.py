@@ -2,7 +2,6 @@
 """Message definitions without ROS: the contract's own, and those that a bag brings along."""
 
 from functools import cache
-from importlib import resources
 from pathlib import Path
 
 from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
@@ -16,7 +15,7 @@ OWN = "selfcal_msgs"
 def _message_folder() -> Path:
     """Return the folder of the .msg files: installed beside the code, or in the source tree."""
     source = Path(__file__).parents[2] / "msg_defs" / "msg"
-    return source if source.is_dir() else Path(str(resources.files("selfcal_ros.msg_text")))
+    return source if source.is_dir() else Path(__file__).parents[1] / "msg_text"
 
 
 @cache

@@ -4,6 +4,7 @@
 import argparse
 import contextlib
 import fcntl
+import importlib.util
 import os
 import subprocess
 import sys
@@ -35,6 +36,11 @@ def run(args: argparse.Namespace) -> int:
     from selfcal_ros.files import read_json, write_json
     from selfcal_ros.model.result import result_from_dict, result_to_dict, with_input
 
+    for package in ("rclpy", "selfcal_msgs"):
+        if importlib.util.find_spec(package) is None:
+            raise InputError("selfcal replay", f"there is no {package} in this environment",
+                             "source a ROS 2 installation with this package built, use the "
+                             "environment of `make setup`, or use `selfcal solve`")
     if not args.fast and not args.rate > 0:
         raise InputError("--rate", f"{args.rate:g} is not a speed", "give a number above 0")
     source = bag_input(args.bag)
