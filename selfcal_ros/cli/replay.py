@@ -38,7 +38,7 @@ def run(args: argparse.Namespace) -> int:
 
     for package in ("rclpy", "selfcal_msgs"):
         if importlib.util.find_spec(package) is None:
-            raise InputError("selfcal replay", f"there is no {package} in this environment",
+            raise InputError("environment", f"there is no {package} in this environment",
                              "source a ROS 2 installation with this package built, use the "
                              "environment of `make setup`, or use `selfcal solve`")
     if not args.fast and not args.rate > 0:
