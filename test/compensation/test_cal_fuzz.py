@@ -23,7 +23,8 @@ SEEDS = [
 PIECES = [b"1e999", b"-1e308", b"1e-400", b"nan", b"inf", b":START 1", b":START2D", b":END\n",
           b"\0", b"\xff", b"\xc3", b'"', b";", b"'", b"/", b"=", b"\t", b"\r", b"\n\n",
           b"99999999999", b"POSUNIT=", b"SECONDARY/1e-15", b"ROLLOVER=1e-15", b"\xe2\x80\xa8",
-          b"\x0b\x1f", b"\xd9\xa3", b"1_0", b"0x1", b"-", b"+", b".", b"e", b"9" * 500, b"SAMPLEDIST=1e-15"]
+          b"\x0b\x1f", b"\xd9\xa3", b"1_0", b"0x1", b"-", b"+", b".", b"e", b"9" * 500,
+          b"SAMPLEDIST=1e-15"]
 SETUP = MachineSetup({a: AxisSetup(1000.0, 10.0, "CW", 1.0, 5.0) for a in range(1, 33)}, 25.0)
 
 
