@@ -23,7 +23,7 @@ from selfcal_ros.errors import InputError, NotIdentifiableError
 from selfcal_ros.laser.data import StepDiagonal, step_vectors
 
 MAX_ITERATIONS = 30
-CONVERGED = 1e-14
+CONVERGED = 1e-12
 """Largest last correction, relative to the largest step."""
 
 

@@ -52,24 +52,25 @@ def refuse_equal_readings(data: StepDiagonal) -> None:
                          "linear errors of the axes truly are the same")
 
 
-def solve_blocks(data: StepDiagonal, readings_m: np.ndarray,
-                 errata: Collection[Erratum] = ()) -> np.ndarray:
-    """Return the errors (D, n, D) that solve eq. 1 block by block, turned to the first X step.
+def block_gain(data: StepDiagonal) -> np.ndarray:
+    """Return what takes the readings of an axis in a block to its step, (D, n, D, K).
 
-    In 3D the four readings of an axis give its three components by least squares, weighted by
-    the repeats.
+    Eq. 1 splits into one small system for each axis: 2D two readings for two components, 3D
+    four for three, by least squares weighted by the repeats.
     """
+    directions = data.signs[:, :, None] * laser_directions(data)[:, None, :]
+    weights = np.sqrt(data.counts).transpose(1, 2, 0)
+    weighted = directions.transpose(1, 0, 2)[:, None] * weights[..., None]
+    return np.linalg.pinv(weighted) * weights[:, :, None, :]
+
+
+def solve_blocks(data: StepDiagonal, readings_m: np.ndarray, gain: np.ndarray,
+                 errata: Collection[Erratum] = ()) -> np.ndarray:
+    """Return the errors (D, n, D) that solve eq. 1 block by block, turned to the first X step."""
     if Erratum.EQ1_ROWS in errata:
         readings_m = readings_m.copy()
         readings_m[:, 1] = readings_m[::-1, 1]
-    directions = data.signs[:, :, None] * laser_directions(data)[:, None, :]
-    weights = np.sqrt(data.counts)
-    vectors = np.empty((data.dim, data.n_blocks, data.dim))
-    for j in range(data.dim):
-        for i in range(data.n_blocks):
-            weight = weights[:, j, i]
-            vectors[j, i] = np.linalg.lstsq(directions[:, j] * weight[:, None],
-                                            readings_m[:, j, i] * weight, rcond=None)[0]
+    vectors = np.einsum("jick,kji->jic", gain, readings_m)
     return turn_to_first_step(vectors) - step_vectors(data.steps_m, np.zeros_like(vectors))
 
 
@@ -101,12 +102,12 @@ def identify_conventional(data: StepDiagonal, *, errata: Collection[Erratum] = (
                          "the conventional formulation needs every diagonal; measure the others")
     if not allow_equal:
         refuse_equal_readings(data)
-    readings = data.readings_m
-    errors = solve_blocks(data, readings, errata)
+    readings, gain = data.readings_m, block_gain(data)
+    errors = solve_blocks(data, readings, gain, errata)
     covariance = None
     noise = reading_noise(data)
     if noise.dof:
-        jac = jacobian(lambda r: solve_blocks(data, r, errata), readings)
+        jac = jacobian(lambda r: solve_blocks(data, r, gain, errata), readings)
         covariance = jac @ reading_covariance(data, noise) @ jac.T
     return Identified(data.steps_m, errors, covariance, Method.CONVENTIONAL, Form.PRINTED, {},
                       Closure(residual_rms_m=_residual(data, readings)))

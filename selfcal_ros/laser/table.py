@@ -147,7 +147,8 @@ def _block(text: str, where: str) -> int:
 
 def _number(text: str, where: str) -> float:
     try:
-        number = float(text)
+        # float() also takes 1_000 and digits of other scripts, which no table means.
+        number = float(text if text.isascii() and "_" not in text else "other")
     except ValueError as error:
         raise InputError(where, f"'{text}' is not a number" if text else "the cell is empty",
                          "give a number in mm") from error

@@ -108,3 +108,25 @@ def test_jacobian_of_a_product():
     at = np.array([[2.0, 3.0]])
     np.testing.assert_allclose(jacobian(lambda x: np.array([x[0, 0] * x[0, 1]]), at),
                                [[3.0, 2.0]], rtol=1e-7)
+
+
+def test_body_diagonals_are_weighted_by_their_repeats():
+    machine = random_machine((0.01, 0.01, 0.01), 2, np.random.default_rng(3))
+    samples = exact_nominal(machine.steps_m, machine.errors_m).samples_m.repeat(9, axis=0)
+    samples[:, 0] += 1e-8  # ppp is off, and measured nine times; the others once
+    heavy = samples.copy()
+    heavy[1:, 1:] = np.nan
+    residual = [identify_conventional(StepDiagonal(machine.steps_m, DIAGONALS[3], each))
+                for each in (samples, heavy)]
+    off = [np.abs(found.errors_m - machine.errors_m).max() for found in residual]
+    # Four readings for three components: ppp alone pulls with 1/4 of its misfit left over, with
+    # ninefold weight with 1/28, so that the component along ppp follows more.
+    assert off[0] < off[1] < 2e-8
+
+
+def test_equal_readings_of_one_diagonal_only_are_a_measurement():
+    data = planar((0.01, 0.01), random_errors(3, np.random.default_rng(0)))
+    samples = data.samples_m.copy()
+    samples[:, 0, 1] = samples[:, 0, 0]
+    found = identify_conventional(StepDiagonal(data.steps_m, data.diagonals, samples))
+    assert np.isfinite(found.errors_m).all()

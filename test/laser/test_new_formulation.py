@@ -246,3 +246,25 @@ def test_paper_forms_are_planar():
     data = simulate_step_diagonal(machine, Measurement(), np.random.default_rng(0))
     with pytest.raises(InputError, match="in 2D only; use the exact form for body diagonals"):
         identify_new(data, form=Form.PRINTED)
+
+
+def test_eq_5_as_printed_has_the_right_sign():
+    # Ex(x) and the half diagonal the same in every block, Ey(x) not: the printed form is right.
+    n = 6
+    ey_x = np.array([0, 1, -2, 3, -1, 2]) * 1e-7
+    errors = np.zeros((2, n, 2))
+    errors[0, :, 1] = ey_x
+    errors[1, :, 0] = -ey_x  # keeps the diagonal's length to first order
+    data = planar((0.01, 0.01), errors, mirror_rad=(1e-3, -1e-3))
+    found = identify_new(data, form=Form.PRINTED)
+    np.testing.assert_allclose(found.errors_m[0, :, 1], ey_x, atol=1 * NM)
+
+
+@pytest.mark.parametrize("form", [Form.STEPWISE, Form.PRINTED])
+def test_paper_forms_hold_for_unequal_steps(form):
+    errors = random_errors(1, np.random.default_rng(25)).repeat(6, axis=1)
+    errors[0, :, 1] = np.array([0, 1, -1, 2, 0, 1]) * 1e-7
+    errors[1, :, 0] = -errors[0, :, 1] * 0.006 / 0.01
+    data = planar((0.01, 0.006), errors, mirror_rad=(1e-3, -1e-3))
+    assert np.abs(identify_new(data, form=form).errors_m - errors).max() < (
+        1 * NM if form is Form.STEPWISE else 60 * NM)

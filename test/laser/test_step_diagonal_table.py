@@ -69,6 +69,7 @@ HOSTILE = {
     "nan": (HEAD + "\n1,nan,7,7,7,0,0\n", InputError, "d.csv:2: rx_pp: 'nan' is not a finite"),
     "inf": (HEAD + "\n1,7,inf,7,7,0,0\n", InputError, "d.csv:2: ry_pp: 'inf' is not a finite"),
     "text": (HEAD + "\n1,7,7,seven,7,0,0\n", InputError, "d.csv:2: rx_np: 'seven' is not a num"),
+    "underscore": (HEAD + "\n1,7_0,7,7,7,0,0\n", InputError, "rx_pp: '7_0' is not a number"),
     "empty cell": (HEAD + "\n1,7,7,,7,0,0\n", InputError, "d.csv:2: rx_np: the cell is empty"),
     "micrometres": (HEAD + "\n1,7071.1,7,7,7,0,0\n", InputError,
                     "rx_pp: 7071.1 where 7.07107 mm is nominal: it looks like micrometres"),

@@ -126,3 +126,16 @@ def test_a_spoilt_recording_is_one_clear_line(spoil, kind, message):
 def test_the_sign_of_the_laser_is_a_sign():
     with pytest.raises(InputError, match="laser_sign: 2 is not a sign"):
         cut_zigzag(recording(), replace(RULE, laser_sign=2))
+
+
+@pytest.mark.parametrize("edge", ["start", "end"])
+def test_both_ends_of_a_rest_are_left_out(edge):
+    series = recording()
+    rest, phase = np.divmod(series.laser_ns - 3_000_000, 1_200_000_000)
+    creeping = phase < 80_000_000 if edge == "start" else (phase > 900_000_000) & (phase < 10**9)
+    creeping &= rest % 2 == 1  # of every rest alike it would cancel in the readings
+    spoilt = replace(series, laser_m=series.laser_m + 1e-6 * creeping)
+    np.testing.assert_allclose(cut_zigzag(spoilt, RULE).data.readings_m,
+                               cut_zigzag(series, RULE).data.readings_m, atol=1e-14)
+    with_all = cut_zigzag(spoilt, replace(RULE, settle_s=0.0)).data.readings_m
+    assert np.abs(with_all - cut_zigzag(series, RULE).data.readings_m).max() > 10e-9
