@@ -26,8 +26,8 @@ from selfcal_ros.compensation.cells import (
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.error_map import ErrorMap
 
-MAX_GRADIENT = 0.5
-"""Largest slope of the error that the inverse accepts: the fixed point then halves each step."""
+MAX_SLOPE = 0.25
+"""Largest slope between neighbours that the inverse accepts: the fixed point converges fast."""
 
 _Field = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 
@@ -236,8 +236,8 @@ class _Circle:
         if cubic and not np.isfinite(values).all():
             raise InputError("error map", f"{int((~np.isfinite(values)).sum())} angular lines are "
                              "unknown", "bicubic needs all of them: take bilinear")
-        if self._count and not np.isnan(self._closed).all() and \
-                np.nanmax(np.abs(np.diff(self._closed))) > MAX_GRADIENT * 2 * np.pi / self._count:
+        steps = np.abs(np.diff(self._closed))
+        if np.any(steps > MAX_SLOPE * 2 * np.pi / max(self._count, 1)):
             raise _steep("angular lines")
         self._spline = (CubicSpline(np.arange(self._count + 1), self._closed, bc_type="periodic")
                         if cubic and self._count else None)
@@ -262,7 +262,7 @@ class _Circle:
 def _refuse_steep(fields: np.ndarray, pitch: float) -> None:
     for axis in (1, 2):
         steps = np.abs(np.diff(fields, axis=axis))
-        if np.any(steps > MAX_GRADIENT * pitch / 2):
+        if np.any(steps > MAX_SLOPE * pitch):
             raise _steep("sites")
 
 

@@ -167,6 +167,16 @@ def test_unknown_words_are_refused(words):
         Compensator(MAP, **words)
 
 
+def test_lines_that_are_known_only_here_and_there():
+    emap = random_map(ARTIFACT, 4)
+    emap.g_theta[::2] = np.nan
+    compensator = Compensator(emap)
+    assert compensator.error_theta(np.pi / 12) == pytest.approx(emap.g_theta[1])
+    assert np.isnan(compensator.correct_theta(np.pi / 12))
+    emap.g_theta[:] = np.nan
+    assert np.isnan(Compensator(emap).error_theta(0.0))
+
+
 def test_a_map_in_the_wrong_unit_is_refused():
     with pytest.raises(InputError, match=r"neighbouring sites .* cannot be inverted"):
         Compensator(random_map(ARTIFACT, 1, gain=1e6))
