@@ -45,6 +45,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--sensitivity", action="store_true",
                         help="without DATA.csv: simulate what each fault of the set-up does to "
                              "both formulations; table to stdout, JSON with -o, curves with --plot")
+    parser.add_argument("--simulate", metavar="SIM.yaml",
+                        help="without DATA.csv: write the readings of a simulated measurement to "
+                             "-o (or print them); see config/step_diagonal/case_study.yaml")
+    parser.add_argument("--truth", metavar="TRUTH.json",
+                        help="with --simulate: write the errors of the machine")
     parser.add_argument("--cal", metavar="FILE.cal",
                         help="write straightness, squareness and measured linear errors as 1D "
                              "tables; positions count from the start of the first block")
@@ -66,9 +71,11 @@ def run(args: argparse.Namespace) -> int:
 
     if args.sensitivity:
         return _sensitivity(args)
+    if args.simulate:
+        return _simulate(args)
     if args.data is None or args.method is None:
         raise InputError("arguments", "DATA.csv and --method are wanted",
-                         "give both, or --sensitivity alone")
+                         "give both, or --sensitivity or --simulate alone")
     data, warnings, source = _measurement(args)
     choice = Choice(Method(args.method), Form(args.form), args.allow_equal)
     found = identify(data, choice)
@@ -126,6 +133,31 @@ def _sensitivity(args: argparse.Namespace) -> int:
     if args.output:
         write_json(args.output, {"machine": "case study, 6 blocks of 10 mm x 10 mm", "rows": rows})
     print(sensitivity_text(rows))
+    return ExitCode.DONE
+
+
+def _simulate(args: argparse.Namespace) -> int:
+    """Write the readings of a simulated measurement as a table."""
+    from selfcal_ros.files import read_yaml, write_json, write_text
+    from selfcal_ros.laser.table import table_text
+    from selfcal_ros.simulation.laser import simulate_step_diagonal
+    from selfcal_ros.simulation.laser_config import simulation_from_dict, truth_of
+
+    if args.data is not None:
+        raise InputError("arguments", "--simulate makes data and reads none",
+                         "leave DATA.csv out")
+    simulation = simulation_from_dict(read_yaml(args.simulate), args.simulate)
+    data = simulate_step_diagonal(simulation.machine, simulation.measurement, simulation.rng)
+    text = table_text(data, [
+        f"simulated from {args.simulate}; mm; several rows of a block are repeats",
+        "readings are positive on every diagonal (np: rx = -l.dx); a block is a place on the axis",
+        "ex_x, ey_y: directly measured linear errors, actual - nominal of each step"])
+    if args.truth:
+        write_json(args.truth, truth_of(simulation.machine))
+    if args.output:
+        write_text(args.output, text)
+    else:
+        print(text, end="")
     return ExitCode.DONE
 
 

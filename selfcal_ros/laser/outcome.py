@@ -60,7 +60,7 @@ def outcome(found: Identified, data: StepDiagonal, *, line: Line = Line.LEAST_SQ
     if found.covariance is not None:
         u = found.u_errors_m
         out |= {f"u_{name_of(j, c)}": _mm(u[j, :, c]) for j, c in kinds}
-    out |= _geometry(found, line)
+    out |= geometry(found, line)
     out["profiles"] = {f"p{name_of(j, c)[1:]}": {
         "position": _mm(positions_m(found, j)), "error": _mm(profile_m(found, j, c)),
         "u": None if found.covariance is None else _mm(u_profile_m(found, j, c))}
@@ -87,8 +87,8 @@ def _value(prefix: str, value: Value) -> dict[str, float | None]:
     return {prefix: value.value / MM, f"u_{prefix}": None if value.u is None else value.u / MM}
 
 
-def _geometry(found: Identified, line: Line) -> dict[str, Any]:
-    """Return squareness and straightness: short names in 2D, one name a pair in 3D as well."""
+def geometry(found: Identified, line: Line) -> dict[str, Any]:
+    """Return squareness and straightness, mm: in 3D one name a pair beside the short names."""
     out: dict[str, Any] = _value("squareness", squareness(found, line=line))
     out["squareness_rad"] = squareness_rad(found, line=line)
     for axis in range(2):

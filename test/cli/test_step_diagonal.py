@@ -228,3 +228,40 @@ def test_a_diagonal_that_was_not_run_is_named(tmp_path, capsys):
     assert code == 2 and "'ppp' is unknown" in err
     code, _, err = run(capsys, bag, "--method", "conventional", *topics, "--laser-sign", "-1")
     assert code == 2 and "the sign is wrong" in err
+
+
+def test_the_example_is_what_its_configuration_simulates(tmp_path, capsys):
+    table, truth = tmp_path / "d.csv", tmp_path / "t.json"
+    assert run(capsys, "--simulate", CONFIG / "case_study.yaml", "-o", table,
+               "--truth", truth)[0] == 0
+
+    def rows(path):
+        return [line for line in path.read_text().splitlines() if line[0] != "#"]
+
+    made, shipped = rows(table), rows(EXAMPLE)
+    assert made[0] == shipped[0] and len(made) == len(shipped) == 19
+    np.testing.assert_allclose([list(map(float, row.split(","))) for row in made[1:]],
+                               [list(map(float, row.split(","))) for row in shipped[1:]], atol=2e-8)
+    shipped_truth = json.loads((CONFIG / "case_study_truth.json").read_text())
+    for key in ("ex_x", "ey_x", "ex_y", "ey_y", "squareness", "straightness_x", "straightness_y"):
+        np.testing.assert_allclose(json.loads(truth.read_text())[key], shipped_truth[key],
+                                   atol=1e-11)
+    assert run(capsys, "--simulate", CONFIG / "case_study.yaml")[1] == table.read_text()
+    code, _, err = run(capsys, EXAMPLE, "--simulate", CONFIG / "case_study.yaml")
+    assert code == 2 and "makes data and reads none" in err
+
+
+def test_the_body_diagonals_of_the_example(tmp_path, capsys):
+    table, truth = tmp_path / "d.csv", tmp_path / "t.json"
+    assert run(capsys, "--simulate", CONFIG / "body_diagonals.yaml", "-o", table,
+               "--truth", truth)[0] == 0
+    code, text, _ = run(capsys, table, "--method", "new", "--step-x", 10, "--step-y", 8,
+                        "--step-z", 5)
+    result, expected = json.loads(text), json.loads(truth.read_text())
+    assert code == 0
+    for key in (key for key in expected if key.startswith(("e", "sq", "st"))):
+        if key == "squareness_rad":
+            continue
+        off = np.abs(np.array(result[key]) - expected[key])
+        u = np.array(result[f"u_{key}"], dtype=float)
+        assert (off <= 5 * u + 1e-12).all(), key
