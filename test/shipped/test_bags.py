@@ -1,0 +1,82 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The recorded bags give what their manifest says, and the truth that lies beside them."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from selfcal_ros.bagio.offline import bag_input, collect_bag
+from selfcal_ros.bagio.simulated import read_truth
+from selfcal_ros.collection.parameters import parameter_values
+from selfcal_ros.errors import NotIdentifiableError
+from selfcal_ros.estimation.api import calibrate
+from selfcal_ros.reporting.summary_numbers import summary_numbers
+
+BAGS = Path(__file__).parents[2] / "bags"
+MANIFEST = yaml.safe_load((BAGS / "manifest.yaml").read_text())
+
+
+def measured(name):
+    values = parameter_values("measurement_collector", {}, "defaults")
+    return collect_bag(BAGS / name, values)
+
+
+def test_every_bag_is_in_the_manifest_and_they_stay_small():
+    assert sorted(MANIFEST) == sorted(path.name for path in BAGS.iterdir() if path.is_dir())
+    assert sum(path.stat().st_size for path in BAGS.rglob("*") if path.is_file()) < 15e6
+
+
+@pytest.mark.parametrize("name", MANIFEST)
+def test_bag_gives_what_the_manifest_says(name):
+    entry = MANIFEST[name]
+    assert bag_input(BAGS / name)["sha256"] == entry["sha256"]
+    measurements, _, lost = measured(name)
+    expected = entry["expected"]
+    assert lost == expected["lost"]
+    assert measurements.all_rejected() == expected["rejected"]
+    if not expected["identifiable"]:
+        with pytest.raises(NotIdentifiableError, match="shifted by one pitch") as caught:
+            calibrate(measurements)
+        assert caught.value.observability.deficiency == expected["deficiency"]
+        return
+    result = calibrate(measurements)
+    assert summary_numbers(result).max_error_um == pytest.approx(expected["max_error_um"], abs=1e-4)
+    assert result.error_map.nonorthogonality * 1e6 == pytest.approx(
+        expected["nonorthogonality_urad"], abs=1e-4)
+    assert result.error_map.scale_difference * 1e6 == pytest.approx(
+        expected["scale_difference_ppm"], abs=1e-4)
+
+
+def test_noise_free_bag_gives_the_truth_to_rounding():
+    result = calibrate(measured("hu_exact")[0])
+    truth = read_truth(BAGS / "hu_exact")
+    assert np.abs(result.error_map.gx - truth["gx"]).max() <= 1e-12
+    assert np.abs(result.error_map.gy - truth["gy"]).max() <= 1e-12
+    assert np.abs(result.error_map.g_theta - truth["g_theta"]).max() <= 1e-12
+    for view, phi, t in zip(result.views, truth["phi"], truth["t"], strict=False):
+        assert view.phi == pytest.approx(phi, abs=1e-12)
+        if np.isfinite(view.tx):
+            assert (view.tx, view.ty) == pytest.approx(t, abs=1e-12)
+
+
+@pytest.mark.parametrize("name", ["hu_noise", "fig10_faults"])
+def test_every_site_lies_within_five_standard_uncertainties_of_the_truth(name):
+    emap = calibrate(measured(name)[0]).error_map
+    truth = read_truth(BAGS / name)
+    for found, u, true in ((emap.gx, emap.u_gx, truth["gx"]), (emap.gy, emap.u_gy, truth["gy"]),
+                           (emap.g_theta, emap.u_g_theta, truth["g_theta"])):
+        assert np.isfinite(found).all()
+        assert (np.abs(found - np.array(true)) <= 5 * u).all()
+
+
+def test_faults_that_survive_the_encoder_are_all_found():
+    measurements, _, _ = measured("fig10_faults")
+    rejected, made = measurements.all_rejected(), read_truth(BAGS / "fig10_faults")["faults"]
+    assert rejected["duplicate"] == made["duplicated"]
+    assert rejected["low_score"] == made["low_score"]
+    assert rejected["not_finite"] == made["not_finite"]
+    assert rejected["unknown_mark"] == made["unknown_mark"]
+    # an outlier may also fall into the encoder's gap or the stepped clock
+    assert made["outliers"] - 3 <= rejected["outlier_among_repeats"] <= made["outliers"]
