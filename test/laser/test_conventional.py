@@ -8,7 +8,13 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.laser.conventional import identify_conventional, jacobian
 from selfcal_ros.laser.data import DIAGONALS, StepDiagonal, signs_of, step_vectors
 from selfcal_ros.laser.paper import Erratum
-from selfcal_ros.simulation.laser import random_machine
+from selfcal_ros.laser.profiles import squareness
+from selfcal_ros.simulation.laser import (
+    Measurement,
+    SetUp,
+    random_machine,
+    simulate_step_diagonal,
+)
 from test.support.laser import MM, one_block, planar, random_errors
 
 # Table 1 of the source, mm: given and estimated Ex(x), Ey(x), Ex(y), Ey(y); a = b = 10 mm.
@@ -130,3 +136,15 @@ def test_equal_readings_of_one_diagonal_only_are_a_measurement():
     samples[:, 0, 1] = samples[:, 0, 0]
     found = identify_conventional(StepDiagonal(data.steps_m, data.diagonals, samples))
     assert np.isfinite(found.errors_m).all()
+
+
+def test_body_diagonals_take_a_mirror_for_a_lean_to_first_order():
+    machine = random_machine((0.01, 0.01, 0.01), 4, np.random.default_rng(6))
+    wrong = []
+    for angle in (1e-4, 2e-4):
+        setups = {"npp": SetUp(mirror_rad=(angle, 0.0))}
+        data = simulate_step_diagonal(machine, Measurement(setups), np.random.default_rng(0))
+        found = identify_conventional(data)
+        wrong.append(squareness(found, 0, 2).value)
+    off = wrong[1] - wrong[0]
+    assert abs(off) > 1e-4 * 0.04 / 10, "of the order of angle x range, not of its square"
