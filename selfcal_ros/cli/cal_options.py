@@ -28,13 +28,15 @@ def pairs(texts: list[str] | None, option: str) -> dict[int, str]:
 
 def numbers(texts: list[str] | None, option: str, *, positive: bool = False) -> dict[int, float]:
     """Return axis -> number of options AXIS=NUMBER; InputError for anything else."""
+    from selfcal_ros.compensation.cal_keywords import SMALLEST, ArgumentFault, number
+
     found = {}
     for axis, text in pairs(texts, option).items():
         try:
-            value = float(text)
-        except ValueError:
+            value = number(text)
+        except ArgumentFault:
             value = math.nan
-        if not math.isfinite(value) or (positive and not 1e-15 <= value <= 1e15):
+        if not value >= (SMALLEST if positive else -math.inf):
             raise InputError(option, f"'{text}' is not a {'positive ' * positive}number",
                              f"write {option} {axis}=1000")
         found[axis] = value

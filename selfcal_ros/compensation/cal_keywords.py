@@ -17,8 +17,8 @@ SMALLEST = 1e-15
 """The same for distances and divisors that must not be zero."""
 OLD_UNITS = {"METRIC": "PRIMARY"}
 """Words of older controllers."""
-_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d{1,4})?")
-_INTEGER = re.compile(r"[+-]?\d{1,9}")
+_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d{1,4})?", re.ASCII)
+_INTEGER = re.compile(r"[+-]?\d{1,9}", re.ASCII)
 
 
 class ArgumentFault(Exception):

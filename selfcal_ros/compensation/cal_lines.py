@@ -15,6 +15,8 @@ from typing import Literal
 import numpy as np
 
 from selfcal_ros.compensation.cal_export import DECIMALS, PRIMARY, micrometres, tidy
+from selfcal_ros.compensation.cal_keywords import ArgumentFault
+from selfcal_ros.compensation.cal_keywords import number as plain_number
 from selfcal_ros.compensation.cal_model import Table1D
 from selfcal_ros.compensation.machine import UNITS_M, MachineFrame
 from selfcal_ros.errors import InputError
@@ -22,7 +24,8 @@ from selfcal_ros.model.error_map import ErrorMap
 
 UNIFORM = 1e-6
 """Largest departure of measured positions from equal distances, in distances."""
-_LENGTH = re.compile(r"([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*(m|mm|um|µm|μm|nm)")
+_LENGTH = re.compile(r"([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*(m|mm|um|µm|μm|nm)",
+                     re.ASCII)
 _LENGTH_UNITS_M = {**UNITS_M, "µm": 1e-6, "μm": 1e-6, "nm": 1e-9}
 
 Home = Literal["end", "middle", "middle-balanced"]
@@ -98,11 +101,10 @@ def measured_line(text: str, where: str, unit_m: float) -> Line:
     values = []
     for number, row in rows[1:]:
         try:
-            position, error = (float(cell) for cell in row)
-        except ValueError:
-            position = float("nan")
-        if not np.isfinite(position) or not np.isfinite(error):
-            raise InputError(f"{where}:{number}", "not two numbers", "give position,error")
+            position, error = (plain_number(cell.strip()) for cell in row)
+        except (ArgumentFault, ValueError):
+            raise InputError(f"{where}:{number}", "not two numbers",
+                             "give position,error") from None
         values.append((position * unit_m, -error * 1e-6))
     if len(values) < 2:
         raise InputError(where, f"{len(values)} measured positions", "give at least two")

@@ -221,6 +221,7 @@ def test_eval_counts(run, tmp_path):
     (["--position", "1"], "'1' is not AXIS=VALUE"),
     (["--position", "33=1"], "'33=1' is not AXIS=VALUE"),
     (["--position", "1=x"], "'x' is not a number"),
+    (["--position", "1=1_0"], "'1_0' is not a number"),
     (["--position", "1=inf"], "'inf' is not a number"),
     (["--position", "1=1", "--position", "1=2"], "axis 1 is given twice"),
     (["--position", "1=1", "--home-direction", "1=UP"], "'UP' is not a home direction"),

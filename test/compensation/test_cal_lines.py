@@ -82,7 +82,7 @@ def test_lengths_with_units(text, value):
     assert length_m(text, "--over") == pytest.approx(value, rel=1e-12)
 
 
-@pytest.mark.parametrize("text", ["5", "um", "5 inch", "nan m", "1e999 m", "", "5umm"])
+@pytest.mark.parametrize("text", ["5", "um", "5 inch", "nan m", "1e999 m", "", "5umm", "٣mm"])
 def test_lengths_without_sense(text):
     with pytest.raises(InputError, match=r"--over: .* is not a length; write a number with"):
         length_m(text, "--over")
@@ -150,6 +150,7 @@ def test_measured_errors_are_opposed():
     ("x,y\n1,2\n", "d.csv:1: the header is not position,error"),
     ("position,error\n1,2\n", "d.csv: 1 measured positions; give at least two"),
     ("position,error\n1,2\n2,x\n", "d.csv:3: not two numbers"),
+    ("position,error\n1,2\n2,1_0\n", "d.csv:3: not two numbers"),
     ("position,error\n1,2\n2\n", "d.csv:3: not two numbers"),
     ("position,error\n1,nan\n2,0\n", "d.csv:2: not two numbers"),
     ("position,error\n1,1\n1,2\n", "not equidistant between 1 and 1"),

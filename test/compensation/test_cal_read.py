@@ -179,6 +179,8 @@ BROKEN = [
     (":START 1 SAMPLEDIST=1\n0\n\n1-2\n:END\n", 4, "'1-2' is not a number"),
     (":START 1 SAMPLEDIST=1\n0\n1\u00a02\n:END\n", 3, "odd characters between the numbers"),
     (":START 1 SAMPLEDIST=one\n0\n:END\n", 1, "SAMPLEDIST: 'one' is not a number"),
+    (":START 1 SAMPLEDIST=\u0663\n0\n:END\n", 1, "SAMPLEDIST: '\u0663' is not a number"),
+    (":START \u0661 SAMPLEDIST=1\n0\n:END\n", 1, "axis_index: '\u0661' is not a whole number"),
     (":START 1 SAMPLEDIST=\n0\n:END\n", 1, "SAMPLEDIST has no argument"),
     (":START 1 SAMPLEDIST\n0\n:END\n", 1, "SAMPLEDIST has no argument"),
     (":START 1 SAMPLEDIST=1 NEGCOR=1\n0\n:END\n", 1, "NEGCOR takes no argument"),
