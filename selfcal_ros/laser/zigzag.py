@@ -179,28 +179,44 @@ def find_rests(series: Series, rule: CutRule) -> list[Rest]:
     without a laser sample after settling do not count.
     """
     stamps, positions = series.position_ns, series.position_m
-    rests, start = [], 0
+    rests, start, end = [], 0, 1
     while start < len(stamps):
-        low = high = positions[start]
-        end = start + 1
-        while end < len(stamps):
-            lower, higher = np.minimum(low, positions[end]), np.maximum(high, positions[end])
-            if np.any(higher - lower > rule.rest_tolerance_m):
-                break
-            low, high, end = lower, higher, end + 1
+        end = _end_of_rest(positions, (start, end), rule.rest_tolerance_m)
         first, last = stamps[start], stamps[end - 1]
         if last - first >= rule.min_rest_s * 1e9:
-            settle_ns = round(rule.settle_s * 1e9)
-            inside = slice(np.searchsorted(series.laser_ns, first + settle_ns),
-                           np.searchsorted(series.laser_ns, last - settle_ns, side="right"))
-            distances = series.laser_m[inside]
-            if len(distances):
-                rests.append(Rest(positions[start:end].mean(axis=0),
-                                  rule.laser_sign * float(distances.mean()), int(first)))
-            start = end
+            laser = _mean_laser(series, (first, last), rule)
+            if laser is not None:
+                rests.append(Rest(positions[start:end].mean(axis=0), laser, int(first)))
+            start, end = end, end + 1
+        elif end == len(stamps):
+            break
         else:
-            start += 1
+            # No rest holds both the sample at `end` and the last one that lies too far from it.
+            far = np.abs(positions[start:end] - positions[end]).max(axis=1) > rule.rest_tolerance_m
+            start += int(np.flatnonzero(far)[-1]) + 1
+            end += 1
     return rests
+
+
+def _end_of_rest(positions: np.ndarray, known: tuple[int, int], tolerance_m: float) -> int:
+    """Return the end of the stretch from known[0] that stays within the tolerance."""
+    start, end = known
+    low, high = positions[start:end].min(axis=0), positions[start:end].max(axis=0)
+    while end < len(positions):
+        low, high = np.minimum(low, positions[end]), np.maximum(high, positions[end])
+        if np.any(high - low > tolerance_m):
+            break
+        end += 1
+    return end
+
+
+def _mean_laser(series: Series, between_ns: tuple[int, int], rule: CutRule) -> float | None:
+    """Return the mean distance of a rest without its ends; None without samples."""
+    settle_ns = round(rule.settle_s * 1e9)
+    inside = slice(np.searchsorted(series.laser_ns, between_ns[0] + settle_ns),
+                   np.searchsorted(series.laser_ns, between_ns[1] - settle_ns, side="right"))
+    distances = series.laser_m[inside]
+    return rule.laser_sign * float(distances.mean()) if len(distances) else None
 
 
 def _moves(rests: Sequence[Rest], rule: CutRule) -> list[Move | None]:

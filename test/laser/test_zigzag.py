@@ -3,6 +3,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.laser.new import identify_new
@@ -139,3 +141,39 @@ def test_both_ends_of_a_rest_are_left_out(edge):
                                cut_zigzag(series, RULE).data.readings_m, atol=1e-14)
     with_all = cut_zigzag(spoilt, replace(RULE, settle_s=0.0)).data.readings_m
     assert np.abs(with_all - cut_zigzag(series, RULE).data.readings_m).max() > 10e-9
+
+
+def rests_by_trying_every_start(series, rule):
+    """Return (first, number of samples) of every rest, as the definition says."""
+    found, start, stamps = [], 0, series.position_ns
+    while start < len(stamps):
+        end = start + 1
+        while end < len(stamps) and np.ptp(series.position_m[start:end + 1],
+                                           axis=0).max() <= rule.rest_tolerance_m:
+            end += 1
+        if stamps[end - 1] - stamps[start] >= rule.min_rest_s * 1e9:
+            found.append(int(stamps[start]))
+            start = end
+        else:
+            start += 1
+    return found
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.floats(1e-8, 3e-7), st.integers(2, 40))
+def test_rests_of_creeping_axes_are_those_of_the_definition(seed, creep, jumps):
+    rng = np.random.default_rng(seed)
+    walk = np.cumsum(rng.normal(0, creep, (300, 2)), axis=0)
+    walk += np.cumsum(rng.random((300, 1)) < jumps / 300, axis=0) * 1e-5
+    stamps = np.arange(300) * 20_000_000
+    series = Series(stamps, np.zeros(300), stamps, walk)
+    rule = CutRule((0.01, 0.01), min_rest_s=0.2, settle_s=0.0)
+    assert [rest.start_ns for rest in find_rests(series, rule)] == \
+        rests_by_trying_every_start(series, rule)
+
+
+def test_a_rest_without_laser_samples_does_not_count():
+    series = recording()
+    lost = (series.laser_ns > 1_200_000_000) & (series.laser_ns < 2_400_000_000)
+    gap = replace(series, laser_ns=series.laser_ns[~lost], laser_m=series.laser_m[~lost])
+    assert len(find_rests(gap, RULE)) == len(find_rests(series, RULE)) - 1
