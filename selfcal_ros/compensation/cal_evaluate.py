@@ -102,11 +102,11 @@ class Track:
 
     def locate(self, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the entry below each position and the part of the way to the next, clamped."""
-        if self.rollover is not None:
-            position = self.first + np.mod(position - self.first, self.rollover)
-        way = np.clip((position - self.first) / self.step, 0, self.count - 1)
         with np.errstate(invalid="ignore"):
             # A NaN position turns into some integer; its part stays NaN.
+            if self.rollover is not None:
+                position = self.first + np.mod(position - self.first, self.rollover)
+            way = np.clip((position - self.first) / self.step, 0, self.count - 1)
             entry = np.clip(way.astype(np.int64), 0, max(self.count - 2, 0))
         return entry, way - entry
 

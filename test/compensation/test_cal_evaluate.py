@@ -199,6 +199,9 @@ def test_positions_that_are_not_finite():
     table = Table1D(1, 10.0, np.array([0.0, 2.0, 3.0]), pos_unit=MM)
     got = CalEvaluator([table]).corrections({1: [np.nan, np.inf, -np.inf]})[1]
     np.testing.assert_array_equal(got, [np.nan, 3.0, 0.0])
+    round_ = Table1D(1, 10.0, np.array([0.0, 2.0, 0.0]), pos_unit=MM, rollover=20.0)
+    got = CalEvaluator([round_], MachineSetup({1: AxisSetup(1.0)})).corrections({1: [np.inf, 5]})
+    np.testing.assert_array_equal(got[1], [np.nan, 1.0])
 
 
 @pytest.mark.parametrize(("text", "message"), [

@@ -275,3 +275,16 @@ def test_provenance_says_bag_plan_date_and_uncertainty():
         assert part in text
     u = np.sqrt(np.mean(np.square([result.error_map.u_gx, result.error_map.u_gy]))) * 1e9
     assert f"(k=1): {u:.3g} nm rms" in text
+
+
+def test_the_residual_is_true_minus_commanded():
+    emap = random_map(OBLONG, 4)
+    found = verify_tables(emap, [table_xy(emap, MachineFrame())], MachineFrame())
+    g = np.stack([emap.gx.ravel(), emap.gy.ravel()])
+    np.testing.assert_allclose(found.sites.before, g.mean(axis=1)[:, None] - g, atol=1e-10)
+    np.testing.assert_allclose(found.sites.shift_after, -np.array([emap.gx[3, 2], emap.gy[3, 2]]),
+                               atol=1e-10)
+    lines = verify_tables(emap, [table_theta(emap, FRAMES[0])], FRAMES[0]).lines
+    # Without a table the stage stands at the angle whose error it shows: slope times error off.
+    np.testing.assert_allclose(lines.before[0], emap.g_theta.mean() - emap.g_theta, atol=1e-6)
+    assert np.corrcoef(lines.before[0], emap.g_theta)[0, 1] < -0.99
