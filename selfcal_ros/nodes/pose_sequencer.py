@@ -38,7 +38,7 @@ class PoseSequencer(SelfcalNode):
         self._goal: Any = None
         self._ended: Future | None = None
         self._deadline, self._confirm_at, self._redos = 0.0, 0.0, 0
-        self._coverage = 0.0
+        self._coverage, self._commanded_ns = 0.0, 0
         self._command = self.publisher(names.COMMAND)
         self.subscribe(names.COMMAND, self._on_command)
         self.subscribe(names.STATUS, self._on_status)
@@ -66,6 +66,7 @@ class PoseSequencer(SelfcalNode):
         for command in commands:
             command = replace(command, stamp_ns=self.get_clock().now().nanoseconds)
             self._own.add(_key(command))
+            self._commanded_ns = command.stamp_ns
             self._command.publish(fill(names.COMMAND.type(), convert_out.command(
                 command, self.frame_id)))
             name = command.view.name if command.view else self.machine.plan.plan_id
@@ -86,6 +87,8 @@ class PoseSequencer(SelfcalNode):
             self._ended.set_result(None)
 
     def _on_status(self, message: Any) -> None:
+        if convert_in.stamp_ns(message) < self._commanded_ns:
+            return  # of before the command: a redone view would look complete
         expected = message.grid_expected + message.angular_expected
         if message.view_index == self.machine.index and expected:
             self._coverage = (message.grid_done + message.angular_done) / expected
