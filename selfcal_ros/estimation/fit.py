@@ -5,14 +5,22 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from selfcal_ros.estimation.noise import Level, level, pooled
-from selfcal_ros.estimation.readings_data import AngularData, GridData
-from selfcal_ros.estimation.system import JointSystem
-from selfcal_ros.estimation.theta import Conditions
-from selfcal_ros.model.readings import Measurements
+from selfcal_ros.errors import InputError
+from selfcal_ros.estimation.fit_iterated import solve_iterated
+from selfcal_ros.estimation.noise import Level, level
+from selfcal_ros.estimation.problem import (
+    AngularPart,
+    Problem,
+    Raw,
+    grid_level,
+    sigma_of,
+    weight_ratio,
+)
 
-ROUNDING = 16 * np.finfo(float).eps
-"""Noise below this part of the largest deviation is rounding."""
+MAX_RIGID_STEPS = 20
+
+RIGID_RESOLUTION_M = 1e-14
+"""Change of a misalignment, at the edge of the plate, at which rotations stand still."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +44,9 @@ class Fit:
     xy, theta : Level
         Noise of the grid and of the angular readings.
     inverse : float array (size, size)
-        Covariance of the misalignments for unit grid noise.
+        Covariance of the misalignments for unit grid noise; empty if the sites were iterated.
+    solver : dict
+        How the equations were solved, and to what residual.
     """
 
     field: np.ndarray
@@ -50,40 +60,7 @@ class Fit:
     xy: Level
     theta: Level
     inverse: np.ndarray
-
-
-@dataclass(frozen=True, eq=False)
-class Problem:
-    """What is to be fitted.
-
-    Attributes
-    ----------
-    system : JointSystem
-        The measured plan.
-    grid, angular : GridData, AngularData
-        The readings.
-    repeats_xy, repeats_theta : tuple
-        (sigma, degrees of freedom) from the scatter of repeats.
-    half_width_m : float
-        Unit of the system's positions, m.
-    conditions : Conditions
-        Angular datum.
-    """
-
-    system: JointSystem
-    grid: GridData
-    angular: AngularData
-    repeats_xy: tuple[float, int]
-    repeats_theta: tuple[float, int]
-    half_width_m: float
-    conditions: Conditions
-
-
-def repeats_of(measurements: Measurements) -> tuple[tuple[float, int], tuple[float, int]]:
-    """Return pooled (sigma, degrees of freedom) of the repeats, grid and angular."""
-    views = measurements.views
-    return (pooled((v.sigma_xy, v.dof_xy) for v in views if len(v.m)),
-            pooled((v.sigma_theta, v.dof_theta) for v in views if len(v.k)))
+    solver: dict
 
 
 def fit(problem: Problem, y: np.ndarray) -> Fit:
@@ -101,16 +78,9 @@ def fit(problem: Problem, y: np.ndarray) -> Fit:
     """
     system, grid, angular = problem.system, problem.system.grid, problem.system.angular
     n, length = 3 * grid.n_views, problem.half_width_m
-    free, d = grid.reduced(y)
-    xy = _grid_level(problem, y, free=free, d=d)
-    theta_free, theta_d, theta = _angular_level(problem)
-    ratio = weight_ratio(problem, xy.sigma, theta.sigma, y)
-    right = np.zeros(system.size)
-    right[:n] = d
-    right[system.phi_at] += ratio * length * theta_d
-    inverse = system.inverse(ratio)
-    parameters = inverse @ right
-    field = (free - grid.response @ parameters[:n]).reshape(grid.views.shape)
+    theta = _angular_part(problem)
+    raw = (_solve_direct if problem.direct else solve_iterated)(problem, y, theta)
+    field, parameters = raw.field, raw.parameters
 
     parts = system.gauge.parts(field)
     field = system.gauge.remove(field, parts)
@@ -119,10 +89,11 @@ def fit(problem: Problem, y: np.ndarray) -> Fit:
     plate_parts = system.plate_gauge.parts(plate)
     plate = system.plate_gauge.remove(plate, plate_parts)
     parameters = parameters - plate_parts @ system.rigid[4:]
+    xy = raw.xy or grid_level(problem, residuals)
 
     conditions = problem.conditions
     phi = parameters[system.phi_at] / length
-    g_theta = theta_free - angular.response @ phi
+    g_theta = theta.free - angular.response @ phi
     slopes = np.einsum("cij,ij->c", conditions.slopes.conj(), field).real
     misclosure = slopes - conditions.rows @ g_theta
     g_theta = g_theta + conditions.gain @ misclosure
@@ -130,45 +101,58 @@ def fit(problem: Problem, y: np.ndarray) -> Fit:
     parameters[system.phi_at] = phi * length
     a_theta, residuals_theta = angular.plate(problem.angular.y, g_theta, phi)
     return Fit(field, plate, residuals, parameters, g_theta, a_theta, residuals_theta,
-               misclosure, xy, theta, inverse)
+               misclosure, xy, theta.level, raw.inverse, raw.solver)
 
 
-def _grid_level(problem: Problem, y: np.ndarray, *, free: np.ndarray, d: np.ndarray) -> Level:
-    grid = problem.system.grid
-    alone = problem.system.grid_inverse @ d
+def fit_rigid(problem: Problem) -> Fit:
+    """Return the solution for finite rotations of the plate (Gauss-Newton).
+
+    A mark lies at R(phi) R^q (m + A) + t. What that holds beyond the linear model,
+    ((R(phi) - 1 - phi J) m + (R(phi) - 1) A) in the plate frame, is taken off the readings with the
+    last solution until it stands still; every step solves the same factored equations.
+    """
+    y, n = problem.grid.y, 3 * problem.system.grid.n_views
+    found = fit(problem, y)
+    marks = problem.system.grid.views.z * problem.half_width_m
+    for _ in range(MAX_RIGID_STEPS):
+        phi = found.parameters[:n:3, None, None] / problem.half_width_m
+        turn = np.expm1(1j * phi)
+        excess = (turn - 1j * phi) * marks + turn * found.plate
+        step = fit(problem, np.where(problem.system.grid.read, y - excess, 0.0))
+        change = float(np.abs(step.parameters - found.parameters).max())
+        found = step
+        if change <= RIGID_RESOLUTION_M:
+            return found
+    raise InputError("misalignment model 'rigid'", "the rotations do not settle",
+                     "check the readings for misalignments of more than a few degrees")
+
+
+def _solve_direct(problem: Problem, y: np.ndarray, theta: AngularPart) -> Raw:
+    system, grid = problem.system, problem.system.grid
+    n = 3 * grid.n_views
+    free, d = grid.reduced(y)
+    alone = system.grid_inverse @ d
     field = (free - grid.response @ alone).reshape(grid.views.shape)
-    _, left = grid.plate(y, field, alone)
-    dof = 2 * grid.n_readings - problem.system.rank_grid
-    total = float((grid.weight * (left.real**2 + left.imag**2)).sum())
-    return level(problem.repeats_xy, _sigma(total, dof), problem.grid.sigma_declared)
+    xy = grid_level(problem, grid.plate(y, field, alone)[1])
+    ratio = weight_ratio(problem, xy.sigma, theta.level.sigma, y)
+    right = np.zeros(system.size)
+    right[:n] = d
+    right[system.phi_at] += ratio * problem.half_width_m * theta.d
+    inverse = system.inverse(ratio)
+    parameters = inverse @ right
+    field = (free - grid.response @ parameters[:n]).reshape(grid.views.shape)
+    return Raw(field, parameters, xy, inverse, {"method": "multifrontal"})
 
 
-def _angular_level(problem: Problem) -> tuple[np.ndarray, np.ndarray, Level]:
+def _angular_part(problem: Problem) -> AngularPart:
     angular, y = problem.system.angular, problem.angular.y
     if not angular.n_views:
         nothing = level((float("nan"), 0), (float("nan"), 0), float("nan"))
-        return np.full(angular.n_lines, np.nan), np.zeros(0), nothing
+        return AngularPart(np.full(angular.n_lines, np.nan), np.zeros(0), nothing)
     free, d = angular.reduced(y)
     phi = problem.system.angular_inverse @ d
     _, left = angular.plate(y, free - angular.response @ phi, phi)
     dof = angular.n_readings - problem.system.rank_angular
-    found = level(problem.repeats_theta, _sigma(float((angular.weight * left**2).sum()), dof),
+    found = level(problem.repeats_theta, sigma_of(float((angular.weight * left**2).sum()), dof),
                   problem.angular.sigma_declared)
-    return free, d, found
-
-
-def _sigma(total: float, dof: int) -> tuple[float, int]:
-    return (float(np.sqrt(total / dof)), dof) if dof > 0 else (float("nan"), 0)
-
-
-def weight_ratio(problem: Problem, sigma_xy: float, sigma_theta: float, y: np.ndarray) -> float:
-    """Return the weight of an angular reading against a grid reading, in misalignment units.
-
-    Without both noises, an angular reading counts like a grid reading at the half width.
-    """
-    if not (np.isfinite(sigma_xy) and np.isfinite(sigma_theta)):
-        return 1.0
-    sigma_xy = max(sigma_xy, ROUNDING * float(np.abs(y).max()), 1e-300)
-    peak = float(np.abs(problem.angular.y).max())
-    sigma_theta = max(sigma_theta, ROUNDING * peak, 1e-300)
-    return (sigma_xy / (sigma_theta * problem.half_width_m)) ** 2
+    return AngularPart(free, d, found)

@@ -46,7 +46,7 @@ class Components:
 
 
 def components(site: np.ndarray, mark: np.ndarray, q: np.ndarray, *, n_sites: int,
-               n_marks: int) -> Components:
+               n_marks: int, turning: int = -1) -> Components:
     """Return the components of readings.
 
     Parameters
@@ -55,6 +55,8 @@ def components(site: np.ndarray, mark: np.ndarray, q: np.ndarray, *, n_sites: in
         Site and mark that each reading joins, and its quarter turns (0 for angular lines).
     n_sites, n_marks : int
         Number of sites and marks.
+    turning : int
+        A site known to lie in a component that is not balanced; -1 = none is known.
     """
     n_nodes = n_sites + n_marks
     _, label = _connect(site, mark + n_sites, n_nodes)
@@ -64,7 +66,9 @@ def components(site: np.ndarray, mark: np.ndarray, q: np.ndarray, *, n_sites: in
     _, numbers[touched] = np.unique(label[touched], return_inverse=True)
     n_components = int(numbers.max(initial=-1)) + 1
     balanced = np.ones(n_components, dtype=bool)
-    if np.ptp(q) if len(q) else 0:
+    if n_components == 1 and turning >= 0:
+        balanced[0] = False
+    elif len(q) and np.ptp(q):
         balanced = _balanced(site, mark + n_sites, q, numbers=numbers, n=n_components)
     return Components(numbers[:n_sites], numbers[n_sites:], balanced)
 

@@ -3,14 +3,16 @@
 
 import numpy as np
 
-from selfcal_ros.errors import NoDataError, NotIdentifiableError
+from selfcal_ros.errors import InputError, NoDataError, NotIdentifiableError
 from selfcal_ros.estimation.api import Options
-from selfcal_ros.estimation.fit import Fit, Problem, fit, repeats_of
+from selfcal_ros.estimation.blas_threads import one_thread
+from selfcal_ros.estimation.fit import Fit, fit, fit_rigid
 from selfcal_ros.estimation.lattice import PHASES
 from selfcal_ros.estimation.noise import disagreement
+from selfcal_ros.estimation.problem import Problem, repeats_of
 from selfcal_ros.estimation.rank import measured_observability, refusal
 from selfcal_ros.estimation.readings_data import angular_data, grid_data
-from selfcal_ros.estimation.system import system_for
+from selfcal_ros.estimation.system import MAX_DIRECT_SITES, system_for
 from selfcal_ros.estimation.theta import conditions_for, misclosure_warning
 from selfcal_ros.estimation.uncertainty import FieldCovariance, angular_variance
 from selfcal_ros.model.error_map import ErrorMap, ThetaDatum
@@ -26,9 +28,11 @@ from selfcal_ros.model.result import (
 
 def solve_joint(measurements: Measurements, options: Options) -> CalibrationResult:
     """Calibrate by joint least squares; see `selfcal_ros.estimation.api.calibrate`."""
-    problem, seen = prepare(measurements, options)
-    solution = fit(problem, problem.grid.y)
-    return _result(measurements, options, problem=problem, found=solution, seen=seen)
+    with one_thread():
+        problem, seen = prepare(measurements, options)
+        rigid = options.misalignment_model == "rigid"
+        found = fit_rigid(problem) if rigid else fit(problem, problem.grid.y)
+        return _result(measurements, options, problem=problem, found=found, seen=seen)
 
 
 def prepare(measurements: Measurements, options: Options) -> tuple[Problem, Observability]:
@@ -50,13 +54,17 @@ def prepare(measurements: Measurements, options: Options) -> tuple[Problem, Obse
         raise NotIdentifiableError(refusal(seen), seen)
     half_width_m = measurements.artifact.grid_pitch_m * max(measurements.artifact.half)
     conditions = conditions_for(system, options.datum_theta, measurements.sense, half_width_m)
-    return Problem(system, grid, angular, *repeats_of(measurements), half_width_m,
-                   conditions), seen
+    direct = system.direct or bool(options.uncertainty)
+    if direct and system.grid.n_sites > MAX_DIRECT_SITES:
+        raise InputError("options", f"the uncertainty of {system.grid.n_sites} sites is beyond "
+                         f"the limit of {MAX_DIRECT_SITES}", "solve without the uncertainty")
+    return Problem(system, grid, angular, *repeats_of(measurements), half_width_m, conditions,
+                   direct), seen
 
 
 def _result(measurements: Measurements, options: Options, *, problem: Problem, found: Fit,
             seen: Observability) -> CalibrationResult:
-    error_map, closure = _error_map(measurements, problem, found)
+    error_map, closure = _error_map(measurements, options, problem=problem, found=found)
     xy, theta = found.xy, found.theta
     noise = Noise(xy.sigma, theta.sigma, xy.repeats, theta.repeats, xy.residuals,
                   theta.residuals, xy.dof_repeats, theta.dof_repeats, xy.dof_residuals,
@@ -69,17 +77,19 @@ def _result(measurements: Measurements, options: Options, *, problem: Problem, f
         measurements.plan_id, error_map, _artifact_map(problem, found),
         _views(measurements, problem, found), seen, noise, measurements.all_rejected(),
         warnings=tuple(text for text in warnings if text), method="joint",
-        sense=str(measurements.sense))
+        sense=str(measurements.sense), extra={"solver": found.solver})
 
 
-def _error_map(measurements: Measurements, problem: Problem, found: Fit
-               ) -> tuple[ErrorMap, np.ndarray]:
+def _error_map(measurements: Measurements, options: Options, *, problem: Problem, found: Fit
+               ) -> tuple[ErrorMap, np.ndarray | None]:
     """Return the map in the stage frame, and the covariance of the angular misclosure."""
     system, length = problem.system, problem.half_width_m
-    cover = FieldCovariance(system, found.inverse)
-    u_x, u_y = (np.sqrt(v) * found.xy.sigma for v in cover.diagonal())
-    u_theta, closure = np.full(system.angular.n_lines, np.nan), np.zeros((0, 0))
-    if system.angular.n_views:
+    u_x = u_y = np.full(system.grid.views.shape, np.nan)
+    u_theta, closure = np.full(system.angular.n_lines, np.nan), None
+    if problem.direct and options.uncertainty is not False:
+        cover = FieldCovariance(system, found.inverse)
+        u_x, u_y = (np.sqrt(v) * found.xy.sigma for v in cover.diagonal())
+    if problem.direct and options.uncertainty is not False and system.angular.n_views:
         variance, closure = angular_variance(
             cover, problem.conditions, sigma=(found.xy.sigma, found.theta.sigma),
             half_width_m=length)
@@ -123,12 +133,12 @@ def _views(measurements: Measurements, problem: Problem, found: Fit) -> tuple[Vi
 
 
 def _datum_warnings(options: Options, problem: Problem, found: Fit, *,
-                    closure: np.ndarray) -> list[str]:
+                    closure: np.ndarray | None) -> list[str]:
     if not problem.system.angular.n_views:
         return []
     if problem.conditions.datum is not options.datum_theta:
         return ["theta: no half axis has two known sites, so the datum is zero_mean"]
-    if problem.conditions.datum is ThetaDatum.ZERO_MEAN:
+    if problem.conditions.datum is ThetaDatum.ZERO_MEAN or closure is None:
         return []
     return [misclosure_warning(found.misclosure, closure)]
 

@@ -69,18 +69,34 @@ class LatticeViews:
         Marks (and sites) along x and y.
     poses : tuple of GridPose
         One a view.
+    unit : int
+        Pitches in the unit of positions; 0 = the longer half width.
     """
 
-    def __init__(self, shape: tuple[int, int], poses: tuple[GridPose, ...]) -> None:
+    def __init__(self, shape: tuple[int, int], poses: tuple[GridPose, ...],
+                 unit: int = 0) -> None:
         self.shape, self.poses = shape, poses
         self.half = (shape[0] - 1) // 2, (shape[1] - 1) // 2
+        self.unit = unit or max(self.half)
         self.windows = tuple(window(pose, self.half) for pose in poses)
+
+    @property
+    def reach(self) -> int:
+        """Largest folded distance, in pitches, of two sites that one mark visits."""
+        out = 0
+        for p in self.poses:
+            for r in self.poses:
+                if p.q == r.q:
+                    out = max(out, abs(p.a - r.a), abs(p.b - r.b))
+                else:
+                    out = max(out, max(abs(p.a), abs(p.b)) + max(abs(r.a), abs(r.b)))
+        return out
 
     @cached_property
     def z(self) -> np.ndarray:
-        """Mark positions m + i n in units of the longer half width, complex (nx, ny)."""
+        """Mark positions m + i n in the unit, complex (nx, ny)."""
         hx, hy = self.half
-        return (np.arange(-hx, hx + 1)[:, None] + 1j * np.arange(-hy, hy + 1)) / max(hx, hy)
+        return (np.arange(-hx, hx + 1)[:, None] + 1j * np.arange(-hy, hy + 1)) / self.unit
 
     @cached_property
     def in_field(self) -> np.ndarray:
@@ -109,6 +125,40 @@ class LatticeViews:
                         out=out[index][win.marks])
         return out
 
+    def gather_mean(self, field: np.ndarray, share: np.ndarray) -> np.ndarray:
+        """Return the sum over views of share times `gather`, complex (nx, ny)."""
+        out = np.zeros(self.shape, dtype=complex)
+        for index, (pose, win) in enumerate(zip(self.poses, self.windows, strict=True)):
+            sites = field[win.sites]
+            part = (sites.T if win.transposed else sites) * share[index][win.marks]
+            if pose.q:
+                part *= PHASES[-pose.q % 4]
+            out[win.marks] += part
+        return out
+
+    def subtract_scattered(self, out: np.ndarray, weight: np.ndarray, mean: np.ndarray) -> None:
+        """Subtract the scatter of weight times one field over the marks from `out`."""
+        for index, (pose, win) in enumerate(zip(self.poses, self.windows, strict=True)):
+            part = weight[index][win.marks] * mean[win.marks]
+            if pose.q:
+                part *= PHASES[pose.q]
+            out[win.sites] -= part.T if win.transposed else part
+
+    def scatter_one(self, index: int, mark: np.ndarray) -> np.ndarray:
+        """Return the scatter of one view's field over the marks, complex (nx, ny)."""
+        out, win = np.zeros(self.shape, dtype=complex), self.windows[index]
+        part = mark[win.marks] * PHASES[self.poses[index].q]
+        out[win.sites] = part.T if win.transposed else part
+        return out
+
+    def scatter_weight(self, weight: np.ndarray) -> np.ndarray:
+        """Return the sum of the weights of all readings at every site, (nx, ny)."""
+        out = np.zeros(self.shape)
+        for index, win in enumerate(self.windows):
+            part = weight[index][win.marks]
+            out[win.sites] += part.T if win.transposed else part
+        return out
+
     def scatter(self, marks: np.ndarray) -> np.ndarray:
         """Return the adjoint of `gather`: the sum over views at every site, complex (nx, ny)."""
         out = np.zeros(self.shape, dtype=complex)
@@ -128,7 +178,7 @@ def rigid_parameters(views: LatticeViews) -> np.ndarray:
     out = np.zeros((7, len(views.poses), 3))
     for v, pose in enumerate(views.poses):
         back = PHASES[-pose.q % 4]
-        shift = back * (pose.a + 1j * pose.b) / max(views.half)
+        shift = back * (pose.a + 1j * pose.b) / views.unit
         taus = (-back, -1j * back, -1j * shift, -shift, -1, -1j, 0)
         out[:, v, 0] = (0, 0, -1, 0, 0, 0, -1)
         out[:, v, 1], out[:, v, 2] = np.real(taus), np.imag(taus)

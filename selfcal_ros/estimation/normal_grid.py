@@ -9,11 +9,11 @@ three numbers a view (phi, Re tau, Im tau), which are eliminated last.
 from functools import cached_property
 
 import numpy as np
-from scipy.sparse import coo_matrix, csc_matrix
 
-from selfcal_ros.estimation.factor import factorise
+from selfcal_ros.estimation.factor import Factor
+from selfcal_ros.estimation.fold import fold
 from selfcal_ros.estimation.graph import Components, components
-from selfcal_ros.estimation.lattice import PHASES, GridPose, LatticeViews, rigid_parameters
+from selfcal_ros.estimation.lattice import GridPose, LatticeViews, rigid_parameters
 
 
 class GridSystem:
@@ -25,11 +25,15 @@ class GridSystem:
         One a view.
     weight : float array (views, nx, ny)
         Weight of each reading; 0 = not read.
+    unit : int
+        Pitches in the unit of positions; 0 = the longer half width.
     """
 
-    def __init__(self, poses: tuple[GridPose, ...], weight: np.ndarray) -> None:
+    def __init__(self, poses: tuple[GridPose, ...], weight: np.ndarray, unit: int = 0) -> None:
         self.weight = weight
-        self.views = LatticeViews(weight.shape[1:], poses)
+        self.views = LatticeViews(weight.shape[1:], poses, unit)
+        self.turning_site = -1
+        """A site known to lie on a closed path that turns, which saves looking for one."""
         self.read = weight > 0
         total = weight.sum(axis=0)
         self.mark_read = total > 0
@@ -62,44 +66,33 @@ class GridSystem:
     def components(self) -> Components:
         """Components of the graph of sites and marks."""
         site, mark, q = self.edges
-        return components(site, mark, q, n_sites=self.n_sites, n_marks=self.n_sites)
+        return components(site, mark, q, n_sites=self.n_sites, n_marks=self.n_sites,
+                          turning=self.turning_site)
 
     def centred(self, marks: np.ndarray) -> np.ndarray:
         """Return `marks` (views, nx, ny) less the weighted mean of each mark over its views."""
-        return marks - np.einsum("vij,vij->ij", self.share, marks)
+        mean = self.share[0] * marks[0]
+        for share, mark in zip(self.share[1:], marks[1:], strict=True):
+            mean += share * mark
+        return marks - mean
+
+    @property
+    def mean_weight(self) -> float:
+        """Mean weight of a reading."""
+        return float(self.weight.sum() / max(self.n_readings, 1))
 
     @cached_property
-    def matrix(self) -> csc_matrix:
-        """The eliminated matrix over the sites, Hermitian, pinned where a component is free."""
-        index = self.views.site_index.reshape(self.n_views, -1)
-        weight, share = (a.reshape(self.n_views, -1) for a in (self.weight, self.share))
-        rows, cols, values = [], [], []
-        for i, pose_i in enumerate(self.views.poses):
-            for j, pose_j in enumerate(self.views.poses):
-                both = (weight[i] > 0) & (weight[j] > 0)
-                value = -weight[i][both] * share[j][both]
-                if i == j:
-                    value = value + weight[i][both]
-                rows.append(index[i][both])
-                cols.append(index[j][both])
-                values.append(value * PHASES[(pose_i.q - pose_j.q) % 4])
-        pins = self._pins()
-        rows.append(pins)
-        cols.append(pins)
-        values.append(np.full(len(pins), self.weight.sum() / max(self.n_readings, 1)))
-        data, at = np.concatenate(values), (np.concatenate(rows), np.concatenate(cols))
-        return coo_matrix((data, at), shape=(self.n_sites, self.n_sites)).tocsc()
-
-    def _pins(self) -> np.ndarray:
-        """Return the sites that are held: never visited, and one of each free component."""
+    def pins(self) -> np.ndarray:
+        """The sites that are held: never visited, and one of each free component."""
         parts = self.components
         held = parts.first_sites[parts.balanced]
         return np.concatenate([np.flatnonzero(parts.of_site < 0), held])
 
     @cached_property
-    def factor(self):
-        """Factorisation of `matrix`."""
-        return factorise(self.matrix, self.views.shape)
+    def factor(self) -> Factor:
+        """Factorisation of the matrix over the sites, pinned where a component is free."""
+        folded = fold(self.views, self.weight, self.share, self.pins)
+        return Factor(folded, self.views.shape, self.views.reach)
 
     @cached_property
     def shapes(self) -> np.ndarray:
@@ -109,24 +102,29 @@ class GridSystem:
     @cached_property
     def columns(self) -> np.ndarray:
         """Coupling of sites to phi and tau, complex (sites, views, 2), plate eliminated."""
-        out = np.empty((self.n_sites, self.n_views, 2), dtype=complex)
+        out = np.empty((2 * self.n_views, *self.views.shape), dtype=complex)
         for v in range(self.n_views):
             for c in range(2):
-                marks = -self.weight * (self.share[v] * self.shapes[c])
-                marks[v] += self.weight[v] * self.shapes[c]
-                out[:, v, c] = self.views.scatter(marks).ravel()
-        return out
+                own = self.views.scatter_one(v, self.weight[v] * self.shapes[c])
+                self.views.subtract_scattered(own, self.weight, self.share[v] * self.shapes[c])
+                out[2 * v + c] = own
+        return out.reshape(self.n_views, 2, self.n_sites).transpose(2, 0, 1)
 
     @cached_property
     def block(self) -> np.ndarray:
         """Block of the misalignments, plate eliminated, real (3 views, 3 views)."""
-        f = _real_columns(self.shapes.reshape(2, -1).T).T
-        weight, share = (a.reshape(self.n_views, -1) for a in (self.weight, self.share))
+        z = self.views.z
+        x, y = z.real, z.imag
         out = np.empty((self.n_views, 3, self.n_views, 3))
         for i in range(self.n_views):
             for j in range(self.n_views):
-                w = (weight[i] if i == j else 0.0) - weight[i] * share[j]
-                out[i, :, j, :] = np.real((np.conj(f) * w) @ f.T)
+                w = -self.weight[i] * self.share[j]
+                if i == j:
+                    w += self.weight[i]
+                # f = iz, 1, i: the inner products Re(conj(f) f') are |z|^2, -y, x, 1
+                s, sy, sx = w.sum(), (w * y).sum(), (w * x).sum()
+                out[i, :, j, :] = (((w * (x * x + y * y)).sum(), -sy, sx), (-sy, s, 0),
+                                   (sx, 0, s))
         return out.reshape(3 * self.n_views, -1)
 
     @cached_property

@@ -18,6 +18,15 @@ GAP = 1e-9
 """Relative size below which an eigenvalue of a misalignment matrix is a zero; the true zeros lie
 near 1e-15 and the smallest others above 1e-4."""
 
+DIRECT_SITES = 201 * 201
+"""Sites up to which the normal matrix is factorised in any case."""
+
+MAX_DIRECT_SITES = 401 * 401
+"""Sites up to which it is factorised where iteration is slow or an uncertainty is wanted."""
+
+CORE = 41
+"""Sites along each side of the middle part of a large field."""
+
 CACHED = 16
 CACHED_READINGS = 4_000_000
 """Limits of the cache: number of plans, and readings in all of them together."""
@@ -47,6 +56,34 @@ class JointSystem:
         """Place of phi of each angular view among the misalignments."""
 
     @cached_property
+    def direct(self) -> bool:
+        """Whether the sites are factorised; otherwise they are iterated."""
+        sites = self.grid.n_sites
+        if sites <= DIRECT_SITES or sites > MAX_DIRECT_SITES:
+            return sites <= DIRECT_SITES
+        # iteration slows down where marks are missing or weigh very differently
+        weight = self.grid.weight
+        return bool((self.grid.read != self.grid.views.in_field).any()
+                    or weight.max() > 2 * weight[self.grid.read].min())
+
+    @cached_property
+    def _core(self) -> GridSystem:
+        """Grid equations that tell the rank of the misalignments: a middle part of a large field.
+
+        If the middle of the plate determines all misalignments up to the datum, then so does the
+        whole, since readings only add; otherwise the whole has to be factorised.
+        """
+        if self.direct:
+            return self.grid
+        core = core_of(self.grid)
+        values = np.linalg.eigvalsh(core.schur)
+        if _rank(values, core.scale) == len(values) - 7:
+            middle = tuple(size // 2 for size in self.grid.views.shape)
+            self.grid.turning_site = middle[0] * self.grid.views.shape[1] + middle[1]
+            return core
+        return self.grid
+
+    @cached_property
     def rigid(self) -> np.ndarray:
         """Datum modes in all misalignments, (7, size)."""
         out = np.zeros((7, self.size))
@@ -58,7 +95,7 @@ class JointSystem:
         """Return the normal matrix of all misalignments; `ratio` weighs the angular readings."""
         out = np.zeros((self.size, self.size))
         n = 3 * self.grid.n_views
-        out[:n, :n] = self.grid.schur
+        out[:n, :n] = self._core.schur
         out[np.ix_(self.phi_at, self.phi_at)] += ratio * self.angular.schur
         return out
 
@@ -79,7 +116,7 @@ class JointSystem:
     @cached_property
     def spectrum_grid(self) -> tuple[np.ndarray, np.ndarray]:
         """Eigenvalues and vectors of the grid's misalignment matrix."""
-        return np.linalg.eigh(self.grid.schur)
+        return np.linalg.eigh(self._core.schur)
 
     @cached_property
     def rank_schur(self) -> int:
@@ -104,9 +141,10 @@ class JointSystem:
     @cached_property
     def rank_grid(self) -> int:
         """Rank of the grid readings."""
+        rank = self.rank_schur  # first: it may find the turning site for the components
         parts = self.grid.components
         nodes = np.count_nonzero(parts.of_site >= 0) + np.count_nonzero(parts.of_mark >= 0)
-        return int(2 * (nodes - np.count_nonzero(parts.balanced)) + self.rank_schur)
+        return int(2 * (nodes - np.count_nonzero(parts.balanced)) + rank)
 
     @cached_property
     def rank_angular(self) -> int:
@@ -141,10 +179,11 @@ class JointSystem:
     @cached_property
     def known_sites(self) -> np.ndarray:
         """Sites whose error is determined up to the datum, bool (nx, ny)."""
+        hidden = self.unseen[:3 * self.grid.n_views]
         parts = self.grid.components
         known = (parts.of_site >= 0) & ~parts.balanced[parts.of_site]
-        if self.unseen.shape[1] and known.any():
-            moved = self.grid.response @ self.unseen[:3 * self.grid.n_views]
+        if np.any(np.abs(hidden) > 1e-6) and known.any():
+            moved = self.grid.response @ hidden
             gauge = Gauge(self.grid.views.z, known.reshape(self.grid.views.shape), scale=True)
             for column in moved.T:
                 field = column.reshape(self.grid.views.shape)
@@ -189,6 +228,15 @@ class JointSystem:
     def plate_gauge(self) -> Gauge:
         """Datum of the plate."""
         return Gauge(self.grid.views.z, self.known_marks, scale=False)
+
+
+def core_of(grid: GridSystem) -> GridSystem:
+    """Return the readings of the marks and sites in the middle of a field, a smaller system."""
+    low = [(size - CORE) // 2 if size > CORE else 0 for size in grid.views.shape]
+    part = tuple(slice(a, size - a) for a, size in zip(low, grid.views.shape, strict=True))
+    weight = grid.weight[(slice(None), *part)]
+    inside = GridSystem(grid.views.poses, weight, grid.views.unit).views.in_field
+    return GridSystem(grid.views.poses, weight * inside, grid.views.unit)
 
 
 def _rank(values: np.ndarray, scale: float) -> int:
