@@ -10,6 +10,7 @@ from collections.abc import Collection
 import numpy as np
 
 from selfcal_ros.errors import InputError
+from selfcal_ros.estimation.blas_threads import one_thread
 from selfcal_ros.laser.data import (
     Closure,
     Form,
@@ -74,6 +75,7 @@ def solve_blocks(data: StepDiagonal, readings_m: np.ndarray, gain: np.ndarray,
     return turn_to_first_step(vectors) - step_vectors(data.steps_m, np.zeros_like(vectors))
 
 
+@one_thread()
 def identify_conventional(data: StepDiagonal, *, errata: Collection[Erratum] = (),
                           allow_equal: bool = False) -> Identified:
     """Identify all errors from the readings alone, trusting the nominal laser directions.

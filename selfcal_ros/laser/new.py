@@ -5,6 +5,7 @@ from collections.abc import Collection
 
 import numpy as np
 
+from selfcal_ros.estimation.blas_threads import one_thread
 from selfcal_ros.laser.adjust import adjust
 from selfcal_ros.laser.closure import (
     between_diagonals,
@@ -17,6 +18,7 @@ from selfcal_ros.laser.data import Closure, Form, Identified, Method, StepDiagon
 from selfcal_ros.laser.paper import Erratum, solve_diagonal
 
 
+@one_thread()
 def identify_new(data: StepDiagonal, *, form: Form = Form.EXACT,
                  errata: Collection[Erratum] = ()) -> Identified:
     """Identify the transverse errors from the readings and the measured linear errors.
