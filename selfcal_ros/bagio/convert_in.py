@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """From messages to the model. Messages of rclpy and of rosbags have the same fields."""
 
+import math
 from typing import Any
 
 import numpy as np
@@ -98,20 +99,49 @@ def view_readings(message: Any) -> ViewReadings:
 
 
 def counts(message: Any, prefix: str) -> dict[str, int]:
-    """Return reason -> count from a pair of arrays ``<prefix>_reasons``, ``<prefix>_counts``."""
-    return {str(reason): int(count) for reason, count in
-            zip(getattr(message, f"{prefix}_reasons"), getattr(message, f"{prefix}_counts"),
-                strict=True)}
+    """Return reason -> count from a pair of arrays ``<prefix>_reasons``, ``<prefix>_counts``.
+
+    Raises
+    ------
+    InputError
+        If the two arrays differ in length.
+    """
+    reasons, numbers = (getattr(message, f"{prefix}_{name}") for name in ("reasons", "counts"))
+    if len(reasons) != len(numbers):
+        raise InputError(f"selfcal/view_measurement of '{message.view_name}'",
+                         f"{prefix}_reasons and {prefix}_counts differ in length",
+                         "mend the publisher")
+    return {str(reason): int(number) for reason, number in zip(reasons, numbers, strict=True)}
 
 
 def sense_of(message: Any) -> Sense:
-    """Return the sense of measurement behind a ViewMeasurement."""
-    return Sense(message.measurement_sense or Sense.MICROSCOPE_MOVES)
+    """Return the sense of measurement behind a ViewMeasurement; InputError for a word unknown."""
+    try:
+        return Sense(message.measurement_sense or Sense.MICROSCOPE_MOVES)
+    except ValueError as error:
+        raise InputError(f"selfcal/view_measurement of '{message.view_name}'",
+                         f"measurement_sense {message.measurement_sense!r} is not known",
+                         f"use one of {', '.join(Sense)}") from error
 
 
 def error_map(message: Any) -> ErrorMap:
-    """Return the map in a selfcal_msgs/ErrorMap."""
+    """Return the map in a selfcal_msgs/ErrorMap.
+
+    Raises
+    ------
+    InputError
+        If an array does not have one value a site or a line, or the datum is not known.
+    """
     artifact = artifact_of(message)
+    sites, lines = math.prod(artifact.shape), artifact.angular_count
+    for name, size in (("gx", sites), ("gy", sites), ("u_gx", sites), ("u_gy", sites),
+                       ("valid", sites), ("g_theta", lines), ("u_g_theta", lines)):
+        if len(getattr(message, name)) != size:
+            raise InputError("selfcal/error_map", f"{name} has {len(getattr(message, name))} "
+                             f"values, the plate {size}", "mend the publisher")
+    if message.datum_theta not in list(ThetaDatum):
+        raise InputError("selfcal/error_map", f"datum_theta {message.datum_theta!r} is not known",
+                         f"use one of {', '.join(ThetaDatum)}")
     grids = {name: np.array(getattr(message, name), dtype=float).reshape(artifact.shape)
              for name in ("gx", "gy", "u_gx", "u_gy")}
     unknown = ~np.array(message.valid, dtype=bool).reshape(artifact.shape)

@@ -102,7 +102,7 @@ def _sort_key(command: Command) -> tuple:
 
 
 def _unused(ordered: list[Command]) -> list[Interval]:
-    ends = [command.stamp_ns for command in ordered[1:]] + [NO_END]
+    ends = [*(command.stamp_ns for command in ordered[1:]), NO_END][:len(ordered)]
     return [Interval(c.stamp_ns, end, None, Reason.OUTSIDE_VIEWS)
             for c, end in zip(ordered, ends, strict=True)]
 

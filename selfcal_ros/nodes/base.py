@@ -11,7 +11,6 @@ import numpy as np
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
-from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
 from rclpy.executors import ExternalShutdownException
 from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.node import Node
@@ -20,7 +19,7 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 
 from selfcal_ros.collection.parameters import NODE_PARAMETERS, Parameter, parameter_values
-from selfcal_ros.errors import ExitCode, InputError, SelfcalError
+from selfcal_ros.errors import ExitCode, SelfcalError
 from selfcal_ros.nodes.names import Topic
 
 SPIN_SECONDS = 86400.0
@@ -47,11 +46,9 @@ class SelfcalNode(Node):
         super().__init__(name, **kwargs)
         overrides = {key: value.value for key, value in self._parameter_overrides.items()}
         self.values = parameter_values(name, overrides, f"parameters of {name}")
-        for parameter in NODE_PARAMETERS[name]:
-            try:
-                self.declare_parameter(parameter.name, parameter.default, _descriptor(parameter))
-            except (InvalidParameterTypeException, InvalidParameterValueException) as error:
-                raise InputError(f"parameters of {name}", str(error), "mend the value") from error
+        for parameter in NODE_PARAMETERS[name]:  # the checked value: 2 is a good 2.0 here
+            self.declare_parameter(parameter.name, self.values[parameter.name],
+                                   _descriptor(parameter), ignore_override=True)
         self.frame_id = self.values.get("frame_id", "stage")
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
 

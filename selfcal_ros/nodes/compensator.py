@@ -42,6 +42,9 @@ class CompensatorNode(SelfcalNode):
         place = {name: index for index, name in enumerate(message.name)}
         x, y, theta = (place.get(self.values[f"joint_{axis}"]) for axis in ("x", "y", "theta"))
         position = list(message.position)
+        if len(position) != len(message.name):
+            self._counts["refused"] += 1
+            return
         try:
             if x is not None and y is not None:
                 corrected = self._compensator.correct(position[x], position[y])

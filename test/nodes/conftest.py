@@ -1,0 +1,51 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Every test here gets a ROS domain of its own on loopback; without ROS all of them are skipped."""
+
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+
+HERE = Path(__file__).parent
+MISSING = [name for name in ("rclpy", "selfcal_msgs") if find_spec(name) is None]
+
+
+class ModuleWithoutRos(pytest.Module):
+    """A test module that cannot be imported here."""
+
+    def collect(self):
+        pytest.skip(f"needs {' and '.join(MISSING)}", allow_module_level=True)
+
+
+def pytest_pycollect_makemodule(module_path, parent):
+    return ModuleWithoutRos.from_parent(parent, path=module_path) if MISSING else None
+
+
+def pytest_collection_modifyitems(items):
+    for item in items:
+        if HERE in item.path.parents:
+            item.add_marker("ros")
+            # the parser that rclpy's type description service loads is older than Python 3.12
+            item.add_marker(pytest.mark.filterwarnings("ignore:module 'sre_:DeprecationWarning"))
+
+
+@pytest.fixture
+def ros_environment(monkeypatch):
+    """Yield the environment for processes of this test; this process is in the same domain."""
+    from selfcal_ros.cli.replay import domain
+
+    monkeypatch.delenv("ROS_DOMAIN_ID", raising=False)
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    with domain() as environment:
+        monkeypatch.setenv("ROS_DOMAIN_ID", environment["ROS_DOMAIN_ID"])
+        yield environment
+
+
+@pytest.fixture
+def graph(ros_environment):
+    """Yield an empty ROS graph of this test alone."""
+    from test.support.ros import Graph
+
+    graph = Graph(int(ros_environment["ROS_DOMAIN_ID"]))
+    yield graph
+    graph.close()

@@ -1,0 +1,150 @@
+# SPDX-License-Identifier: Apache-2.0
+"""measurement_collector: the QoS it takes the encoder with, status, finish, readings sent on."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from rclpy.qos import ReliabilityPolicy
+from selfcal_msgs.msg import MarkDetection, ViewCommand
+from std_srvs.srv import Trigger
+
+from selfcal_ros.bagio import convert_in
+from selfcal_ros.collection.digest import readings_digest, session_digest
+from selfcal_ros.collection.messages import Command, Detection
+from selfcal_ros.nodes import names
+from selfcal_ros.nodes.measurement_collector import MeasurementCollector
+from test.support.ros import publish_events
+from test.support.sessions import collected, events_of, small_plan
+
+FINISH = "measurement_collector/finish"
+
+
+def encoder_subscriptions(graph) -> list[ReliabilityPolicy]:
+    return [info.qos_profile.reliability for info in
+            graph.hand.get_subscriptions_info_by_topic("/stage/joint_states")]
+
+
+def received(node, counts: dict[str, int]) -> bool:
+    return list(node.collector.received.values()) == list(counts.values())
+
+
+@pytest.mark.parametrize("offer, policy", [
+    (names.ENCODER, ReliabilityPolicy.RELIABLE),
+    (names.ENCODER_BEST_EFFORT, ReliabilityPolicy.BEST_EFFORT)])
+def test_the_encoder_is_taken_as_it_is_offered(graph, offer, policy):
+    node = graph.node(MeasurementCollector)
+    publisher = graph.publisher(offer)
+    assert encoder_subscriptions(graph) == [policy]
+    publisher.publish(names.ENCODER.type(name=["x"], position=[1.0]))
+    graph.until(lambda: node.collector.received["encoder"] == 1, "the sample")
+
+
+def test_an_encoder_that_becomes_best_effort_is_still_heard(graph):
+    node = graph.node(MeasurementCollector)
+    graph.publisher(names.ENCODER)
+    graph.hand.create_publisher(names.ENCODER.type, names.ENCODER.name,
+                                names.ENCODER_BEST_EFFORT.qos)
+    graph.until(lambda: encoder_subscriptions(graph) == [ReliabilityPolicy.BEST_EFFORT],
+                "a subscription that matches both publishers")
+    for publisher in list(graph.hand.publishers):
+        if publisher.topic_name == "/stage/joint_states":
+            graph.until(lambda p=publisher: p.get_subscription_count() == 1, "a match")
+            publisher.publish(names.ENCODER.type(name=["x"], position=[1.0]))
+    graph.until(lambda: node.collector.received["encoder"] == 2, "both samples")
+
+
+def test_what_it_publishes_is_what_the_messages_hold_bit_for_bit(graph):
+    events = events_of(small_plan())
+    _, measurements, progress = collected(events)
+    node = graph.node(MeasurementCollector)
+    heard, status = graph.listen(names.MEASUREMENT), graph.listen(names.STATUS)
+    counts = publish_events(graph, events)
+    graph.until(lambda: received(node, counts), "all messages")
+    answer = graph.call(Trigger, FINISH)
+    expected = {index: readings_digest(item.readings, measurements.rejected)
+                for index, item in progress.items()}
+    assert answer.success
+    assert answer.message == session_digest(expected)
+    graph.until(lambda: {m.view_index for m in heard} == set(expected), "all views")
+    newest = {message.view_index: message for message in heard}
+    for index, message in newest.items():
+        found = readings_digest(convert_in.view_readings(message), measurements.rejected)
+        assert found == expected[index]
+        assert message.plan_id == measurements.plan_id
+        assert convert_in.artifact_of(message) == measurements.artifact
+    graph.until(lambda: {m.view_index for m in status if m.complete} == set(expected), "status")
+
+
+def test_order_of_arrival_changes_nothing(graph):
+    events = events_of(small_plan("0, 90", repeats=1))
+    _, measurements, progress = collected(events)
+    node = graph.node(MeasurementCollector)
+    order = np.random.default_rng(3).permutation(len(events))
+    counts = publish_events(graph, [events[i] for i in order])
+    graph.until(lambda: received(node, counts), "all messages")
+    assert graph.call(Trigger, FINISH).message == session_digest(
+        {index: readings_digest(item.readings, measurements.rejected)
+         for index, item in progress.items()})
+
+
+def test_the_status_counts_marks_and_rejections_while_the_view_is_open(graph):
+    events = events_of(small_plan("0", repeats=1))
+    commands = [index for index, event in enumerate(events) if isinstance(event, Command)]
+    events = events[:commands[2]]  # the first view alone, still open
+    detections = [event for event in events if isinstance(event, Detection)]
+    events.remove(detections[3])
+    events += [detections[0], replace(detections[7], m=9)]
+    graph.node(MeasurementCollector, status_period=0.02)
+    status = graph.listen(names.STATUS)
+    publish_events(graph, events)
+    graph.until(lambda: status and status[-1].detections_rejected == 2, "the rejections")
+    last = status[-1]
+    assert (last.grid_expected, last.grid_done) == (25, 24)
+    assert (last.angular_expected, last.angular_done) == (8, 8)
+    assert dict(zip(last.reject_reasons, last.reject_counts, strict=True)) == {
+        "duplicate": 1, "unknown_mark": 1}
+    assert last.detections_used == 32
+    assert not last.complete
+
+
+def test_finish_without_a_command_says_what_is_missing(graph):
+    graph.node(MeasurementCollector)
+    answer = graph.call(Trigger, FINISH)
+    assert not answer.success
+    assert answer.message.startswith("selfcal/view_command: no MEASURE command")
+
+
+def test_a_command_that_cannot_be_used_is_counted_and_does_not_end_the_node(graph):
+    node = graph.node(MeasurementCollector)
+    commands = graph.publisher(names.COMMAND)
+    commands.publish(ViewCommand(phase=9))
+    commands.publish(ViewCommand(phase=1, grid=True, grid_size=5, grid_pitch=0.01, repeats=1,
+                                 translation_x=0.0042))
+    graph.until(lambda: node.collector.received["command"] == 2, "both commands")
+    publish_events(graph, events_of(small_plan("0", repeats=1)))
+    graph.until(lambda: node.collector.received["command"] == 2 + 5, "the good commands")
+    measurements, _ = node.collector.collect()
+    assert measurements.rejected["command_unusable"] == 2
+
+
+def test_a_late_solver_hears_the_views_that_are_done(graph):
+    node = graph.node(MeasurementCollector)
+    counts = publish_events(graph, events_of(small_plan("0", repeats=1)))
+    graph.until(lambda: received(node, counts), "all messages")
+    assert graph.call(Trigger, FINISH).success
+    late = graph.listen(names.MEASUREMENT)
+    graph.until(lambda: {m.view_index for m in late} == {0, 1}, "the latched views")
+
+
+def test_diagnostics_count_what_was_received(graph):
+    from diagnostic_msgs.msg import DiagnosticArray
+
+    graph.node(MeasurementCollector)
+    heard: list = []
+    graph.hand.create_subscription(DiagnosticArray, "/diagnostics", heard.append, 10)
+    graph.publisher(names.DETECTIONS).publish(MarkDetection())
+    wanted = ("detection_received", "1")
+    graph.until(lambda: any(wanted == (v.key, v.value) for m in heard for s in m.status
+                            for v in s.values), "the count")
+    assert heard[-1].status[0].name == "measurement_collector"

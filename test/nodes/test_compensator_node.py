@@ -1,0 +1,116 @@
+# SPDX-License-Identifier: Apache-2.0
+"""compensator: corrected positions, by a map from the graph or from a file."""
+
+import json
+
+import numpy as np
+import pytest
+from diagnostic_msgs.msg import DiagnosticArray
+
+from selfcal_ros.bagio import convert_out
+from selfcal_ros.compensation.compensator import Compensator
+from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.result import result_to_dict
+from selfcal_ros.nodes import names
+from selfcal_ros.nodes.base import fill
+from selfcal_ros.nodes.compensator import CompensatorNode
+from test.support.maps import random_map, result_of
+
+MAP = random_map(Artifact(5, 0.01, 8), 3)
+PLACES = [(0.0, 0.0, 0.0), (0.0123, -0.0071, 0.4), (0.02, 0.02, 3.0), (0.09, -0.09, -1.0)]
+
+
+def latch_map(graph, error_map=MAP) -> None:
+    publisher = graph.hand.create_publisher(names.ERROR_MAP.type, names.ERROR_MAP.name,
+                                            names.ERROR_MAP.qos)
+    publisher.publish(fill(names.ERROR_MAP.type(), convert_out.error_map(
+        result_of(error_map), 1, "stage")))
+
+
+def map_file(folder) -> str:
+    path = folder / "map.json"
+    path.write_text(json.dumps(result_to_dict(result_of(MAP))))
+    return str(path)
+
+
+def sample(*position: float, name=("x", "y", "theta")):
+    return names.ENCODER.type(name=list(name), position=list(position),
+                              velocity=[0.5] * len(position))
+
+
+def correct(graph, messages: list) -> list:
+    """Publish samples until each has been answered, and return the answers."""
+    heard = graph.listen(names.CORRECTED)
+    publisher = graph.publisher(names.ENCODER)
+    for index, message in enumerate(messages):
+        message.header.stamp.sec = index + 1
+        publisher.publish(message)
+        graph.until(lambda index=index: len(heard) > index, f"answer {index}")
+    return heard
+
+
+@pytest.mark.parametrize("interpolation", ["bilinear", "bicubic"])
+def test_each_sample_comes_back_with_the_stage_error_taken_off(graph, tmp_path, interpolation):
+    graph.node(CompensatorNode, map=map_file(tmp_path), interpolation=interpolation)
+    reference = Compensator(MAP, method=interpolation, outside="clamp")
+    for place, answer in zip(PLACES, correct(graph, [sample(*p) for p in PLACES]), strict=True):
+        x, y = reference.correct(place[0], place[1])
+        assert list(answer.position) == [x, y, reference.correct_theta(place[2])]
+        assert list(answer.velocity) == [0.5, 0.5, 0.5]
+
+
+def test_the_error_is_taken_off_not_added(graph, tmp_path):
+    """At a true position p the stage indicates p + G(p); the answer must be p."""
+    graph.node(CompensatorNode, map=map_file(tmp_path))
+    i, j = 3, 1
+    p = np.array([(i - 2) * 0.01, (j - 2) * 0.01])
+    indicated = p + np.array([MAP.gx[i, j], MAP.gy[i, j]])
+    [answer] = correct(graph, [sample(*indicated, 0.0)])
+    np.testing.assert_allclose(answer.position[:2], p, rtol=0, atol=1e-15)
+
+
+def test_a_map_that_was_published_before_the_node_started_is_used(graph):
+    latch_map(graph)
+    node = graph.node(CompensatorNode)
+    graph.until(lambda: node._compensator is not None, "the latched map")
+    [answer] = correct(graph, [sample(0.01, 0.0, 0.0)])
+    assert answer.position[0] == Compensator(MAP).correct(0.01, 0.0)[0]
+
+
+def test_joints_are_found_by_name_and_others_pass_unchanged(graph, tmp_path):
+    graph.node(CompensatorNode, map=map_file(tmp_path), joint_x="stage_x", joint_y="stage_y")
+    [answer] = correct(graph, [sample(7.0, 0.01, 0.005, name=("z", "stage_y", "stage_x"))])
+    x, y = Compensator(MAP).correct(0.005, 0.01)
+    assert list(answer.position) == [7.0, y, x]
+
+
+def test_what_is_not_corrected_is_counted_and_not_published(graph, tmp_path):
+    node = graph.node(CompensatorNode, map=map_file(tmp_path), outside="refuse")
+    heard, said = graph.listen(names.CORRECTED), []
+    graph.hand.create_subscription(DiagnosticArray, "/diagnostics", said.append, 10)
+    publisher = graph.publisher(names.ENCODER)
+    publisher.publish(sample(0.5, 0.0, 0.0))
+    publisher.publish(sample(name=("x", "y")))
+    publisher.publish(sample(0.0, 0.0, 0.0))
+    graph.until(lambda: len(heard) == 1, "the good sample")
+    wanted = {"corrected": "1", "without_map": "0", "refused": "2"}
+    graph.until(lambda: said and {v.key: v.value for v in said[-1].status[0].values} == wanted,
+                "the counts")
+    assert node.get_name() == "compensator"
+
+
+def test_without_a_map_the_state_is_a_warning(graph):
+    graph.node(CompensatorNode)
+    said: list = []
+    graph.hand.create_subscription(DiagnosticArray, "/diagnostics", said.append, 10)
+    graph.until(lambda: said, "diagnostics")
+    status = said[0].status[0]
+    assert (status.level, status.message) == (b"\x01", "no error map yet")
+
+
+def test_a_malformed_map_does_not_end_the_node(graph):
+    node = graph.node(CompensatorNode)
+    publisher = graph.publisher(names.ERROR_MAP)
+    publisher.publish(names.ERROR_MAP.type(grid_size=5, grid_pitch=0.01, gx=[0.0] * 3))
+    latch_map(graph)
+    graph.until(lambda: node._compensator is not None, "the good map")

@@ -1,0 +1,86 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Parameters of the nodes: every one described and bounded, what is not known refused."""
+
+import pytest
+from rclpy.parameter import Parameter as RosParameter
+
+from selfcal_ros.collection.parameters import NODE_PARAMETERS
+from selfcal_ros.errors import InputError
+from selfcal_ros.nodes.bag_player import BagPlayer
+from selfcal_ros.nodes.bag_recorder import BagRecorder
+from selfcal_ros.nodes.compensator import CompensatorNode
+from selfcal_ros.nodes.measurement_collector import MeasurementCollector
+from selfcal_ros.nodes.pose_sequencer import PoseSequencer
+from selfcal_ros.nodes.solver import Solver
+from selfcal_ros.nodes.stage_simulator import StageSimulator
+from test.support.sessions import small_bag
+
+NODES = {"measurement_collector": MeasurementCollector, "pose_sequencer": PoseSequencer,
+         "solver": Solver, "compensator": CompensatorNode, "bag_player": BagPlayer,
+         "bag_recorder": BagRecorder, "stage_simulator": StageSimulator}
+
+
+@pytest.fixture
+def needed(tmp_path):
+    """Return the parameters without which a node cannot run."""
+    return {"bag_player": {"bag": str(small_bag(tmp_path))},
+            "bag_recorder": {"bag": str(tmp_path / "recorded")}}
+
+
+def test_the_table_covers_every_node():
+    assert set(NODES) == set(NODE_PARAMETERS)
+
+
+@pytest.mark.parametrize("name", NODES)
+def test_every_parameter_is_described_bounded_and_has_its_default(graph, needed, name):
+    node = graph.node(NODES[name], **needed.get(name, {}))
+    for parameter in NODE_PARAMETERS[name]:
+        found = node.describe_parameter(parameter.name)
+        assert found.description.startswith(parameter.description)
+        assert found.read_only
+        for choice in parameter.choices:
+            assert choice in found.additional_constraints
+        ranges = [*found.floating_point_range, *found.integer_range]
+        expected = [] if parameter.low is None else [(parameter.low, parameter.high)]
+        assert [(r.from_value, r.to_value) for r in ranges] == expected
+        if parameter.name not in needed.get(name, {}):
+            assert node.get_parameter(parameter.name).value == parameter.default
+    if name == "bag_recorder":
+        node.close()
+
+
+@pytest.mark.parametrize("name", NODES)
+def test_an_unknown_parameter_is_refused_with_the_known_names(graph, needed, name):
+    first = NODE_PARAMETERS[name][0].name
+    with pytest.raises(InputError) as caught:
+        graph.node(NODES[name], misspelt=1, **needed.get(name, {}))
+    message = str(caught.value)
+    assert message.startswith(f"parameters of {name}: misspelt: {name} has no such parameter")
+    assert first in message
+
+
+@pytest.mark.parametrize("value, problem", [
+    (-1.0, "-1.0 is outside 0.0 to 3600.0 s"), ("soon", "'soon' is not of type float")])
+def test_a_value_that_cannot_be_is_refused(graph, value, problem):
+    with pytest.raises(InputError, match=f"parameters of pose_sequencer: settle_time: {problem}"):
+        graph.node(PoseSequencer, settle_time=value)
+
+
+def test_a_whole_number_is_taken_where_a_number_is_wanted(graph):
+    """`settle_time: 2` in a file means 2.0, for the nodes as for `selfcal solve --params`."""
+    node = graph.node(PoseSequencer, settle_time=2)
+    assert node.get_parameter("settle_time").value == 2.0
+    assert node.get_parameter("settle_time").type_ is RosParameter.Type.DOUBLE
+
+
+def test_a_parameter_cannot_be_changed_while_the_node_runs(graph):
+    node = graph.node(PoseSequencer)
+    [answer] = node.set_parameters([RosParameter("settle_time", value=2.0)])
+    assert not answer.successful
+    assert "read-only" in answer.reason
+
+
+@pytest.mark.parametrize("make", [BagPlayer, BagRecorder])
+def test_a_bag_must_be_named(graph, make):
+    with pytest.raises(InputError, match="no bag is named; set the parameter 'bag'"):
+        graph.node(make)

@@ -1,0 +1,127 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Each node as a process: it starts, a signal ends it with code 0, and nothing stays behind."""
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+import yaml
+
+from selfcal_ros.collection.parameters import NODE_PARAMETERS
+from test.support.sessions import plan_file, small_bag, small_plan
+
+PATIENCE_S = 30.0
+SELFCAL = "import sys; from selfcal_ros.cli.main import main; sys.exit(main())"
+
+
+class Group:
+    """Processes in a session of their own, as a terminal or a launcher would have them."""
+
+    def __init__(self, environment: dict) -> None:
+        self.environment = environment
+        self.running: list[subprocess.Popen] = []
+
+    def start(self, *command: str) -> subprocess.Popen:
+        process = subprocess.Popen([sys.executable, *command], env=self.environment,
+                                   stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+                                   start_new_session=True)
+        self.running.append(process)
+        return process
+
+    def node(self, name: str, **parameters: object) -> subprocess.Popen:
+        arguments = [word for key, value in parameters.items()
+                     for word in ("-p", f"{key}:={value}")]
+        return self.start("-m", f"selfcal_ros.nodes.{name}", "--ros-args", *arguments)
+
+    def close(self) -> None:
+        for process in self.running:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
+            process.communicate()
+
+
+@pytest.fixture
+def group(ros_environment):
+    group = Group(ros_environment)
+    yield group
+    group.close()
+
+
+def alive(session: int) -> bool:
+    """Return whether any process of a session still runs."""
+    try:
+        os.killpg(session, 0)
+    except ProcessLookupError:
+        return False
+    return True
+
+
+def ended(process: subprocess.Popen) -> tuple[int, str, str]:
+    out, err = process.communicate(timeout=PATIENCE_S)
+    deadline = time.monotonic() + PATIENCE_S
+    while alive(process.pid):
+        assert time.monotonic() < deadline, "a child stays behind"
+    return process.returncode, out, err
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_every_node_cleanly(graph, group, tmp_path, number):
+    bag, recorded = small_bag(tmp_path), tmp_path / "recorded"
+    needed = {"bag_player": {"bag": bag, "rate": 0.001}, "bag_recorder": {"bag": recorded},
+              "pose_sequencer": {"plan": plan_file(tmp_path, small_plan())}}
+    processes = {name: group.node(name, **needed.get(name, {})) for name in NODE_PARAMETERS}
+    graph.until(lambda: set(NODE_PARAMETERS) <= set(graph.hand.get_node_names()), "all nodes")
+    graph.until(lambda: len(graph.hand.get_publishers_info_by_topic("/diagnostics")) >= 6,
+                "their diagnostics")
+    for process in processes.values():
+        process.send_signal(number)
+    for name, process in processes.items():
+        code, _, err = ended(process)
+        assert code == 0, f"{name}: {err}"
+        assert "Traceback" not in err, name
+    info = yaml.safe_load((recorded / "metadata.yaml").read_text())
+    assert info["rosbag2_bagfile_information"]["version"] == 9
+
+
+def test_a_player_ends_by_itself_when_the_bag_is_played(group, tmp_path):
+    code, _, err = ended(group.node("bag_player", bag=small_bag(tmp_path), rate=0.0,
+                                    wait_for_subscribers=0.0))
+    assert code == 0
+    assert "played" in err
+
+
+@pytest.mark.parametrize("node, parameters, line", [
+    ("solver", {"metod": "joint"}, "parameters of solver: metod: solver has no such parameter"),
+    ("pose_sequencer", {"plan": "/no/plan.yaml"}, "/no/plan.yaml: no such file"),
+    ("bag_player", {"bag": "/no/bag"}, "/no/bag: no such file or folder")])
+def test_bad_input_is_one_line_and_code_2(group, node, parameters, line):
+    code, _, err = ended(group.node(node, **parameters))
+    assert code == 2
+    [said] = [text for text in err.splitlines() if text.startswith("selfcal: ")]
+    assert line in said
+    assert "Traceback" not in err
+
+
+def test_an_unknown_name_in_a_parameter_file_is_refused(group, tmp_path):
+    file = tmp_path / "params.yaml"
+    file.write_text(yaml.safe_dump({"solver": {"ros__parameters": {"theta_data": "zero_mean"}}}))
+    code, _, err = ended(group.start("-m", "selfcal_ros.nodes.solver", "--ros-args",
+                                     "--params-file", str(file)))
+    assert code == 2
+    assert "theta_data: solver has no such parameter; known are" in err
+
+
+@pytest.mark.parametrize("whole_group", [True, False], ids=["ctrl-c", "kill -INT"])
+def test_an_interrupted_replay_leaves_no_process(graph, group, tmp_path, whole_group):
+    bag = small_bag(tmp_path)
+    replay = group.start("-c", SELFCAL, "replay", str(bag), "--rate", "0.001")
+    graph.until(lambda: {"bag_player", "solver"} <= set(graph.hand.get_node_names()), "the nodes")
+    (os.killpg if whole_group else os.kill)(replay.pid, signal.SIGINT)
+    code, _, err = ended(replay)
+    assert code == 128 + signal.SIGINT
+    assert "selfcal replay: interrupted" in err
+    assert "Traceback" not in err

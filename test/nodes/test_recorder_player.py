@@ -1,0 +1,134 @@
+# SPDX-License-Identifier: Apache-2.0
+"""bag_player and bag_recorder: what one plays the other writes, all of it."""
+
+from collections import Counter
+from pathlib import Path
+
+import pytest
+import yaml
+from mcap.reader import make_reader
+
+from selfcal_ros.bagio.offline import collect_bag
+from selfcal_ros.bagio.reader import BagReader
+from selfcal_ros.collection.digest import readings_digest
+from selfcal_ros.collection.parameters import parameter_values
+from selfcal_ros.errors import InputError, NoDataError
+from selfcal_ros.nodes import names
+from selfcal_ros.nodes.bag_player import BagPlayer
+from selfcal_ros.nodes.bag_recorder import BagRecorder
+from test.support.sessions import small_bag
+
+
+def stamps(bag: Path) -> list[tuple[str, int]]:
+    """Return topic and header stamp of every message of a bag, in the order of the file."""
+    return [(topic, m.header.stamp.sec * 10**9 + m.header.stamp.nanosec)
+            for topic, _, m in BagReader(bag).stamped_messages()]
+
+
+def content(bag: Path) -> Counter:
+    return Counter((topic, repr(message)) for topic, _, message in
+                   BagReader(bag).stamped_messages())
+
+
+def digests(bag: Path) -> list[str]:
+    measurements, _, _ = collect_bag(bag, parameter_values("measurement_collector", {}, "test"))
+    return [readings_digest(view, {}) for view in measurements.views]
+
+
+@pytest.fixture
+def played(graph, tmp_path):
+    """Return a function that plays a bag into a recorder: (bag, recorded, player)."""
+    def play(**parameters):
+        bag = small_bag(tmp_path)
+        recorder = graph.node(BagRecorder, bag=str(tmp_path / "recorded"))
+        player = graph.node(BagPlayer, bag=str(bag), **({"rate": 0.0} | parameters))
+        graph.until(player.finished.done, "the end of the bag")
+        total = player.player.total
+        graph.until(lambda: sum(recorder._writer.counts.values()) >= total, "the last message")
+        recorder.close()
+        return bag, tmp_path / "recorded", player
+    return play
+
+
+def test_nothing_is_lost_added_or_changed(played):
+    bag, recorded, player = played()
+    assert content(recorded) == content(bag)
+    assert sum(content(bag).values()) == player.player.total
+    assert digests(recorded) == digests(bag)
+
+
+def test_shuffled_messages_arrive_in_another_order_with_their_own_stamps(played):
+    bag, recorded, _ = played(seed=4)
+    assert sorted(stamps(recorded)) == sorted(stamps(bag))
+    assert stamps(recorded) != stamps(bag)
+    assert digests(recorded) == digests(bag)
+
+
+def test_a_bag_is_played_at_its_own_pace_times_the_rate(played):
+    bag, recorded, _ = played(rate=20.0)
+    assert content(recorded) == content(bag)
+    arrivals = [stamp for _, stamp, _ in BagReader(recorded).stamped_messages()]
+    original = [stamp for _, stamp, _ in BagReader(bag).stamped_messages()]
+    assert max(arrivals) - min(arrivals) >= (max(original) - min(original)) / 20 * 0.9
+
+
+def test_the_recording_is_a_rosbag2_bag(played):
+    _, recorded, _ = played()
+    info = yaml.safe_load((recorded / "metadata.yaml").read_text())["rosbag2_bagfile_information"]
+    assert (info["version"], info["storage_identifier"]) == (9, "mcap")
+    counts = {t["topic_metadata"]["name"]: t["message_count"]
+              for t in info["topics_with_message_count"]}
+    expected = Counter(f"/{topic}" for topic, _ in stamps(recorded))
+    assert {name: n for name, n in counts.items() if n} == expected
+    qos = {t["topic_metadata"]["name"]: t["topic_metadata"]["offered_qos_profiles"][0]
+           for t in info["topics_with_message_count"]}
+    assert qos["/selfcal/view_command"]["durability"] == "transient_local"
+    assert qos["/stage/mark_detections"]["durability"] == "volatile"
+    with (recorded / info["relative_file_paths"][0]).open("rb") as stream:
+        reader = make_reader(stream)
+        assert reader.get_header().profile == "ros2"
+        summary = reader.get_summary()
+    assert {schema.encoding for schema in summary.schemas.values()} == {"ros2msg"}
+    assert {channel.message_encoding for channel in summary.channels.values()} == {"cdr"}
+
+
+def test_an_encoder_with_best_effort_is_recorded(graph, tmp_path):
+    recorder = graph.node(BagRecorder, bag=str(tmp_path / "bag"))
+    publisher = graph.publisher(names.ENCODER_BEST_EFFORT)
+    publisher.publish(names.ENCODER.type(name=["x"], position=[0.25]))
+    graph.until(lambda: recorder._writer.counts["/stage/joint_states"] == 1, "the sample")
+    recorder.close()
+
+
+def test_what_was_flushed_survives_a_crash(graph, tmp_path):
+    recorder = graph.node(BagRecorder, bag=str(tmp_path / "bag"))
+    graph.publisher(names.DETECTIONS).publish(names.DETECTIONS.type(m=3))
+    graph.until(lambda: recorder._writer.counts["/stage/mark_detections"] == 1, "the message")
+    recorder._flush()
+    reader = BagReader(tmp_path / "bag")
+    assert [message.m for _, _, message in reader.stamped_messages()] == [3]
+    assert reader.lost
+    recorder.close()
+
+
+def test_only_the_inputs_are_recorded_when_asked(graph, tmp_path):
+    recorder = graph.node(BagRecorder, bag=str(tmp_path / "bag"), all_topics=False)
+    assert set(recorder._writer.counts) == {f"/{topic.name}" for topic in names.INPUTS}
+    recorder.close()
+
+
+def test_an_existing_folder_is_never_written_into(graph, tmp_path):
+    with pytest.raises(InputError, match="exists already; remove it or name another folder"):
+        graph.node(BagRecorder, bag=str(tmp_path))
+
+
+def test_a_bag_that_is_none_is_refused(graph, tmp_path):
+    with pytest.raises(InputError, match="no such file or folder"):
+        graph.node(BagPlayer, bag=str(tmp_path / "no"))
+
+
+def test_a_bag_without_our_topics_is_refused(graph, tmp_path):
+    recorder = graph.node(BagRecorder, bag=str(tmp_path / "bag"))
+    recorder.close()
+    with pytest.raises(NoDataError, match="no message on the topics of the contract"):
+        graph.node(BagPlayer, bag=str(tmp_path / "bag"))

@@ -1,0 +1,42 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`selfcal replay`: over DDS, at any pace and in any order, the map of `selfcal solve`."""
+
+import pytest
+
+from selfcal_ros.cli.main import main as selfcal
+from test.support.sessions import small_bag, small_plan
+
+
+@pytest.fixture(scope="module")
+def solved(tmp_path_factory):
+    """Return a bag and the text of the result that `selfcal solve` writes for it."""
+    folder = tmp_path_factory.mktemp("replay")
+    bag = small_bag(folder)
+    assert selfcal(["solve", str(bag), "--quiet", "-o", str(folder / "solved.json")]) == 0
+    return bag, (folder / "solved.json").read_text()
+
+
+@pytest.mark.parametrize("options", [["--fast"], ["--rate", "20"], ["--rate", "50"],
+                                     ["--fast", "--shuffle", "3"]], ids=" ".join)
+def test_replay_gives_the_result_of_solve_bit_for_bit(ros_environment, solved, tmp_path, options):
+    bag, expected = solved
+    output = tmp_path / "replayed.json"
+    assert selfcal(["replay", str(bag), *options, "--quiet", "-o", str(output)]) == 0
+    assert output.read_text() == expected
+
+
+def test_a_deficient_bag_ends_with_code_3_and_says_why(ros_environment, tmp_path, capfd):
+    bag = small_bag(tmp_path, small_plan("0, 90"))
+    assert selfcal(["replay", str(bag), "--fast", "--quiet"]) == 3
+    [line] = [text for text in capfd.readouterr().err.splitlines() if "selfcal replay: " in text]
+    solve = selfcal(["solve", str(bag), "--quiet"])
+    assert solve == 3
+    [same] = [text for text in capfd.readouterr().err.splitlines() if "selfcal solve: " in text]
+    assert line.removeprefix("selfcal replay: ") == same.removeprefix("selfcal solve: ")
+
+
+@pytest.mark.parametrize("options, problem", [
+    (["--rate", "0"], "--rate: 0 is not a speed; give a number above 0")])
+def test_a_rate_must_be_above_zero(options, problem, capsys):
+    assert selfcal(["replay", "bag", *options]) == 2
+    assert problem in capsys.readouterr().err

@@ -1,0 +1,250 @@
+# SPDX-License-Identifier: Apache-2.0
+"""pose_sequencer: services, status, foreign commands, time-outs and the action."""
+
+import pytest
+from action_msgs.msg import GoalStatus
+from rclpy.action import ActionClient
+from selfcal_msgs.action import RunCalibration
+from selfcal_msgs.srv import SaveMap
+from std_srvs.srv import Trigger
+
+from selfcal_ros.bagio import convert_in, convert_out
+from selfcal_ros.collection.messages import Command, Phase
+from selfcal_ros.nodes import names
+from selfcal_ros.nodes.base import fill
+from selfcal_ros.nodes.pose_sequencer import PoseSequencer
+from test.support.ros import Graph
+from test.support.sessions import plan_file, small_plan
+
+PLAN = small_plan()
+PLACE, MEASURE, DONE, ABORT = Phase
+
+
+class Desk:
+    """A sequencer with a plan, what it commands, and a collector's voice."""
+
+    def __init__(self, graph: Graph, folder, **parameters) -> None:
+        self.graph = graph
+        self.plan = plan_file(folder, PLAN)
+        self.node = graph.node(PoseSequencer, **({"plan": self.plan} | parameters))
+        self.heard = graph.listen(names.COMMAND)
+        self.status = graph.publisher(names.STATUS)
+
+    def ask(self, service: str):
+        return self.graph.call(Trigger, f"pose_sequencer/{service}")
+
+    @property
+    def commands(self) -> list[tuple[Phase, int]]:
+        return [(Phase(m.phase), m.view_index) for m in self.heard]
+
+    def expect(self, *commands) -> None:
+        self.graph.until(lambda: len(self.heard) >= len(commands), f"{commands}")
+        assert self.commands == list(commands)
+
+    def complete(self, index: int, *, plan_id: str = PLAN.plan_id, complete: bool = True,
+                 age_ns: int = 0) -> None:
+        stamp = convert_in.stamp_ns(self.heard[-1]) - age_ns if self.heard else 0
+        self.status.publish(fill(names.STATUS.type(), {
+            "header": convert_out.header(stamp, "stage"), "plan_id": plan_id, "view_index": index, "complete": complete, "grid_expected": 25,
+            "grid_done": 25 if complete else 5, "angular_expected": 0}))
+
+
+@pytest.fixture
+def desk(graph, tmp_path):
+    return Desk(graph, tmp_path)
+
+
+def test_a_plan_runs_from_start_to_done(desk):
+    assert desk.ask("start").message == "waiting for the plate to be placed: view 0"
+    expected = []
+    for index in range(len(PLAN.views)):
+        expected.append((PLACE, index))
+        desk.expect(*expected)
+        assert desk.ask("confirm_view").success
+        expected.append((MEASURE, index))
+        desk.expect(*expected)
+        desk.complete(index, complete=False)
+        desk.complete(index, plan_id="another plan")
+        desk.complete(index + 1)
+        desk.complete(index)
+    desk.expect(*expected, (DONE, len(PLAN.views)))
+
+
+def test_commands_carry_plan_plate_and_pose_with_growing_stamps(desk):
+    desk.ask("start")
+    desk.ask("confirm_view")
+    desk.complete(0)
+    desk.expect((PLACE, 0), (MEASURE, 0), (PLACE, 1))
+    commands = [convert_in.command(message) for message in desk.heard]
+    stamps = [command.stamp_ns for command in commands]
+    assert stamps == sorted(set(stamps))
+    assert commands == [Command(stamp, phase, PLAN.plan_id, index, PLAN.views[index],
+                                PLAN.artifact, len(PLAN.views))
+                        for stamp, (phase, index) in zip(stamps, desk.commands, strict=True)]
+
+
+def test_redo_skip_and_abort(desk):
+    desk.ask("start")
+    desk.ask("confirm_view")
+    assert desk.ask("redo_view").success
+    assert desk.ask("skip_view").message.endswith("view 1")
+    assert desk.ask("abort").message == "aborted: view 1"
+    desk.expect((PLACE, 0), (MEASURE, 0), (PLACE, 0), (PLACE, 1), (ABORT, 1))
+    assert desk.ask("start").success
+
+
+@pytest.mark.parametrize("service, problem", [
+    ("confirm_view", "confirm_view does not fit while idle"),
+    ("redo_view", "nothing to redo while idle"), ("skip_view", "nothing to skip while idle"),
+    ("abort", "nothing to abort while idle")])
+def test_a_request_that_does_not_fit_is_refused_and_changes_nothing(desk, service, problem):
+    answer = desk.ask(service)
+    assert not answer.success
+    assert problem in answer.message
+    assert desk.ask("start").success
+    desk.expect((PLACE, 0))
+
+
+def test_without_a_plan_start_says_so(graph, tmp_path):
+    answer = Desk(graph, tmp_path, plan="").ask("start")
+    assert not answer.success
+    assert answer.message == "pose_sequencer: there is no plan; set the parameter 'plan'"
+
+
+def test_a_late_joiner_hears_every_command(desk):
+    desk.ask("start")
+    desk.ask("confirm_view")
+    late = desk.graph.listen(names.COMMAND)
+    desk.graph.until(lambda: len(late) >= 2, "the latched commands")
+    assert [message.phase for message in late] == [PLACE, MEASURE]
+
+
+def test_recorded_commands_win_over_its_own(desk):
+    desk.ask("start")
+    desk.expect((PLACE, 0))
+    foreign = [Command(1_000 + index, phase, "recorded", index, PLAN.views[index], PLAN.artifact)
+               for index in (0, 1) for phase in (PLACE, MEASURE)]
+    publisher = desk.graph.publisher(names.COMMAND, readers=2)
+    for command in foreign:
+        publisher.publish(fill(names.COMMAND.type(), convert_out.command(command, "stage")))
+    desk.graph.until(lambda: len(desk.heard) >= 5, "the recorded commands")
+    for service in ("start", "confirm_view", "skip_view"):
+        answer = desk.ask(service)
+        assert not answer.success
+        assert "following recorded commands" in answer.message
+    desk.complete(0)
+    assert len(desk.commands) == 5
+
+
+def test_an_incomplete_view_is_redone_and_then_skipped(graph, tmp_path):
+    desk = Desk(graph, tmp_path, auto_start=True, auto_confirm=True, settle_time=0.0,
+                view_timeout=0.1, max_redos=1)
+    twice = [(phase, index) for index in range(len(PLAN.views))
+             for phase in (PLACE, MEASURE, PLACE, MEASURE)]
+    desk.expect(*twice, (DONE, len(PLAN.views)))
+
+
+class Actor(Desk):
+    """A desk with an action client, and a solver that only saves."""
+
+    def __init__(self, graph: Graph, folder, **parameters) -> None:
+        super().__init__(graph, folder, auto_confirm=True, settle_time=0.0,
+                         result_path=str(folder / "map.json"), **parameters)
+        self.saved, self.feedback = [], []
+        self.answer = SaveMap.Response(success=True, message="saved")
+        graph.hand.create_service(SaveMap, "solver/save_map", self._save)
+        self.client = ActionClient(graph.hand, RunCalibration, "pose_sequencer/run_calibration")
+        graph.until(self.client.server_is_ready, "the action server")
+
+    def _save(self, request, response):
+        self.saved.append(request.path)
+        return self.answer
+
+    def send(self, plan_path: str = ""):
+        return self.graph.finish(self.client.send_goal_async(
+            RunCalibration.Goal(plan_path=plan_path),
+            feedback_callback=lambda m: self.feedback.append(m.feedback)), "the goal's response")
+
+    def result(self, handle):
+        answer = self.graph.finish(handle.get_result_async(), "the result")
+        return answer.status, answer.result
+
+    def measure_all(self) -> None:
+        for index in range(len(PLAN.views)):
+            self.graph.until(lambda index=index: (MEASURE, index) in self.commands,
+                             f"view {index}")
+            self.complete(index)
+
+
+@pytest.fixture
+def actor(graph, tmp_path):
+    return Actor(graph, tmp_path)
+
+
+def test_the_action_runs_the_plan_and_names_the_map(actor, tmp_path):
+    handle = actor.send()
+    assert handle.accepted
+    actor.graph.until(lambda: (MEASURE, 0) in actor.commands, "the first view")
+    actor.complete(0, complete=False)
+    actor.graph.until(lambda: any(f.coverage == 0.2 for f in actor.feedback), "coverage")
+    actor.measure_all()
+    status, result = actor.result(handle)
+    assert status == GoalStatus.STATUS_SUCCEEDED
+    assert (result.error_code, result.map_path) == (0, str(tmp_path / "map.json"))
+    assert actor.saved == [result.map_path]
+    assert {f.view for f in actor.feedback} <= {view.name for view in PLAN.views}
+
+
+def test_a_cancelled_goal_aborts_the_plan(actor):
+    handle = actor.send(actor.plan)
+    actor.graph.until(lambda: (MEASURE, 0) in actor.commands, "the first view")
+    actor.graph.finish(handle.cancel_goal_async(), "the cancel response")
+    status, result = actor.result(handle)
+    assert status == GoalStatus.STATUS_CANCELED
+    assert result.error_code == 4
+    assert "not measured to its end: aborted" in result.message
+    actor.graph.until(lambda: (ABORT, 0) in actor.commands, "the ABORT command")
+    assert actor.saved == []
+
+
+def test_a_second_goal_is_rejected_and_the_first_goes_on(actor):
+    first = actor.send()
+    assert not actor.send().accepted
+    actor.measure_all()
+    assert actor.result(first)[0] == GoalStatus.STATUS_SUCCEEDED
+
+
+def test_a_goal_after_a_goal(actor):
+    for _ in range(2):
+        actor.heard.clear()
+        handle = actor.send()
+        actor.measure_all()
+        assert actor.result(handle)[0] == GoalStatus.STATUS_SUCCEEDED
+
+
+def test_a_plan_that_cannot_be_read_fails_with_code_2(actor, tmp_path):
+    status, result = actor.result(actor.send(str(tmp_path / "no.yaml")))
+    assert status == GoalStatus.STATUS_ABORTED
+    assert result.error_code == 2
+    assert result.message == f"{tmp_path}/no.yaml: no such file; check the path"
+    assert actor.commands == []
+
+
+def test_a_map_that_cannot_be_saved_fails_with_the_solvers_words(actor):
+    actor.answer = SaveMap.Response(success=False, error_code=3, message="modes are unseen")
+    handle = actor.send()
+    actor.measure_all()
+    status, result = actor.result(handle)
+    assert status == GoalStatus.STATUS_ABORTED
+    assert (result.error_code, result.message, result.map_path) == (3, "modes are unseen", "")
+
+
+def test_a_status_of_before_the_command_does_not_complete_a_redone_view(desk):
+    desk.ask("start")
+    desk.ask("confirm_view")
+    desk.ask("redo_view")
+    desk.ask("confirm_view")
+    desk.expect((PLACE, 0), (MEASURE, 0), (PLACE, 0), (MEASURE, 0))
+    desk.complete(0, age_ns=1)
+    desk.complete(0)
+    desk.expect((PLACE, 0), (MEASURE, 0), (PLACE, 0), (MEASURE, 0), (PLACE, 1))

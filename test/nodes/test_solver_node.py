@@ -1,0 +1,169 @@
+# SPDX-License-Identifier: Apache-2.0
+"""solver: maps from readings, the services, and a plan that does not identify the stage."""
+
+import json
+
+import numpy as np
+import pytest
+from selfcal_msgs.srv import LoadMap, SaveMap
+
+from selfcal_ros.bagio import convert_in, convert_out
+from selfcal_ros.estimation.api import calibrate
+from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.result import result_to_dict
+from selfcal_ros.nodes import names
+from selfcal_ros.nodes.base import fill
+from selfcal_ros.nodes.solver import Solver
+from test.support.maps import random_map, result_of
+from test.support.sessions import collected, events_of, small_plan
+
+PLAN = small_plan()
+
+
+def measured(plan=PLAN, seed: int = 5) -> tuple:
+    """Return ViewMeasurement messages of a plan, and the readings behind them."""
+    _, measurements, progress = collected(events_of(plan, seed))
+    return [fill(names.MEASUREMENT.type(), convert_out.view_measurement(
+        view, measurements, 10 + index, "stage")) for index, view in progress.items()], measurements
+
+
+@pytest.fixture
+def solve(graph):
+    """Return a function that gives a fresh solver the views of a plan and waits for its word."""
+    def run(plan=PLAN, **parameters):
+        graph.node(Solver, **parameters)
+        maps, summaries = graph.listen(names.ERROR_MAP), graph.listen(names.SUMMARY)
+        messages, measurements = measured(plan)
+        publisher = graph.publisher(names.MEASUREMENT)
+        for message in messages:
+            publisher.publish(message)
+        graph.until(lambda: summaries and summaries[-1].views_done == len(messages), "all views")
+        return maps, summaries, measurements
+    return run
+
+
+def same_map(message, error_map) -> None:
+    found = convert_in.error_map(message)
+    for name in ("gx", "gy", "u_gx", "u_gy", "g_theta", "u_g_theta"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(error_map, name))
+    assert found.nonorthogonality == error_map.nonorthogonality
+    assert found.scale_difference == error_map.scale_difference
+    assert found.datum_theta == error_map.datum_theta
+
+
+def test_the_map_is_that_of_the_readings_bit_for_bit(solve, graph):
+    maps, summaries, measurements = solve()
+    result = calibrate(measurements)
+    graph.until(lambda: maps, "a map")
+    same_map(maps[-1], result.error_map)
+    assert maps[-1].identifiable
+    assert maps[-1].plan_id == PLAN.plan_id
+    last = summaries[-1]
+    assert (last.identifiable, last.rank_deficiency) == (True, 0)
+    norm = np.hypot(result.error_map.gx, result.error_map.gy)
+    assert last.max_error_um == pytest.approx(norm.max() * 1e6, rel=1e-12)
+
+
+def test_a_late_joiner_gets_map_and_summary(solve, graph):
+    solve()
+    maps, summaries = graph.listen(names.ERROR_MAP), graph.listen(names.SUMMARY)
+    graph.until(lambda: maps and summaries, "the latched messages")
+    assert len(maps) == len(summaries) == 1
+
+
+def test_save_map_writes_the_result_of_the_readings(solve, graph, tmp_path):
+    _, _, measurements = solve()
+    path = tmp_path / "map.json"
+    answer = graph.call(SaveMap, "solver/save_map", path=str(path))
+    assert (answer.success, answer.error_code) == (True, 0)
+    assert answer.message.startswith(f"saved to {path}")
+    expected = json.loads(json.dumps(result_to_dict(calibrate(measurements))))
+    assert json.loads(path.read_text()) == expected
+
+
+def test_the_map_is_also_saved_by_itself(solve, graph, tmp_path):
+    path = tmp_path / "always.json"
+    solve(save_path=str(path))
+    graph.until(path.exists, "the file")
+
+
+def test_a_view_measured_anew_replaces_the_old_one(graph):
+    graph.node(Solver)
+    maps, summaries = graph.listen(names.ERROR_MAP), graph.listen(names.SUMMARY)
+    publisher = graph.publisher(names.MEASUREMENT)
+    old, _ = measured(seed=5)
+    new, measurements = measured(seed=6)
+    for message in [*old, *new]:
+        publisher.publish(message)
+    wanted = calibrate(measurements).error_map
+    graph.until(lambda: maps and np.array_equal(
+        convert_in.error_map(maps[-1]).gx, wanted.gx, equal_nan=True), "the new map")
+    graph.until(lambda: summaries, "a summary")
+    assert summaries[-1].views_done == len(new)
+
+
+def test_a_deficient_plan_is_told_with_advice_and_publishes_no_map(solve, graph, tmp_path):
+    maps, summaries, _ = solve(small_plan("0, 90"))
+    last = summaries[-1]
+    assert not last.identifiable
+    assert last.rank_deficiency > 0
+    assert last.advice
+    assert maps == []
+    answer = graph.call(SaveMap, "solver/save_map", path=str(tmp_path / "no.json"))
+    assert (answer.success, answer.error_code) == (False, 3)
+    assert answer.message == last.state
+    assert not (tmp_path / "no.json").exists()
+
+
+def test_without_readings_there_is_nothing_to_save(graph, tmp_path):
+    graph.node(Solver)
+    answer = graph.call(SaveMap, "solver/save_map", path=str(tmp_path / "no.json"))
+    assert (answer.success, answer.error_code) == (False, 4)
+    assert "there is no map yet" in answer.message
+
+
+def test_a_path_that_cannot_be_written_is_bad_input(solve, graph, tmp_path):
+    solve()
+    answer = graph.call(SaveMap, "solver/save_map", path=str(tmp_path / "no" / "map.json"))
+    assert (answer.success, answer.error_code) == (False, 2)
+    assert "cannot be written" in answer.message
+
+
+def test_load_map_publishes_what_the_file_holds(graph, tmp_path):
+    graph.node(Solver)
+    result = result_of(random_map(Artifact(5, 0.01, 8), 3, unknown=((0, 0),)))
+    result.error_map.u_gx[0, 0] = result.error_map.u_gy[0, 0] = np.nan
+    path = tmp_path / "map.json"
+    path.write_text(json.dumps(result_to_dict(result)))
+    maps = graph.listen(names.ERROR_MAP)
+    answer = graph.call(LoadMap, "solver/load_map", path=str(path))
+    assert (answer.success, answer.error_code) == (True, 0)
+    graph.until(lambda: maps, "the map")
+    same_map(maps[-1], result.error_map)
+    assert maps[-1].valid[0] is False
+
+
+@pytest.mark.parametrize("content", ["", "{}", "not json"])
+def test_a_file_that_is_no_result_is_refused(graph, tmp_path, content):
+    graph.node(Solver)
+    path = tmp_path / "map.json"
+    path.write_text(content)
+    answer = graph.call(LoadMap, "solver/load_map", path=str(path))
+    assert (answer.success, answer.error_code) == (False, 2)
+    assert str(path) in answer.message
+
+
+def test_a_malformed_measurement_does_not_end_the_solver(graph):
+    node = graph.node(Solver)
+    summaries = graph.listen(names.SUMMARY)
+    messages, _ = measured()
+    publisher = graph.publisher(names.MEASUREMENT)
+    bad, _ = measured()
+    bad[0].dx = bad[0].dx[:-1]
+    bad[1].measurement_sense = "sideways"
+    bad[2].reject_reasons = ["a reason without a count"]
+    for message in [*bad, *messages]:
+        publisher.publish(message)
+    graph.until(lambda: summaries and summaries[-1].identifiable
+                and summaries[-1].views_done == len(messages), "the good views")
+    assert node.result is not None

@@ -1,0 +1,74 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A small calibration with known truth, as events, as readings and as a bag; no middleware."""
+
+from pathlib import Path
+
+import numpy as np
+import yaml
+
+from selfcal_ros.bagio.simulated import write_simulation
+from selfcal_ros.collection.collector import Collector, ViewProgress
+from selfcal_ros.collection.messages import Command, Detection
+from selfcal_ros.collection.parameters import parameter_values
+from selfcal_ros.model.readings import Measurements
+from selfcal_ros.model.view import Plan
+from selfcal_ros.simulation.cell import CellSettings, Event, plan_events
+from selfcal_ros.simulation.spec import read_simulation
+from selfcal_ros.simulation.truth import random_truth
+from test.support.plans import plan_of
+
+START_NS = 1_700_000_000_000_000_000
+NOISE = {"sigma_xy_m": 2e-8, "sigma_theta_rad": 2e-5}
+
+
+def small_plan(text: str = "0, 90, tx", *, repeats: int = 2) -> Plan:
+    """Return a plan of a 5 x 5 plate with 8 lines."""
+    return plan_of(text, 5, count=8, line=True, repeats=repeats)
+
+
+def events_of(plan: Plan, seed: int = 5) -> list[Event]:
+    """Return all messages of a plan measured on a stage with errors."""
+    rng = np.random.default_rng(seed)
+    truth = random_truth(plan.artifact, len(plan.views), rng)
+    return list(plan_events(truth, plan, settings=CellSettings(**NOISE), rng=rng,
+                            start_ns=START_NS))
+
+
+def collected(events: list[Event]) -> tuple[Collector, Measurements, dict[int, ViewProgress]]:
+    """Return what the collector makes of them without any node."""
+    collector = Collector(parameter_values("measurement_collector", {}, "test"))
+    for event in events:
+        if isinstance(event, Command):
+            collector.add_command(event)
+        elif isinstance(event, Detection):
+            collector.add_detection(event)
+        else:
+            collector.add_encoder(event)
+    return collector, *collector.collect()
+
+
+def plan_file(folder: Path, plan: Plan) -> str:
+    """Write PLAN.yaml and return its path."""
+    artifact, views = plan.artifact, []
+    for view in plan.views:
+        shift = [round(t / artifact.grid_pitch_m) for t in view.translation_m]
+        views.append({"name": view.name, "rotation_deg": float(np.degrees(view.rotation_rad)),
+                      "translation_pitch": shift, "grid": view.grid, "angular": view.angular,
+                      "repeats": view.repeats})
+    path = folder / "plan.yaml"
+    path.write_text(yaml.safe_dump({
+        "plan_id": plan.plan_id, "views": views,
+        "artifact": {"grid_size": artifact.grid_size, "grid_pitch": artifact.grid_pitch_m,
+                     "angular_count": artifact.angular_count}}))
+    return str(path)
+
+
+def small_bag(folder: Path, plan: Plan | None = None) -> Path:
+    """Write a simulated bag with noise and faults, and return its folder."""
+    plan_file(folder, plan or small_plan())
+    simulation = folder / "simulation.yaml"
+    simulation.write_text(yaml.safe_dump({
+        "plan": "plan.yaml", "seed": 7, "noise": {"sigma_xy": 2e-8, "sigma_theta": 2e-5},
+        "faults": {"lost": 0.02, "duplicated": 0.02, "delay": 0.05}}))
+    write_simulation(read_simulation(simulation), folder / "bag")
+    return folder / "bag"
