@@ -58,8 +58,9 @@ def _block_inverse(problem: Problem, of_phi: np.ndarray) -> np.ndarray:
     block = grid.block.copy()
     block[::3, ::3] += of_phi
     null = np.linalg.qr(grid.rigid[4:].T)[0]
-    held = grid.scale * (null @ null.T)
-    return np.linalg.inv(block + held) - held / grid.scale**2
+    scale = float(np.trace(block))
+    held = scale * (null @ null.T)
+    return np.linalg.inv(block + held) - held / scale**2
 
 
 def _angular_on_grid(problem: Problem, theta: AngularPart) -> tuple:

@@ -77,7 +77,7 @@ class JointSystem:
             return self.grid
         core = core_of(self.grid)
         values = np.linalg.eigvalsh(core.schur)
-        if _rank(values, core.scale) == len(values) - 7:
+        if _rank(values, _trace(core)) == len(values) - 7:
             middle = tuple(size // 2 for size in self.grid.views.shape)
             self.grid.turning_site = middle[0] * self.grid.views.shape[1] + middle[1]
             return core
@@ -105,8 +105,7 @@ class JointSystem:
 
         Ranks refer to it: what is left after the elimination may be nothing but rounding.
         """
-        trace = (self.grid.weight * (abs(self.grid.views.z) ** 2 + 2)).sum()
-        return float(max(trace, np.finfo(float).tiny))
+        return _trace(self._core)
 
     @cached_property
     def angular_scale(self) -> float:
@@ -135,8 +134,10 @@ class JointSystem:
 
     def inverse(self, ratio: float) -> np.ndarray:
         """Return the pseudo-inverse of `normal`: covariance of the misalignments, unit noise."""
-        scale = max(self.grid_scale, ratio * self.angular_scale)
-        return pseudo_inverse(*np.linalg.eigh(self.normal(ratio)), scale)
+        null = self._null
+        held = self.grid_scale * (null @ null.T)
+        out = np.linalg.inv(self.normal(ratio) + held) - held / self.grid_scale**2
+        return (out + out.T) / 2
 
     @cached_property
     def rank_grid(self) -> int:
@@ -160,19 +161,23 @@ class JointSystem:
         return np.linalg.eigh(self.normal(scale))
 
     @cached_property
+    def _null(self) -> np.ndarray:
+        """Orthonormal misalignments that no reading tells, (size, nullity)."""
+        values, vectors = self._spectrum
+        return vectors[:, values <= GAP * self.grid_scale]
+
+    @cached_property
     def nullity(self) -> int:
         """Combinations of misalignments that no reading tells, the datum's among them."""
-        return self.size - _rank(self._spectrum[0], self.grid_scale)
+        return self._null.shape[1]
 
     @cached_property
     def unseen(self) -> np.ndarray:
         """Misalignments that no reading tells, beside the datum, (size, modes)."""
-        values, vectors = self._spectrum
-        null = vectors[:, values <= GAP * self.grid_scale]
         # without turns the rigid modes depend on each other: an orthonormal basis of their span
         rigid, size, _ = np.linalg.svd(self.rigid.T, full_matrices=False)
         rigid = rigid[:, size > 1e-9 * size[0]]
-        left = null - rigid @ (rigid.T @ null)
+        left = self._null - rigid @ (rigid.T @ self._null)
         u, s, _ = np.linalg.svd(left, full_matrices=False)
         return u[:, s > 1e-6]
 
@@ -237,6 +242,11 @@ def core_of(grid: GridSystem) -> GridSystem:
     weight = grid.weight[(slice(None), *part)]
     inside = GridSystem(grid.views.poses, weight, grid.views.unit).views.in_field
     return GridSystem(grid.views.poses, weight * inside, grid.views.unit)
+
+
+def _trace(grid: GridSystem) -> float:
+    total = (grid.weight * (abs(grid.views.z) ** 2 + 2)).sum()
+    return float(max(total, np.finfo(float).tiny))
 
 
 def _rank(values: np.ndarray, scale: float) -> int:
