@@ -45,7 +45,8 @@ class Desk:
                  age_ns: int = 0) -> None:
         stamp = convert_in.stamp_ns(self.heard[-1]) - age_ns if self.heard else 0
         self.status.publish(fill(names.STATUS.type(), {
-            "header": convert_out.header(stamp, "stage"), "plan_id": plan_id, "view_index": index, "complete": complete, "grid_expected": 25,
+            "header": convert_out.header(stamp, "stage"), "plan_id": plan_id,
+            "view_index": index, "complete": complete, "grid_expected": 25,
             "grid_done": 25 if complete else 5, "angular_expected": 0}))
 
 
