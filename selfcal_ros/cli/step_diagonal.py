@@ -64,6 +64,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Identify, write the result, and say what was found."""
     from selfcal_ros.files import write_json
+    from selfcal_ros.laser.conventional import EQUAL_READINGS, readings_are_equal
     from selfcal_ros.laser.data import Form, Method
     from selfcal_ros.laser.identify import Choice, identify
     from selfcal_ros.laser.outcome import outcome, summary
@@ -79,6 +80,8 @@ def run(args: argparse.Namespace) -> int:
     data, warnings, source = _measurement(args)
     choice = Choice(Method(args.method), Form(args.form), args.allow_equal)
     found = identify(data, choice)
+    if readings_are_equal(data):
+        warnings = [*warnings, EQUAL_READINGS]
     result = outcome(found, data, line=Line(args.line), warnings=warnings)
     result["input"] = source
     for warning in result["warnings"]:

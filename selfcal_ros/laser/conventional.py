@@ -33,24 +33,21 @@ def laser_directions(data: StepDiagonal) -> np.ndarray:
     return data.signs * steps / np.linalg.norm(steps)
 
 
-def refuse_equal_readings(data: StepDiagonal) -> None:
-    """Refuse readings that hold nothing but the diagonal's length.
+EQUAL_READINGS = ("the readings of all axes are equal in every block: either the linear errors of "
+                  "the axes are the same, or the mirror is parallel to the other diagonal and they "
+                  "hold only the length of the diagonal")
 
-    A mirror adjusted parallel to the other diagonal makes the X and Y readings equal, and the
-    conventional formulation cannot but fail (source, "Misalignment of mirror directions").
 
-    Raises
-    ------
-    InputError
-        If the readings of all axes are equal in each of two or more blocks, with equal steps.
+def readings_are_equal(data: StepDiagonal) -> bool:
+    """Return whether all axes read the same in each of two or more blocks, with equal steps.
+
+    A mirror adjusted parallel to the other diagonal does that, and the step diagonal then tells
+    only diagonal lengths (source, "Misalignment of mirror directions"); so do axes with the same
+    linear errors (source, Table 1 b).
     """
     r = data.readings_m
     same = np.ptp(r, axis=1) <= EQUAL_RELATIVE * np.abs(r).max()
-    if data.n_blocks > 1 and np.ptp(data.steps_m) == 0 and same.all():
-        raise InputError("readings", "the readings of all axes are equal in every block: they "
-                         "hold only the length of the diagonal",
-                         "turn the mirror square to the laser, or allow equal readings if the "
-                         "linear errors of the axes truly are the same")
+    return bool(data.n_blocks > 1 and np.ptp(data.steps_m) == 0 and same.all())
 
 
 def block_gain(data: StepDiagonal) -> np.ndarray:
@@ -76,8 +73,7 @@ def solve_blocks(data: StepDiagonal, readings_m: np.ndarray, gain: np.ndarray,
 
 
 @one_thread()
-def identify_conventional(data: StepDiagonal, *, errata: Collection[Erratum] = (),
-                          allow_equal: bool = False) -> Identified:
+def identify_conventional(data: StepDiagonal, *, errata: Collection[Erratum] = ()) -> Identified:
     """Identify all errors from the readings alone, trusting the nominal laser directions.
 
     Parameters
@@ -86,8 +82,6 @@ def identify_conventional(data: StepDiagonal, *, errata: Collection[Erratum] = (
         All diagonals; linear errors are not used.
     errata : collection of Erratum
         Errors of the printed equations to put back, for comparison.
-    allow_equal : bool
-        Whether to accept readings that are equal on all axes.
 
     Returns
     -------
@@ -97,13 +91,11 @@ def identify_conventional(data: StepDiagonal, *, errata: Collection[Erratum] = (
     Raises
     ------
     InputError
-        If a diagonal is missing, or the readings are equal on all axes.
+        If a diagonal is missing.
     """
     if len(data.diagonals) < 2 ** (data.dim - 1):
         raise InputError("diagonals", f"only {', '.join(data.diagonals)} measured",
                          "the conventional formulation needs every diagonal; measure the others")
-    if not allow_equal:
-        refuse_equal_readings(data)
     readings, gain = data.readings_m, block_gain(data)
     errors = solve_blocks(data, readings, gain, errata)
     covariance = None

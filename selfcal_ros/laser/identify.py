@@ -4,7 +4,11 @@
 from dataclasses import dataclass
 
 from selfcal_ros.errors import InputError
-from selfcal_ros.laser.conventional import identify_conventional, refuse_equal_readings
+from selfcal_ros.laser.conventional import (
+    EQUAL_READINGS,
+    identify_conventional,
+    readings_are_equal,
+)
 from selfcal_ros.laser.data import Form, Identified, Method, StepDiagonal
 from selfcal_ros.laser.new import identify_new
 
@@ -20,7 +24,8 @@ class Choice:
     form : Form
         Form of the new formulation.
     allow_equal : bool
-        Whether readings that are equal on all axes are accepted.
+        Whether the new formulation accepts readings that are equal on all axes; the
+        conventional one, a closed formula, always does.
     """
 
     method: Method
@@ -42,7 +47,8 @@ def identify(data: StepDiagonal, choice: Choice) -> Identified:
         if choice.form is not Form.EXACT:
             raise InputError("--form", "the conventional formulation has one form only",
                              "leave it out, or use --method new")
-        return identify_conventional(data, allow_equal=choice.allow_equal)
-    if not choice.allow_equal:
-        refuse_equal_readings(data)
+        return identify_conventional(data)
+    if readings_are_equal(data) and not choice.allow_equal:
+        raise InputError("readings", EQUAL_READINGS, "turn the mirror square to the laser, or "
+                         "allow equal readings if the linear errors truly are the same")
     return identify_new(data, form=choice.form)

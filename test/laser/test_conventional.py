@@ -5,8 +5,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from selfcal_ros.errors import InputError
-from selfcal_ros.laser.conventional import identify_conventional, jacobian
-from selfcal_ros.laser.data import DIAGONALS, StepDiagonal, signs_of, step_vectors
+from selfcal_ros.laser.conventional import (
+    identify_conventional,
+    jacobian,
+    readings_are_equal,
+)
+from selfcal_ros.laser.data import DIAGONALS, Method, StepDiagonal, signs_of, step_vectors
+from selfcal_ros.laser.identify import Choice, identify
 from selfcal_ros.laser.paper import Erratum
 from selfcal_ros.laser.profiles import squareness
 from selfcal_ros.simulation.laser import (
@@ -52,7 +57,7 @@ def test_table_1_needs_the_corrected_rows_of_eq_1():
 @given(st.integers(0, 2**32 - 1), st.floats(1e-3, 0.1), st.floats(1e-3, 0.1), st.integers(1, 8))
 def test_nominal_lasers_give_the_truth_for_any_steps_and_blocks(seed, a, b, n):
     errors = random_errors(n, np.random.default_rng(seed))
-    found = identify_conventional(exact_nominal((a, b), errors), allow_equal=True)
+    found = identify_conventional(exact_nominal((a, b), errors))
     np.testing.assert_allclose(found.errors_m, errors, atol=1e-15)
 
 
@@ -82,12 +87,23 @@ def test_a_turn_of_the_whole_machine_changes_nothing():
                                errors, atol=1e-15)
 
 
-def test_equal_readings_of_several_blocks_are_refused():
+def test_equal_readings_are_said_and_the_new_formulation_refuses_them():
     samples = np.full((1, 2, 2, 3), 7.0711e-3)
-    data = StepDiagonal((0.01, 0.01), DIAGONALS[2], samples)
+    data = StepDiagonal((0.01, 0.01), DIAGONALS[2], samples, np.zeros((1, 2, 3)))
+    assert readings_are_equal(data)
     with pytest.raises(InputError, match="readings of all axes are equal in every block"):
-        identify_conventional(data)
-    assert np.isfinite(identify_conventional(data, allow_equal=True).errors_m).all()
+        identify(data, Choice(Method.NEW))
+    for choice in (Choice(Method.NEW, allow_equal=True), Choice(Method.CONVENTIONAL)):
+        assert np.isfinite(identify(data, choice).errors_m).all()
+
+
+def test_table_1_case_b_holds_in_many_blocks():
+    given, estimated, _ = TABLE_1["b"]
+    data = planar((0.01, 0.01), np.repeat(one_block(*given), 6, axis=1))
+    assert readings_are_equal(data)
+    found = identify(data, Choice(Method.CONVENTIONAL)).errors_m
+    np.testing.assert_allclose(found / MM, np.repeat(one_block(*estimated) / MM, 6, axis=1),
+                               atol=1e-9)
 
 
 def test_one_diagonal_is_refused():
