@@ -2,6 +2,7 @@
 """Readings laid out on the lattice: the canonical form, whatever their order was."""
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -9,6 +10,7 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.lattice import PHASES, GridPose
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Measurements, ViewReadings
+from selfcal_ros.model.view import LatticePose, View
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +86,7 @@ def angular_data(measurements: Measurements) -> AngularData:
     for row, i in enumerate(index):
         readings = measurements.views[i]
         where = f"view '{readings.view.name}' angular readings"
-        turn = readings.view.lattice_pose(artifact).turn_lines
+        turn = _pose_of(readings.view, artifact).turn_lines
         k = np.asarray(readings.k)
         if turn is None or k.min() < 0 or k.max() >= artifact.angular_count:
             raise InputError(where, "a line that the plate does not have",
@@ -97,8 +99,13 @@ def angular_data(measurements: Measurements) -> AngularData:
     return AngularData(index, tuple(turns), y, weight, sigma)
 
 
+@lru_cache(maxsize=1024)
+def _pose_of(view: View, artifact: Artifact) -> LatticePose:
+    return view.lattice_pose(artifact)
+
+
 def _grid_pose(readings: ViewReadings, artifact: Artifact) -> GridPose:
-    pose = readings.view.lattice_pose(artifact)
+    pose = _pose_of(readings.view, artifact)
     if pose.quarter_turns is None:
         raise InputError(f"view '{readings.view.name}'", "grid marks were read at a turn that is "
                          "not a multiple of 90 deg", "turn by a multiple of 90 deg")

@@ -90,6 +90,14 @@ def conditions_for(system: JointSystem, datum: ThetaDatum, sense: Sense,
     half_width_m : float
         Length of the unit of the system's positions, m.
     """
+    key = ("conditions", datum, sense, half_width_m)
+    if key not in system.memo:
+        system.memo[key] = _conditions(system, datum, sense, half_width_m)
+    return system.memo[key]
+
+
+def _conditions(system: JointSystem, datum: ThetaDatum, sense: Sense,
+                half_width_m: float) -> Conditions:
     known, n_lines = system.known_lines, system.angular.n_lines
     flipped = sense is Sense.PLATE_MOVES
     if datum is ThetaDatum.XY_AXES and n_lines:
