@@ -55,12 +55,26 @@ def check_plan(plan: Plan) -> PlanCheck:
     """Return rank, deficiency, unseen modes and cures of a plan with every mark read."""
     system = planned_system(plan.artifact, plan.views)
     seen = full_observability(system, plan.artifact, plan.views)
-    if seen.identifiable:
-        return PlanCheck(seen, ())
+    return PlanCheck(seen, ()) if seen.identifiable else explained(seen, system, plan)
+
+
+def explained(seen: Observability, system: JointSystem, plan: Plan) -> PlanCheck:
+    """Return a deficient set of readings with its unseen modes in words and what would cure it.
+
+    Parameters
+    ----------
+    seen : Observability
+        Rank and deficiency.
+    system : JointSystem
+        The readings, some of them perhaps missing.
+    plan : Plan
+        The views behind the readings.
+    """
     modes = unseen_modes(system)
     cures = tuple(find_cures(plan))
-    advice = tuple("add " + " and ".join(describe_views(cure, plan.artifact))
-                   for cure in cures[:3])
+    advice = tuple(("or add " if number else "add ")
+                   + " and ".join(describe_views(cure, plan.artifact))
+                   for number, cure in enumerate(cures[:3]))
     seen = replace(seen, modes=tuple(mode.text for mode in modes), advice=advice or seen.advice)
     return PlanCheck(seen, modes, cures)
 

@@ -7,10 +7,11 @@ from selfcal_ros.errors import InputError, NoDataError, NotIdentifiableError
 from selfcal_ros.estimation.api import Options
 from selfcal_ros.estimation.blas_threads import one_thread
 from selfcal_ros.estimation.fit import Fit, fit, fit_rigid
+from selfcal_ros.estimation.identifiability import explained
 from selfcal_ros.estimation.lattice import PHASES
 from selfcal_ros.estimation.noise import disagreement
 from selfcal_ros.estimation.problem import Problem, repeats_of
-from selfcal_ros.estimation.rank import measured_observability, refusal
+from selfcal_ros.estimation.rank import measured_observability, plan_observability, refusal
 from selfcal_ros.estimation.readings_data import angular_data, grid_data
 from selfcal_ros.estimation.system import MAX_DIRECT_SITES, system_for
 from selfcal_ros.estimation.theta import conditions_for, misclosure_warning
@@ -24,6 +25,7 @@ from selfcal_ros.model.result import (
     Observability,
     ViewResult,
 )
+from selfcal_ros.model.view import Plan
 
 
 def solve_joint(measurements: Measurements, options: Options) -> CalibrationResult:
@@ -51,6 +53,10 @@ def prepare(measurements: Measurements, options: Options) -> tuple[Problem, Obse
     seen = measured_observability(system, measurements.artifact,
                                   tuple(v.view for v in measurements.views))
     if not seen.identifiable:
+        plan = Plan(measurements.plan_id, measurements.artifact,
+                    tuple(v.view for v in measurements.views))
+        if not plan_observability(plan).identifiable:
+            seen = explained(seen, system, plan).observability
         raise NotIdentifiableError(refusal(seen), seen)
     half_width_m = measurements.artifact.grid_pitch_m * max(measurements.artifact.half)
     conditions = conditions_for(system, options.datum_theta, measurements.sense, half_width_m)

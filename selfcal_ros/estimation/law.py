@@ -8,6 +8,7 @@ import numpy as np
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.law_equations import HuLaw, HuReadings, HuSolution
+from selfcal_ros.estimation.noise import level, pooled
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ErrorMap, ThetaDatum
 from selfcal_ros.model.readings import Measurements, Sense, ViewReadings
@@ -244,21 +245,14 @@ def _noise(found: HuSolution, spread: _Spread, views: tuple[ViewReadings, ...]) 
     """Estimate the noise of one reading from repeats, and from what the equations leave over."""
     rest = np.sqrt([(found.rest_xy**2).sum() / spread.rest[0],
                     (found.rest_theta**2).sum() / spread.rest[1]])
-    xy, dof_xy = _pooled([(v.sigma_xy, v.dof_xy) for v in views])
-    theta, dof_theta = _pooled([(v.sigma_theta, v.dof_theta) for v in views])
-    dof_rest = np.maximum(np.round(spread.rest_dof), 1).astype(int)
-    return Noise(xy if dof_xy else float(rest[0]), theta if dof_theta else float(rest[1]),
-                 xy, theta, float(rest[0]), float(rest[1]), dof_xy, dof_theta,
-                 int(dof_rest[0]), int(dof_rest[1]))
-
-
-def _pooled(pairs: list[tuple[float, int]]) -> tuple[float, int]:
-    """Pool standard deviations by their degrees of freedom; NaN if there are none."""
-    known = [(sigma, dof) for sigma, dof in pairs if dof > 0]
-    total = sum(dof for _, dof in known)
-    if not total:
-        return float("nan"), 0
-    return float(np.sqrt(sum(sigma**2 * dof for sigma, dof in known) / total)), total
+    dof = np.maximum(np.round(spread.rest_dof), 1).astype(int)
+    declared = float("nan")
+    xy = level(pooled((v.sigma_xy, v.dof_xy) for v in views if len(v.m)),
+               (float(rest[0]), int(dof[0])), declared)
+    theta = level(pooled((v.sigma_theta, v.dof_theta) for v in views if len(v.k)),
+                  (float(rest[1]), int(dof[1])), declared)
+    return Noise(xy.sigma, theta.sigma, xy.repeats, theta.repeats, xy.residuals, theta.residuals,
+                 xy.dof_repeats, theta.dof_repeats, xy.dof_residuals, theta.dof_residuals)
 
 
 def _to_stage(field: np.ndarray, theta: np.ndarray, sign: int) -> tuple[np.ndarray, np.ndarray]:

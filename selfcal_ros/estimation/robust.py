@@ -4,8 +4,9 @@
 The rule. The noise is the median of the standardised squares over that of chi^2. A grid reading is
 an outlier if its squared standardised residual (leverage included) exceeds the level that one of n
 good readings exceeds with probability LEVEL; an angular one likewise. The largest are removed
-first, at most one for each mark and site in a round, then the fit is repeated. At the end a removed
-reading that agrees with the map after all is taken back. A slipped view is split before that.
+first, at most one for each mark and site in a round, then the fit is repeated; readings that
+contradict each other so that the largest is not unique all go. At the end a removed reading is
+taken back if it can be checked and agrees after all. A slipped view is split before that.
 """
 
 from dataclasses import asdict, dataclass, replace
@@ -24,9 +25,16 @@ from selfcal_ros.model.result import CalibrationResult
 LEVEL = 0.01
 """Probability that a measurement without outliers loses a reading."""
 
-MAX_ROUNDS = 30
+MAX_ROUNDS = 60
+NEAR_LARGEST = 0.5
+"""Part of the largest ratio that a reading needs to go in the same round: an outlier makes its
+neighbours look bad."""
+
 MAX_REMOVED = 0.1
 """Largest part of the readings that is removed; beyond, the fault is not in single readings."""
+
+TIED = 1e-6
+"""Readings whose ratios differ by less contradict each other, no one knows which is wrong."""
 
 MAX_SLIPS = 3
 NOISY_VIEW = 3.0
@@ -211,14 +219,18 @@ def _worst(left: Residuals, measurements: Measurements) -> dict[Key, Removed]:
     grid, problem = left.problem.system.grid, left.problem
     sigma, n = robust_sigma(left.squares, 2), np.isfinite(left.squares).sum()
     ratio = _ratio(left.squares, sigma)
-    taken: set[tuple[str, int]] = set()
-    for at in np.argsort(-ratio, axis=None)[:int((ratio > chi2.isf(LEVEL / n, 2)).sum())]:
+    taken: dict[tuple[str, int], float] = {}
+    # in the order of ratios rounded, so that ties have the order of the readings
+    order = np.argsort(-np.round(ratio.ravel(), 6), kind="stable")
+    floor = max(chi2.isf(LEVEL / n, 2), NEAR_LARGEST * float(ratio.max()))
+    for at in order[:int((ratio > floor).sum())]:
         v, i, j = np.unravel_index(at, ratio.shape)
-        nodes = {("mark", int(i * ratio.shape[2] + j)), ("site", int(grid.views.site_index[v, i,
-                                                                                          j]))}
-        if taken & nodes:
+        nodes = (("mark", int(i * ratio.shape[2] + j)),
+                 ("site", int(grid.views.site_index[v, i, j])))
+        above = max((taken[node] for node in nodes if node in taken), default=0.0)
+        if above > (1 + TIED) * ratio[v, i, j]:
             continue
-        taken |= nodes
+        taken |= {node: ratio[v, i, j] for node in nodes if node not in taken}
         index, (hx, hy) = problem.grid.index[v], grid.views.half
         mark = (int(i) - hx, int(j) - hy)
         found[index, "grid", mark] = Removed(
@@ -253,9 +265,25 @@ def _taken_back(measurements: Measurements, options: Options, gone: dict[Key, Re
     for key in sorted(gone, key=lambda k: gone[k].standardised):
         rest = {k: v for k, v in gone.items() if k != key}
         again = residuals_of(_without(measurements, rest), options)
-        if key not in _worst(again, measurements):
+        if _agrees(again, key):
             gone, left = rest, again
     return gone, left, ""
+
+
+def _agrees(left: Residuals, key: Key) -> bool:
+    """Return whether a reading can be checked against the others and agrees with them."""
+    index, kind, mark = key
+    if kind == "grid":
+        hx, hy = left.problem.system.grid.views.half
+        squares, dof = left.squares, 2
+        at = (left.problem.grid.index.index(index), mark[0] + hx, mark[1] + hy)
+    else:
+        squares, dof = left.squares_theta, 1
+        at = (left.problem.angular.index.index(index), *mark)
+    limit = chi2.isf(LEVEL / np.isfinite(squares).sum(), dof)
+    # NaN: a reading that cannot be checked does not agree
+    return bool(_ratio(squares, robust_sigma(squares, dof))[at] <= limit
+                and np.isfinite(squares[at]))
 
 
 def _without(measurements: Measurements, gone: dict[Key, Removed], *,

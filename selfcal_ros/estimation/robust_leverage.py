@@ -11,10 +11,12 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import nnls
 
+from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.api import Options
-from selfcal_ros.estimation.fit import Fit, Problem, fit
+from selfcal_ros.estimation.fit import Fit, fit
 from selfcal_ros.estimation.joint import prepare
 from selfcal_ros.estimation.lattice import PHASES
+from selfcal_ros.estimation.problem import Problem
 from selfcal_ros.estimation.system import JointSystem
 from selfcal_ros.model.readings import Measurements
 
@@ -71,8 +73,17 @@ def _scaled(squares: np.ndarray, weight: np.ndarray, redundancy: np.ndarray) -> 
 
 
 def residuals_of(measurements: Measurements, options: Options) -> Residuals:
-    """Fit the readings and return their residuals with redundancies."""
+    """Fit the readings and return their residuals with redundancies.
+
+    Raises
+    ------
+    InputError
+        If the field is so large that it is solved by iteration.
+    """
     problem, _ = prepare(measurements, options)
+    if not problem.direct:
+        raise InputError("--robust", f"{problem.system.grid.n_sites} sites are too many for the "
+                         "leverage of each reading", "solve without it")
     found = fit(problem, problem.grid.y)
     system = problem.system
     if system.grid.n_sites <= EXACT_SITES:

@@ -13,9 +13,10 @@ from scipy.stats import chi2
 
 from selfcal_ros.errors import NotIdentifiableError
 from selfcal_ros.estimation.api import Options
-from selfcal_ros.estimation.fit import Fit, Problem, fit
+from selfcal_ros.estimation.fit import Fit, fit
 from selfcal_ros.estimation.joint import prepare
 from selfcal_ros.estimation.lattice import PHASES
+from selfcal_ros.estimation.problem import Problem
 from selfcal_ros.estimation.robust_leverage import Residuals, grid_residuals
 from selfcal_ros.model.readings import Measurements, ViewReadings
 

@@ -24,7 +24,7 @@ from selfcal_ros.estimation.rank import plan_observability
 from selfcal_ros.estimation.system import planned_system
 from selfcal_ros.model.view import View
 from selfcal_ros.simulation.truth import random_truth, simulate_measurements
-from test.support.plans import POSES, QIAO_TABLES, plan_of
+from test.support.view_plans import POSES, QIAO_TABLES, plan_of
 
 
 def dense_rank(plan):
@@ -222,3 +222,17 @@ def test_smaller_fields_keep_room_for_the_shifts():
     assert smaller(plan, 5).artifact.shape == (7, 7)
     assert smaller(plan, 51).artifact.shape == (21, 21)
     assert smaller(plan_of("0, 180", 21, size_y=5), 9).artifact.shape == (9, 5)
+
+
+def test_a_deficient_measurement_is_refused_with_its_modes_and_cures():
+    plan = plan_of("0, tx, ty", 5)
+    rng = np.random.default_rng(1)
+    readings = simulate_measurements(random_truth(plan.artifact, 3, rng), plan, rng)
+    with pytest.raises(NotIdentifiableError) as refusal:
+        calibrate(readings, Options())
+    assert "2 modes unseen" in str(refusal.value)
+    assert "add a view turned by 90 deg" in str(refusal.value)
+    seen = refusal.value.observability
+    assert seen.modes == ("non-orthogonality of the axes: Gx = O y, Gy = O x",
+                          "scale difference of the axes: Gx = R x, Gy = -R y")
+    assert seen.advice[1] == "or add a view turned by 270 deg"

@@ -1,0 +1,45 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Plans written as in the tables: '0, 90, tx', on any plate."""
+
+from math import pi
+
+from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.view import Plan, View
+
+POSES = {"0": (0, 0, 0), "90": (1, 0, 0), "180": (2, 0, 0), "270": (3, 0, 0), "tx": (0, 1, 0),
+         "+tx": (0, 1, 0), "-tx": (0, -1, 0), "ty": (0, 0, 1), "-ty": (0, 0, -1),
+         "tx2": (0, 2, 0), "ty2": (0, 0, 2), "90tx": (1, 1, 0)}
+
+QIAO_TABLES = [
+    # views, rank, unknowns (Qiao, tables 1-4)
+    ("0", lambda n: 2 * n**2 + 7, 3),
+    ("90", lambda n: 2 * n**2 + 7, 3),
+    ("180", lambda n: 2 * n**2 + 7, 3),
+    ("tx", lambda n: 2 * n**2 - 2 * n + 7, 3),
+    ("0, 90", lambda n: (7 * n**2 + 17) // 2, 6),
+    ("0, 180", lambda n: 3 * n**2 + 9, 6),
+    ("0, tx", lambda n: 4 * n**2 - 2 * n + 7, 6),
+    ("0, 90, 180", lambda n: (7 * n**2 + 23) // 2, 9),
+    ("0, 90, tx", lambda n: 4 * n**2 + 9, 9),
+    ("0, 180, tx", lambda n: 4 * n**2 - n + 10, 9),
+    ("0, +tx, -tx", lambda n: 4 * n**2 - 2 * n + 10, 9),
+    ("0, tx, ty", lambda n: 4 * n**2 + 7, 9),
+    ("0, 90, 180, tx", lambda n: 4 * n**2 + 12, 12),
+    ("0, 90, +tx, -tx", lambda n: 4 * n**2 + 12, 12),
+    ("0, 90, tx, ty", lambda n: 4 * n**2 + 12, 12),
+    ("0, 180, +tx, -tx", lambda n: 4 * n**2 - n + 13, 12),
+    ("0, 180, tx, ty", lambda n: 4 * n**2 + 10, 12),
+    ("0, +tx, -tx, ty", lambda n: 4 * n**2 + 10, 12),
+]
+
+
+def plan_of(text: str, size: int = 5, *, count: int = 0, size_y: int = 0, line: bool = False,
+            repeats: int = 1) -> Plan:
+    """Return the plan of views such as '0, 90, tx'; `line` adds the turn by one line."""
+    artifact = Artifact(size, 0.01, count, size_y)
+    names = [name.strip() for name in text.split(",")]
+    views = [View(name, POSES[name][0] * pi / 2, (POSES[name][1] * 0.01, POSES[name][2] * 0.01),
+                  True, count > 0, repeats) for name in names]
+    if line:
+        views.append(View("line", 2 * pi / count, (0.0, 0.0), False, True, repeats))
+    return Plan(text, artifact, tuple(views))
