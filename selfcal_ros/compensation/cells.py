@@ -6,12 +6,15 @@ gather of a row and a short Horner scheme; positions go through in blocks that s
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-BLOCK = 8192
-"""Positions handled at once: small enough for the second-level cache."""
+BLOCK = 16384
+"""Bilinear positions handled at once: their coefficients fill the second-level cache."""
+SMALL = 1 << 20
+"""Bytes of coefficients that stay in cache."""
 MAX_ITERATIONS = 60
 REST = 4 * float(np.finfo(float).eps)
 """Step, in pitches, at which a fixed point has come to rest."""
@@ -33,12 +36,26 @@ class Cells:
         Of u^p v^q at [cell, field, p, q]; u, v in 0..1 inside the cell.
     nodes : float array (2, nx, ny)
         Values at the nodes.
+    by_power : float array (coefficients, cells) or None
+        The coefficients the other way round, for a grid so small that all of them stay in cache.
     """
 
     shape: tuple[int, int]
     degree: int
     coefficients: np.ndarray
     nodes: np.ndarray
+    by_power: np.ndarray | None = None
+
+    @property
+    def block(self) -> int:
+        """Positions handled at once, so that their coefficients stay in cache."""
+        return BLOCK * 8 // self.coefficients[0].size
+
+    @cached_property
+    def largest_step(self) -> float:
+        """Largest difference between neighbouring known nodes."""
+        steps = [np.abs(np.diff(self.nodes, axis=axis)) for axis in (1, 2)]
+        return max(float(step.max(initial=0.0, where=np.isfinite(step))) for step in steps)
 
     def at(self, s: np.ndarray, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return both fields at grid coordinates `s`, `t` (0..nx-1, 0..ny-1; clamped), (P,).
@@ -54,33 +71,33 @@ class Cells:
                                               (u[unknown], v[unknown]))
         return first, second
 
-    def solve(self, s: np.ndarray, t: np.ndarray, scale: float,
-              ) -> tuple[np.ndarray, np.ndarray]:
+    def solve_in_cell(self, s: np.ndarray, t: np.ndarray, scale: float,
+                      ) -> tuple[np.ndarray, np.ndarray]:
         """Return the (a, b) with (a, b) + scale * fields(a, b) = (s, t), by fixed point.
 
         The solution nearly always lies in the cell of (s, t) itself, so each cell's polynomial
-        is fetched once; the few positions that leave their cell are iterated in full.
+        is fetched once. Where it does not, or (s, t) lies outside of the grid, both are NaN.
         """
         (i, j), (u, v) = self._locate(s, t)
         us, vt = u, v
-        rows = self._rows(i, j)
+        rows = self._rows(i, j, often=True)
+        # Each step shrinks what is left by the slope of the fields (two directions, and as much
+        # again for what a spline does between its nodes).
+        shrink = min(1.0, 4 * scale * self.largest_step)
         for _ in range(MAX_ITERATIONS):
             first, second = self._polynomials(rows, u, v)
             un, vn = us - scale * first, vt - scale * second
             moved = max(np.abs(un - u).max(initial=0.0), np.abs(vn - v).max(initial=0.0))
             u, v = un, vn
-            if not moved > REST:
+            if not moved * shrink > REST:
                 break
         with np.errstate(invalid="ignore"):
             stayed = (u >= 0) & (u <= 1) & (v >= 0) & (v <= 1) & (i + us == s) & (j + vt == t)
-        a, b = i + u, j + v
-        left = ~stayed
-        if left.any():
-            a[left], b[left] = self._solve_anywhere(s[left], t[left], scale)
-        return a, b
+        return np.where(stayed, i + u, np.nan), np.where(stayed, j + v, np.nan)
 
-    def _solve_anywhere(self, s: np.ndarray, t: np.ndarray, scale: float,
-                        ) -> tuple[np.ndarray, np.ndarray]:
+    def solve(self, s: np.ndarray, t: np.ndarray, scale: float,
+              ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the same as `solve_in_cell`, wherever the solution lies."""
         a, b = s, t
         for _ in range(MAX_ITERATIONS):
             first, second = self.at(a, b)
@@ -102,9 +119,13 @@ class Cells:
             j = np.clip(t.astype(np.int64), 0, ny - 2)
         return (i, j), (s - i, t - j)
 
-    def _rows(self, i: np.ndarray, j: np.ndarray) -> np.ndarray:
-        flat = self.coefficients.reshape(len(self.coefficients), -1)
-        return np.ascontiguousarray(flat.take(i * (self.shape[1] - 1) + j, axis=0).T)
+    def _rows(self, i: np.ndarray, j: np.ndarray, *, often: bool = False) -> np.ndarray:
+        """Return the coefficients of cells, (coefficients, P); contiguous if used `often`."""
+        cell = i * (self.shape[1] - 1) + j
+        if self.by_power is not None:
+            return self.by_power.take(cell, axis=1)
+        rows = self.coefficients.reshape(len(self.coefficients), -1).take(cell, axis=0).T
+        return np.ascontiguousarray(rows) if often else rows
 
     def _polynomials(self, rows: np.ndarray, u: np.ndarray, v: np.ndarray,
                      ) -> tuple[np.ndarray, np.ndarray]:
@@ -147,7 +168,7 @@ def bilinear_cells(fields: np.ndarray) -> Cells:
     f00, f10 = fields[:, :-1, :-1], fields[:, 1:, :-1]
     f01, f11 = fields[:, :-1, 1:], fields[:, 1:, 1:]
     c = np.stack([f00, f01 - f00, f10 - f00, f11 - f10 - f01 + f00], axis=-1)
-    return Cells(fields.shape[1:], 1, _by_cell(c, 2), fields)
+    return _cells(c, 2, fields)
 
 
 def bicubic_cells(fields: np.ndarray) -> Cells:
@@ -159,9 +180,14 @@ def bicubic_cells(fields: np.ndarray) -> Cells:
     along_x = CubicSpline(np.arange(nx), fields, axis=1).c[::-1]
     both = CubicSpline(np.arange(ny), along_x, axis=3).c[::-1]
     # Axes now: q, j, p, i, field.
-    return Cells((nx, ny), 3, _by_cell(both.transpose(4, 3, 1, 2, 0), 4), fields)
+    return _cells(both.transpose(4, 3, 1, 2, 0), 4, fields)
 
 
-def _by_cell(c: np.ndarray, side: int) -> np.ndarray:
-    cells = c.shape[1] * c.shape[2]
-    return np.ascontiguousarray(c.reshape(2, cells, side, side).transpose(1, 0, 2, 3))
+def _cells(c: np.ndarray, side: int, fields: np.ndarray) -> Cells:
+    """Return cells from coefficients (field, i, j, p, q)."""
+    count = c.shape[1] * c.shape[2]
+    by_cell = np.ascontiguousarray(c.reshape(2, count, side, side).transpose(1, 0, 2, 3))
+    by_power = None
+    if by_cell.nbytes <= SMALL:
+        by_power = np.ascontiguousarray(by_cell.reshape(count, -1).T)
+    return Cells(fields.shape[1:], side - 1, by_cell, fields, by_power)

@@ -15,7 +15,6 @@ from numpy.typing import ArrayLike
 from scipy.interpolate import CubicSpline
 
 from selfcal_ros.compensation.cells import (
-    BLOCK,
     MAX_ITERATIONS,
     REST,
     SNAP,
@@ -75,8 +74,9 @@ class Compensator:
             missing = int((~error_map.valid).sum())
             raise InputError("error map", f"{missing} sites are unknown",
                              "bicubic needs all of them: take bilinear or measure them")
-        _refuse_steep(fields, self._pitch)
         self._cells = bilinear_cells(fields) if method == "bilinear" else bicubic_cells(fields)
+        if self._cells.largest_step > MAX_SLOPE * self._pitch:
+            raise _steep("sites")
         self._u_cells = bilinear_cells(np.stack([error_map.u_gx, error_map.u_gy]))
         self._theta = _Circle(error_map.g_theta, cubic=method == "bicubic")
         self._u_theta = _Circle(error_map.u_g_theta, cubic=False)
@@ -100,7 +100,8 @@ class Compensator:
             With ``outside="refuse"``, if a position lies outside of the field.
         """
         self._refuse_outside(x_m, y_m)
-        return self._blocks(lambda x, y: self._at(self._cells, x, y), x_m, y_m)
+        return self._blocks(lambda x, y: self._at(self._cells, x, y), (x_m, y_m),
+                            self._cells.block)
 
     def command(self, x_m: ArrayLike, y_m: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
         """Return the indicated position to command so that the true one is `x_m`, `y_m`.
@@ -121,7 +122,14 @@ class Compensator:
         InputError
             With ``outside="refuse"``, if a true position lies outside of the field.
         """
-        out = self._blocks(self._invert, x_m, y_m)
+        x, y = np.broadcast_arrays(np.asarray(x_m, dtype=float), np.asarray(y_m, dtype=float))
+        out = self._blocks(self._invert(self._cells.solve_in_cell), (x, y), self._cells.block)
+        left = np.isnan(out[0])
+        if left.any():
+            found = self._blocks(self._invert(self._cells.solve), (x[left], y[left]),
+                                 self._cells.block)
+            for axis, part in zip(out, found, strict=True):
+                axis[left] = part
         self._refuse_outside(*out)
         return out
 
@@ -138,7 +146,8 @@ class Compensator:
             With ``outside="refuse"``, if a position lies outside of the field.
         """
         self._refuse_outside(x_m, y_m)
-        return self._blocks(lambda x, y: self._at(self._u_cells, x, y), x_m, y_m)
+        return self._blocks(lambda x, y: self._at(self._u_cells, x, y), (x_m, y_m),
+                            self._u_cells.block)
 
     def error_theta(self, theta_rad: ArrayLike) -> np.ndarray:
         """Return Gtheta = indicated - true, rad, at true angles; any number of turns.
@@ -194,19 +203,24 @@ class Compensator:
         hx, hy = self.error_map.artifact.half
         return cells.at(x / self._pitch + hx, y / self._pitch + hy)
 
-    def _invert(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _invert(self, solve: Callable) -> _Field:
         hx, hy = self.error_map.artifact.half
-        a, b = self._cells.solve(x / self._pitch + hx, y / self._pitch + hy, 1 / self._pitch)
-        return (a - hx) * self._pitch, (b - hy) * self._pitch
+        pitch = self._pitch
 
-    def _blocks(self, field: _Field, x_m: ArrayLike, y_m: ArrayLike,
+        def field(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            a, b = solve(x / pitch + hx, y / pitch + hy, 1 / pitch)
+            return (a - hx) * pitch, (b - hy) * pitch
+
+        return field
+
+    def _blocks(self, field: _Field, position: tuple[ArrayLike, ArrayLike], block: int,
                 ) -> tuple[np.ndarray, np.ndarray]:
         """Apply `field` block by block to broadcast positions."""
-        x, y = np.broadcast_arrays(np.asarray(x_m, dtype=float), np.asarray(y_m, dtype=float))
+        x, y = np.broadcast_arrays(*(np.asarray(p, dtype=float) for p in position))
         shape, x, y = x.shape, x.ravel(), y.ravel()
         out = np.empty((2, x.size))
-        for start in range(0, x.size, BLOCK):
-            part = slice(start, start + BLOCK)
+        for start in range(0, x.size, block):
+            part = slice(start, start + block)
             out[0, part], out[1, part] = field(x[part], y[part])
         return out[0].reshape(shape), out[1].reshape(shape)
 
@@ -257,13 +271,6 @@ class _Circle:
         low, high = self._closed[i], self._closed[i + 1]
         # A line of zero weight does not count, so that a known line stays known.
         return np.where(u == 0, low, low + u * (high - low))
-
-
-def _refuse_steep(fields: np.ndarray, pitch: float) -> None:
-    for axis in (1, 2):
-        steps = np.abs(np.diff(fields, axis=axis))
-        if np.any(steps > MAX_SLOPE * pitch):
-            raise _steep("sites")
 
 
 def _steep(what: str) -> InputError:
