@@ -87,7 +87,7 @@ class Cells:
         for _ in range(MAX_ITERATIONS):
             first, second = self._polynomials(rows, u, v)
             un, vn = us - scale * first, vt - scale * second
-            moved = max(np.abs(un - u).max(initial=0.0), np.abs(vn - v).max(initial=0.0))
+            moved = max(_largest(un - u), _largest(vn - v))
             u, v = un, vn
             if not moved * shrink > REST:
                 break
@@ -131,6 +131,13 @@ class Cells:
                      ) -> tuple[np.ndarray, np.ndarray]:
         side = self.degree + 1
         return (_horner(rows[:side * side], u, v, side), _horner(rows[side * side:], u, v, side))
+
+
+def _largest(step: np.ndarray) -> float:
+    """Return the largest amount in `step`; NaN (unknown nodes, NaN positions) does not count."""
+    size = np.abs(step)
+    largest = size.max(initial=0.0)
+    return size.max(initial=0.0, where=~np.isnan(size)) if np.isnan(largest) else largest
 
 
 def _horner(rows: np.ndarray, u: np.ndarray, v: np.ndarray, side: int) -> np.ndarray:

@@ -99,6 +99,27 @@ def test_nan_positions_give_nan_and_leave_the_others_alone():
     assert np.isnan([gx[0], tx[0], ty[0]]).all() and np.isfinite([gx[1], tx[1], ty[1]]).all()
 
 
+@pytest.mark.parametrize("method", METHODS)
+def test_nan_positions_do_not_spoil_the_precision_of_the_others(method):
+    rng = np.random.default_rng(5)
+    compensator = Compensator(random_map(ARTIFACT, 3, gain=1000), method=method)
+    x, y = rng.uniform(-0.05, 0.05, (2, 500))
+    q = np.array(compensator.command(x, y))
+    q[:, ::50] = np.nan
+    known = np.isfinite(q[0])
+    got = np.array(compensator.correct(*q))
+    assert np.isnan(got[:, ~known]).all()
+    np.testing.assert_allclose(got[:, known], np.stack([x, y])[:, known], rtol=0, atol=1e-15)
+
+
+def test_unknown_sites_do_not_spoil_the_precision_of_the_others():
+    compensator = Compensator(random_map(ARTIFACT, 3, gain=1000, unknown=[(5, 5)]))
+    x, y = np.random.default_rng(5).uniform(-0.05, 0.05, (2, 500))
+    far = np.hypot(x, y) > 0.02
+    got = np.array(compensator.correct(*compensator.command(x, y)))
+    np.testing.assert_allclose(got[:, far], np.stack([x, y])[:, far], rtol=0, atol=1e-15)
+
+
 def test_an_unknown_site_spoils_its_cells_but_not_its_neighbours():
     emap = random_map(ARTIFACT, 4, unknown=[(5, 5)])
     compensator = Compensator(emap)
