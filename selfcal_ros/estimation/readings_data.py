@@ -67,6 +67,8 @@ def grid_data(measurements: Measurements) -> GridData:
         pose = _grid_pose(readings, artifact)
         where = f"view '{readings.view.name}' grid readings"
         flat = _flat_marks(readings, artifact, pose, where=where)
+        if not (np.isfinite(readings.dx).all() and np.isfinite(readings.dy).all()):
+            raise InputError(where, "a deviation is not a finite number", "remove the mark")
         values = (readings.dx + 1j * readings.dy) * PHASES[-pose.q % 4]
         _place(y[row].reshape(-1), weight[row].reshape(-1), flat, values=values,
                count=readings.count, where=where)
