@@ -23,7 +23,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--namespace", default="", help="namespace of the cell's topics, for bags "
                         "that hold several cells")
     parser.add_argument("--robust", action="store_true",
-                        help="find and remove outliers among the marks (docs/estimation.md)")
+                        help="find and remove outliers among the marks, name bad views "
+                        "(docs/identifiability.md)")
+    parser.add_argument("--validate", action="store_true",
+                        help="hold out tenths of the readings and whole views, and predict them")
+    parser.add_argument("--budget", action="store_true",
+                        help="print the uncertainty budget of the map (GUM)")
     parser.add_argument("--quiet", action="store_true", help="print no summary")
 
 
@@ -72,10 +77,35 @@ def run(args: argparse.Namespace) -> int:
             result = unidentified_result(measurements, error.observability)
             write_json(args.output, result_to_dict(with_input(result, bag_input(args.bag), lost)))
         raise
+    result, lines = _extended(args, measurements, options, result)
     result = with_input(result, bag_input(args.bag), lost)
     if args.output:
         write_json(args.output, result_to_dict(result))
     if not args.quiet:
         from selfcal_ros.cli.shown import show
         show(result, args.bag, args.output)
+        print("\n".join(lines), end="\n" * bool(lines))
     return 0
+
+
+def _extended(args: argparse.Namespace, measurements: Any, options: Any,
+              result: Any) -> tuple[Any, list[str]]:
+    """Return the result with validation and budget where they are wanted, and what to print."""
+    from dataclasses import replace
+
+    lines: list[str] = []
+    if args.validate:
+        from selfcal_ros.estimation.robust import clean
+        from selfcal_ros.estimation.validation import validate, validation_json, validation_text
+
+        used = clean(measurements, options).measurements if args.robust else measurements
+        found = validate(used, options)
+        result = replace(result, extra={**result.extra, "validation": validation_json(found)})
+        lines += ["", "held-out readings:", *(f"  {line}" for line in validation_text(found))]
+    if args.budget:
+        from selfcal_ros.estimation.budget import budget_json, budget_text, budgets
+
+        rows = budgets(result, options.reference)
+        result = replace(result, extra={**result.extra, "budget": budget_json(rows)})
+        lines += ["", *budget_text(rows)]
+    return result, lines

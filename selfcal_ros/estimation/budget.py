@@ -15,6 +15,9 @@ from selfcal_ros.model.result import CalibrationResult
 COVERAGE = 0.9545
 """Probability of the expanded uncertainty: k = 2 for many degrees of freedom."""
 
+MANY_DOF = 1e5
+"""Degrees of freedom above which a number of them says nothing more."""
+
 CELL_MEAN = 8 / 15
 """Mean square of the parabola 4 s (1 - s) over a cell: rms of an interpolation error."""
 
@@ -205,12 +208,16 @@ def budget_text(found: list[Budget]) -> list[str]:
         lines += [f"uncertainty of {budget.quantity}, {unit}",
                   f"  {'component':18}{'type':>5}{'u rms':>12}{'u max':>12}{'dof':>10}  from"]
         for part in budget.components:
-            dof = f"{part.dof:.0f}" if np.isfinite(part.dof) else "inf"
-            lines.append(f"  {part.label:18}{part.kind:>5}{part.u_rms * factor:12.5f}"
-                         f"{part.u_max * factor:12.5f}{dof:>10}  {part.note}")
-        dof = f"{budget.dof:.0f}" if np.isfinite(budget.dof) else "inf"
-        lines += [f"  {'combined':18}{'':5}{budget.u_rms * factor:12.5f}"
-                  f"{budget.u_max * factor:12.5f}{dof:>10}",
-                  f"  {f'expanded, k = {budget.k:.2f}':23}{budget.U_rms * factor:12.5f}"
-                  f"{budget.U_max * factor:12.5f}          95.45 % coverage"]
+            dof = _dof_text(part.dof)
+            lines.append(f"  {part.label:18}{part.kind:>5}{part.u_rms * factor:12.4g}"
+                         f"{part.u_max * factor:12.4g}{dof:>10}  {part.note}")
+        dof = _dof_text(budget.dof)
+        lines += [f"  {'combined':18}{'':5}{budget.u_rms * factor:12.4g}"
+                  f"{budget.u_max * factor:12.4g}{dof:>10}",
+                  f"  {f'expanded, k = {budget.k:.2f}':23}{budget.U_rms * factor:12.4g}"
+                  f"{budget.U_max * factor:12.4g}          95.45 % coverage"]
     return lines
+
+
+def _dof_text(dof: float) -> str:
+    return f"{dof:.0f}" if dof < MANY_DOF else "many"

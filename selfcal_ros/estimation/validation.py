@@ -214,10 +214,10 @@ def validation_text(found: list[HeldOut]) -> list[str]:
             continue
         parts = []
         if item.n_grid:
-            parts.append(f"{item.n_grid} marks predicted within {item.rms_m * 1e6:.4f} um rms, "
-                         f"{item.max_m * 1e6:.4f} um at most ({item.ratio:.2f} times the noise)")
+            parts.append(f"{item.n_grid} marks predicted within {item.rms_m * 1e6:.4g} um rms, "
+                         f"{item.max_m * 1e6:.4g} um at most ({item.ratio:.2f} times the noise)")
         if item.n_angular:
             parts.append(f"{item.n_angular} lines within "
-                         f"{np.degrees(item.rms_rad) * 3600:.3f} arcsec rms")
+                         f"{np.degrees(item.rms_rad) * 3600:.4g} arcsec rms")
         lines.append(f"{item.name}: " + ", ".join(parts))
     return lines

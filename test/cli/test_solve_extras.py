@@ -1,0 +1,50 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``selfcal solve`` with --robust, --validate and --budget on the shipped bags."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from selfcal_ros.cli.main import main
+
+BAGS = Path(__file__).parents[2] / "bags"
+
+
+@pytest.fixture
+def solved(tmp_path, capsys):
+    def solve(bag, *options):
+        out = tmp_path / "result.json"
+        code = main(["solve", str(BAGS / bag), "-o", str(out), *options])
+        return code, json.loads(out.read_text()), capsys.readouterr()
+    return solve
+
+
+def test_validation_and_budget_are_printed_and_written(solved):
+    code, result, printed = solved("hu_noise", "--validate", "--budget")
+    assert code == 0
+    assert "held-out readings:" in printed.out and "reading noise" in printed.out
+    assert result["validation"][0]["n_grid"] > 20
+    assert 1 < result["validation"][0]["ratio"] < 4
+    labels = [row["component"] for row in result["budget"] if row["u_rms_m"] is not None]
+    assert labels[-2:] == ["combined", "expanded"]
+
+
+def test_robust_lists_what_it_removed(solved):
+    code, result, _ = solved("hu_noise", "--robust", "--quiet")
+    assert code == 0
+    assert set(result["outliers"]) == {"rule", "unchecked", "removed"}
+    assert result["slips"] == [] and result["noisy_views"] == []
+
+
+def test_extras_only_on_demand(solved):
+    _, result, printed = solved("hu_noise")
+    assert not {"validation", "budget", "outliers"} & set(result)
+    assert "held-out" not in printed.out
+
+
+def test_deficient_bag_names_the_unseen_modes(solved):
+    code, result, printed = solved("deficient")
+    assert code == 3
+    assert "do not identify the stage" in printed.err and len(printed.err.splitlines()) == 1
+    assert result["observability"]["modes"] and result["observability"]["advice"]
