@@ -1,0 +1,199 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Bench: the joint solver beside other solvers, same readings, one run, one table.
+
+Every measurement is a process of its own with a limit of time and of memory; what goes beyond is
+skipped and says so. Writes build/bench.json.
+
+    python test/bench/run.py [--sizes 11,21] [--methods selfcal,"scipy lsmr"] [-o FILE]
+"""
+
+import argparse
+import json
+import os
+import resource
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+sys.path.insert(0, str(ROOT))
+
+from rivals import RIVALS, Rival, installed  # noqa: E402
+
+from selfcal_ros.errors import InputError  # noqa: E402
+from selfcal_ros.files import write_json  # noqa: E402
+
+SIZES = (11, 21, 51, 101, 201, 401, 1001)
+OURS = {"solve": "selfcal", "re-solve": "selfcal (factored plan)",
+        "map only": "selfcal (factored plan, map only)", "uncertainty": "selfcal (uncertainty map)"}
+MAX_RE_SOLVE, MAX_UNCERTAINTY = 201, 201
+TIME_LIMIT_S = 60.0
+MEMORY_LIMIT_MB = 8000
+MIN_SECONDS, MAX_REPEATS = 0.5, 30
+
+
+def readings(size: int):
+    """Return truth and noise-free readings of Hu's three grid views, 10 mm pitch."""
+    import numpy as np
+
+    from selfcal_ros.model.artifact import Artifact
+    from selfcal_ros.simulation.truth import hu_plan, random_truth, simulate_measurements
+
+    plan = hu_plan(Artifact(size, 0.01))
+    rng = np.random.default_rng(size)
+    truth = random_truth(plan.artifact, len(plan.views), rng)
+    return truth, simulate_measurements(truth, plan, rng)
+
+
+def error_of(field, truth) -> float:
+    """Return the largest |G - truth| in m after moving G to the datum."""
+    import numpy as np
+
+    from selfcal_ros.estimation.gauge import Gauge
+
+    nx, ny = truth.artifact.shape
+    z = truth.artifact.m / (nx // 2) + 1j * truth.artifact.n / (nx // 2)
+    gauge = Gauge(z, np.ones((nx, ny), dtype=bool), scale=True)
+    found = field[0] + 1j * field[1]
+    left = gauge.remove(found, gauge.parts(found)) - (truth.g[0] + 1j * truth.g[1])
+    return float(max(abs(left.real).max(), abs(left.imag).max()))
+
+
+def median_time(run, once: bool) -> tuple[float, object]:
+    """Return the median wall time of `run` and its last result; at least one run."""
+    times, start = [], time.perf_counter()
+    while True:
+        began = time.perf_counter()
+        result = run()
+        times.append(time.perf_counter() - began)
+        if once or len(times) == MAX_REPEATS or time.perf_counter() - start > MIN_SECONDS:
+            return sorted(times)[len(times) // 2], result
+
+
+def ours(benchmark: str, data) -> tuple:
+    """Return seconds and G of our own solver."""
+    import numpy as np
+
+    from selfcal_ros.estimation.api import Options, calibrate
+    from selfcal_ros.estimation.map_only import MapSolver
+    from selfcal_ros.estimation.system import clear_cache
+
+    quick = Options(uncertainty=False)
+
+    def cold():
+        clear_cache()
+        return calibrate(data, quick).error_map
+
+    if benchmark == "solve":
+        small = readings(5)[1]
+        calibrate(small, quick)
+        seconds, found = median_time(cold, once=False)
+    elif benchmark == "re-solve":
+        calibrate(data, quick)
+        seconds, found = median_time(lambda: calibrate(data, quick).error_map, once=False)
+    elif benchmark == "map only":
+        solver = MapSolver(data)
+        seconds, field = median_time(lambda: solver.solve(data), once=False)
+        return seconds, field
+    else:
+        calibrate(data, quick)
+        seconds, found = median_time(
+            lambda: calibrate(data, Options(uncertainty=True)).error_map, once=False)
+    return seconds, np.stack([found.gx, found.gy])
+
+
+def worker(benchmark: str, method: str, size: int) -> dict:
+    """Measure one method in this process."""
+    resource.setrlimit(resource.RLIMIT_AS, (MEMORY_LIMIT_MB * 2**20,) * 2)
+    truth, data = readings(size)
+    if method in OURS.values():
+        seconds, field = ours(benchmark, data)
+    else:
+        seconds, field = median_time(Rival(method, data).solve, once=size > 11)
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    return {"benchmark": benchmark, "method": method, "n": size, "seconds": seconds,
+            "peak_mb": round(peak, 1), "max_error": error_of(field, truth)}
+
+
+def measure(benchmark: str, method: str, size: int) -> dict:
+    """Run one worker in a process of its own; a row without figures says why."""
+    row = {"benchmark": benchmark, "method": method, "n": size, "seconds": None,
+           "peak_mb": None, "max_error": None}
+    if not installed(method):
+        return {**row, "note": "not installed"}
+    command = [sys.executable, __file__, "--worker", benchmark, method, str(size)]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=TIME_LIMIT_S,
+                              cwd=ROOT, check=False, env={**os.environ})
+    except subprocess.TimeoutExpired:
+        return {**row, "note": f"skipped: more than {TIME_LIMIT_S:.0f} s"}
+    if done.returncode:
+        last = (done.stderr.strip().splitlines() or ["no message"])[-1]
+        if "MemoryError" in last or "llocate" in last or done.returncode < 0:
+            return {**row, "note": f"skipped: more than {MEMORY_LIMIT_MB / 1000:.0f} GB"}
+        return {**row, "note": f"failed: {last}"}
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def jobs(sizes: list[int], methods: list[str]):
+    """Yield (benchmark, method, size); a rival that was skipped is not tried at larger sizes."""
+    for size in sizes:
+        for benchmark, method in OURS.items():
+            if "selfcal" not in methods:
+                continue
+            if benchmark in ("re-solve", "map only") and size > MAX_RE_SOLVE:
+                continue
+            if benchmark == "uncertainty" and size > MAX_UNCERTAINTY:
+                continue
+            yield benchmark, method, size
+        for method in RIVALS:
+            if method in methods:
+                yield "solve", method, size
+
+
+def show(row: dict) -> None:
+    """Print one line of the table."""
+    if row["seconds"] is None:
+        figures = f"{row['note']:>36}"
+    else:
+        figures = f"{row['seconds']:12.6f} {row['peak_mb']:10.0f} {row['max_error']:12.1e}"
+    print(f"{row['benchmark']:<12} {row['method']:<36} {row['n']:>5} {figures}", flush=True)
+
+
+def main() -> int:
+    """Measure, print the table and write the JSON file."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--sizes", default=",".join(map(str, SIZES)))
+    parser.add_argument("--methods", default=",".join(("selfcal", *RIVALS)))
+    parser.add_argument("-o", "--output", default=str(ROOT / "build" / "bench.json"))
+    parser.add_argument("--worker", nargs=3, help=argparse.SUPPRESS)
+    args = parser.parse_args()
+    if args.worker:
+        print(json.dumps(worker(args.worker[0], args.worker[1], int(args.worker[2]))))
+        return 0
+    methods = args.methods.split(",")
+    for method in methods:
+        if method not in ("selfcal", *RIVALS):
+            raise InputError("--methods", f"'{method}' is unknown", "see --help")
+    print(f"{'benchmark':<12} {'method':<36} {'N':>5} {'seconds':>12} {'peak MB':>10} "
+          f"{'max error m':>12}")
+    rows, given_up = [], set()
+    for benchmark, method, size in jobs([int(s) for s in args.sizes.split(",")], methods):
+        if method in given_up:
+            rows.append({"benchmark": benchmark, "method": method, "n": size, "seconds": None,
+                         "peak_mb": None, "max_error": None,
+                         "note": "skipped: beyond its limit at a smaller N"})
+        else:
+            rows.append(measure(benchmark, method, size))
+            if "skipped" in rows[-1].get("note", ""):
+                given_up.add(method)
+        show(rows[-1])
+    Path(args.output).parent.mkdir(parents=True, exist_ok=True)
+    write_json(args.output, rows)
+    print(f"written to {args.output}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,40 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The bench runs, skips with a reason, and writes what the contract says."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+RUN = Path(__file__).with_name("run.py")
+KEYS = {"benchmark", "method", "n", "seconds", "peak_mb", "max_error"}
+
+
+def bench(tmp_path, *args):
+    target = tmp_path / "bench.json"
+    done = subprocess.run([sys.executable, str(RUN), "-o", str(target), *args], text=True,
+                          capture_output=True, check=False)
+    return done, json.loads(target.read_text()) if target.exists() else None
+
+
+def test_every_method_is_measured_and_exact(tmp_path):
+    done, rows = bench(tmp_path, "--sizes", "5")
+    assert done.returncode == 0, done.stderr
+    methods = {row["method"] for row in rows}
+    assert {"selfcal", "numpy.linalg.lstsq", "scipy lsmr", "scipy splu", "gtsam",
+            "pyceres"} <= methods
+    assert {row["benchmark"] for row in rows} == {"solve", "re-solve", "map only", "uncertainty"}
+    for row in rows:
+        assert row.keys() >= KEYS and row["n"] == 5
+        assert row["method"] in done.stdout
+        if row["seconds"] is None:
+            assert row["note"] == "not installed" and row["method"] in ("gtsam", "pyceres")
+        else:
+            assert row["seconds"] > 0 and row["peak_mb"] > 10
+            assert row["max_error"] < 1e-12
+
+
+def test_unknown_methods_are_refused(tmp_path):
+    done, rows = bench(tmp_path, "--methods", "magic")
+    assert done.returncode != 0 and rows is None
+    assert "--methods: 'magic' is unknown" in done.stderr
