@@ -11,7 +11,7 @@ import numpy as np
 from scipy.linalg import blas, lapack
 
 from selfcal_ros.estimation.fold import FoldedMatrix
-from selfcal_ros.estimation.fronts import Front, add_to, dissect
+from selfcal_ros.estimation.fronts import Front, add_to, dissect, runs
 
 
 class Factor:
@@ -63,8 +63,8 @@ class Factor:
         for child in front.children:
             boundary, update = self.dissection.fronts[child].boundary, updates.pop(child)
             k = int(np.searchsorted(boundary, front.stop))
-            to_own = boundary[:k] - front.start
-            to_rest = np.searchsorted(front.boundary, boundary[k:])
+            to_own = runs(boundary[:k] - front.start)
+            to_rest = runs(np.searchsorted(front.boundary, boundary[k:]))
             add_to(f11, to_own, to_own, update[:k, :k])
             add_to(f12, to_own, to_rest, update[:k, k:])
             add_to(f22, to_rest, to_rest, update[k:, k:])
@@ -75,7 +75,7 @@ class Factor:
         folded, n = self.folded, self._n_free
         rest = self.dissection.matrix[n:, n:].toarray()
         for number in self.dissection.top:
-            places = self.dissection.fronts[number].boundary - n
+            places = runs(self.dissection.fronts[number].boundary - n)
             add_to(rest, places, places, updates.pop(number))
         size = len(folded.cut)
         joined = np.zeros((len(rest), size), dtype=complex)

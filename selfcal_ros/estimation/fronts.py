@@ -63,25 +63,30 @@ class Dissection:
     matrix: csr_matrix
 
 
-def add_to(block: np.ndarray, rows: np.ndarray, columns: np.ndarray,
-           update: np.ndarray) -> None:
-    """Add `update` at the places `rows`, `columns` of a matrix, run by run of places."""
-    row_spans, column_spans = _runs(rows), _runs(columns)
-    if len(row_spans) * len(column_spans) > 64:
-        block[rows[:, None], columns] += update
+MAX_BLOCKS = 24
+"""Blocks of runs up to which matrices are added block by block rather than entry by entry."""
+
+Places = tuple[np.ndarray, list[tuple[slice, slice]]]
+
+
+def add_to(block: np.ndarray, rows: Places, columns: Places, update: np.ndarray) -> None:
+    """Add `update` to the rows and columns of a matrix at places prepared by `runs`."""
+    if len(rows[1]) * len(columns[1]) > MAX_BLOCKS:
+        block[rows[0][:, None], columns[0]] += update
         return
-    for take_rows, to_rows in row_spans:
-        for take_columns, to_columns in column_spans:
+    for take_rows, to_rows in rows[1]:
+        for take_columns, to_columns in columns[1]:
             block[to_rows, to_columns] += update[take_rows, take_columns]
 
 
-def _runs(places: np.ndarray) -> list[tuple[slice, slice]]:
-    """Return (from, to) slices of the runs of consecutive places."""
+def runs(places: np.ndarray) -> Places:
+    """Return places with the (from, to) slices of their runs of consecutive numbers."""
     if not len(places):
-        return []
+        return places, []
     ends = (np.flatnonzero(places[1:] - places[:-1] != 1) + 1).tolist()
-    return [(slice(a, b), slice(int(places[a]), int(places[b - 1]) + 1))
-            for a, b in zip([0, *ends], [*ends, len(places)], strict=True)]
+    low, high = places[[0, *ends]].tolist(), places[[*(e - 1 for e in ends), -1]].tolist()
+    return places, [(slice(a, b), slice(c, d + 1)) for a, b, c, d in
+                    zip([0, *ends], [*ends, len(places)], low, high, strict=True)]
 
 
 def dissect(matrix: csr_matrix, sites: np.ndarray, shape: tuple[int, int],

@@ -10,7 +10,7 @@ components is therefore an exact rank.
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import coo_matrix
+from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 
 
@@ -59,36 +59,36 @@ def components(site: np.ndarray, mark: np.ndarray, q: np.ndarray, *, n_sites: in
         A site known to lie in a component that is not balanced; -1 = none is known.
     """
     n_nodes = n_sites + n_marks
-    _, label = _connect(site, mark + n_sites, n_nodes)
+    node = mark + n_sites
+    plain = turning >= 0 or not (len(q) and np.ptp(q))
+    label = _connect(site, node, n_nodes)[None] if plain else _cover(site, node, q, n_nodes)
     touched = np.zeros(n_nodes, dtype=bool)
-    touched[site], touched[mark + n_sites] = True, True
+    touched[site], touched[node] = True, True
     numbers = np.full(n_nodes, -1)
-    _, numbers[touched] = np.unique(label[touched], return_inverse=True)
-    n_components = int(numbers.max(initial=-1)) + 1
-    balanced = np.ones(n_components, dtype=bool)
-    if n_components == 1 and turning >= 0:
-        balanced[0] = False
-    elif len(q) and np.ptp(q):
-        balanced = _balanced(site, mark + n_sites, q, numbers=numbers, n=n_components)
+    # the copies of a node lie in all components of the cover over its own component
+    _, first, numbers[touched] = np.unique(label.min(axis=0)[touched], return_index=True,
+                                           return_inverse=True)
+    copies = label[:, np.flatnonzero(touched)[first]]
+    balanced = (copies[1:] != copies[0]).all(axis=0) if len(q) else np.zeros(0, dtype=bool)
+    if turning >= 0 and len(balanced) == 1:
+        balanced = np.zeros(1, dtype=bool)
+    elif turning >= 0:
+        return components(site, mark, q, n_sites=n_sites, n_marks=n_marks)
     return Components(numbers[:n_sites], numbers[n_sites:], balanced)
 
 
-def _connect(a: np.ndarray, b: np.ndarray, n: int) -> tuple[int, np.ndarray]:
-    edges = coo_matrix((np.ones(len(a), dtype=np.int8), (a, b)), shape=(n, n))
-    return connected_components(edges, directed=False)
+def _connect(a: np.ndarray, b: np.ndarray, n: int) -> np.ndarray:
+    """Return the component of every node; edges join a to b, and every b has few edges."""
+    order = np.argsort(a, kind="stable")
+    starts = np.concatenate([[0], np.cumsum(np.bincount(a, minlength=n))])
+    graph = csr_matrix((np.ones(len(a)), b[order], starts), shape=(n, n))
+    return connected_components(graph, directed=False)[1]
 
 
-def _balanced(site: np.ndarray, mark: np.ndarray, q: np.ndarray, *, numbers: np.ndarray,
-              n: int) -> np.ndarray:
-    """Return which components fall apart into four in the fourfold cover of the graph."""
-    size = len(numbers)
+def _cover(site: np.ndarray, node: np.ndarray, q: np.ndarray, n: int) -> np.ndarray:
+    """Return the components (4, nodes) of the fourfold cover: a vector in each of four turns."""
     turns = np.arange(4)[:, None]
     # a vector v on the mark appears as i^q v on the site
-    cover_site = ((turns + q) % 4) * size + site
-    cover_mark = np.broadcast_to(turns * size + mark, cover_site.shape)
-    _, label = _connect(cover_site.ravel(), cover_mark.ravel(), 4 * size)
-    first = np.zeros(n, dtype=int)
-    nodes = np.flatnonzero(numbers >= 0)[::-1]
-    first[numbers[nodes]] = nodes
-    copies = np.stack([label[first + k * size] for k in range(4)])
-    return (copies[1:] != copies[0]).all(axis=0)
+    cover_site = ((turns + q) % 4) * n + site
+    cover_node = np.broadcast_to(turns * n + node, cover_site.shape)
+    return _connect(cover_site.ravel(), cover_node.ravel(), 4 * n).reshape(4, n)
