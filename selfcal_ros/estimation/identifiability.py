@@ -3,7 +3,7 @@
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
-from itertools import combinations
+from itertools import combinations, islice
 from math import pi
 
 from selfcal_ros.estimation.modes import (
@@ -83,7 +83,7 @@ def predict_plan(plan: Plan, datum: ThetaDatum) -> Prediction:
     """Return the uncertainties that a plan promises if every mark is read.
 
     Fields above MAX_SITES are predicted on a smaller field, and the note says so: the gain grows
-    slowly, as log N, so that it is a little too small then.
+    slowly, as log N, so that it is too small then.
     """
     artifact = plan.artifact
     if artifact.shape[0] * artifact.shape[1] <= MAX_SITES:
@@ -93,8 +93,8 @@ def predict_plan(plan: Plan, datum: ThetaDatum) -> Prediction:
     found = predict(planned_system(small.artifact, small.views), small.artifact, datum,
                     repeats=unit_repeats(plan))
     nx, ny = small.artifact.shape
-    return replace(found, note=f"predicted for a field of {nx} x {ny} sites; on the plan's own "
-                               "field it is larger by some percent")
+    return replace(found, note=f"predicted for a field of {nx} x {ny} sites; XY is about 5 % "
+                               "larger for each doubling of the field")
 
 
 def unit_repeats(plan: Plan) -> int:
@@ -145,18 +145,15 @@ def find_cures(plan: Plan) -> Iterator[tuple[View, ...]]:
     found: list[tuple[View, ...]] = [()]
     if not _grid_seen(small, ()):
         for size in (1, 2):
-            found = [views for views in combinations(grid_only, size) if _grid_seen(small, views)]
+            good = (views for views in combinations(grid_only, size) if _grid_seen(small, views))
+            found = list(islice(good, MAX_CURES))
             if found:
                 break
-    n = 0
     for views in found:
         cure = next((more for more in (views, (*views, candidates[-1]))
                      if more and _cured(plan, more)), None)
         if cure:
             yield cure
-            n += 1
-        if n == MAX_CURES:
-            return
 
 
 def _grid_seen(plan: Plan, views: tuple[View, ...]) -> bool:

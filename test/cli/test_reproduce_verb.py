@@ -23,7 +23,7 @@ def test_text_and_plots(paper, figures, word, tmp_path, capsys):
 
 def test_same_seed_same_bytes(tmp_path, capsys):
     for name in ("a", "b"):
-        assert main(["reproduce", "hu", "--draws", "2", "--out", str(tmp_path / name)]) == 0
+        assert main(["reproduce", "qiao", "--draws", "2", "--out", str(tmp_path / name)]) == 0
     for path in (tmp_path / "a").iterdir():
         assert path.read_bytes() == (tmp_path / "b" / path.name).read_bytes()
     assert "wrote" in capsys.readouterr().out

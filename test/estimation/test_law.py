@@ -33,7 +33,7 @@ CASES = [(5, 8, datum, sense) for datum in ThetaDatum for sense in Sense]
 
 @pytest.mark.parametrize(("size", "count", "datum", "sense"), [
     *CASES, (11, 24, ThetaDatum.XY_AXES, Sense.PLATE_MOVES),
-    (21, 72, ThetaDatum.XY_AXES, Sense.MICROSCOPE_MOVES)])
+    (15, 36, ThetaDatum.XY_AXES, Sense.MICROSCOPE_MOVES)])
 def test_noise_free_readings_give_the_truth_back(size, count, datum, sense):
     truth, readings = measured(size, count, sense=sense)
     result = calibrate(readings, replace(LAW, datum_theta=datum))

@@ -107,23 +107,27 @@ def test_suggested_views_keep_the_repeats_and_have_names_of_their_own():
     assert {item.view.repeats for item in ranked if item.repeat_of is not None} == {6}
 
 
+@pytest.fixture
+def few_candidates(monkeypatch):
+    few = [view for view in candidate_views(Artifact(3, 0.01), angular=False)
+           if view.name in ("0deg", "90deg", "180deg", "270deg", "0deg+x", "0deg+y", "0deg-x")]
+    monkeypatch.setattr(suggest, "candidate_views", lambda *_, **__: few)
+    return few
+
+
 @pytest.mark.parametrize("criterion", suggest.CRITERIA)
-def test_best_plan_of_three_views_is_the_best_of_all(criterion):
-    artifact = Artifact(3, 0.01)
-    plan, score, how = best_plan(artifact, 3, angular=False, criterion=criterion)
-    assert how == "all 210 plans tried"
-    every = [score_plan(replace(plan, views=views)).key(criterion)
-             for views in combinations_with_replacement(candidate_views(artifact, angular=False), 3)
-             if views[0].rotation_rad == 0.0 and views[0].translation_m == (0.0, 0.0)]
+def test_best_plan_of_three_views_is_the_best_of_all(criterion, few_candidates):
+    plan, score, how = best_plan(Artifact(3, 0.01), 3, angular=False, criterion=criterion)
+    assert how == "all 28 plans tried"
+    every = [score_plan(replace(plan, views=(few_candidates[0], *views))).key(criterion)
+             for views in combinations_with_replacement(few_candidates, 2)]
     assert score.key(criterion) == min(every)
 
 
-def test_exchange_finds_what_trying_all_finds(monkeypatch):
+def test_exchange_finds_what_trying_all_finds(monkeypatch, few_candidates):
     artifact = Artifact(3, 0.01)
-    few = candidate_views(artifact, angular=False)[:9]
-    monkeypatch.setattr(suggest, "candidate_views", lambda *_, **__: few)
     _, best, how = best_plan(artifact, 4, angular=False)
-    assert how == "all 165 plans tried"
+    assert how == "all 84 plans tried"
     monkeypatch.setattr(suggest, "EXHAUSTIVE", 1)
     plan, found, how = best_plan(artifact, 4, angular=False)
     assert how.startswith("greedy")
@@ -132,15 +136,15 @@ def test_exchange_finds_what_trying_all_finds(monkeypatch):
 
 
 def test_best_plan_measures_the_angular_map_too():
-    plan, score, _ = best_plan(Artifact(5, 0.01, 24), 4, angular=True, repeats=5)
+    plan, score, _ = best_plan(Artifact(3, 0.01, 24), 4, angular=True, repeats=5)
     assert check_plan(plan).observability.identifiable
     assert plan.views[-1].grid is False and {view.repeats for view in plan.views} == {5}
     assert np.isfinite(score.rms_theta) and score.rms_theta > 0
 
 
-def test_large_plates_are_searched_small_and_judged_in_full():
-    _, score, how = best_plan(Artifact(21, 0.005), 3, angular=False)
-    assert how == "all 210 plans tried on a field of 11 x 11 sites"
+def test_large_plates_are_searched_small_and_judged_in_full(few_candidates):
+    _, score, how = best_plan(Artifact(21, 0.01), 3, angular=False)
+    assert how == "all 28 plans tried on a field of 11 x 11 sites"
     assert score.rms_xy == pytest.approx(0.949, abs=5e-4)
 
 
@@ -159,5 +163,5 @@ def test_gain_is_the_scatter_of_recalibrations():
     errors = np.array([
         [result.gx - truth.g[0], result.gy - truth.g[1]] for result in (
             calibrate(simulate_measurements(truth, plan, rng, sigma_m=1e-8), Options()).error_map
-            for _ in range(400))]) / 1e-8
-    assert np.sqrt((errors**2).mean()) == pytest.approx(found.rms_xy, rel=0.03)
+            for _ in range(250))]) / 1e-8
+    assert np.sqrt((errors**2).mean()) == pytest.approx(found.rms_xy, rel=0.035)
