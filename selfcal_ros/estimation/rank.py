@@ -49,14 +49,20 @@ def full_observability(system: JointSystem, artifact: Artifact,
 
 
 def angular_deficiency(system: JointSystem) -> int:
-    """Return how many modes of the angular map stay unseen beside its free constant."""
+    """Return how many modes of the angular map stay unseen beside its free constant.
+
+    If no angular view shares its rotation with a grid view, the constant of the plate's lines is
+    free as well: a datum of the plate, which the stage's map does not feel.
+    """
     angular = system.angular
     if not angular.n_views:
         return 0
     parts = angular.components
     nodes = int((parts.of_site >= 0).sum() + (parts.of_mark >= 0).sum())
-    return (2 * angular.n_lines - nodes + len(parts.balanced) - 1
-            + max(system.nullity - (3 * system.grid.n_views - system.rank_schur), 0))
+    turns = max(system.nullity - (3 * system.grid.n_views - system.rank_schur), 0)
+    if system.apart:
+        turns = max(turns - 1, 0)
+    return 2 * angular.n_lines - nodes + len(parts.balanced) - 1 + turns
 
 
 def measured_observability(system: JointSystem, artifact: Artifact,

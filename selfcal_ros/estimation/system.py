@@ -177,11 +177,28 @@ class JointSystem:
     def unseen(self) -> np.ndarray:
         """Misalignments that no reading tells, beside the datum, (size, modes)."""
         # without turns the rigid modes depend on each other: an orthonormal basis of their span
-        rigid, size, _ = np.linalg.svd(self.rigid.T, full_matrices=False)
+        datum = np.vstack([self.rigid, self._turn_of_lines]) if self.apart else self.rigid
+        rigid, size, _ = np.linalg.svd(datum.T, full_matrices=False)
         rigid = rigid[:, size > 1e-9 * size[0]]
         left = self._null - rigid @ (rigid.T @ self._null)
         u, s, _ = np.linalg.svd(left, full_matrices=False)
         return u[:, s > 1e-6]
+
+    @property
+    def apart(self) -> bool:
+        """Whether no angular view shares its rotation with a grid view.
+
+        Then a common rotation of the angular views and the constant of the plate's lines are one
+        datum more, which the stage's map does not feel.
+        """
+        return bool(self.angular_index) and set(self.angular_index).isdisjoint(self.grid_index)
+
+    @property
+    def _turn_of_lines(self) -> np.ndarray:
+        """The common rotation of views that measure lines alone, (size,)."""
+        out = np.zeros(self.size)
+        out[3 * self.grid.n_views:] = 1.0
+        return out
 
     @cached_property
     def known_sites(self) -> np.ndarray:
@@ -201,7 +218,8 @@ class JointSystem:
     @cached_property
     def known_views(self) -> np.ndarray:
         """Misalignments that are determined up to the datum, bool (size,)."""
-        return np.all(abs(self.unseen) <= 1e-6, axis=1)
+        known = np.all(abs(self.unseen) <= 1e-6, axis=1)
+        return known & (self._turn_of_lines == 0) if self.apart else known
 
     @cached_property
     def known_marks(self) -> np.ndarray:

@@ -236,3 +236,21 @@ def test_a_deficient_measurement_is_refused_with_its_modes_and_cures():
     assert seen.modes == ("non-orthogonality of the axes: Gx = O y, Gy = O x",
                           "scale difference of the axes: Gx = R x, Gy = -R y")
     assert seen.advice[1] == "or add a view turned by 270 deg"
+
+
+@pytest.mark.parametrize("datum", ["xy_axes", "zero_mean"])
+def test_lines_may_be_measured_in_views_of_their_own(datum):
+    plan = plan_of("0, 90, tx", 5, count=12)
+    grid = tuple(replace(view, angular=False) for view in plan.views)
+    lines = tuple(View(f"line {s}", s * np.pi / 6, (0.0, 0.0), False, True) for s in (0, 1))
+    plan = replace(plan, views=(*grid, *lines))
+    assert plan_observability(plan).identifiable
+    assert plan_observability(replace(plan, views=(*grid, lines[0]))).deficiency == 11
+    rng = np.random.default_rng(2)
+    truth = random_truth(plan.artifact, 5, rng)
+    result = calibrate(simulate_measurements(truth, plan, rng), Options(datum_theta=datum))
+    shift = truth.g_theta.mean() if datum == "zero_mean" else 0.0
+    assert np.abs(result.error_map.g_theta - truth.g_theta + shift).max() < 1e-15
+    # the rotation of the lines' own views and the constant of the plate's lines are one datum
+    assert np.allclose([v.phi for v in result.views[:3]], truth.phi_rad[:3], rtol=0, atol=1e-13)
+    assert np.isnan([v.phi for v in result.views[3:]]).all()
