@@ -33,9 +33,13 @@ def run(args: argparse.Namespace) -> int:
         rows = compare_with_laser(a, second, args.b)
         print(json.dumps(_laser_json(rows), indent=1) if args.json else _laser_text(rows))
         return int(ExitCode.DONE)
-    found = compare(a, result_from_dict(second, args.b), keep_scale=args.keep_scale,
-                    names=(args.a, args.b))
+    b = result_from_dict(second, args.b)
+    found = compare(a, b, keep_scale=args.keep_scale, names=(args.a, args.b))
     print(json.dumps(_json(found), indent=1) if args.json else _text(found))
+    datums = [result.error_map.datum_theta for result in (a, b)]
+    if datums[0] != datums[1] and not args.json and found.theta is not None:
+        print(f"       theta datums differ: {datums[0]} and {datums[1]}; xy_axes also ties four "
+              "lines to the XY axes")
     return int(ExitCode.DONE)
 
 

@@ -88,6 +88,10 @@ def budgets(result: CalibrationResult, reference: ReferenceLength | None = None)
     """
     emap, noise, artifact = result.error_map, result.noise, result.artifact
     u = np.stack([emap.u_gx, emap.u_gy])
+    if reference is not None:
+        # the map's uncertainty holds the reference's, which has a line of its own
+        own = reference.u_relative * np.stack([artifact.x_m, artifact.y_m])
+        u = np.sqrt(np.maximum(u**2 - own**2, 0.0))
     parts = _noise_parts(u, noise.sigma_xy, repeats=(noise.sigma_xy_repeats,
                                                      noise.dof_xy_repeats),
                          residuals=(noise.sigma_xy_residuals, noise.dof_xy_residuals))

@@ -44,6 +44,17 @@ def test_two_results_as_text_and_as_json(files, capsys):
     assert 1e-3 < found["significance_xy"]["p"] < 1 and len(found["dx"]) == 5
 
 
+def test_different_theta_datums_are_said(files, tmp_path, capsys):
+    data = read_json(files[1])
+    data["error_map"]["datum_theta"] = "zero_mean"
+    other = str(tmp_path / "other.json")
+    write_json(other, data)
+    assert main(["diff", files[0], other]) == 0
+    assert "theta datums differ: xy_axes and zero_mean" in capsys.readouterr().out
+    assert main(["diff", *files]) == 0
+    assert "datums differ" not in capsys.readouterr().out
+
+
 def test_keep_scale(files, capsys):
     assert main(["diff", *files, "--keep-scale"]) == 0
     assert "scale +0 ppm" in capsys.readouterr().out

@@ -68,6 +68,18 @@ def test_reference_length_grows_with_the_distance_from_the_centre():
     assert part.kind == "B" and "artifact" in part.note
 
 
+def test_the_reference_is_not_counted_twice():
+    result = calibrated(angular=False)
+    noise = parts_of(budgets(result)[0])["reading noise"]
+    own = 3e-7 * np.stack([ARTIFACT.x_m, ARTIFACT.y_m])
+    emap = result.error_map
+    with_scale = replace(emap, u_gx=np.hypot(emap.u_gx, own[0]), u_gy=np.hypot(emap.u_gy, own[1]))
+    reference = ReferenceLength(ReferenceKind.ARTIFACT, 0.0, 3e-7)
+    found = parts_of(budgets(replace(result, error_map=with_scale), reference)[0])
+    assert found["reading noise"].u_rms == pytest.approx(noise.u_rms)
+    assert found["reading noise"].u_max == pytest.approx(noise.u_max)
+
+
 def test_interpolation_error_of_a_parabola_is_the_exact_one():
     result = calibrated()
     x = ARTIFACT.x_m

@@ -254,3 +254,10 @@ def test_lines_may_be_measured_in_views_of_their_own(datum):
     # the rotation of the lines' own views and the constant of the plate's lines are one datum
     assert np.allclose([v.phi for v in result.views[:3]], truth.phi_rad[:3], rtol=0, atol=1e-13)
     assert np.isnan([v.phi for v in result.views[3:]]).all()
+
+
+@pytest.mark.parametrize(("views", "rank"), [
+    ("0, 90, tx", 4 * 101**2 + 9), ("0, 180, tx", 4 * 101**2 - 101 + 10),
+    ("0, tx, ty", 4 * 101**2 + 7), ("0, 90", (7 * 101**2 + 17) // 2)])
+def test_large_fields_have_the_rank_of_the_formula(views, rank):
+    assert plan_observability(plan_of(views, 101)).rank == rank

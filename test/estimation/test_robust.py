@@ -232,3 +232,31 @@ def test_order_of_readings_does_not_matter():
     a, b = (robust_calibrate(r, ZERO_MEAN) for r in (bad, replace(bad, views=tuple(shuffled))))
     assert np.array_equal(a.error_map.gx, b.error_map.gx)
     assert a.extra["outliers"] == b.extra["outliers"]
+
+
+def test_finite_rotations_are_no_outliers_with_the_rigid_model():
+    truth, readings = measured(3)
+    views = []
+    for view, phi in zip(readings.views, truth.phi_rad, strict=True):
+        q = view.view.lattice_pose(ARTIFACT).quarter_turns
+        if len(view.m):
+            x, y = (c * 0.01 for c in ((view.m, view.n), (-view.n, view.m))[q])
+            cos, sin = np.cos(phi) - 1, np.sin(phi) - phi
+            view = replace(view, dx=view.dx + cos * x - sin * y, dy=view.dy + sin * x + cos * y)
+        views.append(view)
+    bad = with_errors(replace(readings, views=tuple(views)), 1, dx={(-4, 2): 1e-6})
+    result = robust_calibrate(bad, replace(ZERO_MEAN, misalignment_model="rigid"))
+    assert removed(result) == {("rot90", "grid", "-4, 2")}
+    assert error_rms(result, truth) < 1.3 * error_rms(calibrate(readings, ZERO_MEAN), truth)
+
+
+def test_a_view_whose_slip_cannot_be_placed_is_left_out_if_it_can_be_spared(monkeypatch):
+    monkeypatch.setattr("selfcal_ros.estimation.robust_slip.AMBIGUOUS", 1e9)
+    truth, readings = measured(4, more=True)
+    result = robust_calibrate(slipped(readings, 3, "m", 2, (2e-7, -1e-7, 0.0)), ZERO_MEAN)
+    assert "the readings do not tell which; the view is left out" in " ".join(result.warnings)
+    view = result.views[3]
+    lost = len(readings.views[3].m) + len(readings.views[3].k)
+    assert view.name == "shift_x" and view.used == 0 and view.rejected == lost
+    assert np.isnan(view.tx) and result.rejected[REASON] == lost
+    assert error_rms(result, truth) < 1.5 * error_rms(calibrate(readings, ZERO_MEAN), truth)
