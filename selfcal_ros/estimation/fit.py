@@ -16,6 +16,7 @@ from selfcal_ros.estimation.problem import (
     sigma_of,
     weight_ratio,
 )
+from selfcal_ros.estimation.reference import scale_of
 
 MAX_RIGID_STEPS = 20
 
@@ -89,6 +90,11 @@ def fit(problem: Problem, y: np.ndarray) -> Fit:
     plate_parts = system.plate_gauge.parts(plate)
     plate = system.plate_gauge.remove(plate, plate_parts)
     parameters = parameters - plate_parts @ system.rigid[4:]
+    if problem.reference is not None:
+        grown = scale_of(system, problem.reference, field=field, plate=plate,
+                         half_width_m=length)
+        field, plate = field + grown * grid.views.z, plate - grown * grid.views.z
+        parameters = parameters + grown * system.rigid[3]
     xy = raw.xy or grid_level(problem, residuals)
 
     conditions = problem.conditions

@@ -32,6 +32,12 @@ class Gauge:
         sums = self._flat @ np.concatenate([flat.real, flat.imag])
         return self._gram_inverse @ sums
 
+    def dual(self, mode: int) -> np.ndarray:
+        """Return the row that gives one of `parts`, complex (nx, ny), real inner product."""
+        row = self._gram_inverse[mode] @ self._flat
+        n = self.known.size
+        return (row[:n] + 1j * row[n:]).reshape(self.known.shape)
+
     def remove(self, field: np.ndarray, parts: np.ndarray) -> np.ndarray:
         """Return `field` less the modes with coefficients `parts`."""
         return field - np.tensordot(parts, self.modes, axes=1)

@@ -13,6 +13,7 @@ from selfcal_ros.estimation.noise import disagreement
 from selfcal_ros.estimation.problem import Problem, repeats_of
 from selfcal_ros.estimation.rank import measured_observability, plan_observability, refusal
 from selfcal_ros.estimation.readings_data import angular_data, grid_data
+from selfcal_ros.estimation.reference import scale_datum
 from selfcal_ros.estimation.system import MAX_DIRECT_SITES, system_for
 from selfcal_ros.estimation.theta import conditions_for, misclosure_warning
 from selfcal_ros.estimation.uncertainty import FieldCovariance, angular_variance
@@ -65,7 +66,7 @@ def prepare(measurements: Measurements, options: Options) -> tuple[Problem, Obse
         raise InputError("options", f"the uncertainty of {system.grid.n_sites} sites is beyond "
                          f"the limit of {MAX_DIRECT_SITES}", "solve without the uncertainty")
     return Problem(system, grid, angular, *repeats_of(measurements), half_width_m, conditions,
-                   direct), seen
+                   direct, options.reference), seen
 
 
 def _result(measurements: Measurements, options: Options, *, problem: Problem, found: Fit,
@@ -93,7 +94,8 @@ def _error_map(measurements: Measurements, options: Options, *, problem: Problem
     u_x = u_y = np.full(system.grid.views.shape, np.nan)
     u_theta, closure = np.full(system.angular.n_lines, np.nan), None
     if problem.direct and options.uncertainty is not False:
-        cover = FieldCovariance(system, found.inverse)
+        scale = (scale_datum(system, options.reference, length) if options.reference else None)
+        cover = FieldCovariance(system, found.inverse, scale, found.xy.sigma)
         u_x, u_y = (np.sqrt(v) * found.xy.sigma for v in cover.diagonal())
     if problem.direct and options.uncertainty is not False and system.angular.n_views:
         variance, closure = angular_variance(

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from selfcal_ros.estimation.api import ReferenceLength
 from selfcal_ros.estimation.noise import Level, level, pooled
 from selfcal_ros.estimation.readings_data import AngularData, GridData
 from selfcal_ros.estimation.system import JointSystem
@@ -33,6 +34,8 @@ class Problem:
         Angular datum.
     direct : bool
         Whether the sites are factorised rather than iterated.
+    reference : ReferenceLength, optional
+        What sets the scale.
     """
 
     system: JointSystem
@@ -43,6 +46,7 @@ class Problem:
     half_width_m: float
     conditions: Conditions
     direct: bool
+    reference: ReferenceLength | None = None
 
 
 @dataclass(frozen=True, eq=False)

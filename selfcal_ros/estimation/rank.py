@@ -82,6 +82,14 @@ def measured_observability(system: JointSystem, artifact: Artifact,
     views : tuple of View
         The views that were read.
     """
+    key = ("observability", artifact, views)
+    if key not in system.memo:
+        system.memo[key] = _measured_observability(system, artifact, views)
+    return system.memo[key]
+
+
+def _measured_observability(system: JointSystem, artifact: Artifact,
+                            views: tuple[View, ...]) -> Observability:
     full = full_observability(system, artifact, views)
     if full.identifiable:
         return full

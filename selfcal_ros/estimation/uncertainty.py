@@ -9,6 +9,7 @@ from functools import cached_property
 
 import numpy as np
 
+from selfcal_ros.estimation.reference import ScaleDatum
 from selfcal_ros.estimation.system import JointSystem
 from selfcal_ros.estimation.theta import Conditions
 
@@ -22,10 +23,18 @@ class FieldCovariance:
         The measured plan.
     inverse : float array (size, size)
         Covariance of the misalignments for unit grid noise.
+    scale : ScaleDatum, optional
+        What sets the scale of the map; without it the map has none.
+    sigma : float
+        Noise of one grid reading, m, by which the reference's uncertainty is measured.
     """
 
-    def __init__(self, system: JointSystem, inverse: np.ndarray) -> None:
+    def __init__(self, system: JointSystem, inverse: np.ndarray,
+                 scale: ScaleDatum | None = None, sigma: float = 1.0) -> None:
         self.system, self.inverse = system, inverse
+        self.scale, self._u2 = scale, 0.0
+        if scale is not None:
+            self._u2 = scale.variance + (scale.u_m / max(sigma, 1e-300)) ** 2
         n = 3 * system.grid.n_views
         self._p = inverse[:n, :n]
 
@@ -48,9 +57,27 @@ class FieldCovariance:
 
     def of(self, rows: np.ndarray) -> np.ndarray:
         """Return the covariance (k, k) of functionals Re(conj(row) G), complex (k, nx, ny)."""
-        flat = self.project(rows.reshape(len(rows), -1).T)
-        out = np.real(flat.conj().T @ self._raw(flat))
-        return (out + out.T) / 2
+        flat = rows.reshape(len(rows), -1).T
+        out, extra = self.project(flat), 0.0
+        moved = np.zeros((self.system.grid.response.shape[1], len(rows)))
+        if self.scale is not None:
+            grown = np.real(self.system.grid.views.z.ravel().conj() @ flat)
+            out = out + self.scale.rows[:, None] * grown
+            moved, extra = np.outer(self.scale.parameters, grown), self._u2 * np.outer(grown, grown)
+        answer = np.real(self.system.grid.response.conj().T @ out) - moved
+        solved = self.system.grid.factor.solve(np.ascontiguousarray(out))
+        cov = np.real(out.conj().T @ solved) + answer.T @ self._p @ answer + extra
+        return (cov + cov.T) / 2
+
+    def _of_scale(self) -> tuple[np.ndarray, float]:
+        """Return the covariance of the scale with G in its datum (sites,), and its variance."""
+        grid, rows = self.system.grid, self.scale.rows
+        answer = np.real(grid.response.conj().T @ rows) - self.scale.parameters
+        solved = grid.factor.solve(rows)
+        spread = solved + grid.response @ (self._p @ answer)
+        basis = self.system.gauge.orthonormal
+        variance = float(np.real(np.vdot(rows, solved)) + answer @ self._p @ answer) + self._u2
+        return spread - basis @ np.real(basis.conj().T @ spread), variance
 
     def diagonal(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the variances of Gx and Gy at every site, (nx, ny) each; NaN if unknown."""
@@ -59,10 +86,14 @@ class FieldCovariance:
         out = []
         response = grid.response
         common = grid.factor.inverse_diagonal()
+        with_scale, of_scale = (None, 0.0) if self.scale is None else self._of_scale()
         for part in (np.real, np.imag):
             b, s, y = part(basis), part(spread), part(response)
             value = common + np.einsum("sa,ab,sb->s", y, self._p, y)
             value += np.einsum("sk,kl,sl->s", b, inner, b) - 2 * np.einsum("sk,sk->s", b, s)
+            if with_scale is not None:
+                z = part(grid.views.z.ravel())
+                value += 2 * z * part(with_scale) + z**2 * of_scale
             out.append(np.where(self.system.known_sites, np.maximum(value, 0.0).reshape(
                 grid.views.shape), np.nan))
         return out[0], out[1]
