@@ -6,9 +6,9 @@ from pathlib import Path
 from ament_index_python.packages import get_package_share_directory
 from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument, IncludeLaunchDescription
-from launch.conditions import LaunchConfigurationNotEquals
+from launch.conditions import IfCondition
 from launch.launch_description_sources import PythonLaunchDescriptionSource
-from launch.substitutions import LaunchConfiguration
+from launch.substitutions import LaunchConfiguration, NotEqualsSubstitution
 from launch_ros.actions import Node
 
 
@@ -22,7 +22,7 @@ def generate_launch_description() -> LaunchDescription:
         Node(package="selfcal_ros", executable="bag_recorder", name="bag_recorder",
              namespace=LaunchConfiguration("namespace"), output="screen",
              parameters=[{"bag": LaunchConfiguration("bag")}],
-             condition=LaunchConfigurationNotEquals("bag", "")),
+             condition=IfCondition(NotEqualsSubstitution(LaunchConfiguration("bag"), ""))),
         Node(package="selfcal_ros", executable="stage_simulator", name="stage_simulator",
              namespace=LaunchConfiguration("namespace"), output="screen", parameters=[params]),
         IncludeLaunchDescription(
