@@ -4,7 +4,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import t as t_distribution
+from scipy.special import stdtrit
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.api import Options
@@ -22,7 +22,7 @@ COVERAGE = 0.9545
 
 def coverage_factor(dof: float, probability: float = COVERAGE) -> float:
     """Return k such that value +- k u covers the truth with `probability` (Student's t)."""
-    return float(t_distribution.ppf((1 + probability) / 2, min(dof, 1e9)))
+    return float(stdtrit(min(dof, 1e9), (1 + probability) / 2))
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,7 +5,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import f as f_distribution
+from scipy.special import fdtrc
 
 MIN_REPEAT_DOF = 30
 """Degrees of freedom from which the scatter of repeats is trusted; below, residuals are."""
@@ -87,7 +87,7 @@ def disagreement(found: Level, what: str, unit: tuple[float, str], floor: float)
     if not (found.dof_residuals and dof) or max(base, found.residuals) <= floor:
         return ""
     ratio = (found.residuals / max(base, 1e-300)) ** 2
-    upper = f_distribution.sf(ratio, found.dof_residuals, min(dof, 1e9))
+    upper = float(fdtrc(found.dof_residuals, min(dof, 1e9), ratio))
     if min(upper, 1 - upper) >= F_LEVEL / 2:
         return ""
     factor, symbol = unit

@@ -8,7 +8,7 @@ XY map, so they act on Gtheta alone, with slopes and rotations as the readings g
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from selfcal_ros.estimation.system import JointSystem
 from selfcal_ros.model.error_map import ThetaDatum
@@ -154,7 +154,7 @@ def misclosure_warning(misclosure: np.ndarray, covariance: np.ndarray) -> str:
     left = contrasts @ misclosure
     spread = contrasts @ covariance @ contrasts.T + CLOSED_RAD**2 * np.eye(n - 1)
     value = float(left @ np.linalg.solve(spread, left))
-    if not value > chi2.isf(MISCLOSURE_LEVEL, n - 1):
+    if not value > chdtri(n - 1, MISCLOSURE_LEVEL):
         return ""
     arcsec = np.degrees(np.abs(left).max()) * 3600
     return (f"theta: the stage does not satisfy the axis conditions of the datum xy_axes: "
