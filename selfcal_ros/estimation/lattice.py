@@ -131,18 +131,14 @@ class LatticeViews:
         for index, (pose, win) in enumerate(zip(self.poses, self.windows, strict=True)):
             sites = field[win.sites]
             part = (sites.T if win.transposed else sites) * share[index][win.marks]
-            if pose.q:
-                part *= PHASES[-pose.q % 4]
-            out[win.marks] += part
+            _add_turned(out[win.marks], part, -pose.q % 4)
         return out
 
     def subtract_scattered(self, out: np.ndarray, weight: np.ndarray, mean: np.ndarray) -> None:
         """Subtract the scatter of weight times one field over the marks from `out`."""
         for index, (pose, win) in enumerate(zip(self.poses, self.windows, strict=True)):
             part = weight[index][win.marks] * mean[win.marks]
-            if pose.q:
-                part *= PHASES[pose.q]
-            out[win.sites] -= part.T if win.transposed else part
+            _add_turned(out[win.sites], part.T if win.transposed else part, (pose.q + 2) % 4)
 
     def scatter_one(self, index: int, mark: np.ndarray) -> np.ndarray:
         """Return the scatter of one view's field over the marks, complex (nx, ny)."""
@@ -166,6 +162,18 @@ class LatticeViews:
             part = marks[index][win.marks]
             out[win.sites] += PHASES[pose.q] * (part.T if win.transposed else part)
         return out
+
+
+def _add_turned(out: np.ndarray, part: np.ndarray, q: int) -> None:
+    """Add i^q times `part` to `out` without multiplying: only signs and parts change places."""
+    if q == 0:
+        out += part
+    elif q == 2:
+        out -= part
+    else:
+        sign = np.subtract if q == 1 else np.add
+        sign(out.real, part.imag, out=out.real)
+        (np.add if q == 1 else np.subtract)(out.imag, part.real, out=out.imag)
 
 
 def rigid_parameters(views: LatticeViews) -> np.ndarray:
