@@ -8,6 +8,7 @@ from scipy.stats import chi2, norm
 from scipy.stats import f as f_test
 
 from selfcal_ros.errors import InputError
+from selfcal_ros.estimation.blas_threads import one_thread
 from selfcal_ros.estimation.compare_covariance import first_order_u, theta_covariance, xy_covariance
 from selfcal_ros.estimation.datum import datum_modes
 from selfcal_ros.model.artifact import Artifact
@@ -101,6 +102,7 @@ def rms(values: np.ndarray) -> float:
     return float(np.sqrt(np.mean(known**2))) if len(known) else float("nan")
 
 
+@one_thread()
 def compare(a: CalibrationResult, b: CalibrationResult, *, keep_scale: bool = False,
             names: tuple[str, str] = ("A", "B")) -> MapDifference:
     """Compare two calibrations of the same lattice.
@@ -231,6 +233,7 @@ class LaserDifference:
         return self.of_laser - self.of_map
 
 
+@one_thread()
 def compare_with_laser(result: CalibrationResult, laser: dict,
                        where: str) -> list[LaserDifference]:
     """Compare O and R of a map with a step-diagonal measurement.

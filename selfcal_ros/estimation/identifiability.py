@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from itertools import combinations, islice
 from math import pi
 
+from selfcal_ros.estimation.blas_threads import one_thread
 from selfcal_ros.estimation.modes import (
     UnseenMode,
     angular_families,
@@ -51,6 +52,7 @@ class PlanCheck:
     cures: tuple[tuple[View, ...], ...] = ()
 
 
+@one_thread()
 def check_plan(plan: Plan) -> PlanCheck:
     """Return rank, deficiency, unseen modes and cures of a plan with every mark read."""
     system = planned_system(plan.artifact, plan.views)
@@ -79,6 +81,7 @@ def explained(seen: Observability, system: JointSystem, plan: Plan) -> PlanCheck
     return PlanCheck(seen, modes, cures)
 
 
+@one_thread()
 def predict_plan(plan: Plan, datum: ThetaDatum) -> Prediction:
     """Return the uncertainties that a plan promises if every mark is read.
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from selfcal_ros.errors import InputError
+from selfcal_ros.estimation.blas_threads import one_thread
 from selfcal_ros.estimation.law_equations import HuLaw, HuReadings, HuSolution
 from selfcal_ros.estimation.noise import level, pooled
 from selfcal_ros.model.artifact import Artifact
@@ -35,6 +36,7 @@ _NAMES = ("0 deg with grid and lines", "90 deg with grid and lines", "one line, 
           "one pitch along +X with grid and lines")
 
 
+@one_thread()
 def solve_law(measurements: Measurements, options: "Options") -> CalibrationResult:
     """Calibrate by Hu's law from exactly his four views, each of them complete.
 

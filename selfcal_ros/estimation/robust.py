@@ -17,6 +17,7 @@ from scipy.stats import chi2
 
 from selfcal_ros.errors import InputError, NotIdentifiableError
 from selfcal_ros.estimation.api import Options, calibrate
+from selfcal_ros.estimation.blas_threads import one_thread
 from selfcal_ros.estimation.robust_leverage import Residuals, residuals_of, view_noise
 from selfcal_ros.estimation.robust_slip import Slip, find_slip, split_view
 from selfcal_ros.model.readings import Measurements, ViewReadings
@@ -139,6 +140,7 @@ def _listed(cleaned: Cleaned) -> dict[str, Any]:
             "noisy_views": [{"view": name, "ratio": ratio} for name, ratio in cleaned.noisy]}
 
 
+@one_thread()
 def clean(measurements: Measurements, options: Options) -> Cleaned:
     """Return the measurement split at slips and without outliers, and what was found."""
     linear = replace(options, misalignment_model="linear", reference=None)

@@ -7,6 +7,7 @@ from itertools import combinations_with_replacement
 from math import comb, inf
 
 from selfcal_ros.errors import InputError
+from selfcal_ros.estimation.blas_threads import one_thread
 from selfcal_ros.estimation.identifiability import (
     candidate_views,
     describe_view,
@@ -26,7 +27,7 @@ SEARCH_SIZE = 11
 FULL_SIZE = 41
 """Largest field on which every candidate is judged in full."""
 
-EXHAUSTIVE = 400
+EXHAUSTIVE = 2000
 """Largest number of plans that are all tried; beyond it greedy choice and exchange."""
 
 FINALISTS = 5
@@ -65,6 +66,7 @@ class Suggestion:
     repeat_of: int | None = None
 
 
+@one_thread()
 def score_plan(plan: Plan, datum: ThetaDatum = ThetaDatum.XY_AXES, *,
                repeats: int | None = None) -> Score:
     """Return the score of a plan with every mark read.
@@ -81,6 +83,7 @@ def score_plan(plan: Plan, datum: ThetaDatum = ThetaDatum.XY_AXES, *,
     return Score(0, found.rms_xy, found.max_xy, theta)
 
 
+@one_thread()
 def rank_next(plan: Plan, *, criterion: str = "rms",
               datum: ThetaDatum = ThetaDatum.XY_AXES) -> tuple[Score, list[Suggestion]]:
     """Return the plan's score and every candidate for the next step, the best first.
@@ -115,6 +118,7 @@ def rank_next(plan: Plan, *, criterion: str = "rms",
     return score_plan(judged, datum, repeats=unit), out
 
 
+@one_thread()
 def best_plan(artifact: Artifact, n_views: int, *, angular: bool, criterion: str = "rms",
               repeats: int = 1) -> tuple[Plan, Score, str]:
     """Return the best plan of `n_views` views among the candidates, its score, how it was found.

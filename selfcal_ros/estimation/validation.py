@@ -13,6 +13,7 @@ import numpy as np
 
 from selfcal_ros.errors import InputError, NoDataError, NotIdentifiableError
 from selfcal_ros.estimation.api import Options, calibrate
+from selfcal_ros.estimation.blas_threads import one_thread
 from selfcal_ros.estimation.robust import subset
 from selfcal_ros.model.readings import Measurements, Sense, ViewReadings
 from selfcal_ros.model.result import CalibrationResult
@@ -54,6 +55,7 @@ class HeldOut:
     note: str = ""
 
 
+@one_thread()
 def validate(measurements: Measurements, options: Options | None = None, *, seed: int = 0,
              folds: int = 3) -> list[HeldOut]:
     """Hold out random tenths and whole views in turn, and predict them.

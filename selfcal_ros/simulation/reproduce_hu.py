@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from selfcal_ros.estimation.api import Options, calibrate
+from selfcal_ros.estimation.blas_threads import one_thread
 from selfcal_ros.estimation.law import hu_readings, hu_views, law_for
 from selfcal_ros.estimation.law_equations import HuReadings
 from selfcal_ros.estimation.prediction import predict
@@ -85,6 +86,7 @@ class HuReproduction:
     runs: tuple[HuRun, ...]
 
 
+@one_thread()
 def reproduce_hu(n_draws: int, seed: int) -> HuReproduction:
     """Run Hu's simulation: one truth, `n_draws` draws of noise at each of his two levels."""
     rng = np.random.default_rng(seed)

@@ -7,6 +7,7 @@ from math import pi
 import numpy as np
 
 from selfcal_ros.estimation.api import Options, calibrate
+from selfcal_ros.estimation.blas_threads import one_thread
 from selfcal_ros.estimation.datum import datum_modes
 from selfcal_ros.estimation.prediction import predict
 from selfcal_ros.estimation.rank import plan_observability
@@ -123,6 +124,7 @@ def plan_of(views: tuple[str, ...], artifact: Artifact = ARTIFACT) -> Plan:
         for name, (q, a, b) in ((name, POSES[name]) for name in views)))
 
 
+@one_thread()
 def reproduce_qiao(n_draws: int, seed: int) -> QiaoReproduction:
     """Compute all ranks, run both programs without noise and the noise run `n_draws` times."""
     seen = [[plan_observability(plan_of(row.views, Artifact(n, 0.01))) for n in SIZES]
