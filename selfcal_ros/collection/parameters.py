@@ -33,7 +33,7 @@ class Parameter:
             value = float(value)
         if not isinstance(value, kind) or (kind is int and isinstance(value, bool)):
             raise InputError(f"{where}: {self.name}", f"{value!r} is not of type {kind.__name__}",
-                             "mend the value")
+                             "put it in quotes" if kind is str else "mend the value")
         if self.choices and value not in self.choices:
             raise InputError(f"{where}: {self.name}", f"{value!r} is not known",
                              f"choose one of {', '.join(self.choices)}")

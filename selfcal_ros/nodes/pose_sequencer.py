@@ -50,13 +50,18 @@ class PoseSequencer(SelfcalNode):
         self._saver = self.create_client(SaveMap, "solver/save_map")
         self._action = ActionServer(
             self, RunCalibration, "~/run_calibration", self._execute,
-            goal_callback=lambda goal: GoalResponse.ACCEPT if self.machine.state in ENDED
-            else GoalResponse.REJECT, cancel_callback=lambda goal: CancelResponse.ACCEPT)
+            goal_callback=self._on_goal, cancel_callback=lambda goal: CancelResponse.ACCEPT)
         self.create_timer(0.05, self.guarded(self._on_timer))
         self.create_timer(1.0, lambda: self.diagnose(str(self.machine.state),
                                                      {"view": self.machine.index}))
         if self.values["auto_start"]:
             self._send(self.machine.start())
+
+    def _on_goal(self, _: Any) -> GoalResponse:
+        if self.machine.state in ENDED:
+            return GoalResponse.ACCEPT
+        self.get_logger().warning(f"goal rejected while {self.machine.state}: abort the plan first")
+        return GoalResponse.REJECT
 
     def _do(self, act: Any) -> str:
         self._send(act())

@@ -24,6 +24,9 @@ from selfcal_ros.nodes.base import SelfcalNode, fill, run
 from selfcal_ros.reporting.summary import state_sentence
 from selfcal_ros.reporting.summary_numbers import summary_numbers
 
+ECHO_LENGTH = 128
+"""Characters of a string that `ros2 topic echo` shows."""
+
 
 class Solver(SelfcalNode):
     """Solves whenever a view's readings arrive; publishes ErrorMap and CalibrationSummary."""
@@ -109,7 +112,7 @@ class Solver(SelfcalNode):
             "rms_theta_uncertainty_arcsec")}
         self._summary.publish(fill(names.SUMMARY.type(), {
             "header": convert_out.header(stamp, self.frame_id),
-            "state": str(self._problem) if self._problem else state_sentence(self.result),
+            "state": short(str(self._problem or state_sentence(self.result))),
             "views_done": len(self._messages), "views_planned": self._planned,
             "identifiable": seen.identifiable, "rank_deficiency": seen.deficiency, **fields,
             "advice": [*seen.advice, *self.result.warnings]}))
@@ -142,6 +145,15 @@ class Solver(SelfcalNode):
             self.diagnose(str(self._problem) if self._problem else "solved",
                           {"views": len(self._messages), "readings": self.digest()},
                           ok=self._problem is None)
+
+
+def short(sentence: str) -> str:
+    """Return a sentence without the clauses at its end that `ros2 topic echo` would cut into."""
+    if len(sentence) <= ECHO_LENGTH:
+        return sentence
+    head = sentence[:ECHO_LENGTH]
+    end = max(head.rfind(mark) for mark in ("; ", ", ", ": "))
+    return (head[:end] if end > 0 else head[:-1]) + "."
 
 
 def main() -> None:

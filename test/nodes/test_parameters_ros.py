@@ -1,7 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Parameters of the nodes: every one described and bounded, what is not known refused."""
 
+from pathlib import Path
+
 import pytest
+import yaml
 from rclpy.parameter import Parameter as RosParameter
 
 from selfcal_ros.collection.parameters import NODE_PARAMETERS
@@ -13,8 +16,9 @@ from selfcal_ros.nodes.measurement_collector import MeasurementCollector
 from selfcal_ros.nodes.pose_sequencer import PoseSequencer
 from selfcal_ros.nodes.solver import Solver
 from selfcal_ros.nodes.stage_simulator import StageSimulator
-from test.support.sessions import small_bag
+from test.support.sessions import plan_file, small_bag, small_plan
 
+PARAMS = Path(__file__).parents[2] / "config" / "params"
 NODES = {"measurement_collector": MeasurementCollector, "pose_sequencer": PoseSequencer,
          "solver": Solver, "compensator": CompensatorNode, "bag_player": BagPlayer,
          "bag_recorder": BagRecorder, "stage_simulator": StageSimulator}
@@ -24,7 +28,8 @@ NODES = {"measurement_collector": MeasurementCollector, "pose_sequencer": PoseSe
 def needed(tmp_path):
     """Return the parameters without which a node cannot run."""
     return {"bag_player": {"bag": str(small_bag(tmp_path))},
-            "bag_recorder": {"bag": str(tmp_path / "recorded")}}
+            "bag_recorder": {"bag": str(tmp_path / "recorded")},
+            "pose_sequencer": {"plan": plan_file(tmp_path, small_plan())}}
 
 
 def test_the_table_covers_every_node():
@@ -71,6 +76,29 @@ def test_a_whole_number_is_taken_where_a_number_is_wanted(graph):
     node = graph.node(PoseSequencer, settle_time=2)
     assert node.get_parameter("settle_time").value == 2.0
     assert node.get_parameter("settle_time").type_ is RosParameter.Type.DOUBLE
+
+
+@pytest.mark.parametrize("name", NODES)
+@pytest.mark.parametrize("file", sorted(PARAMS.glob("*.yaml")), ids=lambda path: path.name)
+def test_every_node_takes_the_shipped_parameter_files(graph, needed, file, name):
+    """As ROS reads them: there a bare y is true, and 1 is not 1.0."""
+    more = [word for key, value in needed.get(name, {}).items()
+            for word in ("-p", f"{key}:={value}")]
+    node = graph.add(NODES[name](context=graph.context, cli_args=[
+        "--ros-args", "--params-file", str(file), *more]))
+    told = yaml.safe_load(file.read_text()).get(name, {"ros__parameters": {}})
+    for key, value in told["ros__parameters"].items():
+        assert node.get_parameter(key).value == value
+    if name == "bag_recorder":
+        node.close()
+
+
+def test_a_word_that_the_file_makes_a_bool_is_refused_with_the_mend(graph, tmp_path):
+    file = tmp_path / "cell.yaml"
+    file.write_text("measurement_collector: {ros__parameters: {joint_y: y}}")
+    with pytest.raises(InputError, match="joint_y: True is not of type str; put it in quotes"):
+        MeasurementCollector(context=graph.context, cli_args=[
+            "--ros-args", "--params-file", str(file)])
 
 
 def test_a_parameter_cannot_be_changed_while_the_node_runs(graph):

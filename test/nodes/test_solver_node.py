@@ -13,7 +13,7 @@ from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.result import result_to_dict
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes.base import fill
-from selfcal_ros.nodes.solver import Solver
+from selfcal_ros.nodes.solver import Solver, short
 from test.support.maps import random_map, result_of
 from test.support.sessions import collected, events_of, small_plan
 
@@ -64,6 +64,20 @@ def test_the_map_is_that_of_the_readings_bit_for_bit(solve, graph):
     assert last.max_error_um == pytest.approx(norm.max() * 1e6, rel=1e-12)
 
 
+def test_the_state_is_a_sentence_that_topic_echo_shows_whole(solve):
+    _, summaries, _ = solve()
+    assert summaries[-1].state.startswith("Calibrated from 4 views: largest error ")
+    assert summaries[-1].state.endswith("(k=2).")
+    assert len(summaries[-1].state) <= 128
+
+
+@pytest.mark.parametrize("sentence, shown", [
+    ("Short.", "Short."), ("a" * 100 + "; " + "b" * 40 + ".", "a" * 100 + "."),
+    ("a" * 60 + ", b; " + "c" * 80, "a" * 60 + ", b."), ("a" * 200, "a" * 127 + ".")])
+def test_a_long_sentence_ends_with_a_clause(sentence, shown):
+    assert short(sentence) == shown
+
+
 def test_a_late_joiner_gets_map_and_summary(solve, graph):
     solve()
     maps, summaries = graph.listen(names.ERROR_MAP), graph.listen(names.SUMMARY)
@@ -111,7 +125,8 @@ def test_a_deficient_plan_is_told_with_advice_and_publishes_no_map(solve, graph,
     assert maps == []
     answer = graph.call(SaveMap, "solver/save_map", path=str(tmp_path / "no.json"))
     assert (answer.success, answer.error_code) == (False, 3)
-    assert answer.message == last.state
+    assert answer.message.startswith(last.state.rstrip("."))
+    assert len(last.state) <= 128
     assert not (tmp_path / "no.json").exists()
 
 
