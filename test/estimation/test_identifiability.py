@@ -24,7 +24,7 @@ from selfcal_ros.estimation.rank import plan_observability
 from selfcal_ros.estimation.system import planned_system
 from selfcal_ros.model.view import View
 from selfcal_ros.simulation.truth import random_truth, simulate_measurements
-from test.support.view_plans import POSES, QIAO_TABLES, plan_of
+from test.support.plans import POSES, QIAO_TABLES, plan_of
 
 
 def dense_rank(plan):

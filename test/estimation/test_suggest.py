@@ -17,7 +17,7 @@ from selfcal_ros.estimation.system import planned_system
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.simulation.truth import hu_plan, random_truth, simulate_measurements
-from test.support.view_plans import plan_of
+from test.support.plans import plan_of
 
 BOUNDS = {  # method, section 5: rms gain at N = 5, 11, 21
     "0, 90, tx": (0.800, 0.890, 0.949),
