@@ -7,7 +7,7 @@ import pytest
 import yaml
 from rclpy.parameter import Parameter as RosParameter
 
-from selfcal_ros.collection.parameters import NODE_PARAMETERS
+from selfcal_ros.collection.parameters import NODE_PARAMETERS, overrides_in
 from selfcal_ros.errors import InputError
 from selfcal_ros.nodes.bag_player import BagPlayer
 from selfcal_ros.nodes.bag_recorder import BagRecorder
@@ -78,16 +78,17 @@ def test_a_whole_number_is_taken_where_a_number_is_wanted(graph):
     assert node.get_parameter("settle_time").type_ is RosParameter.Type.DOUBLE
 
 
-@pytest.mark.parametrize("name", NODES)
+@pytest.mark.parametrize("namespace, name", [*(("/", name) for name in NODES),
+                                             ("/cell1", "pose_sequencer")])
 @pytest.mark.parametrize("file", sorted(PARAMS.glob("*.yaml")), ids=lambda path: path.name)
-def test_every_node_takes_the_shipped_parameter_files(graph, needed, file, name):
-    """As ROS reads them: there a bare y is true, and 1 is not 1.0."""
+def test_every_node_takes_the_shipped_parameter_files(graph, needed, file, name,
+                                                              namespace):
+    """As ROS reads them: a bare y is true, and `name:` does not hold in a namespace."""
     more = [word for key, value in needed.get(name, {}).items()
             for word in ("-p", f"{key}:={value}")]
-    node = graph.add(NODES[name](context=graph.context, cli_args=[
+    node = graph.add(NODES[name](context=graph.context, namespace=namespace, cli_args=[
         "--ros-args", "--params-file", str(file), *more]))
-    told = yaml.safe_load(file.read_text()).get(name, {"ros__parameters": {}})
-    for key, value in told["ros__parameters"].items():
+    for key, value in overrides_in(yaml.safe_load(file.read_text()), name, str(file)).items():
         assert node.get_parameter(key).value == value
     if name == "bag_recorder":
         node.close()
