@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.sparse import csr_matrix
 
-LEAF = 128
+LEAF = 192
 """Sites below which a part of the field is not cut any more."""
 
 

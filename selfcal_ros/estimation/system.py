@@ -218,7 +218,17 @@ class JointSystem:
     @cached_property
     def known_views(self) -> np.ndarray:
         """Misalignments that are determined up to the datum, bool (size,)."""
-        known = np.all(abs(self.unseen) <= 1e-6, axis=1)
+        known = np.ones(self.size, dtype=bool)
+        n, shape = 3 * self.grid.n_views, self.grid.views.shape
+        nothing = np.zeros(self.grid.weight.shape)
+        for column in self.unseen.T:
+            # an unseen mode may carry rigid parts: it counts as it looks in the datum
+            field = -(self.grid.response @ column[:n]).reshape(shape)
+            parts = self.gauge.parts(field)
+            moved = column - parts @ self.rigid[:4]
+            plate, _ = self.grid.plate(nothing, self.gauge.remove(field, parts), moved[:n])
+            moved = moved - self.plate_gauge.parts(plate) @ self.rigid[4:]
+            known &= abs(moved) <= 1e-6
         return known & (self._turn_of_lines == 0) if self.apart else known
 
     @cached_property

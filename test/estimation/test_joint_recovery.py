@@ -166,6 +166,29 @@ def test_weights_of_repeats_are_those_of_repeated_readings():
     assert np.abs(weighted.gx - calibrate(readings).error_map.gx).max() > 1e-10
 
 
+def test_a_view_broken_off_after_one_mark_harms_nothing():
+    plan = hu_plan(Artifact(7, 0.01, 24))
+    truth, readings = measured(plan)
+    first = readings.views[0]
+    broken = ViewReadings(View("broken", 0.0, (0.0, 0.01)), first.m[:1], first.n[:1] + 2,
+                          first.dx[:1], first.dy[:1], first.count[:1])
+    found = calibrate(replace(readings, views=(*readings.views, broken)))
+    assert np.abs(found.error_map.gx - truth.g[0]).max() < EXACT
+    assert [view.phi for view in found.views[:4]] == pytest.approx(list(truth.phi_rad), abs=EXACT)
+    assert np.isnan(found.views[4].phi)
+    assert found.observability.identifiable and found.observability.deficiency == 0
+
+
+def test_angular_marks_planned_but_never_read_leave_the_xy_map():
+    truth, readings = measured(hu_plan(Artifact(7, 0.01, 24)))
+    bare = replace(readings, views=tuple(
+        replace(view, k=view.k[:0], dtheta=view.dtheta[:0], count_theta=view.count_theta[:0])
+        for view in readings.views))
+    found = calibrate(bare)
+    assert np.abs(found.error_map.gx - truth.g[0]).max() < EXACT
+    assert np.isnan(found.error_map.g_theta).all() and np.isnan(found.views[2].phi)
+
+
 def test_large_fields_are_iterated_to_the_same_map(monkeypatch):
     plan = hu_plan(Artifact(51, 0.002, 24))
     _, readings = measured(plan, sigma_m=2e-8, sigma_theta_rad=1e-7)
