@@ -162,4 +162,6 @@ def run(make_node: Callable[[], Node], argv: list[str] | None = None) -> int:
             getattr(node, "close", lambda: None)()
             node.destroy_node()
         rclpy.try_shutdown()
+        for number in (signal.SIGINT, signal.SIGTERM):  # a launcher repeats Ctrl-C: nothing is
+            signal.signal(number, signal.SIG_IGN)       # left that it could stop
     return code

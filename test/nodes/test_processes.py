@@ -87,6 +87,19 @@ def test_a_signal_ends_every_node_cleanly(graph, group, tmp_path, number):
     assert info["rosbag2_bagfile_information"]["version"] == 9
 
 
+def test_a_signal_that_comes_again_and_again_changes_nothing(graph, group):
+    """Ctrl-C reaches a node from the terminal and once more from `ros2 launch`."""
+    process = group.node("solver")
+    graph.until(lambda: "solver" in graph.hand.get_node_names(), "the node")
+    deadline = time.monotonic() + PATIENCE_S
+    while process.poll() is None:
+        assert time.monotonic() < deadline
+        process.send_signal(signal.SIGINT)
+    code, _, err = ended(process)
+    assert code == 0
+    assert "Traceback" not in err
+
+
 def test_a_player_ends_by_itself_when_the_bag_is_played(group, tmp_path):
     code, _, err = ended(group.node("bag_player", bag=small_bag(tmp_path), rate=0.0,
                                     wait_for_subscribers=0.0))
