@@ -1,0 +1,77 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The launch files: they load, state their arguments, and start executables that exist."""
+
+from importlib.util import module_from_spec, spec_from_file_location
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+FILES = sorted((ROOT / "launch").glob("*.launch.py"))
+ARGUMENTS = {
+    "calibrate.launch.py": {"namespace", "params", "plan", "compensate"},
+    "replay.launch.py": {"bag", "rate", "namespace"},
+    "simulated_cell.launch.py": {"namespace", "bag"},
+}
+STARTED = {
+    "calibrate.launch.py": {"measurement_collector", "solver", "pose_sequencer", "compensator"},
+    "replay.launch.py": {"bag_player"},
+    "simulated_cell.launch.py": {"bag_recorder", "stage_simulator"},
+}
+
+
+@pytest.fixture
+def description():
+    """Return a function that loads a launch file with the real launch package."""
+    pytest.importorskip("launch.actions", reason="needs the launch package of ROS 2")
+    pytest.importorskip("launch_ros.actions", reason="needs launch_ros")
+    packages = pytest.importorskip("ament_index_python.packages")
+    try:
+        packages.get_package_share_directory("selfcal_ros")
+    except (OSError, KeyError):  # no ROS environment, or the package is not in it
+        pytest.skip("selfcal_ros is not installed in this ROS 2 environment")
+
+    def load(path: Path):
+        spec = spec_from_file_location(path.name.replace(".", "_"), path)
+        module = module_from_spec(spec)
+        spec.loader.exec_module(module)
+        return module.generate_launch_description()
+    return load
+
+
+def test_every_launch_file_is_known_here():
+    assert [path.name for path in FILES] == sorted(ARGUMENTS) == sorted(STARTED)
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.name)
+def test_it_states_its_arguments(description, path):
+    from launch.actions import DeclareLaunchArgument
+
+    stated = [entity for entity in description(path).entities
+              if isinstance(entity, DeclareLaunchArgument)]
+    assert {argument.name for argument in stated} == ARGUMENTS[path.name]
+    assert all(argument.description for argument in stated)
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.name)
+def test_it_starts_executables_of_this_package(description, path):
+    from launch_ros.actions import Node
+
+    from selfcal_ros.collection.parameters import NODE_PARAMETERS
+
+    nodes = [entity for entity in description(path).entities if isinstance(entity, Node)]
+    assert {node.node_executable for node in nodes} == STARTED[path.name]
+    assert {node.node_executable for node in nodes} <= set(NODE_PARAMETERS)
+    assert {node.node_package for node in nodes} == {"selfcal_ros"}
+
+
+def test_shipped_files_that_are_defaults_exist(description):
+    from launch import LaunchContext
+    from launch.actions import DeclareLaunchArgument
+    from launch.utilities import perform_substitutions
+
+    for path in FILES:
+        for entity in description(path).entities:
+            if isinstance(entity, DeclareLaunchArgument) and entity.default_value:
+                value = perform_substitutions(LaunchContext(), entity.default_value)
+                assert not value.startswith("/") or Path(value).is_file(), value
