@@ -15,8 +15,10 @@ lint: setup
 test: lint
 	@$(BIN)/python -m pytest -n 2 --dist worksteal
 bench: setup
-	@mkdir -p build
-	@$(BIN)/python test/bench/run.py
+	@test -d build/rivals || $(BIN)/python -m pip install --quiet --disable-pip-version-check \
+		--no-deps --target build/rivals -r tools/bench-requirements.txt \
+		|| echo "bench: the rivals could not be installed and are left out"
+	@PYTHONPATH=build/rivals $(BIN)/python test/bench/run.py
 clean:
 	rm -rf .venv build install log selfcal_ros.egg-info
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
