@@ -22,6 +22,7 @@ from selfcal_ros.collection.parameters import NODE_PARAMETERS, Parameter, parame
 from selfcal_ros.errors import ExitCode, SelfcalError
 from selfcal_ros.nodes.names import Topic
 
+STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 SPIN_SECONDS = 86400.0
 """An infinite time-out overflows in the executor of the wheels; a day is long enough to loop."""
 
@@ -144,8 +145,8 @@ def run(make_node: Callable[[], Node], argv: list[str] | None = None) -> int:
     """
     rclpy.init(args=argv, signal_handler_options=SignalHandlerOptions.NO)
     stop = Future()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set_result(None))
+    for number in STOP_SIGNALS:
+        signal.signal(number, lambda *_: _stop(stop))
     node, code = None, int(ExitCode.DONE)
     try:
         node = make_node()
@@ -162,6 +163,17 @@ def run(make_node: Callable[[], Node], argv: list[str] | None = None) -> int:
             getattr(node, "close", lambda: None)()
             node.destroy_node()
         rclpy.try_shutdown()
-        for number in (signal.SIGINT, signal.SIGTERM):  # a launcher repeats Ctrl-C: nothing is
-            signal.signal(number, signal.SIG_IGN)       # left that it could stop
+        _ignore_signals()
     return code
+
+
+def _stop(future: Future) -> None:
+    """End the spinning once; a second signal would wait for the future's lock for ever."""
+    _ignore_signals()
+    future.set_result(None)
+
+
+def _ignore_signals() -> None:
+    """Let no repeated signal (a launcher passes Ctrl-C on) disturb the clean-up or the exit."""
+    for number in STOP_SIGNALS:
+        signal.signal(number, signal.SIG_IGN)
