@@ -136,7 +136,7 @@ class Collector:
             raise NoDataError("selfcal/view_command", "no MEASURE command",
                               "readings cannot be assigned to views without one")
         table = np.array(self._detections, dtype=DETECTION)
-        scored = bool((table["score"] > 0).any())
+        scored = bool((np.isfinite(table["score"]) & (table["score"] > 0)).any())
         interval_of = timeline.assign(table["stamp"])
         loose = Counter({str(reason): count for reason, count in self._rejected_input.items()})
         view_of = np.full(len(table), -1)

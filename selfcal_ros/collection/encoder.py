@@ -50,9 +50,10 @@ class JointTrack:
             order = np.lexsort((np.nan_to_num(speeds, nan=np.inf), positions, stamps))
             stamps, positions, speeds = stamps[order], positions[order], speeds[order]
             first = np.flatnonzero(np.diff(stamps, prepend=stamps[:1] - 1))
-            last = np.append(first[1:], len(stamps)) - 1
-            spread = np.abs(self._difference(positions[last] - positions[first]))
-            bad = spread > self.limits.agreement
+            # from the first of each stamp to all of it: on a circle the last may lie nearer
+            beside = np.repeat(positions[first], np.diff(first, append=len(stamps)))
+            spread = np.abs(self._difference(positions - beside))
+            bad = np.maximum.reduceat(spread, first) > self.limits.agreement
             self._sorted = stamps[first], positions[first], speeds[first], bad
         return self._sorted
 

@@ -160,7 +160,7 @@ def identify_angular(artifact: Artifact, view: View, reading_rad: np.ndarray, *,
         free = np.remainder(reading_rad / step + 0.5, 1) * step - step / 2
         values = named if len(named) else free
         phi_rad = float(np.median(values)) if len(values) else 0.0
-    nearest = np.rint((reading_rad - phi_rad) / step).astype(np.int64) - base
+    nearest = np.rint(wrap(reading_rad - phi_rad) / step).astype(np.int64) - base
     line = np.where(known, ids, np.remainder(nearest, count))
     deviation = wrap(reading_rad - (line + base) * step)
     away = np.abs(wrap(deviation - phi_rad))

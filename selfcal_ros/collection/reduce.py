@@ -114,6 +114,8 @@ def _reduce_grid(artifact: Artifact, view: View, d: np.ndarray, tracks: Tracks, 
 def _reduce_angular(artifact: Artifact, view: View, d: np.ndarray, tracks: Tracks, rules: Rules,
                     rejected: Counter, phi: float | None) -> dict:
     theta, why = tracks.theta.query(d["stamp"])
+    # beyond half a turn an offset is no sight of the line, though it may wrap to a small one
+    why[(why == None) & (np.abs(d["ot"]) > np.pi)] = Reason.TOO_FAR  # noqa: E711
     d, (theta,) = _keep(d, why, rejected, theta)
     found = identify_angular(artifact, view, _reading(rules.sense, theta, d["ot"]), ids=d["k"],
                              has_id=d["has_id"], rules=rules.identity, phi_rad=phi)

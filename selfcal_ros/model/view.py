@@ -82,6 +82,9 @@ class View:
         where = f"view '{self.name}'"
         steps = [value / artifact.grid_pitch_m for value in self.translation_m]
         shift = [_whole(step, f"{where} translation", "pitch") for step in steps]
+        if not math.isfinite(self.rotation_rad):
+            raise InputError(f"{where} rotation", f"{self.rotation_rad} is not an angle",
+                             "give a finite turn")
         turns = self.rotation_rad / (math.pi / 2)
         quarter = round(turns) % 4 if abs(turns - round(turns)) <= LATTICE_TOLERANCE else None
         if self.grid and quarter is None:

@@ -1,0 +1,95 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Messages of a small cell to spoil one by one, and what the collector makes of them."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from selfcal_ros.collection.collector import Collector, ViewProgress
+from selfcal_ros.collection.digest import readings_digest, session_digest
+from selfcal_ros.collection.messages import Command, Detection, EncoderSample, Kind
+from selfcal_ros.collection.parameters import parameter_values
+from selfcal_ros.model.readings import Measurements, ViewReadings
+from selfcal_ros.model.view import Plan
+from selfcal_ros.simulation.cell import CellSettings, Event, plan_events
+from selfcal_ros.simulation.truth import Truth, random_truth
+from test.support.plans import plan_of
+
+START_NS = 1_700_000_000_000_000_000
+
+
+@dataclass
+class Scene:
+    """All messages of a measured plan, by kind, and the truth behind them."""
+
+    plan: Plan
+    truth: Truth
+    commands: list[Command]
+    samples: list[EncoderSample]
+    detections: list[Detection]
+
+    @property
+    def events(self) -> list[Event]:
+        return [*self.commands, *self.samples, *self.detections]
+
+    def grid(self, number: int) -> int:
+        """Return the index of the `number`-th grid detection."""
+        return [i for i, d in enumerate(self.detections) if d.kind == Kind.GRID][number]
+
+    def angular(self, number: int) -> int:
+        """Return the index of the `number`-th angular detection."""
+        return [i for i, d in enumerate(self.detections) if d.kind == Kind.ANGULAR][number]
+
+    def spoil(self, index: int, **fields: Any) -> None:
+        self.detections[index] = replace(self.detections[index], **fields)
+
+
+def scene(text: str = "0", *, size: int = 5, count: int = 8, line: bool = False, repeats: int = 1,
+          seed: int = 3, **settings: Any) -> Scene:
+    """Return the messages of a plan such as '0, 90, tx' on a stage with errors."""
+    plan = plan_of(text, size, count=count, line=line, repeats=repeats)
+    rng = np.random.default_rng(seed)
+    truth = random_truth(plan.artifact, len(plan.views), rng)
+    events = list(plan_events(truth, plan, settings=CellSettings(**settings), rng=rng,
+                              start_ns=START_NS))
+    kinds = [[e for e in events if isinstance(e, kind)]
+             for kind in (Command, EncoderSample, Detection)]
+    return Scene(plan, truth, *kinds)
+
+
+def gathered(events: Iterable[Event], **parameters: Any) -> Collector:
+    """Return a collector that has taken all events in their order."""
+    collector = Collector(parameter_values("measurement_collector", parameters, "test"))
+    for event in events:
+        if isinstance(event, Command):
+            collector.add_command(event)
+        elif isinstance(event, Detection):
+            collector.add_detection(event)
+        else:
+            collector.add_encoder(event)
+    return collector
+
+
+def collect(events: Iterable[Event], **parameters: Any,
+            ) -> tuple[Measurements, dict[int, ViewProgress]]:
+    """Return the readings of all events."""
+    return gathered(events, **parameters).collect()
+
+
+def digest(events: Iterable[Event], **parameters: Any) -> str:
+    """Return one digest of everything that the events give."""
+    measurements, progress = collect(events, **parameters)
+    return session_digest({index: readings_digest(item.readings, measurements.rejected)
+                           for index, item in progress.items()})
+
+
+def table(readings: ViewReadings) -> dict[tuple, tuple]:
+    """Return mark -> what was read of it: ('grid', m, n) -> (dx, dy, count), ('line', k) -> ..."""
+    grid = zip(readings.m.tolist(), readings.n.tolist(), readings.dx.tolist(),
+               readings.dy.tolist(), readings.count.tolist(), strict=True)
+    lines = zip(readings.k.tolist(), readings.dtheta.tolist(), readings.count_theta.tolist(),
+                strict=True)
+    return ({("grid", m, n): (dx, dy, count) for m, n, dx, dy, count in grid}
+            | {("line", k): (value, count) for k, value, count in lines})
