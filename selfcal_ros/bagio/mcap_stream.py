@@ -17,12 +17,13 @@ import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import EndOfFile, InvalidMagic, McapError
 from mcap.opcode import Opcode
-from mcap.records import Channel, Chunk, Footer, Message, Schema
+from mcap.records import Channel, Chunk, DataEnd, Footer, Message, Schema
 from mcap.stream_reader import StreamReader, breakup_chunk
 
 from selfcal_ros.errors import InputError
 
 MAGIC = b"\x89MCAP0\r\n"
+DATA_END_SIZE = 13
 
 
 @dataclass
@@ -65,7 +66,7 @@ class McapStream:
 
     def _records(self, file: BinaryIO, size: int) -> Iterator[tuple[Channel, Message]]:
         records = iter(StreamReader(file, emit_chunks=True, record_size_limit=size).records)
-        good_until, ended = len(MAGIC), False
+        good_until, ended, data_ended = len(MAGIC), False, False
         while True:
             try:
                 record = next(records)
@@ -74,9 +75,11 @@ class McapStream:
             except (EndOfFile, InvalidMagic, McapError, struct.error, ValueError,
                     UnicodeDecodeError) as error:
                 if not ended:
-                    yield from self._salvage(file, good_until, size, error)
+                    yield from self._salvage(file, good_until, size, error, summary=data_ended)
                 return
             ended = ended or isinstance(record, Footer)
+            whole = file.tell() - good_until == DATA_END_SIZE
+            data_ended = data_ended or (isinstance(record, DataEnd) and whole)
             good_until = file.tell()
             if isinstance(record, Chunk):
                 yield from self._chunk(record, good_until)
@@ -105,9 +108,18 @@ class McapStream:
             else:
                 yield channel, record
 
-    def _salvage(self, file: BinaryIO, start: int, size: int,
-                 error: Exception) -> Iterator[tuple[Channel, Message]]:
-        """Yield what is readable of the record that was cut off at the end of the file."""
+    def _salvage(self, file: BinaryIO, start: int, size: int, error: Exception, *,
+                 summary: bool) -> Iterator[tuple[Channel, Message]]:
+        """Yield what is readable of the record that was cut off at the end of the file.
+
+        `summary` tells that the data section was complete, so that only indexes can be missing.
+        """
+        if summary or (start == size and isinstance(error, EndOfFile)):
+            self.lost.append(
+                "the end of the file is damaged, behind the last message: no message is lost"
+                if summary else "the file ends without its footer, as when a recorder is killed: "
+                "every message that was written is read")
+            return
         file.seek(start)
         rest = file.read()
         count = 0

@@ -44,6 +44,9 @@ def collect_bag(path: str | Path, values: dict[str, Any], *, namespace: str = ""
         if count % 1000 == 0:
             progress(count)
     received = collector.received
+    if namespace and reader.cells and namespace.strip("/") not in reader.cells:
+        raise NoDataError(str(path), f"no topics of the cell '{namespace}'", "choose one of "
+                          + ", ".join(f"/{name}" for name in sorted(reader.cells)))
     tail = f" ({reader.lost[-1]})" if reader.lost else ""
     for kind, topic in (("command", COMMAND_TOPIC), ("detection", DETECTION_TOPIC),
                         ("encoder", ENCODER_TOPIC)):

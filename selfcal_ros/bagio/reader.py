@@ -2,6 +2,7 @@
 """Bags of any origin: an MCAP file or a rosbag2 folder, read for the topics of this package."""
 
 import re
+from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -57,11 +58,14 @@ class BagReader:
     ----------
     lost : list of str
         What could not be read, one line each, after reading.
+    cells : set of str
+        Namespaces of the input topics that were met, without slashes.
     """
 
     path: Path
     namespace: str = ""
     lost: list[str] = field(default_factory=list)
+    cells: set[str] = field(default_factory=set)
 
     def __post_init__(self) -> None:
         """Find the MCAP files, refuse what is no bag."""
@@ -92,7 +96,7 @@ class BagReader:
         try:
             info = yaml.safe_load(metadata.read_text())["rosbag2_bagfile_information"]
             names = [Path(name).name for name in info["relative_file_paths"]]
-        except (yaml.YAMLError, KeyError, TypeError, UnicodeDecodeError):
+        except (yaml.YAMLError, KeyError, TypeError, ValueError):
             self.lost.append("metadata.yaml is damaged and was not used")
             return []
         return [name for name in names if name.endswith(".mcap")]
@@ -127,10 +131,10 @@ class BagReader:
             If a topic has another type, encoding or message version than the contract's, or the
             bag holds several namespaces.
         """
-        decoders: dict[tuple[int, int], tuple[str, Callable] | None] = {}
-        bad = 0
+        decoders: dict[tuple[Path, int], tuple[str, Callable] | None] = {}
+        bad: Counter = Counter()
         for stream, channel, message in self._all():
-            key = (id(stream), channel.id)
+            key = (stream.path, channel.id)
             if key not in decoders:
                 decoders[key] = self._decoder(stream, channel)
             entry = decoders[key]
@@ -139,11 +143,11 @@ class BagReader:
             try:
                 decoded = entry[1](message.data)
             except Exception:  # a damaged payload may fail anywhere in the decoder
-                bad += 1
+                bad[entry[0]] += 1
                 continue
             yield entry[0], message.log_time, decoded
-        if bad:
-            self.lost.append(f"{bad} messages could not be decoded")
+        self.lost += [f"{count} messages on {topic} could not be decoded"
+                      for topic, count in bad.items()]
 
     def _decoder(self, stream: McapStream, channel: Channel) -> tuple[str, Callable] | None:
         role = self._role(channel.topic)
@@ -172,11 +176,12 @@ class BagReader:
             if topic != role and not topic.endswith("/" + role):
                 continue
             space = topic.removesuffix(role).strip("/")
-            if self.namespace and space != self.namespace.strip("/"):
-                return None
-            seen = self.__dict__.setdefault("_space", space)
-            if seen != space:
-                raise InputError(str(self.path), f"topics of two cells, '/{seen}' and '/{space}'",
+            self.cells.add(space)
+            if self.namespace:
+                return role if space == self.namespace.strip("/") else None
+            if len(self.cells) > 1:
+                raise InputError(str(self.path), "topics of two cells, "
+                                 + " and ".join(f"'/{name}'" for name in sorted(self.cells)),
                                  "choose one with --namespace")
             return role
         return None
