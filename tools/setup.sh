@@ -45,7 +45,7 @@ if ! fresh wheels "$wheels"; then
   include=$("$venv/bin/python" -c 'import sysconfig; print(sysconfig.get_path("include"))')
   [ -f "$include/Python.h" ] || die "Python.h is missing; install the headers, e.g. 'apt install python3.12-dev'"
   step "installing the pinned wheels (about a minute)" "$venv/bin/python" -m pip install \
-    --disable-pip-version-check --no-deps --only-binary :all: --no-binary empy -r tools/requirements.txt
+    --disable-pip-version-check --no-deps --no-compile --only-binary :all: --no-binary empy -r tools/requirements.txt
   step "mending the wheels' CMake paths" "$venv/bin/python" tools/mend_wheels.py
   rm -f "$venv/.stamp-messages"
   stamp wheels "$wheels"
@@ -54,7 +54,9 @@ fi
 messages=$(find msg_defs -type f | LC_ALL=C sort | xargs sha256sum | sha256sum | cut -d' ' -f1)
 if ! fresh messages "$messages"; then
   rm -rf build/selfcal_msgs
+  # -j in MAKEFLAGS: else colcon has ninja wait while the load is high, and everything is serial
   step "building selfcal_msgs" env PATH="$venv/bin:$PATH" LD_LIBRARY_PATH="$venv/lib" \
+    MAKEFLAGS="-j$(nproc)" \
     AMENT_PREFIX_PATH="$venv" CMAKE_PREFIX_PATH="$venv" \
     "$venv/bin/colcon" --log-base build/colcon_log build --base-paths msg_defs --build-base build \
     --merge-install --install-base "$venv" --cmake-args -G Ninja -DBUILD_TESTING=OFF \
