@@ -5,6 +5,8 @@ import argparse
 import sys
 from typing import Any
 
+from selfcal_ros.errors import InputError
+
 HELP = "calibrate from a bag: MCAP file or rosbag2 folder"
 
 
@@ -20,6 +22,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
                         help="who moves (default: microscope_moves)")
     parser.add_argument("--params", metavar="NODES.yaml",
                         help="ROS parameter file, the same that the nodes take")
+    parser.add_argument("--reference", metavar="KIND:ERROR:U", help="known length that sets the "
+                        "scale: artifact, stage_x or stage_y, its relative error and the standard "
+                        "uncertainty of that, e.g. artifact:1.2e-6:3e-7")
     parser.add_argument("--namespace", default="", help="namespace of the cell's topics, for bags "
                         "that hold several cells")
     parser.add_argument("--robust", action="store_true",
@@ -40,13 +45,26 @@ def parameters(args: argparse.Namespace) -> tuple[dict[str, Any], dict[str, Any]
     data = read_yaml(args.params) if args.params else {}
     where = args.params or "options"
     options = {"measurement_collector": {"measurement_sense": args.sense},
-               "solver": {"method": args.method, "theta_datum": args.theta_datum}}
+               "solver": {"method": args.method, "theta_datum": args.theta_datum,
+                          **_reference(args.reference)}}
     values = []
     for node, given in options.items():
         overrides = overrides_in(data, node, where)
         overrides |= {name: value for name, value in given.items() if value is not None}
         values.append(parameter_values(node, overrides, where))
     return values[0], values[1]
+
+
+def _reference(text: str | None) -> dict[str, Any]:
+    """Return the solver parameters in KIND:ERROR:U."""
+    if text is None:
+        return {}
+    try:
+        kind, error, u = text.split(":")
+        return {"reference_kind": kind, "reference_error": float(error), "reference_u": float(u)}
+    except ValueError as error:
+        raise InputError("--reference", f"{text!r} is not KIND:ERROR:U",
+                         "write e.g. artifact:1.2e-6:3e-7") from error
 
 
 def run(args: argparse.Namespace) -> int:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from selfcal_ros.errors import InputError
-from selfcal_ros.estimation.api import Options
+from selfcal_ros.estimation.api import Options, ReferenceKind, ReferenceLength
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.readings import Sense
 
@@ -87,6 +87,12 @@ SOLVER = (
               choices=tuple(str(datum) for datum in ThetaDatum)),
     Parameter("misalignment_model", "linear", "linear: as published; rigid: exact rotation",
               choices=("linear", "rigid")),
+    Parameter("reference_kind", "none", "what a known length was measured on: it sets the scale",
+              choices=("none", *map(str, ReferenceKind))),
+    Parameter("reference_error", 0.0, "relative error of that length: artifact (true - nominal) / "
+              "nominal, stage axis (indicated - true) / nominal", "m/m", -0.09, 0.09),
+    Parameter("reference_u", 0.0, "standard uncertainty of reference_error (k=1)",
+              "m/m", 0.0, 0.09),
     Parameter("save_path", "", "RESULT.json to write whenever the map changes; empty = none"),
 )
 SEQUENCER = (
@@ -213,5 +219,8 @@ def _flatten(section: dict, prefix: str) -> list[tuple[str, Any]]:
 
 def solver_options(values: dict[str, Any], **more: Any) -> Options:
     """Return the estimator's options in a solver's parameter values."""
+    kind = values["reference_kind"]
+    reference = None if kind == "none" else ReferenceLength(
+        ReferenceKind(kind), values["reference_error"], values["reference_u"])
     return Options(method=values["method"], datum_theta=ThetaDatum(values["theta_datum"]),
-                   misalignment_model=values["misalignment_model"], **more)
+                   misalignment_model=values["misalignment_model"], reference=reference, **more)

@@ -1,0 +1,48 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`selfcal solve --reference`: a known length sets the scale of the map."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from selfcal_ros.cli.main import main
+
+BAG = str(Path(__file__).parents[2] / "bags" / "hu_exact")
+
+
+def solved(tmp_path, *options):
+    out = tmp_path / "r.json"
+    assert main(["solve", BAG, "--quiet", "-o", str(out), *options]) == 0
+    result = json.loads(out.read_text())
+    maps = result["error_map"] | result["artifact_map"]
+    return {key: np.array(maps[key]) for key in ("gx", "gy", "u_gx", "ax", "ay")}
+
+
+@pytest.mark.parametrize("kind", ["artifact", "stage_x", "stage_y"])
+def test_a_reference_length_adds_its_scale_and_its_uncertainty(tmp_path, kind):
+    free = solved(tmp_path)
+    fixed = solved(tmp_path, "--reference", f"{kind}:2e-6:1e-7")
+    x = (np.arange(11) - 5)[:, None] * 0.01 * np.ones(11)
+    grown_x, grown_y = fixed["gx"] - free["gx"], fixed["gy"] - free["gy"]
+    scale = (grown_x * x).sum() / (x * x).sum()
+    # one scale for x and y: only the magnification moves
+    np.testing.assert_allclose(grown_x, scale * x, atol=1e-15)
+    np.testing.assert_allclose(grown_y, scale * x.T, atol=1e-15)
+    if kind == "artifact":
+        # a longer plate (A grows) is a stage that indicates too little (G falls)
+        plate = ((free["ax"] * x + free["ay"] * x.T).sum()) / (2 * (x * x).sum())
+        assert scale == pytest.approx(plate - 2e-6, abs=1e-12)
+    else:
+        along = fixed["gx"] if kind == "stage_x" else fixed["gy"]
+        axis = x if kind == "stage_x" else x.T
+        assert (along * axis).sum() / (axis * axis).sum() == pytest.approx(2e-6, abs=1e-9)
+    assert fixed["u_gx"][0, 5] == pytest.approx(0.05 * 1e-7, rel=0.05)
+
+
+@pytest.mark.parametrize("text", ["artifact", "artifact:x:1", "moon:1e-6:1e-7", "artifact:1:0"])
+def test_a_bad_reference_is_one_line(capsys, text):
+    assert main(["solve", BAG, "--reference", text]) == 2
+    err = capsys.readouterr().err
+    assert err.count("\n") == 1 and "reference" in err
