@@ -5,7 +5,9 @@ Rule: a repeat is an outlier if it lies further from the median of its mark's re
 `limit` standard deviations of one reading. The standard deviation is robust: the median of
 the absolute differences of all pairs of repeats of the view, over 0.6745 sqrt(2), so that it
 stays put while under a quarter of the pairs are spoilt. With few pairs the limit grows. Of two
-repeats that contradict each other both are outliers: neither can be believed.
+repeats that contradict each other both are outliers: neither can be believed. So are all repeats
+of a mark of which fewer than half are left: the median of a mark whose repeats are mostly
+outliers is itself an outlier, and would be kept in place of the good one.
 Of clean Gaussian readings fewer than 1 in 100,000 are rejected (test_repeats.py).
 """
 
@@ -101,7 +103,8 @@ def _outliers(key: np.ndarray, values: np.ndarray, relative: np.ndarray,
     for group in groups:
         away = np.abs(values[:, group] - np.median(values[:, group], axis=2, keepdims=True))
         share = np.sqrt(0.5) if group.shape[1] == 2 else 1.0  # of two, each is half-way off
-        out[group] = (away > np.maximum(cut * share * relative[group], floor)).any(axis=0)
+        bad = (away > np.maximum(cut * share * relative[group], floor)).any(axis=0)
+        out[group] = bad | (2 * (~bad).sum(axis=1, keepdims=True) < group.shape[1])
     return out
 
 

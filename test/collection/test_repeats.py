@@ -1,0 +1,156 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Repeats: clean Gaussian readings stay, outliers go, means and repeatability as by hand."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.stats import binom
+
+from selfcal_ros.collection.repeats import reduce_repeats
+
+SIGMA = 2e-8
+LIMIT = 6.0
+
+
+def readings(marks, repeats, rng, *, components=2):
+    key = np.tile(np.arange(marks), repeats)
+    return key, rng.normal(0, SIGMA, (components, marks * repeats)), np.zeros(marks * repeats)
+
+
+def rejected_of_clean(marks, repeats, views, *, components=2):
+    """Return how many of all clean readings of many views are rejected, and how many there are."""
+    rng = np.random.default_rng([marks, repeats])
+    bad = sum(int(reduce_repeats(*readings(marks, repeats, rng, components=components),
+                                 limit=LIMIT).outlier.sum()) for _ in range(views))
+    return bad, marks * repeats * views
+
+
+@pytest.mark.parametrize("repeats", range(2, 8))
+def test_of_clean_readings_fewer_than_one_in_100000_are_rejected(repeats):
+    large = rejected_of_clean(40_000 // repeats, repeats, 8)
+    middle = rejected_of_clean(121, repeats, 120)
+    small = rejected_of_clean(9, repeats, 500)
+    line = rejected_of_clean(24, repeats, 200, components=1)
+    bad, total = np.sum([large, middle, small, line], axis=0)
+    assert bad <= binom.ppf(0.999, total, 1e-5)
+
+
+@pytest.mark.parametrize("marks", [5, 6, 8])
+def test_views_with_few_pairs_of_repeats_reject_no_more(marks):
+    bad, total = rejected_of_clean(marks, 2, 1500)
+    assert bad <= binom.ppf(0.999, total, 1e-5)
+
+
+@pytest.mark.parametrize("repeats", range(3, 8))
+@pytest.mark.parametrize("marks", [121, 441])
+def test_every_outlier_of_1_to_20_um_is_caught(repeats, marks):
+    rng = np.random.default_rng(repeats)
+    spoilt_total = 0
+    for _ in range(25):
+        key, values, sigma = readings(marks, repeats, rng)
+        spoilt = rng.random(len(key)) < 0.01
+        angle, size = rng.uniform(0, 2 * np.pi, len(key)), rng.uniform(1e-6, 20e-6, len(key))
+        values += spoilt * size * np.stack([np.cos(angle), np.sin(angle)])
+        outlier = reduce_repeats(key, values, sigma, limit=LIMIT).outlier
+        assert outlier[spoilt].all()
+        alone = np.bincount(key, spoilt)[key] <= (repeats - 1) // 2
+        assert not outlier[~spoilt & alone].any()
+        spoilt_total += spoilt.sum()
+    assert spoilt_total > 0.005 * marks * repeats * 25
+
+
+def one_spoilt_mark(repeats, offsets, *, marks=100):
+    """Return which repeats of mark 0 are outliers when `offsets` (x) are added to the first."""
+    key, values, sigma = readings(marks, repeats, np.random.default_rng(4))
+    at = np.flatnonzero(key == 0)
+    values[0, at[:len(offsets)]] += offsets
+    means = reduce_repeats(key, values, sigma, limit=LIMIT)
+    assert not means.outlier[key != 0].any()
+    return means.outlier[at].tolist(), means.key.tolist()
+
+
+def test_two_repeats_that_contradict_each_other_are_both_rejected():
+    outlier, marks = one_spoilt_mark(2, [1e-6])
+    assert outlier == [True, True]
+    assert marks == list(range(1, 100))
+
+
+@pytest.mark.parametrize("offsets", [[1e-6, 7e-6], [-1e-6, 7e-6], [5e-6, 2e-6]])
+def test_three_repeats_that_all_differ_are_all_rejected(offsets):
+    assert one_spoilt_mark(3, offsets)[0] == [True, True, True]
+
+
+def test_one_of_three_and_two_of_five_are_told_from_the_rest():
+    assert one_spoilt_mark(3, [1e-6])[0] == [True, False, False]
+    assert one_spoilt_mark(5, [1e-6, -2e-6])[0] == [True, True, False, False, False]
+    assert one_spoilt_mark(5, [1e-6, 9e-6])[0] == [True, True, False, False, False]
+    assert one_spoilt_mark(5, [1e-6, 5e-6, 9e-6])[0] == [True] * 5
+
+
+def test_a_limit_of_zero_keeps_all():
+    key, values, sigma = readings(50, 3, np.random.default_rng(1))
+    values[0, 0] += 1e-3
+    assert not reduce_repeats(key, values, sigma, limit=0.0).outlier.any()
+    assert reduce_repeats(key, values, sigma, limit=LIMIT).outlier.sum() == 1
+
+
+def test_outliers_are_told_in_units_of_the_declared_sigma():
+    key, values, _ = readings(50, 4, np.random.default_rng(1))
+    coarse = key < 10
+    values[:, coarse] *= 50
+    sigma = np.where(coarse, 50 * SIGMA, SIGMA)
+    assert not reduce_repeats(key, values, sigma, limit=LIMIT).outlier.any()
+    assert reduce_repeats(key, values, 0 * sigma, limit=LIMIT).outlier[coarse].sum() > 10
+
+
+def test_mean_count_repeatability_and_degrees_of_freedom_as_by_hand():
+    rng = np.random.default_rng(2)
+    key = rng.permutation(np.repeat([3, 5, 8, 9], [4, 1, 2, 5]))
+    values = rng.normal(1e-6, SIGMA, (2, len(key)))
+    means = reduce_repeats(key, values, np.zeros(len(key)), limit=0.0)
+    assert means.key.tolist() == [3, 5, 8, 9]
+    assert means.count.tolist() == [4, 1, 2, 5]
+    assert means.dof == 2 * (3 + 0 + 1 + 4)
+    groups = [values[:, key == k] for k in (3, 5, 8, 9)]
+    np.testing.assert_allclose(means.mean.T, [g.mean(axis=1) for g in groups], rtol=1e-14)
+    squares = sum(((g - g.mean(axis=1, keepdims=True))**2).sum() for g in groups)
+    assert means.sigma == pytest.approx(np.sqrt(squares / means.dof), rel=1e-12)
+    assert means.u.shape == (0,)
+
+
+def test_without_repeats_there_is_no_repeatability():
+    means = reduce_repeats(np.arange(4), np.ones((2, 4)), np.zeros(4), limit=LIMIT)
+    assert np.isnan(means.sigma)
+    assert means.dof == 0
+    empty = reduce_repeats(np.zeros(0, int), np.zeros((2, 0)), np.zeros(0), limit=LIMIT)
+    assert (empty.mean.shape, empty.count.tolist(), empty.dof) == ((2, 0), [], 0)
+
+
+def test_declared_sigmas_weigh_the_mean_and_tell_its_uncertainty():
+    key = np.array([0, 0, 0, 1, 1, 2])
+    values = np.array([[1.0, 2.0, 4.0, 5.0, 7.0, 9.0]])
+    sigma = np.array([1.0, 2.0, 0.5, 1.0, 0.0, 3.0])
+    means = reduce_repeats(key, values, sigma, limit=0.0)
+    weights = 1 / sigma[:3]**2
+    assert means.mean[0, 0] == pytest.approx(np.average(values[0, :3], weights=weights), rel=1e-14)
+    assert means.mean[0, 1] == 6.0  # one of its repeats declares none: not weighted
+    np.testing.assert_allclose(means.u, [1 / np.sqrt(weights.sum()), np.nan, 3.0], rtol=1e-14)
+
+
+@given(st.floats(-1e-3, 1e-3), st.integers(1, 9), st.floats(1e-12, 1e-3))
+def test_equal_repeats_give_back_the_same_bits(value, repeats, sigma):
+    key = np.repeat(np.arange(5), repeats)
+    for declared in (0.0, sigma):
+        means = reduce_repeats(key, np.full((2, len(key)), value), np.full(len(key), declared),
+                               limit=LIMIT)
+        assert (means.mean == value).all()
+        assert not means.outlier.any()
+        assert means.sigma == 0 or repeats == 1
+
+
+def test_the_pooled_repeatability_is_unbiased():
+    key, values, sigma = readings(20_000, 3, np.random.default_rng(9))
+    means = reduce_repeats(key, values, sigma, limit=LIMIT)
+    # a standard deviation with n degrees of freedom scatters by 1/sqrt(2 n)
+    assert abs(means.sigma / SIGMA - 1) < 4 / np.sqrt(2 * means.dof)
