@@ -1,0 +1,131 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Parameters: declared once; unknown names, wrong types and values out of bounds are refused."""
+
+import math
+
+import pytest
+import yaml
+
+from selfcal_ros.collection.parameters import (
+    NODE_PARAMETERS,
+    overrides_in,
+    parameter_values,
+    solver_options,
+)
+from selfcal_ros.errors import InputError
+from selfcal_ros.model.error_map import ThetaDatum
+
+EVERY = [(node, p) for node, table in NODE_PARAMETERS.items() for p in table]
+
+
+def values_in(text, node="measurement_collector"):
+    return parameter_values(node, overrides_in(yaml.safe_load(text), node, "p.yaml"), "p.yaml")
+
+
+@pytest.mark.parametrize(("node", "parameter"), EVERY, ids=lambda v: getattr(v, "name", v))
+def test_every_default_is_in_bounds_and_said_in_words(node, parameter):
+    assert parameter.check(parameter.default, "here") == parameter.default
+    assert parameter.description
+    assert parameter_values(node, {}, "here")[parameter.name] == parameter.default
+
+
+@pytest.mark.parametrize(("node", "parameter"),
+                         [item for item in EVERY if item[1].high is not None],
+                         ids=lambda v: getattr(v, "name", v))
+def test_the_bounds_are_allowed_and_beyond_is_not(node, parameter):
+    kind = type(parameter.default)
+    for bound, away in ((parameter.low, -math.inf), (parameter.high, math.inf)):
+        assert parameter.check(kind(bound), "here") == bound
+        beyond = math.nextafter(bound, away) if kind is float else int(bound + math.copysign(
+            1, away))
+        with pytest.raises(InputError, match=f"^here: {parameter.name}: .* is outside "):
+            parameter_values(node, {parameter.name: beyond}, "here")
+
+
+def test_names_are_unique_in_a_node():
+    for table in NODE_PARAMETERS.values():
+        assert len({p.name for p in table}) == len(table)
+
+
+@pytest.mark.parametrize(("name", "value", "message"), [
+    ("max_sped", 1.0, "measurement_collector has no such parameter; known are measurement_sense"),
+    ("max_speed", "fast", "'fast' is not of type float; mend the value"),
+    ("max_speed", True, "True is not of type float; mend the value"),
+    ("max_speed", math.nan, "nan is outside 0.0 to 1.0 m/s; mend the value"),
+    ("max_speed", math.inf, "inf is outside 0.0 to 1.0 m/s; mend the value"),
+    ("joint_x", 3, "3 is not of type str; put it in quotes"),
+    ("joint_y", True, "True is not of type str; put it in quotes"),
+    ("measurement_sense", "plate", "'plate' is not known; choose one of microscope_moves, plate_"),
+])
+def test_what_is_refused_and_how(name, value, message):
+    with pytest.raises(InputError) as caught:
+        parameter_values("measurement_collector", {name: value}, "p.yaml")
+    assert str(caught.value).startswith(f"p.yaml: {name}: {message}")
+
+
+def test_whole_numbers_are_floats_where_floats_are_wanted_but_not_the_other_way():
+    value = parameter_values("bag_player", {"rate": 2}, "here")["rate"]
+    assert (value, type(value)) == (2.0, float)
+    for value in (1.0, True):
+        with pytest.raises(InputError, match="is not of type int"):
+            parameter_values("bag_player", {"seed": value}, "here")
+    with pytest.raises(InputError, match="is not of type bool"):
+        parameter_values("bag_recorder", {"all_topics": 1}, "here")
+
+
+def test_parameters_that_ros_adds_itself_are_let_pass():
+    overrides = {"use_sim_time": True, "start_type_description_service": False,
+                 "qos_overrides./tf.publisher.depth": 5}
+    assert parameter_values("solver", overrides, "here") == parameter_values("solver", {}, "here")
+
+
+@pytest.mark.parametrize("section", [
+    "measurement_collector", "/measurement_collector", "/cell/measurement_collector", "/**", "**",
+    "/**/measurement_collector", "/cell/**", "/*"])
+def test_sections_that_mean_a_node(section):
+    text = f"'{section}':\n  ros__parameters:\n    max_speed: 0.25\n"
+    assert values_in(text)["max_speed"] == 0.25
+
+
+def test_nested_namespaces_and_nested_names():
+    text = "cell:\n  left:\n    measurement_collector:\n      ros__parameters: {max_speed: 0.5}\n"
+    assert values_in(text)["max_speed"] == 0.5
+    dotted = {"solver": {"ros__parameters": {"a": {"b": {"c": 1}}, "d": 2}}}
+    assert overrides_in(dotted, "solver", "f") == {"a.b.c": 1, "d": 2}
+
+
+def test_sections_of_other_nodes_do_not_reach():
+    text = "solver: {ros__parameters: {method: law}}\nbag_player: {ros__parameters: {rate: 0.0}}"
+    assert values_in(text) == parameter_values("measurement_collector", {}, "f")
+    assert values_in(text, "solver")["method"] == "law"
+
+
+def test_a_wild_card_section_holds_parameters_of_many_nodes_but_no_unknown_ones():
+    text = "/**: {ros__parameters: {method: law, max_speed: 0.1, frame_id: base}}"
+    assert values_in(text)["frame_id"] == "base"
+    assert values_in(text, "solver")["method"] == "law"
+    with pytest.raises(InputError, match=r"p.yaml: methd: solver has no such parameter"):
+        values_in("/**: {ros__parameters: {methd: law}}", "solver")
+
+
+@pytest.mark.parametrize(("text", "message"), [
+    ("colector: {ros__parameters: {}}", "p.yaml: /colector: no node of this package; known are "),
+    ("[1, 2]", "p.yaml: not a ROS parameter file; write 'NODE: ros__parameters: ...'"),
+    ("solver: 5", "p.yaml: not a ROS parameter file; write 'NODE: ros__parameters: ...'"),
+    ("solver: {ros__parameters: [1]}", "p.yaml: /solver: ros__parameters is not a mapping; write")])
+def test_files_that_are_refused(text, message):
+    with pytest.raises(InputError) as caught:
+        values_in(text)
+    assert str(caught.value).startswith(message)
+
+
+def test_an_empty_section_sets_nothing():
+    assert values_in("solver: {ros__parameters: }", "solver")["method"] == "joint"
+
+
+def test_the_estimator_gets_what_the_solver_was_given():
+    values = parameter_values("solver", {"method": "law", "theta_datum": "zero_mean",
+                                         "misalignment_model": "rigid"}, "here")
+    options = solver_options(values)
+    assert (options.method, options.datum_theta, options.misalignment_model) == (
+        "law", ThetaDatum.ZERO_MEAN, "rigid")

@@ -1,0 +1,121 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which view an instant belongs to: half-open intervals between the stamps of commands."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from selfcal_ros.collection.messages import Command, Phase
+from selfcal_ros.collection.reasons import Reason
+from selfcal_ros.collection.timeline import NO_END, build_timeline
+from selfcal_ros.errors import InputError
+from selfcal_ros.model.artifact import Artifact
+from test.support.plans import plan_of
+
+PLAN = plan_of("0, 90, tx")
+PLACE, MEASURE, DONE, ABORT = Phase
+
+
+def command(stamp, phase, index=0, **fields):
+    view = (PLAN.views[index], PLAN.artifact, 3) if phase in (PLACE, MEASURE) else (None, None, 3)
+    return replace(Command(stamp, phase, PLAN.plan_id, index, *view), **fields)
+
+
+def owners(commands, *stamps):
+    """Return, for each stamp, the view or the reason why it is in none."""
+    timeline = build_timeline(commands)
+    out = []
+    for number in timeline.assign(np.array(stamps, dtype=np.int64)).tolist():
+        interval = timeline.intervals[number] if number >= 0 else None
+        out.append("before" if interval is None
+                   else interval.reason if interval.view_index is None else interval.view_index)
+    return out
+
+
+WHOLE = [command(10, PLACE), command(20, MEASURE), command(30, PLACE, 1), command(40, MEASURE, 1),
+         command(50, DONE, 3)]
+OUT, OLD, OTHER = Reason.OUTSIDE_VIEWS, Reason.SUPERSEDED, Reason.OTHER_PLAN
+
+
+def test_a_view_lasts_from_its_stamp_to_just_before_the_next():
+    assert owners(WHOLE, 9, 10, 19, 20, 29, 30, 40, 49, 50, 10**18) == [
+        "before", OUT, OUT, 0, 0, OUT, 1, 1, OUT, OUT]
+
+
+def test_what_the_timeline_says_of_itself():
+    timeline = build_timeline(WHOLE)
+    assert (timeline.plan_id, timeline.artifact) == (PLAN.plan_id, PLAN.artifact)
+    assert timeline.views == {0: PLAN.views[0], 1: PLAN.views[1]}
+    assert (timeline.views_planned, timeline.finished, timeline.last_stamp_ns) == (3, True, 50)
+    assert [(i.start_ns, i.end_ns) for i in timeline.of_view(1)] == [(40, 50)]
+    unended = build_timeline(WHOLE[:-1])
+    assert not unended.finished
+    assert unended.of_view(1)[0].end_ns == NO_END
+    assert build_timeline([*WHOLE[:-1], command(50, ABORT)]).finished
+
+
+@given(st.permutations(WHOLE + WHOLE[1:3]))
+def test_the_order_of_arrival_and_repeated_commands_change_nothing(commands):
+    assert build_timeline(commands) == build_timeline(WHOLE)
+
+
+def test_no_command_and_no_measure():
+    empty = build_timeline([])
+    assert (empty.artifact, empty.views, empty.intervals) == (None, {}, ())
+    assert owners([], 5) == ["before"]
+    placed = build_timeline(WHOLE[:1])
+    assert placed.artifact is None
+    assert placed.last_stamp_ns == 10
+    assert owners(WHOLE[:1], 5, 15) == ["before", OUT]
+
+
+def test_a_view_without_its_place_is_measured():
+    assert owners([command(20, MEASURE)], 19, 20) == ["before", 0]
+
+
+def test_place_and_measure_of_one_stamp_are_taken_in_their_order():
+    assert owners([command(10, MEASURE), command(10, PLACE)], 10) == [0]
+
+
+def test_a_redo_supersedes_only_its_own_view():
+    redo = [*WHOLE[:-1], command(50, PLACE), command(60, MEASURE), command(70, DONE)]
+    assert owners(redo, 20, 40, 55, 60, 70) == [OLD, 1, OUT, 0, OUT]
+
+
+def test_only_the_last_of_many_redos_counts():
+    redo = [command(10 * k, phase) for k, phase in enumerate([PLACE, MEASURE] * 3, 1)]
+    assert owners(redo, 20, 40, 60) == [OLD, OLD, 0]
+
+
+def test_a_view_measured_again_without_place_has_two_intervals():
+    commands = [command(10, PLACE), command(20, MEASURE), command(30, PLACE, 1),
+                command(40, MEASURE, 1), command(50, MEASURE)]
+    assert owners(commands, 20, 40, 50) == [0, 1, 0]
+    assert len(build_timeline(commands).of_view(0)) == 2
+
+
+def test_a_place_that_no_measure_follows_supersedes_nothing():
+    assert owners([*WHOLE[:2], command(30, PLACE)], 20, 30) == [0, OUT]
+
+
+def test_the_plan_of_the_last_measure_is_used():
+    other = [command(1, PLACE, plan_id="b"), command(2, MEASURE, plan_id="b")]
+    assert owners([*other, *WHOLE], 1, 2, 20) == [OUT, OTHER, 0]
+    late = [replace(c, stamp_ns=c.stamp_ns + 100) for c in other]
+    assert owners([*WHOLE, *late], 20, 40, 102) == [OTHER, OTHER, 0]
+    assert build_timeline([*WHOLE, *late]).plan_id == "b"
+
+
+def test_views_planned_is_at_least_what_was_seen():
+    unsaid = [replace(c, views_planned=0) for c in WHOLE]
+    assert build_timeline(unsaid).views_planned == 2
+
+
+def test_two_plates_in_one_plan_are_refused():
+    odd = command(40, MEASURE, 1, artifact=Artifact(7, 0.01))
+    with pytest.raises(InputError, match=r"^view command of '0': describes another plate than the "
+                       r"rest of plan '0, 90, tx'; use one plate in one plan$"):
+        build_timeline([*WHOLE[:2], odd])
