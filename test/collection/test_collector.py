@@ -329,7 +329,7 @@ def test_any_order_of_all_messages_gives_the_same_bits(seed, ids):
 @settings(max_examples=100)
 @given(st.data())
 def test_any_order_of_few_messages_gives_the_same_bits(data):
-    cell = scene(size=3, count=4)
+    cell = scene(size=3, count=0)
     few = [*cell.commands, *cell.samples[::2], *cell.detections, *cell.detections[:3]]
     assert digest(data.draw(st.permutations(few))) == digest(few)
 
