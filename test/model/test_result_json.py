@@ -1,0 +1,127 @@
+# SPDX-License-Identifier: Apache-2.0
+"""RESULT.json: what is written is what is read, to the last bit, NaN included."""
+
+import copy
+import json
+from dataclasses import asdict, replace
+
+import numpy as np
+import pytest
+
+from selfcal_ros.errors import InputError
+from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.readings import Measurements, ViewReadings
+from selfcal_ros.model.result import (
+    Observability,
+    plain,
+    result_from_dict,
+    result_to_dict,
+    unidentified_result,
+    with_input,
+)
+from selfcal_ros.model.view import View
+from test.support.results import known_result
+
+ARRAYS = ("gx", "gy", "u_gx", "u_gy", "g_theta", "u_g_theta")
+
+
+def through_json(result):
+    return result_from_dict(json.loads(json.dumps(result_to_dict(result), allow_nan=False)), "f")
+
+
+def assert_same(a, b):
+    for name in ARRAYS:
+        np.testing.assert_array_equal(getattr(a.error_map, name), getattr(b.error_map, name))
+    for name in ("ax", "ay", "a_theta"):
+        np.testing.assert_array_equal(getattr(a.artifact_map, name), getattr(b.artifact_map, name))
+    for name in ("plan_id", "observability", "rejected", "input", "warnings", "method", "sense",
+                 "extra", "artifact"):
+        assert getattr(a, name) == getattr(b, name)
+    for name in ("nonorthogonality", "scale_difference", "datum_theta"):
+        np.testing.assert_equal(getattr(a.error_map, name), getattr(b.error_map, name))
+    np.testing.assert_equal(asdict(a.noise), asdict(b.noise))
+    np.testing.assert_equal([asdict(v) for v in a.views], [asdict(v) for v in b.views])
+
+
+@pytest.mark.parametrize(("lines", "size_y"), [(24, 0), (0, 0), (8, 7)])
+def test_a_result_survives_its_json_to_the_last_bit(lines, size_y):
+    result, _ = known_result(11, lines, size_y=size_y)
+    result = replace(result, warnings=("a", "b"), sense="plate_moves", method="law",
+                     extra={"budget": {"x": [1, 2.5, None]}})
+    assert_same(through_json(result), result)
+
+
+def test_unknown_places_are_null_and_come_back_as_nan():
+    result, _ = known_result()
+    result.error_map.gx[2, 3] = result.error_map.u_gy[0, 0] = np.nan
+    result.error_map.g_theta[5] = np.nan
+    result = replace(result, views=(replace(result.views[0], phi=np.nan), *result.views[1:]),
+                     noise=replace(result.noise, sigma_theta=np.nan))
+    data = result_to_dict(result)
+    assert data["error_map"]["gx"][2][3] is None
+    assert data["views"][0]["misalignment"]["phi"] is None
+    assert data["noise"]["sigma_theta"] is None
+    assert_same(through_json(result), result)
+    assert not through_json(result).error_map.valid[2, 3]
+
+
+def test_an_unidentified_plan_has_maps_of_nulls():
+    view = View("a")
+    measured = Measurements("p", Artifact(3, 0.01, 4), (
+        ViewReadings(view, used=9, rejected={"duplicate": 2}),), rejected={"outside_every_view": 1})
+    result = unidentified_result(measured, Observability(25, 39, 14, False, ("m",), ("add tx",)))
+    again = through_json(result)
+    assert_same(again, result)
+    assert np.isnan(again.error_map.gx).all()
+    assert again.rejected == {"duplicate": 2, "outside_every_view": 1}
+    assert (again.views[0].used, again.views[0].rejected) == (9, 2)
+
+
+def test_the_input_and_its_losses_are_added():
+    result, _ = known_result()
+    told = with_input(replace(result, warnings=("w",)), {"file": "b", "sha256": "0"}, ["cut"])
+    assert (told.input, told.warnings) == ({"file": "b", "sha256": "0"}, ("w", "cut"))
+
+
+def test_plain_makes_json_types():
+    value = {"a": np.float64("nan"), "b": (np.int64(3), np.array([1.0, np.inf])), "c": np.True_}
+    assert plain(value) == {"a": None, "b": [3, [1.0, None]], "c": True}
+
+
+def damaged(path, value):
+    data = copy.deepcopy(result_to_dict(known_result(5, 8)[0]))
+    at = data
+    for key in path[:-1]:
+        at = at[key]
+    if value is KeyError:
+        del at[path[-1]]
+    else:
+        at[path[-1]] = value
+    return data
+
+
+@pytest.mark.parametrize(("path", "value", "message"), [
+    (("error_map",), KeyError, "the key 'error_map' is missing"),
+    (("error_map", "gx"), [[1.0]], "gx has the shape (1, 1), not (5, 5)"),
+    (("error_map", "g_theta"), [], "g_theta has the shape (0,), not (8,)"),
+    (("error_map", "nonorthogonality"), "0", "'0' is not a number"),
+    (("error_map", "datum_theta"), "free", "'free' is not a valid ThetaDatum"),
+    (("plan_id",), 3, "3 is not of type str"),
+    (("views", 0, "rotation"), None, "the pose of view 'identity' is not finite"),
+    (("views", 0, "used"), True, "True is not of type int"),
+    (("noise", "sigma_xy"), "small", "'small' is not a number"),
+    (("rejected",), {"a": "many"}, "'many' is not of type int"),
+    (("warnings",), "one", "'one' is not of type list"),
+    (("observability", "identifiable"), 1, "1 is not of type bool"),
+    (("views",), 3, "'int' object is not iterable")])
+def test_damaged_results_are_refused(path, value, message):
+    with pytest.raises(InputError) as caught:
+        result_from_dict(damaged(path, value), "f.json")
+    assert str(caught.value) == (f"f.json: damaged result ({message}); "
+                                 "write it anew with `selfcal solve`")
+
+
+@pytest.mark.parametrize("data", [None, [], {}, {"schema": "selfcal.result/2"}])
+def test_other_json_is_no_result(data):
+    with pytest.raises(InputError, match=r"^f: not a result of schema selfcal\.result/1; give a "):
+        result_from_dict(data, "f")

@@ -1,0 +1,141 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Plates, views and plans: poses in whole steps, and what a PLAN.yaml may say."""
+
+import math
+
+import numpy as np
+import pytest
+
+from selfcal_ros.errors import InputError
+from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.view import View, plan_from_dict
+
+PLATE = Artifact(11, 0.01, 24)
+PLAN = {"plan_id": "p", "artifact": {"grid_size": 11, "grid_pitch": 0.01, "angular_count": 24},
+        "views": [{"name": "a"}]}
+
+
+def plan_with(view=None, **keys):
+    return {**PLAN, **keys, **({"views": [{"name": "a", **view}]} if view is not None else {})}
+
+
+@pytest.mark.parametrize(("degrees", "quarter", "lines"), [
+    (0, 0, 0), (90, 1, 6), (180, 2, 12), (270, 3, 18), (360, 0, 0), (-90, 3, 18), (-270, 1, 6),
+    (450, 1, 6), (15, None, 1), (-15, None, 23), (90.001, 1, 6)])
+def test_turns_in_quarters_and_lines(degrees, quarter, lines):
+    pose = View("v", math.radians(degrees), grid=quarter is not None).lattice_pose(PLATE)
+    assert (pose.quarter_turns, pose.turn_lines) == (quarter, lines)
+
+
+@pytest.mark.parametrize(("pitches", "shift"), [
+    ((0, 0), (0, 0)), ((1, -2), (1, -2)), ((0.9991, 0), (1, 0)), ((-3, 0.0009), (-3, 0))])
+def test_translations_in_pitches(pitches, shift):
+    view = View("v", 0.0, (pitches[0] * 0.01, pitches[1] * 0.01))
+    assert view.lattice_pose(PLATE).shift == shift
+
+
+@pytest.mark.parametrize("quarter", range(4))
+def test_sites_are_turned_counter_clockwise_then_shifted(quarter):
+    pose = View("v", quarter * math.pi / 2, (0.02, -0.01)).lattice_pose(PLATE)
+    m, n = PLATE.m, PLATE.n
+    turn = np.exp(1j * quarter * math.pi / 2)
+    want = np.rint(np.stack([((m + 1j * n) * turn).real, ((m + 1j * n) * turn).imag]))
+    np.testing.assert_array_equal(np.stack(pose.site_of(m, n)),
+                                  want + np.array([2, -1])[:, None, None])
+
+
+def test_marks_have_no_sites_between_quarter_turns():
+    pose = View("v", math.radians(15), grid=False).lattice_pose(PLATE)
+    with pytest.raises(ValueError, match="only after whole quarter turns"):
+        pose.site_of(1, 2)
+
+
+@pytest.mark.parametrize(("view", "plate", "message"), [
+    (View("v", 0.0, (0.005, 0.0)), PLATE,
+     "view 'v' translation: 0.5 is not a whole number of pitch steps; place the plate on the"),
+    (View("v", 0.0, (math.nan, 0.0)), PLATE, "view 'v' translation: nan is not a whole number"),
+    (View("v", 0.0, (0.0, math.inf)), PLATE, "view 'v' translation: inf is not a whole number"),
+    (View("v", math.nan), PLATE, "view 'v' rotation: nan is not an angle; give a finite turn"),
+    (View("v", -math.inf), PLATE, "view 'v' rotation: -inf is not an angle; give a finite turn"),
+    (View("v", math.radians(15)), PLATE,
+     "view 'v': grid marks cannot be measured at a turn of 15 deg; turn by a multiple of 90 deg"),
+    (View("v", math.radians(7), grid=False), PLATE,
+     "view 'v' rotation: 0.466667 is not a whole number of angular line steps"),
+    (View("v", math.radians(15), grid=False), Artifact(11, 0.01),
+     "view 'v': a turn that is not a quarter needs angular lines; turn by a multiple of 90 deg")])
+def test_poses_off_the_lattice_are_refused(view, plate, message):
+    with pytest.raises(InputError) as caught:
+        view.lattice_pose(plate)
+    assert str(caught.value).startswith(message)
+
+
+@pytest.mark.parametrize(("arguments", "message"), [
+    ((10, 0.01), "artifact grid_size: 10 is not an odd number from 3 to 4001"),
+    ((1, 0.01), "artifact grid_size: 1 is not"), ((-3, 0.01), "artifact grid_size: -3 is not"),
+    ((4003, 0.01), "artifact grid_size: 4003 is not"),
+    ((11, 0.01, 0, 4), "artifact grid_size_y: 4 is not"),
+    ((11, 0.0), "artifact grid_pitch: 0.0 m is not a length"),
+    ((11, -0.01), "artifact grid_pitch: -0.01 m is not a length"),
+    ((11, math.nan), "artifact grid_pitch: nan m is not a length"),
+    ((11, math.inf), "artifact grid_pitch: inf m is not a length"),
+    ((11, 0.01, 6), "artifact angular_count: 6 is not a multiple of 4"),
+    ((11, 0.01, -4), "artifact angular_count: -4 is not a multiple of 4"),
+    ((11, 0.01, 2**31), "artifact angular_count: 2147483648 is not a multiple of 4")])
+def test_plates_that_are_refused(arguments, message):
+    with pytest.raises(InputError) as caught:
+        Artifact(*arguments)
+    assert str(caught.value).startswith(message)
+
+
+def test_the_lattice_of_a_plate():
+    plate = Artifact(5, 0.01, 8, 7)
+    assert (plate.shape, plate.half) == ((5, 7), (2, 3))
+    assert plate.x_m[0, 0] == -0.02
+    assert plate.y_m[0, 6] == 0.03
+    np.testing.assert_allclose(plate.theta_rad, np.arange(8) * math.pi / 4)
+    assert Artifact(5, 0.01).theta_rad.shape == (0,)
+
+
+def test_a_plan_with_its_defaults_and_with_all_its_keys():
+    (view,) = plan_from_dict(PLAN, "f").views
+    assert view == View("a", 0.0, (0.0, 0.0), True, True, 1)
+    plan = plan_from_dict(plan_with({"rotation_deg": 15, "translation_pitch": [0, 2],
+                                     "grid": False, "angular": True, "repeats": 3}), "f")
+    assert plan.artifact == PLATE
+    assert plan.views[0] == View("a", math.radians(15), (0.0, 0.02), False, True, 3)
+    bare = plan_from_dict({**PLAN, "artifact": {**PLAN["artifact"], "angular_count": 0}}, "f")
+    assert not bare.views[0].angular
+
+
+@pytest.mark.parametrize(("data", "message"), [
+    (None, "f: not a mapping of keys to values; see config/plans"),
+    ({}, "f: the key 'plan_id' is missing; add it"),
+    (plan_with(extra=1), "f: extra: unknown key; known are plan_id, artifact, views"),
+    (plan_with(plan_id=3), "f: plan_id: 3 is not of type str; mend the value"),
+    (plan_with(views=[]), "f: the plan has no views; add at least one view"),
+    (plan_with(views=[3]), "f: views[0]: not a mapping of keys to values"),
+    (plan_with(views=[{"name": "a"}] * 2), "f: views[1]: the name 'a' is used twice; give every"),
+    (plan_with(artifact=[]), "f: artifact: [] is not of type dict"),
+    (plan_with(artifact={"grid_size": 11.0, "grid_pitch": 1, "angular_count": 0}),
+     "f: artifact: grid_size: 11.0 is not of type int"),
+    (plan_with(artifact={"grid_size": True, "grid_pitch": 1, "angular_count": 0}),
+     "f: artifact: grid_size: True is not of type int"),
+    (plan_with(artifact={"grid_size": 11, "grid_pitch": 1}),
+     "f: artifact: the key 'angular_count' is missing"),
+    (plan_with({"rotation": 90}), "f: views[0]: rotation: unknown key; known are name, rotation_"),
+    (plan_with({"rotation_deg": "90"}), "f: views[0]: rotation_deg: '90' is not of type float"),
+    (plan_with({"rotation_deg": math.nan}), "view 'a' rotation: nan is not an angle"),
+    (plan_with({"rotation_deg": math.inf}), "view 'a' rotation: inf is not an angle"),
+    (plan_with({"rotation_deg": 1}), "view 'a': grid marks cannot be measured at a turn of 1 deg"),
+    (plan_with({"translation_pitch": [1]}), "f: views[0]: translation_pitch: not two numbers; "),
+    (plan_with({"translation_pitch": ["1", 0]}), "f: views[0]: translation_pitch: not two number"),
+    (plan_with({"translation_pitch": [0.5, 0]}), "view 'a' translation: 0.5 is not a whole number"),
+    (plan_with({"repeats": 0}), "f: views[0]: repeats: 0 is not positive; give 1 or more"),
+    (plan_with({"grid": 1}), "f: views[0]: grid: 1 is not of type bool"),
+    (plan_with({"grid": False, "angular": False}), "f: views[0]: neither grid nor angular marks"),
+    ({**plan_with({"angular": True}), "artifact": {**PLAN["artifact"], "angular_count": 0}},
+     "f: views[0]: angular marks are wanted but the plate has none; set angular to false")])
+def test_plans_that_are_refused(data, message):
+    with pytest.raises(InputError) as caught:
+        plan_from_dict(data, "f")
+    assert str(caught.value).startswith(message)
