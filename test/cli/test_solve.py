@@ -1,0 +1,251 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``selfcal solve``: exit codes, one clear line for each fault, the keys of RESULT.json."""
+
+import json
+
+import pytest
+import yaml
+
+from selfcal_ros.cli.main import main
+from selfcal_ros.collection.messages import Command, Detection, EncoderSample
+from test.support import bags
+from test.support.bags import Foreign
+from test.support.sessions import events_of, small_bag, small_plan
+
+KEYS = {
+    "": {"schema": str, "plan_id": str, "artifact": dict, "views": list, "error_map": dict,
+         "artifact_map": dict, "observability": dict, "noise": dict, "rejected": dict,
+         "input": dict},
+    "artifact": {"grid_size": int, "grid_pitch": float, "angular_count": int},
+    "error_map": {"gx": list, "gy": list, "u_gx": list, "u_gy": list, "g_theta": list,
+                  "u_g_theta": list, "nonorthogonality": float, "scale_difference": float,
+                  "datum_theta": str},
+    "artifact_map": {"ax": list, "ay": list, "a_theta": list},
+    "observability": {"rank": int, "unknowns": int, "deficiency": int, "identifiable": bool,
+                      "modes": list},
+    "noise": {"sigma_xy": float, "sigma_theta": float},
+    "input": {"file": str, "sha256": str},
+}
+
+
+@pytest.fixture(scope="module")
+def events():
+    return events_of(small_plan())
+
+
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory):
+    return small_bag(tmp_path_factory.mktemp("solve"))
+
+
+def solve(path, *options, output=None):
+    more = ("-o", str(output)) if output else ()
+    return main(["solve", str(path), "--quiet", *more, *options])
+
+
+def refused(capsys, code, path, *options):
+    """Return the one line on stderr of a solve that must end with `code`."""
+    assert solve(path, *options) == code
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert printed.err.count("\n") == 1 and "Traceback" not in printed.err
+    assert printed.err.startswith("selfcal solve: ")
+    return printed.err.removeprefix("selfcal solve: ").rstrip()
+
+
+def without(events, kind):
+    return [event for event in events if not isinstance(event, kind)]
+
+
+def test_what_is_no_bag(tmp_path, capsys):
+    text, empty, folder = tmp_path / "a.txt", tmp_path / "empty.mcap", tmp_path / "folder"
+    text.write_text("some words, and no bag at all")
+    empty.write_bytes(b"")
+    folder.mkdir()
+    lines = [refused(capsys, 2, path) for path in (text, empty, folder, tmp_path / "none")]
+    assert lines == [
+        f"{text}: not an MCAP file; give an .mcap file or a rosbag2 folder",
+        f"{empty}: the file is empty; record the bag anew",
+        f"{folder}: no .mcap file in this folder; give an MCAP file or a rosbag2 folder with MCAP "
+        "storage",
+        f"{tmp_path / 'none'}: no such file or folder; check the path"]
+
+
+@pytest.mark.parametrize(("kind", "topic"), [
+    (Command, "selfcal/view_command"), (Detection, "stage/mark_detections"),
+    (EncoderSample, "stage/joint_states")])
+def test_a_topic_without_messages(tmp_path, capsys, events, kind, topic):
+    path = Foreign().write(tmp_path / "x.mcap", without(events, kind))
+    assert refused(capsys, 4, path).startswith(f"{path}: no message on {topic}; record this topic")
+
+
+def test_commands_without_measure(tmp_path, capsys, events):
+    kept = [e for e in events if not isinstance(e, Command) or e.phase != 1]
+    path = Foreign().write(tmp_path / "x.mcap", kept)
+    assert "no MEASURE command" in refused(capsys, 4, path)
+
+
+@pytest.mark.parametrize(("names", "field", "typename"), [
+    ("detection", "float64 offset_theta", "selfcal_msgs/msg/MarkDetection"),
+    ("command", "uint32 repeats", "selfcal_msgs/msg/ViewCommand")])
+def test_another_version_of_a_message(tmp_path, capsys, events, names, field, typename):
+    text = {"detection": bags.DETECTION, "command": bags.COMMAND}[names]
+    types = bags.contract_types(**{names: text.replace(field + "\n", "")})
+    line = refused(capsys, 2, Foreign(types=types).write(tmp_path / "x.mcap", events))
+    assert f"another version of {typename}: no field '{field.split()[1]}'; record" in line
+
+
+@pytest.mark.parametrize(("wanted", "other"), [("kind", "uint8 kind"), ("offset_x", "x")])
+def test_a_field_of_another_type(tmp_path, capsys, events, wanted, other):
+    old = {"kind": "uint8 kind", "offset_x": "float64 offset_x"}[wanted]
+    text = bags.DETECTION.replace(old, {"uint8 kind": "string kind", "x": "string offset_x"}[other])
+    types = bags.contract_types(detection=text)
+    path = Foreign(types=types).write(tmp_path / "x.mcap", without(events, Detection))
+    line = refused(capsys, 4, path)
+    assert "no message on stage/mark_detections" in line
+
+
+def test_bags_of_ros1_and_topics_of_another_type(tmp_path, capsys, events):
+    ros1 = Foreign(encoding="ros1").write(tmp_path / "ros1.mcap", events)
+    assert refused(capsys, 2, ros1).endswith(
+        "message encoding 'ros1' instead of cdr; convert the bag to ROS 2, e.g. with "
+        "rosbags-convert")
+    wrong = Foreign(renamed={"stage/joint_states": "sensor_msgs/msg/Range"}).write(
+        tmp_path / "wrong.mcap", events)
+    assert refused(capsys, 2, wrong) == (
+        f"{wrong}: topic /stage/joint_states: type sensor_msgs/msg/Range instead of "
+        "sensor_msgs/msg/JointState; remap the topic or record the right one")
+
+
+def test_two_cells_name_the_option_and_the_option_works(tmp_path, capsys, events):
+    for name in ("one", "two"):
+        Foreign(namespace=f"/{name}").write(tmp_path / "bag" / f"{name}.mcap", events)
+    assert refused(capsys, 2, tmp_path / "bag").endswith("choose one with --namespace")
+    assert solve(tmp_path / "bag", "--namespace", "two") == 0
+
+
+def test_a_plan_that_does_not_identify_the_stage(tmp_path, capsys):
+    path = Foreign().write(tmp_path / "x.mcap", events_of(small_plan("0, 90")))
+    output = tmp_path / "result.json"
+    assert solve(path, output=output) == 3
+    printed = capsys.readouterr().err
+    assert printed.count("\n") == 1 and "shift" in printed
+    found = json.loads(output.read_text())
+    check_keys(found)
+    assert found["observability"]["identifiable"] is False
+    assert found["observability"]["deficiency"] > 0 and found["observability"]["modes"]
+    assert {value for row in found["error_map"]["gx"] for value in row} == {None}
+    assert found["error_map"]["nonorthogonality"] is None
+
+
+def test_nothing_usable(tmp_path, capsys, events):
+    moved = [e if not isinstance(e, EncoderSample) else EncoderSample(
+        e.stamp_ns - 10**12, e.names, e.positions) for e in events]
+    line = refused(capsys, 4, Foreign().write(tmp_path / "x.mcap", moved))
+    count = len([e for e in events if isinstance(e, Detection)])
+    assert (f"none of {count} detections became a reading (rejected: no_encoder_sample_near "
+            f"{count})") in line
+
+
+def check_keys(found):
+    for part, wanted in KEYS.items():
+        values = found[part] if part else found
+        for key, kind in wanted.items():
+            assert key in values
+            assert isinstance(values[key], kind) or (kind is float and values[key] is None), key
+    size, count = found["artifact"]["grid_size"], found["artifact"]["angular_count"]
+    for name in ("gx", "gy", "u_gx", "u_gy"):
+        assert [len(row) for row in found["error_map"][name]] == [size] * size
+    assert len(found["error_map"]["g_theta"]) == len(found["error_map"]["u_g_theta"]) == count
+    for view in found["views"]:
+        assert {"name", "rotation", "translation_x", "translation_y", "misalignment", "used",
+                "rejected"} <= set(view)
+        assert set(view["misalignment"]) == {"phi", "tx", "ty"}
+
+
+def result_of(tmp_path, bag, *options):
+    output = tmp_path / "result.json"
+    assert solve(bag, *options, output=output) == 0
+    return output.read_text()
+
+
+def test_the_result_has_the_keys_of_the_contract(tmp_path, bag):
+    found = json.loads(result_of(tmp_path, bag))
+    check_keys(found)
+    assert found["schema"] == "selfcal.result/1"
+    assert found["input"]["file"] == "bag" and len(found["input"]["sha256"]) == 64
+    assert found["rejected"]["duplicate"] > 0
+    assert sum(view["rejected"] for view in found["views"]) == sum(found["rejected"].values())
+
+
+def test_the_same_bits_every_time_and_for_file_and_folder(tmp_path, bag):
+    first = result_of(tmp_path, bag)
+    assert result_of(tmp_path, bag) == first
+    assert json.loads(first)["error_map"] is not None
+    single = json.loads(result_of(tmp_path, next(bag.glob("*.mcap"))))
+    folder = json.loads(first)
+    assert single["input"].pop("file") != folder["input"].pop("file")
+    assert single == folder
+
+
+def params(tmp_path, **nodes):
+    path = tmp_path / "nodes.yaml"
+    path.write_text(yaml.safe_dump({name: {"ros__parameters": values}
+                                    for name, values in nodes.items()}))
+    return str(path)
+
+
+def test_parameters_reach_collector_and_solver_and_options_win(tmp_path, capsys, bag):
+    path = params(tmp_path, solver={"theta_datum": "zero_mean"},
+                  measurement_collector={"measurement_sense": "plate_moves"})
+    by_file = refused(capsys, 4, bag, "--params", path)
+    assert by_file == refused(capsys, 4, bag, "--sense", "plate_moves")
+    assert "detections became a reading" in by_file
+    sense = ("--sense", "microscope_moves")
+    zero_mean = result_of(tmp_path, bag, "--params", path, *sense)
+    assert zero_mean == result_of(tmp_path, bag, "--theta-datum", "zero_mean")
+    assert sum(json.loads(zero_mean)["error_map"]["g_theta"]) == pytest.approx(0, abs=1e-15)
+    plain = result_of(tmp_path, bag)
+    assert plain == result_of(tmp_path, bag, "--params", path, *sense, "--theta-datum", "xy_axes")
+    assert plain != zero_mean
+
+
+def test_methods(tmp_path):
+    complete = small_bag(tmp_path, small_plan("0, 90, tx"))
+    joint = json.loads(result_of(tmp_path, complete))
+    assert joint == json.loads(result_of(tmp_path, complete, "--method", "joint"))
+    law = json.loads(result_of(tmp_path, complete, "--method", "law"))
+    assert (joint["method"], law["method"]) == ("joint", "law")
+
+
+@pytest.mark.parametrize(("values", "message"), [
+    ({"solver": {"methode": "joint"}}, "methode: solver has no such parameter"),
+    ({"solver": {"method": "best"}}, "method: 'best' is not known; choose one of joint, law"),
+    ({"measurement_collector": {"min_score": 7.0}}, "min_score: 7.0 is outside 0.0 to 1.0"),
+    ({"measurement_collector": {"min_score": "much"}}, "min_score: 'much' is not of type float"),
+    ({"colector": {"min_score": 0.5}}, "colector: no node of this package")])
+def test_bad_parameters(tmp_path, capsys, bag, values, message):
+    path = params(tmp_path, **values)
+    line = refused(capsys, 2, bag, "--params", path)
+    assert line.startswith(path) and message in line
+
+
+def test_parameter_files_that_cannot_be_read(tmp_path, capsys, bag):
+    assert "no such file" in refused(capsys, 2, bag, "--params", str(tmp_path / "none.yaml"))
+    (tmp_path / "bad.yaml").write_text("solver:\n  a: [1\n")
+    assert "bad.yaml:3:1: not YAML" in refused(capsys, 2, bag, "--params",
+                                               str(tmp_path / "bad.yaml"))
+
+
+@pytest.mark.parametrize("options", [("--method", "best"), ("--theta-datum", "up"),
+                                     ("--sense", "none"), ("--nonsense",)])
+def test_bad_options(capsys, bag, options):
+    with pytest.raises(SystemExit) as stop:
+        solve(bag, *options)
+    assert stop.value.code == 2
+    assert options[-1] in capsys.readouterr().err
+
+
+def test_an_output_that_cannot_be_written(tmp_path, capsys, bag):
+    line = refused(capsys, 2, bag, "-o", str(tmp_path / "none" / "r.json"))
+    assert "cannot be written (No such file or directory); name a folder" in line
