@@ -145,8 +145,16 @@ def run(make_node: Callable[[], Node], argv: list[str] | None = None) -> int:
     """
     rclpy.init(args=argv, signal_handler_options=SignalHandlerOptions.NO)
     stop = Future()
+    signalled: list[int] = []
+
+    def on_signal(number: int, _: object) -> None:
+        """End the spinning once; a second signal would wait for the future's lock for ever."""
+        signalled.append(number)
+        if len(signalled) == 1:
+            stop.set_result(None)
+
     for number in STOP_SIGNALS:
-        signal.signal(number, lambda *_: _stop(stop))
+        signal.signal(number, on_signal)
     node, code = None, int(ExitCode.DONE)
     try:
         node = make_node()
@@ -167,13 +175,11 @@ def run(make_node: Callable[[], Node], argv: list[str] | None = None) -> int:
     return code
 
 
-def _stop(future: Future) -> None:
-    """End the spinning once; a second signal would wait for the future's lock for ever."""
-    _ignore_signals()
-    future.set_result(None)
-
-
 def _ignore_signals() -> None:
-    """Let no repeated signal (a launcher passes Ctrl-C on) disturb the clean-up or the exit."""
+    """Let no repeated signal (a launcher passes Ctrl-C on) disturb the exit.
+
+    Blocked first: a signal between two lines of Python would be reported as a race.
+    """
+    signal.pthread_sigmask(signal.SIG_BLOCK, STOP_SIGNALS)
     for number in STOP_SIGNALS:
         signal.signal(number, signal.SIG_IGN)
