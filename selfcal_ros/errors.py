@@ -66,3 +66,8 @@ class NoDataError(InputError):
     """Raised when the input is well formed but holds nothing to calibrate from."""
 
     exit_code = ExitCode.NO_DATA
+
+
+def first_line(error: BaseException) -> str:
+    """Return the first line of another library's error text, or its type if it has none."""
+    return (str(error).splitlines() or [type(error).__name__])[0]

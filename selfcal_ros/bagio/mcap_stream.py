@@ -20,7 +20,7 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, DataEnd, Footer, Message, Schema
 from mcap.stream_reader import StreamReader, breakup_chunk
 
-from selfcal_ros.errors import InputError
+from selfcal_ros.errors import InputError, first_line
 
 MAGIC = b"\x89MCAP0\r\n"
 DATA_END_SIZE = 13
@@ -91,7 +91,7 @@ class McapStream:
             records = breakup_chunk(chunk, validate_crc=True)
         except Exception as error:
             self.lost.append(f"the chunk that ends at byte {position} is damaged "
-                             f"({str(error).splitlines()[0][:80]}): its messages are lost")
+                             f"({first_line(error)[:80]}): its messages are lost")
             return
         for record in records:
             yield from self._take(record)
@@ -147,12 +147,14 @@ def _front_of_chunk(data: bytes) -> Iterator[object]:
         if at + length > len(body):
             return
         stream = ReadDataStream(io.BytesIO(body[at:at + length]))
-        if opcode == Opcode.SCHEMA:
-            yield Schema.read(stream)
-        elif opcode == Opcode.CHANNEL:
-            yield Channel.read(stream)
-        elif opcode == Opcode.MESSAGE:
-            yield Message.read(stream, length)
+        try:
+            record = (Schema.read(stream) if opcode == Opcode.SCHEMA
+                      else Channel.read(stream) if opcode == Opcode.CHANNEL
+                      else Message.read(stream, length) if opcode == Opcode.MESSAGE else None)
+        except Exception:  # a chunk that is damaged, not only cut: its rest cannot be trusted
+            return
+        if record is not None:
+            yield record
         at += length
 
 

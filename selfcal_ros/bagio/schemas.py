@@ -7,7 +7,7 @@ from pathlib import Path
 from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-from selfcal_ros.errors import InputError
+from selfcal_ros.errors import InputError, first_line
 
 OWN = "selfcal_msgs"
 
@@ -63,6 +63,6 @@ def store_of_schema(name: str, encoding: str, text: str, where: str) -> Typestor
             types.setdefault(known, typestore().fielddefs[known])
         store.register(types)
     except Exception as error:
-        raise InputError(where, f"the definition of {name} cannot be read "
-                         f"({str(error).splitlines()[0]})", "record the bag anew") from error
+        raise InputError(where, f"the definition of {name} cannot be read ({first_line(error)})",
+                         "record the bag anew") from error
     return store

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """SIM.yaml: what `selfcal simulate` is to simulate."""
 
+import math
 from dataclasses import dataclass, fields
 from pathlib import Path
 
@@ -72,6 +73,7 @@ def read_simulation(path: str | Path) -> Simulation:
     if compression not in ("zstd", "lz4", "none"):
         raise InputError(f"{where}: compression", f"{compression!r} is not known",
                          "choose zstd, lz4 or none")
+    _check_plain(data, where)
     cell = _numbers({**data.get("cell", {}), **data.get("noise", {})}, f"{where}: cell, noise", {
         "sense": "sense", "encoder_rate": "encoder_rate_hz", "with_ids": "with_ids",
         "exposure_period": "exposure_period_s", "declare_sigma": "declare_sigma",
@@ -102,5 +104,20 @@ def _numbers(data: object, where: str, names: dict[str, str]) -> dict:
             raise InputError(f"{where}: {key}", "unknown key", "known are " + ", ".join(names))
         if not isinstance(value, int | float | bool) and key != "sense":
             raise InputError(f"{where}: {key}", f"{value!r} is not a number", "mend the value")
+        if key != "sense" and not 0 <= value < math.inf:
+            raise InputError(f"{where}: {key}", f"{value!r} is negative or not finite",
+                             "mend the value")
         out[names[key]] = value
     return out
+
+
+def _check_plain(data: dict, where: str) -> None:
+    """Refuse sections that are no mappings, and a seed or start time that is no number."""
+    for key in ("cell", "noise"):
+        if not isinstance(data.get(key, {}), dict):
+            raise InputError(f"{where}: {key}", "not a mapping", "see docs/simulate.md")
+    for key in ("seed", "start_time"):
+        value = data.get(key, 0)
+        if not isinstance(value, int if key == "seed" else int | float) or value < 0:
+            raise InputError(f"{where}: {key}", f"{value!r} is not a number from 0 up",
+                             "mend the value")

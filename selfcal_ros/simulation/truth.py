@@ -72,7 +72,9 @@ def random_truth(artifact: Artifact, n_views: int, rng: np.random.Generator,
                      datum_modes(artifact, scale=False))
     g_theta = rng.normal(0, spread.g_theta_rad, artifact.angular_count)
     if artifact.angular_count:
-        g_theta[:: artifact.angular_count // 4] = axis_slopes(artifact, *g)
+        slopes = axis_slopes(artifact, *g)  # a half axis of one site has none
+        quarter = g_theta[:: artifact.angular_count // 4]
+        quarter[:] = np.where(np.isfinite(slopes), slopes, quarter)
     a_theta = rng.normal(0, spread.a_theta_rad, artifact.angular_count)
     return Truth(artifact, g, a, g_theta, a_theta, rng.normal(0, spread.phi_rad, n_views),
                  rng.normal(0, spread.t_m, (n_views, 2)))

@@ -122,3 +122,8 @@ def test_simulated_noise_is_that_of_a_mean_of_repeats():
 def test_plates_without_lines_have_three_views_of_hu():
     assert [v.name for v in hu_plan(Artifact(5, 0.01)).views] == ["identity", "rot90", "shift_x"]
     assert truth_of(Artifact(5, 0.01)).g_theta.shape == (0,)
+
+
+def test_half_axes_of_one_site_leave_the_lines_as_drawn():
+    truth = random_truth(Artifact(3, 0.01, 8), 1, np.random.default_rng(0))
+    assert np.isfinite(truth.g_theta).all()
