@@ -1,0 +1,73 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Every shipped file loads: plans, simulations, parameters, launch files, package manifests."""
+
+import re
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+
+import pytest
+
+from selfcal_ros import __version__
+from selfcal_ros.cli.main import verbs
+from selfcal_ros.collection.parameters import NODE_PARAMETERS, overrides_in, parameter_values
+from selfcal_ros.files import read_yaml
+from selfcal_ros.model.view import plan_from_dict
+from selfcal_ros.simulation.spec import read_simulation
+
+ROOT = Path(__file__).parents[2]
+
+
+def shipped(folder, pattern="*.yaml"):
+    return pytest.mark.parametrize("path", sorted((ROOT / folder).glob(pattern)),
+                                   ids=lambda path: path.name)
+
+
+@shipped("config/plans")
+def test_plans_load(path):
+    plan = plan_from_dict(read_yaml(path), str(path))
+    assert plan.plan_id and plan.views
+
+
+@shipped("config/simulations")
+def test_simulations_load(path):
+    assert read_simulation(path).plan.views
+
+
+@shipped("config/params")
+def test_parameter_files_name_only_what_exists(path):
+    data = read_yaml(path)
+    for node in NODE_PARAMETERS:
+        parameter_values(node, overrides_in(data, node, str(path)), str(path))
+
+
+def test_cell_parameters_are_the_defaults_they_say_they_are():
+    data = read_yaml(ROOT / "config/params/cell.yaml")
+    for node, table in NODE_PARAMETERS.items():
+        defaults = {parameter.name: parameter.default for parameter in table}
+        for name, value in overrides_in(data, node, "cell.yaml").items():
+            assert value == defaults[name], f"{node}: {name}"
+
+
+@shipped("launch", "*.launch.py")
+def test_launch_files_compile_and_start_only_our_nodes(path):
+    text = path.read_text()
+    compile(text, str(path), "exec")
+    for name in re.findall(r'executable="(\w+)"', text):
+        assert name in NODE_PARAMETERS
+
+
+def test_versions_agree():
+    found = {ElementTree.parse(ROOT / path).findtext("version")
+             for path in ("package.xml", "msg_defs/package.xml")}
+    found |= set(re.findall(r'version="([\d.]+)"', (ROOT / "setup.py").read_text()))
+    assert found == {__version__}
+
+
+def test_readme_names_every_verb_and_every_page_of_the_documentation():
+    readme = (ROOT / "README.md").read_text()
+    for verb in verbs():
+        assert f"selfcal {verb}" in readme
+    for page in (ROOT / "docs").glob("*.md"):
+        assert f"docs/{page.name}" in readme
+    for link in re.findall(r"\]\((docs/[\w.]+)\)", readme):
+        assert (ROOT / link).is_file(), link

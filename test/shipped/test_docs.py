@@ -1,0 +1,38 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The tables of the documentation are complete, and its example runs."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from selfcal_ros.cli.main import main, verbs
+from selfcal_ros.collection.parameters import NODE_PARAMETERS
+from selfcal_ros.collection.reasons import Reason
+
+ROOT = Path(__file__).parents[2]
+BAGS = (ROOT / "docs/bags.md").read_text()
+
+
+def test_every_reason_and_every_parameter_of_the_collector_is_explained():
+    for reason in Reason:
+        assert f"| `{reason}` |" in BAGS
+    for parameter in NODE_PARAMETERS["measurement_collector"]:
+        assert f"| `{parameter.name}` | {parameter.default} |" in BAGS
+
+
+def test_the_simulation_of_the_documentation_runs(tmp_path, capsys):
+    text = re.search(r"```yaml\n(.*?)```", (ROOT / "docs/simulate.md").read_text(), re.S)[1]
+    spec = tmp_path / "sim.yaml"
+    spec.write_text(text.replace("../plans", str(ROOT / "config/plans")))
+    assert main(["simulate", str(spec), "-o", str(tmp_path / "bag")]) == 0
+    assert main(["solve", str(tmp_path / "bag")]) == 0
+    assert "Against the known truth" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("verb", verbs())
+def test_every_verb_explains_itself(verb, capsys):
+    with pytest.raises(SystemExit) as ended:
+        main([verb, "--help"])
+    assert ended.value.code == 0
+    assert f"usage: selfcal {verb}" in capsys.readouterr().out
