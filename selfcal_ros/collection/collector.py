@@ -84,7 +84,7 @@ class Collector:
         if not len(sample.names) == len(sample.positions) == len(velocities):
             self._rejected_input[Reason.ENCODER_MALFORMED] += 1
             return
-        known = False
+        known, finite = False, True
         for name, position, speed in zip(sample.names, sample.positions, velocities, strict=True):
             joint = self._joints.get(name)
             if joint is None:
@@ -93,7 +93,9 @@ class Collector:
             if math.isfinite(position):
                 getattr(self.tracks, joint).add(sample.stamp_ns, position, speed)
             else:
-                self._rejected_input[Reason.ENCODER_NOT_FINITE] += 1
+                finite = False
+        if not finite:
+            self._rejected_input[Reason.ENCODER_NOT_FINITE] += 1
         if not known:
             self._rejected_input[Reason.ENCODER_UNKNOWN_JOINT] += 1
 

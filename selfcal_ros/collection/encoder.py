@@ -34,7 +34,7 @@ class JointTrack:
     def add(self, stamp_ns: int, position: float, speed: float) -> None:
         """Add one sample; `speed` is NaN where the encoder does not tell it."""
         self._stamps.append(stamp_ns)
-        self._positions.append(position)
+        self._positions.append(position + 0.0)  # -0.0 and 0.0 sort alike: keep one of them
         self._speeds.append(speed)
         self._sorted = None
 

@@ -102,7 +102,8 @@ def _reduce_grid(artifact: Artifact, view: View, d: np.ndarray, tracks: Tracks, 
     d, (m, n, vx, vy) = _keep(d, found.reasons, rejected, *found.index, *found.deviation)
     hx, hy = artifact.half
     means = reduce_repeats((m + hx) * (2 * hy + 1) + n + hy, np.stack([vx, vy]), d["sigma"],
-                           limit=rules.outlier_limit)
+                           limit=rules.outlier_limit,
+                           extent=2 * max(hx, hy) * artifact.grid_pitch_m)
     _count(rejected, Reason.OUTLIER, means.outlier)
     mark = means.key.astype(np.int64)
     phi = found.rigid.phi_rad if len(means.key) >= 3 else None
@@ -120,7 +121,8 @@ def _reduce_angular(artifact: Artifact, view: View, d: np.ndarray, tracks: Track
     found = identify_angular(artifact, view, _reading(rules.sense, theta, d["ot"]), ids=d["k"],
                              has_id=d["has_id"], rules=rules.identity, phi_rad=phi)
     d, (k, v) = _keep(d, found.reasons, rejected, found.index, found.deviation)
-    means = reduce_repeats(k, v[None], d["sigma"], limit=rules.outlier_limit)
+    means = reduce_repeats(k, v[None], d["sigma"], limit=rules.outlier_limit,
+                           extent=4 * np.pi)
     _count(rejected, Reason.OUTLIER, means.outlier)
     return {"k": means.key.astype(np.int64), "dtheta": means.mean[0], "count_theta": means.count,
             "u_theta": means.u, "sigma_theta": means.sigma, "dof_theta": means.dof}

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-MIN_PAIRS = 10
+MIN_PAIRS = 12
 """Pairs of repeats below which a view is too small to tell outliers."""
 
 
@@ -33,7 +33,7 @@ class Means:
 
 
 def reduce_repeats(key: np.ndarray, values: np.ndarray, sigma: np.ndarray, *,
-                   limit: float) -> Means:
+                   limit: float, extent: float = 0.0) -> Means:
     """Reject outliers and average the repeats of every mark.
 
     Parameters
@@ -46,6 +46,9 @@ def reduce_repeats(key: np.ndarray, values: np.ndarray, sigma: np.ndarray, *,
         Declared standard uncertainty of each reading, 0 = not declared.
     limit : float
         Outlier limit in standard deviations; 0 keeps all.
+    extent : float
+        Size of the positions behind the readings, m or rad: what differs by no more than their
+        rounding is no outlier, however exact the other repeats are.
 
     Returns
     -------
@@ -56,7 +59,7 @@ def reduce_repeats(key: np.ndarray, values: np.ndarray, sigma: np.ndarray, *,
     """
     outlier = np.zeros(len(key), dtype=bool)
     if limit > 0 and len(key):
-        outlier = _outliers(key, values, _relative(sigma), limit)
+        outlier = _outliers(key, values, _relative(sigma), limit, extent)
     marks, inverse, count = np.unique(key[~outlier], return_inverse=True, return_counts=True)
     kept, s = values[:, ~outlier], sigma[~outlier]
     declared = np.bincount(inverse, s > 0, len(marks)) == count
@@ -91,15 +94,16 @@ def _relative(sigma: np.ndarray) -> np.ndarray:
 
 
 def _outliers(key: np.ndarray, values: np.ndarray, relative: np.ndarray,
-              limit: float) -> np.ndarray:
+              limit: float, extent: float) -> np.ndarray:
     groups = _groups(key)
     scale, pairs = _pair_scale(groups, values, relative)
     out = np.zeros(len(key), dtype=bool)
     if pairs < MIN_PAIRS:
         return out
-    # a robust scale from n pairs scatters by about 1.2/sqrt(n); keep three of these in hand
-    cut = limit * scale * (1 + 4 / np.sqrt(pairs))
-    floor = 16 * np.finfo(float).eps * np.abs(values).max()
+    # a robust scale from n pairs scatters by about 1.2/sqrt(n): keep three of these in hand, and
+    # more where few pairs make its distribution skew
+    cut = limit * scale * (1 + 4 / np.sqrt(pairs) + 8 / pairs)
+    floor = 16 * np.finfo(float).eps * max(extent, np.abs(values).max())
     for group in groups:
         away = np.abs(values[:, group] - np.median(values[:, group], axis=2, keepdims=True))
         share = np.sqrt(0.5) if group.shape[1] == 2 else 1.0  # of two, each is half-way off

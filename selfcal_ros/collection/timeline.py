@@ -69,7 +69,8 @@ def build_timeline(commands: Iterable[Command]) -> Timeline:
     """Return the timeline of a set of commands.
 
     A detection belongs to view i from the stamp of (MEASURE, i) to that of the next command.
-    A second PLACE of a view starts it anew: what was read before it is superseded.
+    A second PLACE of a view starts it anew: what was read before it is superseded. So does a
+    MEASURE in another pose: what was read in the former pose cannot be read in this one.
 
     Raises
     ------
@@ -110,12 +111,18 @@ def _unused(ordered: list[Command]) -> list[Interval]:
 def _intervals(ordered: list[Command], plan_id: str) -> list[Interval]:
     placed = {}  # view_index -> stamp of the last PLACE that a MEASURE of the view followed
     pending: dict[int, int] = {}
+    poses: dict[int, tuple] = {}
     for command in ordered:
         if command.plan_id == plan_id and command.phase == Phase.PLACE:
             pending[command.view_index] = command.stamp_ns
         elif command.plan_id == plan_id and command.phase == Phase.MEASURE:
             index = command.view_index
-            placed[index] = pending.get(index, placed.get(index, command.stamp_ns))
+            pose = (command.view.rotation_rad, command.view.translation_m)
+            if poses.setdefault(index, pose) != pose:
+                poses[index] = pose
+                placed[index] = max(pending.get(index, 0), command.stamp_ns)
+            placed[index] = max(placed.get(index, 0),
+                                pending.get(index, placed.get(index, command.stamp_ns)))
     out = []
     for interval, command in zip(_unused(ordered), ordered, strict=True):
         index, reason = None, interval.reason
