@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from selfcal_ros.collection.messages import Command, Detection, EncoderSample, Kind
+from selfcal_ros.collection.messages import Detection, EncoderSample, Kind
 from selfcal_ros.simulation.cell import Event
 
 
@@ -78,7 +78,7 @@ def apply_faults(events: Sequence[Event], faults: Faults, rng: np.random.Generat
 
 
 def _spoil(event: Event, faults: Faults, rng: np.random.Generator, ledger: Counter) -> list[Event]:
-    if not isinstance(event, Detection) or isinstance(event, Command):
+    if not isinstance(event, Detection):
         return [event]
     chance = rng.random()
     parts = (("lost", faults.lost), ("outliers", faults.outliers),

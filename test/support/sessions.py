@@ -8,13 +8,12 @@ import yaml
 
 from selfcal_ros.bagio.simulated import write_simulation
 from selfcal_ros.collection.collector import Collector, ViewProgress
-from selfcal_ros.collection.messages import Command, Detection
-from selfcal_ros.collection.parameters import parameter_values
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.view import Plan
 from selfcal_ros.simulation.cell import CellSettings, Event, plan_events
 from selfcal_ros.simulation.spec import read_simulation
 from selfcal_ros.simulation.truth import random_truth
+from test.support.collecting import gathered
 from test.support.plans import plan_of
 
 START_NS = 1_700_000_000_000_000_000
@@ -36,14 +35,7 @@ def events_of(plan: Plan, seed: int = 5) -> list[Event]:
 
 def collected(events: list[Event]) -> tuple[Collector, Measurements, dict[int, ViewProgress]]:
     """Return what the collector makes of them without any node."""
-    collector = Collector(parameter_values("measurement_collector", {}, "test"))
-    for event in events:
-        if isinstance(event, Command):
-            collector.add_command(event)
-        elif isinstance(event, Detection):
-            collector.add_detection(event)
-        else:
-            collector.add_encoder(event)
+    collector = gathered(events)
     return collector, *collector.collect()
 
 
