@@ -5,6 +5,8 @@ import contextlib
 import hashlib
 import json
 import os
+import re
+import stat
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,37 +14,77 @@ from typing import Any, BinaryIO
 
 import yaml
 
-from selfcal_ros.errors import InputError
+from selfcal_ros.errors import InputError, first_line
+
+
+class YamlLoader(yaml.SafeLoader):
+    """PyYAML's safe loader that reads floats as YAML 1.2 and rcl do: 5e-4, 1.0e3, -.5."""
+
+
+class YamlDumper(yaml.SafeDumper):
+    """Writes what `YamlLoader` reads: a text that looks like such a float is quoted."""
+
+
+FLOATS = re.compile(r"^[-+]?(?:(?:[0-9]+\.?[0-9]*|\.[0-9]+)[eE][-+]?[0-9]+|\.[0-9]+)$")
+"""What YAML 1.1 takes for text, because a dot or the sign of the exponent is missing."""
+
+for _class in (YamlLoader, YamlDumper):
+    _class.add_implicit_resolver("tag:yaml.org,2002:float", FLOATS, list("-+.0123456789"))
 
 
 @contextlib.contextmanager
 def atomic_file(path: str | os.PathLike) -> Iterator[BinaryIO]:
     """Yield a binary file that becomes `path` only if the block ends without an error.
 
+    A file that exists keeps its permissions, a link stays a link, and what is no file (a pipe,
+    /dev/null) is written into as it is.
+
     Raises
     ------
     InputError
-        If the folder does not exist or cannot be written.
+        If the folder does not exist, or the file or folder cannot be written.
     """
     target = Path(path)
     try:
-        fd, name = tempfile.mkstemp(prefix=f".{target.name}.", dir=target.parent)
+        if target.exists() and not target.is_file() and not target.is_dir():
+            with target.open("wb") as file:
+                yield file
+        else:
+            with _replacement(Path(os.path.realpath(target))) as file:
+                yield file
     except OSError as error:
-        raise InputError(str(target), f"cannot be written ({error.strerror})",
+        raise InputError(str(target), f"cannot be written ({_reason(error)})",
                          "name a folder that exists and that you may write") from error
+
+
+@contextlib.contextmanager
+def _replacement(target: Path) -> Iterator[BinaryIO]:
+    """Yield a temporary file beside `target` that takes its place in one step, or vanishes."""
+    fd, name = tempfile.mkstemp(prefix=".selfcal.", dir=target.parent)
     try:
         with os.fdopen(fd, "wb") as file:
             yield file
             file.flush()
             os.fsync(file.fileno())
-        umask = os.umask(0)
-        os.umask(umask)
-        os.chmod(name, 0o666 & ~umask)
+        os.chmod(name, _mode(target))
         os.replace(name, target)
     except BaseException:
         with contextlib.suppress(FileNotFoundError):
             os.unlink(name)
         raise
+
+
+def _mode(target: Path) -> int:
+    """Return the permissions of a file that exists, or those that a new one gets."""
+    if target.is_file():
+        return stat.S_IMODE(target.stat().st_mode)
+    umask = os.umask(0)
+    os.umask(umask)
+    return 0o666 & ~umask
+
+
+def _reason(error: Exception) -> str:
+    return getattr(error, "strerror", None) or first_line(error)
 
 
 def write_bytes(path: str | os.PathLike, data: bytes) -> None:
@@ -61,6 +103,11 @@ def write_json(path: str | os.PathLike, value: Any) -> None:
     write_text(path, json.dumps(value, indent=1, allow_nan=False) + "\n")
 
 
+def write_yaml(path: str | os.PathLike, value: Any) -> None:
+    """Write `value` as YAML, keys in their order, to `path` atomically."""
+    write_text(path, yaml.dump(value, Dumper=YamlDumper, sort_keys=False))
+
+
 def read_bytes(path: str | os.PathLike) -> bytes:
     """Return the content of `path`.
 
@@ -73,8 +120,8 @@ def read_bytes(path: str | os.PathLike) -> bytes:
         return Path(path).read_bytes()
     except FileNotFoundError as error:
         raise InputError(str(path), "no such file", "check the path") from error
-    except OSError as error:
-        raise InputError(str(path), f"cannot be read ({error.strerror})",
+    except (OSError, ValueError) as error:
+        raise InputError(str(path), f"cannot be read ({_reason(error)})",
                          "name a readable file") from error
 
 
@@ -89,32 +136,58 @@ def read_text(path: str | os.PathLike) -> str:
 
 def read_json(path: str | os.PathLike) -> Any:
     """Return the JSON value in `path`; InputError names line and column of a fault."""
+    text = read_text(path)
     try:
-        return json.loads(read_text(path))
+        return json.loads(text)
     except json.JSONDecodeError as error:
         raise InputError(f"{path}:{error.lineno}:{error.colno}", f"not JSON ({error.msg})",
+                         "give a file that `selfcal` wrote") from error
+    except (ValueError, RecursionError) as error:  # a number too long, brackets too deep
+        raise InputError(str(path), f"not usable JSON ({first_line(error)})",
                          "give a file that `selfcal` wrote") from error
 
 
 def read_yaml(path: str | os.PathLike) -> Any:
-    """Return the YAML value in `path`; InputError names line and column of a fault."""
+    """Return the YAML value in `path`; InputError names line and column of a fault.
+
+    Floats are read as YAML 1.2 and ROS parameter files have them (`YamlLoader`).
+    """
+    text = read_text(path)
     try:
-        return yaml.safe_load(read_text(path))
+        return yaml.load(text, YamlLoader)
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark
         place = f"{path}:{mark.line + 1}:{mark.column + 1}" if mark else str(path)
         raise InputError(place, f"not YAML ({error.problem})", "mend the line") from error
     except yaml.YAMLError as error:
         raise InputError(str(path), "not YAML", "give a YAML text file") from error
+    except (ValueError, RecursionError) as error:  # the 40th of a month, brackets too deep
+        raise InputError(str(path), f"not usable YAML ({first_line(error)})",
+                         "mend the value") from error
 
 
 def sha256_of(path: str | os.PathLike) -> str:
-    """Return the SHA-256 of a file, or of a folder's files in the order of their names."""
+    """Return the SHA-256 of a file, or of a folder's files in the order of their names.
+
+    Raises
+    ------
+    InputError
+        If a file is missing or cannot be read.
+    """
     root = Path(path)
     digest = hashlib.sha256()
     files = sorted(p for p in root.rglob("*") if p.is_file()) if root.is_dir() else [root]
     for file in files:
-        with file.open("rb") as stream:
+        add_file(digest, file)
+    return digest.hexdigest()
+
+
+def add_file(digest: Any, path: Path) -> None:
+    """Add the content of a file to a digest of hashlib; InputError if it cannot be read."""
+    try:
+        with path.open("rb") as stream:
             while block := stream.read(1 << 20):
                 digest.update(block)
-    return digest.hexdigest()
+    except OSError as error:
+        raise InputError(str(path), f"cannot be read ({_reason(error)})",
+                         "name a readable file") from error

@@ -184,15 +184,12 @@ def view_to_dict(view, artifact) -> dict:
 
 
 def _write_plan(path: str, plan) -> None:
-    import yaml
-
-    from selfcal_ros.files import write_text
+    from selfcal_ros.files import write_yaml
 
     artifact = plan.artifact
     plate = {"grid_size": artifact.grid_size, "grid_pitch": artifact.grid_pitch_m,
              "angular_count": artifact.angular_count}
     if artifact.grid_size_y:
         plate["grid_size_y"] = artifact.grid_size_y
-    write_text(path, yaml.safe_dump(
-        {"plan_id": plan.plan_id, "artifact": plate,
-         "views": [view_to_dict(view, artifact) for view in plan.views]}, sort_keys=False))
+    write_yaml(path, {"plan_id": plan.plan_id, "artifact": plate,
+                      "views": [view_to_dict(view, artifact) for view in plan.views]})

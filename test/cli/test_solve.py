@@ -210,6 +210,17 @@ def test_parameters_reach_collector_and_solver_and_options_win(tmp_path, capsys,
     assert plain != zero_mean
 
 
+def test_numbers_in_a_parameter_file_are_read_as_the_nodes_read_them(tmp_path, bag):
+    path = tmp_path / "nodes.yaml"
+    text = "measurement_collector:\n  ros__parameters: {max_speed: %s, min_score: 4e-1}\n"
+    path.write_text(text % "5e-4")
+    plain = result_of(tmp_path, bag)
+    assert result_of(tmp_path, bag, "--params", str(path)) == plain
+    path.write_text(text % "1e-9")
+    assert json.loads(result_of(tmp_path, bag, "--params", str(path)))["rejected"] != (
+        json.loads(plain)["rejected"])
+
+
 def test_methods(tmp_path):
     complete = small_bag(tmp_path, small_plan("0, 90, tx"))
     joint = json.loads(result_of(tmp_path, complete))

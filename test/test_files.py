@@ -1,0 +1,260 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Files: a write is whole or not at all, faults name file and place, YAML as ROS reads it."""
+
+import hashlib
+import json
+import math
+import os
+import stat
+
+import pytest
+import yaml
+from hypothesis import given
+from hypothesis import strategies as st
+
+from selfcal_ros import files
+from selfcal_ros.errors import InputError
+from selfcal_ros.files import (
+    atomic_file,
+    read_bytes,
+    read_json,
+    read_text,
+    read_yaml,
+    sha256_of,
+    write_bytes,
+    write_json,
+    write_text,
+    write_yaml,
+)
+
+
+def names(folder):
+    return sorted(path.name for path in folder.iterdir())
+
+
+def yaml_of(folder, text):
+    path = folder / "x.yaml"
+    path.write_text(text)
+    return read_yaml(path)
+
+
+class Crash(Exception):
+    pass
+
+
+@pytest.mark.parametrize("crash", [Crash, KeyboardInterrupt, SystemExit])
+def test_a_crash_in_the_middle_keeps_the_old_file_and_leaves_no_other(tmp_path, crash):
+    path = tmp_path / "a.json"
+    path.write_bytes(b"old")
+
+    def torn():
+        with atomic_file(path) as file:
+            file.write(b"half of the n")
+            file.flush()
+            assert path.read_bytes() == b"old"
+            raise crash
+
+    with pytest.raises(crash):
+        torn()
+    assert path.read_bytes() == b"old"
+    assert names(tmp_path) == ["a.json"]
+
+
+@pytest.mark.parametrize("step", ["write", "fsync", "replace"])
+def test_a_full_disk_is_one_line_and_keeps_the_old_file(tmp_path, monkeypatch, step):
+    path = tmp_path / "a.json"
+    path.write_bytes(b"old")
+
+    def fail(*_):
+        raise OSError(28, "No space left on device")
+
+    def write():
+        with atomic_file(path) as file:
+            if step == "write":
+                fail()
+            else:
+                monkeypatch.setattr(files.os, step, fail)
+                file.write(b"new")
+
+    with pytest.raises(InputError, match=r"a\.json: cannot be written \(No space left on device\)"):
+        write()
+    assert path.read_bytes() == b"old"
+    assert names(tmp_path) == ["a.json"]
+
+
+def test_a_write_replaces_all_of_the_old_file(tmp_path):
+    write_bytes(tmp_path / "a", b"something long")
+    write_bytes(tmp_path / "a", b"short")
+    assert (tmp_path / "a").read_bytes() == b"short"
+    write_text(tmp_path / "a", "µ")
+    assert (tmp_path / "a").read_bytes() == b"\xc2\xb5"
+    assert names(tmp_path) == ["a"]
+
+
+@pytest.mark.parametrize("umask", [0o022, 0o077])
+def test_a_new_file_has_the_permissions_that_the_umask_leaves(tmp_path, umask):
+    before = os.umask(umask)
+    try:
+        write_bytes(tmp_path / "a", b"")
+        assert os.umask(umask) == umask, "the umask of the process is what it was"
+    finally:
+        os.umask(before)
+    assert stat.S_IMODE((tmp_path / "a").stat().st_mode) == 0o666 & ~umask
+
+
+def test_an_old_file_keeps_its_permissions(tmp_path):
+    (tmp_path / "a").touch()
+    (tmp_path / "a").chmod(0o640)
+    write_bytes(tmp_path / "a", b"new")
+    assert stat.S_IMODE((tmp_path / "a").stat().st_mode) == 0o640
+
+
+def test_a_link_stays_a_link(tmp_path):
+    (tmp_path / "there").mkdir()
+    (tmp_path / "there" / "b").write_bytes(b"old")
+    (tmp_path / "a").symlink_to("there/b")
+    write_bytes(tmp_path / "a", b"new")
+    assert (tmp_path / "a").is_symlink()
+    assert (tmp_path / "there" / "b").read_bytes() == b"new"
+
+
+def test_what_is_no_file_is_written_into_and_not_replaced(tmp_path):
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    reader = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
+    try:
+        write_bytes(pipe, b"through")
+        assert os.read(reader, 100) == b"through"
+    finally:
+        os.close(reader)
+    assert stat.S_ISFIFO(pipe.stat().st_mode)
+
+
+@pytest.mark.parametrize(("target", "reason"), [
+    ("none/a", "No such file or directory"), ("file/a", "Not a directory"),
+    ("folder", "Is a directory"), ("n" * 300, "File name too long")])
+def test_where_nothing_can_be_written(tmp_path, target, reason):
+    (tmp_path / "file").touch()
+    (tmp_path / "folder").mkdir()
+    with pytest.raises(InputError) as caught:
+        write_bytes(tmp_path / target, b"x")
+    assert str(caught.value) == (f"{tmp_path / target}: cannot be written ({reason}); name a "
+                                 "folder that exists and that you may write")
+    assert names(tmp_path) == ["file", "folder"]
+
+
+@pytest.mark.parametrize(("source", "message"), [
+    ("none", "no such file; check the path"),
+    ("", "cannot be read (Is a directory); name a readable file"),
+    ("a\0b", "cannot be read (embedded null byte); name a readable file"),
+    ("n" * 300, "cannot be read (File name too long); name a readable file")])
+def test_what_cannot_be_read(tmp_path, source, message):
+    for read in (read_bytes, read_text, read_json, read_yaml):
+        with pytest.raises(InputError) as caught:
+            read(tmp_path / source)
+        assert str(caught.value) == f"{tmp_path / source}: {message}"
+
+
+def test_text_that_is_not_utf8(tmp_path):
+    (tmp_path / "a").write_bytes(b"abc\xff")
+    for read in (read_text, read_json, read_yaml):
+        with pytest.raises(InputError, match="a: byte 3: not UTF-8 text; save the file as UTF-8"):
+            read(tmp_path / "a")
+
+
+@pytest.mark.parametrize(("text", "message"), [
+    ('{"a": 1,\n "b": }', ":2:7: not JSON (Expecting value)"),
+    ("", ":1:1: not JSON (Expecting value)"),
+    ("[" * 100_000, ": not usable JSON ("), ("9" * 5000, ": not usable JSON (Exceeds the limit")])
+def test_faults_in_json(tmp_path, text, message):
+    (tmp_path / "a.json").write_text(text)
+    with pytest.raises(InputError) as caught:
+        read_json(tmp_path / "a.json")
+    assert str(caught.value).startswith(f"{tmp_path / 'a.json'}{message}")
+    assert str(caught.value).endswith("; give a file that `selfcal` wrote")
+
+
+@pytest.mark.parametrize(("text", "message"), [
+    ("a: 1\nb: [", ":2:5: not YAML (expected the node content, but found '<stream end>')"),
+    ("a: &x 1\nb: *y", ":2:4: not YAML (found undefined alias 'y')"),
+    ("a: !!python/name:os.system ''", ":1:4: not YAML (could not determine a constructor"),
+    ("a: \x01", ": not YAML; give a YAML text file"),
+    ("a: 2001-13-40", ": not usable YAML (month must be in 1..12); mend the value"),
+    ("[" * 100_000, ": not usable YAML (maximum recursion depth")])
+def test_faults_in_yaml(tmp_path, text, message):
+    with pytest.raises(InputError) as caught:
+        yaml_of(tmp_path, text)
+    assert str(caught.value).startswith(f"{tmp_path / 'x.yaml'}{message}")
+
+
+def test_json_is_strict_and_comes_back(tmp_path):
+    path = tmp_path / "a.json"
+    value = {"b": [1, 2.5, None, True], "a": "µ"}
+    write_json(path, value)
+    assert read_json(path) == value
+    assert path.read_text().endswith("}\n")
+    with pytest.raises(ValueError):
+        write_json(path, {"a": math.nan})
+    assert read_json(path) == value
+
+
+@pytest.mark.parametrize(("text", "value"), [
+    ("5e-4", 5e-4), ("1e3", 1e3), ("1E+3", 1e3), ("-2e-6", -2e-6), ("+3e2", 3e2), ("1.e3", 1e3),
+    ("1.0e3", 1e3), ("1.7e9", 1.7e9), (".5e1", 5.0), ("-.5e-1", -0.05), ("-.5", -0.5),
+    ("00e0", 0.0), ("2.0e-7", 2e-7), ("-.inf", -math.inf)])
+def test_floats_as_ros_reads_them(tmp_path, text, value):
+    found = yaml_of(tmp_path, f"a: {text}\nb: [{text}, {{c: {text}}}]")
+    assert found == {"a": value, "b": [value, {"c": value}]}
+    assert type(found["a"]) is float
+    assert float(text.replace(".inf", "inf")) == value
+
+
+@pytest.mark.parametrize("text", [
+    "1e3abc", "'5e-4'", '"5e-4"', "!!str 5e-4", "e3", "1e", "1e+", "1e3.5", "1 e3", ".e3", "1_0e3",
+    "--1e3", "0x1e3", "1e3e4", "x1e3", "+", ".", "...x", "1.2.3", "1-2e3", "true", "off", "~", "7",
+    "0x1f", "017", "1:30", "2.5", ".nan", "2001-01-02", "1e3:4", "1e3 # x", "|\n 5e-4", "5e-4 m"])
+def test_everything_else_stays_what_it_was(tmp_path, text):
+    found = yaml_of(tmp_path, f"a: {text}\n")["a"]
+    expected = yaml.safe_load(f"a: {text}\n")["a"]
+    if text == "1e3 # x":
+        expected = 1e3
+    assert type(found) is type(expected)
+    assert found == expected or (math.isnan(found) and math.isnan(expected))
+
+
+def test_the_loader_of_others_is_left_alone():
+    assert yaml.safe_load("5e-4") == "5e-4"
+
+
+PLAIN = st.one_of(st.none(), st.booleans(), st.integers(), st.floats(allow_nan=False), st.text(),
+                  st.from_regex(r"\A[-+]?[0-9]*\.?[0-9]*[eE]?[-+]?[0-9]*\Z"))
+
+
+@given(value=st.recursive(PLAIN, lambda inner: st.lists(inner, max_size=3) | st.dictionaries(
+    st.text(max_size=5), inner, max_size=3), max_leaves=8))
+def test_yaml_that_is_written_comes_back(tmp_path_factory, value):
+    path = tmp_path_factory.mktemp("yaml") / "x.yaml"
+    write_yaml(path, value)
+    found = read_yaml(path)
+    assert found == value
+    assert repr(found) == repr(value)
+
+
+def test_keys_are_written_in_their_order(tmp_path):
+    write_yaml(tmp_path / "x.yaml", {"b": 1, "a": "1e3"})
+    assert (tmp_path / "x.yaml").read_text() == "b: 1\na: '1e3'\n"
+
+
+def test_digests_of_files_and_of_folders(tmp_path):
+    (tmp_path / "f" / "b").mkdir(parents=True)
+    (tmp_path / "f" / "b" / "1").write_bytes(b"one")
+    (tmp_path / "f" / "a").write_bytes(b"two")
+    assert sha256_of(tmp_path / "f" / "a") == hashlib.sha256(b"two").hexdigest()
+    assert sha256_of(tmp_path / "f") == hashlib.sha256(b"twoone").hexdigest()
+    with pytest.raises(InputError, match=r"none: cannot be read \(No such file"):
+        sha256_of(tmp_path / "none")
+
+
+def test_what_json_writes_is_what_json_reads(tmp_path):
+    write_json(tmp_path / "a", [0.1, 1e-300, -0.0])
+    assert json.loads((tmp_path / "a").read_text()) == [0.1, 1e-300, -0.0]
