@@ -212,11 +212,11 @@ def test_parameters_reach_collector_and_solver_and_options_win(tmp_path, capsys,
 
 def test_numbers_in_a_parameter_file_are_read_as_the_nodes_read_them(tmp_path, bag):
     path = tmp_path / "nodes.yaml"
-    text = "measurement_collector:\n  ros__parameters: {max_speed: %s, min_score: 4e-1}\n"
-    path.write_text(text % "5e-4")
+    text = "measurement_collector:\n  ros__parameters: {max_speed: 5e-4, outlier_limit: %s}\n"
+    path.write_text(text % "6e0")
     plain = result_of(tmp_path, bag)
     assert result_of(tmp_path, bag, "--params", str(path)) == plain
-    path.write_text(text % "1e-9")
+    path.write_text(text % "10e-1")
     assert json.loads(result_of(tmp_path, bag, "--params", str(path)))["rejected"] != (
         json.loads(plain)["rejected"])
 
