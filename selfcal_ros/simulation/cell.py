@@ -70,12 +70,6 @@ def view_events(truth: Truth, plan: Plan, index: int, *, settings: CellSettings,
                                                      dwell_ns))
 
 
-def view_duration_s(truth: Truth, plan: Plan, index: int, settings: CellSettings) -> float:
-    """Return how long a view takes."""
-    targets, _, _ = _exposures(truth, plan, index, settings, np.random.default_rng(0))
-    return len(targets) * settings.exposure_period_s
-
-
 def plan_events(truth: Truth, plan: Plan, *, settings: CellSettings, rng: np.random.Generator,
                 start_ns: int) -> Iterator[Event]:
     """Yield all messages of a plan, commands included, in the order of their stamps."""

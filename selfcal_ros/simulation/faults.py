@@ -8,7 +8,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from selfcal_ros.collection.messages import Detection, EncoderSample, Kind
+from selfcal_ros.errors import InputError
 from selfcal_ros.simulation.cell import Event
+
+PARTS = ("lost", "outliers", "low_score", "not_finite", "unknown_mark", "duplicated")
+"""Faults that meet a part of the detections, one at most each; in the order of the draw."""
 
 
 @dataclass(frozen=True)
@@ -23,11 +27,17 @@ class Faults:
     low_score, not_finite, unknown_mark : float
         Parts with a score of 0.1, a NaN offset, or an id off the plate.
     delay_s : float
-        Largest delay of arrival; messages overtake each other.
+        Delay of arrival, drawn from an exponential distribution with a fifth of this as its mean;
+        messages overtake each other.
     clock_step_s : float
         In the middle of the recording the cell's clock steps back by this much; 0 = never.
     encoder_gap_s : float
         Length of a hole in the encoder stream, at a third of the recording; 0 = none.
+
+    Raises
+    ------
+    InputError
+        If the parts add up to more than 1.
     """
 
     lost: float = 0.0
@@ -39,6 +49,13 @@ class Faults:
     delay_s: float = 0.0
     clock_step_s: float = 0.0
     encoder_gap_s: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Refuse parts that cannot all be: a detection has one fault at most."""
+        total = sum(getattr(self, name) for name in PARTS)
+        if total > 1 + 1e-9:
+            raise InputError("faults", f"the parts of the detections add up to {total:g}",
+                             "keep the sum at 1 or below: a detection has one fault at most")
 
 
 def apply_faults(events: Sequence[Event], faults: Faults, rng: np.random.Generator,
@@ -81,10 +98,8 @@ def _spoil(event: Event, faults: Faults, rng: np.random.Generator, ledger: Count
     if not isinstance(event, Detection):
         return [event]
     chance = rng.random()
-    parts = (("lost", faults.lost), ("outliers", faults.outliers),
-             ("low_score", faults.low_score), ("not_finite", faults.not_finite),
-             ("unknown_mark", faults.unknown_mark), ("duplicated", faults.duplicated))
-    for name, part in parts:
+    for name in PARTS:
+        part = getattr(faults, name)
         if chance < part:
             ledger[name] += 1
             return _one_fault(event, name, rng)

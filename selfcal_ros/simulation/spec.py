@@ -1,19 +1,46 @@
 # SPDX-License-Identifier: Apache-2.0
 """SIM.yaml: what `selfcal simulate` is to simulate."""
 
-import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from selfcal_ros.collection.parameters import Parameter
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import read_yaml
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.view import Plan, plan_from_dict
 from selfcal_ros.simulation.cell import CellSettings, Event, plan_events
-from selfcal_ros.simulation.faults import Faults, apply_faults
+from selfcal_ros.simulation.faults import PARTS, Faults, apply_faults
 from selfcal_ros.simulation.truth import Spread, Truth, random_truth
+
+PART = {"low": 0.0, "high": 1.0}
+LENGTH = {"unit": "m", "low": 0.0, "high": 1e-3}
+ANGLE = {"unit": "rad", "low": 0.0, "high": 0.1}
+TIME = {"unit": "s", "low": 0.0, "high": 3600.0}
+LAST_START_S = 2.1e9
+"""Stamps are 32 bit seconds; this leaves room for the longest recording."""
+
+TRUTH = {"g": ("g_m", LENGTH), "a": ("a_m", LENGTH), "g_theta": ("g_theta_rad", ANGLE),
+         "a_theta": ("a_theta_rad", ANGLE), "phi": ("phi_rad", ANGLE), "t": ("t_m", LENGTH)}
+NOISE = {"sigma_xy": ("sigma_xy_m", LENGTH), "sigma_theta": ("sigma_theta_rad", ANGLE)}
+CELL = {"sense": ("sense", {"choices": tuple(str(sense) for sense in Sense)}),
+        "encoder_rate": ("encoder_rate_hz", {"unit": "Hz", "low": 1.0, "high": 10000.0}),
+        "exposure_period": ("exposure_period_s", {"unit": "s", "low": 0.001, "high": 10.0}),
+        "with_ids": ("with_ids", {}), "declare_sigma": ("declare_sigma", {}),
+        "servo_sigma": ("servo_sigma_m", LENGTH), "servo_sigma_theta": ("servo_sigma_rad", ANGLE)}
+FAULTS = {name: (name, PART) for name in PARTS} | {
+    key: (f"{key.removesuffix('_s')}_s", TIME)
+    for key in ("delay", "clock_step", "encoder_gap", "delay_s", "clock_step_s", "encoder_gap_s")}
+"""Key of a section -> field of the dataclass, unit and bounds; type and default are the field's."""
+
+TOP = (
+    Parameter("seed", 0, "of truth, noise and faults", low=0, high=2**63),
+    Parameter("start_time", 1.7e9, "first stamp", "s", 0.0, LAST_START_S),
+    Parameter("compression", "zstd", "of the bag", choices=("zstd", "lz4", "none")),
+)
 
 
 @dataclass(frozen=True)
@@ -50,74 +77,54 @@ def read_simulation(path: str | Path) -> Simulation:
     Raises
     ------
     InputError
-        For an unknown key or a value of the wrong type.
+        For an unknown key, a value of the wrong type or out of bounds, or faults that together
+        meet more than all detections.
     """
     where = str(path)
-    data = read_yaml(path)
-    if not isinstance(data, dict):
-        raise InputError(where, "not a mapping", "see docs/simulate.md")
-    known = {"plan", "seed", "truth", "noise", "cell", "faults", "start_time", "compression"}
-    for key in data:
-        if key not in known:
-            raise InputError(f"{where}: {key}", "unknown key", "known are " + ", ".join(
-                sorted(known)))
+    data = _mapping(read_yaml(path), where, (
+        "plan", "truth", "noise", "cell", "faults", *(parameter.name for parameter in TOP)))
     if "plan" not in data:
         raise InputError(where, "the key 'plan' is missing", "name a PLAN.yaml")
-    plan = data["plan"]
+    top = {parameter.name: parameter.check(data.get(parameter.name, parameter.default), where)
+           for parameter in TOP}
+    read = {name: _section(data.get(name, {}), f"{where}: {name}", keys, defaults)
+            for name, keys, defaults in (("truth", TRUTH, Spread()), ("noise", NOISE,
+                                         CellSettings()), ("cell", CELL, CellSettings()),
+                                         ("faults", FAULTS, Faults()))}
+    try:
+        settings = CellSettings(**read["noise"], **read["cell"])
+        faults = Faults(**read["faults"])
+    except InputError as error:
+        raise InputError(f"{where}: {error.where}", error.what, error.mend) from error
+    return Simulation(_plan(data["plan"], Path(path)), top["seed"], Spread(**read["truth"]),
+                      settings, faults, round(top["start_time"] * 1e9), top["compression"])
+
+
+def _plan(plan: Any, path: Path) -> Plan:
     if isinstance(plan, str):
-        source = Path(path).parent / plan
-        plan = plan_from_dict(read_yaml(source), str(source))
-    else:
-        plan = plan_from_dict(plan, f"{where}: plan")
-    compression = data.get("compression", "zstd")
-    if compression not in ("zstd", "lz4", "none"):
-        raise InputError(f"{where}: compression", f"{compression!r} is not known",
-                         "choose zstd, lz4 or none")
-    _check_plain(data, where)
-    cell = _numbers({**data.get("cell", {}), **data.get("noise", {})}, f"{where}: cell, noise", {
-        "sense": "sense", "encoder_rate": "encoder_rate_hz", "with_ids": "with_ids",
-        "exposure_period": "exposure_period_s", "declare_sigma": "declare_sigma",
-        "servo_sigma": "servo_sigma_m", "servo_sigma_theta": "servo_sigma_rad",
-        "sigma_xy": "sigma_xy_m", "sigma_theta": "sigma_theta_rad"})
-    if "sense" in cell:
-        if cell["sense"] not in list(Sense):
-            raise InputError(f"{where}: cell: sense", f"{cell['sense']!r} is not known",
-                             f"choose one of {', '.join(Sense)}")
-        cell["sense"] = Sense(cell["sense"])
-    spread = _numbers(data.get("truth", {}), f"{where}: truth", {
-        "g": "g_m", "a": "a_m", "g_theta": "g_theta_rad", "a_theta": "a_theta_rad",
-        "phi": "phi_rad", "t": "t_m"})
-    names = {field.name: field.name for field in fields(Faults)}
-    names |= {name.removesuffix("_s"): name for name in names}
-    faults = _numbers(data.get("faults", {}), f"{where}: faults", names)
-    return Simulation(plan, int(data.get("seed", 0)), Spread(**spread), CellSettings(**cell),
-                      Faults(**faults), round(float(data.get("start_time", 1.7e9)) * 1e9),
-                      compression)
+        source = path.parent / plan
+        return plan_from_dict(read_yaml(source), str(source))
+    return plan_from_dict(plan, f"{path}: plan")
 
 
-def _numbers(data: object, where: str, names: dict[str, str]) -> dict:
+def _mapping(data: Any, where: str, known: tuple[str, ...]) -> dict:
     if not isinstance(data, dict):
         raise InputError(where, "not a mapping", "see docs/simulate.md")
-    out = {}
-    for key, value in data.items():
-        if key not in names:
-            raise InputError(f"{where}: {key}", "unknown key", "known are " + ", ".join(names))
-        if not isinstance(value, int | float | bool) and key != "sense":
-            raise InputError(f"{where}: {key}", f"{value!r} is not a number", "mend the value")
-        if key != "sense" and not 0 <= value < math.inf:
-            raise InputError(f"{where}: {key}", f"{value!r} is negative or not finite",
-                             "mend the value")
-        out[names[key]] = value
+    for key in data:
+        if key not in known:
+            raise InputError(f"{where}: {key}", "unknown key", "known are " + ", ".join(known))
+    return data
+
+
+def _section(data: Any, where: str, keys: dict[str, tuple[str, dict]], defaults: Any) -> dict:
+    """Return field -> value of a section, each of the type of its default and within bounds."""
+    out: dict[str, Any] = {}
+    for key, value in _mapping(data, where, tuple(keys)).items():
+        name, bounds = keys[key]
+        if name in out:
+            raise InputError(f"{where}: {key}", "given twice", "remove one")
+        default = getattr(defaults, name)
+        kind = next(kind for kind in (str, float, bool) if isinstance(default, kind))
+        value = Parameter(key, kind(default), "", **bounds).check(value, where)
+        out[name] = type(default)(value)
     return out
-
-
-def _check_plain(data: dict, where: str) -> None:
-    """Refuse sections that are no mappings, and a seed or start time that is no number."""
-    for key in ("cell", "noise"):
-        if not isinstance(data.get(key, {}), dict):
-            raise InputError(f"{where}: {key}", "not a mapping", "see docs/simulate.md")
-    for key in ("seed", "start_time"):
-        value = data.get(key, 0)
-        if not isinstance(value, int if key == "seed" else int | float) or value < 0:
-            raise InputError(f"{where}: {key}", f"{value!r} is not a number from 0 up",
-                             "mend the value")

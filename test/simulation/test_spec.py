@@ -57,20 +57,87 @@ def test_a_seed_gives_the_same_messages(tmp_path):
 
 
 @pytest.mark.parametrize(("data", "message"), [
-    ("[1]", "sim.yaml: not a mapping; see docs/simulate.md"),
-    ({}, "sim.yaml: the key 'plan' is missing; name a PLAN.yaml"),
-    ({"plan": PLAN, "sed": 1}, "sim.yaml: sed: unknown key; known are cell, compression"),
-    ({"plan": "no.yaml"}, "no.yaml: no such file; check the path"),
-    ({"plan": {**PLAN, "views": []}}, "sim.yaml: plan: the plan has no views; add at least one"),
-    ({"plan": PLAN, "compression": "gzip"}, "compression: 'gzip' is not known; choose zstd, lz4"),
-    ({"plan": PLAN, "truth": {"gx": 1}}, "sim.yaml: truth: gx: unknown key; known are g, a, "),
-    ({"plan": PLAN, "truth": 5}, "sim.yaml: truth: not a mapping; see docs/simulate.md"),
-    ({"plan": PLAN, "noise": {"sigma_xy": "1 um"}}, "sigma_xy: '1 um' is not a number; mend"),
-    ({"plan": PLAN, "cell": {"sense": "both"}}, "cell: sense: 'both' is not known; choose one of "),
-    ({"plan": PLAN, "faults": {"lots": 0.1}}, "faults: lots: unknown key; known are lost, "),
-    ({"plan": PLAN, "cell": {"encoder_rate": 100}}, "simulated cell: 100 Hz gives fewer than 2.5"),
+    ("[1]", ": not a mapping; see docs/simulate.md"),
+    ({}, ": the key 'plan' is missing; name a PLAN.yaml"),
+    ({"plan": PLAN, "sed": 1}, ": sed: unknown key; known are plan, truth, noise, cell, faults, "
+     "seed, start_time, compression"),
+    ({"plan": {**PLAN, "views": []}}, ": plan: the plan has no views; add at least one view"),
+    ({"plan": True}, ": plan: not a mapping of keys to values; see config/plans for examples"),
+    ({"plan": PLAN, "truth": 5}, ": truth: not a mapping; see docs/simulate.md"),
+    ({"plan": PLAN, "faults": None}, ": faults: not a mapping; see docs/simulate.md"),
+    ({"plan": PLAN, "noise": {"encoder_rate": 500}}, ": noise: encoder_rate: unknown key; known "
+     "are sigma_xy, sigma_theta"),
+    ({"plan": PLAN, "cell": {"encoder_rate": 100}}, ": simulated cell: 100 Hz gives fewer than 2.5 "
+     "encoder samples in a dwell of 0.006 s; raise encoder_rate or exposure_period"),
+    ({"plan": PLAN, "faults": {"lost": 0.6, "duplicated": 0.6}}, ": faults: the parts of the "
+     "detections add up to 1.2; keep the sum at 1 or below: a detection has one fault at most"),
+    ({"plan": PLAN, "faults": {"delay": 0.6, "delay_s": 0.6}}, ": faults: delay_s: given twice; "
+     "remove one"),
 ])
 def test_what_is_refused_and_how(tmp_path, data, message):
     with pytest.raises(InputError) as caught:
         simulation(tmp_path, data)
-    assert message in str(caught.value)
+    assert str(caught.value) == f"{tmp_path / 'sim.yaml'}{message}"
+
+
+def test_a_plan_that_is_not_there(tmp_path):
+    with pytest.raises(InputError, match=r"no\.yaml: no such file; check the path"):
+        simulation(tmp_path, {"plan": "no.yaml"})
+
+
+KEYS = {
+    None: {"seed": (int, 0, 2**63), "start_time": (float, 0.0, 2.1e9), "compression": str},
+    "truth": dict.fromkeys(("g", "a", "t"), (float, 0.0, 1e-3))
+    | dict.fromkeys(("g_theta", "a_theta", "phi"), (float, 0.0, 0.1)),
+    "noise": {"sigma_xy": (float, 0.0, 1e-3), "sigma_theta": (float, 0.0, 0.1)},
+    "cell": {"sense": str, "with_ids": bool, "declare_sigma": bool,
+             "encoder_rate": (float, 1.0, 10000.0), "exposure_period": (float, 0.001, 10.0),
+             "servo_sigma": (float, 0.0, 1e-3), "servo_sigma_theta": (float, 0.0, 0.1)},
+    "faults": dict.fromkeys(("lost", "duplicated", "outliers", "low_score", "not_finite",
+                             "unknown_mark"), (float, 0.0, 1.0))
+    | dict.fromkeys(("delay", "clock_step", "encoder_gap"), (float, 0.0, 3600.0)),
+}
+FIELDS = [(section, key, rule) for section, keys in KEYS.items() for key, rule in keys.items()]
+
+
+def one(section, key, value):
+    return {"plan": PLAN, **({section: {key: value}} if section else {key: value})}
+
+
+@pytest.mark.parametrize(("section", "key", "rule"), FIELDS)
+def test_every_field_has_a_type_and_bounds(tmp_path, section, key, rule):
+    kind, *bounds = rule if isinstance(rule, tuple) else (rule,)
+    wrong = [("many", f"'many' is not {'known' if kind is str else f'of type {kind.__name__}'}; "),
+             ([1], f"[1] is not of type {kind.__name__}; "),
+             (None, f"None is not of type {kind.__name__}; ")]
+    if kind is not bool:
+        wrong += [(True, f"True is not of type {kind.__name__}; ")]
+    if kind is not float:
+        wrong += [(1.5, f"1.5 is not of type {kind.__name__}; ")]
+    if bounds:
+        low, high = bounds
+        wrong += [(value, f"{value} is outside {low} to {high}")
+                  for value in (kind(low) - 1, kind(high) * 2)]
+    if kind is float:
+        wrong += [(value, f"{value} is outside") for value in (np.nan, np.inf, -np.inf)]
+    for value, message in wrong:
+        with pytest.raises(InputError) as caught:
+            simulation(tmp_path, one(section, key, value))
+        place = f"{section}: {key}" if section else key
+        assert str(caught.value).startswith(f"{tmp_path / 'sim.yaml'}: {place}: {message}")
+
+
+@pytest.mark.parametrize(("section", "key", "rule"), [
+    field for field in FIELDS if isinstance(field[2], tuple)
+    and field[1] not in ("encoder_rate", "exposure_period")])
+def test_the_bounds_themselves_are_accepted(tmp_path, section, key, rule):
+    for value in rule[1:]:
+        simulation(tmp_path, one(section, key, value))
+
+
+def test_a_number_in_a_form_of_yaml_1_2_is_a_number(tmp_path):
+    made = simulation(tmp_path, "plan: {plan_id: p, artifact: {grid_size: 5, grid_pitch: 1e-2, "
+                      "angular_count: 0}, views: [{name: a}]}\nstart_time: 1.7e9\n"
+                      "noise: {sigma_xy: 2e-8}\n")
+    assert made.plan.artifact.grid_pitch_m == 0.01
+    assert (made.start_ns, made.settings.sigma_xy_m) == (1_700_000_000_000_000_000, 2e-8)
