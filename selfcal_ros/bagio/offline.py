@@ -10,10 +10,11 @@ from selfcal_ros.bagio import convert_in
 from selfcal_ros.bagio.reader import COMMAND_TOPIC, DETECTION_TOPIC, ENCODER_TOPIC, BagReader
 from selfcal_ros.collection.collector import Collector, ViewProgress
 from selfcal_ros.errors import InputError, NoDataError
+from selfcal_ros.files import add_file
 from selfcal_ros.model.readings import Measurements
 
 
-def collect_bag(path: str | Path, values: dict[str, Any], *, namespace: str = "",
+def collect_bag(path: str | Path, values: dict[str, Any], *, namespace: str | None = None,
                 progress: Callable[[int], None] = lambda count: None,
                 ) -> tuple[Measurements, dict[int, ViewProgress], list[str]]:
     """Return the readings in a bag, how far each view came, and what could not be read.
@@ -24,8 +25,8 @@ def collect_bag(path: str | Path, values: dict[str, Any], *, namespace: str = ""
         MCAP file or rosbag2 folder.
     values : dict
         Values of the measurement_collector's parameters.
-    namespace : str
-        Namespace of the cell's topics; empty = the only one.
+    namespace : str or None
+        Namespace of the cell's topics; empty = the root, None = the only one.
     progress : callable
         Called now and then with the number of messages read.
 
@@ -44,8 +45,9 @@ def collect_bag(path: str | Path, values: dict[str, Any], *, namespace: str = ""
         if count % 1000 == 0:
             progress(count)
     received = collector.received
-    if namespace and reader.cells and namespace.strip("/") not in reader.cells:
-        raise NoDataError(str(path), f"no topics of the cell '{namespace}'", "choose one of "
+    cell = None if namespace is None else namespace.strip("/")
+    if cell is not None and reader.cells and cell not in reader.cells:
+        raise NoDataError(str(path), f"no topics of the cell '/{cell}'", "choose one of "
                           + ", ".join(f"/{name}" for name in sorted(reader.cells)))
     tail = f" ({reader.lost[-1]})" if reader.lost else ""
     for kind, topic in (("command", COMMAND_TOPIC), ("detection", DETECTION_TOPIC),
@@ -84,7 +86,5 @@ def bag_input(path: str | Path) -> dict[str, str]:
     """Return the result's ``input`` entry: file name and SHA-256 of the bag's MCAP files."""
     digest = hashlib.sha256()
     for file in BagReader(Path(path)).files:
-        with file.open("rb") as stream:
-            while block := stream.read(1 << 20):
-                digest.update(block)
+        add_file(digest, file)
     return {"file": Path(path).name, "sha256": digest.hexdigest()}

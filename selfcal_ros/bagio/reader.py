@@ -7,12 +7,14 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import yaml
-from mcap.records import Channel
+from mcap.records import Channel, Message
+from rosbags.serde import SerdeError
+from rosbags.typesys.store import Typestore
 
 from selfcal_ros.bagio.mcap_stream import McapStream
-from selfcal_ros.bagio.schemas import store_of_schema
+from selfcal_ros.bagio.schemas import other_field, shorter_stores, store_of_schema
 from selfcal_ros.errors import InputError
+from selfcal_ros.files import read_yaml
 
 COMMAND_TOPIC = "selfcal/view_command"
 DETECTION_TOPIC = "stage/mark_detections"
@@ -22,25 +24,9 @@ INPUT_TOPICS = {
     DETECTION_TOPIC: "selfcal_msgs/msg/MarkDetection",
     COMMAND_TOPIC: "selfcal_msgs/msg/ViewCommand",
 }
-REQUIRED_FIELDS = {
-    ENCODER_TOPIC: {"header", "name", "position"},
-    DETECTION_TOPIC: {"header", "kind", "has_id", "m", "n", "k", "offset_x", "offset_y",
-                      "offset_theta", "sigma", "score"},
-    COMMAND_TOPIC: {"header", "phase", "plan_id", "view_index", "view_name", "rotation",
-                    "translation_x", "translation_y", "grid", "angular", "repeats", "grid_size",
-                    "grid_pitch", "angular_count"},
-}
-
-
-@dataclass(frozen=True, slots=True)
-class RawMessage:
-    """One message as the bag has it: topic, type, time of logging in ns, CDR bytes, QoS text."""
-
-    topic: str
-    type: str
-    log_time_ns: int
-    data: bytes
-    qos: str
+LAST_FIELDS = {ENCODER_TOPIC: "position", DETECTION_TOPIC: "score", COMMAND_TOPIC: "angular_count"}
+"""Last field that the contract asks for; what stands behind it may be missing."""
+SUFFIXES = (".mcap", ".mcap.zstd")
 
 
 @dataclass
@@ -51,8 +37,9 @@ class BagReader:
     ----------
     path : Path
         MCAP file or rosbag2 folder, with or without metadata.yaml.
-    namespace : str
-        Namespace of the topics, for bags that hold several cells; empty = the only one.
+    namespace : str or None
+        Namespace of the topics, for bags that hold several cells; empty = the root, None = the
+        only one.
 
     Attributes
     ----------
@@ -63,27 +50,33 @@ class BagReader:
     """
 
     path: Path
-    namespace: str = ""
+    namespace: str | None = None
     lost: list[str] = field(default_factory=list)
     cells: set[str] = field(default_factory=set)
 
     def __post_init__(self) -> None:
         """Find the MCAP files, refuse what is no bag."""
         self.path = Path(self.path)
-        if not self.path.exists():
-            raise InputError(str(self.path), "no such file or folder", "check the path")
-        self.files = self._files()
+        try:
+            self.path.stat()
+            self.files = self._files()
+        except (FileNotFoundError, NotADirectoryError) as error:
+            raise InputError(str(self.path), "no such file or folder", "check the path") from error
+        except OSError as error:
+            raise InputError(str(self.path), f"cannot be read ({error.strerror})",
+                             "name a readable file or folder") from error
 
     def _files(self) -> list[Path]:
         if self.path.is_file():
             return [self.path]
-        names = self._listed() or sorted((p.name for p in self.path.glob("*.mcap")), key=_natural)
-        files = []
+        there = {p.name for p in self.path.iterdir() if p.name.endswith(SUFFIXES) and p.is_file()}
+        names = self._listed() or sorted(
+            (name for name in there if name.removesuffix(".zstd") not in there - {name}),
+            key=_natural)
         for name in names:
-            if (self.path / name).is_file():
-                files.append(self.path / name)
-            else:
+            if name not in there:
                 self.lost.append(f"the file {name}, which metadata.yaml lists, is missing")
+        files = [self.path / name for name in names if name in there]
         if not files:
             raise InputError(str(self.path), "no .mcap file in this folder",
                              "give an MCAP file or a rosbag2 folder with MCAP storage")
@@ -94,21 +87,14 @@ class BagReader:
         if not metadata.is_file():
             return []
         try:
-            info = yaml.safe_load(metadata.read_text())["rosbag2_bagfile_information"]
+            info = read_yaml(metadata)["rosbag2_bagfile_information"]
             names = [Path(name).name for name in info["relative_file_paths"]]
-        except (yaml.YAMLError, KeyError, TypeError, ValueError):
+        except (InputError, KeyError, TypeError, ValueError):
             self.lost.append("metadata.yaml is damaged and was not used")
             return []
-        return [name for name in names if name.endswith(".mcap")]
+        return [name for name in dict.fromkeys(names) if name.endswith(SUFFIXES)]
 
-    def raw_messages(self) -> Iterator[RawMessage]:
-        """Yield every message of the bag, of all topics, in the order of the file."""
-        for stream, channel, message in self._all():
-            schema = stream.schemas.get(channel.schema_id)
-            yield RawMessage(channel.topic, schema.name if schema else "", message.log_time,
-                             message.data, channel.metadata.get("offered_qos_profiles", ""))
-
-    def _all(self) -> Iterator[tuple[McapStream, Channel, object]]:
+    def _all(self) -> Iterator[tuple[McapStream, Channel, Message]]:
         for file in self.files:
             stream = McapStream(file, lost=self.lost)
             for channel, message in stream.messages():
@@ -131,7 +117,7 @@ class BagReader:
             If a topic has another type, encoding or message version than the contract's, or the
             bag holds several namespaces.
         """
-        decoders: dict[tuple[Path, int], tuple[str, Callable] | None] = {}
+        decoders: dict[tuple[Path, int], tuple[str, Callable, str] | None] = {}
         bad: Counter = Counter()
         for stream, channel, message in self._all():
             key = (stream.path, channel.id)
@@ -140,16 +126,18 @@ class BagReader:
             entry = decoders[key]
             if entry is None:
                 continue
+            role, decode, _ = entry
             try:
-                decoded = entry[1](message.data)
+                decoded = decode(message.data)
             except Exception:  # a damaged payload may fail anywhere in the decoder
-                bad[entry[0]] += 1
+                bad[entry[::2]] += 1
                 continue
-            yield entry[0], message.log_time, decoded
-        self.lost += [f"{count} messages on {topic} could not be decoded"
-                      for topic, count in bad.items()]
+            yield role, message.log_time, decoded
+        self.lost += [f"{count} messages on {role} could not be decoded{why}"
+                      for (role, why), count in bad.items()]
 
-    def _decoder(self, stream: McapStream, channel: Channel) -> tuple[str, Callable] | None:
+    def _decoder(self, stream: McapStream, channel: Channel) -> tuple[str, Callable, str] | None:
+        """Return role, decoder and what to say if it fails, None for a topic that is not ours."""
         role = self._role(channel.topic)
         if role is None:
             return None
@@ -164,12 +152,15 @@ class BagReader:
                              "remap the topic or record the right one")
         text = schema.data.decode(errors="replace") if schema else ""
         store = store_of_schema(name, schema.encoding if schema else "ros2msg", text, where)
-        fields = {item[0] for item in store.fielddefs[name][1]}
-        missing = sorted(REQUIRED_FIELDS[role] - fields)
-        if missing:
-            raise InputError(where, f"another version of {name}: no field '{missing[0]}'",
+        if not text.strip():
+            stores = [store, *shorter_stores(name, LAST_FIELDS[role])]
+            return role, lambda data: _first_that_fits(stores, name, data), (
+                f": the bag holds no definition of {name}, and they do not fit the one known here")
+        other = other_field(store, name, LAST_FIELDS[role])
+        if other:
+            raise InputError(where, f"another version of {name}: {other}",
                              "record the bag with the messages of this version")
-        return role, lambda data: store.deserialize_cdr(data, name)
+        return role, lambda data: store.deserialize_cdr(data, name), ""
 
     def _role(self, topic: str) -> str | None:
         for role in INPUT_TOPICS:
@@ -177,7 +168,7 @@ class BagReader:
                 continue
             space = topic.removesuffix(role).strip("/")
             self.cells.add(space)
-            if self.namespace:
+            if self.namespace is not None:
                 return role if space == self.namespace.strip("/") else None
             if len(self.cells) > 1:
                 raise InputError(str(self.path), "topics of two cells, "
@@ -185,6 +176,16 @@ class BagReader:
                                  "choose one with --namespace")
             return role
         return None
+
+
+def _first_that_fits(stores: list[Typestore], name: str, data: bytes) -> object:
+    """Decode by the first definition whose length is that of the payload."""
+    for store in stores[:-1]:
+        try:
+            return store.deserialize_cdr(data, name)
+        except SerdeError:
+            continue
+    return stores[-1].deserialize_cdr(data, name)
 
 
 def _natural(name: str) -> list:

@@ -3,7 +3,9 @@
 
 from functools import cache
 from pathlib import Path
+from typing import Any
 
+from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
@@ -66,3 +68,54 @@ def store_of_schema(name: str, encoding: str, text: str, where: str) -> Typestor
         raise InputError(where, f"the definition of {name} cannot be read ({first_line(error)})",
                          "record the bag anew") from error
     return store
+
+
+@cache
+def shorter_stores(name: str, last: str) -> tuple[Typestore, ...]:
+    """Return typestores of a type without one, two, ... of the fields that stand behind `last`.
+
+    A message recorded without its definition is of one of these, longest first: the contract's
+    fields, and as many of those that this package added at the end as its publisher knew. A type
+    of others has one length only.
+    """
+    if not name.startswith(OWN):
+        return ()
+    constants, fields = typestore().fielddefs[name]
+    names = [field for field, _ in fields]
+    stores = []
+    for count in range(len(names) - 1, names.index(last), -1):
+        store = get_typestore(Stores.ROS2_JAZZY)
+        store.register({name: (constants, fields[:count])})
+        stores.append(store)
+    return tuple(stores)
+
+
+def other_field(store: Typestore, name: str, last: str) -> str:
+    """Return how a type differs from the one known here, or ''.
+
+    Every field up to `last` must be there, and what is there must have the same type. Fields that
+    are not known here, and bounds on the length of a text or an array, are free.
+    """
+    found, required = dict(store.fielddefs[name][1]), True
+    for field, wanted in typestore().fielddefs[name][1]:
+        if field not in found and required:
+            return f"no field '{field}'"
+        if field in found and _free_of_bounds(found[field]) != _free_of_bounds(wanted):
+            return f"the field '{field}' has another type"
+        kind, inner = wanted
+        if kind == Nodetype.NAME and field in found:
+            other = other_field(store, inner, typestore().fielddefs[inner][1][-1][0])
+            if other:
+                return f"in '{field}', {other}"
+        required = required and field != last
+    return ""
+
+
+def _free_of_bounds(kind: Any) -> Any:
+    """Return a field's type with the largest length of texts and sequences left out."""
+    node, inner = kind
+    if node == Nodetype.BASE:
+        return node, inner[0]
+    if node in (Nodetype.SEQUENCE, Nodetype.ARRAY):
+        return node, _free_of_bounds(inner[0])
+    return node, inner

@@ -25,8 +25,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--reference", metavar="KIND:ERROR:U", help="known length that sets the "
                         "scale: artifact, stage_x or stage_y, its relative error and the standard "
                         "uncertainty of that, e.g. artifact:1.2e-6:3e-7")
-    parser.add_argument("--namespace", default="", help="namespace of the cell's topics, for bags "
-                        "that hold several cells")
+    parser.add_argument("--namespace", metavar="NAME", help="namespace of the cell's topics, "
+                        "for bags that hold several cells; / is the root")
     parser.add_argument("--robust", action="store_true",
                         help="find and remove outliers among the marks, name bad views "
                         "(docs/identifiability.md)")

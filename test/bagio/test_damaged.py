@@ -1,14 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """Cut and damaged bags: what is there is read, what was lost is said, never a traceback."""
 
+import struct
 from pathlib import Path
 
 import numpy as np
 import pytest
+from mcap.opcode import Opcode
+from mcap.reader import make_reader
 
 from selfcal_ros.bagio.reader import BagReader
 from selfcal_ros.cli.main import main
 from selfcal_ros.errors import InputError
+from test.support.bags import COMPRESSIONS, NO_SUMMARY, Foreign
+from test.support.sessions import events_of, small_plan
 
 SOURCE = Path(__file__).parents[2] / "bags" / "hu_exact" / "hu_exact_0.mcap"
 DATA = SOURCE.read_bytes()
@@ -56,6 +61,104 @@ def test_a_truncated_bag_gives_the_result_of_what_is_there(tmp_path, capsys):
     assert "truncated" in capsys.readouterr().err
     count, lost = read(file)
     assert 0 < count < TOTAL and "could be saved" in lost[0]
+
+
+@pytest.fixture(scope="module")
+def events():
+    return events_of(small_plan("0", repeats=1))
+
+
+def records(data):
+    """Return (opcode, place, length) of all records of a file."""
+    at, out = 8, []
+    while at < len(data) - 8:
+        opcode, length = struct.unpack_from("<BQ", data, at)
+        out.append((opcode, at, length))
+        at += 9 + length
+    return out
+
+
+def relength(data, at, change):
+    length = struct.unpack_from("<Q", data, at + 1)[0]
+    return data[:at + 1] + struct.pack("<Q", (length + change) % 2**64) + data[at + 9:]
+
+
+def damaged(folder, data):
+    path = folder / "damaged.mcap"
+    path.write_bytes(data)
+    reader = BagReader(path)
+    return [(topic, stamp) for topic, stamp, _ in reader.stamped_messages()], reader.lost
+
+
+@pytest.mark.parametrize("compression", COMPRESSIONS)
+@pytest.mark.parametrize("options", [{}, NO_SUMMARY], ids=["summary", "no summary"])
+@pytest.mark.parametrize("change", [1, -1, 700, -700, 10**6, 2**62, -10**6])
+def test_a_wrong_length_of_a_chunk_loses_nothing(tmp_path, events, compression, options, change):
+    path = Foreign({"chunk_size": 1500, "compression": COMPRESSIONS[compression], **options}).write(
+        tmp_path / "x.mcap", events)
+    data = path.read_bytes()
+    whole, lost = damaged(tmp_path, data)
+    assert lost == [] and len(whole) == len(events)
+    chunks = [at for opcode, at, _ in records(data) if opcode == Opcode.CHUNK]
+    assert len(chunks) > 5
+    for at in (chunks[0], chunks[3], chunks[-1]):
+        found, lost = damaged(tmp_path, relength(data, at, change))
+        assert found == whole
+        assert len(lost) <= 1 and (lost or change > 0)
+        assert not lost or lost[0].startswith(f"the file is damaged from byte {at} to ")
+
+
+@pytest.mark.parametrize("compression", COMPRESSIONS)
+@pytest.mark.parametrize("options", [{}, NO_SUMMARY], ids=["summary", "no summary"])
+def test_a_destroyed_chunk_costs_its_own_messages_and_no_more(tmp_path, events, compression,
+                                                             options):
+    path = Foreign({"chunk_size": 1500, "compression": COMPRESSIONS[compression], **options}).write(
+        tmp_path / "x.mcap", events)
+    data = path.read_bytes()
+    whole, _ = damaged(tmp_path, data)
+    for number in (3, 0) if not options else (3,):  # the first one declares the topics
+        chunks = [(at, length) for op, at, length in records(data) if op == Opcode.CHUNK]
+        (at, length), (behind, _) = chunks[number], chunks[number + 1]
+        broken = data[:at] + bytes(9 + length) + data[at + 9 + length:]
+        found, lost = damaged(tmp_path, broken)
+        missing = len(whole) - len(found)
+        assert 0 < missing < 100
+        front = next(i for i, item in enumerate(whole) if found[i] != item)
+        assert found == whole[:front] + whole[front + missing:]
+        assert lost[0].startswith(f"the file is damaged from byte {at} to {behind}: 0 messages")
+        assert lost[1:] == ([] if options else
+                            [f"{missing} of {len(whole)} messages of the file are lost"])
+
+
+@pytest.mark.parametrize("options", [{}, NO_SUMMARY], ids=["summary", "no summary"])
+@pytest.mark.parametrize("change", [1, -1, 50, 5000, 2**40])
+def test_a_wrong_length_without_chunks_costs_one_message(tmp_path, events, options, change):
+    path = Foreign({"use_chunking": False, **options}).write(tmp_path / "x.mcap", events)
+    data = path.read_bytes()
+    whole, lost = damaged(tmp_path, data)
+    assert lost == [] and len(whole) == len(events)
+    places = [at for opcode, at, _ in records(data) if opcode == Opcode.MESSAGE]
+    for number in (0, 100, len(places) - 1):
+        found, lost = damaged(tmp_path, relength(data, places[number], change))
+        # the payload may still decode, with its end missing or more behind it
+        assert found in (whole, whole[:number] + whole[number + 1:])
+        assert lost
+
+
+def test_a_chunk_whose_checksum_fails_is_not_believed_in_part(tmp_path, events):
+    path = Foreign({"chunk_size": 1500, "compression": COMPRESSIONS["none"]}).write(
+        tmp_path / "x.mcap", events)
+    data = bytearray(path.read_bytes())
+    whole, _ = damaged(tmp_path, data)
+    _, at, length = [r for r in records(data) if r[0] == Opcode.CHUNK][3]
+    data[at + length] ^= 1
+    found, lost = damaged(tmp_path, bytes(relength(bytes(data), at, 2**50)))
+    assert len(found) < len(whole) and set(found) < set(whole)
+    assert "0 messages there could be saved" in lost[0]
+    with pytest.raises(ValueError, match="crc"):
+        path.write_bytes(data)
+        with path.open("rb") as file:
+            list(make_reader(file, validate_crcs=True).iter_messages())
 
 
 def test_what_is_no_bag_is_refused(tmp_path):

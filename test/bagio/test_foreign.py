@@ -3,10 +3,12 @@
 
 import pytest
 import yaml
-from rosbags.rosbag2 import Reader
+import zstandard
+from rosbags.rosbag2 import CompressionMode, Reader
 
 from selfcal_ros.bagio.offline import collect_bag
 from selfcal_ros.bagio.reader import BagReader
+from selfcal_ros.collection.messages import Command, Detection, EncoderSample
 from selfcal_ros.collection.parameters import parameter_values
 from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.estimation.api import Options, calibrate
@@ -144,13 +146,140 @@ def test_two_cells_in_one_bag(tmp_path, events, expected):
     result, lost = solved(tmp_path / "bag", namespace="/cell2")
     assert result == result_to_dict(calibrate(collected(other)[1], Options()))
     assert lost == []
-    with pytest.raises(NoDataError, match="no topics of the cell 'cell3'; choose one of "
+    with pytest.raises(NoDataError, match="no topics of the cell '/cell3'; choose one of "
                        "/cell1, /cell2"):
         solved(tmp_path / "bag", namespace="cell3")
 
 
-def test_without_definitions_the_own_ones_must_fit(tmp_path, events):
-    path = Foreign(schemas=False).write(tmp_path / "x.mcap", events)
-    with pytest.raises(NoDataError, match=r"no message on selfcal/view_command \(9 messages on "
-                       r"selfcal/view_command could not be decoded\)"):
+@pytest.mark.parametrize("namespace", ["", "/"])
+def test_the_cell_in_the_root_can_be_chosen(tmp_path, events, expected, namespace):
+    other = events_of(small_plan("0, 90, ty"), seed=8)
+    for name, content in (("", events), ("/cell2", other)):
+        Foreign(namespace=name).write(tmp_path / "bag" / f"x{name.strip('/')}.mcap", content)
+    with pytest.raises(InputError, match="topics of two cells, '/' and '/cell2'; choose"):
+        solved(tmp_path / "bag")
+    check(tmp_path / "bag", expected, namespace=namespace)
+    with pytest.raises(NoDataError, match="no topics of the cell '/'; choose one of /cell2"):
+        solved(tmp_path / "bag" / "xcell2.mcap", namespace=namespace)
+
+
+@pytest.mark.parametrize("more", ["", "uint32 grid_size_y\n",
+                                  "uint32 grid_size_y\nuint32 views_planned\n"])
+def test_without_definitions_messages_of_every_version_are_read(tmp_path, events, expected, more):
+    types = bags.contract_types(command=bags.COMMAND + more)
+    path = Foreign(types=types, schemas=False).write(tmp_path / "x.mcap", events)
+    check(path, expected)
+
+
+def test_without_definitions_what_does_not_fit_is_said(tmp_path, events):
+    types = bags.contract_types(EXTRA)
+    path = Foreign(types=types, schemas=False).write(tmp_path / "x.mcap", events)
+    with pytest.raises(NoDataError, match=r"no message on selfcal/view_command \(.*\); record"):
         solved(path)
+    reader = BagReader(path)
+    assert {topic for topic, _ in reader.messages()} == {"stage/joint_states"}
+    n_seen = sum(isinstance(event, Detection) for event in events)
+    assert sorted(reader.lost) == [
+        f"{count} messages on {topic} could not be decoded: the bag holds no definition of {name}, "
+        "and they do not fit the one known here"
+        for count, topic, name in ((n_seen, "stage/mark_detections", bags.DETECTION_TYPE),
+                                   (9, "selfcal/view_command", bags.COMMAND_TYPE))]
+
+
+TYPES = {"command": ("selfcal/view_command", bags.COMMAND),
+         "detection": ("stage/mark_detections", bags.DETECTION)}
+
+
+@pytest.mark.parametrize(("which", "old", "new"), [
+    ("detection", "float64 offset_x", "string offset_x"),
+    ("detection", "uint8 kind", "string kind"),
+    ("detection", "float32 score", "float64[] score"),
+    ("detection", "int32 m", "std_msgs/Header m"),
+    ("command", "string plan_id", "uint32 plan_id"),
+    ("command", "uint32 angular_count", "uint32 angular_count\nstring views_planned"),
+    ("command", "uint32 grid_size", "uint32[3] grid_size")])
+def test_a_field_of_another_type_is_named(tmp_path, events, which, old, new):
+    topic, text = TYPES[which]
+    assert old in text
+    types = bags.contract_types(**{which: text.replace(old + "\n", new + "\n")})
+    kept = [e for e in events if isinstance(e, EncoderSample)]
+    kept.append(next(e for e in events if isinstance(e, Detection | Command)
+                     and isinstance(e, Detection) == (which == "detection")))
+    path = Foreign(types=types).write(tmp_path / "x.mcap", kept, spoil=True)
+    field = new.split()[-1]
+    with pytest.raises(InputError, match=f"topic /{topic}: another version of .*: the field "
+                       f"'{field}' has another type; record the bag with"):
+        solved(path)
+
+
+def test_a_header_of_another_kind_is_named(tmp_path, events):
+    types = bags.contract_types(detection=bags.DETECTION.replace(
+        "std_msgs/Header header", "builtin_interfaces/Time header"))
+    path = Foreign(types=types).write(tmp_path / "x.mcap", events, spoil=True)
+    with pytest.raises(InputError, match="the field 'header' has another type"):
+        solved(path)
+
+
+def test_bounds_on_lengths_are_free(tmp_path, events, expected):
+    types = bags.contract_types(command=bags.COMMAND.replace("string plan", "string<=64 plan"))
+    check(Foreign(types=types).write(tmp_path / "x.mcap", events), expected)
+
+
+@pytest.mark.parametrize("mode", [CompressionMode.FILE, CompressionMode.MESSAGE])
+def test_bags_that_rosbag2_compressed(tmp_path, events, expected, mode):
+    bag = bags.rosbags_bag(tmp_path / "bag", events, mode)
+    [file] = bag.glob("*.mcap*")
+    assert (file.suffix == ".zstd") == (mode == CompressionMode.FILE)
+    check(bag, expected)
+    check(file, expected)
+    (bag / "metadata.yaml").unlink()
+    check(bag, expected)
+
+
+def test_a_compressed_file_beside_its_plain_one_is_read_once(tmp_path, events, expected):
+    bag = bags.rosbags_bag(tmp_path / "bag", events, CompressionMode.FILE)
+    [file] = bag.glob("*.mcap.zstd")
+    file.with_suffix("").write_bytes(zstandard.ZstdDecompressor().stream_reader(
+        file.read_bytes()).read())
+    check(bag, expected)
+    (bag / "metadata.yaml").unlink()
+    check(bag, expected)
+
+
+@pytest.mark.parametrize("spoil", [lambda data: data[:len(data) * 9 // 10],
+                                   lambda data: data[:-900] + bytes(50) + data[-850:]])
+def test_a_compressed_file_that_is_damaged_is_read_as_far_as_it_goes(tmp_path, events, spoil):
+    bag = bags.rosbags_bag(tmp_path / "bag", events, CompressionMode.FILE)
+    [file] = bag.glob("*.mcap.zstd")
+    data = file.read_bytes()
+    file.write_bytes(spoil(data))
+    reader = BagReader(bag)
+    assert 100 < len(list(reader.messages())) < len(events)
+    assert reader.lost
+    file.write_bytes(data[:100])
+    with pytest.raises(InputError, match="nothing of the compressed file can be read; record"):
+        solved(bag)
+
+
+def test_a_message_whose_compression_is_damaged_is_counted(tmp_path, events):
+    bag = bags.rosbags_bag(tmp_path / "bag", events, CompressionMode.MESSAGE)
+    [file] = bag.glob("*.mcap")
+    data = bytearray(file.read_bytes())
+    data[data.index(b"\x28\xb5\x2f\xfd") + 4] ^= 0xFF
+    file.write_bytes(data)
+    reader = BagReader(bag)
+    assert len(list(reader.messages())) == len(events) - 1
+    assert reader.lost == ["1 messages on selfcal/view_command could not be decoded"]
+
+
+def test_a_file_listed_twice_is_read_once(tmp_path, events, expected):
+    Foreign().write(tmp_path / "bag" / "a.mcap", events)
+    (tmp_path / "bag" / "metadata.yaml").write_text(yaml.safe_dump(
+        {"rosbag2_bagfile_information": {"relative_file_paths": ["a.mcap", "a.mcap"]}}))
+    check(tmp_path / "bag", expected)
+
+
+def test_a_folder_with_the_name_of_a_file_is_no_file(tmp_path, events, expected):
+    Foreign().write(tmp_path / "bag" / "a.mcap", events)
+    (tmp_path / "bag" / "b.mcap").mkdir()
+    check(tmp_path / "bag", expected)

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 from mcap.writer import CompressionType, IndexType, Writer
-from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as RosbagsWriter
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
@@ -105,7 +105,7 @@ def contract_message(store: Typestore, event: Event) -> tuple[str, str, object]:
                   "velocity": np.array(event.velocities), "effort": np.array([])}
         topic, typename = "stage/joint_states", ENCODER_TYPE
     names = [name for name, _ in store.fielddefs[typename][1]]
-    extra = {"temperature": 20.5, "operator": "somebody"}
+    extra = {"temperature": 20.5, "operator": "somebody", "grid_size_y": 0, "views_planned": 3}
     values |= {name: extra[name] for name in names if name in extra}
     kept = {name: value for name, value in values.items() if name in names}
     return topic, typename, store.types[typename](header=header, **kept)
@@ -140,16 +140,19 @@ class Foreign:
     encoding: str = "cdr"
     renamed: dict[str, str] = field(default_factory=dict)
 
-    def write(self, path: Path, events: Iterable[Event], *, order: int = 0) -> Path:
-        """Write one MCAP file and return its path; `order` turns the order of the channels."""
+    def write(self, path: Path, events: Iterable[Event], *, order: int = 0,
+              spoil: bool = False) -> Path:
+        """Write one MCAP file and return its path; `order` turns the order of the channels.
+
+        `spoil` writes empty payloads, for types whose fields the events cannot fill.
+        """
         path.parent.mkdir(parents=True, exist_ok=True)
         with path.open("wb") as file:
             writer = Writer(file, **self.options)
             writer.start(profile="ros2", library="by somebody else")
             write = self._channels(writer, order)
             for number, event in enumerate(events):
-                topic, typename, message = contract_message(self.types, event)
-                data = bytes(self.types.serialize_cdr(message, typename))
+                topic, data = _empty(event) if spoil else self._payload(event)
                 write(topic, event.stamp_ns + 1000, data)
                 if self.others and number % 7 == 0:
                     write("/camera/thing", event.stamp_ns, b"\x00\x01\x00\x00 no CDR at all")
@@ -158,6 +161,10 @@ class Foreign:
             else:
                 writer.flush()
         return path
+
+    def _payload(self, event: Event) -> tuple[str, bytes]:
+        topic, typename, message = contract_message(self.types, event)
+        return topic, bytes(self.types.serialize_cdr(message, typename))
 
     def _channels(self, writer: Writer, order: int) -> Callable[[str, int, bytes], None]:
         topics = dict(TOPICS)
@@ -176,16 +183,24 @@ class Foreign:
         return lambda topic, time_ns, data: writer.add_message(ids[topic], time_ns, data, time_ns)
 
 
+def _empty(event: Event) -> tuple[str, bytes]:
+    topic, _, _ = contract_message(contract_types(), event)
+    return topic, b"\0\1\0\0" + bytes(300)
+
+
 NO_SUMMARY = {"index_types": IndexType.NONE, "repeat_channels": False, "repeat_schemas": False,
               "use_statistics": False, "use_summary_offsets": False}
 COMPRESSIONS = {"none": CompressionType.NONE, "lz4": CompressionType.LZ4,
                 "zstd": CompressionType.ZSTD}
 
 
-def rosbags_bag(path: Path, events: Iterable[Event]) -> Path:
-    """Write a folder by the Writer of rosbags."""
+def rosbags_bag(path: Path, events: Iterable[Event],
+                mode: CompressionMode = CompressionMode.NONE) -> Path:
+    """Write a folder by the Writer of rosbags, compressed as rosbag2 does."""
     store = contract_types()
-    with RosbagsWriter(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+    writer = RosbagsWriter(path, version=9, storage_plugin=StoragePlugin.MCAP)
+    writer.set_compression(mode, CompressionFormat.ZSTD)
+    with writer:
         links = {topic: writer.add_connection(f"/{topic}", typename, typestore=store)
                  for topic, typename in TOPICS.items()}
         for event in events:
