@@ -44,8 +44,10 @@ def command(message: Any) -> Command:
     Raises
     ------
     InputError
-        For an unknown phase, or a plate that cannot be.
+        For an unknown phase, a plate that cannot be, or a stamp before 1970.
     """
+    if stamp_ns(message) < 0:
+        raise InputError("selfcal/view_command", "the stamp lies before 1970", "set the clock")
     try:
         phase = Phase(int(message.phase))
     except ValueError as error:
@@ -79,14 +81,16 @@ def view_readings(message: Any) -> ViewReadings:
     Raises
     ------
     InputError
-        If arrays that belong together differ in length.
+        If arrays that belong together differ in length; `u` and `u_theta` may be empty.
     """
     table = {name: np.array(getattr(message, name), dtype=kind)
              for name, kind in (("m", np.int64), ("n", np.int64), ("dx", float), ("dy", float),
                                 ("count", np.int64), ("u", float), ("k", np.int64),
                                 ("dtheta", float), ("count_theta", np.int64),
                                 ("u_theta", float))}
-    for names in (("m", "n", "dx", "dy", "count"), ("k", "dtheta", "count_theta")):
+    for *names, u in (("m", "n", "dx", "dy", "count", "u"),
+                      ("k", "dtheta", "count_theta", "u_theta")):
+        names += [u] * (len(table[u]) > 0)
         if len({len(table[name]) for name in names}) > 1:
             raise InputError(f"selfcal/view_measurement of '{message.view_name}'",
                              f"{', '.join(names)} differ in length", "mend the publisher")

@@ -85,6 +85,9 @@ def read_series(path: Path, topics: SeriesTopics) -> tuple[Series, list[str]]:
             if not hasattr(decoded, "header"):
                 unstamped.add(topic)
             stamp = stamp_ns(decoded) if hasattr(decoded, "header") else message.log_time
+            if stamp > np.iinfo(np.int64).max:
+                raise InputError(f"{path}: topic {topic}", f"{stamp} ns is no time of logging",
+                                 "record the bag anew")
             found[topic].append((stamp, wanted[topic](name, decoded, f"{path}: topic {topic}")))
     for topic, samples in found.items():
         if not samples:

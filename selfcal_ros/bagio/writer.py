@@ -5,6 +5,8 @@ A crash keeps what was flushed: chunks go to the disk as they fill, at the lates
 `flush`, and metadata.yaml, which only sums up, is written last.
 """
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
@@ -53,7 +55,7 @@ class BagWriter:
     Raises
     ------
     InputError
-        If the folder exists or cannot be made.
+        If the folder exists or cannot be made; from every method, if it cannot be written.
     """
 
     path: Path
@@ -74,33 +76,41 @@ class BagWriter:
         except OSError as error:
             raise InputError(str(self.path), f"cannot be made ({error.strerror})",
                              "name a folder that you may write") from error
-        self._file = (self.path / f"{self.path.name}_0.mcap").open("wb")
-        self._mcap = Writer(self._file, chunk_size=CHUNK_SIZE,
-                            compression=CompressionType[self.compression.upper()])
-        self._mcap.start(profile="ros2", library="selfcal_ros")
+        with self._said():
+            self._file = (self.path / f"{self.path.name}_0.mcap").open("wb")
+            self._mcap = Writer(self._file, chunk_size=CHUNK_SIZE,
+                                compression=CompressionType[self.compression.upper()])
+            self._mcap.start(profile="ros2", library="selfcal_ros")
 
-    def add_topic(self, topic: str, typename: str, qos: list[dict], *,
-                  definition: str | None = None, type_hash: str | None = None) -> None:
-        """Declare a topic before its first message; definition and hash default to our own.
+    @contextmanager
+    def _said(self) -> Iterator[None]:
+        """Turn a full disk or a vanished folder into the package's own error."""
+        try:
+            yield
+        except OSError as error:
+            raise InputError(str(self.path), f"cannot be written ({error.strerror})",
+                             "make room or name another folder") from error
+
+    def add_topic(self, topic: str, typename: str, qos: list[dict]) -> None:
+        """Declare a topic of a type known here, before its first message.
 
         Raises
         ------
         InputError
-            If the type is not known here and no definition is given.
+            If the type is not known here.
         """
         store = typestore()
-        if definition is None and typename not in store.fielddefs:
+        if typename not in store.fielddefs:
             raise InputError(f"topic {topic}", f"no definition of {typename}",
                              "record only topics of known types")
         if typename not in self._schemas:
-            text = definition or store.generate_msgdef(typename, ros_version=2)[0]
+            text = store.generate_msgdef(typename, ros_version=2)[0]
             self._schemas[typename] = self._mcap.register_schema(typename, "ros2msg",
                                                                  text.encode())
         profile = yaml.safe_dump(qos, sort_keys=False) if qos else ""
         channel = self._mcap.register_channel(
             topic, "cdr", self._schemas[typename],
-            {"offered_qos_profiles": profile,
-             "topic_type_hash": type_hash or store.hash_rihs01(typename)})
+            {"offered_qos_profiles": profile, "topic_type_hash": store.hash_rihs01(typename)})
         self._topics[topic] = _Topic(typename, qos, channel)
 
     def write(self, topic: str, fields: Fields, log_time_ns: int) -> None:
@@ -116,7 +126,8 @@ class BagWriter:
         self._first_ns = log_time_ns if self._first_ns is None else min(self._first_ns,
                                                                         log_time_ns)
         self._last_ns = max(self._last_ns, log_time_ns)
-        self._mcap.add_message(entry.channel, log_time_ns, data, log_time_ns)
+        with self._said():
+            self._mcap.add_message(entry.channel, log_time_ns, data, log_time_ns)
 
     @property
     def counts(self) -> dict[str, int]:
@@ -125,14 +136,15 @@ class BagWriter:
 
     def flush(self) -> None:
         """Write everything so far to the disk."""
-        self._mcap.flush()
+        with self._said():
+            self._mcap.flush()
 
     def close(self) -> None:
         """Finish the file and write metadata.yaml."""
         if self._file.closed:
             return
-        self._mcap.finish()
-        self._file.close()
+        with self._said(), self._file:
+            self._mcap.finish()
         write_text(self.path / "metadata.yaml", yaml.safe_dump(self._metadata(), sort_keys=False))
 
     def _metadata(self) -> dict:

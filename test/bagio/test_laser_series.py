@@ -74,3 +74,11 @@ def test_a_laser_type_without_a_known_field_is_named(tmp_path, field, message):
 def test_a_missing_bag_is_named(tmp_path):
     with pytest.raises(InputError, match="no such file or folder"):
         read_series(tmp_path / "none.mcap", TOPICS)
+
+
+def test_a_time_of_logging_beyond_all_clocks_is_named(tmp_path):
+    late = Series(SHORT.laser_ns + (2**63 - EPOCH_NS), SHORT.laser_m, SHORT.position_ns,
+                  SHORT.position_m)
+    bag = write_laser_bag(tmp_path / "b", late, laser="std_msgs/msg/Float64")
+    with pytest.raises(InputError, match=r"laser: \d+ ns is no time of logging; record"):
+        read_series(bag, TOPICS)

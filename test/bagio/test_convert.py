@@ -1,0 +1,279 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Between messages and the model: every field, by name, with its sign and unit, there and back."""
+
+import math
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from selfcal_ros.bagio import convert_in, convert_out
+from selfcal_ros.bagio.schemas import typestore
+from selfcal_ros.collection.collector import ViewProgress
+from selfcal_ros.collection.messages import Command, Detection, EncoderSample, Phase
+from selfcal_ros.collection.timeline import Timeline
+from selfcal_ros.errors import InputError
+from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.error_map import ThetaDatum
+from selfcal_ros.model.readings import Measurements, Sense, ViewReadings
+from selfcal_ros.model.view import View
+from test.support.bags import contract_message, contract_types
+from test.support.results import known_result
+
+STAMPS = st.integers(0, (2**31 - 1) * 10**9 + 999_999_999)
+FLOATS = st.floats(allow_nan=False)
+TEXTS = st.text(st.characters(exclude_categories=["Cs"], exclude_characters="\0"), max_size=9)
+U32, I32 = st.integers(0, 2**32 - 1), st.integers(-2**31, 2**31 - 1)
+FLOATS32 = st.floats(width=32, allow_nan=False)
+DETECTIONS = st.builds(Detection, STAMPS, st.integers(0, 255), st.booleans(), I32, I32, U32, FLOATS,
+                       FLOATS, FLOATS, FLOATS, FLOATS32)
+SAMPLES = st.lists(st.tuples(TEXTS, FLOATS, FLOATS), max_size=4).flatmap(
+    lambda rows: st.builds(EncoderSample, STAMPS, *(
+        st.just(tuple(row[i] for row in rows)) for i in range(3))))
+ARTIFACTS = st.builds(Artifact, st.integers(1, 50).map(lambda h: 2 * h + 1),
+                      st.floats(1e-9, 1.0), st.integers(0, 90).map(lambda q: 4 * q),
+                      st.integers(0, 50).map(lambda h: 2 * h + 1 if h else 0))
+VIEWS = st.builds(View, TEXTS, FLOATS, st.tuples(FLOATS, FLOATS), st.booleans(), st.booleans(),
+                  st.integers(1, 2**32 - 1))
+ASKING = st.builds(Command, STAMPS, st.sampled_from([Phase.PLACE, Phase.MEASURE]), TEXTS, U32,
+                   VIEWS, ARTIFACTS, U32)
+ENDING = st.builds(Command, STAMPS, st.sampled_from([Phase.DONE, Phase.ABORT]), TEXTS, U32,
+                   views_planned=U32)
+COUNTS = st.dictionaries(TEXTS, U32, max_size=3)
+STAMP_NS = 1_700_000_000_123_456_789
+
+
+def through_cdr(name, values):
+    """Return the message with these fields after it was encoded and decoded."""
+    typename = f"{'sensor' if name == 'JointState' else 'selfcal'}_msgs/msg/{name}"
+    message = convert_out.build(typestore(), typename, values)
+    data = typestore().serialize_cdr(message, typename)
+    return typestore().deserialize_cdr(bytes(data), typename)
+
+
+@given(event=DETECTIONS)
+def test_detections_come_back(event):
+    message = through_cdr("MarkDetection", convert_out.detection(event, "stage"))
+    assert convert_in.detection(message) == event
+    assert message.header.frame_id == "stage"
+
+
+@given(event=SAMPLES)
+def test_encoder_samples_come_back(event):
+    message = through_cdr("JointState", convert_out.joint_state(event, "stage"))
+    assert convert_in.encoder_sample(message) == event
+    assert len(message.effort) == 0
+
+
+@given(event=ASKING | ENDING)
+def test_commands_come_back(event):
+    message = through_cdr("ViewCommand", convert_out.command(event, "stage"))
+    assert convert_in.command(message) == event
+
+
+@given(event=DETECTIONS | SAMPLES | ASKING)
+def test_a_message_of_somebody_else_is_what_it_says(event):
+    """The contract's fields by name, filled by another hand: no two are swapped both ways."""
+    if isinstance(event, Command):
+        event = replace(event, views_planned=0, artifact=replace(event.artifact, grid_size_y=0))
+    topic, typename, message = contract_message(contract_types(), event)
+    read = {"stage/joint_states": convert_in.encoder_sample, "selfcal/view_command":
+            convert_in.command, "stage/mark_detections": convert_in.detection}[topic]
+    data = bytes(contract_types().serialize_cdr(message, typename))
+    assert read(contract_types().deserialize_cdr(data, typename)) == event
+
+
+def test_fields_of_a_detection_by_name():
+    event = Detection(STAMP_NS, 1, True, -2, 3, 4, -5e-6, 6e-6, -7e-3, 8e-8, 0.5)
+    assert convert_out.detection(event, "f") == {
+        "header": {"stamp": {"sec": 1_700_000_000, "nanosec": 123_456_789}, "frame_id": "f"},
+        "kind": 1, "has_id": True, "m": -2, "n": 3, "k": 4, "offset_x": -5e-6, "offset_y": 6e-6,
+        "offset_theta": -7e-3, "sigma": 8e-8, "score": 0.5}
+
+
+def test_fields_of_a_command_by_name():
+    view = View("turned", math.pi / 2, (0.01, -0.02), True, False, 7)
+    made = convert_out.command(Command(STAMP_NS, Phase.MEASURE, "p", 3, view,
+                                       Artifact(5, 0.0125, 8, 7), 9), "f")
+    del made["header"]
+    assert made == {
+        "phase": 1, "plan_id": "p", "view_index": 3, "view_name": "turned",
+        "rotation": math.pi / 2, "translation_x": 0.01, "translation_y": -0.02, "grid": True,
+        "angular": False, "repeats": 7, "grid_size": 5, "grid_pitch": 0.0125, "angular_count": 8,
+        "grid_size_y": 7, "views_planned": 9}
+
+
+@pytest.mark.parametrize(("changes", "message"), [
+    ({"phase": 4}, "selfcal/view_command: unknown phase 4; use PLACE, MEASURE, DONE or ABORT"),
+    ({"grid_size": 4}, "artifact grid_size: 4 is not an odd number"),
+    ({"grid_pitch": math.nan}, "artifact grid_pitch: nan m is not a length"),
+    ({"header": convert_out.header(-1, "f")},
+     "selfcal/view_command: the stamp lies before 1970; set the clock")])
+def test_commands_that_cannot_be_used(changes, message):
+    values = convert_out.command(Command(STAMP_NS, Phase.PLACE, "p", 3, View("a"),
+                                         Artifact(5, 0.01)), "f")
+    with pytest.raises(InputError) as caught:
+        convert_in.command(through_cdr("ViewCommand", values | changes))
+    assert str(caught.value).startswith(message)
+
+
+def test_no_repeats_are_one():
+    values = convert_out.command(Command(STAMP_NS, Phase.PLACE, "p", 3, View("a"),
+                                         Artifact(5, 0.01)), "f")
+    assert convert_in.command(through_cdr("ViewCommand", values | {"repeats": 0})).view.repeats == 1
+
+
+@given(stamp=st.integers(-(2**31) * 10**9, 2**31 * 10**9 - 1))
+def test_a_stamp_is_kept_to_the_nanosecond(stamp):
+    made = convert_out.header(stamp, "f")["stamp"]
+    assert 0 <= made["nanosec"] < 10**9
+    assert made["sec"] * 10**9 + made["nanosec"] == stamp
+
+
+def arrays(size, element, kind):
+    return st.lists(element, min_size=size, max_size=size).map(lambda v: np.array(v, dtype=kind))
+
+
+@st.composite
+def readings(draw):
+    """Return readings with every field drawn by itself."""
+    size, lines = draw(st.integers(0, 4)), draw(st.integers(0, 3))
+    u, u_theta = (count * draw(st.booleans()) for count in (size, lines))
+    return ViewReadings(
+        draw(VIEWS), draw(arrays(size, I32, int)), draw(arrays(size, I32, int)),
+        draw(arrays(size, FLOATS, float)), draw(arrays(size, FLOATS, float)),
+        draw(arrays(size, U32, int)), draw(arrays(u, FLOATS, float)),
+        draw(arrays(lines, U32, int)), draw(arrays(lines, FLOATS, float)),
+        draw(arrays(lines, U32, int)), draw(arrays(u_theta, FLOATS, float)), draw(FLOATS),
+        draw(FLOATS), draw(U32), draw(U32), draw(U32), draw(COUNTS))
+
+
+@given(read=readings(), artifact=ARTIFACTS, rejected=COUNTS, sense=st.sampled_from(Sense))
+def test_view_measurements_come_back(read, artifact, rejected, sense):
+    progress = ViewProgress(5, read.view, 0, 0, 0, 0, read, 0)
+    whole = Measurements("p", artifact, (read,), sense, rejected)
+    message = through_cdr("ViewMeasurement", convert_out.view_measurement(
+        progress, whole, STAMP_NS, "f"))
+    found = convert_in.view_readings(message)
+    for entry in fields(ViewReadings):
+        got, wanted = getattr(found, entry.name), getattr(read, entry.name)
+        np.testing.assert_array_equal(got, wanted, entry.name)
+        assert not isinstance(wanted, np.ndarray) or got.dtype == wanted.dtype
+    assert convert_in.artifact_of(message) == artifact
+    assert convert_in.counts(message, "session_reject") == rejected
+    assert (convert_in.sense_of(message), message.plan_id, message.view_index) == (sense, "p", 5)
+
+
+READ = ViewReadings(
+    View("a", 0.5, (0.01, -0.02), True, False, 3), np.array([-1]), np.array([2]), np.array([3e-6]),
+    np.array([-4e-6]), np.array([5]), np.array([6e-8]), np.array([7]), np.array([-8e-3]),
+    np.array([9]), np.array([1e-5]), 1.1e-8, 1.2e-6, 13, 14, 15, {"low_score": 16})
+MEASURED = Measurements("p", Artifact(5, 0.01, 8, 7), (READ,), Sense.PLATE_MOVES, {"other": 17})
+PROGRESS = ViewProgress(18, READ.view, 19, 20, 21, 22, READ, 23)
+
+
+def test_fields_of_a_view_measurement_by_name():
+    made = convert_out.view_measurement(PROGRESS, MEASURED, STAMP_NS, "f")
+    del made["header"]
+    assert made == {
+        "plan_id": "p", "view_index": 18, "view_name": "a", "rotation": 0.5, "translation_x": 0.01,
+        "translation_y": -0.02, "grid": True, "angular": False, "repeats": 3, "grid_size": 5,
+        "grid_pitch": 0.01, "angular_count": 8, "grid_size_y": 7, "m": -1, "n": 2, "dx": 3e-6,
+        "dy": -4e-6, "count": 5, "u": 6e-8, "k": 7, "dtheta": -8e-3, "count_theta": 9,
+        "u_theta": 1e-5, "sigma_xy": 1.1e-8, "sigma_theta": 1.2e-6, "dof_xy": 13, "dof_theta": 14,
+        "detections_used": 15, "reject_reasons": ["low_score"], "reject_counts": [16],
+        "measurement_sense": "plate_moves", "session_reject_reasons": ["other"],
+        "session_reject_counts": [17]}
+
+
+def test_fields_of_a_view_status_by_name():
+    made = convert_out.view_status(PROGRESS, "p", STAMP_NS, "f")
+    assert made.pop("header") == convert_out.header(STAMP_NS, "f")
+    assert made == {
+        "plan_id": "p", "view_index": 18, "view_name": "a", "grid_expected": 19, "grid_done": 20,
+        "angular_expected": 21, "angular_done": 22, "detections_used": 15,
+        "detections_rejected": 16, "reject_reasons": ["low_score"], "reject_counts": [16],
+        "sigma_xy": 1.1e-8, "sigma_theta": 1.2e-6, "complete": True}
+    through_cdr("ViewStatus", {"header": convert_out.header(0, ""), **made})
+
+
+@pytest.mark.parametrize(("changes", "said"), [
+    ({"n": [1, 2]}, "m, n, dx, dy, count, u differ in length"),
+    ({"u": [1.0, 2.0]}, "m, n, dx, dy, count, u differ in length"),
+    ({"u": [], "dy": []}, "m, n, dx, dy, count differ in length"),
+    ({"k": []}, "k, dtheta, count_theta, u_theta differ in length"),
+    ({"u_theta": [1.0, 2.0]}, "k, dtheta, count_theta, u_theta differ in length"),
+    ({"reject_counts": []}, "reject_reasons and reject_counts differ in length")])
+def test_arrays_that_do_not_belong_together(changes, said):
+    values = convert_out.view_measurement(PROGRESS, MEASURED, STAMP_NS, "f")
+    with pytest.raises(InputError) as caught:
+        convert_in.view_readings(through_cdr("ViewMeasurement", values | changes))
+    assert str(caught.value) == (f"selfcal/view_measurement of 'a': {said}; mend the publisher")
+
+
+def test_the_sense_of_a_measurement():
+    values = convert_out.view_measurement(PROGRESS, MEASURED, STAMP_NS, "f")
+    older = through_cdr("ViewMeasurement", values | {"measurement_sense": ""})
+    assert convert_in.sense_of(older) is Sense.MICROSCOPE_MOVES
+    with pytest.raises(InputError, match="measurement_sense 'both' is not known; use one of "
+                       "microscope_moves, plate_moves"):
+        convert_in.sense_of(through_cdr("ViewMeasurement", values | {"measurement_sense": "both"}))
+
+
+@pytest.fixture(scope="module")
+def result():
+    made, _ = known_result(5, 8, size_y=7)
+    emap = replace(made.error_map, nonorthogonality=1.5e-6, scale_difference=-2.5e-6,
+                   datum_theta=ThetaDatum.ZERO_MEAN)
+    emap.gx[1, 2] = emap.gy[1, 2] = np.nan
+    return replace(made, error_map=emap)
+
+
+def test_an_error_map_comes_back(result):
+    emap = result.error_map
+    message = through_cdr("ErrorMap", convert_out.error_map(result, STAMP_NS, "f"))
+    found = convert_in.error_map(message)
+    for name in ("gx", "gy", "g_theta", "u_g_theta"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(emap, name), name)
+    for name in ("u_gx", "u_gy"):
+        wanted = np.where(emap.valid, getattr(emap, name), np.nan)
+        np.testing.assert_array_equal(getattr(found, name), wanted, name)
+    assert (found.artifact, found.datum_theta, found.nonorthogonality, found.scale_difference) == (
+        emap.artifact, ThetaDatum.ZERO_MEAN, 1.5e-6, -2.5e-6)
+    for m in range(-2, 3):
+        for n in range(-3, 4):
+            at = (m + 2) * 7 + (n + 3)
+            assert message.valid[at] == ((m, n) != (-1, -1))
+            if message.valid[at]:
+                assert message.gx[at] == emap.gx[m + 2, n + 3]
+                assert message.u_gy[at] == emap.u_gy[m + 2, n + 3]
+    assert (message.sigma_xy, message.sigma_theta) == (result.noise.sigma_xy,
+                                                       result.noise.sigma_theta)
+    assert message.identifiable and message.plan_id == result.plan_id
+
+
+@pytest.mark.parametrize(("changes", "said"), [
+    ({"gx": [1.0]}, "gx has 1 values, the plate 35; mend the publisher"),
+    ({"valid": []}, "valid has 0 values, the plate 35; mend the publisher"),
+    ({"u_g_theta": [1.0]}, "u_g_theta has 1 values, the plate 8; mend the publisher"),
+    ({"datum_theta": "none"}, "datum_theta 'none' is not known; use one of xy_axes, zero_mean")])
+def test_error_maps_that_cannot_be(result, changes, said):
+    values = convert_out.error_map(result, STAMP_NS, "f") | changes
+    with pytest.raises(InputError) as caught:
+        convert_in.error_map(through_cdr("ErrorMap", values))
+    assert str(caught.value) == f"selfcal/error_map: {said}"
+
+
+@pytest.mark.parametrize(("last", "end"), [(10, 10), (40, 23)])
+def test_the_stamp_of_a_view_is_its_end_or_the_last_command(last, end):
+    assert convert_out.session_stamp_ns(Timeline(last_stamp_ns=last), PROGRESS) == end
+
+
+def test_a_field_that_is_not_given_is_an_error():
+    with pytest.raises(KeyError, match="score"):
+        convert_out.build(typestore(), "selfcal_msgs/msg/MarkDetection", {
+            name: value for name, value in convert_out.detection(
+                Detection(0, 0, True, 0, 0, 0, 0.0, 0.0, 0.0, 0.0, 0.0), "").items()
+            if name != "score"})
