@@ -1,17 +1,26 @@
 # SPDX-License-Identifier: Apache-2.0
 """Multifrontal factorisation of the eliminated normal matrix, and its selected inverse.
 
-Each front keeps K = F11^-1 and W = F11^-1 F12. A solution then needs matrix products only, and
-the diagonal of the inverse follows from the last front down to the first (Takahashi):
-Z12 = -W Z22, Z11 = K - Z12 W', with Z22 taken from the parent's Z. K and W are real; only the
-cut, which is solved last, is complex, and only the real part of its inverse reaches a diagonal.
+Each front keeps J = L^-1 and Y = F21 J', where F11 = L L'. A solution then needs matrix products
+only, and the diagonal of the inverse follows from the last front down to the first (Takahashi):
+with K = J' J and W = J' Y', Z12 = -W Z22, Z11 = K - Z12 W', with Z22 taken from the parent's Z.
+All this is real; only the cut, which is solved last, is complex, and only the real part of its
+inverse reaches a diagonal.
 """
+
+from itertools import pairwise
 
 import numpy as np
 from scipy.linalg import blas, lapack
 
 from selfcal_ros.estimation.fold import FoldedMatrix
-from selfcal_ros.estimation.fronts import Front, add_to, dissect, runs
+from selfcal_ros.estimation.fronts import dissect
+
+RUN = 12
+"""Mean length of runs of places from which matrices are added run by run, not by entries."""
+
+SMALL = 64
+"""Side up to which a triangle is inverted by substitution."""
 
 
 class Factor:
@@ -34,49 +43,30 @@ class Factor:
 
     def __init__(self, folded: FoldedMatrix, shape: tuple[int, int], reach: int) -> None:
         self.folded = folded
-        self.dissection = dissect(folded.real, folded.free, shape, reach)
-        self._inverses: list[np.ndarray] = []
-        self._weights: list[np.ndarray] = []
+        self.dissection = dissect(folded, shape, reach)
+        self._blocks: list[tuple[np.ndarray, np.ndarray]] = []
         updates: dict[int, np.ndarray] = {}
         for number, front in enumerate(self.dissection.fronts):
-            inverse, weight, updates[number] = _eliminate(*self._assemble(front, updates))
-            self._inverses.append(inverse)
-            self._weights.append(weight)
+            f11, f21 = front.blocks(self.dissection.storage)
+            f22 = np.zeros((len(f21), len(f21)), order="F")
+            for child in front.children:
+                boundary = self.dissection.fronts[child].boundary
+                _extend((f11, f21, f22), front.places(boundary), updates.pop(child))
+            inverse, below, updates[number] = _eliminate(f11, f21, f22)
+            self._blocks.append((inverse, below))
         self._cut_inverse = self._close(updates)
 
     @property
     def _n_free(self) -> int:
         return len(self.folded.free)
 
-    def _assemble(self, front: Front, updates: dict[int, np.ndarray]
-                  ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return F11, F12, F22 of a front: rows of the matrix and what its children left."""
-        matrix, own, n = self.dissection.matrix, front.stop - front.start, len(front.boundary)
-        f11, f12, f22 = (np.zeros(size, order="F") for size in ((own, own), (own, n), (n, n)))
-        span = slice(matrix.indptr[front.start], matrix.indptr[front.stop])
-        columns, data = matrix.indices[span], matrix.data[span]
-        rows = np.repeat(np.arange(own), np.diff(matrix.indptr[front.start:front.stop + 1]))
-        inner = (columns >= front.start) & (columns < front.stop)
-        f11[rows[inner], columns[inner] - front.start] = data[inner]
-        outer = columns >= front.stop
-        f12[rows[outer], np.searchsorted(front.boundary, columns[outer])] = data[outer]
-        for child in front.children:
-            boundary, update = self.dissection.fronts[child].boundary, updates.pop(child)
-            k = int(np.searchsorted(boundary, front.stop))
-            to_own = runs(boundary[:k] - front.start)
-            to_rest = runs(np.searchsorted(front.boundary, boundary[k:]))
-            add_to(f11, to_own, to_own, update[:k, :k])
-            add_to(f12, to_own, to_rest, update[:k, k:])
-            add_to(f22, to_rest, to_rest, update[k:, k:])
-        return f11, f12, f22
-
     def _close(self, updates: dict[int, np.ndarray]) -> np.ndarray:
         """Join the copies of the cut sites and invert what remains, complex (cut, cut)."""
-        folded, n = self.folded, self._n_free
-        rest = self.dissection.matrix[n:, n:].toarray()
+        folded, rest = self.folded, self.dissection.rest
         for number in self.dissection.top:
-            places = runs(self.dissection.fronts[number].boundary - n)
-            add_to(rest, places, places, updates.pop(number))
+            places = self.dissection.fronts[number].boundary - self._n_free
+            _extend((rest,), places, updates.pop(number))
+        rest = _mirrored(np.tril(rest))
         size = len(folded.cut)
         joined = np.zeros((len(rest), size), dtype=complex)
         joined[np.arange(len(rest)), folded.copy_of] = folded.copy_phase
@@ -87,15 +77,14 @@ class Factor:
         lower, info = lapack.zpotrf(closed, lower=1)
         if info:
             raise np.linalg.LinAlgError("the normal matrix is not positive definite")
-        half, _ = lapack.zpotri(lower, lower=1)
-        return np.tril(half) + np.tril(half, -1).conj().T
+        return _mirrored(lapack.zpotri(lower, lower=1)[0])
 
     def solve(self, right: np.ndarray) -> np.ndarray:
         """Return the solution for one or more right-hand sides, (sites,) or (sites, k)."""
         folded, n = self.folded, self._n_free
         columns = right.reshape(len(right), -1)
         turned = folded.phase.conj()[:, None] * columns
-        work = np.zeros((self.dissection.matrix.shape[0], turned.shape[1]), dtype=complex)
+        work = np.zeros((folded.size, turned.shape[1]), dtype=complex)
         work[:n] = turned[folded.free[self.dissection.order]]
         real = work.view(float)
         self._forward(real)
@@ -111,18 +100,19 @@ class Factor:
         return out.reshape(right.shape)
 
     def _forward(self, work: np.ndarray) -> None:
-        for front, weight in zip(self.dissection.fronts, self._weights, strict=True):
-            if len(front.boundary):
-                work[front.boundary] -= weight.T @ work[front.start:front.stop]
+        for front, (inverse, below) in zip(self.dissection.fronts, self._blocks, strict=True):
+            own = inverse @ work[front.start:front.stop]
+            work[front.start:front.stop] = own
+            if len(below):
+                work[front.boundary] -= below @ own
 
     def _backward(self, work: np.ndarray) -> None:
-        for front, inverse, weight in zip(reversed(self.dissection.fronts),
-                                          reversed(self._inverses), reversed(self._weights),
-                                          strict=True):
-            own = inverse @ work[front.start:front.stop]
-            if len(front.boundary):
-                own -= weight @ work[front.boundary]
-            work[front.start:front.stop] = own
+        for front, (inverse, below) in zip(reversed(self.dissection.fronts),
+                                           reversed(self._blocks), strict=True):
+            own = work[front.start:front.stop]
+            if len(below):
+                own = own - below.T @ work[front.boundary]
+            work[front.start:front.stop] = inverse.T @ own
 
     def inverse_diagonal(self) -> np.ndarray:
         """Return the diagonal of the inverse, real (sites,)."""
@@ -147,7 +137,8 @@ class Factor:
 
     def _selected(self, number: int, z22: np.ndarray) -> np.ndarray:
         """Return the inverse over one front, given that over its boundary."""
-        inverse, weight = self._inverses[number], self._weights[number]
+        lower, below = self._blocks[number]
+        inverse, weight = lower.T @ lower, lower.T @ below.T
         own = len(inverse)
         z = np.empty((own + len(z22),) * 2, order="F")
         z12 = weight @ z22
@@ -156,16 +147,74 @@ class Factor:
         return z
 
 
-def _eliminate(f11: np.ndarray, f12: np.ndarray, f22: np.ndarray
+def _mirrored(lower: np.ndarray) -> np.ndarray:
+    """Return the Hermitian matrix with this lower triangle; above it are zeros."""
+    out = lower + lower.conj().T
+    out[np.diag_indices(len(out))] /= 2
+    return out
+
+
+def _extend(blocks: tuple[np.ndarray, ...], places: np.ndarray, update: np.ndarray) -> None:
+    """Add the lower triangle of `update` at places of a symmetric matrix, given its lower blocks.
+
+    Parameters
+    ----------
+    blocks : tuple of float arrays
+        (F11, F21, F22) of a front; or the whole matrix alone.
+    places : int array (b,)
+        Rows and columns of the update, ascending.
+    update : float array (b, b)
+        Its upper triangle is not used.
+    """
+    own = len(blocks[0])
+    breaks = (np.flatnonzero((places[1:] - places[:-1] != 1) | (places[1:] == own)) + 1).tolist()
+    by_runs = len(places) >= RUN * (len(breaks) + 1)
+    if not by_runs:
+        breaks = [int(np.searchsorted(places, own))]
+    parts = []
+    for low, high in pairwise([0, *breaks, len(places)]):
+        if low < high:
+            first, last = int(places[low]), int(places[high - 1])
+            outer = first >= own
+            first, last = first - own * outer, last - own * outer
+            to = slice(first, last + 1) if by_runs else places[low:high] - own * outer
+            parts.append((slice(low, high), to, outer))
+    for number, (take_rows, rows, outer) in enumerate(parts):
+        for take, columns, outer_too in parts[:number + 1]:
+            block = blocks[outer + outer_too]
+            at = (rows, columns) if by_runs else (rows[:, None], columns)
+            block[at] += update[take_rows, take]
+
+
+def _eliminate(f11: np.ndarray, f21: np.ndarray, f22: np.ndarray
                ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return F11^-1, F11^-1 F12 and what remains for the boundary; f22 is overwritten."""
+    """Return L^-1, F21 L^-T and what remains for the boundary; all three are overwritten.
+
+    Of the symmetric blocks the lower triangles are read and written.
+    """
     lower, info = lapack.dpotrf(f11, lower=1, overwrite_a=1)
     if info:
         raise np.linalg.LinAlgError("the normal matrix is not positive definite")
-    half, _ = lapack.dpotri(lower, lower=1, overwrite_c=1)
-    inverse = half + np.tril(half, -1).T
-    if not f12.shape[1]:
-        return inverse, f12, f22
-    weight = blas.dgemm(1.0, inverse, f12)
-    rest = blas.dgemm(-1.0, f12, weight, trans_a=1, beta=1.0, c=f22, overwrite_c=1)
-    return inverse, weight, rest
+    inverse = _inverse(lower)
+    if not len(f21):
+        return inverse, f21, f22
+    below = blas.dtrmm(1.0, inverse, f21, side=1, lower=1, trans_a=1, overwrite_b=1)
+    rest = blas.dsyrk(-1.0, below, beta=1.0, c=f22, lower=1, overwrite_c=1)
+    return inverse, below, rest
+
+
+def _inverse(lower: np.ndarray) -> np.ndarray:
+    """Return the inverse of a lower triangular matrix, which is overwritten.
+
+    Halves are joined by matrix products, which are faster than substitution.
+    """
+    n = len(lower)
+    if n <= SMALL:
+        return lapack.dtrtri(lower, lower=1, overwrite_c=1)[0]
+    half = n // 2
+    first = _inverse(np.asfortranarray(lower[:half, :half]))
+    last = _inverse(np.asfortranarray(lower[half:, half:]))
+    below = blas.dtrmm(1.0, first, lower[half:, :half], side=1, lower=1)
+    lower[half:, :half] = blas.dtrmm(-1.0, last, below, lower=1, overwrite_b=1)
+    lower[:half, :half], lower[half:, half:] = first, last
+    return lower

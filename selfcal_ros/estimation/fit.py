@@ -139,6 +139,8 @@ def _solve_direct(problem: Problem, y: np.ndarray, theta: AngularPart) -> Raw:
     free, d = grid.reduced(y)
     alone = system.grid_inverse @ d
     field = (free - grid.response @ alone).reshape(grid.views.shape)
+    if not system.angular.n_views:
+        return Raw(field, alone, None, system.grid_inverse, {"method": "multifrontal"})
     xy = grid_level(problem, grid.plate(y, field, alone)[1])
     ratio = weight_ratio(problem, xy.sigma, theta.level.sigma, y)
     right = np.zeros(system.size)

@@ -9,9 +9,9 @@ rest of the elimination is real.
 """
 
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
-from scipy.sparse import coo_matrix, csr_matrix
 
 from selfcal_ros.estimation.lattice import PHASES, LatticeViews
 
@@ -22,8 +22,13 @@ class FoldedMatrix:
 
     Attributes
     ----------
-    real : csr_matrix
-        R over the free sites, then the copies of the cut sites.
+    rows, columns : int array (entries,)
+        Variables that an entry of R joins: the free sites, then the copies of the cut sites. R is
+        symmetric, either triangle may hold an entry; entries at one place add up.
+    values : float array (entries,)
+        The entries.
+    size : int
+        Number of variables.
     free, cut : int array
         Sites without and with copies.
     copy_of : int array (copies,)
@@ -36,7 +41,10 @@ class FoldedMatrix:
         What is added to the diagonal of the cut sites.
     """
 
-    real: csr_matrix
+    rows: np.ndarray
+    columns: np.ndarray
+    values: np.ndarray
+    size: int
     free: np.ndarray
     cut: np.ndarray
     copy_of: np.ndarray
@@ -75,12 +83,14 @@ def fold(views: LatticeViews, weight: np.ndarray, share: np.ndarray,
     variable = place[index]
     variable[on_cut] = len(free) + copies
     mean = weight.sum() / max(np.count_nonzero(read), 1)
-    held = pins[~is_cut[pins]]
-    real = _assemble(variable, weight.reshape(read.shape), share.reshape(read.shape),
-                     size=len(free) + len(keys), pins=place[held], pin=mean)
+    size = len(free) + len(keys)
+    diagonal = np.bincount(variable.ravel(), (weight * (1 - share)).ravel(), minlength=size)
+    diagonal[place[pins[~is_cut[pins]]]] += mean
+    entries = _entries(variable, diagonal, weight.reshape(read.shape), share.reshape(read.shape))
     cut_pins = np.zeros(len(cut))
     cut_pins[place[pins[is_cut[pins]]]] = mean
-    return FoldedMatrix(real, free, cut, keys // 4, PHASES[keys % 4], PHASES[quadrant], cut_pins)
+    return FoldedMatrix(*entries, size, free, cut, keys // 4, PHASES[keys % 4],
+                        PHASES[quadrant], cut_pins)
 
 
 def _quadrants(shape: tuple[int, int]) -> np.ndarray:
@@ -94,21 +104,17 @@ def _quadrants(shape: tuple[int, int]) -> np.ndarray:
     return out
 
 
-def _assemble(variable: np.ndarray, weight: np.ndarray, share: np.ndarray, *, size: int,
-              pins: np.ndarray, pin: float) -> csr_matrix:
-    rows, cols, values = [pins], [pins], [np.full(len(pins), pin)]
-    for i in range(len(weight)):
-        for j in range(i, len(weight)):
-            both = np.flatnonzero((weight[i] > 0) & (weight[j] > 0))
-            value = -weight[i][both] * share[j][both]
-            if i == j:
-                value = value + weight[i][both]
-            rows.append(variable[i][both])
-            cols.append(variable[j][both])
-            values.append(value)
-            if i != j:
-                rows.append(variable[j][both])
-                cols.append(variable[i][both])
-                values.append(value)
-    at = np.concatenate(rows), np.concatenate(cols)
-    return coo_matrix((np.concatenate(values), at), shape=(size, size)).tocsr()
+def _entries(variable: np.ndarray, diagonal: np.ndarray, weight: np.ndarray, share: np.ndarray,
+             ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return rows, columns and values of one triangle of R."""
+    rows, values = [np.arange(len(diagonal))], [diagonal]
+    columns = rows.copy()
+    for i, j in combinations(range(len(weight)), 2):
+        both = np.flatnonzero((weight[i] > 0) & (weight[j] > 0))
+        a, b = variable[i][both], variable[j][both]
+        value = -weight[i][both] * share[j][both]
+        rows.append(a)
+        columns.append(b)
+        # an entry and its mirror image may meet on the diagonal
+        values.append(np.where(a == b, 2 * value, value))
+    return np.concatenate(rows), np.concatenate(columns), np.concatenate(values)

@@ -7,9 +7,11 @@ cuts through the folded field separate the matrix.
 """
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
-from scipy.sparse import csr_matrix
+
+from selfcal_ros.estimation.fold import FoldedMatrix
 
 LEAF = 192
 """Sites below which a part of the field is not cut any more."""
@@ -27,12 +29,28 @@ class Front:
         Later variables that they are joined to, sorted.
     children : tuple of int
         Fronts that are eliminated into this one.
+    offset : int
+        Where the front's numbers start in the storage of all: the block of its own variables,
+        then that of its boundary against them, both by columns.
     """
 
     start: int
     stop: int
     boundary: np.ndarray
     children: tuple[int, ...]
+    offset: int
+
+    @property
+    def size(self) -> int:
+        """Numbers that the front stores."""
+        own = self.stop - self.start
+        return own * (own + len(self.boundary))
+
+    def blocks(self, storage: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return views of the blocks (own, own) and (b, own), by columns."""
+        own, middle = self.stop - self.start, self.offset + (self.stop - self.start) ** 2
+        return (storage[self.offset:middle].reshape(own, own).T,
+                storage[middle:self.offset + self.size].reshape(own, -1).T)
 
     def places(self, variables: np.ndarray) -> np.ndarray:
         """Return where variables stand in this front: its own first, then its boundary."""
@@ -53,74 +71,89 @@ class Dissection:
         In the order of elimination.
     top : tuple of int
         Fronts without a parent: only copies are left on their boundaries.
-    matrix : csr_matrix
-        The matrix in that order.
+    storage : float array
+        The lower triangle of the matrix, laid out for the fronts.
+    rest : float array (copies, copies)
+        Its lower triangle over the copies.
     """
 
     order: np.ndarray
     fronts: tuple[Front, ...]
     top: tuple[int, ...]
-    matrix: csr_matrix
+    storage: np.ndarray
+    rest: np.ndarray
 
 
-MAX_BLOCKS = 24
-"""Blocks of runs up to which matrices are added block by block rather than entry by entry."""
-
-Places = tuple[np.ndarray, list[tuple[slice, slice]]]
-
-
-def add_to(block: np.ndarray, rows: Places, columns: Places, update: np.ndarray) -> None:
-    """Add `update` to the rows and columns of a matrix at places prepared by `runs`."""
-    if len(rows[1]) * len(columns[1]) > MAX_BLOCKS:
-        block[rows[0][:, None], columns[0]] += update
-        return
-    for take_rows, to_rows in rows[1]:
-        for take_columns, to_columns in columns[1]:
-            block[to_rows, to_columns] += update[take_rows, take_columns]
-
-
-def runs(places: np.ndarray) -> Places:
-    """Return places with the (from, to) slices of their runs of consecutive numbers."""
-    if not len(places):
-        return places, []
-    ends = (np.flatnonzero(places[1:] - places[:-1] != 1) + 1).tolist()
-    low, high = places[[0, *ends]].tolist(), places[[*(e - 1 for e in ends), -1]].tolist()
-    return places, [(slice(a, b), slice(c, d + 1)) for a, b, c, d in
-                    zip([0, *ends], [*ends, len(places)], low, high, strict=True)]
-
-
-def dissect(matrix: csr_matrix, sites: np.ndarray, shape: tuple[int, int],
-            reach: int) -> Dissection:
+def dissect(folded: FoldedMatrix, shape: tuple[int, int], reach: int) -> Dissection:
     """Return the nested dissection of a matrix over sites of a field.
 
     Parameters
     ----------
-    matrix : csr_matrix
-        Symmetric; the variables after the `sites` are not eliminated here.
-    sites : int array (free,)
-        Flat index of each variable's site.
+    folded : FoldedMatrix
+        The matrix; its copies are not eliminated here.
     shape : tuple of int
         Sites along x and y.
     reach : int
         Largest folded distance of two sites that the matrix joins.
     """
     hx, hy = (size // 2 for size in shape)
-    i, j = abs(sites // shape[1] - hx), abs(sites % shape[1] - hy)
-    folded = np.stack([np.maximum(i, j), np.minimum(i, j)])
+    i, j = abs(folded.free // shape[1] - hx), abs(folded.free % shape[1] - hy)
+    far, near = np.maximum(i, j), np.minimum(i, j)
     pieces: list[tuple[np.ndarray, tuple[int, ...]]] = []
     # neighbours in a row, so that a child's boundary is a few runs of its parent's variables
-    top = _cut(np.lexsort((folded[1], folded[0])), folded, max(reach, 1), pieces)
+    rows = np.argsort(far * (max(shape) + 1) + near, kind="stable")
+    top = _cut(rows, np.stack([far, near]), max(reach, 1), pieces)
     order = np.concatenate([np.zeros(0, dtype=int), *(piece for piece, _ in pieces)])
-    turned = _permuted(matrix, order)
+
+    n, size = len(order), folded.size
+    position = np.arange(size)
+    position[order] = np.arange(n)
+    a, b = position[folded.rows], position[folded.columns]
+    row, column = np.maximum(a, b), np.minimum(a, b)
+    inner = column < n
+    lengths = [len(piece) for piece, _ in pieces]
+    front = np.repeat(np.arange(len(pieces)), lengths)[column[inner]]
+    fronts = _fronts(pieces, row[inner], front, size=size)
+    total = sum(one.size for one in fronts)
+    at = total + (row - n) * (size - n) + column - n
+    at[inner] = _addresses(fronts, row[inner], column[inner], front=front, size=size)
+    both = np.bincount(at, folded.values, minlength=total + (size - n) ** 2)
+    return Dissection(order, fronts, top, both[:total],
+                      both[total:].reshape(size - n, size - n))
+
+
+def _fronts(pieces: list, row: np.ndarray, front: np.ndarray, *, size: int) -> tuple[Front, ...]:
+    """Return the fronts of pieces, given the rows of the matrix in each front's columns."""
+    stops = np.cumsum([len(piece) for piece, _ in pieces], dtype=int)
+    later = row >= stops[front]
+    keys = np.unique(front[later] * size + row[later])
+    cuts = np.searchsorted(keys, np.arange(len(pieces) + 1) * size).tolist()
+    keys %= size
     fronts: list[Front] = []
-    position = 0
-    for piece, children in pieces:
-        stop = position + len(piece)
-        near = turned.indices[turned.indptr[position]:turned.indptr[stop]]
-        later = np.concatenate([near, *(fronts[c].boundary for c in children)])
-        fronts.append(Front(position, stop, np.unique(later[later >= stop]), children))
-        position = stop
-    return Dissection(order, tuple(fronts), top, turned)
+    start = offset = 0
+    for (_, children), (a, b), stop in zip(pieces, pairwise(cuts), stops.tolist(), strict=True):
+        boundary = keys[a:b]
+        if children:
+            later = np.concatenate([boundary, *(fronts[c].boundary for c in children)])
+            boundary = np.unique(later[later >= stop])
+        fronts.append(Front(start, stop, boundary, children, offset))
+        start, offset = stop, offset + fronts[-1].size
+    return tuple(fronts)
+
+
+def _addresses(fronts: tuple[Front, ...], row: np.ndarray, column: np.ndarray, *,
+               front: np.ndarray, size: int) -> np.ndarray:
+    """Return where the entries (row, column) of the lower triangle are stored."""
+    start = np.array([one.start for one in fronts])[front]
+    own = np.array([one.stop for one in fronts])[front] - start
+    widths = np.array([len(one.boundary) for one in fronts])
+    keys = np.concatenate([number * size + one.boundary for number, one in enumerate(fronts)])
+    before = np.cumsum(widths) - widths
+    place = np.searchsorted(keys, front * size + row) - before[front]
+    offset = np.array([one.offset for one in fronts])[front]
+    column = column - start
+    return offset + np.where(row < start + own, column * own + row - start,
+                             own * own + column * widths[front] + place)
 
 
 def _cut(sites: np.ndarray, folded: np.ndarray, reach: int, pieces: list) -> tuple[int, ...]:
@@ -152,10 +185,3 @@ def _best_cut(at: np.ndarray, reach: int) -> int:
     starts = np.arange(1, len(counts) - reach)
     left, right = before[starts], before[-1] - before[starts + reach]
     return int(starts[np.argmin(np.maximum(left, right))] + at.min())
-
-
-def _permuted(matrix: csr_matrix, order: np.ndarray) -> csr_matrix:
-    inverse = np.arange(matrix.shape[0])
-    inverse[order] = np.arange(len(order))
-    rows = matrix[np.concatenate([order, np.arange(len(order), matrix.shape[0])])]
-    return csr_matrix((rows.data, inverse[rows.indices], rows.indptr), shape=matrix.shape)

@@ -58,37 +58,46 @@ def components(site: np.ndarray, mark: np.ndarray, q: np.ndarray, *, n_sites: in
     turning : int
         A site known to lie in a component that is not balanced; -1 = none is known.
     """
-    n_nodes = n_sites + n_marks
-    node = mark + n_sites
-    plain = turning >= 0 or not (len(q) and np.ptp(q))
-    label = _connect(site, node, n_nodes)[None] if plain else _cover(site, node, q, n_nodes)
-    touched = np.zeros(n_nodes, dtype=bool)
-    touched[site], touched[node] = True, True
-    numbers = np.full(n_nodes, -1)
-    # the copies of a node lie in all components of the cover over its own component
-    _, first, numbers[touched] = np.unique(label.min(axis=0)[touched], return_index=True,
-                                           return_inverse=True)
-    copies = label[:, np.flatnonzero(touched)[first]]
-    balanced = (copies[1:] != copies[0]).all(axis=0) if len(q) else np.zeros(0, dtype=bool)
+    of_site, of_mark = np.full(n_sites, -1), np.full(n_marks, -1)
+    if not len(site):
+        return Components(of_site, of_mark, np.zeros(0, dtype=bool))
+    first = np.empty(n_marks, dtype=int)
+    first[mark[::-1]] = np.arange(len(mark))[::-1]
+    # a mark joins the site of its first reading to those of its others
+    other = np.flatnonzero(first[mark] != np.arange(len(mark)))
+    start = first[mark[other]]
+    turn = (q[other] - q[start]) % 4
+    plain = turning >= 0 or not turn.any()
+    label = _connect(site[start], site[other], n_sites)[None] if plain else _cover(
+        site[start], site[other], turn, n_sites)
+    touched = np.zeros(n_sites, dtype=bool)
+    touched[site] = True
+    # the copies of a site lie in all components of the cover over its own component
+    _, one, number = np.unique(label.min(axis=0)[touched], return_index=True,
+                               return_inverse=True)
+    copies = label[:, np.flatnonzero(touched)[one]]
+    balanced = (copies[1:] != copies[0]).all(axis=0)
     if turning >= 0 and len(balanced) == 1:
         balanced = np.zeros(1, dtype=bool)
     elif turning >= 0:
         return components(site, mark, q, n_sites=n_sites, n_marks=n_marks)
-    return Components(numbers[:n_sites], numbers[n_sites:], balanced)
+    of_site[touched] = number
+    of_mark[mark] = of_site[site]
+    return Components(of_site, of_mark, balanced)
 
 
 def _connect(a: np.ndarray, b: np.ndarray, n: int) -> np.ndarray:
-    """Return the component of every node; edges join a to b, and every b has few edges."""
+    """Return the component of every node; edges join a to b."""
     order = np.argsort(a, kind="stable")
     starts = np.concatenate([[0], np.cumsum(np.bincount(a, minlength=n))])
     graph = csr_matrix((np.ones(len(a)), b[order], starts), shape=(n, n))
     return connected_components(graph, directed=False)[1]
 
 
-def _cover(site: np.ndarray, node: np.ndarray, q: np.ndarray, n: int) -> np.ndarray:
-    """Return the components (4, nodes) of the fourfold cover: a vector in each of four turns."""
+def _cover(a: np.ndarray, b: np.ndarray, turn: np.ndarray, n: int) -> np.ndarray:
+    """Return the components (4, sites) of the fourfold cover: a vector in each of four turns."""
     turns = np.arange(4)[:, None]
-    # a vector v on the mark appears as i^q v on the site
-    cover_site = ((turns + q) % 4) * n + site
-    cover_node = np.broadcast_to(turns * n + node, cover_site.shape)
-    return _connect(cover_site.ravel(), cover_node.ravel(), 4 * n).reshape(4, n)
+    # a vector v on site a appears as i^turn v on site b
+    from_a = np.broadcast_to(turns * n + a, (4, len(a)))
+    to_b = ((turns + turn) % 4) * n + b
+    return _connect(from_a.ravel(), to_b.ravel(), 4 * n).reshape(4, n)

@@ -140,12 +140,12 @@ class LatticeViews:
             part = weight[index][win.marks] * mean[win.marks]
             _add_turned(out[win.sites], part.T if win.transposed else part, (pose.q + 2) % 4)
 
-    def scatter_one(self, index: int, mark: np.ndarray) -> np.ndarray:
-        """Return the scatter of one view's field over the marks, complex (nx, ny)."""
-        out, win = np.zeros(self.shape, dtype=complex), self.windows[index]
-        part = mark[win.marks] * PHASES[self.poses[index].q]
-        out[win.sites] = part.T if win.transposed else part
-        return out
+    def add_scattered(self, out: np.ndarray, index: int, marks: np.ndarray) -> None:
+        """Add the scatter of one view's fields over the marks to `out`, (..., nx, ny) both."""
+        win = self.windows[index]
+        part = marks[(..., *win.marks)]
+        _add_turned(out[(..., *win.sites)], part.swapaxes(-1, -2) if win.transposed else part,
+                    self.poses[index].q)
 
     def scatter_weight(self, weight: np.ndarray) -> np.ndarray:
         """Return the sum of the weights of all readings at every site, (nx, ny)."""
@@ -158,9 +158,8 @@ class LatticeViews:
     def scatter(self, marks: np.ndarray) -> np.ndarray:
         """Return the adjoint of `gather`: the sum over views at every site, complex (nx, ny)."""
         out = np.zeros(self.shape, dtype=complex)
-        for index, (pose, win) in enumerate(zip(self.poses, self.windows, strict=True)):
-            part = marks[index][win.marks]
-            out[win.sites] += PHASES[pose.q] * (part.T if win.transposed else part)
+        for index in range(len(self.poses)):
+            self.add_scattered(out, index, marks[index])
         return out
 
 

@@ -7,6 +7,7 @@ three numbers a view (phi, Re tau, Im tau), which are eliminated last.
 """
 
 from functools import cached_property
+from itertools import combinations
 
 import numpy as np
 
@@ -33,7 +34,7 @@ class GridSystem:
         self.weight = weight
         self.views = LatticeViews(weight.shape[1:], poses, unit)
         self.turning_site = -1
-        """A site known to lie on a closed path that turns, which saves looking for one."""
+        """A site known to lie on a closed path that turns; looked for if -1."""
         self.read = weight > 0
         total = weight.sum(axis=0)
         self.mark_read = total > 0
@@ -66,8 +67,20 @@ class GridSystem:
     def components(self) -> Components:
         """Components of the graph of sites and marks."""
         site, mark, q = self.edges
+        turning = self.turning_site if self.turning_site >= 0 else self._find_turning_site()
         return components(site, mark, q, n_sites=self.n_sites, n_marks=self.n_sites,
-                          turning=self.turning_site)
+                          turning=turning)
+
+    def _find_turning_site(self) -> int:
+        """Return a site that one mark visits in two turns, which closes a path; -1 = none."""
+        q = [pose.q for pose in self.views.poses]
+        for i, j in combinations(range(self.n_views), 2):
+            if q[i] != q[j]:
+                same = self.read[i] & self.read[j]
+                same &= self.views.site_index[i] == self.views.site_index[j]
+                if same.any():
+                    return int(self.views.site_index[i].ravel()[same.argmax()])
+        return -1
 
     def centred(self, marks: np.ndarray) -> np.ndarray:
         """Return `marks` (views, nx, ny) less the weighted mean of each mark over its views."""
@@ -102,29 +115,28 @@ class GridSystem:
     @cached_property
     def columns(self) -> np.ndarray:
         """Coupling of sites to phi and tau, complex (sites, views, 2), plate eliminated."""
-        out = np.empty((2 * self.n_views, *self.views.shape), dtype=complex)
-        for v in range(self.n_views):
-            for c in range(2):
-                own = self.views.scatter_one(v, self.weight[v] * self.shapes[c])
-                self.views.subtract_scattered(own, self.weight, self.share[v] * self.shapes[c])
-                out[2 * v + c] = own
+        meant = self.share[:, None] * self.shapes
+        out = np.zeros_like(meant)
+        for v, weight in enumerate(self.weight):
+            part = meant * -weight
+            part[v] += weight * self.shapes
+            self.views.add_scattered(out, v, part)
         return out.reshape(self.n_views, 2, self.n_sites).transpose(2, 0, 1)
 
     @cached_property
     def block(self) -> np.ndarray:
         """Block of the misalignments, plate eliminated, real (3 views, 3 views)."""
-        z = self.views.z
-        x, y = z.real, z.imag
-        out = np.empty((self.n_views, 3, self.n_views, 3))
-        for i in range(self.n_views):
-            for j in range(self.n_views):
-                w = -self.weight[i] * self.share[j]
-                if i == j:
-                    w += self.weight[i]
-                # f = iz, 1, i: the inner products Re(conj(f) f') are |z|^2, -y, x, 1
-                s, sy, sx = w.sum(), (w * y).sum(), (w * x).sum()
-                out[i, :, j, :] = (((w * (x * x + y * y)).sum(), -sy, sx), (-sy, s, 0),
-                                   (sx, 0, s))
+        x, y = self.views.z.real.ravel(), self.views.z.imag.ravel()
+        moments = np.stack([x * x + y * y, x, y, np.ones_like(x)], axis=1)
+        out = np.zeros((self.n_views, 3, self.n_views, 3))
+        for v, weight in enumerate(self.weight):
+            w = self.share * -weight
+            w[v] += weight
+            # f = iz, 1, i: the inner products Re(conj(f) f') are |z|^2, -y, x, 1
+            zz, sx, sy, s = (w.reshape(self.n_views, -1) @ moments).T
+            out[v, 0, :, 0], out[v, 1, :, 1], out[v, 2, :, 2] = zz, s, s
+            out[v, 0, :, 1] = out[v, 1, :, 0] = -sy
+            out[v, 0, :, 2] = out[v, 2, :, 0] = sx
         return out.reshape(3 * self.n_views, -1)
 
     @cached_property

@@ -180,6 +180,8 @@ class JointSystem:
         datum = np.vstack([self.rigid, self._turn_of_lines]) if self.apart else self.rigid
         rigid, size, _ = np.linalg.svd(datum.T, full_matrices=False)
         rigid = rigid[:, size > 1e-9 * size[0]]
+        if rigid.shape[1] == self.nullity:  # no reading tells the datum
+            return np.zeros((self.size, 0))
         left = self._null - rigid @ (rigid.T @ self._null)
         u, s, _ = np.linalg.svd(left, full_matrices=False)
         return u[:, s > 1e-6]
