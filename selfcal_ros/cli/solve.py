@@ -72,6 +72,7 @@ def run(args: argparse.Namespace) -> int:
     from selfcal_ros.bagio.offline import bag_input, collect_bag
     from selfcal_ros.cli.progress import progress_bar
     from selfcal_ros.collection.parameters import solver_options
+    from selfcal_ros.collection.reasons import advice
     from selfcal_ros.errors import NotIdentifiableError
     from selfcal_ros.estimation.api import calibrate
     from selfcal_ros.files import write_json
@@ -81,7 +82,7 @@ def run(args: argparse.Namespace) -> int:
     with progress_bar("reading") as bar:
         measurements, _, lost = collect_bag(args.bag, collector_values, namespace=args.namespace,
                                             progress=lambda count: bar(count, None))
-    for line in lost:
+    for line in (*lost, *advice(measurements.all_rejected())):
         print(f"selfcal solve: {args.bag}: {line}", file=sys.stderr)
     options = solver_options(solver_values)
     try:

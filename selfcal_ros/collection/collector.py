@@ -18,7 +18,7 @@ from selfcal_ros.collection.messages import Command, Detection, EncoderSample
 from selfcal_ros.collection.reasons import Reason
 from selfcal_ros.collection.reduce import DETECTION, Rules, Tracks, clean, reduce_view
 from selfcal_ros.collection.timeline import Timeline, build_timeline
-from selfcal_ros.errors import NoDataError
+from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Measurements, Sense, ViewReadings
 from selfcal_ros.model.view import View
@@ -57,6 +57,11 @@ class Collector:
     ----------
     values : dict
         Values of the measurement_collector's parameters (`parameters.parameter_values`).
+
+    Raises
+    ------
+    InputError
+        If two joints have one name.
     """
 
     def __init__(self, values: dict[str, Any]) -> None:
@@ -66,6 +71,9 @@ class Collector:
         self.sense = Sense(values["measurement_sense"])
         self._joints = {values["joint_x"]: "x", values["joint_y"]: "y",
                         values["joint_theta"]: "theta"}
+        if len(self._joints) < 3:
+            raise InputError("measurement_collector: joint_x, joint_y, joint_theta",
+                             "two of them are the same joint", "give each its own name")
         self.tracks = Tracks(JointTrack(linear), JointTrack(linear), JointTrack(turn))
         self._rules = Rules(
             self.sense, IdentityRules(values["max_deviation"], values["ambiguity_ratio"],

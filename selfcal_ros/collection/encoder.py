@@ -8,6 +8,9 @@ import numpy as np
 
 from selfcal_ros.collection.reasons import Reason
 
+BEYOND_NOISE = 6.0
+"""Standard deviations by which two samples must differ to show that an unneeded joint moves."""
+
 
 @dataclass(frozen=True)
 class TrackLimits:
@@ -26,6 +29,7 @@ class JointTrack:
         self.limits = limits
         self._stamps, self._positions, self._speeds = array("q"), array("d"), array("d")
         self._sorted: tuple[np.ndarray, ...] | None = None
+        self._noise: tuple[float, float] | None = None
 
     def __len__(self) -> int:
         """Return the number of samples."""
@@ -36,7 +40,7 @@ class JointTrack:
         self._stamps.append(stamp_ns)
         self._positions.append(position + 0.0)  # -0.0 and 0.0 sort alike: keep one of them
         self._speeds.append(speed)
-        self._sorted = None
+        self._sorted = self._noise = None
 
     def _difference(self, a: np.ndarray) -> np.ndarray:
         return np.remainder(a + np.pi, 2 * np.pi) - np.pi if self.limits.wraps else a
@@ -47,14 +51,15 @@ class JointTrack:
             stamps = np.array(self._stamps, dtype=np.int64)
             positions = np.array(self._positions)
             speeds = np.array(self._speeds)
-            order = np.lexsort((np.nan_to_num(speeds, nan=np.inf), positions, stamps))
+            order = np.lexsort((positions, stamps))
             stamps, positions, speeds = stamps[order], positions[order], speeds[order]
             first = np.flatnonzero(np.diff(stamps, prepend=stamps[:1] - 1))
             # from the first of each stamp to all of it: on a circle the last may lie nearer
             beside = np.repeat(positions[first], np.diff(first, append=len(stamps)))
             spread = np.abs(self._difference(positions - beside))
             bad = np.maximum.reduceat(spread, first) > self.limits.agreement
-            self._sorted = stamps[first], positions[first], speeds[first], bad
+            speeds = np.fmax.reduceat(np.abs(speeds), first)
+            self._sorted = stamps[first], positions[first], speeds, bad
         return self._sorted
 
     def query(self, stamps_ns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -77,15 +82,8 @@ class JointTrack:
             reasons[:] = Reason.NO_ENCODER
             return np.full(len(stamps_ns), np.nan), reasons
         t, p, _, _ = self._series()
-        after = np.searchsorted(t, stamps_ns, "left")
-        outside = after >= len(t)
-        after = np.minimum(after, len(t) - 1)
-        exact = t[after] == stamps_ns
-        before = np.where(exact, after, after - 1)
-        outside |= before < 0
-        before = np.maximum(before, 0)
+        before, after, exact, outside = self._around(stamps_ns)
         gap = t[after] - t[before]
-        outside |= gap > self.limits.max_gap_ns
         step = self._difference(p[after] - p[before])
         weight = (stamps_ns - t[before]) / np.where(gap > 0, gap, 1)
         moving, reversing = self._motion(before, after, exact)
@@ -93,6 +91,59 @@ class JointTrack:
         reasons[reversing | self._contradicted(stamps_ns, before, after)] = Reason.CONTRADICTION
         reasons[outside] = Reason.NO_ENCODER
         return np.where(outside, np.nan, p[before] + step * weight), reasons
+
+    def moving(self, stamps_ns: np.ndarray) -> np.ndarray:
+        """Return `Reason.MOVING` where this joint is known to move, else None, object array (Q,).
+
+        For joints that a reading does not need: one that has no samples near, or whose samples
+        contradict each other, tells nothing; and what its own noise can do is no motion.
+        """
+        _, reasons = self.query(stamps_ns)
+        fast = reasons == Reason.MOVING
+        if fast.any():
+            t, p, v, _ = self._series()
+            before, after, exact, _ = self._around(stamps_ns)
+            # at a sample: the longer way to one of its neighbours
+            left = np.where(exact, np.maximum(before - 1, 0), before)
+            right = np.where(exact, np.minimum(after + 1, len(t) - 1), after)
+            way = np.fmax(np.abs(self._difference(p[right] - p[after])),
+                          np.abs(self._difference(p[after] - p[left])))
+            noise, speed_noise = self._noise_of_rest()
+            told = np.where(np.isfinite(v[before]) & np.isfinite(v[after]),
+                            np.fmax(v[before], v[after]), 0.0)
+            told = np.where(told > BEYOND_NOISE * speed_noise, told, 0.0)
+            told *= (t[right] - t[left]) / 1e9
+            fast &= np.fmax(way, told) > BEYOND_NOISE * np.sqrt(2) * noise
+        return np.where(fast, Reason.MOVING, None)
+
+    def _noise_of_rest(self) -> tuple[float, float]:
+        """Return the standard deviations of one position and of one told speed, robustly.
+
+        That of a position comes from each sample's distance to the line through its neighbours,
+        whose variance is 1.5 times as large: motion at a steady speed adds nothing to it.
+        """
+        if self._noise is None:
+            t, p, v, _ = self._series()
+            step, dt = self._difference(np.diff(p)), np.diff(t)
+            off = (step[:-1] * dt[1:] - step[1:] * dt[:-1]) / (dt[:-1] + dt[1:])
+            self._noise = _spread(off / np.sqrt(1.5)), _spread(v[np.isfinite(v)])
+        return self._noise
+
+    def _around(self, stamps_ns: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Return the samples before and after each instant, where they are one, where too far.
+
+        They are one where the instant is that sample's stamp.
+        """
+        t = self._series()[0]
+        after = np.searchsorted(t, stamps_ns, "left")
+        outside = after >= len(t)
+        after = np.minimum(after, len(t) - 1)
+        exact = t[after] == stamps_ns
+        before = np.where(exact, after, after - 1)
+        outside |= before < 0
+        before = np.maximum(before, 0)
+        outside |= t[after] - t[before] > self.limits.max_gap_ns
+        return before, after, exact, outside
 
     def _motion(self, before: np.ndarray, after: np.ndarray, exact: np.ndarray,
                 ) -> tuple[np.ndarray, np.ndarray]:
@@ -110,7 +161,7 @@ class JointTrack:
         both = ~calm & (near[left] | near[right])
         moving = np.where(exact, both, fast[after])
         told = np.isfinite(v[before]) & np.isfinite(v[after])
-        rate = np.maximum(np.abs(np.nan_to_num(v[before])), np.abs(np.nan_to_num(v[after])))
+        rate = np.fmax(v[before], v[after])
         moving = np.where(told & exact, rate > self.limits.max_speed, moving)
         moving |= told & (rate > self.limits.max_speed)
         middle = move[after]
@@ -137,3 +188,8 @@ class JointTrack:
             beside = (at[chosen] >= before - 1) & (at[chosen] <= after + 1)
             out |= inside & (near | beside)
         return out
+
+
+def _spread(values: np.ndarray) -> float:
+    """Return the standard deviation about 0 of values most of which are noise; 0 without any."""
+    return float(np.median(np.abs(values)) / 0.6744897501960817) if len(values) else 0.0

@@ -1,17 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
 """Which mark was seen: by its id, or as the nearest nominal mark of the view."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from selfcal_ros.collection.reasons import Reason
-from selfcal_ros.collection.rigid import Rigid, fit_rigid
+from selfcal_ros.collection.rigid import LARGEST_TURN_RAD, Fit, Known, Rigid, fit_motion
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.view import View
 
 TOO_FAR_FROM_ANY = 0.75
 """Distance to the nearest mark, in pitches, beyond which a detection is of no mark at all."""
+SURE = 0.25
+"""Largest error of a predicted place, in pitches, at which the nearest mark is the one seen:
+with an unknown offset of a quarter pitch it stays below half a pitch."""
+OFF_ANY_PLATE_M = 1e9
+"""Coordinate beyond which a reading is not looked at more closely."""
+HALF_A_LINE = 0.45
+"""Largest rotation to reckon with, in lines, at which the nearest line is the one seen."""
 
 
 @dataclass(frozen=True)
@@ -25,12 +32,18 @@ class IdentityRules:
 
 @dataclass(frozen=True)
 class Identified:
-    """Marks behind readings: indices, deviations (rows, n), and reasons where rejected."""
+    """Marks behind readings: indices, deviations (rows, n), and reasons where rejected.
+
+    `residual` is the deviation without the view's own motion `rigid`; `phi_error_rad` says how
+    far its rotation may be off.
+    """
 
     index: np.ndarray
     deviation: np.ndarray
+    residual: np.ndarray
     reasons: np.ndarray
     rigid: Rigid
+    phi_error_rad: float = float("inf")
 
 
 def identify_grid(artifact: Artifact, view: View, reading_m: np.ndarray, *, ids: np.ndarray,
@@ -55,35 +68,38 @@ def identify_grid(artifact: Artifact, view: View, reading_m: np.ndarray, *, ids:
     reasons = np.full(reading_m.shape[1], None, dtype=object)
     if not view.grid or pose.quarter_turns is None:
         reasons[:] = Reason.NOT_IN_VIEW
-        return Identified(ids, np.zeros_like(reading_m), reasons, Rigid())
+        return Identified(ids, *np.zeros((2, *reading_m.shape)), reasons, Rigid())
     half = np.array(artifact.half)[:, None]
     named_unknown = has_id & (np.abs(ids) > half).any(axis=0)
     marks = np.where(has_id & ~named_unknown, ids, 0)
+    reading_m = np.clip(reading_m, -OFF_ANY_PLATE_M, OFF_ANY_PLATE_M)  # squares stay finite
     centred = reading_m - np.array(pose.shift)[:, None] * pitch  # about the plate's centre
-    rigid = _settle_rigid(pose, centred, marks, has_id & ~named_unknown, pitch, half, rules)
+    named = has_id & ~named_unknown
     free = ~has_id
-    nearest, ratio, distance = _nearest(pose, centred - _moved(rigid, centred), pitch, half)
+    known, fit = _settle(pose, centred, half, marks, (named, free), pitch, rules)
+    rigid = known.rigid if fit.marks < 3 else fit.rigid
+    nominal = known.rigid.undo(centred)
+    nearest, ratio, distance = _nearest(pose, nominal, pitch, half)
     marks[:, free] = nearest[:, free]
     far = free & (distance > TOO_FAR_FROM_ANY * pitch)
+    error = known.error_at(nominal)
+    unsure = free & (error > SURE * pitch) & (distance <= TOO_FAR_FROM_ANY * pitch + error)
     ambiguous = free & ~far & (ratio > rules.ambiguity_ratio)
+    far &= ~unsure
     site = np.stack(pose.site_of(marks[0], marks[1]))
     deviation = reading_m - site * pitch
     about = (site - np.array(pose.shift)[:, None]) * pitch
     limit = min(rules.max_deviation_m, pitch / 4)
-    if np.unique(marks[:, ~far & ~ambiguous], axis=1).shape[1] < 3:
+    if np.unique(marks[:, ~far & ~ambiguous & ~unsure], axis=1).shape[1] < 3:
         limit = pitch / 4  # too few marks to know the view's own rotation and offset
-    far |= ~ambiguous & (np.hypot(*(deviation - rigid.at(about))) > limit)
+    residual = deviation - rigid.at(about)
+    far |= ~ambiguous & (np.hypot(*residual) > limit)
     reasons[far] = Reason.TOO_FAR
     reasons[ambiguous] = Reason.AMBIGUOUS
-    reasons[(np.abs(site) > half).any(axis=0)] = Reason.NOT_IN_VIEW
+    reasons[unsure] = Reason.ROTATION
+    reasons[(np.abs(site) > half).any(axis=0) & ~unsure] = Reason.NOT_IN_VIEW
     reasons[named_unknown] = Reason.UNKNOWN_MARK
-    return Identified(marks, deviation, reasons, rigid)
-
-
-def _moved(rigid: Rigid, centred: np.ndarray) -> np.ndarray:
-    """Return the misalignment at readings that already contain it (two fixed-point steps)."""
-    nominal = centred - rigid.at(centred)
-    return rigid.at(centred - rigid.at(nominal))
+    return Identified(marks, deviation, residual, reasons, rigid, fit.phi_error_rad)
 
 
 def _nearest(pose, centred: np.ndarray, pitch: float, half: np.ndarray,
@@ -99,27 +115,57 @@ def _nearest(pose, centred: np.ndarray, pitch: float, half: np.ndarray,
     return mark.astype(np.int64), first / np.maximum(second, 1e-12), first * pitch
 
 
-def _settle_rigid(pose, centred: np.ndarray, ids: np.ndarray, named: np.ndarray, pitch: float,
-                  half: np.ndarray, rules: IdentityRules) -> Rigid:
-    """Return the view's own motion: from named marks, or grown outwards from the centre.
+def _settle(pose, centred: np.ndarray, half: np.ndarray, ids: np.ndarray,
+            kinds: tuple[np.ndarray, np.ndarray], pitch: float,
+            rules: IdentityRules) -> tuple[Known, Fit]:
+    """Return what is known of the view's own motion: grown outwards from what is sure.
 
-    Far from the centre a misalignment in rotation may exceed half a pitch; so marks without
-    ids are used only out to where the rotation known so far cannot confuse them.
+    Far from the centre a misalignment in rotation may exceed half a pitch. So marks without ids
+    are used only where the motion known so far cannot confuse them: about the named marks, or
+    about the innermost one if none is named; the motion that they tell reaches further out.
     """
-    if named.any():
-        about = _about(pose, ids[:, named], pitch)
-        return fit_rigid(about, centred[:, named] - about)
-    rigid, reach = Rigid(), 0.2 * pitch / rules.max_rotation_rad
-    radius = np.hypot(*centred)
-    rim = radius.max(initial=0.0)
-    while True:
-        mark, ratio, distance = _nearest(pose, centred - _moved(rigid, centred), pitch, half)
-        use = (radius <= max(reach, 2 * pitch)) & (ratio < 0.5) & (distance < 0.4 * pitch)
-        about = _about(pose, mark[:, use], pitch)
-        rigid = fit_rigid(about, centred[:, use] - about)
-        if reach > rim:
-            return rigid
-        reach *= 2
+    named, free = kinds
+    about = _about(pose, ids, pitch)
+    use, fit = named, fit_motion(about[:, named], (centred - about)[:, named])
+    known = (fit.known(pitch, rules.max_rotation_rad) if named.any() else
+             _innermost(centred[:, free], pitch, rules.max_rotation_rad))
+    while free.any():
+        nominal = known.rigid.undo(centred)
+        nearest, ratio, _ = _nearest(pose, nominal, pitch, half)
+        sure = (known.error_at(nominal) <= SURE * pitch) & (ratio < 0.5)
+        wider = named | (free & sure)
+        if wider.sum() <= use.sum():
+            break
+        use, mark = wider, np.where(named, ids, nearest)
+        about = _about(pose, mark, pitch)
+        fit = fit_motion(about[:, use], (centred - about)[:, use])
+        known = fit.known(pitch, rules.max_rotation_rad)
+    return (known, fit) if named.any() else _folded(known, fit, pitch)
+
+
+def _innermost(centred: np.ndarray, pitch: float, max_rotation_rad: float) -> Known:
+    """Return what marks about the innermost one tell: the offset there, up to whole pitches."""
+    if not centred.shape[1]:
+        return Known(phi_error_rad=max_rotation_rad)
+    centre = centred[:, np.argmin(np.hypot(*centred))]
+    near = np.hypot(*(centred - centre[:, None])) * max_rotation_rad <= SURE * pitch
+    offset = [_middle(row * (2 * np.pi / pitch), 2 * np.pi) * pitch / (2 * np.pi)
+              for row in centred[:, near]]
+    return Known(Rigid(0.0, *offset), (float(centre[0]), float(centre[1])), 0.0, max_rotation_rad)
+
+
+def _folded(known: Known, fit: Fit, pitch: float) -> tuple[Known, Fit]:
+    """Return the motion whose offset at the plate's centre is below half a pitch.
+
+    Marks without ids tell it only up to whole pitches, and not at all where they lie so far out
+    that the rotation does not tell what becomes of it at the centre.
+    """
+    if known.error_at(np.zeros((2, 1)))[0] > SURE * pitch:
+        return replace(known, offset_error_m=float("inf")), fit
+    shift = np.rint(np.array([known.rigid.tx_m, known.rigid.ty_m]) / pitch) * pitch
+    moved = [replace(rigid, tx_m=rigid.tx_m - float(shift[0]), ty_m=rigid.ty_m - float(shift[1]))
+             for rigid in (known.rigid, fit.rigid)]
+    return replace(known, rigid=moved[0]), replace(fit, rigid=moved[1])
 
 
 def _about(pose, marks: np.ndarray, pitch: float) -> np.ndarray:
@@ -145,29 +191,53 @@ def identify_angular(artifact: Artifact, view: View, reading_rad: np.ndarray, *,
     rules : IdentityRules
         Limits.
     phi_rad : float or None
-        The view's rotation where the grid marks told it.
+        The view's rotation where the grid marks told it. Where neither they nor ids tell it, and
+        the nearest line need not be the one seen, lines without ids are rejected.
     """
     reasons = np.full(len(reading_rad), None, dtype=object)
     count = artifact.angular_count
     if not count or not view.angular:
         reasons[:] = Reason.NOT_IN_VIEW
-        return Identified(np.zeros(len(ids), int), np.zeros(len(ids)), reasons, Rigid())
+        return Identified(np.zeros(len(ids), int), *np.zeros((2, len(ids))), reasons, Rigid())
     step = 2 * np.pi / count
     base = view.lattice_pose(artifact).turn_lines
-    known = has_id & (ids < count)
+    known = has_id & (ids >= 0) & (ids < count)
+    told = phi_rad is not None or known.any()
     if phi_rad is None:
         named = wrap(reading_rad - (ids + base) * step)[known]
-        free = np.remainder(reading_rad / step + 0.5, 1) * step - step / 2
-        values = named if len(named) else free
-        phi_rad = float(np.median(values)) if len(values) else 0.0
+        phi_rad = _middle(named, 2 * np.pi) if len(named) else _middle(reading_rad, step)
     nearest = np.rint(wrap(reading_rad - phi_rad) / step).astype(np.int64) - base
     line = np.where(known, ids, np.remainder(nearest, count))
     deviation = wrap(reading_rad - (line + base) * step)
-    away = np.abs(wrap(deviation - phi_rad))
-    reasons[away > step / 4] = Reason.TOO_FAR
+    residual = wrap(deviation - phi_rad)
+    away = np.abs(residual)
+    reasons[(away > step / 4) | (abs(phi_rad) > max(LARGEST_TURN_RAD, step / 2))] = Reason.TOO_FAR
     reasons[~has_id & (away > rules.ambiguity_ratio * (step - away))] = Reason.AMBIGUOUS
+    if not told and not _nearest_line_is_sure(phi_rad, step, rules.max_rotation_rad):
+        reasons[~has_id] = Reason.ROTATION
     reasons[has_id & ~known] = Reason.UNKNOWN_MARK
-    return Identified(line, deviation, reasons, Rigid(phi_rad))
+    return Identified(line, deviation, residual, reasons, Rigid(phi_rad))
+
+
+def _nearest_line_is_sure(phi_rad: float, step_rad: float, max_rotation_rad: float) -> bool:
+    """Return whether lines that are off by `phi_rad` from the nearest can be no others.
+
+    Lines tell a rotation only up to whole steps. What is seen is the truth if every rotation
+    to reckon with stays below half a step, and what is seen is one to reckon with.
+    """
+    return (max_rotation_rad <= HALF_A_LINE * step_rad
+            and abs(phi_rad) <= max(max_rotation_rad, step_rad / 4))
+
+
+def _middle(angles_rad: np.ndarray, period_rad: float) -> float:
+    """Return the median of angles on a circle of a given period, within half of it about 0."""
+    if not len(angles_rad):
+        return 0.0
+    turn = 2 * np.pi / period_rad
+    start = np.angle(np.exp(1j * turn * angles_rad).mean()) / turn
+    rest = np.remainder(angles_rad - start + period_rad / 2, period_rad) - period_rad / 2
+    middle = start + np.median(rest)
+    return float(middle - period_rad * np.rint(middle / period_rad))
 
 
 def wrap(angle_rad: np.ndarray) -> np.ndarray:

@@ -74,7 +74,8 @@ COLLECTOR = (
               "nearest nominal mark exceeds this part of that to the second nearest",
               "", 0.01, 1.0),
     Parameter("max_rotation", 0.035, "largest misalignment in rotation to reckon with when marks "
-              "have no ids", "rad", 0.0, 0.2),
+              "have no ids; where lines alone are read it must be below 0.45 of a line",
+              "rad", 0.0, 0.2),
     Parameter("outlier_limit", 6.0, "distance from the median of a mark's repeats, in standard "
               "deviations of one reading, beyond which a repeat is an outlier; 0 = keep all",
               "", 0.0, 1000.0),

@@ -95,18 +95,22 @@ def _reduce_grid(artifact: Artifact, view: View, d: np.ndarray, tracks: Tracks, 
                  rejected: Counter) -> tuple[dict, float | None]:
     x, why_x = tracks.x.query(d["stamp"])
     y, why_y = tracks.y.query(d["stamp"])
-    d, (x, y) = _keep(d, np.where(why_x == None, why_y, why_x), rejected, x, y)  # noqa: E711
+    why = _first(why_x, why_y, tracks.theta.moving(d["stamp"]))
+    d, (x, y) = _keep(d, why, rejected, x, y)
     reading = _reading(rules.sense, np.stack([x, y]), np.stack([d["ox"], d["oy"]]))
     found = identify_grid(artifact, view, reading, ids=np.stack([d["m"], d["n"]]),
                           has_id=d["has_id"], rules=rules.identity)
-    d, (m, n, vx, vy) = _keep(d, found.reasons, rejected, *found.index, *found.deviation)
+    d, (m, n, vx, vy, *rest) = _keep(d, found.reasons, rejected, *found.index, *found.deviation,
+                                     *found.residual)
     hx, hy = artifact.half
     means = reduce_repeats((m + hx) * (2 * hy + 1) + n + hy, np.stack([vx, vy]), d["sigma"],
                            limit=rules.outlier_limit,
-                           extent=2 * max(hx, hy) * artifact.grid_pitch_m)
+                           extent=2 * max(hx, hy) * artifact.grid_pitch_m,
+                           residual=np.stack(rest))
     _count(rejected, Reason.OUTLIER, means.outlier)
     mark = means.key.astype(np.int64)
-    phi = found.rigid.phi_rad if len(means.key) >= 3 else None
+    told = found.phi_error_rad <= np.pi / 2 / max(artifact.angular_count, 1)  # a quarter line
+    phi = found.rigid.phi_rad if told else None
     return {"m": mark // (2 * hy + 1) - hx, "n": mark % (2 * hy + 1) - hy, "dx": means.mean[0],
             "dy": means.mean[1], "count": means.count, "u": means.u, "sigma_xy": means.sigma,
             "dof_xy": means.dof}, phi
@@ -115,14 +119,16 @@ def _reduce_grid(artifact: Artifact, view: View, d: np.ndarray, tracks: Tracks, 
 def _reduce_angular(artifact: Artifact, view: View, d: np.ndarray, tracks: Tracks, rules: Rules,
                     rejected: Counter, phi: float | None) -> dict:
     theta, why = tracks.theta.query(d["stamp"])
+    why = _first(why, tracks.x.moving(d["stamp"]), tracks.y.moving(d["stamp"]))
     # beyond half a turn an offset is no sight of the line, though it may wrap to a small one
     why[(why == None) & (np.abs(d["ot"]) > np.pi)] = Reason.TOO_FAR  # noqa: E711
     d, (theta,) = _keep(d, why, rejected, theta)
     found = identify_angular(artifact, view, _reading(rules.sense, theta, d["ot"]), ids=d["k"],
                              has_id=d["has_id"], rules=rules.identity, phi_rad=phi)
-    d, (k, v) = _keep(d, found.reasons, rejected, found.index, found.deviation)
+    d, (k, v, rest) = _keep(d, found.reasons, rejected, found.index, found.deviation,
+                            found.residual)
     means = reduce_repeats(k, v[None], d["sigma"], limit=rules.outlier_limit,
-                           extent=4 * np.pi)
+                           extent=4 * np.pi, residual=rest[None])
     _count(rejected, Reason.OUTLIER, means.outlier)
     return {"k": means.key.astype(np.int64), "dtheta": means.mean[0], "count_theta": means.count,
             "u_theta": means.u, "sigma_theta": means.sigma, "dof_theta": means.dof}
@@ -131,6 +137,13 @@ def _reduce_angular(artifact: Artifact, view: View, d: np.ndarray, tracks: Track
 def _reading(sense: Sense, position: np.ndarray, offset: np.ndarray) -> np.ndarray:
     """Return where the mark lies: over a moved microscope, or on a moved plate (method 1)."""
     return offset - position if sense is Sense.PLATE_MOVES else position + offset
+
+
+def _first(reasons: np.ndarray, *more: np.ndarray) -> np.ndarray:
+    """Return the first reason of each detection, None where there is none: each counts once."""
+    for other in more:
+        reasons = np.where(reasons == None, other, reasons)  # noqa: E711
+    return reasons
 
 
 def _keep(d: np.ndarray, reasons: np.ndarray, rejected: Counter, *values: np.ndarray,

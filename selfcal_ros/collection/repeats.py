@@ -33,7 +33,8 @@ class Means:
 
 
 def reduce_repeats(key: np.ndarray, values: np.ndarray, sigma: np.ndarray, *,
-                   limit: float, extent: float = 0.0) -> Means:
+                   limit: float, extent: float = 0.0,
+                   residual: np.ndarray | None = None) -> Means:
     """Reject outliers and average the repeats of every mark.
 
     Parameters
@@ -49,6 +50,9 @@ def reduce_repeats(key: np.ndarray, values: np.ndarray, sigma: np.ndarray, *,
     extent : float
         Size of the positions behind the readings, m or rad: what differs by no more than their
         rounding is no outlier, however exact the other repeats are.
+    residual : float array (c, n), optional
+        The readings without the view's own motion. Where too few repeats tell the noise, it is at
+        most the scatter of these from mark to mark.
 
     Returns
     -------
@@ -59,17 +63,21 @@ def reduce_repeats(key: np.ndarray, values: np.ndarray, sigma: np.ndarray, *,
     """
     outlier = np.zeros(len(key), dtype=bool)
     if limit > 0 and len(key):
-        outlier = _outliers(key, values, _relative(sigma), limit, extent)
+        outlier = _outliers(key, values, _relative(sigma), (limit, extent),
+                            residual)
     marks, inverse, count = np.unique(key[~outlier], return_inverse=True, return_counts=True)
     kept, s = values[:, ~outlier], sigma[~outlier]
     declared = np.bincount(inverse, s > 0, len(marks)) == count
-    weight = np.where(declared[inverse] & (s > 0), 1 / np.where(s > 0, s, 1) ** 2, 1.0)
+    best = np.full(len(marks), np.inf)  # weights relative to a mark's best reading stay finite
+    np.minimum.at(best, inverse, s)
+    weight = np.where(declared[inverse] & (s > 0),
+                      (best[inverse] / np.where(s > 0, s, 1)) ** 2, 1.0)
     total = np.bincount(inverse, weight, len(marks))
     mean = _means(kept, weight, inverse, total)
     rest = kept - mean[:, inverse]
     dof = int(len(kept) * (count - 1).sum())
     pooled = float(np.sqrt((rest**2).sum() / dof)) if dof else float("nan")
-    u = np.where(declared, 1 / np.sqrt(total), np.nan) if declared.any() else np.zeros(0)
+    u = np.where(declared, best / np.sqrt(total), np.nan) if declared.any() else np.zeros(0)
     return Means(marks, mean, count, u, pooled, dof, outlier)
 
 
@@ -94,9 +102,13 @@ def _relative(sigma: np.ndarray) -> np.ndarray:
 
 
 def _outliers(key: np.ndarray, values: np.ndarray, relative: np.ndarray,
-              limit: float, extent: float) -> np.ndarray:
+              limits: tuple[float, float], residual: np.ndarray | None) -> np.ndarray:
     groups = _groups(key)
+    limit, extent = limits
     scale, pairs = _pair_scale(groups, values, relative)
+    if groups and pairs < MIN_PAIRS and residual is not None:
+        scale = float(np.median(np.abs(residual)) / 0.6744897501960817)
+        pairs = len(np.unique(key)) * len(residual)
     out = np.zeros(len(key), dtype=bool)
     if pairs < MIN_PAIRS:
         return out

@@ -5,10 +5,21 @@ from dataclasses import dataclass
 
 import numpy as np
 
+LARGEST_TURN_RAD = 0.2
+"""A plate that is turned by more than this was put in wrongly: that is no misalignment."""
+EXPECTED_SCATTER = 0.03
+"""Distance of a mark from the rigid motion to reckon with while few marks tell it, in pitches."""
+EXPECTED_WEIGHT = 4
+"""Degrees of freedom that this expectation is worth."""
+COVERAGE = 3.0
+"""Standard deviations within which the motion counts as known."""
+FEW_MARKS_COVERAGE = 10.0
+"""The same where the scatter itself is estimated, from as few as three marks."""
+
 
 @dataclass(frozen=True)
 class Rigid:
-    """A small turn and an offset: deviation = phi J p + t; rad and m, stage frame."""
+    """A small turn and an offset: deviation = (R(phi) - 1) p + t; rad and m, stage frame."""
 
     phi_rad: float = 0.0
     tx_m: float = 0.0
@@ -20,8 +31,99 @@ class Rigid:
         return np.stack([one * p[0] - turn * p[1] + self.tx_m,
                          turn * p[0] + one * p[1] + self.ty_m])
 
+    def undo(self, q: np.ndarray) -> np.ndarray:
+        """Return the nominal positions (2, n) of marks that are read at `q`."""
+        turn, cosine = np.sin(self.phi_rad), np.cos(self.phi_rad)
+        x, y = q[0] - self.tx_m, q[1] - self.ty_m
+        return np.stack([cosine * x + turn * y, cosine * y - turn * x])
 
-def fit_rigid(p: np.ndarray, deviation: np.ndarray) -> Rigid:
+
+@dataclass(frozen=True)
+class Known:
+    """What is known of a view's motion, and how far its prediction may be wrong.
+
+    Attributes
+    ----------
+    rigid : Rigid
+        The motion.
+    centre_m : tuple of float
+        Nominal position where the offset is known best, about the plate centre.
+    offset_error_m : float
+        Largest error of a prediction there, a mark's own scatter included.
+    phi_error_rad : float
+        Largest error of the rotation.
+    """
+
+    rigid: Rigid = Rigid()
+    centre_m: tuple[float, float] = (0.0, 0.0)
+    offset_error_m: float = 0.0
+    phi_error_rad: float = 0.0
+
+    def error_at(self, p: np.ndarray) -> np.ndarray:
+        """Return the largest error (n,) of the predicted deviation at `p` (2, n), m."""
+        away = np.hypot(p[0] - self.centre_m[0], p[1] - self.centre_m[1])
+        return self.offset_error_m + self.phi_error_rad * away
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A rigid motion fitted to marks.
+
+    Attributes
+    ----------
+    rigid : Rigid
+        The motion; without a rotation where all marks are one.
+    centre_m : tuple of float
+        Mean nominal position of the marks, about the plate centre.
+    marks : int
+        Different marks behind the fit.
+    power_m2 : float
+        Sum of their squared distances from the centre.
+    squares_m2 : float
+        Sum of their squared residuals.
+    """
+
+    rigid: Rigid
+    centre_m: tuple[float, float]
+    marks: int
+    power_m2: float
+    squares_m2: float
+
+    @property
+    def phi_error_rad(self) -> float:
+        """How far the rotation may be off, by the scatter of the marks alone; inf below three."""
+        if self.marks < 3 or not self.power_m2:
+            return float("inf")
+        return FEW_MARKS_COVERAGE * float(np.sqrt(
+            self.squares_m2 / (2 * self.marks - 3) / self.power_m2))
+
+    def known(self, pitch_m: float, max_rotation_rad: float) -> Known:
+        """Return what the fit tells together with what is known beforehand.
+
+        Before any mark is read the rotation is 0 to within `max_rotation_rad`, and marks
+        scatter by `EXPECTED_SCATTER`: with few or close marks that is better than the fit.
+        """
+        expected = EXPECTED_WEIGHT * (EXPECTED_SCATTER * pitch_m) ** 2
+        freedom = EXPECTED_WEIGHT + max(2 * self.marks - 3, 0)
+        scatter = COVERAGE * np.sqrt((expected + self.squares_m2) / freedom)
+        weight, error = 0.0, max_rotation_rad
+        if self.power_m2 and max_rotation_rad:
+            found = scatter / np.sqrt(self.power_m2)
+            weight = max_rotation_rad**2 / (max_rotation_rad**2 + found**2)
+            error = weight * found + (1 - weight) * max_rotation_rad
+        rigid = _through(weight * self.rigid.phi_rad, self.centre_m,
+                         self.rigid.at(np.array(self.centre_m)))
+        return Known(rigid, self.centre_m, float(scatter * np.sqrt(1 + 1 / max(self.marks, 1))),
+                     float(error))
+
+
+def _through(phi_rad: float, centre: tuple[float, float], deviation: np.ndarray) -> Rigid:
+    """Return the motion that turns by phi and has a given deviation at a point."""
+    rest = deviation - Rigid(phi_rad).at(np.array(centre))
+    return Rigid(float(phi_rad), float(rest[0]), float(rest[1]))
+
+
+def fit_motion(p: np.ndarray, deviation: np.ndarray) -> Fit:
     """Fit a rigid motion to deviations, without those that lie far off.
 
     Parameters
@@ -33,27 +135,41 @@ def fit_rigid(p: np.ndarray, deviation: np.ndarray) -> Rigid:
 
     Returns
     -------
-    Rigid
+    Fit
         From the median start, five rounds of least squares over the deviations within three
-        times the median distance. With fewer than three marks only an offset is fitted.
+        times the median distance. The turn is never beyond `LARGEST_TURN_RAD`.
     """
     if not p.shape[1]:
-        return Rigid()
+        return Fit(Rigid(), (0.0, 0.0), 0, 0.0, 0.0)
+    middle = p.mean(axis=1)
+    arm = p - middle[:, None]
     offset = np.median(deviation, axis=1)
-    radius2 = (p**2).sum(axis=0)
-    if p.shape[1] < 3 or not radius2.any():
-        return Rigid(0.0, float(offset[0]), float(offset[1]))
-    lever = np.stack([-p[1], p[0]])
-    rim = radius2 >= np.median(radius2)
-    phi = np.median(((deviation - offset[:, None]) * lever).sum(axis=0)[rim] / radius2[rim])
-    fit = np.array([phi, *offset])
+    radius2 = (arm**2).sum(axis=0)
+    rim = (radius2 >= np.median(radius2)) & (radius2 > 0)
+    cross = _cross(arm, deviation - offset[:, None])
+    rigid = _through(_turn(np.median(cross[rim] / radius2[rim])) if rim.any() else 0.0,
+                     tuple(middle), offset)
+    keep = np.ones(p.shape[1], dtype=bool)
     for _ in range(5):
-        distance = np.hypot(*(deviation - fit[0] * lever - fit[1:, None]))
+        distance = np.hypot(*(deviation - rigid.at(p)))
         keep = distance <= 3 * np.median(distance) + 1e-9
-        centre = p[:, keep].mean(axis=1, keepdims=True)
-        arm = np.stack([-(p - centre)[1], (p - centre)[0]])[:, keep]
-        mean = deviation[:, keep].mean(axis=1)
+        middle, mean = p[:, keep].mean(axis=1), deviation[:, keep].mean(axis=1)
+        arm = p[:, keep] - middle[:, None]
         power = (arm**2).sum()
-        phi = (arm * (deviation[:, keep] - mean[:, None])).sum() / power if power > 0 else 0.0
-        fit = np.array([phi, *(mean - phi * np.array([-centre[1, 0], centre[0, 0]]))])
-    return Rigid(float(fit[0]), float(fit[1]), float(fit[2]))
+        cross = _cross(arm, deviation[:, keep] - mean[:, None]).sum()
+        rigid = _through(_turn(cross / power) if power > 0 else 0.0, tuple(middle), mean)
+    rest = deviation[:, keep] - rigid.at(p[:, keep])
+    marks = len(np.unique(p[0, keep] + 1j * p[1, keep]))
+    share = marks / keep.sum()  # repeats of a mark are no further marks
+    return Fit(rigid, (float(middle[0]), float(middle[1])), marks, float(power * share),
+               float((rest**2).sum() * share))
+
+
+def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return a[0] * b[1] - a[1] * b[0]
+
+
+def _turn(sine: float) -> float:
+    # the deviation across the arm is its sine; the arm itself shortens, which tells nothing
+    largest = np.sin(LARGEST_TURN_RAD)
+    return float(np.arcsin(np.clip(sine, -largest, largest)))

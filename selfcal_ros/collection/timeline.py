@@ -109,26 +109,24 @@ def _unused(ordered: list[Command]) -> list[Interval]:
 
 
 def _intervals(ordered: list[Command], plan_id: str) -> list[Interval]:
-    placed = {}  # view_index -> stamp of the last PLACE that a MEASURE of the view followed
-    pending: dict[int, int] = {}
+    began: dict[int, int] = {}  # view_index -> stamp from which its MEASUREs count
+    placed: dict[int, int] = {}  # view_index -> stamp of a PLACE that no MEASURE has followed yet
     poses: dict[int, tuple] = {}
     for command in ordered:
+        index = command.view_index
         if command.plan_id == plan_id and command.phase == Phase.PLACE:
-            pending[command.view_index] = command.stamp_ns
+            placed[index] = command.stamp_ns
         elif command.plan_id == plan_id and command.phase == Phase.MEASURE:
-            index = command.view_index
             pose = (command.view.rotation_rad, command.view.translation_m)
-            if poses.setdefault(index, pose) != pose:
-                poses[index] = pose
-                placed[index] = max(pending.get(index, 0), command.stamp_ns)
-            placed[index] = max(placed.get(index, 0),
-                                pending.get(index, placed.get(index, command.stamp_ns)))
+            start = placed.pop(index, began.get(index, command.stamp_ns))
+            began[index] = start if poses.get(index, pose) == pose else command.stamp_ns
+            poses[index] = pose
     out = []
     for interval, command in zip(_unused(ordered), ordered, strict=True):
         index, reason = None, interval.reason
         if command.phase == Phase.MEASURE and command.plan_id != plan_id:
             reason = Reason.OTHER_PLAN
-        elif command.phase == Phase.MEASURE and command.stamp_ns < placed[command.view_index]:
+        elif command.phase == Phase.MEASURE and command.stamp_ns < began[command.view_index]:
             reason = Reason.SUPERSEDED
         elif command.phase == Phase.MEASURE:
             index, reason = command.view_index, None

@@ -12,6 +12,7 @@ from selfcal_ros.bagio import convert_in, convert_out
 from selfcal_ros.collection.collector import Collector, ViewProgress
 from selfcal_ros.collection.digest import readings_digest, session_digest
 from selfcal_ros.collection.messages import EncoderSample
+from selfcal_ros.collection.reasons import advice
 from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.nodes import names
@@ -29,7 +30,7 @@ class MeasurementCollector(SelfcalNode):
         self.collector = Collector(self.values)
         self._dirty, self._since_report, self._next_status = False, 0, 0.0
         self._published: dict[int, str] = {}
-        self._plan_id = ""
+        self._plan_id, self._advised = "", set()
         self._status = self.publisher(names.STATUS)
         self._measurement = self.publisher(names.MEASUREMENT)
         self.subscribe(names.DETECTIONS, self._on_detection)
@@ -99,7 +100,7 @@ class MeasurementCollector(SelfcalNode):
                  final: bool) -> None:
         timeline = self.collector.timeline
         if timeline.plan_id != self._plan_id:
-            self._plan_id, self._published = timeline.plan_id, {}
+            self._plan_id, self._published, self._advised = timeline.plan_id, {}, set()
         for index, view in progress.items():
             stamp = convert_out.session_stamp_ns(timeline, view)
             is_last = view is list(progress.values())[-1] or not view.complete
@@ -107,6 +108,8 @@ class MeasurementCollector(SelfcalNode):
                 self._status.publish(fill(names.STATUS.type(), convert_out.view_status(
                     view, timeline.plan_id, stamp, self.frame_id)))
             closed = view.end_ns <= timeline.last_stamp_ns
+            if closed or final:
+                self._advise(index, view)
             key = readings_digest(view.readings, measurements.rejected)
             ready = final or closed or view.complete
             worth = view.readings.used or index in self._published
@@ -115,6 +118,13 @@ class MeasurementCollector(SelfcalNode):
                 self._measurement.publish(fill(
                     names.MEASUREMENT.type(), convert_out.view_measurement(
                         view, measurements, stamp, self.frame_id)))
+
+    def _advise(self, index: int, view: ViewProgress) -> None:
+        """Say once for each view that is over what would mend its rejections."""
+        lines = advice(view.readings.rejected) if index not in self._advised else []
+        for line in lines:
+            self.get_logger().warning(f"view '{view.view.name}': {line}")
+            self._advised.add(index)
 
     def _finish(self) -> str:
         measurements, progress = self.collector.collect()

@@ -2,6 +2,7 @@
 """measurement_collector: the QoS it takes the encoder with, status, finish, readings sent on."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from selfcal_ros.collection.digest import readings_digest, session_digest
 from selfcal_ros.collection.messages import Command, Detection
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes.measurement_collector import MeasurementCollector
+from test.support.plans import plan_of
 from test.support.ros import publish_events
 from test.support.sessions import collected, events_of, small_plan
 
@@ -135,6 +137,20 @@ def test_a_late_solver_hears_the_views_that_are_done(graph):
     assert graph.call(Trigger, FINISH).success
     late = graph.listen(names.MEASUREMENT)
     graph.until(lambda: {m.view_index for m in late} == {0, 1}, "the latched views")
+
+
+def test_a_view_whose_lines_cannot_be_told_apart_says_once_what_to_do(graph, monkeypatch):
+    events = [replace(event, has_id=False) if isinstance(event, Detection) else event
+              for event in events_of(plan_of("0", 3, count=96, line=True))]
+    node = graph.node(MeasurementCollector, status_period=0.02)
+    said: list[str] = []
+    monkeypatch.setattr(node, "get_logger", lambda: SimpleNamespace(warning=said.append))
+    counts = publish_events(graph, events)
+    graph.until(lambda: received(node, counts), "all messages")
+    for _ in range(2):
+        assert graph.call(Trigger, FINISH).success
+    (line,) = said
+    assert line.startswith("view 'line': 96 detections rejected as rotation_not_known: ")
 
 
 def test_diagnostics_count_what_was_received(graph):
