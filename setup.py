@@ -39,8 +39,8 @@ setup(
     license="Apache-2.0",
     entry_points={
         "console_scripts": [
-            "selfcal = selfcal_ros.cli.main:main",
-            *(f"{node} = {NAME}.nodes.{node}:main" for node in NODES),
+            "selfcal = selfcal_ros.start:selfcal",
+            *(f"{node} = {NAME}.start:{node}" for node in NODES),
         ],
     },
 )

@@ -3,6 +3,6 @@
 
 import sys
 
-from selfcal_ros.cli.main import main
+from selfcal_ros.start import selfcal
 
-sys.exit(main())
+sys.exit(selfcal())

@@ -69,6 +69,9 @@ class BagReader:
     def _files(self) -> list[Path]:
         if self.path.is_file():
             return [self.path]
+        if not self.path.is_dir():
+            raise InputError(str(self.path), "neither a file nor a folder",
+                             "give an MCAP file or a rosbag2 folder")
         there = {p.name for p in self.path.iterdir() if p.name.endswith(SUFFIXES) and p.is_file()}
         names = self._listed() or sorted(
             (name for name in there if name.removesuffix(".zstd") not in there - {name}),

@@ -45,16 +45,19 @@ def build_parser() -> argparse.ArgumentParser:
 
 def main(argv: list[str] | None = None) -> int:
     """Run one verb and return its exit code."""
-    args = build_parser().parse_args(argv)
+    said = "selfcal"
     try:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})  # blocked by `start`
+        args = build_parser().parse_args(argv)
+        said = f"selfcal {args.verb}"
         code = int(args.run(args))
         sys.stdout.flush()
         return code
     except SelfcalError as error:
-        print(f"selfcal {args.verb}: {error}", file=sys.stderr)
+        print(f"{said}: {error}", file=sys.stderr)
         return int(error.exit_code)
     except KeyboardInterrupt:
-        print(f"selfcal {args.verb}: interrupted", file=sys.stderr)
+        print(f"{said}: interrupted", file=sys.stderr)
         return 128 + signal.SIGINT
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -6,6 +6,7 @@ import contextlib
 import fcntl
 import importlib.util
 import os
+import signal
 import subprocess
 import sys
 import tempfile
@@ -87,18 +88,32 @@ def _play(args: argparse.Namespace, saved: Path, environment: dict) -> tuple[int
 @contextlib.contextmanager
 def process(module: str, arguments: list[str], environment: dict, **kwargs,
             ) -> Iterator[subprocess.Popen]:
-    """Run a module as a process that is stopped, at worst killed, at the end of the block."""
-    child = subprocess.Popen([sys.executable, "-m", module, *arguments], env=environment, **kwargs)
+    """Run a module as a process that is stopped, at worst killed, at the end of the block.
+
+    Ctrl-C reaches the process from the terminal too. It is blocked there from the start, and let
+    through by `nodes.base.run` once the imports are done and it can be handled.
+    """
+    child, before = None, signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
+        child = subprocess.Popen([sys.executable, "-m", module, *arguments], env=environment,
+                                 **kwargs)
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
         yield child
     finally:
-        for stop in (child.terminate, child.kill):
-            if child.poll() is None:
-                stop()
-                with contextlib.suppress(subprocess.TimeoutExpired):
-                    child.wait(10)
-        if child.stdout:
-            child.stdout.close()
+        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        if child is not None:
+            _stop(child)
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _stop(child: subprocess.Popen) -> None:
+    for stop in (child.terminate, child.kill):
+        if child.poll() is None:
+            stop()
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                child.wait(10)
+    if child.stdout:
+        child.stdout.close()
 
 
 @contextlib.contextmanager

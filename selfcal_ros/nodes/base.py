@@ -143,7 +143,6 @@ def run(make_node: Callable[[], Node], argv: list[str] | None = None) -> int:
     A signal completes the future that the executor spins on, between two callbacks, so that no
     callback is torn and what a node has to finish in `close` is finished.
     """
-    rclpy.init(args=argv, signal_handler_options=SignalHandlerOptions.NO)
     stop = Future()
     signalled: list[int] = []
 
@@ -155,8 +154,10 @@ def run(make_node: Callable[[], Node], argv: list[str] | None = None) -> int:
 
     for number in STOP_SIGNALS:
         signal.signal(number, on_signal)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, STOP_SIGNALS)  # blocked while modules are imported
     node, code = None, int(ExitCode.DONE)
     try:
+        rclpy.init(args=argv, signal_handler_options=SignalHandlerOptions.NO)
         node = make_node()
         finished = getattr(node, "finished", None)
         if finished is not None:

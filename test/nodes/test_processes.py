@@ -138,3 +138,57 @@ def test_an_interrupted_replay_leaves_no_process(graph, group, tmp_path, whole_g
     assert code == 128 + signal.SIGINT
     assert "selfcal replay: interrupted" in err
     assert "Traceback" not in err
+
+
+INTERRUPT_WHILE_IMPORTING = """
+import signal, sys
+
+class Finder:
+    def find_spec(self, name, *_):
+        if name == {module!r}:
+            signal.raise_signal(signal.SIGINT)
+
+sys.meta_path.insert(0, Finder())
+from selfcal_ros import start
+sys.argv = {argv!r}
+sys.exit(start.{command}())
+"""
+
+
+@pytest.mark.parametrize("module", ["rclpy", "numpy", "selfcal_ros.estimation.api"])
+def test_a_signal_while_a_node_is_imported_ends_it_cleanly(group, module):
+    code, out, err = ended(group.start("-c", INTERRUPT_WHILE_IMPORTING.format(
+        module=module, argv=["solver"], command="solver")))
+    assert (code, out, err) == (0, "", "")
+
+
+@pytest.mark.parametrize("module", ["argparse", "selfcal_ros.cli.solve", "selfcal_ros.errors"])
+def test_a_signal_while_the_command_is_imported_is_one_line(group, module):
+    code, out, err = ended(group.start("-c", INTERRUPT_WHILE_IMPORTING.format(
+        module=module, argv=["selfcal", "solve", "none"], command="selfcal")))
+    assert (out, err) == ("", "selfcal: interrupted\n")
+    # the interpreter may repeat the signal for its parent: a shell has 130 for both
+    assert code in (128 + signal.SIGINT, -signal.SIGINT)
+
+
+INTERRUPT_WHILE_STARTING = """
+import os, signal, subprocess, sys
+from selfcal_ros import start
+
+class Popen(subprocess.Popen):
+    def __init__(self, command, **kwargs):
+        super().__init__(command, **kwargs)
+        os.kill(self.pid, signal.SIGINT)
+        if "selfcal_ros.nodes.replay_session" in command:
+            os.kill(os.getpid(), signal.SIGINT)
+
+subprocess.Popen = Popen
+sys.argv = {argv!r}
+sys.exit(start.selfcal())
+"""
+
+
+def test_a_replay_interrupted_while_its_nodes_start_is_one_line(group, tmp_path):
+    argv = ["selfcal", "replay", str(small_bag(tmp_path)), "--rate", "0.001"]
+    code, out, err = ended(group.start("-c", INTERRUPT_WHILE_STARTING.format(argv=argv)))
+    assert (code, out, err) == (128 + signal.SIGINT, "", "selfcal replay: interrupted\n")
