@@ -171,24 +171,38 @@ def test_a_signal_while_the_command_is_imported_is_one_line(group, module):
     assert code in (128 + signal.SIGINT, -signal.SIGINT)
 
 
-INTERRUPT_WHILE_STARTING = """
-import os, signal, subprocess, sys
+SITE = """
+import signal, sys
+
+class Finder:
+    def find_spec(self, name, *_):
+        if name == "diagnostic_msgs.msg":  # by every node, not by the command itself
+            signal.raise_signal(signal.SIGINT)
+
+sys.meta_path.insert(0, Finder())
+"""
+INTERRUPTED_REPLAY = """
+import os, signal, sys
 from selfcal_ros import start
+from selfcal_ros.cli import replay
 
-class Popen(subprocess.Popen):
-    def __init__(self, command, **kwargs):
-        super().__init__(command, **kwargs)
-        os.kill(self.pid, signal.SIGINT)
-        if "selfcal_ros.nodes.replay_session" in command:
-            os.kill(os.getpid(), signal.SIGINT)
+def play(*args, play=replay._play):
+    try:
+        return play(*args)
+    finally:
+        os.kill(os.getpid(), signal.SIGINT)
 
-subprocess.Popen = Popen
+replay._play = play
 sys.argv = {argv!r}
 sys.exit(start.selfcal())
 """
 
 
-def test_a_replay_interrupted_while_its_nodes_start_is_one_line(group, tmp_path):
+def test_a_replay_interrupted_while_its_nodes_are_imported_is_one_line(group, tmp_path):
+    (tmp_path / "site").mkdir()
+    (tmp_path / "site" / "sitecustomize.py").write_text(SITE)
+    group.environment["PYTHONPATH"] = os.pathsep.join(
+        [str(tmp_path / "site"), group.environment.get("PYTHONPATH", "")])
     argv = ["selfcal", "replay", str(small_bag(tmp_path)), "--rate", "0.001"]
-    code, out, err = ended(group.start("-c", INTERRUPT_WHILE_STARTING.format(argv=argv)))
+    code, out, err = ended(group.start("-c", INTERRUPTED_REPLAY.format(argv=argv)))
     assert (code, out, err) == (128 + signal.SIGINT, "", "selfcal replay: interrupted\n")
