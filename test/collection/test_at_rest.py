@@ -102,6 +102,23 @@ def test_noise_of_an_unneeded_joint_is_no_motion(size):
         assert found.all_rejected() == {}
 
 
+def test_noise_of_a_told_speed_is_no_motion_though_the_position_stands_still():
+    cell, rng = scene(count=0), np.random.default_rng(1)
+    noisy = [replace(s, velocities=(0.0, 0.0, rng.normal(0, 0.05))) for s in cell.samples]
+    found, _ = collect([*cell.commands, *noisy, *cell.detections])
+    assert found.all_rejected() == {}
+
+
+def test_the_noise_is_that_of_all_samples_whenever_it_is_asked_for():
+    joint, noise = JointTrack(LIMITS), np.random.default_rng(3).normal(0, 1e-4, 300)
+    for number in range(10):
+        joint.add(number * 2 * MS, 1.0 * (number == 9), math.nan)
+    assert joint.moving(np.array([17 * MS])).tolist() == [Reason.MOVING]
+    for number, position in enumerate(noise, 10):
+        joint.add(number * 2 * MS, 1.0 + 1e4 * position, math.nan)
+    assert joint.moving(np.array([17 * MS])).tolist() == [None]
+
+
 def steps(rng, motion, *, sigma, speeds=False):
     """Return a track of 400 samples, 2 ms apart: noise on a motion in units per s."""
     joint, position = JointTrack(LIMITS), 0.0

@@ -7,7 +7,12 @@ from math import pi
 import numpy as np
 import pytest
 
-from selfcal_ros.collection.identify import IdentityRules, identify_angular, identify_grid
+from selfcal_ros.collection.identify import (
+    IdentityRules,
+    _middle,
+    identify_angular,
+    identify_grid,
+)
 from selfcal_ros.collection.messages import Kind
 from selfcal_ros.collection.reasons import Reason, advice
 from selfcal_ros.collection.rigid import LARGEST_TURN_RAD, Rigid, fit_motion
@@ -221,6 +226,30 @@ def test_a_rotation_is_told_to_the_lines_only_where_enough_marks_agree_on_it():
     repeated = fit_motion(np.repeat(p, 9, axis=1), np.repeat(off, 9, axis=1))
     assert repeated.marks == 3
     assert repeated.phi_error_rad == pytest.approx(fit.phi_error_rad)
+    one, nine = fit.known(0.01, 0.035), repeated.known(0.01, 0.035)
+    assert nine.phi_error_rad == pytest.approx(one.phi_error_rad)
+    assert nine.offset_error_m == pytest.approx(one.offset_error_m)
+    assert fit_motion(p, off + 1.0).known(0.01, 0.035).phi_error_rad == pytest.approx(
+        one.phi_error_rad)
+
+
+def test_named_marks_of_a_plate_that_was_put_in_a_quarter_turn_off_are_too_far():
+    artifact = Artifact(5, 0.01, 0)
+    marks = np.stack([artifact.m.ravel(), artifact.n.ravel()])
+    found = identify_grid(artifact, View("v"), np.stack([-marks[1], marks[0]]) * 0.01, ids=marks,
+                          has_id=np.ones(25, bool), rules=RULES)
+    good = found.reasons == None  # noqa: E711
+    assert good.sum() == 1 and (marks[:, good] == 0).all()
+    assert set(found.reasons[~good]) == {Reason.TOO_FAR}
+
+
+@pytest.mark.parametrize("centre", [0.0, 0.3, 0.5, -0.45, 1.2])
+def test_the_median_on_a_circle_does_not_depend_on_where_it_is_cut(centre):
+    off = np.array([-0.2, -0.15, 0.0, 0.05, 0.1])
+    found = _middle((centre + off) * 2.0, 2.0) / 2.0
+    assert abs(found) <= 0.5
+    assert (found - centre + 0.5) % 1.0 == pytest.approx(0.5)
+    assert _middle(np.zeros(0), 2.0) == 0.0
 
 
 def test_grid_marks_that_disagree_leave_fine_lines_unread():

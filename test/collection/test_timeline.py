@@ -97,6 +97,13 @@ def test_a_view_measured_again_without_place_has_two_intervals():
     assert len(build_timeline(commands).of_view(0)) == 2
 
 
+def test_another_pose_stays_superseded_when_its_view_goes_on():
+    shifted = replace(PLAN.views[0], translation_m=(0.01, 0.0))
+    commands = [command(10, PLACE), command(20, MEASURE), command(30, MEASURE, view=shifted),
+                command(40, MEASURE, view=shifted)]
+    assert owners(commands, 20, 30, 40) == [OLD, 0, 0]
+
+
 def test_a_place_that_no_measure_follows_supersedes_nothing():
     assert owners([*WHOLE[:2], command(30, PLACE)], 20, 30) == [0, OUT]
 
