@@ -12,7 +12,14 @@ from rosbags.serde import SerdeError
 from rosbags.typesys.store import Typestore
 
 from selfcal_ros.bagio.mcap_stream import McapStream
-from selfcal_ros.bagio.schemas import other_field, shorter_stores, store_of_schema
+from selfcal_ros.bagio.schemas import (
+    other_field,
+    own_message,
+    same_layout,
+    shorter_stores,
+    store_of_schema,
+    typestore,
+)
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import read_yaml
 
@@ -27,6 +34,21 @@ INPUT_TOPICS = {
 LAST_FIELDS = {ENCODER_TOPIC: "position", DETECTION_TOPIC: "score", COMMAND_TOPIC: "angular_count"}
 """Last field that the contract asks for; what stands behind it may be missing."""
 SUFFIXES = (".mcap", ".mcap.zstd")
+LITTLE_ENDIAN = 1
+"""Second byte of CDR."""
+
+
+@dataclass(frozen=True)
+class _Decoder:
+    """How the messages of a channel are decoded.
+
+    `own` tells that their type is the one known here, `why` what to say if they do not decode.
+    """
+
+    role: str
+    decode: Callable[[bytes], object]
+    own: bool
+    why: str = ""
 
 
 @dataclass
@@ -120,27 +142,43 @@ class BagReader:
             If a topic has another type, encoding or message version than the contract's, or the
             bag holds several namespaces.
         """
-        decoders: dict[tuple[Path, int], tuple[str, Callable, str] | None] = {}
+        for role, stamp, decoded, _ in self._decoded():
+            yield role, stamp, decoded
+
+    def cdr_messages(self) -> Iterator[tuple[str, int, bytes]]:
+        """Yield (topic, time of logging in ns, CDR bytes) of the three input topics.
+
+        The bytes are of the types known here, whatever fields the bag's have. What cannot be
+        decoded is left out as in `messages`, so that both say the same. Raises as they do.
+        """
+        for role, stamp, decoded, data in self._decoded():
+            name = INPUT_TOPICS[role]
+            yield role, stamp, data or bytes(
+                typestore().serialize_cdr(own_message(decoded, name), name))
+
+    def _decoded(self) -> Iterator[tuple[str, int, object, bytes]]:
+        """Yield topic, time, message, and its bytes if they are of the type known here."""
+        decoders: dict[tuple[Path, int], _Decoder | None] = {}
         bad: Counter = Counter()
         for stream, channel, message in self._all():
             key = (stream.path, channel.id)
             if key not in decoders:
                 decoders[key] = self._decoder(stream, channel)
-            entry = decoders[key]
-            if entry is None:
+            decoder = decoders[key]
+            if decoder is None:
                 continue
-            role, decode, _ = entry
             try:
-                decoded = decode(message.data)
+                decoded = decoder.decode(message.data)
             except Exception:  # a damaged payload may fail anywhere in the decoder
-                bad[entry[::2]] += 1
+                bad[decoder.role, decoder.why] += 1
                 continue
-            yield role, message.log_time, decoded
+            own = decoder.own and message.data[1] == LITTLE_ENDIAN
+            yield decoder.role, message.log_time, decoded, message.data if own else b""
         self.lost += [f"{count} messages on {role} could not be decoded{why}"
                       for (role, why), count in bad.items()]
 
-    def _decoder(self, stream: McapStream, channel: Channel) -> tuple[str, Callable, str] | None:
-        """Return role, decoder and what to say if it fails, None for a topic that is not ours."""
+    def _decoder(self, stream: McapStream, channel: Channel) -> _Decoder | None:
+        """Return how a channel is decoded, None for a topic that is not ours."""
         role = self._role(channel.topic)
         if role is None:
             return None
@@ -157,13 +195,14 @@ class BagReader:
         store = store_of_schema(name, schema.encoding if schema else "ros2msg", text, where)
         if not text.strip():
             stores = [store, *shorter_stores(name, LAST_FIELDS[role])]
-            return role, lambda data: _first_that_fits(stores, name, data), (
-                f": the bag holds no definition of {name}, and they do not fit the one known here")
+            return _Decoder(role, lambda data: _first_that_fits(stores, name, data), False, (
+                f": the bag holds no definition of {name}, and they do not fit the one known here"))
         other = other_field(store, name, LAST_FIELDS[role])
         if other:
             raise InputError(where, f"another version of {name}: {other}",
                              "record the bag with the messages of this version")
-        return role, lambda data: store.deserialize_cdr(data, name), ""
+        return _Decoder(role, lambda data: store.deserialize_cdr(data, name),
+                        same_layout(store, name))
 
     def _role(self, topic: str) -> str | None:
         for role in INPUT_TOPICS:

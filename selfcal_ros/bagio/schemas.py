@@ -5,6 +5,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
@@ -88,6 +89,28 @@ def shorter_stores(name: str, last: str) -> tuple[Typestore, ...]:
         store.register({name: (constants, fields[:count])})
         stores.append(store)
     return tuple(stores)
+
+
+def same_layout(store: Typestore, name: str) -> bool:
+    """Return whether a type has the fields of the one known here and no others, in their order."""
+    wanted = typestore().fielddefs[name][1]
+    return store.fielddefs[name][1] == wanted and all(
+        same_layout(store, inner) for _, (kind, inner) in wanted if kind == Nodetype.NAME)
+
+
+def own_message(message: Any, name: str) -> object:
+    """Return a message of the type known here with every field that `message` has as well.
+
+    Fields that it does not have are 0 or empty.
+    """
+    values = {}
+    for field, (kind, inner) in typestore().fielddefs[name][1]:
+        if kind == Nodetype.NAME:
+            values[field] = own_message(getattr(message, field), inner)
+        else:
+            missing = np.zeros(0) if kind != Nodetype.BASE else "" if inner[0] == "string" else 0
+            values[field] = getattr(message, field, missing)
+    return typestore().types[name](**values)
 
 
 def other_field(store: Typestore, name: str, last: str) -> str:

@@ -12,7 +12,7 @@ from rclpy.duration import Duration
 from selfcal_ros.bagio.reader import COMMAND_TOPIC, DETECTION_TOPIC, ENCODER_TOPIC, BagReader
 from selfcal_ros.errors import NoDataError
 from selfcal_ros.nodes import names
-from selfcal_ros.nodes.base import SelfcalNode, fill
+from selfcal_ros.nodes.base import SelfcalNode
 
 KINDS = {ENCODER_TOPIC: "encoder", DETECTION_TOPIC: "detection", COMMAND_TOPIC: "command"}
 WINDOW = 1500
@@ -24,14 +24,14 @@ UNHEARD_RATE = 4000
 class Player:
     """Publishes the input topics of a bag from the timers of a node.
 
-    Messages are re-encoded with this package's types, so that a bag with more or fewer trailing
-    fields plays as well. `seed` shuffles the order of arrival, not the stamps.
+    Messages go out as the bytes that the bag has, or are re-encoded where its types have other
+    trailing fields than this package's. `seed` shuffles the order of arrival, not the stamps.
     """
 
     def __init__(self, node: SelfcalNode, bag: str, *, rate: float, seed: int) -> None:
         self.node, self.rate = node, rate
         self.reader = BagReader(Path(bag))
-        items = list(self.reader.stamped_messages())
+        items = list(self.reader.cdr_messages())
         if not items:
             raise NoDataError(bag, "no message on the topics of the contract", "see the README")
         items.sort(key=lambda item: item[1])
@@ -42,7 +42,6 @@ class Player:
                      for i, stamp in zip(order, times, strict=True)]
         self._items = items
         self._publishers = {topic.name: node.publisher(topic) for topic in names.INPUTS}
-        self._types = {topic.name: topic.type for topic in names.INPUTS}
         self.sent = dict.fromkeys(KINDS.values(), 0)
         self.heard: dict[str, int] | None = None
         self._at, self._began = 0, None
@@ -77,12 +76,12 @@ class Player:
         first = self._items[0][1]
         stop = now + 0.02
         while not self.done and time.monotonic() < stop:
-            topic, stamp, message = self._items[self._at]
+            topic, stamp, data = self._items[self._at]
             if self.rate > 0 and (stamp - first) * 1e-9 / self.rate > now - self._began:
                 return
             if not self._room():
                 return
-            self._publishers[topic].publish(_converted(message, self._types[topic]()))
+            self._publishers[topic].publish(data)
             self.sent[KINDS[topic]] += 1
             self._at += 1
 
@@ -102,18 +101,3 @@ class Player:
         """Wait until everything has been acknowledged."""
         for publisher in self._publishers.values():
             publisher.wait_for_all_acked(Duration(seconds=10))
-
-
-def _converted(message: Any, target: Any) -> Any:
-    """Return `target` with every field that `message` has as well."""
-    return fill(target, _fields(message, target))
-
-
-def _fields(message: Any, target: Any) -> dict[str, Any]:
-    out = {}
-    for name in target.get_fields_and_field_types():
-        if hasattr(message, name):
-            value, wanted = getattr(message, name), getattr(target, name)
-            nested = hasattr(wanted, "get_fields_and_field_types")
-            out[name] = _fields(value, wanted) if nested else value
-    return out

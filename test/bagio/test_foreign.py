@@ -6,8 +6,10 @@ import yaml
 import zstandard
 from rosbags.rosbag2 import CompressionMode, Reader
 
-from selfcal_ros.bagio.offline import collect_bag
-from selfcal_ros.bagio.reader import BagReader
+from selfcal_ros.bagio.offline import collect_bag, feeder
+from selfcal_ros.bagio.reader import INPUT_TOPICS, BagReader
+from selfcal_ros.bagio.schemas import typestore
+from selfcal_ros.collection.collector import Collector
 from selfcal_ros.collection.messages import Command, Detection, EncoderSample
 from selfcal_ros.collection.parameters import parameter_values
 from selfcal_ros.errors import InputError, NoDataError
@@ -283,3 +285,39 @@ def test_a_folder_with_the_name_of_a_file_is_no_file(tmp_path, events, expected)
     Foreign().write(tmp_path / "bag" / "a.mcap", events)
     (tmp_path / "bag" / "b.mcap").mkdir()
     check(tmp_path / "bag", expected)
+
+
+def played(path):
+    """Return the result of the bytes that a player sends, decoded by the own types."""
+    messages = [(topic, typestore().deserialize_cdr(data, INPUT_TOPICS[topic]))
+                for topic, _, data in BagReader(path).cdr_messages()]
+    collector = Collector(VALUES)
+    feed = feeder(collector, [])
+    for topic, message in messages:
+        feed[topic](message)
+    return result_to_dict(calibrate(collector.collect()[0], Options()))
+
+
+@pytest.mark.parametrize("options", [
+    {}, {"types": bags.contract_types(EXTRA)}, {"schemas": False},
+    {"types": bags.contract_types(command=bags.COMMAND + "uint32 grid_size_y\n")}],
+    ids=["contract", "more fields", "no definitions", "one version back"])
+def test_the_bytes_to_play_are_of_the_own_types_and_give_the_same(tmp_path, events, expected,
+                                                                 options):
+    path = Foreign(**options).write(tmp_path / "x.mcap", events)
+    assert played(path) == expected
+
+
+def test_bytes_of_the_own_types_are_played_as_they_are(tmp_path, events):
+    path = Foreign().write(tmp_path / "x.mcap", events)
+    raw = {message.data for _, _, message in BagReader(path)._all()}
+    sent = [(topic, data) for topic, _, data in BagReader(path).cdr_messages()]
+    assert {topic for topic, data in sent if data not in raw} == {"selfcal/view_command"}
+
+
+def test_bytes_of_the_other_order_are_turned(tmp_path, events, expected):
+    types = bags.contract_types()
+    swapped = Foreign(little=False, types=types).write(tmp_path / "x.mcap", events)
+    check(swapped, expected)
+    assert played(swapped) == expected
+    assert {data[1] for _, _, data in BagReader(swapped).cdr_messages()} == {1}

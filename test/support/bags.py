@@ -127,8 +127,9 @@ class Foreign:
         Whether topics of types that are not known here stand beside ours.
     footer : bool
         Whether the file is finished, or ends after the last full chunk.
-    schemas, encoding, renamed :
-        Whether definitions are written, the encoding of messages, and other types of topics.
+    schemas, little, encoding, renamed :
+        Whether definitions are written, the order of bytes, the encoding of messages, and other
+        types of topics.
     """
 
     options: dict = field(default_factory=dict)
@@ -137,6 +138,7 @@ class Foreign:
     others: bool = False
     footer: bool = True
     schemas: bool = True
+    little: bool = True
     encoding: str = "cdr"
     renamed: dict[str, str] = field(default_factory=dict)
 
@@ -164,7 +166,8 @@ class Foreign:
 
     def _payload(self, event: Event) -> tuple[str, bytes]:
         topic, typename, message = contract_message(self.types, event)
-        return topic, bytes(self.types.serialize_cdr(message, typename))
+        return topic, bytes(self.types.serialize_cdr(message, typename,
+                                                     little_endian=self.little))
 
     def _channels(self, writer: Writer, order: int) -> Callable[[str, int, bytes], None]:
         topics = dict(TOPICS)
