@@ -86,13 +86,12 @@ class Factor:
         turned = folded.phase.conj()[:, None] * columns
         work = np.zeros((folded.size, turned.shape[1]), dtype=complex)
         work[:n] = turned[folded.free[self.dissection.order]]
-        real = work.view(float)
-        self._forward(real)
+        self._forward(work)
         closed = turned[folded.cut]
         np.add.at(closed, folded.copy_of, folded.copy_phase.conj()[:, None] * work[n:])
         closed = self._cut_inverse @ closed
         work[n:] = folded.copy_phase[:, None] * closed[folded.copy_of]
-        self._backward(real)
+        self._backward(work)
         out = np.empty_like(work[:len(right)])
         out[folded.free[self.dissection.order]] = work[:n]
         out[folded.cut] = closed
@@ -100,19 +99,23 @@ class Factor:
         return out.reshape(right.shape)
 
     def _forward(self, work: np.ndarray) -> None:
+        real, lanes = work.view(float), _lanes(work)
         for front, (inverse, below) in zip(self.dissection.fronts, self._blocks, strict=True):
-            own = inverse @ work[front.start:front.stop]
-            work[front.start:front.stop] = own
+            own = inverse @ real[front.start:front.stop]
+            real[front.start:front.stop] = own
             if len(below):
-                work[front.boundary] -= below @ own
+                left = (below @ own).view(complex).reshape(-1, *lanes.shape[1:])
+                lanes[front.boundary] = lanes.take(front.boundary, axis=0) - left
 
     def _backward(self, work: np.ndarray) -> None:
+        real, lanes = work.view(float), _lanes(work)
         for front, (inverse, below) in zip(reversed(self.dissection.fronts),
                                            reversed(self._blocks), strict=True):
-            own = work[front.start:front.stop]
+            own = real[front.start:front.stop]
             if len(below):
-                own = own - below.T @ work[front.boundary]
-            work[front.start:front.stop] = inverse.T @ own
+                later = lanes.take(front.boundary, axis=0).view(float)
+                own = own - below.T @ later.reshape(len(below), -1)
+            real[front.start:front.stop] = inverse.T @ own
 
     def inverse_diagonal(self) -> np.ndarray:
         """Return the diagonal of the inverse, real (sites,)."""
@@ -145,6 +148,11 @@ class Factor:
         z[own:, own:], z[:own, own:], z[own:, :own] = z22, -z12, -z12.T
         z[:own, :own] = inverse + z12 @ weight.T
         return z
+
+
+def _lanes(work: np.ndarray) -> np.ndarray:
+    """Return (n, k) as (n,) if k is 1: single numbers are indexed faster than rows."""
+    return work.reshape(-1) if work.shape[1] == 1 else work
 
 
 def _mirrored(lower: np.ndarray) -> np.ndarray:

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.fft import dct, dctn, idctn, next_fast_len
 
+from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.lattice import PHASES
 from selfcal_ros.estimation.normal_grid import GridSystem
 
@@ -61,9 +62,7 @@ class GridIteration:
 
     def __init__(self, grid: GridSystem, inverse: np.ndarray) -> None:
         self.grid, self.inverse = grid, inverse
-        self._columns = np.ascontiguousarray(grid.columns.reshape(grid.n_sites, -1).T)
         self._diagonal = grid.views.scatter_weight(grid.weight)
-        self._diagonal.ravel()[grid.pins] += grid.mean_weight
         self._symbols = preconditioner_symbols(grid)
         size = max(grid.views.shape)
         slow = next_fast_len(size, real=True) != size and size <= DENSE_DCT
@@ -72,15 +71,10 @@ class GridIteration:
         self._pool = ThreadPoolExecutor(2) if slow else None
         self._x, self._y = grid.views.z[:, 0].real, grid.views.z[0].imag
 
-    def coupled(self, field: np.ndarray) -> np.ndarray:
-        """Return C^H field: what a field asks of phi, Re tau, Im tau of each view."""
-        sums = (self._columns @ field.conj().ravel()).conj().reshape(-1, 2)
-        return np.stack([sums[:, 0].real, sums[:, 1].real, sums[:, 1].imag], axis=1).ravel()
-
     def spread(self, parameters: np.ndarray) -> np.ndarray:
         """Return C parameters as a field."""
         p = parameters.reshape(-1, 3)
-        flat = np.stack([p[:, 0] + 0j, p[:, 1] + 1j * p[:, 2]], axis=1).ravel() @ self._columns
+        flat = np.stack([p[:, 0] + 0j, p[:, 1] + 1j * p[:, 2]], axis=1).ravel() @ self.grid.columns
         return flat.reshape(self.grid.views.shape)
 
     def product(self, field: np.ndarray) -> np.ndarray:
@@ -89,7 +83,7 @@ class GridIteration:
         mean = grid.views.gather_mean(field, grid.share)
         out = self._diagonal * field
         grid.views.subtract_scattered(out, grid.weight, mean)
-        out -= self.spread(self.inverse @ self.coupled(field))
+        out -= self.spread(self.inverse @ grid.coupled(field.ravel()))
         return out
 
     def remove_rigid(self, field: np.ndarray) -> None:
@@ -158,8 +152,8 @@ class GridIteration:
 
         Raises
         ------
-        numpy.linalg.LinAlgError
-            If the residual does not fall to `tolerance`.
+        InputError
+            If the residual does not fall to `tolerance`: weights differ by many orders.
         """
         right = b - self.spread(self.inverse @ d)
         self.remove_rigid(right)
@@ -169,8 +163,10 @@ class GridIteration:
         count, direction, rho = 0, np.zeros_like(b), 1.0
         while (size := _norm(left)) > target:
             if count == MAX_ITERATIONS:
-                raise np.linalg.LinAlgError(
-                    f"the residual stays at {size / target * tolerance:.1e}")
+                raise InputError(
+                    "weights", f"the residual stays at {size / target * tolerance:.1e} after "
+                    f"{MAX_ITERATIONS} iterations, because repeats or declared uncertainties "
+                    "differ too much", "leave out the weakest readings")
             z = self.precondition(left)
             new = _dot(left, z)
             direction *= new / rho if count else 0.0
@@ -184,7 +180,7 @@ class GridIteration:
             self.remove_rigid(left)
             count += 1
         true = _norm(right - self.product(field)) / max(_norm(right), 1e-300)
-        parameters = self.inverse @ (d - self.coupled(field))
+        parameters = self.inverse @ (d - self.grid.coupled(field.ravel()))
         return Iterated(field, parameters, count, true)
 
 

@@ -114,14 +114,18 @@ class GridSystem:
 
     @cached_property
     def columns(self) -> np.ndarray:
-        """Coupling of sites to phi and tau, complex (sites, views, 2), plate eliminated."""
+        """Coupling of sites to phi and tau, complex (2 views, sites), plate eliminated."""
         meant = self.share[:, None] * self.shapes
         out = np.zeros_like(meant)
         for v, weight in enumerate(self.weight):
             part = meant * -weight
             part[v] += weight * self.shapes
             self.views.add_scattered(out, v, part)
-        return out.reshape(self.n_views, 2, self.n_sites).transpose(2, 0, 1)
+        return out.reshape(2 * self.n_views, self.n_sites)
+
+    def coupled(self, fields: np.ndarray) -> np.ndarray:
+        """Return what fields (sites, ...) ask of phi, Re, Im tau of the views, (3 views, ...)."""
+        return _of_misalignments((self.columns @ fields.conj()).conj())
 
     @cached_property
     def block(self) -> np.ndarray:
@@ -142,15 +146,13 @@ class GridSystem:
     @cached_property
     def response(self) -> np.ndarray:
         """M^-1 times `columns`: the sites' answer to phi, Re tau, Im tau, (sites, 3 views)."""
-        flat = self.columns.reshape(self.n_sites, -1)
-        solved = self.factor.solve(flat).reshape(self.n_sites, self.n_views, 2)
-        return _real_columns(solved).reshape(self.n_sites, -1)
+        solved = self.factor.solve(np.ascontiguousarray(self.columns.T))
+        return _real_columns(solved.reshape(self.n_sites, self.n_views, 2))
 
     @cached_property
     def schur(self) -> np.ndarray:
         """Normal matrix of the misalignments alone, real symmetric (3 views, 3 views)."""
-        c = _real_columns(self.columns).reshape(self.n_sites, -1)
-        out = self.block - np.real(c.conj().T @ self.response)
+        out = self.block - self.coupled(self.response)
         return (out + out.T) / 2
 
     @cached_property
@@ -161,18 +163,15 @@ class GridSystem:
     def right_side(self, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the right-hand sides of sites (complex) and misalignments (real)."""
         weighted = self.weight * self.centred(y)
-        sums = np.einsum("cij,vij->vc", np.conj(self.shapes), weighted)
-        d = np.stack([sums[:, 0].real, sums[:, 1].real, sums[:, 1].imag], axis=1)
-        return self.views.scatter(weighted).ravel(), d.ravel()
+        shapes = self.shapes.reshape(2, -1)
+        sums = (shapes @ weighted.conj().reshape(self.n_views, -1).T).conj()
+        return self.views.scatter(weighted).ravel(), _of_misalignments(sums.T.ravel())
 
     def reduced(self, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return M^-1 b and the right-hand side of the misalignments with sites eliminated."""
         b, d = self.right_side(y)
         free = self.factor.solve(b)
-        c = self.columns.reshape(self.n_sites, -1)
-        sums = (np.conj(c).T @ free).reshape(self.n_views, 2)
-        d = d - np.stack([sums[:, 0].real, sums[:, 1].real, sums[:, 1].imag], axis=1).ravel()
-        return free, d
+        return free, d - self.coupled(free)
 
     def misaligned(self, parameters: np.ndarray) -> np.ndarray:
         """Return phi i z + tau at every mark, complex (views, nx, ny)."""
@@ -186,6 +185,14 @@ class GridSystem:
         return a, np.where(self.read, left - a, 0.0)
 
 
+def _of_misalignments(sums: np.ndarray) -> np.ndarray:
+    """Return sums over phi and tau of each view (2 views, ...) as phi, Re tau, Im tau."""
+    pairs = sums.reshape(-1, 2, *sums.shape[1:])
+    parts = (pairs[:, 0].real, pairs[:, 1].real, pairs[:, 1].imag)
+    return np.stack(parts, axis=1).reshape(-1, *sums.shape[1:])
+
+
 def _real_columns(pairs: np.ndarray) -> np.ndarray:
-    """Return (..., 2) columns of phi and Re tau as (..., 3): Im tau is i times Re tau."""
-    return np.concatenate([pairs, 1j * pairs[..., 1:]], axis=-1)
+    """Return (sites, views, 2) of phi and Re tau as (sites, 3 views): Im tau is i times Re tau."""
+    three = np.concatenate([pairs, 1j * pairs[..., 1:]], axis=-1)
+    return three.reshape(len(pairs), -1)

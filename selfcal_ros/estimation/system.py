@@ -63,10 +63,9 @@ class JointSystem:
         sites = self.grid.n_sites
         if sites <= DIRECT_SITES or sites > MAX_DIRECT_SITES:
             return sites <= DIRECT_SITES
-        # iteration slows down where marks are missing or weigh very differently
+        # iteration slows down where readings weigh very differently
         weight = self.grid.weight
-        return bool((self.grid.read != self.grid.views.in_field).any()
-                    or weight.max() > 2 * weight[self.grid.read].min())
+        return bool(weight.max() > 2 * weight[self.grid.read].min())
 
     @cached_property
     def _core(self) -> GridSystem:
@@ -95,9 +94,12 @@ class JointSystem:
 
     def normal(self, ratio: float) -> np.ndarray:
         """Return the normal matrix of all misalignments; `ratio` weighs the angular readings."""
+        return self._joined(self.grid.schur, ratio)
+
+    def _joined(self, of_grid: np.ndarray, ratio: float) -> np.ndarray:
         out = np.zeros((self.size, self.size))
         n = 3 * self.grid.n_views
-        out[:n, :n] = self._core.schur
+        out[:n, :n] = of_grid
         out[np.ix_(self.phi_at, self.phi_at)] += ratio * self.angular.schur
         return out
 
@@ -107,7 +109,7 @@ class JointSystem:
 
         Ranks refer to it: what is left after the elimination may be nothing but rounding.
         """
-        return _trace(self._core)
+        return _trace(self.grid)
 
     @cached_property
     def angular_scale(self) -> float:
@@ -115,19 +117,14 @@ class JointSystem:
         return float(max(self.angular.weight.sum(), np.finfo(float).tiny))
 
     @cached_property
-    def spectrum_grid(self) -> tuple[np.ndarray, np.ndarray]:
-        """Eigenvalues and vectors of the grid's misalignment matrix."""
-        return np.linalg.eigh(self._core.schur)
-
-    @cached_property
     def rank_schur(self) -> int:
         """Rank of the grid's misalignment matrix."""
-        return _rank(self.spectrum_grid[0], self.grid_scale)
+        return _rank(np.linalg.eigvalsh(self._core.schur), _trace(self._core))
 
     @cached_property
     def grid_inverse(self) -> np.ndarray:
-        """Pseudo-inverse of the grid's misalignment matrix."""
-        return pseudo_inverse(*self.spectrum_grid, self.grid_scale)
+        """Pseudo-inverse of the grid's misalignment matrix: their covariance, unit noise."""
+        return pseudo_inverse(*np.linalg.eigh(self.grid.schur), self.grid_scale)
 
     @cached_property
     def angular_inverse(self) -> np.ndarray:
@@ -158,15 +155,12 @@ class JointSystem:
         return int(nodes - len(parts.balanced) + rank)
 
     @cached_property
-    def _spectrum(self) -> tuple[np.ndarray, np.ndarray]:
-        scale = self.grid_scale / self.angular_scale if self.angular.n_views else 0.0
-        return np.linalg.eigh(self.normal(scale))
-
-    @cached_property
     def _null(self) -> np.ndarray:
         """Orthonormal misalignments that no reading tells, (size, nullity)."""
-        values, vectors = self._spectrum
-        return vectors[:, values <= GAP * self.grid_scale]
+        size = _trace(self._core)
+        ratio = size / self.angular_scale if self.angular.n_views else 0.0
+        values, vectors = np.linalg.eigh(self._joined(self._core.schur, ratio))
+        return vectors[:, values <= GAP * size]
 
     @cached_property
     def nullity(self) -> int:

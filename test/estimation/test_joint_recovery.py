@@ -1,11 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The joint solution returns a known truth to rounding, whatever the plan."""
 
-import os
-import subprocess
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -23,7 +19,6 @@ from selfcal_ros.simulation.truth import hu_plan, random_truth, simulate_measure
 from test.support.lattice_plans import in_datum, plan_of
 
 EXACT = 1e-12
-ROOT = Path(__file__).parents[2]
 
 
 def measured(plan, seed=1, **how):
@@ -187,68 +182,6 @@ def test_angular_marks_planned_but_never_read_leave_the_xy_map():
     found = calibrate(bare)
     assert np.abs(found.error_map.gx - truth.g[0]).max() < EXACT
     assert np.isnan(found.error_map.g_theta).all() and np.isnan(found.views[2].phi)
-
-
-def test_large_fields_are_iterated_to_the_same_map(monkeypatch):
-    plan = hu_plan(Artifact(51, 0.002, 24))
-    _, readings = measured(plan, sigma_m=2e-8, sigma_theta_rad=1e-7)
-    options = Options(uncertainty=False)
-    direct = calibrate(readings, options)
-    for name in ("DIRECT_SITES", "MAX_DIRECT_SITES"):
-        monkeypatch.setattr(system, name, 0)
-    system.clear_cache()
-    iterated = calibrate(readings, options)
-    system.clear_cache()
-    assert iterated.extra["solver"]["method"] == "conjugate gradients"
-    assert iterated.extra["solver"]["relative_residual"] < 1e-11
-    assert iterated.extra["solver"]["iterations"] < 40
-    assert iterated.observability == direct.observability
-    assert np.abs(iterated.error_map.gx - direct.error_map.gx).max() < 1e-15
-    assert np.abs(iterated.error_map.g_theta - direct.error_map.g_theta).max() < 1e-15
-    assert iterated.noise.sigma_xy == pytest.approx(direct.noise.sigma_xy, rel=1e-9)
-
-
-def test_iteration_takes_missing_marks_and_weights(monkeypatch):
-    plan = plan_of("0,90,tx,ty", Artifact(31, 0.002))
-    truth, readings = measured(plan, missing=0.03)
-    readings = replace(readings, views=tuple(
-        replace(view, count=1 + np.arange(len(view.m)) % 3) for view in readings.views))
-    for name in ("DIRECT_SITES", "MAX_DIRECT_SITES"):
-        monkeypatch.setattr(system, name, 0)
-    system.clear_cache()
-    found = calibrate(readings).error_map
-    system.clear_cache()
-    expected = in_datum(truth.g, found.valid, plan.artifact, scale=True)
-    assert np.nanmax(np.abs(found.gx - expected[0])) < EXACT
-    assert np.isnan(found.u_gx).all()
-
-
-SCRIPT = """
-import hashlib, numpy as np
-from selfcal_ros.estimation import system
-from selfcal_ros.estimation.api import Options, calibrate
-from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.simulation.truth import hu_plan, random_truth, simulate_measurements
-plan, rng = hu_plan(Artifact(61, 0.01, 24)), np.random.default_rng(0)
-data = simulate_measurements(random_truth(plan.artifact, 4, rng), plan, rng, sigma_m=1e-8,
-                             sigma_theta_rad=1e-7)
-for limit in (system.DIRECT_SITES, 0):
-    system.DIRECT_SITES = system.MAX_DIRECT_SITES = limit
-    system.clear_cache()
-    found = calibrate(data, Options(uncertainty=None if limit else False)).error_map
-    parts = (found.gx, found.gy, found.g_theta, found.u_gx)
-    print(hashlib.sha256(b"".join(part.tobytes() for part in parts)).hexdigest())
-"""
-
-
-def test_the_number_of_threads_changes_no_bit():
-    """Factorised and iterated, in processes with one and with several threads."""
-    runs = [subprocess.run([sys.executable, "-c", SCRIPT], text=True, capture_output=True,
-                           check=True, cwd=ROOT,
-                           env={**os.environ, "OPENBLAS_NUM_THREADS": threads}).stdout
-            for threads in ("1", "2", "5")]
-    assert len(set(runs[0].split())) == 2
-    assert runs[0] == runs[1] == runs[2]
 
 
 class TestHostile:
