@@ -18,6 +18,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
                         help="joint least squares (default) or Hu's published law")
     parser.add_argument("--theta-datum", choices=("xy_axes", "zero_mean"),
                         help="what fixes the constant of the angular map (default: xy_axes)")
+    parser.add_argument("--uncertainty", choices=("auto", "always", "never"),
+                        help="uncertainty map; auto (default): up to 201 x 201 sites")
     parser.add_argument("--sense", choices=("microscope_moves", "plate_moves"),
                         help="who moves (default: microscope_moves)")
     parser.add_argument("--params", metavar="NODES.yaml",
@@ -46,6 +48,7 @@ def parameters(args: argparse.Namespace) -> tuple[dict[str, Any], dict[str, Any]
     where = args.params or "options"
     options = {"measurement_collector": {"measurement_sense": args.sense},
                "solver": {"method": args.method, "theta_datum": args.theta_datum,
+                          "uncertainty": args.uncertainty,
                           **_reference(args.reference)}}
     values = []
     for node, given in options.items():

@@ -81,6 +81,8 @@ COLLECTOR = (
               "", 0.0, 1000.0),
     Parameter("status_period", 0.5, "time between two ViewStatus messages", "s", 0.02, 60.0),
 )
+_UNCERTAINTY = {"auto": None, "always": True, "never": False}
+
 SOLVER = (
     _FRAME,
     Parameter("method", "joint", "estimator", choices=("joint", "law")),
@@ -88,6 +90,9 @@ SOLVER = (
               choices=tuple(str(datum) for datum in ThetaDatum)),
     Parameter("misalignment_model", "linear", "linear: as published; rigid: exact rotation",
               choices=("linear", "rigid")),
+    Parameter("uncertainty", "auto", "uncertainty map of the joint solution: auto = up to "
+              "201 x 201 sites; always = up to 1001 x 1001, in minutes",
+              choices=tuple(_UNCERTAINTY)),
     Parameter("reference_kind", "none", "what a known length was measured on: it sets the scale",
               choices=("none", *map(str, ReferenceKind))),
     Parameter("reference_error", 0.0, "relative error of that length: artifact (true - nominal) / "
@@ -218,10 +223,11 @@ def _flatten(section: dict, prefix: str) -> list[tuple[str, Any]]:
     return out
 
 
-def solver_options(values: dict[str, Any], **more: Any) -> Options:
+def solver_options(values: dict[str, Any]) -> Options:
     """Return the estimator's options in a solver's parameter values."""
     kind = values["reference_kind"]
     reference = None if kind == "none" else ReferenceLength(
         ReferenceKind(kind), values["reference_error"], values["reference_u"])
     return Options(method=values["method"], datum_theta=ThetaDatum(values["theta_datum"]),
-                   misalignment_model=values["misalignment_model"], reference=reference, **more)
+                   misalignment_model=values["misalignment_model"], reference=reference,
+                   uncertainty=_UNCERTAINTY[values["uncertainty"]])

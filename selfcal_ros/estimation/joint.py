@@ -79,7 +79,9 @@ def _result(measurements: Measurements, options: Options, *, problem: Problem, f
     warnings = (
         disagreement(xy, "grid readings", (1e6, "µm"), 1e-13),
         disagreement(theta, "angular readings", (np.degrees(3600), "arcsec"), 1e-13),
-        *_datum_warnings(options, problem, found, closure=closure))
+        *_datum_warnings(options, problem, found, closure=closure),
+        "" if problem.direct or options.uncertainty is not None else
+        "no uncertainty map, because of the size of the field: ask for it (--uncertainty always)")
     return CalibrationResult(
         measurements.plan_id, error_map, _artifact_map(problem, found),
         _views(measurements, problem, found), seen, noise, measurements.all_rejected(),

@@ -21,8 +21,11 @@ near 1e-15 and the smallest others above 1e-4."""
 DIRECT_SITES = 201 * 201
 """Sites up to which the normal matrix is factorised in any case."""
 
-MAX_DIRECT_SITES = 401 * 401
-"""Sites up to which it is factorised where iteration is slow or an uncertainty is wanted."""
+UNEVEN_SITES = 401 * 401
+"""Sites up to which it is factorised where weights differ, which slows an iteration down."""
+
+MAX_DIRECT_SITES = 1001 * 1001
+"""Sites up to which it is factorised if an uncertainty is wanted: 5.6 GB."""
 
 CORE = 41
 """Sites along each side of the middle part of a large field."""
@@ -61,11 +64,9 @@ class JointSystem:
     def direct(self) -> bool:
         """Whether the sites are factorised; otherwise they are iterated."""
         sites = self.grid.n_sites
-        if sites <= DIRECT_SITES or sites > MAX_DIRECT_SITES:
-            return sites <= DIRECT_SITES
-        # iteration slows down where readings weigh very differently
         weight = self.grid.weight
-        return bool(weight.max() > 2 * weight[self.grid.read].min())
+        uneven = sites <= UNEVEN_SITES and weight.max() > 2 * weight[self.grid.read].min()
+        return bool(sites <= DIRECT_SITES or uneven)
 
     @cached_property
     def _core(self) -> GridSystem:

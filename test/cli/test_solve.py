@@ -210,6 +210,14 @@ def test_parameters_reach_collector_and_solver_and_options_win(tmp_path, capsys,
     assert plain != zero_mean
 
 
+def test_the_uncertainty_map_on_request(tmp_path, bag):
+    plain = result_of(tmp_path, bag)
+    assert plain == result_of(tmp_path, bag, "--uncertainty", "always")
+    bare = json.loads(result_of(tmp_path, bag, "--uncertainty", "never"))["error_map"]
+    assert bare["gx"] == json.loads(plain)["error_map"]["gx"]
+    assert all(u is None for row in bare["u_gx"] for u in row)
+
+
 def test_numbers_in_a_parameter_file_are_read_as_the_nodes_read_them(tmp_path, bag):
     path = tmp_path / "nodes.yaml"
     text = "measurement_collector:\n  ros__parameters: {max_speed: 5e-4, outlier_limit: %s}\n"

@@ -129,3 +129,10 @@ def test_the_estimator_gets_what_the_solver_was_given():
     options = solver_options(values)
     assert (options.method, options.datum_theta, options.misalignment_model) == (
         "law", ThetaDatum.ZERO_MEAN, "rigid")
+    assert options.uncertainty is None
+
+
+@pytest.mark.parametrize(("word", "wanted"), [("auto", None), ("always", True), ("never", False)])
+def test_the_uncertainty_map_is_wanted_in_words(word, wanted):
+    values = parameter_values("solver", {"uncertainty": word}, "here")
+    assert solver_options(values).uncertainty is wanted

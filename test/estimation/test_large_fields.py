@@ -75,6 +75,7 @@ def test_iteration_takes_fields_in_pieces(as_large):
     expected = in_datum(truth.g, valid, readings.artifact, scale=True)
     assert np.nanmax(np.abs(found.error_map.gx - expected[0])) < EXACT
     assert np.isnan(found.error_map.u_gx).all()
+    assert any("--uncertainty always" in text for text in found.warnings)
 
 
 def test_uneven_weights_are_factorised_or_iterated_to_the_truth(as_large, monkeypatch):
@@ -84,7 +85,7 @@ def test_uneven_weights_are_factorised_or_iterated_to_the_truth(as_large, monkey
     as_large()
     factorised = calibrate(readings)
     assert factorised.extra["solver"]["method"] == "multifrontal"
-    monkeypatch.setattr(system, "MAX_DIRECT_SITES", 0)
+    monkeypatch.setattr(system, "UNEVEN_SITES", 0)
     system.clear_cache()
     iterated = calibrate(readings)
     assert iterated.extra["solver"]["method"] == "conjugate gradients"
