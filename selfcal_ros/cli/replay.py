@@ -27,6 +27,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
                         help="deliver the messages in shuffled order")
     parser.add_argument("-o", "--output", metavar="RESULT.json", help="where to write the result")
     parser.add_argument("--params", metavar="NODES.yaml", help="ROS parameter file for the nodes")
+    parser.add_argument("--namespace", metavar="NAME", help="namespace of the cell's topics, "
+                        "for bags that hold several cells; / is the root")
     parser.add_argument("--quiet", action="store_true", help="print no summary")
 
 
@@ -65,12 +67,13 @@ def _play(args: argparse.Namespace, saved: Path, environment: dict) -> tuple[int
     rest = ["--ros-args", "--params-file", args.params] if args.params else []
     quiet = ["--ros-args", "--log-level", "warn"]
     rate = 0.0 if args.fast else args.rate
+    cell = "" if args.namespace is None else f"/{args.namespace.strip('/')}"
     with contextlib.ExitStack() as stack:
         for node in NODES:
             stack.enter_context(process(f"selfcal_ros.nodes.{node}", [*rest, *quiet], environment))
         session = stack.enter_context(process(
             "selfcal_ros.nodes.replay_session",
-            [args.bag, str(rate), str(args.shuffle), str(saved), *quiet], environment,
+            [args.bag, str(rate), str(args.shuffle), str(saved), cell, *quiet], environment,
             stdout=subprocess.PIPE, text=True))
         bar = stack.enter_context(progress_bar("replaying"))
         lost = []

@@ -25,12 +25,14 @@ class Player:
     """Publishes the input topics of a bag from the timers of a node.
 
     Messages go out as the bytes that the bag has, or are re-encoded where its types have other
-    trailing fields than this package's. `seed` shuffles the order of arrival, not the stamps.
+    trailing fields than this package's. `seed` shuffles the order of arrival, not the stamps;
+    `namespace` is that of the cell in the bag, None = the only one.
     """
 
-    def __init__(self, node: SelfcalNode, bag: str, *, rate: float, seed: int) -> None:
+    def __init__(self, node: SelfcalNode, bag: str, *, rate: float, seed: int,
+                 namespace: str | None = None) -> None:
         self.node, self.rate = node, rate
-        self.reader = BagReader(Path(bag))
+        self.reader = BagReader(Path(bag), namespace)
         items = list(self.reader.cdr_messages())
         if not items:
             raise NoDataError(bag, "no message on the topics of the contract", "see the README")

@@ -2,13 +2,15 @@
 """The heart of `selfcal replay`: plays a bag into live nodes and sees it through to the map.
 
 Run as a process beside measurement_collector and solver:
-``python -m selfcal_ros.nodes.replay_session BAG RATE SEED RESULT.json``. Progress goes to
-stdout, one line ``progress DONE TOTAL`` a step, for the command line to draw.
+``python -m selfcal_ros.nodes.replay_session BAG RATE SEED RESULT.json NAMESPACE`` (of the
+cell in the bag; empty = the only one). Progress goes to stdout, one line ``progress DONE TOTAL``
+a step, for the command line to draw.
 """
 
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
@@ -27,11 +29,11 @@ PATIENCE_S = 30.0
 class ReplaySession(SelfcalNode):
     """Waits for subscribers, plays, checks that nothing was lost, has the map saved."""
 
-    def __init__(self, bag: str, rate: float, seed: int, output: str) -> None:
+    def __init__(self, player: Callable[[SelfcalNode], Player], output: str) -> None:
         super().__init__("bag_player", parameter_overrides=[])
         self.finished, self.exit_code = Future(), ExitCode.INTERNAL
         self._output = output
-        self.player = Player(self, bag, rate=rate, seed=seed)
+        self.player = player(self)
         self._finish = self.create_client(Trigger, "measurement_collector/finish")
         self._save = self.create_client(SaveMap, "solver/save_map")
         self._act: Callable[[], None] = self._wait_for_nodes
@@ -122,9 +124,10 @@ class ReplaySession(SelfcalNode):
 
 
 def main() -> None:
-    """Run the session: BAG RATE SEED RESULT.json."""
-    bag, rate, seed, output = sys.argv[1:5]
-    sys.exit(run(lambda: ReplaySession(bag, float(rate), int(seed), output), sys.argv[5:]))
+    """Run the session: BAG RATE SEED RESULT.json NAMESPACE."""
+    bag, rate, seed, output, cell = sys.argv[1:6]
+    player = partial(Player, bag=bag, rate=float(rate), seed=int(seed), namespace=cell or None)
+    sys.exit(run(lambda: ReplaySession(player, output), sys.argv[6:]))
 
 
 if __name__ == "__main__":

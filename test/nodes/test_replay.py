@@ -4,7 +4,8 @@
 import pytest
 
 from selfcal_ros.cli.main import main as selfcal
-from test.support.sessions import small_bag, small_plan
+from test.support.bags import Foreign
+from test.support.sessions import events_of, small_bag, small_plan
 
 
 @pytest.fixture(scope="module")
@@ -23,6 +24,19 @@ def test_replay_gives_the_result_of_solve_bit_for_bit(ros_environment, solved, t
     output = tmp_path / "replayed.json"
     assert selfcal(["replay", str(bag), *options, "--quiet", "-o", str(output)]) == 0
     assert output.read_text() == expected
+
+
+@pytest.mark.parametrize("cell", ["/", "cell2"])
+def test_one_of_two_cells_is_played(ros_environment, tmp_path, capfd, cell):
+    for name, plan in (("", "0, 90, tx"), ("/cell2", "0, 90, ty")):
+        Foreign(namespace=name).write(tmp_path / "bag" / f"x{name.strip('/')}.mcap",
+                                      events_of(small_plan(plan, repeats=1)))
+    bag, replayed, solved = (str(tmp_path / name) for name in ("bag", "replayed", "solved"))
+    assert selfcal(["replay", bag, "--fast", "--quiet"]) == 2
+    assert "choose one with --namespace" in capfd.readouterr().err
+    for verb, output in ((["replay", "--fast"], replayed), (["solve"], solved)):
+        assert selfcal([*verb, bag, "--namespace", cell, "--quiet", "-o", output]) == 0
+    assert (tmp_path / "replayed").read_text() == (tmp_path / "solved").read_text()
 
 
 def test_a_deficient_bag_ends_with_code_3_and_says_why(ros_environment, tmp_path, capfd):
