@@ -33,8 +33,6 @@ class GridSystem:
     def __init__(self, poses: tuple[GridPose, ...], weight: np.ndarray, unit: int = 0) -> None:
         self.weight = weight
         self.views = LatticeViews(weight.shape[1:], poses, unit)
-        self.turning_site = -1
-        """A site known to lie on a closed path that turns; looked for if -1."""
         self.read = weight > 0
         total = weight.sum(axis=0)
         self.mark_read = total > 0
@@ -67,9 +65,8 @@ class GridSystem:
     def components(self) -> Components:
         """Components of the graph of sites and marks."""
         site, mark, q = self.edges
-        turning = self.turning_site if self.turning_site >= 0 else self._find_turning_site()
         return components(site, mark, q, n_sites=self.n_sites, n_marks=self.n_sites,
-                          turning=turning)
+                          turning=self._find_turning_site())
 
     def _find_turning_site(self) -> int:
         """Return a site that one mark visits in two turns, which closes a path; -1 = none."""

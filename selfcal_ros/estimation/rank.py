@@ -23,8 +23,8 @@ DETERMINED = 0.5
 
 def plan_observability(plan: Plan) -> Observability:
     """Return what the plan would tell if every mark in the field were read."""
-    return full_observability(planned_system(plan.artifact, plan.views), plan.artifact,
-                              plan.views)
+    system = planned_system(plan.artifact, plan.views, rank_only=True)
+    return full_observability(system, plan.artifact, plan.views)
 
 
 def full_observability(system: JointSystem, artifact: Artifact,
@@ -139,7 +139,7 @@ def _tried(artifact: Artifact, views: tuple[View, ...]) -> tuple[str, ...]:
                               ("turned by 90 deg", math.pi / 2, (0.0, 0.0)),
                               ("that is neither turned nor shifted", 0.0, (0.0, 0.0))):
         more = View("", turn, shift, True, artifact.angular_count > 0)
-        system = planned_system(artifact, (*views, more))
+        system = planned_system(artifact, (*views, more), rank_only=True)
         if (system.rank_grid + DATUM_ROWS == 4 * system.grid.n_sites + 3 * system.grid.n_views
                 and not angular_deficiency(system)):
             return (f"add a view {name}",)

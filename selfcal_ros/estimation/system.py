@@ -44,11 +44,13 @@ class JointSystem:
         The two sets of equations.
     grid_index, angular_index : tuple of int
         Position of their views in the measurement.
+    rank_only : bool
+        Whether its rank alone will be asked for: a large field then needs no factorisation.
     """
 
     def __init__(self, grid: GridSystem, angular: AngularSystem, grid_index: tuple[int, ...],
-                 angular_index: tuple[int, ...]) -> None:
-        self.grid, self.angular = grid, angular
+                 angular_index: tuple[int, ...], *, rank_only: bool = False) -> None:
+        self.grid, self.angular, self.rank_only = grid, angular, rank_only
         self.grid_index, self.angular_index = grid_index, angular_index
         extra = [i for i in angular_index if i not in grid_index]
         self.size = 3 * len(grid_index) + len(extra)
@@ -75,15 +77,11 @@ class JointSystem:
         If the middle of the plate determines all misalignments up to the datum, then so does the
         whole, since readings only add; otherwise the whole has to be factorised.
         """
-        if self.direct:
+        if self.grid.n_sites <= CORE**2 or (self.direct and not self.rank_only):
             return self.grid
         core = core_of(self.grid)
         values = np.linalg.eigvalsh(core.schur)
-        if _rank(values, _trace(core)) == len(values) - 7:
-            middle = tuple(size // 2 for size in self.grid.views.shape)
-            self.grid.turning_site = middle[0] * self.grid.views.shape[1] + middle[1]
-            return core
-        return self.grid
+        return core if _rank(values, _trace(core)) == len(values) - 7 else self.grid
 
     @cached_property
     def rigid(self) -> np.ndarray:
@@ -142,10 +140,9 @@ class JointSystem:
     @cached_property
     def rank_grid(self) -> int:
         """Rank of the grid readings."""
-        rank = self.rank_schur  # first: it may find the turning site for the components
         parts = self.grid.components
         nodes = np.count_nonzero(parts.of_site >= 0) + np.count_nonzero(parts.of_mark >= 0)
-        return int(2 * (nodes - np.count_nonzero(parts.balanced)) + rank)
+        return int(2 * (nodes - np.count_nonzero(parts.balanced)) + self.rank_schur)
 
     @cached_property
     def rank_angular(self) -> int:
@@ -319,7 +316,7 @@ def clear_cache() -> None:
         _cache.clear()
 
 
-def planned_system(artifact, views) -> JointSystem:
+def planned_system(artifact, views, *, rank_only: bool = False) -> JointSystem:
     """Return the system of views as planned: every mark that lies in the field, unit repeats.
 
     Parameters
@@ -328,6 +325,8 @@ def planned_system(artifact, views) -> JointSystem:
         The plate.
     views : sequence of View
         The plan.
+    rank_only : bool
+        Whether its rank alone will be asked for.
     """
     grid_views = [(i, v) for i, v in enumerate(views) if v.grid]
     poses = []
@@ -343,4 +342,4 @@ def planned_system(artifact, views) -> JointSystem:
     return JointSystem(
         GridSystem(tuple(poses), field * repeats[:, None, None]),
         AngularSystem(turns, np.ones((len(turns), artifact.angular_count)) * lines[:, None]),
-        tuple(i for i, _ in grid_views), tuple(i for i, _ in angular))
+        tuple(i for i, _ in grid_views), tuple(i for i, _ in angular), rank_only=rank_only)

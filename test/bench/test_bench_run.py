@@ -23,7 +23,8 @@ def test_every_method_is_measured_and_exact(tmp_path):
     methods = {row["method"] for row in rows}
     assert {"selfcal", "numpy.linalg.lstsq", "scipy lsmr", "scipy splu", "gtsam",
             "pyceres"} <= methods
-    assert {row["benchmark"] for row in rows} == {"solve", "re-solve", "map only", "uncertainty"}
+    assert {row["benchmark"] for row in rows} == {"solve", "re-solve", "map only", "uncertainty",
+                                                "missing"}
     for row in rows:
         assert row.keys() >= KEYS and row["n"] == 5
         assert row["method"] in done.stdout

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from selfcal_ros.errors import InputError
+from selfcal_ros.errors import InputError, NotIdentifiableError
 from selfcal_ros.estimation import iterative, system
 from selfcal_ros.estimation.api import Options, calibrate
 from selfcal_ros.estimation.map_only import MapSolver
@@ -100,6 +100,18 @@ def test_an_iteration_that_stalls_says_so(as_large, monkeypatch):
     monkeypatch.setattr(iterative, "MAX_ITERATIONS", 3)
     with pytest.raises(InputError, match=r"^weights: the residual stays at .* after 3 iterations"):
         calibrate(readings)
+
+
+@pytest.mark.parametrize(("names", "missing"), [
+    ("0,tx,ty", 0.0), ("0,180,tx", 0.0), ("0,90", 0.0), ("0,90,180,270", 0.0), ("0,tx,ty", 0.05)])
+def test_deficient_plans_are_refused_at_any_size(as_large, names, missing):
+    _, readings = measured(plan_of(names, Artifact(21, 0.005)), missing=missing)
+    with pytest.raises(NotIdentifiableError) as small:
+        calibrate(readings)
+    as_large()
+    with pytest.raises(NotIdentifiableError) as large:
+        calibrate(readings)
+    assert large.value.observability == small.value.observability
 
 
 def test_the_core_of_a_large_field_tells_its_rank_alone(as_large):
