@@ -155,12 +155,22 @@ class LatticeViews:
             out[win.sites] += part.T if win.transposed else part
         return out
 
+    @cached_property
+    def _of_site(self) -> tuple[np.ndarray, np.ndarray]:
+        """Place of the mark on every site, and i^q or 0 where there is none, (views, sites)."""
+        n = self.shape[0] * self.shape[1]
+        place = np.zeros((len(self.poses), n), dtype=int)
+        phase = np.zeros(place.shape, dtype=complex)
+        for v, pose in enumerate(self.poses):
+            marks = np.flatnonzero(self.in_field[v])
+            sites = self.site_index[v].reshape(-1)[marks]
+            place[v, sites], phase[v, sites] = marks + v * n, PHASES[pose.q]
+        return place, phase
+
     def scatter(self, marks: np.ndarray) -> np.ndarray:
         """Return the adjoint of `gather`: the sum over views at every site, complex (nx, ny)."""
-        out = np.zeros(self.shape, dtype=complex)
-        for index in range(len(self.poses)):
-            self.add_scattered(out, index, marks[index])
-        return out
+        place, phase = self._of_site
+        return (marks.reshape(-1)[place] * phase).sum(axis=0).reshape(self.shape)
 
 
 def _add_turned(out: np.ndarray, part: np.ndarray, q: int) -> None:

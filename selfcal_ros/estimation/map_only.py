@@ -74,7 +74,9 @@ class MapSolver:
             free, d = grid.reduced(y)
             field = (free - self._response @ (self._inverse @ d)).reshape(grid.views.shape)
         field = self._gauge.remove(field, self._gauge.parts(field))
-        field = np.where(self._known, field, complex(np.nan, np.nan))
+        field[~self._known] = complex(np.nan, np.nan)
         if self._sign < 0:
             field = -field[::-1, ::-1]
-        return np.stack([field.real, field.imag])
+        out = np.empty((2, *field.shape))
+        out[0], out[1] = field.real, field.imag
+        return out
