@@ -8,16 +8,11 @@ All this is real; only the cut, which is solved last, is complex, and only the r
 inverse reaches a diagonal.
 """
 
-from itertools import pairwise
-
 import numpy as np
 from scipy.linalg import blas, lapack
 
 from selfcal_ros.estimation.fold import FoldedMatrix
 from selfcal_ros.estimation.fronts import dissect
-
-RUN = 12
-"""Mean length of runs of places from which matrices are added run by run, not by entries."""
 
 SMALL = 64
 """Side up to which a triangle is inverted by substitution."""
@@ -175,23 +170,13 @@ def _extend(blocks: tuple[np.ndarray, ...], places: np.ndarray, update: np.ndarr
         Its upper triangle is not used.
     """
     own = len(blocks[0])
-    breaks = (np.flatnonzero((places[1:] - places[:-1] != 1) | (places[1:] == own)) + 1).tolist()
-    by_runs = len(places) >= RUN * (len(breaks) + 1)
-    if not by_runs:
-        breaks = [int(np.searchsorted(places, own))]
-    parts = []
-    for low, high in pairwise([0, *breaks, len(places)]):
-        if low < high:
-            first, last = int(places[low]), int(places[high - 1])
-            outer = first >= own
-            first, last = first - own * outer, last - own * outer
-            to = slice(first, last + 1) if by_runs else places[low:high] - own * outer
-            parts.append((slice(low, high), to, outer))
-    for number, (take_rows, rows, outer) in enumerate(parts):
-        for take, columns, outer_too in parts[:number + 1]:
-            block = blocks[outer + outer_too]
-            at = (rows, columns) if by_runs else (rows[:, None], columns)
-            block[at] += update[take_rows, take]
+    inner = int(np.searchsorted(places, own))
+    first, last = slice(inner), slice(inner, len(places))
+    to = {first: places[first], last: places[last] - own}
+    for block, (rows, columns) in zip(blocks, ((first, first), (last, first), (last, last)),
+                                      strict=False):
+        at = to[columns][:, None] * len(block) + to[rows]
+        np.add.at(block.T.reshape(-1), at.ravel(), update[rows, columns].T.ravel())
 
 
 def _eliminate(f11: np.ndarray, f21: np.ndarray, f22: np.ndarray

@@ -74,7 +74,7 @@ class Dissection:
     storage : float array
         The lower triangle of the matrix, laid out for the fronts.
     rest : float array (copies, copies)
-        Its lower triangle over the copies.
+        Its lower triangle over the copies, by columns.
     """
 
     order: np.ndarray
@@ -115,11 +115,11 @@ def dissect(folded: FoldedMatrix, shape: tuple[int, int], reach: int) -> Dissect
     front = np.repeat(np.arange(len(pieces)), lengths)[column[inner]]
     fronts = _fronts(pieces, row[inner], front, size=size)
     total = sum(one.size for one in fronts)
-    at = total + (row - n) * (size - n) + column - n
+    at = total + (column - n) * (size - n) + row - n
     at[inner] = _addresses(fronts, row[inner], column[inner], front=front, size=size)
     both = np.bincount(at, folded.values, minlength=total + (size - n) ** 2)
     return Dissection(order, fronts, top, both[:total],
-                      both[total:].reshape(size - n, size - n))
+                      both[total:].reshape(size - n, size - n).T)
 
 
 def _fronts(pieces: list, row: np.ndarray, front: np.ndarray, *, size: int) -> tuple[Front, ...]:
