@@ -2,7 +2,6 @@
 """What all nodes share: checked parameters, diagnostics, one way to run and to stop."""
 
 import array
-import signal
 import sys
 from collections.abc import Callable
 from typing import Any
@@ -21,8 +20,8 @@ from rclpy.task import Future
 from selfcal_ros.collection.parameters import NODE_PARAMETERS, Parameter, parameter_values
 from selfcal_ros.errors import ExitCode, SelfcalError
 from selfcal_ros.nodes.names import Topic
+from selfcal_ros.nodes.stopping import complete_on_signal, ignore_signals
 
-STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 SPIN_SECONDS = 86400.0
 """An infinite time-out overflows in the executor of the wheels; a day is long enough to loop."""
 
@@ -144,17 +143,7 @@ def run(make_node: Callable[[], Node], argv: list[str] | None = None) -> int:
     callback is torn and what a node has to finish in `close` is finished.
     """
     stop = Future()
-    signalled: list[int] = []
-
-    def on_signal(number: int, _: object) -> None:
-        """End the spinning once; a second signal would wait for the future's lock for ever."""
-        signalled.append(number)
-        if len(signalled) == 1:
-            stop.set_result(None)
-
-    for number in STOP_SIGNALS:
-        signal.signal(number, on_signal)
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, STOP_SIGNALS)  # blocked while modules are imported
+    complete_on_signal(stop)
     node, code = None, int(ExitCode.DONE)
     try:
         rclpy.init(args=argv, signal_handler_options=SignalHandlerOptions.NO)
@@ -172,15 +161,5 @@ def run(make_node: Callable[[], Node], argv: list[str] | None = None) -> int:
             getattr(node, "close", lambda: None)()
             node.destroy_node()
         rclpy.try_shutdown()
-        _ignore_signals()
+        ignore_signals()
     return code
-
-
-def _ignore_signals() -> None:
-    """Let no repeated signal (a launcher passes Ctrl-C on) disturb the exit.
-
-    Blocked first: a signal between two lines of Python would be reported as a race.
-    """
-    signal.pthread_sigmask(signal.SIG_BLOCK, STOP_SIGNALS)
-    for number in STOP_SIGNALS:
-        signal.signal(number, signal.SIG_IGN)
