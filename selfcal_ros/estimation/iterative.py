@@ -64,6 +64,7 @@ class GridIteration:
         self.grid, self.inverse = grid, inverse
         self._diagonal = grid.views.scatter_weight(grid.weight)
         self._symbols = preconditioner_symbols(grid)
+        self._loose = loose_sites(grid)
         size = max(grid.views.shape)
         slow = next_fast_len(size, real=True) != size and size <= DENSE_DCT
         self._cosines = (dct(np.eye(size, dtype=np.float32), axis=0, norm="ortho") if slow
@@ -97,10 +98,10 @@ class GridIteration:
 
     def precondition(self, field: np.ndarray) -> np.ndarray:
         """Return an approximate inverse of the normal matrix times a field."""
-        shape, size = field.shape, max(field.shape)
+        shape, size, loose = field.shape, max(field.shape), self._loose * field
+        low = [(size - n) // 2 for n in shape]
+        part = np.s_[low[0]:low[0] + shape[0], low[1]:low[1] + shape[1]]
         if shape != (size, size):
-            low = [(size - n) // 2 for n in shape]
-            part = np.s_[low[0]:low[0] + shape[0], low[1]:low[1] + shape[1]]
             square = np.zeros((size, size), dtype=complex)
             square[part] = field
             field = square
@@ -113,8 +114,8 @@ class GridIteration:
         turned *= turning
         hat *= rest
         hat += turned
-        out = self._transform(hat, idctn).astype(complex)
-        return out if shape == (size, size) else out[part]
+        loose += self._transform(hat, idctn)[part]
+        return loose
 
     def _transform(self, field: np.ndarray, transform: Callable) -> np.ndarray:
         """Return the DCT-II of a field or its inverse, in single precision.
@@ -209,6 +210,21 @@ def preconditioner_symbols(grid: GridSystem) -> tuple[np.ndarray, np.ndarray]:
     inverse = 1 / np.maximum(other, floor)
     turning = np.where(odd, 0.5 * (1 / np.maximum(laplace, floor) - inverse), 0.0)
     return turning.astype(np.float32), inverse.astype(np.float32)
+
+
+def loose_sites(grid: GridSystem) -> np.ndarray:
+    """Return what the inverse of the matrix has on its diagonal beyond that of a full plate.
+
+    A site that has lost readings is looser than the transform, which knows full plates alone,
+    takes it for; this keeps the number of steps from growing with the marks that are missing.
+    """
+    views = grid.views
+    full = GridSystem(views.poses, views.in_field * grid.mean_weight, views.unit)
+    now, then = (views.scatter_weight(one.weight * (1 - one.share)) for one in (grid, full))
+    good = (now > 0) & (then > 0)
+    out = np.zeros(views.shape)
+    out[good] = np.maximum(1 / now[good] - 1 / then[good], 0.0)
+    return out
 
 
 def _dot(a: np.ndarray, b: np.ndarray) -> float:

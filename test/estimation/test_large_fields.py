@@ -78,6 +78,15 @@ def test_iteration_takes_fields_in_pieces(as_large):
     assert any("--uncertainty always" in text for text in found.warnings)
 
 
+@pytest.mark.parametrize(("missing", "steps"), [(0.0, 26), (0.03, 42), (0.2, 120)])
+def test_the_number_of_steps_does_not_grow_with_the_field(as_large, missing, steps):
+    as_large()
+    for size in (41, 101, 161):
+        _, readings = measured(plan_of("0,90,tx", Artifact(size, 0.002)), missing=missing)
+        solver = calibrate(readings, Options(uncertainty=False)).extra["solver"]
+        assert solver["iterations"] <= steps
+
+
 def test_uneven_weights_are_factorised_or_iterated_to_the_truth(as_large, monkeypatch):
     truth, readings = measured(plan_of("0,90,tx,ty", Artifact(31, 0.002)), missing=0.03)
     readings = replace(readings, views=tuple(
