@@ -21,8 +21,7 @@ class Gauge:
 
     def __init__(self, z: np.ndarray, known: np.ndarray, *, scale: bool) -> None:
         self.z, self.known, self.scale = z, known, scale
-        self.modes = _modes(z, 4 if scale else 3)
-        self._rows = (self.modes * known).reshape(len(self.modes), -1)
+        self._rows = _modes(z, known)[:4 if scale else 3]
         self._gram_inverse = _inverse((self._rows.conj() @ self._rows.T).real)
 
     def parts(self, field: np.ndarray) -> np.ndarray:
@@ -50,9 +49,8 @@ class Gauge:
     @cached_property
     def shear(self) -> np.ndarray:
         """Rows that give O and R of Hu eq. 6, times the half width: complex (2, nx, ny)."""
-        back = np.conj(self.z) * self.known
-        rows = np.concatenate([(_modes(self.z, 4) * self.known), [1j * back, back]])
-        flat = rows.reshape(6, -1)
+        back = (np.conj(self.z) * self.known).reshape(-1)
+        flat = np.stack([*_modes(self.z, self.known), 1j * back, back])
         rows = _inverse((flat.conj() @ flat.T).real)[4:] @ flat
         return rows.reshape(2, *self.z.shape)
 
@@ -63,9 +61,12 @@ class Gauge:
         return float(both[0]), float(both[1])
 
 
-def _modes(z: np.ndarray, number: int) -> np.ndarray:
-    one = np.ones_like(z)
-    return np.stack([one, 1j * one, 1j * z, z])[:number]
+def _modes(z: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Return the modes 1, i, iz, z over the known sites, complex (4, sites)."""
+    out = np.empty((4, z.size), dtype=complex)
+    out[0], out[3] = known.reshape(-1), (z * known).reshape(-1)
+    out[1], out[2] = 1j * out[0], 1j * out[3]
+    return out
 
 
 def _inverse(gram: np.ndarray) -> np.ndarray:

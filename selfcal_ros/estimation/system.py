@@ -116,14 +116,24 @@ class JointSystem:
         return float(max(self.angular.weight.sum(), np.finfo(float).tiny))
 
     @cached_property
+    def _core_scale(self) -> float:
+        return self.grid_scale if self._core is self.grid else _trace(self._core)
+
+    @cached_property
+    def _core_spectrum(self) -> tuple[np.ndarray, np.ndarray]:
+        return np.linalg.eigh(self._core.schur)
+
+    @cached_property
     def rank_schur(self) -> int:
         """Rank of the grid's misalignment matrix."""
-        return _rank(np.linalg.eigvalsh(self._core.schur), _trace(self._core))
+        return _rank(self._core_spectrum[0], self._core_scale)
 
     @cached_property
     def grid_inverse(self) -> np.ndarray:
         """Pseudo-inverse of the grid's misalignment matrix: their covariance, unit noise."""
-        return pseudo_inverse(*np.linalg.eigh(self.grid.schur), self.grid_scale)
+        spectrum = (self._core_spectrum if self._core is self.grid
+                    else np.linalg.eigh(self.grid.schur))
+        return pseudo_inverse(*spectrum, self.grid_scale)
 
     @cached_property
     def angular_inverse(self) -> np.ndarray:
@@ -155,10 +165,11 @@ class JointSystem:
     @cached_property
     def _null(self) -> np.ndarray:
         """Orthonormal misalignments that no reading tells, (size, nullity)."""
-        size = _trace(self._core)
-        ratio = size / self.angular_scale if self.angular.n_views else 0.0
-        values, vectors = np.linalg.eigh(self._joined(self._core.schur, ratio))
-        return vectors[:, values <= GAP * size]
+        values, vectors = self._core_spectrum
+        if self.angular.n_views:
+            ratio = self._core_scale / self.angular_scale
+            values, vectors = np.linalg.eigh(self._joined(self._core.schur, ratio))
+        return vectors[:, values <= GAP * self._core_scale]
 
     @cached_property
     def nullity(self) -> int:
