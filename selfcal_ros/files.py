@@ -8,7 +8,7 @@ import os
 import re
 import stat
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -85,6 +85,33 @@ def _mode(target: Path) -> int:
 
 def _reason(error: Exception) -> str:
     return getattr(error, "strerror", None) or first_line(error)
+
+
+def check_outputs(inputs: Iterable[str | os.PathLike | None],
+                  outputs: Iterable[str | os.PathLike | None]) -> None:
+    """Refuse outputs that cannot all be written, before the first of them is.
+
+    Raises
+    ------
+    InputError
+        If an output is one of the files that are read (or in a folder that is), two outputs are
+        one file, or an output is a folder or has none to lie in.
+    """
+    taken = {os.path.realpath(name) for name in inputs if name}
+    taken |= {os.path.realpath(file) for folder in map(Path, list(taken)) if folder.is_dir()
+              for file in folder.iterdir()}
+    for name in filter(None, outputs):
+        target = Path(os.path.realpath(name))
+        if target.exists() and not target.is_file() and not target.is_dir():
+            continue  # a pipe or /dev/null takes any number of outputs
+        if target.is_dir():
+            raise InputError(str(name), "it is a folder", "name a file")
+        if str(target) in taken:
+            raise InputError(str(name), "would be written over", "name another output file")
+        if not target.parent.is_dir():
+            raise InputError(str(name), "cannot be written (No such file or directory)",
+                             "name a folder that exists and that you may write")
+        taken.add(str(target))
 
 
 def write_bytes(path: str | os.PathLike, data: bytes) -> None:

@@ -16,6 +16,7 @@ from selfcal_ros import files
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import (
     atomic_file,
+    check_outputs,
     read_bytes,
     read_json,
     read_text,
@@ -253,6 +254,23 @@ def test_digests_of_files_and_of_folders(tmp_path):
     assert sha256_of(tmp_path / "f") == hashlib.sha256(b"twoone").hexdigest()
     with pytest.raises(InputError, match=r"none: cannot be read \(No such file"):
         sha256_of(tmp_path / "none")
+
+
+def test_outputs_are_refused_that_cannot_all_be_written(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "bag").mkdir()
+    (tmp_path / "bag" / "metadata.yaml").write_text("")
+    (tmp_path / "in.csv").write_text("")
+    (tmp_path / "link.json").symlink_to("in.csv")
+    for outputs, message in (
+            (["in.csv"], "in.csv: would be written over"),
+            (["link.json"], "link.json: would be written over"),
+            (["bag/metadata.yaml"], "bag/metadata.yaml: would be written over"),
+            (["a", "./a"], "./a: would be written over"), (["bag"], "bag: it is a folder"),
+            (["a", "no/a"], r"no/a: cannot be written \(No such file")):
+        with pytest.raises(InputError, match="^" + message):
+            check_outputs(["in.csv", "bag", None], outputs)
+    check_outputs(["in.csv", None], ["a", "b", None, os.devnull, os.devnull])
 
 
 def test_what_json_writes_is_what_json_reads(tmp_path):

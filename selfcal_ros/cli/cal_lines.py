@@ -71,8 +71,7 @@ def _orthogonality(args: argparse.Namespace) -> int:
     if None in measured:
         raise InputError("arguments", "the measurement is not complete",
                          "give --measured, --over and --travel, or a RESULT.json")
-    if args.home_x is not None or args.home_y is not None:
-        raise InputError("--home-x", "it has no meaning for a measured square", "take --home")
+    _refuse_frame(args, "a measured square", "take --home")
     lengths = [cal_lines.length_m(text, name) for text, name in
                zip(measured, ("--measured", "--over", "--travel"), strict=True)]
     if args.output:
@@ -112,12 +111,24 @@ def _line(args: argparse.Namespace, corrected: str) -> int:
 
     frame = frame_of(args)
     if Path(args.source).suffix.lower() == ".csv":
+        _refuse_frame(args, "measured errors, whose positions are the controller's own",
+                      "leave it out")
         line = cal_lines.measured_line(read_text(args.source), args.source, frame.unit_m)
     else:
         line = cal_lines.map_line(read_result(args.source).error_map, args.along, corrected)
     if corrected != args.along:
         line = cal_lines.without_slope(line)
     return _deliver(args, line, frame, (args.along, corrected))
+
+
+def _refuse_frame(args: argparse.Namespace, what: str, mend: str) -> None:
+    """Refuse options that place the stage frame: what a machine shows is not in that frame."""
+    for axis in "xy":
+        if getattr(args, f"home_{axis}") is not None:
+            raise InputError(f"--home-{axis}", f"it has no meaning for {what}", mend)
+        if getattr(args, f"reverse_{axis}"):
+            raise InputError(f"--reverse-{axis}", f"it has no meaning for {what}",
+                             "give positions and errors in the sense of the encoders")
 
 
 def _deliver(args: argparse.Namespace, line: "Line", frame: "MachineFrame",

@@ -44,6 +44,7 @@ def _export(args: argparse.Namespace) -> int:
 
     from selfcal_ros.compensation import cal_export
     from selfcal_ros.compensation.cal_write import cal_text, refuse_existing, write_cal
+    from selfcal_ros.files import check_outputs
 
     result, frame = read_result(args.result), frame_of(args)
     if not result.observability.identifiable:
@@ -65,6 +66,7 @@ def _export(args: argparse.Namespace) -> int:
         table = cal_export.table_theta(result.error_map, frame)
         texts[beside] = cal_text([table], comments=comments,
                                  decimals=cal_export.theta_decimals(result.error_map))
+    check_outputs([args.result], texts)
     refuse_existing(list(texts), force=args.force)
     for path, text in texts.items():
         backup = write_cal(path, text, force=args.force)

@@ -21,37 +21,25 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Read the result, write the report, say where it is."""
-    from selfcal_ros.files import read_json
+    from selfcal_ros.files import check_outputs, read_json
     from selfcal_ros.model.result import result_from_dict
     from selfcal_ros.reporting.html import save_report
     from selfcal_ros.reporting.map_plot import save_map_plot
     from selfcal_ros.reporting.summary import can_print_symbols, summary_text
 
     output = Path(args.output) if args.output else Path(args.result).with_suffix(".html")
-    _keep_apart([args.result, args.truth], [output, args.plot])
+    check_outputs([args.result, args.truth], [output, args.plot])
     result = result_from_dict(read_json(args.result), args.result)
     truth = _read_truth(args.truth) if args.truth else None
-    save_report(result, output, truth=truth)
     if args.plot:
         save_map_plot(result, args.plot, truth=truth)
+    save_report(result, output, truth=truth)
     if args.text:
         print(summary_text(result, truth=truth, ascii_only=not can_print_symbols(sys.stdout)))
     for written in (output, args.plot):
         if written:
             print(f"written: {written}")
     return 0
-
-
-def _keep_apart(inputs: list[str | None], outputs: list[str | Path | None]) -> None:
-    """Refuse to write over a file that is read, or two outputs to one file."""
-    from selfcal_ros.errors import InputError
-
-    taken = {Path(name).resolve() for name in inputs if name}
-    for name in outputs:
-        if name and Path(name).resolve() in taken:
-            raise InputError(str(name), "would be written over", "name another output file")
-        if name:
-            taken.add(Path(name).resolve())
 
 
 def _read_truth(path: str) -> dict:

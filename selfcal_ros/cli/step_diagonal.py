@@ -70,6 +70,7 @@ def run(args: argparse.Namespace) -> int:
     from selfcal_ros.laser.outcome import outcome, summary
     from selfcal_ros.laser.profiles import Line
 
+    _check_outputs(args)
     if args.sensitivity:
         return _sensitivity(args)
     if args.simulate:
@@ -97,6 +98,26 @@ def run(args: argparse.Namespace) -> int:
     else:
         print(json.dumps(result, indent=1, allow_nan=False))
     return ExitCode.DONE
+
+
+def _check_outputs(args: argparse.Namespace) -> None:
+    """Refuse outputs that would not be written, or not all of them."""
+    from selfcal_ros.compensation.cal_write import refuse_existing
+    from selfcal_ros.files import check_outputs
+
+    measured = not (args.sensitivity or args.simulate)
+    for option, path, there, mend in (
+            ("--truth", args.truth, args.simulate, "it belongs to --simulate"),
+            ("--plot", args.plot, not args.simulate, "leave it out with --simulate"),
+            ("--cal", args.cal, measured, "it belongs to a measurement"),
+            ("--save-csv", args.save_csv, measured and args.data and is_bag(args.data),
+             "it belongs to a bag")):
+        if path and not there:
+            raise InputError(option, "nothing would be written", mend)
+    check_outputs([args.data, args.simulate],
+                  [args.output, args.plot, args.cal, args.truth, args.save_csv])
+    if args.cal:
+        refuse_existing([args.cal], force=args.force)
 
 
 def _write_cal(args: argparse.Namespace, found: object) -> None:

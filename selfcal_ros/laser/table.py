@@ -3,8 +3,8 @@
 
 Columns: ``block``; ``rx_pp, ry_pp, rx_np, ry_np`` (3D: ``rx_ppp, ry_ppp, rz_ppp, rx_npp, ...``);
 and, for the new formulation, the linear errors ``ex_x, ey_y`` (3D: ``ez_z``). Several repeats are
-several rows of the same block. Lines that start with ``#`` are comments. A cell of a linear error
-may stay empty where it was repeated less often than the diagonals.
+several rows of the same block. Lines that start with ``#`` are comments. The cells of a diagonal,
+or of a linear error, stay empty in the rows beyond its own repeats.
 """
 
 import csv
@@ -74,6 +74,7 @@ def read_table(path: str | os.PathLike, columns: Columns) -> tuple[StepDiagonal,
     ignored = [name for name in header if name not in known]
     warnings = [f"{path}: column '{name}' is not used" for name in ignored]
     cells: dict[int, list[tuple[np.ndarray, np.ndarray]]] = {}
+    first_line: dict[int, int] = {}
     for line, row in rows[1:]:
         if len(row) != len(header):
             raise InputError(f"{path}:{line}", f"{len(row)} cells where the header has "
@@ -81,6 +82,9 @@ def read_table(path: str | os.PathLike, columns: Columns) -> tuple[StepDiagonal,
         named = dict(zip(header, row, strict=True))
         block = _block(named[BLOCK], f"{path}:{line}: {BLOCK}")
         cells.setdefault(block, []).append(_values(named, columns, f"{path}:{line}"))
+        first_line.setdefault(block, line)
+    for block, line in first_line.items():
+        _refuse_unread(cells[block], columns, f"{path}:{line}")
     return _assemble(_in_order(cells, path), columns), warnings
 
 
@@ -161,19 +165,32 @@ def _number(text: str, where: str) -> float:
 def _values(named: dict[str, str], columns: Columns, where: str) -> tuple[np.ndarray, np.ndarray]:
     """Return one row's readings (K, D) and linear errors (D,), m."""
     steps = np.array(columns.steps_m)
-    nominal = np.tile(steps**2 / np.linalg.norm(steps), len(columns.diagonals))
-    readings = np.empty(len(columns.readings))
+    nominal = steps**2 / np.linalg.norm(steps)
+    readings = np.full((len(columns.diagonals), len(steps)), np.nan)
     for index, name in enumerate(columns.readings):
+        k, j = divmod(index, len(steps))
+        of_diagonal = columns.readings[k * len(steps):(k + 1) * len(steps)]
+        if not any(named[other] for other in of_diagonal):
+            continue
         place = f"{where}: {name}"
-        readings[index] = _number(named[name], place) * MM
-        check_reading(readings[index], nominal[index], place)
+        readings[k, j] = _number(named[name], place) * MM
+        check_reading(readings[k, j], nominal[j], place)
     linear = np.full(len(steps), np.nan)
     for index, name in enumerate(columns.errors):
         if named[name]:
             place = f"{where}: {name}"
             linear[index] = _number(named[name], place) * MM
             check_linear(linear[index], steps[index], place)
-    return readings.reshape(len(columns.diagonals), -1), linear
+    return readings, linear
+
+
+def _refuse_unread(rows: list[tuple[np.ndarray, np.ndarray]], columns: Columns,
+                   where: str) -> None:
+    """Refuse a block in which a diagonal was read in no row."""
+    read = np.isfinite([readings for readings, _ in rows]).any(axis=0).ravel()
+    if not read.all():
+        raise InputError(f"{where}: {columns.readings[int(np.argmin(read))]}", "the cell is empty",
+                         "give a number in mm")
 
 
 def _in_order(cells: dict[int, list], path: str | os.PathLike) -> list[list]:
@@ -205,15 +222,21 @@ def table_text(data: StepDiagonal, comments: Sequence[str] = ()) -> str:
         out.write(f"# {comment}\n")
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow([BLOCK, *columns.readings, *columns.errors])
-    for repeat, sample in enumerate(data.samples_m):
+    for repeat in range(max(len(data.samples_m), len(data.linear_m) if columns.linear else 0)):
         for i in range(data.n_blocks):
-            if np.isnan(sample[:, :, i]).any():
-                continue
-            values = list(sample[:, :, i].ravel())
+            values = _row(data.samples_m[:, :, :, i], repeat)
             if columns.linear:
-                values += list(data.linear_m[repeat, :, i])
-            writer.writerow([i + 1, *("" if np.isnan(v) else f"{v / MM:.8f}" for v in values)])
+                values += _row(data.linear_m[:, :, i], repeat)
+            if not np.isnan(values).all():
+                writer.writerow([i + 1, *("" if np.isnan(v) else f"{v / MM:.8f}" for v in values)])
     return out.getvalue()
+
+
+def _row(of_block: np.ndarray, repeat: int) -> list[float]:
+    """Return the values of one repeat, NaN where there are not so many."""
+    if repeat < len(of_block):
+        return of_block[repeat].ravel().tolist()
+    return [math.nan] * of_block[0].size
 
 
 def write_table(path: str | os.PathLike, data: StepDiagonal,

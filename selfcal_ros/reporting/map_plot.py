@@ -4,6 +4,7 @@
 import io
 import os
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from textwrap import fill
 
 import numpy as np
@@ -13,6 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.projections.polar import PolarAxes
 
 from selfcal_ros import __version__
+from selfcal_ros.errors import InputError
 from selfcal_ros.files import write_bytes
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.reporting.map_plot_style import RC, drawable
@@ -40,8 +42,11 @@ def save_map_plot(result: CalibrationResult, path: str | os.PathLike, *,
     Raises
     ------
     InputError
-        If `truth` does not fit the map, or the file cannot be written.
+        If `truth` does not fit the map, the name does not end in .png, or the file cannot be
+        written.
     """
+    if Path(path).suffix.lower() != ".png":
+        raise InputError(str(path), "the picture is a PNG", "name a file that ends in .png")
     truth = truth_arrays(result.error_map, truth)
     with rc_context(RC):
         figure = _whole_figure(result, truth)

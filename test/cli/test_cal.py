@@ -282,6 +282,27 @@ def test_lines_from_a_result_and_from_measured_errors(run, tmp_path):
     one_line(err, "a.cal: the file exists")
 
 
+@pytest.mark.parametrize("args", [
+    ["accuracy", "d.csv", "--home-x", "-50"], ["accuracy", "d.csv", "--reverse-x"],
+    ["straightness", "d.csv", "--along", "y", "--home-y", "5"],
+    ["orthogonality", "--measured", "5um", "--over", "1m", "--travel", "1m", "--reverse-y"]])
+def test_what_was_measured_is_in_the_controllers_own_coordinates(run, tmp_path, args):
+    (tmp_path / "d.csv").write_text("position,error\n0,0\n10,1\n20,3\n")
+    code, out, err = run(*args)
+    assert code == 2 and not out
+    one_line(err, "it has no meaning for")
+
+
+def test_all_outputs_of_an_export_are_checked_first(run, tmp_path):
+    args = ("export", "r.json", "--theta-axis", "3", "-o", "f.cal")
+    code, _, err = run(*args, "--theta-output", "no/t.cal")
+    assert code == 2 and not (tmp_path / "f.cal").exists()
+    one_line(err, "no/t.cal: cannot be written")
+    code, _, err = run("export", "r.json", "-o", "r.json", "--force")
+    assert code == 2
+    one_line(err, "r.json: would be written over")
+
+
 def test_bad_paths_and_bad_plots(run, tmp_path):
     run("export", "r.json", "-o", "f.cal")
     (tmp_path / "x.json").write_text("{}")

@@ -71,6 +71,11 @@ def test_summary_on_a_terminal_without_symbols(folder, monkeypatch):
      "result.json: would be written over; name another output file"),
     (["result.json", "-o", "a.html", "--plot", "a.html"],
      "a.html: would be written over; name another output file"),
+    (["result.json", "-o", "a.html", "--plot", "a.pdf"],
+     "a.pdf: the picture is a PNG; name a file that ends in .png"),
+    (["result.json", "-o", "a.html", "--plot", "none/a.png"],
+     "none/a.png: cannot be written (No such file or directory); name a folder that exists and "
+     "that you may write"),
     (["result.json", "-o", "none/a.html"],
      "none/a.html: cannot be written (No such file or directory); name a folder that exists and "
      "that you may write"),

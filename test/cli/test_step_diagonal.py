@@ -111,6 +111,31 @@ def test_bad_arguments_are_one_line_and_exit_code_2(capsys, extra, message):
     assert message in err
 
 
+@pytest.mark.parametrize(("args", "message"), [
+    (("d.csv", "--method", "new", "-o", "d.csv"), "d.csv: would be written over"),
+    (("d.csv", "--method", "new", "-o", "a.json", "--cal", "a.json"), "a.json: would be written"),
+    (("d.csv", "--method", "new", "-o", "no/a.json", "--cal", "a.cal"), "no/a.json: cannot be wr"),
+    (("d.csv", "--method", "new", "-o", "a.json", "--plot", "a.png", "--cal", "old.cal"),
+     "old.cal: the file exists"),
+    (("d.csv", "--method", "new", "--save-csv", "a.csv"), "--save-csv: nothing would be written"),
+    (("d.csv", "--method", "new", "--truth", "a.json"), "--truth: nothing would be written"),
+    (("--simulate", "s.yaml", "-o", "s.yaml"), "s.yaml: would be written over"),
+    (("--simulate", "s.yaml", "-o", "a.csv", "--truth", "./a.csv"), "./a.csv: would be written"),
+    (("--simulate", "s.yaml", "--plot", "a.png"), "--plot: nothing would be written"),
+    (("--sensitivity", "--cal", "a.cal"), "--cal: nothing would be written"),
+])
+def test_outputs_are_refused_before_anything_is_written(tmp_path, monkeypatch, capsys, args,
+                                                        message):
+    monkeypatch.chdir(tmp_path)
+    for name, text in (("d.csv", EXAMPLE.read_text()), ("old.cal", ""),
+                       ("s.yaml", EXAMPLE.with_suffix(".yaml").read_text())):
+        (tmp_path / name).write_text(text)
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    code, _, err = run(capsys, *args)
+    assert code == 2 and message in err and err.count("\n") == 1
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
 def test_bad_tables_are_one_line_with_their_exit_code(tmp_path, capsys):
     table = tmp_path / "d.csv"
     for text, expected, message in (

@@ -60,6 +60,24 @@ def test_a_repeat_of_some_blocks_only_is_written_as_such():
     assert [line.split(",")[0] for line in text.splitlines()] == ["block", "1", "2", "1"]
 
 
+@pytest.mark.parametrize("repeats", [(3, 2, 1, 1), (2, 3, 2, 4), (1, 1, 1, 2), (2, 1, 3, 1)])
+def test_diagonals_and_axes_of_unequal_repeats_lose_nothing(tmp_path, repeats):
+    rng = np.random.default_rng(3)
+    samples = 7.07e-3 + rng.normal(0, 1e-8, (max(repeats[:2]), 2, 2, 3))
+    linear = rng.normal(0, 1e-8, (max(repeats[2:]), 2, 3))
+    for index in range(2):
+        samples[repeats[index]:, index] = np.nan
+        linear[repeats[2 + index]:, index] = np.nan
+    path = tmp_path / "out.csv"
+    write_table(path, StepDiagonal((0.01, 0.01), DIAGONALS[2], samples, linear))
+    back, _ = read_table(path, Columns((0.01, 0.01), DIAGONALS[2], True))
+    rows = max(repeats)
+    for got, want in ((back.samples_m, samples), (back.linear_m, linear)):
+        assert got.shape[0] == rows
+        np.testing.assert_allclose(got[:len(want)], want, atol=0.6e-11)
+        assert np.isnan(got[len(want):]).all()
+
+
 ROW = f"1,{GOOD}\n"
 HOSTILE = {
     "empty": ("", NoDataError, "the table is empty"),
@@ -71,6 +89,10 @@ HOSTILE = {
     "text": (HEAD + "\n1,7,7,seven,7,0,0\n", InputError, "d.csv:2: rx_np: 'seven' is not a num"),
     "underscore": (HEAD + "\n1,7_0,7,7,7,0,0\n", InputError, "rx_pp: '7_0' is not a number"),
     "empty cell": (HEAD + "\n1,7,7,,7,0,0\n", InputError, "d.csv:2: rx_np: the cell is empty"),
+    "empty cell of a repeat": (f"{HEAD}\n{ROW}1,7,7,,7,0,0\n", InputError,
+                               "d.csv:3: rx_np: the cell is empty"),
+    "diagonal never read": (f"{HEAD}\n{ROW}2,7,7,,,0,0\n2,7,7,,,0,0\n", InputError,
+                            "d.csv:3: rx_np: the cell is empty"),
     "micrometres": (HEAD + "\n1,7071.1,7,7,7,0,0\n", InputError,
                     "rx_pp: 7071.1 where 7.07107 mm is nominal: it looks like micrometres"),
     "mixed units": (f"{HEAD}\n{ROW}2,7,0.0070711,7,7,0,0\n", InputError,

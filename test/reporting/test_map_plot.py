@@ -94,8 +94,8 @@ def test_png_of_any_size(tmp_path, size, lines):
 def test_truth_changes_the_picture_and_the_same_input_gives_the_same_bytes(tmp_path):
     result, truth = known_result(3, 8)
     for name, options in (("a", {}), ("b", {}), ("c", {"truth": truth})):
-        save_map_plot(result, tmp_path / name, **options)
-    a, b, c = ((tmp_path / name).read_bytes() for name in "abc")
+        save_map_plot(result, tmp_path / f"{name}.png", **options)
+    a, b, c = ((tmp_path / f"{name}.png").read_bytes() for name in "abc")
     assert a == b != c
     assert error_map_svg(result) == error_map_svg(result)
 
