@@ -57,6 +57,22 @@ class Cells:
         steps = [np.abs(np.diff(self.nodes, axis=axis)) for axis in (1, 2)]
         return max(float(step.max(initial=0.0, where=np.isfinite(step))) for step in steps)
 
+    def steepest(self) -> float:
+        """Return the largest |df/du| + |df/dv| of either field at 5 x 5 points of every cell.
+
+        Unknown nodes do not count.
+        """
+        powers = np.arange(self.degree + 1)
+        places = np.linspace(0, 1, 5)[:, None]
+        value = places ** powers
+        slope = powers * places ** np.maximum(powers - 1, 0)
+        largest = 0.0
+        for along, along_slope in zip(value, slope, strict=True):
+            size = (np.abs((along_slope @ self.coefficients) @ value.T)
+                    + np.abs((along @ self.coefficients) @ slope.T))
+            largest = max(largest, np.nan_to_num(size).max(initial=0.0))
+        return float(largest)
+
     def at(self, s: np.ndarray, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return both fields at grid coordinates `s`, `t` (0..nx-1, 0..ny-1; clamped), (P,).
 

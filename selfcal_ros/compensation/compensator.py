@@ -28,6 +28,9 @@ from selfcal_ros.model.error_map import ErrorMap
 MAX_SLOPE = 0.25
 """Largest slope between neighbours that the inverse accepts: the fixed point converges fast."""
 
+GENTLE = 0.005
+"""Slope between neighbours below which no spline through them comes near twice MAX_SLOPE."""
+
 _Field = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 
@@ -77,6 +80,9 @@ class Compensator:
         self._cells = bilinear_cells(fields) if method == "bilinear" else bicubic_cells(fields)
         if self._cells.largest_step > MAX_SLOPE * self._pitch:
             raise _steep("sites")
+        if method == "bicubic" and self._cells.largest_step > GENTLE * self._pitch \
+                and self._cells.steepest() > 2 * MAX_SLOPE * self._pitch:
+            raise _steep_spline()
         self._u_cells = bilinear_cells(np.stack([error_map.u_gx, error_map.u_gy]))
         self._theta = _Circle(error_map.g_theta, cubic=method == "bicubic")
         self._u_theta = _Circle(error_map.u_g_theta, cubic=False)
@@ -227,7 +233,8 @@ class Compensator:
     def _refuse_outside(self, x_m: ArrayLike, y_m: ArrayLike) -> None:
         if self.outside == "clamp":
             return
-        off = ~self.inside(x_m, y_m)
+        # An unknown position (NaN) lies neither inside nor outside: it gives NaN.
+        off = ~(self.inside(x_m, y_m) | np.isnan(x_m) | np.isnan(y_m))
         if np.any(off):
             x, y = np.broadcast_arrays(x_m, y_m)
             first = np.flatnonzero(off)[0]
@@ -259,6 +266,7 @@ class _Circle:
     def at(self, angle_rad: np.ndarray) -> np.ndarray:
         """Return the values at `angle_rad`, any shape; NaN next to unknown lines."""
         s = angle_rad * (self._count / (2 * np.pi))
+        s = np.where(np.isfinite(s), s, np.nan)
         if self._spline is not None:
             return self._spline(np.mod(s, self._count))
         if self._holes:
@@ -271,6 +279,11 @@ class _Circle:
         low, high = self._closed[i], self._closed[i + 1]
         # A line of zero weight does not count, so that a known line stays known.
         return np.where(u == 0, low, low + u * (high - low))
+
+
+def _steep_spline() -> InputError:
+    return InputError("error map", "the cubic spline between the sites is steeper than one half",
+                      "such a map cannot be inverted: take bilinear, or check its units (m, rad)")
 
 
 def _steep(what: str) -> InputError:

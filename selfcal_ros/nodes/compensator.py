@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """compensator: true positions from indicated ones, by the calibrated error map."""
 
+import math
 import sys
 from typing import Any
 
@@ -45,15 +46,22 @@ class CompensatorNode(SelfcalNode):
         if len(position) != len(message.name):
             self._counts["refused"] += 1
             return
+        corrected = []
         try:
             if x is not None and y is not None:
-                corrected = self._compensator.correct(position[x], position[y])
-                position[x], position[y] = float(corrected[0]), float(corrected[1])
-            if theta is not None and len(self._compensator.error_map.g_theta):
-                position[theta] = float(self._compensator.correct_theta(position[theta]))
+                corrected += zip((x, y), self._compensator.correct(position[x], position[y]),
+                                 strict=True)
+            if theta is not None and self._compensator.has_theta:
+                corrected.append((theta, self._compensator.correct_theta(position[theta])))
         except InputError:
+            corrected.append((0, math.nan))
+        if not all(math.isfinite(value) for _, value in corrected):
+            # Outside of the field with outside=refuse, beside an unknown site or line, or no
+            # position at all.
             self._counts["refused"] += 1
             return
+        for index, value in corrected:
+            position[index] = float(value)
         message.position = position
         self._counts["corrected"] += 1
         self._corrected.publish(message)

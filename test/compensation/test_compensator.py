@@ -5,6 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.interpolate import RectBivariateSpline
 
+from selfcal_ros.compensation.cells import bicubic_cells
 from selfcal_ros.compensation.compensator import Compensator
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.artifact import Artifact
@@ -97,6 +98,16 @@ def test_nan_positions_give_nan_and_leave_the_others_alone():
     gx, _ = Compensator(MAP).error([np.nan, 0.012], 0.0)
     tx, ty = Compensator(MAP).correct([np.nan, 0.012], 0.0)
     assert np.isnan([gx[0], tx[0], ty[0]]).all() and np.isfinite([gx[1], tx[1], ty[1]]).all()
+
+
+def test_what_is_not_known_is_nan_and_not_outside():
+    holed = Compensator(random_map(ARTIFACT, 3, unknown=[(5, 5)]), outside="refuse")
+    for call in ("error", "command", "correct"):
+        assert np.isnan(getattr(holed, call)(0.002, 0.002)).all()
+    for call in ("error", "command", "correct", "uncertainty"):
+        assert np.isnan(getattr(holed, call)(np.nan, 0.02)[0])
+        with pytest.raises(InputError, match=r"\(0\.06.*, 0\.0"):
+            getattr(holed, call)([np.nan, 0.06], [0.0, 0.01])
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -205,6 +216,41 @@ def test_a_map_in_the_wrong_unit_is_refused():
     emap.g_theta[2] = 20.0
     with pytest.raises(InputError, match="angular lines"):
         Compensator(emap)
+
+
+def checked(step, lines=0.0):
+    """Return a map that jumps by `step` pitches from site to site, `lines` from line to line."""
+    sign = (-1.0) ** np.add.outer(np.arange(11), np.arange(11))
+    g = sign * step * ARTIFACT.grid_pitch_m / 2
+    theta = (-1.0) ** np.arange(24) * lines * np.pi / 24
+    return ErrorMap(ARTIFACT, g, -g, 0 * g, 0 * g, theta, 0 * theta)
+
+
+def test_a_spline_that_is_too_steep_between_its_sites_is_refused():
+    # Between the sites the spline is steeper than from site to site: at steps of 0.24 pitches the
+    # fixed point did not come to rest, and the inverse erred by millimetres without a word.
+    x, y = np.random.default_rng(6).uniform(-0.05, 0.05, (2, 2000))
+    Compensator(checked(0.24, 0.24))
+    with pytest.raises(InputError, match="spline between the sites is steeper than one half"):
+        Compensator(checked(0.24), method="bicubic")
+    compensator = Compensator(checked(0.05, 0.24), method="bicubic")
+    back = compensator.correct(*compensator.command(x, y))
+    np.testing.assert_allclose(back, (x, y), rtol=0, atol=1e-16)
+    theta = np.linspace(-4, 4, 99)
+    np.testing.assert_allclose(compensator.correct_theta(compensator.command_theta(theta)), theta,
+                               rtol=0, atol=4e-15)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_the_largest_slope_of_the_spline(seed):
+    rng = np.random.default_rng(seed)
+    cells = bicubic_cells(rng.normal(size=(2, 7, 5)))
+    s, t = np.meshgrid(np.linspace(1e-5, 6 - 1e-5, 301), np.linspace(1e-5, 4 - 1e-5, 201))
+    s, t = s.ravel(), t.ravel()
+    step = 1e-6
+    slopes = [np.abs(np.subtract(cells.at(s + a, t + b), cells.at(s - a, t - b))) / (2 * step)
+              for a, b in ((step, 0), (0, step))]
+    assert cells.steepest() == pytest.approx(np.max(slopes[0] + slopes[1]), rel=0.1)
 
 
 def test_scalars_and_shapes_come_back_as_they_were():

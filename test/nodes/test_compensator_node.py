@@ -2,6 +2,7 @@
 """compensator: corrected positions, by a map from the graph or from a file."""
 
 import json
+import math
 
 import numpy as np
 import pytest
@@ -97,6 +98,22 @@ def test_what_is_not_corrected_is_counted_and_not_published(graph, tmp_path):
     graph.until(lambda: said and {v.key: v.value for v in said[-1].status[0].values} == wanted,
                 "the counts")
     assert node.get_name() == "compensator"
+
+
+def test_places_beside_unknown_sites_and_no_numbers_are_refused(graph):
+    graph.node(CompensatorNode)
+    latch_map(graph, random_map(Artifact(5, 0.01, 8), 3, unknown=[(2, 2)]))
+    said: list = []
+    graph.hand.create_subscription(DiagnosticArray, "/diagnostics", said.append, 10)
+    graph.until(lambda: said and said[-1].status[0].message == "correcting", "the map")
+    heard, publisher = graph.listen(names.CORRECTED), graph.publisher(names.ENCODER)
+    for place in ((0.002, 0.002, 0.0), (math.nan, 0.0, 0.0), (0.0, 0.0, math.inf)):
+        publisher.publish(sample(*place))
+    publisher.publish(sample(0.015, 0.015, 0.0))
+    graph.until(lambda: heard, "the good sample")
+    assert heard[0].position[0] == pytest.approx(0.015, abs=1e-5)
+    graph.until(lambda: {v.key: v.value for v in said[-1].status[0].values}["refused"] == "3",
+                "the counts")
 
 
 def test_without_a_map_the_state_is_a_warning(graph):
