@@ -55,10 +55,14 @@ class Sequencer:
         if self.state not in ENDED:
             raise InputError("pose_sequencer", f"cannot start while {self.state}",
                              "abort the plan first")
-        if self.plan is None:
-            raise InputError("pose_sequencer", "there is no plan", "set the parameter 'plan'")
+        self.need_plan()
         self.skipped, self.index = [], 0
         return self._place()
+
+    def need_plan(self) -> None:
+        """Raise InputError if there is no plan to start."""
+        if self.plan is None:
+            raise InputError("pose_sequencer", "there is no plan", "set the parameter 'plan'")
 
     def confirm(self) -> list[Command]:
         """Take the plate as placed: measure."""
@@ -88,7 +92,14 @@ class Sequencer:
         return self._advance()
 
     def abort(self) -> list[Command]:
-        """Give the plan up; what was measured stays with the collector."""
+        """Give the plan up; what was measured stays with the collector.
+
+        While following somebody else's commands there is no plan of its own to abort: it only
+        stops following, and can be started again.
+        """
+        if self.state is State.FOLLOWING:
+            self.state = State.IDLE
+            return []
         if self.state not in (State.PLACING, State.MEASURING):
             raise InputError("pose_sequencer", f"nothing to abort while {self.state}",
                              "start a plan first")

@@ -4,6 +4,7 @@
 import sys
 import time
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
@@ -15,7 +16,7 @@ from std_srvs.srv import Trigger
 from selfcal_ros.bagio import convert_in, convert_out
 from selfcal_ros.collection.messages import Command
 from selfcal_ros.collection.sequencer import ENDED, Sequencer, State
-from selfcal_ros.errors import ExitCode, SelfcalError
+from selfcal_ros.errors import ExitCode, NoDataError, SelfcalError
 from selfcal_ros.files import read_yaml
 from selfcal_ros.model.view import Plan, plan_from_dict
 from selfcal_ros.nodes import names
@@ -39,23 +40,26 @@ class PoseSequencer(SelfcalNode):
         self._ended: Future | None = None
         self._deadline, self._confirm_at, self._redos = 0.0, 0.0, 0
         self._coverage, self._commanded_ns = 0.0, 0
+        self._measured: dict[str, dict[int, str]] = {}
         self._command = self.publisher(names.COMMAND)
         self.subscribe(names.COMMAND, self._on_command)
         self.subscribe(names.STATUS, self._on_status)
-        for name, act in (("start", self.machine.start), ("confirm_view", self.machine.confirm),
-                          ("redo_view", self.machine.redo), ("skip_view", self.machine.skip),
-                          ("abort", self.machine.abort)):
-            self.create_service(Trigger, f"~/{name}", lambda request, response, act=act:
-                                self.trigger(request, response, lambda: self._do(act)))
+        self.subscribe(names.MEASUREMENT, self._on_measurement)
+        self.create_service(Trigger, "~/start", partial(self.trigger, act=self._begin))
+        machine = self.machine
+        for name, act in (("confirm_view", machine.confirm), ("redo_view", machine.redo),
+                          ("skip_view", machine.skip), ("abort", machine.abort)):
+            do = partial(self._do, act)
+            self.create_service(Trigger, f"~/{name}", partial(self.trigger, act=do))
         self._saver = self.create_client(SaveMap, "solver/save_map")
         self._action = ActionServer(
             self, RunCalibration, "~/run_calibration", self._execute,
             goal_callback=self._on_goal, cancel_callback=lambda goal: CancelResponse.ACCEPT)
         self.create_timer(0.05, self.guarded(self._on_timer))
-        self.create_timer(1.0, lambda: self.diagnose(str(self.machine.state),
-                                                     {"view": self.machine.index}))
-        if self.values["auto_start"]:
-            self._send(self.machine.start())
+        self.create_timer(1.0, self._report)
+        self._waiting = self.values["auto_start"]
+        if self._waiting:
+            self.machine.need_plan()
 
     def _on_goal(self, _: Any) -> GoalResponse:
         if self.machine.state in ENDED:
@@ -66,6 +70,29 @@ class PoseSequencer(SelfcalNode):
     def _do(self, act: Any) -> str:
         self._send(act())
         return f"{self.machine.state}: view {self.machine.index}"
+
+    def _begin(self) -> str:
+        """Start the plan; say what is known of it and who is missing."""
+        self._waiting = False
+        answer = self._do(self.machine.start)
+        known = self._measured.get(self.machine.plan.plan_id, {})
+        if known:
+            views = ", ".join(known[index] for index in sorted(known))
+            answer += f"; measured already: {views} (skip_view keeps a view as it is)"
+        if not self._collectors():
+            answer += "; no measurement_collector is running: what is measured now is lost"
+        self.get_logger().info(answer)
+        return answer
+
+    def _collectors(self) -> int:
+        return self.count_publishers(self.resolve_topic_name(names.STATUS.name))
+
+    def _on_measurement(self, message: Any) -> None:
+        self._measured.setdefault(message.plan_id, {})[message.view_index] = message.view_name
+
+    def _report(self) -> None:
+        state = "waiting for a measurement_collector" if self._waiting else str(self.machine.state)
+        self.diagnose(state, {"view": self.machine.index, "coverage": f"{self._coverage:.3f}"})
 
     def _send(self, commands: list[Command]) -> None:
         for command in commands:
@@ -86,7 +113,8 @@ class PoseSequencer(SelfcalNode):
         if _key(convert_in.command(message)) in self._own:
             return
         if self.machine.state is not State.FOLLOWING:
-            self.get_logger().warning("another publisher sends view commands: following them")
+            self.get_logger().warning("another publisher sends view commands: following them; "
+                                      "abort ends that")
         self.machine.foreign_command()
         if self._ended is not None:
             self._ended.set_result(None)
@@ -97,13 +125,14 @@ class PoseSequencer(SelfcalNode):
         expected = message.grid_expected + message.angular_expected
         if message.view_index == self.machine.index and expected:
             self._coverage = (message.grid_done + message.angular_done) / expected
-        index = self.machine.index
-        self._send(self.machine.status(message.plan_id, message.view_index, message.complete))
-        if self.machine.index != index:
-            self._redos = 0
+        next_view = self.machine.status(message.plan_id, message.view_index, message.complete)
+        self._redos = 0 if next_view else self._redos
+        self._send(next_view)
 
     def _on_timer(self) -> None:
         now = time.monotonic()
+        if self._waiting and self._collectors():
+            self._begin()
         if (self.machine.state is State.PLACING and self.values["auto_confirm"]
                 and now >= self._confirm_at):
             self._send(self.machine.confirm())
@@ -133,7 +162,7 @@ class PoseSequencer(SelfcalNode):
             if goal.request.plan_path:
                 self.machine.plan = load_plan(goal.request.plan_path)
             self._goal, self._ended = goal, Future()
-            self._send(self.machine.start())
+            self._begin()
             await self._ended
             await self._conclude(goal, result)
         except SelfcalError as error:
@@ -151,16 +180,11 @@ class PoseSequencer(SelfcalNode):
             return
         path = self.values["result_path"] or f"{self.machine.plan.plan_id}.json"
         if not self._saver.service_is_ready():
-            result.error_code, result.message = int(ExitCode.NO_DATA), "no solver is running"
-            goal.abort()
-            return
+            raise NoDataError("run_calibration", "no solver is running", "start one, then save_map")
         answer = await self._saver.call_async(SaveMap.Request(path=path))
         result.error_code, result.message = answer.error_code, answer.message
-        if answer.success:
-            result.map_path = path
-            goal.succeed()
-        else:
-            goal.abort()
+        result.map_path = path if answer.success else ""
+        goal.succeed() if answer.success else goal.abort()
 
 
 def _key(command: Command) -> tuple:

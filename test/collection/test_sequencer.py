@@ -51,6 +51,7 @@ FITS = {  # (state, request) -> phase of the command, its view, state after
     (State.MEASURING, "skip"): (PLACE, 1, State.PLACING),
     (State.MEASURING, "abort"): (ABORT, 0, State.ABORTED),
 }
+QUIET = {(State.FOLLOWING, "abort"): State.IDLE}  # fits, and commands nothing
 
 
 @pytest.mark.parametrize("request_name", REQUESTS)
@@ -67,7 +68,10 @@ def test_every_request_in_every_state(state, request_name):
         assert command.view == (PLAN.views[view] if phase in (PLACE, MEASURE) else None)
         assert command.artifact == (PLAN.artifact if phase in (PLACE, MEASURE) else None)
         return
-    if request_name == "complete":
+    if (state, request_name) in QUIET:
+        assert REQUESTS[request_name](sequencer) == []
+        state = QUIET[state, request_name]
+    elif request_name == "complete":
         assert REQUESTS[request_name](sequencer) == []
     else:
         with pytest.raises(InputError, match=f"^pose_sequencer: .*while {state}"):

@@ -3,6 +3,7 @@
 
 import pytest
 from action_msgs.msg import GoalStatus
+from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.action import ActionClient
 from selfcal_msgs.action import RunCalibration
 from selfcal_msgs.srv import SaveMap
@@ -10,6 +11,7 @@ from std_srvs.srv import Trigger
 
 from selfcal_ros.bagio import convert_in, convert_out
 from selfcal_ros.collection.messages import Command, Phase
+from selfcal_ros.collection.sequencer import State
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes.base import fill
 from selfcal_ros.nodes.pose_sequencer import PoseSequencer
@@ -135,6 +137,42 @@ def test_recorded_commands_win_over_its_own(desk):
         assert "following recorded commands" in answer.message
     desk.complete(0)
     assert len(desk.commands) == 5
+    assert desk.ask("abort").message == "idle: view 0"
+    assert desk.ask("start").success
+    desk.graph.until(lambda: len(desk.heard) == 6, "a command of its own")
+
+
+def test_a_start_names_the_views_that_are_measured_already(desk):
+    readings = desk.graph.publisher(names.MEASUREMENT)
+    for plan_id, index in (("another plan", 3), (PLAN.plan_id, 1), (PLAN.plan_id, 0)):
+        readings.publish(names.MEASUREMENT.type(plan_id=plan_id, view_index=index,
+                                                view_name=PLAN.views[index].name))
+    desk.graph.until(lambda: len(desk.node._measured.get(PLAN.plan_id, {})) == 2, "both views")
+    first, second = (view.name for view in PLAN.views[:2])
+    assert desk.ask("start").message == (
+        "waiting for the plate to be placed: view 0; measured already: "
+        f"{first}, {second} (skip_view keeps a view as it is)")
+    assert desk.ask("skip_view").success
+    desk.expect((PLACE, 0), (PLACE, 1))
+
+
+def test_a_start_without_a_collector_says_so(graph, tmp_path):
+    graph.node(PoseSequencer, plan=plan_file(tmp_path, PLAN))
+    answer = graph.call(Trigger, "pose_sequencer/start")
+    assert answer.success
+    assert answer.message.endswith(
+        "; no measurement_collector is running: what is measured now is lost")
+
+
+def test_an_automatic_start_waits_for_a_collector(graph, tmp_path):
+    node = graph.node(PoseSequencer, plan=plan_file(tmp_path, PLAN), auto_start=True)
+    diagnostics: list = []
+    graph.hand.create_subscription(DiagnosticArray, "/diagnostics", diagnostics.append, 10)
+    graph.until(lambda: diagnostics, "its diagnostics")
+    assert diagnostics[-1].status[0].message == "waiting for a measurement_collector"
+    assert node.machine.state is State.IDLE
+    graph.hand.create_publisher(names.STATUS.type, names.STATUS.name, names.STATUS.qos)
+    graph.until(lambda: node.machine.state is State.PLACING, "the start")
 
 
 def test_an_incomplete_view_is_redone_and_then_skipped(graph, tmp_path):
