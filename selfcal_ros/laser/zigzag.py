@@ -19,6 +19,10 @@ from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.laser.data import AXES, DIAGONALS, MAX_BLOCKS, StepDiagonal
 from selfcal_ros.laser.plausible import check_reading
 
+OUTLIER = 10.0
+"""Laser samples of a rest farther than this from its median are left out, in median distances: for
+Gaussian noise 6.7 standard deviations."""
+
 
 @dataclass(frozen=True)
 class CutRule:
@@ -71,11 +75,12 @@ class Series:
 
 @dataclass(frozen=True, eq=False)
 class Rest:
-    """Axes at rest: mean position (D,) and mean laser distance, m."""
+    """Axes at rest: mean position (D,) and mean laser distance, m; laser samples left out."""
 
     position_m: np.ndarray
     laser_m: float
     start_ns: int
+    outliers: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,8 +124,12 @@ def cut_zigzag(series: Series, rule: CutRule) -> Cut:
         reading cannot be what it says.
     """
     _check(series, rule)
-    moves = _moves(find_rests(series, rule), rule)
+    rests = find_rests(series, rule)
+    moves = _moves(rests, rule)
     chains, notes = _chains(moves), []
+    outliers = sum(rest.outliers for rest in rests)
+    if outliers:
+        notes.append(f"{outliers} laser sample(s) that jump out of their rest are left out")
     if None in moves:
         notes.append(f"{moves.count(None)} move(s) that are not one step of one axis")
     dim = len(rule.steps_m)
@@ -186,7 +195,8 @@ def find_rests(series: Series, rule: CutRule) -> list[Rest]:
         if last - first >= rule.min_rest_s * 1e9:
             laser = _mean_laser(series, (first, last), rule)
             if laser is not None:
-                rests.append(Rest(positions[start:end].mean(axis=0), laser, int(first)))
+                rests.append(Rest(positions[start:end].mean(axis=0), laser[0], int(first),
+                                  laser[1]))
             start, end = end, end + 1
         elif end == len(stamps):
             break
@@ -210,13 +220,25 @@ def _end_of_rest(positions: np.ndarray, known: tuple[int, int], tolerance_m: flo
     return end
 
 
-def _mean_laser(series: Series, between_ns: tuple[int, int], rule: CutRule) -> float | None:
-    """Return the mean distance of a rest without its ends; None without samples."""
+def _mean_laser(series: Series, between_ns: tuple[int, int],
+                rule: CutRule) -> tuple[float, int] | None:
+    """Return the mean distance of a rest without its ends, and the number of samples left out.
+
+    A single sample beside the others (a beam that was cut, a digit that was lost) would move the
+    mean by far more than the noise of the laser. None without samples.
+    """
     settle_ns = round(rule.settle_s * 1e9)
     inside = slice(np.searchsorted(series.laser_ns, between_ns[0] + settle_ns),
                    np.searchsorted(series.laser_ns, between_ns[1] - settle_ns, side="right"))
     distances = series.laser_m[inside]
-    return rule.laser_sign * float(distances.mean()) if len(distances) else None
+    if not len(distances):
+        return None
+    away = np.abs(distances - np.median(distances))
+    # Half of the samples lie within the median of `away`. If they are all equal, the laser's
+    # resolution hides its noise, and the wandering of the axes is all that is known.
+    usual = float(np.median(away)) or rule.rest_tolerance_m / OUTLIER
+    kept = away <= OUTLIER * usual
+    return rule.laser_sign * float(distances[kept].mean()), int((~kept).sum())
 
 
 def _moves(rests: Sequence[Rest], rule: CutRule) -> list[Move | None]:

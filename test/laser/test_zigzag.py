@@ -143,6 +143,25 @@ def test_both_ends_of_a_rest_are_left_out(edge):
     assert np.abs(with_all - cut_zigzag(series, RULE).data.readings_m).max() > 10e-9
 
 
+@pytest.mark.parametrize("noise_m", [0.0, 1e-8])
+@pytest.mark.parametrize("spike_m", [1e-3, -3e-6])
+def test_single_laser_samples_beside_their_rest_are_left_out_and_said(noise_m, spike_m):
+    series = recording()
+    rng = np.random.default_rng(8)
+    quiet = series.laser_m + rng.normal(0, 1, len(series.laser_m)) * noise_m
+    phase = np.divmod(series.laser_ns - 3_000_000, 1_200_000_000)[1]
+    in_rest = np.flatnonzero((phase > 200_000_000) & (phase < 800_000_000))
+    spiked = quiet.copy()
+    spiked[in_rest[::50]] += spike_m
+    cut = cut_zigzag(replace(series, laser_m=spiked), RULE)
+    want = cut_zigzag(replace(series, laser_m=quiet), RULE)
+    atol = 3 * noise_m / np.sqrt(len(in_rest) / 50) + 1e-14
+    np.testing.assert_allclose(cut.data.readings_m, want.data.readings_m, atol=atol)
+    assert cut.notes == (f"{len(in_rest[::50])} laser sample(s) that jump out of their rest are "
+                         "left out", *want.notes)
+    assert not any("jump" in note for note in want.notes)
+
+
 def rests_by_trying_every_start(series, rule):
     """Return (first, number of samples) of every rest, as the definition says."""
     found, start, stamps = [], 0, series.position_ns
