@@ -18,8 +18,10 @@ from scipy.stats import chi2
 from selfcal_ros.errors import InputError, NotIdentifiableError
 from selfcal_ros.estimation.api import Options, calibrate
 from selfcal_ros.estimation.blas_threads import one_thread
+from selfcal_ros.estimation.finite_rotation import rotation_excess, turned_marks, turned_plate
 from selfcal_ros.estimation.robust_leverage import Residuals, residuals_of, view_noise
 from selfcal_ros.estimation.robust_slip import Slip, find_slip, split_view
+from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.readings import Measurements, ViewReadings
 from selfcal_ros.model.result import CalibrationResult
 
@@ -40,6 +42,9 @@ TIED = 1e-6
 MAX_SLIPS = 3
 NOISY_VIEW = 3.0
 """A view is named if its noise is this many times that of the others together."""
+MIN_VIEW_DOF = 5.0
+"""Degrees of freedom of a view's own noise below which it is not judged: chance does as much."""
+
 MAX_RATIO = 20.0
 """Largest ratio of noises that residuals can tell: a noisy view hides the noise of the others."""
 
@@ -143,7 +148,9 @@ def _listed(cleaned: Cleaned) -> dict[str, Any]:
 @one_thread()
 def clean(measurements: Measurements, options: Options) -> Cleaned:
     """Return the measurement split at slips and without outliers, and what was found."""
-    linear = replace(options, misalignment_model="linear", reference=None)
+    # a pure datum: the redundant axis conditions of xy_axes would show in the angular residuals
+    linear = replace(options, misalignment_model="linear", reference=None,
+                     datum_theta=ThetaDatum.ZERO_MEAN)
     flattened = measurements
     if options.misalignment_model != "linear":
         flattened = _flattened(measurements, options)
@@ -326,9 +333,9 @@ def _noisy_views(left: Residuals, measurements: Measurements) -> tuple[tuple[str
     if left.problem.system.grid.n_views < 2:
         return ()
     out = []
-    for index, (own, others) in zip(left.problem.grid.index, view_noise(left), strict=True):
+    for index, (own, others, dof) in zip(left.problem.grid.index, view_noise(left), strict=True):
         ratio = float(own / max(others, own / MAX_RATIO, ROUNDING))
-        if ratio > NOISY_VIEW:
+        if ratio > NOISY_VIEW and dof >= MIN_VIEW_DOF:
             out.append((measurements.views[index].view.name, ratio))
     return tuple(out)
 
@@ -349,13 +356,11 @@ def _warnings(removed: tuple[Removed, ...], noisy: tuple[tuple[str, float], ...]
 def _flattened(measurements: Measurements, options: Options) -> Measurements:
     """Return the readings less what finite rotations add to the linear model."""
     found = calibrate(measurements, replace(options, uncertainty=False))
-    pitch, views = measurements.artifact.grid_pitch_m, []
+    artifact, views = measurements.artifact, []
     for view, result in zip(measurements.views, found.views, strict=True):
         if len(view.m) and np.isfinite(result.phi):
-            pose = view.view.lattice_pose(measurements.artifact)
-            i, j = pose.site_of(view.m, view.n)
-            x, y = (i - pose.shift[0]) * pitch, (j - pose.shift[1]) * pitch
-            cos, sin = np.cos(result.phi) - 1, np.sin(result.phi) - result.phi
-            view = replace(view, dx=view.dx - cos * x + sin * y, dy=view.dy - cos * y - sin * x)
+            plate = np.nan_to_num(turned_plate(view, artifact, found.artifact_map))
+            more = rotation_excess(result.phi, turned_marks(view, artifact), plate)
+            view = replace(view, dx=view.dx - more.real, dy=view.dy - more.imag)
         views.append(view)
     return replace(measurements, views=tuple(views))

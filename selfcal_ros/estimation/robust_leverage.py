@@ -143,10 +143,11 @@ def grid_residuals(system: JointSystem, y: np.ndarray) -> np.ndarray:
 
 
 def view_noise(left: Residuals) -> np.ndarray:
-    """Return the noise of each grid view and of the others together, m, (views, 2).
+    """Return noise of each grid view and of the others, m, and dof of its own, (views, 3).
 
     The residuals of one view hold the noise of all: their sums of squares are unmixed with what
     seeded unit noise of each view leaves in each (Helmert's variance components, two at a time).
+    Twice the inverse of that mixing is the covariance of two variances that are 1.
     """
     system, grid = left.problem.system, left.problem.system.grid
     rng = np.random.default_rng(0)
@@ -159,13 +160,16 @@ def view_noise(left: Residuals) -> np.ndarray:
             noise[u] = draw[0] + 1j * draw[1]
             rest = grid_residuals(system, noise)
             mixing[:, u] += (abs(rest) ** 2 * grid.weight).sum(axis=(1, 2)) / VIEW_DRAWS
+    mixing = (mixing + mixing.T) / 2
     sums = (abs(left.found.residuals) ** 2 * grid.weight).sum(axis=(1, 2))
-    out = np.empty((grid.n_views, 2))
+    out = np.empty((grid.n_views, 3))
     for v in range(grid.n_views):
         group = np.zeros((grid.n_views, 2))
         group[:, 1], group[v] = 1.0, (1.0, 0.0)
-        out[v] = nnls(group.T @ mixing @ group, group.T @ sums)[0]
-    return np.sqrt(out)
+        normal = group.T @ mixing @ group
+        out[v, :2] = np.sqrt(nnls(normal, group.T @ sums)[0])
+        out[v, 2] = normal[0, 0] - normal[0, 1] ** 2 / max(normal[1, 1], 1e-300)
+    return out
 
 
 def angular_redundancy(system: JointSystem) -> np.ndarray:

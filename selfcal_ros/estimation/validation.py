@@ -14,6 +14,7 @@ import numpy as np
 from selfcal_ros.errors import InputError, NoDataError, NotIdentifiableError
 from selfcal_ros.estimation.api import Options, calibrate
 from selfcal_ros.estimation.blas_threads import one_thread
+from selfcal_ros.estimation.finite_rotation import rotation_excess, turned_marks, turned_plate
 from selfcal_ros.estimation.robust import subset
 from selfcal_ros.model.readings import Measurements, Sense, ViewReadings
 from selfcal_ros.model.result import CalibrationResult
@@ -22,6 +23,9 @@ FRACTION = 0.1
 """Part of the readings that is held out at random."""
 
 MAX_FOLDS = 10
+
+RIGID_STEPS = 8
+"""Steps to a finite rotation of a view held out; each gains a factor of its size."""
 
 
 @dataclass(frozen=True)
@@ -84,8 +88,11 @@ def validate(measurements: Measurements, options: Options | None = None, *, seed
     options = replace(options or Options(), method="joint", uncertainty=False)
     calibrate(measurements, options)
     rng = np.random.default_rng(seed)
-    group = [(rng.permutation(len(v.m)) % MAX_FOLDS, rng.permutation(len(v.k)) % MAX_FOLDS)
-             for v in measurements.views]
+    group = []
+    for view in measurements.views:
+        # drawn in the order of the lattice: the order of the readings changes nothing
+        ranks = (np.lexsort((view.n, view.m)).argsort(), np.argsort(view.k).argsort())
+        group.append(tuple((rng.permutation(len(rank)) % MAX_FOLDS)[rank] for rank in ranks))
     out = []
     for fold in range(folds):
         chosen = [(grid == fold, lines == fold) for grid, lines in group]
@@ -108,9 +115,10 @@ def _held_out(measurements: Measurements, options: Options,
     except (NotIdentifiableError, NoDataError):
         return HeldOut(name, note="cannot be held out: the rest does not identify the stage")
     errors, angles, weights = [], [], []
+    rigid = options.misalignment_model == "rigid"
     for index, (view, (grid, lines)) in enumerate(zip(measurements.views, chosen, strict=True)):
         left, left_theta = prediction_errors(measurements, result, index,
-                                             subset(view, grid, lines))
+                                             subset(view, grid, lines), rigid=rigid)
         errors.append(left)
         angles.append(left_theta)
         weights.append(view.count[grid])
@@ -130,7 +138,8 @@ def _rms(values: np.ndarray) -> float:
 
 
 def prediction_errors(measurements: Measurements, result: CalibrationResult, index: int,
-                      view: ViewReadings) -> tuple[np.ndarray, np.ndarray]:
+                      view: ViewReadings, *, rigid: bool = False
+                      ) -> tuple[np.ndarray, np.ndarray]:
     """Return reading less prediction of the readings `view`, (2, P) in m and (Q,) in rad.
 
     Parameters
@@ -144,10 +153,12 @@ def prediction_errors(measurements: Measurements, result: CalibrationResult, ind
         not known there is fitted to the readings.
     view : ViewReadings
         What is to be predicted.
+    rigid : bool
+        Whether the calibration took finite rotations of the plate.
     """
-    grid = _grid_errors(measurements, result, view)
     known = result.views[index]
-    grid = _aligned(measurements, view, grid, (known.phi, known.tx, known.ty))
+    grid = _aligned(_grid_errors(measurements, result, view), measurements, result, view,
+                    known=(known.phi, known.tx, known.ty), rigid=rigid)
     theta = np.zeros(0)
     if len(view.k):
         sign = -1 if measurements.sense is Sense.PLATE_MOVES else 1
@@ -164,42 +175,48 @@ def prediction_errors(measurements: Measurements, result: CalibrationResult, ind
 
 def _grid_errors(measurements: Measurements, result: CalibrationResult,
                  view: ViewReadings) -> np.ndarray:
-    """Return the readings less stage and plate error, (2, P); NaN where either is unknown."""
+    """Return the readings less stage and plate error, complex (P,); NaN where one is unknown."""
     if not len(view.m):
-        return np.zeros((2, 0))
-    artifact, emap, amap = measurements.artifact, result.error_map, result.artifact_map
-    pose, (hx, hy) = view.view.lattice_pose(artifact), artifact.half
-    i, j = pose.site_of(view.m, view.n)
+        return np.zeros(0, dtype=complex)
+    artifact, emap = measurements.artifact, result.error_map
+    i, j = view.view.lattice_pose(artifact).site_of(view.m, view.n)
     sign = -1 if measurements.sense is Sense.PLATE_MOVES else 1
-    at, mark = (sign * i + hx, sign * j + hy), (view.m + hx, view.n + hy)
-    ax, ay = amap.ax[mark], amap.ay[mark]
-    turned = ((ax, ay), (-ay, ax), (-ax, -ay), (ay, -ax))[pose.quarter_turns]
-    return np.stack([view.dx - sign * emap.gx[at] - turned[0],
-                     view.dy - sign * emap.gy[at] - turned[1]])
+    at = sign * i + artifact.half[0], sign * j + artifact.half[1]
+    return (view.dx + 1j * view.dy - sign * (emap.gx[at] + 1j * emap.gy[at])
+            - turned_plate(view, artifact, result.artifact_map))
 
 
-def _aligned(measurements: Measurements, view: ViewReadings, left: np.ndarray,
-             known: tuple[float, float, float]) -> np.ndarray:
-    """Return `left` less the misalignment, known or fitted to `left` itself."""
+def _aligned(left: np.ndarray, measurements: Measurements, result: CalibrationResult,
+             view: ViewReadings, *, known: tuple[float, float, float], rigid: bool) -> np.ndarray:
+    """Return `left` less the misalignment, known or fitted to `left` itself, (2, P)."""
     if not left.size:
-        return left
+        return np.zeros((2, 0))
     artifact = measurements.artifact
-    pose, pitch = view.view.lattice_pose(artifact), artifact.grid_pitch_m
-    i, j = pose.site_of(view.m, view.n)
-    x, y = (i - pose.shift[0]) * pitch, (j - pose.shift[1]) * pitch
-    one, zero = np.ones(len(x)), np.zeros(len(x))
-    columns = np.stack([np.concatenate([-y, x]), np.concatenate([one, zero]),
-                        np.concatenate([zero, one])], axis=1)
-    values = np.concatenate(left)
+    marks = turned_marks(view, artifact)
+    plate = turned_plate(view, artifact, result.artifact_map)
     if np.isfinite(known).all():
-        fitted = np.array(known)
+        phi, tx, ty = known
     else:
-        good = np.isfinite(values)
-        if good.sum() < 6:
-            return np.full_like(left, np.nan)
-        scale = np.linalg.norm(columns[good], axis=0)
-        fitted = np.linalg.lstsq(columns[good] / scale, values[good], rcond=None)[0] / scale
-    return (values - columns @ fitted).reshape(2, -1)
+        phi, tx, ty = _misalignment(left, marks)
+        for _ in range(RIGID_STEPS if rigid else 0):
+            phi, tx, ty = _misalignment(left - rotation_excess(phi, marks, plate), marks)
+    if rigid:
+        left = left - rotation_excess(phi, marks, plate)
+    rest = left - 1j * phi * marks - complex(tx, ty)
+    return np.stack([rest.real, rest.imag])
+
+
+def _misalignment(left: np.ndarray, marks: np.ndarray) -> tuple[float, float, float]:
+    """Return (phi, tx, ty) fitted to `left`, NaN if fewer than three marks are known."""
+    good = np.isfinite(left)
+    if good.sum() < 3:
+        return (float("nan"),) * 3
+    columns = np.stack([1j * marks[good], np.ones(good.sum()), np.full(good.sum(), 1j)])
+    rows = np.concatenate([columns.real, columns.imag], axis=1).T
+    scale = np.linalg.norm(rows, axis=0)
+    values = np.concatenate([left[good].real, left[good].imag])
+    phi, tx, ty = np.linalg.lstsq(rows / scale, values, rcond=None)[0] / scale
+    return float(phi), float(tx), float(ty)
 
 
 def validation_json(found: list[HeldOut]) -> list[dict[str, Any]]:
