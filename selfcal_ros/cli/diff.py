@@ -69,7 +69,8 @@ def _text(found) -> str:
              f"arcsec, scale {found.scale * 1e6:+.4g} ppm"
              + ("" if math.isnan(found.theta_rad)
                 else f", theta {found.theta_rad * ARCSEC:+.4g} arcsec"),
-             f"XY     rms {found.rms_m * UM:.5f} um   largest {found.max_m * UM:.5f} um"
+             f"XY     rms {found.rms_m * UM:.5f} um per axis   largest {found.max_m * UM:.5f} um "
+             "on an axis"
              + _significance_text(found.xy),
              f"       non-orthogonality {found.nonorthogonality * ARCSEC:+.4g} arcsec, scale "
              f"difference {found.scale_difference * 1e6:+.4g} ppm"]

@@ -118,11 +118,11 @@ def map_figures(emap: ErrorMap) -> MapFigures:
     u = np.stack([emap.u_gx, emap.u_gy])[:, known]
     max_error, index = largest(np.where(known, np.hypot(emap.gx, emap.gy), np.nan))
     max_theta, line = largest(emap.g_theta)
+    u_theta = emap.u_g_theta[np.isfinite(emap.g_theta)]
     return MapFigures(
         known.size, int(known.sum()), max_error, _site(emap, index), rms(g), rms(u),
         largest(u)[0], emap.g_theta.size, int(np.isfinite(emap.g_theta).sum()), max_theta,
-        line[0] if line else None, rms(emap.g_theta), rms(emap.u_g_theta),
-        largest(emap.u_g_theta)[0])
+        line[0] if line else None, rms(emap.g_theta), rms(u_theta), largest(u_theta)[0])
 
 
 def _site(emap: ErrorMap, index: tuple[int, ...] | None) -> tuple[int, int] | None:

@@ -38,6 +38,11 @@ def test_two_results_as_text_and_as_json(files, capsys):
     assert "translation (+1, " in text and "not significant" in text and "theta  rms" in text
     assert main(["diff", *files, "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
+    assert f"XY     rms {found['rms_um']:.5f} um per axis   largest {found['max_um']:.5f} um on" \
+        in text
+    both = np.abs([found["dx"], found["dy"]]) * 1e6
+    assert found["max_um"] == pytest.approx(both.max())
+    assert found["rms_um"] == pytest.approx(np.sqrt(np.mean(both**2)))
     assert found["datum_difference"]["translation_x"] == pytest.approx(1e-6, rel=1e-6)
     assert 0.005 < found["rms_um"] < found["max_um"] < 0.1
     assert found["significance_xy"]["correlated"] is True

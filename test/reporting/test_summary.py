@@ -24,6 +24,7 @@ from selfcal_ros.reporting.summary_format import aligned, fixed_column, signific
 from selfcal_ros.reporting.summary_numbers import map_figures, truth_figures
 from selfcal_ros.reporting.summary_sections import noise_section, place_text, pose_text
 from selfcal_ros.simulation.truth import hu_plan, random_truth, simulate_measurements
+from test.support.maps import random_map
 from test.support.results import known_result
 
 UNSEEN = Observability(5, 7, 2, False, ("non-orthogonality", "scale difference"),
@@ -66,6 +67,13 @@ def test_unknown_sites_do_not_count():
     assert (figures.n_sites, figures.n_known) == (9, 7)
     assert figures.max_error_m == pytest.approx(1e-6)
     assert figures.rms_error_m == pytest.approx(1e-6 / np.sqrt(14))
+
+
+def test_uncertainties_of_unknown_lines_do_not_count():
+    emap = replace(random_map(Artifact(3, 0.01, 4), 1), g_theta=np.array([np.nan, 1.0, 0, 0]),
+                   u_g_theta=np.array([9.0, 1.0, 1.0, 1.0]))
+    figures = map_figures(emap)
+    assert (figures.rms_u_theta_rad, figures.max_u_theta_rad) == (1.0, 1.0)
 
 
 def test_state_sentence_says_what_was_found():
