@@ -127,6 +127,11 @@ class Collector:
         self._rejected_input[Reason.COMMAND_BAD] += 1
 
     @property
+    def unusable(self) -> dict[str, int]:
+        """Messages that are no usable encoder sample or command, by reason."""
+        return {str(reason): count for reason, count in sorted(self._rejected_input.items())}
+
+    @property
     def timeline(self) -> Timeline:
         """The commands so far, in the order of their stamps."""
         if self._timeline is None:

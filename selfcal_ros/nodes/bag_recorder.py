@@ -11,7 +11,7 @@ from selfcal_ros.bagio.writer import BagWriter, qos_profile
 from selfcal_ros.errors import InputError
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes.base import SelfcalNode, run
-from selfcal_ros.nodes.names import Topic
+from selfcal_ros.nodes.encoder_input import EncoderInput
 
 
 class BagRecorder(SelfcalNode):
@@ -23,7 +23,6 @@ class BagRecorder(SelfcalNode):
             raise InputError("bag_recorder", "no bag is named", "set the parameter 'bag'")
         self._writer = BagWriter(self.values["bag"])
         topics = [*names.INPUTS, *(names.RESULTS if self.values["all_topics"] else ())]
-        self._subscriptions_by_topic: dict[str, tuple[Topic, Any]] = {}
         for topic in topics:
             name = self.resolve_topic_name(topic.name)
             typename = f"{topic.type.__module__.split('.')[0]}/msg/{topic.type.__name__}"
@@ -33,20 +32,9 @@ class BagRecorder(SelfcalNode):
                 depth=topic.qos.depth)])
             if topic is not names.ENCODER:
                 self.subscribe(topic, partial(self._record, name), raw=True)
-        self._encoder_qos: Topic | None = None
-        self._match_encoder()
-        self.create_timer(0.1, self._match_encoder)
+        encoder = self.resolve_topic_name(names.ENCODER.name)
+        EncoderInput(self, partial(self._record, encoder), raw=True)
         self.create_timer(1.0, self._flush)
-
-    def _match_encoder(self) -> None:
-        """Subscribe to the encoder once it is offered, reliable if it is offered so."""
-        name = self.resolve_topic_name(names.ENCODER.name)
-        offers = self.get_publishers_info_by_topic(name)
-        if not offers or self._encoder_qos is not None:
-            return
-        reliable = all(o.qos_profile.reliability == ReliabilityPolicy.RELIABLE for o in offers)
-        self._encoder_qos = names.ENCODER if reliable else names.ENCODER_BEST_EFFORT
-        self.subscribe(self._encoder_qos, partial(self._record, name), raw=True)
 
     def _record(self, topic: str, data: bytes) -> None:
         self._writer.write_raw(topic, bytes(data), self.get_clock().now().nanoseconds)

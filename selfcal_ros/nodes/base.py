@@ -2,7 +2,10 @@
 """What all nodes share: checked parameters, diagnostics, one way to run and to stop."""
 
 import array
+import inspect
+import re
 import sys
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -10,6 +13,7 @@ import numpy as np
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rclpy._rclpy_pybind11 import RCLError, UnknownROSArgsError
 from rclpy.executors import ExternalShutdownException
 from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.node import Node
@@ -18,7 +22,7 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 
 from selfcal_ros.collection.parameters import NODE_PARAMETERS, Parameter, parameter_values
-from selfcal_ros.errors import ExitCode, SelfcalError
+from selfcal_ros.errors import ExitCode, InputError, SelfcalError
 from selfcal_ros.nodes.names import Topic
 from selfcal_ros.nodes.stopping import complete_on_signal, ignore_signals
 
@@ -60,6 +64,21 @@ class SelfcalNode(Node):
         """Subscribe `callback` to `topic`; what it raises is logged and does not end the node."""
         return self.create_subscription(topic.type, topic.name, self.guarded(callback), topic.qos,
                                         **kwargs)
+
+    def subscribe_with_age(self, topic: Topic, callback: Callable[[Any, bool], None]):
+        """Subscribe `callback`; its second argument says if the message is older than this call.
+
+        Only a latched message can be: it was published before this node listened.
+        """
+        began_ns = time.time_ns()
+
+        def call(*received: Any) -> None:
+            # the events executor of rclpy 7.1 passes message and info as one pair
+            message, info = received[0] if len(received) == 1 else received
+            callback(message, info["source_timestamp"] < began_ns)
+        guarded = self.guarded(call)
+        guarded.__signature__ = inspect.signature(lambda message, info: None)  # rclpy counts them
+        return self.create_subscription(topic.type, topic.name, guarded, topic.qos)
 
     def guarded(self, callback: Callable[..., Any]) -> Callable[..., Any]:
         """Return `callback` with the package's errors logged in one line instead of raised."""
@@ -136,6 +155,14 @@ def spin(node: Node, until: Future) -> None:
         executor.shutdown()
 
 
+def _init(argv: list[str] | None) -> None:
+    try:
+        rclpy.init(args=argv, signal_handler_options=SignalHandlerOptions.NO)
+    except (RCLError, UnknownROSArgsError) as error:
+        what = re.sub(r",? at /\S+", "", " ".join(str(error).split()))
+        raise InputError("arguments after --ros-args", what, "mend them") from error
+
+
 def run(make_node: Callable[[], Node], argv: list[str] | None = None) -> int:
     """Run one node as a process; SIGINT and SIGTERM end it cleanly. Return the exit code.
 
@@ -146,7 +173,7 @@ def run(make_node: Callable[[], Node], argv: list[str] | None = None) -> int:
     complete_on_signal(stop)
     node, code = None, int(ExitCode.DONE)
     try:
-        rclpy.init(args=argv, signal_handler_options=SignalHandlerOptions.NO)
+        _init(argv)
         node = make_node()
         finished = getattr(node, "finished", None)
         if finished is not None:

@@ -3,20 +3,21 @@
 
 import sys
 import time
+from collections import Counter
 from typing import Any
 
-from rclpy.qos import ReliabilityPolicy
 from std_srvs.srv import Trigger
 
 from selfcal_ros.bagio import convert_in, convert_out
 from selfcal_ros.collection.collector import Collector, ViewProgress
 from selfcal_ros.collection.digest import readings_digest, session_digest
-from selfcal_ros.collection.messages import EncoderSample
+from selfcal_ros.collection.messages import Command, EncoderSample, Phase
 from selfcal_ros.collection.reasons import advice
 from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes.base import SelfcalNode, fill, run
+from selfcal_ros.nodes.encoder_input import EncoderInput
 
 REPORT_EVERY = 500
 """Messages after which the counts are reported at once, so that a player can keep pace."""
@@ -31,29 +32,17 @@ class MeasurementCollector(SelfcalNode):
         self._dirty, self._since_report, self._next_status = False, 0, 0.0
         self._published: dict[int, str] = {}
         self._plan_id, self._advised = "", set()
+        self._missed: dict[tuple[str, int], str] = {}  # views that began before this node
+        self._state, self._rejected = "waiting for a MEASURE command", Counter()
         self._status = self.publisher(names.STATUS)
         self._measurement = self.publisher(names.MEASUREMENT)
         self.subscribe(names.DETECTIONS, self._on_detection)
-        self.subscribe(names.COMMAND, self._on_command)
-        self._encoder = None
-        self._match_encoder()
-        self.create_timer(0.1, self._match_encoder)
+        self.subscribe_with_age(names.COMMAND, self._on_command)
+        EncoderInput(self, self._on_encoder)
         self.create_timer(0.05, self.guarded(self._on_timer))
+        self.create_timer(1.0, self._report)
         self.create_service(Trigger, "~/finish", lambda request, response: self.trigger(
             request, response, self._finish))
-
-    def _match_encoder(self) -> None:
-        """Subscribe to the encoder as its publishers offer it: reliable if all of them are."""
-        offers = self.get_publishers_info_by_topic(self.resolve_topic_name(names.ENCODER.name))
-        if not offers:
-            return
-        reliable = all(o.qos_profile.reliability == ReliabilityPolicy.RELIABLE for o in offers)
-        topic = names.ENCODER if reliable else names.ENCODER_BEST_EFFORT
-        if self._encoder is not None and self._encoder[0] is topic:
-            return
-        if self._encoder is not None:
-            self.destroy_subscription(self._encoder[1])
-        self._encoder = (topic, self.subscribe(topic, self._on_encoder))
 
     def _on_encoder(self, message: Any) -> None:
         self.collector.add_encoder(EncoderSample(
@@ -65,15 +54,28 @@ class MeasurementCollector(SelfcalNode):
         self.collector.add_detection(convert_in.detection(message))
         self._count()
 
-    def _on_command(self, message: Any) -> None:
+    def _on_command(self, message: Any, is_older: bool) -> None:
         try:
-            self.collector.add_command(convert_in.command(message))
+            command = convert_in.command(message)
+            self.collector.add_command(command)
+            self._note_missed(command, is_older=is_older)
         except InputError:
             self.collector.refuse_command()
             raise
         finally:
             self._next_status = 0.0
             self._count()
+
+    def _note_missed(self, command: Command, *, is_older: bool) -> None:
+        """Say which views began before this node: their detections up to now are not here."""
+        view = (command.plan_id, command.view_index)
+        if command.phase == Phase.PLACE:
+            self._missed.pop(view, None)
+        elif command.phase == Phase.MEASURE and is_older:
+            self._missed[view] = command.view.name
+            self.get_logger().warning(
+                f"view '{command.view.name}' began before this node: what was detected until now "
+                "is missing here; redo_view measures it again")
 
     def _count(self) -> None:
         self._dirty = True
@@ -91,8 +93,10 @@ class MeasurementCollector(SelfcalNode):
         try:
             measurements, progress = self.collector.collect()
         except NoDataError:
+            self._rejected = Counter(self.collector.unusable)
             return
         self._publish(measurements, progress, final=False)
+        self._describe(measurements, progress)
         spent = time.monotonic() - now
         self._next_status = now + max(self.values["status_period"], 5 * spent)
 
@@ -103,14 +107,9 @@ class MeasurementCollector(SelfcalNode):
             self._plan_id, self._published, self._advised = timeline.plan_id, {}, set()
         for index, view in progress.items():
             stamp = convert_out.session_stamp_ns(timeline, view)
-            is_last = view is list(progress.values())[-1] or not view.complete
-            if is_last or final:
-                self._status.publish(fill(names.STATUS.type(), convert_out.view_status(
-                    view, timeline.plan_id, stamp, self.frame_id)))
-            closed = view.end_ns <= timeline.last_stamp_ns
-            if closed or final:
-                self._advise(index, view)
+            current = index == timeline.intervals[-1].view_index or not view.complete
             key = readings_digest(view.readings, measurements.rejected)
+            closed = view.end_ns <= timeline.last_stamp_ns
             ready = final or closed or view.complete
             worth = view.readings.used or index in self._published
             if ready and worth and self._published.get(index) != key:
@@ -118,6 +117,12 @@ class MeasurementCollector(SelfcalNode):
                 self._measurement.publish(fill(
                     names.MEASUREMENT.type(), convert_out.view_measurement(
                         view, measurements, stamp, self.frame_id)))
+            # after the readings: what is called complete can be solved
+            if current or index == max(progress) or final:
+                self._status.publish(fill(names.STATUS.type(), convert_out.view_status(
+                    view, timeline.plan_id, stamp, self.frame_id)))
+            if closed or final:
+                self._advise(index, view)
 
     def _advise(self, index: int, view: ViewProgress) -> None:
         """Say once for each view that is over what would mend its rejections."""
@@ -125,6 +130,16 @@ class MeasurementCollector(SelfcalNode):
         for line in lines:
             self.get_logger().warning(f"view '{view.view.name}': {line}")
             self._advised.add(index)
+
+    def _describe(self, measurements: Measurements, progress: dict[int, ViewProgress]) -> None:
+        """Keep for the diagnostics how far the view is and what was rejected so far."""
+        self._rejected = Counter(measurements.rejected)
+        for view in progress.values():
+            self._rejected.update(view.readings.rejected)
+        index = self.collector.timeline.intervals[-1].view_index
+        self._state = "between views" if index is None else (
+            f"view '{progress[index].view.name}': {100 * progress[index].coverage:.0f} % of the "
+            "marks read")
 
     def _finish(self) -> str:
         measurements, progress = self.collector.collect()
@@ -134,7 +149,12 @@ class MeasurementCollector(SelfcalNode):
     def _report(self) -> None:
         self._since_report = 0
         received = {f"{kind}_received": n for kind, n in self.collector.received.items()}
-        self.diagnose("collecting", {**received, "views": len(self._published)})
+        missed = ", ".join(self._missed.values())
+        state = self._state + (f"; began before this node: {missed}" if missed else "")
+        self.diagnose(state, {
+            **received, "views": len(self._published),
+            **{f"rejected {reason}": n for reason, n in sorted(self._rejected.items())}},
+            ok=not missed and not self.collector.unusable)
 
 
 def main() -> None:

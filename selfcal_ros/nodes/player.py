@@ -94,7 +94,10 @@ class Player:
         return self._at - sum(self.heard.values()) < WINDOW
 
     def _on_diagnostics(self, message: Any) -> None:
+        own = self.node.get_namespace().strip("/")
         for status in message.status:
+            if status.name.rpartition("/")[0] != own:
+                continue  # the collector of another cell
             values = {item.key: item.value for item in status.values}
             if "encoder_received" in values:
                 self.heard = {kind: int(values[f"{kind}_received"]) for kind in self.sent}

@@ -6,14 +6,16 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.qos import ReliabilityPolicy
 from selfcal_msgs.msg import MarkDetection, ViewCommand
 from std_srvs.srv import Trigger
 
-from selfcal_ros.bagio import convert_in
+from selfcal_ros.bagio import convert_in, convert_out
 from selfcal_ros.collection.digest import readings_digest, session_digest
 from selfcal_ros.collection.messages import Command, Detection
 from selfcal_ros.nodes import names
+from selfcal_ros.nodes.base import fill
 from selfcal_ros.nodes.measurement_collector import MeasurementCollector
 from test.support.plans import plan_of
 from test.support.ros import publish_events
@@ -130,6 +132,77 @@ def test_a_command_that_cannot_be_used_is_counted_and_does_not_end_the_node(grap
     assert measurements.rejected["command_unusable"] == 2
 
 
+def small_run(start_s: int) -> list:
+    """Return the messages of a plan of two views, all stamps later by `start_s`."""
+    return [replace(event, stamp_ns=event.stamp_ns + start_s * 10**9)
+            for event in events_of(small_plan("0", repeats=1))]
+
+
+def test_a_view_measured_again_in_a_second_run_is_called_complete(graph):
+    first, second = small_run(0), small_run(1000)
+    commands = [index for index, event in enumerate(second) if isinstance(event, Command)]
+    node = graph.node(MeasurementCollector, status_period=0.02)
+    counts = publish_events(graph, first)
+    graph.until(lambda: received(node, counts), "the first run")
+    status = graph.listen(names.STATUS)
+    publish_events(graph, second[:commands[2]])  # its first view, still open
+    graph.until(lambda: any(m.complete and m.view_index == 0 for m in status),
+                "the first view of the second run")
+
+
+def test_the_readings_of_a_view_are_sent_before_it_is_called_complete(graph, monkeypatch):
+    node = graph.node(MeasurementCollector)
+    counts = publish_events(graph, events_of(small_plan("0", repeats=1)))
+    graph.until(lambda: received(node, counts), "all messages")
+    node._published.clear()
+    sent: list[str] = []
+    for name in ("_status", "_measurement"):
+        monkeypatch.setattr(node, name, SimpleNamespace(
+            publish=lambda message, name=name: sent.append(f"{name} {message.view_index}")))
+    node._finish()
+    assert sent == ["_measurement 0", "_status 0", "_measurement 1", "_status 1"]
+
+
+def test_a_collector_that_starts_within_a_view_names_it_until_it_is_placed_anew(graph):
+    place, measure = (event for event in events_of(small_plan("0"))[:9]
+                      if isinstance(event, Command))
+    diagnostics: list = []
+    graph.hand.create_subscription(DiagnosticArray, "/diagnostics", diagnostics.append, 10)
+    commands = graph.publisher(names.COMMAND, readers=0)
+    for command in (place, measure):
+        commands.publish(fill(names.COMMAND.type(), convert_out.command(command, "stage")))
+    node = graph.node(MeasurementCollector)
+    line = f"began before this node: {measure.view.name}"
+    graph.until(lambda: any(line in s.message and s.level == DiagnosticStatus.WARN
+                            for m in diagnostics for s in m.status), line)
+    again = [replace(command, stamp_ns=command.stamp_ns + 10**9) for command in (place, measure)]
+    for command in again:
+        commands.publish(fill(names.COMMAND.type(), convert_out.command(command, "stage")))
+    graph.until(lambda: node.collector.received["command"] == 4, "the commands")
+    diagnostics.clear()
+    graph.until(lambda: diagnostics, "diagnostics")
+    assert diagnostics[-1].status[0].message == "view '0': 0 % of the marks read"
+    assert diagnostics[-1].status[0].level == DiagnosticStatus.OK
+
+
+def test_diagnostics_count_rejections_before_any_view_and_beat_without_messages(graph):
+    node = graph.node(MeasurementCollector)
+    diagnostics: list = []
+    graph.hand.create_subscription(DiagnosticArray, "/diagnostics", diagnostics.append, 10)
+    graph.until(lambda: diagnostics, "a sign of life")
+    (status,) = diagnostics[-1].status
+    assert (status.level, status.message) == (DiagnosticStatus.OK, "waiting for a MEASURE command")
+    encoder = graph.publisher(names.ENCODER)
+    encoder.publish(names.ENCODER.type(name=["spindle"], position=[0.0]))
+    encoder.publish(names.ENCODER.type(name=["x"], position=[float("nan")]))
+    graph.until(lambda: node.collector.received["encoder"] == 2, "the samples")
+    wanted = {("rejected encoder_sample_unknown_joint", "1"),
+              ("rejected encoder_sample_not_finite", "1")}
+    graph.until(lambda: any(wanted <= {(v.key, v.value) for v in s.values}
+                            and s.level == DiagnosticStatus.WARN
+                            for m in diagnostics for s in m.status), "the counts")
+
+
 def test_a_late_solver_hears_the_views_that_are_done(graph):
     node = graph.node(MeasurementCollector)
     counts = publish_events(graph, events_of(small_plan("0", repeats=1)))
@@ -154,8 +227,6 @@ def test_a_view_whose_lines_cannot_be_told_apart_says_once_what_to_do(graph, mon
 
 
 def test_diagnostics_count_what_was_received(graph):
-    from diagnostic_msgs.msg import DiagnosticArray
-
     graph.node(MeasurementCollector)
     heard: list = []
     graph.hand.create_subscription(DiagnosticArray, "/diagnostics", heard.append, 10)

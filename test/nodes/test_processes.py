@@ -128,6 +128,19 @@ def test_an_unknown_name_in_a_parameter_file_is_refused(group, tmp_path):
     assert "theta_data: solver has no such parameter; known are" in err
 
 
+@pytest.mark.parametrize("words, problem", [
+    (("--params-file", "/no/params.yaml"), "Couldn't parse params file"),
+    (("--bogus",), "['--bogus']")])
+def test_arguments_that_ros_does_not_take_are_one_line_and_code_2(group, words, problem):
+    code, _, err = ended(group.start("-m", "selfcal_ros.nodes.solver", "--ros-args", *words))
+    assert code == 2
+    [said] = [text for text in err.splitlines() if text.startswith("selfcal: ")]
+    assert said.startswith("selfcal: arguments after --ros-args: ")
+    assert problem in said
+    assert " at /" not in said
+    assert "Traceback" not in err
+
+
 @pytest.mark.parametrize("whole_group", [True, False], ids=["ctrl-c", "kill -INT"])
 def test_an_interrupted_replay_leaves_no_process(graph, group, tmp_path, whole_group):
     bag = small_bag(tmp_path)

@@ -1,0 +1,38 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The subscription to the encoder, as its publishers offer it at the moment."""
+
+from collections.abc import Callable
+from typing import Any
+
+from rclpy.qos import ReliabilityPolicy
+
+from selfcal_ros.nodes import names
+from selfcal_ros.nodes.base import SelfcalNode
+
+
+class EncoderInput:
+    """Hears the encoder reliably if all its publishers are reliable, else with best effort.
+
+    It is looked at ten times a second: a driver may come late, or come back with another offer.
+    """
+
+    def __init__(self, node: SelfcalNode, callback: Callable[[Any], None], **kwargs: Any) -> None:
+        self._node, self._callback, self._kwargs = node, callback, kwargs
+        self._name = node.resolve_topic_name(names.ENCODER.name)
+        self._topic: names.Topic | None = None
+        self._subscription: Any = None
+        self._match()
+        node.create_timer(0.1, self._match)
+
+    def _match(self) -> None:
+        offers = self._node.get_publishers_info_by_topic(self._name)
+        if not offers:
+            return
+        reliable = all(o.qos_profile.reliability == ReliabilityPolicy.RELIABLE for o in offers)
+        topic = names.ENCODER if reliable else names.ENCODER_BEST_EFFORT
+        if topic is self._topic:
+            return
+        if self._subscription is not None:
+            self._node.destroy_subscription(self._subscription)
+        self._topic = topic
+        self._subscription = self._node.subscribe(topic, self._callback, **self._kwargs)
