@@ -47,6 +47,8 @@ def check_table(table: Table, findings: Findings, *, gi4: Gi4 | None = None) -> 
     if not np.all(np.abs(table.values) <= LIMIT):
         findings.error(table.line, "values that are not finite, or too large",
                        f"stay within +-{LIMIT:g}")
+    if not table.values.size:
+        findings.error(table.line, "the table has no correction values", "give at least one")
     _axes(table, findings)
     if isinstance(table, Table1D):
         _table_1d(table, findings)

@@ -3,14 +3,15 @@
 
 import os
 from collections.abc import Sequence
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
 
 from selfcal_ros.compensation.cal_keywords import KEYWORDS
-from selfcal_ros.compensation.cal_model import CalFile, Table, Table1D, Unit
-from selfcal_ros.compensation.cal_read import refuse_errors
+from selfcal_ros.compensation.cal_model import CalFile, Table, Table1D, Unit, same_table
+from selfcal_ros.compensation.cal_read import parse_cal, refuse_errors
 from selfcal_ros.compensation.cal_rules import check_tables
 from selfcal_ros.compensation.cal_text import Findings
 from selfcal_ros.errors import InputError
@@ -40,7 +41,7 @@ def cal_text(tables: Sequence[Table], *, comments: Sequence[str] = (),
     Raises
     ------
     InputError
-        If the tables break a rule of the format.
+        If the tables break a rule of the format, or hold what it cannot say.
     """
     findings = Findings()
     check_tables(tables, findings)
@@ -57,7 +58,23 @@ def cal_text(tables: Sequence[Table], *, comments: Sequence[str] = (),
             row_format = " ".join([f"%.{decimals}f"] * values.shape[1])
             lines += [row_format % tuple(row) for row in _no_minus_zero(values, decimals).tolist()]
         lines.append(":END")
-    return "\n".join(lines) + "\n"
+    text = "\n".join(lines) + "\n"
+    _refuse_what_reads_differently(text, tables, exact=decimals is None)
+    return text
+
+
+def _refuse_what_reads_differently(text: str, tables: Sequence[Table], *, exact: bool) -> None:
+    """Raise InputError if a file does not give back the tables it was written from.
+
+    The fields of a table are whatever its maker put there: a quote in a serial number, an offset
+    that is no number, keywords that a galvo table must not have.
+    """
+    back = refuse_errors(parse_cal(text.encode(), "calibration file")).tables
+    for number, (table, read) in enumerate(zip(tables, back, strict=True), 1):
+        rounded = table.values.shape == read.values.shape and not exact
+        if not same_table(read, replace(table, values=read.values) if rounded else table):
+            raise InputError("calibration file", f"table {number} holds what the format cannot say",
+                             "keep to plain numbers, CW or CCW, and a serial number without quotes")
 
 
 def _printable(text: str) -> str:
@@ -85,18 +102,15 @@ def _head(table: Table) -> list[str]:
         if keyword.read is None and value:
             lines.append(f"{start} {word}")
         elif keyword.read is not None and value is not None:
-            lines.append(f"{start} {word}={_argument(value)}")
+            quote = '"' if word == "SERIALNUMBER" else ""
+            lines.append(f"{start} {word}={quote}{_argument(value)}{quote}")
     return lines
 
 
 def _argument(value: float | int | str | Unit) -> str:
     if isinstance(value, Unit):
         return value.word if value.divisor == 1 else f"{value.word}/{decimal(value.divisor)}"
-    if isinstance(value, int):
-        return str(value)
-    if isinstance(value, float):
-        return decimal(value)
-    return value if value in ("CW", "CCW") else f'"{value}"'
+    return decimal(value) if isinstance(value, float) else str(value)
 
 
 def refuse_existing(paths: Sequence[str | os.PathLike], *, force: bool) -> None:

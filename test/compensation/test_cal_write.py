@@ -1,4 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
+from dataclasses import replace
 from datetime import UTC, datetime
 
 import numpy as np
@@ -6,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from selfcal_ros.compensation.cal_model import Severity, Table1D, same_table
+from selfcal_ros.compensation.cal_model import Severity, Table1D, Table2D, same_table
 from selfcal_ros.compensation.cal_read import parse_cal
 from selfcal_ros.compensation.cal_write import cal_text, decimal, write_cal
 from selfcal_ros.errors import InputError
@@ -55,6 +56,34 @@ def test_tables_that_break_a_rule_are_not_written(tables, what):
 def test_values_that_are_not_finite_are_not_written():
     with pytest.raises(InputError, match="values that are not finite"):
         cal_text([Table1D(1, 1.0, np.array([0.0, np.nan]))])
+
+
+PLAIN = Table1D(1, 1.0, np.zeros(3))
+PLANE = Table2D(2, 1, (1, 2), 1.0, 1.0, np.zeros((3, 3, 2)))
+
+
+@pytest.mark.parametrize("serial", ["CW", "CCW", "", "it's; 1", " a "])
+def test_a_serial_number_is_always_quoted(serial):
+    cal = parse_cal(cal_text([replace(PLAIN, serial_number=serial)]).encode(), "f")
+    assert cal.tables[0].serial_number == serial and not cal.findings
+
+
+@pytest.mark.parametrize(("table", "what"), [
+    (replace(PLAIN, serial_number='a"b'), "unknown keyword"),
+    (replace(PLAIN, serial_number="a\nb"), "a stray quote in the serial number"),
+    (replace(PLAIN, offset=float("nan")), "OFFSET: 'nan' is not a number"),
+    (replace(PLAIN, sample_dist=float("inf")), "SAMPLEDIST: 'inf' is not a number"),
+    (replace(PLAIN, home_direction="cw"), "table 1 holds what the format cannot say"),
+    (replace(PLAIN, values=np.zeros((2, 2))), "table 1 holds what the format cannot say"),
+    (replace(PLAIN, values=np.zeros(0)), "the table has no correction values"),
+    (replace(PLANE, galvo=True, offset_row=1.0), "table 1 holds what the format cannot say"),
+    (replace(PLANE, output_axes=(1, 2, 3)), "6 values on the line"),
+])
+@pytest.mark.parametrize("decimals", [None, 5])
+def test_what_would_read_back_differently_is_not_written(table, what, decimals):
+    with pytest.raises(InputError) as caught:
+        cal_text([table], decimals=decimals)
+    assert str(caught.value).startswith("calibration file") and what in str(caught.value)
 
 
 def test_an_existing_file_stays_unless_forced_and_then_as_a_dated_backup(tmp_path):
