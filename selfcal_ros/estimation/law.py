@@ -20,6 +20,7 @@ from selfcal_ros.model.result import (
     Observability,
     ViewResult,
 )
+from selfcal_ros.model.view import View
 
 if TYPE_CHECKING:
     from selfcal_ros.estimation.api import Options
@@ -204,6 +205,38 @@ def _propagate(law: HuLaw, views: list[ViewReadings]) -> _Spread:
     return _Spread(var_g, var_theta, rest, dof)
 
 
+def law_covariance(result: CalibrationResult) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return the covariances of the law's maps for equal repeats, (2 sites, 2 sites) and (K, K).
+
+    In m^2 and rad^2, stage frame; None for plates beyond EXACT_SIZE, or without known noise.
+    """
+    artifact, noise = result.artifact, result.noise
+    power = np.array([noise.sigma_xy, noise.sigma_theta]) ** 2
+    if artifact.grid_size > EXACT_SIZE or not np.isfinite(power).all():
+        return None
+    law = law_for(artifact, result.error_map.datum_theta, Sense(result.sense))
+    turn = _to_stage if result.sense == Sense.PLATE_MOVES else _as_is
+    parts = []
+    for kind in range(2):
+        found = law.solve(_unit_noise(artifact, _full_views(artifact), kind=kind, exact=True))
+        g, theta = turn(found.g, found.g_theta, -1)
+        g = g.reshape(-1, g.shape[-1])
+        parts.append((power[kind] * (g @ g.T), power[kind] * (theta @ theta.T)))
+    (of_grid, theta_of_grid), (of_lines, theta_of_lines) = parts
+    return of_grid + of_lines, theta_of_grid + theta_of_lines
+
+
+def _full_views(artifact: Artifact) -> list[ViewReadings]:
+    """Return Hu's four views with every mark read once."""
+    lines = {"k": np.arange(artifact.angular_count),
+             "count_theta": np.ones(artifact.angular_count, dtype=int)}
+    out = []
+    for marks in (artifact.grid_size, artifact.grid_size, 0, artifact.grid_size - 1):
+        m, n = artifact.m[:marks].ravel(), artifact.n[:marks].ravel()
+        out.append(ViewReadings(View(""), m, n, count=np.ones(len(m), dtype=int), **lines))
+    return out
+
+
 def _quadratic_form(rest: np.ndarray, *, exact: bool) -> tuple[float, float]:
     """Return mean and effective degrees of freedom (Satterthwaite) of the sum of squares left."""
     if exact:
@@ -259,7 +292,7 @@ def _noise(found: HuSolution, spread: _Spread, views: tuple[ViewReadings, ...]) 
 
 def _to_stage(field: np.ndarray, theta: np.ndarray, sign: int) -> tuple[np.ndarray, np.ndarray]:
     """Turn H(X) = -G(-X), Htheta(k) = -Gtheta(-k) back into G; sign +1 for uncertainties."""
-    return sign * field[:, ::-1, ::-1], sign * np.roll(theta[::-1], 1)
+    return sign * field[:, ::-1, ::-1], sign * np.roll(theta[::-1], 1, axis=0)
 
 
 def _as_is(field: np.ndarray, theta: np.ndarray, sign: int) -> tuple[np.ndarray, np.ndarray]:

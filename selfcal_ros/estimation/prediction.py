@@ -100,21 +100,23 @@ def theta_variance(system: JointSystem, artifact: Artifact, datum: ThetaDatum) -
     return np.where(system.known_lines, np.maximum(variance, 0.0), np.nan)
 
 
-def theta_matrix(system: JointSystem, artifact: Artifact, datum: ThetaDatum) -> np.ndarray:
-    """Return the covariance (K, K) whose diagonal `theta_variance` gives."""
-    answer, inner, _, conditions = _theta_parts(system, artifact, datum)
+def theta_matrix(system: JointSystem, artifact: Artifact, datum: ThetaDatum, *,
+                 sense: Sense = Sense.MICROSCOPE_MOVES) -> np.ndarray:
+    """Return the covariance (K, K) of `theta_variance`, in the frame of the equations."""
+    answer, inner, _, conditions = _theta_parts(system, artifact, datum, sense)
     n = system.angular.n_lines
     raw = system.angular.solve(np.eye(n)) + answer @ inner @ answer.T
     datum_map = np.eye(n) - conditions.gain @ conditions.rows
     return datum_map @ raw @ datum_map.T
 
 
-def _theta_parts(system: JointSystem, artifact: Artifact, datum: ThetaDatum
+def _theta_parts(system: JointSystem, artifact: Artifact, datum: ThetaDatum,
+                 sense: Sense = Sense.MICROSCOPE_MOVES
                  ) -> tuple[np.ndarray, np.ndarray, np.ndarray, Conditions]:
     """Return the lines' answer to free rotations, their covariance, and the datum's columns."""
     angular = system.angular
     half_width_m = artifact.grid_pitch_m * max(artifact.half)
-    conditions = conditions_for(system, ThetaDatum(datum), Sense.MICROSCOPE_MOVES, half_width_m)
+    conditions = conditions_for(system, ThetaDatum(datum), sense, half_width_m)
     free = [v for v, i in enumerate(system.angular_index) if i not in system.grid_index]
     inner = np.linalg.pinv(angular.schur[np.ix_(free, free)], hermitian=True)
     answer = angular.response[:, free]
