@@ -13,6 +13,7 @@ from selfcal_msgs.msg import (
     ViewStatus,
 )
 from sensor_msgs.msg import JointState
+from visualization_msgs.msg import MarkerArray
 
 
 @dataclass(frozen=True)
@@ -40,6 +41,7 @@ STATUS = Topic("selfcal/view_status", ViewStatus, _qos(64))
 MEASUREMENT = Topic("selfcal/view_measurement", ViewMeasurement, _qos(64, latched=True))
 ERROR_MAP = Topic("selfcal/error_map", ErrorMap, _qos(1, latched=True))
 SUMMARY = Topic("selfcal/summary", CalibrationSummary, _qos(1, latched=True))
+MAP_MARKERS = Topic("selfcal/map_markers", MarkerArray, _qos(1, latched=True))
 CORRECTED = Topic("stage/corrected_joint_states", JointState, _qos(100, reliable=False))
 
 INPUTS = (ENCODER, DETECTIONS, COMMAND)

@@ -21,6 +21,7 @@ from selfcal_ros.model.result import (
 )
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes.base import SelfcalNode, fill, run
+from selfcal_ros.nodes.markers import map_markers
 from selfcal_ros.reporting.summary import state_sentence
 from selfcal_ros.reporting.summary_numbers import summary_numbers
 
@@ -35,12 +36,14 @@ class Solver(SelfcalNode):
         super().__init__("solver", **kwargs)
         self._messages: dict[int, Any] = {}
         self._plan_id: str | None = None
-        self._planned = 0
+        self._planned: dict[str, int] = {}
+        self._loaded = False
         self._stale = False
         self.result: CalibrationResult | None = None
         self._problem: SelfcalError | None = None
         self._map = self.publisher(names.ERROR_MAP)
         self._summary = self.publisher(names.SUMMARY)
+        self._markers = self.publisher(names.MAP_MARKERS)
         self.subscribe(names.MEASUREMENT, self._on_measurement)
         self.subscribe(names.COMMAND, self._on_command)
         self.create_timer(0.05, self.guarded(self._solve_if_stale))
@@ -51,8 +54,10 @@ class Solver(SelfcalNode):
             request, response, lambda: self._load(request.path)))
 
     def _on_command(self, message: Any) -> None:
-        if not self._plan_id or message.plan_id == self._plan_id:
-            self._planned = max(self._planned, message.views_planned)
+        known = self._planned.get(message.plan_id, 0)
+        self._planned[message.plan_id] = max(known, message.views_planned)
+        if message.plan_id == self._plan_id and message.views_planned > known:
+            self._stale = True  # the summary says how many views are planned
 
     def _on_measurement(self, message: Any) -> None:
         if message.plan_id != self._plan_id:
@@ -87,7 +92,7 @@ class Solver(SelfcalNode):
 
     def _solve(self) -> None:
         measurements = self.measurements()
-        self._problem = None
+        self._problem, self._loaded = None, False
         try:
             self.result = calibrate(measurements, solver_options(self.values))
         except NotIdentifiableError as error:
@@ -105,6 +110,7 @@ class Solver(SelfcalNode):
         if self._problem is None:
             self._map.publish(fill(names.ERROR_MAP.type(), convert_out.error_map(
                 self.result, stamp, self.frame_id)))
+            self._markers.publish(map_markers(self.result.error_map, stamp, self.frame_id))
         numbers = summary_numbers(self.result)
         seen = self.result.observability
         fields = {name: getattr(numbers, name) for name in (
@@ -112,14 +118,26 @@ class Solver(SelfcalNode):
             "rms_theta_uncertainty_arcsec")}
         self._summary.publish(fill(names.SUMMARY.type(), {
             "header": convert_out.header(stamp, self.frame_id),
-            "state": short(str(self._problem or state_sentence(self.result))),
-            "views_done": len(self._messages), "views_planned": self._planned,
+            "state": short(self._state()),
+            "views_done": len(self._messages),
+            "views_planned": self._planned.get(self._plan_id, 0),
             "identifiable": seen.identifiable, "rank_deficiency": seen.deficiency, **fields,
             "advice": [*seen.advice, *self.result.warnings]}))
 
+    def _unfinished(self) -> bool:
+        """Return whether the plan has views that are still to come."""
+        return (isinstance(self._problem, NotIdentifiableError)
+                and len(self._messages) < self._planned.get(self._plan_id, 0))
+
+    def _state(self) -> str:
+        if self._unfinished():
+            return (f"{len(self._messages)} of {self._planned[self._plan_id]} views measured, "
+                    "not yet enough to identify the stage.")
+        return str(self._problem or state_sentence(self.result))
+
     def digest(self) -> str:
         """Return the fingerprint of the readings that the published map comes from."""
-        if self._stale or not self._messages:
+        if self._stale or self._loaded or not self._messages:
             return ""
         rejected = self.measurements().rejected
         return session_digest({index: readings_digest(convert_in.view_readings(m), rejected)
@@ -131,20 +149,27 @@ class Solver(SelfcalNode):
             raise self._problem
         if self.result is None:
             raise NoDataError("solver", "there is no map yet", "measure the views of the plan")
-        write_json(path, result_to_dict(self.result))
-        return f"saved to {path}; readings {self.digest()}"
+        write_json(_named(path), result_to_dict(self.result))
+        return f"saved to {path}; readings {self.digest() or 'of a loaded map'}"
 
     def _load(self, path: str) -> str:
-        self.result = result_from_dict(read_json(path), path)
-        self._problem = None
+        self.result = result_from_dict(read_json(_named(path)), path)
+        self._problem, self._loaded = None, True
         self._publish()
         return f"loaded {path}: plan {self.result.plan_id}"
 
     def _report(self) -> None:
-        if self._messages:
-            self.diagnose(str(self._problem) if self._problem else "solved",
-                          {"views": len(self._messages), "readings": self.digest()},
-                          ok=self._problem is None)
+        known = self.result is not None or self._problem is not None
+        self.diagnose(self._state() if known else "waiting for views",
+                      {"views": len(self._messages), "readings": self.digest()},
+                      ok=self._problem is None or self._unfinished())
+
+
+def _named(path: str) -> str:
+    """Return `path`, or raise InputError if it is empty."""
+    if not path:
+        raise InputError("path", "is empty", "name a file")
+    return path
 
 
 def short(sentence: str) -> str:

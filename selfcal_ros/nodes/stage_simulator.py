@@ -42,6 +42,9 @@ class StageSimulator(SelfcalNode):
         self._detection = self.publisher(names.DETECTIONS)
         self.subscribe(names.COMMAND, self._on_command)
         self.create_timer(0.005, self.guarded(self._on_timer))
+        self._sent = {"encoder_sent": 0, "detection_sent": 0}
+        self.create_timer(1.0, lambda: self.diagnose(
+            "at home" if self._next is None else "measuring", self._sent))
 
     def _on_command(self, message: Any) -> None:
         command = convert_in.command(message)
@@ -87,7 +90,9 @@ class StageSimulator(SelfcalNode):
 
     def _publish(self, event: Event) -> None:
         _, fields = event_fields(event, self.frame_id)
-        if isinstance(event, Detection):
+        is_detection = isinstance(event, Detection)
+        self._sent["detection_sent" if is_detection else "encoder_sent"] += 1
+        if is_detection:
             self._detection.publish(fill(names.DETECTIONS.type(), fields))
         else:
             self._encoder.publish(fill(names.ENCODER.type(), fields))

@@ -10,6 +10,7 @@ import time
 
 import pytest
 import yaml
+from diagnostic_msgs.msg import DiagnosticArray
 
 from selfcal_ros.collection.parameters import NODE_PARAMETERS
 from test.support.sessions import plan_file, small_bag, small_plan
@@ -73,10 +74,12 @@ def test_a_signal_ends_every_node_cleanly(graph, group, tmp_path, number):
     bag, recorded = small_bag(tmp_path), tmp_path / "recorded"
     needed = {"bag_player": {"bag": bag, "rate": 0.001}, "bag_recorder": {"bag": recorded},
               "pose_sequencer": {"plan": plan_file(tmp_path, small_plan())}}
+    diagnostics: list = []
+    graph.hand.create_subscription(DiagnosticArray, "/diagnostics", diagnostics.append, 100)
     processes = {name: group.node(name, **needed.get(name, {})) for name in NODE_PARAMETERS}
     graph.until(lambda: set(NODE_PARAMETERS) <= set(graph.hand.get_node_names()), "all nodes")
-    graph.until(lambda: len(graph.hand.get_publishers_info_by_topic("/diagnostics")) >= 6,
-                "their diagnostics")
+    graph.until(lambda: {status.name for m in diagnostics for status in m.status}
+                >= set(NODE_PARAMETERS) - {"bag_player"}, "their diagnostics")
     for process in processes.values():
         process.send_signal(number)
     for name, process in processes.items():

@@ -5,9 +5,12 @@ import json
 
 import numpy as np
 import pytest
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from selfcal_msgs.srv import LoadMap, SaveMap
+from visualization_msgs.msg import Marker
 
 from selfcal_ros.bagio import convert_in, convert_out
+from selfcal_ros.bagio.map_markers import map_geometry
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.result import result_to_dict
@@ -166,6 +169,67 @@ def test_a_file_that_is_no_result_is_refused(graph, tmp_path, content):
     answer = graph.call(LoadMap, "solver/load_map", path=str(path))
     assert (answer.success, answer.error_code) == (False, 2)
     assert str(path) in answer.message
+
+
+def test_an_empty_path_is_named(solve, graph):
+    solve()
+    for kind, name in ((SaveMap, "save_map"), (LoadMap, "load_map")):
+        answer = graph.call(kind, f"solver/{name}", path="")
+        assert (answer.success, answer.error_code) == (False, 2)
+        assert answer.message == "path: is empty; name a file"
+
+
+def test_a_loaded_map_is_not_said_to_come_from_the_readings(solve, graph, tmp_path):
+    solve()
+    path = str(tmp_path / "map.json")
+    assert graph.call(SaveMap, "solver/save_map", path=path).success
+    assert graph.call(LoadMap, "solver/load_map", path=path).success
+    answer = graph.call(SaveMap, "solver/save_map", path=path)
+    assert answer.message == f"saved to {path}; readings of a loaded map"
+
+
+def command_of(plan_id: str, views_planned: int):
+    return names.COMMAND.type(plan_id=plan_id, views_planned=views_planned)
+
+
+def test_the_plan_is_known_whichever_topic_is_heard_first(graph):
+    graph.node(Solver)
+    summaries, diagnostics = graph.listen(names.SUMMARY), []
+    graph.hand.create_subscription(DiagnosticArray, "/diagnostics", diagnostics.append, 10)
+    graph.until(lambda: diagnostics, "a sign of life")
+    assert diagnostics[-1].status[0].message == "waiting for views"
+    readings, commands = graph.publisher(names.MEASUREMENT), graph.publisher(names.COMMAND)
+    commands.publish(command_of("an earlier plan", 9))
+    readings.publish(measured()[0][0])
+    graph.until(lambda: summaries, "a summary")
+    assert (summaries[-1].views_done, summaries[-1].views_planned) == (1, 0)
+    diagnostics.clear()
+    commands.publish(command_of(PLAN.plan_id, len(PLAN.views)))
+    graph.until(lambda: summaries[-1].views_planned == len(PLAN.views), "the plan")
+    line = "1 of 4 views measured, not yet enough to identify the stage."
+    assert summaries[-1].state == line
+    assert not summaries[-1].identifiable
+    graph.until(lambda: any(s.message == line and s.level == DiagnosticStatus.OK
+                            for m in diagnostics for s in m.status), "no alarm")
+
+
+def test_the_map_is_shown_as_markers_in_the_frame_of_the_map(solve, graph):
+    _, _, measurements = solve(frame_id="cell")
+    arrays = graph.listen(names.MAP_MARKERS)
+    graph.until(lambda: arrays, "the latched markers")
+    result = calibrate(measurements)
+    shape = map_geometry(result.error_map)
+    vectors, uncertainty, legend = arrays[-1].markers
+    assert {m.header.frame_id for m in arrays[-1].markers} == {"cell"}
+    assert (vectors.type, uncertainty.type, legend.type) == (
+        Marker.LINE_LIST, Marker.CUBE_LIST, Marker.TEXT_VIEW_FACING)
+    np.testing.assert_array_equal([(p.x, p.y, p.z) for p in vectors.points], shape.ends)
+    np.testing.assert_array_equal([(p.x, p.y) for p in uncertainty.points], shape.sites[:, :2])
+    np.testing.assert_allclose([(c.r, c.g, c.b) for c in uncertainty.colors], shape.colours,
+                               rtol=1e-6)
+    assert all(0 < m.color.a == m.pose.orientation.w for m in arrays[-1].markers)
+    assert vectors.scale.x > 0 < legend.scale.z
+    assert legend.text == shape.legend
 
 
 def test_a_malformed_measurement_does_not_end_the_solver(graph):
