@@ -70,22 +70,24 @@ def _pooled(runs: np.ndarray) -> ReadingNoise:
     if dof == 0:
         return ReadingNoise(float("nan"))
     variance = float(np.nansum(runs**2)) / dof
-    # Neighbours in time can be paired only where every repeat is a complete run.
-    if variance == 0 or counts.min() < len(runs) or runs.shape[2] < 2:
+    # Neighbours in time can be paired only where every repeat is a complete run; a series may
+    # have fewer of them than another.
+    complete = np.isfinite(runs).all(axis=2)
+    if variance == 0 or np.any(np.isfinite(runs).any(axis=2) & ~complete) or runs.shape[2] < 2:
         return ReadingNoise(float(np.sqrt(variance)), 0.0, dof)
-    correlation, variance = _likeliest(runs)
+    correlation, variance = _likeliest(np.nan_to_num(runs), int((complete.sum(axis=0) - 1).sum()))
     return ReadingNoise(float(np.sqrt(variance)), correlation, dof)
 
 
-def _likeliest(runs: np.ndarray) -> tuple[float, float]:
+def _likeliest(runs: np.ndarray, dof: int) -> tuple[float, float]:
     """Return the correlation of neighbours and the variance of greatest likelihood.
 
+    `runs` are deviations from the mean of their series, with `dof` degrees of freedom at each time.
     The covariance is variance * (1 + correlation on both neighbouring diagonals); the sine
     transform (DST-I) diagonalises it, with eigenvalues 1 + 2 correlation cos(pi k / (N + 1)). Sums
     of many readings hang on the smallest of these, which the lag-1 moment alone estimates badly.
     """
     size = runs.shape[2]
-    dof = (len(runs) - 1) * runs.shape[1]
     power = np.sum(dst(runs, type=1, norm="ortho") ** 2, axis=(0, 1)) / dof
     cosines = 2 * np.cos(np.pi * np.arange(1, size + 1) / (size + 1))
     grid = np.linspace(-0.5, 0.0, 501)[:, None]

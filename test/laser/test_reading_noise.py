@@ -1,4 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -61,7 +63,31 @@ def test_without_repeats_nothing_is_known():
     assert np.isnan(noise.sigma_m) and noise.dof == 0
 
 
-def test_unequal_repeats_are_pooled_without_correlation():
+def test_diagonals_with_fewer_complete_runs_keep_their_correlation():
+    full = simulated(LaserNoise(distance_m=10 * NM, linear_m=5 * NM, repeats=40))
+    samples = full.samples_m.copy()
+    samples[25:, 1] = np.nan
+    fewer = replace(full, samples_m=samples)
+    noise = reading_noise(fewer)
+    assert noise.sigma_m == pytest.approx(np.sqrt(2) * 10 * NM, rel=0.06)
+    assert noise.correlation == pytest.approx(-0.5, abs=0.01)
+    assert noise.dof == 39 * 12 + 24 * 12
+    # The sum of a run is the difference of two distances, however many steps it has.
+    sums = [np.ones(12) @ reading_covariance(fewer, noise)[k:k + 12, k:k + 12] @ np.ones(12)
+            for k in (0, 12)]
+    np.testing.assert_allclose(sums, [2 * (10 * NM)**2 / 40, 2 * (10 * NM)**2 / 25], rtol=0.2)
+
+
+def test_rows_that_only_others_have_filled_change_nothing():
+    full = simulated(LaserNoise(distance_m=10 * NM, linear_m=5 * NM, repeats=4))
+    rows = np.full((3, *full.samples_m.shape[1:]), np.nan)
+    padded = replace(full, samples_m=np.concatenate([full.samples_m, rows]),
+                     linear_m=np.concatenate([full.linear_m, rows[:, 0]]))
+    assert reading_noise(padded) == reading_noise(full)
+    assert linear_noise(padded) == linear_noise(full)
+
+
+def test_partly_repeated_blocks_are_pooled_without_correlation():
     samples = np.full((3, 2, 2, 2), 7e-3)
     samples[1:, :, :, 1] = np.nan
     samples[1, :, :, 0] += 6 * NM
