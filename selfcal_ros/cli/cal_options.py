@@ -94,8 +94,11 @@ def frame_of(args: argparse.Namespace, base: "MachineFrame | None" = None) -> "M
                              "indices in calibration files count from 1")
     counts = numbers(getattr(args, "counts_per_unit", None), "--counts-per-unit", positive=True)
     theta_axis = changes.get("theta_axis", base.theta_axis)
-    if counts and theta_axis in counts:
-        changes["theta_counts_per_unit"] = counts[theta_axis]
+    for axis, count in counts.items():
+        if axis != theta_axis:
+            raise InputError("--counts-per-unit", f"axis {axis} is not the theta axis",
+                             f"write {theta_axis}={count:g}" if theta_axis else "name --theta-axis")
+        changes["theta_counts_per_unit"] = count
     return replace(base, **changes)
 
 

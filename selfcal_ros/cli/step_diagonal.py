@@ -16,6 +16,8 @@ from selfcal_ros.cli.step_diagonal_bag import (
 from selfcal_ros.errors import ExitCode, InputError
 
 HELP = "identify linear, straightness and squareness errors from a laser step-diagonal measurement"
+SHORTEST_MM = 1e-6
+"""Steps below 1 nm are no steps of a machine."""
 SEED = 1
 """Of the noise in the table of sensitivities."""
 
@@ -204,7 +206,7 @@ def _measurement(args: argparse.Namespace) -> tuple:
 def _steps(args: argparse.Namespace, dim: int) -> tuple[float, ...]:
     for axis in "xyz"[:dim]:
         step = getattr(args, f"step_{axis}")
-        if not (math.isfinite(step) and step > 0):
+        if not SHORTEST_MM <= step < math.inf:
             raise InputError(f"--step-{axis}", f"{step:g} mm is not a length",
                              "give the nominal step in mm, greater than 0")
     return tuple(getattr(args, f"step_{axis}") * 1e-3 for axis in "xyz"[:dim])

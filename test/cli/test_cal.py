@@ -154,6 +154,8 @@ def test_results_that_cannot_be_exported(run):
     (["--x-axis", "0"], "--x-axis: 0 is not in 1..32"),
     (["--x-axis", "2"], "the indices [2, 2] are not distinct"),
     (["--home-x", "nan"], "--home-x: nan is not a position"),
+    (["--theta-axis", "3", "--counts-per-unit", "4=1000"], "axis 4 is not the theta axis; write"),
+    (["--counts-per-unit", "3=1000"], "axis 3 is not the theta axis; name --theta-axis"),
     (["--theta-axis", "3", "--counts-per-unit", "3=0"], "'0' is not a positive number"),
     (["--theta-axis", "3", "--counts-per-unit", "1000"], "'1000' is not AXIS=VALUE")])
 def test_options_of_export_without_sense(run, args, message):

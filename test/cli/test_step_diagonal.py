@@ -101,6 +101,8 @@ def test_one_diagonal_on_request(capsys):
     (("--step-x", "-10"), "--step-x: -10 mm is not a length; give the nominal step in mm, greater"),
     (("--step-y", "0"), "--step-y: 0 mm is not a length"),
     (("--step-y", "nan"), "--step-y: nan mm is not a length"),
+    (("--step-x", "1e-320"), "--step-x: 9.99989e-321 mm is not a length"),
+    (("--step-x", "inf"), "--step-x: inf mm is not a length"),
     (("--step-x", "20"), "case_study.csv:8: rx_pp: "),
     (("--diagonals", "pp,qq"), "--diagonals: 'qq' is unknown or named twice"),
     (("--diagonals", "pp,pp"), "--diagonals: 'pp' is unknown or named twice"),
