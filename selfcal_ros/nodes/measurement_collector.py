@@ -33,6 +33,7 @@ class MeasurementCollector(SelfcalNode):
         self._published: dict[int, str] = {}
         self._plan_id, self._advised = "", set()
         self._missed: dict[tuple[str, int], str] = {}  # views that began before this node
+        self._placed: set[tuple[str, int]] = set()
         self._state, self._rejected = "waiting for a MEASURE command", Counter()
         self._status = self.publisher(names.STATUS)
         self._measurement = self.publisher(names.MEASUREMENT)
@@ -69,7 +70,9 @@ class MeasurementCollector(SelfcalNode):
     def _note_missed(self, command: Command, *, is_older: bool) -> None:
         """Say which views began before this node: their detections up to now are not here."""
         view = (command.plan_id, command.view_index)
-        if command.phase == Phase.PLACE:
+        if command.phase == Phase.PLACE and not is_older:
+            self._placed.add(view)
+        elif command.phase == Phase.MEASURE and view in self._placed:
             self._missed.pop(view, None)
         elif command.phase == Phase.MEASURE and is_older:
             self._missed[view] = command.view.name

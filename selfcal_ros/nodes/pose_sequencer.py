@@ -80,7 +80,7 @@ class PoseSequencer(SelfcalNode):
             views = ", ".join(known[index] for index in sorted(known))
             answer += f"; measured already: {views} (skip_view keeps a view as it is)"
         if not self._collectors():
-            answer += "; no measurement_collector is running: what is measured now is lost"
+            answer += "; no measurement_collector is seen yet: make sure that one runs"
         self.get_logger().info(answer)
         return answer
 

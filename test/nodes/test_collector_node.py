@@ -175,10 +175,12 @@ def test_a_collector_that_starts_within_a_view_names_it_until_it_is_placed_anew(
     line = f"began before this node: {measure.view.name}"
     graph.until(lambda: any(line in s.message and s.level == DiagnosticStatus.WARN
                             for m in diagnostics for s in m.status), line)
-    again = [replace(command, stamp_ns=command.stamp_ns + 10**9) for command in (place, measure)]
-    for command in again:
+    for number, command in enumerate((measure, place, measure), 1):
+        assert set(node._missed.values()) == {measure.view.name}  # until it is measured anew
+        command = replace(command, stamp_ns=command.stamp_ns + number * 10**9)
         commands.publish(fill(names.COMMAND.type(), convert_out.command(command, "stage")))
-    graph.until(lambda: node.collector.received["command"] == 4, "the commands")
+        graph.until(lambda number=number: node.collector.received["command"] == 2 + number,
+                    "the command")
     diagnostics.clear()
     graph.until(lambda: diagnostics, "diagnostics")
     assert diagnostics[-1].status[0].message == "view '0': 0 % of the marks read"

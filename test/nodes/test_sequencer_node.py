@@ -161,7 +161,7 @@ def test_a_start_without_a_collector_says_so(graph, tmp_path):
     answer = graph.call(Trigger, "pose_sequencer/start")
     assert answer.success
     assert answer.message.endswith(
-        "; no measurement_collector is running: what is measured now is lost")
+        "; no measurement_collector is seen yet: make sure that one runs")
 
 
 def test_an_automatic_start_waits_for_a_collector(graph, tmp_path):
