@@ -15,6 +15,10 @@ from selfcal_ros.model.readings import Measurements
 ROUNDING = 16 * np.finfo(float).eps
 """Noise below this part of the largest deviation is rounding."""
 
+MAX_WEIGHT = 1e8
+"""Largest weight of one kind of readings against the other, all together: beyond, the lighter one
+would be lost in the rounding of the heavier, and with it the rotations that it alone tells."""
+
 
 @dataclass(frozen=True, eq=False)
 class Problem:
@@ -99,4 +103,6 @@ def weight_ratio(problem: Problem, sigma_xy: float, sigma_theta: float, y: np.nd
     sigma_xy = max(sigma_xy, ROUNDING * float(np.abs(y).max()), 1e-300)
     peak = float(np.abs(problem.angular.y).max())
     sigma_theta = max(sigma_theta, ROUNDING * peak, 1e-300)
-    return (sigma_xy / (sigma_theta * problem.half_width_m)) ** 2
+    ratio = (sigma_xy / (sigma_theta * problem.half_width_m)) ** 2
+    equal = problem.system.grid_scale / problem.system.angular_scale
+    return float(np.clip(ratio, equal / MAX_WEIGHT, equal * MAX_WEIGHT))
