@@ -22,6 +22,8 @@ from selfcal_ros.simulation.laser import (
 
 MM, UM, NM, MRAD, URAD = 1e-3, 1e-6, 1e-9, 1e-3, 1e-6
 MAX_REPEATS = 1000
+LARGEST = 1e9
+"""No length, angle or ratio of a set-up is larger, in the units of the file."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,8 +155,9 @@ def _mapping(data: object, where: str, known: tuple[str, ...]) -> dict[str, Any]
 
 def _number(value: object, where: str, *, positive: bool = False) -> float:
     is_number = isinstance(value, int | float) and not isinstance(value, bool)
-    if not is_number or not np.isfinite(value) or (positive and value < 0):
-        raise InputError(where, f"{value!r} is not a number" + " from 0" * positive, "give one")
+    if not is_number or not abs(value) <= LARGEST or (positive and value < 0):
+        raise InputError(where, f"{value!r} is not a number" + " from 0" * positive,
+                         f"give one within +-{LARGEST:g}")
     return float(value)
 
 

@@ -77,6 +77,8 @@ def test_the_truth_of_the_case_study():
     ({"setups": {"pp": {"laser_mrad": 1}}}, "laser_mrad: 1 is not a list of 1 numbers"),
     ({"setups": {"pp": {"to_machine": "no"}}}, "'no' is neither true nor false"),
     ({"noise": {"distance_nm": float("nan")}}, "distance_nm: nan is not a number from 0"),
+    ({"noise": {"linear_nm": 10**30}}, "is not a number from 0; give one within +-1e+09"),
+    ({"machine": {"steps_mm": [1e300, 1]}}, "1e+300 is not a number"),
     ({"noise": {"repeats": 1.5}}, "repeats: 1.5 is not a whole number from 1 to 1000")])
 def test_what_is_wrong_is_named(data, message):
     with pytest.raises(InputError) as caught:
