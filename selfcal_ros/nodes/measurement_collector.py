@@ -34,6 +34,7 @@ class MeasurementCollector(SelfcalNode):
         self._plan_id, self._advised = "", set()
         self._missed: dict[tuple[str, int], str] = {}  # views that began before this node
         self._placed: set[tuple[str, int]] = set()
+        self._problem = ""
         self._state, self._rejected = "waiting for a MEASURE command", Counter()
         self._status = self.publisher(names.STATUS)
         self._measurement = self.publisher(names.MEASUREMENT)
@@ -98,6 +99,11 @@ class MeasurementCollector(SelfcalNode):
         except NoDataError:
             self._rejected = Counter(self.collector.unusable)
             return
+        except InputError as error:  # holds until this node is restarted: say it once
+            if self._problem != str(error):
+                self._problem = str(error)
+                self.get_logger().error(f"{error}; then restart this node")
+            return
         self._publish(measurements, progress, final=False)
         self._describe(measurements, progress)
         spent = time.monotonic() - now
@@ -153,11 +159,12 @@ class MeasurementCollector(SelfcalNode):
         self._since_report = 0
         received = {f"{kind}_received": n for kind, n in self.collector.received.items()}
         missed = ", ".join(self._missed.values())
-        state = self._state + (f"; began before this node: {missed}" if missed else "")
+        state = self._problem or self._state
+        state += f"; began before this node: {missed}" if missed else ""
         self.diagnose(state, {
             **received, "views": len(self._published),
             **{f"rejected {reason}": n for reason, n in sorted(self._rejected.items())}},
-            ok=not missed and not self.collector.unusable)
+            ok=not missed and not self._problem and not self.collector.unusable)
 
 
 def main() -> None:

@@ -13,7 +13,7 @@ from std_srvs.srv import Trigger
 
 from selfcal_ros.bagio import convert_in, convert_out
 from selfcal_ros.collection.digest import readings_digest, session_digest
-from selfcal_ros.collection.messages import Command, Detection
+from selfcal_ros.collection.messages import Command, Detection, Phase
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes.base import fill
 from selfcal_ros.nodes.measurement_collector import MeasurementCollector
@@ -185,6 +185,31 @@ def test_a_collector_that_starts_within_a_view_names_it_until_it_is_placed_anew(
     graph.until(lambda: diagnostics, "diagnostics")
     assert diagnostics[-1].status[0].message == "view '0': 0 % of the marks read"
     assert diagnostics[-1].status[0].level == DiagnosticStatus.OK
+
+
+def test_another_plate_under_the_same_plan_is_said_once_and_in_the_diagnostics(
+        graph, monkeypatch):
+    node = graph.node(MeasurementCollector, status_period=0.02)
+    said, diagnostics = [], []
+    monkeypatch.setattr(node, "get_logger", lambda: SimpleNamespace(error=said.append))
+    graph.hand.create_subscription(DiagnosticArray, "/diagnostics", diagnostics.append, 10)
+    commands, detections = graph.publisher(names.COMMAND), graph.publisher(names.DETECTIONS)
+    for second, size in enumerate((5, 7)):
+        plan = plan_of("0", size, count=8)
+        commands.publish(fill(names.COMMAND.type(), convert_out.command(Command(
+            second * 10**9, Phase.MEASURE, "one", 0, plan.views[0], plan.artifact, 1), "stage")))
+    line = "describes another plate than the rest of plan 'one'"
+    for expected in (3, 6, 9):  # each makes the collector look again
+        graph.until(lambda: any(line in s.message and s.level == DiagnosticStatus.WARN
+                                for m in diagnostics for s in m.status), "the diagnostics")
+        diagnostics.clear()
+        for _ in range(3):
+            detections.publish(MarkDetection())
+        graph.until(lambda expected=expected: node.collector.received["detection"] == expected,
+                    "the detections")
+    assert len(said) == 1
+    assert line in said[0]
+    assert said[0].endswith("; then restart this node")
 
 
 def test_diagnostics_count_rejections_before_any_view_and_beat_without_messages(graph):
