@@ -49,13 +49,19 @@ class MachineFrame:
     theta_counts_per_unit: float | None = None
 
     def __post_init__(self) -> None:
-        """Refuse an unknown unit and axes that are not distinct."""
+        """Refuse an unknown unit, axes that are not distinct, and values that are no numbers."""
         if self.unit not in UNITS_M:
             raise InputError("unit", f"'{self.unit}' is not a primary unit", "take m, mm or um")
         axes = [a for a in (self.x_axis, self.y_axis, self.theta_axis) if a is not None]
         if len(set(axes)) < len(axes):
             raise InputError("axes", f"the indices {axes} are not distinct",
                              "give each axis its own index")
+        for value in (self.home_x_m, self.home_y_m, self.home_theta_rad):
+            if not math.isfinite(value):
+                raise InputError("home position", f"{value} is not a position", "give a number")
+        if self.theta_counts_per_unit is not None and not 0 < self.theta_counts_per_unit < math.inf:
+            raise InputError("counts per degree", f"{self.theta_counts_per_unit} is not a positive "
+                             "number", "give the encoder counts in a degree of theta")
 
     @property
     def unit_m(self) -> float:

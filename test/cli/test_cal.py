@@ -89,6 +89,20 @@ def test_verify_of_a_file_without_our_comments_takes_options(run):
     assert wrong["sites"]["after"]["max"] > 1e-8
 
 
+@pytest.mark.parametrize(("old", "new", "message"), [
+    ("home-x=0", "home-x=nan", "home position: nan is not a position"),
+    ("theta-counts-per-unit=1000", "theta-counts-per-unit=0", "0.0 is not a positive number"),
+    ("y-axis=2", "y-axis=1", "the indices [1, 1, 3] are not distinct")])
+def test_a_wiring_in_the_file_without_sense_is_named(run, tmp_path, old, new, message):
+    run("export", "r.json", "-o", "f.cal", "--theta-axis", "3", "--counts-per-unit", "3=1000")
+    text = (tmp_path / "f.cal").read_text()
+    assert text.count(old) == 1
+    (tmp_path / "f.cal").write_text(text.replace(old, new))
+    code, _, err = run("verify", "r.json", "f.cal")
+    assert code == 2
+    one_line(err, message)
+
+
 def test_a_file_with_the_wrong_sign_is_refused_by_verify(run):
     run("export", "r.json", "-o", "f.cal")
     with open("f.cal") as file:
