@@ -111,15 +111,20 @@ def _noise_parts(u: np.ndarray, sigma: float, *, repeats: tuple[float, int],
     if not (np.isfinite(sigma) and sigma > 0):
         return [Component("reading noise", "A", 0.0, 0.0, np.inf, "no noise was found")]
     gain_rms, gain_max = _rms(u) / sigma, float(np.nanmax(u)) / sigma
-    level, dof = repeats if repeats[1] > 0 else (sigma, residuals[1] or np.inf)
-    source = "scatter of repeats" if repeats[1] > 0 else (
-        "residuals of the fit" if residuals[1] else "declared by the detections")
-    out = [Component("reading noise", "A", gain_rms * level, gain_max * level, dof, source)]
-    if repeats[1] > 0:
+    if sigma not in (repeats[0], residuals[0]):
+        level, dof, kind, base = sigma, np.inf, "B", "declaration"
+        source = "declared by the detections"
+    elif repeats[1] > 0:
+        (level, dof), kind, base, source = repeats, "A", "repeats", "scatter of repeats"
+    else:
+        level, dof, kind, base, source = sigma, residuals[1], "A", "", "residuals of the fit"
+    out = [Component("reading noise", kind, gain_rms * level, gain_max * level, dof, source)]
+    if base:
+        beyond_what = "scatter of repeats" if base == "repeats" else "declared noise"
         beyond = float(np.sqrt(max(residuals[0]**2 - level**2, 0.0))) if residuals[1] else 0.0
-        out.append(Component("beyond repeats", "A", gain_rms * beyond, gain_max * beyond,
-                             residuals[1] or np.inf, "residuals beyond the scatter of repeats: "
-                             "drift, seating, slow vibration"))
+        out.append(Component(f"beyond {base}", "A", gain_rms * beyond, gain_max * beyond,
+                             residuals[1] or np.inf, f"residuals beyond the {beyond_what}: drift, "
+                             "seating, slow vibration"))
     return out
 
 

@@ -122,9 +122,13 @@ def map_covariance(measurements: Measurements, options: Options | None = None) -
     Raises
     ------
     NoDataError, NotIdentifiableError, InputError
-        As `selfcal_ros.estimation.api.calibrate`; also for a field too large to factorise.
+        As `selfcal_ros.estimation.api.calibrate`; also for a field too large to factorise, and
+        for Hu's law, whose map has another covariance.
     """
     options = options or Options()
+    if options.method != "joint":
+        raise InputError("covariance", f"that of the method '{options.method}' is not known",
+                         "calibrate with the method joint")
     wanted = Options(options.method, options.datum_theta, options.reference,
                      options.misalignment_model, uncertainty=True)
     with one_thread():

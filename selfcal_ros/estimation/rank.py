@@ -90,10 +90,11 @@ def measured_observability(system: JointSystem, artifact: Artifact,
 
 def _measured_observability(system: JointSystem, artifact: Artifact,
                             views: tuple[View, ...]) -> Observability:
-    full = full_observability(system, artifact, views)
+    read = _as_read(system, views)
+    full = full_observability(system, artifact, read)
     if full.identifiable:
         return full
-    as_planned = plan_observability(Plan("", artifact, _as_read(system, views)))
+    as_planned = plan_observability(Plan("", artifact, read))
     if not as_planned.identifiable:
         return full
     sites, lines = system.known_sites, system.known_lines

@@ -13,6 +13,9 @@ from selfcal_ros.estimation.reference import ScaleDatum
 from selfcal_ros.estimation.system import JointSystem
 from selfcal_ros.estimation.theta import Conditions
 
+NO_NOISE_M = 1e-100
+"""Noise that stands for none: its square is still a number."""
+
 
 class FieldCovariance:
     """Covariance of the stage map G in its datum, for unit noise of one grid reading.
@@ -34,7 +37,7 @@ class FieldCovariance:
         self.system, self.inverse = system, inverse
         self.scale, self._u2 = scale, 0.0
         if scale is not None:
-            self._u2 = scale.variance + (scale.u_m / max(sigma, 1e-300)) ** 2
+            self._u2 = scale.variance + (scale.u_m / max(sigma, NO_NOISE_M)) ** 2
         n = 3 * system.grid.n_views
         self._p = inverse[:n, :n]
 

@@ -124,3 +124,20 @@ def test_a_map_without_noise_has_no_noise_component():
     result = calibrated()
     silent = replace(result, noise=replace(result.noise, sigma_xy=0.0))
     assert parts_of(budgets(silent)[0])["reading noise"].note == "no noise was found"
+
+
+def test_noise_that_the_detections_declare_is_told_as_such():
+    """Also where residuals or a few repeats have their own figure: the map's u is the declared."""
+    rng = np.random.default_rng(1)
+    truth = random_truth(ARTIFACT, 4, rng)
+    for repeats in (1, 3):
+        readings = simulate_measurements(truth, hu_plan(ARTIFACT, repeats), rng, sigma_m=2e-8,
+                                         sigma_theta_rad=2e-5)
+        views = tuple(replace(v, u=np.full(len(v.m), 5e-8)) for v in readings.views)
+        result = calibrate(replace(readings, views=views))
+        parts = parts_of(budgets(result)[0])
+        noise = parts["reading noise"]
+        assert (noise.kind, noise.dof, noise.note) == ("B", np.inf, "declared by the detections")
+        u = np.stack([result.error_map.u_gx, result.error_map.u_gy])
+        assert noise.u_rms == pytest.approx(np.sqrt((u**2).mean()))
+        assert parts["beyond declaration"].u_rms == 0.0

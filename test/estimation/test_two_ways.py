@@ -6,12 +6,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from selfcal_ros.errors import InputError, NotIdentifiableError
 from selfcal_ros.estimation.api import Options, ReferenceLength, calibrate
+from selfcal_ros.estimation.covariance import map_covariance
 from selfcal_ros.estimation.robust import _noisy_views, clean, robust_calibrate
 from selfcal_ros.estimation.robust_leverage import residuals_of
 from selfcal_ros.estimation.validation import validate
 from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.model.readings import Sense
+from selfcal_ros.model.readings import Sense, ViewReadings
 from selfcal_ros.simulation.truth import Spread, hu_plan, random_truth, simulate_measurements
 from test.support.lattice_plans import plan_of
 from test.support.two_ways import (
@@ -134,3 +136,27 @@ def test_one_kind_of_readings_may_be_exact(sigma_m, sigma_rad, limit_m):
         assert error < limit_m
         left = emap.g_theta - truth.g_theta
         assert np.sqrt(np.mean((left - left.mean()) ** 2)) < 3 * max(sigma_rad, sigma_m * 50, 1e-15)
+
+
+def test_a_view_that_was_never_read_is_missed_by_name():
+    """Planned, but without a reading: the advice must not count on it."""
+    _, readings = measured(CASES["square"])
+    gone = {1, 4}  # both views turned by a quarter
+    views = tuple(ViewReadings(view.view) if i in gone else view
+                  for i, view in enumerate(readings.views))
+    with pytest.raises(NotIdentifiableError, match="add a view turned by 90 deg"):
+        calibrate(replace(readings, views=views))
+
+
+def test_readings_of_zero_alone_take_a_reference():
+    still = Spread(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    _, readings = measured(CASES["square"], sigma_m=0.0, sigma_theta_rad=0.0, spread=still)
+    options = Options(reference=ReferenceLength("stage_x", 1e-6, 1e-6))
+    emap = calibrate(readings, options).error_map
+    assert np.allclose(emap.gx, 1e-6 * emap.artifact.x_m, rtol=1e-9, atol=0)
+
+
+def test_the_covariance_of_the_law_is_not_that_of_the_joint_map():
+    _, readings = measured(hu_plan(Artifact(5, 0.01, 8)))
+    with pytest.raises(InputError, match="covariance: that of the method 'law' is not known"):
+        map_covariance(readings, Options(method="law"))
