@@ -185,6 +185,21 @@ def test_uncertainty_is_that_of_the_sites_and_a_bound_between_them():
     assert compensator.uncertainty(0.005, 0.0)[0] == pytest.approx(MAP.u_gx[5:7, 5].mean())
 
 
+def test_bicubic_uncertainty_exceeds_that_of_the_sites_in_the_outermost_cells_only():
+    # Variances of independent sites add up with the squares of the weights that each site has;
+    # those along x and y multiply.
+    x = np.linspace(-0.05, 0.05, 401)
+    weights = []
+    for site in range(11):
+        g = np.zeros(ARTIFACT.shape)
+        g[site] = 1e-6
+        emap = ErrorMap(ARTIFACT, g, 0 * g, 0 * g, 0 * g, np.zeros(24), np.zeros(24))
+        weights.append(Compensator(emap, method="bicubic").error(x, 0.0)[0] / 1e-6)
+    ratio = np.sum(np.square(weights), axis=0)  # of the variance along x, of the u over the field
+    assert ratio[np.abs(x) <= 0.04 + 1e-9].max() < 1.01
+    assert 1.37 < ratio.max() < 1.38
+
+
 def test_a_map_without_lines_says_so():
     compensator = Compensator(random_map(Artifact(5, 0.01), 1))
     assert not compensator.has_theta
