@@ -26,6 +26,9 @@ from selfcal_ros.model.view import Plan, View
 SEARCH_SIZE = 9
 """Largest field on which the view that cures is searched; it is then verified on the real one."""
 
+NARROW = 5
+"""Sites across that a smaller field keeps in any case."""
+
 PROXY_SIZE = 101
 """Field on which the uncertainty of a larger one is predicted."""
 
@@ -174,11 +177,14 @@ def _cured(plan: Plan, views: tuple[View, ...]) -> bool:
 def smaller(plan: Plan, size: int) -> Plan:
     """Return the plan on a field of at most `size` sites a side, same turns and shifts.
 
-    The field stays large enough for the plan's own shifts.
+    The field keeps its proportions, on which the uncertainty of a long field depends, and stays
+    large enough for the plan's own shifts.
     """
     reach = [max(map(abs, view.lattice_pose(plan.artifact).shift)) for view in plan.views]
-    size = max(size, 2 * max(reach, default=0) + 3)
-    nx, ny = (min(n, size) for n in plan.artifact.shape)
+    room = 2 * max(reach, default=0) + 3
+    part = min(1.0, max(size, room) / max(plan.artifact.shape))
+    nx, ny = (max(2 * round((n * part - 1) / 2) + 1, min(n, max(room, NARROW)))
+              for n in plan.artifact.shape)
     return replace(plan, artifact=Artifact(nx, plan.artifact.grid_pitch_m,
                                            plan.artifact.angular_count, 0 if nx == ny else ny))
 

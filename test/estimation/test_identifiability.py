@@ -10,12 +10,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from selfcal_ros.errors import NotIdentifiableError
+from selfcal_ros.estimation import identifiability
 from selfcal_ros.estimation.api import Options, calibrate
 from selfcal_ros.estimation.identifiability import (
     candidate_views,
     check_plan,
     describe_view,
     find_cures,
+    predict_plan,
     smaller,
     unseen_modes,
 )
@@ -222,6 +224,21 @@ def test_smaller_fields_keep_room_for_the_shifts():
     assert smaller(plan, 5).artifact.shape == (7, 7)
     assert smaller(plan, 51).artifact.shape == (21, 21)
     assert smaller(plan_of("0, 180", 21, size_y=5), 9).artifact.shape == (9, 5)
+    assert smaller(plan_of("0, 90, ty", 41, size_y=61), 31).artifact.shape == (21, 31)
+    assert smaller(plan_of("0, 90, ty2", 9, size_y=61), 31).artifact.shape == (7, 31)
+
+
+@pytest.mark.parametrize(("size", "size_y"), [(21, 31), (31, 21), (11, 21)])
+def test_long_fields_are_predicted_on_long_ones(size, size_y, monkeypatch):
+    """A square would promise two thirds of the uncertainty, and half of the largest one."""
+    plan = plan_of("0, 90, tx, ty", size, size_y=size_y)
+    full = predict_plan(plan, "xy_axes")
+    monkeypatch.setattr(identifiability, "MAX_SITES", 100)
+    monkeypatch.setattr(identifiability, "PROXY_SIZE", 11)
+    found = predict_plan(plan, "xy_axes")
+    assert "predicted for a field of" in found.note
+    assert found.rms_xy == pytest.approx(full.rms_xy, rel=0.1)
+    assert found.max_xy == pytest.approx(full.max_xy, rel=0.2)
 
 
 def test_a_deficient_measurement_is_refused_with_its_modes_and_cures():
