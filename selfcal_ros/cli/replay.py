@@ -36,7 +36,7 @@ def run(args: argparse.Namespace) -> int:
     """Start the nodes, play, collect the result, stop the nodes."""
     from selfcal_ros.bagio.offline import bag_input
     from selfcal_ros.errors import InputError
-    from selfcal_ros.files import read_json, write_json
+    from selfcal_ros.files import check_outputs, read_json, write_json
     from selfcal_ros.model.result import result_from_dict, result_to_dict, with_input
 
     for package in ("rclpy", "selfcal_msgs"):
@@ -46,6 +46,7 @@ def run(args: argparse.Namespace) -> int:
                              "environment of `make setup`, or use `selfcal solve`")
     if not args.fast and not args.rate > 0:
         raise InputError("--rate", f"{args.rate:g} is not a speed", "give a number above 0")
+    check_outputs([args.bag, args.params], [args.output])
     source = bag_input(args.bag)
     with tempfile.TemporaryDirectory() as folder, domain() as environment:
         saved = Path(folder, "result.json")

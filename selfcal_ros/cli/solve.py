@@ -78,9 +78,10 @@ def run(args: argparse.Namespace) -> int:
     from selfcal_ros.collection.reasons import advice
     from selfcal_ros.errors import NotIdentifiableError
     from selfcal_ros.estimation.api import calibrate
-    from selfcal_ros.files import write_json
+    from selfcal_ros.files import check_outputs, write_json
     from selfcal_ros.model.result import result_to_dict, unidentified_result, with_input
 
+    check_outputs([args.bag, args.params], [args.output])
     collector_values, solver_values = parameters(args)
     with progress_bar("reading") as bar:
         measurements, _, lost = collect_bag(args.bag, collector_values, namespace=args.namespace,

@@ -268,3 +268,15 @@ def test_bad_options(capsys, bag, options):
 def test_an_output_that_cannot_be_written(tmp_path, capsys, bag):
     line = refused(capsys, 2, bag, "-o", str(tmp_path / "none" / "r.json"))
     assert "cannot be written (No such file or directory); name a folder" in line
+
+
+def test_the_measurement_is_never_written_over(tmp_path, capsys):
+    bag = small_bag(tmp_path)
+    parts = sorted(bag.rglob("*")) if bag.is_dir() else [bag]
+    before = [part.read_bytes() for part in parts]
+    for target in parts:
+        assert solve(bag, output=target) == 2
+        assert f"{target.name}: would be written over; name another" in capsys.readouterr().err
+    assert solve(bag, output=tmp_path / "none" / "r.json") == 2
+    assert "cannot be written (No such file or directory)" in capsys.readouterr().err
+    assert [part.read_bytes() for part in parts] == before
