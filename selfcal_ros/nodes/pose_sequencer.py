@@ -36,8 +36,7 @@ class PoseSequencer(SelfcalNode):
         path = self.values["plan"]
         self.machine = Sequencer(load_plan(path) if path else None)
         self._own: set[tuple] = set()
-        self._goal: Any = None
-        self._ended: Future | None = None
+        self._goal, self._ended = None, None  # of the action that runs
         self._deadline, self._confirm_at, self._redos = 0.0, 0.0, 0
         self._coverage, self._commanded_ns = 0.0, 0
         self._measured: dict[str, dict[int, str]] = {}
@@ -112,9 +111,11 @@ class PoseSequencer(SelfcalNode):
     def _on_command(self, message: Any) -> None:
         if _key(convert_in.command(message)) in self._own:
             return
-        if self.machine.state is not State.FOLLOWING:
-            self.get_logger().warning("another publisher sends view commands: following them; "
-                                      "abort ends that")
+        said = "another publisher sends view commands: following them; abort ends that"
+        if self.machine.state in ENDED:
+            self.get_logger().info(said)
+        elif self.machine.state is not State.FOLLOWING:  # its own plan stops here
+            self.get_logger().warning(said)
         self.machine.foreign_command()
         if self._ended is not None:
             self._ended.set_result(None)
@@ -125,9 +126,9 @@ class PoseSequencer(SelfcalNode):
         expected = message.grid_expected + message.angular_expected
         if message.view_index == self.machine.index and expected:
             self._coverage = (message.grid_done + message.angular_done) / expected
-        next_view = self.machine.status(message.plan_id, message.view_index, message.complete)
-        self._redos = 0 if next_view else self._redos
-        self._send(next_view)
+        moved_on = self.machine.status(message.plan_id, message.view_index, message.complete)
+        self._redos = 0 if moved_on else self._redos
+        self._send(moved_on)
 
     def _on_timer(self) -> None:
         now = time.monotonic()
@@ -139,8 +140,7 @@ class PoseSequencer(SelfcalNode):
         timed_out = self.values["view_timeout"] > 0 and now >= self._deadline
         if self.machine.state is State.MEASURING and timed_out:
             view = self.machine.plan.views[self.machine.index].name
-            self.get_logger().warning(f"view {view} is not complete after "
-                                      f"{self.values['view_timeout']:g} s")
+            self.get_logger().warning(f"view {view} is not complete in time")
             again = self._redos < self.values["max_redos"]
             self._redos = self._redos + 1 if again else 0
             self._send(self.machine.redo() if again else self.machine.skip())

@@ -37,7 +37,7 @@ class Solver(SelfcalNode):
         self._messages: dict[int, Any] = {}
         self._plan_id: str | None = None
         self._planned: dict[str, int] = {}
-        self._loaded = False
+        self._digest = ""
         self._stale = False
         self.result: CalibrationResult | None = None
         self._problem: SelfcalError | None = None
@@ -87,20 +87,24 @@ class Solver(SelfcalNode):
             self._stale = False
             try:
                 self._solve()
+            except SelfcalError as error:
+                self._problem = error
+                raise
             finally:
                 self._report()
 
     def _solve(self) -> None:
+        self._digest = ""
         measurements = self.measurements()
-        self._problem, self._loaded = None, False
+        self._digest = session_digest({
+            index: readings_digest(convert_in.view_readings(message), measurements.rejected)
+            for index, message in self._messages.items()})
+        self._problem = None
         try:
             self.result = calibrate(measurements, solver_options(self.values))
         except NotIdentifiableError as error:
             self._problem = error
             self.result = unidentified_result(measurements, error.observability)
-        except SelfcalError as error:
-            self._problem = error
-            raise
         self._publish()
         if self.values["save_path"] and self._problem is None:
             write_json(self.values["save_path"], result_to_dict(self.result))
@@ -136,12 +140,8 @@ class Solver(SelfcalNode):
         return str(self._problem or state_sentence(self.result))
 
     def digest(self) -> str:
-        """Return the fingerprint of the readings that the published map comes from."""
-        if self._stale or self._loaded or not self._messages:
-            return ""
-        rejected = self.measurements().rejected
-        return session_digest({index: readings_digest(convert_in.view_readings(m), rejected)
-                               for index, m in self._messages.items()})
+        """Return the fingerprint of the readings behind the published map; "" = of none."""
+        return "" if self._stale else self._digest
 
     def _save(self, path: str) -> str:
         self._solve_if_stale()
@@ -154,7 +154,7 @@ class Solver(SelfcalNode):
 
     def _load(self, path: str) -> str:
         self.result = result_from_dict(read_json(_named(path)), path)
-        self._problem, self._loaded = None, True
+        self._problem, self._digest = None, ""
         self._publish()
         return f"loaded {path}: plan {self.result.plan_id}"
 

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """pose_sequencer: services, status, foreign commands, time-outs and the action."""
 
+from types import SimpleNamespace
+
 import pytest
 from action_msgs.msg import GoalStatus
 from diagnostic_msgs.msg import DiagnosticArray
@@ -173,6 +175,23 @@ def test_an_automatic_start_waits_for_a_collector(graph, tmp_path):
     assert node.machine.state is State.IDLE
     graph.hand.create_publisher(names.STATUS.type, names.STATUS.name, names.STATUS.qos)
     graph.until(lambda: node.machine.state is State.PLACING, "the start")
+
+
+def test_following_is_a_warning_only_where_a_plan_is_given_up(desk, monkeypatch):
+    said = []
+    monkeypatch.setattr(desk.node, "get_logger", lambda: SimpleNamespace(
+        info=lambda text: said.append(("info", text)),
+        warning=lambda text: said.append(("warning", text))))
+    for stamp, level in ((1, "info"), (2, "warning")):
+        message = fill(names.COMMAND.type(), convert_out.command(Command(
+            stamp, PLACE, "recorded", 0, PLAN.views[0], PLAN.artifact), "stage"))
+        desk.node._on_command(message)
+        desk.node._on_command(message)
+        assert [item for item in said if item[1].startswith("another publisher")] == [
+            (level, "another publisher sends view commands: following them; abort ends that")]
+        assert desk.ask("abort").success
+        assert desk.ask("start").success
+        said.clear()
 
 
 def test_an_incomplete_view_is_redone_and_then_skipped(graph, tmp_path):

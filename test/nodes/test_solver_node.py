@@ -213,6 +213,22 @@ def test_the_plan_is_known_whichever_topic_is_heard_first(graph):
                             for m in diagnostics for s in m.status), "no alarm")
 
 
+def test_views_of_two_plates_are_an_alarm(graph, tmp_path):
+    graph.node(Solver)
+    diagnostics: list = []
+    graph.hand.create_subscription(DiagnosticArray, "/diagnostics", diagnostics.append, 10)
+    readings = graph.publisher(names.MEASUREMENT)
+    messages, _ = measured()
+    messages[1].grid_pitch *= 2
+    for message in messages[:2]:
+        readings.publish(message)
+    line = "selfcal/view_measurement: views of different plates in one plan; measure one plate"
+    graph.until(lambda: any(s.message == line and s.level == DiagnosticStatus.WARN
+                            for m in diagnostics for s in m.status), "the alarm")
+    answer = graph.call(SaveMap, "solver/save_map", path=str(tmp_path / "no.json"))
+    assert (answer.success, answer.error_code, answer.message) == (False, 2, line)
+
+
 def test_the_map_is_shown_as_markers_in_the_frame_of_the_map(solve, graph):
     _, _, measurements = solve(frame_id="cell")
     arrays = graph.listen(names.MAP_MARKERS)
