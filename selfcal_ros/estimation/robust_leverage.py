@@ -23,6 +23,9 @@ from selfcal_ros.model.readings import Measurements
 EXACT_SITES = 31 * 31
 """Largest field whose leverages are computed exactly; beyond, from seeded draws."""
 
+EXACT_LINES = 2048
+"""Largest number of lines whose leverages are computed exactly; beyond, all have their mean."""
+
 N_DRAWS = 64
 """Draws of unit noise for a larger field: 9 % standard error of a residual's variance."""
 
@@ -177,7 +180,7 @@ def angular_redundancy(system: JointSystem) -> np.ndarray:
     angular = system.angular
     if not angular.n_views:
         return np.zeros(angular.weight.shape)
-    if angular.n_lines**2 > EXACT_SITES * 16:
+    if angular.n_lines > EXACT_LINES:
         mean = 1 - system.rank_angular / max(angular.n_readings, 1)
         return np.where(angular.read, mean, 0.0)
     inverse = angular.solve(np.eye(angular.n_lines))

@@ -9,7 +9,7 @@ import pytest
 from selfcal_ros.errors import InputError, NotIdentifiableError
 from selfcal_ros.estimation.api import Options, ReferenceLength, calibrate
 from selfcal_ros.estimation.covariance import map_covariance
-from selfcal_ros.estimation.robust import _noisy_views, clean, robust_calibrate
+from selfcal_ros.estimation.robust import _noisy_views, clean, robust_calibrate, subset
 from selfcal_ros.estimation.robust_leverage import residuals_of
 from selfcal_ros.estimation.validation import validate
 from selfcal_ros.model.artifact import Artifact
@@ -160,3 +160,14 @@ def test_the_covariance_of_the_law_is_not_that_of_the_joint_map():
     _, readings = measured(hu_plan(Artifact(5, 0.01, 8)))
     with pytest.raises(InputError, match="covariance: that of the method 'law' is not known"):
         map_covariance(readings, Options(method="law"))
+
+
+def test_a_line_of_a_fine_circle_that_is_read_once_cannot_be_checked():
+    _, readings = measured(CASES["circle of 360"])
+    views = tuple(subset(view, np.ones(len(view.m), dtype=bool), (view.k != 7) | (row == 0))
+                  for row, view in enumerate(readings.views))
+    left = residuals_of(replace(readings, views=views), Options())
+    assert left.redundancy_theta[0, 7] < 1e-9 and np.isnan(left.squares_theta[0, 7])
+    assert left.redundancy_theta.sum() == pytest.approx(left.found.theta.dof_residuals)
+    # lines beside the gap are checked by fewer readings than the others
+    assert np.ptp(left.redundancy_theta[left.redundancy_theta > 0.05]) > 0.1
