@@ -171,3 +171,33 @@ def test_a_line_of_a_fine_circle_that_is_read_once_cannot_be_checked():
     assert left.redundancy_theta.sum() == pytest.approx(left.found.theta.dof_residuals)
     # lines beside the gap are checked by fewer readings than the others
     assert np.ptp(left.redundancy_theta[left.redundancy_theta > 0.05]) > 0.1
+
+
+ROUGH = Spread(a_m=20e-6, phi_rad=0.02)
+SHIFTS = plan_of("0,90+tx,2ty,270-2tx+ty,tx", Artifact(7, 0.01, 12), lines=1)
+FOUR = plan_of("0,90,tx", Artifact(5, 0.01, 4), lines=1)
+
+
+@pytest.mark.parametrize(("plan", "sense", "missing", "options"), [
+    (SHIFTS, Sense.PLATE_MOVES, 0.2, Options()), (FOUR, Sense.MICROSCOPE_MOVES, 0.0, Options()),
+    (CASES["square"], Sense.MICROSCOPE_MOVES, 0.0, Options(misalignment_model="rigid"))])
+def test_uncertainties_are_the_scatter_of_recalibrations(plan, sense, missing, options):
+    rng, rigid = np.random.default_rng(11), options.misalignment_model == "rigid"
+    truth, clean = measured(plan, sense=sense, missing=missing, sigma_m=0.0, sigma_theta_rad=0.0,
+                            spread=ROUGH if rigid else None)
+    if rigid:
+        clean = with_finite_rotations(clean, truth)
+    wanted, squares = maps_of(calibrate(clean, options)), {"xy": [], "theta": []}
+    for _ in range(60):
+        views = tuple(replace(
+            v, dx=v.dx + SIGMA_M * rng.normal(size=len(v.m)),
+            dy=v.dy + SIGMA_M * rng.normal(size=len(v.m)),
+            dtheta=v.dtheta + SIGMA_RAD * rng.normal(size=len(v.k))) for v in clean.views)
+        found = maps_of(calibrate(replace(clean, views=views), options))
+        for key, kind in (("gx", "xy"), ("gy", "xy"), ("g_theta", "theta")):
+            z = (found[key] - wanted[key]) / found["u_" + key]
+            squares[kind].append(z[np.isfinite(z)] ** 2)
+    for kind, tolerance in (("xy", 0.1), ("theta", 0.35)):
+        values = np.concatenate(squares[kind])
+        assert values.mean() == pytest.approx(1, abs=tolerance)
+        assert np.mean(values < 4) == pytest.approx(0.95, abs=tolerance / 4)
