@@ -60,7 +60,8 @@ def test_rviz_layout_shows_the_stage_frame_from_above():
     manager = layout["Visualization Manager"]
     assert manager["Global Options"]["Fixed Frame"] == "stage"
     classes = [display["Class"] for display in manager["Displays"]]
-    assert classes == [f"rviz_default_plugins/{name}" for name in ("Grid", "MarkerArray", "Axes", "TF")]
+    names = ("Grid", "MarkerArray", "Axes", "TF")
+    assert classes == [f"rviz_default_plugins/{name}" for name in names]
     assert manager["Views"]["Current"]["Class"] == "rviz_default_plugins/TopDownOrtho"
     assert {panel["Class"] for panel in layout["Panels"]} >= {"rviz_common/Displays"}
 
