@@ -183,7 +183,7 @@ def _significance(values: np.ndarray, covariances: list[tuple[np.ndarray, bool]]
     q = np.linalg.qr(removed)[0]
     if total.ndim == 1:
         variance = total * (1 - (q**2).sum(axis=1))
-        twice_squares = 2.0 * (len(values) - q.shape[1])
+        twice_squares = 2.0 * len(values) ** 2 / (len(values) - q.shape[1])
     else:
         total = total - q @ (q.T @ total)
         total = total - (total @ q) @ q.T

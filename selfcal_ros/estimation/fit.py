@@ -9,6 +9,7 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.fit_iterated import solve_iterated
 from selfcal_ros.estimation.noise import Level, level
 from selfcal_ros.estimation.problem import (
+    ROUNDING,
     AngularPart,
     Problem,
     Raw,
@@ -20,8 +21,8 @@ from selfcal_ros.estimation.reference import scale_of
 
 MAX_RIGID_STEPS = 20
 
-RIGID_RESOLUTION_M = 1e-14
-"""Change of a misalignment, at the edge of the plate, at which rotations stand still."""
+RIGID_RESOLUTION = 1e-11
+"""Change of a misalignment, against the largest, at which rotations stand still."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,7 +128,8 @@ def fit_rigid(problem: Problem) -> Fit:
         step = fit(problem, np.where(problem.system.grid.read, y - excess, 0.0))
         change = float(np.abs(step.parameters - found.parameters).max())
         found = step
-        if change <= RIGID_RESOLUTION_M:
+        still = RIGID_RESOLUTION * float(np.abs(step.parameters).max())
+        if change <= max(still, ROUNDING * float(np.abs(y).max())):
             return found
     raise InputError("misalignment model 'rigid'", "the rotations do not settle",
                      "check the readings for misalignments of more than a few degrees")

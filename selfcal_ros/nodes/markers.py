@@ -9,9 +9,9 @@ from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
 
 from selfcal_ros.bagio.convert_out import header
-from selfcal_ros.bagio.map_markers import map_geometry
 from selfcal_ros.model.error_map import ErrorMap
 from selfcal_ros.nodes.base import fill
+from selfcal_ros.reporting.map_markers import map_geometry
 
 INK = (0.1, 0.1, 0.1)
 

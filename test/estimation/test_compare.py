@@ -120,6 +120,9 @@ def test_views_that_tell_no_correlation_are_said_so():
     found = compare(replace(A, views=()), B)
     assert found.xy.correlated is False
     assert 0.2 < found.xy.chi2_ratio < 5
+    sites, lines = ARTIFACT.shape[0] * ARTIFACT.shape[1], ARTIFACT.angular_count
+    assert found.xy.dof == pytest.approx(2 * sites - 4)  # translation, rotation, magnification
+    assert found.theta.dof == pytest.approx(lines - 1)
     assert found.xy.dof > compare(A, B).xy.dof
 
 

@@ -201,3 +201,20 @@ def test_uncertainties_are_the_scatter_of_recalibrations(plan, sense, missing, o
         values = np.concatenate(squares[kind])
         assert values.mean() == pytest.approx(1, abs=tolerance)
         assert np.mean(values < 4) == pytest.approx(0.95, abs=tolerance / 4)
+
+
+@pytest.mark.parametrize("factor", [1e-3, 1e3])
+def test_finite_rotations_settle_in_any_unit(factor):
+    options = Options(misalignment_model="rigid")
+    truth, clean = measured(CASES["square"], spread=ROUGH)
+    readings = with_finite_rotations(clean, truth)
+    wanted, found = calibrate(readings, options), calibrate(scaled(readings, factor), options)
+    assert np.allclose(found.error_map.gx / factor, wanted.error_map.gx, rtol=0, atol=1e-14)
+    assert [v.phi for v in found.views] == pytest.approx([v.phi for v in wanted.views], abs=1e-13)
+
+
+def test_a_plate_laid_exactly_has_settled():
+    straight = Spread(phi_rad=0.0, t_m=0.0)
+    truth, readings = measured(CASES["square"], spread=straight)
+    found = calibrate(readings, Options(misalignment_model="rigid"))
+    assert np.abs(found.error_map.gx - truth.g[0]).max() < 1e-15

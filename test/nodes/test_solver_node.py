@@ -10,13 +10,13 @@ from selfcal_msgs.srv import LoadMap, SaveMap
 from visualization_msgs.msg import Marker
 
 from selfcal_ros.bagio import convert_in, convert_out
-from selfcal_ros.bagio.map_markers import map_geometry
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.result import result_to_dict
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes.base import fill
 from selfcal_ros.nodes.solver import Solver, short
+from selfcal_ros.reporting.map_markers import map_geometry
 from test.support.maps import random_map, result_of
 from test.support.sessions import collected, events_of, small_plan
 

@@ -6,14 +6,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from selfcal_ros.bagio.map_markers import (
+from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.reporting.map_markers import (
     CERTAIN,
     UNCERTAIN,
     UNKNOWN,
     enlargement,
     map_geometry,
 )
-from selfcal_ros.model.artifact import Artifact
 from test.support.maps import random_map
 
 PITCH = 0.01
