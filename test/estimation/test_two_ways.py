@@ -215,6 +215,6 @@ def test_finite_rotations_settle_in_any_unit(factor):
 
 def test_a_plate_laid_exactly_has_settled():
     straight = Spread(phi_rad=0.0, t_m=0.0)
-    truth, readings = measured(CASES["square"], spread=straight)
+    truth, readings = measured(CASES["square"], spread=straight, sigma_m=0.0, sigma_theta_rad=0.0)
     found = calibrate(readings, Options(misalignment_model="rigid"))
     assert np.abs(found.error_map.gx - truth.g[0]).max() < 1e-15
