@@ -100,10 +100,12 @@ def _suggest(args: argparse.Namespace, plan) -> int:
 
     from selfcal_ros.errors import ExitCode, InputError
     from selfcal_ros.estimation.suggest import best_plan, rank_next
+    from selfcal_ros.files import check_outputs
     from selfcal_ros.model.error_map import ThetaDatum
 
     if args.top < 1:
         raise InputError("--top", f"{args.top} is not positive", "give 1 or more")
+    check_outputs([args.plan], [args.output])
     if args.views is not None:
         angular = any(view.angular for view in plan.views) and plan.artifact.angular_count > 0
         repeats = min(view.repeats for view in plan.views)

@@ -73,6 +73,14 @@ def test_suggest_next_views(capsys, tmp_path):
     assert text.startswith("plan deficient_qiao_180: 10 modes unseen\n")
 
 
+def test_suggest_does_not_write_over_its_plan(capsys, tmp_path):
+    plan = tmp_path / "plan.yaml"
+    plan.write_bytes(Path(shipped("qiao")).read_bytes())
+    assert main(["plan", "suggest", str(plan), "-o", str(plan)]) == 2
+    assert "would be written over" in capsys.readouterr().err
+    assert plan.read_bytes() == Path(shipped("qiao")).read_bytes()
+
+
 def test_suggest_the_best_plan(capsys, tmp_path):
     out = tmp_path / "best.yaml"
     assert main(["plan", "suggest", shipped("deficient_no_line"), "--views", "4", "-o",
