@@ -100,7 +100,7 @@ def dissect(folded: FoldedMatrix, shape: tuple[int, int], reach: int) -> Dissect
     i, j = abs(folded.free // shape[1] - hx), abs(folded.free % shape[1] - hy)
     far, near = np.maximum(i, j), np.minimum(i, j)
     pieces: list[tuple[np.ndarray, tuple[int, ...]]] = []
-    # neighbours in a row, so that a child's boundary is a few runs of its parent's variables
+    # neighbours in a row: the variables of a front are stored, and read, side by side
     rows = np.argsort(far * (max(shape) + 1) + near, kind="stable")
     top = _cut(rows, np.stack([far, near]), max(reach, 1), pieces)
     order = np.concatenate([np.zeros(0, dtype=int), *(piece for piece, _ in pieces)])
