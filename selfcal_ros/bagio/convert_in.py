@@ -10,7 +10,7 @@ from selfcal_ros.collection.messages import Command, Detection, EncoderSample, P
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ErrorMap, ThetaDatum
-from selfcal_ros.model.readings import Sense, ViewReadings
+from selfcal_ros.model.readings import GridVisits, Sense, ViewReadings
 from selfcal_ros.model.view import View
 
 
@@ -54,12 +54,13 @@ def command(message: Any) -> Command:
         raise InputError("selfcal/view_command", f"unknown phase {message.phase}",
                          "use PLACE, MEASURE, DONE or ABORT") from error
     base = (stamp_ns(message), phase, str(message.plan_id), int(message.view_index))
-    planned = int(getattr(message, "views_planned", 0))
+    more = {"views_planned": int(getattr(message, "views_planned", 0)),
+            "run_id": str(getattr(message, "run_id", ""))}
     if phase not in (Phase.PLACE, Phase.MEASURE):
-        return Command(*base, views_planned=planned)
+        return Command(*base, **more)
     return Command(*base, view_of(message, repeats=max(1, int(message.repeats)),
                                   grid=bool(message.grid), angular=bool(message.angular)),
-                   artifact_of(message), planned)
+                   artifact_of(message), **more)
 
 
 def artifact_of(message: Any) -> Artifact:
@@ -99,7 +100,30 @@ def view_readings(message: Any) -> ViewReadings:
                 angular=bool(message.angular)), **table,
         sigma_xy=float(message.sigma_xy), sigma_theta=float(message.sigma_theta),
         dof_xy=int(message.dof_xy), dof_theta=int(message.dof_theta),
-        used=int(message.detections_used), rejected=counts(message, "reject"))
+        used=int(message.detections_used), rejected=counts(message, "reject"),
+        visits=_visits_of(message))
+
+
+_VISITS = (("mark", "mark", np.int64), ("dx", "dx", float), ("dy", "dy", float),
+           ("count", "count", np.int64), ("stamp", "stamp_ns", np.int64),
+           ("offset_x", "offset_x", float), ("offset_y", "offset_y", float),
+           ("approach_x", "approach_x", np.int8), ("approach_y", "approach_y", np.int8))
+
+
+def _visits_of(message: Any) -> GridVisits | None:
+    """Return the visits in a ViewMeasurement; None if it has none."""
+    if not len(getattr(message, "visit_mark", ())):
+        return None
+    table = {name: np.array(getattr(message, f"visit_{field}"), dtype=kind)
+             for field, name, kind in _VISITS}
+    u = np.array(message.visit_u, dtype=float)
+    lengths = {len(column) for column in table.values()} | ({len(u)} if len(u) else set())
+    if len(lengths) > 1 or table["mark"].min() < 0 or table["mark"].max() >= len(message.m):
+        raise InputError(f"selfcal/view_measurement of '{message.view_name}'",
+                         "the visits differ in length or name marks that were not read",
+                         "mend the publisher")
+    return GridVisits(**table, u=u, sigma_m=float(message.sigma_visit),
+                      dof=int(message.dof_visit))
 
 
 def counts(message: Any, prefix: str) -> dict[str, int]:

@@ -14,11 +14,15 @@ from selfcal_ros.collection.collector import ViewProgress
 from selfcal_ros.collection.messages import Command, Detection, EncoderSample
 from selfcal_ros.collection.timeline import Timeline
 from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.model.readings import Measurements
+from selfcal_ros.model.readings import GridVisits, Measurements
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.view import View
 
 Fields = dict[str, Any]
+
+VISIT_COLUMNS = ("mark", "dx", "dy", "count", "u", "offset_x", "offset_y", "approach_x",
+                 "approach_y")
+"""Columns of `GridVisits` that have the name of their field in ViewMeasurement, less visit_."""
 
 
 def header(stamp_ns: int, frame_id: str) -> Fields:
@@ -57,10 +61,12 @@ def command(c: Command, frame_id: str) -> Fields:
     plate = _artifact(c.artifact) if c.artifact else {
         "grid_size": 0, "grid_pitch": 0.0, "angular_count": 0, "grid_size_y": 0}
     return {"header": header(c.stamp_ns, frame_id), "phase": int(c.phase), "plan_id": c.plan_id,
-            "view_index": c.view_index, **view, **plate, "views_planned": c.views_planned}
+            "view_index": c.view_index, **view, **plate, "views_planned": c.views_planned,
+            "visit_order": "", "run_id": c.run_id}
 
 
-def view_status(progress: ViewProgress, plan_id: str, stamp_ns: int, frame_id: str) -> Fields:
+def view_status(progress: ViewProgress, plan_id: str, stamp_ns: int, frame_id: str, *,
+                run_id: str = "") -> Fields:
     """Return the fields of a selfcal_msgs/ViewStatus."""
     readings = progress.readings
     return {
@@ -72,7 +78,8 @@ def view_status(progress: ViewProgress, plan_id: str, stamp_ns: int, frame_id: s
         "detections_rejected": sum(readings.rejected.values()),
         **_rejected(readings.rejected, "reject"),
         "sigma_xy": readings.sigma_xy, "sigma_theta": readings.sigma_theta,
-        "complete": progress.complete}
+        "complete": progress.complete,
+        "missing_m": [], "missing_n": [], "missing_k": [], "run_id": run_id}
 
 
 def view_measurement(progress: ViewProgress, measurements: Measurements, stamp_ns: int,
@@ -90,7 +97,17 @@ def view_measurement(progress: ViewProgress, measurements: Measurements, stamp_n
         "detections_used": readings.used,
         **_rejected(readings.rejected, "reject"),
         "measurement_sense": str(measurements.sense),
-        **_rejected(measurements.rejected, "session_reject")}
+        **_rejected(measurements.rejected, "session_reject"),
+        **_visits(readings.visits), "run_id": measurements.run_id}
+
+
+def _visits(visits: GridVisits | None) -> Fields:
+    """Return the fields of the visits of a view; empty where they are not known."""
+    fields = {f"visit_{name}": getattr(visits, name) if visits else []
+              for name in VISIT_COLUMNS}
+    return {**fields, "visit_stamp": visits.stamp_ns if visits else [],
+            "sigma_visit": visits.sigma_m if visits else float("nan"),
+            "dof_visit": visits.dof if visits else 0}
 
 
 def _rejected(rejected: dict[str, int], prefix: str) -> Fields:
@@ -108,7 +125,8 @@ def error_map(result: CalibrationResult, stamp_ns: int, frame_id: str) -> Fields
         "u_g_theta": emap.u_g_theta, "nonorthogonality": emap.nonorthogonality,
         "scale_difference": emap.scale_difference, "sigma_xy": result.noise.sigma_xy,
         "sigma_theta": result.noise.sigma_theta,
-        "identifiable": result.observability.identifiable}
+        "identifiable": result.observability.identifiable,
+        "qualified": result.observability.identifiable, "run_id": ""}
 
 
 def session_stamp_ns(timeline: Timeline, progress: ViewProgress) -> int:

@@ -62,3 +62,4 @@ class Command:
     view: View | None = None
     artifact: Artifact | None = None
     views_planned: int = 0
+    run_id: str = ""

@@ -99,7 +99,7 @@ def build_timeline(commands: Iterable[Command]) -> Timeline:
 
 def _sort_key(command: Command) -> tuple:
     return (command.stamp_ns, int(command.phase), command.plan_id, command.view_index,
-            repr(command.view), repr(command.artifact), command.views_planned)
+            repr(command.view), repr(command.artifact), command.views_planned, command.run_id)
 
 
 def _unused(ordered: list[Command]) -> list[Interval]:

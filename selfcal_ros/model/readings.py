@@ -26,6 +26,49 @@ def _empty(kind: type) -> field:
 
 
 @dataclass(frozen=True, eq=False)
+class GridVisits:
+    """Visits of grid marks in one view: readings of a mark between which no other mark was read.
+
+    What a mean over all repeats of a mark hides, and terms of the model need: when, with which
+    offset, and from where each visit was measured. Sorted by (mark, stamp), each visit once.
+
+    Attributes
+    ----------
+    mark : int array (V,)
+        Index of the mark in `ViewReadings.m` and `ViewReadings.n`.
+    dx, dy : float array (V,)
+        Mean deviation of the visit, stage frame, m.
+    count : int array (V,)
+        Repeats in the visit.
+    stamp_ns : int64 array (V,)
+        Mean instant of exposure.
+    offset_x, offset_y : float array (V,)
+        Mean offset that the microscope saw, stage axes, m.
+    approach_x, approach_y : int8 array (V,)
+        Sign of the last motion of each stage axis before the exposure; 0 = not known.
+    u : float array (V,) or (0,)
+        Declared standard uncertainty of each mean, m; as `ViewReadings.u`.
+    sigma_m : float
+        Repeatability of one reading within its visit, pooled, m; NaN without repeats.
+    dof : int
+        Degrees of freedom of `sigma_m`.
+    """
+
+    mark: np.ndarray
+    dx: np.ndarray
+    dy: np.ndarray
+    count: np.ndarray
+    stamp_ns: np.ndarray
+    offset_x: np.ndarray
+    offset_y: np.ndarray
+    approach_x: np.ndarray
+    approach_y: np.ndarray
+    u: np.ndarray = _empty(float)
+    sigma_m: float = float("nan")
+    dof: int = 0
+
+
+@dataclass(frozen=True, eq=False)
 class ViewReadings:
     """Deviations of one view: reading minus nominal position, stage frame, m and rad.
 
@@ -54,6 +97,8 @@ class ViewReadings:
         Detections behind the means.
     rejected : dict
         Reason -> number of detections that were rejected.
+    visits : GridVisits, optional
+        The visits behind the means of the grid marks; None where they are not known.
     """
 
     view: View
@@ -73,6 +118,7 @@ class ViewReadings:
     dof_theta: int = 0
     used: int = 0
     rejected: dict[str, int] = field(default_factory=dict)
+    visits: GridVisits | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,6 +137,8 @@ class Measurements:
         Sense of measurement, the same for all views.
     rejected : dict
         Reason -> number of detections that belong to no view.
+    run_id : str
+        Run of the plan: the stamp of its first command, ns, as text; empty if not told.
     """
 
     plan_id: str
@@ -98,6 +146,7 @@ class Measurements:
     views: tuple[ViewReadings, ...]
     sense: Sense = Sense.MICROSCOPE_MOVES
     rejected: dict[str, int] = field(default_factory=dict)
+    run_id: str = ""
 
     def all_rejected(self) -> dict[str, int]:
         """Return reason -> count over all views and outside of them, sorted by reason."""

@@ -126,7 +126,8 @@ class Solver(SelfcalNode):
             "views_done": len(self._messages),
             "views_planned": self._planned.get(self._plan_id, 0),
             "identifiable": seen.identifiable, "rank_deficiency": seen.deficiency, **fields,
-            "advice": [*seen.advice, *self.result.warnings]}))
+            "advice": [*seen.advice, *self.result.warnings],
+            "qualified": seen.identifiable, "causes": [], "run_id": ""}))
 
     def _unfinished(self) -> bool:
         """Return whether the plan has views that are still to come."""

@@ -17,7 +17,7 @@ from selfcal_ros.collection.timeline import Timeline
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ThetaDatum
-from selfcal_ros.model.readings import Measurements, Sense, ViewReadings
+from selfcal_ros.model.readings import GridVisits, Measurements, Sense, ViewReadings
 from selfcal_ros.model.view import View
 from test.support.bags import contract_message, contract_types
 from test.support.results import known_result
@@ -102,7 +102,7 @@ def test_fields_of_a_command_by_name():
         "phase": 1, "plan_id": "p", "view_index": 3, "view_name": "turned",
         "rotation": math.pi / 2, "translation_x": 0.01, "translation_y": -0.02, "grid": True,
         "angular": False, "repeats": 7, "grid_size": 5, "grid_pitch": 0.0125, "angular_count": 8,
-        "grid_size_y": 7, "views_planned": 9}
+        "grid_size_y": 7, "views_planned": 9, "visit_order": "", "run_id": ""}
 
 
 @pytest.mark.parametrize(("changes", "message"), [
@@ -166,17 +166,35 @@ def test_view_measurements_come_back(read, artifact, rejected, sense):
     assert (convert_in.sense_of(message), message.plan_id, message.view_index) == (sense, "p", 5)
 
 
+VISITS = GridVisits(
+    np.array([0, 0]), np.array([1e-6, 5e-6]), np.array([-2e-6, -6e-6]), np.array([2, 3]),
+    np.array([5, 9]), np.array([1e-5, 2e-5]), np.array([3e-5, 4e-5]),
+    np.array([1, -1], dtype=np.int8), np.array([0, 1], dtype=np.int8), np.array([4e-8, 5e-8]),
+    9e-9, 6)
 READ = ViewReadings(
     View("a", 0.5, (0.01, -0.02), True, False, 3), np.array([-1]), np.array([2]), np.array([3e-6]),
     np.array([-4e-6]), np.array([5]), np.array([6e-8]), np.array([7]), np.array([-8e-3]),
-    np.array([9]), np.array([1e-5]), 1.1e-8, 1.2e-6, 13, 14, 15, {"low_score": 16})
-MEASURED = Measurements("p", Artifact(5, 0.01, 8, 7), (READ,), Sense.PLATE_MOVES, {"other": 17})
+    np.array([9]), np.array([1e-5]), 1.1e-8, 1.2e-6, 13, 14, 15, {"low_score": 16},
+    VISITS)
+MEASURED = Measurements("p", Artifact(5, 0.01, 8, 7), (READ,), Sense.PLATE_MOVES, {"other": 17},
+                        "77")
 PROGRESS = ViewProgress(18, READ.view, 19, 20, 21, 22, READ, 23)
+
+
+def test_the_visits_of_a_view_survive_the_message():
+    there = convert_out.view_measurement(PROGRESS, MEASURED, STAMP_NS, "f")
+    back = convert_in.view_readings(through_cdr("ViewMeasurement", there)).visits
+    for name, column in vars(VISITS).items():
+        assert np.array_equal(getattr(back, name), column), name
+    old = through_cdr("ViewMeasurement", {**there, "visit_mark": []})
+    assert convert_in.view_readings(old).visits is None
 
 
 def test_fields_of_a_view_measurement_by_name():
     made = convert_out.view_measurement(PROGRESS, MEASURED, STAMP_NS, "f")
     del made["header"]
+    for name in [name for name in made if name.startswith("visit_")]:
+        del made[name]
     assert made == {
         "plan_id": "p", "view_index": 18, "view_name": "a", "rotation": 0.5, "translation_x": 0.01,
         "translation_y": -0.02, "grid": True, "angular": False, "repeats": 3, "grid_size": 5,
@@ -185,7 +203,7 @@ def test_fields_of_a_view_measurement_by_name():
         "u_theta": 1e-5, "sigma_xy": 1.1e-8, "sigma_theta": 1.2e-6, "dof_xy": 13, "dof_theta": 14,
         "detections_used": 15, "reject_reasons": ["low_score"], "reject_counts": [16],
         "measurement_sense": "plate_moves", "session_reject_reasons": ["other"],
-        "session_reject_counts": [17]}
+        "session_reject_counts": [17], "run_id": "77", "sigma_visit": 9e-9, "dof_visit": 6}
 
 
 def test_fields_of_a_view_status_by_name():
@@ -195,7 +213,8 @@ def test_fields_of_a_view_status_by_name():
         "plan_id": "p", "view_index": 18, "view_name": "a", "grid_expected": 19, "grid_done": 20,
         "angular_expected": 21, "angular_done": 22, "detections_used": 15,
         "detections_rejected": 16, "reject_reasons": ["low_score"], "reject_counts": [16],
-        "sigma_xy": 1.1e-8, "sigma_theta": 1.2e-6, "complete": True}
+        "sigma_xy": 1.1e-8, "sigma_theta": 1.2e-6, "complete": True,
+        "missing_m": [], "missing_n": [], "missing_k": [], "run_id": ""}
     through_cdr("ViewStatus", {"header": convert_out.header(0, ""), **made})
 
 
@@ -205,7 +224,9 @@ def test_fields_of_a_view_status_by_name():
     ({"u": [], "dy": []}, "m, n, dx, dy, count differ in length"),
     ({"k": []}, "k, dtheta, count_theta, u_theta differ in length"),
     ({"u_theta": [1.0, 2.0]}, "k, dtheta, count_theta, u_theta differ in length"),
-    ({"reject_counts": []}, "reject_reasons and reject_counts differ in length")])
+    ({"reject_counts": []}, "reject_reasons and reject_counts differ in length"),
+    ({"visit_dy": [1.0]}, "the visits differ in length or name marks that were not read"),
+    ({"visit_mark": [0, 1]}, "the visits differ in length or name marks that were not read")])
 def test_arrays_that_do_not_belong_together(changes, said):
     values = convert_out.view_measurement(PROGRESS, MEASURED, STAMP_NS, "f")
     with pytest.raises(InputError) as caught:
