@@ -10,6 +10,7 @@ from selfcal_ros.collection.messages import Command, Detection, EncoderSample, P
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ErrorMap, ThetaDatum
+from selfcal_ros.model.orders import parse_order
 from selfcal_ros.model.readings import GridVisits, Sense, ViewReadings
 from selfcal_ros.model.view import View
 
@@ -73,7 +74,16 @@ def view_of(message: Any, *, repeats: int, grid: bool, angular: bool) -> View:
     """Return the view that a ViewCommand or ViewMeasurement describes."""
     return View(str(message.view_name), float(message.rotation),
                 (float(message.translation_x), float(message.translation_y)), grid, angular,
-                repeats)
+                repeats, _order_of(message))
+
+
+def _order_of(message: Any) -> str:
+    """Return the visiting order of a message; empty, as the cell likes, where it is not known."""
+    try:
+        text = str(getattr(message, "visit_order", ""))
+        return str(parse_order(text)) if text else ""
+    except InputError:
+        return ""
 
 
 def view_readings(message: Any) -> ViewReadings:

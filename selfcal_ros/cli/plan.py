@@ -180,9 +180,10 @@ def _score_text(score) -> str:
 def view_to_dict(view, artifact) -> dict:
     """Return a view in the form of a PLAN.yaml."""
     a, b = view.lattice_pose(artifact).shift
+    order = {"visit_order": view.visit_order} if view.visit_order else {}
     return {"name": view.name, "rotation_deg": round(math.degrees(view.rotation_rad), 9),
             "translation_pitch": [a, b], "grid": view.grid, "angular": view.angular,
-            "repeats": view.repeats}
+            "repeats": view.repeats, **order}
 
 
 def _write_plan(path: str, plan) -> None:

@@ -8,6 +8,7 @@ import numpy as np
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.orders import parse_order
 
 LATTICE_TOLERANCE = 1e-3
 """Largest distance of a commanded pose from the lattice, in pitches or lines."""
@@ -61,6 +62,9 @@ class View:
         Which marks are measured.
     repeats : int
         Times that every mark is measured.
+    visit_order : str
+        Order in which the grid marks are visited, see `selfcal_ros.model.orders`; empty = as
+        the cell likes.
     """
 
     name: str
@@ -69,6 +73,7 @@ class View:
     grid: bool = True
     angular: bool = True
     repeats: int = 1
+    visit_order: str = ""
 
     def lattice_pose(self, artifact: Artifact) -> LatticePose:
         """Return the pose in whole steps of the artifact's lattice.
@@ -123,23 +128,27 @@ def plan_from_dict(data: object, where: str) -> Plan:
     Parameters
     ----------
     data : object
-        Parsed YAML: ``plan_id``, ``artifact {grid_size, grid_pitch, angular_count}`` (m) and
-        ``views [{name, rotation_deg, translation_pitch, grid, angular, repeats}]``.
+        Parsed YAML: ``plan_id``, ``artifact {grid_size, grid_pitch, angular_count}`` (m),
+        ``views [{name, rotation_deg, translation_pitch, grid, angular, repeats, visit_order}]``
+        and ``visit_order``, which holds for views that have none of their own.
     where : str
         File name, for messages.
 
     Raises
     ------
     InputError
-        For a missing or unknown key, a wrong type, or a pose off the lattice.
+        For a missing or unknown key, a wrong type, an unknown visiting order, or a pose off the
+        lattice.
     """
-    fields = _fields(data, where, {"plan_id": str, "artifact": dict, "views": list})
+    fields = _fields(data, where, {"plan_id": str, "artifact": dict, "views": list},
+                     {"visit_order": (str, "")})
     raw = _fields(fields["artifact"], f"{where}: artifact",
                   {"grid_size": int, "grid_pitch": float, "angular_count": int},
                   {"grid_size_y": (int, 0)})
     artifact = Artifact(raw["grid_size"], raw["grid_pitch"], raw["angular_count"],
                         raw["grid_size_y"])
-    views = tuple(_view_from_dict(view, f"{where}: views[{index}]", artifact)
+    order = _order(fields["visit_order"], where)
+    views = tuple(_view_from_dict(view, f"{where}: views[{index}]", artifact, order)
                   for index, view in enumerate(fields["views"]))
     if not views:
         raise InputError(where, "the plan has no views", "add at least one view")
@@ -150,11 +159,15 @@ def plan_from_dict(data: object, where: str) -> Plan:
     return Plan(fields["plan_id"], artifact, views)
 
 
-def _view_from_dict(data: object, where: str, artifact: Artifact) -> View:
+def _order(text: str, where: str) -> str:
+    return str(parse_order(text, f"{where}: visit_order")) if text else ""
+
+
+def _view_from_dict(data: object, where: str, artifact: Artifact, order: str) -> View:
     raw = _fields(data, where, {"name": str},
                   {"rotation_deg": (float, 0.0), "translation_pitch": (list, [0, 0]),
                    "grid": (bool, True), "angular": (bool, artifact.angular_count > 0),
-                   "repeats": (int, 1)})
+                   "repeats": (int, 1), "visit_order": (str, order)})
     shift = raw["translation_pitch"]
     if len(shift) != 2 or not all(isinstance(s, int | float) for s in shift):
         raise InputError(f"{where}: translation_pitch", "not two numbers", "give [a, b]")
@@ -167,7 +180,7 @@ def _view_from_dict(data: object, where: str, artifact: Artifact) -> View:
         raise InputError(where, "neither grid nor angular marks are wanted", "set one to true")
     view = View(raw["name"], math.radians(raw["rotation_deg"]),
                 (shift[0] * artifact.grid_pitch_m, shift[1] * artifact.grid_pitch_m),
-                raw["grid"], raw["angular"], raw["repeats"])
+                raw["grid"], raw["angular"], raw["repeats"], _order(raw["visit_order"], where))
     view.lattice_pose(artifact)
     return view
 

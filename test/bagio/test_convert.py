@@ -17,6 +17,7 @@ from selfcal_ros.collection.timeline import Timeline
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ThetaDatum
+from selfcal_ros.model.orders import ORDERS
 from selfcal_ros.model.readings import GridVisits, Measurements, Sense, ViewReadings
 from selfcal_ros.model.view import View
 from test.support.bags import contract_message, contract_types
@@ -37,8 +38,9 @@ ARTIFACTS = st.builds(Artifact, st.integers(1, 50).map(lambda h: 2 * h + 1),
                       st.integers(0, 50).map(lambda h: 2 * h + 1 if h else 0))
 VIEWS = st.builds(View, TEXTS, FLOATS, st.tuples(FLOATS, FLOATS), st.booleans(), st.booleans(),
                   st.integers(1, 2**32 - 1))
+ORDER_TEXTS = st.sampled_from(["", *ORDERS]) | st.sampled_from(ORDERS).map(lambda o: o + "@plate")
 ASKING = st.builds(Command, STAMPS, st.sampled_from([Phase.PLACE, Phase.MEASURE]), TEXTS, U32,
-                   VIEWS, ARTIFACTS, U32)
+                   st.builds(replace, VIEWS, visit_order=ORDER_TEXTS), ARTIFACTS, U32)
 ENDING = st.builds(Command, STAMPS, st.sampled_from([Phase.DONE, Phase.ABORT]), TEXTS, U32,
                    views_planned=U32)
 COUNTS = st.dictionaries(TEXTS, U32, max_size=3)
@@ -77,7 +79,8 @@ def test_commands_come_back(event):
 def test_a_message_of_somebody_else_is_what_it_says(event):
     """The contract's fields by name, filled by another hand: no two are swapped both ways."""
     if isinstance(event, Command):
-        event = replace(event, views_planned=0, artifact=replace(event.artifact, grid_size_y=0))
+        event = replace(event, views_planned=0, artifact=replace(event.artifact, grid_size_y=0),
+                        view=replace(event.view, visit_order=""))
     topic, typename, message = contract_message(contract_types(), event)
     read = {"stage/joint_states": convert_in.encoder_sample, "selfcal/view_command":
             convert_in.command, "stage/mark_detections": convert_in.detection}[topic]
@@ -94,7 +97,7 @@ def test_fields_of_a_detection_by_name():
 
 
 def test_fields_of_a_command_by_name():
-    view = View("turned", math.pi / 2, (0.01, -0.02), True, False, 7)
+    view = View("turned", math.pi / 2, (0.01, -0.02), True, False, 7, "x_then_y")
     made = convert_out.command(Command(STAMP_NS, Phase.MEASURE, "p", 3, view,
                                        Artifact(5, 0.0125, 8, 7), 9), "f")
     del made["header"]
@@ -102,7 +105,7 @@ def test_fields_of_a_command_by_name():
         "phase": 1, "plan_id": "p", "view_index": 3, "view_name": "turned",
         "rotation": math.pi / 2, "translation_x": 0.01, "translation_y": -0.02, "grid": True,
         "angular": False, "repeats": 7, "grid_size": 5, "grid_pitch": 0.0125, "angular_count": 8,
-        "grid_size_y": 7, "views_planned": 9, "visit_order": "", "run_id": ""}
+        "grid_size_y": 7, "views_planned": 9, "visit_order": "x_then_y", "run_id": ""}
 
 
 @pytest.mark.parametrize(("changes", "message"), [
@@ -117,6 +120,13 @@ def test_commands_that_cannot_be_used(changes, message):
     with pytest.raises(InputError) as caught:
         convert_in.command(through_cdr("ViewCommand", values | changes))
     assert str(caught.value).startswith(message)
+
+
+@pytest.mark.parametrize("text", ["spiral", "\x1b[31m", "raster@stage"])
+def test_an_order_that_is_not_known_does_not_cost_the_command(text):
+    event = Command(STAMP_NS, Phase.MEASURE, "p", 3, View("a", repeats=2), Artifact(5, 0.01))
+    values = convert_out.command(event, "f") | {"visit_order": text}
+    assert convert_in.command(through_cdr("ViewCommand", values)) == event
 
 
 def test_no_repeats_are_one():

@@ -103,6 +103,11 @@ def test_a_plan_with_its_defaults_and_with_all_its_keys():
                                      "grid": False, "angular": True, "repeats": 3}), "f")
     assert plan.artifact == PLATE
     assert plan.views[0] == View("a", math.radians(15), (0.0, 0.02), False, True, 3)
+    ordered = plan_from_dict({**PLAN, "visit_order": "x_then_y", "views": [
+        {"name": "a"}, {"name": "b", "visit_order": "raster@plate"},
+        {"name": "c", "visit_order": ""}]}, "f")
+    assert [v.visit_order for v in ordered.views] == ["x_then_y", "raster@plate", ""]
+    assert plan.views[0].visit_order == ""
     bare = plan_from_dict({**PLAN, "artifact": {**PLAN["artifact"], "angular_count": 0}}, "f")
     assert not bare.views[0].angular
 
@@ -110,7 +115,7 @@ def test_a_plan_with_its_defaults_and_with_all_its_keys():
 @pytest.mark.parametrize(("data", "message"), [
     (None, "f: not a mapping of keys to values; see config/plans"),
     ({}, "f: the key 'plan_id' is missing; add it"),
-    (plan_with(extra=1), "f: extra: unknown key; known are plan_id, artifact, views"),
+    (plan_with(extra=1), "f: extra: unknown key; known are plan_id, artifact, views, visit"),
     (plan_with(plan_id=3), "f: plan_id: 3 is not of type str; mend the value"),
     (plan_with(views=[]), "f: the plan has no views; add at least one view"),
     (plan_with(views=[3]), "f: views[0]: not a mapping of keys to values"),
@@ -131,6 +136,10 @@ def test_a_plan_with_its_defaults_and_with_all_its_keys():
     (plan_with({"translation_pitch": ["1", 0]}), "f: views[0]: translation_pitch: not two number"),
     (plan_with({"translation_pitch": [0.5, 0]}), "view 'a' translation: 0.5 is not a whole number"),
     (plan_with({"repeats": 0}), "f: views[0]: repeats: 0 is not positive; give 1 or more"),
+    (plan_with(visit_order="spiral"), "f: visit_order: 'spiral' is no visiting order; use one of"),
+    (plan_with(visit_order=1), "f: visit_order: 1 is not of type str"),
+    (plan_with({"visit_order": "back"}), "f: views[0]: visit_order: 'back' is no visiting order"),
+    (plan_with({"visit_order": None}), "f: views[0]: visit_order: None is not of type str"),
     (plan_with({"grid": 1}), "f: views[0]: grid: 1 is not of type bool"),
     (plan_with({"grid": False, "angular": False}), "f: views[0]: neither grid nor angular marks"),
     ({**plan_with({"angular": True}), "artifact": {**PLAN["artifact"], "angular_count": 0}},

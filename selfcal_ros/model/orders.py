@@ -1,0 +1,44 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Names of visiting orders: in which order the grid marks of a view are measured."""
+
+from dataclasses import dataclass
+
+from selfcal_ros.errors import InputError
+
+ORDERS = ("raster", "serpentine", "there_and_back", "x_then_y", "x_back_y_back", "random")
+"""raster: rows along x, one after another, each from its first mark to its last. serpentine:
+the same, every other row backwards. there_and_back: a raster pass, then exactly the same
+backwards. x_then_y: a raster pass with rows along x, then one with rows along y. x_back_y_back:
+rows along x, back, rows along y, back. random: every mark once in each pass, in any order."""
+PLATE_SUFFIX = "@plate"
+"""Rows are those of the plate's marks, the same marks in the same order in every view. Without
+it rows are those of the stage's sites, the same sites in the same order in every view."""
+DEFAULT_ORDER = "serpentine"
+"""What a cell does that is not told otherwise."""
+
+
+@dataclass(frozen=True)
+class VisitOrder:
+    """A visiting order: one of `ORDERS`, along the rows of the stage or of the plate."""
+
+    name: str
+    of_plate: bool = False
+
+    def __str__(self) -> str:
+        """Return the text that names the order."""
+        return self.name + PLATE_SUFFIX * self.of_plate
+
+
+def parse_order(text: str, where: str = "visit_order") -> VisitOrder:
+    """Return the order that a text such as ``there_and_back@plate`` names.
+
+    Raises
+    ------
+    InputError
+        If no order has that name.
+    """
+    name = text.removesuffix(PLATE_SUFFIX)
+    if name not in ORDERS:
+        raise InputError(where, f"'{text}' is no visiting order",
+                         f"use one of {', '.join(ORDERS)}, if need be with {PLATE_SUFFIX}")
+    return VisitOrder(name, name != text)

@@ -1,0 +1,150 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Visiting orders: written out by hand on a small plate, and what holds on any."""
+
+import math
+
+import numpy as np
+import pytest
+
+from selfcal_ros.errors import InputError
+from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.orders import ORDERS, VisitOrder, parse_order
+from selfcal_ros.model.view import View
+from selfcal_ros.model.visit_order import approach_signs, visit_sequence
+
+PLATE = Artifact(3, 0.01, 0, 5)
+"""Three marks along x, five along y: no order may mix up its axes unseen."""
+ONCE = View("v")
+
+
+def sites(order, *, plate=PLATE, view=ONCE, **more):
+    found = visit_sequence(plate, view, order=order, rng=np.random.default_rng(1), **more)
+    return list(zip(found.i.tolist(), found.j.tolist(), strict=True))
+
+
+def marks(order, *, plate=PLATE, view=ONCE):
+    found = visit_sequence(plate, view, order=order)
+    return list(zip(found.m.tolist(), found.n.tolist(), strict=True))
+
+
+ALONG_X = [(i, j) for j in (-2, -1, 0, 1, 2) for i in (-1, 0, 1)]
+ALONG_Y = [(i, j) for i in (-1, 0, 1) for j in (-2, -1, 0, 1, 2)]
+
+
+def test_the_orders_written_out():
+    assert sites("raster") == ALONG_X
+    assert sites("serpentine") == [
+        (-1, -2), (0, -2), (1, -2), (1, -1), (0, -1), (-1, -1), (-1, 0), (0, 0), (1, 0),
+        (1, 1), (0, 1), (-1, 1), (-1, 2), (0, 2), (1, 2)]
+    four = View("v", repeats=4)
+    # where a pass ends on the mark on which the next begins, that is one visit of two exposures
+    assert sites("there_and_back", view=four) == [
+        *ALONG_X, *ALONG_X[-2::-1], *ALONG_X[1:], *ALONG_X[-2::-1]]
+    assert sites("x_then_y", view=four) == 2 * (ALONG_X + ALONG_Y)
+    assert sites("x_back_y_back", view=four) == [
+        *ALONG_X, *ALONG_X[-2::-1], *ALONG_Y[1:], *ALONG_Y[-2::-1]]
+    assert sorted(sites("random")) == sorted(ALONG_X)
+    assert sites("random") != ALONG_X
+
+
+def test_a_turn_that_does_not_end_is_cut():
+    assert sites("x_then_y", view=View("v", repeats=3)) == ALONG_X + ALONG_Y + ALONG_X
+    assert sites("x_back_y_back", view=View("v", repeats=1)) == ALONG_X
+
+
+def test_times_passes_and_counts():
+    found = visit_sequence(PLATE, View("v", repeats=2), order="there_and_back")
+    assert found.count.tolist() == [1] * 14 + [2] + [1] * 14
+    assert found.time.tolist() == [*range(14), 14.5, *range(16, 30)]
+    assert found.pass_number.tolist() == [0] * 15 + [1] * 14
+    assert len(found) == 29
+
+
+def test_consecutive_repeats_are_one_visit_of_one_pass():
+    found = visit_sequence(PLATE, View("v", repeats=3), order="there_and_back", consecutive=True)
+    assert list(zip(found.i, found.j, strict=True)) == ALONG_X
+    assert found.count.tolist() == [3] * 15
+    assert found.time.tolist() == [3 * visit + 1 for visit in range(15)]
+    assert set(found.pass_number) == {0}
+
+
+def test_the_stage_goes_the_same_way_and_the_marks_turn():
+    plate = Artifact(3, 0.01)
+    turned = View("v", math.pi / 2)
+    assert sites("raster", plate=plate, view=turned) == sites("raster", plate=plate)
+    # a quarter turn brings mark (m, n) to site (-n, m): the first site, (-1, -1), holds (-1, 1)
+    assert marks("raster", plate=plate, view=turned)[:4] == [(-1, 1), (-1, 0), (-1, -1), (0, 1)]
+
+
+def test_of_the_plate_the_same_marks_follow_each_other_in_every_view():
+    plate = Artifact(3, 0.01)
+    turned = View("v", math.pi / 2)
+    assert marks("raster@plate", plate=plate, view=turned) == marks("raster", plate=plate)
+    assert sites("raster@plate", plate=plate, view=turned)[:4] == [(1, -1), (1, 0), (1, 1), (0, -1)]
+
+
+def test_marks_off_the_field_are_not_visited():
+    shifted = View("v", 0.0, (0.01, 0.0))
+    assert sites("raster", view=shifted) == [(i, j) for i, j in ALONG_X if i >= 0]
+    assert marks("raster", view=shifted)[0] == (-1, -2)
+    # rows still turn about at their own ends
+    assert sites("serpentine", view=shifted)[:4] == [(0, -2), (1, -2), (1, -1), (0, -1)]
+
+
+@pytest.mark.parametrize("suffix", ["", "@plate"])
+@pytest.mark.parametrize("order", ORDERS)
+@pytest.mark.parametrize("consecutive", [True, False])
+def test_every_mark_is_exposed_as_often_as_the_view_asks(order, suffix, consecutive):
+    plate, view = Artifact(5, 0.01, 0, 7), View("v", math.pi, (0.01, -0.02), repeats=5)
+    found = visit_sequence(plate, view, order=order + suffix, consecutive=consecutive,
+                           rng=np.random.default_rng(2))
+    assert (abs(found.i) <= 2).all() and (abs(found.j) <= 3).all()
+    np.testing.assert_array_equal(found.i, -found.m + 1)
+    np.testing.assert_array_equal(found.j, -found.n - 2)
+    _, at = np.unique(100 * found.m + found.n, return_inverse=True)
+    assert set(np.bincount(at, found.count)) == {5.0}
+    assert len(np.unique(at)) == 4 * 5
+    assert found.count.sum() == 100
+    # times are the means of runs of whole numbers that follow each other
+    np.testing.assert_allclose(found.time, np.cumsum(found.count) - (found.count + 1) / 2)
+
+
+def test_the_order_of_the_view_holds_unless_another_is_asked_for():
+    view = View("v", visit_order="raster")
+    assert sites("", view=view) == ALONG_X
+    assert sites("serpentine", view=view) == sites("serpentine")
+    assert sites("") == sites("serpentine")
+
+
+def test_lines_are_no_visits():
+    assert len(visit_sequence(Artifact(3, 0.01, 8), View("v", math.pi / 4, grid=False))) == 0
+
+
+def test_a_random_order_needs_chance():
+    with pytest.raises(ValueError, match=r"^a random visiting order needs a source of chance$"):
+        visit_sequence(PLATE, View("v"), order="random")
+
+
+@pytest.mark.parametrize("text", ["spiral", "raster@stage", "@plate", "raster@plate@plate",
+                                  "Raster"])
+def test_orders_that_are_not_known(text):
+    with pytest.raises(InputError) as caught:
+        parse_order(text, "here")
+    assert str(caught.value) == (
+        f"here: '{text}' is no visiting order; use one of raster, serpentine, there_and_back, "
+        "x_then_y, x_back_y_back, random, if need be with @plate")
+
+
+def test_text_and_order_are_one():
+    assert parse_order("x_then_y@plate") == VisitOrder("x_then_y", True)
+    for name in ORDERS:
+        assert str(parse_order(name)) == name
+        assert str(parse_order(name + "@plate")) == name + "@plate"
+
+
+def test_the_side_from_which_a_place_is_reached():
+    assert approach_signs(np.array([2.0, 2.0, 3.0, 3.0, 1.0, 1.0, 5.0])).tolist() == [
+        0, 0, 1, 1, -1, -1, 1]
+    assert approach_signs(np.array([0.0, 0.1, 1.0, 0.9, 0.0]), 0.2).tolist() == [0, 0, 1, 1, -1]
+    assert approach_signs(np.array([0.0, 0.2, 0.0]), 0.2).tolist() == [0, 0, 0]
+    assert approach_signs(np.zeros(0)).tolist() == []
