@@ -2,7 +2,7 @@
 """Entry points of all commands. An interrupt while modules are imported waits until they are.
 
 Python would end in the middle of an import with a traceback. Blocked, Ctrl-C is kept by the
-system until `cli.main.main` or `nodes.base.run` let it through to where it is handled.
+system until `cli.main.main` or `nodes.running.run` let it through to where it is handled.
 """
 
 import importlib

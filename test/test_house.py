@@ -19,7 +19,8 @@ MAY_IMPORT = {
     "model": BASE,
     **{name: DOMAIN | ESTIMATION for name in ESTIMATION},
     **{name: DOMAIN | ESTIMATION | MIDDLE for name in MIDDLE},
-    "nodes": DOMAIN | ESTIMATION | MIDDLE,
+    "sessions": DOMAIN | ESTIMATION | MIDDLE,
+    "nodes": DOMAIN | ESTIMATION | MIDDLE | {"sessions"},
     "cli": DOMAIN | ESTIMATION | MIDDLE,
 }
 ONLY_IN = {

@@ -95,7 +95,7 @@ def process(module: str, arguments: list[str], environment: dict, **kwargs,
     """Run a module as a process that is stopped, at worst killed, at the end of the block.
 
     Ctrl-C reaches the process from the terminal too. It is blocked there from the start, and let
-    through by `nodes.base.run` once the imports are done and it can be handled.
+    through by `nodes.running.run` once the imports are done and it can be handled.
     """
     child, before = None, signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:

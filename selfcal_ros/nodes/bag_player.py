@@ -8,8 +8,10 @@ from typing import Any
 from rclpy.task import Future
 
 from selfcal_ros.errors import ExitCode, InputError
-from selfcal_ros.nodes.base import SelfcalNode, run
+from selfcal_ros.nodes.base import SelfcalNode
 from selfcal_ros.nodes.player import Player
+from selfcal_ros.nodes.running import run
+from selfcal_ros.sessions.ports import Diagnosis, Level
 
 
 class BagPlayer(SelfcalNode):
@@ -26,8 +28,8 @@ class BagPlayer(SelfcalNode):
         self._patience = time.monotonic() + self.values["wait_for_subscribers"]
         self._started = False
         self.create_timer(0.002, self.guarded(self._step))
-        self.create_timer(1.0, lambda: self.diagnose("playing", {
-            "played": self.player.played, "total": self.player.total}))
+        self.create_timer(1.0, lambda: self.diagnose(Diagnosis(Level.OK, "playing", {
+            "played": self.player.played, "total": self.player.total})))
 
     def _step(self) -> None:
         if not self._started:

@@ -10,8 +10,10 @@ from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from selfcal_ros.bagio.writer import BagWriter, qos_profile
 from selfcal_ros.errors import InputError
 from selfcal_ros.nodes import names
-from selfcal_ros.nodes.base import SelfcalNode, run
+from selfcal_ros.nodes.base import SelfcalNode
 from selfcal_ros.nodes.encoder_input import EncoderInput
+from selfcal_ros.nodes.running import run
+from selfcal_ros.sessions.ports import Diagnosis, Level
 
 
 class BagRecorder(SelfcalNode):
@@ -41,7 +43,7 @@ class BagRecorder(SelfcalNode):
 
     def _flush(self) -> None:
         self._writer.flush()
-        self.diagnose("recording", self._writer.counts)
+        self.diagnose(Diagnosis(Level.OK, "recording", self._writer.counts))
 
     def close(self) -> None:
         """Finish the bag."""

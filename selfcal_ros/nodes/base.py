@@ -1,33 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What all nodes share: checked parameters, diagnostics, one way to run and to stop."""
+"""What all nodes share: checked parameters, ports for the session, diagnostics."""
 
 import array
 import inspect
-import re
-import sys
 import time
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
-from rclpy._rclpy_pybind11 import RCLError, UnknownROSArgsError
-from rclpy.executors import ExternalShutdownException
-from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.signals import SignalHandlerOptions
-from rclpy.task import Future
 
 from selfcal_ros.collection.parameters import NODE_PARAMETERS, Parameter, parameter_values
-from selfcal_ros.errors import ExitCode, InputError, SelfcalError
+from selfcal_ros.errors import SelfcalError
 from selfcal_ros.nodes.names import Topic
-from selfcal_ros.nodes.stopping import complete_on_signal, ignore_signals
-
-SPIN_SECONDS = 86400.0
-"""An infinite time-out overflows in the executor of the wheels; a day is long enough to loop."""
+from selfcal_ros.sessions.ports import Diagnosis, Level, Ports
 
 
 class SelfcalNode(Node):
@@ -90,13 +79,28 @@ class SelfcalNode(Node):
                 return None
         return call
 
-    def diagnose(self, message: str, values: dict[str, Any], *, ok: bool = True) -> None:
+    def ports(self, publish: Callable[[str, dict[str, Any]], None]) -> Ports:
+        """Return what a session needs of this node; `publish` takes its outputs."""
+        return Ports(publish, self.say, time.monotonic,
+                     lambda: self.get_clock().now().nanoseconds)
+
+    def say(self, level: Level, line: str) -> None:
+        """Write one line to the log."""
+        logger = self.get_logger()  # a line each: rclpy tells call sites apart by their place
+        if level == Level.OK:
+            logger.info(line)
+        elif level == Level.WARN:
+            logger.warning(line)
+        else:
+            logger.error(line)
+
+    def diagnose(self, diagnosis: Diagnosis) -> None:
         """Publish one diagnostic status of this node."""
         status = DiagnosticStatus(
-            level=DiagnosticStatus.OK if ok else DiagnosticStatus.WARN,
-            name=self.get_fully_qualified_name().lstrip("/"), message=message,
-            hardware_id="selfcal",
-            values=[KeyValue(key=key, value=str(value)) for key, value in values.items()])
+            level=bytes([diagnosis.level]), name=self.get_fully_qualified_name().lstrip("/"),
+            message=diagnosis.message, hardware_id="selfcal",
+            values=[KeyValue(key=key, value=str(value))
+                    for key, value in diagnosis.values.items()])
         array_message = DiagnosticArray(status=[status])
         array_message.header.stamp = self.get_clock().now().to_msg()
         self._diagnostics.publish(array_message)
@@ -139,54 +143,3 @@ def fill(message: Any, fields: dict[str, Any]) -> Any:
         else:
             setattr(message, name, value)
     return message
-
-
-def spin(node: Node, until: Future) -> None:
-    """Spin a node with the events executor until `until` is done or the context is shut down."""
-    executor = EventsExecutor()
-    executor.add_node(node)
-    try:
-        while rclpy.ok() and not until.done():
-            executor.spin_until_future_complete(until, timeout_sec=SPIN_SECONDS)
-    except ExternalShutdownException:
-        pass
-    finally:
-        executor.remove_node(node)
-        executor.shutdown()
-
-
-def _init(argv: list[str] | None) -> None:
-    try:
-        rclpy.init(args=argv, signal_handler_options=SignalHandlerOptions.NO)
-    except (RCLError, UnknownROSArgsError) as error:
-        what = re.sub(r",? at /\S+", "", " ".join(str(error).split()))
-        raise InputError("arguments after --ros-args", what, "mend them") from error
-
-
-def run(make_node: Callable[[], Node], argv: list[str] | None = None) -> int:
-    """Run one node as a process; SIGINT and SIGTERM end it cleanly. Return the exit code.
-
-    A signal completes the future that the executor spins on, between two callbacks, so that no
-    callback is torn and what a node has to finish in `close` is finished.
-    """
-    stop = Future()
-    complete_on_signal(stop)
-    node, code = None, int(ExitCode.DONE)
-    try:
-        _init(argv)
-        node = make_node()
-        finished = getattr(node, "finished", None)
-        if finished is not None:
-            finished.add_done_callback(lambda _: stop.set_result(None))
-        spin(node, stop)
-        code = int(getattr(node, "exit_code", ExitCode.DONE))
-    except SelfcalError as error:
-        print(f"selfcal: {error}", file=sys.stderr)
-        code = int(error.exit_code)
-    finally:
-        if node is not None:
-            getattr(node, "close", lambda: None)()
-            node.destroy_node()
-        rclpy.try_shutdown()
-        ignore_signals()
-    return code

@@ -19,8 +19,9 @@ from selfcal_msgs.srv import SaveMap
 from std_srvs.srv import Trigger
 
 from selfcal_ros.errors import ExitCode, SelfcalError
-from selfcal_ros.nodes.base import SelfcalNode, run
+from selfcal_ros.nodes.base import SelfcalNode
 from selfcal_ros.nodes.player import Player
+from selfcal_ros.nodes.running import run
 
 PATIENCE_S = 30.0
 """Longest wait for the nodes to appear, to receive what was sent, or to answer."""

@@ -14,8 +14,10 @@ from selfcal_ros.collection.messages import Command, Detection, EncoderSample, P
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.view import Plan, View
 from selfcal_ros.nodes import names
-from selfcal_ros.nodes.base import SelfcalNode, fill, run
-from selfcal_ros.nodes.pose_sequencer import load_plan
+from selfcal_ros.nodes.base import SelfcalNode, fill
+from selfcal_ros.nodes.running import run
+from selfcal_ros.sessions.ports import Diagnosis, Level
+from selfcal_ros.sessions.sequencing import load_plan
 from selfcal_ros.simulation.cell import JOINTS, CellSettings, Event, view_events
 from selfcal_ros.simulation.truth import Truth, random_truth
 
@@ -43,8 +45,8 @@ class StageSimulator(SelfcalNode):
         self.subscribe(names.COMMAND, self._on_command)
         self.create_timer(0.005, self.guarded(self._on_timer))
         self._sent = {"encoder_sent": 0, "detection_sent": 0}
-        self.create_timer(1.0, lambda: self.diagnose(
-            "at home" if self._next is None else "measuring", self._sent))
+        self.create_timer(1.0, lambda: self.diagnose(Diagnosis(
+            Level.OK, "at home" if self._next is None else "measuring", self._sent)))
 
     def _on_command(self, message: Any) -> None:
         command = convert_in.command(message)

@@ -30,7 +30,7 @@ def encoder_subscriptions(graph) -> list[ReliabilityPolicy]:
 
 
 def received(node, counts: dict[str, int]) -> bool:
-    return list(node.collector.received.values()) == list(counts.values())
+    return list(node.session.collector.received.values()) == list(counts.values())
 
 
 @pytest.mark.parametrize("offer, policy", [
@@ -41,7 +41,7 @@ def test_the_encoder_is_taken_as_it_is_offered(graph, offer, policy):
     publisher = graph.publisher(offer)
     assert encoder_subscriptions(graph) == [policy]
     publisher.publish(names.ENCODER.type(name=["x"], position=[1.0]))
-    graph.until(lambda: node.collector.received["encoder"] == 1, "the sample")
+    graph.until(lambda: node.session.collector.received["encoder"] == 1, "the sample")
 
 
 def test_an_encoder_that_becomes_best_effort_is_still_heard(graph):
@@ -55,7 +55,7 @@ def test_an_encoder_that_becomes_best_effort_is_still_heard(graph):
         if publisher.topic_name == "/stage/joint_states":
             graph.until(lambda p=publisher: p.get_subscription_count() == 1, "a match")
             publisher.publish(names.ENCODER.type(name=["x"], position=[1.0]))
-    graph.until(lambda: node.collector.received["encoder"] == 2, "both samples")
+    graph.until(lambda: node.session.collector.received["encoder"] == 2, "both samples")
 
 
 def test_what_it_publishes_is_what_the_messages_hold_bit_for_bit(graph):
@@ -125,10 +125,10 @@ def test_a_command_that_cannot_be_used_is_counted_and_does_not_end_the_node(grap
     commands.publish(ViewCommand(phase=9))
     commands.publish(ViewCommand(phase=1, grid=True, grid_size=5, grid_pitch=0.01, repeats=1,
                                  translation_x=0.0042))
-    graph.until(lambda: node.collector.received["command"] == 2, "both commands")
+    graph.until(lambda: node.session.collector.received["command"] == 2, "both commands")
     publish_events(graph, events_of(small_plan("0", repeats=1)))
-    graph.until(lambda: node.collector.received["command"] == 2 + 5, "the good commands")
-    measurements, _ = node.collector.collect()
+    graph.until(lambda: node.session.collector.received["command"] == 2 + 5, "the good commands")
+    measurements, _ = node.session.collector.collect()
     assert measurements.rejected["command_unusable"] == 2
 
 
@@ -154,13 +154,14 @@ def test_the_readings_of_a_view_are_sent_before_it_is_called_complete(graph, mon
     node = graph.node(MeasurementCollector)
     counts = publish_events(graph, events_of(small_plan("0", repeats=1)))
     graph.until(lambda: received(node, counts), "all messages")
-    node._published.clear()
+    node.session._published.clear()
     sent: list[str] = []
-    for name in ("_status", "_measurement"):
-        monkeypatch.setattr(node, name, SimpleNamespace(
-            publish=lambda message, name=name: sent.append(f"{name} {message.view_index}")))
-    node._finish()
-    assert sent == ["_measurement 0", "_status 0", "_measurement 1", "_status 1"]
+    monkeypatch.setattr(node, "_outputs", {name: SimpleNamespace(
+        msg_type=names.STATUS.type if name == "status" else names.MEASUREMENT.type,
+        publish=lambda message, name=name: sent.append(f"{name} {message.view_index}"))
+        for name in ("status", "measurement")})
+    node.session.finish()
+    assert sent == ["measurement 0", "status 0", "measurement 1", "status 1"]
 
 
 def test_a_collector_that_starts_within_a_view_names_it_until_it_is_placed_anew(graph):
@@ -176,10 +177,10 @@ def test_a_collector_that_starts_within_a_view_names_it_until_it_is_placed_anew(
     graph.until(lambda: any(line in s.message and s.level == DiagnosticStatus.WARN
                             for m in diagnostics for s in m.status), line)
     for number, command in enumerate((measure, place, measure), 1):
-        assert set(node._missed.values()) == {measure.view.name}  # until it is measured anew
+        assert set(node.session.missed.values()) == {measure.view.name}  # until it is measured anew
         command = replace(command, stamp_ns=command.stamp_ns + number * 10**9)
         commands.publish(fill(names.COMMAND.type(), convert_out.command(command, "stage")))
-        graph.until(lambda number=number: node.collector.received["command"] == 2 + number,
+        graph.until(lambda number=number: node.session.collector.received["command"] == 2 + number,
                     "the command")
     diagnostics.clear()
     graph.until(lambda: diagnostics, "diagnostics")
@@ -199,14 +200,14 @@ def test_another_plate_under_the_same_plan_is_said_once_and_in_the_diagnostics(
         commands.publish(fill(names.COMMAND.type(), convert_out.command(Command(
             second * 10**9, Phase.MEASURE, "one", 0, plan.views[0], plan.artifact, 1), "stage")))
     line = "describes another plate than the rest of plan 'one'"
+    received = node.session.collector.received
     for expected in (3, 6, 9):  # each makes the collector look again
         graph.until(lambda: any(line in s.message and s.level == DiagnosticStatus.WARN
                                 for m in diagnostics for s in m.status), "the diagnostics")
         diagnostics.clear()
         for _ in range(3):
             detections.publish(MarkDetection())
-        graph.until(lambda expected=expected: node.collector.received["detection"] == expected,
-                    "the detections")
+        graph.until(lambda n=expected: received["detection"] == n, "the detections")
     assert len(said) == 1
     assert line in said[0]
     assert said[0].endswith("; then restart this node")
@@ -222,7 +223,7 @@ def test_diagnostics_count_rejections_before_any_view_and_beat_without_messages(
     encoder = graph.publisher(names.ENCODER)
     encoder.publish(names.ENCODER.type(name=["spindle"], position=[0.0]))
     encoder.publish(names.ENCODER.type(name=["x"], position=[float("nan")]))
-    graph.until(lambda: node.collector.received["encoder"] == 2, "the samples")
+    graph.until(lambda: node.session.collector.received["encoder"] == 2, "the samples")
     wanted = {("rejected encoder_sample_unknown_joint", "1"),
               ("rejected encoder_sample_not_finite", "1")}
     graph.until(lambda: any(wanted <= {(v.key, v.value) for v in s.values}

@@ -73,7 +73,7 @@ def test_the_error_is_taken_off_not_added(graph, tmp_path):
 def test_a_map_that_was_published_before_the_node_started_is_used(graph):
     latch_map(graph)
     node = graph.node(CompensatorNode)
-    graph.until(lambda: node._compensator is not None, "the latched map")
+    graph.until(lambda: node.session.compensator is not None, "the latched map")
     [answer] = correct(graph, [sample(0.01, 0.0, 0.0)])
     assert answer.position[0] == Compensator(MAP).correct(0.01, 0.0)[0]
 
@@ -130,4 +130,4 @@ def test_a_malformed_map_does_not_end_the_node(graph):
     publisher = graph.publisher(names.ERROR_MAP)
     publisher.publish(names.ERROR_MAP.type(grid_size=5, grid_pitch=0.01, gx=[0.0] * 3))
     latch_map(graph)
-    graph.until(lambda: node._compensator is not None, "the good map")
+    graph.until(lambda: node.session.compensator is not None, "the good map")

@@ -149,7 +149,8 @@ def test_a_start_names_the_views_that_are_measured_already(desk):
     for plan_id, index in (("another plan", 3), (PLAN.plan_id, 1), (PLAN.plan_id, 0)):
         readings.publish(names.MEASUREMENT.type(plan_id=plan_id, view_index=index,
                                                 view_name=PLAN.views[index].name))
-    desk.graph.until(lambda: len(desk.node._measured.get(PLAN.plan_id, {})) == 2, "both views")
+    known = desk.node.session._measured
+    desk.graph.until(lambda: len(known.get(PLAN.plan_id, {})) == 2, "both views")
     first, second = (view.name for view in PLAN.views[:2])
     assert desk.ask("start").message == (
         "waiting for the plate to be placed: view 0; measured already: "
@@ -172,9 +173,9 @@ def test_an_automatic_start_waits_for_a_collector(graph, tmp_path):
     graph.hand.create_subscription(DiagnosticArray, "/diagnostics", diagnostics.append, 10)
     graph.until(lambda: diagnostics, "its diagnostics")
     assert diagnostics[-1].status[0].message == "waiting for a measurement_collector"
-    assert node.machine.state is State.IDLE
+    assert node.session.machine.state is State.IDLE
     graph.hand.create_publisher(names.STATUS.type, names.STATUS.name, names.STATUS.qos)
-    graph.until(lambda: node.machine.state is State.PLACING, "the start")
+    graph.until(lambda: node.session.machine.state is State.PLACING, "the start")
 
 
 def test_following_is_a_warning_only_where_a_plan_is_given_up(desk, monkeypatch):
@@ -185,8 +186,8 @@ def test_following_is_a_warning_only_where_a_plan_is_given_up(desk, monkeypatch)
     for stamp, level in ((1, "info"), (2, "warning")):
         message = fill(names.COMMAND.type(), convert_out.command(Command(
             stamp, PLACE, "recorded", 0, PLAN.views[0], PLAN.artifact), "stage"))
-        desk.node._on_command(message)
-        desk.node._on_command(message)
+        desk.node.session.take_command(message)
+        desk.node.session.take_command(message)
         assert [item for item in said if item[1].startswith("another publisher")] == [
             (level, "another publisher sends view commands: following them; abort ends that")]
         assert desk.ask("abort").success

@@ -15,8 +15,9 @@ from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.result import result_to_dict
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes.base import fill
-from selfcal_ros.nodes.solver import Solver, short
+from selfcal_ros.nodes.solver import Solver
 from selfcal_ros.reporting.map_markers import map_geometry
+from selfcal_ros.sessions.solving import short
 from test.support.maps import random_map, result_of
 from test.support.sessions import collected, events_of, small_plan
 
@@ -261,4 +262,4 @@ def test_a_malformed_measurement_does_not_end_the_solver(graph):
         publisher.publish(message)
     graph.until(lambda: summaries and summaries[-1].identifiable
                 and summaries[-1].views_done == len(messages), "the good views")
-    assert node.result is not None
+    assert node.session.result is not None

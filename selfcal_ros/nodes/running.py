@@ -1,0 +1,71 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One way to run a node as a process, and to stop it."""
+
+import re
+import sys
+from collections.abc import Callable
+
+import rclpy
+from rclpy._rclpy_pybind11 import RCLError, UnknownROSArgsError
+from rclpy.executors import ExternalShutdownException
+from rclpy.experimental.events_executor import EventsExecutor
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
+from rclpy.task import Future
+
+from selfcal_ros.errors import ExitCode, InputError, SelfcalError
+from selfcal_ros.nodes.stopping import complete_on_signal, ignore_signals
+
+SPIN_SECONDS = 86400.0
+"""An infinite time-out overflows in the executor of the wheels; a day is long enough to loop."""
+
+
+def spin(node: Node, until: Future) -> None:
+    """Spin a node with the events executor until `until` is done or the context is shut down."""
+    executor = EventsExecutor()
+    executor.add_node(node)
+    try:
+        while rclpy.ok() and not until.done():
+            executor.spin_until_future_complete(until, timeout_sec=SPIN_SECONDS)
+    except ExternalShutdownException:
+        pass
+    finally:
+        executor.remove_node(node)
+        executor.shutdown()
+
+
+def _init(argv: list[str] | None) -> None:
+    try:
+        rclpy.init(args=argv, signal_handler_options=SignalHandlerOptions.NO)
+    except (RCLError, UnknownROSArgsError) as error:
+        what = re.sub(r",? at /\S+", "", " ".join(str(error).split()))
+        raise InputError("arguments after --ros-args", what, "mend them") from error
+
+
+def run(make_node: Callable[[], Node], argv: list[str] | None = None) -> int:
+    """Run one node as a process; SIGINT and SIGTERM end it cleanly. Return the exit code.
+
+    A signal completes the future that the executor spins on, between two callbacks, so that no
+    callback is torn and what a node has to finish in `close` is finished.
+    """
+    stop = Future()
+    complete_on_signal(stop)
+    node, code = None, int(ExitCode.DONE)
+    try:
+        _init(argv)
+        node = make_node()
+        finished = getattr(node, "finished", None)
+        if finished is not None:
+            finished.add_done_callback(lambda _: stop.set_result(None))
+        spin(node, stop)
+        code = int(getattr(node, "exit_code", ExitCode.DONE))
+    except SelfcalError as error:
+        print(f"selfcal: {error}", file=sys.stderr)
+        code = int(error.exit_code)
+    finally:
+        if node is not None:
+            getattr(node, "close", lambda: None)()
+            node.destroy_node()
+        rclpy.try_shutdown()
+        ignore_signals()
+    return code

@@ -1,0 +1,153 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The session of measurement_collector: what is published of the readings, and when."""
+
+from collections import Counter
+from typing import Any
+
+from selfcal_ros.bagio import convert_in, convert_out
+from selfcal_ros.collection.collector import Collector, ViewProgress
+from selfcal_ros.collection.digest import readings_digest, session_digest
+from selfcal_ros.collection.messages import Command, EncoderSample, Phase
+from selfcal_ros.collection.reasons import advice
+from selfcal_ros.errors import InputError, NoDataError
+from selfcal_ros.model.readings import Measurements
+from selfcal_ros.sessions.ports import Diagnosis, Level, Ports
+
+
+class CollectingSession:
+    """Feeds a `Collector`; publishes ``status``, and ``measurement`` when a view completes.
+
+    Parameters
+    ----------
+    values : dict
+        Values of the collector's parameters.
+    ports : Ports
+        Publishes ``status`` and ``measurement``.
+    """
+
+    def __init__(self, values: dict[str, Any], ports: Ports) -> None:
+        self._values, self._ports = values, ports
+        self.collector = Collector(values)
+        self._dirty, self._next_status = False, 0.0
+        self._published: dict[int, str] = {}
+        self._plan_id, self._advised = "", set()
+        self.missed: dict[tuple[str, int], str] = {}  # views that began before this node
+        self._placed: set[tuple[str, int]] = set()
+        self._problem = ""
+        self._state, self._rejected = "waiting for a MEASURE command", Counter()
+
+    def take_encoder(self, message: Any) -> None:
+        """Take a sensor_msgs/JointState."""
+        self.collector.add_encoder(EncoderSample(
+            convert_in.stamp_ns(message), tuple(message.name), tuple(message.position),
+            tuple(message.velocity)))
+        self._dirty = True
+
+    def take_detection(self, message: Any) -> None:
+        """Take a selfcal_msgs/MarkDetection."""
+        self.collector.add_detection(convert_in.detection(message))
+        self._dirty = True
+
+    def take_command(self, message: Any, is_older: bool) -> None:
+        """Take a selfcal_msgs/ViewCommand; `is_older`: published before this node listened."""
+        try:
+            command = convert_in.command(message)
+            self.collector.add_command(command)
+            self._note_missed(command, is_older=is_older)
+        except InputError:
+            self.collector.refuse_command()
+            raise
+        finally:
+            self._next_status = 0.0
+            self._dirty = True
+
+    def _note_missed(self, command: Command, *, is_older: bool) -> None:
+        """Say which views began before this node: their detections up to now are not here."""
+        view = (command.plan_id, command.view_index)
+        if command.phase == Phase.PLACE and not is_older:
+            self._placed.add(view)
+        elif command.phase == Phase.MEASURE and view in self._placed:
+            self.missed.pop(view, None)
+        elif command.phase == Phase.MEASURE and is_older:
+            self.missed[view] = command.view.name
+            self._ports.say(
+                Level.WARN, f"view '{command.view.name}' began before this node: what was "
+                "detected until now is missing here; redo_view measures it again")
+
+    def tick(self) -> None:
+        """Publish how far the views are, if something has come and it is time for it."""
+        now = self._ports.now_s()
+        if not self._dirty or now < self._next_status:
+            return
+        self._dirty = False
+        try:
+            measurements, progress = self.collector.collect()
+        except NoDataError:
+            self._rejected = Counter(self.collector.unusable)
+            return
+        except InputError as error:  # holds until this node is restarted: say it once
+            if self._problem != str(error):
+                self._problem = str(error)
+                self._ports.say(Level.ERROR, f"{error}; then restart this node")
+            return
+        self._publish(measurements, progress, final=False)
+        self._describe(measurements, progress)
+        spent = self._ports.now_s() - now
+        self._next_status = now + max(self._values["status_period"], 5 * spent)
+
+    def finish(self) -> str:
+        """Publish every view as it is and return the digest of all readings."""
+        measurements, progress = self.collector.collect()
+        self._publish(measurements, progress, final=True)
+        return session_digest(self._published)
+
+    def _publish(self, measurements: Measurements, progress: dict[int, ViewProgress], *,
+                 final: bool) -> None:
+        timeline, frame_id = self.collector.timeline, self._values["frame_id"]
+        if timeline.plan_id != self._plan_id:
+            self._plan_id, self._published, self._advised = timeline.plan_id, {}, set()
+        for index, view in progress.items():
+            stamp = convert_out.session_stamp_ns(timeline, view)
+            current = index == timeline.intervals[-1].view_index or not view.complete
+            key = readings_digest(view.readings, measurements.rejected)
+            closed = view.end_ns <= timeline.last_stamp_ns
+            ready = final or closed or view.complete
+            worth = view.readings.used or index in self._published
+            if ready and worth and self._published.get(index) != key:
+                self._published[index] = key
+                self._ports.publish("measurement", convert_out.view_measurement(
+                    view, measurements, stamp, frame_id))
+            # after the readings: what is called complete can be solved
+            if current or index == max(progress) or final:
+                self._ports.publish("status", convert_out.view_status(
+                    view, timeline.plan_id, stamp, frame_id))
+            if closed or final:
+                self._advise(index, view)
+
+    def _advise(self, index: int, view: ViewProgress) -> None:
+        """Say once for each view that is over what would mend its rejections."""
+        lines = advice(view.readings.rejected) if index not in self._advised else []
+        for line in lines:
+            self._ports.say(Level.WARN, f"view '{view.view.name}': {line}")
+            self._advised.add(index)
+
+    def _describe(self, measurements: Measurements, progress: dict[int, ViewProgress]) -> None:
+        """Keep for the diagnostics how far the view is and what was rejected so far."""
+        self._rejected = Counter(measurements.rejected)
+        for view in progress.values():
+            self._rejected.update(view.readings.rejected)
+        index = self.collector.timeline.intervals[-1].view_index
+        self._state = "between views" if index is None else (
+            f"view '{progress[index].view.name}': {100 * progress[index].coverage:.0f} % of the "
+            "marks read")
+
+    def diagnosis(self) -> Diagnosis:
+        """Return what the node says of itself."""
+        received = {f"{kind}_received": n for kind, n in self.collector.received.items()}
+        missed = ", ".join(self.missed.values())
+        state = self._problem or self._state
+        state += f"; began before this node: {missed}" if missed else ""
+        bad = missed or self._problem or self.collector.unusable
+        return Diagnosis(Level.WARN if bad else Level.OK, state, {
+            **received, "views": len(self._published),
+            **{f"rejected {reason}": n for reason, n in sorted(self._rejected.items())}})

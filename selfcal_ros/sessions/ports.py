@@ -1,0 +1,46 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a session needs of the node around it, and what it says of itself."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from enum import IntEnum
+from typing import Any
+
+
+class Level(IntEnum):
+    """Levels of diagnostic_msgs/DiagnosticStatus, and of log lines."""
+
+    OK = 0
+    WARN = 1
+    ERROR = 2
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """One diagnostic status: level, one line, and values by name."""
+
+    level: Level
+    message: str
+    values: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Ports:
+    """How a session reaches the world.
+
+    Attributes
+    ----------
+    publish : callable (output, fields)
+        Publish the fields of a message on one of the node's outputs, named by one word.
+    say : callable (level, line)
+        Write one line to the log.
+    now_s : callable
+        Monotonic seconds, for time-outs.
+    now_ns : callable
+        The clock that stamps messages, integer ns.
+    """
+
+    publish: Callable[[str, dict[str, Any]], None]
+    say: Callable[[Level, str], None]
+    now_s: Callable[[], float]
+    now_ns: Callable[[], int]
