@@ -13,10 +13,11 @@ from typing import Any
 import numpy as np
 
 from selfcal_ros.collection.encoder import JointTrack, TrackLimits
+from selfcal_ros.collection.exposures import Exposures, Tracks, look_up
 from selfcal_ros.collection.identify import IdentityRules
 from selfcal_ros.collection.messages import Command, Detection, EncoderSample
 from selfcal_ros.collection.reasons import Reason
-from selfcal_ros.collection.reduce import DETECTION, Rules, Tracks, clean, reduce_view
+from selfcal_ros.collection.reduce import DETECTION, Rules, clean, reduce_view
 from selfcal_ros.collection.timeline import Timeline, build_timeline
 from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.model.artifact import Artifact
@@ -79,6 +80,7 @@ class Collector:
             self.sense, IdentityRules(values["max_deviation"], values["ambiguity_ratio"],
                                       values["max_rotation"]),
             values["min_score"], values["outlier_limit"])
+        self._approach_threshold_m = values["approach_threshold"]
         self._detections: list[tuple] = []
         self._commands: dict[Command, None] = {}
         self._rejected_input: Counter = Counter()
@@ -162,18 +164,20 @@ class Collector:
                 view_of[here] = interval.view_index
             else:
                 loose[str(interval.reason if interval else Reason.OUTSIDE_VIEWS)] += int(here.sum())
+        exposures = look_up(self.tracks, table["stamp"],
+                            approach_threshold_m=self._approach_threshold_m)
         progress = {}
         for index, view in timeline.views.items():
             progress[index] = self._progress(timeline, index, view, table[view_of == index],
-                                             scored=scored)
+                                             exposures, scored=scored)
         views = tuple(item.readings for item in progress.values())
         return Measurements(timeline.plan_id, timeline.artifact, views, self.sense,
                             dict(sorted(loose.items()))), progress
 
-    def _progress(self, timeline: Timeline, index: int, view: View, detections: np.ndarray, *,
-                  scored: bool) -> ViewProgress:
+    def _progress(self, timeline: Timeline, index: int, view: View, detections: np.ndarray,
+                  exposures: Exposures, *, scored: bool) -> ViewProgress:
         good, reasons = clean(detections, self._rules, scored=scored)
-        readings = reduce_view(timeline.artifact, view, good, tracks=self.tracks,
+        readings = reduce_view(timeline.artifact, view, good, exposures=exposures,
                                rules=self._rules)
         total = Counter(readings.rejected)
         total.update({str(reason): count for reason, count in reasons.items()})

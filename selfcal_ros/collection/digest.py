@@ -9,13 +9,20 @@ from selfcal_ros.model.readings import ViewReadings
 
 _ARRAYS = (("m", "i8"), ("n", "i8"), ("dx", "f8"), ("dy", "f8"), ("count", "i8"), ("u", "f8"),
            ("k", "i8"), ("dtheta", "f8"), ("count_theta", "i8"), ("u_theta", "f8"))
+_VISITS = (("mark", "i8"), ("dx", "f8"), ("dy", "f8"), ("count", "i8"), ("stamp_ns", "i8"),
+           ("offset_x", "f8"), ("offset_y", "f8"), ("approach_x", "i1"), ("approach_y", "i1"),
+           ("u", "f8"))
 
 
 def readings_digest(readings: ViewReadings, rejected: dict[str, int]) -> str:
-    """Return the SHA-256 of one view's readings and of the rejections outside of views."""
+    """Return the SHA-256 of one view's readings, visits, and the rejections outside of views."""
     digest = hashlib.sha256()
-    for name, kind in _ARRAYS:
-        digest.update(np.ascontiguousarray(getattr(readings, name), dtype=kind).tobytes())
+    visits = readings.visits
+    for table, columns in ((readings, _ARRAYS), *(((visits, _VISITS),) if visits else ())):
+        for name, kind in columns:
+            digest.update(np.ascontiguousarray(getattr(table, name), dtype=kind).tobytes())
+    if visits:
+        digest.update(repr((visits.sigma_m, visits.dof)).encode())
     digest.update(repr((readings.view, readings.sigma_xy, readings.sigma_theta, readings.dof_xy,
                         readings.dof_theta, readings.used, readings.rejected,
                         dict(sorted(rejected.items())))).encode())

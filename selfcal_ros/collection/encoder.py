@@ -9,7 +9,11 @@ import numpy as np
 from selfcal_ros.collection.reasons import Reason
 
 BEYOND_NOISE = 6.0
-"""Standard deviations by which two samples must differ to show that an unneeded joint moves."""
+"""Standard deviations by which two samples must differ to show that a joint has moved."""
+NEAR = 16
+"""Samples on either side of an exposure that tell the noise of a joint at rest there."""
+LOOK_BACK_NS = 60_000_000_000
+"""Time before an exposure in which a motion is looked for."""
 
 
 @dataclass(frozen=True)
@@ -115,6 +119,62 @@ class JointTrack:
             told *= (t[right] - t[left]) / 1e9
             fast &= np.fmax(way, told) > BEYOND_NOISE * np.sqrt(2) * noise
         return np.where(fast, Reason.MOVING, None)
+
+    def approach(self, stamps_ns: np.ndarray, positions: np.ndarray, *, threshold: float,
+                 ) -> np.ndarray:
+        """Return the sign of the last motion before each exposure, int8 array (Q,); 0 = unknown.
+
+        A motion is a displacement beyond `threshold`, m, and beyond the noise at rest. It is
+        looked for from the exposure back to the one before; where there is none, the sign is that
+        of the exposure before. A gap in the samples and a time of more than `LOOK_BACK_NS` without
+        motion since the last exposure leave it unknown.
+
+        Parameters
+        ----------
+        stamps_ns : int64 array (Q,)
+            Instants of exposure, rising, each once.
+        positions : float array (Q,)
+            Positions there, as `query` returns them.
+        threshold : float
+            Smallest displacement that counts as a motion, m.
+        """
+        out = np.zeros(len(stamps_ns), dtype=np.int8)
+        if not len(self) or not len(stamps_ns):
+            return out
+        t, p, _, _ = self._series()
+        limit = np.fmax(threshold, BEYOND_NOISE * np.sqrt(2) * self._noise_near(stamps_ns))
+        owner = np.searchsorted(stamps_ns, t, "left")  # the first exposure at or after a sample
+        sample = np.flatnonzero(owner < len(stamps_ns))
+        owner = owner[sample]
+        away = p[sample] - positions[owner]
+        moved = (np.abs(away) > limit[owner]) & (stamps_ns[owner] - t[sample] <= LOOK_BACK_NS)
+        last = np.full(len(stamps_ns), -1)
+        last[owner[moved]] = sample[moved]  # of samples with one owner the last stays
+        broken = np.diff(t, prepend=t[0]) > self.limits.max_gap_ns
+        broken[0] = True
+        resumed = np.full(len(stamps_ns), -1)
+        resumed[owner[broken[sample]]] = sample[broken[sample]]
+        told = (last >= 0) & (last >= resumed)
+        out[told] = np.sign(positions[told] - p[last[told]])
+        lost = ~told & ((resumed >= 0) | ~np.isfinite(positions))
+        lost |= ~told & (np.diff(stamps_ns, prepend=stamps_ns[0]) > LOOK_BACK_NS)
+        settled = np.where(told | lost, np.arange(len(out)), 0)
+        return out[np.maximum.accumulate(settled)]
+
+    def _noise_near(self, stamps_ns: np.ndarray) -> np.ndarray:
+        """Return the standard deviation of one position beside each exposure, robustly, (Q,).
+
+        From each sample's distance to the line through its neighbours, as in `_noise_of_rest`.
+        """
+        t, p, _, _ = self._series()
+        if len(t) < 3:
+            return np.zeros(len(stamps_ns))
+        step, dt = self._difference(np.diff(p)), np.diff(t)
+        off = np.abs(step[:-1] * dt[1:] - step[1:] * dt[:-1]) / (dt[:-1] + dt[1:])
+        width = min(2 * NEAR, len(off))
+        start = np.clip(np.searchsorted(t, stamps_ns, "left") - 1 - NEAR, 0, len(off) - width)
+        near = np.lib.stride_tricks.sliding_window_view(off, width)
+        return np.median(near[start], axis=1) / (0.6744897501960817 * np.sqrt(1.5))
 
     def _noise_of_rest(self) -> tuple[float, float]:
         """Return the standard deviations of one position and of one told speed, robustly.

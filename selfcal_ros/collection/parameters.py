@@ -79,6 +79,8 @@ COLLECTOR = (
     Parameter("outlier_limit", 6.0, "distance from the median of a mark's repeats, in standard "
               "deviations of one reading, beyond which a repeat is an outlier; 0 = keep all",
               "", 0.0, 1000.0),
+    Parameter("approach_threshold", 1e-6, "displacement of x or y before an exposure that counts "
+              "as a motion and tells the direction of approach", "m", 0.0, 1e-2),
     Parameter("status_period", 0.5, "time between two ViewStatus messages", "s", 0.02, 60.0),
 )
 _UNCERTAINTY = {"auto": None, "always": True, "never": False}

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from selfcal_ros.collection.encoder import JointTrack
+from selfcal_ros.collection.exposures import Exposures
 from selfcal_ros.collection.identify import (
     IdentityRules,
     identify_angular,
@@ -15,6 +15,7 @@ from selfcal_ros.collection.identify import (
 from selfcal_ros.collection.messages import Kind
 from selfcal_ros.collection.reasons import Reason
 from selfcal_ros.collection.repeats import reduce_repeats
+from selfcal_ros.collection.visits import grid_visits
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Sense, ViewReadings
 from selfcal_ros.model.view import View
@@ -32,15 +33,6 @@ class Rules:
     identity: IdentityRules
     min_score: float
     outlier_limit: float
-
-
-@dataclass(frozen=True)
-class Tracks:
-    """Encoder samples of the three joints."""
-
-    x: JointTrack
-    y: JointTrack
-    theta: JointTrack
 
 
 def clean(detections: np.ndarray, rules: Rules, *, scored: bool,
@@ -78,51 +70,56 @@ def clean(detections: np.ndarray, rules: Rules, *, scored: bool,
     return unique, +rejected
 
 
-def reduce_view(artifact: Artifact, view: View, detections: np.ndarray, *, tracks: Tracks,
-                rules: Rules) -> ViewReadings:
-    """Return the readings of one view from its cleaned detections (see `clean`)."""
+def reduce_view(artifact: Artifact, view: View, detections: np.ndarray, *,
+                exposures: Exposures, rules: Rules) -> ViewReadings:
+    """Return the readings of one view from its cleaned detections (see `clean`).
+
+    `exposures` hold the stage at the instants of at least these detections.
+    """
     rejected: Counter = Counter()
     grid = detections[detections["kind"] == Kind.GRID]
     angular = detections[detections["kind"] == Kind.ANGULAR]
-    readings, phi = _reduce_grid(artifact, view, grid, tracks, rules, rejected)
-    part = _reduce_angular(artifact, view, angular, tracks, rules, rejected, phi)
+    readings, phi = _reduce_grid(artifact, view, grid, exposures, rules, rejected)
+    part = _reduce_angular(artifact, view, angular, exposures, rules, rejected, phi)
     used = int(readings["count"].sum() + part["count_theta"].sum())
     return replace(ViewReadings(view), **readings, **part, used=used,
                    rejected=dict(sorted((str(r), c) for r, c in rejected.items())))
 
 
-def _reduce_grid(artifact: Artifact, view: View, d: np.ndarray, tracks: Tracks, rules: Rules,
+def _reduce_grid(artifact: Artifact, view: View, d: np.ndarray, exposures: Exposures, rules: Rules,
                  rejected: Counter) -> tuple[dict, float | None]:
-    x, why_x = tracks.x.query(d["stamp"])
-    y, why_y = tracks.y.query(d["stamp"])
-    why = _first(why_x, why_y, tracks.theta.moving(d["stamp"]))
-    d, (x, y) = _keep(d, why, rejected, x, y)
+    stage = exposures.at(d["stamp"])
+    why = _first(stage.x.reason, stage.y.reason, stage.theta.moving)
+    d, (x, y, *approach) = _keep(d, why, rejected, stage.x.position, stage.y.position,
+                                 *stage.approach)
     reading = _reading(rules.sense, np.stack([x, y]), np.stack([d["ox"], d["oy"]]))
     found = identify_grid(artifact, view, reading, ids=np.stack([d["m"], d["n"]]),
                           has_id=d["has_id"], rules=rules.identity)
-    d, (m, n, vx, vy, *rest) = _keep(d, found.reasons, rejected, *found.index, *found.deviation,
-                                     *found.residual)
+    d, (m, n, vx, vy, rx, ry, *approach) = _keep(
+        d, found.reasons, rejected, *found.index, *found.deviation, *found.residual, *approach)
     hx, hy = artifact.half
-    means = reduce_repeats((m + hx) * (2 * hy + 1) + n + hy, np.stack([vx, vy]), d["sigma"],
-                           limit=rules.outlier_limit,
+    key, deviation = (m + hx) * (2 * hy + 1) + n + hy, np.stack([vx, vy])
+    means = reduce_repeats(key, deviation, d["sigma"], limit=rules.outlier_limit,
                            extent=2 * max(hx, hy) * artifact.grid_pitch_m,
-                           residual=np.stack(rest))
+                           residual=np.stack([rx, ry]))
     _count(rejected, Reason.OUTLIER, means.outlier)
+    visits = grid_visits(means, key, d["sigma"], stamps_ns=d["stamp"], deviation=deviation,
+                         offset=np.stack([d["ox"], d["oy"]]), approach=np.stack(approach))
     mark = means.key.astype(np.int64)
     told = found.phi_error_rad <= np.pi / 2 / max(artifact.angular_count, 1)  # a quarter line
     phi = found.rigid.phi_rad if told else None
     return {"m": mark // (2 * hy + 1) - hx, "n": mark % (2 * hy + 1) - hy, "dx": means.mean[0],
             "dy": means.mean[1], "count": means.count, "u": means.u, "sigma_xy": means.sigma,
-            "dof_xy": means.dof}, phi
+            "dof_xy": means.dof, "visits": visits}, phi
 
 
-def _reduce_angular(artifact: Artifact, view: View, d: np.ndarray, tracks: Tracks, rules: Rules,
-                    rejected: Counter, phi: float | None) -> dict:
-    theta, why = tracks.theta.query(d["stamp"])
-    why = _first(why, tracks.x.moving(d["stamp"]), tracks.y.moving(d["stamp"]))
+def _reduce_angular(artifact: Artifact, view: View, d: np.ndarray, exposures: Exposures,
+                    rules: Rules, rejected: Counter, phi: float | None) -> dict:
+    stage = exposures.at(d["stamp"])
+    why = _first(stage.theta.reason, stage.x.moving, stage.y.moving)
     # beyond half a turn an offset is no sight of the line, though it may wrap to a small one
     why[(why == None) & (np.abs(d["ot"]) > np.pi)] = Reason.TOO_FAR  # noqa: E711
-    d, (theta,) = _keep(d, why, rejected, theta)
+    d, (theta,) = _keep(d, why, rejected, stage.theta.position)
     found = identify_angular(artifact, view, _reading(rules.sense, theta, d["ot"]), ids=d["k"],
                              has_id=d["has_id"], rules=rules.identity, phi_rad=phi)
     d, (k, v, rest) = _keep(d, found.reasons, rejected, found.index, found.deviation,

@@ -11,7 +11,7 @@ outliers is itself an outlier, and would be kept in place of the good one.
 Of clean Gaussian readings fewer than 1 in 100,000 are rejected (test_repeats.py).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -21,7 +21,11 @@ MIN_PAIRS = 12
 
 @dataclass(frozen=True)
 class Means:
-    """Means of marks: (c, marks) values, their counts and declared standard uncertainties."""
+    """Means of marks: (c, marks) values, their counts and declared standard uncertainties.
+
+    `companions` are means of further quantities with the same weights; `outlier` is a mask over
+    the readings, those that are in no mean.
+    """
 
     key: np.ndarray
     mean: np.ndarray
@@ -30,6 +34,7 @@ class Means:
     sigma: float
     dof: int
     outlier: np.ndarray
+    companions: np.ndarray
 
 
 def reduce_repeats(key: np.ndarray, values: np.ndarray, sigma: np.ndarray, *,
@@ -65,20 +70,30 @@ def reduce_repeats(key: np.ndarray, values: np.ndarray, sigma: np.ndarray, *,
     if limit > 0 and len(key):
         outlier = _outliers(key, values, _relative(sigma), (limit, extent),
                             residual)
-    marks, inverse, count = np.unique(key[~outlier], return_inverse=True, return_counts=True)
-    kept, s = values[:, ~outlier], sigma[~outlier]
-    declared = np.bincount(inverse, s > 0, len(marks)) == count
+    means = average(key[~outlier], values[:, ~outlier], sigma[~outlier])
+    return replace(means, outlier=outlier)
+
+
+def average(key: np.ndarray, values: np.ndarray, sigma: np.ndarray,
+            companions: np.ndarray | None = None) -> Means:
+    """Average the readings of each key; arguments as for `reduce_repeats`, none is an outlier.
+
+    `companions` (e, n) are averaged alike, and tell nothing of the repeatability.
+    """
+    marks, inverse, count = np.unique(key, return_inverse=True, return_counts=True)
+    declared = np.bincount(inverse, sigma > 0, len(marks)) == count
     best = np.full(len(marks), np.inf)  # weights relative to a mark's best reading stay finite
-    np.minimum.at(best, inverse, s)
-    weight = np.where(declared[inverse] & (s > 0),
-                      (best[inverse] / np.where(s > 0, s, 1)) ** 2, 1.0)
+    np.minimum.at(best, inverse, sigma)
+    weight = np.where(declared[inverse] & (sigma > 0),
+                      (best[inverse] / np.where(sigma > 0, sigma, 1)) ** 2, 1.0)
     total = np.bincount(inverse, weight, len(marks))
-    mean = _means(kept, weight, inverse, total)
-    rest = kept - mean[:, inverse]
-    dof = int(len(kept) * (count - 1).sum())
+    mean = _means(values, weight, inverse, total)
+    rest = values - mean[:, inverse]
+    dof = int(len(values) * (count - 1).sum())
     pooled = float(np.sqrt((rest**2).sum() / dof)) if dof else float("nan")
     u = np.where(declared, best / np.sqrt(total), np.nan) if declared.any() else np.zeros(0)
-    return Means(marks, mean, count, u, pooled, dof, outlier)
+    more = mean[:0] if companions is None else _means(companions, weight, inverse, total)
+    return Means(marks, mean, count, u, pooled, dof, np.zeros(len(key), dtype=bool), more)
 
 
 def _means(values: np.ndarray, weight: np.ndarray, inverse: np.ndarray,
