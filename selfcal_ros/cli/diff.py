@@ -23,7 +23,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Compare and print."""
     from selfcal_ros.errors import ExitCode
-    from selfcal_ros.estimation.compare import compare, compare_with_laser
+    from selfcal_ros.estimation.comparison.maps import compare, compare_with_laser
     from selfcal_ros.files import read_json
     from selfcal_ros.model.result import result_from_dict
 

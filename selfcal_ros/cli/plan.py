@@ -43,7 +43,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _check(args: argparse.Namespace, plan) -> int:
     from selfcal_ros.errors import ExitCode
-    from selfcal_ros.estimation.identifiability import check_plan, predict_plan
+    from selfcal_ros.estimation.observability.plan_check import check_plan, predict_plan
     from selfcal_ros.model.error_map import ThetaDatum
 
     found = check_plan(plan)
@@ -99,7 +99,7 @@ def _suggest(args: argparse.Namespace, plan) -> int:
     from dataclasses import replace
 
     from selfcal_ros.errors import ExitCode, InputError
-    from selfcal_ros.estimation.suggest import best_plan, rank_next
+    from selfcal_ros.estimation.observability.suggest import best_plan, rank_next
     from selfcal_ros.files import check_outputs
     from selfcal_ros.model.error_map import ThetaDatum
 

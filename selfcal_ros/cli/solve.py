@@ -91,7 +91,7 @@ def run(args: argparse.Namespace) -> int:
     options = solver_options(solver_values)
     try:
         if args.robust:
-            from selfcal_ros.estimation.robust import robust_calibrate
+            from selfcal_ros.estimation.quality.outliers import robust_calibrate
             result = robust_calibrate(measurements, options)
         else:
             result = calibrate(measurements, options)
@@ -118,15 +118,19 @@ def _extended(args: argparse.Namespace, measurements: Any, options: Any,
 
     lines: list[str] = []
     if args.validate:
-        from selfcal_ros.estimation.robust import clean
-        from selfcal_ros.estimation.validation import validate, validation_json, validation_text
+        from selfcal_ros.estimation.quality.outliers import clean
+        from selfcal_ros.estimation.quality.validation import (
+            validate,
+            validation_json,
+            validation_text,
+        )
 
         used = clean(measurements, options).measurements if args.robust else measurements
         found = validate(used, options)
         result = replace(result, extra={**result.extra, "validation": validation_json(found)})
         lines += ["", "held-out readings:", *(f"  {line}" for line in validation_text(found))]
     if args.budget:
-        from selfcal_ros.estimation.budget import budget_json, budget_text, budgets
+        from selfcal_ros.estimation.quality.budget import budget_json, budget_text, budgets
 
         rows = budgets(result, options.reference)
         result = replace(result, extra={**result.extra, "budget": budget_json(rows)})

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from selfcal_ros.errors import InputError
-from selfcal_ros.estimation.api import Options, ReferenceKind, ReferenceLength
+from selfcal_ros.estimation.options import Options, ReferenceKind, ReferenceLength
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.readings import Sense
 

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Estimators: joint least squares, Hu's law, datum, identifiability, uncertainty."""
+"""Estimators: from readings to maps with uncertainties; one sub-package a question."""

@@ -13,7 +13,7 @@ from selfcal_ros.compensation.cal_lines import Line, line_table
 from selfcal_ros.compensation.cal_model import Table1D
 from selfcal_ros.compensation.machine import MachineFrame
 from selfcal_ros.errors import InputError
-from selfcal_ros.estimation.api import ReferenceKind, ReferenceLength
+from selfcal_ros.estimation.options import ReferenceKind, ReferenceLength
 from selfcal_ros.laser.data import Identified, Method
 from selfcal_ros.laser.profiles import (
     positions_m,

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from selfcal_ros.errors import InputError
-from selfcal_ros.estimation.datum import datum_modes, remove_modes
+from selfcal_ros.estimation.datum.modes import datum_modes, remove_modes
 from selfcal_ros.model.error_map import ErrorMap
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.reporting.summary_format import ARCSEC, UM

@@ -5,12 +5,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from selfcal_ros.estimation.api import Options, calibrate
+from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.blas_threads import one_thread
-from selfcal_ros.estimation.law import hu_readings, hu_views, law_for
-from selfcal_ros.estimation.law_equations import HuReadings
-from selfcal_ros.estimation.prediction import predict
-from selfcal_ros.estimation.system import planned_system
+from selfcal_ros.estimation.law.equations import HuReadings
+from selfcal_ros.estimation.law.solve import hu_readings, hu_views, law_for
+from selfcal_ros.estimation.normal.planned import planned_system
+from selfcal_ros.estimation.observability.prediction import predict
+from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.readings import Measurements, Sense

@@ -6,12 +6,13 @@ from math import pi
 
 import numpy as np
 
-from selfcal_ros.estimation.api import Options, calibrate
+from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.blas_threads import one_thread
-from selfcal_ros.estimation.datum import datum_modes
-from selfcal_ros.estimation.prediction import predict
-from selfcal_ros.estimation.rank import plan_observability
-from selfcal_ros.estimation.system import planned_system
+from selfcal_ros.estimation.datum.modes import datum_modes
+from selfcal_ros.estimation.normal.planned import planned_system
+from selfcal_ros.estimation.observability.prediction import predict
+from selfcal_ros.estimation.observability.rank import plan_observability
+from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.readings import Measurements, ViewReadings

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from selfcal_ros.estimation.datum import axis_slopes, datum_modes, remove_modes
+from selfcal_ros.estimation.datum.modes import axis_slopes, datum_modes, remove_modes
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Measurements, Sense, ViewReadings
 from selfcal_ros.model.view import Plan, View

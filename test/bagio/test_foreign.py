@@ -13,7 +13,8 @@ from selfcal_ros.collection.collector import Collector
 from selfcal_ros.collection.messages import Command, Detection, EncoderSample
 from selfcal_ros.collection.parameters import parameter_values
 from selfcal_ros.errors import InputError, NoDataError
-from selfcal_ros.estimation.api import Options, calibrate
+from selfcal_ros.estimation.api import calibrate
+from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.result import result_to_dict
 from test.support import bags
 from test.support.bags import COMPRESSIONS, NO_SUMMARY, Foreign

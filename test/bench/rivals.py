@@ -6,9 +6,9 @@ import importlib.util
 import numpy as np
 from scipy.sparse import coo_matrix, csr_matrix
 
-from selfcal_ros.estimation.lattice import PHASES
-from selfcal_ros.estimation.normal_grid import GridSystem
-from selfcal_ros.estimation.readings_data import grid_data
+from selfcal_ros.estimation.lattice.maps import PHASES
+from selfcal_ros.estimation.lattice.readings import grid_data
+from selfcal_ros.estimation.normal.grid import GridSystem
 
 RIVALS = ("numpy.linalg.lstsq", "scipy lsmr", "scipy splu", "gtsam", "pyceres")
 

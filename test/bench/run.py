@@ -52,7 +52,7 @@ def error_of(field, truth) -> float:
     """Return the largest |G - truth| in m in the datum, over the sites that are known."""
     import numpy as np
 
-    from selfcal_ros.estimation.gauge import Gauge
+    from selfcal_ros.estimation.lattice.gauge import Gauge
 
     z = (truth.artifact.m + 1j * truth.artifact.n) / truth.artifact.half[0]
     known = np.isfinite(field).all(axis=0)
@@ -78,9 +78,10 @@ def ours(benchmark: str, data) -> tuple:
     """Return seconds and G of our own solver."""
     import numpy as np
 
-    from selfcal_ros.estimation.api import Options, calibrate
-    from selfcal_ros.estimation.map_only import MapSolver
-    from selfcal_ros.estimation.system import clear_cache
+    from selfcal_ros.estimation.api import calibrate
+    from selfcal_ros.estimation.joint.map_only import MapSolver
+    from selfcal_ros.estimation.normal.cache import clear_cache
+    from selfcal_ros.estimation.options import Options
 
     quick = Options(uncertainty=False)
 

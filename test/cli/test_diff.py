@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from selfcal_ros.cli.main import main
-from selfcal_ros.estimation.api import Options, calibrate
+from selfcal_ros.estimation.api import calibrate
+from selfcal_ros.estimation.options import Options
 from selfcal_ros.files import read_json, write_json
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.result import result_to_dict

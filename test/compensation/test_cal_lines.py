@@ -18,7 +18,7 @@ from selfcal_ros.compensation.cal_verify import verify_tables
 from selfcal_ros.compensation.compensator import Compensator
 from selfcal_ros.compensation.machine import MachineFrame, SimulatedController
 from selfcal_ros.errors import InputError
-from selfcal_ros.estimation.datum import first_order
+from selfcal_ros.estimation.datum.modes import first_order
 from selfcal_ros.model.artifact import Artifact
 from test.support.maps import random_map
 

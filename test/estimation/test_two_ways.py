@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 
 from selfcal_ros.errors import InputError, NotIdentifiableError
-from selfcal_ros.estimation.api import Options, ReferenceLength, calibrate
-from selfcal_ros.estimation.covariance import map_covariance
-from selfcal_ros.estimation.robust import _noisy_views, clean, robust_calibrate, subset
-from selfcal_ros.estimation.robust_leverage import residuals_of
-from selfcal_ros.estimation.validation import validate
+from selfcal_ros.estimation.api import calibrate
+from selfcal_ros.estimation.joint.covariance import map_covariance
+from selfcal_ros.estimation.options import Options, ReferenceLength
+from selfcal_ros.estimation.quality.leverage import residuals_of
+from selfcal_ros.estimation.quality.outliers import _noisy_views, clean, robust_calibrate, subset
+from selfcal_ros.estimation.quality.validation import validate
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Sense, ViewReadings
 from selfcal_ros.simulation.truth import Spread, hu_plan, random_truth, simulate_measurements

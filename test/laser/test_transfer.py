@@ -5,8 +5,8 @@ import pytest
 from selfcal_ros.compensation.cal_evaluate import CalEvaluator
 from selfcal_ros.compensation.machine import MachineFrame
 from selfcal_ros.errors import InputError
-from selfcal_ros.estimation.api import ReferenceKind
-from selfcal_ros.estimation.datum import first_order
+from selfcal_ros.estimation.datum.modes import first_order
+from selfcal_ros.estimation.options import ReferenceKind
 from selfcal_ros.laser.conventional import identify_conventional
 from selfcal_ros.laser.new import identify_new
 from selfcal_ros.laser.profiles import profile_m, squareness, squareness_rad

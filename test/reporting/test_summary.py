@@ -10,7 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from selfcal_ros.errors import InputError
-from selfcal_ros.estimation.api import Options, calibrate
+from selfcal_ros.estimation.api import calibrate
+from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ErrorMap, ThetaDatum
 from selfcal_ros.model.result import Noise, Observability, result_from_dict, result_to_dict

@@ -79,8 +79,8 @@ def test_qiaos_noise_run_meets_the_bound_not_the_printed_figure(qiao):
 
 
 def test_the_unseen_part_of_program_2_is_all_that_is_wrong(qiao):
-    from selfcal_ros.estimation.modes import mode_maps
-    from selfcal_ros.estimation.system import planned_system
+    from selfcal_ros.estimation.normal.planned import planned_system
+    from selfcal_ros.estimation.observability.unseen import mode_maps
     from selfcal_ros.simulation.reproduce_qiao import ARTIFACT, PROGRAMS, plan_of
 
     maps = mode_maps(planned_system(ARTIFACT, plan_of(PROGRAMS[1]).views)).reshape(10, -1)

@@ -5,7 +5,7 @@ from math import pi
 
 import numpy as np
 
-from selfcal_ros.estimation.datum import datum_modes, remove_modes
+from selfcal_ros.estimation.datum.modes import datum_modes, remove_modes
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.view import Plan, View
 

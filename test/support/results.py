@@ -3,7 +3,7 @@
 
 import numpy as np
 
-from selfcal_ros.estimation.datum import first_order
+from selfcal_ros.estimation.datum.modes import first_order
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ErrorMap
 from selfcal_ros.model.result import (

@@ -1,0 +1,275 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Two maps compared after the datum difference is taken out, with the significance of the rest."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import chi2, norm
+from scipy.stats import f as f_test
+
+from selfcal_ros.errors import InputError
+from selfcal_ros.estimation.blas_threads import one_thread
+from selfcal_ros.estimation.comparison.covariance import (
+    first_order_u,
+    theta_covariance,
+    xy_covariance,
+)
+from selfcal_ros.estimation.datum.modes import datum_modes
+from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.result import CalibrationResult
+
+PITCH_TOLERANCE = 1e-9
+"""Largest relative difference of pitch between two maps of the same lattice."""
+
+MANY_DOF = 1e6
+"""Degrees of freedom from which a noise counts as known."""
+
+
+@dataclass(frozen=True)
+class Significance:
+    """Test of a difference against both uncertainties.
+
+    Attributes
+    ----------
+    chi2_ratio : float
+        Mean of (difference / its standard uncertainty)^2: 1 if the maps agree.
+    dof : float
+        Effective degrees of freedom; less than the number of values, as nodes are correlated.
+    p : float
+        Probability of so large a ratio if the maps agree; NaN without uncertainties.
+    correlated : bool
+        Whether correlations between nodes were taken from the views; without them dof is
+        too large and p too small.
+    """
+
+    chi2_ratio: float
+    dof: float
+    p: float
+    correlated: bool
+
+
+@dataclass(frozen=True, eq=False)
+class MapDifference:
+    """Map B less map A, datum difference taken out.
+
+    Attributes
+    ----------
+    dx, dy : float array (nx, ny)
+        Difference, m; NaN where either map is unknown.
+    d_theta : float array (K,)
+        Difference of the angular maps, rad.
+    translation_m, rotation_rad, scale, theta_rad : tuple, float
+        The datum difference that was taken out.
+    nonorthogonality, scale_difference : float
+        Differences of O and R.
+    xy, theta : Significance or None
+        Tests; None where there is nothing to test.
+    """
+
+    dx: np.ndarray
+    dy: np.ndarray
+    d_theta: np.ndarray
+    translation_m: tuple[float, float]
+    rotation_rad: float
+    scale: float
+    theta_rad: float
+    nonorthogonality: float
+    scale_difference: float
+    xy: Significance | None
+    theta: Significance | None
+
+    @property
+    def rms_m(self) -> float:
+        """Root mean square over the known sites and both axes, m."""
+        return rms(np.stack([self.dx, self.dy]))
+
+    @property
+    def max_m(self) -> float:
+        """Largest difference on an axis, m."""
+        return float(np.nanmax(np.abs(np.stack([self.dx, self.dy]))))
+
+    @property
+    def rms_theta_rad(self) -> float:
+        """Root mean square of the angular difference, rad; NaN without angular maps."""
+        return rms(self.d_theta)
+
+    @property
+    def max_theta_rad(self) -> float:
+        """Largest angular difference, rad; NaN without angular maps."""
+        known = self.d_theta[np.isfinite(self.d_theta)]
+        return float(np.abs(known).max()) if len(known) else float("nan")
+
+
+def rms(values: np.ndarray) -> float:
+    """Return the root mean square of the finite values; NaN if there are none."""
+    known = values[np.isfinite(values)]
+    return float(np.sqrt(np.mean(known**2))) if len(known) else float("nan")
+
+
+@one_thread()
+def compare(a: CalibrationResult, b: CalibrationResult, *, keep_scale: bool = False,
+            names: tuple[str, str] = ("A", "B")) -> MapDifference:
+    """Compare two calibrations of the same lattice.
+
+    Parameters
+    ----------
+    a, b : CalibrationResult
+        The calibrations; the difference is B less A.
+    keep_scale : bool
+        Leave magnification in the difference: both maps have a scale of their own.
+    names : tuple of str
+        For messages.
+
+    Raises
+    ------
+    InputError
+        If the lattices differ or no site is known in both.
+    """
+    require_same_lattice(a.artifact, b.artifact, names)
+    artifact = a.artifact
+    difference = np.stack([b.error_map.gx - a.error_map.gx, b.error_map.gy - a.error_map.gy])
+    known = np.isfinite(difference).all(axis=0)
+    if known.sum() < 3:
+        raise InputError(names[1], f"{int(known.sum())} sites are known in both maps",
+                         "compare maps that overlap")
+    modes = datum_modes(artifact, scale=not keep_scale)
+    basis = modes[:, :, known].reshape(len(modes), -1).T
+    parts = np.linalg.lstsq(basis / np.linalg.norm(basis, axis=0), difference[:, known].ravel(),
+                            rcond=None)[0] / np.linalg.norm(basis, axis=0)
+    rest = difference - np.tensordot(parts, modes, axes=1)
+    d_theta = b.error_map.g_theta - a.error_map.g_theta
+    constant = float(np.nanmean(d_theta)) if np.isfinite(d_theta).any() else float("nan")
+    xy = _significance(rest[:, known].ravel(), [xy_covariance(r, known) for r in (a, b)], basis,
+                       _noise_dof(a, b, "xy"))
+    return MapDifference(
+        rest[0], rest[1], d_theta - constant, (float(parts[0]), float(parts[1])), float(parts[2]),
+        0.0 if keep_scale else float(parts[3]), constant,
+        b.error_map.nonorthogonality - a.error_map.nonorthogonality,
+        b.error_map.scale_difference - a.error_map.scale_difference, xy, _theta_test(a, b, d_theta))
+
+
+def require_same_lattice(a: Artifact, b: Artifact, names: tuple[str, str]) -> None:
+    """Raise InputError unless both maps stand on the same lattice."""
+    for what, one, other in (("sites", a.shape, b.shape),
+                             ("angular lines", a.angular_count, b.angular_count)):
+        if one != other:
+            raise InputError(f"{names[0]} and {names[1]}", f"the lattices differ: {one} and "
+                             f"{other} {what}", "compare maps of the same plate")
+    if abs(a.grid_pitch_m - b.grid_pitch_m) > PITCH_TOLERANCE * a.grid_pitch_m:
+        raise InputError(f"{names[0]} and {names[1]}", "the lattices differ: pitches of "
+                         f"{a.grid_pitch_m * 1e3:.9g} and {b.grid_pitch_m * 1e3:.9g} mm",
+                         "compare maps of the same plate")
+
+
+def _theta_test(a: CalibrationResult, b: CalibrationResult,
+                d_theta: np.ndarray) -> Significance | None:
+    known = np.isfinite(d_theta)
+    if known.sum() < 2:
+        return None
+    values = d_theta[known] - d_theta[known].mean()
+    return _significance(values, [theta_covariance(r, known) for r in (a, b)],
+                         np.ones((int(known.sum()), 1)), _noise_dof(a, b, "theta"))
+
+
+def _significance(values: np.ndarray, covariances: list[tuple[np.ndarray, bool]],
+                  removed: np.ndarray, noise_dof: float) -> Significance | None:
+    """Test values from which the columns `removed` were taken out by least squares.
+
+    The mean of the squares over their variances is compared with its own distribution,
+    approximated by a scaled chi^2 with the same mean and variance (Satterthwaite), or F where
+    the noise itself is known from few residuals.
+    """
+    correlated = all(flag for _, flag in covariances)
+    total = sum(covariance if correlated or covariance.ndim == 1 else np.diag(covariance)
+                for covariance, _ in covariances)
+    if not np.isfinite(total).all() or not total.any():
+        return None
+    q = np.linalg.qr(removed)[0]
+    if total.ndim == 1:
+        variance = total * (1 - (q**2).sum(axis=1))
+        twice_squares = 2.0 * len(values) ** 2 / (len(values) - q.shape[1])
+    else:
+        total = total - q @ (q.T @ total)
+        total = total - (total @ q) @ q.T
+        variance = np.diag(total).copy()
+    good = variance > 1e-9 * variance.max()
+    weights = np.where(good, 1 / np.where(good, variance, 1.0), 0.0)
+    ratio = float(weights @ values**2 / good.sum())
+    if total.ndim == 2:
+        scaled = total * np.sqrt(weights)[:, None] * np.sqrt(weights)
+        twice_squares = 2 * float((scaled**2).sum())
+    dof = 2 * float(good.sum()) ** 2 / twice_squares
+    p = chi2.sf(ratio * dof, dof) if noise_dof > MANY_DOF else f_test.sf(ratio, dof, noise_dof)
+    return Significance(ratio, dof, float(p), correlated)
+
+
+def _noise_dof(a: CalibrationResult, b: CalibrationResult, kind: str) -> float:
+    """Return the effective degrees of freedom of the noise behind both uncertainties.
+
+    Welch and Satterthwaite; what the detections declare counts as known.
+    """
+    parts = []
+    for noise in (a.noise, b.noise):
+        sigma = getattr(noise, f"sigma_{kind}")
+        dofs = {getattr(noise, f"sigma_{kind}_{way}"): getattr(noise, f"dof_{kind}_{way}")
+                for way in ("repeats", "residuals")}
+        parts.append((sigma**2, dofs.get(sigma) or np.inf))
+    return sum(v for v, _ in parts)**2 / max(sum(v**2 / dof for v, dof in parts), 1e-300)
+
+
+@dataclass(frozen=True)
+class LaserDifference:
+    """One first-order part of a map against the laser's: squareness as O, or scale as R.
+
+    `difference` is laser less map; `u` its standard uncertainty, NaN where not known; `p` the
+    two-sided probability of so large a difference.
+    """
+
+    name: str
+    of_map: float
+    of_laser: float
+    u: float
+    p: float
+
+    @property
+    def difference(self) -> float:
+        """Laser less map."""
+        return self.of_laser - self.of_map
+
+
+@one_thread()
+def compare_with_laser(result: CalibrationResult, laser: dict,
+                       where: str) -> list[LaserDifference]:
+    """Compare O and R of a map with a step-diagonal measurement.
+
+    Parameters
+    ----------
+    result : CalibrationResult
+        The calibration.
+    laser : dict
+        OUT.json of `selfcal step-diagonal`; its ``error_map_equivalent`` is read.
+    where : str
+        File name, for messages.
+
+    Raises
+    ------
+    InputError
+        If the laser's result has no first-order parts of an error map.
+    """
+    parts = laser.get("error_map_equivalent")
+    if not isinstance(parts, dict) or parts.get("nonorthogonality") is None:
+        raise InputError(where, "no error_map_equivalent with a nonorthogonality",
+                         "give an OUT.json of a 2D measurement that `selfcal step-diagonal` wrote")
+    of_map = {"nonorthogonality": result.error_map.nonorthogonality,
+              "scale_difference": result.error_map.scale_difference}
+    u_map = first_order_u(result)
+    out = []
+    for (name, value), u_of_map in zip(of_map.items(), u_map, strict=True):
+        if parts.get(name) is None:
+            continue
+        u_laser = parts.get(f"u_{name}")
+        u = float(np.hypot(u_of_map, np.nan if u_laser is None else u_laser))
+        gap = abs(float(parts[name]) - value)
+        p = 2 * float(norm.sf(gap / u)) if u > 0 else float("nan")
+        out.append(LaserDifference(name, value, float(parts[name]), u, p))
+    return out

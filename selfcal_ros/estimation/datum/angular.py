@@ -1,0 +1,162 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The datum of the angular map: zero mean, or Hu's four axis conditions (eqs. 9, 27).
+
+The four conditions fix one free constant and test three differences. They shall not bend the
+XY map, so they act on Gtheta alone, with slopes and rotations as the readings gave them.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import chdtri
+
+from selfcal_ros.estimation.normal.equations import JointSystem
+from selfcal_ros.model.error_map import ThetaDatum
+from selfcal_ros.model.readings import Sense
+
+MISCLOSURE_LEVEL = 1e-4
+"""Level of the test of the three redundant axis conditions."""
+
+CLOSED_RAD = 1e-12
+"""Misclosure that is rounding, not a fault, rad."""
+
+
+@dataclass(frozen=True, eq=False)
+class Conditions:
+    """Linear conditions on the angular map and the map's answer to them.
+
+    In the frame of the equations: with ``plate_moves`` the solved fields are H(X) = -G(-X).
+
+    Attributes
+    ----------
+    datum : ThetaDatum
+        The convention that they hold.
+    rows : float array (conditions, K)
+        rows @ Gtheta = slopes @ G.
+    slopes : complex array (conditions, nx, ny)
+        Slopes of the XY error, 1 / length; real inner product. Zero for ``zero_mean``.
+    gain : float array (K, conditions)
+        Change of Gtheta for a unit misclosure.
+    phi_gain : float array (views, conditions)
+        Change of phi of the angular views that no grid reading fixes.
+    """
+
+    datum: ThetaDatum
+    rows: np.ndarray
+    slopes: np.ndarray
+    gain: np.ndarray
+    phi_gain: np.ndarray
+
+
+def slope_rows(z_m: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Return the slopes of `datum.axis_slopes` as rows over the sites, complex (4, nx, ny).
+
+    A row of zeros stands for a half axis with fewer than two known sites.
+
+    Parameters
+    ----------
+    z_m : complex array (nx, ny)
+        Site positions, m.
+    known : bool array (nx, ny)
+        Sites that count.
+    """
+    hx, hy = (size // 2 for size in z_m.shape)
+    out = np.zeros((4, *z_m.shape), dtype=complex)
+    halves = ((np.s_[hx + 1:, hy], 1j), (np.s_[hx, hy + 1:], -1), (np.s_[:hx, hy], 1j),
+              (np.s_[hx, :hy], -1))
+    for row, (part, unit) in zip(out, halves, strict=True):
+        good = known[part]
+        if good.sum() >= 2:
+            at = (z_m[part].real + z_m[part].imag) * good
+            centred = (at - at.sum() / good.sum()) * good
+            row[part] = unit * centred / (centred @ centred)
+    return out
+
+
+def conditions_for(system: JointSystem, datum: ThetaDatum, sense: Sense,
+                   half_width_m: float) -> Conditions:
+    """Return the conditions of a datum on what was measured.
+
+    ``xy_axes`` becomes ``zero_mean`` if no half axis has two known sites.
+
+    Parameters
+    ----------
+    system : JointSystem
+        The measured plan.
+    datum : ThetaDatum
+        The convention wanted.
+    sense : Sense
+        Who moves.
+    half_width_m : float
+        Length of the unit of the system's positions, m.
+    """
+    key = ("conditions", datum, sense, half_width_m)
+    if key not in system.memo:
+        system.memo[key] = _conditions(system, datum, sense, half_width_m)
+    return system.memo[key]
+
+
+def _conditions(system: JointSystem, datum: ThetaDatum, sense: Sense,
+                half_width_m: float) -> Conditions:
+    known, n_lines = system.known_lines, system.angular.n_lines
+    flipped = sense is Sense.PLATE_MOVES
+    if datum is ThetaDatum.XY_AXES and n_lines:
+        sites = system.known_sites[::-1, ::-1] if flipped else system.known_sites
+        slopes = slope_rows(system.grid.views.z * half_width_m, sites)
+        lines = np.arange(4) * (n_lines // 4)
+        rows = np.zeros((4, n_lines))
+        rows[np.arange(4), lines] = 1.0
+        if flipped:
+            rows = -rows[:, -np.arange(n_lines) % n_lines]
+            slopes = -slopes[:, ::-1, ::-1]
+        use = np.array([known[row != 0].all() for row in rows]) & (slopes != 0).any(axis=(1, 2))
+        if use.any():
+            return _solve_conditions(system, rows[use], slopes[use])
+    rows = np.atleast_2d(known / max(known.sum(), 1))
+    return Conditions(ThetaDatum.ZERO_MEAN, rows,
+                      np.zeros((1, *system.grid.views.shape), dtype=complex),
+                      np.ones((n_lines, 1)), np.zeros((system.angular.n_views, 1)))
+
+
+def _solve_conditions(system: JointSystem, rows: np.ndarray, slopes: np.ndarray) -> Conditions:
+    """Return the least-squares answer of the angular equations, given phi of the grid views."""
+    angular = system.angular
+    free = [v for v, i in enumerate(system.angular_index) if i not in system.grid_index]
+    inverse = np.linalg.pinv(angular.schur[np.ix_(free, free)], hermitian=True)
+    response = angular.response[:, free]
+    spread = angular.solve(np.ascontiguousarray(rows.T))
+    spread = spread + response @ (inverse @ (response.T @ rows.T))
+    n, ones = len(rows), rows.sum(axis=1)
+    border = np.zeros((n + 1, n + 1))
+    border[:n, :n] = rows @ spread
+    border[:n, n] = border[n, :n] = ones
+    solved = np.linalg.pinv(border)[:, :n]
+    gain = spread @ solved[:n] + solved[n]
+    phi_gain = np.zeros((angular.n_views, n))
+    phi_gain[free] = -inverse @ (response.T @ rows.T) @ solved[:n]
+    return Conditions(ThetaDatum.XY_AXES, rows, slopes, gain, phi_gain)
+
+
+def misclosure_warning(misclosure: np.ndarray, covariance: np.ndarray) -> str:
+    """Return a warning if the redundant axis conditions contradict the readings.
+
+    Parameters
+    ----------
+    misclosure : float array (conditions,)
+        Slopes less Gtheta at the axes, up to one common constant, rad.
+    covariance : float array (conditions, conditions)
+        Its covariance, rad^2.
+    """
+    n = len(misclosure)
+    if n < 2:
+        return ""
+    contrasts = np.linalg.qr(np.column_stack([np.ones(n), np.eye(n)[:, 1:]]))[0][:, 1:].T
+    left = contrasts @ misclosure
+    spread = contrasts @ covariance @ contrasts.T + CLOSED_RAD**2 * np.eye(n - 1)
+    value = float(left @ np.linalg.solve(spread, left))
+    if not value > chdtri(n - 1, MISCLOSURE_LEVEL):
+        return ""
+    arcsec = np.degrees(np.abs(left).max()) * 3600
+    return (f"theta: the stage does not satisfy the axis conditions of the datum xy_axes: "
+            f"misclosure {arcsec:.3g} arcsec, chi2 {value:.3g} with {n - 1} degrees of freedom; "
+            "use zero_mean")

@@ -1,0 +1,154 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Covariance of the calibrated maps: exact, with the datum, without forming it as a whole.
+
+For unit noise the sites have the covariance S = M^-1 + Y P Y', with M the eliminated matrix,
+Y its answer to the misalignments and P their covariance; the datum projects it.
+"""
+
+from functools import cached_property
+
+import numpy as np
+
+from selfcal_ros.estimation.datum.angular import Conditions
+from selfcal_ros.estimation.datum.scale import ScaleDatum
+from selfcal_ros.estimation.normal.equations import JointSystem
+
+NO_NOISE_M = 1e-100
+"""Noise that stands for none: its square is still a number."""
+
+
+class FieldCovariance:
+    """Covariance of the stage map G in its datum, for unit noise of one grid reading.
+
+    Parameters
+    ----------
+    system : JointSystem
+        The measured plan.
+    inverse : float array (size, size)
+        Covariance of the misalignments for unit grid noise.
+    scale : ScaleDatum, optional
+        What sets the scale of the map; without it the map has none.
+    sigma : float
+        Noise of one grid reading, m, by which the reference's uncertainty is measured.
+    """
+
+    def __init__(self, system: JointSystem, inverse: np.ndarray,
+                 scale: ScaleDatum | None = None, sigma: float = 1.0) -> None:
+        self.system, self.inverse = system, inverse
+        self.scale, self._u2 = scale, 0.0
+        if scale is not None:
+            self._u2 = scale.variance + (scale.u_m / max(sigma, NO_NOISE_M)) ** 2
+        n = 3 * system.grid.n_views
+        self._p = inverse[:n, :n]
+
+    def _raw(self, rows: np.ndarray) -> np.ndarray:
+        """Return S times complex columns (sites, k)."""
+        response = self.system.grid.response
+        answer = self._p @ np.real(response.conj().T @ rows)
+        return self.system.grid.factor.solve(np.ascontiguousarray(rows)) + response @ answer
+
+    @cached_property
+    def _datum(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        basis = self.system.gauge.orthonormal
+        spread = self._raw(basis)
+        return basis, spread, np.real(basis.conj().T @ spread)
+
+    def project(self, rows: np.ndarray) -> np.ndarray:
+        """Return functionals (sites, k) as they act on a map that is not in its datum."""
+        basis = self.system.gauge.orthonormal
+        return rows - basis @ np.real(basis.conj().T @ rows)
+
+    def of(self, rows: np.ndarray) -> np.ndarray:
+        """Return the covariance (k, k) of functionals Re(conj(row) G), complex (k, nx, ny)."""
+        flat = rows.reshape(len(rows), -1).T
+        out, extra = self.project(flat), 0.0
+        moved = np.zeros((self.system.grid.response.shape[1], len(rows)))
+        if self.scale is not None:
+            grown = np.real(self.system.grid.views.z.ravel().conj() @ flat)
+            out = out + self.scale.rows[:, None] * grown
+            moved, extra = np.outer(self.scale.parameters, grown), self._u2 * np.outer(grown, grown)
+        answer = np.real(self.system.grid.response.conj().T @ out) - moved
+        solved = self.system.grid.factor.solve(np.ascontiguousarray(out))
+        cov = np.real(out.conj().T @ solved) + answer.T @ self._p @ answer + extra
+        return (cov + cov.T) / 2
+
+    def _of_scale(self) -> tuple[np.ndarray, float]:
+        """Return the covariance of the scale with G in its datum (sites,), and its variance."""
+        grid, rows = self.system.grid, self.scale.rows
+        answer = np.real(grid.response.conj().T @ rows) - self.scale.parameters
+        solved = grid.factor.solve(rows)
+        spread = solved + grid.response @ (self._p @ answer)
+        basis = self.system.gauge.orthonormal
+        variance = float(np.real(np.vdot(rows, solved)) + answer @ self._p @ answer) + self._u2
+        return spread - basis @ np.real(basis.conj().T @ spread), variance
+
+    def diagonal(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the variances of Gx and Gy at every site, (nx, ny) each; NaN if unknown."""
+        grid = self.system.grid
+        basis, spread, inner = self._datum
+        out = []
+        response = grid.response
+        common = grid.factor.inverse_diagonal()
+        with_scale, of_scale = (None, 0.0) if self.scale is None else self._of_scale()
+        for part in (np.real, np.imag):
+            b, s, y = part(basis), part(spread), part(response)
+            value = common + np.einsum("sa,ab,sb->s", y, self._p, y)
+            value += np.einsum("sk,kl,sl->s", b, inner, b) - 2 * np.einsum("sk,sk->s", b, s)
+            if with_scale is not None:
+                z = part(grid.views.z.ravel())
+                value += 2 * z * part(with_scale) + z**2 * of_scale
+            out.append(np.where(self.system.known_sites, np.maximum(value, 0.0).reshape(
+                grid.views.shape), np.nan))
+        return out[0], out[1]
+
+
+def angular_variance(field: FieldCovariance, conditions: Conditions, *,
+                     sigma: tuple[float, float], half_width_m: float
+                     ) -> tuple[np.ndarray, np.ndarray]:
+    """Return the variance of Gtheta (K,) in its datum and the covariance of the misclosure.
+
+    Parameters
+    ----------
+    field : FieldCovariance
+        Covariance of the XY map.
+    conditions : Conditions
+        The angular datum.
+    sigma : tuple of float
+        Noise of one grid reading, m, and of one angular reading, rad.
+    half_width_m : float
+        Length of the unit of the system's positions, m.
+    """
+    system, (sigma_xy, sigma_theta) = field.system, sigma
+    angular, rows, gain = system.angular, conditions.rows, conditions.gain
+    per_phi = sigma_xy**2 / half_width_m**2
+    p_phi = field.inverse[np.ix_(system.phi_at, system.phi_at)] * per_phi
+    y = angular.response
+
+    columns = angular.solve(np.ascontiguousarray(rows.T)) * sigma_theta**2
+    columns = columns + y @ (p_phi @ (y.T @ rows.T))
+    variance = sigma_theta**2 * _inverse_diagonal(system) + np.einsum("ka,ab,kb->k", y, p_phi, y)
+
+    flat = field.project(conditions.slopes.reshape(len(rows), -1).T)
+    n = 3 * system.grid.n_views
+    answer = np.real(system.grid.response.conj().T @ flat) * sigma_xy**2 / half_width_m
+    with_slopes = y @ (field.inverse[np.ix_(system.phi_at, np.arange(n))] @ answer)
+    of_slopes = field.of(conditions.slopes) * sigma_xy**2
+
+    cross = rows @ with_slopes
+    closure = of_slopes + rows @ columns - cross - cross.T
+    both = with_slopes - columns
+    variance = variance + np.einsum("kc,cd,kd->k", gain, closure, gain)
+    variance = variance + 2 * np.einsum("kc,kc->k", gain, both)
+    return np.where(system.known_lines, np.maximum(variance, 0.0), np.nan), closure
+
+
+def _inverse_diagonal(system: JointSystem) -> np.ndarray:
+    n = system.angular.n_lines
+    out = np.empty(n)
+    for start in range(0, n, 512):
+        stop = min(start + 512, n)
+        unit = np.zeros((n, stop - start))
+        unit[np.arange(start, stop), np.arange(stop - start)] = 1.0
+        out[start:stop] = system.angular.solve(unit)[np.arange(start, stop),
+                                                     np.arange(stop - start)]
+    return out

@@ -1,0 +1,168 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The joint least squares of one set of readings (method, sections 2-4)."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from selfcal_ros.errors import InputError
+from selfcal_ros.estimation.datum.scale import scale_of
+from selfcal_ros.estimation.joint.iterated import solve_iterated
+from selfcal_ros.estimation.joint.noise import Level, level
+from selfcal_ros.estimation.joint.problem import (
+    ROUNDING,
+    AngularPart,
+    Problem,
+    Raw,
+    grid_level,
+    sigma_of,
+    weight_ratio,
+)
+
+MAX_RIGID_STEPS = 20
+
+RIGID_RESOLUTION = 1e-11
+"""Change of a misalignment, against the largest, at which rotations stand still."""
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """A solution in its datum, in the frame of the equations (H for ``plate_moves``).
+
+    Attributes
+    ----------
+    field, plate : complex array (nx, ny)
+        G and A, m.
+    residuals : complex array (views, nx, ny)
+        Grid residuals in the plate frame, m; 0 where not read.
+    parameters : float array (size,)
+        Misalignments as in `JointSystem`: phi times the half width, tau; m.
+    g_theta, a_theta : float array (K,)
+        Angular maps, rad.
+    residuals_theta : float array (views, K)
+        Angular residuals, rad.
+    misclosure : float array (conditions,)
+        Slopes less Gtheta before the angular datum was applied, rad.
+    xy, theta : Level
+        Noise of the grid and of the angular readings.
+    inverse : float array (size, size)
+        Covariance of the misalignments for unit grid noise; empty if the sites were iterated.
+    solver : dict
+        How the equations were solved, and to what residual.
+    """
+
+    field: np.ndarray
+    plate: np.ndarray
+    residuals: np.ndarray
+    parameters: np.ndarray
+    g_theta: np.ndarray
+    a_theta: np.ndarray
+    residuals_theta: np.ndarray
+    misclosure: np.ndarray
+    xy: Level
+    theta: Level
+    inverse: np.ndarray
+    solver: dict
+
+
+def fit(problem: Problem, y: np.ndarray) -> Fit:
+    """Return the joint least-squares solution.
+
+    Each kind of readings is first fitted alone, for its noise; the two noises then weigh them
+    against each other in the views' rotations, which both see.
+
+    Parameters
+    ----------
+    problem : Problem
+        The plan and its readings.
+    y : complex array (views, nx, ny)
+        Grid deviations in the plate frame, m.
+    """
+    system, grid, angular = problem.system, problem.system.grid, problem.system.angular
+    n, length = 3 * grid.n_views, problem.half_width_m
+    theta = _angular_part(problem)
+    raw = (_solve_direct if problem.direct else solve_iterated)(problem, y, theta)
+    field, parameters = raw.field, raw.parameters
+
+    parts = system.gauge.parts(field)
+    field = system.gauge.remove(field, parts)
+    parameters = parameters - parts @ system.rigid[:4]
+    plate, residuals = grid.plate(y, field, parameters[:n])
+    plate_parts = system.plate_gauge.parts(plate)
+    plate = system.plate_gauge.remove(plate, plate_parts)
+    parameters = parameters - plate_parts @ system.rigid[4:]
+    if problem.reference is not None:
+        grown = scale_of(system, problem.reference, field=field, plate=plate,
+                         half_width_m=length)
+        field, plate = field + grown * grid.views.z, plate - grown * grid.views.z
+        parameters = parameters + grown * system.rigid[3]
+    xy = raw.xy or grid_level(problem, residuals)
+
+    conditions = problem.conditions
+    phi = parameters[system.phi_at] / length
+    g_theta = theta.free - angular.response @ phi
+    slopes = np.einsum("cij,ij->c", conditions.slopes.conj(), field).real
+    misclosure = slopes - conditions.rows @ g_theta
+    g_theta = g_theta + conditions.gain @ misclosure
+    phi = phi + conditions.phi_gain @ misclosure
+    parameters[system.phi_at] = phi * length
+    a_theta, residuals_theta = angular.plate(problem.angular.y, g_theta, phi)
+    return Fit(field, plate, residuals, parameters, g_theta, a_theta, residuals_theta,
+               misclosure, xy, theta.level, raw.inverse, raw.solver)
+
+
+def fit_rigid(problem: Problem) -> Fit:
+    """Return the solution for finite rotations of the plate (Gauss-Newton).
+
+    A mark lies at R(phi) R^q (m + A) + t. What that holds beyond the linear model,
+    ((R(phi) - 1 - phi J) m + (R(phi) - 1) A) in the plate frame, is taken off the readings with the
+    last solution until it stands still; every step solves the same factored equations.
+    """
+    y, n = problem.grid.y, 3 * problem.system.grid.n_views
+    found = fit(problem, y)
+    marks = problem.system.grid.views.z * problem.half_width_m
+    for _ in range(MAX_RIGID_STEPS):
+        phi = found.parameters[:n:3, None, None] / problem.half_width_m
+        turn = np.expm1(1j * phi)
+        excess = (turn - 1j * phi) * marks + turn * found.plate
+        step = fit(problem, np.where(problem.system.grid.read, y - excess, 0.0))
+        change = float(np.abs(step.parameters - found.parameters).max())
+        found = step
+        still = RIGID_RESOLUTION * float(np.abs(step.parameters).max())
+        if change <= max(still, ROUNDING * float(np.abs(y).max())):
+            return found
+    raise InputError("misalignment model 'rigid'", "the rotations do not settle",
+                     "check the readings for misalignments of more than a few degrees")
+
+
+def _solve_direct(problem: Problem, y: np.ndarray, theta: AngularPart) -> Raw:
+    system, grid = problem.system, problem.system.grid
+    n = 3 * grid.n_views
+    free, d = grid.reduced(y)
+    alone = system.grid_inverse @ d
+    field = (free - grid.response @ alone).reshape(grid.views.shape)
+    if not system.angular.n_views:
+        return Raw(field, alone, None, system.grid_inverse, {"method": "multifrontal"})
+    xy = grid_level(problem, grid.plate(y, field, alone)[1])
+    ratio = weight_ratio(problem, xy.sigma, theta.level.sigma, y)
+    right = np.zeros(system.size)
+    right[:n] = d
+    right[system.phi_at] += ratio * problem.half_width_m * theta.d
+    inverse = system.inverse(ratio)
+    parameters = inverse @ right
+    field = (free - grid.response @ parameters[:n]).reshape(grid.views.shape)
+    return Raw(field, parameters, xy, inverse, {"method": "multifrontal"})
+
+
+def _angular_part(problem: Problem) -> AngularPart:
+    angular, y = problem.system.angular, problem.angular.y
+    if not angular.n_views:
+        nothing = level((float("nan"), 0), (float("nan"), 0), float("nan"))
+        return AngularPart(np.full(angular.n_lines, np.nan), np.zeros(0), nothing)
+    free, d = angular.reduced(y)
+    phi = problem.system.angular_inverse @ d
+    _, left = angular.plate(y, free - angular.response @ phi, phi)
+    dof = angular.n_readings - problem.system.rank_angular
+    found = level(problem.repeats_theta, sigma_of(float((angular.weight * left**2).sum()), dof),
+                  problem.angular.sigma_declared)
+    return AngularPart(free, d, found)

@@ -1,0 +1,236 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Large fields: conjugate gradients with a cosine-transform preconditioner (method, section 7).
+
+The plate and the misalignments are eliminated exactly in every product; what is iterated is the
+stage map alone. The fields that a quarter turn maps to themselves meet only differences over a
+shift, a Laplacian with free edges; all others meet a turn as well, a Laplacian plus a constant.
+Both are diagonal under the DCT-II, in whose basis a quarter turn is a transposition with signs.
+"""
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.fft import dct, dctn, idctn, next_fast_len
+
+from selfcal_ros.errors import InputError
+from selfcal_ros.estimation.lattice.maps import PHASES
+from selfcal_ros.estimation.normal.grid import GridSystem
+
+TOLERANCE = 1e-12
+"""Residual of the normal equations at which the iteration ends, relative to the right side."""
+
+DENSE_DCT = 600
+"""Largest side whose cosine transform may be a matrix product."""
+
+MAX_ITERATIONS = 2000
+
+
+@dataclass(frozen=True, eq=False)
+class Iterated:
+    """A solution by iteration.
+
+    Attributes
+    ----------
+    field : complex array (nx, ny)
+        G, in no particular datum.
+    parameters : float array (3 views,) or more
+        Misalignments.
+    iterations : int
+        Steps taken.
+    relative_residual : float
+        True residual b - N G, computed afresh at the end, over |b|.
+    """
+
+    field: np.ndarray
+    parameters: np.ndarray
+    iterations: int
+    relative_residual: float
+
+
+class GridIteration:
+    """Matrix-free normal equations of the grid readings, misalignments eliminated.
+
+    Parameters
+    ----------
+    grid : GridSystem
+        The readings.
+    inverse : float array (3 views, 3 views)
+        Pseudo-inverse of the misalignments' block, with what the angular readings add to it.
+    """
+
+    def __init__(self, grid: GridSystem, inverse: np.ndarray) -> None:
+        self.grid, self.inverse = grid, inverse
+        self._diagonal = grid.views.scatter_weight(grid.weight)
+        self._symbols = preconditioner_symbols(grid)
+        self._loose = loose_sites(grid)
+        size = max(grid.views.shape)
+        slow = next_fast_len(size, real=True) != size and size <= DENSE_DCT
+        self._cosines = (dct(np.eye(size, dtype=np.float32), axis=0, norm="ortho") if slow
+                         else None)
+        self._pool = ThreadPoolExecutor(2) if slow else None
+        self._x, self._y = grid.views.z[:, 0].real, grid.views.z[0].imag
+
+    def spread(self, parameters: np.ndarray) -> np.ndarray:
+        """Return C parameters as a field."""
+        p = parameters.reshape(-1, 3)
+        flat = np.stack([p[:, 0] + 0j, p[:, 1] + 1j * p[:, 2]], axis=1).ravel() @ self.grid.columns
+        return flat.reshape(self.grid.views.shape)
+
+    def product(self, field: np.ndarray) -> np.ndarray:
+        """Return the normal matrix times a field."""
+        grid = self.grid
+        mean = grid.views.gather_mean(field, grid.share)
+        out = self._diagonal * field
+        grid.views.subtract_scattered(out, grid.weight, mean)
+        out -= self.spread(self.inverse @ grid.coupled(field.ravel()))
+        return out
+
+    def remove_rigid(self, field: np.ndarray) -> None:
+        """Take the rigid modes, which no reading tells and rounding would feed, off a field."""
+        rows, columns = field.sum(axis=1), field.sum(axis=0)
+        mean = rows.sum() / field.size
+        turn = (self._x @ rows - 1j * (self._y @ columns)) / (
+            field.shape[1] * (self._x @ self._x) + field.shape[0] * (self._y @ self._y))
+        field -= (mean + turn * self._x)[:, None]
+        field -= 1j * turn * self._y
+
+    def precondition(self, field: np.ndarray) -> np.ndarray:
+        """Return an approximate inverse of the normal matrix times a field."""
+        shape, size, loose = field.shape, max(field.shape), self._loose * field
+        low = [(size - n) // 2 for n in shape]
+        part = np.s_[low[0]:low[0] + shape[0], low[1]:low[1] + shape[1]]
+        if shape != (size, size):
+            square = np.zeros((size, size), dtype=complex)
+            square[part] = field
+            field = square
+        turning, rest = self._symbols
+        hat = self._transform(field.astype(np.complex64), dctn)
+        turned = hat.T.copy()
+        turned[::2] *= np.complex64(1j)
+        turned[1::2] *= np.complex64(-1j)
+        turned += hat
+        turned *= turning
+        hat *= rest
+        hat += turned
+        loose += self._transform(hat, idctn)[part]
+        return loose
+
+    def _transform(self, field: np.ndarray, transform: Callable) -> np.ndarray:
+        """Return the DCT-II of a field or its inverse, in single precision.
+
+        Lengths with large prime factors are slow in a fast transform; up to `DENSE_DCT` a matrix
+        product is faster for them.
+        """
+        if self._cosines is None:
+            return transform(field, type=2, norm="ortho", workers=-1)
+        cosines = self._cosines if transform is dctn else self._cosines.T
+        out = np.empty_like(field)
+
+        def transform_part(name: str) -> None:
+            part = np.ascontiguousarray(getattr(field, name))
+            setattr(out, name, cosines @ part @ cosines.T)
+
+        # two parts, two threads: neither depends on the other
+        list(self._pool.map(transform_part, ("real", "imag")))
+        return out
+
+    def solve(self, b: np.ndarray, d: np.ndarray, *, start: np.ndarray | None = None,
+              tolerance: float = TOLERANCE) -> Iterated:
+        """Return the solution of the normal equations.
+
+        Parameters
+        ----------
+        b : complex array (nx, ny)
+            Right side of the sites.
+        d : float array (3 views,)
+            Right side of the misalignments.
+        start : complex array (nx, ny), optional
+            Field to start from.
+        tolerance : float
+            Relative residual to reach.
+
+        Raises
+        ------
+        InputError
+            If the residual does not fall to `tolerance`: weights differ by many orders.
+        """
+        right = b - self.spread(self.inverse @ d)
+        self.remove_rigid(right)
+        target = tolerance * _norm(right)
+        field = np.zeros_like(b) if start is None else start.copy()
+        left = right - self.product(field) if start is not None else right.copy()
+        count, direction, rho = 0, np.zeros_like(b), 1.0
+        while (size := _norm(left)) > target:
+            if count == MAX_ITERATIONS:
+                raise InputError(
+                    "weights", f"the residual stays at {size / target * tolerance:.1e} after "
+                    f"{MAX_ITERATIONS} iterations, because repeats or declared uncertainties "
+                    "differ too much", "leave out the weakest readings")
+            z = self.precondition(left)
+            new = _dot(left, z)
+            direction *= new / rho if count else 0.0
+            direction += z
+            rho = new
+            image = self.product(direction)
+            step = rho / _dot(direction, image)
+            field += step * direction
+            image *= step
+            left -= image
+            self.remove_rigid(left)
+            count += 1
+        true = _norm(right - self.product(field)) / max(_norm(right), 1e-300)
+        parameters = self.inverse @ (d - self.grid.coupled(field.ravel()))
+        return Iterated(field, parameters, count, true)
+
+
+def preconditioner_symbols(grid: GridSystem) -> tuple[np.ndarray, np.ndarray]:
+    """Return the diagonals that act on hat + T hat (turning fields) and on hat (all), (N, N).
+
+    T is a quarter turn in the DCT basis; (hat + T hat) / 2 where kx + ky is odd is the part of a
+    field that quarter turns map to itself.
+    """
+    size = max(grid.views.shape)
+    k = np.arange(size) * (np.pi / size)
+    laplace = np.zeros((size, size))
+    other = np.zeros((size, size))
+    pairs = [(i, j) for i in range(grid.n_views) for j in range(i)]
+    for i, j in pairs:
+        weight = np.vdot(grid.weight[i], grid.share[j]) / max(np.count_nonzero(grid.read[i]), 1)
+        p, r = grid.views.poses[i], grid.views.poses[j]
+        shift = (PHASES[-p.q % 4] * complex(p.a, p.b) - PHASES[-r.q % 4] * complex(r.a, r.b))
+        a, b = round(shift.real), round(shift.imag)
+        both = np.outer(np.cos(a * k), np.cos(b * k)) + np.outer(np.cos(b * k), np.cos(a * k))
+        laplace += weight * (2 - both)
+        same = (p.q - r.q) % 4 == 0
+        other += weight * ((2 - both) if same else (2 + both / 3))
+    odd = (np.arange(size)[:, None] + np.arange(size)) % 2 == 1
+    floor = 1e-3 * laplace[laplace > 0].min(initial=1.0)
+    inverse = 1 / np.maximum(other, floor)
+    turning = np.where(odd, 0.5 * (1 / np.maximum(laplace, floor) - inverse), 0.0)
+    return turning.astype(np.float32), inverse.astype(np.float32)
+
+
+def loose_sites(grid: GridSystem) -> np.ndarray:
+    """Return what the inverse of the matrix has on its diagonal beyond that of a full plate.
+
+    A site that has lost readings is looser than the transform, which knows full plates alone,
+    takes it for; this keeps the number of steps from growing with the marks that are missing.
+    """
+    views = grid.views
+    full = GridSystem(views.poses, views.in_field * grid.mean_weight, views.unit)
+    now, then = (views.scatter_weight(one.weight * (1 - one.share)) for one in (grid, full))
+    good = (now > 0) & (then > 0)
+    out = np.zeros(views.shape)
+    out[good] = np.maximum(1 / now[good] - 1 / then[good], 0.0)
+    return out
+
+
+def _dot(a: np.ndarray, b: np.ndarray) -> float:
+    """Return Re(a, b); with one BLAS thread the order of the sum is fixed."""
+    return float(np.vdot(a, b).real)
+
+
+def _norm(a: np.ndarray) -> float:
+    return float(np.sqrt(_dot(a, a)))

@@ -1,0 +1,108 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is to be fitted, and how its two kinds of readings weigh against each other."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from selfcal_ros.estimation.datum.angular import Conditions
+from selfcal_ros.estimation.joint.noise import Level, level, pooled
+from selfcal_ros.estimation.lattice.readings import AngularData, GridData
+from selfcal_ros.estimation.normal.equations import JointSystem
+from selfcal_ros.estimation.options import ReferenceLength
+from selfcal_ros.model.readings import Measurements
+
+ROUNDING = 16 * np.finfo(float).eps
+"""Noise below this part of the largest deviation is rounding."""
+
+MAX_WEIGHT = 1e8
+"""Largest weight of one kind of readings against the other, all together: beyond, the lighter one
+would be lost in the rounding of the heavier, and with it the rotations that it alone tells."""
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """What is to be fitted.
+
+    Attributes
+    ----------
+    system : JointSystem
+        The measured plan.
+    grid, angular : GridData, AngularData
+        The readings.
+    repeats_xy, repeats_theta : tuple
+        (sigma, degrees of freedom) from the scatter of repeats.
+    half_width_m : float
+        Unit of the system's positions, m.
+    conditions : Conditions
+        Angular datum.
+    direct : bool
+        Whether the sites are factorised rather than iterated.
+    reference : ReferenceLength, optional
+        What sets the scale.
+    """
+
+    system: JointSystem
+    grid: GridData
+    angular: AngularData
+    repeats_xy: tuple[float, int]
+    repeats_theta: tuple[float, int]
+    half_width_m: float
+    conditions: Conditions
+    direct: bool
+    reference: ReferenceLength | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class AngularPart:
+    """Angular equations with stage lines eliminated: M^-1 b, right side of phi, noise."""
+
+    free: np.ndarray
+    d: np.ndarray
+    level: Level
+
+
+@dataclass(frozen=True, eq=False)
+class Raw:
+    """A solution in no particular datum; `xy` is None where it is yet to be taken from it."""
+
+    field: np.ndarray
+    parameters: np.ndarray
+    xy: Level | None
+    inverse: np.ndarray
+    solver: dict
+
+
+def repeats_of(measurements: Measurements) -> tuple[tuple[float, int], tuple[float, int]]:
+    """Return pooled (sigma, degrees of freedom) of the repeats, grid and angular."""
+    views = measurements.views
+    return (pooled((v.sigma_xy, v.dof_xy) for v in views if len(v.m)),
+            pooled((v.sigma_theta, v.dof_theta) for v in views if len(v.k)))
+
+
+def grid_level(problem: Problem, left: np.ndarray) -> Level:
+    """Return the noise of the grid readings, given their residuals (views, nx, ny)."""
+    grid = problem.system.grid
+    dof = 2 * grid.n_readings - problem.system.rank_grid
+    total = float((grid.weight * (left.real**2 + left.imag**2)).sum())
+    return level(problem.repeats_xy, sigma_of(total, dof), problem.grid.sigma_declared)
+
+
+def sigma_of(total: float, dof: int) -> tuple[float, int]:
+    """Return (sigma, dof) of a weighted sum of squares."""
+    return (float(np.sqrt(total / dof)), dof) if dof > 0 else (float("nan"), 0)
+
+
+def weight_ratio(problem: Problem, sigma_xy: float, sigma_theta: float, y: np.ndarray) -> float:
+    """Return the weight of an angular reading against a grid reading, in misalignment units.
+
+    Without both noises, an angular reading counts like a grid reading at the half width.
+    """
+    if not (np.isfinite(sigma_xy) and np.isfinite(sigma_theta)):
+        return 1.0
+    sigma_xy = max(sigma_xy, ROUNDING * float(np.abs(y).max()), 1e-300)
+    peak = float(np.abs(problem.angular.y).max())
+    sigma_theta = max(sigma_theta, ROUNDING * peak, 1e-300)
+    ratio = (sigma_xy / (sigma_theta * problem.half_width_m)) ** 2
+    equal = problem.system.grid_scale / problem.system.angular_scale
+    return float(np.clip(ratio, equal / MAX_WEIGHT, equal * MAX_WEIGHT))

@@ -1,0 +1,172 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Readings laid out on the lattice: the canonical form, whatever their order was."""
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from selfcal_ros.errors import InputError
+from selfcal_ros.estimation.lattice.maps import PHASES, GridPose
+from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.readings import Measurements, ViewReadings
+from selfcal_ros.model.view import LatticePose, View
+
+
+@dataclass(frozen=True, eq=False)
+class GridData:
+    """Grid readings on the plate's lattice.
+
+    Attributes
+    ----------
+    index : tuple of int
+        Position in `Measurements.views` of every grid view.
+    poses : tuple of GridPose
+        Their poses.
+    y : complex array (views, nx, ny)
+        Deviations turned into the plate frame, m; 0 where not read.
+    weight : float array (views, nx, ny)
+        Repeats, or (sigma / u)^2 where detections declare their uncertainty; 0 = not read.
+    sigma_declared : float
+        Standard deviation of one reading as declared, m; NaN if not declared.
+    """
+
+    index: tuple[int, ...]
+    poses: tuple[GridPose, ...]
+    y: np.ndarray
+    weight: np.ndarray
+    sigma_declared: float
+
+
+@dataclass(frozen=True, eq=False)
+class AngularData:
+    """Angular readings: like `GridData` on the circle, arrays (views, K), rad."""
+
+    index: tuple[int, ...]
+    turns: tuple[int, ...]
+    y: np.ndarray
+    weight: np.ndarray
+    sigma_declared: float
+
+
+def grid_data(measurements: Measurements) -> GridData:
+    """Return the grid readings of all views that have any.
+
+    Raises
+    ------
+    InputError
+        If a mark does not exist, is off the field, comes twice, or is not a finite number.
+    """
+    artifact = measurements.artifact
+    index = tuple(i for i, view in enumerate(measurements.views) if len(view.m))
+    y = np.zeros((len(index), *artifact.shape), dtype=complex)
+    weight = np.zeros(y.shape)
+    poses, ones = [], []
+    for row, i in enumerate(index):
+        readings = measurements.views[i]
+        pose = _grid_pose(readings, artifact)
+        where = f"view '{readings.view.name}' grid readings"
+        flat = _flat_marks(readings, artifact, pose, where=where)
+        if not (np.isfinite(readings.dx).all() and np.isfinite(readings.dy).all()):
+            raise InputError(where, "a deviation is not a finite number", "remove the mark")
+        values = (readings.dx + 1j * readings.dy) * PHASES[-pose.q % 4]
+        _place(y[row].reshape(-1), weight[row].reshape(-1), flat, values=values,
+               count=readings.count, where=where)
+        ones.append((flat, readings.count, readings.u))
+        poses.append(pose)
+    sigma = _declare(weight, ones)
+    return GridData(index, tuple(poses), y, weight, sigma)
+
+
+def angular_data(measurements: Measurements) -> AngularData:
+    """Return the angular readings of all views that have any; InputError as `grid_data`."""
+    artifact = measurements.artifact
+    index = tuple(i for i, view in enumerate(measurements.views) if len(view.k))
+    y = np.zeros((len(index), artifact.angular_count))
+    weight = np.zeros(y.shape)
+    turns, ones = [], []
+    for row, i in enumerate(index):
+        readings = measurements.views[i]
+        where = f"view '{readings.view.name}' angular readings"
+        turn = _pose_of(readings.view, artifact).turn_lines
+        k = np.asarray(readings.k)
+        if turn is None or k.min() < 0 or k.max() >= artifact.angular_count:
+            raise InputError(where, "a line that the plate does not have",
+                             f"lines are 0 to {artifact.angular_count - 1}")
+        _place(y[row], weight[row], k, values=np.asarray(readings.dtheta),
+               count=readings.count_theta, where=where)
+        ones.append((k, readings.count_theta, readings.u_theta))
+        turns.append(turn)
+    sigma = _declare(weight, ones)
+    return AngularData(index, tuple(turns), y, weight, sigma)
+
+
+@lru_cache(maxsize=1024)
+def _pose_of(view: View, artifact: Artifact) -> LatticePose:
+    return view.lattice_pose(artifact)
+
+
+def _grid_pose(readings: ViewReadings, artifact: Artifact) -> GridPose:
+    pose = _pose_of(readings.view, artifact)
+    if pose.quarter_turns is None:
+        raise InputError(f"view '{readings.view.name}'", "grid marks were read at a turn that is "
+                         "not a multiple of 90 deg", "turn by a multiple of 90 deg")
+    return GridPose(pose.quarter_turns, *pose.shift)
+
+
+def _flat_marks(readings: ViewReadings, artifact: Artifact, pose: GridPose, *,
+                where: str) -> np.ndarray:
+    """Return the flat index of every mark read, checked against plate and field."""
+    (hx, hy), m, n = artifact.half, np.asarray(readings.m), np.asarray(readings.n)
+    if m.shape != n.shape:
+        raise InputError(where, "m and n differ in length", "give one value a mark")
+    i, j = ((m, n), (-n, m), (-m, -n), (n, -m))[pose.q]
+    for name, a, la, b, lb in (("off the plate", m, hx, n, hy),
+                               ("off the stage's field", i + pose.a, hx, j + pose.b, hy)):
+        bad = (np.maximum(a, -a) > la) | (np.maximum(b, -b) > lb)
+        if bad.any():
+            k = int(np.argmax(bad))
+            raise InputError(where, f"mark ({m[k]}, {n[k]}) lies {name}",
+                             "check the view's pose and the plate's size")
+    return (m + hx) * artifact.shape[1] + (n + hy)
+
+
+def _place(y: np.ndarray, weight: np.ndarray, flat: np.ndarray, *, values: np.ndarray,
+           count: np.ndarray, where: str) -> None:
+    if values.shape != flat.shape or np.shape(count) != flat.shape:
+        raise InputError(where, "marks, deviations and counts differ in length",
+                         "give one value a mark")
+    if not np.isfinite(values).all():
+        raise InputError(where, "a deviation is not a finite number", "remove the mark")
+    if np.min(count) < 1:
+        raise InputError(where, "a count below 1", "leave out marks that were not read")
+    y[flat] = values
+    weight[flat] = count
+    if np.count_nonzero(weight) != len(flat):
+        raise InputError(where, "a mark comes twice", "average its readings first")
+
+
+def _declare(weight: np.ndarray, ones: list[tuple]) -> float:
+    """Turn counts into (sigma / u)^2 where uncertainties are declared; return that sigma.
+
+    Sigma is the rms of u sqrt(count) over the declared marks; marks without a declaration are
+    taken as readings of that sigma.
+    """
+    if not any(len(u) for _, _, u in ones):
+        return float("nan")
+    total, number = 0.0, 0
+    for row, (flat, _, u) in enumerate(ones):
+        if len(u):
+            good = np.isfinite(u) & (u > 0)
+            # summed in the order of the lattice: no result depends on the order of readings
+            square = np.zeros(weight[row].size)
+            square[flat[good]] = u[good] ** 2 * weight[row].reshape(-1)[flat[good]]
+            total, number = total + float(square.sum()), number + int(good.sum())
+    if not number:
+        return float("nan")
+    variance = total / number
+    for row, (flat, _, u) in enumerate(ones):
+        if len(u):
+            good = np.isfinite(u) & (u > 0)
+            weight[row].reshape(-1)[flat[good]] = variance / u[good] ** 2
+    return float(np.sqrt(variance))

@@ -1,0 +1,308 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Hu's self-calibration law, for comparison with the joint solution (method, section 4)."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from selfcal_ros.errors import InputError
+from selfcal_ros.estimation.blas_threads import one_thread
+from selfcal_ros.estimation.joint.noise import level, pooled
+from selfcal_ros.estimation.law.equations import HuLaw, HuReadings, HuSolution
+from selfcal_ros.estimation.options import Options
+from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.error_map import ErrorMap, ThetaDatum
+from selfcal_ros.model.readings import Measurements, Sense, ViewReadings
+from selfcal_ros.model.result import (
+    ArtifactMap,
+    CalibrationResult,
+    Noise,
+    Observability,
+    ViewResult,
+)
+from selfcal_ros.model.view import View
+
+EXACT_SIZE = 21
+"""Largest N whose noise is propagated reading by reading."""
+
+N_DRAWS = 400
+"""Unit-noise draws behind the uncertainties of a larger plate: 3.5 % standard error each."""
+
+_JOINT = "solve with --method joint"
+_MEND = "measure Hu's four views in full, or solve with --method joint"
+_NAMES = ("0 deg with grid and lines", "90 deg with grid and lines", "one line, lines only",
+          "one pitch along +X with grid and lines")
+
+
+@one_thread()
+def solve_law(measurements: Measurements, options: Options) -> CalibrationResult:
+    """Calibrate by Hu's law from exactly his four views, each of them complete.
+
+    Parameters
+    ----------
+    measurements : Measurements
+        Readings; their repeats are averaged as they are, without weights, as published.
+    options : Options
+        Only `datum_theta` matters here.
+
+    Returns
+    -------
+    CalibrationResult
+        With `method` "law". Uncertainties are propagated linearly through every step.
+
+    Raises
+    ------
+    InputError
+        If a view is missing, surplus or incomplete, or an option is not the law's.
+    """
+    _require_plain(options)
+    views = hu_views(measurements)
+    order = [next(i for i, v in enumerate(measurements.views) if v is view) for view in views]
+    law = law_for(measurements.artifact, ThetaDatum(options.datum_theta), measurements.sense)
+    found = law.solve(hu_readings(measurements.artifact, views))
+    spread = _propagate(law, views)
+    noise = _noise(found, spread, measurements.views)
+    u_g, u_theta = spread.uncertainty(noise)
+    turn = _to_stage if measurements.sense is Sense.PLATE_MOVES else _as_is
+    g, g_theta = turn(found.g[..., 0], found.g_theta[:, 0], -1)
+    u_g, u_theta = turn(u_g, u_theta, 1)
+    artifact = measurements.artifact
+    sites = artifact.shape[0] * artifact.shape[1]
+    return CalibrationResult(
+        measurements.plan_id,
+        ErrorMap(artifact, g[0], g[1], u_g[0], u_g[1], g_theta, u_theta, float(found.o[0]),
+                 float(found.r[0]), law.datum),
+        ArtifactMap(found.a[0, ..., 0], found.a[1, ..., 0], found.a_theta[:, 0]),
+        tuple(_view_result(view, order.index(i), found)
+              for i, view in enumerate(measurements.views)),
+        Observability(4 * sites + 9, 4 * sites + 9, 0, True), noise,
+        measurements.all_rejected(), warnings=_warnings(artifact), method="law",
+        sense=str(measurements.sense))
+
+
+def _require_plain(options: Options) -> None:
+    if options.reference is not None:
+        raise InputError("method law", "Hu's law knows no reference length", _JOINT)
+    if options.misalignment_model != "linear":
+        raise InputError("method law", f"Hu's law is linear, not {options.misalignment_model}",
+                         _JOINT)
+
+
+def law_for(artifact: Artifact, datum: ThetaDatum, sense: Sense) -> HuLaw:
+    """Return the law for a plate and a sense of measurement.
+
+    With the plate on the stage the law solves for H(X) = -G(-X): the slopes of G along +X, +Y,
+    -X, -Y are those of H along -X, -Y, +X, +Y, and Htheta(-k) = -Gtheta(k).
+
+    Raises
+    ------
+    InputError
+        If the half axes are too short for the slopes of eq. 27.
+    """
+    if datum is ThetaDatum.XY_AXES and artifact.grid_size < 5:
+        raise InputError("method law", "a half axis of one mark has no slope (Hu eq. 27)",
+                         "use the theta datum zero_mean")
+    quarter = artifact.angular_count // 4
+    if sense is Sense.PLATE_MOVES:
+        return HuLaw(artifact, datum, np.array([2, 1, 0, 3]) * quarter, -1)
+    return HuLaw(artifact, datum, np.arange(4) * quarter, 1)
+
+
+def hu_views(measurements: Measurements) -> list[ViewReadings]:
+    """Return the readings of Hu's views 0, 1, 2, 3, found by their pose.
+
+    Raises
+    ------
+    InputError
+        If the plate or the views are not Hu's, or marks are missing.
+    """
+    artifact = measurements.artifact
+    if artifact.shape[0] != artifact.shape[1] or not artifact.angular_count:
+        raise InputError("method law", "Hu's law needs a square plate with angular lines",
+                         _JOINT)
+    wanted = {(0, (0, 0), 0): 0, (1, (0, 0), artifact.angular_count // 4): 1,
+              (0, (1, 0), 0): 3}
+    found: dict[int, ViewReadings] = {}
+    for view in measurements.views:
+        pose = view.view.lattice_pose(artifact)
+        grid, lines = len(view.m) > 0, len(view.k) > 0
+        index = wanted.get((pose.quarter_turns, pose.shift, pose.turn_lines)) if grid else None
+        if not grid and lines and (pose.shift, pose.turn_lines) == ((0, 0), 1):
+            index = 2
+        if index is None or index in found:
+            raise InputError(f"method law: view '{view.view.name}'", "is not one of Hu's four "
+                             "views, each once", _MEND)
+        found[index] = view
+    for index, name in enumerate(_NAMES):
+        if index not in found:
+            raise InputError("method law", f"Hu's view {index} ({name}) is missing", _MEND)
+        _require_complete(found[index], index, artifact)
+    return [found[index] for index in range(4)]
+
+
+def _require_complete(view: ViewReadings, index: int, artifact: Artifact) -> None:
+    size, lines = artifact.grid_size, artifact.angular_count
+    wanted = {2: 0, 3: size * (size - 1)}.get(index, size * size)
+    for what, have, want in (("grid marks", len(view.m), wanted),
+                             ("angular lines", len(view.k), lines)):
+        if have != want:
+            raise InputError(f"method law: view '{view.view.name}'",
+                             f"{have} of {want} {what} were read", _MEND)
+
+
+def hu_readings(artifact: Artifact, views: list[ViewReadings]) -> HuReadings:
+    """Return the deviations of Hu's four views, as `hu_views` gives them, as arrays."""
+    v0, v1, v3 = (_grid(views[index], artifact) for index in (0, 1, 3))
+    vt = np.zeros((4, artifact.angular_count, 1))
+    for index, view in enumerate(views):
+        vt[index, view.k, 0] = view.dtheta
+    return HuReadings(v0[..., None], v1[..., None], v3[:, :-1, :, None], vt)
+
+
+def _grid(view: ViewReadings, artifact: Artifact) -> np.ndarray:
+    values = np.full((2, *artifact.shape), np.nan)
+    at = view.m + artifact.half[0], view.n + artifact.half[1]
+    values[0][at], values[1][at] = view.dx, view.dy
+    return values
+
+
+@dataclass(frozen=True, eq=False)
+class _Spread:
+    """Sums over the readings of one unit of noise each, grid readings first, then angular.
+
+    `var_g` (2, 2, N, N), `var_theta` (2, K): the variances; `rest` (2,) and `rest_dof` (2,): the
+    expected sums of squares of what is left over, grid for XY and angular for theta, and their
+    effective degrees of freedom.
+    """
+
+    var_g: np.ndarray
+    var_theta: np.ndarray
+    rest: np.ndarray
+    rest_dof: np.ndarray
+
+    def uncertainty(self, noise: Noise) -> tuple[np.ndarray, np.ndarray]:
+        """Return the standard uncertainties of g (2, N, N) and g_theta (K,)."""
+        power = np.array([noise.sigma_xy, noise.sigma_theta]) ** 2
+        return (np.sqrt(np.tensordot(power, self.var_g, axes=1)),
+                np.sqrt(np.tensordot(power, self.var_theta, axes=1)))
+
+
+def _propagate(law: HuLaw, views: list[ViewReadings]) -> _Spread:
+    """Send the noise of each reading through the law: exactly up to EXACT_SIZE, else by draws."""
+    exact = law.artifact.grid_size <= EXACT_SIZE
+    parts = []
+    for kind in range(2):
+        columns = _unit_noise(law.artifact, views, kind=kind, exact=exact)
+        found = law.solve(columns)
+        scale = 1.0 if exact else 1.0 / N_DRAWS
+        rest = found.rest_theta if kind else found.rest_xy
+        parts.append((scale * (found.g**2).sum(axis=-1), scale * (found.g_theta**2).sum(axis=-1),
+                      *_quadratic_form(rest, exact=exact)))
+    var_g, var_theta, rest, dof = (np.array(part) for part in zip(*parts, strict=True))
+    return _Spread(var_g, var_theta, rest, dof)
+
+
+def law_covariance(result: CalibrationResult) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return the covariances of the law's maps for equal repeats, (2 sites, 2 sites) and (K, K).
+
+    In m^2 and rad^2, stage frame; None for plates beyond EXACT_SIZE, or without known noise.
+    """
+    artifact, noise = result.artifact, result.noise
+    power = np.array([noise.sigma_xy, noise.sigma_theta]) ** 2
+    if artifact.grid_size > EXACT_SIZE or not np.isfinite(power).all():
+        return None
+    law = law_for(artifact, result.error_map.datum_theta, Sense(result.sense))
+    turn = _to_stage if result.sense == Sense.PLATE_MOVES else _as_is
+    parts = []
+    for kind in range(2):
+        found = law.solve(_unit_noise(artifact, _full_views(artifact), kind=kind, exact=True))
+        g, theta = turn(found.g, found.g_theta, -1)
+        g = g.reshape(-1, g.shape[-1])
+        parts.append((power[kind] * (g @ g.T), power[kind] * (theta @ theta.T)))
+    (of_grid, theta_of_grid), (of_lines, theta_of_lines) = parts
+    return of_grid + of_lines, theta_of_grid + theta_of_lines
+
+
+def _full_views(artifact: Artifact) -> list[ViewReadings]:
+    """Return Hu's four views with every mark read once."""
+    lines = {"k": np.arange(artifact.angular_count),
+             "count_theta": np.ones(artifact.angular_count, dtype=int)}
+    out = []
+    for marks in (artifact.grid_size, artifact.grid_size, 0, artifact.grid_size - 1):
+        m, n = artifact.m[:marks].ravel(), artifact.n[:marks].ravel()
+        out.append(ViewReadings(View(""), m, n, count=np.ones(len(m), dtype=int), **lines))
+    return out
+
+
+def _quadratic_form(rest: np.ndarray, *, exact: bool) -> tuple[float, float]:
+    """Return mean and effective degrees of freedom (Satterthwaite) of the sum of squares left."""
+    if exact:
+        gram = rest.T @ rest
+        mean, twice_squares = float(np.trace(gram)), 2 * float((gram**2).sum())
+    else:
+        sums = (rest**2).sum(axis=0)
+        mean, twice_squares = float(sums.mean()), float(sums.var(ddof=1))
+    return mean, 2 * mean**2 / twice_squares
+
+
+def _unit_noise(artifact: Artifact, views: list[ViewReadings], *, kind: int,
+                exact: bool) -> HuReadings:
+    """Return unit noise of every single reading of one kind: a column each, or random columns."""
+    size, lines = artifact.grid_size, artifact.angular_count
+    shapes = [(2, size, size), (2, size, size), (2, size - 1, size), (4, lines)]
+    weights = [_per_mean(views[index], artifact, shape)
+               for index, shape in zip((0, 1, 3), shapes, strict=False)]
+    weights.append(np.array([1 / np.sqrt(view.count_theta) for view in views]))
+    slots = np.concatenate([w.ravel() if (i == 3) == bool(kind) else np.zeros(w.size)
+                            for i, w in enumerate(weights)])
+    active = np.flatnonzero(slots)
+    if exact:
+        columns = np.zeros((len(slots), len(active)))
+        columns[active, np.arange(len(active))] = slots[active]
+    else:
+        rng = np.random.default_rng(kind)
+        columns = slots[:, None] * rng.standard_normal((len(slots), N_DRAWS))
+    edges = np.cumsum([w.size for w in weights])[:-1]
+    return HuReadings(*(part.reshape(*shape, -1) for part, shape in
+                        zip(np.split(columns, edges), shapes, strict=True)))
+
+
+def _per_mean(view: ViewReadings, artifact: Artifact, shape: tuple[int, ...]) -> np.ndarray:
+    counts = np.full(artifact.shape, np.nan)
+    counts[view.m + artifact.half[0], view.n + artifact.half[1]] = view.count
+    return np.broadcast_to(1 / np.sqrt(counts[:shape[1]]), shape)
+
+
+def _noise(found: HuSolution, spread: _Spread, views: tuple[ViewReadings, ...]) -> Noise:
+    """Estimate the noise of one reading from repeats, and from what the equations leave over."""
+    rest = np.sqrt([(found.rest_xy**2).sum() / spread.rest[0],
+                    (found.rest_theta**2).sum() / spread.rest[1]])
+    dof = np.maximum(np.round(spread.rest_dof), 1).astype(int)
+    declared = float("nan")
+    xy = level(pooled((v.sigma_xy, v.dof_xy) for v in views if len(v.m)),
+               (float(rest[0]), int(dof[0])), declared)
+    theta = level(pooled((v.sigma_theta, v.dof_theta) for v in views if len(v.k)),
+                  (float(rest[1]), int(dof[1])), declared)
+    return Noise(xy.sigma, theta.sigma, xy.repeats, theta.repeats, xy.residuals, theta.residuals,
+                 xy.dof_repeats, theta.dof_repeats, xy.dof_residuals, theta.dof_residuals)
+
+
+def _to_stage(field: np.ndarray, theta: np.ndarray, sign: int) -> tuple[np.ndarray, np.ndarray]:
+    """Turn H(X) = -G(-X), Htheta(k) = -Gtheta(-k) back into G; sign +1 for uncertainties."""
+    return sign * field[:, ::-1, ::-1], sign * np.roll(theta[::-1], 1, axis=0)
+
+
+def _as_is(field: np.ndarray, theta: np.ndarray, sign: int) -> tuple[np.ndarray, np.ndarray]:
+    return field, theta
+
+
+def _view_result(view: ViewReadings, index: int, found: HuSolution) -> ViewResult:
+    return ViewResult(view.view.name, view.view.rotation_rad, *view.view.translation_m,
+                      float(found.phi[index, 0]), *(float(t) for t in found.t[index, :, 0]),
+                      used=view.used, rejected=sum(view.rejected.values()))
+
+
+def _warnings(artifact: Artifact) -> tuple[str, ...]:
+    if artifact.grid_size <= EXACT_SIZE:
+        return ()
+    return (f"uncertainties of the law from {N_DRAWS} draws of unit noise: 3.5 % standard error",)

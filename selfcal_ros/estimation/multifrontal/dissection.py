@@ -1,0 +1,187 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Nested dissection of the field, and the fronts of a multifrontal factorisation.
+
+A mark joins only sites that quarter turns and small shifts carry into each other. Folded into
+one eighth of the plane, (max(|i|, |j|), min(|i|, |j|)), such sites are neighbours, so straight
+cuts through the folded field separate the matrix.
+"""
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from selfcal_ros.estimation.multifrontal.symmetry import FoldedMatrix
+
+LEAF = 192
+"""Sites below which a part of the field is not cut any more."""
+
+
+@dataclass(frozen=True, eq=False)
+class Front:
+    """One dense block of the elimination.
+
+    Attributes
+    ----------
+    start, stop : int
+        Range of the variables eliminated here, in the order of elimination.
+    boundary : int array (b,)
+        Later variables that they are joined to, sorted.
+    children : tuple of int
+        Fronts that are eliminated into this one.
+    offset : int
+        Where the front's numbers start in the storage of all: the block of its own variables,
+        then that of its boundary against them, both by columns.
+    """
+
+    start: int
+    stop: int
+    boundary: np.ndarray
+    children: tuple[int, ...]
+    offset: int
+
+    @property
+    def size(self) -> int:
+        """Numbers that the front stores."""
+        own = self.stop - self.start
+        return own * (own + len(self.boundary))
+
+    def blocks(self, storage: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return views of the blocks (own, own) and (b, own), by columns."""
+        own, middle = self.stop - self.start, self.offset + (self.stop - self.start) ** 2
+        return (storage[self.offset:middle].reshape(own, own).T,
+                storage[middle:self.offset + self.size].reshape(own, -1).T)
+
+    def places(self, variables: np.ndarray) -> np.ndarray:
+        """Return where variables stand in this front: its own first, then its boundary."""
+        own = self.stop - self.start
+        return np.where(variables < self.stop, variables - self.start,
+                        own + np.searchsorted(self.boundary, variables))
+
+
+@dataclass(frozen=True, eq=False)
+class Dissection:
+    """Order of elimination and its fronts, children before parents.
+
+    Attributes
+    ----------
+    order : int array (free,)
+        Variable eliminated at each position; the copies of the cut follow in their order.
+    fronts : tuple of Front
+        In the order of elimination.
+    top : tuple of int
+        Fronts without a parent: only copies are left on their boundaries.
+    storage : float array
+        The lower triangle of the matrix, laid out for the fronts.
+    rest : float array (copies, copies)
+        Its lower triangle over the copies, by columns.
+    """
+
+    order: np.ndarray
+    fronts: tuple[Front, ...]
+    top: tuple[int, ...]
+    storage: np.ndarray
+    rest: np.ndarray
+
+
+def dissect(folded: FoldedMatrix, shape: tuple[int, int], reach: int) -> Dissection:
+    """Return the nested dissection of a matrix over sites of a field.
+
+    Parameters
+    ----------
+    folded : FoldedMatrix
+        The matrix; its copies are not eliminated here.
+    shape : tuple of int
+        Sites along x and y.
+    reach : int
+        Largest folded distance of two sites that the matrix joins.
+    """
+    hx, hy = (size // 2 for size in shape)
+    i, j = abs(folded.free // shape[1] - hx), abs(folded.free % shape[1] - hy)
+    far, near = np.maximum(i, j), np.minimum(i, j)
+    pieces: list[tuple[np.ndarray, tuple[int, ...]]] = []
+    # neighbours in a row: the variables of a front are stored, and read, side by side
+    rows = np.argsort(far * (max(shape) + 1) + near, kind="stable")
+    top = _cut(rows, np.stack([far, near]), max(reach, 1), pieces)
+    order = np.concatenate([np.zeros(0, dtype=int), *(piece for piece, _ in pieces)])
+
+    n, size = len(order), folded.size
+    position = np.arange(size)
+    position[order] = np.arange(n)
+    a, b = position[folded.rows], position[folded.columns]
+    row, column = np.maximum(a, b), np.minimum(a, b)
+    inner = column < n
+    lengths = [len(piece) for piece, _ in pieces]
+    front = np.repeat(np.arange(len(pieces)), lengths)[column[inner]]
+    fronts = _fronts(pieces, row[inner], front, size=size)
+    total = sum(one.size for one in fronts)
+    at = total + (column - n) * (size - n) + row - n
+    at[inner] = _addresses(fronts, row[inner], column[inner], front=front, size=size)
+    both = np.bincount(at, folded.values, minlength=total + (size - n) ** 2)
+    return Dissection(order, fronts, top, both[:total],
+                      both[total:].reshape(size - n, size - n).T)
+
+
+def _fronts(pieces: list, row: np.ndarray, front: np.ndarray, *, size: int) -> tuple[Front, ...]:
+    """Return the fronts of pieces, given the rows of the matrix in each front's columns."""
+    stops = np.cumsum([len(piece) for piece, _ in pieces], dtype=int)
+    later = row >= stops[front]
+    keys = np.unique(front[later] * size + row[later])
+    cuts = np.searchsorted(keys, np.arange(len(pieces) + 1) * size).tolist()
+    keys %= size
+    fronts: list[Front] = []
+    start = offset = 0
+    for (_, children), (a, b), stop in zip(pieces, pairwise(cuts), stops.tolist(), strict=True):
+        boundary = keys[a:b]
+        if children:
+            later = np.concatenate([boundary, *(fronts[c].boundary for c in children)])
+            boundary = np.unique(later[later >= stop])
+        fronts.append(Front(start, stop, boundary, children, offset))
+        start, offset = stop, offset + fronts[-1].size
+    return tuple(fronts)
+
+
+def _addresses(fronts: tuple[Front, ...], row: np.ndarray, column: np.ndarray, *,
+               front: np.ndarray, size: int) -> np.ndarray:
+    """Return where the entries (row, column) of the lower triangle are stored."""
+    start = np.array([one.start for one in fronts])[front]
+    own = np.array([one.stop for one in fronts])[front] - start
+    widths = np.array([len(one.boundary) for one in fronts])
+    keys = np.concatenate([number * size + one.boundary for number, one in enumerate(fronts)])
+    before = np.cumsum(widths) - widths
+    place = np.searchsorted(keys, front * size + row) - before[front]
+    offset = np.array([one.offset for one in fronts])[front]
+    column = column - start
+    return offset + np.where(row < start + own, column * own + row - start,
+                             own * own + column * widths[front] + place)
+
+
+def _cut(sites: np.ndarray, folded: np.ndarray, reach: int, pieces: list) -> tuple[int, ...]:
+    """Append the pieces of `sites`, separators last; return the numbers of the topmost ones."""
+    if not len(sites):
+        return ()
+    if len(sites) > LEAF:
+        at = folded[:, sites]
+        spans = at.max(axis=1) - at.min(axis=1)
+        axis = int(np.argmax(spans))
+        if spans[axis] > 2 * reach:
+            low = _best_cut(at[axis], reach)
+            left, right = at[axis] < low, at[axis] >= low + reach
+            below = (*_cut(sites[left], folded, reach, pieces),
+                     *_cut(sites[right], folded, reach, pieces))
+            between = sites[~left & ~right]
+            if not len(between):
+                return below
+            pieces.append((between, below))
+            return (len(pieces) - 1,)
+    pieces.append((sites, ()))
+    return (len(pieces) - 1,)
+
+
+def _best_cut(at: np.ndarray, reach: int) -> int:
+    """Return where to cut: halves as equal as they can be, both of them not empty."""
+    counts = np.bincount(at - at.min())
+    before = np.concatenate([[0], np.cumsum(counts)])
+    starts = np.arange(1, len(counts) - reach)
+    left, right = before[starts], before[-1] - before[starts + reach]
+    return int(starts[np.argmin(np.maximum(left, right))] + at.min())

@@ -1,0 +1,137 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Normal equations of the angular readings with the plate's lines eliminated.
+
+Model (method, section 2): V(k) = Gtheta((k + s) mod K) + Atheta(k) + phi + noise.
+"""
+
+from functools import cached_property
+
+import numpy as np
+from scipy.linalg import lapack
+from scipy.sparse import coo_matrix, csc_matrix
+from scipy.sparse.linalg import splu
+
+from selfcal_ros.estimation.lattice.connectivity import Components, components
+
+DENSE_LINES = 512
+"""Largest K that is solved with dense matrices."""
+
+
+class AngularSystem:
+    """Everything about a set of angular readings that does not depend on their values.
+
+    Parameters
+    ----------
+    turns : tuple of int
+        Total turn of each angular view in lines.
+    weight : float array (views, K)
+        Weight of each reading; 0 = not read.
+    """
+
+    def __init__(self, turns: tuple[int, ...], weight: np.ndarray) -> None:
+        self.turns, self.weight = turns, weight
+        self.read = weight > 0
+        total = weight.sum(axis=0)
+        self.share = weight / np.where(total > 0, total, 1.0)
+        lines = np.arange(weight.shape[1])
+        self.site = (lines + np.array(turns, dtype=int)[:, None]) % max(len(lines), 1)
+        """Stage line of each plate line in each view, (views, K)."""
+
+    @property
+    def n_views(self) -> int:
+        """Number of angular views."""
+        return len(self.turns)
+
+    @property
+    def n_lines(self) -> int:
+        """K."""
+        return self.weight.shape[1]
+
+    @property
+    def n_readings(self) -> int:
+        """Number of lines read, over all views."""
+        return int(np.count_nonzero(self.read))
+
+    @cached_property
+    def components(self) -> Components:
+        """Components of the graph of stage lines and plate lines: each has a free constant."""
+        view, line = np.nonzero(self.read)
+        return components(self.site[view, line], line, np.zeros(len(line), dtype=int),
+                          n_sites=self.n_lines, n_marks=self.n_lines)
+
+    def centred(self, y: np.ndarray) -> np.ndarray:
+        """Return `y` (views, K, ...) less the weighted mean of each line over its views."""
+        return y - np.einsum("vk,vk...->k...", self.share, y)
+
+    def scatter(self, y: np.ndarray) -> np.ndarray:
+        """Return the sum over readings at every stage line, (K, ...)."""
+        out = np.zeros((self.n_lines, *y.shape[2:]))
+        for v in range(self.n_views):
+            out[self.site[v]] += y[v]
+        return out
+
+    @cached_property
+    def matrix(self) -> csc_matrix:
+        """The eliminated matrix over the stage lines, one line of each component pinned."""
+        rows, cols, values = [], [], []
+        for i in range(self.n_views):
+            for j in range(self.n_views):
+                value = -self.weight[i] * self.share[j] + (self.weight[i] if i == j else 0.0)
+                rows.append(self.site[i])
+                cols.append(self.site[j])
+                values.append(value)
+        pins = self._pins()
+        rows.append(pins)
+        cols.append(pins)
+        values.append(np.full(len(pins), self.weight.sum() / max(self.n_readings, 1)))
+        data, at = np.concatenate(values), (np.concatenate(rows), np.concatenate(cols))
+        return coo_matrix((data, at), shape=(self.n_lines, self.n_lines)).tocsc()
+
+    def _pins(self) -> np.ndarray:
+        parts = self.components
+        return np.concatenate([np.flatnonzero(parts.of_site < 0), parts.first_sites])
+
+    @cached_property
+    def _factor(self):
+        if self.n_lines <= DENSE_LINES:
+            return lapack.dpotrf(self.matrix.toarray(), lower=1)[0]
+        return splu(self.matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0,
+                    options={"SymmetricMode": True})
+
+    def solve(self, right: np.ndarray) -> np.ndarray:
+        """Return the solution of the pinned system for (K,) or (K, k)."""
+        if self.n_lines <= DENSE_LINES:
+            return lapack.dpotrs(self._factor, right, lower=1)[0].reshape(right.shape)
+        return self._factor.solve(right)
+
+    @cached_property
+    def columns(self) -> np.ndarray:
+        """Coupling of the stage lines to phi of each view, (K, views)."""
+        if not self.n_views:
+            return np.zeros((self.n_lines, 0))
+        unit = np.eye(self.n_views)[:, None, :] - self.share.T
+        return self.scatter(self.weight[:, :, None] * unit)
+
+    @cached_property
+    def response(self) -> np.ndarray:
+        """M^-1 times `columns`, (K, views)."""
+        return self.solve(self.columns) if self.n_views else self.columns
+
+    @cached_property
+    def schur(self) -> np.ndarray:
+        """Normal matrix of phi alone, (views, views)."""
+        block = np.diag(self.weight.sum(axis=1)) - self.weight @ self.share.T
+        out = block - self.columns.T @ self.response
+        return (out + out.T) / 2
+
+    def reduced(self, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return M^-1 b and the right-hand side of phi with the stage lines eliminated."""
+        weighted = self.weight * self.centred(y)
+        free = self.solve(self.scatter(weighted))
+        return free, weighted.sum(axis=1) - self.columns.T @ free
+
+    def plate(self, y: np.ndarray, field: np.ndarray, phi: np.ndarray) -> tuple:
+        """Return Atheta (K,) and the residuals (views, K) for given Gtheta and phi."""
+        left = y - field[self.site] - phi[:, None]
+        a = np.einsum("vk,vk->k", self.share, left)
+        return a, np.where(self.read, left - a, 0.0)

@@ -1,0 +1,285 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The normal equations of a measured plan, grid and lines together, and what they determine."""
+
+from functools import cached_property
+
+import numpy as np
+
+from selfcal_ros.estimation.lattice.gauge import Gauge
+from selfcal_ros.estimation.normal.angular import AngularSystem
+from selfcal_ros.estimation.normal.grid import GridSystem
+
+GAP = 1e-9
+"""Relative size below which an eigenvalue of a misalignment matrix is a zero; the true zeros lie
+near 1e-15 and the smallest others above 1e-4."""
+
+DIRECT_SITES = 201 * 201
+"""Sites up to which the normal matrix is factorised in any case."""
+
+UNEVEN_SITES = 401 * 401
+"""Sites up to which it is factorised where weights differ, which slows an iteration down."""
+
+MAX_DIRECT_SITES = 1001 * 1001
+"""Sites up to which it is factorised if an uncertainty is wanted: 5.6 GB."""
+
+CORE = 41
+"""Sites along each side of the middle part of a large field."""
+
+
+class JointSystem:
+    """Grid and angular equations of one measured plan, joined by the views' rotations.
+
+    Parameters
+    ----------
+    grid, angular : GridSystem, AngularSystem
+        The two sets of equations.
+    grid_index, angular_index : tuple of int
+        Position of their views in the measurement.
+    rank_only : bool
+        Whether its rank alone will be asked for: a large field then needs no factorisation.
+    """
+
+    def __init__(self, grid: GridSystem, angular: AngularSystem, grid_index: tuple[int, ...],
+                 angular_index: tuple[int, ...], *, rank_only: bool = False) -> None:
+        self.grid, self.angular, self.rank_only = grid, angular, rank_only
+        self.grid_index, self.angular_index = grid_index, angular_index
+        extra = [i for i in angular_index if i not in grid_index]
+        self.size = 3 * len(grid_index) + len(extra)
+        """Misalignments: (phi, Re tau, Im tau) of each grid view, phi of each other view."""
+        of_view = {i: 3 * row for row, i in enumerate(grid_index)}
+        of_view |= {i: 3 * len(grid_index) + row for row, i in enumerate(extra)}
+        self.memo: dict = {}
+        """What others derive from this system alone, by their own keys."""
+        self.phi_at = np.array([of_view[i] for i in angular_index], dtype=int)
+        """Place of phi of each angular view among the misalignments."""
+
+    @cached_property
+    def direct(self) -> bool:
+        """Whether the sites are factorised; otherwise they are iterated."""
+        sites = self.grid.n_sites
+        weight = self.grid.weight
+        uneven = sites <= UNEVEN_SITES and weight.max() > 2 * weight[self.grid.read].min()
+        return bool(sites <= DIRECT_SITES or uneven)
+
+    @cached_property
+    def _core(self) -> GridSystem:
+        """Grid equations that tell the rank of the misalignments: a middle part of a large field.
+
+        If the middle of the plate determines all misalignments up to the datum, then so does the
+        whole, since readings only add; otherwise the whole has to be factorised.
+        """
+        if self.grid.n_sites <= CORE**2 or (self.direct and not self.rank_only):
+            return self.grid
+        core = core_of(self.grid)
+        values = np.linalg.eigvalsh(core.schur)
+        return core if _rank(values, _trace(core)) == len(values) - 7 else self.grid
+
+    @cached_property
+    def rigid(self) -> np.ndarray:
+        """Datum modes in all misalignments, (7, size)."""
+        out = np.zeros((7, self.size))
+        out[:, :3 * self.grid.n_views] = self.grid.rigid
+        out[[2, 6], 3 * self.grid.n_views:] = -1
+        return out
+
+    def normal(self, ratio: float) -> np.ndarray:
+        """Return the normal matrix of all misalignments; `ratio` weighs the angular readings."""
+        return self._joined(self.grid.schur, ratio)
+
+    def _joined(self, of_grid: np.ndarray, ratio: float) -> np.ndarray:
+        out = np.zeros((self.size, self.size))
+        n = 3 * self.grid.n_views
+        out[:n, :n] = of_grid
+        out[np.ix_(self.phi_at, self.phi_at)] += ratio * self.angular.schur
+        return out
+
+    @cached_property
+    def grid_scale(self) -> float:
+        """Size of the grid's misalignment matrix before plate and sites were eliminated.
+
+        Ranks refer to it: what is left after the elimination may be nothing but rounding.
+        """
+        return _trace(self.grid)
+
+    @cached_property
+    def angular_scale(self) -> float:
+        """Size of the angular misalignment matrix before the lines were eliminated."""
+        return float(max(self.angular.weight.sum(), np.finfo(float).tiny))
+
+    @cached_property
+    def _core_scale(self) -> float:
+        return self.grid_scale if self._core is self.grid else _trace(self._core)
+
+    @cached_property
+    def _core_spectrum(self) -> tuple[np.ndarray, np.ndarray]:
+        return np.linalg.eigh(self._core.schur)
+
+    @cached_property
+    def rank_schur(self) -> int:
+        """Rank of the grid's misalignment matrix."""
+        return _rank(self._core_spectrum[0], self._core_scale)
+
+    @cached_property
+    def grid_inverse(self) -> np.ndarray:
+        """Pseudo-inverse of the grid's misalignment matrix: their covariance, unit noise."""
+        spectrum = (self._core_spectrum if self._core is self.grid
+                    else np.linalg.eigh(self.grid.schur))
+        return pseudo_inverse(*spectrum, self.grid_scale)
+
+    @cached_property
+    def angular_inverse(self) -> np.ndarray:
+        """Pseudo-inverse of the angular misalignment matrix."""
+        return pseudo_inverse(*np.linalg.eigh(self.angular.schur), self.angular_scale)
+
+    def inverse(self, ratio: float) -> np.ndarray:
+        """Return the pseudo-inverse of `normal`: covariance of the misalignments, unit noise."""
+        null = self._null
+        held = self.grid_scale * (null @ null.T)
+        out = np.linalg.inv(self.normal(ratio) + held) - held / self.grid_scale**2
+        return (out + out.T) / 2
+
+    @cached_property
+    def rank_grid(self) -> int:
+        """Rank of the grid readings."""
+        parts = self.grid.components
+        nodes = np.count_nonzero(parts.of_site >= 0) + np.count_nonzero(parts.of_mark >= 0)
+        return int(2 * (nodes - np.count_nonzero(parts.balanced)) + self.rank_schur)
+
+    @cached_property
+    def rank_angular(self) -> int:
+        """Rank of the angular readings."""
+        parts = self.angular.components
+        nodes = np.count_nonzero(parts.of_site >= 0) + np.count_nonzero(parts.of_mark >= 0)
+        rank = _rank(np.linalg.eigvalsh(self.angular.schur), self.angular_scale)
+        return int(nodes - len(parts.balanced) + rank)
+
+    @cached_property
+    def _null(self) -> np.ndarray:
+        """Orthonormal misalignments that no reading tells, (size, nullity)."""
+        values, vectors = self._core_spectrum
+        if self.angular.n_views:
+            ratio = self._core_scale / self.angular_scale
+            values, vectors = np.linalg.eigh(self._joined(self._core.schur, ratio))
+        return vectors[:, values <= GAP * self._core_scale]
+
+    @cached_property
+    def nullity(self) -> int:
+        """Combinations of misalignments that no reading tells, the datum's among them."""
+        return self._null.shape[1]
+
+    @cached_property
+    def unseen(self) -> np.ndarray:
+        """Misalignments that no reading tells, beside the datum, (size, modes)."""
+        # without turns the rigid modes depend on each other: an orthonormal basis of their span
+        datum = np.vstack([self.rigid, self._turn_of_lines]) if self.apart else self.rigid
+        rigid, size, _ = np.linalg.svd(datum.T, full_matrices=False)
+        rigid = rigid[:, size > 1e-9 * size[0]]
+        if rigid.shape[1] == self.nullity:  # no reading tells the datum
+            return np.zeros((self.size, 0))
+        left = self._null - rigid @ (rigid.T @ self._null)
+        u, s, _ = np.linalg.svd(left, full_matrices=False)
+        return u[:, s > 1e-6]
+
+    @property
+    def apart(self) -> bool:
+        """Whether no angular view shares its rotation with a grid view.
+
+        Then a common rotation of the angular views and the constant of the plate's lines are one
+        datum more, which the stage's map does not feel.
+        """
+        return bool(self.angular_index) and set(self.angular_index).isdisjoint(self.grid_index)
+
+    @property
+    def _turn_of_lines(self) -> np.ndarray:
+        """The common rotation of views that measure lines alone, (size,)."""
+        out = np.zeros(self.size)
+        out[3 * self.grid.n_views:] = 1.0
+        return out
+
+    @cached_property
+    def known_sites(self) -> np.ndarray:
+        """Sites whose error is determined up to the datum, bool (nx, ny)."""
+        hidden = self.unseen[:3 * self.grid.n_views]
+        parts = self.grid.components
+        known = (parts.of_site >= 0) & ~parts.balanced[parts.of_site]
+        if np.any(np.abs(hidden) > 1e-6) and known.any():
+            moved = self.grid.response @ hidden
+            gauge = Gauge(self.grid.views.z, known.reshape(self.grid.views.shape), scale=True)
+            for column in moved.T:
+                field = column.reshape(self.grid.views.shape)
+                left = gauge.remove(field, gauge.parts(field)).ravel()
+                known &= abs(left) <= 1e-6
+        return known.reshape(self.grid.views.shape)
+
+    @cached_property
+    def known_views(self) -> np.ndarray:
+        """Misalignments that are determined up to the datum, bool (size,)."""
+        known = np.ones(self.size, dtype=bool)
+        n, shape = 3 * self.grid.n_views, self.grid.views.shape
+        nothing = np.zeros(self.grid.weight.shape)
+        for column in self.unseen.T:
+            # an unseen mode may carry rigid parts: it counts as it looks in the datum
+            field = -(self.grid.response @ column[:n]).reshape(shape)
+            parts = self.gauge.parts(field)
+            moved = column - parts @ self.rigid[:4]
+            plate, _ = self.grid.plate(nothing, self.gauge.remove(field, parts), moved[:n])
+            moved = moved - self.plate_gauge.parts(plate) @ self.rigid[4:]
+            known &= abs(moved) <= 1e-6
+        return known & (self._turn_of_lines == 0) if self.apart else known
+
+    @cached_property
+    def known_marks(self) -> np.ndarray:
+        """Marks whose error is determined up to the datum, bool (nx, ny)."""
+        index = self.grid.views.site_index
+        good = self.grid.read & (index >= 0) & self.known_sites.reshape(-1)[index]
+        return good.any(axis=0)
+
+    @cached_property
+    def known_lines(self) -> np.ndarray:
+        """Stage lines that are determined up to one constant, bool (K,)."""
+        parts = self.angular.components
+        known = parts.of_site == parts.largest if len(parts.balanced) else parts.of_site >= 0
+        if self.unseen.shape[1] and known.any():
+            moved = self.angular.response @ self.unseen[self.phi_at]
+            moved = moved - moved[known].mean(axis=0)
+            known = known & np.all(abs(moved) <= 1e-6, axis=1)
+        return known
+
+    @cached_property
+    def known_plate_lines(self) -> np.ndarray:
+        """Plate lines that are determined, bool (K,)."""
+        return (self.angular.read & self.known_lines[self.angular.site]).any(axis=0)
+
+    @cached_property
+    def gauge(self) -> Gauge:
+        """Datum of the stage."""
+        return Gauge(self.grid.views.z, self.known_sites, scale=True)
+
+    @cached_property
+    def plate_gauge(self) -> Gauge:
+        """Datum of the plate."""
+        return Gauge(self.grid.views.z, self.known_marks, scale=False)
+
+
+def core_of(grid: GridSystem) -> GridSystem:
+    """Return the readings of the marks and sites in the middle of a field, a smaller system."""
+    low = [(size - CORE) // 2 if size > CORE else 0 for size in grid.views.shape]
+    part = tuple(slice(a, size - a) for a, size in zip(low, grid.views.shape, strict=True))
+    weight = grid.weight[(slice(None), *part)]
+    inside = GridSystem(grid.views.poses, weight, grid.views.unit).views.in_field
+    return GridSystem(grid.views.poses, weight * inside, grid.views.unit)
+
+
+def _trace(grid: GridSystem) -> float:
+    total = (grid.weight * (abs(grid.views.z) ** 2 + 2)).sum()
+    return float(max(total, np.finfo(float).tiny))
+
+
+def _rank(values: np.ndarray, scale: float) -> int:
+    return int(np.count_nonzero(values > GAP * scale))
+
+
+def pseudo_inverse(values: np.ndarray, vectors: np.ndarray, scale: float) -> np.ndarray:
+    """Return the pseudo-inverse of a matrix of size `scale`, given its eigenvalues and vectors."""
+    good = values > GAP * scale
+    return (vectors[:, good] / values[good]) @ vectors[:, good].T

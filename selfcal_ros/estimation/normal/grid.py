@@ -1,0 +1,195 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Normal equations of the grid readings with the plate eliminated (method, section 7).
+
+The plate's error at a mark is the weighted mean of what its readings leave, so eliminating it
+is exact and local. What remains couples the stage error G at sites that one mark visits, and
+three numbers a view (phi, Re tau, Im tau), which are eliminated last.
+"""
+
+from functools import cached_property
+from itertools import combinations
+
+import numpy as np
+
+from selfcal_ros.estimation.lattice.connectivity import Components, components
+from selfcal_ros.estimation.lattice.maps import GridPose, LatticeViews, rigid_parameters
+from selfcal_ros.estimation.multifrontal.factor import Factor
+from selfcal_ros.estimation.multifrontal.symmetry import fold
+
+
+class GridSystem:
+    """Everything about a set of grid readings that does not depend on their values.
+
+    Parameters
+    ----------
+    poses : tuple of GridPose
+        One a view.
+    weight : float array (views, nx, ny)
+        Weight of each reading; 0 = not read.
+    unit : int
+        Pitches in the unit of positions; 0 = the longer half width.
+    """
+
+    def __init__(self, poses: tuple[GridPose, ...], weight: np.ndarray, unit: int = 0) -> None:
+        self.weight = weight
+        self.views = LatticeViews(weight.shape[1:], poses, unit)
+        self.read = weight > 0
+        total = weight.sum(axis=0)
+        self.mark_read = total > 0
+        self.share = weight / np.where(self.mark_read, total, 1.0)
+        """Part of each reading in the mean of its mark, (views, nx, ny)."""
+
+    @property
+    def n_views(self) -> int:
+        """Number of grid views."""
+        return len(self.views.poses)
+
+    @property
+    def n_sites(self) -> int:
+        """Number of sites of the field."""
+        return self.weight[0].size
+
+    @property
+    def n_readings(self) -> int:
+        """Number of marks read, over all views; each has two coordinates."""
+        return int(np.count_nonzero(self.read))
+
+    @cached_property
+    def edges(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Site, mark and quarter turns of every reading."""
+        view, mark = np.nonzero(self.read.reshape(self.n_views, -1))
+        site = self.views.site_index.reshape(self.n_views, -1)[view, mark]
+        return site, mark, np.array([pose.q for pose in self.views.poses])[view]
+
+    @cached_property
+    def components(self) -> Components:
+        """Components of the graph of sites and marks."""
+        site, mark, q = self.edges
+        return components(site, mark, q, n_sites=self.n_sites, n_marks=self.n_sites,
+                          turning=self._find_turning_site())
+
+    def _find_turning_site(self) -> int:
+        """Return a site that one mark visits in two turns, which closes a path; -1 = none."""
+        q = [pose.q for pose in self.views.poses]
+        for i, j in combinations(range(self.n_views), 2):
+            if q[i] != q[j]:
+                same = self.read[i] & self.read[j]
+                same &= self.views.site_index[i] == self.views.site_index[j]
+                if same.any():
+                    return int(self.views.site_index[i].ravel()[same.argmax()])
+        return -1
+
+    def centred(self, marks: np.ndarray) -> np.ndarray:
+        """Return `marks` (views, nx, ny) less the weighted mean of each mark over its views."""
+        mean = self.share[0] * marks[0]
+        for share, mark in zip(self.share[1:], marks[1:], strict=True):
+            mean += share * mark
+        return marks - mean
+
+    @property
+    def mean_weight(self) -> float:
+        """Mean weight of a reading."""
+        return float(self.weight.sum() / max(self.n_readings, 1))
+
+    @cached_property
+    def pins(self) -> np.ndarray:
+        """The sites that are held: never visited, and one of each free component."""
+        parts = self.components
+        held = parts.first_sites[parts.balanced]
+        return np.concatenate([np.flatnonzero(parts.of_site < 0), held])
+
+    @cached_property
+    def factor(self) -> Factor:
+        """Factorisation of the matrix over the sites, pinned where a component is free."""
+        folded = fold(self.views, self.weight, self.share, self.pins)
+        return Factor(folded, self.views.shape, self.views.reach)
+
+    @cached_property
+    def shapes(self) -> np.ndarray:
+        """What phi and Re tau of a view do to its readings: i z and 1, complex (2, nx, ny)."""
+        return np.stack([1j * self.views.z, np.ones(self.views.shape)])
+
+    @cached_property
+    def columns(self) -> np.ndarray:
+        """Coupling of sites to phi and tau, complex (2 views, sites), plate eliminated."""
+        meant = self.share[:, None] * self.shapes
+        out = np.zeros_like(meant)
+        for v, weight in enumerate(self.weight):
+            part = meant * -weight
+            part[v] += weight * self.shapes
+            self.views.add_scattered(out, v, part)
+        return out.reshape(2 * self.n_views, self.n_sites)
+
+    def coupled(self, fields: np.ndarray) -> np.ndarray:
+        """Return what fields (sites, ...) ask of phi, Re, Im tau of the views, (3 views, ...)."""
+        return _of_misalignments((self.columns @ fields.conj()).conj())
+
+    @cached_property
+    def block(self) -> np.ndarray:
+        """Block of the misalignments, plate eliminated, real (3 views, 3 views)."""
+        x, y = self.views.z.real.ravel(), self.views.z.imag.ravel()
+        moments = np.stack([x * x + y * y, x, y, np.ones_like(x)], axis=1)
+        out = np.zeros((self.n_views, 3, self.n_views, 3))
+        for v, weight in enumerate(self.weight):
+            w = self.share * -weight
+            w[v] += weight
+            # f = iz, 1, i: the inner products Re(conj(f) f') are |z|^2, -y, x, 1
+            zz, sx, sy, s = (w.reshape(self.n_views, -1) @ moments).T
+            out[v, 0, :, 0], out[v, 1, :, 1], out[v, 2, :, 2] = zz, s, s
+            out[v, 0, :, 1] = out[v, 1, :, 0] = -sy
+            out[v, 0, :, 2] = out[v, 2, :, 0] = sx
+        return out.reshape(3 * self.n_views, -1)
+
+    @cached_property
+    def response(self) -> np.ndarray:
+        """M^-1 times `columns`: the sites' answer to phi, Re tau, Im tau, (sites, 3 views)."""
+        solved = self.factor.solve(np.ascontiguousarray(self.columns.T))
+        return _real_columns(solved.reshape(self.n_sites, self.n_views, 2))
+
+    @cached_property
+    def schur(self) -> np.ndarray:
+        """Normal matrix of the misalignments alone, real symmetric (3 views, 3 views)."""
+        out = self.block - self.coupled(self.response)
+        return (out + out.T) / 2
+
+    @cached_property
+    def rigid(self) -> np.ndarray:
+        """The datum modes in the misalignments, (7, 3 views)."""
+        return rigid_parameters(self.views).reshape(7, -1)
+
+    def right_side(self, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the right-hand sides of sites (complex) and misalignments (real)."""
+        weighted = self.weight * self.centred(y)
+        shapes = self.shapes.reshape(2, -1)
+        sums = (shapes @ weighted.conj().reshape(self.n_views, -1).T).conj()
+        return self.views.scatter(weighted).ravel(), _of_misalignments(sums.T.ravel())
+
+    def reduced(self, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return M^-1 b and the right-hand side of the misalignments with sites eliminated."""
+        b, d = self.right_side(y)
+        free = self.factor.solve(b)
+        return free, d - self.coupled(free)
+
+    def misaligned(self, parameters: np.ndarray) -> np.ndarray:
+        """Return phi i z + tau at every mark, complex (views, nx, ny)."""
+        phi, re, im = parameters.reshape(self.n_views, 3).T
+        return (phi[:, None, None] * self.shapes[0] + (re + 1j * im)[:, None, None])
+
+    def plate(self, y: np.ndarray, field: np.ndarray, parameters: np.ndarray) -> tuple:
+        """Return A (nx, ny) and the residuals (views, nx, ny) for given G and misalignments."""
+        left = y - self.views.gather(field) - self.misaligned(parameters)
+        a = np.einsum("vij,vij->ij", self.share, left)
+        return a, np.where(self.read, left - a, 0.0)
+
+
+def _of_misalignments(sums: np.ndarray) -> np.ndarray:
+    """Return sums over phi and tau of each view (2 views, ...) as phi, Re tau, Im tau."""
+    pairs = sums.reshape(-1, 2, *sums.shape[1:])
+    parts = (pairs[:, 0].real, pairs[:, 1].real, pairs[:, 1].imag)
+    return np.stack(parts, axis=1).reshape(-1, *sums.shape[1:])
+
+
+def _real_columns(pairs: np.ndarray) -> np.ndarray:
+    """Return (sites, views, 2) of phi and Re tau as (sites, 3 views): Im tau is i times Re tau."""
+    three = np.concatenate([pairs, 1j * pairs[..., 1:]], axis=-1)
+    return three.reshape(len(pairs), -1)

@@ -1,0 +1,211 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Whether a plan identifies the stage, what it leaves unseen, and which view would cure it."""
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+from itertools import combinations, islice
+from math import pi
+
+from selfcal_ros.estimation.blas_threads import one_thread
+from selfcal_ros.estimation.normal.equations import JointSystem
+from selfcal_ros.estimation.normal.planned import planned_system
+from selfcal_ros.estimation.observability.prediction import MAX_SITES, Prediction, predict
+from selfcal_ros.estimation.observability.rank import full_observability
+from selfcal_ros.estimation.observability.unseen import (
+    UnseenMode,
+    angular_families,
+    component_family,
+    known_families,
+    unread_marks,
+    unvisited_family,
+)
+from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.error_map import ThetaDatum
+from selfcal_ros.model.result import Observability
+from selfcal_ros.model.view import Plan, View
+
+SEARCH_SIZE = 9
+"""Largest field on which the view that cures is searched; it is then verified on the real one."""
+
+NARROW = 5
+"""Sites across that a smaller field keeps in any case."""
+
+PROXY_SIZE = 101
+"""Field on which the uncertainty of a larger one is predicted."""
+
+MAX_CURES = 5
+"""Largest number of sets of views that are offered."""
+
+
+@dataclass(frozen=True, eq=False)
+class PlanCheck:
+    """A plan judged before anything moves.
+
+    Attributes
+    ----------
+    observability : Observability
+        Rank, deficiency, unseen modes in words, advice.
+    modes : tuple of UnseenMode
+        The unseen modes with an example map each.
+    cures : tuple of tuple of View
+        The smallest sets of views that would make the plan identify the stage.
+    """
+
+    observability: Observability
+    modes: tuple[UnseenMode, ...]
+    cures: tuple[tuple[View, ...], ...] = ()
+
+
+@one_thread()
+def check_plan(plan: Plan) -> PlanCheck:
+    """Return rank, deficiency, unseen modes and cures of a plan with every mark read."""
+    system = planned_system(plan.artifact, plan.views)
+    seen = full_observability(system, plan.artifact, plan.views)
+    return PlanCheck(seen, ()) if seen.identifiable else explained(seen, system, plan)
+
+
+def explained(seen: Observability, system: JointSystem, plan: Plan) -> PlanCheck:
+    """Return a deficient set of readings with its unseen modes in words and what would cure it.
+
+    Parameters
+    ----------
+    seen : Observability
+        Rank and deficiency.
+    system : JointSystem
+        The readings, some of them perhaps missing.
+    plan : Plan
+        The views behind the readings.
+    """
+    modes = unseen_modes(system)
+    cures = tuple(find_cures(plan))
+    advice = tuple(("or add " if number else "add ")
+                   + " and ".join(describe_views(cure, plan.artifact))
+                   for number, cure in enumerate(cures[:3]))
+    seen = replace(seen, modes=tuple(mode.text for mode in modes), advice=advice or seen.advice)
+    return PlanCheck(seen, modes, cures)
+
+
+@one_thread()
+def predict_plan(plan: Plan, datum: ThetaDatum) -> Prediction:
+    """Return the uncertainties that a plan promises if every mark is read.
+
+    Fields above MAX_SITES are predicted on a smaller field, and the note says so: the gain grows
+    slowly, as log N, so that it is too small then.
+    """
+    artifact = plan.artifact
+    if artifact.shape[0] * artifact.shape[1] <= MAX_SITES:
+        return predict(planned_system(artifact, plan.views), artifact, datum,
+                       repeats=unit_repeats(plan))
+    small = smaller(plan, PROXY_SIZE)
+    found = predict(planned_system(small.artifact, small.views), small.artifact, datum,
+                    repeats=unit_repeats(plan))
+    nx, ny = small.artifact.shape
+    return replace(found, note=f"predicted for a field of {nx} x {ny} sites; XY is about 5 % "
+                               "larger for each doubling of the field")
+
+
+def unit_repeats(plan: Plan) -> int:
+    """Return the repeats of the averaged reading whose noise is the unit: the fewest."""
+    return min(view.repeats for view in plan.views)
+
+
+def unseen_modes(system: JointSystem) -> tuple[UnseenMode, ...]:
+    """Return the unseen families of a set of readings, the named ones first."""
+    grid = system.grid
+    families = known_families(system) if grid.n_views > 1 else []
+    families += [family for family in (component_family(system), unvisited_family(grid),
+                                       unread_marks(grid)) if family is not None]
+    return (*families, *angular_families(system))
+
+
+def candidate_views(artifact: Artifact, *, angular: bool) -> list[View]:
+    """Return the views that a cell can usually offer: quarter turns and one-pitch shifts.
+
+    Parameters
+    ----------
+    artifact : Artifact
+        The plate.
+    angular : bool
+        Whether angular lines are measured as well; then a turn by one line is offered too.
+    """
+    pitch = artifact.grid_pitch_m
+    names = {(0, 0): "", (1, 0): "+x", (0, 1): "+y", (-1, 0): "-x", (0, -1): "-y"}
+    views = [View(f"{90 * q}deg{name}", q * pi / 2, (a * pitch, b * pitch), True, angular)
+             for (a, b), name in names.items() for q in range(4)
+             if q % 2 == 0 or artifact.shape[0] == artifact.shape[1] or (a, b) == (0, 0)]
+    if angular and artifact.angular_count:
+        views.append(View("one_line", 2 * pi / artifact.angular_count, (0.0, 0.0), False, True))
+    return views
+
+
+def find_cures(plan: Plan) -> Iterator[tuple[View, ...]]:
+    """Yield the smallest sets of candidate views that make `plan` identify the stage.
+
+    Sets for the grid are searched on a field of at most SEARCH_SIZE sites a side, a view turned by
+    one line is added where the angular map needs it, and every set is verified on the plan's
+    own field: what is yielded is exact, whatever the search field was.
+    """
+    angular = any(view.angular for view in plan.views) and plan.artifact.angular_count > 0
+    candidates = candidate_views(plan.artifact, angular=angular)
+    grid_only = [view for view in candidates if view.grid]
+    small = smaller(plan, SEARCH_SIZE)
+    found: list[tuple[View, ...]] = [()]
+    if not _grid_seen(small, ()):
+        for size in (1, 2):
+            good = (views for views in combinations(grid_only, size) if _grid_seen(small, views))
+            found = list(islice(good, MAX_CURES))
+            if found:
+                break
+    for views in found:
+        cure = next((more for more in (views, (*views, candidates[-1]))
+                     if more and _cured(plan, more)), None)
+        if cure:
+            yield cure
+
+
+def _grid_seen(plan: Plan, views: tuple[View, ...]) -> bool:
+    every = tuple(replace(view, angular=False) for view in (*plan.views, *views) if view.grid)
+    return full_observability(planned_system(plan.artifact, every), plan.artifact,
+                              every).identifiable
+
+
+def _cured(plan: Plan, views: tuple[View, ...]) -> bool:
+    every = (*plan.views, *views)
+    return full_observability(planned_system(plan.artifact, every), plan.artifact,
+                              every).identifiable
+
+
+def smaller(plan: Plan, size: int) -> Plan:
+    """Return the plan on a field of at most `size` sites a side, same turns and shifts.
+
+    The field keeps its proportions, on which the uncertainty of a long field depends, and stays
+    large enough for the plan's own shifts.
+    """
+    reach = [max(map(abs, view.lattice_pose(plan.artifact).shift)) for view in plan.views]
+    room = 2 * max(reach, default=0) + 3
+    part = min(1.0, max(size, room) / max(plan.artifact.shape))
+    nx, ny = (max(2 * round((n * part - 1) / 2) + 1, min(n, max(room, NARROW)))
+              for n in plan.artifact.shape)
+    return replace(plan, artifact=Artifact(nx, plan.artifact.grid_pitch_m,
+                                           plan.artifact.angular_count, 0 if nx == ny else ny))
+
+
+def describe_view(view: View, artifact: Artifact) -> str:
+    """Return a view in words: turn, shift in pitches, kind of marks, repeats."""
+    pose = view.lattice_pose(artifact)
+    if pose.quarter_turns is None or not view.grid:
+        lines = pose.turn_lines or 0
+        what = (f"an angular view turned by {lines} line{'s' * (lines != 1)} "
+                f"({360 * lines / artifact.angular_count:g} deg)")
+    elif pose.quarter_turns:
+        what = f"a view turned by {90 * pose.quarter_turns} deg"
+    else:
+        what = "a view without turn"
+    a, b = pose.shift
+    shifted = [f"{step:+d} pitch along {axis}" for step, axis in ((a, "X"), (b, "Y")) if step]
+    return what + (" and shifted by " + " and ".join(shifted) if shifted else "")
+
+
+def describe_views(views: Iterable[View], artifact: Artifact) -> list[str]:
+    """Return several views in words."""
+    return [describe_view(view, artifact) for view in views]

@@ -1,0 +1,159 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Exact rank: what a set of views, or the marks that were read in them, can tell (section 6).
+
+The rank is not found by a tolerance on a large matrix. With misalignments known, it is a count
+of graph components (`lattice.connectivity`); what the misalignments add is the rank of a matrix of
+three rows a view, whose zeros and non-zeros lie ten orders of magnitude apart.
+"""
+
+import math
+from collections.abc import Iterable
+
+from selfcal_ros.estimation.normal.equations import JointSystem
+from selfcal_ros.estimation.normal.planned import planned_system
+from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.result import Observability
+from selfcal_ros.model.view import Plan, View
+
+DATUM_ROWS = 7
+"""Stage translation, rotation, magnification; plate translation, rotation (Hu 5, 11)."""
+
+DETERMINED = 0.5
+"""Part of the field's sites that must be determined; below, a map is refused."""
+
+
+def plan_observability(plan: Plan) -> Observability:
+    """Return what the plan would tell if every mark in the field were read."""
+    system = planned_system(plan.artifact, plan.views, rank_only=True)
+    return full_observability(system, plan.artifact, plan.views)
+
+
+def full_observability(system: JointSystem, artifact: Artifact,
+                       views: Iterable[View]) -> Observability:
+    """Return rank and deficiency over all sites, marks and lines of the artifact.
+
+    Parameters
+    ----------
+    system : JointSystem
+        The readings.
+    artifact : Artifact
+        The plate.
+    views : iterable of View
+        The views behind the readings, for the advice.
+    """
+    unknowns = 4 * system.grid.n_sites + 3 * system.grid.n_views
+    rank = system.rank_grid + DATUM_ROWS
+    angular = angular_deficiency(system)
+    advice = advice_for(artifact, views) if unknowns > rank or angular else ()
+    deficiency = unknowns - rank + angular
+    return Observability(rank, unknowns, deficiency, deficiency == 0, advice=advice)
+
+
+def angular_deficiency(system: JointSystem) -> int:
+    """Return how many modes of the angular map stay unseen beside its free constant.
+
+    If no angular view shares its rotation with a grid view, the constant of the plate's lines is
+    free as well: a datum of the plate, which the stage's map does not feel.
+    """
+    angular = system.angular
+    if not angular.n_views:
+        return 0
+    parts = angular.components
+    nodes = int((parts.of_site >= 0).sum() + (parts.of_mark >= 0).sum())
+    turns = max(system.nullity - (3 * system.grid.n_views - system.rank_schur), 0)
+    if system.apart:
+        turns = max(turns - 1, 0)
+    return 2 * angular.n_lines - nodes + len(parts.balanced) - 1 + turns
+
+
+def measured_observability(system: JointSystem, artifact: Artifact,
+                           views: tuple[View, ...]) -> Observability:
+    """Return what the marks that were read tell.
+
+    If the views would identify the stage and only marks are missing, the sites that are
+    determined are enough, as long as they are at least half of the field: then rank and
+    unknowns count these alone.
+
+    Parameters
+    ----------
+    system : JointSystem
+        The readings.
+    artifact : Artifact
+        The plate.
+    views : tuple of View
+        The views that were read.
+    """
+    key = ("observability", artifact, views)
+    if key not in system.memo:
+        system.memo[key] = _measured_observability(system, artifact, views)
+    return system.memo[key]
+
+
+def _measured_observability(system: JointSystem, artifact: Artifact,
+                            views: tuple[View, ...]) -> Observability:
+    read = _as_read(system, views)
+    full = full_observability(system, artifact, read)
+    if full.identifiable:
+        return full
+    as_planned = plan_observability(Plan("", artifact, read))
+    if not as_planned.identifiable:
+        return full
+    sites, lines = system.known_sites, system.known_lines
+    if sites.mean() < DETERMINED or (len(lines) and lines.mean() < DETERMINED):
+        text = (f"read the missing marks: only {int(sites.sum())} of {sites.size} sites and "
+                f"{int(lines.sum())} of {len(lines)} lines are determined")
+        return Observability(full.rank, full.unknowns, full.deficiency, False, advice=(text,))
+    kept = 2 * int(sites.sum() + system.known_marks.sum())
+    kept += int(system.known_views[:3 * system.grid.n_views].sum())
+    return Observability(kept, kept, 0, True)
+
+
+def _as_read(system: JointSystem, views: tuple[View, ...]) -> tuple[View, ...]:
+    """Return the views with only those kinds of marks that were read."""
+    return tuple(View(view.name, view.rotation_rad, view.translation_m,
+                      i in system.grid_index, i in system.angular_index)
+                 for i, view in enumerate(views)
+                 if i in system.grid_index or i in system.angular_index)
+
+
+def advice_for(artifact: Artifact, views: Iterable[View]) -> tuple[str, ...]:
+    """Return the views that a deficient plan lacks: a quarter turn, a shift, a one-line turn."""
+    views = tuple(views)
+    poses = [view.lattice_pose(artifact) for view in views if view.grid]
+    advice = []
+    if len({pose.quarter_turns % 2 for pose in poses}) < 2:
+        advice.append("add a view turned by 90 deg")
+    if len({pose.shift for pose in poses}) < 2:
+        advice.append("add a view shifted by one pitch along X")
+    if any(view.angular for view in views) and artifact.angular_count:
+        turns = [v.lattice_pose(artifact).turn_lines for v in views if v.angular]
+        if _common_step([turn - turns[0] for turn in turns], artifact.angular_count) > 1:
+            advice.append(f"add an angular view turned by one line "
+                          f"({360 / artifact.angular_count:g} deg)")
+    return tuple(advice) or _tried(artifact, views)
+
+
+def _tried(artifact: Artifact, views: tuple[View, ...]) -> tuple[str, ...]:
+    """Return the first single view that cures the plan, found by trying them."""
+    pitch = artifact.grid_pitch_m
+    for name, turn, shift in (("shifted by one pitch along Y", 0.0, (0.0, pitch)),
+                              ("shifted by one pitch along X", 0.0, (pitch, 0.0)),
+                              ("turned by 90 deg", math.pi / 2, (0.0, 0.0)),
+                              ("that is neither turned nor shifted", 0.0, (0.0, 0.0))):
+        more = View("", turn, shift, True, artifact.angular_count > 0)
+        system = planned_system(artifact, (*views, more), rank_only=True)
+        if (system.rank_grid + DATUM_ROWS == 4 * system.grid.n_sites + 3 * system.grid.n_views
+                and not angular_deficiency(system)):
+            return (f"add a view {name}",)
+    return ("add views turned by 90 deg and shifted by one pitch along X and along Y",)
+
+
+def _common_step(turns: list[int], lines: int) -> int:
+    return math.gcd(lines, *turns)
+
+
+def refusal(observability: Observability) -> str:
+    """Return the one line that refuses a deficient measurement and names what would cure it."""
+    modes = f"{observability.deficiency} mode" + "s" * (observability.deficiency != 1)
+    return (f"the marks that were read do not identify the stage ({modes} unseen): "
+            + "; ".join(observability.advice))

@@ -1,0 +1,243 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a deficient plan cannot see: the unseen fields of the stage, named and as maps.
+
+Two sources (method, section 6). A component of sites and marks that no closed path of readings
+turns leaves a vector free, which goes along with the readings. And combinations of misalignments
+that no reading tells move whole fields.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+from selfcal_ros.estimation.lattice.connectivity import Components
+from selfcal_ros.estimation.lattice.maps import PHASES
+from selfcal_ros.estimation.normal.equations import JointSystem, pseudo_inverse
+from selfcal_ros.estimation.normal.grid import GridSystem
+
+MATCH = 1e-9
+"""Relative sum of squares that a reading of a field may leave if the field is unseen."""
+
+MAX_MAPS = 400
+"""Largest number of maps that are made of one plan."""
+
+
+@dataclass(frozen=True, eq=False)
+class UnseenMode:
+    """A family of stage errors that the readings cannot tell from plate errors.
+
+    Attributes
+    ----------
+    name : str
+        Short name, such as ``non-orthogonality``.
+    text : str
+        The family in words.
+    example : float array (2, nx, ny)
+        One member, largest value 1, stage frame; empty for an angular family.
+    """
+
+    name: str
+    text: str
+    example: np.ndarray
+
+
+def is_unseen(system: JointSystem, field: np.ndarray) -> bool:
+    """Return whether a stage error can hide behind a plate error and misalignments.
+
+    Parameters
+    ----------
+    system : JointSystem
+        The readings.
+    field : complex array (nx, ny)
+        Stage error Gx + i Gy.
+    """
+    grid = system.grid
+    y = grid.views.gather(field) * grid.read
+    left = grid.centred(y) * grid.read
+    total = float((grid.weight * abs(left) ** 2).sum())
+    scale = float((grid.weight * abs(y) ** 2).sum())
+    right = np.zeros(system.size)
+    right[:3 * grid.n_views] = grid.right_side(y)[1]
+    block = np.zeros((system.size, system.size))
+    block[:len(grid.block), :len(grid.block)] = grid.block
+    if system.angular.n_views:
+        # the angular lines hold the rotations together as far as they were read
+        weight = system.grid_scale / system.angular_scale
+        block[np.ix_(system.phi_at, system.phi_at)] += weight * system.angular.schur
+    explained = right @ pseudo_inverse(*np.linalg.eigh(block), system.grid_scale) @ right
+    return bool(total - explained <= MATCH * scale)
+
+
+def known_families(system: JointSystem) -> list[UnseenMode]:
+    """Return the unseen fields among those that have a name of their own."""
+    z = system.grid.views.z
+    x, y = z.real, z.imag
+    named = [
+        ("non-orthogonality", "non-orthogonality of the axes: Gx = O y, Gy = O x", y + 1j * x),
+        ("scale difference", "scale difference of the axes: Gx = R x, Gy = -R y", x - 1j * y),
+        ("bending along x", "steady turn from column to column: Gx = x y, Gy = -x^2/2",
+         x * y - 0.5j * x**2),
+        ("bending along y", "steady turn from row to row: Gx = y^2/2, Gy = -x y",
+         0.5 * y**2 - 1j * x * y),
+    ]
+    return [UnseenMode(name, text, as_map(field)) for name, text, field in named
+            if is_unseen(system, field)]
+
+
+def component_family(system: JointSystem) -> UnseenMode | None:
+    """Return the family of vectors left free by balanced components, None if one spans all."""
+    grid = system.grid
+    parts, phase = grid.components, phases(grid)
+    free = np.flatnonzero(parts.balanced)
+    seen = parts.of_site >= 0
+    if len(free) < 2 and not (len(free) == 1 and len(parts.balanced) > 1):
+        return None
+    label = np.where(seen & np.isin(parts.of_site, free), parts.of_site, -1)
+    label = label.reshape(grid.views.shape)
+    signs = np.where(label >= 0, phase.reshape(label.shape), 0)
+    name, text = _shape_of(grid, label, signs, n=len(free))
+    # the example: one component against the rest
+    example = np.where(label == free[0], PHASES[signs], 0)
+    return UnseenMode(name, text, as_map(example))
+
+
+def phases(grid: GridSystem) -> np.ndarray:
+    """Return the quarter turns that a free vector of each site's component takes, (sites,)."""
+    site, mark, q = grid.edges
+    n = 2 * grid.n_sites
+    turns = np.arange(4)[:, None]
+    a = ((turns + q) % 4) * n + site
+    b = np.broadcast_to(turns * n + mark + grid.n_sites, a.shape)
+    edges = coo_matrix((np.ones(a.size, dtype=np.int8), (a.ravel(), b.ravel())),
+                       shape=(4 * n, 4 * n))
+    cover = connected_components(edges, directed=False)[1].reshape(4, n)[:, :grid.n_sites]
+    parts = grid.components
+    home = cover[0][parts.first_sites]
+    wanted = np.where(parts.of_site >= 0, home[parts.of_site], -1)
+    return np.argmax(cover == wanted, axis=0)
+
+
+def _shape_of(grid: GridSystem, label: np.ndarray, signs: np.ndarray, *,
+              n: int) -> tuple[str, str]:
+    """Name the pattern of the free components on the field."""
+    shifts = {(pose.a, pose.b) for pose in grid.views.poses}
+    turns = sorted({(pose.q - grid.views.poses[0].q) % 4 for pose in grid.views.poses})
+    if len(grid.views.poses) == 1:
+        return "every field", "every field: one view cannot tell the stage from the plate"
+    for axis, line in ((0, "rows"), (1, "columns")):
+        first = np.take(label, [label.shape[axis] // 2], axis=axis)
+        if (label == first).all():
+            return (f"{line[:-1]} offsets",
+                    f"offsets of the {line} against each other, in x and in y"
+                    + (f", opposite in opposite {line}" if len(turns) > 1 else ""))
+    if len(shifts) == 1:
+        turn = "quarter" if any(t % 2 for t in turns) else "half"
+        return ("rotation-symmetric fields", f"rotation-symmetric fields: every field that a "
+                f"{turn} turn maps to itself ({2 * n} numbers)")
+    period = _period(label)
+    if period:
+        along = " and ".join(f"every {p} pitches along {a}"
+                             for p, a in zip(period, "xy", strict=True) if p > 1)
+        return "periodic fields", f"patterns that repeat {along} ({2 * n} numbers)"
+    return ("separate groups of sites", f"{n} groups of sites that no reading joins to the others: "
+            f"each may move by itself, the smallest is {_smallest(grid, label)}")
+
+
+def _period(label: np.ndarray) -> tuple[int, int] | None:
+    """Return the smallest period of the components along x and y, None if there is none."""
+    out = []
+    for axis in (0, 1):
+        size = label.shape[axis]
+        moved = [p for p in range(1, size // 2 + 1)
+                 if np.array_equal(np.take(label, range(p, size), axis=axis),
+                                   np.take(label, range(size - p), axis=axis))]
+        if not moved:
+            return None
+        out.append(moved[0])
+    return (out[0], out[1]) if max(out) > 1 else None
+
+
+def _smallest(grid: GridSystem, label: np.ndarray) -> str:
+    sizes = np.bincount(label[label >= 0])
+    which = int(np.argmin(np.where(sizes > 0, sizes, sizes.max() + 1)))
+    hx, hy = grid.views.half
+    at = np.argwhere(label == which)
+    text = ", ".join(f"({i - hx}, {j - hy})" for i, j in at[:4])
+    return text + (", ..." if len(at) > 4 else "")
+
+
+def unvisited_family(grid: GridSystem) -> UnseenMode | None:
+    """Return the sites that no mark visits as a family, None if all are visited."""
+    missing = (grid.components.of_site < 0).reshape(grid.views.shape)
+    if not missing.any():
+        return None
+    at = np.argwhere(missing)[0] - np.array(grid.views.half)
+    return UnseenMode("sites never visited", f"{int(missing.sum())} sites that no mark visits, "
+                      f"the first is ({at[0]}, {at[1]})", as_map(missing.astype(complex)))
+
+
+def unread_marks(grid: GridSystem) -> UnseenMode | None:
+    """Return the marks that no view reads as a family, None if all are read."""
+    n = int((grid.components.of_mark < 0).sum())
+    if not n:
+        return None
+    return UnseenMode("marks never read", f"{n} marks of the plate that no view reads",
+                      np.zeros((0,)))
+
+
+def angular_families(system: JointSystem) -> list[UnseenMode]:
+    """Return what the turns leave unseen of the angular map, in words."""
+    angular = system.angular
+    if not angular.n_views:
+        return []
+    parts, out = angular.components, []
+    n = len(parts.balanced)
+    if n > 1:
+        out.append(UnseenMode("angular groups", _angular_text(parts, n), np.zeros((0,))))
+    missing = int((parts.of_site < 0).sum())
+    if missing:
+        out.append(UnseenMode("lines never visited", f"{missing} stage angles that no line "
+                              "visits", np.zeros((0,))))
+    return out
+
+
+def _angular_text(parts: Components, n: int) -> str:
+    lines = np.arange(len(parts.of_site))
+    if np.array_equal(parts.of_site, parts.of_site[lines % n]):
+        if n == len(lines):
+            return "angular map: every field, as no view turns the lines"
+        return f"angular map: patterns that repeat every {n} lines"
+    return f"angular map: {n} groups of lines that no view joins"
+
+
+def as_map(field: np.ndarray) -> np.ndarray:
+    """Return a complex field (nx, ny) as (2, nx, ny), largest value 1."""
+    both = np.stack([field.real, field.imag]).astype(float)
+    return both / max(float(abs(both).max()), np.finfo(float).tiny)
+
+
+def mode_maps(system: JointSystem) -> np.ndarray:
+    """Return an orthonormal basis of the unseen fields of the stage, (modes, 2, nx, ny).
+
+    Fields of the datum are taken out; sites that no mark visits are not counted. At most
+    MAX_MAPS are returned.
+    """
+    grid = system.grid
+    parts, phase = grid.components, PHASES[phases(grid)]
+    fields = []
+    for component in np.flatnonzero(parts.balanced)[:MAX_MAPS]:
+        here = np.where(parts.of_site == component, phase, 0)
+        fields += [here, 1j * here]
+    fields += list((grid.response @ system.unseen[:3 * grid.n_views]).T)
+    if not fields:
+        return np.zeros((0, 2, *grid.views.shape))
+    basis = np.array(fields)
+    real = np.concatenate([basis.real, basis.imag], axis=1).T
+    z, seen = grid.views.z.ravel(), parts.of_site >= 0
+    datum = np.array([np.ones_like(z), 1j * np.ones_like(z), 1j * z, z]) * seen
+    rigid = np.linalg.qr(np.concatenate([datum.real, datum.imag], axis=1).T)[0]
+    real = real - rigid @ (rigid.T @ real)
+    u, s, _ = np.linalg.svd(real, full_matrices=False)
+    return u[:, s > 1e-8].T.reshape(-1, 2, *grid.views.shape)[:MAX_MAPS]

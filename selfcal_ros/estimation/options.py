@@ -1,0 +1,97 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How to calibrate: method, datum, reference length, model of the misalignments."""
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+from selfcal_ros.errors import InputError
+from selfcal_ros.model.error_map import ThetaDatum
+
+METHODS = ("joint", "law")
+MISALIGNMENT_MODELS = ("linear", "rigid")
+
+
+class ReferenceKind(StrEnum):
+    """What the reference length was measured on."""
+
+    ARTIFACT = "artifact"
+    STAGE_X = "stage_x"
+    STAGE_Y = "stage_y"
+
+
+@dataclass(frozen=True)
+class ReferenceLength:
+    """A length that sets the scale, which no view can tell.
+
+    Attributes
+    ----------
+    kind : ReferenceKind
+        ``artifact``: a certified plate; ``stage_x``, ``stage_y``: a laser-measured axis.
+    relative_error : float
+        Plate: (true - nominal) / nominal length, the least-squares scale of A over the plate.
+        Stage axis: (indicated - true) / nominal length, the least-squares slope of Gx on x
+        (of Gy on y) over the field.
+    u_relative : float
+        Its standard uncertainty (k=1).
+
+    Raises
+    ------
+    InputError
+        If a number is not finite, not small, or the uncertainty is negative.
+    """
+
+    kind: ReferenceKind
+    relative_error: float
+    u_relative: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Refuse lengths that cannot be relative errors."""
+        object.__setattr__(self, "kind", ReferenceKind(self.kind))
+        if not abs(self.relative_error) < 0.1:
+            raise InputError("reference length", f"{self.relative_error} is not a relative error",
+                             "give (true - nominal) / nominal, below 0.1")
+        if not 0 <= self.u_relative < 0.1:
+            raise InputError("reference length", f"{self.u_relative} is not a standard "
+                             "uncertainty of a relative error", "give a number from 0 to 0.1")
+
+
+@dataclass(frozen=True)
+class Options:
+    """How to calibrate.
+
+    Attributes
+    ----------
+    method : str
+        ``joint`` (all readings in one least squares) or ``law`` (Hu's published steps).
+    datum_theta : ThetaDatum
+        What fixes the free constant of the angular map.
+    reference : ReferenceLength, optional
+        Sets the scale; without it the map has none (Hu eq. 5).
+    misalignment_model : str
+        ``linear`` as published, or ``rigid``: finite rotations of the plate.
+    uncertainty : bool, optional
+        Whether to compute the uncertainty map; None decides by the size of the field.
+
+    Raises
+    ------
+    InputError
+        For an unknown method or model.
+    """
+
+    method: str = "joint"
+    datum_theta: ThetaDatum = ThetaDatum.XY_AXES
+    reference: ReferenceLength | None = None
+    misalignment_model: str = "linear"
+    uncertainty: bool | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse unknown names."""
+        for name, known in (("method", METHODS), ("misalignment_model", MISALIGNMENT_MODELS)):
+            if getattr(self, name) not in known:
+                raise InputError(name, f"'{getattr(self, name)}' is unknown",
+                                 "known are " + ", ".join(known))
+        try:
+            object.__setattr__(self, "datum_theta", ThetaDatum(self.datum_theta))
+        except ValueError as error:
+            raise InputError("datum_theta", f"'{self.datum_theta}' is unknown",
+                             "known are " + ", ".join(ThetaDatum)) from error

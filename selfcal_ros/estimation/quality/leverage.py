@@ -1,0 +1,197 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Residuals of a measurement with their leverage: how far each reading checks itself.
+
+The leverage h of a reading is the part of it that the fit follows; its residual has the standard
+deviation sigma sqrt((1 - h) / weight). For a grid reading of weight w in a mark of total weight W,
+h = w (1/W + var(x - mean x)), with x the part of the model other than the plate's error.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import nnls
+
+from selfcal_ros.errors import InputError
+from selfcal_ros.estimation.joint.fit import Fit, fit
+from selfcal_ros.estimation.joint.problem import Problem
+from selfcal_ros.estimation.joint.solve import prepare
+from selfcal_ros.estimation.lattice.maps import PHASES
+from selfcal_ros.estimation.normal.equations import JointSystem
+from selfcal_ros.estimation.options import Options
+from selfcal_ros.model.readings import Measurements
+
+EXACT_SITES = 31 * 31
+"""Largest field whose leverages are computed exactly; beyond, from seeded draws."""
+
+EXACT_LINES = 2048
+"""Largest number of lines whose leverages are computed exactly; beyond, all have their mean."""
+
+N_DRAWS = 64
+"""Draws of unit noise for a larger field: 9 % standard error of a residual's variance."""
+
+VIEW_DRAWS = 16
+"""Draws of unit noise in each view, to unmix the noises of views."""
+
+CHECKED = 0.05
+"""Smallest 1 - h of a reading that can be checked against the others."""
+
+
+@dataclass(frozen=True, eq=False)
+class Residuals:
+    """Residuals of all readings.
+
+    Attributes
+    ----------
+    problem : Problem
+        The plan and its readings.
+    found : Fit
+        The joint solution.
+    redundancy, redundancy_theta : float array (views, nx, ny), (views, K)
+        1 - h; 0 where not read.
+    """
+
+    problem: Problem
+    found: Fit
+    redundancy: np.ndarray
+    redundancy_theta: np.ndarray
+
+    @property
+    def squares(self) -> np.ndarray:
+        """|residual|^2 weight / (1 - h), m^2, (views, nx, ny): 2 sigma^2 on average.
+
+        NaN where the reading cannot be checked.
+        """
+        return _scaled(abs(self.found.residuals) ** 2, self.problem.grid.weight, self.redundancy)
+
+    @property
+    def squares_theta(self) -> np.ndarray:
+        """The same for angular readings, rad^2, (views, K); sigma^2 on average."""
+        return _scaled(self.found.residuals_theta**2, self.problem.angular.weight,
+                       self.redundancy_theta)
+
+
+def _scaled(squares: np.ndarray, weight: np.ndarray, redundancy: np.ndarray) -> np.ndarray:
+    good = redundancy > CHECKED
+    return np.where(good, squares * weight / np.where(good, redundancy, 1.0), np.nan)
+
+
+def residuals_of(measurements: Measurements, options: Options) -> Residuals:
+    """Fit the readings and return their residuals with redundancies.
+
+    Raises
+    ------
+    InputError
+        If the field is so large that it is solved by iteration.
+    """
+    problem, _ = prepare(measurements, options)
+    if not problem.direct:
+        raise InputError("--robust", f"{problem.system.grid.n_sites} sites are too many for the "
+                         "leverage of each reading", "solve without it")
+    found = fit(problem, problem.grid.y)
+    system = problem.system
+    if system.grid.n_sites <= EXACT_SITES:
+        redundancy = exact_redundancy(system)
+    else:
+        redundancy = drawn_redundancy(system)
+    return Residuals(problem, found, redundancy, angular_redundancy(system))
+
+
+def exact_redundancy(system: JointSystem) -> np.ndarray:
+    """Return 1 - h of every grid reading, (views, nx, ny), mean of both coordinates."""
+    grid = system.grid
+    inverse = grid.factor.solve(np.eye(grid.n_sites, dtype=complex))
+    index = np.maximum(grid.views.site_index, 0)
+    turns = PHASES[[-pose.q % 4 for pose in grid.views.poses]]
+    variance = np.zeros(grid.weight.shape)
+    for v in range(grid.n_views):
+        part = -grid.share * turns[:, None, None]
+        part[v] += turns[v]
+        for i in range(grid.n_views):
+            for j in range(grid.n_views):
+                entry = inverse[index[i], index[j]]
+                variance[v] += np.real(part[i] * entry * np.conj(part[j]))
+    basis = np.array([grid.centred(grid.views.gather(-column.reshape(grid.views.shape))
+                                   + grid.misaligned(unit)) for column, unit in
+                      zip(grid.response.T, np.eye(3 * grid.n_views), strict=True)])
+    spread = np.einsum("pvij,pq,qvij->vij", np.conj(basis), system.grid_inverse, basis).real / 2
+    return _redundancy(grid.weight, variance + spread)
+
+
+def _redundancy(weight: np.ndarray, variance: np.ndarray) -> np.ndarray:
+    total = weight.sum(axis=0)
+    h = weight * (1 / np.where(total > 0, total, 1.0) + variance)
+    return np.where(weight > 0, np.clip(1 - h, 0.0, 1.0), 0.0)
+
+
+def drawn_redundancy(system: JointSystem) -> np.ndarray:
+    """Return 1 - h of every grid reading from the residuals of seeded unit noise."""
+    grid = system.grid
+    rng = np.random.default_rng(0)
+    root = np.sqrt(np.where(grid.read, grid.weight, 1.0))
+    total = np.zeros(grid.weight.shape)
+    for _ in range(N_DRAWS):
+        noise = rng.standard_normal((2, *root.shape)) / root * grid.read
+        left = grid_residuals(system, noise[0] + 1j * noise[1])
+        total += abs(left) ** 2 * grid.weight
+    return np.where(grid.read, np.minimum(total / (2 * N_DRAWS), 1.0), 0.0)
+
+
+def grid_residuals(system: JointSystem, y: np.ndarray) -> np.ndarray:
+    """Return what the grid readings `y` (views, nx, ny) leave over when fitted alone."""
+    grid = system.grid
+    free, d = grid.reduced(y)
+    parameters = system.grid_inverse @ d
+    field = (free - grid.response @ parameters).reshape(grid.views.shape)
+    return grid.plate(y, field, parameters)[1]
+
+
+def view_noise(left: Residuals) -> np.ndarray:
+    """Return noise of each grid view and of the others, m, and dof of its own, (views, 3).
+
+    The residuals of one view hold the noise of all: their sums of squares are unmixed with what
+    seeded unit noise of each view leaves in each (Helmert's variance components, two at a time).
+    Twice the inverse of that mixing is the covariance of two variances that are 1.
+    """
+    system, grid = left.problem.system, left.problem.system.grid
+    rng = np.random.default_rng(0)
+    root = np.sqrt(np.where(grid.read, grid.weight, 1.0))
+    mixing = np.zeros((grid.n_views, grid.n_views))
+    for u in range(grid.n_views):
+        for _ in range(VIEW_DRAWS):
+            noise = np.zeros(grid.weight.shape, dtype=complex)
+            draw = rng.standard_normal((2, *root[u].shape)) / root[u] * grid.read[u]
+            noise[u] = draw[0] + 1j * draw[1]
+            rest = grid_residuals(system, noise)
+            mixing[:, u] += (abs(rest) ** 2 * grid.weight).sum(axis=(1, 2)) / VIEW_DRAWS
+    mixing = (mixing + mixing.T) / 2
+    sums = (abs(left.found.residuals) ** 2 * grid.weight).sum(axis=(1, 2))
+    out = np.empty((grid.n_views, 3))
+    for v in range(grid.n_views):
+        group = np.zeros((grid.n_views, 2))
+        group[:, 1], group[v] = 1.0, (1.0, 0.0)
+        normal = group.T @ mixing @ group
+        out[v, :2] = np.sqrt(nnls(normal, group.T @ sums)[0])
+        out[v, 2] = normal[0, 0] - normal[0, 1] ** 2 / max(normal[1, 1], 1e-300)
+    return out
+
+
+def angular_redundancy(system: JointSystem) -> np.ndarray:
+    """Return 1 - h of every angular reading, (views, K), rotations from the lines alone."""
+    angular = system.angular
+    if not angular.n_views:
+        return np.zeros(angular.weight.shape)
+    if angular.n_lines > EXACT_LINES:
+        mean = 1 - system.rank_angular / max(angular.n_readings, 1)
+        return np.where(angular.read, mean, 0.0)
+    inverse = angular.solve(np.eye(angular.n_lines))
+    variance = np.zeros(angular.weight.shape)
+    for v in range(angular.n_views):
+        part = -angular.share
+        part[v] += 1.0
+        for i in range(angular.n_views):
+            for j in range(angular.n_views):
+                variance[v] += part[i] * inverse[angular.site[i], angular.site[j]] * part[j]
+    basis = np.array([angular.centred(-column[angular.site] + unit[:, None]) for column, unit in
+                      zip(angular.response.T, np.eye(angular.n_views), strict=True)])
+    spread = np.einsum("pvk,pq,qvk->vk", basis, system.angular_inverse, basis)
+    return _redundancy(angular.weight, variance + spread)

@@ -1,0 +1,223 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A plate that slipped between two readings of a view: found, sized, and split in two placements.
+
+A view is read line by line. If the plate slips on the way, the rest of the view has another
+misalignment. For each view and each line the gain of a second misalignment is tested: the sum of
+squares that it explains, from the projection of its three columns on the residuals.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.stats import chi2
+
+from selfcal_ros.errors import NotIdentifiableError
+from selfcal_ros.estimation.joint.fit import Fit, fit
+from selfcal_ros.estimation.joint.problem import Problem
+from selfcal_ros.estimation.joint.solve import prepare
+from selfcal_ros.estimation.lattice.maps import PHASES
+from selfcal_ros.estimation.options import Options
+from selfcal_ros.estimation.quality.leverage import Residuals, grid_residuals
+from selfcal_ros.model.readings import Measurements, ViewReadings
+
+AMBIGUOUS = 16.0
+"""Difference of chi2 below which two places explain the readings equally well."""
+
+TRIED = 12
+"""Places that are tried in full."""
+
+TINY_M2 = 1e-30
+"""Square of a noise that is rounding."""
+
+SLIP_LEVEL = 1e-9
+"""Level of the test of each place where the plate may have slipped."""
+
+MAX_PLACES = 20
+"""Places tested along each axis of a view."""
+
+CLIP = 4.0
+"""Residuals count at most as this many standard deviations, so that one outlier is no slip."""
+
+
+@dataclass(frozen=True)
+class Slip:
+    """A slip of the plate within a view.
+
+    Attributes
+    ----------
+    view : str
+        Name of the view.
+    index : int
+        Its position in the measurement.
+    axis : str
+        ``m`` or ``n``: index of the marks along which the view was read.
+    first : int
+        First value of that index after the slip.
+    tx_m, ty_m, phi_rad : float
+        Change of offset and rotation, stage frame.
+    chi2 : float
+        Explained sum of squares over the noise variance; 3 on average without a slip.
+    alternatives : tuple of str
+        Other places that explain the readings as well: few views do not always tell where.
+    """
+
+    view: str
+    index: int
+    axis: str
+    first: int
+    tx_m: float
+    ty_m: float
+    phi_rad: float
+    chi2: float
+    alternatives: tuple[str, ...] = ()
+
+    @property
+    def place(self) -> str:
+        """Where it slipped, in words."""
+        return f"before {self.axis} = {self.first}"
+
+    def text(self) -> str:
+        """Return the slip in words."""
+        size = (f"({self.tx_m * 1e6:.3g}, {self.ty_m * 1e6:.3g}) um and "
+                f"{self.phi_rad * 1e6:.3g} urad")
+        if self.alternatives:
+            return (f"view '{self.view}': the plate slipped by about {size}, {self.place} or "
+                    + " or ".join(self.alternatives) + "; the readings do not tell which")
+        return (f"view '{self.view}': the plate slipped {self.place} by {size}; treated as two "
+                "placements")
+
+
+def find_slip(left: Residuals, sigma_m: float, measurements: Measurements,
+              options: Options) -> Slip | None:
+    """Return the slip that explains the residuals best, None if no place passes the test.
+
+    The places that explain most are tried in full: the one whose split leaves least is the slip.
+
+    Parameters
+    ----------
+    left : Residuals
+        Residuals of the fit.
+    sigma_m : float
+        Noise of one reading, m.
+    measurements, options : Measurements, Options
+        The readings and how they were fitted.
+    """
+    grid = left.problem.system.grid
+    found: list[Slip] = []
+    limit = CLIP * sigma_m / np.sqrt(np.where(grid.read, grid.weight, 1.0))
+    size = abs(left.found.residuals)
+    clipped = left.found.residuals * np.minimum(1.0, limit / np.maximum(size, 1e-300))
+    for v, i in enumerate(left.problem.grid.index):
+        for axis in (0, 1):
+            for place in _places(grid.read[v], axis):
+                tested = _test(left, clipped, v, axis, place)
+                if tested is None or tested[0] / sigma_m**2 < chi2.isf(SLIP_LEVEL, 3):
+                    continue
+                gain, parameters = tested
+                half = grid.views.half[axis]
+                t = PHASES[grid.views.poses[v].q] * complex(*parameters[1:])
+                found.append(Slip(measurements.views[i].view.name, i, "mn"[axis],
+                                  int(place) - half, t.real, t.imag,
+                                  float(parameters[0] / left.problem.half_width_m),
+                                  gain / sigma_m**2))
+    found.sort(key=lambda slip: -slip.chi2)
+    return _best(found[:TRIED], measurements, options)
+
+
+def _best(found: list[Slip], measurements: Measurements, options: Options) -> Slip | None:
+    """Return the slip whose split leaves the smallest clipped sum of squares."""
+    fits = []
+    for slip in found:
+        try:
+            problem, _ = prepare(split_view(measurements, slip), options)
+        except NotIdentifiableError:
+            continue
+        fitted = fit(problem, problem.grid.y)
+        weight = problem.grid.weight
+        squares = (abs(fitted.residuals) ** 2 * weight)[weight > 0]
+        fits.append((slip, squares, _size(slip, fitted, problem)))
+    if not fits:
+        return None
+    limit = CLIP**2 * max(min(float(np.median(squares)) for _, squares, _ in fits), TINY_M2)
+    losses = [float(np.minimum(squares, limit).sum()) for _, squares, _ in fits]
+    order = np.argsort(losses, kind="stable")
+    slip, squares, size = fits[order[0]]
+    # the loss counts residuals, which are smaller than the noise by the part that the fit follows
+    dof_part = 1 - _followed(measurements, slip, options)
+    near = losses[order[0]] + AMBIGUOUS * float(np.median(squares)) / chi2.median(2) / dof_part
+    others = tuple(f"before {fits[i][0].axis} = {fits[i][0].first}" + (
+        "" if fits[i][0].view == slip.view else f" in view '{fits[i][0].view}'")
+        for i in order[1:] if losses[i] < near)
+    return replace(slip, tx_m=size[0], ty_m=size[1], phi_rad=size[2], alternatives=others)
+
+
+def _followed(measurements: Measurements, slip: Slip, options: Options) -> float:
+    """Return the mean leverage after the split."""
+    system = prepare(split_view(measurements, slip), options)[0].system
+    return system.rank_grid / (2 * system.grid.n_readings)
+
+
+def _size(slip: Slip, fitted: Fit, problem: Problem) -> tuple[float, float, float]:
+    """Return offset and rotation of the second placement less those of the first."""
+    row = problem.grid.index.index(slip.index)
+    before, after = fitted.parameters[:3 * problem.system.grid.n_views].reshape(-1, 3)[row:row + 2]
+    phi, re, im = after - before
+    t = PHASES[problem.grid.poses[row].q] * complex(re, im)
+    return float(t.real), float(t.imag), float(phi / problem.half_width_m)
+
+
+def _places(read: np.ndarray, axis: int) -> np.ndarray:
+    """Return the lines before which a slip is tested: at least one line read on either side."""
+    lines = np.flatnonzero(read.any(axis=1 - axis))
+    inner = lines[1:]
+    if len(inner) <= MAX_PLACES:
+        return inner
+    return inner[np.linspace(0, len(inner) - 1, MAX_PLACES).round().astype(int)]
+
+
+def _test(left: Residuals, clipped: np.ndarray, v: int, axis: int,
+          place: int) -> tuple[float, np.ndarray] | None:
+    """Return the sum of squares that a slip explains, m^2, and its size (phi, Re, Im tau)."""
+    system = left.problem.system
+    grid = system.grid
+    after = grid.read[v].copy()
+    after[(slice(0, place), slice(None))[::1 - 2 * axis]] = False
+    if after.sum() < 3 or (grid.read[v] & ~after).sum() < 3:
+        return None
+    columns = np.zeros((3, *grid.weight.shape), dtype=complex)
+    columns[0, v], columns[1, v], columns[2, v] = (
+        shape * after for shape in (1j * grid.views.z, np.ones_like(grid.views.z),
+                                    np.full_like(grid.views.z, 1j)))
+    projected = np.array([grid_residuals(system, column) for column in columns])
+    normal = np.einsum("avij,bvij,vij->ab", np.conj(projected), projected, grid.weight).real
+    if np.linalg.matrix_rank(normal, tol=1e-9 * max(np.trace(normal), 1e-300)) < 3:
+        return None
+    right = np.einsum("avij,vij,vij->a", np.conj(projected), clipped, grid.weight).real
+    parameters = np.linalg.solve(normal, right)
+    return float(right @ parameters), parameters
+
+
+def split_view(measurements: Measurements, slip: Slip) -> Measurements:
+    """Return the measurement with the view as two placements, before and after the slip.
+
+    Its angular lines become a placement of their own: when they were read is not known.
+    """
+    view = measurements.views[slip.index]
+    after = getattr(view, slip.axis) >= slip.first
+    parts = [_grid_part(view, ~after, ""), _grid_part(view, after, " after slip")]
+    if len(view.k):
+        lines = replace(view.view, name=view.view.name + " lines", grid=False)
+        parts.append(replace(ViewReadings(lines), k=view.k, dtheta=view.dtheta,
+                             count_theta=view.count_theta, u_theta=view.u_theta,
+                             sigma_theta=view.sigma_theta, dof_theta=view.dof_theta))
+    views = (*measurements.views[:slip.index], *parts, *measurements.views[slip.index + 1:])
+    return replace(measurements, views=views)
+
+
+def _grid_part(view: ViewReadings, keep: np.ndarray, suffix: str) -> ViewReadings:
+    named = replace(view.view, name=view.view.name + suffix, angular=False)
+    used = int(view.count[keep].sum())
+    return ViewReadings(named, view.m[keep], view.n[keep], view.dx[keep], view.dy[keep],
+                        view.count[keep], view.u[keep] if len(view.u) else view.u,
+                        sigma_xy=view.sigma_xy, dof_xy=int(view.dof_xy * keep.mean()), used=used,
+                        rejected={} if suffix else view.rejected)

@@ -1,0 +1,247 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Held-out validation: how well a calibration predicts readings that it has not seen.
+
+Small residuals prove nothing; a prediction can fail. A tenth of the readings, or a whole view, is
+left out, the rest is calibrated, and the readings left out are predicted. To a whole view its three
+misalignments are fitted first, as no calibration can know them.
+"""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from selfcal_ros.errors import InputError, NoDataError, NotIdentifiableError
+from selfcal_ros.estimation.api import calibrate
+from selfcal_ros.estimation.blas_threads import one_thread
+from selfcal_ros.estimation.lattice.finite_rotation import (
+    rotation_excess,
+    turned_marks,
+    turned_plate,
+)
+from selfcal_ros.estimation.options import Options
+from selfcal_ros.estimation.quality.outliers import subset
+from selfcal_ros.model.readings import Measurements, Sense, ViewReadings
+from selfcal_ros.model.result import CalibrationResult
+
+FRACTION = 0.1
+"""Part of the readings that is held out at random."""
+
+MAX_FOLDS = 10
+
+RIGID_STEPS = 8
+"""Steps to a finite rotation of a view held out; each gains a factor of its size."""
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """Prediction error of one set of held-out readings.
+
+    Attributes
+    ----------
+    name : str
+        What was held out.
+    n_grid, n_angular : int
+        Readings that were predicted.
+    rms_m, max_m : float
+        Error of a coordinate, m; NaN if no grid reading was predicted.
+    rms_rad : float
+        Error of an angular reading, rad; NaN if none was predicted.
+    ratio : float
+        rms over the noise of one reading; the noise alone gives 1, the map's own uncertainty
+        adds to it.
+    note : str
+        Why nothing could be predicted; empty otherwise.
+    """
+
+    name: str
+    n_grid: int = 0
+    n_angular: int = 0
+    rms_m: float = float("nan")
+    max_m: float = float("nan")
+    rms_rad: float = float("nan")
+    ratio: float = float("nan")
+    note: str = ""
+
+
+@one_thread()
+def validate(measurements: Measurements, options: Options | None = None, *, seed: int = 0,
+             folds: int = 3) -> list[HeldOut]:
+    """Hold out random tenths and whole views in turn, and predict them.
+
+    Parameters
+    ----------
+    measurements : Measurements
+        All readings.
+    options : Options, optional
+        As for `calibrate`; uncertainties are not computed, the method is ``joint``.
+    seed : int
+        Of the random tenths.
+    folds : int
+        Number of random tenths, 1 to 10; they do not overlap.
+
+    Raises
+    ------
+    InputError
+        If `folds` is out of range.
+    NoDataError, NotIdentifiableError
+        As `calibrate`, for all readings.
+    """
+    if not 1 <= folds <= MAX_FOLDS:
+        raise InputError("folds", f"{folds} is not a number from 1 to {MAX_FOLDS}",
+                         "give a number of tenths")
+    options = replace(options or Options(), method="joint", uncertainty=False)
+    calibrate(measurements, options)
+    rng = np.random.default_rng(seed)
+    group = []
+    for view in measurements.views:
+        # drawn in the order of the lattice: the order of the readings changes nothing
+        ranks = (np.lexsort((view.n, view.m)).argsort(), np.argsort(view.k).argsort())
+        group.append(tuple((rng.permutation(len(rank)) % MAX_FOLDS)[rank] for rank in ranks))
+    out = []
+    for fold in range(folds):
+        chosen = [(grid == fold, lines == fold) for grid, lines in group]
+        out.append(_held_out(measurements, options, chosen, f"a random tenth ({fold + 1})"))
+    for index, view in enumerate(measurements.views):
+        chosen = [(np.full(len(v.m), i == index), np.full(len(v.k), i == index))
+                  for i, v in enumerate(measurements.views)]
+        out.append(_held_out(measurements, options, chosen, f"view '{view.view.name}'"))
+    return out
+
+
+def _held_out(measurements: Measurements, options: Options,
+              chosen: list[tuple[np.ndarray, np.ndarray]], name: str) -> HeldOut:
+    """Calibrate from the readings that are not chosen and predict the chosen ones."""
+    kept = replace(measurements, views=tuple(
+        subset(view, ~grid, ~lines)
+        for view, (grid, lines) in zip(measurements.views, chosen, strict=True)))
+    try:
+        result = calibrate(kept, options)
+    except (NotIdentifiableError, NoDataError):
+        return HeldOut(name, note="cannot be held out: the rest does not identify the stage")
+    errors, angles, weights = [], [], []
+    rigid = options.misalignment_model == "rigid"
+    for index, (view, (grid, lines)) in enumerate(zip(measurements.views, chosen, strict=True)):
+        left, left_theta = prediction_errors(measurements, result, index,
+                                             subset(view, grid, lines), rigid=rigid)
+        errors.append(left)
+        angles.append(left_theta)
+        weights.append(view.count[grid])
+    left, left_theta = np.concatenate(errors, axis=1), np.concatenate(angles)
+    known, angular = np.isfinite(left).all(axis=0), np.isfinite(left_theta)
+    if not known.any() and not angular.any():
+        return HeldOut(name, note="nothing to predict: no held-out mark is known from the rest")
+    scaled = left[:, known] * np.sqrt(np.concatenate(weights)[known])
+    return HeldOut(
+        name, int(known.sum()), int(angular.sum()), _rms(left[:, known]),
+        float(abs(left[:, known]).max()) if known.any() else float("nan"),
+        _rms(left_theta[angular]), _rms(scaled) / max(result.noise.sigma_xy, 1e-300))
+
+
+def _rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(values**2))) if values.size else float("nan")
+
+
+def prediction_errors(measurements: Measurements, result: CalibrationResult, index: int,
+                      view: ViewReadings, *, rigid: bool = False
+                      ) -> tuple[np.ndarray, np.ndarray]:
+    """Return reading less prediction of the readings `view`, (2, P) in m and (Q,) in rad.
+
+    Parameters
+    ----------
+    measurements : Measurements
+        For the plate and the sense.
+    result : CalibrationResult
+        Calibration that has not seen these readings.
+    index : int
+        Position of the view in the calibration, for its misalignment; a misalignment that is
+        not known there is fitted to the readings.
+    view : ViewReadings
+        What is to be predicted.
+    rigid : bool
+        Whether the calibration took finite rotations of the plate.
+    """
+    known = result.views[index]
+    grid = _aligned(_grid_errors(measurements, result, view), measurements, result, view,
+                    known=(known.phi, known.tx, known.ty), rigid=rigid)
+    theta = np.zeros(0)
+    if len(view.k):
+        sign = -1 if measurements.sense is Sense.PLATE_MOVES else 1
+        count = measurements.artifact.angular_count
+        site = sign * (view.k + view.view.lattice_pose(measurements.artifact).turn_lines) % count
+        theta = (view.dtheta - sign * result.error_map.g_theta[site]
+                 - result.artifact_map.a_theta[view.k])
+        phi = known.phi
+        if not np.isfinite(phi):
+            phi = np.nanmean(theta) if np.isfinite(theta).any() else np.nan
+        theta = theta - phi
+    return grid, theta
+
+
+def _grid_errors(measurements: Measurements, result: CalibrationResult,
+                 view: ViewReadings) -> np.ndarray:
+    """Return the readings less stage and plate error, complex (P,); NaN where one is unknown."""
+    if not len(view.m):
+        return np.zeros(0, dtype=complex)
+    artifact, emap = measurements.artifact, result.error_map
+    i, j = view.view.lattice_pose(artifact).site_of(view.m, view.n)
+    sign = -1 if measurements.sense is Sense.PLATE_MOVES else 1
+    at = sign * i + artifact.half[0], sign * j + artifact.half[1]
+    return (view.dx + 1j * view.dy - sign * (emap.gx[at] + 1j * emap.gy[at])
+            - turned_plate(view, artifact, result.artifact_map))
+
+
+def _aligned(left: np.ndarray, measurements: Measurements, result: CalibrationResult,
+             view: ViewReadings, *, known: tuple[float, float, float], rigid: bool) -> np.ndarray:
+    """Return `left` less the misalignment, known or fitted to `left` itself, (2, P)."""
+    if not left.size:
+        return np.zeros((2, 0))
+    artifact = measurements.artifact
+    marks = turned_marks(view, artifact)
+    plate = turned_plate(view, artifact, result.artifact_map)
+    if np.isfinite(known).all():
+        phi, tx, ty = known
+    else:
+        phi, tx, ty = _misalignment(left, marks)
+        for _ in range(RIGID_STEPS if rigid else 0):
+            phi, tx, ty = _misalignment(left - rotation_excess(phi, marks, plate), marks)
+    if rigid:
+        left = left - rotation_excess(phi, marks, plate)
+    rest = left - 1j * phi * marks - complex(tx, ty)
+    return np.stack([rest.real, rest.imag])
+
+
+def _misalignment(left: np.ndarray, marks: np.ndarray) -> tuple[float, float, float]:
+    """Return (phi, tx, ty) fitted to `left`, NaN if fewer than three marks are known."""
+    good = np.isfinite(left)
+    if good.sum() < 3:
+        return (float("nan"),) * 3
+    columns = np.stack([1j * marks[good], np.ones(good.sum()), np.full(good.sum(), 1j)])
+    rows = np.concatenate([columns.real, columns.imag], axis=1).T
+    scale = np.linalg.norm(rows, axis=0)
+    values = np.concatenate([left[good].real, left[good].imag])
+    phi, tx, ty = np.linalg.lstsq(rows / scale, values, rcond=None)[0] / scale
+    return float(phi), float(tx), float(ty)
+
+
+def validation_json(found: list[HeldOut]) -> list[dict[str, Any]]:
+    """Return the validation for ``extra["validation"]`` of a result: SI units."""
+    return [vars(item) for item in found]
+
+
+def validation_text(found: list[HeldOut]) -> list[str]:
+    """Return one line a held-out set, um and arcsec."""
+    lines = []
+    for item in found:
+        if item.note:
+            lines.append(f"{item.name}: {item.note}")
+            continue
+        parts = []
+        if item.n_grid:
+            parts.append(f"{item.n_grid} marks predicted within {item.rms_m * 1e6:.4g} um rms, "
+                         f"{item.max_m * 1e6:.4g} um at most ({item.ratio:.2f} times the noise)")
+        if item.n_angular:
+            parts.append(f"{item.n_angular} lines within "
+                         f"{np.degrees(item.rms_rad) * 3600:.4g} arcsec rms")
+        lines.append(f"{item.name}: " + ", ".join(parts))
+    return lines

@@ -1,0 +1,88 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Covariances computed anew from a saved map are those of the calibration behind it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from selfcal_ros.estimation.api import calibrate
+from selfcal_ros.estimation.comparison.covariance import first_order_u, xy_covariance
+from selfcal_ros.estimation.comparison.maps import compare
+from selfcal_ros.estimation.joint.covariance import map_covariance
+from selfcal_ros.estimation.options import Options, ReferenceLength
+from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.readings import Sense
+from selfcal_ros.model.view import View
+from selfcal_ros.simulation.truth import hu_plan, random_truth, simulate_measurements
+from test.support.lattice_plans import plan_of
+
+PLAN = plan_of("0,90,tx,2ty", Artifact(5, 0.01, 12), lines=1)
+HU, SMALL = hu_plan(Artifact(7, 0.01, 12)), hu_plan(Artifact(5, 0.01, 8))
+_BARE = plan_of("0,90,tx,ty", Artifact(7, 0.01, 24))
+APART = replace(_BARE, views=(*(replace(view, angular=False) for view in _BARE.views), *(
+    View(f"lines {k}", k * np.pi / 12, (0.0, 0.0), False, True) for k in (0, 1, 6))))
+
+
+def measured(plan, seed, truth_seed=99, sense=Sense.MICROSCOPE_MOVES):
+    truth = random_truth(plan.artifact, len(plan.views), np.random.default_rng(truth_seed))
+    return simulate_measurements(truth, plan, np.random.default_rng(seed), sense=sense,
+                                 sigma_m=2e-8, sigma_theta_rad=2e-5)
+
+
+@pytest.mark.parametrize("sense", Sense)
+@pytest.mark.parametrize("reference", [
+    None, ReferenceLength("stage_x", 1e-6, 0.0), ReferenceLength("stage_y", 1e-6, 2e-6),
+    ReferenceLength("artifact", 1e-6, 2e-6)])
+def test_covariance_of_a_saved_map(sense, reference):
+    readings = measured(PLAN, 1, sense=sense)
+    options = Options(reference=reference)
+    result = calibrate(readings, options)
+    known = result.error_map.valid
+    found, correlated = xy_covariance(result, known)
+    wanted = map_covariance(readings, options).nodes(*np.nonzero(known))
+    assert correlated
+    # a reference on an axis correlates the scale with the errors of that axis, by less than this
+    assert abs(found - wanted).max() < (0.02 if reference is None else 0.1) * wanted.max()
+
+
+def test_a_reference_adds_nothing_to_the_uncertainty_of_squareness():
+    readings = measured(PLAN, 1)
+    plain = first_order_u(calibrate(readings))
+    scaled = first_order_u(calibrate(readings, Options(
+        reference=ReferenceLength("artifact", 1e-6, 2e-6))))
+    assert scaled == pytest.approx(plain, rel=0.05)
+
+
+def ratios(plan, seeds, *, options=None, keep_scale=False, shaken=0.0):
+    """Return the chi2 ratios (pairs, 2) of calibrations of one stage, XY and theta."""
+    options, out = options or Options(), []
+    for seed in range(seeds):
+        pair = []
+        for one in range(2):
+            how = options
+            if shaken:
+                error = shaken * np.random.default_rng((seed, one)).normal()
+                how = Options(reference=ReferenceLength("stage_x", error, shaken))
+            pair.append(calibrate(measured(plan, 1000 * seed + one), how))
+        found = compare(*pair, keep_scale=keep_scale)
+        assert found.xy.correlated and found.theta.correlated
+        out.append((found.xy.chi2_ratio, found.theta.chi2_ratio))
+    return np.array(out)
+
+
+@pytest.mark.parametrize("keep_scale", [False, True])
+def test_maps_with_references_agree_as_often_as_they_should(keep_scale):
+    """Ratios of 40 pairs; with the scale left in, each holds a chi^2 of few degrees of freedom."""
+    found = ratios(HU, 40, keep_scale=keep_scale, shaken=3e-6)[:, 0]
+    if not keep_scale:
+        assert found.mean() == pytest.approx(1, abs=0.15)
+        assert found.std() < 0.5
+    assert 0.55 < found.mean() < 1.45
+
+
+@pytest.mark.parametrize(("plan", "options"), [
+    (APART, Options()), (APART, Options(datum_theta="zero_mean")), (SMALL, Options(method="law"))])
+def test_lines_in_views_of_their_own_and_maps_of_the_law_can_be_compared(plan, options):
+    found = ratios(plan, 30, options=options)
+    assert found.mean(axis=0) == pytest.approx([1, 1], abs=0.25)

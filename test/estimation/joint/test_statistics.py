@@ -1,0 +1,278 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Predicted uncertainties: the published bounds, Monte Carlo re-solves, coverage, noise."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import binom, chi2
+
+from selfcal_ros.errors import InputError
+from selfcal_ros.estimation.api import calibrate
+from selfcal_ros.estimation.joint.covariance import coverage_factor, map_covariance
+from selfcal_ros.estimation.joint.map_only import MapSolver
+from selfcal_ros.estimation.options import Options, ReferenceKind, ReferenceLength
+from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.error_map import ThetaDatum
+from selfcal_ros.model.readings import Sense
+from selfcal_ros.simulation.truth import hu_plan, random_truth, simulate_measurements
+from test.support.lattice_plans import in_datum, plan_of
+
+TABLE = {  # method, section 5: rms of u(G) / sigma of a reading for N = 5, 11, 21
+    "0,90,tx": (0.800, 0.890, 0.949), "0,90,180,tx": (0.664, 0.763, 0.825),
+    "0,90,tx,ty": (0.622, 0.660, 0.686), "0,90,180,tx,ty": (0.532, 0.581, 0.612),
+    "0,90,180,270,tx,ty": (0.477, 0.530, 0.563)}
+
+
+def measured(plan, seed=1, **how):
+    rng = np.random.default_rng(seed)
+    truth = random_truth(plan.artifact, len(plan.views), rng)
+    return truth, simulate_measurements(truth, plan, rng, **how)
+
+
+@pytest.mark.parametrize("names", TABLE)
+@pytest.mark.parametrize("size", [5, 11, 21])
+def test_rms_uncertainty_is_the_published_bound(names, size):
+    _, readings = measured(plan_of(names, Artifact(size, 0.01)), sigma_m=1e-8)
+    found = calibrate(readings)
+    emap = found.error_map
+    rms = np.sqrt(np.mean([emap.u_gx**2, emap.u_gy**2])) / found.noise.sigma_xy
+    assert round(rms, 3) == TABLE[names][(5, 11, 21).index(size)]
+
+
+@pytest.mark.parametrize(("lines", "datum", "bound"), [
+    (24, "xy_axes", 0.752), (24, "zero_mean", 0.677), (72, "xy_axes", 1.129),
+    (72, "zero_mean", 0.891)])
+def test_angular_bounds(lines, datum, bound):
+    """With XY readings so good that the rotations are known (method, section 5)."""
+    _, readings = measured(hu_plan(Artifact(11, 0.01, lines)), sigma_m=1e-12,
+                           sigma_theta_rad=1e-5)
+    found = calibrate(readings, Options(datum_theta=ThetaDatum(datum)))
+    rms = np.sqrt(np.mean(found.error_map.u_g_theta**2)) / found.noise.sigma_theta
+    assert round(rms, 3) == bound
+
+
+def noisy(readings, rng, sigma, sigma_theta):
+    """Return the readings with fresh noise on every mean, by its repeats."""
+    views = []
+    for view in readings.views:
+        s, a = sigma / np.sqrt(view.count), sigma_theta / np.sqrt(view.count_theta)
+        views.append(replace(view, dx=view.dx + s * rng.normal(size=len(view.m)),
+                             dy=view.dy + s * rng.normal(size=len(view.m)),
+                             dtheta=view.dtheta + a * rng.normal(size=len(view.k)),
+                             sigma_xy=sigma, dof_xy=1000, sigma_theta=sigma_theta,
+                             dof_theta=1000))
+    return replace(readings, views=tuple(views))
+
+
+@pytest.mark.parametrize(("missing", "sigma_theta"), [(0.0, 1e-5), (0.2, 2e-8)])
+def test_thousand_re_solves_agree_with_the_prediction(missing, sigma_theta):
+    """Also with angular readings so good that they steer the rotations, and unequal repeats."""
+    n, sigma = 1000, 2e-8
+    plan = hu_plan(Artifact(7, 0.01, 24))
+    _, clean = measured(plan, seed=12, missing=missing, sense=Sense.PLATE_MOVES)
+    clean = replace(clean, views=tuple(
+        replace(view, count=1 + (view.m + 2 * view.n) % 3) for view in clean.views))
+    rng = np.random.default_rng(3)
+    quick = Options(uncertainty=False)
+    exact = calibrate(clean).error_map
+    predicted = calibrate(noisy(clean, rng, sigma, sigma_theta)).error_map
+    draws = [calibrate(noisy(clean, rng, sigma, sigma_theta), quick).error_map
+             for _ in range(n)]
+    for name in ("gx", "gy", "g_theta"):
+        u = getattr(predicted, "u_" + name)
+        errors = np.array([getattr(draw, name) for draw in draws]) - getattr(exact, name)
+        known = np.isfinite(u)
+        ratio = np.mean(errors[:, known] ** 2, axis=0) / u[known] ** 2
+        assert np.sqrt(ratio.mean()) == pytest.approx(1.0, abs=0.03)
+        assert (ratio * n < chi2.isf(1e-7, n)).all() and (ratio * n > chi2.ppf(1e-7, n)).all()
+        inside = (abs(errors[:, known]) <= 2 * u[known]).sum(axis=0)
+        assert (inside >= binom.ppf(1e-7, n, 0.9545)).all()
+        assert (inside <= binom.ppf(1 - 1e-7, n, 0.9545)).all()
+
+
+def test_covariance_and_use_between_nodes_by_monte_carlo():
+    n, sigma = 1500, 2e-8
+    artifact = Artifact(7, 0.01)
+    truth, clean = measured(plan_of("0,90,tx", artifact), seed=4, sense=Sense.PLATE_MOVES)
+    cover = map_covariance(noisy(clean, np.random.default_rng(0), sigma, 1.0))
+    x, y = np.array([0.004, -0.0251, 0.03]), np.array([0.013, 0.0299, -0.03])
+    i, j = np.array([0, 3, 6]), np.array([1, 3, 6])
+    solver, rng, at_nodes, at_points = MapSolver(clean), np.random.default_rng(8), [], []
+    for _ in range(n):
+        found = solver.solve(noisy(clean, rng, sigma, 1.0)) - truth.g
+        at_nodes.append(found[:, i, j].ravel())
+        at_points.append(bilinear(found, artifact, x, y))
+    observed, predicted = np.cov(np.array(at_nodes).T), cover.nodes(i, j)
+    scale = np.sqrt(np.outer(np.diag(predicted), np.diag(predicted)))
+    assert np.abs((observed - predicted) / scale).max() < 6 / np.sqrt(n)
+    u = cover.between(x, y)
+    assert np.std(at_points, axis=0).ravel() / u.ravel() == pytest.approx(1.0, abs=0.09)
+    emap = calibrate(noisy(clean, np.random.default_rng(0), sigma, 1.0)).error_map
+    assert np.sqrt(np.diag(predicted)) == pytest.approx(np.r_[emap.u_gx[i, j], emap.u_gy[i, j]],
+                                                        rel=1e-9)
+
+
+def bilinear(field, artifact, x, y):
+    from scipy.interpolate import RegularGridInterpolator
+
+    axes = artifact.x_m[:, 0], artifact.y_m[0]
+    return np.stack([RegularGridInterpolator(axes, part)(np.stack([x, y], axis=-1))
+                     for part in field], axis=-1)
+
+
+def test_positions_off_the_field_are_refused():
+    cover = map_covariance(measured(plan_of("0,90,tx", Artifact(5, 0.01)), sigma_m=1e-8)[1])
+    with pytest.raises(InputError, match="off the calibrated field"):
+        cover.between([0.021], [0.0])
+
+
+def test_coverage_factor_grows_with_few_degrees_of_freedom():
+    assert coverage_factor(float("inf")) == pytest.approx(2.0, abs=1e-3)
+    assert coverage_factor(10) == pytest.approx(2.28, abs=0.01)
+
+
+@pytest.mark.parametrize("kind", ReferenceKind)
+@pytest.mark.parametrize("sense", Sense)
+def test_a_reference_length_sets_the_scale_and_its_uncertainty(kind, sense):
+    n, sigma, scale = 300, 2e-8, 3e-6
+    artifact = Artifact(5, 0.01)
+    plan = plan_of("0,90,tx", artifact)
+    _, clean = measured(plan, seed=2, sense=sense, missing=0.05)
+    free = calibrate(clean)
+    grown = np.stack([artifact.x_m, artifact.y_m])
+    if kind is ReferenceKind.ARTIFACT:
+        reached = in_datum(np.stack([free.artifact_map.ax, free.artifact_map.ay]),
+                           np.isfinite(free.artifact_map.ax), artifact, scale=False)
+        good = np.isfinite(reached)
+        value = (reached[good] @ grown[good]) / (grown[good] @ grown[good])
+        reference = ReferenceLength(kind, value - scale, 2e-6)
+    else:
+        axis = 0 if kind is ReferenceKind.STAGE_X else 1
+        error = free.error_map.gx if axis == 0 else free.error_map.gy
+        known = np.isfinite(error)
+        value = np.polyfit(grown[axis][known], error[known], 1)[0]
+        reference = ReferenceLength(kind, value + scale, 2e-6)
+    found = calibrate(clean, Options(reference=reference))
+    known = found.error_map.valid
+    assert found.error_map.gx[known] == pytest.approx(
+        (free.error_map.gx + scale * artifact.x_m)[known], abs=1e-14)
+    assert found.error_map.gy[known] == pytest.approx(
+        (free.error_map.gy + scale * artifact.y_m)[known], abs=1e-14)
+    assert np.nanmax(abs(found.artifact_map.ax - free.artifact_map.ax
+                         + scale * artifact.x_m)) < 1e-14
+    rng = np.random.default_rng(5)
+    predicted = calibrate(noisy(clean, rng, sigma, 1.0), Options(reference=reference)).error_map
+    draws = []
+    for _ in range(n):
+        drawn = replace(reference, relative_error=reference.relative_error + rng.normal(0, 2e-6))
+        draws.append(calibrate(noisy(clean, rng, sigma, 1.0),
+                               Options(reference=drawn, uncertainty=False)).error_map)
+    for name in ("gx", "gy"):
+        spread = np.std([getattr(draw, name)[known] for draw in draws], axis=0)
+        ratio = spread / getattr(predicted, "u_" + name)[known]
+        assert ratio == pytest.approx(1.0, abs=0.25)
+        assert np.sqrt(np.mean(ratio**2)) == pytest.approx(1.0, abs=0.08)
+
+
+def test_a_reference_must_be_a_small_number():
+    with pytest.raises(InputError, match="not a relative error"):
+        ReferenceLength("artifact", 1.0)
+    with pytest.raises(InputError, match="not a standard uncertainty"):
+        ReferenceLength("stage_x", 0.0, -1e-6)
+
+
+class TestNoise:
+    plan = hu_plan(Artifact(11, 0.01, 24), repeats=5)
+
+    def test_residuals_and_repeats_agree_on_honest_readings(self):
+        _, readings = measured(self.plan, sigma_m=1e-8, sigma_theta_rad=1e-6)
+        noise = calibrate(readings).noise
+        assert noise.sigma_xy == noise.sigma_xy_repeats == pytest.approx(1e-8)
+        assert noise.dof_xy_residuals == 2 * (121 + 121 + 110) - (493 - 7)
+        low, high = chi2.ppf([1e-4, 1 - 1e-4], noise.dof_xy_residuals) / noise.dof_xy_residuals
+        assert low < (noise.sigma_xy_residuals / 1e-8) ** 2 < high
+        low, high = chi2.ppf([1e-4, 1 - 1e-4], noise.dof_theta_residuals) \
+            / noise.dof_theta_residuals
+        assert low < (noise.sigma_theta_residuals / 1e-6) ** 2 < high
+        assert calibrate(readings).warnings == ()
+
+    def test_residuals_that_exceed_repeats_are_told(self):
+        _, readings = measured(self.plan, sigma_m=1e-8, sigma_theta_rad=1e-6)
+        calm = replace(readings, views=tuple(
+            replace(view, sigma_xy=view.sigma_xy / 3) for view in readings.views))
+        text = " ".join(calibrate(calm).warnings)
+        assert "grid readings: residuals show a noise of" in text
+        assert "something beside random noise" in text
+        assert "angular readings" not in text
+
+    def test_without_repeats_the_residuals_speak(self):
+        _, readings = measured(hu_plan(Artifact(11, 0.01, 24)), sigma_m=1e-8)
+        noise = calibrate(readings).noise
+        assert noise.sigma_xy == noise.sigma_xy_residuals
+        assert noise.dof_xy_repeats == 0 and np.isnan(noise.sigma_xy_repeats)
+
+    def test_declared_uncertainties_are_the_noise(self):
+        _, readings = measured(hu_plan(Artifact(11, 0.01)), sigma_m=1e-8)
+        declared = replace(readings, views=tuple(
+            replace(view, u=np.full(len(view.m), 1e-8)) for view in readings.views))
+        found = calibrate(declared)
+        assert found.noise.sigma_xy == pytest.approx(1e-8)
+        assert np.sqrt(np.mean(found.error_map.u_gx**2)) == pytest.approx(0.89e-8, rel=0.02)
+
+
+def test_an_encoder_that_does_not_follow_the_axes_is_told_and_bends_nothing():
+    plan = hu_plan(Artifact(11, 0.01, 24))
+    rng = np.random.default_rng(1)
+    truth = random_truth(plan.artifact, 4, rng)
+    g_theta = truth.g_theta.copy()
+    g_theta[6] += 1e-4
+    readings = simulate_measurements(replace(truth, g_theta=g_theta), plan, rng, sigma_m=1e-9,
+                                     sigma_theta_rad=1e-6)
+    axes = calibrate(readings)
+    free = calibrate(readings, Options(datum_theta="zero_mean"))
+    assert len(axes.warnings) == 1
+    assert axes.warnings[0].startswith("theta: the stage does not satisfy the axis conditions")
+    assert axes.warnings[0].endswith("use zero_mean")
+    assert free.warnings == ()
+    assert axes.error_map.gx.tobytes() == free.error_map.gx.tobytes()
+    assert np.abs(free.error_map.g_theta - (g_theta - g_theta.mean())).max() < 1e-5
+
+
+def test_small_fields_fall_back_to_zero_mean_and_say_so():
+    plan, rng = plan_of("0,90,tx", Artifact(3, 0.01, 8), lines=1), np.random.default_rng(1)
+    truth = random_truth(plan.artifact, 4, rng)
+    truth = replace(truth, g_theta=rng.normal(0, 1e-4, 8))
+    readings = simulate_measurements(truth, plan, rng)
+    found = calibrate(readings)
+    assert found.error_map.datum_theta is ThetaDatum.ZERO_MEAN
+    assert any("the datum is zero_mean" in text for text in found.warnings)
+    assert np.abs(found.error_map.gx - truth.g[0]).max() < 1e-12
+
+
+@pytest.mark.parametrize("degrees", [0.3, 2.0])
+def test_finite_rotations_need_and_take_the_rigid_model(degrees):
+    plan = plan_of("0,90,tx", Artifact(7, 0.01))
+    truth, readings = measured(plan)
+    phi = np.deg2rad(degrees) * np.array([1.0, -0.7, 0.4])
+    truth = replace(truth, phi_rad=phi)
+    views = []
+    for index, (view, q) in enumerate(zip(readings.views, (0, 1, 0), strict=True)):
+        shift = view.view.translation_m[0] / 0.01
+        place = (view.m + 1j * view.n) * 0.01
+        back = 1j**q
+        site = np.round((place * back).real / 0.01 + shift).astype(int) + 3, \
+            np.round((place * back).imag / 0.01).astype(int) + 3
+        plate = truth.a[0] + 1j * truth.a[1]
+        stage = (truth.g[0] + 1j * truth.g[1])[site]
+        marks = place + plate[view.m + 3, view.n + 3]
+        v = stage + np.exp(1j * phi[index]) * back * marks - back * place \
+            + complex(*truth.t_m[index])
+        views.append(replace(view, dx=v.real, dy=v.imag))
+    bent = replace(readings, views=tuple(views))
+    rigid = calibrate(bent, Options(misalignment_model="rigid"))
+    linear = calibrate(bent)
+    assert np.abs(rigid.error_map.gx - truth.g[0]).max() < 1e-12
+    assert np.abs(rigid.error_map.gy - truth.g[1]).max() < 1e-12
+    assert [view.phi for view in rigid.views] == pytest.approx(list(phi), abs=1e-12)
+    assert np.abs(linear.error_map.gx - truth.g[0]).max() > 1e-9

@@ -1,0 +1,281 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a plan sees and what it leaves unseen: Qiao's tables, named modes, cures, missing marks."""
+
+from dataclasses import replace
+from math import gcd
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from selfcal_ros.errors import NotIdentifiableError
+from selfcal_ros.estimation.api import calibrate
+from selfcal_ros.estimation.normal.planned import planned_system
+from selfcal_ros.estimation.observability import plan_check
+from selfcal_ros.estimation.observability.plan_check import (
+    candidate_views,
+    check_plan,
+    describe_view,
+    find_cures,
+    predict_plan,
+    smaller,
+    unseen_modes,
+)
+from selfcal_ros.estimation.observability.rank import plan_observability
+from selfcal_ros.estimation.observability.unseen import is_unseen, mode_maps
+from selfcal_ros.estimation.options import Options
+from selfcal_ros.model.view import View
+from selfcal_ros.simulation.truth import random_truth, simulate_measurements
+from test.support.plans import POSES, QIAO_TABLES, plan_of
+
+
+def dense_rank(plan):
+    """Return Qiao's rank by brute force: the matrix of his eqs. 1 and 5 as it stands."""
+    artifact, (hx, hy) = plan.artifact, plan.artifact.half
+    nx, ny = artifact.shape
+    sites = nx * ny
+    rows = []
+    for index, view in enumerate(plan.views):
+        pose = view.lattice_pose(artifact)
+        cos, sin = ((1, 0), (0, 1), (-1, 0), (0, -1))[pose.quarter_turns]
+        for m in range(-hx, hx + 1):
+            for n in range(-hy, hy + 1):
+                x, y = cos * m - sin * n, sin * m + cos * n
+                i, j = x + pose.shift[0], y + pose.shift[1]
+                if abs(i) > hx or abs(j) > hy:
+                    continue
+                mark, site = (m + hx) * ny + n + hy, (i + hx) * ny + j + hy
+                for axis, turn in enumerate(((cos, -sin), (sin, cos))):
+                    row = np.zeros(4 * sites + 3 * len(plan.views))
+                    row[axis * sites + site] = 1
+                    row[2 * sites + mark], row[3 * sites + mark] = turn
+                    row[4 * sites + 3 * index] = (-y, x)[axis]
+                    row[4 * sites + 3 * index + 1 + axis] = 1
+                    rows.append(row)
+    one, x, y = np.ones(sites), artifact.m.ravel(), artifact.n.ravel()
+    for parts in ((one, None), (None, one), (-y, x), (x, y)):
+        for base in (0, 2 * sites) if parts[0] is not x else (0,):
+            row = np.zeros(4 * sites + 3 * len(plan.views))
+            for axis, part in enumerate(parts):
+                if part is not None:
+                    row[base + axis * sites:base + (axis + 1) * sites] = part
+            rows.append(row)
+    return np.linalg.matrix_rank(np.array(rows))
+
+
+@pytest.mark.parametrize("size", [3, 5, 7, 9, 11])
+@pytest.mark.parametrize(("views", "rank", "extra"), QIAO_TABLES, ids=lambda v: str(v)[:16])
+def test_all_rank_tables_of_qiao(views, rank, extra, size):
+    seen = plan_observability(plan_of(views, size))
+    assert (seen.rank, seen.unknowns) == (rank(size), 4 * size**2 + extra)
+    assert seen.deficiency == seen.unknowns - seen.rank
+    assert seen.identifiable == (seen.deficiency == 0)
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.lists(st.sampled_from(sorted(POSES)), min_size=1, max_size=4),
+       st.sampled_from([(3, 0), (5, 0), (5, 3)]))
+def test_rank_is_that_of_the_dense_matrix(names, shape):
+    if shape[1]:
+        names = [name for name in names if POSES[name][0] % 2 == 0] or ["0"]
+    plan = plan_of(", ".join(names), shape[0], size_y=shape[1])
+    assert plan_observability(plan).rank == dense_rank(plan)
+
+
+@pytest.mark.parametrize("views", [row[0] for row in QIAO_TABLES])
+def test_maps_of_the_unseen_modes_are_as_many_as_the_deficiency_and_are_unseen(views):
+    plan = plan_of(views, 5)
+    system = planned_system(plan.artifact, plan.views)
+    maps = mode_maps(system)
+    visited = int((system.grid.components.of_site >= 0).sum())
+    unread = 25 - visited
+    # sites that are never visited and marks that are never read have no map
+    assert len(maps) == plan_observability(plan).deficiency - 4 * unread
+    for field in maps:
+        assert is_unseen(system, field[0] + 1j * field[1])
+    gram = np.einsum("acij,bcij->ab", maps, maps)
+    assert np.allclose(gram, np.eye(len(maps)), atol=1e-9)
+
+
+def test_an_arbitrary_field_is_seen_by_hus_plan_and_not_by_one_view():
+    field = np.random.default_rng(1).normal(size=(2, 5, 5))
+    for views, unseen in (("0, 90, tx", False), ("0, 90", False), ("0", True)):
+        plan = plan_of(views)
+        assert is_unseen(planned_system(plan.artifact, plan.views),
+                         field[0] + 1j * field[1]) is unseen
+
+
+def names(views, **kwargs):
+    plan = plan_of(views, **kwargs)
+    return [mode.name for mode in unseen_modes(planned_system(plan.artifact, plan.views))]
+
+
+def test_shifts_along_both_axes_leave_exactly_nonorthogonality_and_scale_difference():
+    for size in (3, 5, 11):
+        assert names("0, tx, ty", size=size) == ["non-orthogonality", "scale difference"]
+        assert plan_observability(plan_of("0, tx, ty", size)).deficiency == 2
+
+
+@pytest.mark.parametrize(("views", "expected"), [
+    ("0", ["every field"]),
+    ("tx", ["every field", "sites never visited", "marks never read"]),
+    ("0, 90", ["rotation-symmetric fields"]),
+    ("0, 90, 180, 270", ["rotation-symmetric fields"]),
+    ("0, 180", ["non-orthogonality", "scale difference", "rotation-symmetric fields"]),
+    ("0, tx", ["non-orthogonality", "scale difference", "bending along x", "row offsets"]),
+    ("0, ty", ["non-orthogonality", "scale difference", "bending along y", "column offsets"]),
+    ("0, 180, tx", ["non-orthogonality", "scale difference", "row offsets"]),
+    ("0, tx2, ty2", ["non-orthogonality", "scale difference", "periodic fields"]),
+    ("0, 90, tx", []),
+])
+def test_unseen_modes_by_name(views, expected):
+    assert names(views, size=7) == expected
+
+
+def test_angular_lines_see_the_bending_that_shifts_alone_do_not():
+    assert "bending along x" in names("0, tx", size=7)
+    assert "bending along x" not in names("0, tx", size=7, count=8, line=True)
+
+
+def test_unseen_modes_in_words():
+    modes = check_plan(plan_of("0, 180, tx, ty", 5)).observability.modes
+    assert modes == ("non-orthogonality of the axes: Gx = O y, Gy = O x",
+                     "scale difference of the axes: Gx = R x, Gy = -R y")
+    modes = check_plan(plan_of("0, 90", 5, count=8)).observability.modes
+    assert modes == ("rotation-symmetric fields: every field that a quarter turn maps to itself "
+                     "(12 numbers)", "angular map: patterns that repeat every 2 lines")
+    half = check_plan(plan_of("0, 180", 5)).observability.modes[-1]
+    assert "half turn" in half
+    rows = check_plan(plan_of("0, 180, tx", 5)).observability.modes[-1]
+    assert rows.endswith("opposite in opposite rows")
+    double = check_plan(plan_of("0, tx2, ty2", 7)).observability.modes[-1]
+    assert double == ("patterns that repeat every 2 pitches along x and every 2 pitches along y "
+                      "(8 numbers)")
+
+
+@pytest.mark.parametrize(("views", "first"), [
+    ("0, 90", "add a view without turn and shifted by +1 pitch along X"),
+    ("0, tx, ty", "add a view turned by 90 deg"),
+    ("0", "add a view turned by 90 deg and a view without turn and shifted by +1 pitch along X"),
+])
+def test_advice_names_the_missing_view(views, first):
+    assert check_plan(plan_of(views)).observability.advice[0] == first
+
+
+@pytest.mark.parametrize(("views", "size"), [("tx", 3), ("0, 180", 5), ("0, 180, +tx, -tx", 5)])
+def test_every_cure_cures_and_nothing_smaller_does(views, size):
+    plan = plan_of(views, size, count=8)
+    cures = list(find_cures(plan))
+    assert cures
+    for cure in cures:
+        assert plan_observability(replace(plan, views=(*plan.views, *cure))).identifiable
+        if len(cure) > 1:
+            for left_out in range(len(cure)):
+                part = cure[:left_out] + cure[left_out + 1:]
+                assert not plan_observability(
+                    replace(plan, views=(*plan.views, *part))).identifiable
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.lists(st.integers(0, 23), min_size=1, max_size=4))
+def test_turns_identify_the_circle_if_they_generate_it(turns):
+    plan = plan_of("0, 90, tx", 3, count=24)
+    lines = tuple(View(f"l{i}", turn * np.pi / 12, (0.0, 0.0), False, True)
+                  for i, turn in enumerate(turns))
+    grid = tuple(replace(view, angular=view.name == "0") for view in plan.views)
+    step = gcd(24, *turns)
+    seen = plan_observability(replace(plan, views=(*grid, *lines)))
+    assert seen.deficiency == step - 1
+
+
+def test_two_turns_that_only_together_generate_the_circle():
+    grid = plan_of("0, 90, tx", 3, count=24)
+    eight, nine = (View(f"l{k}", k * np.pi / 12, (0.0, 0.0), False, True) for k in (8, 9))
+    assert check_plan(replace(grid, views=(*grid.views, nine))).observability.deficiency == 2
+    assert check_plan(replace(grid, views=(*grid.views, eight))).observability.deficiency == 1
+    assert check_plan(replace(grid, views=(*grid.views, eight, nine))).observability.identifiable
+
+
+def test_missing_marks_change_the_verdict():
+    plan = plan_of("0, 90, tx", 5)
+    rng = np.random.default_rng(1)
+    readings = simulate_measurements(random_truth(plan.artifact, 3, rng), plan, rng)
+    assert calibrate(readings, Options()).observability.identifiable
+    shifted = readings.views[2]
+    gone = replace(shifted, **{name: getattr(shifted, name)[:1]
+                               for name in ("m", "n", "dx", "dy", "count")})
+    with pytest.raises(NotIdentifiableError, match="do not identify the stage"):
+        calibrate(replace(readings, views=(*readings.views[:2], gone)), Options())
+
+
+def test_candidates_and_their_description():
+    artifact = plan_of("0", 5, count=8).artifact
+    views = candidate_views(artifact, angular=True)
+    assert len(views) == len({view.name for view in views}) == 21
+    texts = [describe_view(view, artifact) for view in views]
+    assert texts[-1] == "an angular view turned by 1 line (45 deg)"
+    assert "a view turned by 270 deg and shifted by -1 pitch along Y" in texts
+    tall = plan_of("0", 5, size_y=9).artifact
+    assert all(describe_view(view, tall) for view in candidate_views(tall, angular=False))
+
+
+def test_smaller_fields_keep_room_for_the_shifts():
+    plan = plan_of("0, 90, tx2", 21)
+    assert smaller(plan, 5).artifact.shape == (7, 7)
+    assert smaller(plan, 51).artifact.shape == (21, 21)
+    assert smaller(plan_of("0, 180", 21, size_y=5), 9).artifact.shape == (9, 5)
+    assert smaller(plan_of("0, 90, ty", 41, size_y=61), 31).artifact.shape == (21, 31)
+    assert smaller(plan_of("0, 90, ty2", 9, size_y=61), 31).artifact.shape == (7, 31)
+
+
+@pytest.mark.parametrize(("size", "size_y"), [(21, 31), (31, 21), (11, 21)])
+def test_long_fields_are_predicted_on_long_ones(size, size_y, monkeypatch):
+    """A square would promise two thirds of the uncertainty, and half of the largest one."""
+    plan = plan_of("0, 90, tx, ty", size, size_y=size_y)
+    full = predict_plan(plan, "xy_axes")
+    monkeypatch.setattr(plan_check, "MAX_SITES", 100)
+    monkeypatch.setattr(plan_check, "PROXY_SIZE", 11)
+    found = predict_plan(plan, "xy_axes")
+    assert "predicted for a field of" in found.note
+    assert found.rms_xy == pytest.approx(full.rms_xy, rel=0.1)
+    assert found.max_xy == pytest.approx(full.max_xy, rel=0.2)
+
+
+def test_a_deficient_measurement_is_refused_with_its_modes_and_cures():
+    plan = plan_of("0, tx, ty", 5)
+    rng = np.random.default_rng(1)
+    readings = simulate_measurements(random_truth(plan.artifact, 3, rng), plan, rng)
+    with pytest.raises(NotIdentifiableError) as refusal:
+        calibrate(readings, Options())
+    assert "2 modes unseen" in str(refusal.value)
+    assert "add a view turned by 90 deg" in str(refusal.value)
+    seen = refusal.value.observability
+    assert seen.modes == ("non-orthogonality of the axes: Gx = O y, Gy = O x",
+                          "scale difference of the axes: Gx = R x, Gy = -R y")
+    assert seen.advice[1] == "or add a view turned by 270 deg"
+
+
+@pytest.mark.parametrize("datum", ["xy_axes", "zero_mean"])
+def test_lines_may_be_measured_in_views_of_their_own(datum):
+    plan = plan_of("0, 90, tx", 5, count=12)
+    grid = tuple(replace(view, angular=False) for view in plan.views)
+    lines = tuple(View(f"line {s}", s * np.pi / 6, (0.0, 0.0), False, True) for s in (0, 1))
+    plan = replace(plan, views=(*grid, *lines))
+    assert plan_observability(plan).identifiable
+    assert plan_observability(replace(plan, views=(*grid, lines[0]))).deficiency == 11
+    rng = np.random.default_rng(2)
+    truth = random_truth(plan.artifact, 5, rng)
+    result = calibrate(simulate_measurements(truth, plan, rng), Options(datum_theta=datum))
+    shift = truth.g_theta.mean() if datum == "zero_mean" else 0.0
+    assert np.abs(result.error_map.g_theta - truth.g_theta + shift).max() < 1e-15
+    # the rotation of the lines' own views and the constant of the plate's lines are one datum
+    assert np.allclose([v.phi for v in result.views[:3]], truth.phi_rad[:3], rtol=0, atol=1e-13)
+    assert np.isnan([v.phi for v in result.views[3:]]).all()
+
+
+@pytest.mark.parametrize(("views", "rank"), [
+    ("0, 90, tx", 4 * 101**2 + 9), ("0, 180, tx", 4 * 101**2 - 101 + 10),
+    ("0, tx, ty", 4 * 101**2 + 7), ("0, 90", (7 * 101**2 + 17) // 2)])
+def test_large_fields_have_the_rank_of_the_formula(views, rank):
+    assert plan_observability(plan_of(views, 101)).rank == rank

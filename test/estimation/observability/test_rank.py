@@ -1,0 +1,87 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The rank by components and misalignments is that of the full matrix."""
+
+import numpy as np
+import pytest
+
+from selfcal_ros.errors import NotIdentifiableError
+from selfcal_ros.estimation.api import calibrate
+from selfcal_ros.estimation.lattice.maps import PHASES, GridPose, LatticeViews
+from selfcal_ros.estimation.normal.angular import AngularSystem
+from selfcal_ros.estimation.normal.equations import JointSystem
+from selfcal_ros.estimation.normal.grid import GridSystem
+from selfcal_ros.estimation.observability.rank import plan_observability
+from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.simulation.truth import random_truth, simulate_measurements
+from test.support.lattice_plans import plan_of
+
+PLANS = [((0, 0, 0), (1, 0, 0), (0, 1, 0)), ((0, 0, 0), (2, 0, 0), (0, 1, 0)),
+         ((0, 0, 0), (0, 1, 0), (0, 0, 1)), ((0, 0, 0), (3, 1, 0), (0, 2, -1)),
+         ((0, 0, 0), (1, 0, 0), (2, 0, 0), (3, 0, 0), (0, 0, 1)), ((0, 0, 0), (1, 0, 0))]
+
+
+def dense(grid: GridSystem) -> np.ndarray:
+    """Return the real matrix of all grid readings over G, A, phi, tau."""
+    n, views = grid.n_sites, grid.n_views
+    index = grid.views.site_index.reshape(views, -1)
+    z, rows = grid.views.z.ravel(), []
+    for v, pose in enumerate(grid.views.poses):
+        back = PHASES[-pose.q % 4]
+        for m in np.flatnonzero(grid.read[v].ravel()):
+            row = np.zeros(4 * n + 3 * views, dtype=complex)
+            row[2 * index[v, m]:2 * index[v, m] + 2] = back, 1j * back
+            row[2 * n + 2 * m:2 * n + 2 * m + 2] = 1, 1j
+            row[4 * n + 3 * v:4 * n + 3 * v + 3] = 1j * z[m], 1, 1j
+            rows += [row.real, row.imag]
+    return np.array(rows)
+
+
+@pytest.mark.parametrize("shape", [(5, 5), (5, 7)])
+@pytest.mark.parametrize("poses", PLANS)
+@pytest.mark.parametrize("missing", [0.0, 0.2, 0.5, 0.8])
+def test_rank_is_that_of_the_full_matrix(poses, shape, missing):
+    rng = np.random.default_rng(int(100 * missing))
+    views = tuple(GridPose(*pose) for pose in poses)
+    field = LatticeViews(shape, views).in_field
+    weight = field * (rng.random(field.shape) >= missing) * rng.integers(1, 5, field.shape)
+    grid = GridSystem(views, weight.astype(float))
+    joint = JointSystem(grid, AngularSystem((), np.zeros((0, 0))), tuple(range(len(views))), ())
+    assert joint.rank_grid == np.linalg.matrix_rank(dense(grid), tol=1e-8)
+
+
+@pytest.mark.parametrize(("names", "needs"), [
+    ("0", "turned by 90 deg"), ("0,90", "1 pitch along X"), ("0,tx", "turned by 90 deg"),
+    ("0,180,tx,ty", "turned by 90 deg"), ("0,tx,ty", "turned by 90 deg"),
+    ("0,90,180,270", "1 pitch along X")])
+@pytest.mark.parametrize("lines", [0, 24])
+def test_deficient_plans_are_refused_by_name(names, needs, lines):
+    artifact = Artifact(7, 0.01, lines)
+    plan = plan_of(names, artifact, lines=1 if lines else None)
+    rng = np.random.default_rng(0)
+    readings = simulate_measurements(random_truth(artifact, len(plan.views), rng), plan, rng)
+    with pytest.raises(NotIdentifiableError) as caught:
+        calibrate(readings)
+    assert needs in str(caught.value)
+    assert "\n" not in str(caught.value)
+    seen = caught.value.observability
+    assert not seen.identifiable
+    assert seen.deficiency == plan_observability(plan).deficiency > 0
+    assert seen.unknowns - seen.rank == seen.deficiency
+
+
+def test_angular_views_without_a_line_turn_are_refused():
+    artifact = Artifact(5, 0.01, 24)
+    plan = plan_of("0,90,tx", artifact)
+    rng = np.random.default_rng(0)
+    readings = simulate_measurements(random_truth(artifact, 3, rng), plan, rng)
+    with pytest.raises(NotIdentifiableError, match=r"5 modes unseen.*1 line \(15 deg\)"):
+        calibrate(readings)
+
+
+def test_too_many_missing_marks_are_refused():
+    artifact = Artifact(11, 0.01)
+    plan = plan_of("0,90,tx", artifact)
+    rng = np.random.default_rng(0)
+    readings = simulate_measurements(random_truth(artifact, 3, rng), plan, rng, missing=0.7)
+    with pytest.raises(NotIdentifiableError, match="read the missing marks: only"):
+        calibrate(readings)

@@ -1,0 +1,172 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Predicted uncertainties against the published bounds and Monte Carlo; suggested views."""
+
+from dataclasses import replace
+from itertools import combinations_with_replacement
+
+import numpy as np
+import pytest
+
+from selfcal_ros.errors import InputError
+from selfcal_ros.estimation.api import calibrate
+from selfcal_ros.estimation.normal.planned import planned_system
+from selfcal_ros.estimation.observability import suggest
+from selfcal_ros.estimation.observability.plan_check import (
+    candidate_views,
+    check_plan,
+    predict_plan,
+)
+from selfcal_ros.estimation.observability.prediction import predict
+from selfcal_ros.estimation.observability.suggest import best_plan, rank_next, score_plan
+from selfcal_ros.estimation.options import Options
+from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.error_map import ThetaDatum
+from selfcal_ros.simulation.truth import hu_plan, random_truth, simulate_measurements
+from test.support.plans import plan_of
+
+BOUNDS = {  # method, section 5: rms gain at N = 5, 11, 21
+    "0, 90, tx": (0.800, 0.890, 0.949),
+    "0, 90, 180, tx": (0.664, 0.763, 0.825),
+    "0, 90, tx, ty": (0.622, 0.660, 0.686),
+    "0, 90, 180, tx, ty": (0.532, 0.581, 0.612),
+    "0, 90, 180, 270, tx, ty": (0.477, 0.530, 0.563),
+}
+
+
+@pytest.mark.parametrize("views", BOUNDS)
+def test_gains_of_the_table(views):
+    found = [predict_plan(plan_of(views, size), ThetaDatum.XY_AXES).rms_xy for size in (5, 11, 21)]
+    assert np.round(found, 3) == pytest.approx(BOUNDS[views], abs=1e-9)
+
+
+@pytest.mark.parametrize(("count", "datum", "gain"), [
+    (24, "xy_axes", 0.752), (24, "zero_mean", 0.677), (72, "xy_axes", 1.129),
+    (72, "zero_mean", 0.891)])
+def test_angular_gains(count, datum, gain):
+    found = predict_plan(hu_plan(Artifact(11, 0.01, count)), ThetaDatum(datum))
+    assert found.rms_theta == pytest.approx(gain, abs=5e-4)
+    assert found.rms_xy == pytest.approx(0.890, abs=5e-4)
+
+
+def test_prediction_is_the_uncertainty_that_the_solver_reports():
+    plan = plan_of("0, 90, tx, ty", 7, count=12, line=True)
+    rng = np.random.default_rng(2)
+    readings = simulate_measurements(random_truth(plan.artifact, 5, rng), plan, rng,
+                                     sigma_m=1e-8, sigma_theta_rad=1e-3)
+    result = calibrate(readings, Options())
+    found = predict_plan(plan, ThetaDatum.XY_AXES)
+    assert np.allclose(result.error_map.u_gx / result.noise.sigma_xy, found.ux, rtol=1e-4)
+    assert np.allclose(result.error_map.u_gy / result.noise.sigma_xy, found.uy, rtol=1e-4)
+    assert np.allclose(result.error_map.u_g_theta / result.noise.sigma_theta, found.u_theta,
+                       rtol=1e-4, atol=1e-3)
+
+
+def test_equal_repeats_change_nothing_for_an_averaged_reading():
+    once, five = (predict_plan(plan_of("0, 90, tx", 5, repeats=r), ThetaDatum.XY_AXES)
+                  for r in (1, 5))
+    assert np.allclose(once.ux, five.ux, rtol=1e-12)
+
+
+def test_large_fields_are_predicted_on_a_smaller_one_and_say_so(monkeypatch):
+    monkeypatch.setattr("selfcal_ros.estimation.observability.plan_check.MAX_SITES", 100)
+    monkeypatch.setattr("selfcal_ros.estimation.observability.plan_check.PROXY_SIZE", 9)
+    found = predict_plan(plan_of("0, 90, tx", 21), ThetaDatum.XY_AXES)
+    assert found.ux.shape == (9, 9)
+    assert "9 x 9 sites" in found.note
+    assert found.rms_xy < 0.949
+
+
+def test_next_views_are_ranked_by_what_they_give():
+    plan = hu_plan(Artifact(11, 0.01, 24))
+    now, ranked = rank_next(plan)
+    assert now.rms_xy == pytest.approx(0.890, abs=5e-4)
+    values = [item.score.rms_xy for item in ranked]
+    assert np.all(np.diff(np.round(values, 8)) >= 0)
+    by_text = {item.text: item.score for item in ranked}
+    added = by_text["add a view without turn and shifted by +1 pitch along Y"]
+    assert added.rms_xy == pytest.approx(0.660, abs=5e-4)
+    assert by_text["add a view turned by 180 deg"].rms_xy == pytest.approx(0.763, abs=5e-4)
+    line = by_text["add an angular view turned by 1 line (15 deg)"]
+    assert line.rms_xy == pytest.approx(now.rms_xy) and line.rms_theta < now.rms_theta
+    again = by_text["measure view 'rot90' 2 times, not 1"]
+    assert added.rms_xy < again.rms_xy < now.rms_xy
+    _, by_max = rank_next(plan, criterion="max")
+    assert by_max[0].score.max_xy == min(item.score.max_xy for item in by_max)
+
+
+def test_a_deficient_plan_is_cured_first():
+    now, ranked = rank_next(plan_of("0, tx, ty", 5))
+    assert now.deficiency == 2 and not np.isfinite(now.rms_xy)
+    assert ranked[0].score.deficiency == 0
+    assert "turned by" in ranked[0].text
+    assert ranked[-1].score.deficiency == 2
+
+
+def test_suggested_views_keep_the_repeats_and_have_names_of_their_own():
+    plan = plan_of("0, 90, tx", 5, repeats=3)
+    plan = replace(plan, views=(replace(plan.views[0], name="0deg"), *plan.views[1:]))
+    _, ranked = rank_next(plan)
+    views = [item.view for item in ranked if item.repeat_of is None]
+    assert {view.repeats for view in views} == {3}
+    assert "0deg_2" in {view.name for view in views}
+    assert {item.view.repeats for item in ranked if item.repeat_of is not None} == {6}
+
+
+@pytest.fixture
+def few_candidates(monkeypatch):
+    few = [view for view in candidate_views(Artifact(3, 0.01), angular=False)
+           if view.name in ("0deg", "90deg", "180deg", "270deg", "0deg+x", "0deg+y", "0deg-x")]
+    monkeypatch.setattr(suggest, "candidate_views", lambda *_, **__: few)
+    return few
+
+
+@pytest.mark.parametrize("criterion", suggest.CRITERIA)
+def test_best_plan_of_three_views_is_the_best_of_all(criterion, few_candidates):
+    plan, score, how = best_plan(Artifact(3, 0.01), 3, angular=False, criterion=criterion)
+    assert how == "all 28 plans tried"
+    every = [score_plan(replace(plan, views=(few_candidates[0], *views))).key(criterion)
+             for views in combinations_with_replacement(few_candidates, 2)]
+    assert score.key(criterion) == min(every)
+
+
+def test_exchange_finds_what_trying_all_finds(monkeypatch, few_candidates):
+    artifact = Artifact(3, 0.01)
+    _, best, how = best_plan(artifact, 4, angular=False)
+    assert how == "all 84 plans tried"
+    monkeypatch.setattr(suggest, "EXHAUSTIVE", 1)
+    plan, found, how = best_plan(artifact, 4, angular=False)
+    assert how.startswith("greedy")
+    assert found.key("rms") == best.key("rms")
+    assert len({view.name for view in plan.views}) == 4
+
+
+def test_best_plan_measures_the_angular_map_too():
+    plan, score, _ = best_plan(Artifact(3, 0.01, 24), 4, angular=True, repeats=5)
+    assert check_plan(plan).observability.identifiable
+    assert plan.views[-1].grid is False and {view.repeats for view in plan.views} == {5}
+    assert np.isfinite(score.rms_theta) and score.rms_theta > 0
+
+
+def test_large_plates_are_searched_small_and_judged_in_full(few_candidates):
+    _, score, how = best_plan(Artifact(21, 0.01), 3, angular=False)
+    assert how == "all 28 plans tried on a field of 11 x 11 sites"
+    assert score.rms_xy == pytest.approx(0.949, abs=5e-4)
+
+
+@pytest.mark.parametrize(("n", "angular"), [(2, False), (3, True), (0, False)])
+def test_too_few_views_are_refused(n, angular):
+    with pytest.raises(InputError, match="cannot identify the stage"):
+        best_plan(Artifact(5, 0.01, 8), n, angular=angular)
+
+
+def test_gain_is_the_scatter_of_recalibrations():
+    plan = plan_of("0, 90, tx", 5)
+    system = planned_system(plan.artifact, plan.views)
+    found = predict(system, plan.artifact, ThetaDatum.XY_AXES)
+    rng = np.random.default_rng(7)
+    truth = random_truth(plan.artifact, 3, rng)
+    errors = np.array([
+        [result.gx - truth.g[0], result.gy - truth.g[1]] for result in (
+            calibrate(simulate_measurements(truth, plan, rng, sigma_m=1e-8), Options()).error_map
+            for _ in range(250))]) / 1e-8
+    assert np.sqrt((errors**2).mean()) == pytest.approx(found.rms_xy, rel=0.035)

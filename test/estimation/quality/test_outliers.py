@@ -1,0 +1,263 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Outliers, slipped and noisy views: found, named, removed; good readings stay."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import binom
+
+from selfcal_ros.errors import InputError
+from selfcal_ros.estimation.api import calibrate
+from selfcal_ros.estimation.options import Options
+from selfcal_ros.estimation.quality import leverage
+from selfcal_ros.estimation.quality.leverage import (
+    angular_redundancy,
+    drawn_redundancy,
+    exact_redundancy,
+    residuals_of,
+)
+from selfcal_ros.estimation.quality.outliers import LEVEL, REASON, robust_calibrate
+from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.readings import Sense
+from selfcal_ros.model.result import plain, result_from_dict, result_to_dict
+from selfcal_ros.model.view import View
+from selfcal_ros.simulation.truth import hu_plan, random_truth, simulate_measurements
+
+ARTIFACT = Artifact(9, 0.01, 24)
+SIGMA_M, SIGMA_RAD = 2e-8, 2e-5
+ZERO_MEAN = Options(datum_theta="zero_mean")
+
+
+def measured(seed=0, *, repeats=1, sense=Sense.MICROSCOPE_MOVES, missing=0.0, sigma=SIGMA_M,
+             more=False):
+    rng = np.random.default_rng(seed)
+    plan = hu_plan(ARTIFACT, repeats)
+    if more:
+        plan = replace(plan, views=(*plan.views, View("rot180", np.pi), View(
+            "shift_y", 0.0, (0.0, 0.01))))
+    truth = random_truth(ARTIFACT, len(plan.views), rng)
+    return truth, simulate_measurements(truth, plan, rng, sigma_m=sigma,
+                                        sigma_theta_rad=SIGMA_RAD, sense=sense, missing=missing)
+
+
+def with_errors(readings, index, *, dx=None, dtheta=None):
+    """Add errors to marks {(m, n): m} and lines {k: rad} of one view."""
+    view = readings.views[index]
+    x, theta = view.dx.copy(), view.dtheta.copy()
+    for (m, n), value in (dx or {}).items():
+        x[(view.m == m) & (view.n == n)] += value
+    for k, value in (dtheta or {}).items():
+        theta[view.k == k] += value
+    views = list(readings.views)
+    views[index] = replace(view, dx=x, dtheta=theta)
+    return replace(readings, views=tuple(views))
+
+
+def error_rms(result, truth):
+    emap = result.error_map
+    return float(np.sqrt(np.nanmean(np.stack([emap.gx - truth.g[0], emap.gy - truth.g[1]]) ** 2)))
+
+
+def removed(result):
+    return {(row["view"], row["kind"], row["mark"]) for row in result.extra["outliers"]["removed"]}
+
+
+def test_redundancies_add_up_to_the_degrees_of_freedom():
+    _, readings = measured(missing=0.1)
+    left = residuals_of(readings, ZERO_MEAN)
+    system = left.problem.system
+    assert 2 * left.redundancy.sum() == pytest.approx(
+        2 * system.grid.n_readings - system.rank_grid, rel=1e-9)
+    assert angular_redundancy(system).sum() == pytest.approx(
+        system.angular.n_readings - system.rank_angular, rel=1e-9)
+
+
+def test_drawn_and_exact_redundancies_agree(monkeypatch):
+    _, readings = measured(missing=0.1, repeats=3)
+    system = residuals_of(readings, ZERO_MEAN).problem.system
+    monkeypatch.setattr(leverage, "N_DRAWS", 400)
+    assert np.abs(drawn_redundancy(system) - exact_redundancy(system)).max() < 0.06
+
+
+def test_standardised_residuals_are_chi_square():
+    squares = np.concatenate([
+        residuals_of(measured(seed, repeats=2)[1], ZERO_MEAN).squares.ravel() / SIGMA_M**2
+        for seed in range(10)])
+    squares = squares[np.isfinite(squares)]
+    assert squares.mean() == pytest.approx(2, rel=0.08)
+    for level in (0.5, 0.1, 0.01):
+        assert np.mean(squares > -2 * np.log(level)) == pytest.approx(level, rel=0.35)
+
+
+def test_good_readings_stay():
+    touched = sum(bool(removed(robust_calibrate(measured(seed)[1], ZERO_MEAN)))
+                  for seed in range(20))
+    # grid and angular readings each lose one with probability LEVEL
+    assert touched <= binom.ppf(0.9999, 20, 2 * LEVEL)
+
+
+@pytest.mark.parametrize("sense", list(Sense))
+def test_planted_outliers_are_removed_and_nothing_else(sense):
+    truth, readings = measured(3, sense=sense)
+    bad = with_errors(readings, 1, dx={(-4, 2): 1e-6, (0, 0): 1e-6, (3, -3): -3e-7})
+    bad = with_errors(bad, 0, dtheta={5: 6e-4})
+    result = robust_calibrate(bad, ZERO_MEAN)
+    assert removed(result) == {("rot90", "grid", "-4, 2"), ("rot90", "grid", "0, 0"),
+                               ("rot90", "grid", "3, -3"), ("identity", "angular", "5")}
+    assert error_rms(result, truth) < 1.2 * error_rms(calibrate(readings, ZERO_MEAN), truth)
+    assert error_rms(calibrate(bad, ZERO_MEAN), truth) > 1.5 * error_rms(result, truth)
+    assert result.rejected[REASON] == 4
+    assert result.views[1].used == bad.views[1].used - 3 and result.views[1].rejected == 3
+    row = next(r for r in result.extra["outliers"]["removed"] if r["mark"] == "-4, 2")
+    assert row["standardised"] > 10 and 0 < row["leverage"] < 1
+    # the fit follows the outlier by its leverage: the residual is the rest of it
+    assert row["residual_m"] == pytest.approx((1 - row["leverage"]) * 1e-6, abs=1e-7)
+    assert "removed 4 outliers: 'identity' angular 5" in result.warnings[-1]
+
+
+def test_readings_that_only_check_each_other_both_go():
+    truth, readings = measured(3)
+    # the last column leaves the field when the plate is shifted: two readings a mark
+    result = robust_calibrate(with_errors(readings, 1, dx={(4, 1): 5e-7}), ZERO_MEAN)
+    assert removed(result) == {("rot90", "grid", "4, 1"), ("identity", "grid", "4, 1")}
+    assert error_rms(result, truth) < 1.2 * error_rms(calibrate(readings, ZERO_MEAN), truth)
+
+
+def test_removed_readings_survive_the_file(tmp_path):
+    _, readings = measured(3)
+    result = robust_calibrate(with_errors(readings, 1, dx={(0, 0): 1e-6}), ZERO_MEAN)
+    again = result_from_dict(plain(result_to_dict(result)), "r")
+    assert again.extra["outliers"] == plain(result.extra["outliers"])
+
+
+@pytest.mark.parametrize(("index", "axis", "first", "change"), [
+    (3, "m", 2, (2e-7, -1e-7, 0.0)), (0, "n", -1, (2e-6, 0.0, 1e-5)), (1, "m", 0, (0, 3e-7, 0))])
+def test_a_slipped_view_is_named_sized_and_split(index, axis, first, change):
+    truth, readings = measured(4, more=True)
+    slipped_readings = slipped(readings, index, axis, first, change)
+    view = readings.views[index]
+    result = robust_calibrate(slipped_readings, ZERO_MEAN)
+    (slip,) = result.extra["slips"]
+    assert (slip["view"], slip["axis"], slip["first"]) == (view.view.name, axis, first)
+    assert slip["alternatives"] == ""
+    assert slip["tx_m"] == pytest.approx(change[0], abs=3e-8)
+    assert slip["ty_m"] == pytest.approx(change[1], abs=3e-8)
+    assert slip["phi_rad"] == pytest.approx(change[2], abs=1e-6)
+    assert not removed(result)
+    assert error_rms(result, truth) < 1.3 * error_rms(calibrate(readings, ZERO_MEAN), truth)
+    name = view.view.name
+    assert f"view '{name}': the plate slipped before {axis} = {first}" in result.warnings[-1]
+    assert [v.name for v in result.views if v.name.startswith(name)] == [
+        name, f"{name} after slip", f"{name} lines"]
+
+
+def test_a_slip_whose_place_three_views_do_not_tell_is_reported_not_mended():
+    _, readings = measured(4)
+    result = robust_calibrate(slipped(readings, 3, "m", 2, (2e-7, -1e-7, 0.0)), ZERO_MEAN)
+    (slip,) = result.extra["slips"]
+    assert slip["view"] == "shift_x"
+    places = {f"before {slip['axis']} = {slip['first']}", *slip["alternatives"].split("; ")}
+    assert "before m = 2" in places and len(places) >= 2
+    assert "do not tell which; the map is spoiled by it: measure the view again" in " ".join(
+        result.warnings)
+    assert [v.name for v in result.views] == [v.view.name for v in readings.views]
+
+
+def slipped(readings, index, axis, first, change):
+    """Let the plate slip in one view before the marks from `first` on."""
+    view = readings.views[index]
+    after = getattr(view, axis) >= first
+    q = view.view.lattice_pose(ARTIFACT).quarter_turns
+    x, y = ((view.m, view.n), (-view.n, view.m))[q]
+    moved = replace(view, dx=view.dx + after * (change[0] - change[2] * y * 0.01),
+                    dy=view.dy + after * (change[1] + change[2] * x * 0.01))
+    return replace(readings, views=(*readings.views[:index], moved, *readings.views[index + 1:]))
+
+
+def test_one_gross_outlier_is_no_slip():
+    _, readings = measured(9)
+    result = robust_calibrate(with_errors(readings, 3, dx={(1, 1): 5e-6}), ZERO_MEAN)
+    assert result.extra["slips"] == []
+    assert removed(result) == {("shift_x", "grid", "1, 1")}
+
+
+@pytest.mark.parametrize("index", [0, 1, 3])
+def test_a_noisy_view_is_named(index):
+    _, readings = measured(6)
+    rng = np.random.default_rng(1)
+    view = readings.views[index]
+    noisy = replace(view, dx=view.dx + rng.normal(0, 2e-7, view.dx.shape),
+                    dy=view.dy + rng.normal(0, 2e-7, view.dy.shape))
+    views = (*readings.views[:index], noisy, *readings.views[index + 1:])
+    result = robust_calibrate(replace(readings, views=views), ZERO_MEAN)
+    (named,) = result.extra["noisy_views"]
+    assert named["view"] == view.view.name and 3 < named["ratio"] <= 20
+    assert "times as noisy as the others: measure it again" in result.warnings[-1]
+
+
+def test_too_many_contradictions_remove_nothing():
+    _, readings = measured(7)
+    rng = np.random.default_rng(2)
+    view = readings.views[1]
+    bad = {(int(m), int(n)): float(rng.choice([-1, 1]) * 5e-6)
+           for m, n in zip(view.m[::2], view.n[::2], strict=True)}
+    result = robust_calibrate(with_errors(readings, 1, dx=bad), ZERO_MEAN)
+    assert not removed(result)
+    text = " ".join(result.warnings)
+    assert "none was removed" in text or "rot90" in text
+
+
+def test_exact_readings_have_no_outliers():
+    _, readings = measured(8, sigma=0.0)
+    views = tuple(replace(v, dtheta=v.dtheta) for v in readings.views)
+    result = robust_calibrate(replace(readings, views=views), ZERO_MEAN)
+    assert {kind for _, kind, _ in removed(result)} <= {"angular"} and not result.extra["slips"]
+
+
+def test_the_law_is_refused():
+    with pytest.raises(InputError, match="Hu's law needs every reading"):
+        robust_calibrate(measured()[1], Options(method="law"))
+
+
+def test_order_of_readings_does_not_matter():
+    _, readings = measured(3)
+    bad = with_errors(readings, 1, dx={(-4, 2): 1e-6})
+    rng = np.random.default_rng(0)
+    shuffled = []
+    for view in bad.views:
+        at, to = rng.permutation(len(view.m)), rng.permutation(len(view.k))
+        shuffled.append(replace(
+            view, **{name: getattr(view, name)[at] for name in ("m", "n", "dx", "dy", "count")},
+            **{name: getattr(view, name)[to] for name in ("k", "dtheta", "count_theta")}))
+    a, b = (robust_calibrate(r, ZERO_MEAN) for r in (bad, replace(bad, views=tuple(shuffled))))
+    assert np.array_equal(a.error_map.gx, b.error_map.gx)
+    assert a.extra["outliers"] == b.extra["outliers"]
+
+
+def test_finite_rotations_are_no_outliers_with_the_rigid_model():
+    truth, readings = measured(3)
+    views = []
+    for view, phi in zip(readings.views, truth.phi_rad, strict=True):
+        q = view.view.lattice_pose(ARTIFACT).quarter_turns
+        if len(view.m):
+            x, y = (c * 0.01 for c in ((view.m, view.n), (-view.n, view.m))[q])
+            cos, sin = np.cos(phi) - 1, np.sin(phi) - phi
+            view = replace(view, dx=view.dx + cos * x - sin * y, dy=view.dy + sin * x + cos * y)
+        views.append(view)
+    bad = with_errors(replace(readings, views=tuple(views)), 1, dx={(-4, 2): 1e-6})
+    result = robust_calibrate(bad, replace(ZERO_MEAN, misalignment_model="rigid"))
+    assert removed(result) == {("rot90", "grid", "-4, 2")}
+    assert error_rms(result, truth) < 1.3 * error_rms(calibrate(readings, ZERO_MEAN), truth)
+
+
+def test_a_view_whose_slip_cannot_be_placed_is_left_out_if_it_can_be_spared(monkeypatch):
+    monkeypatch.setattr("selfcal_ros.estimation.quality.slip.AMBIGUOUS", 1e9)
+    truth, readings = measured(4, more=True)
+    result = robust_calibrate(slipped(readings, 3, "m", 2, (2e-7, -1e-7, 0.0)), ZERO_MEAN)
+    assert "the readings do not tell which; the view is left out" in " ".join(result.warnings)
+    view = result.views[3]
+    lost = len(readings.views[3].m) + len(readings.views[3].k)
+    assert view.name == "shift_x" and view.used == 0 and view.rejected == lost
+    assert np.isnan(view.tx) and result.rejected[REASON] == lost
+    assert error_rms(result, truth) < 1.5 * error_rms(calibrate(readings, ZERO_MEAN), truth)
