@@ -41,9 +41,9 @@ def add_to(group: argparse._SubParsersAction) -> None:
 
 
 def _check(args: argparse.Namespace) -> int:
-    from selfcal_ros.compensation.cal_model import Severity
-    from selfcal_ros.compensation.cal_read import read_cal, refuse_errors
-    from selfcal_ros.compensation.cal_rules import Gi4
+    from selfcal_ros.compensation.aerotech.model import Severity
+    from selfcal_ros.compensation.aerotech.read import read_cal, refuse_errors
+    from selfcal_ros.compensation.aerotech.rules import Gi4
 
     if not 6 <= args.scanner_bits <= 48:
         raise InputError("--scanner-bits", f"{args.scanner_bits} bits", "give 16, 18 or 20")
@@ -81,8 +81,8 @@ def _described(table: object) -> dict:
 
 
 def _evaluate(args: argparse.Namespace) -> int:
-    from selfcal_ros.compensation.cal_evaluate import CalEvaluator
-    from selfcal_ros.compensation.cal_read import load_cal
+    from selfcal_ros.compensation.aerotech.evaluate import CalEvaluator
+    from selfcal_ros.compensation.aerotech.read import load_cal
 
     positions = numbers(args.position, "--position")
     if not positions:
@@ -93,7 +93,7 @@ def _evaluate(args: argparse.Namespace) -> int:
 
 
 def _setup(args: argparse.Namespace) -> "object":
-    from selfcal_ros.compensation.cal_evaluate import AxisSetup, MachineSetup
+    from selfcal_ros.compensation.aerotech.evaluate import AxisSetup, MachineSetup
 
     if args.temperature is not None and not math.isfinite(args.temperature):
         raise InputError("--temperature", f"{args.temperature} is no temperature", "give degC")

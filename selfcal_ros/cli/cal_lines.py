@@ -10,7 +10,7 @@ from selfcal_ros.cli.cal_options import add_frame, frame_of, read_result
 from selfcal_ros.errors import ExitCode, InputError
 
 if TYPE_CHECKING:
-    from selfcal_ros.compensation.cal_lines import Line
+    from selfcal_ros.compensation.aerotech.lines import Line
     from selfcal_ros.compensation.machine import MachineFrame
 
 _HOMES = {"end": "home at one end of travel", "middle": "home in the middle of travel",
@@ -56,7 +56,7 @@ def _common(parser: argparse.ArgumentParser, run: object) -> None:
 
 
 def _orthogonality(args: argparse.Namespace) -> int:
-    from selfcal_ros.compensation import cal_lines
+    from selfcal_ros.compensation.aerotech import lines as cal_lines
     from selfcal_ros.compensation.machine import UNITS_M
 
     frame = frame_of(args)
@@ -106,7 +106,7 @@ def _straightness(args: argparse.Namespace) -> int:
 
 
 def _line(args: argparse.Namespace, corrected: str) -> int:
-    from selfcal_ros.compensation import cal_lines
+    from selfcal_ros.compensation.aerotech import lines as cal_lines
     from selfcal_ros.files import read_text
 
     frame = frame_of(args)
@@ -137,9 +137,9 @@ def _deliver(args: argparse.Namespace, line: "Line", frame: "MachineFrame",
     from datetime import UTC, datetime
 
     from selfcal_ros import __version__
-    from selfcal_ros.compensation.cal_export import DECIMALS
-    from selfcal_ros.compensation.cal_lines import line_table
-    from selfcal_ros.compensation.cal_write import cal_text, write_cal
+    from selfcal_ros.compensation.aerotech.export import DECIMALS
+    from selfcal_ros.compensation.aerotech.lines import line_table
+    from selfcal_ros.compensation.aerotech.write import cal_text, write_cal
 
     source = args.source or f"{args.measured} over {args.over}, travel {args.travel}"
     comments = [f"written by selfcal {__version__} on {datetime.now(UTC):%Y-%m-%dT%H:%M:%SZ}",

@@ -11,7 +11,7 @@ from selfcal_ros.cli.cal_options import add_frame, frame_of, read_result
 from selfcal_ros.errors import ExitCode, InputError, NotIdentifiableError
 
 if TYPE_CHECKING:
-    from selfcal_ros.compensation.cal_verify import Verification
+    from selfcal_ros.compensation.aerotech.verify import Verification
 
 
 def add_to(group: argparse._SubParsersAction) -> None:
@@ -42,8 +42,8 @@ def add_to(group: argparse._SubParsersAction) -> None:
 def _export(args: argparse.Namespace) -> int:
     from dataclasses import replace
 
-    from selfcal_ros.compensation import cal_export
-    from selfcal_ros.compensation.cal_write import cal_text, refuse_existing, write_cal
+    from selfcal_ros.compensation.aerotech import export
+    from selfcal_ros.compensation.aerotech.write import cal_text, refuse_existing, write_cal
     from selfcal_ros.files import check_outputs
 
     result, frame = read_result(args.result), frame_of(args)
@@ -53,19 +53,19 @@ def _export(args: argparse.Namespace) -> int:
                                    result.observability)
     filled = 0
     if args.fill:
-        error_map, filled = cal_export.fill_unknown(result.error_map)
+        error_map, filled = export.fill_unknown(result.error_map)
         result = replace(result, error_map=error_map)
-    comments = cal_export.provenance(result, frame, filled=filled)
-    texts = {args.output: cal_text([cal_export.table_xy(result.error_map, frame)],
-                                   comments=comments, decimals=cal_export.DECIMALS)}
+    comments = export.provenance(result, frame, filled=filled)
+    texts = {args.output: cal_text([export.table_xy(result.error_map, frame)],
+                                   comments=comments, decimals=export.DECIMALS)}
     if frame.theta_axis is not None:
         target = Path(args.output)
         beside = args.theta_output or str(target.with_name(f"{target.stem}_theta{target.suffix}"))
         if Path(beside).resolve() == target.resolve():
             raise InputError(beside, "a 1D and a 2D table cannot share a file", "name another file")
-        table = cal_export.table_theta(result.error_map, frame)
+        table = export.table_theta(result.error_map, frame)
         texts[beside] = cal_text([table], comments=comments,
-                                 decimals=cal_export.theta_decimals(result.error_map))
+                                 decimals=export.theta_decimals(result.error_map))
     check_outputs([args.result], texts)
     refuse_existing(list(texts), force=args.force)
     for path, text in texts.items():
@@ -81,9 +81,9 @@ def _export(args: argparse.Namespace) -> int:
 
 
 def _verify(args: argparse.Namespace) -> int:
-    from selfcal_ros.compensation.cal_model import Table2D
-    from selfcal_ros.compensation.cal_read import load_cal
-    from selfcal_ros.compensation.cal_verify import verify_tables
+    from selfcal_ros.compensation.aerotech.model import Table2D
+    from selfcal_ros.compensation.aerotech.read import load_cal
+    from selfcal_ros.compensation.aerotech.verify import verify_tables
     from selfcal_ros.compensation.machine import MachineFrame, frame_from_comments
 
     result, cal = read_result(args.result), load_cal(args.file)
@@ -111,7 +111,7 @@ def _numbers(found: "Verification") -> dict:
 
 def _text(found: "Verification") -> str:
     """Return the residuals as a small table: um, and arcsec for angular lines."""
-    from selfcal_ros.compensation.cal_verify import ARCSEC_RAD
+    from selfcal_ros.compensation.aerotech.verify import ARCSEC_RAD
 
     lines = ["residual true - commanded, without its constant shift         before          after"]
     names = {"sites": "sites", "between": "cell centres (cubic stage)", "lines": "angular lines"}

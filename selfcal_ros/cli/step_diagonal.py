@@ -104,7 +104,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _check_outputs(args: argparse.Namespace) -> None:
     """Refuse outputs that would not be written, or not all of them."""
-    from selfcal_ros.compensation.cal_write import refuse_existing
+    from selfcal_ros.compensation.aerotech.write import refuse_existing
     from selfcal_ros.files import check_outputs
 
     measured = not (args.sensitivity or args.simulate)
@@ -125,8 +125,8 @@ def _check_outputs(args: argparse.Namespace) -> None:
 def _write_cal(args: argparse.Namespace, found: object) -> None:
     """Write the corrections as 1D tables."""
     from selfcal_ros import __version__
-    from selfcal_ros.compensation.cal_export import DECIMALS
-    from selfcal_ros.compensation.cal_write import cal_text, write_cal
+    from selfcal_ros.compensation.aerotech.export import DECIMALS
+    from selfcal_ros.compensation.aerotech.write import cal_text, write_cal
     from selfcal_ros.laser.transfer import correction_tables
 
     frame = frame_of(args)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from selfcal_ros.compensation.cal_evaluate import AxisSetup, CalEvaluator, MachineSetup
+from selfcal_ros.compensation.aerotech.evaluate import AxisSetup, CalEvaluator, MachineSetup
 from selfcal_ros.compensation.compensator import Compensator
 from selfcal_ros.errors import InputError
 

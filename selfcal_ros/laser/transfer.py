@@ -9,8 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from selfcal_ros.compensation.cal_lines import Line, line_table
-from selfcal_ros.compensation.cal_model import Table1D
+from selfcal_ros.compensation.aerotech.lines import Line, line_table
+from selfcal_ros.compensation.aerotech.model import Table1D
 from selfcal_ros.compensation.machine import MachineFrame
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.options import ReferenceKind, ReferenceLength

@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from selfcal_ros.compensation.cal_verify import ARCSEC_RAD, Residual, Verification
+from selfcal_ros.compensation.aerotech.verify import ARCSEC_RAD, Residual, Verification
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import write_bytes
 

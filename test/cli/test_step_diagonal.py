@@ -192,7 +192,7 @@ def test_a_picture_has_a_known_format(tmp_path, capsys):
 
 
 def test_the_corrections_are_written_as_tables(tmp_path, capsys):
-    from selfcal_ros.compensation.cal_read import load_cal
+    from selfcal_ros.compensation.aerotech.read import load_cal
 
     cal = tmp_path / "s.cal"
     args = (EXAMPLE, "--method", "new", "--cal", cal, "--x-axis", 3, "--y-axis", 4,

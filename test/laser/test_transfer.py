@@ -2,7 +2,7 @@
 import numpy as np
 import pytest
 
-from selfcal_ros.compensation.cal_evaluate import CalEvaluator
+from selfcal_ros.compensation.aerotech.evaluate import CalEvaluator
 from selfcal_ros.compensation.machine import MachineFrame
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.datum.modes import first_order

@@ -4,7 +4,7 @@
 import numpy as np
 from hypothesis import strategies as st
 
-from selfcal_ros.compensation.cal_model import Table1D, Table2D, Unit, UnitWord
+from selfcal_ros.compensation.aerotech.model import Table1D, Table2D, Unit, UnitWord
 
 AXES = (1, 2, 3)
 

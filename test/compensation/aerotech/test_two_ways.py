@@ -6,12 +6,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from selfcal_ros.compensation.cal_evaluate import AxisSetup, CalEvaluator, MachineSetup
-from selfcal_ros.compensation.cal_export import DECIMALS, table_theta, table_xy, theta_decimals
-from selfcal_ros.compensation.cal_lines import Line, line_table
-from selfcal_ros.compensation.cal_model import Unit, UnitWord
-from selfcal_ros.compensation.cal_read import parse_cal, refuse_errors
-from selfcal_ros.compensation.cal_write import cal_text
+from selfcal_ros.compensation.aerotech.evaluate import AxisSetup, CalEvaluator, MachineSetup
+from selfcal_ros.compensation.aerotech.export import DECIMALS, table_theta, table_xy, theta_decimals
+from selfcal_ros.compensation.aerotech.lines import Line, line_table
+from selfcal_ros.compensation.aerotech.model import Unit, UnitWord
+from selfcal_ros.compensation.aerotech.read import parse_cal, refuse_errors
+from selfcal_ros.compensation.aerotech.write import cal_text
 from selfcal_ros.compensation.compensator import Compensator
 from selfcal_ros.compensation.machine import MachineFrame, SimulatedController, frame_from_comments
 from selfcal_ros.model.artifact import Artifact

@@ -13,8 +13,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike
 
-from selfcal_ros.compensation.cal_model import Table, Table1D, Table2D, Unit, UnitWord
-from selfcal_ros.compensation.cal_rules import EDGE
+from selfcal_ros.compensation.aerotech.model import Table, Table1D, Table2D, Unit, UnitWord
+from selfcal_ros.compensation.aerotech.rules import EDGE
 from selfcal_ros.compensation.cells import BLOCK
 from selfcal_ros.errors import InputError
 

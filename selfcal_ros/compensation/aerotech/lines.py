@@ -14,10 +14,10 @@ from typing import Literal
 
 import numpy as np
 
-from selfcal_ros.compensation.cal_export import DECIMALS, PRIMARY, micrometres, tidy
-from selfcal_ros.compensation.cal_keywords import ArgumentFault
-from selfcal_ros.compensation.cal_keywords import number as plain_number
-from selfcal_ros.compensation.cal_model import Table1D
+from selfcal_ros.compensation.aerotech.export import DECIMALS, PRIMARY, micrometres, tidy
+from selfcal_ros.compensation.aerotech.keywords import ArgumentFault
+from selfcal_ros.compensation.aerotech.keywords import number as plain_number
+from selfcal_ros.compensation.aerotech.model import Table1D
 from selfcal_ros.compensation.machine import UNITS_M, MachineFrame
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.error_map import ErrorMap

@@ -4,7 +4,7 @@
 import codecs
 import re
 
-from selfcal_ros.compensation.cal_model import Finding, Severity
+from selfcal_ros.compensation.aerotech.model import Finding, Severity
 
 MAX_FINDINGS = 100
 _MARKS = re.compile("[;'\"]")

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from selfcal_ros.compensation.cal_model import Severity, Table1D, Table2D, same_table
-from selfcal_ros.compensation.cal_read import parse_cal
-from selfcal_ros.compensation.cal_write import cal_text, decimal, write_cal
+from selfcal_ros.compensation.aerotech.model import Severity, Table1D, Table2D, same_table
+from selfcal_ros.compensation.aerotech.read import parse_cal
+from selfcal_ros.compensation.aerotech.write import cal_text, decimal, write_cal
 from selfcal_ros.errors import InputError
 from test.support.cal_tables import tables_1d, tables_2d, tables_galvo
 

@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from selfcal_ros.compensation.cal_evaluate import AxisSetup, CalEvaluator, MachineSetup
-from selfcal_ros.compensation.cal_model import Severity, same_table
-from selfcal_ros.compensation.cal_read import parse_cal, refuse_errors
-from selfcal_ros.compensation.cal_write import cal_text
+from selfcal_ros.compensation.aerotech.evaluate import AxisSetup, CalEvaluator, MachineSetup
+from selfcal_ros.compensation.aerotech.model import Severity, same_table
+from selfcal_ros.compensation.aerotech.read import parse_cal, refuse_errors
+from selfcal_ros.compensation.aerotech.write import cal_text
 from selfcal_ros.errors import InputError
 
 SEEDS = [

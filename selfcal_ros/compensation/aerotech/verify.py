@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from selfcal_ros.compensation.cal_evaluate import CalEvaluator
-from selfcal_ros.compensation.cal_model import Table
+from selfcal_ros.compensation.aerotech.evaluate import CalEvaluator
+from selfcal_ros.compensation.aerotech.model import Table
 from selfcal_ros.compensation.compensator import Compensator
 from selfcal_ros.compensation.machine import MachineFrame, SimulatedController
 from selfcal_ros.errors import InputError

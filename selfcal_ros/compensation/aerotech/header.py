@@ -5,7 +5,7 @@ import re
 from dataclasses import dataclass, field
 from typing import Any
 
-from selfcal_ros.compensation.cal_keywords import (
+from selfcal_ros.compensation.aerotech.keywords import (
     ALIASES,
     ALL_KEYWORDS,
     KEYWORDS,
@@ -16,8 +16,8 @@ from selfcal_ros.compensation.cal_keywords import (
     number,
     short,
 )
-from selfcal_ros.compensation.cal_model import Kind, Unit
-from selfcal_ros.compensation.cal_text import Findings
+from selfcal_ros.compensation.aerotech.model import Kind, Unit
+from selfcal_ros.compensation.aerotech.text import Findings
 
 _WORD = re.compile(r"""[ \t]*(?:
     (?P<key>[A-Za-z_]\w*) (?P<blank>[ \t]*) = (?P<blank2>[ \t]*) (?P<value>"[^"]*"|[^ \t]*)

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from selfcal_ros.compensation.cal_model import Kind, Unit, UnitWord
+from selfcal_ros.compensation.aerotech.model import Kind, Unit, UnitWord
 
 LIMIT = 1e15
 """Numbers beyond this are no lengths, angles or counts of a machine."""

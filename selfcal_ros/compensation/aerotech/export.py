@@ -13,7 +13,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.linalg import spsolve
 
 from selfcal_ros import __version__
-from selfcal_ros.compensation.cal_model import Table1D, Table2D, Unit, UnitWord
+from selfcal_ros.compensation.aerotech.model import Table1D, Table2D, Unit, UnitWord
 from selfcal_ros.compensation.machine import MachineFrame
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.error_map import ErrorMap

@@ -4,8 +4,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from selfcal_ros.compensation.cal_evaluate import CalEvaluator
-from selfcal_ros.compensation.cal_lines import (
+from selfcal_ros.compensation.aerotech.evaluate import CalEvaluator
+from selfcal_ros.compensation.aerotech.lines import (
     length_m,
     line_table,
     map_line,
@@ -14,7 +14,7 @@ from selfcal_ros.compensation.cal_lines import (
     orthogonality,
     without_slope,
 )
-from selfcal_ros.compensation.cal_verify import verify_tables
+from selfcal_ros.compensation.aerotech.verify import verify_tables
 from selfcal_ros.compensation.compensator import Compensator
 from selfcal_ros.compensation.machine import MachineFrame, SimulatedController
 from selfcal_ros.errors import InputError

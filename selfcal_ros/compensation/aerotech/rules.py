@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from selfcal_ros.compensation.cal_keywords import LIMIT, SMALLEST
-from selfcal_ros.compensation.cal_model import Kind, Table, Table1D, Table2D, UnitWord
-from selfcal_ros.compensation.cal_text import Findings
+from selfcal_ros.compensation.aerotech.keywords import LIMIT, SMALLEST
+from selfcal_ros.compensation.aerotech.model import Kind, Table, Table1D, Table2D, UnitWord
+from selfcal_ros.compensation.aerotech.text import Findings
 
 MAX_AXIS = 32
 MAX_1D_TABLES = 100

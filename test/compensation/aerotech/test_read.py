@@ -2,8 +2,8 @@
 import numpy as np
 import pytest
 
-from selfcal_ros.compensation.cal_model import Kind, Severity, Unit, UnitWord
-from selfcal_ros.compensation.cal_read import load_cal, parse_cal, read_cal
+from selfcal_ros.compensation.aerotech.model import Kind, Severity, Unit, UnitWord
+from selfcal_ros.compensation.aerotech.read import load_cal, parse_cal, read_cal
 from selfcal_ros.errors import InputError
 
 STRICT_1D = """\

@@ -9,11 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
-from selfcal_ros.compensation.cal_keywords import KEYWORDS
-from selfcal_ros.compensation.cal_model import CalFile, Table, Table1D, Unit, same_table
-from selfcal_ros.compensation.cal_read import parse_cal, refuse_errors
-from selfcal_ros.compensation.cal_rules import check_tables
-from selfcal_ros.compensation.cal_text import Findings
+from selfcal_ros.compensation.aerotech.keywords import KEYWORDS
+from selfcal_ros.compensation.aerotech.model import CalFile, Table, Table1D, Unit, same_table
+from selfcal_ros.compensation.aerotech.read import parse_cal, refuse_errors
+from selfcal_ros.compensation.aerotech.rules import check_tables
+from selfcal_ros.compensation.aerotech.text import Findings
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import read_bytes, write_bytes
 

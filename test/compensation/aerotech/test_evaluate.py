@@ -6,9 +6,9 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from selfcal_ros.compensation.cal_evaluate import AxisSetup, CalEvaluator, MachineSetup
-from selfcal_ros.compensation.cal_model import Table1D, Table2D, Unit, UnitWord
-from selfcal_ros.compensation.cal_read import parse_cal
+from selfcal_ros.compensation.aerotech.evaluate import AxisSetup, CalEvaluator, MachineSetup
+from selfcal_ros.compensation.aerotech.model import Table1D, Table2D, Unit, UnitWord
+from selfcal_ros.compensation.aerotech.read import parse_cal
 from selfcal_ros.errors import InputError
 from test.support.cal_tables import AXES, decimals, setups, tables_1d, tables_2d, tables_galvo
 from test.support.slow_cal import slow_1d, slow_2d

@@ -8,22 +8,17 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from selfcal_ros.compensation.cal_header import Header, read_header
-from selfcal_ros.compensation.cal_keywords import LIMIT, ArgumentFault, number, short
-from selfcal_ros.compensation.cal_model import CalFile, Kind, Severity, Table, Table1D, Table2D
-from selfcal_ros.compensation.cal_rules import (
+from selfcal_ros.compensation.aerotech.header import Header, read_header
+from selfcal_ros.compensation.aerotech.keywords import LIMIT, ArgumentFault, number, short
+from selfcal_ros.compensation.aerotech.model import CalFile, Kind, Severity, Table, Table1D, Table2D
+from selfcal_ros.compensation.aerotech.rules import (
     MAX_1D_TABLES,
     Gi4,
     check_counts,
     check_table,
     mixed_kinds,
 )
-from selfcal_ros.compensation.cal_text import (
-    Findings,
-    TooManyFindings,
-    decode,
-    strip_comment,
-)
+from selfcal_ros.compensation.aerotech.text import Findings, TooManyFindings, decode, strip_comment
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import read_bytes
 

@@ -5,8 +5,8 @@ from datetime import UTC, datetime
 import numpy as np
 import pytest
 
-from selfcal_ros.compensation.cal_evaluate import CalEvaluator
-from selfcal_ros.compensation.cal_export import (
+from selfcal_ros.compensation.aerotech.evaluate import CalEvaluator
+from selfcal_ros.compensation.aerotech.export import (
     DECIMALS,
     fill_unknown,
     provenance,
@@ -14,10 +14,10 @@ from selfcal_ros.compensation.cal_export import (
     table_xy,
     theta_decimals,
 )
-from selfcal_ros.compensation.cal_model import same_table
-from selfcal_ros.compensation.cal_read import parse_cal
-from selfcal_ros.compensation.cal_verify import verify_tables
-from selfcal_ros.compensation.cal_write import cal_text
+from selfcal_ros.compensation.aerotech.model import same_table
+from selfcal_ros.compensation.aerotech.read import parse_cal
+from selfcal_ros.compensation.aerotech.verify import verify_tables
+from selfcal_ros.compensation.aerotech.write import cal_text
 from selfcal_ros.compensation.compensator import Compensator
 from selfcal_ros.compensation.machine import (
     MachineFrame,

@@ -2,9 +2,9 @@
 import numpy as np
 import pytest
 
-from selfcal_ros.compensation.cal_model import Severity
-from selfcal_ros.compensation.cal_read import parse_cal
-from selfcal_ros.compensation.cal_rules import Gi4
+from selfcal_ros.compensation.aerotech.model import Severity
+from selfcal_ros.compensation.aerotech.read import parse_cal
+from selfcal_ros.compensation.aerotech.rules import Gi4
 
 
 def findings(text, severity=Severity.ERROR, **options):
