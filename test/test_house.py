@@ -12,7 +12,7 @@ SOURCES = sorted(PACKAGE.rglob("*.py"))
 BASE = {"errors", "files"}
 DOMAIN = {"model"} | BASE
 ESTIMATION = {"estimation", "compensation", "laser"}
-MIDDLE = {"bagio", "reporting", "collection", "simulation"}
+MIDDLE = {"messages", "bagio", "reporting", "collection", "simulation"}
 MAY_IMPORT = {
     "errors": set(),
     "files": {"errors"},

@@ -13,12 +13,12 @@ from typing import Any
 
 import numpy as np
 
-from selfcal_ros.bagio.convert_in import stamp_ns
 from selfcal_ros.bagio.mcap_stream import McapStream
 from selfcal_ros.bagio.reader import BagReader
 from selfcal_ros.bagio.schemas import store_of_schema
 from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.laser.zigzag import Series
+from selfcal_ros.messages.to_model import stamp_ns
 
 FIELDS = {"std_msgs/msg/Float64": "data", "std_msgs/msg/Float32": "data",
           "sensor_msgs/msg/Range": "range"}

@@ -6,11 +6,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from selfcal_ros.bagio import convert_in
-from selfcal_ros.bagio.reader import COMMAND_TOPIC, DETECTION_TOPIC, ENCODER_TOPIC, BagReader
+from selfcal_ros.bagio.reader import BagReader
 from selfcal_ros.collection.collector import Collector, ViewProgress
 from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.files import add_file
+from selfcal_ros.messages import to_model
+from selfcal_ros.messages.topics import COMMAND_TOPIC, DETECTION_TOPIC, ENCODER_TOPIC
 from selfcal_ros.model.readings import Measurements
 
 
@@ -72,13 +73,13 @@ def feeder(collector: Collector, complaints: list[str]) -> dict[str, Callable[[A
     """
     def take_command(message: Any) -> None:
         try:
-            collector.add_command(convert_in.command(message))
+            collector.add_command(to_model.command(message))
         except InputError as error:
             collector.refuse_command()
             complaints.append(f"a view command was not used: {error}")
 
-    return {ENCODER_TOPIC: lambda m: collector.add_encoder(convert_in.encoder_sample(m)),
-            DETECTION_TOPIC: lambda m: collector.add_detection(convert_in.detection(m)),
+    return {ENCODER_TOPIC: lambda m: collector.add_encoder(to_model.encoder_sample(m)),
+            DETECTION_TOPIC: lambda m: collector.add_detection(to_model.detection(m)),
             COMMAND_TOPIC: take_command}
 
 

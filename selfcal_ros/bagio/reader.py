@@ -22,15 +22,8 @@ from selfcal_ros.bagio.schemas import (
 )
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import read_yaml
+from selfcal_ros.messages.topics import COMMAND_TOPIC, DETECTION_TOPIC, ENCODER_TOPIC, INPUT_TOPICS
 
-COMMAND_TOPIC = "selfcal/view_command"
-DETECTION_TOPIC = "stage/mark_detections"
-ENCODER_TOPIC = "stage/joint_states"
-INPUT_TOPICS = {
-    ENCODER_TOPIC: "sensor_msgs/msg/JointState",
-    DETECTION_TOPIC: "selfcal_msgs/msg/MarkDetection",
-    COMMAND_TOPIC: "selfcal_msgs/msg/ViewCommand",
-}
 LAST_FIELDS = {ENCODER_TOPIC: "position", DETECTION_TOPIC: "score", COMMAND_TOPIC: "angular_count"}
 """Last field that the contract asks for; what stands behind it may be missing."""
 SUFFIXES = (".mcap", ".mcap.zstd")

@@ -4,11 +4,11 @@
 from collections.abc import Callable
 from pathlib import Path
 
-from selfcal_ros.bagio import convert_out
-from selfcal_ros.bagio.reader import COMMAND_TOPIC, DETECTION_TOPIC, ENCODER_TOPIC, INPUT_TOPICS
 from selfcal_ros.bagio.writer import BagWriter, qos_profile
 from selfcal_ros.collection.messages import Command, Detection
 from selfcal_ros.files import read_json, write_json
+from selfcal_ros.messages import from_model
+from selfcal_ros.messages.topics import COMMAND_TOPIC, DETECTION_TOPIC, ENCODER_TOPIC, INPUT_TOPICS
 from selfcal_ros.model.result import plain
 from selfcal_ros.simulation.cell import Event
 from selfcal_ros.simulation.spec import Simulation
@@ -39,13 +39,13 @@ def write_simulation(simulation: Simulation, path: str | Path, *,
         return writer.counts
 
 
-def event_fields(event: Event, frame_id: str) -> tuple[str, convert_out.Fields]:
+def event_fields(event: Event, frame_id: str) -> tuple[str, from_model.Fields]:
     """Return topic and fields of a simulated message."""
     if isinstance(event, Command):
-        return COMMAND_TOPIC, convert_out.command(event, frame_id)
+        return COMMAND_TOPIC, from_model.command(event, frame_id)
     if isinstance(event, Detection):
-        return DETECTION_TOPIC, convert_out.detection(event, frame_id)
-    return ENCODER_TOPIC, convert_out.joint_state(event, frame_id)
+        return DETECTION_TOPIC, from_model.detection(event, frame_id)
+    return ENCODER_TOPIC, from_model.joint_state(event, frame_id)
 
 
 def write_truth(path: Path, truth: Truth, **more: object) -> None:

@@ -15,10 +15,11 @@ from typing import Self
 import yaml
 from mcap.writer import CompressionType, Writer
 
-from selfcal_ros.bagio.convert_out import Fields, build
+from selfcal_ros.bagio.build import build
 from selfcal_ros.bagio.schemas import typestore
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import write_text
+from selfcal_ros.messages.from_model import Fields
 
 CHUNK_SIZE = 256 * 1024
 INFINITE = {"sec": 9223372036, "nsec": 854775807}

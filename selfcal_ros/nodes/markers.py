@@ -8,7 +8,7 @@ from geometry_msgs.msg import Point
 from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
 
-from selfcal_ros.bagio.convert_out import header
+from selfcal_ros.messages.from_model import header
 from selfcal_ros.model.error_map import ErrorMap
 from selfcal_ros.nodes.base import fill
 from selfcal_ros.reporting.map_markers import map_geometry

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Every topic with its type and QoS, named once. Names are relative: a namespace goes in front."""
+"""Every topic with its type and QoS; its name is declared in `messages.topics`."""
 
 from dataclasses import dataclass
 
@@ -14,6 +14,8 @@ from selfcal_msgs.msg import (
 )
 from sensor_msgs.msg import JointState
 from visualization_msgs.msg import MarkerArray
+
+from selfcal_ros.messages import topics
 
 
 @dataclass(frozen=True)
@@ -33,16 +35,16 @@ def _qos(depth: int, *, reliable: bool = True, latched: bool = False) -> QoSProf
 
 
 # 1 kHz of encoder: a hiccup of a second must not overwrite a sample
-ENCODER = Topic("stage/joint_states", JointState, _qos(5000))
-ENCODER_BEST_EFFORT = Topic("stage/joint_states", JointState, _qos(5000, reliable=False))
-DETECTIONS = Topic("stage/mark_detections", MarkDetection, _qos(5000))
-COMMAND = Topic("selfcal/view_command", ViewCommand, _qos(256, latched=True))
-STATUS = Topic("selfcal/view_status", ViewStatus, _qos(64))
-MEASUREMENT = Topic("selfcal/view_measurement", ViewMeasurement, _qos(64, latched=True))
-ERROR_MAP = Topic("selfcal/error_map", ErrorMap, _qos(1, latched=True))
-SUMMARY = Topic("selfcal/summary", CalibrationSummary, _qos(1, latched=True))
-MAP_MARKERS = Topic("selfcal/map_markers", MarkerArray, _qos(1, latched=True))
-CORRECTED = Topic("stage/corrected_joint_states", JointState, _qos(100, reliable=False))
+ENCODER = Topic(topics.ENCODER_TOPIC, JointState, _qos(5000))
+ENCODER_BEST_EFFORT = Topic(topics.ENCODER_TOPIC, JointState, _qos(5000, reliable=False))
+DETECTIONS = Topic(topics.DETECTION_TOPIC, MarkDetection, _qos(5000))
+COMMAND = Topic(topics.COMMAND_TOPIC, ViewCommand, _qos(256, latched=True))
+STATUS = Topic(topics.STATUS_TOPIC, ViewStatus, _qos(64))
+MEASUREMENT = Topic(topics.MEASUREMENT_TOPIC, ViewMeasurement, _qos(64, latched=True))
+ERROR_MAP = Topic(topics.ERROR_MAP_TOPIC, ErrorMap, _qos(1, latched=True))
+SUMMARY = Topic(topics.SUMMARY_TOPIC, CalibrationSummary, _qos(1, latched=True))
+MAP_MARKERS = Topic(topics.MAP_MARKERS_TOPIC, MarkerArray, _qos(1, latched=True))
+CORRECTED = Topic(topics.CORRECTED_TOPIC, JointState, _qos(100, reliable=False))
 
 INPUTS = (ENCODER, DETECTIONS, COMMAND)
 RESULTS = (STATUS, MEASUREMENT, ERROR_MAP, SUMMARY, CORRECTED)

@@ -9,8 +9,9 @@ import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.duration import Duration
 
-from selfcal_ros.bagio.reader import COMMAND_TOPIC, DETECTION_TOPIC, ENCODER_TOPIC, BagReader
+from selfcal_ros.bagio.reader import BagReader
 from selfcal_ros.errors import NoDataError
+from selfcal_ros.messages.topics import COMMAND_TOPIC, DETECTION_TOPIC, ENCODER_TOPIC
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes.base import SelfcalNode
 

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from selfcal_ros.bagio import convert_in
 from selfcal_ros.bagio.simulated import event_fields, write_truth
 from selfcal_ros.collection.messages import Command, Detection, EncoderSample, Phase
+from selfcal_ros.messages import to_model
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.view import Plan, View
 from selfcal_ros.nodes import names
@@ -49,7 +49,7 @@ class StageSimulator(SelfcalNode):
             Level.OK, "at home" if self._next is None else "measuring", self._sent)))
 
     def _on_command(self, message: Any) -> None:
-        command = convert_in.command(message)
+        command = to_model.command(message)
         self._next, self._events = None, iter(())
         if command.phase == Phase.MEASURE:
             self._measure(command)

@@ -4,12 +4,12 @@
 from collections import Counter
 from typing import Any
 
-from selfcal_ros.bagio import convert_in, convert_out
 from selfcal_ros.collection.collector import Collector, ViewProgress
 from selfcal_ros.collection.digest import readings_digest, session_digest
 from selfcal_ros.collection.messages import Command, EncoderSample, Phase
 from selfcal_ros.collection.reasons import advice
 from selfcal_ros.errors import InputError, NoDataError
+from selfcal_ros.messages import from_model, to_model
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.sessions.ports import Diagnosis, Level, Ports
 
@@ -39,19 +39,19 @@ class CollectingSession:
     def take_encoder(self, message: Any) -> None:
         """Take a sensor_msgs/JointState."""
         self.collector.add_encoder(EncoderSample(
-            convert_in.stamp_ns(message), tuple(message.name), tuple(message.position),
+            to_model.stamp_ns(message), tuple(message.name), tuple(message.position),
             tuple(message.velocity)))
         self._dirty = True
 
     def take_detection(self, message: Any) -> None:
         """Take a selfcal_msgs/MarkDetection."""
-        self.collector.add_detection(convert_in.detection(message))
+        self.collector.add_detection(to_model.detection(message))
         self._dirty = True
 
     def take_command(self, message: Any, is_older: bool) -> None:
         """Take a selfcal_msgs/ViewCommand; `is_older`: published before this node listened."""
         try:
-            command = convert_in.command(message)
+            command = to_model.command(message)
             self.collector.add_command(command)
             self._note_missed(command, is_older=is_older)
         except InputError:
@@ -107,7 +107,7 @@ class CollectingSession:
         if timeline.plan_id != self._plan_id:
             self._plan_id, self._published, self._advised = timeline.plan_id, {}, set()
         for index, view in progress.items():
-            stamp = convert_out.session_stamp_ns(timeline, view)
+            stamp = from_model.session_stamp_ns(timeline, view)
             current = index == timeline.intervals[-1].view_index or not view.complete
             key = readings_digest(view.readings, measurements.rejected)
             closed = view.end_ns <= timeline.last_stamp_ns
@@ -115,11 +115,11 @@ class CollectingSession:
             worth = view.readings.used or index in self._published
             if ready and worth and self._published.get(index) != key:
                 self._published[index] = key
-                self._ports.publish("measurement", convert_out.view_measurement(
+                self._ports.publish("measurement", from_model.view_measurement(
                     view, measurements, stamp, frame_id))
             # after the readings: what is called complete can be solved
             if current or index == max(progress) or final:
-                self._ports.publish("status", convert_out.view_status(
+                self._ports.publish("status", from_model.view_status(
                     view, timeline.plan_id, stamp, frame_id))
             if closed or final:
                 self._advise(index, view)

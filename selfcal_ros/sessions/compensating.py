@@ -4,10 +4,10 @@
 import math
 from typing import Any
 
-from selfcal_ros.bagio import convert_in
 from selfcal_ros.compensation.compensator import Compensator
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import read_json
+from selfcal_ros.messages import to_model
 from selfcal_ros.model.error_map import ErrorMap
 from selfcal_ros.model.result import result_from_dict
 from selfcal_ros.sessions.ports import Diagnosis, Level
@@ -32,7 +32,7 @@ class CompensatingSession:
 
     def take_map(self, message: Any) -> None:
         """Use the map of a selfcal_msgs/ErrorMap from now on."""
-        self._load(convert_in.error_map(message))
+        self._load(to_model.error_map(message))
 
     def _load(self, error_map: ErrorMap) -> None:
         self.compensator = Compensator(error_map, method=self._values["interpolation"],

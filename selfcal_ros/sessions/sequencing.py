@@ -5,10 +5,10 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
-from selfcal_ros.bagio import convert_in, convert_out
 from selfcal_ros.collection.messages import Command
 from selfcal_ros.collection.sequencer import ENDED, Sequencer, State
 from selfcal_ros.files import read_yaml
+from selfcal_ros.messages import from_model, to_model
 from selfcal_ros.model.view import Plan, View, plan_from_dict
 from selfcal_ros.sessions.ports import Diagnosis, Level, Ports
 
@@ -86,7 +86,7 @@ class SequencingSession:
 
     def take_command(self, message: Any) -> None:
         """Follow a command that somebody else published."""
-        if _key(convert_in.command(message)) in self._own:
+        if _key(to_model.command(message)) in self._own:
             return
         said = "another publisher sends view commands: following them; abort ends that"
         if self.ended:
@@ -98,7 +98,7 @@ class SequencingSession:
 
     def take_status(self, message: Any) -> None:
         """Note how far the view is; move on when it is complete."""
-        if convert_in.stamp_ns(message) < self._commanded_ns:
+        if to_model.stamp_ns(message) < self._commanded_ns:
             return  # of before the command: a redone view would look complete
         expected = message.grid_expected + message.angular_expected
         if message.view_index == self.machine.index and expected:
@@ -133,7 +133,7 @@ class SequencingSession:
             command = replace(command, stamp_ns=self._ports.now_ns())
             self._own.add(_key(command))
             self._commanded_ns = command.stamp_ns
-            self._ports.publish("command", convert_out.command(command, self._values["frame_id"]))
+            self._ports.publish("command", from_model.command(command, self._values["frame_id"]))
             name = command.view.name if command.view else self.machine.plan.plan_id
             self._ports.say(Level.OK, f"{command.phase.name} {name}")
             self.coverage = 0.0

@@ -3,12 +3,12 @@
 
 from typing import Any
 
-from selfcal_ros.bagio import convert_in, convert_out
 from selfcal_ros.collection.digest import readings_digest, session_digest
 from selfcal_ros.collection.parameters import solver_options
 from selfcal_ros.errors import InputError, NoDataError, NotIdentifiableError, SelfcalError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.files import read_json, write_json
+from selfcal_ros.messages import from_model, to_model
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.result import (
     CalibrationResult,
@@ -67,14 +67,14 @@ class SolvingSession:
                               "start the collector and measure")
         ordered = [self._messages[index] for index in sorted(self._messages)]
         newest = max(ordered, key=lambda m: sum(m.session_reject_counts))
-        artifacts = {convert_in.artifact_of(message) for message in ordered}
+        artifacts = {to_model.artifact_of(message) for message in ordered}
         if len(artifacts) > 1:
             raise InputError("selfcal/view_measurement", "views of different plates in one plan",
                              "measure one plate")
         return Measurements(ordered[0].plan_id, artifacts.pop(),
-                            tuple(convert_in.view_readings(message) for message in ordered),
-                            convert_in.sense_of(ordered[0]),
-                            convert_in.counts(newest, "session_reject"))
+                            tuple(to_model.view_readings(message) for message in ordered),
+                            to_model.sense_of(ordered[0]),
+                            to_model.counts(newest, "session_reject"))
 
     def tick(self) -> bool:
         """Solve if readings have come since; return whether it did.
@@ -98,7 +98,7 @@ class SolvingSession:
         self._digest = ""
         measurements = self.measurements()
         self._digest = session_digest({
-            index: readings_digest(convert_in.view_readings(message), measurements.rejected)
+            index: readings_digest(to_model.view_readings(message), measurements.rejected)
             for index, message in self._messages.items()})
         self._problem = None
         try:
@@ -111,10 +111,10 @@ class SolvingSession:
             write_json(self._values["save_path"], result_to_dict(self.result))
 
     def _publish(self) -> None:
-        stamp = max((convert_in.stamp_ns(m) for m in self._messages.values()), default=0)
+        stamp = max((to_model.stamp_ns(m) for m in self._messages.values()), default=0)
         frame_id = self._values["frame_id"]
         if self._problem is None:
-            self._ports.publish("map", convert_out.error_map(self.result, stamp, frame_id))
+            self._ports.publish("map", from_model.error_map(self.result, stamp, frame_id))
             self._ports.publish("markers", {"error_map": self.result.error_map, "stamp_ns": stamp})
         numbers = summary_numbers(self.result)
         seen = self.result.observability
@@ -122,7 +122,7 @@ class SolvingSession:
             "max_error_um", "rms_error_um", "rms_uncertainty_um", "max_theta_error_arcsec",
             "rms_theta_uncertainty_arcsec")}
         self._ports.publish("summary", {
-            "header": convert_out.header(stamp, frame_id),
+            "header": from_model.header(stamp, frame_id),
             "state": short(self._state()),
             "views_done": len(self._messages),
             "views_planned": self._planned.get(self._plan_id, 0),

@@ -10,13 +10,13 @@ from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
 from rosbags.rosbag2 import Reader
 
-from selfcal_ros.bagio import convert_out
 from selfcal_ros.bagio.reader import INPUT_TOPICS, BagReader
 from selfcal_ros.bagio.schemas import typestore
 from selfcal_ros.bagio.simulated import QOS, event_fields
 from selfcal_ros.bagio.writer import BagWriter, qos_profile
 from selfcal_ros.collection.messages import Detection, EncoderSample
 from selfcal_ros.errors import InputError
+from selfcal_ros.messages import from_model
 from test.support.sessions import events_of, small_plan
 
 STRING_HASH = "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"
@@ -180,7 +180,7 @@ def test_what_was_flushed_is_there_before_the_end_and_an_error_keeps_it(tmp_path
         with BagWriter(tmp_path / "bag") as writer:
             writer.add_topic(ENCODER, "sensor_msgs/msg/JointState", [RELIABLE])
             sample = EncoderSample(5, ("x",), (0.5,))
-            writer.write(ENCODER, convert_out.joint_state(sample, "stage"), 5)
+            writer.write(ENCODER, from_model.joint_state(sample, "stage"), 5)
             writer.flush()
             reader = BagReader(tmp_path / "bag")
             assert len(list(reader.messages())) == 1 and "without its footer" in reader.lost[0]

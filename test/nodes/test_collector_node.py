@@ -11,9 +11,9 @@ from rclpy.qos import ReliabilityPolicy
 from selfcal_msgs.msg import MarkDetection, ViewCommand
 from std_srvs.srv import Trigger
 
-from selfcal_ros.bagio import convert_in, convert_out
 from selfcal_ros.collection.digest import readings_digest, session_digest
 from selfcal_ros.collection.messages import Command, Detection, Phase
+from selfcal_ros.messages import from_model, to_model
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes.base import fill
 from selfcal_ros.nodes.measurement_collector import MeasurementCollector
@@ -73,10 +73,10 @@ def test_what_it_publishes_is_what_the_messages_hold_bit_for_bit(graph):
     graph.until(lambda: {m.view_index for m in heard} == set(expected), "all views")
     newest = {message.view_index: message for message in heard}
     for index, message in newest.items():
-        found = readings_digest(convert_in.view_readings(message), measurements.rejected)
+        found = readings_digest(to_model.view_readings(message), measurements.rejected)
         assert found == expected[index]
         assert message.plan_id == measurements.plan_id
-        assert convert_in.artifact_of(message) == measurements.artifact
+        assert to_model.artifact_of(message) == measurements.artifact
     graph.until(lambda: {m.view_index for m in status if m.complete} == set(expected), "status")
 
 
@@ -171,7 +171,7 @@ def test_a_collector_that_starts_within_a_view_names_it_until_it_is_placed_anew(
     graph.hand.create_subscription(DiagnosticArray, "/diagnostics", diagnostics.append, 10)
     commands = graph.publisher(names.COMMAND, readers=0)
     for command in (place, measure):
-        commands.publish(fill(names.COMMAND.type(), convert_out.command(command, "stage")))
+        commands.publish(fill(names.COMMAND.type(), from_model.command(command, "stage")))
     node = graph.node(MeasurementCollector)
     line = f"began before this node: {measure.view.name}"
     graph.until(lambda: any(line in s.message and s.level == DiagnosticStatus.WARN
@@ -179,7 +179,7 @@ def test_a_collector_that_starts_within_a_view_names_it_until_it_is_placed_anew(
     for number, command in enumerate((measure, place, measure), 1):
         assert set(node.session.missed.values()) == {measure.view.name}  # until it is measured anew
         command = replace(command, stamp_ns=command.stamp_ns + number * 10**9)
-        commands.publish(fill(names.COMMAND.type(), convert_out.command(command, "stage")))
+        commands.publish(fill(names.COMMAND.type(), from_model.command(command, "stage")))
         graph.until(lambda number=number: node.session.collector.received["command"] == 2 + number,
                     "the command")
     diagnostics.clear()
@@ -197,7 +197,7 @@ def test_another_plate_under_the_same_plan_is_said_once_and_in_the_diagnostics(
     commands, detections = graph.publisher(names.COMMAND), graph.publisher(names.DETECTIONS)
     for second, size in enumerate((5, 7)):
         plan = plan_of("0", size, count=8)
-        commands.publish(fill(names.COMMAND.type(), convert_out.command(Command(
+        commands.publish(fill(names.COMMAND.type(), from_model.command(Command(
             second * 10**9, Phase.MEASURE, "one", 0, plan.views[0], plan.artifact, 1), "stage")))
     line = "describes another plate than the rest of plan 'one'"
     received = node.session.collector.received

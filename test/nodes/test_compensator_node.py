@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
 
-from selfcal_ros.bagio import convert_out
 from selfcal_ros.compensation.compensator import Compensator
+from selfcal_ros.messages import from_model
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.result import result_to_dict
 from selfcal_ros.nodes import names
@@ -24,7 +24,7 @@ PLACES = [(0.0, 0.0, 0.0), (0.0123, -0.0071, 0.4), (0.02, 0.02, 3.0), (0.09, -0.
 def latch_map(graph, error_map=MAP) -> None:
     publisher = graph.hand.create_publisher(names.ERROR_MAP.type, names.ERROR_MAP.name,
                                             names.ERROR_MAP.qos)
-    publisher.publish(fill(names.ERROR_MAP.type(), convert_out.error_map(
+    publisher.publish(fill(names.ERROR_MAP.type(), from_model.error_map(
         result_of(error_map), 1, "stage")))
 
 

@@ -11,9 +11,9 @@ from selfcal_msgs.action import RunCalibration
 from selfcal_msgs.srv import SaveMap
 from std_srvs.srv import Trigger
 
-from selfcal_ros.bagio import convert_in, convert_out
 from selfcal_ros.collection.messages import Command, Phase
 from selfcal_ros.collection.sequencer import State
+from selfcal_ros.messages import from_model, to_model
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes.base import fill
 from selfcal_ros.nodes.pose_sequencer import PoseSequencer
@@ -47,9 +47,9 @@ class Desk:
 
     def complete(self, index: int, *, plan_id: str = PLAN.plan_id, complete: bool = True,
                  age_ns: int = 0) -> None:
-        stamp = convert_in.stamp_ns(self.heard[-1]) - age_ns if self.heard else 0
+        stamp = to_model.stamp_ns(self.heard[-1]) - age_ns if self.heard else 0
         self.status.publish(fill(names.STATUS.type(), {
-            "header": convert_out.header(stamp, "stage"), "plan_id": plan_id,
+            "header": from_model.header(stamp, "stage"), "plan_id": plan_id,
             "view_index": index, "complete": complete, "grid_expected": 25,
             "grid_done": 25 if complete else 5, "angular_expected": 0}))
 
@@ -80,7 +80,7 @@ def test_commands_carry_plan_plate_and_pose_with_growing_stamps(desk):
     desk.ask("confirm_view")
     desk.complete(0)
     desk.expect((PLACE, 0), (MEASURE, 0), (PLACE, 1))
-    commands = [convert_in.command(message) for message in desk.heard]
+    commands = [to_model.command(message) for message in desk.heard]
     stamps = [command.stamp_ns for command in commands]
     assert stamps == sorted(set(stamps))
     assert commands == [Command(stamp, phase, PLAN.plan_id, index, PLAN.views[index],
@@ -131,7 +131,7 @@ def test_recorded_commands_win_over_its_own(desk):
                for index in (0, 1) for phase in (PLACE, MEASURE)]
     publisher = desk.graph.publisher(names.COMMAND, readers=2)
     for command in foreign:
-        publisher.publish(fill(names.COMMAND.type(), convert_out.command(command, "stage")))
+        publisher.publish(fill(names.COMMAND.type(), from_model.command(command, "stage")))
     desk.graph.until(lambda: len(desk.heard) >= 5, "the recorded commands")
     for service in ("start", "confirm_view", "skip_view"):
         answer = desk.ask(service)
@@ -184,7 +184,7 @@ def test_following_is_a_warning_only_where_a_plan_is_given_up(desk, monkeypatch)
         info=lambda text: said.append(("info", text)),
         warning=lambda text: said.append(("warning", text))))
     for stamp, level in ((1, "info"), (2, "warning")):
-        message = fill(names.COMMAND.type(), convert_out.command(Command(
+        message = fill(names.COMMAND.type(), from_model.command(Command(
             stamp, PLACE, "recorded", 0, PLAN.views[0], PLAN.artifact), "stage"))
         desk.node.session.take_command(message)
         desk.node.session.take_command(message)

@@ -9,8 +9,8 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from selfcal_msgs.srv import LoadMap, SaveMap
 from visualization_msgs.msg import Marker
 
-from selfcal_ros.bagio import convert_in, convert_out
 from selfcal_ros.estimation.api import calibrate
+from selfcal_ros.messages import from_model, to_model
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.result import result_to_dict
 from selfcal_ros.nodes import names
@@ -27,7 +27,7 @@ PLAN = small_plan()
 def measured(plan=PLAN, seed: int = 5) -> tuple:
     """Return ViewMeasurement messages of a plan, and the readings behind them."""
     _, measurements, progress = collected(events_of(plan, seed))
-    return [fill(names.MEASUREMENT.type(), convert_out.view_measurement(
+    return [fill(names.MEASUREMENT.type(), from_model.view_measurement(
         view, measurements, 10 + index, "stage")) for index, view in progress.items()], measurements
 
 
@@ -47,7 +47,7 @@ def solve(graph):
 
 
 def same_map(message, error_map) -> None:
-    found = convert_in.error_map(message)
+    found = to_model.error_map(message)
     for name in ("gx", "gy", "u_gx", "u_gy", "g_theta", "u_g_theta"):
         np.testing.assert_array_equal(getattr(found, name), getattr(error_map, name))
     assert found.nonorthogonality == error_map.nonorthogonality
@@ -115,7 +115,7 @@ def test_a_view_measured_anew_replaces_the_old_one(graph):
         publisher.publish(message)
     wanted = calibrate(measurements).error_map
     graph.until(lambda: maps and np.array_equal(
-        convert_in.error_map(maps[-1]).gx, wanted.gx, equal_nan=True), "the new map")
+        to_model.error_map(maps[-1]).gx, wanted.gx, equal_nan=True), "the new map")
     graph.until(lambda: summaries, "a summary")
     assert summaries[-1].views_done == len(new)
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from selfcal_ros.collection.messages import Command, Detection, EncoderSample, Phase
 from selfcal_ros.errors import InputError
+from selfcal_ros.messages.topics import COMMAND_TOPIC, ERROR_MAP_TOPIC, MEASUREMENT_TOPIC
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ErrorMap, ThetaDatum
 from selfcal_ros.model.orders import parse_order
@@ -48,11 +49,11 @@ def command(message: Any) -> Command:
         For an unknown phase, a plate that cannot be, or a stamp before 1970.
     """
     if stamp_ns(message) < 0:
-        raise InputError("selfcal/view_command", "the stamp lies before 1970", "set the clock")
+        raise InputError(COMMAND_TOPIC, "the stamp lies before 1970", "set the clock")
     try:
         phase = Phase(int(message.phase))
     except ValueError as error:
-        raise InputError("selfcal/view_command", f"unknown phase {message.phase}",
+        raise InputError(COMMAND_TOPIC, f"unknown phase {message.phase}",
                          "use PLACE, MEASURE, DONE or ABORT") from error
     base = (stamp_ns(message), phase, str(message.plan_id), int(message.view_index))
     more = {"views_planned": int(getattr(message, "views_planned", 0)),
@@ -103,7 +104,7 @@ def view_readings(message: Any) -> ViewReadings:
                       ("k", "dtheta", "count_theta", "u_theta")):
         names += [u] * (len(table[u]) > 0)
         if len({len(table[name]) for name in names}) > 1:
-            raise InputError(f"selfcal/view_measurement of '{message.view_name}'",
+            raise InputError(f"{MEASUREMENT_TOPIC} of '{message.view_name}'",
                              f"{', '.join(names)} differ in length", "mend the publisher")
     return ViewReadings(
         view_of(message, repeats=int(message.repeats), grid=bool(message.grid),
@@ -129,7 +130,7 @@ def _visits_of(message: Any) -> GridVisits | None:
     u = np.array(message.visit_u, dtype=float)
     lengths = {len(column) for column in table.values()} | ({len(u)} if len(u) else set())
     if len(lengths) > 1 or table["mark"].min() < 0 or table["mark"].max() >= len(message.m):
-        raise InputError(f"selfcal/view_measurement of '{message.view_name}'",
+        raise InputError(f"{MEASUREMENT_TOPIC} of '{message.view_name}'",
                          "the visits differ in length or name marks that were not read",
                          "mend the publisher")
     return GridVisits(**table, u=u, sigma_m=float(message.sigma_visit),
@@ -146,7 +147,7 @@ def counts(message: Any, prefix: str) -> dict[str, int]:
     """
     reasons, numbers = (getattr(message, f"{prefix}_{name}") for name in ("reasons", "counts"))
     if len(reasons) != len(numbers):
-        raise InputError(f"selfcal/view_measurement of '{message.view_name}'",
+        raise InputError(f"{MEASUREMENT_TOPIC} of '{message.view_name}'",
                          f"{prefix}_reasons and {prefix}_counts differ in length",
                          "mend the publisher")
     return {str(reason): int(number) for reason, number in zip(reasons, numbers, strict=True)}
@@ -157,7 +158,7 @@ def sense_of(message: Any) -> Sense:
     try:
         return Sense(message.measurement_sense or Sense.MICROSCOPE_MOVES)
     except ValueError as error:
-        raise InputError(f"selfcal/view_measurement of '{message.view_name}'",
+        raise InputError(f"{MEASUREMENT_TOPIC} of '{message.view_name}'",
                          f"measurement_sense {message.measurement_sense!r} is not known",
                          f"use one of {', '.join(Sense)}") from error
 
@@ -175,10 +176,10 @@ def error_map(message: Any) -> ErrorMap:
     for name, size in (("gx", sites), ("gy", sites), ("u_gx", sites), ("u_gy", sites),
                        ("valid", sites), ("g_theta", lines), ("u_g_theta", lines)):
         if len(getattr(message, name)) != size:
-            raise InputError("selfcal/error_map", f"{name} has {len(getattr(message, name))} "
+            raise InputError(ERROR_MAP_TOPIC, f"{name} has {len(getattr(message, name))} "
                              f"values, the plate {size}", "mend the publisher")
     if message.datum_theta not in list(ThetaDatum):
-        raise InputError("selfcal/error_map", f"datum_theta {message.datum_theta!r} is not known",
+        raise InputError(ERROR_MAP_TOPIC, f"datum_theta {message.datum_theta!r} is not known",
                          f"use one of {', '.join(ThetaDatum)}")
     grids = {name: np.array(getattr(message, name), dtype=float).reshape(artifact.shape)
              for name in ("gx", "gy", "u_gx", "u_gy")}

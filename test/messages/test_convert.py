@@ -9,12 +9,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from selfcal_ros.bagio import convert_in, convert_out
+from selfcal_ros.bagio.build import build
 from selfcal_ros.bagio.schemas import typestore
 from selfcal_ros.collection.collector import ViewProgress
 from selfcal_ros.collection.messages import Command, Detection, EncoderSample, Phase
 from selfcal_ros.collection.timeline import Timeline
 from selfcal_ros.errors import InputError
+from selfcal_ros.messages import from_model, to_model
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.orders import ORDERS
@@ -50,29 +51,29 @@ STAMP_NS = 1_700_000_000_123_456_789
 def through_cdr(name, values):
     """Return the message with these fields after it was encoded and decoded."""
     typename = f"{'sensor' if name == 'JointState' else 'selfcal'}_msgs/msg/{name}"
-    message = convert_out.build(typestore(), typename, values)
+    message = build(typestore(), typename, values)
     data = typestore().serialize_cdr(message, typename)
     return typestore().deserialize_cdr(bytes(data), typename)
 
 
 @given(event=DETECTIONS)
 def test_detections_come_back(event):
-    message = through_cdr("MarkDetection", convert_out.detection(event, "stage"))
-    assert convert_in.detection(message) == event
+    message = through_cdr("MarkDetection", from_model.detection(event, "stage"))
+    assert to_model.detection(message) == event
     assert message.header.frame_id == "stage"
 
 
 @given(event=SAMPLES)
 def test_encoder_samples_come_back(event):
-    message = through_cdr("JointState", convert_out.joint_state(event, "stage"))
-    assert convert_in.encoder_sample(message) == event
+    message = through_cdr("JointState", from_model.joint_state(event, "stage"))
+    assert to_model.encoder_sample(message) == event
     assert len(message.effort) == 0
 
 
 @given(event=ASKING | ENDING)
 def test_commands_come_back(event):
-    message = through_cdr("ViewCommand", convert_out.command(event, "stage"))
-    assert convert_in.command(message) == event
+    message = through_cdr("ViewCommand", from_model.command(event, "stage"))
+    assert to_model.command(message) == event
 
 
 @given(event=DETECTIONS | SAMPLES | ASKING)
@@ -82,15 +83,15 @@ def test_a_message_of_somebody_else_is_what_it_says(event):
         event = replace(event, views_planned=0, artifact=replace(event.artifact, grid_size_y=0),
                         view=replace(event.view, visit_order=""))
     topic, typename, message = contract_message(contract_types(), event)
-    read = {"stage/joint_states": convert_in.encoder_sample, "selfcal/view_command":
-            convert_in.command, "stage/mark_detections": convert_in.detection}[topic]
+    read = {"stage/joint_states": to_model.encoder_sample, "selfcal/view_command":
+            to_model.command, "stage/mark_detections": to_model.detection}[topic]
     data = bytes(contract_types().serialize_cdr(message, typename))
     assert read(contract_types().deserialize_cdr(data, typename)) == event
 
 
 def test_fields_of_a_detection_by_name():
     event = Detection(STAMP_NS, 1, True, -2, 3, 4, -5e-6, 6e-6, -7e-3, 8e-8, 0.5)
-    assert convert_out.detection(event, "f") == {
+    assert from_model.detection(event, "f") == {
         "header": {"stamp": {"sec": 1_700_000_000, "nanosec": 123_456_789}, "frame_id": "f"},
         "kind": 1, "has_id": True, "m": -2, "n": 3, "k": 4, "offset_x": -5e-6, "offset_y": 6e-6,
         "offset_theta": -7e-3, "sigma": 8e-8, "score": 0.5}
@@ -98,7 +99,7 @@ def test_fields_of_a_detection_by_name():
 
 def test_fields_of_a_command_by_name():
     view = View("turned", math.pi / 2, (0.01, -0.02), True, False, 7, "x_then_y")
-    made = convert_out.command(Command(STAMP_NS, Phase.MEASURE, "p", 3, view,
+    made = from_model.command(Command(STAMP_NS, Phase.MEASURE, "p", 3, view,
                                        Artifact(5, 0.0125, 8, 7), 9), "f")
     del made["header"]
     assert made == {
@@ -112,32 +113,32 @@ def test_fields_of_a_command_by_name():
     ({"phase": 4}, "selfcal/view_command: unknown phase 4; use PLACE, MEASURE, DONE or ABORT"),
     ({"grid_size": 4}, "artifact grid_size: 4 is not an odd number"),
     ({"grid_pitch": math.nan}, "artifact grid_pitch: nan m is not a length"),
-    ({"header": convert_out.header(-1, "f")},
+    ({"header": from_model.header(-1, "f")},
      "selfcal/view_command: the stamp lies before 1970; set the clock")])
 def test_commands_that_cannot_be_used(changes, message):
-    values = convert_out.command(Command(STAMP_NS, Phase.PLACE, "p", 3, View("a"),
+    values = from_model.command(Command(STAMP_NS, Phase.PLACE, "p", 3, View("a"),
                                          Artifact(5, 0.01)), "f")
     with pytest.raises(InputError) as caught:
-        convert_in.command(through_cdr("ViewCommand", values | changes))
+        to_model.command(through_cdr("ViewCommand", values | changes))
     assert str(caught.value).startswith(message)
 
 
 @pytest.mark.parametrize("text", ["spiral", "\x1b[31m", "raster@stage"])
 def test_an_order_that_is_not_known_does_not_cost_the_command(text):
     event = Command(STAMP_NS, Phase.MEASURE, "p", 3, View("a", repeats=2), Artifact(5, 0.01))
-    values = convert_out.command(event, "f") | {"visit_order": text}
-    assert convert_in.command(through_cdr("ViewCommand", values)) == event
+    values = from_model.command(event, "f") | {"visit_order": text}
+    assert to_model.command(through_cdr("ViewCommand", values)) == event
 
 
 def test_no_repeats_are_one():
-    values = convert_out.command(Command(STAMP_NS, Phase.PLACE, "p", 3, View("a"),
+    values = from_model.command(Command(STAMP_NS, Phase.PLACE, "p", 3, View("a"),
                                          Artifact(5, 0.01)), "f")
-    assert convert_in.command(through_cdr("ViewCommand", values | {"repeats": 0})).view.repeats == 1
+    assert to_model.command(through_cdr("ViewCommand", values | {"repeats": 0})).view.repeats == 1
 
 
 @given(stamp=st.integers(-(2**31) * 10**9, 2**31 * 10**9 - 1))
 def test_a_stamp_is_kept_to_the_nanosecond(stamp):
-    made = convert_out.header(stamp, "f")["stamp"]
+    made = from_model.header(stamp, "f")["stamp"]
     assert 0 <= made["nanosec"] < 10**9
     assert made["sec"] * 10**9 + made["nanosec"] == stamp
 
@@ -164,16 +165,16 @@ def readings(draw):
 def test_view_measurements_come_back(read, artifact, rejected, sense):
     progress = ViewProgress(5, read.view, 0, 0, 0, 0, read, 0)
     whole = Measurements("p", artifact, (read,), sense, rejected)
-    message = through_cdr("ViewMeasurement", convert_out.view_measurement(
+    message = through_cdr("ViewMeasurement", from_model.view_measurement(
         progress, whole, STAMP_NS, "f"))
-    found = convert_in.view_readings(message)
+    found = to_model.view_readings(message)
     for entry in fields(ViewReadings):
         got, wanted = getattr(found, entry.name), getattr(read, entry.name)
         np.testing.assert_array_equal(got, wanted, entry.name)
         assert not isinstance(wanted, np.ndarray) or got.dtype == wanted.dtype
-    assert convert_in.artifact_of(message) == artifact
-    assert convert_in.counts(message, "session_reject") == rejected
-    assert (convert_in.sense_of(message), message.plan_id, message.view_index) == (sense, "p", 5)
+    assert to_model.artifact_of(message) == artifact
+    assert to_model.counts(message, "session_reject") == rejected
+    assert (to_model.sense_of(message), message.plan_id, message.view_index) == (sense, "p", 5)
 
 
 VISITS = GridVisits(
@@ -192,16 +193,16 @@ PROGRESS = ViewProgress(18, READ.view, 19, 20, 21, 22, READ, 23)
 
 
 def test_the_visits_of_a_view_survive_the_message():
-    there = convert_out.view_measurement(PROGRESS, MEASURED, STAMP_NS, "f")
-    back = convert_in.view_readings(through_cdr("ViewMeasurement", there)).visits
+    there = from_model.view_measurement(PROGRESS, MEASURED, STAMP_NS, "f")
+    back = to_model.view_readings(through_cdr("ViewMeasurement", there)).visits
     for name, column in vars(VISITS).items():
         assert np.array_equal(getattr(back, name), column), name
     old = through_cdr("ViewMeasurement", {**there, "visit_mark": []})
-    assert convert_in.view_readings(old).visits is None
+    assert to_model.view_readings(old).visits is None
 
 
 def test_fields_of_a_view_measurement_by_name():
-    made = convert_out.view_measurement(PROGRESS, MEASURED, STAMP_NS, "f")
+    made = from_model.view_measurement(PROGRESS, MEASURED, STAMP_NS, "f")
     del made["header"]
     for name in [name for name in made if name.startswith("visit_")]:
         del made[name]
@@ -217,15 +218,15 @@ def test_fields_of_a_view_measurement_by_name():
 
 
 def test_fields_of_a_view_status_by_name():
-    made = convert_out.view_status(PROGRESS, "p", STAMP_NS, "f")
-    assert made.pop("header") == convert_out.header(STAMP_NS, "f")
+    made = from_model.view_status(PROGRESS, "p", STAMP_NS, "f")
+    assert made.pop("header") == from_model.header(STAMP_NS, "f")
     assert made == {
         "plan_id": "p", "view_index": 18, "view_name": "a", "grid_expected": 19, "grid_done": 20,
         "angular_expected": 21, "angular_done": 22, "detections_used": 15,
         "detections_rejected": 16, "reject_reasons": ["low_score"], "reject_counts": [16],
         "sigma_xy": 1.1e-8, "sigma_theta": 1.2e-6, "complete": True,
         "missing_m": [], "missing_n": [], "missing_k": [], "run_id": ""}
-    through_cdr("ViewStatus", {"header": convert_out.header(0, ""), **made})
+    through_cdr("ViewStatus", {"header": from_model.header(0, ""), **made})
 
 
 @pytest.mark.parametrize(("changes", "said"), [
@@ -238,19 +239,19 @@ def test_fields_of_a_view_status_by_name():
     ({"visit_dy": [1.0]}, "the visits differ in length or name marks that were not read"),
     ({"visit_mark": [0, 1]}, "the visits differ in length or name marks that were not read")])
 def test_arrays_that_do_not_belong_together(changes, said):
-    values = convert_out.view_measurement(PROGRESS, MEASURED, STAMP_NS, "f")
+    values = from_model.view_measurement(PROGRESS, MEASURED, STAMP_NS, "f")
     with pytest.raises(InputError) as caught:
-        convert_in.view_readings(through_cdr("ViewMeasurement", values | changes))
+        to_model.view_readings(through_cdr("ViewMeasurement", values | changes))
     assert str(caught.value) == (f"selfcal/view_measurement of 'a': {said}; mend the publisher")
 
 
 def test_the_sense_of_a_measurement():
-    values = convert_out.view_measurement(PROGRESS, MEASURED, STAMP_NS, "f")
+    values = from_model.view_measurement(PROGRESS, MEASURED, STAMP_NS, "f")
     older = through_cdr("ViewMeasurement", values | {"measurement_sense": ""})
-    assert convert_in.sense_of(older) is Sense.MICROSCOPE_MOVES
+    assert to_model.sense_of(older) is Sense.MICROSCOPE_MOVES
     with pytest.raises(InputError, match="measurement_sense 'both' is not known; use one of "
                        "microscope_moves, plate_moves"):
-        convert_in.sense_of(through_cdr("ViewMeasurement", values | {"measurement_sense": "both"}))
+        to_model.sense_of(through_cdr("ViewMeasurement", values | {"measurement_sense": "both"}))
 
 
 @pytest.fixture(scope="module")
@@ -264,8 +265,8 @@ def result():
 
 def test_an_error_map_comes_back(result):
     emap = result.error_map
-    message = through_cdr("ErrorMap", convert_out.error_map(result, STAMP_NS, "f"))
-    found = convert_in.error_map(message)
+    message = through_cdr("ErrorMap", from_model.error_map(result, STAMP_NS, "f"))
+    found = to_model.error_map(message)
     for name in ("gx", "gy", "g_theta", "u_g_theta"):
         np.testing.assert_array_equal(getattr(found, name), getattr(emap, name), name)
     for name in ("u_gx", "u_gy"):
@@ -291,20 +292,20 @@ def test_an_error_map_comes_back(result):
     ({"u_g_theta": [1.0]}, "u_g_theta has 1 values, the plate 8; mend the publisher"),
     ({"datum_theta": "none"}, "datum_theta 'none' is not known; use one of xy_axes, zero_mean")])
 def test_error_maps_that_cannot_be(result, changes, said):
-    values = convert_out.error_map(result, STAMP_NS, "f") | changes
+    values = from_model.error_map(result, STAMP_NS, "f") | changes
     with pytest.raises(InputError) as caught:
-        convert_in.error_map(through_cdr("ErrorMap", values))
+        to_model.error_map(through_cdr("ErrorMap", values))
     assert str(caught.value) == f"selfcal/error_map: {said}"
 
 
 @pytest.mark.parametrize(("last", "end"), [(10, 10), (40, 23)])
 def test_the_stamp_of_a_view_is_its_end_or_the_last_command(last, end):
-    assert convert_out.session_stamp_ns(Timeline(last_stamp_ns=last), PROGRESS) == end
+    assert from_model.session_stamp_ns(Timeline(last_stamp_ns=last), PROGRESS) == end
 
 
 def test_a_field_that_is_not_given_is_an_error():
     with pytest.raises(KeyError, match="score"):
-        convert_out.build(typestore(), "selfcal_msgs/msg/MarkDetection", {
-            name: value for name, value in convert_out.detection(
+        build(typestore(), "selfcal_msgs/msg/MarkDetection", {
+            name: value for name, value in from_model.detection(
                 Detection(0, 0, True, 0, 0, 0, 0.0, 0.0, 0.0, 0.0, 0.0), "").items()
             if name != "score"})

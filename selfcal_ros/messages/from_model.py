@@ -1,14 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """From the model to the fields of messages, as plain nested dicts.
 
-`build` makes a rosbags message of them; nodes fill rclpy messages from the same dicts.
+`bagio.build` makes a rosbags message of them; nodes fill rclpy messages from the same dicts.
 """
 
 from typing import Any
-
-import numpy as np
-from rosbags.interfaces import Nodetype
-from rosbags.typesys.store import Typestore
 
 from selfcal_ros.collection.collector import ViewProgress
 from selfcal_ros.collection.messages import Command, Detection, EncoderSample
@@ -132,27 +128,3 @@ def error_map(result: CalibrationResult, stamp_ns: int, frame_id: str) -> Fields
 def session_stamp_ns(timeline: Timeline, progress: ViewProgress) -> int:
     """Return the end of a view, or the last command while the view is still open."""
     return min(progress.end_ns, timeline.last_stamp_ns)
-
-
-def build(store: Typestore, typename: str, fields: Fields) -> object:
-    """Return a rosbags message of type `typename` with these fields.
-
-    Raises
-    ------
-    KeyError
-        If a field of the type is not given.
-    """
-    values = {}
-    for name, (kind, argument) in store.fielddefs[typename][1]:
-        value = fields[name]
-        if kind == Nodetype.NAME:
-            values[name] = build(store, argument, value)
-        elif kind == Nodetype.BASE:
-            values[name] = value
-        else:
-            element = argument[0]
-            if element[0] == Nodetype.BASE and element[1][0] != "string":
-                values[name] = np.array(value, dtype=element[1][0])
-            else:
-                values[name] = list(value)
-    return store.types[typename](**values)
