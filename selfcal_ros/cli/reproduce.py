@@ -49,7 +49,7 @@ def _make(folder: Path) -> None:
 
 
 def _hu(args: argparse.Namespace) -> tuple:
-    from selfcal_ros.simulation.reproduce_hu import hu_text, reproduce_hu
+    from selfcal_ros.simulation.reproduce.hu import hu_text, reproduce_hu
 
     found = reproduce_hu(args.draws, args.seed)
 
@@ -62,7 +62,7 @@ def _hu(args: argparse.Namespace) -> tuple:
 
 
 def _qiao(args: argparse.Namespace) -> tuple:
-    from selfcal_ros.simulation.reproduce_qiao import qiao_text, reproduce_qiao
+    from selfcal_ros.simulation.reproduce.qiao import qiao_text, reproduce_qiao
 
     found = reproduce_qiao(args.draws, args.seed)
 

@@ -13,8 +13,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from selfcal_ros.files import write_bytes
-from selfcal_ros.simulation.reproduce_hu import HuReproduction, HuRun
-from selfcal_ros.simulation.reproduce_qiao import Program, QiaoReproduction
+from selfcal_ros.simulation.reproduce.hu import HuReproduction, HuRun
+from selfcal_ros.simulation.reproduce.qiao import Program, QiaoReproduction
 
 DPI = 110
 

@@ -4,8 +4,8 @@
 import numpy as np
 import pytest
 
-from selfcal_ros.simulation.reproduce_hu import hu_text, reproduce_hu
-from selfcal_ros.simulation.reproduce_qiao import ROWS, SIZES, qiao_text, reproduce_qiao
+from selfcal_ros.simulation.reproduce.hu import hu_text, reproduce_hu
+from selfcal_ros.simulation.reproduce.qiao import ROWS, SIZES, qiao_text, reproduce_qiao
 
 
 @pytest.fixture(scope="module")
@@ -81,7 +81,7 @@ def test_qiaos_noise_run_meets_the_bound_not_the_printed_figure(qiao):
 def test_the_unseen_part_of_program_2_is_all_that_is_wrong(qiao):
     from selfcal_ros.estimation.normal.planned import planned_system
     from selfcal_ros.estimation.observability.unseen import mode_maps
-    from selfcal_ros.simulation.reproduce_qiao import ARTIFACT, PROGRAMS, plan_of
+    from selfcal_ros.simulation.reproduce.qiao import ARTIFACT, PROGRAMS, plan_of
 
     maps = mode_maps(planned_system(ARTIFACT, plan_of(PROGRAMS[1]).views)).reshape(10, -1)
     error = (qiao.programs[1].found_um - qiao.programs[1].truth_um).ravel()
