@@ -1,0 +1,253 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The columns of the terms: what a unit of each coefficient does to every reading.
+
+In the plate frame, with o the offset seen, tau the view's time in [-1, 1], z the mark, H the half
+width and s the signs of approach (reality of machines; docs/method.md, terms of the model):
+
+    microscope   V has -E o                  4 coefficients, shared
+    drift        V has sum_l d_l P_l(tau)     2 a degree and view (Legendre)
+    plate_scale  V has b z                    1 a view
+    plate_shape  V has a quadratic form of z/H, 6 a view
+    approach     V has +-(h_x s_x + i h_y s_y)  2, shared; minus where the plate moves
+"""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import eval_legendre
+
+from selfcal_ros.errors import InputError
+from selfcal_ros.estimation.terms.visits import ViewVisits
+from selfcal_ros.model.terms import UNITS, VISIT_TERMS, ModelTerm, TermName
+
+
+@dataclass(frozen=True)
+class Column:
+    """One coefficient: its term, its grid view (-1 = all share it), what it is, its size."""
+
+    term: TermName
+    view: int
+    component: str
+    size: float
+
+    @property
+    def unit(self) -> str:
+        """SI unit of the coefficient."""
+        return UNITS[self.term]
+
+
+@dataclass(frozen=True, eq=False)
+class WithinMarks:
+    """What the visits of each mark tell about the coefficients, and leave: see `visits`.
+
+    Attributes
+    ----------
+    gram : float array (p, p)
+        Weighted inner products of the columns about the means of their marks.
+    right : float array (p,)
+        The same with the deviations, m times the column's unit.
+    total : float
+        Weighted sum of squares of the deviations about the means of their marks, m^2.
+    dof : int
+        Its degrees of freedom.
+    """
+
+    gram: np.ndarray
+    right: np.ndarray
+    total: float
+    dof: int
+
+
+@dataclass(frozen=True, eq=False)
+class TermColumns:
+    """Columns of a set of terms.
+
+    Attributes
+    ----------
+    columns : tuple of Column
+        What each is, p of them.
+    grid : complex array (p, views, nx, ny)
+        Mean over the visits of every mark, plate frame; 0 where not read.
+    within : WithinMarks
+        What the means hide.
+    """
+
+    columns: tuple[Column, ...]
+    grid: np.ndarray
+    within: WithinMarks
+
+    @property
+    def size(self) -> np.ndarray:
+        """Known standard deviation of every coefficient, (p,); infinite if free."""
+        return np.array([column.size for column in self.columns])
+
+    def rows(self, names: Iterable[TermName]) -> np.ndarray:
+        """Return which columns belong to the terms `names`, bool (p,)."""
+        wanted = set(names)
+        return np.array([column.term in wanted for column in self.columns], dtype=bool)
+
+
+@dataclass(frozen=True, eq=False)
+class Ground:
+    """What the columns stand on.
+
+    Attributes
+    ----------
+    z : complex array (nx, ny)
+        Marks in units of `half_width_m`.
+    half_width_m : float
+        Longer half width of the plate, m.
+    weight : float array (views, nx, ny)
+        Weight of the mean of each mark; 0 = not read.
+    visits : tuple of ViewVisits or None
+        Visits of each view.
+    names : tuple of str
+        Names of the views.
+    indicated : int
+        Sign of the indicated position in a reading.
+    """
+
+    z: np.ndarray
+    half_width_m: float
+    weight: np.ndarray
+    visits: tuple[ViewVisits | None, ...]
+    names: tuple[str, ...]
+    indicated: int = 1
+
+
+Parts = list[tuple[str, Callable[[ViewVisits], np.ndarray]]]
+
+
+def term_columns(ground: Ground, terms: Iterable[ModelTerm], degree: int) -> TermColumns:
+    """Return the columns of `terms`.
+
+    Parameters
+    ----------
+    ground : Ground
+        Plate, views, visits.
+    terms : iterable of ModelTerm
+        What is wanted.
+    degree : int
+        Degree of a drift's polynomial.
+
+    Raises
+    ------
+    InputError
+        If a term needs to know the visits of a view, and they are not known.
+    """
+    columns: list[Column] = []
+    blocks: list[np.ndarray] = []
+    seen: list[list[np.ndarray | None]] = []
+    for term in terms:
+        if term.name in VISIT_TERMS:
+            _require_visits(ground, term.name)
+            made = _visit_columns(ground, term, degree)
+        else:
+            made = _plate_columns(ground, term)
+        for column, block, of_visits in made:
+            columns.append(column)
+            blocks.append(block)
+            seen.append(of_visits)
+    shape = (len(columns), *ground.weight.shape)
+    grid = np.array(blocks).reshape(shape) if blocks else np.zeros(shape, dtype=complex)
+    return TermColumns(tuple(columns), grid, _within(ground, seen))
+
+
+def _require_visits(ground: Ground, name: TermName) -> None:
+    for view, visits in zip(ground.names, ground.visits, strict=True):
+        if visits is None:
+            raise InputError(f"view '{view}'", f"the term '{name}' needs to know when, with which "
+                             "offset and from where each mark was read, and the readings do not "
+                             "tell it", "solve from the bag, or leave the term out")
+
+
+def _visit_columns(ground: Ground, term: ModelTerm,
+                   degree: int) -> list[tuple[Column, np.ndarray, list]]:
+    if term.name is TermName.DRIFT:
+        out = []
+        for view in range(len(ground.names)):
+            for order in range(1, degree + 1):
+                parts = _drift_parts(order)
+                out += [_of_visits(ground, Column(term.name, view, text, term.size), shape)
+                        for text, shape in parts]
+        return out
+    parts = _microscope_parts() if term.name is TermName.MICROSCOPE else _approach_parts(ground)
+    return [_of_visits(ground, Column(term.name, -1, text, term.size), shape)
+            for text, shape in parts]
+
+
+def _drift_parts(order: int) -> Parts:
+    return [(f"{axis} P{order}", lambda v, unit=unit: unit * eval_legendre(order, v.time))
+            for axis, unit in (("x", 1), ("y", 1j))]
+
+
+def _microscope_parts() -> Parts:
+    # E o = (e_xx o_x + e_xy o_y) + i (e_yx o_x + e_yy o_y); a reading has o where it should
+    # have (1 + E) o
+    return [("xx", lambda v: -v.offset.real + 0j), ("xy", lambda v: -v.offset.imag + 0j),
+            ("yx", lambda v: -1j * v.offset.real), ("yy", lambda v: -1j * v.offset.imag)]
+
+
+def _approach_parts(ground: Ground) -> Parts:
+    return [("x", lambda v: ground.indicated * v.approach_x + 0j),
+            ("y", lambda v: 1j * ground.indicated * v.approach_y)]
+
+
+def _of_visits(ground: Ground, column: Column,
+               shape: Callable[[ViewVisits], np.ndarray]) -> tuple[Column, np.ndarray, list]:
+    """Return a column of the visits: its means at the marks, and its values at the visits."""
+    block = np.zeros(ground.weight.shape, dtype=complex)
+    values: list[np.ndarray | None] = []
+    for view, visits in enumerate(ground.visits):
+        if visits is None or column.view not in (-1, view):
+            values.append(None)
+            continue
+        at = shape(visits) * visits.phase
+        block[view] = visits.means(at[None], block[view].size)[0].reshape(block[view].shape)
+        values.append(at)
+    return column, block, values
+
+
+def _plate_columns(ground: Ground, term: ModelTerm) -> list[tuple[Column, np.ndarray, list]]:
+    """Return columns of plate scale or shape: the same at all visits of a mark.
+
+    A size says how far views scatter about what they have in common, so that each view has its
+    own; free ones are relative to the first view, as what all have in common is the plate's.
+    """
+    first = 1 if term.free else 0
+    out = []
+    for view in range(first, len(ground.names)):
+        for text, shape in _plate_shapes(ground, term.name):
+            block = np.zeros(ground.weight.shape, dtype=complex)
+            block[view] = np.where(ground.weight[view] > 0, shape, 0)
+            out.append((Column(term.name, view, text, term.size), block,
+                        [None] * len(ground.names)))
+    return out
+
+
+def _plate_shapes(ground: Ground, name: TermName) -> list[tuple[str, np.ndarray]]:
+    if name is TermName.PLATE_SCALE:
+        return [("scale", ground.z * ground.half_width_m)]
+    x, y = ground.z.real, ground.z.imag
+    return [(f"{axis} {text}", unit * form) for axis, unit in (("x", 1), ("y", 1j))
+            for text, form in (("xx", x * x), ("xy", x * y), ("yy", y * y))]
+
+
+def _within(ground: Ground, seen: list[list[np.ndarray | None]]) -> WithinMarks:
+    p, n_marks = len(seen), ground.z.size
+    gram, right, total, dof = np.zeros((p, p)), np.zeros(p), 0.0, 0
+    for view, visits in enumerate(ground.visits):
+        if visits is None:
+            continue
+        rest = visits.about_means(visits.y[None], n_marks)[0]
+        total += float(visits.weight @ abs(rest) ** 2)
+        dof += 2 * (len(visits.mark) - len(np.unique(visits.mark)))
+        here = [k for k in range(p) if seen[k][view] is not None]
+        if here:
+            moved = visits.about_means(np.array([seen[k][view] for k in here]), n_marks)
+            weighted = np.conj(moved) * visits.weight
+            gram[np.ix_(here, here)] += (weighted @ moved.T).real
+            right[here] += (weighted @ rest).real
+    return WithinMarks(gram, right, total, dof)
+

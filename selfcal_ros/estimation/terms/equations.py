@@ -1,0 +1,124 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The equations of the terms' coefficients: what is told of them, and with which covariance."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from selfcal_ros.estimation.system import JointSystem
+from selfcal_ros.estimation.terms.columns import TermColumns
+from selfcal_ros.estimation.terms.projection import ProjectedColumns
+from selfcal_ros.model.terms import TermName
+
+UNTOLD = 1e-9
+"""Relative size below which an eigenvalue of the scaled equations is a zero."""
+
+MOVES_THE_MAP = 1e-5
+"""Root mean square that an untold combination of columns must give the map, in units of its own,
+to count as an unseen mode: rounding gives 1e-9, the smallest true ones 1e-2."""
+
+
+@dataclass(frozen=True, eq=False)
+class TermEquations:
+    """Normal equations of the coefficients with map, plate and misalignments eliminated.
+
+    All is for unit noise of one grid reading; p coefficients.
+
+    Attributes
+    ----------
+    system : JointSystem
+        The measured plan.
+    columns : TermColumns
+        The terms.
+    projected : ProjectedColumns
+        What the estimate makes of them.
+    """
+
+    system: JointSystem
+    columns: TermColumns
+    projected: ProjectedColumns
+
+    @cached_property
+    def information(self) -> np.ndarray:
+        """What the readings tell, sizes apart, (p, p): c' W r + within."""
+        return self.projected.gram + self.columns.within.gram
+
+    @cached_property
+    def norm(self) -> np.ndarray:
+        """Root of the weighted square of every column before anything is taken off, (p,).
+
+        Against it is judged what is told: what is left may be nothing but rounding.
+        """
+        grid = np.einsum("pvij,pvij,vij->p", np.conj(self.columns.grid), self.columns.grid,
+                         self.system.grid.weight, optimize=True).real
+        return np.sqrt(np.maximum(grid + np.diag(self.columns.within.gram),
+                                  np.finfo(float).tiny))
+
+    @property
+    def free(self) -> np.ndarray:
+        """Which coefficients the readings alone are to tell, bool (p,)."""
+        return np.isinf(self.columns.size)
+
+    def untold(self, rows: np.ndarray) -> np.ndarray:
+        """Return combinations of the coefficients `rows` that no reading tells, (p, k).
+
+        Orthonormal in scaled coefficients (times `norm`); others count as known.
+        """
+        scale = self.norm[rows]
+        scaled = self.information[np.ix_(rows, rows)] / np.outer(scale, scale)
+        values, vectors = np.linalg.eigh(scaled)
+        out = np.zeros((len(rows), int((values <= UNTOLD).sum())))
+        out[rows] = vectors[:, values <= UNTOLD]
+        return out
+
+    @cached_property
+    def maps(self) -> np.ndarray:
+        """Map of a unit of each coefficient in the datum, complex (sites, p); 0 where unknown."""
+        known = self.system.known_sites.ravel()[:, None]
+        fields = np.where(known, self.projected.fields, 0.0)
+        basis = self.system.gauge.orthonormal
+        return np.where(known, fields - basis @ np.real(basis.conj().T @ fields), 0.0)
+
+    def unseen(self, rows: np.ndarray) -> np.ndarray:
+        """Return untold combinations of `rows` that move the map, scaled, (p, modes)."""
+        untold = self.untold(rows)
+        if not untold.shape[1]:
+            return untold
+        grid = self.system.grid
+        moved = self.maps @ (untold / self.norm[:, None]) * np.sqrt(grid.weight.sum())
+        both = np.concatenate([moved.real, moved.imag])
+        _, size, right = np.linalg.svd(both / np.sqrt(grid.n_sites), full_matrices=False)
+        return untold @ right[size > MOVES_THE_MAP].T
+
+    def rows(self, names: Iterable[TermName]) -> np.ndarray:
+        """Return which coefficients belong to the terms `names`, bool (p,)."""
+        return self.columns.rows(names)
+
+    def inverse(self, sigma_m: float) -> np.ndarray:
+        """Return the covariance of the coefficients for unit noise, (p, p).
+
+        Untold combinations of free coefficients, which do not move the map, have none.
+
+        Parameters
+        ----------
+        sigma_m : float
+            Noise of one grid reading, m, against which sizes are weighed.
+        """
+        # a sized coefficient in units of its size, a free one in those of its column
+        scale = np.where(self.free, 1 / self.norm, self.columns.size)
+        matrix = self.information * np.outer(scale, scale)
+        matrix[np.diag_indices(len(scale))] += np.where(self.free, 0.0, sigma_m**2)
+        hold = self.untold(self.free)
+        # sized coefficients may be told far better than free ones, in these units
+        own = np.sqrt(np.maximum(np.diag(matrix), np.finfo(float).tiny))
+        matrix = matrix / np.outer(own, own)
+        found = np.linalg.pinv(matrix + hold @ hold.T, hermitian=True, rcond=1e-14)
+        found = found - hold @ hold.T
+        scale = scale / own
+        return found * np.outer(scale, scale)
+
+    def rank(self) -> int:
+        """Return how many combinations of all coefficients the readings tell."""
+        return len(self.norm) - self.untold(np.ones(len(self.norm), dtype=bool)).shape[1]

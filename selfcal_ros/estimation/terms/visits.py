@@ -1,0 +1,105 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The visits of each grid view in the frame of the equations: when, with which offset, from where.
+
+A mean over the visits of a mark serves the map as well as the visits themselves. What the visits
+of one mark leave about their mean tells terms that differ between them, and the noise.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from selfcal_ros.estimation.lattice import PHASES
+from selfcal_ros.estimation.readings_data import GridData
+from selfcal_ros.model.readings import GridVisits, Measurements, Sense, ViewReadings
+
+
+@dataclass(frozen=True, eq=False)
+class ViewVisits:
+    """Visits of one grid view; arrays (V,).
+
+    Attributes
+    ----------
+    mark : int array
+        Flat index of the mark on the plate's lattice.
+    weight : float array
+        Weight of each visit; the visits of a mark add up to the weight of its mean.
+    y : complex array
+        Deviation in the plate frame, m.
+    time : float array
+        Instant in the view's time, -1 at its first visit and +1 at its last.
+    offset : complex array
+        Offset that the microscope saw, stage axes, m.
+    approach_x, approach_y : float array
+        Sign of the last motion of each stage axis; 0 = not known.
+    phase : complex
+        i^-q: from the stage frame to the plate frame.
+    """
+
+    mark: np.ndarray
+    weight: np.ndarray
+    y: np.ndarray
+    time: np.ndarray
+    offset: np.ndarray
+    approach_x: np.ndarray
+    approach_y: np.ndarray
+    phase: complex
+
+    def means(self, values: np.ndarray, n_marks: int) -> np.ndarray:
+        """Return the weighted mean of complex values (k, V) at each mark, (k, marks)."""
+        total = np.bincount(self.mark, self.weight, n_marks)
+        relative = self.weight / total[self.mark]
+        out = np.zeros((len(values), n_marks), dtype=complex)
+        for row, value in zip(out, values, strict=True):
+            row.real = np.bincount(self.mark, relative * value.real, n_marks)
+            row.imag = np.bincount(self.mark, relative * value.imag, n_marks)
+        return out
+
+    def about_means(self, values: np.ndarray, n_marks: int) -> np.ndarray:
+        """Return complex values (k, V) less the mean of their mark."""
+        return values - self.means(values, n_marks)[:, self.mark]
+
+
+def approach_sign(sense: Sense) -> int:
+    """Return the sign of the indicated position in a reading: -1 where the plate moves."""
+    return -1 if sense is Sense.PLATE_MOVES else 1
+
+
+def visits_of(measurements: Measurements, grid: GridData) -> tuple[ViewVisits | None, ...]:
+    """Return the visits of every grid view, in the order of `grid`; None where not known."""
+    return tuple(_visits_of(measurements.views[i], grid, row)
+                 for row, i in enumerate(grid.index))
+
+
+def _visits_of(view: ViewReadings, grid: GridData, row: int) -> ViewVisits | None:
+    visits = view.visits
+    if visits is None or not len(visits.mark):
+        return None
+    hx, hy = ((size - 1) // 2 for size in grid.y.shape[1:])
+    flat = (view.m + hx) * grid.y.shape[2] + (view.n + hy)
+    mark = flat[visits.mark]
+    own = _own_weights(visits, mark, grid.y[row].size)
+    total = np.bincount(mark, own, grid.y[row].size)
+    weight = own / total[mark] * grid.weight[row].reshape(-1)[mark]
+    phase = PHASES[-grid.poses[row].q % 4]
+    return ViewVisits(mark, weight, (visits.dx + 1j * visits.dy) * phase,
+                      view_time(visits.stamp_ns), visits.offset_x + 1j * visits.offset_y,
+                      visits.approach_x.astype(float), visits.approach_y.astype(float), phase)
+
+
+def _own_weights(visits: GridVisits, mark: np.ndarray, n_marks: int) -> np.ndarray:
+    """Return 1/u^2 where all visits of a mark declare it, else the repeats: as for its mean."""
+    count = visits.count.astype(float)
+    if not len(visits.u):
+        return count
+    good = np.isfinite(visits.u) & (visits.u > 0)
+    whole = np.bincount(mark, ~good, n_marks)[mark] == 0
+    return np.where(whole, 1 / np.where(good, visits.u, 1.0) ** 2, count)
+
+
+def view_time(stamps_ns: np.ndarray) -> np.ndarray:
+    """Return instants in the view's time: -1 at the first, +1 at the last; 0 if there is one."""
+    first, last = int(stamps_ns.min()), int(stamps_ns.max())
+    if first == last:
+        return np.zeros(len(stamps_ns))
+    return 2 * (stamps_ns - first) / (last - first) - 1
