@@ -6,6 +6,7 @@ from enum import StrEnum
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.error_map import ThetaDatum
+from selfcal_ros.model.terms import DRIFT_DEGREE, ModelTerm
 
 METHODS = ("joint", "law")
 MISALIGNMENT_MODELS = ("linear", "rigid")
@@ -83,6 +84,8 @@ class Options:
     reference: ReferenceLength | None = None
     misalignment_model: str = "linear"
     uncertainty: bool | None = None
+    terms: tuple[ModelTerm, ...] = ()
+    drift_degree: int = DRIFT_DEGREE
 
     def __post_init__(self) -> None:
         """Refuse unknown names."""

@@ -5,6 +5,7 @@ For unit noise the sites have the covariance S = M^-1 + Y P Y', with M the elimi
 Y its answer to the misalignments and P their covariance; the datum projects it.
 """
 
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -15,6 +16,25 @@ from selfcal_ros.estimation.normal.equations import JointSystem
 
 NO_NOISE_M = 1e-100
 """Noise that stands for none: its square is still a number."""
+
+
+@dataclass(frozen=True, eq=False)
+class TermSpread:
+    """How the coefficients of terms reach the map: part of its covariance.
+
+    Attributes
+    ----------
+    fields : complex array (sites, p)
+        Map of a unit of each coefficient, in no particular datum.
+    parameters : float array (size, p)
+        Misalignments that belong to it.
+    covariance : float array (p, p)
+        Of the coefficients, for unit noise of one grid reading.
+    """
+
+    fields: np.ndarray
+    parameters: np.ndarray
+    covariance: np.ndarray
 
 
 class FieldCovariance:
@@ -30,11 +50,18 @@ class FieldCovariance:
         What sets the scale of the map; without it the map has none.
     sigma : float
         Noise of one grid reading, m, by which the reference's uncertainty is measured.
+    terms : TermSpread, optional
+        Terms of the model that were estimated with the map.
     """
 
     def __init__(self, system: JointSystem, inverse: np.ndarray,
-                 scale: ScaleDatum | None = None, sigma: float = 1.0) -> None:
+                 scale: ScaleDatum | None = None, sigma: float = 1.0,
+                 terms: TermSpread | None = None) -> None:
         self.system, self.inverse = system, inverse
+        if terms is None:
+            terms = TermSpread(np.zeros((system.grid.n_sites, 0), dtype=complex),
+                               np.zeros((system.size, 0)), np.zeros((0, 0)))
+        self.terms = terms
         self.scale, self._u2 = scale, 0.0
         if scale is not None:
             self._u2 = scale.variance + (scale.u_m / max(sigma, NO_NOISE_M)) ** 2
@@ -45,7 +72,9 @@ class FieldCovariance:
         """Return S times complex columns (sites, k)."""
         response = self.system.grid.response
         answer = self._p @ np.real(response.conj().T @ rows)
-        return self.system.grid.factor.solve(np.ascontiguousarray(rows)) + response @ answer
+        of_terms = self.terms.covariance @ np.real(self.terms.fields.conj().T @ rows)
+        return (self.system.grid.factor.solve(np.ascontiguousarray(rows)) + response @ answer
+                + self.terms.fields @ of_terms)
 
     @cached_property
     def _datum(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -70,6 +99,9 @@ class FieldCovariance:
         answer = np.real(self.system.grid.response.conj().T @ out) - moved
         solved = self.system.grid.factor.solve(np.ascontiguousarray(out))
         cov = np.real(out.conj().T @ solved) + answer.T @ self._p @ answer + extra
+        n = len(moved)
+        of_terms = np.real(self.terms.fields.conj().T @ out) + self.terms.parameters[:n].T @ moved
+        cov += of_terms.T @ self.terms.covariance @ of_terms
         return (cov + cov.T) / 2
 
     def _of_scale(self) -> tuple[np.ndarray, float]:
@@ -80,6 +112,11 @@ class FieldCovariance:
         spread = solved + grid.response @ (self._p @ answer)
         basis = self.system.gauge.orthonormal
         variance = float(np.real(np.vdot(rows, solved)) + answer @ self._p @ answer) + self._u2
+        terms, n = self.terms, len(answer)
+        of_terms = np.real(terms.fields.conj().T @ rows) + terms.parameters[:n].T @ (
+            self.scale.parameters)
+        spread = spread + terms.fields @ (terms.covariance @ of_terms)
+        variance += float(of_terms @ terms.covariance @ of_terms)
         return spread - basis @ np.real(basis.conj().T @ spread), variance
 
     def diagonal(self) -> tuple[np.ndarray, np.ndarray]:
@@ -92,7 +129,9 @@ class FieldCovariance:
         with_scale, of_scale = (None, 0.0) if self.scale is None else self._of_scale()
         for part in (np.real, np.imag):
             b, s, y = part(basis), part(spread), part(response)
-            value = common + np.einsum("sa,ab,sb->s", y, self._p, y)
+            f = part(self.terms.fields)
+            value = common + np.einsum("sa,sa->s", y @ self._p, y)
+            value += np.einsum("sp,sp->s", f @ self.terms.covariance, f)
             value += np.einsum("sk,kl,sl->s", b, inner, b) - 2 * np.einsum("sk,sk->s", b, s)
             if with_scale is not None:
                 z = part(grid.views.z.ravel())
@@ -134,6 +173,12 @@ def angular_variance(field: FieldCovariance, conditions: Conditions, *,
     with_slopes = y @ (field.inverse[np.ix_(system.phi_at, np.arange(n))] @ answer)
     of_slopes = field.of(conditions.slopes) * sigma_xy**2
 
+    turned = y @ field.terms.parameters[system.phi_at] / half_width_m
+    cover = field.terms.covariance * sigma_xy**2
+    sloped = np.real(flat.conj().T @ field.terms.fields)
+    columns = columns + turned @ (cover @ (rows @ turned).T)
+    variance += np.einsum("kp,kp->k", turned @ cover, turned)
+    with_slopes = with_slopes - turned @ (cover @ sloped.T)
     cross = rows @ with_slopes
     closure = of_slopes + rows @ columns - cross - cross.T
     both = with_slopes - columns

@@ -10,7 +10,7 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.blas_threads import one_thread
 from selfcal_ros.estimation.datum.covariance import FieldCovariance
 from selfcal_ros.estimation.datum.scale import scale_datum
-from selfcal_ros.estimation.joint.fit import fit, fit_rigid
+from selfcal_ros.estimation.joint.model_fit import fit_model
 from selfcal_ros.estimation.joint.solve import prepare
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact
@@ -133,8 +133,7 @@ def map_covariance(measurements: Measurements, options: Options | None = None) -
                      options.misalignment_model, uncertainty=True)
     with one_thread():
         problem, _ = prepare(measurements, wanted)
-        found = (fit_rigid(problem) if options.misalignment_model == "rigid"
-                 else fit(problem, problem.grid.y))
+        found = fit_model(problem).found
         scale = (scale_datum(problem.system, options.reference, problem.half_width_m)
                  if options.reference else None)
         field = FieldCovariance(problem.system, found.inverse, scale, found.xy.sigma)

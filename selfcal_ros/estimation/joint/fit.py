@@ -5,12 +5,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.datum.scale import scale_of
 from selfcal_ros.estimation.joint.iterated import solve_iterated
 from selfcal_ros.estimation.joint.noise import Level, level
 from selfcal_ros.estimation.joint.problem import (
-    ROUNDING,
     AngularPart,
     Problem,
     Raw,
@@ -18,11 +16,6 @@ from selfcal_ros.estimation.joint.problem import (
     sigma_of,
     weight_ratio,
 )
-
-MAX_RIGID_STEPS = 20
-
-RIGID_RESOLUTION = 1e-11
-"""Change of a misalignment, against the largest, at which rotations stand still."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,30 +102,6 @@ def fit(problem: Problem, y: np.ndarray) -> Fit:
     a_theta, residuals_theta = angular.plate(problem.angular.y, g_theta, phi)
     return Fit(field, plate, residuals, parameters, g_theta, a_theta, residuals_theta,
                misclosure, xy, theta.level, raw.inverse, raw.solver)
-
-
-def fit_rigid(problem: Problem) -> Fit:
-    """Return the solution for finite rotations of the plate (Gauss-Newton).
-
-    A mark lies at R(phi) R^q (m + A) + t. What that holds beyond the linear model,
-    ((R(phi) - 1 - phi J) m + (R(phi) - 1) A) in the plate frame, is taken off the readings with the
-    last solution until it stands still; every step solves the same factored equations.
-    """
-    y, n = problem.grid.y, 3 * problem.system.grid.n_views
-    found = fit(problem, y)
-    marks = problem.system.grid.views.z * problem.half_width_m
-    for _ in range(MAX_RIGID_STEPS):
-        phi = found.parameters[:n:3, None, None] / problem.half_width_m
-        turn = np.expm1(1j * phi)
-        excess = (turn - 1j * phi) * marks + turn * found.plate
-        step = fit(problem, np.where(problem.system.grid.read, y - excess, 0.0))
-        change = float(np.abs(step.parameters - found.parameters).max())
-        found = step
-        still = RIGID_RESOLUTION * float(np.abs(step.parameters).max())
-        if change <= max(still, ROUNDING * float(np.abs(y).max())):
-            return found
-    raise InputError("misalignment model 'rigid'", "the rotations do not settle",
-                     "check the readings for misalignments of more than a few degrees")
 
 
 def _solve_direct(problem: Problem, y: np.ndarray, theta: AngularPart) -> Raw:

@@ -10,7 +10,9 @@ from selfcal_ros.estimation.joint.noise import Level, level, pooled
 from selfcal_ros.estimation.lattice.readings import AngularData, GridData
 from selfcal_ros.estimation.normal.equations import JointSystem
 from selfcal_ros.estimation.options import ReferenceLength
+from selfcal_ros.estimation.terms.ground import Ground
 from selfcal_ros.model.readings import Measurements
+from selfcal_ros.model.terms import DRIFT_DEGREE, ModelTerm
 
 ROUNDING = 16 * np.finfo(float).eps
 """Noise below this part of the largest deviation is rounding."""
@@ -40,6 +42,17 @@ class Problem:
         Whether the sites are factorised rather than iterated.
     reference : ReferenceLength, optional
         What sets the scale.
+    rigid : bool
+        Whether the plate turns by finite angles, or as in the papers' linear form.
+    terms : tuple of ModelTerm
+        Terms of the model beside stage, plate and misalignments.
+    drift_degree : int
+        Degree of a drift's polynomial.
+    ground : Ground, optional
+        What the columns of terms stand on; always there if there are terms.
+    residuals_xy : tuple, optional
+        (sigma, degrees of freedom) of the residuals where they are not those of the grid alone:
+        after terms were taken off.
     """
 
     system: JointSystem
@@ -51,6 +64,11 @@ class Problem:
     conditions: Conditions
     direct: bool
     reference: ReferenceLength | None = None
+    rigid: bool = True
+    terms: tuple[ModelTerm, ...] = ()
+    drift_degree: int = DRIFT_DEGREE
+    ground: Ground | None = None
+    residuals_xy: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,13 +100,20 @@ def repeats_of(measurements: Measurements) -> tuple[tuple[float, int], tuple[flo
 
 def grid_level(problem: Problem, left: np.ndarray) -> Level:
     """Return the noise of the grid readings, given their residuals (views, nx, ny)."""
+    if problem.residuals_xy is not None:
+        return level(problem.repeats_xy, problem.residuals_xy, problem.grid.sigma_declared)
     grid = problem.system.grid
-    dof = 2 * grid.n_readings - problem.system.rank_grid
+    dof = grid_dof(problem)
     total = float((grid.weight * (left.real**2 + left.imag**2)).sum())
     return level(problem.repeats_xy, sigma_of(total, dof), problem.grid.sigma_declared)
 
 
-def sigma_of(total: float, dof: int) -> tuple[float, int]:
+def grid_dof(problem: Problem) -> int:
+    """Return the degrees of freedom of the grid residuals without terms."""
+    return 2 * problem.system.grid.n_readings - problem.system.rank_grid
+
+
+def sigma_of(total: float, dof: float) -> tuple[float, float]:
     """Return (sigma, dof) of a weighted sum of squares."""
     return (float(np.sqrt(total / dof)), dof) if dof > 0 else (float("nan"), 0)
 

@@ -8,7 +8,8 @@ from selfcal_ros.estimation.blas_threads import one_thread
 from selfcal_ros.estimation.datum.angular import conditions_for, misclosure_warning
 from selfcal_ros.estimation.datum.covariance import FieldCovariance, angular_variance
 from selfcal_ros.estimation.datum.scale import scale_datum
-from selfcal_ros.estimation.joint.fit import Fit, fit, fit_rigid
+from selfcal_ros.estimation.joint.fit import Fit
+from selfcal_ros.estimation.joint.model_fit import ModelFit, fit_model
 from selfcal_ros.estimation.joint.noise import disagreement
 from selfcal_ros.estimation.joint.problem import Problem, repeats_of
 from selfcal_ros.estimation.lattice.maps import PHASES
@@ -22,6 +23,7 @@ from selfcal_ros.estimation.observability.rank import (
     refusal,
 )
 from selfcal_ros.estimation.options import Options
+from selfcal_ros.estimation.terms.ground import ground_of
 from selfcal_ros.model.error_map import ErrorMap, ThetaDatum
 from selfcal_ros.model.readings import Measurements, Sense
 from selfcal_ros.model.result import (
@@ -38,9 +40,7 @@ def solve_joint(measurements: Measurements, options: Options) -> CalibrationResu
     """Calibrate by joint least squares; see `selfcal_ros.estimation.api.calibrate`."""
     with one_thread():
         problem, seen = prepare(measurements, options)
-        rigid = options.misalignment_model == "rigid"
-        found = fit_rigid(problem) if rigid else fit(problem, problem.grid.y)
-        return _result(measurements, options, problem=problem, found=found, seen=seen)
+        return _result(measurements, options, model=fit_model(problem), seen=seen)
 
 
 def prepare(measurements: Measurements, options: Options) -> tuple[Problem, Observability]:
@@ -66,17 +66,20 @@ def prepare(measurements: Measurements, options: Options) -> tuple[Problem, Obse
         raise NotIdentifiableError(refusal(seen), seen)
     half_width_m = measurements.artifact.grid_pitch_m * max(measurements.artifact.half)
     conditions = conditions_for(system, options.datum_theta, measurements.sense, half_width_m)
-    direct = system.direct or bool(options.uncertainty)
+    direct = system.direct or bool(options.uncertainty) or bool(options.terms)
     if direct and system.grid.n_sites > MAX_DIRECT_SITES:
         raise InputError("options", f"the uncertainty of {system.grid.n_sites} sites is beyond "
                          f"the limit of {MAX_DIRECT_SITES}", "solve without the uncertainty")
-    return Problem(system, grid, angular, *repeats_of(measurements), half_width_m, conditions,
-                   direct, options.reference), seen
+    return Problem(
+        system, grid, angular, *repeats_of(measurements), half_width_m, conditions, direct,
+        options.reference, options.misalignment_model == "rigid", options.terms,
+        options.drift_degree, ground_of(measurements, grid, half_width_m)), seen
 
 
-def _result(measurements: Measurements, options: Options, *, problem: Problem, found: Fit,
+def _result(measurements: Measurements, options: Options, *, model: ModelFit,
             seen: Observability) -> CalibrationResult:
-    error_map, closure = _error_map(measurements, options, problem=problem, found=found)
+    problem, found = model.problem, model.found
+    error_map, closure = _error_map(measurements, options, model=model)
     xy, theta = found.xy, found.theta
     noise = Noise(xy.sigma, theta.sigma, xy.repeats, theta.repeats, xy.residuals,
                   theta.residuals, xy.dof_repeats, theta.dof_repeats, xy.dof_residuals,
@@ -94,15 +97,16 @@ def _result(measurements: Measurements, options: Options, *, problem: Problem, f
         sense=str(measurements.sense), extra={"solver": found.solver})
 
 
-def _error_map(measurements: Measurements, options: Options, *, problem: Problem, found: Fit
+def _error_map(measurements: Measurements, options: Options, *, model: ModelFit,
                ) -> tuple[ErrorMap, np.ndarray | None]:
     """Return the map in the stage frame, and the covariance of the angular misclosure."""
+    problem, found = model.problem, model.found
     system, length = problem.system, problem.half_width_m
     u_x = u_y = np.full(system.grid.views.shape, np.nan)
     u_theta, closure = np.full(system.angular.n_lines, np.nan), None
     if problem.direct and options.uncertainty is not False:
         scale = (scale_datum(system, options.reference, length) if options.reference else None)
-        cover = FieldCovariance(system, found.inverse, scale, found.xy.sigma)
+        cover = FieldCovariance(system, found.inverse, scale, found.xy.sigma, model.spread)
         u_x, u_y = (np.sqrt(v) * found.xy.sigma for v in cover.diagonal())
     if problem.direct and options.uncertainty is not False and system.angular.n_views:
         variance, closure = angular_variance(

@@ -18,15 +18,16 @@ import numpy as np
 from scipy.special import eval_legendre
 
 from selfcal_ros.errors import InputError
+from selfcal_ros.estimation.terms.ground import Ground
 from selfcal_ros.estimation.terms.visits import ViewVisits
 from selfcal_ros.model.terms import UNITS, VISIT_TERMS, ModelTerm, TermName
 
 
 @dataclass(frozen=True)
 class Column:
-    """One coefficient: its term, its grid view (-1 = all share it), what it is, its size."""
+    """One coefficient: its term (or ``slip``), grid view (-1 = all), what it is, its size."""
 
-    term: TermName
+    term: str
     view: int
     component: str
     size: float
@@ -34,7 +35,7 @@ class Column:
     @property
     def unit(self) -> str:
         """SI unit of the coefficient."""
-        return UNITS[self.term]
+        return UNITS.get(self.term, "m")
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,49 +72,25 @@ class TermColumns:
         Mean over the visits of every mark, plate frame; 0 where not read.
     within : WithinMarks
         What the means hide.
+    seen : list
+        Values of each column at the visits of each view, (V,), plate frame; None where they are
+        those of the means.
     """
 
     columns: tuple[Column, ...]
     grid: np.ndarray
     within: WithinMarks
+    seen: list[list[np.ndarray | None]]
 
     @property
     def size(self) -> np.ndarray:
         """Known standard deviation of every coefficient, (p,); infinite if free."""
         return np.array([column.size for column in self.columns])
 
-    def rows(self, names: Iterable[TermName]) -> np.ndarray:
+    def rows(self, names: Iterable[str]) -> np.ndarray:
         """Return which columns belong to the terms `names`, bool (p,)."""
         wanted = set(names)
         return np.array([column.term in wanted for column in self.columns], dtype=bool)
-
-
-@dataclass(frozen=True, eq=False)
-class Ground:
-    """What the columns stand on.
-
-    Attributes
-    ----------
-    z : complex array (nx, ny)
-        Marks in units of `half_width_m`.
-    half_width_m : float
-        Longer half width of the plate, m.
-    weight : float array (views, nx, ny)
-        Weight of the mean of each mark; 0 = not read.
-    visits : tuple of ViewVisits or None
-        Visits of each view.
-    names : tuple of str
-        Names of the views.
-    indicated : int
-        Sign of the indicated position in a reading.
-    """
-
-    z: np.ndarray
-    half_width_m: float
-    weight: np.ndarray
-    visits: tuple[ViewVisits | None, ...]
-    names: tuple[str, ...]
-    indicated: int = 1
 
 
 Parts = list[tuple[str, Callable[[ViewVisits], np.ndarray]]]
@@ -136,22 +113,43 @@ def term_columns(ground: Ground, terms: Iterable[ModelTerm], degree: int) -> Ter
     InputError
         If a term needs to know the visits of a view, and they are not known.
     """
-    columns: list[Column] = []
-    blocks: list[np.ndarray] = []
-    seen: list[list[np.ndarray | None]] = []
+    made: list[tuple[Column, np.ndarray, list]] = []
     for term in terms:
         if term.name in VISIT_TERMS:
             _require_visits(ground, term.name)
-            made = _visit_columns(ground, term, degree)
+            made += _visit_columns(ground, term, degree)
         else:
-            made = _plate_columns(ground, term)
-        for column, block, of_visits in made:
-            columns.append(column)
-            blocks.append(block)
-            seen.append(of_visits)
-    shape = (len(columns), *ground.weight.shape)
-    grid = np.array(blocks).reshape(shape) if blocks else np.zeros(shape, dtype=complex)
-    return TermColumns(tuple(columns), grid, _within(ground, seen))
+            made += _plate_columns(ground, term)
+    return _stacked(ground, made)
+
+
+def columns_from(ground: Ground, columns: Iterable[Column],
+                 shapes: Iterable[np.ndarray]) -> TermColumns:
+    """Return columns of one view each, given by their values at its visits (V,), plate frame."""
+    made = []
+    for column, values in zip(columns, shapes, strict=True):
+        block = np.zeros(ground.weight.shape, dtype=complex)
+        visits = ground.visits[column.view]
+        block[column.view] = visits.means(values[None], ground.z.size).reshape(ground.z.shape)
+        seen: list[np.ndarray | None] = [None] * len(ground.names)
+        seen[column.view] = values
+        made.append((column, block, seen))
+    return _stacked(ground, made)
+
+
+def _stacked(ground: Ground, made: list[tuple[Column, np.ndarray, list]]) -> TermColumns:
+    shape = (len(made), *ground.weight.shape)
+    grid = np.array([block for _, block, _ in made]).reshape(shape) if made else np.zeros(
+        shape, dtype=complex)
+    seen = [values for _, _, values in made]
+    return TermColumns(tuple(column for column, _, _ in made), grid, _within(ground, seen), seen)
+
+
+def joined(ground: Ground, first: TermColumns, second: TermColumns) -> TermColumns:
+    """Return the columns of both."""
+    seen = [*first.seen, *second.seen]
+    return TermColumns((*first.columns, *second.columns),
+                       np.concatenate([first.grid, second.grid]), _within(ground, seen), seen)
 
 
 def _require_visits(ground: Ground, name: TermName) -> None:

@@ -7,10 +7,9 @@ from functools import cached_property
 
 import numpy as np
 
-from selfcal_ros.estimation.system import JointSystem
+from selfcal_ros.estimation.normal.equations import JointSystem
 from selfcal_ros.estimation.terms.columns import TermColumns
 from selfcal_ros.estimation.terms.projection import ProjectedColumns
-from selfcal_ros.model.terms import TermName
 
 UNTOLD = 1e-9
 """Relative size below which an eigenvalue of the scaled equations is a zero."""
@@ -39,6 +38,11 @@ class TermEquations:
     system: JointSystem
     columns: TermColumns
     projected: ProjectedColumns
+
+    @property
+    def n(self) -> int:
+        """Number of coefficients."""
+        return len(self.columns.columns)
 
     @cached_property
     def information(self) -> np.ndarray:
@@ -92,7 +96,7 @@ class TermEquations:
         _, size, right = np.linalg.svd(both / np.sqrt(grid.n_sites), full_matrices=False)
         return untold @ right[size > MOVES_THE_MAP].T
 
-    def rows(self, names: Iterable[TermName]) -> np.ndarray:
+    def rows(self, names: Iterable[str]) -> np.ndarray:
         """Return which coefficients belong to the terms `names`, bool (p,)."""
         return self.columns.rows(names)
 
@@ -121,4 +125,4 @@ class TermEquations:
 
     def rank(self) -> int:
         """Return how many combinations of all coefficients the readings tell."""
-        return len(self.norm) - self.untold(np.ones(len(self.norm), dtype=bool)).shape[1]
+        return self.n - self.untold(np.ones(self.n, dtype=bool)).shape[1]

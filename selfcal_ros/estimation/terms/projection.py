@@ -4,15 +4,16 @@
 The estimate without terms is linear: y -> (G, misalignments) with residuals (1 - P) y. A term's
 column c has the map F = G(c) and the residuals r = (1 - P) c. With these the terms join by
 partitioned regression (Frisch and Waugh):
-    (r'W c + within + sigma^2/size^2) b = c'W e + within,   G = G(y) - F b,   cov G = S + F cov(b) F'
+    (r'W c + within + sigma^2/size^2) b = c'W e + within,
+    G = G(y) - F b,     cov G = S + F cov(b) F'
 """
 
 from dataclasses import dataclass
 
 import numpy as np
 
-from selfcal_ros.estimation.normal_grid import GridSystem
-from selfcal_ros.estimation.system import JointSystem
+from selfcal_ros.estimation.normal.equations import JointSystem
+from selfcal_ros.estimation.normal.grid import GridSystem
 
 CHUNK_READINGS = 4_000_000
 """Readings of columns that are worked on at a time: 64 MB."""

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from selfcal_ros.estimation.lattice import PHASES
-from selfcal_ros.estimation.readings_data import GridData
+from selfcal_ros.estimation.lattice.maps import PHASES
+from selfcal_ros.estimation.lattice.readings import GridData
 from selfcal_ros.model.readings import GridVisits, Measurements, Sense, ViewReadings
 
 

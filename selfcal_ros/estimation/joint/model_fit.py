@@ -1,0 +1,212 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The fit of the whole model: finite rotations and terms around the linear least squares.
+
+A mark lies at R(phi) R^q (m + A + B) + t, with B the plate's own change in a view. What that holds
+beyond the linear model, ((R(phi) - 1 - phi J) m + (R(phi) - 1) (A + B)) in the plate frame, and
+what the terms make of the readings, are taken off with the last solution until it stands still.
+Every step solves the same factored equations (Gauss-Newton).
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from selfcal_ros.errors import InputError
+from selfcal_ros.estimation.datum.covariance import TermSpread
+from selfcal_ros.estimation.joint.fit import Fit, fit
+from selfcal_ros.estimation.joint.problem import ROUNDING, Problem, grid_dof, sigma_of
+from selfcal_ros.estimation.terms.columns import TermColumns, term_columns
+from selfcal_ros.estimation.terms.equations import TermEquations
+from selfcal_ros.estimation.terms.projection import ReducedColumns, project, reduce_columns
+from selfcal_ros.estimation.terms.solution import Sums, next_coefficients, noise_left, score
+from selfcal_ros.model.terms import TermName
+
+MAX_STEPS = 30
+
+RESOLUTION = 1e-12
+"""Change of a misalignment, against the largest, at which rotations stand still."""
+
+ROUGH_RESOLUTION = 1e-11
+"""The same once steps no longer shrink."""
+
+OF_NOISE = 1e-6
+"""Change of a misalignment, against its standard uncertainty, that is none once steps no longer
+shrink: where weights lie far apart rounding moves it."""
+
+SHRINKS = 0.5
+"""Ratio of two steps above which they no longer shrink."""
+
+
+@dataclass(frozen=True, eq=False)
+class ModelFit:
+    """A fit of the whole model.
+
+    Attributes
+    ----------
+    problem : Problem
+        As it was solved, with the noise that terms leave.
+    found : Fit
+        Maps and misalignments, terms taken off.
+    equations : TermEquations or None
+        Equations of the terms; None without terms.
+    coefficients : float array (p,)
+        Of the terms' columns.
+    sums : Sums
+        What is left of the readings, and its degrees of freedom.
+    y : complex array (views, nx, ny)
+        Deviations as the last linear step took them.
+    reduced : ReducedColumns or None
+        The terms' columns with the sites eliminated.
+    """
+
+    problem: Problem
+    found: Fit
+    equations: TermEquations | None
+    coefficients: np.ndarray
+    sums: Sums
+    y: np.ndarray
+    reduced: ReducedColumns | None = None
+
+    @property
+    def covariance(self) -> np.ndarray:
+        """Covariance of the coefficients for unit noise of one grid reading, (p, p)."""
+        if self.equations is None:
+            return np.zeros((0, 0))
+        return self.equations.inverse(self.found.xy.sigma)
+
+    @property
+    def spread(self) -> TermSpread | None:
+        """How the uncertainty of the terms reaches the map; None without terms."""
+        if self.equations is None:
+            return None
+        now = equations_of(self.problem, self.found, self.equations.columns, self.reduced)
+        return TermSpread(now.projected.fields, now.projected.parameters,
+                          now.inverse(self.found.xy.sigma))
+
+
+def fit_model(problem: Problem) -> ModelFit:
+    """Return the joint least-squares solution of the whole model.
+
+    Raises
+    ------
+    InputError
+        If the rotations do not settle, or a term needs what the readings do not tell.
+    """
+    found = fit(problem, problem.grid.y)
+    state = _State(problem, found)
+    if not (problem.rigid or problem.terms):
+        return state.finished()
+    before = np.inf
+    for number in range(MAX_STEPS):
+        change = state.step()
+        largest = float(np.abs(state.found.parameters).max())
+        if change <= max(RESOLUTION * largest, ROUNDING * float(np.abs(problem.grid.y).max())):
+            return state.finished()
+        stuck = number > 2 and change > SHRINKS * before
+        if stuck and (change <= ROUGH_RESOLUTION * largest or state.within_noise(change)):
+            return state.finished()
+        before = change
+    raise InputError("misalignment model 'rigid'", "the rotations do not settle",
+                     "check the readings for misalignments of more than a few degrees")
+
+
+def columns_of(problem: Problem) -> TermColumns:
+    """Return the columns of the problem's terms."""
+    return term_columns(problem.ground, problem.terms, problem.drift_degree)
+
+
+def equations_of(problem: Problem, found: Fit, columns: TermColumns,
+                 reduced: ReducedColumns | None = None) -> TermEquations:
+    """Return the equations of columns beside the estimate `found`."""
+    if reduced is None:
+        reduced = reduce_columns(problem.system.grid, columns.grid)
+    inverse = found.inverse if len(found.inverse) else problem.system.grid_inverse
+    return TermEquations(problem.system, columns,
+                         project(problem.system, columns.grid, reduced, inverse))
+
+
+class _State:
+    """Where the iteration stands."""
+
+    def __init__(self, problem: Problem, found: Fit) -> None:
+        self.problem, self.found = problem, found
+        self.equations, self.reduced = None, None
+        if problem.terms:
+            columns = columns_of(problem)
+            self.reduced = reduce_columns(problem.system.grid, columns.grid)
+            self.equations = equations_of(problem, found, columns, self.reduced)
+        equations = self.equations
+        self.coefficients = np.zeros(equations.n if equations else 0)
+        self.sums = self._sums()
+        self.y = problem.grid.y
+
+    def step(self) -> float:
+        """Take one step; return the largest change of a misalignment, m."""
+        before = self.found.parameters
+        if self.equations is not None:
+            self._solve_terms()
+        self.y = np.where(self.problem.system.grid.read,
+                          self.problem.grid.y - self._excess() - self._of_terms(), 0.0)
+        self.found = fit(self.problem, self.y)
+        return float(np.abs(self.found.parameters - before).max())
+
+    def within_noise(self, change: float) -> bool:
+        """Return whether a change of the misalignments is nothing against their uncertainty."""
+        spread = np.diag(self.found.inverse)
+        spread = spread[spread > 0]
+        sigma = self.found.xy.sigma
+        return bool(len(spread) and np.isfinite(sigma)
+                    and change <= OF_NOISE * sigma * np.sqrt(spread.min()))
+
+    def finished(self) -> ModelFit:
+        self.sums = self._sums()
+        return ModelFit(self.problem, self.found, self.equations, self.coefficients, self.sums,
+                        self.y, self.reduced)
+
+    def _solve_terms(self) -> None:
+        now = score(self.equations, self.found.residuals, dof=grid_dof(self.problem),
+                    coefficients=self.coefficients)
+        left = noise_left(self.equations, now)
+        self.problem = with_noise(self.problem, left)
+        sigma = self.found.xy.sigma if np.isfinite(self.found.xy.sigma) else 0.0
+        self.coefficients = next_coefficients(self.equations, now, self.coefficients, sigma)
+
+    def _of_terms(self) -> np.ndarray | float:
+        if self.equations is None:
+            return 0.0
+        return np.tensordot(self.coefficients, self.equations.columns.grid, axes=1)
+
+    def _excess(self) -> np.ndarray | float:
+        """Return what a finite rotation adds to the linear model, plate frame, m."""
+        if not self.problem.rigid:
+            return 0.0
+        grid, length = self.problem.system.grid, self.problem.half_width_m
+        phi = self.found.parameters[:3 * grid.n_views:3, None, None] / length
+        turn = np.expm1(1j * phi)
+        return (turn - 1j * phi) * (grid.views.z * length) + turn * (
+            self.found.plate + self._of_plate())
+
+    def _of_plate(self) -> np.ndarray | float:
+        """Return how the plate itself differs in each view, B, (views, nx, ny), m."""
+        if self.equations is None:
+            return 0.0
+        rows = self.equations.rows((TermName.PLATE_SCALE, TermName.PLATE_SHAPE))
+        return np.tensordot(self.coefficients[rows], self.equations.columns.grid[rows], axes=1)
+
+    def _sums(self) -> Sums:
+        if self.equations is not None:
+            now = score(self.equations, self.found.residuals, dof=grid_dof(self.problem),
+                        coefficients=self.coefficients)
+            return noise_left(self.equations, now)
+        grid = self.problem.system.grid
+        total = float((grid.weight * abs(self.found.residuals) ** 2).sum())
+        return Sums(total, grid_dof(self.problem), float("nan"), 0)
+
+
+def with_noise(problem: Problem, left: Sums) -> Problem:
+    """Return the problem with the noise that terms leave, of residuals and of visits."""
+    repeats = problem.repeats_xy
+    if left.dof_within >= 1:
+        repeats = sigma_of(left.within, left.dof_within)
+    return replace(problem, residuals_xy=sigma_of(left.between, left.dof_between),
+                   repeats_xy=repeats)

@@ -1,0 +1,120 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Coefficients of the terms from the residuals of an estimate, and the noise that is left."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from selfcal_ros.estimation.terms.equations import TermEquations
+
+
+@dataclass(frozen=True, eq=False)
+class Sums:
+    """Weighted sums of squares of what is left, m^2, with their degrees of freedom.
+
+    `between`: residuals of the marks' means; `within`: visits about the mean of their mark.
+    """
+
+    between: float
+    dof_between: float
+    within: float
+    dof_within: float
+
+    @property
+    def total(self) -> float:
+        """Both together."""
+        return self.between + self.within
+
+    @property
+    def dof(self) -> float:
+        """Degrees of freedom of both together."""
+        return self.dof_between + self.dof_within
+
+
+@dataclass(frozen=True, eq=False)
+class Score:
+    """What columns can explain of the residuals of an estimate that does not hold them.
+
+    Attributes
+    ----------
+    between, within : float array (p,)
+        Inner products c' W e of the marks' means, and those within marks.
+    sums : Sums
+        Sums of squares of the estimate without the columns.
+    """
+
+    between: np.ndarray
+    within: np.ndarray
+    sums: Sums
+
+    @property
+    def total(self) -> np.ndarray:
+        """Right-hand side of the coefficients, (p,)."""
+        return self.between + self.within
+
+
+def score(equations: TermEquations, residuals: np.ndarray, *, dof: float,
+          coefficients: np.ndarray | None = None) -> Score:
+    """Return the right-hand side of the coefficients that are still to come.
+
+    Parameters
+    ----------
+    equations : TermEquations
+        The columns.
+    residuals : complex array (views, nx, ny)
+        Residuals of the estimate, plate frame, m, from deviations less `coefficients` columns.
+    dof : float
+        Degrees of freedom of the estimate without terms.
+    coefficients : float array (p,), optional
+        What has been taken off already.
+    """
+    columns, weight = equations.columns, equations.system.grid.weight
+    within = columns.within
+    taken = np.zeros(equations.n) if coefficients is None else coefficients
+    weighted = (weight * residuals).reshape(-1)
+    between = (np.conj(columns.grid.reshape(len(taken), weighted.size)) @ weighted).real
+    squares = within.total - 2 * taken @ within.right + taken @ within.gram @ taken
+    sums = Sums(float((weight * abs(residuals) ** 2).sum()), dof, float(squares), within.dof)
+    return Score(between, within.right - within.gram @ taken, sums)
+
+
+def noise_left(equations: TermEquations, found: Score) -> Sums:
+    """Return what all the columns leave, were their coefficients free.
+
+    The noise is taken from this fit: a size that is too small would leave part of its term in.
+    """
+    inverse = free_inverse(equations)
+    more = inverse @ found.total
+    gram, within = equations.projected.gram, equations.columns.within.gram
+    between = found.sums.between - 2 * more @ found.between + more @ gram @ more
+    inner = found.sums.within - 2 * more @ found.within + more @ within @ more
+    return Sums(max(float(between), 0.0), found.sums.dof_between - float(np.sum(inverse * gram)),
+                max(float(inner), 0.0), found.sums.dof_within - float(np.sum(inverse * within)))
+
+
+def free_inverse(equations: TermEquations) -> np.ndarray:
+    """Return the pseudo-inverse of the information: covariance were all coefficients free."""
+    everything = np.ones(equations.n, dtype=bool)
+    untold = equations.untold(everything)
+    scaled = equations.information / np.outer(equations.norm, equations.norm)
+    held = np.linalg.inv(scaled + untold @ untold.T) - untold @ untold.T
+    return held / np.outer(equations.norm, equations.norm)
+
+
+def next_coefficients(equations: TermEquations, found: Score, coefficients: np.ndarray,
+                      sigma_m: float) -> np.ndarray:
+    """Return the coefficients that the score asks for, (p,), sizes as prior knowledge.
+
+    Parameters
+    ----------
+    equations : TermEquations
+        The columns.
+    found : Score
+        At `coefficients`.
+    coefficients : float array (p,)
+        Where the estimate stands.
+    sigma_m : float
+        Noise of one grid reading, m.
+    """
+    prior = np.where(equations.free, 0.0, (sigma_m / equations.columns.size) ** 2)
+    return coefficients + equations.inverse(sigma_m) @ (found.total - prior * coefficients)
