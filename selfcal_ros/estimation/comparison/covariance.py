@@ -10,7 +10,7 @@ from scipy.optimize import nnls
 
 from selfcal_ros.estimation.datum.covariance import FieldCovariance
 from selfcal_ros.estimation.law.solve import law_covariance
-from selfcal_ros.estimation.normal.equations import JointSystem
+from selfcal_ros.estimation.normal.equations import NormalEquations
 from selfcal_ros.estimation.normal.planned import planned_system
 from selfcal_ros.estimation.observability.prediction import theta_matrix
 from selfcal_ros.estimation.observability.rank import full_observability
@@ -88,7 +88,7 @@ def first_order_u(result: CalibrationResult) -> tuple[float, float]:
     return float(u[0]), float(u[1])
 
 
-def _powers(result: CalibrationResult, system: JointSystem) -> tuple[float, float]:
+def _powers(result: CalibrationResult, system: NormalEquations) -> tuple[float, float]:
     """Return the variance of a reading, m^2, and that of the map's scale, behind a map's u.
 
     A map whose scale a reference length sets has u^2 = sigma^2 d + s^2 x^2, with d from the views.
@@ -113,14 +113,14 @@ def _flipped(result: CalibrationResult) -> bool:
     return result.sense == Sense.PLATE_MOVES
 
 
-def _field(system: JointSystem) -> FieldCovariance:
+def _field(system: NormalEquations) -> FieldCovariance:
     n = 3 * system.grid.n_views
     inverse = np.zeros((system.size, system.size))
     inverse[:n, :n] = system.grid_inverse
     return FieldCovariance(system, inverse)
 
 
-def _system(result: CalibrationResult) -> JointSystem | None:
+def _system(result: CalibrationResult) -> NormalEquations | None:
     """Return the system of the views behind a result; None if they do not identify the stage."""
     if np.isnan(result.error_map.u_gx).all() or not result.views:
         return None

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import chdtri
 
-from selfcal_ros.estimation.normal.equations import JointSystem
+from selfcal_ros.estimation.normal.equations import NormalEquations
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.readings import Sense
 
@@ -73,7 +73,7 @@ def slope_rows(z_m: np.ndarray, known: np.ndarray) -> np.ndarray:
     return out
 
 
-def conditions_for(system: JointSystem, datum: ThetaDatum, sense: Sense,
+def conditions_for(system: NormalEquations, datum: ThetaDatum, sense: Sense,
                    half_width_m: float) -> Conditions:
     """Return the conditions of a datum on what was measured.
 
@@ -81,7 +81,7 @@ def conditions_for(system: JointSystem, datum: ThetaDatum, sense: Sense,
 
     Parameters
     ----------
-    system : JointSystem
+    system : NormalEquations
         The measured plan.
     datum : ThetaDatum
         The convention wanted.
@@ -96,7 +96,7 @@ def conditions_for(system: JointSystem, datum: ThetaDatum, sense: Sense,
     return system.memo[key]
 
 
-def _conditions(system: JointSystem, datum: ThetaDatum, sense: Sense,
+def _conditions(system: NormalEquations, datum: ThetaDatum, sense: Sense,
                 half_width_m: float) -> Conditions:
     known, n_lines = system.known_lines, system.angular.n_lines
     flipped = sense is Sense.PLATE_MOVES
@@ -118,7 +118,7 @@ def _conditions(system: JointSystem, datum: ThetaDatum, sense: Sense,
                       np.ones((n_lines, 1)), np.zeros((system.angular.n_views, 1)))
 
 
-def _solve_conditions(system: JointSystem, rows: np.ndarray, slopes: np.ndarray) -> Conditions:
+def _solve_conditions(system: NormalEquations, rows: np.ndarray, slopes: np.ndarray) -> Conditions:
     """Return the least-squares answer of the angular equations, given phi of the grid views."""
     angular = system.angular
     free = [v for v, i in enumerate(system.angular_index) if i not in system.grid_index]
@@ -151,12 +151,12 @@ def misclosure_warning(misclosure: np.ndarray, covariance: np.ndarray) -> str:
     if n < 2:
         return ""
     contrasts = np.linalg.qr(np.column_stack([np.ones(n), np.eye(n)[:, 1:]]))[0][:, 1:].T
-    left = contrasts @ misclosure
+    contrast = contrasts @ misclosure
     spread = contrasts @ covariance @ contrasts.T + CLOSED_RAD**2 * np.eye(n - 1)
-    value = float(left @ np.linalg.solve(spread, left))
+    value = float(contrast @ np.linalg.solve(spread, contrast))
     if not value > chdtri(n - 1, MISCLOSURE_LEVEL):
         return ""
-    arcsec = np.degrees(np.abs(left).max()) * 3600
+    arcsec = np.degrees(np.abs(contrast).max()) * 3600
     return (f"theta: the stage does not satisfy the axis conditions of the datum xy_axes: "
             f"misclosure {arcsec:.3g} arcsec, chi2 {value:.3g} with {n - 1} degrees of freedom; "
             "use zero_mean")

@@ -12,7 +12,7 @@ import numpy as np
 
 from selfcal_ros.estimation.datum.angular import Conditions
 from selfcal_ros.estimation.datum.scale import ScaleDatum
-from selfcal_ros.estimation.normal.equations import JointSystem
+from selfcal_ros.estimation.normal.equations import NormalEquations
 
 NO_NOISE_M = 1e-100
 """Noise that stands for none: its square is still a number."""
@@ -42,7 +42,7 @@ class FieldCovariance:
 
     Parameters
     ----------
-    system : JointSystem
+    system : NormalEquations
         The measured plan.
     inverse : float array (size, size)
         Covariance of the misalignments for unit grid noise.
@@ -54,7 +54,7 @@ class FieldCovariance:
         Terms of the model that were estimated with the map.
     """
 
-    def __init__(self, system: JointSystem, inverse: np.ndarray,
+    def __init__(self, system: NormalEquations, inverse: np.ndarray,
                  scale: ScaleDatum | None = None, sigma: float = 1.0,
                  terms: TermSpread | None = None) -> None:
         self.system, self.inverse = system, inverse
@@ -187,7 +187,7 @@ def angular_variance(field: FieldCovariance, conditions: Conditions, *,
     return np.where(system.known_lines, np.maximum(variance, 0.0), np.nan), closure
 
 
-def _inverse_diagonal(system: JointSystem) -> np.ndarray:
+def _inverse_diagonal(system: NormalEquations) -> np.ndarray:
     n = system.angular.n_lines
     out = np.empty(n)
     for start in range(0, n, 512):

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from selfcal_ros.estimation.lattice.gauge import Gauge
-from selfcal_ros.estimation.normal.equations import JointSystem
+from selfcal_ros.estimation.normal.equations import NormalEquations
 from selfcal_ros.estimation.options import ReferenceKind, ReferenceLength
 
 
@@ -39,13 +39,13 @@ class ScaleDatum:
     u_m: float
 
 
-def scale_datum(system: JointSystem, reference: ReferenceLength,
+def scale_datum(system: NormalEquations, reference: ReferenceLength,
                 half_width_m: float) -> ScaleDatum:
     """Return the scale that a reference length sets.
 
     Parameters
     ----------
-    system : JointSystem
+    system : NormalEquations
         The measured plan.
     reference : ReferenceLength
         The length.
@@ -60,15 +60,15 @@ def scale_datum(system: JointSystem, reference: ReferenceLength,
         rows = rows - basis @ np.real(basis.conj().T @ rows)
         return ScaleDatum(value, -rows, np.zeros(n), 0.0, u)
     dual = Gauge(grid.views.z, system.known_marks, scale=True).dual(3)
-    rows = system.gauge.dual(3).ravel() - grid.views.scatter(grid.share * dual).ravel()
-    sums = -np.einsum("cij,vij->vc", np.conj(grid.shapes), grid.share * dual)
+    rows = system.gauge.dual(3).ravel() - grid.views.scatter(grid.relative_weight * dual).ravel()
+    sums = -np.einsum("cij,vij->vc", np.conj(grid.shapes), grid.relative_weight * dual)
     parameters = np.stack([sums[:, 0].real, sums[:, 1].real, sums[:, 1].imag], axis=1).ravel()
     total = grid.weight.sum(axis=0)
     variance = float((abs(dual) ** 2 / np.where(grid.mark_read, total, np.inf)).sum())
     return ScaleDatum(-value, rows, parameters, variance, u)
 
 
-def scale_of(system: JointSystem, reference: ReferenceLength, *, field: np.ndarray,
+def scale_of(system: NormalEquations, reference: ReferenceLength, *, field: np.ndarray,
              plate: np.ndarray, half_width_m: float) -> float:
     """Return c for a map and a plate in their datum, m at the unit of position."""
     value = reference.relative_error * half_width_m

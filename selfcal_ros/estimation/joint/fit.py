@@ -7,19 +7,19 @@ import numpy as np
 
 from selfcal_ros.estimation.datum.scale import scale_of
 from selfcal_ros.estimation.joint.iterated import solve_iterated
-from selfcal_ros.estimation.joint.noise import Level, level
+from selfcal_ros.estimation.joint.noise import NoiseEstimate, noise_estimate
 from selfcal_ros.estimation.joint.problem import (
     AngularPart,
+    FreeNetworkSolution,
     Problem,
-    Raw,
-    grid_level,
+    grid_noise,
     sigma_of,
     weight_ratio,
 )
 
 
 @dataclass(frozen=True, eq=False)
-class Fit:
+class JointFit:
     """A solution in its datum, in the frame of the equations (H for ``plate_moves``).
 
     Attributes
@@ -29,14 +29,14 @@ class Fit:
     residuals : complex array (views, nx, ny)
         Grid residuals in the plate frame, m; 0 where not read.
     parameters : float array (size,)
-        Misalignments as in `JointSystem`: phi times the half width, tau; m.
+        Misalignments as in `NormalEquations`: phi times the half width, tau; m.
     g_theta, a_theta : float array (K,)
         Angular maps, rad.
     residuals_theta : float array (views, K)
         Angular residuals, rad.
     misclosure : float array (conditions,)
         Slopes less Gtheta before the angular datum was applied, rad.
-    xy, theta : Level
+    xy, theta : NoiseEstimate
         Noise of the grid and of the angular readings.
     inverse : float array (size, size)
         Covariance of the misalignments for unit grid noise; empty if the sites were iterated.
@@ -52,13 +52,13 @@ class Fit:
     a_theta: np.ndarray
     residuals_theta: np.ndarray
     misclosure: np.ndarray
-    xy: Level
-    theta: Level
+    xy: NoiseEstimate
+    theta: NoiseEstimate
     inverse: np.ndarray
     solver: dict
 
 
-def fit(problem: Problem, y: np.ndarray) -> Fit:
+def fit(problem: Problem, y: np.ndarray) -> JointFit:
     """Return the joint least-squares solution.
 
     Each kind of readings is first fitted alone, for its noise; the two noises then weigh them
@@ -89,7 +89,7 @@ def fit(problem: Problem, y: np.ndarray) -> Fit:
                          half_width_m=length)
         field, plate = field + grown * grid.views.z, plate - grown * grid.views.z
         parameters = parameters + grown * system.rigid[3]
-    xy = raw.xy or grid_level(problem, residuals)
+    xy = raw.xy or grid_noise(problem, residuals)
 
     conditions = problem.conditions
     phi = parameters[system.phi_at] / length
@@ -100,38 +100,40 @@ def fit(problem: Problem, y: np.ndarray) -> Fit:
     phi = phi + conditions.phi_gain @ misclosure
     parameters[system.phi_at] = phi * length
     a_theta, residuals_theta = angular.plate(problem.angular.y, g_theta, phi)
-    return Fit(field, plate, residuals, parameters, g_theta, a_theta, residuals_theta,
-               misclosure, xy, theta.level, raw.inverse, raw.solver)
+    return JointFit(field, plate, residuals, parameters, g_theta, a_theta, residuals_theta,
+                    misclosure, xy, theta.noise, raw.inverse, raw.solver)
 
 
-def _solve_direct(problem: Problem, y: np.ndarray, theta: AngularPart) -> Raw:
+def _solve_direct(problem: Problem, y: np.ndarray, theta: AngularPart) -> FreeNetworkSolution:
     system, grid = problem.system, problem.system.grid
     n = 3 * grid.n_views
     free, d = grid.reduced(y)
     alone = system.grid_inverse @ d
     field = (free - grid.response @ alone).reshape(grid.views.shape)
     if not system.angular.n_views:
-        return Raw(field, alone, None, system.grid_inverse, {"method": "multifrontal"})
-    xy = grid_level(problem, grid.plate(y, field, alone)[1])
-    ratio = weight_ratio(problem, xy.sigma, theta.level.sigma, y)
+        return FreeNetworkSolution(field, alone, None, system.grid_inverse,
+                                   {"method": "multifrontal"})
+    xy = grid_noise(problem, grid.plate(y, field, alone)[1])
+    ratio = weight_ratio(problem, xy.sigma, theta.noise.sigma, y)
     right = np.zeros(system.size)
     right[:n] = d
     right[system.phi_at] += ratio * problem.half_width_m * theta.d
     inverse = system.inverse(ratio)
     parameters = inverse @ right
     field = (free - grid.response @ parameters[:n]).reshape(grid.views.shape)
-    return Raw(field, parameters, xy, inverse, {"method": "multifrontal"})
+    return FreeNetworkSolution(field, parameters, xy, inverse, {"method": "multifrontal"})
 
 
 def _angular_part(problem: Problem) -> AngularPart:
     angular, y = problem.system.angular, problem.angular.y
     if not angular.n_views:
-        nothing = level((float("nan"), 0), (float("nan"), 0), float("nan"))
+        nothing = noise_estimate((float("nan"), 0), (float("nan"), 0), float("nan"))
         return AngularPart(np.full(angular.n_lines, np.nan), np.zeros(0), nothing)
     free, d = angular.reduced(y)
     phi = problem.system.angular_inverse @ d
-    _, left = angular.plate(y, free - angular.response @ phi, phi)
+    _, residual = angular.plate(y, free - angular.response @ phi, phi)
     dof = angular.n_readings - problem.system.rank_angular
-    found = level(problem.repeats_theta, sigma_of(float((angular.weight * left**2).sum()), dof),
-                  problem.angular.sigma_declared)
+    total = float((angular.weight * residual**2).sum())
+    found = noise_estimate(problem.repeats_theta, sigma_of(total, dof),
+                           problem.angular.sigma_declared)
     return AngularPart(free, d, found)

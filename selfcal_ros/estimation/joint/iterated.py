@@ -4,13 +4,19 @@
 import numpy as np
 
 from selfcal_ros.estimation.joint.pcg import TOLERANCE, GridIteration, Iterated
-from selfcal_ros.estimation.joint.problem import AngularPart, Problem, Raw, grid_level, weight_ratio
+from selfcal_ros.estimation.joint.problem import (
+    AngularPart,
+    FreeNetworkSolution,
+    Problem,
+    grid_noise,
+    weight_ratio,
+)
 
 ROUGH = 1e-6
 """Relative residual at which the noise of the grid readings is taken, to weigh the angular ones."""
 
 
-def solve_iterated(problem: Problem, y: np.ndarray, theta: AngularPart) -> Raw:
+def solve_iterated(problem: Problem, y: np.ndarray, theta: AngularPart) -> FreeNetworkSolution:
     """Return the solution of the joint equations by conjugate gradients.
 
     A rough solution of the grid readings alone gives their noise; with it the angular readings
@@ -30,9 +36,9 @@ def solve_iterated(problem: Problem, y: np.ndarray, theta: AngularPart) -> Raw:
         return _raw(found, near + found.parameters)
 
     rough = kernel.solve(b, d, tolerance=ROUGH)
-    _, left = grid.plate(y, rough.field, near + rough.parameters)
-    sigma = grid_level(problem, left).sigma
-    ratio = weight_ratio(problem, sigma, theta.level.sigma, y)
+    _, residual = grid.plate(y, rough.field, near + rough.parameters)
+    sigma = grid_noise(problem, residual).sigma
+    ratio = weight_ratio(problem, sigma, theta.noise.sigma, y)
     normal, right, rest = _angular_on_grid(problem, theta)
     phi_near = near[::3]
     kernel.inverse = _block_inverse(problem, ratio * normal)
@@ -46,10 +52,11 @@ def solve_iterated(problem: Problem, y: np.ndarray, theta: AngularPart) -> Raw:
     return _raw(found, parameters, rough.iterations)
 
 
-def _raw(found: Iterated, parameters: np.ndarray, before: int = 0) -> Raw:
-    return Raw(found.field, parameters, None, np.zeros((0, 0)),
-               {"method": "conjugate gradients", "iterations": before + found.iterations,
-                "relative_residual": found.relative_residual})
+def _raw(found: Iterated, parameters: np.ndarray, before: int = 0) -> FreeNetworkSolution:
+    return FreeNetworkSolution(
+        found.field, parameters, None, np.zeros((0, 0)),
+        {"method": "conjugate gradients", "iterations": before + found.iterations,
+         "relative_residual": found.relative_residual})
 
 
 def _block_inverse(problem: Problem, of_phi: np.ndarray) -> np.ndarray:

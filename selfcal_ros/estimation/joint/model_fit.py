@@ -13,7 +13,7 @@ import numpy as np
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.datum.covariance import TermSpread
-from selfcal_ros.estimation.joint.fit import Fit, fit
+from selfcal_ros.estimation.joint.fit import JointFit, fit
 from selfcal_ros.estimation.joint.problem import ROUNDING, Problem, grid_dof, sigma_of
 from selfcal_ros.estimation.terms.columns import TermColumns, term_columns
 from selfcal_ros.estimation.terms.equations import TermEquations
@@ -45,7 +45,7 @@ class ModelFit:
     ----------
     problem : Problem
         As it was solved, with the noise that terms leave.
-    found : Fit
+    found : JointFit
         Maps and misalignments, terms taken off.
     equations : TermEquations or None
         Equations of the terms; None without terms.
@@ -60,7 +60,7 @@ class ModelFit:
     """
 
     problem: Problem
-    found: Fit
+    found: JointFit
     equations: TermEquations | None
     coefficients: np.ndarray
     sums: Sums
@@ -115,7 +115,7 @@ def columns_of(problem: Problem) -> TermColumns:
     return term_columns(problem.ground, problem.terms, problem.drift_degree)
 
 
-def equations_of(problem: Problem, found: Fit, columns: TermColumns,
+def equations_of(problem: Problem, found: JointFit, columns: TermColumns,
                  reduced: ReducedColumns | None = None) -> TermEquations:
     """Return the equations of columns beside the estimate `found`."""
     if reduced is None:
@@ -128,7 +128,7 @@ def equations_of(problem: Problem, found: Fit, columns: TermColumns,
 class _State:
     """Where the iteration stands."""
 
-    def __init__(self, problem: Problem, found: Fit) -> None:
+    def __init__(self, problem: Problem, found: JointFit) -> None:
         self.problem, self.found = problem, found
         self.equations, self.reduced = None, None
         if problem.terms:

@@ -15,7 +15,7 @@ F_LEVEL = 1e-3
 
 
 @dataclass(frozen=True)
-class Level:
+class NoiseEstimate:
     """Noise of one kind of readings.
 
     Attributes
@@ -47,8 +47,9 @@ def pooled(parts: Iterable[tuple[float, int]]) -> tuple[float, int]:
     return float(np.sqrt(sum(dof * sigma**2 for sigma, dof in good) / total)), total
 
 
-def level(repeats: tuple[float, int], residuals: tuple[float, int], declared: float) -> Level:
-    """Return the noise level to use: declared, else repeats, else residuals.
+def noise_estimate(repeats: tuple[float, int], residuals: tuple[float, int],
+                   declared: float) -> NoiseEstimate:
+    """Return the noise to use: declared, else repeats, else residuals.
 
     Parameters
     ----------
@@ -63,15 +64,15 @@ def level(repeats: tuple[float, int], residuals: tuple[float, int], declared: fl
         sigma, dof = repeats
     else:
         sigma, dof = residuals
-    return Level(sigma, dof, repeats[0], residuals[0], repeats[1], residuals[1])
+    return NoiseEstimate(sigma, dof, repeats[0], residuals[0], repeats[1], residuals[1])
 
 
-def disagreement(found: Level, what: str, unit: tuple[float, str], floor: float) -> str:
+def disagreement(found: NoiseEstimate, what: str, unit: tuple[float, str], floor: float) -> str:
     """Return a warning if the residuals show another noise than repeats or declaration.
 
     Parameters
     ----------
-    found : Level
+    found : NoiseEstimate
         The noise.
     what : str
         Kind of readings.

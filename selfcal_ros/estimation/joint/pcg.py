@@ -64,7 +64,7 @@ class GridIteration:
         self.grid, self.inverse = grid, inverse
         self._diagonal = grid.views.scatter_weight(grid.weight)
         self._symbols = preconditioner_symbols(grid)
-        self._loose = loose_sites(grid)
+        self._missing = missing_mark_correction(grid)
         size = max(grid.views.shape)
         slow = next_fast_len(size, real=True) != size and size <= DENSE_DCT
         self._cosines = (dct(np.eye(size, dtype=np.float32), axis=0, norm="ortho") if slow
@@ -81,7 +81,7 @@ class GridIteration:
     def product(self, field: np.ndarray) -> np.ndarray:
         """Return the normal matrix times a field."""
         grid = self.grid
-        mean = grid.views.gather_mean(field, grid.share)
+        mean = grid.views.gather_mean(field, grid.relative_weight)
         out = self._diagonal * field
         grid.views.subtract_scattered(out, grid.weight, mean)
         out -= self.spread(self.inverse @ grid.coupled(field.ravel()))
@@ -98,7 +98,7 @@ class GridIteration:
 
     def precondition(self, field: np.ndarray) -> np.ndarray:
         """Return an approximate inverse of the normal matrix times a field."""
-        shape, size, loose = field.shape, max(field.shape), self._loose * field
+        shape, size, loose = field.shape, max(field.shape), self._missing * field
         low = [(size - n) // 2 for n in shape]
         part = np.s_[low[0]:low[0] + shape[0], low[1]:low[1] + shape[1]]
         if shape != (size, size):
@@ -160,16 +160,16 @@ class GridIteration:
         self.remove_rigid(right)
         target = tolerance * _norm(right)
         field = np.zeros_like(b) if start is None else start.copy()
-        left = right - self.product(field) if start is not None else right.copy()
+        residual = right - self.product(field) if start is not None else right.copy()
         count, direction, rho = 0, np.zeros_like(b), 1.0
-        while (size := _norm(left)) > target:
+        while (size := _norm(residual)) > target:
             if count == MAX_ITERATIONS:
                 raise InputError(
                     "weights", f"the residual stays at {size / target * tolerance:.1e} after "
                     f"{MAX_ITERATIONS} iterations, because repeats or declared uncertainties "
                     "differ too much", "leave out the weakest readings")
-            z = self.precondition(left)
-            new = _dot(left, z)
+            z = self.precondition(residual)
+            new = _dot(residual, z)
             direction *= new / rho if count else 0.0
             direction += z
             rho = new
@@ -177,8 +177,8 @@ class GridIteration:
             step = rho / _dot(direction, image)
             field += step * direction
             image *= step
-            left -= image
-            self.remove_rigid(left)
+            residual -= image
+            self.remove_rigid(residual)
             count += 1
         true = _norm(right - self.product(field)) / max(_norm(right), 1e-300)
         parameters = self.inverse @ (d - self.grid.coupled(field.ravel()))
@@ -197,7 +197,8 @@ def preconditioner_symbols(grid: GridSystem) -> tuple[np.ndarray, np.ndarray]:
     other = np.zeros((size, size))
     pairs = [(i, j) for i in range(grid.n_views) for j in range(i)]
     for i, j in pairs:
-        weight = np.vdot(grid.weight[i], grid.share[j]) / max(np.count_nonzero(grid.read[i]), 1)
+        weight = np.vdot(grid.weight[i], grid.relative_weight[j])
+        weight = weight / max(np.count_nonzero(grid.read[i]), 1)
         p, r = grid.views.poses[i], grid.views.poses[j]
         shift = (PHASES[-p.q % 4] * complex(p.a, p.b) - PHASES[-r.q % 4] * complex(r.a, r.b))
         a, b = round(shift.real), round(shift.imag)
@@ -212,7 +213,7 @@ def preconditioner_symbols(grid: GridSystem) -> tuple[np.ndarray, np.ndarray]:
     return turning.astype(np.float32), inverse.astype(np.float32)
 
 
-def loose_sites(grid: GridSystem) -> np.ndarray:
+def missing_mark_correction(grid: GridSystem) -> np.ndarray:
     """Return what the inverse of the matrix has on its diagonal beyond that of a full plate.
 
     A site that has lost readings is looser than the transform, which knows full plates alone,
@@ -220,7 +221,8 @@ def loose_sites(grid: GridSystem) -> np.ndarray:
     """
     views = grid.views
     full = GridSystem(views.poses, views.in_field * grid.mean_weight, views.unit)
-    now, then = (views.scatter_weight(one.weight * (1 - one.share)) for one in (grid, full))
+    now, then = (views.scatter_weight(one.weight * (1 - one.relative_weight))
+                 for one in (grid, full))
     good = (now > 0) & (then > 0)
     out = np.zeros(views.shape)
     out[good] = np.maximum(1 / now[good] - 1 / then[good], 0.0)

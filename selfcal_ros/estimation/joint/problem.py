@@ -6,9 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from selfcal_ros.estimation.datum.angular import Conditions
-from selfcal_ros.estimation.joint.noise import Level, level, pooled
+from selfcal_ros.estimation.joint.noise import NoiseEstimate, noise_estimate, pooled
 from selfcal_ros.estimation.lattice.readings import AngularData, GridData
-from selfcal_ros.estimation.normal.equations import JointSystem
+from selfcal_ros.estimation.normal.equations import NormalEquations
 from selfcal_ros.estimation.options import ReferenceLength
 from selfcal_ros.estimation.terms.ground import Ground
 from selfcal_ros.model.readings import Measurements
@@ -28,7 +28,7 @@ class Problem:
 
     Attributes
     ----------
-    system : JointSystem
+    system : NormalEquations
         The measured plan.
     grid, angular : GridData, AngularData
         The readings.
@@ -55,7 +55,7 @@ class Problem:
         after terms were taken off.
     """
 
-    system: JointSystem
+    system: NormalEquations
     grid: GridData
     angular: AngularData
     repeats_xy: tuple[float, int]
@@ -77,16 +77,16 @@ class AngularPart:
 
     free: np.ndarray
     d: np.ndarray
-    level: Level
+    noise: NoiseEstimate
 
 
 @dataclass(frozen=True, eq=False)
-class Raw:
+class FreeNetworkSolution:
     """A solution in no particular datum; `xy` is None where it is yet to be taken from it."""
 
     field: np.ndarray
     parameters: np.ndarray
-    xy: Level | None
+    xy: NoiseEstimate | None
     inverse: np.ndarray
     solver: dict
 
@@ -98,14 +98,14 @@ def repeats_of(measurements: Measurements) -> tuple[tuple[float, int], tuple[flo
             pooled((v.sigma_theta, v.dof_theta) for v in views if len(v.k)))
 
 
-def grid_level(problem: Problem, left: np.ndarray) -> Level:
+def grid_noise(problem: Problem, residual: np.ndarray) -> NoiseEstimate:
     """Return the noise of the grid readings, given their residuals (views, nx, ny)."""
     if problem.residuals_xy is not None:
-        return level(problem.repeats_xy, problem.residuals_xy, problem.grid.sigma_declared)
+        return noise_estimate(problem.repeats_xy, problem.residuals_xy, problem.grid.sigma_declared)
     grid = problem.system.grid
     dof = grid_dof(problem)
-    total = float((grid.weight * (left.real**2 + left.imag**2)).sum())
-    return level(problem.repeats_xy, sigma_of(total, dof), problem.grid.sigma_declared)
+    total = float((grid.weight * (residual.real**2 + residual.imag**2)).sum())
+    return noise_estimate(problem.repeats_xy, sigma_of(total, dof), problem.grid.sigma_declared)
 
 
 def grid_dof(problem: Problem) -> int:

@@ -8,7 +8,7 @@ from selfcal_ros.estimation.blas_threads import one_thread
 from selfcal_ros.estimation.datum.angular import conditions_for, misclosure_warning
 from selfcal_ros.estimation.datum.covariance import FieldCovariance, angular_variance
 from selfcal_ros.estimation.datum.scale import scale_datum
-from selfcal_ros.estimation.joint.fit import Fit
+from selfcal_ros.estimation.joint.fit import JointFit
 from selfcal_ros.estimation.joint.model_fit import ModelFit, fit_model
 from selfcal_ros.estimation.joint.noise import disagreement
 from selfcal_ros.estimation.joint.problem import Problem, repeats_of
@@ -16,7 +16,7 @@ from selfcal_ros.estimation.lattice.maps import PHASES
 from selfcal_ros.estimation.lattice.readings import angular_data, grid_data
 from selfcal_ros.estimation.normal.cache import system_for
 from selfcal_ros.estimation.normal.equations import MAX_DIRECT_SITES
-from selfcal_ros.estimation.observability.plan_check import explained
+from selfcal_ros.estimation.observability.plan_check import with_unseen_modes
 from selfcal_ros.estimation.observability.rank import (
     measured_observability,
     plan_observability,
@@ -62,7 +62,7 @@ def prepare(measurements: Measurements, options: Options) -> tuple[Problem, Obse
         plan = Plan(measurements.plan_id, measurements.artifact,
                     tuple(v.view for v in measurements.views))
         if not plan_observability(plan).identifiable:
-            seen = explained(seen, system, plan).observability
+            seen = with_unseen_modes(seen, system, plan).observability
         raise NotIdentifiableError(refusal(seen), seen)
     half_width_m = measurements.artifact.grid_pitch_m * max(measurements.artifact.half)
     conditions = conditions_for(system, options.datum_theta, measurements.sense, half_width_m)
@@ -126,14 +126,14 @@ def _error_map(measurements: Measurements, options: Options, *, model: ModelFit,
                     problem.conditions.datum), closure
 
 
-def _artifact_map(problem: Problem, found: Fit) -> ArtifactMap:
+def _artifact_map(problem: Problem, found: JointFit) -> ArtifactMap:
     system = problem.system
     plate = np.where(system.known_marks, found.plate, complex(np.nan, np.nan))
     return ArtifactMap(plate.real.copy(), plate.imag.copy(),
                        np.where(system.known_plate_lines, found.a_theta, np.nan))
 
 
-def _views(measurements: Measurements, problem: Problem, found: Fit) -> tuple[ViewResult, ...]:
+def _views(measurements: Measurements, problem: Problem, found: JointFit) -> tuple[ViewResult, ...]:
     system = problem.system
     values = np.where(system.known_views, found.parameters, np.nan)
     phi = dict(zip(system.angular_index, values[system.phi_at], strict=True))
@@ -151,7 +151,7 @@ def _views(measurements: Measurements, problem: Problem, found: Fit) -> tuple[Vi
         for i, v in enumerate(measurements.views))
 
 
-def _datum_warnings(options: Options, problem: Problem, found: Fit, *,
+def _datum_warnings(options: Options, problem: Problem, found: JointFit, *,
                     closure: np.ndarray | None) -> list[str]:
     if not problem.system.angular.n_views:
         return []

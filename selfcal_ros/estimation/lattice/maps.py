@@ -125,12 +125,12 @@ class LatticeViews:
                         out=out[index][win.marks])
         return out
 
-    def gather_mean(self, field: np.ndarray, share: np.ndarray) -> np.ndarray:
-        """Return the sum over views of share times `gather`, complex (nx, ny)."""
+    def gather_mean(self, field: np.ndarray, relative_weight: np.ndarray) -> np.ndarray:
+        """Return the sum over views of relative_weight times `gather`, complex (nx, ny)."""
         out = np.zeros(self.shape, dtype=complex)
         for index, (pose, win) in enumerate(zip(self.poses, self.windows, strict=True)):
             sites = field[win.sites]
-            part = (sites.T if win.transposed else sites) * share[index][win.marks]
+            part = (sites.T if win.transposed else sites) * relative_weight[index][win.marks]
             _add_turned(out[win.marks], part, -pose.q % 4)
         return out
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.blas_threads import one_thread
-from selfcal_ros.estimation.joint.noise import level, pooled
+from selfcal_ros.estimation.joint.noise import noise_estimate, pooled
 from selfcal_ros.estimation.law.equations import HuLaw, HuReadings, HuSolution
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact
@@ -279,10 +279,10 @@ def _noise(found: HuSolution, spread: _Spread, views: tuple[ViewReadings, ...]) 
                     (found.rest_theta**2).sum() / spread.rest[1]])
     dof = np.maximum(np.round(spread.rest_dof), 1).astype(int)
     declared = float("nan")
-    xy = level(pooled((v.sigma_xy, v.dof_xy) for v in views if len(v.m)),
-               (float(rest[0]), int(dof[0])), declared)
-    theta = level(pooled((v.sigma_theta, v.dof_theta) for v in views if len(v.k)),
-                  (float(rest[1]), int(dof[1])), declared)
+    xy = noise_estimate(pooled((v.sigma_xy, v.dof_xy) for v in views if len(v.m)),
+                        (float(rest[0]), int(dof[0])), declared)
+    theta = noise_estimate(pooled((v.sigma_theta, v.dof_theta) for v in views if len(v.k)),
+                           (float(rest[1]), int(dof[1])), declared)
     return Noise(xy.sigma, theta.sigma, xy.repeats, theta.repeats, xy.residuals, theta.residuals,
                  xy.dof_repeats, theta.dof_repeats, xy.dof_residuals, theta.dof_residuals)
 

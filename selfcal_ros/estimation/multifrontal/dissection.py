@@ -11,7 +11,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from selfcal_ros.estimation.multifrontal.symmetry import FoldedMatrix
+from selfcal_ros.estimation.multifrontal.symmetry import RealSymmetricForm
 
 LEAF = 192
 """Sites below which a part of the field is not cut any more."""
@@ -84,12 +84,12 @@ class Dissection:
     rest: np.ndarray
 
 
-def dissect(folded: FoldedMatrix, shape: tuple[int, int], reach: int) -> Dissection:
+def dissect(folded: RealSymmetricForm, shape: tuple[int, int], reach: int) -> Dissection:
     """Return the nested dissection of a matrix over sites of a field.
 
     Parameters
     ----------
-    folded : FoldedMatrix
+    folded : RealSymmetricForm
         The matrix; its copies are not eliminated here.
     shape : tuple of int
         Sites along x and y.

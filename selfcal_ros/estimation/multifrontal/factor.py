@@ -12,7 +12,7 @@ import numpy as np
 from scipy.linalg import blas, lapack
 
 from selfcal_ros.estimation.multifrontal.dissection import dissect
-from selfcal_ros.estimation.multifrontal.symmetry import FoldedMatrix
+from selfcal_ros.estimation.multifrontal.symmetry import RealSymmetricForm
 
 SMALL = 64
 """Side up to which a triangle is inverted by substitution."""
@@ -23,7 +23,7 @@ class Factor:
 
     Parameters
     ----------
-    folded : FoldedMatrix
+    folded : RealSymmetricForm
         The matrix.
     shape : tuple of int
         Sites along x and y.
@@ -36,7 +36,7 @@ class Factor:
         If the matrix is not positive definite.
     """
 
-    def __init__(self, folded: FoldedMatrix, shape: tuple[int, int], reach: int) -> None:
+    def __init__(self, folded: RealSymmetricForm, shape: tuple[int, int], reach: int) -> None:
         self.folded = folded
         self.dissection = dissect(folded, shape, reach)
         self._blocks: list[tuple[np.ndarray, np.ndarray]] = []

@@ -17,7 +17,7 @@ from selfcal_ros.estimation.lattice.maps import PHASES, LatticeViews
 
 
 @dataclass(frozen=True, eq=False)
-class FoldedMatrix:
+class RealSymmetricForm:
     """The matrix M = P^H R P over the sites, with R real.
 
     Attributes
@@ -53,15 +53,15 @@ class FoldedMatrix:
     pins: np.ndarray
 
 
-def fold(views: LatticeViews, weight: np.ndarray, share: np.ndarray,
-         pins: np.ndarray) -> FoldedMatrix:
+def fold(views: LatticeViews, weight: np.ndarray, relative_weight: np.ndarray,
+         pins: np.ndarray) -> RealSymmetricForm:
     """Return the folded matrix of weighted readings.
 
     Parameters
     ----------
     views : LatticeViews
         Maps between sites and marks.
-    weight, share : float array (views, nx, ny)
+    weight, relative_weight : float array (views, nx, ny)
         Weight of each reading, and its part in the mean of its mark.
     pins : int array
         Sites whose diagonal is raised by the mean weight, because nothing else holds them.
@@ -84,13 +84,15 @@ def fold(views: LatticeViews, weight: np.ndarray, share: np.ndarray,
     variable[on_cut] = len(free) + copies
     mean = weight.sum() / max(np.count_nonzero(read), 1)
     size = len(free) + len(keys)
-    diagonal = np.bincount(variable.ravel(), (weight * (1 - share)).ravel(), minlength=size)
+    diagonal = np.bincount(variable.ravel(), (weight * (1 - relative_weight)).ravel(),
+                           minlength=size)
     diagonal[place[pins[~is_cut[pins]]]] += mean
-    entries = _entries(variable, diagonal, weight.reshape(read.shape), share.reshape(read.shape))
+    entries = _entries(variable, diagonal, weight.reshape(read.shape),
+                       relative_weight.reshape(read.shape))
     cut_pins = np.zeros(len(cut))
     cut_pins[place[pins[is_cut[pins]]]] = mean
-    return FoldedMatrix(*entries, size, free, cut, keys // 4, PHASES[keys % 4],
-                        PHASES[quadrant], cut_pins)
+    return RealSymmetricForm(*entries, size, free, cut, keys // 4, PHASES[keys % 4],
+                             PHASES[quadrant], cut_pins)
 
 
 def _quadrants(shape: tuple[int, int]) -> np.ndarray:
@@ -104,15 +106,15 @@ def _quadrants(shape: tuple[int, int]) -> np.ndarray:
     return out
 
 
-def _entries(variable: np.ndarray, diagonal: np.ndarray, weight: np.ndarray, share: np.ndarray,
-             ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _entries(variable: np.ndarray, diagonal: np.ndarray, weight: np.ndarray,
+             relative_weight: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return rows, columns and values of one triangle of R."""
     rows, values = [np.arange(len(diagonal))], [diagonal]
     columns = rows.copy()
     for i, j in combinations(range(len(weight)), 2):
         both = np.flatnonzero((weight[i] > 0) & (weight[j] > 0))
         a, b = variable[i][both], variable[j][both]
-        value = -weight[i][both] * share[j][both]
+        value = -weight[i][both] * relative_weight[j][both]
         rows.append(a)
         columns.append(b)
         # an entry and its mirror image may meet on the diagonal

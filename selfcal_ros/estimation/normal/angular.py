@@ -32,7 +32,7 @@ class AngularSystem:
         self.turns, self.weight = turns, weight
         self.read = weight > 0
         total = weight.sum(axis=0)
-        self.share = weight / np.where(total > 0, total, 1.0)
+        self.relative_weight = weight / np.where(total > 0, total, 1.0)
         lines = np.arange(weight.shape[1])
         self.site = (lines + np.array(turns, dtype=int)[:, None]) % max(len(lines), 1)
         """Stage line of each plate line in each view, (views, K)."""
@@ -61,7 +61,7 @@ class AngularSystem:
 
     def centred(self, y: np.ndarray) -> np.ndarray:
         """Return `y` (views, K, ...) less the weighted mean of each line over its views."""
-        return y - np.einsum("vk,vk...->k...", self.share, y)
+        return y - np.einsum("vk,vk...->k...", self.relative_weight, y)
 
     def scatter(self, y: np.ndarray) -> np.ndarray:
         """Return the sum over readings at every stage line, (K, ...)."""
@@ -76,7 +76,8 @@ class AngularSystem:
         rows, cols, values = [], [], []
         for i in range(self.n_views):
             for j in range(self.n_views):
-                value = -self.weight[i] * self.share[j] + (self.weight[i] if i == j else 0.0)
+                value = -self.weight[i] * self.relative_weight[j]
+                value = value + (self.weight[i] if i == j else 0.0)
                 rows.append(self.site[i])
                 cols.append(self.site[j])
                 values.append(value)
@@ -109,7 +110,7 @@ class AngularSystem:
         """Coupling of the stage lines to phi of each view, (K, views)."""
         if not self.n_views:
             return np.zeros((self.n_lines, 0))
-        unit = np.eye(self.n_views)[:, None, :] - self.share.T
+        unit = np.eye(self.n_views)[:, None, :] - self.relative_weight.T
         return self.scatter(self.weight[:, :, None] * unit)
 
     @cached_property
@@ -120,7 +121,7 @@ class AngularSystem:
     @cached_property
     def schur(self) -> np.ndarray:
         """Normal matrix of phi alone, (views, views)."""
-        block = np.diag(self.weight.sum(axis=1)) - self.weight @ self.share.T
+        block = np.diag(self.weight.sum(axis=1)) - self.weight @ self.relative_weight.T
         out = block - self.columns.T @ self.response
         return (out + out.T) / 2
 
@@ -132,6 +133,6 @@ class AngularSystem:
 
     def plate(self, y: np.ndarray, field: np.ndarray, phi: np.ndarray) -> tuple:
         """Return Atheta (K,) and the residuals (views, K) for given Gtheta and phi."""
-        left = y - field[self.site] - phi[:, None]
-        a = np.einsum("vk,vk->k", self.share, left)
-        return a, np.where(self.read, left - a, 0.0)
+        residual = y - field[self.site] - phi[:, None]
+        a = np.einsum("vk,vk->k", self.relative_weight, residual)
+        return a, np.where(self.read, residual - a, 0.0)

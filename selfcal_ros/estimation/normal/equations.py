@@ -26,7 +26,7 @@ CORE = 41
 """Sites along each side of the middle part of a large field."""
 
 
-class JointSystem:
+class NormalEquations:
     """Grid and angular equations of one measured plan, joined by the views' rotations.
 
     Parameters
@@ -176,8 +176,8 @@ class JointSystem:
         rigid = rigid[:, size > 1e-9 * size[0]]
         if rigid.shape[1] == self.nullity:  # no reading tells the datum
             return np.zeros((self.size, 0))
-        left = self._null - rigid @ (rigid.T @ self._null)
-        u, s, _ = np.linalg.svd(left, full_matrices=False)
+        residual = self._null - rigid @ (rigid.T @ self._null)
+        u, s, _ = np.linalg.svd(residual, full_matrices=False)
         return u[:, s > 1e-6]
 
     @property
@@ -207,8 +207,8 @@ class JointSystem:
             gauge = Gauge(self.grid.views.z, known.reshape(self.grid.views.shape), scale=True)
             for column in moved.T:
                 field = column.reshape(self.grid.views.shape)
-                left = gauge.remove(field, gauge.parts(field)).ravel()
-                known &= abs(left) <= 1e-6
+                residual = gauge.remove(field, gauge.parts(field)).ravel()
+                known &= abs(residual) <= 1e-6
         return known.reshape(self.grid.views.shape)
 
     @cached_property

@@ -36,7 +36,7 @@ class GridSystem:
         self.read = weight > 0
         total = weight.sum(axis=0)
         self.mark_read = total > 0
-        self.share = weight / np.where(self.mark_read, total, 1.0)
+        self.relative_weight = weight / np.where(self.mark_read, total, 1.0)
         """Part of each reading in the mean of its mark, (views, nx, ny)."""
 
     @property
@@ -81,9 +81,9 @@ class GridSystem:
 
     def centred(self, marks: np.ndarray) -> np.ndarray:
         """Return `marks` (views, nx, ny) less the weighted mean of each mark over its views."""
-        mean = self.share[0] * marks[0]
-        for share, mark in zip(self.share[1:], marks[1:], strict=True):
-            mean += share * mark
+        mean = self.relative_weight[0] * marks[0]
+        for relative_weight, mark in zip(self.relative_weight[1:], marks[1:], strict=True):
+            mean += relative_weight * mark
         return marks - mean
 
     @property
@@ -101,7 +101,7 @@ class GridSystem:
     @cached_property
     def factor(self) -> Factor:
         """Factorisation of the matrix over the sites, pinned where a component is free."""
-        folded = fold(self.views, self.weight, self.share, self.pins)
+        folded = fold(self.views, self.weight, self.relative_weight, self.pins)
         return Factor(folded, self.views.shape, self.views.reach)
 
     @cached_property
@@ -112,7 +112,7 @@ class GridSystem:
     @cached_property
     def columns(self) -> np.ndarray:
         """Coupling of sites to phi and tau, complex (2 views, sites), plate eliminated."""
-        meant = self.share[:, None] * self.shapes
+        meant = self.relative_weight[:, None] * self.shapes
         out = np.zeros_like(meant)
         for v, weight in enumerate(self.weight):
             part = meant * -weight
@@ -131,7 +131,7 @@ class GridSystem:
         moments = np.stack([x * x + y * y, x, y, np.ones_like(x)], axis=1)
         out = np.zeros((self.n_views, 3, self.n_views, 3))
         for v, weight in enumerate(self.weight):
-            w = self.share * -weight
+            w = self.relative_weight * -weight
             w[v] += weight
             # f = iz, 1, i: the inner products Re(conj(f) f') are |z|^2, -y, x, 1
             zz, sx, sy, s = (w.reshape(self.n_views, -1) @ moments).T
@@ -177,9 +177,9 @@ class GridSystem:
 
     def plate(self, y: np.ndarray, field: np.ndarray, parameters: np.ndarray) -> tuple:
         """Return A (nx, ny) and the residuals (views, nx, ny) for given G and misalignments."""
-        left = y - self.views.gather(field) - self.misaligned(parameters)
-        a = np.einsum("vij,vij->ij", self.share, left)
-        return a, np.where(self.read, left - a, 0.0)
+        residual = y - self.views.gather(field) - self.misaligned(parameters)
+        a = np.einsum("vij,vij->ij", self.relative_weight, residual)
+        return a, np.where(self.read, residual - a, 0.0)
 
 
 def _of_misalignments(sums: np.ndarray) -> np.ndarray:

@@ -5,11 +5,11 @@ import numpy as np
 
 from selfcal_ros.estimation.lattice.maps import GridPose
 from selfcal_ros.estimation.normal.angular import AngularSystem
-from selfcal_ros.estimation.normal.equations import JointSystem
+from selfcal_ros.estimation.normal.equations import NormalEquations
 from selfcal_ros.estimation.normal.grid import GridSystem
 
 
-def planned_system(artifact, views, *, rank_only: bool = False) -> JointSystem:
+def planned_system(artifact, views, *, rank_only: bool = False) -> NormalEquations:
     """Return the system of views as planned: every mark that lies in the field, unit repeats.
 
     Parameters
@@ -32,7 +32,7 @@ def planned_system(artifact, views, *, rank_only: bool = False) -> JointSystem:
     field = GridSystem(tuple(poses), empty).views.in_field
     repeats = np.array([v.repeats for _, v in grid_views], dtype=float)
     lines = np.array([v.repeats for _, v in angular], dtype=float)
-    return JointSystem(
+    return NormalEquations(
         GridSystem(tuple(poses), field * repeats[:, None, None]),
         AngularSystem(turns, np.ones((len(turns), artifact.angular_count)) * lines[:, None]),
         tuple(i for i, _ in grid_views), tuple(i for i, _ in angular), rank_only=rank_only)

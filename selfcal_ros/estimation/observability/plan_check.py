@@ -7,7 +7,7 @@ from itertools import combinations, islice
 from math import pi
 
 from selfcal_ros.estimation.blas_threads import one_thread
-from selfcal_ros.estimation.normal.equations import JointSystem
+from selfcal_ros.estimation.normal.equations import NormalEquations
 from selfcal_ros.estimation.normal.planned import planned_system
 from selfcal_ros.estimation.observability.prediction import MAX_SITES, Prediction, predict
 from selfcal_ros.estimation.observability.rank import full_observability
@@ -61,17 +61,17 @@ def check_plan(plan: Plan) -> PlanCheck:
     """Return rank, deficiency, unseen modes and cures of a plan with every mark read."""
     system = planned_system(plan.artifact, plan.views)
     seen = full_observability(system, plan.artifact, plan.views)
-    return PlanCheck(seen, ()) if seen.identifiable else explained(seen, system, plan)
+    return PlanCheck(seen, ()) if seen.identifiable else with_unseen_modes(seen, system, plan)
 
 
-def explained(seen: Observability, system: JointSystem, plan: Plan) -> PlanCheck:
+def with_unseen_modes(seen: Observability, system: NormalEquations, plan: Plan) -> PlanCheck:
     """Return a deficient set of readings with its unseen modes in words and what would cure it.
 
     Parameters
     ----------
     seen : Observability
         Rank and deficiency.
-    system : JointSystem
+    system : NormalEquations
         The readings, some of them perhaps missing.
     plan : Plan
         The views behind the readings.
@@ -109,7 +109,7 @@ def unit_repeats(plan: Plan) -> int:
     return min(view.repeats for view in plan.views)
 
 
-def unseen_modes(system: JointSystem) -> tuple[UnseenMode, ...]:
+def unseen_modes(system: NormalEquations) -> tuple[UnseenMode, ...]:
     """Return the unseen families of a set of readings, the named ones first."""
     grid = system.grid
     families = known_families(system) if grid.n_views > 1 else []

@@ -7,7 +7,7 @@ import numpy as np
 
 from selfcal_ros.estimation.datum.angular import Conditions, conditions_for
 from selfcal_ros.estimation.datum.covariance import FieldCovariance
-from selfcal_ros.estimation.normal.equations import JointSystem
+from selfcal_ros.estimation.normal.equations import NormalEquations
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.readings import Sense
@@ -58,13 +58,13 @@ class Prediction:
         return float(np.sqrt(np.mean(known**2))) if len(known) else float("nan")
 
 
-def predict(system: JointSystem, artifact: Artifact, datum: ThetaDatum, *,
+def predict(system: NormalEquations, artifact: Artifact, datum: ThetaDatum, *,
             repeats: int = 1) -> Prediction:
     """Return the predicted uncertainties of readings that identify the stage.
 
     Parameters
     ----------
-    system : JointSystem
+    system : NormalEquations
         The readings; weights are repeats.
     artifact : Artifact
         The plate.
@@ -82,7 +82,7 @@ def predict(system: JointSystem, artifact: Artifact, datum: ThetaDatum, *,
     return Prediction(ux, uy, np.sqrt(repeats * theta_variance(system, artifact, datum)))
 
 
-def theta_variance(system: JointSystem, artifact: Artifact, datum: ThetaDatum) -> np.ndarray:
+def theta_variance(system: NormalEquations, artifact: Artifact, datum: ThetaDatum) -> np.ndarray:
     """Return the variance of Gtheta (K,) for unit noise of one angular reading.
 
     The rotations of the grid views count as known: the grid fixes them thousands of times better
@@ -100,7 +100,7 @@ def theta_variance(system: JointSystem, artifact: Artifact, datum: ThetaDatum) -
     return np.where(system.known_lines, np.maximum(variance, 0.0), np.nan)
 
 
-def theta_matrix(system: JointSystem, artifact: Artifact, datum: ThetaDatum, *,
+def theta_matrix(system: NormalEquations, artifact: Artifact, datum: ThetaDatum, *,
                  sense: Sense = Sense.MICROSCOPE_MOVES) -> np.ndarray:
     """Return the covariance (K, K) of `theta_variance`, in the frame of the equations."""
     answer, inner, _, conditions = _theta_parts(system, artifact, datum, sense)
@@ -110,7 +110,7 @@ def theta_matrix(system: JointSystem, artifact: Artifact, datum: ThetaDatum, *,
     return datum_map @ raw @ datum_map.T
 
 
-def _theta_parts(system: JointSystem, artifact: Artifact, datum: ThetaDatum,
+def _theta_parts(system: NormalEquations, artifact: Artifact, datum: ThetaDatum,
                  sense: Sense = Sense.MICROSCOPE_MOVES
                  ) -> tuple[np.ndarray, np.ndarray, np.ndarray, Conditions]:
     """Return the lines' answer to free rotations, their covariance, and the datum's columns."""

@@ -9,7 +9,7 @@ three rows a view, whose zeros and non-zeros lie ten orders of magnitude apart.
 import math
 from collections.abc import Iterable
 
-from selfcal_ros.estimation.normal.equations import JointSystem
+from selfcal_ros.estimation.normal.equations import NormalEquations
 from selfcal_ros.estimation.normal.planned import planned_system
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.result import Observability
@@ -28,13 +28,13 @@ def plan_observability(plan: Plan) -> Observability:
     return full_observability(system, plan.artifact, plan.views)
 
 
-def full_observability(system: JointSystem, artifact: Artifact,
+def full_observability(system: NormalEquations, artifact: Artifact,
                        views: Iterable[View]) -> Observability:
     """Return rank and deficiency over all sites, marks and lines of the artifact.
 
     Parameters
     ----------
-    system : JointSystem
+    system : NormalEquations
         The readings.
     artifact : Artifact
         The plate.
@@ -49,7 +49,7 @@ def full_observability(system: JointSystem, artifact: Artifact,
     return Observability(rank, unknowns, deficiency, deficiency == 0, advice=advice)
 
 
-def angular_deficiency(system: JointSystem) -> int:
+def angular_deficiency(system: NormalEquations) -> int:
     """Return how many modes of the angular map stay unseen beside its free constant.
 
     If no angular view shares its rotation with a grid view, the constant of the plate's lines is
@@ -66,7 +66,7 @@ def angular_deficiency(system: JointSystem) -> int:
     return 2 * angular.n_lines - nodes + len(parts.balanced) - 1 + turns
 
 
-def measured_observability(system: JointSystem, artifact: Artifact,
+def measured_observability(system: NormalEquations, artifact: Artifact,
                            views: tuple[View, ...]) -> Observability:
     """Return what the marks that were read tell.
 
@@ -76,7 +76,7 @@ def measured_observability(system: JointSystem, artifact: Artifact,
 
     Parameters
     ----------
-    system : JointSystem
+    system : NormalEquations
         The readings.
     artifact : Artifact
         The plate.
@@ -89,7 +89,7 @@ def measured_observability(system: JointSystem, artifact: Artifact,
     return system.memo[key]
 
 
-def _measured_observability(system: JointSystem, artifact: Artifact,
+def _measured_observability(system: NormalEquations, artifact: Artifact,
                             views: tuple[View, ...]) -> Observability:
     read = _as_read(system, views)
     full = full_observability(system, artifact, read)
@@ -108,7 +108,7 @@ def _measured_observability(system: JointSystem, artifact: Artifact,
     return Observability(kept, kept, 0, True)
 
 
-def _as_read(system: JointSystem, views: tuple[View, ...]) -> tuple[View, ...]:
+def _as_read(system: NormalEquations, views: tuple[View, ...]) -> tuple[View, ...]:
     """Return the views with only those kinds of marks that were read."""
     return tuple(View(view.name, view.rotation_rad, view.translation_m,
                       i in system.grid_index, i in system.angular_index)

@@ -14,7 +14,7 @@ from scipy.sparse.csgraph import connected_components
 
 from selfcal_ros.estimation.lattice.connectivity import Components
 from selfcal_ros.estimation.lattice.maps import PHASES
-from selfcal_ros.estimation.normal.equations import JointSystem, pseudo_inverse
+from selfcal_ros.estimation.normal.equations import NormalEquations, pseudo_inverse
 from selfcal_ros.estimation.normal.grid import GridSystem
 
 MATCH = 1e-9
@@ -43,20 +43,20 @@ class UnseenMode:
     example: np.ndarray
 
 
-def is_unseen(system: JointSystem, field: np.ndarray) -> bool:
+def is_unseen(system: NormalEquations, field: np.ndarray) -> bool:
     """Return whether a stage error can hide behind a plate error and misalignments.
 
     Parameters
     ----------
-    system : JointSystem
+    system : NormalEquations
         The readings.
     field : complex array (nx, ny)
         Stage error Gx + i Gy.
     """
     grid = system.grid
     y = grid.views.gather(field) * grid.read
-    left = grid.centred(y) * grid.read
-    total = float((grid.weight * abs(left) ** 2).sum())
+    residual = grid.centred(y) * grid.read
+    total = float((grid.weight * abs(residual) ** 2).sum())
     scale = float((grid.weight * abs(y) ** 2).sum())
     right = np.zeros(system.size)
     right[:3 * grid.n_views] = grid.right_side(y)[1]
@@ -70,7 +70,7 @@ def is_unseen(system: JointSystem, field: np.ndarray) -> bool:
     return bool(total - explained <= MATCH * scale)
 
 
-def known_families(system: JointSystem) -> list[UnseenMode]:
+def known_families(system: NormalEquations) -> list[UnseenMode]:
     """Return the unseen fields among those that have a name of their own."""
     z = system.grid.views.z
     x, y = z.real, z.imag
@@ -86,7 +86,7 @@ def known_families(system: JointSystem) -> list[UnseenMode]:
             if is_unseen(system, field)]
 
 
-def component_family(system: JointSystem) -> UnseenMode | None:
+def component_family(system: NormalEquations) -> UnseenMode | None:
     """Return the family of vectors left free by balanced components, None if one spans all."""
     grid = system.grid
     parts, phase = grid.components, phases(grid)
@@ -187,7 +187,7 @@ def unread_marks(grid: GridSystem) -> UnseenMode | None:
                       np.zeros((0,)))
 
 
-def angular_families(system: JointSystem) -> list[UnseenMode]:
+def angular_families(system: NormalEquations) -> list[UnseenMode]:
     """Return what the turns leave unseen of the angular map, in words."""
     angular = system.angular
     if not angular.n_views:
@@ -218,7 +218,7 @@ def as_map(field: np.ndarray) -> np.ndarray:
     return both / max(float(abs(both).max()), np.finfo(float).tiny)
 
 
-def mode_maps(system: JointSystem) -> np.ndarray:
+def mode_maps(system: NormalEquations) -> np.ndarray:
     """Return an orthonormal basis of the unseen fields of the stage, (modes, 2, nx, ny).
 
     Fields of the datum are taken out; sites that no mark visits are not counted. At most

@@ -12,11 +12,11 @@ import numpy as np
 from scipy.optimize import nnls
 
 from selfcal_ros.errors import InputError
-from selfcal_ros.estimation.joint.fit import Fit, fit
+from selfcal_ros.estimation.joint.fit import JointFit, fit
 from selfcal_ros.estimation.joint.problem import Problem
 from selfcal_ros.estimation.joint.solve import prepare
 from selfcal_ros.estimation.lattice.maps import PHASES
-from selfcal_ros.estimation.normal.equations import JointSystem
+from selfcal_ros.estimation.normal.equations import NormalEquations
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.readings import Measurements
 
@@ -44,14 +44,14 @@ class Residuals:
     ----------
     problem : Problem
         The plan and its readings.
-    found : Fit
+    found : JointFit
         The joint solution.
     redundancy, redundancy_theta : float array (views, nx, ny), (views, K)
         1 - h; 0 where not read.
     """
 
     problem: Problem
-    found: Fit
+    found: JointFit
     redundancy: np.ndarray
     redundancy_theta: np.ndarray
 
@@ -76,7 +76,7 @@ def _scaled(squares: np.ndarray, weight: np.ndarray, redundancy: np.ndarray) -> 
 
 
 def residuals_of(measurements: Measurements, options: Options) -> Residuals:
-    """Fit the readings and return their residuals with redundancies.
+    """JointFit the readings and return their residuals with redundancies.
 
     Raises
     ------
@@ -96,7 +96,7 @@ def residuals_of(measurements: Measurements, options: Options) -> Residuals:
     return Residuals(problem, found, redundancy, angular_redundancy(system))
 
 
-def exact_redundancy(system: JointSystem) -> np.ndarray:
+def exact_redundancy(system: NormalEquations) -> np.ndarray:
     """Return 1 - h of every grid reading, (views, nx, ny), mean of both coordinates."""
     grid = system.grid
     inverse = grid.factor.solve(np.eye(grid.n_sites, dtype=complex))
@@ -104,7 +104,7 @@ def exact_redundancy(system: JointSystem) -> np.ndarray:
     turns = PHASES[[-pose.q % 4 for pose in grid.views.poses]]
     variance = np.zeros(grid.weight.shape)
     for v in range(grid.n_views):
-        part = -grid.share * turns[:, None, None]
+        part = -grid.relative_weight * turns[:, None, None]
         part[v] += turns[v]
         for i in range(grid.n_views):
             for j in range(grid.n_views):
@@ -123,7 +123,7 @@ def _redundancy(weight: np.ndarray, variance: np.ndarray) -> np.ndarray:
     return np.where(weight > 0, np.clip(1 - h, 0.0, 1.0), 0.0)
 
 
-def drawn_redundancy(system: JointSystem) -> np.ndarray:
+def drawn_redundancy(system: NormalEquations) -> np.ndarray:
     """Return 1 - h of every grid reading from the residuals of seeded unit noise."""
     grid = system.grid
     rng = np.random.default_rng(0)
@@ -131,12 +131,12 @@ def drawn_redundancy(system: JointSystem) -> np.ndarray:
     total = np.zeros(grid.weight.shape)
     for _ in range(N_DRAWS):
         noise = rng.standard_normal((2, *root.shape)) / root * grid.read
-        left = grid_residuals(system, noise[0] + 1j * noise[1])
-        total += abs(left) ** 2 * grid.weight
+        residuals = grid_residuals(system, noise[0] + 1j * noise[1])
+        total += abs(residuals) ** 2 * grid.weight
     return np.where(grid.read, np.minimum(total / (2 * N_DRAWS), 1.0), 0.0)
 
 
-def grid_residuals(system: JointSystem, y: np.ndarray) -> np.ndarray:
+def grid_residuals(system: NormalEquations, y: np.ndarray) -> np.ndarray:
     """Return what the grid readings `y` (views, nx, ny) leave over when fitted alone."""
     grid = system.grid
     free, d = grid.reduced(y)
@@ -145,14 +145,14 @@ def grid_residuals(system: JointSystem, y: np.ndarray) -> np.ndarray:
     return grid.plate(y, field, parameters)[1]
 
 
-def view_noise(left: Residuals) -> np.ndarray:
+def view_noise(residuals: Residuals) -> np.ndarray:
     """Return noise of each grid view and of the others, m, and dof of its own, (views, 3).
 
     The residuals of one view hold the noise of all: their sums of squares are unmixed with what
     seeded unit noise of each view leaves in each (Helmert's variance components, two at a time).
     Twice the inverse of that mixing is the covariance of two variances that are 1.
     """
-    system, grid = left.problem.system, left.problem.system.grid
+    system, grid = residuals.problem.system, residuals.problem.system.grid
     rng = np.random.default_rng(0)
     root = np.sqrt(np.where(grid.read, grid.weight, 1.0))
     mixing = np.zeros((grid.n_views, grid.n_views))
@@ -164,7 +164,7 @@ def view_noise(left: Residuals) -> np.ndarray:
             rest = grid_residuals(system, noise)
             mixing[:, u] += (abs(rest) ** 2 * grid.weight).sum(axis=(1, 2)) / VIEW_DRAWS
     mixing = (mixing + mixing.T) / 2
-    sums = (abs(left.found.residuals) ** 2 * grid.weight).sum(axis=(1, 2))
+    sums = (abs(residuals.found.residuals) ** 2 * grid.weight).sum(axis=(1, 2))
     out = np.empty((grid.n_views, 3))
     for v in range(grid.n_views):
         group = np.zeros((grid.n_views, 2))
@@ -175,7 +175,7 @@ def view_noise(left: Residuals) -> np.ndarray:
     return out
 
 
-def angular_redundancy(system: JointSystem) -> np.ndarray:
+def angular_redundancy(system: NormalEquations) -> np.ndarray:
     """Return 1 - h of every angular reading, (views, K), rotations from the lines alone."""
     angular = system.angular
     if not angular.n_views:
@@ -186,7 +186,7 @@ def angular_redundancy(system: JointSystem) -> np.ndarray:
     inverse = angular.solve(np.eye(angular.n_lines))
     variance = np.zeros(angular.weight.shape)
     for v in range(angular.n_views):
-        part = -angular.share
+        part = -angular.relative_weight
         part[v] += 1.0
         for i in range(angular.n_views):
             for j in range(angular.n_views):

@@ -88,7 +88,7 @@ class Removed:
 
 
 @dataclass(frozen=True, eq=False)
-class Cleaned:
+class OutlierScreening:
     """A measurement without its outliers, and what was found."""
 
     measurements: Measurements
@@ -134,7 +134,7 @@ def robust_calibrate(measurements: Measurements,
                    extra={**result.extra, **_listed(cleaned)})
 
 
-def _listed(cleaned: Cleaned) -> dict[str, Any]:
+def _listed(cleaned: OutlierScreening) -> dict[str, Any]:
     """Return what was found in the form of a RESULT.json: tables of plain values, SI units."""
     removed = [{
         "view": item.view, "kind": item.kind, "mark": ", ".join(map(str, item.mark)),
@@ -151,7 +151,7 @@ def _listed(cleaned: Cleaned) -> dict[str, Any]:
 
 
 @one_thread()
-def clean(measurements: Measurements, options: Options) -> Cleaned:
+def clean(measurements: Measurements, options: Options) -> OutlierScreening:
     """Return the measurement split at slips and without outliers, and what was found."""
     # a pure datum: the redundant axis conditions of xy_axes would show in the angular residuals
     linear = replace(options, misalignment_model="linear", reference=None,
@@ -161,29 +161,29 @@ def clean(measurements: Measurements, options: Options) -> Cleaned:
         flattened = _flattened(measurements, options)
     slips: list[Slip] = []
     notes: list[str] = []
-    left = residuals_of(flattened, linear)
+    residuals = residuals_of(flattened, linear)
     while len(slips) < MAX_SLIPS:
-        sigma = max(robust_sigma(left.squares, 2), ROUNDING)
-        slip = find_slip(left, sigma, flattened, linear)
+        sigma = max(robust_sigma(residuals.squares, 2), ROUNDING)
+        slip = find_slip(residuals, sigma, flattened, linear)
         if slip is None:
             break
         slips.append(slip)
         notes.append(slip.text())
         try:
             mend = _left_out if slip.alternatives else split_view
-            left = residuals_of(mend(flattened, slip), linear)
+            residuals = residuals_of(mend(flattened, slip), linear)
         except NotIdentifiableError:
             notes[-1] += "; the map is spoiled by it: measure the view again"
             break
         flattened, measurements = mend(flattened, slip), mend(measurements, slip)
         notes[-1] += "; the view is left out" if slip.alternatives else ""
-    gone, left, stopped = _reject(flattened, linear, left)
+    gone, residuals, stopped = _reject(flattened, linear, residuals)
     removed = tuple(sorted(gone.values(), key=lambda item: (item.kind, item.view, item.mark)))
-    noisy = _noisy_views(left, flattened)
+    noisy = _noisy_views(residuals, flattened)
     warnings = notes + _warnings(removed, noisy, stopped)
-    unchecked = int((np.isnan(left.squares) & (left.problem.grid.weight > 0)).sum())
-    return Cleaned(_without(measurements, gone, mark=True), removed, tuple(slips), noisy,
-                   unchecked, tuple(warnings))
+    unchecked = int((np.isnan(residuals.squares) & (residuals.problem.grid.weight > 0)).sum())
+    return OutlierScreening(_without(measurements, gone, mark=True), removed, tuple(slips), noisy,
+                            unchecked, tuple(warnings))
 
 
 def _left_out(measurements: Measurements, slip: Slip) -> Measurements:
@@ -206,13 +206,13 @@ def robust_sigma(squares: np.ndarray, dof: int) -> float:
 Key = tuple[int, str, tuple[int, ...]]
 
 
-def _reject(measurements: Measurements, options: Options, left: Residuals
+def _reject(measurements: Measurements, options: Options, residuals: Residuals
             ) -> tuple[dict[Key, Removed], Residuals, str]:
     """Remove outliers round by round; return them, the last residuals, why it stopped early."""
     gone: dict[Key, Removed] = {}
     n_readings = sum(len(view.m) + len(view.k) for view in measurements.views)
     for _ in range(MAX_ROUNDS):
-        found = _worst(left, measurements)
+        found = _worst(residuals, measurements)
         if not found:
             break
         if len(gone) + len(found) > MAX_REMOVED * n_readings:
@@ -220,19 +220,19 @@ def _reject(measurements: Measurements, options: Options, left: Residuals
                 f"more than {MAX_REMOVED:.0%} of the readings contradict the others: none was "
                 "removed; look for a wrong plan or a faulty view")
         try:
-            left = residuals_of(_without(measurements, gone | found), options)
+            residuals = residuals_of(_without(measurements, gone | found), options)
         except NotIdentifiableError:
-            return gone, left, "removing more outliers would leave the stage undetermined"
+            return gone, residuals, "removing more outliers would leave the stage undetermined"
         gone |= found
-    return _taken_back(measurements, options, gone, left)
+    return _taken_back(measurements, options, gone, residuals)
 
 
-def _worst(left: Residuals, measurements: Measurements) -> dict[Key, Removed]:
+def _worst(residuals: Residuals, measurements: Measurements) -> dict[Key, Removed]:
     """Return the outliers of one round: the largest first, one for each mark and site."""
     found: dict[Key, Removed] = {}
-    grid, problem = left.problem.system.grid, left.problem
-    sigma, n = robust_sigma(left.squares, 2), np.isfinite(left.squares).sum()
-    ratio = _ratio(left.squares, sigma)
+    grid, problem = residuals.problem.system.grid, residuals.problem
+    sigma, n = robust_sigma(residuals.squares, 2), np.isfinite(residuals.squares).sum()
+    ratio = _ratio(residuals.squares, sigma)
     taken: dict[tuple[str, int], float] = {}
     # in the order of ratios rounded, so that ties have the order of the readings
     order = np.argsort(-np.round(ratio.ravel(), 6), kind="stable")
@@ -249,13 +249,14 @@ def _worst(left: Residuals, measurements: Measurements) -> dict[Key, Removed]:
         mark = (int(i) - hx, int(j) - hy)
         found[index, "grid", mark] = Removed(
             measurements.views[index].view.name, "grid", mark, float(np.sqrt(ratio[v, i, j])),
-            float(1 - left.redundancy[v, i, j]), float(abs(left.found.residuals[v, i, j])))
-    return found | _worst_theta(left, measurements)
+            float(1 - residuals.redundancy[v, i, j]),
+            float(abs(residuals.found.residuals[v, i, j])))
+    return found | _worst_theta(residuals, measurements)
 
 
-def _worst_theta(left: Residuals, measurements: Measurements) -> dict[Key, Removed]:
+def _worst_theta(residuals: Residuals, measurements: Measurements) -> dict[Key, Removed]:
     """Return the largest angular outlier of a round, if there is one."""
-    squares = left.squares_theta
+    squares = residuals.squares_theta
     n = np.isfinite(squares).sum()
     if not n:
         return {}
@@ -263,10 +264,11 @@ def _worst_theta(left: Residuals, measurements: Measurements) -> dict[Key, Remov
     v, k = np.unravel_index(int(np.argmax(ratio)), ratio.shape)
     if ratio[v, k] <= chi2.isf(LEVEL / n, 1):
         return {}
-    index = left.problem.angular.index[v]
+    index = residuals.problem.angular.index[v]
     return {(index, "angular", (int(k),)): Removed(
         measurements.views[index].view.name, "angular", (int(k),), float(np.sqrt(ratio[v, k])),
-        float(1 - left.redundancy_theta[v, k]), float(abs(left.found.residuals_theta[v, k])))}
+        float(1 - residuals.redundancy_theta[v, k]),
+        float(abs(residuals.found.residuals_theta[v, k])))}
 
 
 def _ratio(squares: np.ndarray, sigma: float) -> np.ndarray:
@@ -274,26 +276,26 @@ def _ratio(squares: np.ndarray, sigma: float) -> np.ndarray:
 
 
 def _taken_back(measurements: Measurements, options: Options, gone: dict[Key, Removed],
-                left: Residuals) -> tuple[dict[Key, Removed], Residuals, str]:
+                residuals: Residuals) -> tuple[dict[Key, Removed], Residuals, str]:
     """Take back, one by one, what is no outlier in the company of the good readings."""
     for key in sorted(gone, key=lambda k: gone[k].standardised):
         rest = {k: v for k, v in gone.items() if k != key}
         again = residuals_of(_without(measurements, rest), options)
         if _agrees(again, key):
-            gone, left = rest, again
-    return gone, left, ""
+            gone, residuals = rest, again
+    return gone, residuals, ""
 
 
-def _agrees(left: Residuals, key: Key) -> bool:
+def _agrees(residuals: Residuals, key: Key) -> bool:
     """Return whether a reading can be checked against the others and agrees with them."""
     index, kind, mark = key
     if kind == "grid":
-        hx, hy = left.problem.system.grid.views.half
-        squares, dof = left.squares, 2
-        at = (left.problem.grid.index.index(index), mark[0] + hx, mark[1] + hy)
+        hx, hy = residuals.problem.system.grid.views.half
+        squares, dof = residuals.squares, 2
+        at = (residuals.problem.grid.index.index(index), mark[0] + hx, mark[1] + hy)
     else:
-        squares, dof = left.squares_theta, 1
-        at = (left.problem.angular.index.index(index), *mark)
+        squares, dof = residuals.squares_theta, 1
+        at = (residuals.problem.angular.index.index(index), *mark)
     limit = chi2.isf(LEVEL / np.isfinite(squares).sum(), dof)
     # NaN: a reading that cannot be checked does not agree
     return bool(_ratio(squares, robust_sigma(squares, dof))[at] <= limit
@@ -333,12 +335,13 @@ def subset(view: ViewReadings, grid: np.ndarray, lines: np.ndarray) -> ViewReadi
         u_theta=view.u_theta[lines] if len(view.u_theta) else view.u_theta)
 
 
-def _noisy_views(left: Residuals, measurements: Measurements) -> tuple[tuple[str, float], ...]:
+def _noisy_views(residuals: Residuals, measurements: Measurements) -> tuple[tuple[str, float], ...]:
     """Return the views whose noise stands out, with its ratio to that of the others."""
-    if left.problem.system.grid.n_views < 2:
+    if residuals.problem.system.grid.n_views < 2:
         return ()
     out = []
-    for index, (own, others, dof) in zip(left.problem.grid.index, view_noise(left), strict=True):
+    for index, (own, others, dof) in zip(residuals.problem.grid.index, view_noise(residuals),
+                                         strict=True):
         ratio = float(own / max(others, own / MAX_RATIO, ROUNDING))
         if ratio > NOISY_VIEW and dof >= MIN_VIEW_DOF:
             out.append((measurements.views[index].view.name, ratio))

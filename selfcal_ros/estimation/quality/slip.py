@@ -12,7 +12,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from selfcal_ros.errors import NotIdentifiableError
-from selfcal_ros.estimation.joint.fit import Fit, fit
+from selfcal_ros.estimation.joint.fit import JointFit, fit
 from selfcal_ros.estimation.joint.problem import Problem
 from selfcal_ros.estimation.joint.solve import prepare
 from selfcal_ros.estimation.lattice.maps import PHASES
@@ -87,7 +87,7 @@ class Slip:
                 "placements")
 
 
-def find_slip(left: Residuals, sigma_m: float, measurements: Measurements,
+def find_slip(residuals: Residuals, sigma_m: float, measurements: Measurements,
               options: Options) -> Slip | None:
     """Return the slip that explains the residuals best, None if no place passes the test.
 
@@ -95,22 +95,22 @@ def find_slip(left: Residuals, sigma_m: float, measurements: Measurements,
 
     Parameters
     ----------
-    left : Residuals
+    residuals : Residuals
         Residuals of the fit.
     sigma_m : float
         Noise of one reading, m.
     measurements, options : Measurements, Options
         The readings and how they were fitted.
     """
-    grid = left.problem.system.grid
+    grid = residuals.problem.system.grid
     found: list[Slip] = []
     limit = CLIP * sigma_m / np.sqrt(np.where(grid.read, grid.weight, 1.0))
-    size = abs(left.found.residuals)
-    clipped = left.found.residuals * np.minimum(1.0, limit / np.maximum(size, 1e-300))
-    for v, i in enumerate(left.problem.grid.index):
+    size = abs(residuals.found.residuals)
+    clipped = residuals.found.residuals * np.minimum(1.0, limit / np.maximum(size, 1e-300))
+    for v, i in enumerate(residuals.problem.grid.index):
         for axis in (0, 1):
             for place in _places(grid.read[v], axis):
-                tested = _test(left, clipped, v, axis, place)
+                tested = _test(residuals, clipped, v, axis, place)
                 if tested is None or tested[0] / sigma_m**2 < chi2.isf(SLIP_LEVEL, 3):
                     continue
                 gain, parameters = tested
@@ -118,7 +118,7 @@ def find_slip(left: Residuals, sigma_m: float, measurements: Measurements,
                 t = PHASES[grid.views.poses[v].q] * complex(*parameters[1:])
                 found.append(Slip(measurements.views[i].view.name, i, "mn"[axis],
                                   int(place) - half, t.real, t.imag,
-                                  float(parameters[0] / left.problem.half_width_m),
+                                  float(parameters[0] / residuals.problem.half_width_m),
                                   gain / sigma_m**2))
     found.sort(key=lambda slip: -slip.chi2)
     return _best(found[:TRIED], measurements, options)
@@ -157,7 +157,7 @@ def _followed(measurements: Measurements, slip: Slip, options: Options) -> float
     return system.rank_grid / (2 * system.grid.n_readings)
 
 
-def _size(slip: Slip, fitted: Fit, problem: Problem) -> tuple[float, float, float]:
+def _size(slip: Slip, fitted: JointFit, problem: Problem) -> tuple[float, float, float]:
     """Return offset and rotation of the second placement less those of the first."""
     row = problem.grid.index.index(slip.index)
     before, after = fitted.parameters[:3 * problem.system.grid.n_views].reshape(-1, 3)[row:row + 2]
@@ -175,10 +175,10 @@ def _places(read: np.ndarray, axis: int) -> np.ndarray:
     return inner[np.linspace(0, len(inner) - 1, MAX_PLACES).round().astype(int)]
 
 
-def _test(left: Residuals, clipped: np.ndarray, v: int, axis: int,
+def _test(residuals: Residuals, clipped: np.ndarray, v: int, axis: int,
           place: int) -> tuple[float, np.ndarray] | None:
     """Return the sum of squares that a slip explains, m^2, and its size (phi, Re, Im tau)."""
-    system = left.problem.system
+    system = residuals.problem.system
     grid = system.grid
     after = grid.read[v].copy()
     after[(slice(0, place), slice(None))[::1 - 2 * axis]] = False

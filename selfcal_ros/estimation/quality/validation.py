@@ -122,20 +122,20 @@ def _held_out(measurements: Measurements, options: Options,
     errors, angles, weights = [], [], []
     rigid = options.misalignment_model == "rigid"
     for index, (view, (grid, lines)) in enumerate(zip(measurements.views, chosen, strict=True)):
-        left, left_theta = prediction_errors(measurements, result, index,
-                                             subset(view, grid, lines), rigid=rigid)
-        errors.append(left)
-        angles.append(left_theta)
+        residual, residual_theta = prediction_errors(measurements, result, index,
+                                                     subset(view, grid, lines), rigid=rigid)
+        errors.append(residual)
+        angles.append(residual_theta)
         weights.append(view.count[grid])
-    left, left_theta = np.concatenate(errors, axis=1), np.concatenate(angles)
-    known, angular = np.isfinite(left).all(axis=0), np.isfinite(left_theta)
+    residual, residual_theta = np.concatenate(errors, axis=1), np.concatenate(angles)
+    known, angular = np.isfinite(residual).all(axis=0), np.isfinite(residual_theta)
     if not known.any() and not angular.any():
         return HeldOut(name, note="nothing to predict: no held-out mark is known from the rest")
-    scaled = left[:, known] * np.sqrt(np.concatenate(weights)[known])
+    scaled = residual[:, known] * np.sqrt(np.concatenate(weights)[known])
     return HeldOut(
-        name, int(known.sum()), int(angular.sum()), _rms(left[:, known]),
-        float(abs(left[:, known]).max()) if known.any() else float("nan"),
-        _rms(left_theta[angular]), _rms(scaled) / max(result.noise.sigma_xy, 1e-300))
+        name, int(known.sum()), int(angular.sum()), _rms(residual[:, known]),
+        float(abs(residual[:, known]).max()) if known.any() else float("nan"),
+        _rms(residual_theta[angular]), _rms(scaled) / max(result.noise.sigma_xy, 1e-300))
 
 
 def _rms(values: np.ndarray) -> float:
@@ -191,10 +191,10 @@ def _grid_errors(measurements: Measurements, result: CalibrationResult,
             - turned_plate(view, artifact, result.artifact_map))
 
 
-def _aligned(left: np.ndarray, measurements: Measurements, result: CalibrationResult,
+def _aligned(residual: np.ndarray, measurements: Measurements, result: CalibrationResult,
              view: ViewReadings, *, known: tuple[float, float, float], rigid: bool) -> np.ndarray:
-    """Return `left` less the misalignment, known or fitted to `left` itself, (2, P)."""
-    if not left.size:
+    """Return `residual` less the misalignment, known or fitted to `residual` itself, (2, P)."""
+    if not residual.size:
         return np.zeros((2, 0))
     artifact = measurements.artifact
     marks = turned_marks(view, artifact)
@@ -202,24 +202,24 @@ def _aligned(left: np.ndarray, measurements: Measurements, result: CalibrationRe
     if np.isfinite(known).all():
         phi, tx, ty = known
     else:
-        phi, tx, ty = _misalignment(left, marks)
+        phi, tx, ty = _misalignment(residual, marks)
         for _ in range(RIGID_STEPS if rigid else 0):
-            phi, tx, ty = _misalignment(left - rotation_excess(phi, marks, plate), marks)
+            phi, tx, ty = _misalignment(residual - rotation_excess(phi, marks, plate), marks)
     if rigid:
-        left = left - rotation_excess(phi, marks, plate)
-    rest = left - 1j * phi * marks - complex(tx, ty)
+        residual = residual - rotation_excess(phi, marks, plate)
+    rest = residual - 1j * phi * marks - complex(tx, ty)
     return np.stack([rest.real, rest.imag])
 
 
-def _misalignment(left: np.ndarray, marks: np.ndarray) -> tuple[float, float, float]:
-    """Return (phi, tx, ty) fitted to `left`, NaN if fewer than three marks are known."""
-    good = np.isfinite(left)
+def _misalignment(residual: np.ndarray, marks: np.ndarray) -> tuple[float, float, float]:
+    """Return (phi, tx, ty) fitted to `residual`, NaN if fewer than three marks are known."""
+    good = np.isfinite(residual)
     if good.sum() < 3:
         return (float("nan"),) * 3
     columns = np.stack([1j * marks[good], np.ones(good.sum()), np.full(good.sum(), 1j)])
     rows = np.concatenate([columns.real, columns.imag], axis=1).T
     scale = np.linalg.norm(rows, axis=0)
-    values = np.concatenate([left[good].real, left[good].imag])
+    values = np.concatenate([residual[good].real, residual[good].imag])
     phi, tx, ty = np.linalg.lstsq(rows / scale, values, rcond=None)[0] / scale
     return float(phi), float(tx), float(ty)
 

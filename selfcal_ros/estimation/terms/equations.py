@@ -7,7 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
-from selfcal_ros.estimation.normal.equations import JointSystem
+from selfcal_ros.estimation.normal.equations import NormalEquations
 from selfcal_ros.estimation.terms.columns import TermColumns
 from selfcal_ros.estimation.terms.projection import ProjectedColumns
 
@@ -27,7 +27,7 @@ class TermEquations:
 
     Attributes
     ----------
-    system : JointSystem
+    system : NormalEquations
         The measured plan.
     columns : TermColumns
         The terms.
@@ -35,7 +35,7 @@ class TermEquations:
         What the estimate makes of them.
     """
 
-    system: JointSystem
+    system: NormalEquations
     columns: TermColumns
     projected: ProjectedColumns
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from selfcal_ros.estimation.normal.equations import JointSystem
+from selfcal_ros.estimation.normal.equations import NormalEquations
 from selfcal_ros.estimation.normal.grid import GridSystem
 
 CHUNK_READINGS = 4_000_000
@@ -44,7 +44,7 @@ class ProjectedColumns:
     fields : complex array (sites, p)
         Map F.
     parameters : float array (size, p)
-        Misalignments, as in `JointSystem`.
+        Misalignments, as in `NormalEquations`.
     gram : float array (p, p)
         Weighted inner products of columns and residuals, c' W r.
     """
@@ -68,13 +68,13 @@ def reduce_columns(grid: GridSystem, columns: np.ndarray) -> ReducedColumns:
     return ReducedColumns(free, right)
 
 
-def project(system: JointSystem, columns: np.ndarray, reduced: ReducedColumns,
+def project(system: NormalEquations, columns: np.ndarray, reduced: ReducedColumns,
             inverse: np.ndarray) -> ProjectedColumns:
     """Return what the joint estimate makes of the columns.
 
     Parameters
     ----------
-    system : JointSystem
+    system : NormalEquations
         The measured plan.
     columns : complex array (p, views, nx, ny)
         The columns in the plate frame.
@@ -106,7 +106,7 @@ def residuals_of_columns(grid: GridSystem, columns: np.ndarray, fields: np.ndarr
 
 
 def _centred(grid: GridSystem, columns: np.ndarray) -> np.ndarray:
-    mean = np.einsum("vij,pvij->pij", grid.share, columns)
+    mean = np.einsum("vij,pvij->pij", grid.relative_weight, columns)
     return columns - mean[:, None]
 
 

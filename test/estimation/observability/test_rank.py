@@ -8,7 +8,7 @@ from selfcal_ros.errors import NotIdentifiableError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.lattice.maps import PHASES, GridPose, LatticeViews
 from selfcal_ros.estimation.normal.angular import AngularSystem
-from selfcal_ros.estimation.normal.equations import JointSystem
+from selfcal_ros.estimation.normal.equations import NormalEquations
 from selfcal_ros.estimation.normal.grid import GridSystem
 from selfcal_ros.estimation.observability.rank import plan_observability
 from selfcal_ros.model.artifact import Artifact
@@ -45,7 +45,7 @@ def test_rank_is_that_of_the_full_matrix(poses, shape, missing):
     field = LatticeViews(shape, views).in_field
     weight = field * (rng.random(field.shape) >= missing) * rng.integers(1, 5, field.shape)
     grid = GridSystem(views, weight.astype(float))
-    joint = JointSystem(grid, AngularSystem((), np.zeros((0, 0))), tuple(range(len(views))), ())
+    joint = NormalEquations(grid, AngularSystem((), np.zeros((0, 0))), tuple(range(len(views))), ())
     assert joint.rank_grid == np.linalg.matrix_rank(dense(grid), tol=1e-8)
 
 
