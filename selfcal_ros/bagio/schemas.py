@@ -11,6 +11,7 @@ from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_
 from rosbags.typesys.store import Typestore
 
 from selfcal_ros.errors import InputError, first_line
+from selfcal_ros.messages.cdr_layout import SEQUENCE, TEXT, Field
 
 OWN = "selfcal_msgs"
 
@@ -89,6 +90,34 @@ def shorter_stores(name: str, last: str) -> tuple[Typestore, ...]:
         store.register({name: (constants, fields[:count])})
         stores.append(store)
     return tuple(stores)
+
+
+NUMBERS = {"bool": "u1", "byte": "u1", "char": "u1", "uint8": "u1", "int8": "i1", "int16": "i2",
+           "uint16": "u2", "int32": "i4", "uint32": "u4", "int64": "i8", "uint64": "u8",
+           "float32": "f4", "float64": "f8"}
+"""Numpy codes of the basic types."""
+
+
+def fields_of(store: Typestore, name: str) -> tuple[Field, ...] | None:
+    """Return the fields of a type for `messages.cdr_layout`; None if it holds others."""
+    try:
+        return tuple(_field(store, field, kind) for field, kind in store.fielddefs[name][1])
+    except KeyError:
+        return None
+
+
+def _field(store: Typestore, name: str, kind: Any) -> Field:
+    """Return one field; KeyError for a basic type without a numpy code, or a type unknown."""
+    node, inner = kind
+    count = None
+    if node == Nodetype.SEQUENCE:
+        (node, inner), count = inner[0], SEQUENCE
+    elif node == Nodetype.ARRAY:
+        (node, inner), count = inner
+    if node == Nodetype.NAME:
+        members = tuple(_field(store, field, kind) for field, kind in store.fielddefs[inner][1])
+        return Field(name, members, count)
+    return Field(name, TEXT if inner[0] == "string" else NUMBERS[inner[0]], count)
 
 
 def same_layout(store: Typestore, name: str) -> bool:

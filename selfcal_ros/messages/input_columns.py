@@ -1,0 +1,97 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The inputs of a calibration as columns: encoder samples and detections of many messages."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from selfcal_ros.collection.reduce import DETECTION
+from selfcal_ros.messages.cdr_columns import ColumnDecoder, Columns, Payloads
+from selfcal_ros.messages.cdr_layout import SEQUENCE, TEXT, Field
+
+TIME = (Field("sec", "i4"), Field("nanosec", "u4"))
+HEADER = (Field("stamp", TIME), Field("frame_id", TEXT))
+JOINT_STATE = (
+    Field("header", HEADER), Field("name", TEXT, SEQUENCE), Field("position", "f8", SEQUENCE),
+    Field("velocity", "f8", SEQUENCE), Field("effort", "f8", SEQUENCE))
+"""Fields of sensor_msgs/msg/JointState."""
+MARK_DETECTION = (
+    Field("header", HEADER), Field("kind", "u1"), Field("has_id", "u1"), Field("m", "i4"),
+    Field("n", "i4"), Field("k", "u4"), Field("offset_x", "f8"), Field("offset_y", "f8"),
+    Field("offset_theta", "f8"), Field("sigma", "f8"), Field("score", "f4"))
+"""Fields of selfcal_msgs/msg/MarkDetection."""
+_OFFSETS = {"ox": "offset_x", "oy": "offset_y", "ot": "offset_theta"}
+
+
+@dataclass(frozen=True)
+class EncoderBlock:
+    """Encoder samples of the same joints.
+
+    Attributes
+    ----------
+    stamps_ns : int64 array (n,)
+        Stamps of the headers.
+    names : tuple of str
+        Joints, as the messages name them.
+    positions : float array (n, j)
+        Indicated positions, m or rad; j differs from the number of names in malformed messages.
+    velocities : float array (n, i) or None
+        m/s or rad/s; None where the messages tell none.
+    """
+
+    stamps_ns: np.ndarray
+    names: tuple[str, ...]
+    positions: np.ndarray
+    velocities: np.ndarray | None
+
+    def __len__(self) -> int:
+        """Return the number of samples."""
+        return len(self.stamps_ns)
+
+
+class EncoderColumns:
+    """Decodes sensor_msgs/JointState; parameters as `ColumnDecoder`."""
+
+    def __init__(self, fields: Sequence[Field] = JOINT_STATE, tail: int | None = None) -> None:
+        self._decoder = ColumnDecoder(fields, tail)
+
+    def decode(self, messages: Payloads) -> tuple[list[EncoderBlock], np.ndarray]:
+        """Return blocks of samples, and the indices of the messages that remain."""
+        groups, rest = self._decoder.decode(messages)
+        return [_encoder_block(group) for group in groups], rest
+
+
+class DetectionColumns:
+    """Decodes selfcal_msgs/MarkDetection; parameters as `ColumnDecoder`."""
+
+    def __init__(self, fields: Sequence[Field] = MARK_DETECTION, tail: int | None = None) -> None:
+        self._decoder = ColumnDecoder(fields, tail)
+
+    def decode(self, messages: Payloads) -> tuple[list[np.ndarray], np.ndarray]:
+        """Return tables of `collection.reduce.DETECTION`, and the indices of what remains."""
+        groups, rest = self._decoder.decode(messages)
+        return [_detection_table(group) for group in groups], rest
+
+
+def stamps_ns(group: Columns) -> np.ndarray:
+    """Return the stamps in the headers of messages, integer ns."""
+    seconds = group["header.stamp.sec"].astype(np.int64)
+    return seconds * 1_000_000_000 + group["header.stamp.nanosec"]
+
+
+def _encoder_block(group: Columns) -> EncoderBlock:
+    velocities = group["velocity"] if "velocity" in group else np.zeros((len(group), 0))
+    return EncoderBlock(stamps_ns(group), group.layout.texts["name"], group["position"],
+                        velocities if velocities.shape[1] else None)
+
+
+def _detection_table(group: Columns) -> np.ndarray:
+    table = np.empty(len(group), dtype=DETECTION)
+    table["stamp"] = stamps_ns(group)
+    table["has_id"] = group["has_id"] != 0
+    for name in ("kind", "m", "n", "k", "sigma", "score"):
+        table[name] = group[name]
+    for name, field in _OFFSETS.items():
+        table[name] = group[field]
+    return table

@@ -1,0 +1,221 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Columns from bytes agree with rosbags, message by message; what is damaged is left over."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from selfcal_ros.bagio.schemas import fields_of, typestore
+from selfcal_ros.messages import cdr_columns
+from selfcal_ros.messages.cdr_columns import ColumnDecoder, Payloads
+from selfcal_ros.messages.cdr_layout import layout_of
+from selfcal_ros.messages.input_columns import (
+    JOINT_STATE,
+    MARK_DETECTION,
+    DetectionColumns,
+    EncoderColumns,
+)
+
+STORE = typestore()
+JOINTS, MARK = "sensor_msgs/msg/JointState", "selfcal_msgs/msg/MarkDetection"
+
+
+def header(stamp_ns, frame="stage", store=STORE):
+    time = store.types["builtin_interfaces/msg/Time"](*divmod(stamp_ns, 10**9))
+    return store.types["std_msgs/msg/Header"](stamp=time, frame_id=frame)
+
+
+def joint_state(stamp_ns, names=("x", "y", "theta"), positions=(1.0, -2.0, 3.0), velocities=(),
+                effort=(), frame="stage"):
+    return STORE.types[JOINTS](header=header(stamp_ns, frame), name=list(names), position=np.array(
+        positions, dtype=float), velocity=np.array(velocities, dtype=float),
+        effort=np.array(effort, dtype=float))
+
+
+def mark(stamp_ns, rng):
+    return STORE.types[MARK](
+        header=header(stamp_ns), kind=int(rng.integers(3)), has_id=bool(rng.integers(2)),
+        m=int(rng.integers(-9, 9)), n=int(rng.integers(-9, 9)), k=int(rng.integers(2**32)),
+        offset_x=rng.normal(), offset_y=rng.normal(), offset_theta=rng.normal(),
+        sigma=rng.normal(), score=float(np.float32(rng.uniform())))
+
+
+def cdr(message, little=True, tail=b"", name=JOINTS, store=STORE):
+    return bytes(store.serialize_cdr(message, name, little_endian=little)) + tail
+
+
+def samples(blocks):
+    """Return the samples of blocks as tuples, in the order of their stamps."""
+    return sorted((stamp, block.names, tuple(position),
+                   () if block.velocities is None else tuple(block.velocities[i].tolist()))
+                  for block in blocks for i, (stamp, position) in enumerate(zip(
+                      block.stamps_ns.tolist(), block.positions.tolist(), strict=True)))
+
+
+def test_the_fields_are_those_of_the_definitions():
+    assert fields_of(STORE, JOINTS) == JOINT_STATE
+    assert fields_of(STORE, MARK) == MARK_DETECTION
+
+
+texts = st.text(st.characters(blacklist_categories=["Cs"], blacklist_characters="\0"), max_size=9)
+numbers = st.lists(st.floats(allow_nan=False), max_size=4)
+states = st.tuples(st.lists(texts, max_size=4), numbers, numbers, numbers, texts, st.booleans(),
+                   st.binary(max_size=9))
+
+
+@settings(deadline=None, max_examples=150)
+@given(st.lists(states, min_size=1, max_size=30))
+def test_any_mixture_of_layouts_gives_what_rosbags_gives(drawn):
+    data, expected = [], []
+    for number, (names, position, velocity, effort, frame, little, tail) in enumerate(drawn * 3):
+        stamp = number * 1_500_000_001
+        data.append(cdr(joint_state(stamp, names, position, velocity, effort, frame), little, tail))
+        expected.append((stamp, tuple(names), tuple(position), tuple(velocity)))
+    blocks, rest = EncoderColumns().decode(Payloads.joined(data))
+    left = {number * 1_500_000_001 for number in rest.tolist()}
+    assert samples(blocks) == [item for item in expected if item[0] not in left]
+    assert len(left) <= max(0, len(data) - cdr_columns.FREE_TRIES)
+
+
+def test_detections_of_both_byte_orders():
+    rng = np.random.default_rng(1)
+    marks = [mark(1_700_000_000_999_999_999 + 10**9 * i, rng) for i in range(50)]
+    data = [cdr(m, little=bool(i % 3), name=MARK) for i, m in enumerate(marks)]
+    tables, rest = DetectionColumns().decode(Payloads.joined(data))
+    assert len(tables) == 2 and not len(rest)
+    rows = sorted(row for table in tables for row in table.tolist())
+    assert rows == [(1_700_000_000_999_999_999 + 10**9 * i, m.kind, m.has_id, m.m, m.n, m.k,
+                     m.offset_x, m.offset_y, m.offset_theta, m.sigma, m.score)
+                    for i, m in enumerate(marks)]
+
+
+def test_a_stamp_before_1970_is_negative():
+    message = joint_state(0)
+    message.header.stamp = STORE.types["builtin_interfaces/msg/Time"](-2, 5)
+    [block], _ = EncoderColumns().decode(Payloads.joined([cdr(message)]))
+    assert block.stamps_ns.tolist() == [-1_999_999_995]
+
+
+def test_fields_before_between_and_behind_the_known_ones():
+    store = get_typestore(Stores.ROS2_JAZZY)
+    text = ("uint8 first\nPart[] parts\nstd_msgs/Header header\nstring[2] pair\nstring[] name\n"
+            "float64[] velocity\nbool b\nfloat64[] position\nPart[2] two\nPart one\n" + "=" * 80
+            + "\nMSG: pkg/Part\nuint8 a\nfloat64 b\nstring c\nint16[3] d\n")
+    store.register(get_types_from_msg(text, "pkg/msg/Odd"))
+    part = store.types["pkg/msg/Part"]
+    parts = [part(1, 2.0, "three", np.array([4, 5, 6], dtype=np.int16))] * 3
+    data = []
+    for i in range(6):
+        message = store.types["pkg/msg/Odd"](
+            first=7, parts=parts[:i % 2], header=header(i, store=store), pair=["a", "bc"],
+            name=["x", "y"], velocity=np.array([0.5, i]), b=True, position=np.array([i, -1.0]),
+            two=parts[:2], one=parts[0])
+        data.append(cdr(message, i < 4, name="pkg/msg/Odd", store=store))
+    blocks, rest = EncoderColumns(fields_of(store, "pkg/msg/Odd")).decode(Payloads.joined(data))
+    assert not len(rest) and len(blocks) == 4
+    assert samples(blocks) == [(i, ("x", "y"), (i, -1.0), (0.5, i)) for i in range(6)]
+
+
+def test_a_basic_type_without_a_numpy_code_is_left_to_rosbags():
+    store = get_typestore(Stores.ROS2_JAZZY)
+    store.register(get_types_from_msg("std_msgs/Header header\nfloat128 much\n", "pkg/msg/Long"))
+    assert fields_of(store, "pkg/msg/Long") is None
+
+
+def test_padding_may_hold_anything():
+    data = bytearray(cdr(joint_state(5, effort=[1.0])))
+    other = bytearray(cdr(joint_state(6, effort=[1.0])))
+    layout = layout_of(JOINT_STATE, bytes(data))
+    inside = set(range(2, len(data))) - {i for i, fixed in enumerate(layout.fixed) if fixed}
+    for code, at, count in layout.values.values():
+        inside -= set(range(at, at + int(code[2:]) * (1 if count is None else count)))
+    assert inside - {2, 3}, "this message has padding"
+    for at in inside:
+        other[at] = 0xA5
+    blocks, _ = EncoderColumns().decode(Payloads.joined([bytes(data), bytes(other)]))
+    assert [len(block) for block in blocks] == [2]
+
+
+@pytest.mark.parametrize("little", [True, False])
+def test_no_part_of_a_message_is_taken_for_a_whole_one(little):
+    whole = cdr(joint_state(5, velocities=[1.0, 2.0, 3.0]), little)
+    cut = [whole[:size] for size in range(len(whole))]
+    blocks, rest = EncoderColumns().decode(Payloads.joined([*cut, whole, whole]))
+    assert [len(block) for block in blocks] == [2]
+    assert rest.tolist() == list(range(len(cut)))
+
+
+@pytest.mark.parametrize("spoil", [
+    lambda d: b"\0\2" + d[2:], lambda d: b"\1\1" + d[2:],
+    lambda d: d.replace(b"theta\0", b"theta!"),
+    lambda d: d.replace(b"theta", b"\xff\xfe\xff\xfe\xff"),
+    lambda d: d.replace(b"stage\0", b"stage\1"),
+    lambda d: d.replace(b"\6\0\0\0stage", b"\0\0\0\0stage"),
+    lambda d: d.replace(b"\3\0\0\0\2\0\0\0x", b"\xff\xff\xff\x7f\2\0\0\0x")],
+    ids=["XCDR", "encapsulation", "no end of a name", "no UTF-8", "no end of the frame",
+         "text of length 0", "very many names"])
+def test_damaged_messages_are_left_to_rosbags_which_refuses_them(spoil):
+    good = cdr(joint_state(5))
+    bad = spoil(good)
+    assert bad != good
+    with pytest.raises(Exception, match=r"deserialize|Invalid|Missing"):
+        STORE.deserialize_cdr(bad, JOINTS)
+    blocks, rest = EncoderColumns().decode(Payloads.joined([good, bad, good]))
+    assert [len(block) for block in blocks] == [2] and rest.tolist() == [1]
+    blocks, rest = EncoderColumns().decode(Payloads.joined([bad, good, good]))
+    assert [len(block) for block in blocks] == [2] and rest.tolist() == [0]
+
+
+def test_how_much_may_stand_behind_the_last_field():
+    data = [cdr(joint_state(i), tail=bytes(i)) for i in range(12)]
+    assert EncoderColumns().decode(Payloads.joined(data))[1].tolist() == []
+    assert EncoderColumns(tail=3).decode(Payloads.joined(data))[1].tolist() == list(range(4, 12))
+
+
+def test_layouts_that_few_share_are_not_tried_without_end(monkeypatch):
+    tried = []
+    monkeypatch.setattr(cdr_columns, "layout_of",
+                        lambda fields, data: tried.append(1) or layout_of(fields, data))
+    data = [cdr(joint_state(i, frame=f"{i:05d}")) for i in range(640)]
+    blocks, rest = EncoderColumns().decode(Payloads.joined(data))
+    assert len(tried) == len(blocks) == cdr_columns.FREE_TRIES + 640 // cdr_columns.WORTH
+    assert len(rest) == 640 - len(blocks)
+    assert samples(blocks) == [(i, ("x", "y", "theta"), (1.0, -2.0, 3.0), ())
+                               for i in sorted(set(range(640)) - set(rest.tolist()))]
+
+
+def test_known_layouts_are_not_walked_again(monkeypatch):
+    decoder = EncoderColumns()
+    data = [cdr(joint_state(i, names=("x", "y", "theta")[i % 3:][:1], positions=[i]))
+            for i in range(30)]
+    blocks, _ = decoder.decode(Payloads.joined(data))
+    assert sorted(len(block) for block in blocks) == [10, 10, 10]
+    monkeypatch.setattr(cdr_columns, "layout_of", None)
+    assert samples(decoder.decode(Payloads.joined(data))[0]) == samples(blocks)
+
+
+def test_the_memory_of_layouts_is_bounded():
+    decoder = ColumnDecoder(JOINT_STATE)
+    for i in range(cdr_columns.MAX_LENGTHS + 9):
+        for frame in ("a", "b"):
+            data = cdr(joint_state(0, frame=frame * (i + 1)))
+            assert len(decoder.decode(Payloads.joined([data]))[0]) == 1
+    assert len(decoder._known) <= cdr_columns.MAX_LENGTHS
+    for i in range(cdr_columns.MAX_KNOWN + 9):
+        decoder.decode(Payloads.joined([cdr(joint_state(0, frame=f"{i:04d}"))]))
+    assert max(map(len, decoder._known.values())) == cdr_columns.MAX_KNOWN
+
+
+def test_a_field_that_is_not_there():
+    decoder = ColumnDecoder(JOINT_STATE)
+    [columns], _ = decoder.decode(Payloads.joined([cdr(joint_state(0))]))
+    assert "position" in columns and "word 0" not in columns
+    with pytest.raises(KeyError, match="acceleration"):
+        columns["acceleration"]
+
+
+def test_nothing_gives_nothing():
+    blocks, rest = EncoderColumns().decode(Payloads.joined([]))
+    assert blocks == [] and len(rest) == 0
