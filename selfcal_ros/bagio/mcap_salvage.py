@@ -18,6 +18,8 @@ from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, McapRecord, Message, Schema, Statistics
 
+from selfcal_ros.bagio.decompress import limit_of
+
 HEAD = struct.Struct("<BQ")
 """Opcode and length of a record."""
 PARSERS = {Opcode.SCHEMA: Schema.read, Opcode.CHANNEL: Channel.read, Opcode.CHUNK: Chunk.read,
@@ -31,6 +33,8 @@ MESSAGE_FRONT = 22
 CHUNK_LOOKS = (rb"\x06(?s:.{36})(?:\x04\0\0\0zstd|\x03\0\0\0lz4|\0\0\0\0)"
                rb"|\x0f\x04\0\0\0\0\0\0\0(?s:.{4})[\x01-\x0e]")
 """The start of a chunk, or the end of the data section with another record behind it."""
+SLICE = 4096
+"""Bytes that are decompressed at once where the end is missing."""
 MESSAGE_LOOKS = rb"\x05(?s:.{5})\0\0\0"
 CHUNKS = re.compile(b"(?=" + CHUNK_LOOKS + b")")
 MESSAGES = re.compile(b"(?=" + CHUNK_LOOKS + b"|" + MESSAGE_LOOKS + b")")
@@ -125,7 +129,7 @@ def front_of_chunk(data: bytes) -> Iterator[McapRecord]:
         return
     inside = struct.unpack_from("<Q", data, begin - 8)[0]
     name = data[41:41 + name_length].decode(errors="replace")
-    body = _decompressed_front(name, data[begin:begin + inside])
+    body = _decompressed_front(name, data[begin:begin + inside], size)
     if crc and len(body) >= size and zlib.crc32(body[:size]) != crc:
         return
     at = 0
@@ -143,18 +147,26 @@ def front_of_chunk(data: bytes) -> Iterator[McapRecord]:
         at += length
 
 
-def _decompressed_front(compression: str, data: bytes) -> bytes:
-    """Return what can be decompressed of a stream whose end is missing."""
+def _decompressed_front(compression: str, data: bytes, declared: int) -> bytes:
+    """Return what can be decompressed of a stream whose end is missing.
+
+    Nothing of one that is larger than is allowed (`decompress`).
+    """
     out = bytearray()
+    limit = limit_of(len(data), declared)
     try:
         if compression == "zstd":
             decoder = zstandard.ZstdDecompressor().decompressobj()
+            if zstandard.frame_content_size(data) > limit:
+                return b""
         elif compression == "lz4":
             decoder = lz4.frame.LZ4FrameDecompressor()
         else:
             return data
-        for at in range(0, len(data), 4096):
-            out += decoder.decompress(data[at:at + 4096])
+        for at in range(0, len(data), SLICE):
+            out += decoder.decompress(data[at:at + SLICE])
+            if len(out) > limit:
+                return b""
     except (zstandard.ZstdError, RuntimeError, EOFError):
         pass  # the cut: what came out so far is good
     return bytes(out)

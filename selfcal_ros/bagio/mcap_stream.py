@@ -1,27 +1,35 @@
 # SPDX-License-Identifier: Apache-2.0
 """MCAP as a stream of messages that survives a truncated or damaged file.
 
-The mcap library reads the single records. This module goes from one to the next, so that what a
-recorder that died leaves behind, or what is damaged in the middle, costs no more than itself.
-Files and messages that rosbag2 compressed are decompressed on the way.
+The mcap library reads the records beside the messages. This module goes from one to the next, so
+that what a recorder that died leaves behind, or what is damaged in the middle, costs no more than
+itself. Messages come in blocks, as many as stand together. Files and messages that rosbag2
+compressed are decompressed on the way.
 """
 
-import shutil
 import struct
-import tempfile
 from collections import Counter
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from mmap import ACCESS_READ, mmap
 from pathlib import Path
 from typing import BinaryIO
 
+import numpy as np
 import zstandard
 from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, McapRecord, Message, Schema, Statistics
-from mcap.stream_reader import breakup_chunk
 
+from selfcal_ros.bagio.decompress import TooLargeError, plain_file, zstd_message
+from selfcal_ros.bagio.mcap_chunk import (
+    FRONT,
+    Block,
+    block_of,
+    chunk_items,
+    gathered,
+    message_block,
+)
+from selfcal_ros.bagio.mcap_index import MAGIC, read_summary
 from selfcal_ros.bagio.mcap_salvage import (
     HEAD,
     declarations,
@@ -30,13 +38,20 @@ from selfcal_ros.bagio.mcap_salvage import (
     parsed,
 )
 from selfcal_ros.errors import InputError, first_line
+from selfcal_ros.messages.cdr_columns import Payloads
 
-MAGIC = b"\x89MCAP0\r\n"
-ZSTD = b"\x28\xb5\x2f\xfd"
-"""First bytes of a file of a bag with compression_mode FILE, or of a message with MESSAGE."""
 CHECKED = (Opcode.HEADER, Opcode.CHUNK, Opcode.MESSAGE_INDEX, Opcode.MESSAGE, Opcode.SCHEMA,
            Opcode.CHANNEL)
 """Records whose length is not believed blindly: one that only skips may skip too far."""
+INDEX = struct.Struct("<HI")
+"""Channel and bytes of the entries of a message index."""
+INDEX_ENTRY = 16
+STRETCH = 1 << 20
+"""Bytes of a file without chunks in which messages are found at once."""
+SQLITE = b"SQLite format 3"
+CONVERT = ("convert it with `ros2 bag convert -i BAG -o OPTIONS.yaml`, where OPTIONS.yaml says "
+           "output_bags: [{uri: NEW, storage_id: mcap, all_topics: true}]")
+"""What to do with a bag of another storage."""
 
 
 class _Cut(Exception):
@@ -55,19 +70,33 @@ class McapStream:
         Filled while the messages are read.
     lost : list of str
         What could not be read, one line each.
+    wanted : callable or None
+        Whether a topic is needed; chunks that hold only others are passed. None = all are.
     """
 
     path: Path
     schemas: dict[int, Schema] = field(default_factory=dict)
     channels: dict[int, Channel] = field(default_factory=dict)
     lost: list[str] = field(default_factory=list)
+    wanted: Callable[[str], bool] | None = None
+    _needless: dict[int, int] = field(default_factory=dict)
     _n_read: int = 0
     _n_written: int = 0
     _chunked: bool = False
     _undeclared: Counter = field(default_factory=Counter)
+    _too_large: Counter = field(default_factory=Counter)
 
     def messages(self) -> Iterator[tuple[Channel, Message]]:
-        """Yield channel and message of every message that can be read.
+        """Yield channel and message of every message that can be read; raises as `blocks`."""
+        for block in self.blocks():
+            for message in block.messages():
+                yield self.channels[message.channel_id], message
+
+    def blocks(self) -> Iterator[Block]:
+        """Yield all messages that can be read, those of declared channels, in blocks.
+
+        What is declared between two blocks stands in `schemas` and `channels` when the second one
+        comes.
 
         Raises
         ------
@@ -75,51 +104,57 @@ class McapStream:
             If the file is empty, no MCAP file, or cannot be read.
         """
         try:
-            with self._opened() as file:
+            with plain_file(self.path, self.lost) as file:
                 head = file.read(len(MAGIC))
-                if not head:
-                    raise InputError(str(self.path), "the file is empty", "record the bag anew")
                 if head != MAGIC:
-                    raise InputError(str(self.path), "not an MCAP file",
-                                     "give an .mcap file or a rosbag2 folder")
+                    raise self._refusal(head + file.read(len(SQLITE)))
+                self._look_ahead(file)
                 yield from self._records(file)
         except OSError as error:
             raise InputError(str(self.path), f"cannot be read ({error.strerror})",
                              "name a readable file") from error
         self.lost += [f"{count} messages of the undeclared channel {number} cannot be read"
                       for number, count in self._undeclared.items()]
+        self.lost += [f"{count} messages on {topic} were not decompressed: they would become too "
+                      "large" for topic, count in self._too_large.items()]
         if self._n_read < self._n_written:
             self.lost.append(f"{self._n_written - self._n_read} of {self._n_written} messages of "
                              "the file are lost")
 
-    @contextmanager
-    def _opened(self) -> Iterator[BinaryIO]:
-        """Yield the file, decompressed if it was compressed as a whole."""
-        with self.path.open("rb") as file:
-            compressed = file.read(len(ZSTD)) == ZSTD
-            file.seek(0)
-            if not compressed:
-                yield file
-                return
-            with tempfile.TemporaryFile() as plain:
-                try:
-                    shutil.copyfileobj(zstandard.ZstdDecompressor().stream_reader(
-                        file, read_across_frames=True), plain)
-                except zstandard.ZstdError as error:
-                    self.lost.append(f"the compression of the file is damaged "
-                                     f"({first_line(error)}): what follows is lost")
-                if not plain.tell():
-                    raise InputError(str(self.path), "nothing of the compressed file can be read",
-                                     "record the bag anew")
-                plain.seek(0)
-                yield plain
+    def _refusal(self, head: bytes) -> InputError:
+        """Return what to say of a file that is no MCAP file, by its first bytes."""
+        if not head:
+            return InputError(str(self.path), "the file is empty", "record the bag anew")
+        if head.startswith(SQLITE):
+            return InputError(str(self.path), "a bag with sqlite3 storage", CONVERT)
+        return InputError(str(self.path), "not an MCAP file",
+                          "give an .mcap file or a rosbag2 folder")
 
-    def _records(self, file: BinaryIO) -> Iterator[tuple[Channel, Message]]:
+    def _look_ahead(self, file: BinaryIO) -> None:
+        """Find out which chunks can be passed; what they declare stands in the summary, too."""
+        if self.wanted is None:
+            return
+        summary = read_summary(file)
+        self._needless = summary.needless(self.wanted)
+        if self._needless:
+            self.schemas, self.channels = summary.schemas, summary.channels
+
+    def _records(self, file: BinaryIO) -> Iterator[Block]:
         """Go from record to record; what begins before `sure` has certainly been read."""
         size = file.seek(0, 2)
         at = sure = clean = len(MAGIC)
-        data_ended = False
+        data_ended = passed = False
         while True:
+            block, end = _stretch(file, at)
+            if block is not None:
+                sure, clean = at + int(block.payloads.start[-1]) - FRONT, end
+                at = end
+                yield from self._take(block)
+                continue
+            if _is_chunk(file, at, self._needless.get(at)):
+                self._chunked = passed = True
+                at = sure = clean = self._needless[at]
+                continue
             try:
                 opcode, record, end = _record(file, at, size)
             except Exception as error:  # a damaged record may fail anywhere in its parser
@@ -138,41 +173,77 @@ class McapStream:
             data_ended = data_ended or opcode == Opcode.DATA_END
             if opcode in CHECKED:  # only the record behind a message shows that its length is right
                 sure, clean = at if opcode == Opcode.MESSAGE else end, end
+            if passed and opcode == Opcode.MESSAGE_INDEX:
+                self._n_read += (end - at - HEAD.size - INDEX.size) // INDEX_ENTRY
             at = end
             if isinstance(record, Chunk):
-                self._chunked = True
+                self._chunked, passed = True, False
                 yield from self._chunk(file, record, end)
             elif record is not None:
                 yield from self._take(record)
 
-    def _chunk(self, file: BinaryIO, chunk: Chunk,
-               position: int) -> Iterator[tuple[Channel, Message]]:
+    def _chunk(self, file: BinaryIO, chunk: Chunk, position: int) -> Iterator[Block]:
         try:
-            records = breakup_chunk(chunk, validate_crc=True)
+            items = chunk_items(chunk)
+        except TooLargeError as error:
+            self.lost.append(f"the chunk that ends at byte {position} was not read: {error}")
+            self._declare(file)
+            return
         except Exception as error:
             self.lost.append(f"the chunk that ends at byte {position} is damaged "
                              f"({first_line(error)[:80]}): its messages are lost")
             self._declare(file)
             return
-        for record in records:
-            yield from self._take(record)
+        for item in items:
+            yield from self._take(item)
 
-    def _take(self, record: McapRecord) -> Iterator[tuple[Channel, Message]]:
-        if isinstance(record, Schema):
-            self.schemas[record.id] = record
-        elif isinstance(record, Channel):
-            self.channels[record.id] = record
-        elif isinstance(record, Statistics):
-            self._n_written = record.message_count
-        elif isinstance(record, Message):
-            self._n_read += 1
-            channel = self.channels.get(record.channel_id)
-            if channel is None:
-                self._undeclared[record.channel_id] += 1
-                return
-            if record.data.startswith(ZSTD) and channel.message_encoding == "cdr":
-                record.data = _decompressed(record.data)
-            yield channel, record
+    def _take(self, item: McapRecord | Block) -> Iterator[Block]:
+        if isinstance(item, Schema):
+            self.schemas[item.id] = item
+        elif isinstance(item, Channel):
+            self.channels[item.id] = item
+        elif isinstance(item, Statistics):
+            self._n_written = item.message_count
+        elif isinstance(item, Message):
+            yield from self._take(block_of([item]))
+        elif isinstance(item, Block):
+            self._n_read += len(item)
+            block = self._decompressed(self._declared(item))
+            if len(block):
+                yield block
+
+    def _declared(self, block: Block) -> Block:
+        """Return the messages of declared channels; the others are counted."""
+        numbers, first, counts = np.unique(block.fronts["channel"], return_index=True,
+                                           return_counts=True)
+        missing = [i for i in np.argsort(first) if int(numbers[i]) not in self.channels]
+        if not missing:
+            return block
+        for i in missing:
+            self._undeclared[int(numbers[i])] += int(counts[i])
+        return block[~np.isin(block.fronts["channel"], numbers[missing])]
+
+    def _decompressed(self, block: Block) -> Block:
+        """Return the messages with the payloads decompressed that rosbag2 compressed one by one.
+
+        A payload that cannot be decompressed stays as it is: it will not decode either.
+        """
+        packed = [number for number in block.compressed().tolist()
+                  if self.channels[int(block.fronts["channel"][number])].message_encoding == "cdr"]
+        if not packed:
+            return block
+        keep = np.ones(len(block), dtype=bool)
+        payloads = list(block.payloads)
+        for number in packed:
+            try:
+                payloads[number] = zstd_message(payloads[number])
+            except TooLargeError:
+                topic = self.channels[int(block.fronts["channel"][number])].topic
+                self._too_large[topic] += 1
+                keep[number] = False
+            except zstandard.ZstdError:
+                pass
+        return Block(block.fronts, Payloads.joined(payloads))[keep]
 
     def _say_end(self, data_ended: bool) -> None:
         self.lost.append(
@@ -193,16 +264,16 @@ class McapStream:
                 known.setdefault(record.id, record)
 
     def _salvage(self, file: BinaryIO, start: int,
-                 error: Exception) -> Iterator[tuple[Channel, Message]]:
+                 error: Exception) -> Iterator[Block]:
         """Yield what is readable of the record at `start`, and say what is not."""
         stop, size = self._found(file, start), file.seek(0, 2)
         file.seek(start)
         count = 0
-        for record in front_of_chunk(file.read(stop - start)):
+        for item in gathered(list(front_of_chunk(file.read(stop - start)))):
             self._chunked = True
-            for item in self._take(record):
-                count += 1
-                yield item
+            for block in self._take(item):
+                count += len(block)
+                yield block
         self._declare(file)
         if stop < size:
             self.lost.append(f"the file is damaged from byte {start} to {stop}: {count} messages "
@@ -211,6 +282,24 @@ class McapStream:
         reason = "truncated" if isinstance(error, _Cut) else f"damaged ({first_line(error)})"
         self.lost.append(f"the file is {reason} after byte {start} of {size}: {count} messages "
                          "of the last chunk could be saved, what followed is lost")
+
+
+def _stretch(file: BinaryIO, at: int) -> tuple[Block | None, int]:
+    """Return messages that stand by themselves from `at` on and where they end, or None."""
+    file.seek(at)
+    if file.read(1) != bytes([Opcode.MESSAGE]):
+        return None, at
+    file.seek(at)
+    block, end = message_block(file.read(STRETCH), 0)
+    return (block if len(block) else None), at + end
+
+
+def _is_chunk(file: BinaryIO, at: int, end: int | None) -> bool:
+    """Return whether a chunk of the length that the index tells stands at `at`."""
+    if end is None:
+        return False
+    file.seek(at)
+    return file.read(HEAD.size) == HEAD.pack(Opcode.CHUNK, end - at - HEAD.size)
 
 
 def _record(file: BinaryIO, at: int, size: int) -> tuple[int, McapRecord | None, int]:
@@ -226,17 +315,11 @@ def _record(file: BinaryIO, at: int, size: int) -> tuple[int, McapRecord | None,
         raise _Cut
     if opcode >= 0x80 or opcode == Opcode.ATTACHMENT:
         return opcode, None, at + HEAD.size + length
+    if opcode == Opcode.MESSAGE_INDEX:
+        if INDEX.unpack(file.read(INDEX.size))[1] != length - INDEX.size:
+            raise ValueError("the length of a message index is wrong")
+        return opcode, None, at + HEAD.size + length
     body = file.read(length)
-    if opcode == Opcode.MESSAGE_INDEX and struct.unpack_from("<I", body, 2)[0] != length - 6:
-        raise ValueError("the length of a message index is wrong")
     record, used = parsed(opcode, body)
     # a chunk ends where its records do, even if the length before it says more
     return opcode, record, at + HEAD.size + (used if opcode == Opcode.CHUNK else length)
-
-
-def _decompressed(data: bytes) -> bytes:
-    """Return a message's payload, or `data` as it is if that fails: it will not decode either."""
-    try:
-        return zstandard.ZstdDecompressor().decompressobj().decompress(data)
-    except zstandard.ZstdError:
-        return data

@@ -6,13 +6,20 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from selfcal_ros.bagio.reader import BagReader
 from selfcal_ros.collection.collector import Collector, ViewProgress
+from selfcal_ros.collection.messages import Detection, EncoderSample
 from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.files import add_file
 from selfcal_ros.messages import to_model
+from selfcal_ros.messages.input_columns import EncoderBlock
 from selfcal_ros.messages.topics import COMMAND_TOPIC, DETECTION_TOPIC, ENCODER_TOPIC
 from selfcal_ros.model.readings import Measurements
+
+MAX_SAID = 3
+"""Lines of what was lost that an error repeats."""
 
 
 def collect_bag(path: str | Path, values: dict[str, Any], *, namespace: str | None = None,
@@ -40,17 +47,16 @@ def collect_bag(path: str | Path, values: dict[str, Any], *, namespace: str | No
     """
     reader = BagReader(Path(path), namespace)
     collector = Collector(values)
-    feed = feeder(collector, reader.lost)
-    for count, (topic, message) in enumerate(reader.messages()):
-        feed[topic](message)
-        if count % 1000 == 0:
-            progress(count)
+    take = block_feeder(collector, reader.lost)
+    for topic, item in reader.columns():
+        take[topic](item)
+        progress(sum(collector.received.values()))
     received = collector.received
     cell = None if namespace is None else namespace.strip("/")
     if cell is not None and reader.cells and cell not in reader.cells:
         raise NoDataError(str(path), f"no topics of the cell '/{cell}'", "choose one of "
                           + ", ".join(f"/{name}" for name in sorted(reader.cells)))
-    tail = f" ({reader.lost[-1]})" if reader.lost else ""
+    tail = f" ({'; '.join(reader.lost[-MAX_SAID:])})" if reader.lost else ""
     for kind, topic in (("command", COMMAND_TOPIC), ("detection", DETECTION_TOPIC),
                         ("encoder", ENCODER_TOPIC)):
         if not received[kind]:
@@ -81,6 +87,25 @@ def feeder(collector: Collector, complaints: list[str]) -> dict[str, Callable[[A
     return {ENCODER_TOPIC: lambda m: collector.add_encoder(to_model.encoder_sample(m)),
             DETECTION_TOPIC: lambda m: collector.add_detection(to_model.detection(m)),
             COMMAND_TOPIC: take_command}
+
+
+def block_feeder(collector: Collector,
+                 complaints: list[str]) -> dict[str, Callable[[Any], None]]:
+    """Return topic -> handler that gives the collector what `BagReader.columns` yields of it."""
+    def take_encoder(block: EncoderBlock) -> None:
+        n_speeds = 0 if block.velocities is None else block.velocities.shape[1]
+        speeds = block.velocities.tolist() if n_speeds else [()] * len(block)
+        for stamp_ns, positions, velocities in zip(block.stamps_ns.tolist(),
+                                                   block.positions.tolist(), speeds, strict=True):
+            collector.add_encoder(EncoderSample(stamp_ns, block.names, tuple(positions),
+                                                tuple(velocities)))
+
+    def take_detections(table: np.ndarray) -> None:
+        for row in table.tolist():
+            collector.add_detection(Detection(*row))
+
+    return {ENCODER_TOPIC: take_encoder, DETECTION_TOPIC: take_detections,
+            COMMAND_TOPIC: feeder(collector, complaints)[COMMAND_TOPIC]}
 
 
 def bag_input(path: str | Path) -> dict[str, str]:

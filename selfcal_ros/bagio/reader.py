@@ -3,23 +3,17 @@
 
 import re
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import numpy as np
 from mcap.records import Channel, Message
-from rosbags.serde import SerdeError
-from rosbags.typesys.store import Typestore
 
-from selfcal_ros.bagio.mcap_stream import McapStream
-from selfcal_ros.bagio.schemas import (
-    other_field,
-    own_message,
-    same_layout,
-    shorter_stores,
-    store_of_schema,
-    typestore,
-)
+from selfcal_ros.bagio.channels import ChannelDecoder, Input, Waiting
+from selfcal_ros.bagio.mcap_chunk import Block
+from selfcal_ros.bagio.mcap_stream import CONVERT, McapStream
+from selfcal_ros.bagio.schemas import other_field, shorter_stores, store_of_schema
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import read_yaml
 from selfcal_ros.messages.topics import COMMAND_TOPIC, DETECTION_TOPIC, ENCODER_TOPIC, INPUT_TOPICS
@@ -27,21 +21,6 @@ from selfcal_ros.messages.topics import COMMAND_TOPIC, DETECTION_TOPIC, ENCODER_
 LAST_FIELDS = {ENCODER_TOPIC: "position", DETECTION_TOPIC: "score", COMMAND_TOPIC: "angular_count"}
 """Last field that the contract asks for; what stands behind it may be missing."""
 SUFFIXES = (".mcap", ".mcap.zstd")
-LITTLE_ENDIAN = 1
-"""Second byte of CDR."""
-
-
-@dataclass(frozen=True)
-class _Decoder:
-    """How the messages of a channel are decoded.
-
-    `own` tells that their type is the one known here, `why` what to say if they do not decode.
-    """
-
-    role: str
-    decode: Callable[[bytes], object]
-    own: bool
-    why: str = ""
 
 
 @dataclass
@@ -95,6 +74,8 @@ class BagReader:
             if name not in there:
                 self.lost.append(f"the file {name}, which metadata.yaml lists, is missing")
         files = [self.path / name for name in names if name in there]
+        if not files and any(p.suffix == ".db3" for p in self.path.iterdir()):
+            raise InputError(str(self.path), "a bag with sqlite3 storage", CONVERT)
         if not files:
             raise InputError(str(self.path), "no .mcap file in this folder",
                              "give an MCAP file or a rosbag2 folder with MCAP storage")
@@ -111,12 +92,6 @@ class BagReader:
             self.lost.append("metadata.yaml is damaged and was not used")
             return []
         return [name for name in dict.fromkeys(names) if name.endswith(SUFFIXES)]
-
-    def _all(self) -> Iterator[tuple[McapStream, Channel, Message]]:
-        for file in self.files:
-            stream = McapStream(file, lost=self.lost)
-            for channel, message in stream.messages():
-                yield stream, channel, message
 
     def messages(self) -> Iterator[tuple[str, object]]:
         """Yield (topic, decoded message) of the three input topics, names without namespace.
@@ -135,8 +110,17 @@ class BagReader:
             If a topic has another type, encoding or message version than the contract's, or the
             bag holds several namespaces.
         """
-        for role, stamp, decoded, _ in self._decoded():
-            yield role, stamp, decoded
+        bad: Counter = Counter()
+        decoders: dict[tuple[Path, int], ChannelDecoder | None] = {}
+        for stream, channel, message in self._all():
+            key = (stream.path, channel.id)
+            if key not in decoders:
+                decoders[key] = self._decoder(stream, channel, bad)
+            decoder = decoders[key]
+            decoded = None if decoder is None else decoder.one(message.data)
+            if decoded is not None:
+                yield decoder.role, message.log_time, decoded
+        self._say(bad)
 
     def cdr_messages(self) -> Iterator[tuple[str, int, bytes]]:
         """Yield (topic, time of logging in ns, CDR bytes) of the three input topics.
@@ -144,33 +128,63 @@ class BagReader:
         The bytes are of the types known here, whatever fields the bag's have. What cannot be
         decoded is left out as in `messages`, so that both say the same. Raises as they do.
         """
-        for role, stamp, decoded, data in self._decoded():
-            name = INPUT_TOPICS[role]
-            yield role, stamp, data or bytes(
-                typestore().serialize_cdr(own_message(decoded, name), name))
-
-    def _decoded(self) -> Iterator[tuple[str, int, object, bytes]]:
-        """Yield topic, time, message, and its bytes if they are of the type known here."""
-        decoders: dict[tuple[Path, int], _Decoder | None] = {}
         bad: Counter = Counter()
-        for stream, channel, message in self._all():
-            key = (stream.path, channel.id)
-            if key not in decoders:
-                decoders[key] = self._decoder(stream, channel)
-            decoder = decoders[key]
-            if decoder is None:
-                continue
-            try:
-                decoded = decoder.decode(message.data)
-            except Exception:  # a damaged payload may fail anywhere in the decoder
-                bad[decoder.role, decoder.why] += 1
-                continue
-            own = decoder.own and message.data[1] == LITTLE_ENDIAN
-            yield decoder.role, message.log_time, decoded, message.data if own else b""
+        for block, parts in self._blocks(bad):
+            found = [(number, decoder.role, data) for decoder, index in parts
+                     for number, data in decoder.own_bytes(block.payloads[index], index)]
+            stamps = block.fronts["log_time"].tolist()
+            for number, role, data in sorted(found, key=lambda item: item[0]):
+                yield role, stamps[number], data
+        self._say(bad)
+
+    def columns(self) -> Iterator[tuple[str, Input]]:
+        """Yield topic, and what many messages of it hold; a command by itself.
+
+        The order of messages is not kept. Raises as `stamped_messages`.
+        """
+        bad: Counter = Counter()
+        waiting: dict[int, Waiting] = {}
+        for block, parts in self._blocks(bad):
+            for decoder, index in parts:
+                queue = waiting.setdefault(id(decoder), Waiting(decoder))
+                for item in queue.add(block.payloads[index]):
+                    yield decoder.role, item
+        for queue in waiting.values():
+            for item in queue.rest():
+                yield queue.decoder.role, item
+        self._say(bad)
+
+    def _stream(self, file: Path) -> McapStream:
+        return McapStream(file, lost=self.lost, wanted=lambda topic: bool(_roles(topic)))
+
+    def _all(self) -> Iterator[tuple[McapStream, Channel, Message]]:
+        for file in self.files:
+            stream = self._stream(file)
+            for channel, message in stream.messages():
+                yield stream, channel, message
+
+    def _blocks(self, bad: Counter,
+                ) -> Iterator[tuple[Block, list[tuple[ChannelDecoder, np.ndarray]]]]:
+        """Yield each block with the indices of its messages on our topics, by channel."""
+        for file in self.files:
+            stream = self._stream(file)
+            decoders: dict[int, ChannelDecoder | None] = {}
+            for block in stream.blocks():
+                parts = []
+                for number, index in _by_channel(block.fronts["channel"]):
+                    if number not in decoders:
+                        decoders[number] = self._decoder(stream, stream.channels[number], bad)
+                    decoder = decoders[number]
+                    if decoder is not None:
+                        parts.append((decoder, index))
+                yield block, parts
+
+    def _say(self, bad: Counter) -> None:
         self.lost += [f"{count} messages on {role} could not be decoded{why}"
                       for (role, why), count in bad.items()]
 
-    def _decoder(self, stream: McapStream, channel: Channel) -> _Decoder | None:
+    def _decoder(self, stream: McapStream, channel: Channel,
+                 bad: Counter) -> ChannelDecoder | None:
         """Return how a channel is decoded, None for a topic that is not ours."""
         role = self._role(channel.topic)
         if role is None:
@@ -187,20 +201,16 @@ class BagReader:
         text = schema.data.decode(errors="replace") if schema else ""
         store = store_of_schema(name, schema.encoding if schema else "ros2msg", text, where)
         if not text.strip():
-            stores = [store, *shorter_stores(name, LAST_FIELDS[role])]
-            return _Decoder(role, lambda data: _first_that_fits(stores, name, data), False, (
-                f": the bag holds no definition of {name}, and they do not fit the one known here"))
+            return ChannelDecoder(role, name, (store, *shorter_stores(name, LAST_FIELDS[role])),
+                                  bad, told=False)
         other = other_field(store, name, LAST_FIELDS[role])
         if other:
             raise InputError(where, f"another version of {name}: {other}",
                              "record the bag with the messages of this version")
-        return _Decoder(role, lambda data: store.deserialize_cdr(data, name),
-                        same_layout(store, name))
+        return ChannelDecoder(role, name, (store,), bad, told=True)
 
     def _role(self, topic: str) -> str | None:
-        for role in INPUT_TOPICS:
-            if topic != role and not topic.endswith("/" + role):
-                continue
+        for role in _roles(topic):
             space = topic.removesuffix(role).strip("/")
             self.cells.add(space)
             if self.namespace is not None:
@@ -213,14 +223,16 @@ class BagReader:
         return None
 
 
-def _first_that_fits(stores: list[Typestore], name: str, data: bytes) -> object:
-    """Decode by the first definition whose length is that of the payload."""
-    for store in stores[:-1]:
-        try:
-            return store.deserialize_cdr(data, name)
-        except SerdeError:
-            continue
-    return stores[-1].deserialize_cdr(data, name)
+def _roles(topic: str) -> list[str]:
+    """Return the input topics that a topic may be, behind a namespace."""
+    return [role for role in INPUT_TOPICS if topic == role or topic.endswith("/" + role)]
+
+
+def _by_channel(channels: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
+    """Yield each channel and the indices of its messages, in the order of first appearance."""
+    numbers, first = np.unique(channels, return_index=True)
+    for number in numbers[np.argsort(first)].tolist():
+        yield number, np.flatnonzero(channels == number)
 
 
 def _natural(name: str) -> list:

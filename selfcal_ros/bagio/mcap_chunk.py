@@ -1,0 +1,205 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The messages of a chunk, or of a stretch of a file without chunks, found all at once.
+
+Records tell their lengths, so that each must be passed to find the next. Where several messages
+in a row are of one length, as those of an encoder are, the next ones are looked for at that
+distance by numpy.
+"""
+
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from mcap.opcode import Opcode
+from mcap.records import Channel, Chunk, McapRecord, Message, Schema
+from mcap.stream_reader import CRCValidationError, breakup_chunk
+
+from selfcal_ros.bagio.decompress import ZSTD, lz4_chunk, zstd_chunk
+from selfcal_ros.bagio.mcap_salvage import HEAD, MESSAGE_FRONT, parsed
+from selfcal_ros.messages.cdr_columns import Payloads
+
+FRONT = HEAD.size + MESSAGE_FRONT
+"""Bytes of a message record before its payload."""
+FRONT_TYPE = np.dtype({
+    "names": ["length", "channel", "sequence", "log_time", "publish_time"],
+    "formats": ["<u8", "<u2", "<u4", "<u8", "<u8"], "offsets": [1, 9, 11, 15, 23],
+    "itemsize": FRONT})
+HEAD_TYPE = np.dtype({"names": ["opcode", "length"], "formats": ["u1", "<u8"],
+                      "offsets": [0, 1], "itemsize": HEAD.size})
+PATIENCE, MAX_PATIENCE = 3, 1024
+"""Messages of one length in a row after which more are looked for; grows where there are none."""
+FIRST_LOOK = 64
+
+
+@dataclass(frozen=True)
+class Block:
+    """Messages that stand in one buffer, in their order.
+
+    Attributes
+    ----------
+    fronts : structured array (n,) of `FRONT_TYPE`
+        Channel, sequence and times of each message.
+    payloads : Payloads
+        Their content.
+    """
+
+    fronts: np.ndarray
+    payloads: Payloads
+
+    def __len__(self) -> int:
+        """Return the number of messages."""
+        return len(self.fronts)
+
+    def __getitem__(self, which: np.ndarray) -> "Block":
+        """Return some of the messages."""
+        return Block(self.fronts[which], self.payloads[which])
+
+    def compressed(self) -> np.ndarray:
+        """Return which messages begin as a zstd frame does, int64 (k,)."""
+        payloads = self.payloads
+        long = np.flatnonzero(payloads.length >= len(ZSTD))
+        if not len(long):
+            return long
+        first = np.ndarray((len(payloads.data) - len(ZSTD) + 1,), "V4", payloads.data,
+                           strides=(1,))[payloads.start[long]].view("<u4")
+        return long[first == int.from_bytes(ZSTD, "little")]
+
+    def messages(self) -> Iterator[Message]:
+        """Yield each message by itself."""
+        columns = (self.fronts[name].tolist() for name in ("channel", "sequence", "log_time",
+                                                           "publish_time"))
+        for channel, sequence, log_time, publish_time, data in zip(*columns, self.payloads,
+                                                                   strict=True):
+            yield Message(channel_id=channel, sequence=sequence, log_time=log_time,
+                          publish_time=publish_time, data=data)
+
+
+def block_of(messages: list[Message]) -> Block:
+    """Return single messages as one block."""
+    fronts = np.zeros(len(messages), dtype=FRONT_TYPE)
+    for name, field in (("channel", "channel_id"), ("sequence", "sequence"),
+                        ("log_time", "log_time"), ("publish_time", "publish_time")):
+        fronts[name] = [getattr(message, field) for message in messages]
+    return Block(fronts, Payloads.joined([message.data for message in messages]))
+
+
+def message_block(data: bytes, at: int) -> tuple[Block, int]:
+    """Return the messages that stand in a row from `at` on, and where they end."""
+    places = _Places(data)
+    end = places.find(at)
+    start = np.concatenate([*places.parts, np.array(places.single, dtype=np.int64)])
+    if not len(start):
+        return Block(np.zeros(0, dtype=FRONT_TYPE), Payloads(data, start, start)), end
+    fronts = np.ndarray((len(data) - FRONT + 1,), f"V{FRONT}", data, strides=(1,))[start].view(
+        FRONT_TYPE)
+    length = fronts["length"].astype(np.int64) - MESSAGE_FRONT
+    return Block(fronts, Payloads(data, start + FRONT, length)), end
+
+
+class _Places:
+    """Finds where message records begin: `parts` of runs, then those in `single`."""
+
+    def __init__(self, data: bytes) -> None:
+        self.data = data
+        self.parts: list[np.ndarray] = [np.zeros(0, dtype=np.int64)]
+        self.single: list[int] = []
+
+    def find(self, at: int) -> int:
+        """Pass the messages from `at` on; return where something else begins."""
+        data, size = self.data, len(self.data)
+        previous, alike, patience = -1, 0, PATIENCE
+        while at + FRONT <= size:
+            opcode, length = HEAD.unpack_from(data, at)
+            end = at + HEAD.size + length
+            if opcode != Opcode.MESSAGE or length < MESSAGE_FRONT or end > size:
+                break
+            self.single.append(at)
+            at = end
+            alike = alike + 1 if length == previous else 0
+            previous = length
+            if alike >= patience:
+                found = self._run(at, length)
+                patience = PATIENCE if found >= FIRST_LOOK else min(2 * patience, MAX_PATIENCE)
+                at, alike = at + found * (HEAD.size + length), 0
+        return at
+
+    def _run(self, at: int, length: int) -> int:
+        """Take the messages of one length in a row from `at` on; return how many there are."""
+        stride = HEAD.size + length
+        possible = (len(self.data) - at) // stride
+        found, look = 0, FIRST_LOOK
+        while found < possible:
+            count = min(look, possible - found)
+            heads = np.ndarray((count,), HEAD_TYPE, self.data, at + found * stride, (stride,))
+            good = (heads["opcode"] == Opcode.MESSAGE) & (heads["length"] == length)
+            step = count if good.all() else int(good.argmin())
+            found += step
+            if step < count:
+                break
+            look *= 4
+        if found:
+            self.parts.append(np.array(self.single, dtype=np.int64))
+            self.parts.append(at + stride * np.arange(found, dtype=np.int64))
+            self.single.clear()
+        return found
+
+
+def chunk_items(chunk: Chunk) -> list[Block | Schema | Channel]:
+    """Return what a chunk holds, in its order, messages that stand together as one block.
+
+    Raises
+    ------
+    TooLargeError
+        If it would decompress to more than is allowed.
+    Exception
+        Of any kind, if it is damaged.
+    """
+    data = chunk.data
+    if chunk.compression == "zstd":
+        data = zstd_chunk(data, chunk.uncompressed_size)
+    elif chunk.compression == "lz4":
+        data = lz4_chunk(data, chunk.uncompressed_size)
+    if chunk.uncompressed_crc and zlib.crc32(data) != chunk.uncompressed_crc:
+        raise CRCValidationError(chunk.uncompressed_crc, zlib.crc32(data), chunk)
+    try:
+        return _items(data)
+    except Exception:  # a form that only the library's own reader takes, or does not
+        chunk.data, chunk.compression = data, ""
+        return gathered(breakup_chunk(chunk))
+
+
+def _items(data: bytes) -> list[Block | Schema | Channel]:
+    items: list[Block | Schema | Channel] = []
+    at = 0
+    while at < len(data):
+        block, at = message_block(data, at)
+        if len(block):
+            items.append(block)
+        if at == len(data):
+            break
+        opcode, length = HEAD.unpack_from(data, at)
+        start, at = at + HEAD.size, at + HEAD.size + length
+        if at > len(data) or opcode == Opcode.MESSAGE:
+            raise ValueError("a record does not fit into its chunk")
+        if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+            record, used = parsed(opcode, data[start:at])
+            if used != length:
+                raise ValueError("the length of a record is wrong")
+            items.append(record)
+    return items
+
+
+def gathered(records: list[McapRecord]) -> list[Block | McapRecord]:
+    """Return records with messages that stand together as one block."""
+    items: list[Block | McapRecord] = []
+    messages: list[Message] = []
+    for record in records:
+        if isinstance(record, Message):
+            messages.append(record)
+            continue
+        if messages:
+            items.append(block_of(messages))
+            messages = []
+        items.append(record)
+    return [*items, block_of(messages)] if messages else items
