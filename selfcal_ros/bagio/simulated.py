@@ -2,6 +2,7 @@
 """A simulation written as a bag, with its truth beside it."""
 
 from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 
 from selfcal_ros.bagio.writer import BagWriter, qos_profile
@@ -35,7 +36,8 @@ def write_simulation(simulation: Simulation, path: str | Path, *,
             writer.write(f"/{topic}", fields, arrival_ns)
             if number % 1000 == 0:
                 progress(number, len(arrivals))
-        write_truth(Path(path) / TRUTH_FILE, truth, seed=simulation.seed, faults=ledger)
+        write_truth(Path(path) / TRUTH_FILE, truth, seed=simulation.seed, faults=ledger,
+                    cell=asdict(simulation.settings))
         return writer.counts
 
 
@@ -49,10 +51,18 @@ def event_fields(event: Event, frame_id: str) -> tuple[str, from_model.Fields]:
 
 
 def write_truth(path: Path, truth: Truth, **more: object) -> None:
-    """Write the known truth: gx, gy, ax, ay (m), g_theta, a_theta (rad), misalignments."""
+    """Write the known truth.
+
+    gx, gy, ax, ay (m), g_theta, a_theta (rad); of each view phi (rad), t, drift, drift_walk,
+    plate_shape (m) and plate_scale, empty where there is none; rotation, microscope, backlash (m).
+    """
     write_json(path, plain({
         "gx": truth.g[0], "gy": truth.g[1], "g_theta": truth.g_theta, "ax": truth.a[0],
-        "ay": truth.a[1], "a_theta": truth.a_theta, "phi": truth.phi_rad, "t": truth.t_m, **more}))
+        "ay": truth.a[1], "a_theta": truth.a_theta, "phi": truth.phi_rad, "t": truth.t_m,
+        "rotation": "linear" if truth.linear else "finite", "microscope": truth.microscope,
+        "backlash": truth.backlash_m, "plate_scale": truth.plate_scale,
+        "plate_shape": truth.plate_shape_m, "drift": truth.drift_m, "drift_walk": truth.walk_m,
+        **more}))
 
 
 def read_truth(bag: str | Path) -> dict | None:

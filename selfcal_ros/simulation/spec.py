@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """SIM.yaml: what `selfcal simulate` is to simulate."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,9 +13,10 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.files import read_yaml
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.view import Plan, plan_from_dict
-from selfcal_ros.simulation.cell import CellSettings, Event, plan_events
+from selfcal_ros.simulation.cell import Event, plan_events
 from selfcal_ros.simulation.faults import PARTS, Faults, apply_faults
-from selfcal_ros.simulation.truth import Spread, Truth, random_truth
+from selfcal_ros.simulation.machine import ENCODERS, ROTATIONS, Spread, Truth, random_truth
+from selfcal_ros.simulation.settings import CellSettings
 
 PART = {"low": 0.0, "high": 1.0}
 LENGTH = {"unit": "m", "low": 0.0, "high": 1e-3}
@@ -23,14 +25,36 @@ TIME = {"unit": "s", "low": 0.0, "high": 3600.0}
 LAST_START_S = 2.1e9
 """Stamps are 32 bit seconds; this leaves room for the longest recording."""
 
+RATIO = {"unit": "m/m", "low": 0.0, "high": 0.1}
+SIGNED_RATIO = RATIO | {"low": -0.1}
+
 TRUTH = {"g": ("g_m", LENGTH), "a": ("a_m", LENGTH), "g_theta": ("g_theta_rad", ANGLE),
-         "a_theta": ("a_theta_rad", ANGLE), "phi": ("phi_rad", ANGLE), "t": ("t_m", LENGTH)}
-NOISE = {"sigma_xy": ("sigma_xy_m", LENGTH), "sigma_theta": ("sigma_theta_rad", ANGLE)}
+         "a_theta": ("a_theta_rad", ANGLE), "phi": ("phi_rad", ANGLE), "t": ("t_m", LENGTH),
+         "encoder": ("encoder", {"choices": ENCODERS}),
+         "rotation": ("rotation", {"choices": ROTATIONS})}
+NOISE = {"sigma_xy": ("sigma_xy_m", LENGTH), "sigma_theta": ("sigma_theta_rad", ANGLE),
+         "visit_xy": ("visit_xy_m", LENGTH), "flicker_xy": ("flicker_xy_m", LENGTH),
+         "flicker_theta": ("flicker_theta_rad", ANGLE),
+         "resolution_xy": ("resolution_xy_m", LENGTH),
+         "resolution_theta": ("resolution_theta_rad", ANGLE)}
 CELL = {"sense": ("sense", {"choices": tuple(str(sense) for sense in Sense)}),
         "encoder_rate": ("encoder_rate_hz", {"unit": "Hz", "low": 1.0, "high": 10000.0}),
         "exposure_period": ("exposure_period_s", {"unit": "s", "low": 0.001, "high": 10.0}),
         "with_ids": ("with_ids", {}), "declare_sigma": ("declare_sigma", {}),
-        "servo_sigma": ("servo_sigma_m", LENGTH), "servo_sigma_theta": ("servo_sigma_rad", ANGLE)}
+        "servo_sigma": ("servo_sigma_m", LENGTH), "servo_sigma_theta": ("servo_sigma_rad", ANGLE),
+        "stop_sigma": ("stop_sigma_m", LENGTH), "stop_sigma_theta": ("stop_sigma_rad", ANGLE),
+        "follow_mark": ("follow_mark", {}), "visit_order": ("visit_order", {}),
+        "consecutive": ("consecutive", {})}
+PHYSICS = {
+    "microscope_scale": ("microscope_scale", SIGNED_RATIO),
+    "microscope_stretch": ("microscope_stretch", SIGNED_RATIO),
+    "microscope_rotation": ("microscope_rotation_rad", ANGLE | {"low": -0.1}),
+    "microscope_shear": ("microscope_shear", SIGNED_RATIO),
+    "backlash_x": ("backlash_x_m", LENGTH | {"low": -1e-3}),
+    "backlash_y": ("backlash_y_m", LENGTH | {"low": -1e-3}),
+    "plate_scale": ("plate_scale", RATIO), "plate_shape": ("plate_shape_m", LENGTH),
+    **{f"drift_{name}": (f"drift_{name}_m", LENGTH)
+       for name in ("linear", "quadratic", "cubic", "walk")}}
 FAULTS = {name: (name, PART) for name in PARTS} | {
     key: (f"{key.removesuffix('_s')}_s", TIME)
     for key in ("delay", "clock_step", "encoder_gap", "delay_s", "clock_step_s", "encoder_gap_s")}
@@ -68,11 +92,9 @@ class Simulation:
 def read_simulation(path: str | Path) -> Simulation:
     """Return the simulation in a SIM.yaml.
 
-    Keys: ``plan`` (a path beside the file, or a plan inline), ``seed``, ``truth`` {g, a,
-    g_theta, a_theta, phi, t: standard deviations}, ``noise`` {sigma_xy, sigma_theta}, ``cell``
-    {sense, encoder_rate, exposure_period, with_ids, declare_sigma, servo_sigma,
-    servo_sigma_theta}, ``faults`` (fields of `Faults`), ``start_time`` (s), ``compression``.
-    SI units.
+    Keys: ``plan`` (a path beside the file, or a plan inline), ``seed``, ``truth``, ``physics``
+    (fields of `Spread`), ``noise``, ``cell`` (fields of `CellSettings`), ``faults`` (fields of
+    `Faults`), ``start_time`` (s), ``compression``; see docs/simulate.md. SI units.
 
     Raises
     ------
@@ -82,22 +104,41 @@ def read_simulation(path: str | Path) -> Simulation:
     """
     where = str(path)
     data = _mapping(read_yaml(path), where, (
-        "plan", "truth", "noise", "cell", "faults", *(parameter.name for parameter in TOP)))
+        "plan", "truth", "physics", "noise", "cell", "faults",
+        *(parameter.name for parameter in TOP)))
     if "plan" not in data:
         raise InputError(where, "the key 'plan' is missing", "name a PLAN.yaml")
     top = {parameter.name: parameter.check(data.get(parameter.name, parameter.default), where)
            for parameter in TOP}
     read = {name: _section(data.get(name, {}), f"{where}: {name}", keys, defaults)
-            for name, keys, defaults in (("truth", TRUTH, Spread()), ("noise", NOISE,
-                                         CellSettings()), ("cell", CELL, CellSettings()),
-                                         ("faults", FAULTS, Faults()))}
+            for name, keys, defaults in (
+                ("truth", TRUTH, Spread()), ("physics", PHYSICS, Spread()),
+                ("noise", NOISE, CellSettings()), ("cell", CELL, CellSettings()),
+                ("faults", FAULTS, Faults()))}
     try:
         settings = CellSettings(**read["noise"], **read["cell"])
         faults = Faults(**read["faults"])
     except InputError as error:
         raise InputError(f"{where}: {error.where}", error.what, error.mend) from error
-    return Simulation(_plan(data["plan"], Path(path)), top["seed"], Spread(**read["truth"]),
-                      settings, faults, round(top["start_time"] * 1e9), top["compression"])
+    return Simulation(_plan(data["plan"], Path(path)), top["seed"],
+                      Spread(**read["truth"], **read["physics"]), settings, faults,
+                      round(top["start_time"] * 1e9), top["compression"])
+
+
+def settings_of(values: Mapping[str, Any]) -> CellSettings:
+    """Return how a cell measures, by the keys of sections ``noise`` and ``cell`` in one mapping."""
+    return CellSettings(**_fields_of(values, NOISE | CELL, CellSettings()))
+
+
+def spread_of(values: Mapping[str, Any]) -> Spread:
+    """Return what a truth is drawn from, by the keys of ``truth`` and ``physics``."""
+    return Spread(**_fields_of(values, TRUTH | PHYSICS, Spread()))
+
+
+def _fields_of(values: Mapping[str, Any], keys: Mapping[str, tuple], defaults: Any,
+               ) -> dict[str, Any]:
+    return {name: type(getattr(defaults, name))(values[key])
+            for key, (name, _) in keys.items() if key in values}
 
 
 def _plan(plan: Any, path: Path) -> Plan:

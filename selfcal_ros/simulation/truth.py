@@ -1,122 +1,61 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A stage and a plate with known errors, and the readings that they give (method, section 2)."""
+"""A machine with known truth, and the readings that it gives (method, section 2)."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
-from selfcal_ros.estimation.datum.modes import axis_slopes, datum_modes, remove_modes
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Measurements, Sense, ViewReadings
 from selfcal_ros.model.view import Plan, View
+from selfcal_ros.simulation import physics
+from selfcal_ros.simulation.direct import measured_view
+from selfcal_ros.simulation.machine import Spread, Truth, random_truth
+from selfcal_ros.simulation.physics import rotate
+from selfcal_ros.simulation.settings import CellSettings
 
+__all__ = ["Spread", "Truth", "angular_deviation", "grid_deviation", "hu_plan", "random_truth",
+           "rotate", "simulate_measurements"]
 
-@dataclass(frozen=True)
-class Spread:
-    """Standard deviations of a random truth; Hu's simulation by default. SI units."""
-
-    g_m: float = 0.2e-6
-    a_m: float = 0.3e-6
-    g_theta_rad: float = np.deg2rad(0.01)
-    a_theta_rad: float = np.deg2rad(0.01)
-    phi_rad: float = np.deg2rad(0.3)
-    t_m: float = 30e-6
-
-
-@dataclass(frozen=True, eq=False)
-class Truth:
-    """Stage error, plate error and the misalignment of each view.
-
-    Attributes
-    ----------
-    artifact : Artifact
-        The lattice.
-    g, a : float array (2, nx, ny)
-        Stage error at the sites (stage frame) and plate error of the marks (plate frame), m.
-    g_theta, a_theta : float array (K,)
-        The same for the angular lines, rad.
-    phi_rad : float array (views,)
-        Rotation of each view.
-    t_m : float array (views, 2)
-        Offset of each view.
-    """
-
-    artifact: Artifact
-    g: np.ndarray
-    a: np.ndarray
-    g_theta: np.ndarray
-    a_theta: np.ndarray
-    phi_rad: np.ndarray
-    t_m: np.ndarray
-
-
-def random_truth(artifact: Artifact, n_views: int, rng: np.random.Generator,
-                 spread: Spread | None = None) -> Truth:
-    """Draw a truth that satisfies Hu's datum (eqs. 5, 9, 11) exactly.
-
-    Parameters
-    ----------
-    artifact : Artifact
-        The lattice.
-    n_views : int
-        Number of misalignments to draw.
-    rng : numpy.random.Generator
-        Source of the draw.
-    spread : Spread, optional
-        Standard deviations before the datum is removed.
-    """
-    spread = spread or Spread()
-    g = remove_modes(rng.normal(0, spread.g_m, (2, *artifact.shape)),
-                     datum_modes(artifact, scale=True))
-    a = remove_modes(rng.normal(0, spread.a_m, (2, *artifact.shape)),
-                     datum_modes(artifact, scale=False))
-    g_theta = rng.normal(0, spread.g_theta_rad, artifact.angular_count)
-    if artifact.angular_count:
-        slopes = axis_slopes(artifact, *g)  # a half axis of one site has none
-        quarter = g_theta[:: artifact.angular_count // 4]
-        quarter[:] = np.where(np.isfinite(slopes), slopes, quarter)
-    a_theta = rng.normal(0, spread.a_theta_rad, artifact.angular_count)
-    return Truth(artifact, g, a, g_theta, a_theta, rng.normal(0, spread.phi_rad, n_views),
-                 rng.normal(0, spread.t_m, (n_views, 2)))
-
-
-def rotate(q: int, vector: np.ndarray) -> np.ndarray:
-    """Return `vector` (2, ...) turned counter-clockwise by `q` quarter turns, exactly."""
-    x, y = vector
-    return np.stack(((x, y), (-y, x), (-x, -y), (y, -x))[q % 4])
+FIRST_STAMP_NS = 1_700_000_000_000_000_000
+BETWEEN_VIEWS_NS = 60_000_000_000
+"""Time that it takes to place the plate anew."""
 
 
 def grid_deviation(truth: Truth, index: int, view: View, *,
                    sense: Sense = Sense.MICROSCOPE_MOVES) -> np.ndarray:
-    """Return the noise-free deviation of every mark in a view, (2, nx, ny); NaN off the field."""
+    """Return the deviation of every mark in a view, (2, nx, ny), m; NaN off the field.
+
+    As read by a stage that stops at the nominal place, at the beginning of the view, without
+    noise, through a perfect microscope.
+    """
     artifact = truth.artifact
-    pose = view.lattice_pose(artifact)
-    i, j = pose.site_of(artifact.m, artifact.n)
-    hx, hy = artifact.half
-    inside = (abs(i) <= hx) & (abs(j) <= hy)
+    place, site = physics.mark_places(truth, index, view, physics.all_marks(artifact))
+    half = (np.array(artifact.half)[:, None] + 0.5) * artifact.grid_pitch_m
+    inside = (np.abs(site) < half).all(axis=0)
     sign = -1 if sense is Sense.PLATE_MOVES else 1
-    stage = np.full((2, *artifact.shape), np.nan)
-    stage[:, inside] = sign * truth.g[:, sign * i[inside] + hx, sign * j[inside] + hy]
-    x, y = rotate(pose.quarter_turns, np.stack([artifact.x_m, artifact.y_m]))
-    return (stage + rotate(pose.quarter_turns, truth.a) + truth.phi_rad[index] * np.stack([-y, x])
-            + truth.t_m[index][:, None, None])
+    # what the stage is off by at the site, as `physics.stage_error` has it at a node
+    i, j = np.rint(sign * site / artifact.grid_pitch_m).astype(int)
+    out = np.full_like(site, np.nan)
+    hx, hy = artifact.half
+    out[:, inside] = (place - site)[:, inside] + sign * truth.g[:, i[inside] + hx, j[inside] + hy]
+    return out.reshape(2, *artifact.shape)
 
 
 def angular_deviation(truth: Truth, index: int, view: View, *,
                       sense: Sense = Sense.MICROSCOPE_MOVES) -> np.ndarray:
     """Return the noise-free deviation of every angular line in a view, (K,), rad."""
-    k = np.arange(truth.artifact.angular_count)
-    site = k + view.lattice_pose(truth.artifact).turn_lines
+    direction, nominal = physics.line_directions(truth, index, view)
     sign = -1 if sense is Sense.PLATE_MOVES else 1
-    stage = sign * truth.g_theta[(sign * site) % len(k)]
-    return stage + truth.a_theta + truth.phi_rad[index]
+    return direction - nominal + sign * physics.encoder_error(truth, sign * nominal)
 
 
 def simulate_measurements(truth: Truth, plan: Plan, rng: np.random.Generator, *,
                           sigma_m: float = 0.0, sigma_theta_rad: float = 0.0,
                           sense: Sense = Sense.MICROSCOPE_MOVES, missing: float = 0.0,
-                          ) -> Measurements:
-    """Return the averaged readings of all views, with Gaussian noise and missing marks.
+                          linear: bool | None = None, visits: bool = False,
+                          settings: CellSettings | None = None) -> Measurements:
+    """Return the readings of all views, with noise and missing marks.
 
     Parameters
     ----------
@@ -128,11 +67,32 @@ def simulate_measurements(truth: Truth, plan: Plan, rng: np.random.Generator, *,
         Who moves.
     missing : float
         Fraction of marks lost, independently in each view.
+    linear : bool, optional
+        Plates that turn as the papers write it, or by a rotation; as the truth says without it.
+    visits : bool
+        Whether every visit of a mark is told. It is where visits differ by more than white noise.
+    settings : CellSettings, optional
+        How the cell measures; in place of `sigma_m`, `sigma_theta_rad` and `sense`.
     """
+    truth = truth if linear is None else replace(truth, linear=linear)
+    if visits or settings or truth.by_visit:
+        settings = settings or CellSettings(sense, sigma_m, sigma_theta_rad, servo_sigma_m=0.0,
+                                            servo_sigma_rad=0.0)
+        return _by_visit(truth, plan, rng, settings=settings, missing=missing)
     views = tuple(_simulate_view(truth, (index, view), rng, sigma=(sigma_m, sigma_theta_rad),
                                  sense=sense, missing=missing)
                   for index, view in enumerate(plan.views))
     return Measurements(plan.plan_id, plan.artifact, views, sense)
+
+
+def _by_visit(truth: Truth, plan: Plan, rng: np.random.Generator, *, settings: CellSettings,
+              missing: float) -> Measurements:
+    views, start_ns = [], FIRST_STAMP_NS
+    for item in enumerate(plan.views):
+        views.append(measured_view(truth, item, rng, settings=settings, missing=missing,
+                                   start_ns=start_ns))
+        start_ns += (views[-1].used + 1) * settings.period_ns + BETWEEN_VIEWS_NS
+    return Measurements(plan.plan_id, plan.artifact, tuple(views), settings.sense)
 
 
 def _simulate_view(truth: Truth, item: tuple[int, View], rng: np.random.Generator, *,

@@ -35,12 +35,12 @@ def runs(cell):
 
 def approaches(cell, axis):
     """Return the sign of the last step of an axis before each exposure: the oracle."""
-    signs, last, sign = {}, None, 0
     samples = sorted(cell.samples, key=lambda s: s.stamp_ns)
+    signs, last, sign = {}, samples[0].positions[axis], 0
     stamps = np.array([s.stamp_ns for s in samples])
     for d in sorted(cell.detections, key=lambda d: d.stamp_ns):
         at = samples[np.searchsorted(stamps, d.stamp_ns) - 1].positions[axis]
-        if last is not None and abs(at - last) > 1e-6:
+        if abs(at - last) > 1e-6:
             sign = 1 if at > last else -1
         signs[d.stamp_ns], last = sign, at
     return signs

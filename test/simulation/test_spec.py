@@ -5,9 +5,20 @@ import numpy as np
 import pytest
 import yaml
 
+from selfcal_ros.collection.parameters import NODE_PARAMETERS
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.readings import Sense
-from selfcal_ros.simulation.spec import read_simulation
+from selfcal_ros.simulation.machine import Spread
+from selfcal_ros.simulation.settings import CellSettings
+from selfcal_ros.simulation.spec import (
+    CELL,
+    NOISE,
+    PHYSICS,
+    TRUTH,
+    read_simulation,
+    settings_of,
+    spread_of,
+)
 
 PLAN = {"plan_id": "p", "artifact": {"grid_size": 5, "grid_pitch": 0.01, "angular_count": 4},
         "views": [{"name": "a"}, {"name": "b", "rotation_deg": 90}]}
@@ -33,10 +44,20 @@ def test_a_plan_alone_is_a_simulation(tmp_path):
 def test_every_key_reaches_its_place(tmp_path):
     (tmp_path / "plan.yaml").write_text(yaml.safe_dump(PLAN))
     made = simulation(tmp_path, {
-        "plan": "plan.yaml", "seed": 5, "truth": {"g": 1e-6, "phi": 0.0},
-        "noise": {"sigma_xy": 1e-8, "sigma_theta": 2e-6}, "start_time": 12.5, "compression": "lz4",
+        "plan": "plan.yaml", "seed": 5, "truth": {"g": 1e-6, "phi": 0.0, "encoder": "xy_axes",
+                                                 "rotation": "linear"},
+        "physics": {"microscope_scale": -0.01, "microscope_stretch": 0.02,
+                    "microscope_rotation": -0.03, "microscope_shear": 0.04, "backlash_x": 1e-8,
+                    "backlash_y": -2e-8, "plate_scale": 1e-6, "plate_shape": 3e-8,
+                    "drift_linear": 1e-7, "drift_quadratic": 2e-7, "drift_cubic": 3e-7,
+                    "drift_walk": 4e-7},
+        "noise": {"sigma_xy": 1e-8, "sigma_theta": 2e-6, "visit_xy": 1e-9, "flicker_xy": 2e-9,
+                  "flicker_theta": 3e-9, "resolution_xy": 4e-9, "resolution_theta": 5e-9},
+        "start_time": 12.5, "compression": "lz4",
         "cell": {"sense": "plate_moves", "encoder_rate": 1000, "with_ids": False,
-                 "exposure_period": 0.02, "declare_sigma": True, "servo_sigma": 0.0},
+                 "exposure_period": 0.02, "declare_sigma": True, "servo_sigma": 0.0,
+                 "stop_sigma": 5e-5, "stop_sigma_theta": 1e-5, "follow_mark": True,
+                 "visit_order": "random@plate", "consecutive": True},
         "faults": {"lost": 0.1, "delay": 0.2, "clock_step_s": 0.3}})
     assert (made.seed, made.start_ns, made.compression) == (5, 12_500_000_000, "lz4")
     assert (made.spread.g_m, made.spread.phi_rad, made.spread.a_m) == (1e-6, 0.0, 0.3e-6)
@@ -44,6 +65,19 @@ def test_every_key_reaches_its_place(tmp_path):
     assert (cell.sense, cell.encoder_rate_hz, cell.with_ids, cell.exposure_period_s) == (
         Sense.PLATE_MOVES, 1000, False, 0.02)
     assert (cell.sigma_xy_m, cell.sigma_theta_rad, cell.declare_sigma) == (1e-8, 2e-6, True)
+    assert (cell.servo_sigma_m, cell.stop_sigma_m, cell.stop_sigma_rad, cell.follow_mark) == (
+        0.0, 5e-5, 1e-5, True)
+    assert (cell.visit_order, cell.consecutive) == ("random@plate", True)
+    assert (cell.visit_xy_m, cell.flicker_xy_m, cell.flicker_theta_rad) == (1e-9, 2e-9, 3e-9)
+    assert (cell.resolution_xy_m, cell.resolution_theta_rad) == (4e-9, 5e-9)
+    spread = made.spread
+    assert (spread.encoder, spread.rotation) == ("xy_axes", "linear")
+    assert (spread.microscope_scale, spread.microscope_stretch, spread.microscope_rotation_rad,
+            spread.microscope_shear) == (-0.01, 0.02, -0.03, 0.04)
+    assert (spread.backlash_x_m, spread.backlash_y_m) == (1e-8, -2e-8)
+    assert (spread.plate_scale, spread.plate_shape_m) == (1e-6, 3e-8)
+    assert (spread.drift_linear_m, spread.drift_quadratic_m, spread.drift_cubic_m,
+            spread.drift_walk_m) == (1e-7, 2e-7, 3e-7, 4e-7)
     assert (made.faults.lost, made.faults.delay_s, made.faults.clock_step_s) == (0.1, 0.2, 0.3)
 
 
@@ -59,14 +93,18 @@ def test_a_seed_gives_the_same_messages(tmp_path):
 @pytest.mark.parametrize(("data", "message"), [
     ("[1]", ": not a mapping; see docs/simulate.md"),
     ({}, ": the key 'plan' is missing; name a PLAN.yaml"),
-    ({"plan": PLAN, "sed": 1}, ": sed: unknown key; known are plan, truth, noise, cell, faults, "
-     "seed, start_time, compression"),
+    ({"plan": PLAN, "sed": 1}, ": sed: unknown key; known are plan, truth, physics, noise, "
+     "cell, faults, seed, start_time, compression"),
     ({"plan": {**PLAN, "views": []}}, ": plan: the plan has no views; add at least one view"),
     ({"plan": True}, ": plan: not a mapping of keys to values; see config/plans for examples"),
     ({"plan": PLAN, "truth": 5}, ": truth: not a mapping; see docs/simulate.md"),
     ({"plan": PLAN, "faults": None}, ": faults: not a mapping; see docs/simulate.md"),
     ({"plan": PLAN, "noise": {"encoder_rate": 500}}, ": noise: encoder_rate: unknown key; known "
-     "are sigma_xy, sigma_theta"),
+     "are sigma_xy, sigma_theta, visit_xy, flicker_xy, flicker_theta, resolution_xy, "
+     "resolution_theta"),
+    ({"plan": PLAN, "cell": {"visit_order": "spiral"}}, ": simulated cell: visit_order: 'spiral' "
+     "is no visiting order; use one of raster, serpentine, there_and_back, x_then_y, "
+     "x_back_y_back, random, if need be with @plate"),
     ({"plan": PLAN, "cell": {"encoder_rate": 100}}, ": simulated cell: 100 Hz gives fewer than 2.5 "
      "encoder samples in a dwell of 0.006 s; raise encoder_rate or exposure_period"),
     ({"plan": PLAN, "faults": {"lost": 0.6, "duplicated": 0.6}}, ": faults: the parts of the "
@@ -88,11 +126,22 @@ def test_a_plan_that_is_not_there(tmp_path):
 KEYS = {
     None: {"seed": (int, 0, 2**63), "start_time": (float, 0.0, 2.1e9), "compression": str},
     "truth": dict.fromkeys(("g", "a", "t"), (float, 0.0, 1e-3))
-    | dict.fromkeys(("g_theta", "a_theta", "phi"), (float, 0.0, 0.1)),
-    "noise": {"sigma_xy": (float, 0.0, 1e-3), "sigma_theta": (float, 0.0, 0.1)},
+    | dict.fromkeys(("g_theta", "a_theta", "phi"), (float, 0.0, 0.1))
+    | {"encoder": str, "rotation": str},
+    "physics": dict.fromkeys(("microscope_scale", "microscope_stretch", "microscope_rotation",
+                              "microscope_shear"), (float, -0.1, 0.1))
+    | dict.fromkeys(("backlash_x", "backlash_y"), (float, -1e-3, 1e-3))
+    | {"plate_scale": (float, 0.0, 0.1)}
+    | dict.fromkeys(("plate_shape", "drift_linear", "drift_quadratic", "drift_cubic",
+                     "drift_walk"), (float, 0.0, 1e-3)),
+    "noise": dict.fromkeys(("sigma_xy", "visit_xy", "flicker_xy", "resolution_xy"),
+                           (float, 0.0, 1e-3))
+    | dict.fromkeys(("sigma_theta", "flicker_theta", "resolution_theta"), (float, 0.0, 0.1)),
     "cell": {"sense": str, "with_ids": bool, "declare_sigma": bool,
              "encoder_rate": (float, 1.0, 10000.0), "exposure_period": (float, 0.001, 10.0),
-             "servo_sigma": (float, 0.0, 1e-3), "servo_sigma_theta": (float, 0.0, 0.1)},
+             "servo_sigma": (float, 0.0, 1e-3), "servo_sigma_theta": (float, 0.0, 0.1),
+             "stop_sigma": (float, 0.0, 1e-3), "stop_sigma_theta": (float, 0.0, 0.1),
+             "follow_mark": bool, "consecutive": bool},
     "faults": dict.fromkeys(("lost", "duplicated", "outliers", "low_score", "not_finite",
                              "unknown_mark"), (float, 0.0, 1.0))
     | dict.fromkeys(("delay", "clock_step", "encoder_gap"), (float, 0.0, 3600.0)),
@@ -141,3 +190,22 @@ def test_a_number_in_a_form_of_yaml_1_2_is_a_number(tmp_path):
                       "noise: {sigma_xy: 2e-8}\n")
     assert made.plan.artifact.grid_pitch_m == 0.01
     assert (made.start_ns, made.settings.sigma_xy_m) == (1_700_000_000_000_000_000, 2e-8)
+
+
+def test_the_node_takes_every_key_with_the_same_bounds():
+    table = {p.name: p for p in NODE_PARAMETERS["stage_simulator"]}
+    draws = {key: TRUTH[key] for key in ("encoder", "rotation")}
+    for keys, defaults in ((NOISE | CELL, CellSettings()), (PHYSICS | draws, Spread())):
+        for key, (field, bounds) in keys.items():
+            parameter = table[{"sense": "measurement_sense"}.get(key, key)]
+            for name, bound in bounds.items():
+                assert getattr(parameter, name) == bound, (key, name)
+            if key not in ("sigma_xy", "sigma_theta"):  # a bag is exact, a live cell is not
+                assert parameter.default == getattr(defaults, field), key
+
+
+def test_flat_keys_reach_their_fields():
+    settings = settings_of({"sense": "plate_moves", "stop_sigma": 1e-5, "other": 1})
+    assert settings == CellSettings(Sense.PLATE_MOVES, stop_sigma_m=1e-5)
+    spread = spread_of({"encoder": "xy_axes", "drift_cubic": 1e-7, "phi": 0.0, "stop_sigma": 1})
+    assert spread == Spread(encoder="xy_axes", drift_cubic_m=1e-7, phi_rad=0.0)

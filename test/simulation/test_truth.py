@@ -19,8 +19,11 @@ from test.support.plans import plan_of
 PLATES = [Artifact(11, 0.01, 24), Artifact(21, 0.005, 72), Artifact(5, 0.01, 8, 9)]
 
 
+AS_PUBLISHED = Spread(encoder="xy_axes", rotation="linear")
+
+
 def truth_of(artifact, views=4, seed=1):
-    return random_truth(artifact, views, np.random.default_rng(seed))
+    return random_truth(artifact, views, np.random.default_rng(seed), AS_PUBLISHED)
 
 
 @pytest.mark.parametrize("artifact", PLATES, ids=str)
@@ -85,7 +88,7 @@ def test_hu_equations_12_to_15_written_out():
 def test_a_moved_plate_sees_the_stage_at_minus_p_with_the_other_sign():
     artifact = Artifact(5, 0.01, 8)
     plan, truth = plan_of("0, 90, tx", 5, count=8), truth_of(artifact)
-    mirrored = random_truth(artifact, 4, np.random.default_rng(1))
+    mirrored = truth_of(artifact)
     mirrored.g[:] = -truth.g[:, ::-1, ::-1]
     mirrored.g_theta[:] = -np.roll(truth.g_theta[::-1], 1)
     for index, view in enumerate(plan.views):
@@ -125,5 +128,5 @@ def test_plates_without_lines_have_three_views_of_hu():
 
 
 def test_half_axes_of_one_site_leave_the_lines_as_drawn():
-    truth = random_truth(Artifact(3, 0.01, 8), 1, np.random.default_rng(0))
+    truth = truth_of(Artifact(3, 0.01, 8), 1)
     assert np.isfinite(truth.g_theta).all()

@@ -15,10 +15,17 @@ from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.readings import Measurements, Sense
-from selfcal_ros.simulation.truth import Truth, hu_plan, random_truth, simulate_measurements
+from selfcal_ros.simulation.truth import (
+    Spread,
+    Truth,
+    hu_plan,
+    random_truth,
+    simulate_measurements,
+)
 
 ARTIFACT = Artifact(11, 0.01, 24)
 """Plate of Hu's section 4: 11 x 11 marks, 10 mm, lines every 15 deg."""
+AS_PUBLISHED = Spread(encoder="xy_axes", rotation="linear")
 
 
 @dataclass(frozen=True)
@@ -91,7 +98,7 @@ class HuReproduction:
 def reproduce_hu(n_draws: int, seed: int) -> HuReproduction:
     """Run Hu's simulation: one truth, `n_draws` draws of noise at each of his two levels."""
     rng = np.random.default_rng(seed)
-    truth = random_truth(ARTIFACT, 4, rng)
+    truth = random_truth(ARTIFACT, 4, rng, AS_PUBLISHED)
     exact = _law_errors(truth, [simulate_measurements(truth, hu_plan(ARTIFACT), rng)])
     runs = tuple(_run(truth, table, rng, n_draws) for table in TABLES)
     return HuReproduction(truth, float(abs(exact.xy).max()), float(abs(exact.theta).max()), runs)
@@ -117,7 +124,9 @@ def _law_errors(truth: Truth, draws: list[Measurements]) -> Errors:
 
 
 def _joint_errors(truth: Truth, draws: list[Measurements]) -> Errors:
-    maps = [calibrate(readings, Options(uncertainty=False)).error_map for readings in draws]
+    options = Options(datum_theta=ThetaDatum.XY_AXES, misalignment_model="linear",
+                      uncertainty=False)
+    maps = [calibrate(readings, options).error_map for readings in draws]
     xy = np.array([[m.gx - truth.g[0], m.gy - truth.g[1]] for m in maps])
     theta = np.array([m.g_theta - truth.g_theta for m in maps])
     return Errors(xy * 1e6, np.rad2deg(theta))

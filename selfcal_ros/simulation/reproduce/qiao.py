@@ -27,7 +27,8 @@ from selfcal_ros.simulation.truth import (
 
 SIZES = (3, 5, 7, 9, 11)
 ARTIFACT = Artifact(11, 0.01)
-SPREAD = Spread(g_m=1e-6, a_m=1e-6, phi_rad=np.deg2rad(30 / 3600), t_m=30e-6)
+SPREAD = Spread(g_m=1e-6, a_m=1e-6, phi_rad=np.deg2rad(30 / 3600), t_m=30e-6,
+                rotation="linear")
 SIGMA_M = 0.1e-6
 PUBLISHED_RMS_UM = (0.0563, 0.0572)
 PUBLISHED_MEAN_UM = 0.05
@@ -150,7 +151,8 @@ def _rms(errors: list[np.ndarray]) -> np.ndarray:
 
 
 def _errors_um(truth: Truth, readings: Measurements) -> np.ndarray:
-    found = calibrate(readings, Options(uncertainty=False)).error_map
+    options = Options(misalignment_model="linear", uncertainty=False)
+    found = calibrate(readings, options).error_map
     return (np.stack([found.gx, found.gy]) - truth.g) * 1e6
 
 
@@ -205,7 +207,7 @@ def _truth_of(vector: np.ndarray, artifact: Artifact, n_views: int) -> Truth:
     tail = vector[4 * sites:].reshape(n_views, 3)
     return Truth(artifact, vector[:2 * sites].reshape(shape),
                  vector[2 * sites:4 * sites].reshape(shape), np.zeros(0), np.zeros(0),
-                 tail[:, 0] / pitch, tail[:, 1:])
+                 tail[:, 0] / pitch, tail[:, 1:], linear=True)
 
 
 def _observe(truth: Truth, plan: Plan) -> np.ndarray:

@@ -1,0 +1,137 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One view exposure by exposure: where the stage says it is, and what the microscope says."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from selfcal_ros.model.readings import Sense
+from selfcal_ros.model.view import View
+from selfcal_ros.model.visit_order import VisitSequence, approach_signs, visit_sequence
+from selfcal_ros.simulation import physics
+from selfcal_ros.simulation.machine import Truth
+from selfcal_ros.simulation.settings import CellSettings
+
+NO_MOTION_M = 1e-6
+"""Largest change of an axis from one stop to the next that leaves its play where it is."""
+
+
+@dataclass(frozen=True, eq=False)
+class GridExposures:
+    """Exposures of grid marks in their order.
+
+    Attributes
+    ----------
+    visits : VisitSequence
+        The visits, V of them.
+    visit : int array (E,)
+        Number of the visit of each exposure.
+    position : float array (2, E)
+        Indicated position of the stage, m.
+    offset : float array (2, E)
+        Offset that the microscope tells, m.
+    approach : int8 array (2, V)
+        Sign of the last motion of each stage axis before the visit.
+    site : float array (2, V)
+        Nominal place of the mark in the stage frame, m.
+    """
+
+    visits: VisitSequence
+    visit: np.ndarray
+    position: np.ndarray
+    offset: np.ndarray
+    approach: np.ndarray
+    site: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class AngularExposures:
+    """Exposures of angular lines in their order: line, indicated angle, offset told, (E,) each."""
+
+    k: np.ndarray
+    position: np.ndarray
+    offset: np.ndarray
+
+
+def grid_exposures(truth: Truth, index: int, view: View, *, settings: CellSettings,
+                   rng: np.random.Generator) -> GridExposures:
+    """Return the exposures of the grid marks of view number `index`.
+
+    The plate drifts from the first of them to the last. Before the first the stage comes from
+    minus, in x and in y (`lead_in`).
+    """
+    visits = visit_sequence(truth.artifact, view, order=view.visit_order or settings.visit_order,
+                            consecutive=settings.consecutive, rng=rng)
+    visit = np.repeat(np.arange(len(visits)), visits.count)
+    size = len(visit)
+    place, site = physics.mark_places(truth, index, view, (visits.m, visits.n))
+    moved = physics.drift(truth, index, np.arange(size) / max(size - 1, 1))
+    sign = -1 if settings.sense is Sense.PLATE_MOVES else 1
+    stop = sign * site
+    if settings.follow_mark:  # the stage goes on until the mark is under the microscope
+        centre = sign * (place + moved[:, np.cumsum(visits.count) - visits.count])
+        stop = centre + physics.stage_error(truth, centre)
+    stop = stop + _normal(rng, settings.stop_sigma_m, stop.shape)
+    approach = np.stack([approach_signs(np.append(lead_in(truth, row[:1]), row), NO_MOTION_M)[1:]
+                         for row in stop])
+    position = stop[:, visit] + _normal(rng, settings.servo_sigma_m, (2, size))
+    stage = (position - physics.stage_error(truth, position)
+             - (truth.backlash_m[:, None] * approach)[:, visit])
+    offset = physics.true_offset(settings.sense, place[:, visit] + moved, stage)
+    told = (physics.seen_offset(truth, offset)
+            + _normal(rng, settings.sigma_xy_m, (2, size))
+            + _normal(rng, settings.visit_xy_m, (2, len(visits)))[:, visit]
+            + _flicker(rng, settings.flicker_xy_m, (2, size)))
+    return GridExposures(visits, visit, position, quantised(told, settings.resolution_xy_m),
+                         approach, site)
+
+
+def lead_in(truth: Truth, first: np.ndarray) -> np.ndarray:
+    """Return from where an axis sets out for the first grid mark of a view, m."""
+    return first - truth.artifact.grid_pitch_m / 2
+
+
+def angular_exposures(truth: Truth, index: int, view: View, *, settings: CellSettings,
+                      rng: np.random.Generator) -> AngularExposures:
+    """Return the exposures of the angular lines of view number `index`, line by line."""
+    direction, nominal = physics.line_directions(truth, index, view)
+    line = np.arange(len(nominal))
+    k = (np.repeat(line, view.repeats) if settings.consecutive
+         else np.tile(line, view.repeats))
+    sign = -1 if settings.sense is Sense.PLATE_MOVES else 1
+    n_stops = len(line) if settings.consecutive else len(k)
+    stop = _normal(rng, settings.stop_sigma_rad, n_stops)
+    stop = np.repeat(stop, view.repeats) if settings.consecutive else stop
+    centre = sign * nominal
+    if settings.follow_mark:
+        centre = sign * direction + physics.encoder_error(truth, sign * direction)
+    position = centre[k] + stop + _normal(rng, settings.servo_sigma_rad, len(k))
+    stage = position - physics.encoder_error(truth, position)
+    offset = physics.true_offset(settings.sense, direction[k], stage)
+    told = (offset + _normal(rng, settings.sigma_theta_rad, len(k))
+            + _flicker(rng, settings.flicker_theta_rad, (len(k),)))
+    return AngularExposures(k, position, quantised(told, settings.resolution_theta_rad))
+
+
+def quantised(told: np.ndarray, step: float) -> np.ndarray:
+    """Return the nearest whole multiples of `step`; as they are if it is 0."""
+    return np.rint(told / step) * step if step else told
+
+
+def flicker_noise(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
+    """Return noise of variance 1 along the last axis whose spectrum falls as 1/f."""
+    length = 2 * max(shape[-1], 2)  # twice as long: what is used does not close on itself
+    k = np.arange(1, length // 2)
+    spectrum = np.zeros((*shape[:-1], length // 2 + 1), dtype=complex)
+    parts = rng.normal(0, 1, (2, *shape[:-1], len(k)))
+    spectrum[..., 1:-1] = (parts[0] + 1j * parts[1]) / np.sqrt(k)
+    wave = np.fft.irfft(spectrum, length) * (length / (2 * np.sqrt((1 / k).sum())))
+    return wave[..., :shape[-1]]
+
+
+def _flicker(rng: np.random.Generator, sigma: float, shape: tuple[int, ...]) -> np.ndarray | float:
+    return sigma * flicker_noise(rng, shape) if sigma and shape[-1] else 0.0
+
+
+def _normal(rng: np.random.Generator, sigma: float, shape: tuple[int, ...] | int) -> np.ndarray:
+    return rng.normal(0, sigma, shape) if sigma else np.zeros(shape)

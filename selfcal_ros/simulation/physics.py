@@ -1,0 +1,134 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where things are: marks on the plate, the plate on the stage, the stage under its encoders.
+
+Everything is told as a place in the stage frame. The estimator's equations are not used here: it
+must find what these places give.
+"""
+
+import numpy as np
+
+from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.readings import Sense
+from selfcal_ros.model.view import View
+from selfcal_ros.simulation.machine import DRIFT_POWERS, Truth
+
+
+def rotate(q: int, vector: np.ndarray) -> np.ndarray:
+    """Return `vector` (2, ...) turned counter-clockwise by `q` quarter turns, exactly."""
+    x, y = vector
+    return np.stack(((x, y), (-y, x), (-x, -y), (y, -x))[q % 4])
+
+
+def plate_displacement(truth: Truth, index: int, m: np.ndarray, n: np.ndarray) -> np.ndarray:
+    """Return true minus nominal place of marks on the plate, as it is in a view, (2, V), m.
+
+    Parameters
+    ----------
+    truth, index
+        What is true, and the number of the view.
+    m, n : int array (V,)
+        The marks.
+    """
+    (hx, hy), pitch = truth.artifact.half, truth.artifact.grid_pitch_m
+    moved = truth.a[:, m + hx, n + hy]
+    if len(truth.plate_scale):
+        moved = moved + truth.plate_scale[index] * np.stack([m, n]) * pitch
+    if len(truth.plate_shape_m):
+        u, v = m / hx, n / hy
+        moved = moved + truth.plate_shape_m[index] @ np.stack([u * u, u * v, v * v])
+    return moved
+
+
+def mark_places(truth: Truth, index: int, view: View,
+                marks: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Return where marks lie in the stage frame when a view begins, and where nominally.
+
+    The plate is turned about its centre, by the view's quarter turns and by its misalignment,
+    and its centre is put down at the view's translation plus the offset.
+
+    Returns
+    -------
+    place, site : float arrays (2, V)
+        True and nominal place, m.
+    """
+    m, n = marks
+    pose, pitch = view.lattice_pose(truth.artifact), truth.artifact.grid_pitch_m
+    site = np.stack(pose.site_of(m, n)) * pitch
+    arm = rotate(pose.quarter_turns, np.stack([m, n]) * pitch)
+    error = rotate(pose.quarter_turns, plate_displacement(truth, index, m, n))
+    phi = truth.phi_rad[index]
+    if truth.linear:
+        away = phi * rotate(1, arm) + error
+    else:  # R(phi) (arm + error) - arm, without the loss of digits
+        away = (np.sin(phi) * rotate(1, arm + error) - 2 * np.sin(phi / 2) ** 2 * (arm + error)
+                + error)
+    return site + (away + truth.t_m[index][:, None]), site
+
+
+def drift(truth: Truth, index: int, tau: np.ndarray) -> np.ndarray:
+    """Return how far the plate has moved at times `tau` (E,), 0..1 of a view, (2, E), m."""
+    moved = np.zeros((2, len(tau)))
+    if len(truth.drift_m):
+        moved += truth.drift_m[index] @ np.stack([tau**power for power in DRIFT_POWERS])
+    if truth.walk_m.any():
+        steps = np.linspace(0, 1, truth.walk_m.shape[2])
+        moved += np.stack([np.interp(tau, steps, row) for row in truth.walk_m[index]])
+    return moved
+
+
+def stage_error(truth: Truth, position: np.ndarray) -> np.ndarray:
+    """Return indicated minus true position at indicated positions (2, E), m: bilinear."""
+    (hx, hy), (nx, ny) = truth.artifact.half, truth.artifact.shape
+    u, v = position / truth.artifact.grid_pitch_m + np.array([[hx], [hy]])
+    i, j = (np.clip(np.floor(w), 0, size - 2).astype(int) for w, size in ((u, nx), (v, ny)))
+    u, v, g = u - i, v - j, truth.g
+    return ((1 - u) * ((1 - v) * g[:, i, j] + v * g[:, i, j + 1])
+            + u * ((1 - v) * g[:, i + 1, j] + v * g[:, i + 1, j + 1]))
+
+
+def encoder_error(truth: Truth, position: np.ndarray) -> np.ndarray:
+    """Return indicated minus true angle at indicated angles (E,), rad: linear between lines."""
+    count = truth.artifact.angular_count
+    u = position * (count / (2 * np.pi))
+    k = np.floor(u).astype(int)
+    u = u - k
+    return (1 - u) * truth.g_theta[k % count] + u * truth.g_theta[(k + 1) % count]
+
+
+def true_offset(sense: Sense, place: np.ndarray, stage: np.ndarray) -> np.ndarray:
+    """Return the place of a mark from the optical axis.
+
+    Parameters
+    ----------
+    sense : Sense
+        With ``microscope_moves`` the axis is where the stage is. With ``plate_moves`` it is at the
+        origin, and the stage carries the plate along.
+    place : float array
+        Place of the mark, in the frame of the stage that rests at 0, m or rad.
+    stage : float array
+        True position of the stage, of the same shape.
+    """
+    return place + stage if sense is Sense.PLATE_MOVES else place - stage
+
+
+def seen_offset(truth: Truth, offset: np.ndarray) -> np.ndarray:
+    """Return what the microscope makes of true offsets (2, E): (1 + E)^-1 offset."""
+    if not truth.microscope.any():
+        return offset
+    return np.linalg.solve(np.eye(2) + truth.microscope, offset)
+
+
+def line_directions(truth: Truth, index: int, view: View) -> tuple[np.ndarray, np.ndarray]:
+    """Return the true and the nominal direction of every line in the stage frame, (K,), rad.
+
+    The nominal direction is within one turn, 0 included.
+    """
+    count = truth.artifact.angular_count
+    turn = (np.arange(count) + view.lattice_pose(truth.artifact).turn_lines) % count
+    nominal = turn * (2 * np.pi / count)
+    return nominal + (truth.a_theta + truth.phi_rad[index]), nominal
+
+
+def all_marks(artifact: Artifact) -> tuple[np.ndarray, np.ndarray]:
+    """Return m and n of all marks of a plate, (V,) each."""
+    return artifact.m.ravel(), artifact.n.ravel()

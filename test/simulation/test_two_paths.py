@@ -1,0 +1,88 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Messages through the collector and the direct readings of one truth are the same readings."""
+
+import numpy as np
+import pytest
+
+from selfcal_ros.model.readings import Sense
+from selfcal_ros.simulation.cell import plan_events
+from selfcal_ros.simulation.machine import Spread, random_truth
+from selfcal_ros.simulation.settings import CellSettings
+from selfcal_ros.simulation.truth import simulate_measurements
+from test.support.collecting import START_NS, collect
+from test.support.plans import plan_of
+
+EVERYTHING = Spread(rotation="finite", encoder="independent", microscope_scale=5e-3,
+                    microscope_rotation_rad=2e-3, microscope_shear=1e-3, backlash_x_m=4e-8,
+                    backlash_y_m=-3e-8, plate_scale=1e-6, plate_shape_m=3e-8, drift_linear_m=1e-7,
+                    drift_quadratic_m=1e-7, drift_cubic_m=1e-7, drift_walk_m=1e-7)
+CASES = {
+    "plain": (Spread(rotation="finite"), {}),
+    "everything": (EVERYTHING, {"stop_sigma_m": 3e-5, "stop_sigma_rad": 1e-5,
+                                "visit_order": "x_back_y_back", "resolution_xy_m": 1e-9,
+                                "flicker_xy_m": 1e-8, "visit_xy_m": 1e-8}),
+    "consecutive": (EVERYTHING, {"consecutive": True, "visit_order": "random",
+                                 "flicker_theta_rad": 1e-6, "resolution_theta_rad": 1e-7}),
+    "followed": (EVERYTHING, {"follow_mark": True, "visit_order": "there_and_back@plate"})}
+
+
+@pytest.mark.parametrize("sense", list(Sense))
+@pytest.mark.parametrize("case", CASES)
+def test_both_give_the_same_readings_visit_by_visit(case, sense):
+    spread, how = CASES[case]
+    plan = plan_of("0, 90, -tx, 90tx", 7, size_y=5, count=8, line=True, repeats=3)
+    truth = random_truth(plan.artifact, len(plan.views), np.random.default_rng(2), spread)
+    settings = CellSettings(sense, 2e-8, 1e-6, **how)
+    direct = simulate_measurements(truth, plan, np.random.default_rng(4), settings=settings)
+    events = plan_events(truth, plan, settings=settings, rng=np.random.default_rng(4),
+                         start_ns=START_NS)
+    collected, _ = collect(events, measurement_sense=str(sense), outlier_limit=0.0)
+    assert collected.all_rejected() == {}
+    for one, other in zip(direct.views, collected.views, strict=True):
+        assert (one.view, one.used, one.dof_xy, one.dof_theta) == (
+            other.view, other.used, other.dof_xy, other.dof_theta)
+        for name in ("m", "n", "count", "k", "count_theta"):
+            np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+        for name in ("dx", "dy", "sigma_xy"):
+            np.testing.assert_allclose(getattr(one, name), getattr(other, name), atol=2e-17)
+        np.testing.assert_allclose(one.dtheta, other.dtheta, atol=4e-15)
+        np.testing.assert_allclose(one.sigma_theta, other.sigma_theta, rtol=1e-9)
+        if one.view.grid:
+            assert_same_visits(one.visits, other.visits)
+
+
+def assert_same_visits(one, other):
+    for name in ("mark", "count", "approach_x", "approach_y", "dof"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(other, name), err_msg=name)
+    for name in ("dx", "dy", "offset_x", "offset_y", "sigma_m"):
+        np.testing.assert_allclose(getattr(one, name), getattr(other, name), atol=2e-17,
+                                   err_msg=name)
+    since = [visits.stamp_ns - visits.stamp_ns.min() for visits in (one, other)]
+    np.testing.assert_array_equal(*since)
+
+
+def test_marks_that_are_missing_are_missing_as_a_whole():
+    plan = plan_of("0, 90, tx", 11, count=24, repeats=3)
+    truth = random_truth(plan.artifact, 3, np.random.default_rng(2))
+    every = simulate_measurements(truth, plan, np.random.default_rng(4), visits=True)
+    found = simulate_measurements(truth, plan, np.random.default_rng(4), visits=True, missing=0.3)
+    for one, whole in zip(found.views, every.views, strict=True):
+        assert 0.5 * len(whole.m) < len(one.m) < 0.9 * len(whole.m)
+        assert 0.4 * len(whole.k) < len(one.k) < len(whole.k)
+        assert set(one.count) == set(one.count_theta) == {3}
+        np.testing.assert_array_equal(np.bincount(one.visits.mark, one.visits.count), one.count)
+        at = np.searchsorted(100 * whole.m + whole.n, 100 * one.m + one.n)
+        np.testing.assert_allclose(one.dx, whole.dx[at], atol=1e-17)
+        assert one.used == one.count.sum() + one.count_theta.sum()
+
+
+def test_means_of_visits_are_the_means_of_marks():
+    plan = plan_of("0", 11, count=24, repeats=3)
+    truth = random_truth(plan.artifact, 1, np.random.default_rng(2))
+    (found,) = simulate_measurements(truth, plan, np.random.default_rng(4), sigma_m=1e-8,
+                                     settings=CellSettings(sigma_xy_m=1e-8)).views
+    visits = found.visits
+    mean = np.bincount(visits.mark, visits.dx * visits.count) / found.count
+    np.testing.assert_allclose(mean, found.dx, atol=1e-17)
+    assert (np.diff(visits.mark) >= 0).all()
+    assert (np.diff(visits.stamp_ns)[np.diff(visits.mark) == 0] > 0).all()
