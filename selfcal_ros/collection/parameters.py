@@ -136,16 +136,56 @@ RECORDER = (
     Parameter("bag", "", "folder to write"),
     Parameter("all_topics", True, "record selfcal/* results beside the inputs"),
 )
+_LENGTH = {"unit": "m", "low": 0.0, "high": 1e-3}
+_ANGLE = {"unit": "rad", "low": 0.0, "high": 0.1}
+_RATIO = {"unit": "m/m", "low": -0.1, "high": 0.1}
+_DRIFT = "motion of the plate at the last grid exposure of a view, standard deviation: "
+
 SIMULATOR = (
     _SENSE, _FRAME, _PLAN,
     Parameter("seed", 0, "seed of the truth and of the noise", "", 0, 2**31),
-    Parameter("sigma_xy", 2e-8, "standard deviation of one grid reading", "m", 0.0, 1e-3),
+    Parameter("sigma_xy", 2e-8, "standard deviation of one grid reading", **_LENGTH),
     Parameter("sigma_theta", 1.7453292519943296e-05, "standard deviation of one angular reading",
-              "rad", 0.0, 0.1),
+              **_ANGLE),
     Parameter("encoder_rate", 500.0, "encoder samples a second", "Hz", 1.0, 10000.0),
     Parameter("exposure_period", 0.01, "time between two exposures", "s", 0.001, 10.0),
     Parameter("with_ids", True, "detections name their marks"),
     Parameter("truth_path", "", "JSON file for the known truth; empty = none"),
+    Parameter("declare_sigma", False, "detections state their standard deviation"),
+    Parameter("servo_sigma", 2e-8, "how far the stage stands off where it stopped", **_LENGTH),
+    Parameter("servo_sigma_theta", 1e-7, "the same of theta", **_ANGLE),
+    Parameter("stop_sigma", 0.0, "how far from its target the stage stops", **_LENGTH),
+    Parameter("stop_sigma_theta", 0.0, "the same of theta", **_ANGLE),
+    Parameter("follow_mark", False, "the stage goes to the mark as it lies, not to its nominal "
+              "place"),
+    Parameter("visit_order", "", "order of the marks where the command asks for none; empty = "
+              "serpentine"),
+    Parameter("consecutive", False, "all repeats of a mark one after another, in one pass"),
+    Parameter("visit_xy", 0.0, "noise shared by the exposures of a visit", **_LENGTH),
+    Parameter("flicker_xy", 0.0, "1/f noise of grid readings", **_LENGTH),
+    Parameter("flicker_theta", 0.0, "1/f noise of angular readings", **_ANGLE),
+    Parameter("resolution_xy", 0.0, "step of the offsets of marks", **_LENGTH),
+    Parameter("resolution_theta", 0.0, "step of the offsets of lines", **_ANGLE),
+    Parameter("microscope_scale", 0.0, "a true length over the seen one, less 1", **_RATIO),
+    Parameter("microscope_stretch", 0.0, "the same for x more, for y less", **_RATIO),
+    Parameter("microscope_rotation", 0.0, "turn of the microscope against the stage", "rad", -0.1,
+              0.1),
+    Parameter("microscope_shear", 0.0, "symmetric shear of the microscope", **_RATIO),
+    Parameter("backlash_x", 0.0, "indicated - true position of x after a motion towards plus",
+              "m", -1e-3, 1e-3),
+    Parameter("backlash_y", 0.0, "the same of y", "m", -1e-3, 1e-3),
+    Parameter("plate_scale", 0.0, "growth of the plate in each view after the first, standard "
+              "deviation", "m/m", 0.0, 0.1),
+    Parameter("plate_shape", 0.0, "bending of the plate in each view after the first, at mid-edge, "
+              "standard deviation", **_LENGTH),
+    Parameter("drift_linear", 0.0, _DRIFT + "with time", **_LENGTH),
+    Parameter("drift_quadratic", 0.0, _DRIFT + "with its square", **_LENGTH),
+    Parameter("drift_cubic", 0.0, _DRIFT + "with its cube", **_LENGTH),
+    Parameter("drift_walk", 0.0, _DRIFT + "as a random walk", **_LENGTH),
+    Parameter("encoder", "xy_axes", "the rotary encoder's error: of its own, or as the slopes of "
+              "the axes", choices=("independent", "xy_axes")),
+    Parameter("rotation", "linear", "how the plate turns: by a rotation, or as the papers write "
+              "it", choices=("finite", "linear")),
 )
 NODE_PARAMETERS: dict[str, tuple[Parameter, ...]] = {
     "measurement_collector": COLLECTOR,

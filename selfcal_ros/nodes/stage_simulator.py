@@ -3,6 +3,7 @@
 
 import sys
 from collections.abc import Iterator
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -11,18 +12,19 @@ import numpy as np
 from selfcal_ros.bagio.simulated import event_fields, write_truth
 from selfcal_ros.collection.messages import Command, Detection, EncoderSample, Phase
 from selfcal_ros.messages import to_model
-from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.view import Plan, View
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes.base import SelfcalNode, fill
 from selfcal_ros.nodes.running import run
 from selfcal_ros.sessions.ports import Diagnosis, Level
 from selfcal_ros.sessions.sequencing import load_plan
-from selfcal_ros.simulation.cell import JOINTS, CellSettings, Event, view_events
-from selfcal_ros.simulation.truth import Truth, random_truth
+from selfcal_ros.simulation.cell import JOINTS, Event, view_events
+from selfcal_ros.simulation.machine import Truth, random_truth
+from selfcal_ros.simulation.spec import settings_of, spread_of
 
 LEAD_NS = 20_000_000
-"""Time between a MEASURE command and the first encoder sample of its view."""
+"""Time between a MEASURE command, or its arrival if that is later, and the first encoder sample
+of its view: nothing is stamped at a time that has passed."""
 
 
 class StageSimulator(SelfcalNode):
@@ -31,9 +33,7 @@ class StageSimulator(SelfcalNode):
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("stage_simulator", **kwargs)
         v = self.values
-        self._settings = CellSettings(
-            Sense(v["measurement_sense"]), v["sigma_xy"], v["sigma_theta"], v["encoder_rate"],
-            v["exposure_period"], v["with_ids"])
+        self._settings = settings_of(v | {"sense": v["measurement_sense"]})
         self._rng = np.random.default_rng(v["seed"])
         self._plan: Plan | None = load_plan(v["plan"]) if v["plan"] else None
         self.truth: Truth | None = None
@@ -59,11 +59,14 @@ class StageSimulator(SelfcalNode):
         if self.truth is None or self.truth.artifact != plan.artifact:
             count = max(64, len(plan.views), command.views_planned)
             self.truth = random_truth(plan.artifact, count,
-                                      np.random.default_rng(self.values["seed"]))
+                                      np.random.default_rng(self.values["seed"]),
+                                      spread_of(self.values))
             if self.values["truth_path"]:
-                write_truth(Path(self.values["truth_path"]), self.truth, seed=self.values["seed"])
+                write_truth(Path(self.values["truth_path"]), self.truth, seed=self.values["seed"],
+                            cell=asdict(self._settings))
+        start_ns = max(command.stamp_ns, self.get_clock().now().nanoseconds) + LEAD_NS
         self._events = view_events(self.truth, plan, command.view_index, settings=self._settings,
-                                   rng=self._rng, start_ns=command.stamp_ns + LEAD_NS)
+                                   rng=self._rng, start_ns=start_ns)
         self._next = next(self._events, None)
 
     def _plan_with(self, command: Command) -> Plan:

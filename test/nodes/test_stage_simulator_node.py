@@ -1,0 +1,82 @@
+# SPDX-License-Identifier: Apache-2.0
+"""stage_simulator: it measures what a command asks for, from when the command arrives."""
+
+import json
+from dataclasses import replace
+
+import pytest
+
+from selfcal_ros.collection.messages import Command, Phase
+from selfcal_ros.messages import from_model
+from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.view import View
+from selfcal_ros.nodes import names
+from selfcal_ros.nodes.base import fill
+from selfcal_ros.nodes.stage_simulator import LEAD_NS, StageSimulator
+
+PLATE = Artifact(3, 0.01, 4)
+QUICK = {"exposure_period": 0.005, "encoder_rate": 1000.0}
+
+
+def now_ns(graph) -> int:
+    return graph.hand.get_clock().now().nanoseconds
+
+
+def measure(graph, view: View, *, late_ns: int = 0) -> int:
+    """Ask for a view with a command stamped `late_ns` ago, and return when it was sent, ns."""
+    publisher = graph.publisher(names.COMMAND)
+    sent = now_ns(graph)
+    command = Command(sent - late_ns, Phase.MEASURE, "p", 0, view, PLATE, 1)
+    publisher.publish(fill(names.COMMAND.type(), from_model.command(command, "stage")))
+    return sent
+
+
+def stamp_ns(message) -> int:
+    return message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec
+
+
+@pytest.mark.parametrize("late_ns", [0, 400_000_000])
+def test_nothing_is_stamped_at_a_time_that_had_passed_when_the_command_came(graph, late_ns):
+    samples, seen = graph.listen(names.ENCODER), graph.listen(names.DETECTIONS)
+    graph.node(StageSimulator, **QUICK)
+    sent = measure(graph, View("a"), late_ns=late_ns)
+    graph.until(lambda: len(seen) == 13, "9 marks and 4 lines")
+    moved = [stamp_ns(s) for s in samples if any(s.position)]
+    assert min(moved) >= sent + LEAD_NS
+    assert min(map(stamp_ns, seen)) > sent + LEAD_NS
+    home = [stamp_ns(s) for s in samples if not any(s.position)]
+    assert all(at < min(moved) or at > max(moved) for at in home)
+
+
+def test_the_order_that_a_command_asks_for(graph):
+    seen = graph.listen(names.DETECTIONS)
+    graph.node(StageSimulator, visit_order="serpentine", **QUICK)
+    view = View("a", angular=False)
+    measure(graph, replace(view, visit_order="raster"))
+    graph.until(lambda: len(seen) == 9, "9 marks")
+    assert [(d.m, d.n) for d in seen] == [(m, n) for n in (-1, 0, 1) for m in (-1, 0, 1)]
+    seen.clear()
+    measure(graph, view)
+    graph.until(lambda: len(seen) == 9, "9 marks again")
+    assert [(d.m, d.n) for d in seen] == [(-1, -1), (0, -1), (1, -1), (1, 0), (0, 0), (-1, 0),
+                                          (-1, 1), (0, 1), (1, 1)]
+
+
+def test_the_truth_that_its_parameters_ask_for_is_recorded(graph, tmp_path):
+    path = tmp_path / "truth.json"
+    node = graph.node(StageSimulator, truth_path=str(path), microscope_rotation=2e-3,
+                      backlash_y=-1e-8, drift_walk=5e-8, plate_shape=3e-8, stop_sigma=5e-5,
+                      measurement_sense="plate_moves", encoder="independent", rotation="finite",
+                      **QUICK)
+    measure(graph, View("a"))
+    graph.until(lambda: node.truth is not None and path.exists(), "the truth")
+    truth = json.loads(path.read_text())
+    assert truth["microscope"] == [[0.0, -2e-3], [2e-3, 0.0]]
+    assert truth["backlash"] == [0.0, -1e-8]
+    assert truth["rotation"] == "finite"
+    assert truth["drift"] == []
+    assert len(truth["drift_walk"]) == len(truth["plate_shape"]) == len(truth["phi"]) == 64
+    assert truth["drift_walk"][0][0][-1] == node.truth.walk_m[0, 0, -1] != 0
+    assert abs(sum(truth["g_theta"])) < 1e-18
+    assert (truth["cell"]["stop_sigma_m"], truth["cell"]["sense"]) == (5e-5, "plate_moves")
+    assert truth["cell"]["exposure_period_s"] == 0.005
