@@ -52,7 +52,13 @@ def limit_of(compressed: int, declared: int | None = None) -> int:
     return max(FREE, large if declared is None else min(large, declared))
 
 
-def check_size(size: int, limit: int) -> None:
+def check_size(size: int, compressed: int, declared: int | None = None) -> None:
+    """Raise TooLargeError if `compressed` bytes may not become `size` bytes."""
+    if size > FREE:
+        refuse_beyond(limit_of(compressed, declared), size)
+
+
+def refuse_beyond(limit: int, size: int) -> None:
     """Raise TooLargeError if `size` bytes are more than `limit`."""
     if size > limit:
         raise TooLargeError(f"it would decompress to {size / 1e6:,.0f} MB, more than the "
@@ -73,7 +79,7 @@ def zstd_chunk(data: bytes, declared: int) -> bytes:
         inside = zstandard.frame_content_size(data)
         if not inside:
             return b""
-        check_size(inside if inside > 0 else declared, limit_of(len(data), declared))
+        check_size(inside if inside > 0 else declared, len(data), declared)
     return zstandard.decompress(data, declared)
 
 
@@ -87,16 +93,15 @@ def lz4_chunk(data: bytes, declared: int) -> bytes:
     RuntimeError
         If the frame is damaged.
     """
-    limit = limit_of(len(data), declared)
     inside = lz4.frame.get_frame_info(data)["content_size"]
-    check_size(inside, limit)
+    check_size(inside, len(data), declared)
     decoder = lz4.frame.LZ4FrameDecompressor()
-    out = [decoder.decompress(data, max_length=max(inside or min(declared, limit), 1))]
+    out = [decoder.decompress(data, max_length=max(inside or min(declared, FREE), 1))]
     size = len(out[0])
     while not decoder.eof and not decoder.needs_input:
         out.append(decoder.decompress(b"", max_length=BLOCK))
         size += len(out[-1])
-        check_size(size, limit)
+        check_size(size, len(data), declared)
     if not decoder.eof:
         raise RuntimeError("the LZ4 frame is incomplete")
     return b"".join(out) if len(out) > 1 else out[0]
@@ -104,13 +109,14 @@ def lz4_chunk(data: bytes, declared: int) -> bytes:
 
 def zstd_message(data: bytes) -> bytes:
     """Return the payload of a message that was compressed by itself; raises as `zstd_chunk`."""
-    inside, limit = zstandard.frame_content_size(data), limit_of(len(data))
+    inside = zstandard.frame_content_size(data)
     if inside >= 0:
-        check_size(inside, limit)
+        check_size(inside, len(data))
         return zstandard.ZstdDecompressor().decompressobj().decompress(data)
+    limit = limit_of(len(data))
     with zstandard.ZstdDecompressor().stream_reader(data) as stream:
         out = stream.read(limit + 1)
-    check_size(len(out), limit)
+    refuse_beyond(limit, len(out))
     return out
 
 
@@ -150,9 +156,9 @@ def _copy(file: BinaryIO, plain: BinaryIO) -> None:
     size = os.fstat(file.fileno()).st_size
     limit = max(FREE, min(RATIO * size, shutil.disk_usage(tempfile.gettempdir()).free // 2))
     inside = zstandard.frame_content_size(file.read(ZSTD_HEAD))
-    check_size(inside, limit)
+    refuse_beyond(limit, inside)
     file.seek(0)
     stream = zstandard.ZstdDecompressor().stream_reader(file, read_across_frames=True)
     while block := stream.read(BLOCK):
-        check_size(plain.tell() + len(block), limit)
+        refuse_beyond(limit, plain.tell() + len(block))
         plain.write(block)

@@ -51,6 +51,14 @@ class Block:
         """Return the number of messages."""
         return len(self.fronts)
 
+    def channels(self) -> list[int]:
+        """Return the channels of the messages, in the order of first appearance."""
+        column = self.fronts["channel"]
+        numbers = np.flatnonzero(np.bincount(column)).tolist()
+        if len(numbers) == 1:
+            return numbers
+        return sorted(numbers, key=lambda number: int((column == number).argmax()))
+
     def __getitem__(self, which: np.ndarray) -> "Block":
         """Return some of the messages."""
         return Block(self.fronts[which], self.payloads[which])

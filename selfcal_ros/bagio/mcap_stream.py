@@ -214,14 +214,12 @@ class McapStream:
 
     def _declared(self, block: Block) -> Block:
         """Return the messages of declared channels; the others are counted."""
-        numbers, first, counts = np.unique(block.fronts["channel"], return_index=True,
-                                           return_counts=True)
-        missing = [i for i in np.argsort(first) if int(numbers[i]) not in self.channels]
+        missing = [number for number in block.channels() if number not in self.channels]
         if not missing:
             return block
-        for i in missing:
-            self._undeclared[int(numbers[i])] += int(counts[i])
-        return block[~np.isin(block.fronts["channel"], numbers[missing])]
+        for number in missing:
+            self._undeclared[number] += int((block.fronts["channel"] == number).sum())
+        return block[~np.isin(block.fronts["channel"], missing)]
 
     def _decompressed(self, block: Block) -> Block:
         """Return the messages with the payloads decompressed that rosbag2 compressed one by one.

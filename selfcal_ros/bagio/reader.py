@@ -171,12 +171,12 @@ class BagReader:
             decoders: dict[int, ChannelDecoder | None] = {}
             for block in stream.blocks():
                 parts = []
-                for number, index in _by_channel(block.fronts["channel"]):
+                for number in block.channels():
                     if number not in decoders:
                         decoders[number] = self._decoder(stream, stream.channels[number], bad)
                     decoder = decoders[number]
                     if decoder is not None:
-                        parts.append((decoder, index))
+                        parts.append((decoder, np.flatnonzero(block.fronts["channel"] == number)))
                 yield block, parts
 
     def _say(self, bad: Counter) -> None:
@@ -226,13 +226,6 @@ class BagReader:
 def _roles(topic: str) -> list[str]:
     """Return the input topics that a topic may be, behind a namespace."""
     return [role for role in INPUT_TOPICS if topic == role or topic.endswith("/" + role)]
-
-
-def _by_channel(channels: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
-    """Yield each channel and the indices of its messages, in the order of first appearance."""
-    numbers, first = np.unique(channels, return_index=True)
-    for number in numbers[np.argsort(first)].tolist():
-        yield number, np.flatnonzero(channels == number)
 
 
 def _natural(name: str) -> list:

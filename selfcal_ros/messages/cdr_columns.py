@@ -117,10 +117,8 @@ class ColumnDecoder:
         groups: list[Columns] = []
         rest: list[np.ndarray] = [np.zeros(0, dtype=np.int64)]
         tries = FREE_TRIES + len(messages) // WORTH
-        order = np.argsort(messages.length, kind="stable")
-        cuts = np.flatnonzero(np.diff(messages.length[order])) + 1
         # the lengths that most messages have come first, so that what is odd costs them nothing
-        for index in sorted(np.split(order, cuts) if len(order) else (), key=len, reverse=True):
+        for index in sorted(_by_length(messages.length), key=len, reverse=True):
             tries, left = self._decode_length(messages, index, groups, tries)
             rest.append(left)
         return groups, np.sort(np.concatenate(rest))
@@ -155,6 +153,16 @@ class ColumnDecoder:
         known = self._known.setdefault(layout.length, [])
         known.append(layout)
         del known[:-MAX_KNOWN]
+
+
+def _by_length(length: np.ndarray) -> list[np.ndarray]:
+    """Return the indices of the messages of each length."""
+    if not len(length):
+        return []
+    if (length == length[0]).all():
+        return [np.arange(len(length))]
+    order = np.argsort(length, kind="stable")
+    return np.split(order, np.flatnonzero(np.diff(length[order])) + 1)
 
 
 def _take(layout: Layout, index: np.ndarray, rows: np.ndarray,
