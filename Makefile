@@ -15,9 +15,11 @@ lint: setup
 test: lint
 	@$(BIN)/python -m pytest -n 2 --dist worksteal
 bench: setup
-	@test -d build/rivals || $(BIN)/python -m pip install --quiet --disable-pip-version-check \
-		--no-deps --target build/rivals -r tools/bench-requirements.txt \
-		|| echo "bench: the rivals could not be installed and are left out"
+	@test build/rivals/.complete -nt tools/bench-requirements.txt || { mkdir -p build/rivals; \
+		grep -v '^#' tools/bench-requirements.txt | while read -r rival; do \
+		$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --upgrade \
+		--target build/rivals "$$rival" || echo "bench: $$rival is left out: no such wheel here"; \
+		done; touch build/rivals/.complete; }
 	@PYTHONPATH=build/rivals $(BIN)/python test/bench/run.py
 clean:
 	rm -rf .venv build install log selfcal_ros.egg-info

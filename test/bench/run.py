@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Bench: the joint solver beside other solvers, same readings, one run, one table.
+"""Bench: the joint solver beside other solvers, reading beside other readers; one run, one table.
 
-Every measurement is a process of its own with a limit of time and of memory; what goes beyond is
-skipped and says so. Writes build/bench.json.
+Same readings, same files. Every measurement is a process of its own with a limit of time and of
+memory; what goes beyond is skipped and says so. Writes build/bench.json.
 
-    python test/bench/run.py [--sizes 11,21] [--methods selfcal,"scipy lsmr"] [-o FILE]
+    python test/bench/run.py [--sizes 11,21] [--methods selfcal,"scipy lsmr"]
+                             [--ingest MESSAGES] [--detections NUMBER] [-o FILE]
 """
 
 import argparse
@@ -19,6 +20,7 @@ from pathlib import Path
 ROOT = Path(__file__).parents[2]
 sys.path.insert(0, str(ROOT))
 
+import ingest  # noqa: E402
 from rivals import RIVALS, Rival, installed  # noqa: E402
 
 from selfcal_ros.errors import InputError  # noqa: E402
@@ -156,13 +158,35 @@ def jobs(sizes: list[int], methods: list[str]):
                 yield "solve", method, size
 
 
+def measure_ingest(benchmark: str, number: int):
+    """Yield a row for each way to read the bag of a benchmark."""
+    bag, total = ingest.prepared(benchmark, number, ROOT / "build" / "ingest")
+    for method in ingest.METHODS[benchmark]:
+        row = {"benchmark": benchmark, "method": method, "n": total, "seconds": None,
+               "peak_mb": None, "max_error": None}
+        if ingest.missing(method):
+            yield {**row, "note": "not installed"}
+            continue
+        command = [sys.executable, __file__, "--ingest-worker", benchmark, method, str(bag)]
+        try:
+            done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT,
+                                  timeout=ingest.MAX_SECONDS)
+        except subprocess.TimeoutExpired:
+            yield {**row, "note": f"skipped: more than {ingest.MAX_SECONDS:.0f} s"}
+            continue
+        last = (done.stderr.strip().splitlines() or ["no message"])[-1]
+        yield (json.loads(done.stdout.splitlines()[-1]) if not done.returncode
+               else {**row, "note": f"failed: {last}"})
+
+
 def show(row: dict) -> None:
     """Print one line of the table."""
     if row["seconds"] is None:
         figures = f"{row['note']:>36}"
     else:
-        figures = f"{row['seconds']:12.6f} {row['peak_mb']:10.0f} {row['max_error']:12.1e}"
-    print(f"{row['benchmark']:<12} {row['method']:<36} {row['n']:>5} {figures}", flush=True)
+        error = "" if row["max_error"] is None else f"{row['max_error']:12.1e}"
+        figures = f"{row['seconds']:12.6f} {row['peak_mb']:10.0f} {error:>12}"
+    print(f"{row['benchmark']:<17} {row['method']:<36} {row['n']:>7} {figures}", flush=True)
 
 
 def main() -> int:
@@ -171,19 +195,29 @@ def main() -> int:
     parser.add_argument("--sizes", default=",".join(map(str, SIZES)))
     parser.add_argument("--methods", default=",".join(("selfcal", *RIVALS)))
     parser.add_argument("-o", "--output", default=str(ROOT / "build" / "bench.json"))
+    parser.add_argument("--ingest", type=int, default=3_600_000,
+                        help="encoder messages of the bag that is read; 0 = leave it out")
+    parser.add_argument("--detections", type=int, default=3_200_000,
+                        help="detections of the other bag that is read; 0 = leave it out")
+    parser.add_argument("--ingest-worker", nargs=3, help=argparse.SUPPRESS)
     parser.add_argument("--worker", nargs=3, help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.worker:
         print(json.dumps(worker(args.worker[0], args.worker[1], int(args.worker[2]))))
         return 0
+    if args.ingest_worker:
+        benchmark, method, bag = args.ingest_worker
+        print(json.dumps(ingest.worker(benchmark, method, Path(bag))))
+        return 0
     methods = args.methods.split(",")
     for method in methods:
         if method not in ("selfcal", *RIVALS):
             raise InputError("--methods", f"'{method}' is unknown", "see --help")
-    print(f"{'benchmark':<12} {'method':<36} {'N':>5} {'seconds':>12} {'peak MB':>10} "
+    print(f"{'benchmark':<17} {'method':<36} {'N':>7} {'seconds':>12} {'peak MB':>10} "
           f"{'max error m':>12}")
     rows, given_up = [], set()
-    for benchmark, method, size in jobs([int(s) for s in args.sizes.split(",")], methods):
+    sizes = [int(size) for size in args.sizes.split(",") if size]
+    for benchmark, method, size in jobs(sizes, methods):
         if method in given_up:
             rows.append({"benchmark": benchmark, "method": method, "n": size, "seconds": None,
                          "peak_mb": None, "max_error": None,
@@ -193,6 +227,10 @@ def main() -> int:
             if "skipped" in rows[-1].get("note", ""):
                 given_up.add(method)
         show(rows[-1])
+    for benchmark, number in ((ingest.ENCODER, args.ingest), (ingest.DETECTIONS, args.detections)):
+        for row in measure_ingest(benchmark, number) if number else ():
+            rows.append(row)
+            show(row)
     Path(args.output).parent.mkdir(parents=True, exist_ok=True)
     write_json(args.output, rows)
     print(f"written to {args.output}")
