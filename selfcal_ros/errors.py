@@ -16,6 +16,7 @@ class ExitCode(IntEnum):
     BAD_INPUT = 2
     NOT_IDENTIFIABLE = 3
     NO_DATA = 4
+    NOT_QUALIFIED = 5
 
 
 class SelfcalError(Exception):

@@ -4,6 +4,7 @@
 from selfcal_ros.estimation.joint.solve import solve_joint
 from selfcal_ros.estimation.law.solve import solve_law
 from selfcal_ros.estimation.options import Options
+from selfcal_ros.estimation.verdict.judge import judged
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.result import CalibrationResult
 
@@ -33,6 +34,5 @@ def calibrate(measurements: Measurements, options: Options | None = None) -> Cal
         If readings contradict the plan, or an option does not fit them.
     """
     options = options or Options()
-    if options.method == "law":
-        return solve_law(measurements, options)
-    return solve_joint(measurements, options)
+    solve = solve_law if options.method == "law" else solve_joint
+    return judged(solve(measurements, options), measurements, options)

@@ -34,6 +34,8 @@ class ReferenceLength:
         (of Gy on y) over the field.
     u_relative : float
         Its standard uncertainty (k=1).
+    certificate : str
+        What states it: number and issuer of a certificate, as text.
 
     Raises
     ------
@@ -44,6 +46,7 @@ class ReferenceLength:
     kind: ReferenceKind
     relative_error: float
     u_relative: float = 0.0
+    certificate: str = ""
 
     def __post_init__(self) -> None:
         """Refuse lengths that cannot be relative errors."""
@@ -72,6 +75,13 @@ class Options:
         ``linear`` as published, or ``rigid``: finite rotations of the plate.
     uncertainty : bool, optional
         Whether to compute the uncertainty map; None decides by the size of the field.
+    terms : tuple of ModelTerm
+        Terms of the model that are estimated with the map.
+    drift_degree : int
+        Degree of the polynomial by which views drift, where drift is a term.
+    causes : bool, optional
+        Whether to look for terms that the readings show and the model does not hold; None does
+        in fields of up to 41 x 41 sites, and where a test fails.
 
     Raises
     ------
@@ -86,6 +96,7 @@ class Options:
     uncertainty: bool | None = None
     terms: tuple[ModelTerm, ...] = ()
     drift_degree: int = DRIFT_DEGREE
+    causes: bool | None = None
 
     def __post_init__(self) -> None:
         """Refuse unknown names."""

@@ -2,6 +2,7 @@
 """The result of a calibration and its JSON form, schema ``selfcal.result/1``."""
 
 from dataclasses import asdict, dataclass, field, replace
+from datetime import UTC, datetime
 from numbers import Integral
 from typing import Any
 
@@ -11,6 +12,15 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ErrorMap, ThetaDatum
 from selfcal_ros.model.readings import Measurements
+from selfcal_ros.model.verdict import ModelResult, Provenance, Verdict
+from selfcal_ros.model.verdict_json import (
+    model_from_dict,
+    model_to_dict,
+    provenance_from_dict,
+    provenance_to_dict,
+    verdict_from_dict,
+    verdict_to_dict,
+)
 
 SCHEMA = "selfcal.result/1"
 
@@ -20,7 +30,9 @@ class ViewResult:
     """One view as it was found: nominal pose, misalignment, detections used and rejected.
 
     Lengths in m, angles in rad, stage frame. `phi` is the rotation about the plate centre,
-    `tx`, `ty` the offset; NaN where the view was not measured.
+    `tx`, `ty` the offset; NaN where the view was not measured. `read_grid` and `read_angular` are
+    the weights of what was read: one number where all marks in the field (all lines) have it,
+    else a number a mark, [i][j], and a line; 0 = not read, None = not told.
     """
 
     name: str
@@ -32,6 +44,8 @@ class ViewResult:
     ty: float
     used: int = 0
     rejected: int = 0
+    read_grid: Any = None
+    read_angular: Any = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,8 +88,10 @@ class Noise:
     """Standard deviation of one reading, pooled over views: m and rad, NaN where unknown.
 
     `sigma_xy`, `sigma_theta` are the values behind the uncertainties; `*_repeats` come from the
-    scatter of repeats, `*_residuals` from the residuals of the fit; `dof_*` are their degrees of
-    freedom.
+    scatter of repeats, `*_residuals` from the residuals of the fit, `*_declared` from the
+    detections; `dof_*` are their degrees of freedom, `dof_xy`, `dof_theta` those of the values
+    used (NaN: not known; infinite: declared), and `k_*` the coverage factors for 95.45 %. `p_*` is
+    the probability that residuals contradict repeats, or the declaration, as they do by chance.
     """
 
     sigma_xy: float
@@ -84,10 +100,18 @@ class Noise:
     sigma_theta_repeats: float = float("nan")
     sigma_xy_residuals: float = float("nan")
     sigma_theta_residuals: float = float("nan")
-    dof_xy_repeats: int = 0
-    dof_theta_repeats: int = 0
-    dof_xy_residuals: int = 0
-    dof_theta_residuals: int = 0
+    dof_xy_repeats: float = 0
+    dof_theta_repeats: float = 0
+    dof_xy_residuals: float = 0
+    dof_theta_residuals: float = 0
+    sigma_xy_declared: float = float("nan")
+    sigma_theta_declared: float = float("nan")
+    dof_xy: float = float("nan")
+    dof_theta: float = float("nan")
+    k_xy: float = 2.0
+    k_theta: float = 2.0
+    p_xy: float = float("nan")
+    p_theta: float = float("nan")
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,6 +130,11 @@ class CalibrationResult:
     method: str = "joint"
     sense: str = "microscope_moves"
     extra: dict[str, Any] = field(default_factory=dict)
+    verdict: Verdict = Verdict(True)
+    model: ModelResult = ModelResult()
+    reference: dict[str, Any] | None = None
+    provenance: Provenance = Provenance()
+    run_id: str = ""
 
     @property
     def artifact(self) -> Artifact:
@@ -117,6 +146,12 @@ def with_input(result: CalibrationResult, source: dict[str, str],
                lost: list[str]) -> CalibrationResult:
     """Return `result` with the file it came from, and what was lost of it as warnings."""
     return replace(result, input=source, warnings=(*result.warnings, *lost))
+
+
+def created_now(result: CalibrationResult) -> CalibrationResult:
+    """Return `result` with the present time as that of its creation, UTC."""
+    now = datetime.now(UTC).isoformat(timespec="seconds")
+    return replace(result, provenance=replace(result.provenance, created=now))
 
 
 def unidentified_result(measurements: Measurements,
@@ -131,7 +166,9 @@ def unidentified_result(measurements: Measurements,
         measurements.plan_id,
         ErrorMap(artifact, grid, grid, grid, grid, circle, circle, nan, nan),
         ArtifactMap(grid, grid, circle), views, observability, Noise(nan, nan),
-        measurements.all_rejected(), sense=str(measurements.sense))
+        measurements.all_rejected(), sense=str(measurements.sense),
+        verdict=Verdict(False, "Not qualified: the readings do not identify the stage"),
+        run_id=measurements.run_id)
 
 
 def result_to_dict(result: CalibrationResult) -> dict[str, Any]:
@@ -145,10 +182,20 @@ def result_to_dict(result: CalibrationResult) -> dict[str, Any]:
         "artifact": {"grid_size": artifact.grid_size, "grid_pitch": artifact.grid_pitch_m,
                      "angular_count": artifact.angular_count,
                      **({"grid_size_y": artifact.grid_size_y} if artifact.grid_size_y else {})},
+        "run_id": result.run_id,
+        "verdict": plain(verdict_to_dict(result.verdict)),
+        "model": plain(model_to_dict(result.model)),
+        "reference": result.reference,
+        "provenance": plain(provenance_to_dict(result.provenance)),
+        "dof": plain({kind: getattr(result.noise, f"dof_{kind}") for kind in ("xy", "theta")}),
+        "coverage_factor": plain({kind: getattr(result.noise, f"k_{kind}")
+                                  for kind in ("xy", "theta")}),
         "views": [{"name": v.name, "rotation": v.rotation, "translation_x": v.translation_x,
                    "translation_y": v.translation_y,
                    "misalignment": {key: plain(getattr(v, key)) for key in ("phi", "tx", "ty")},
-                   "used": v.used, "rejected": v.rejected} for v in result.views],
+                   "used": v.used, "rejected": v.rejected,
+                   "read": {"grid": plain(v.read_grid), "angular": plain(v.read_angular)}}
+                  for v in result.views],
         "error_map": {**{key: plain(getattr(emap, key)) for key in _MAP_ARRAYS},
                       "nonorthogonality": plain(emap.nonorthogonality),
                       "scale_difference": plain(emap.scale_difference),
@@ -164,8 +211,9 @@ def result_to_dict(result: CalibrationResult) -> dict[str, Any]:
 
 
 _MAP_ARRAYS = ("gx", "gy", "u_gx", "u_gy", "g_theta", "u_g_theta")
-_KNOWN = {"schema", "plan_id", "method", "measurement_sense", "artifact", "views", "error_map",
-          "artifact_map", "observability", "noise", "rejected", "warnings", "input"}
+_KNOWN = {"schema", "run_id", "verdict", "model", "reference", "provenance", "dof",
+          "coverage_factor", "plan_id", "method", "measurement_sense", "artifact", "views",
+          "error_map", "artifact_map", "observability", "noise", "rejected", "warnings", "input"}
 
 
 def plain(value: Any) -> Any:
@@ -219,8 +267,7 @@ def _parse(data: dict) -> CalibrationResult:
              for key in ("modes", "advice")}
     seen |= {key: _of(int, seen[key]) for key in ("rank", "unknowns", "deficiency")}
     _of(bool, seen["identifiable"])
-    noise = {key: _of(int, value) if key.startswith("dof_") else _number(value)
-             for key, value in data["noise"].items()}
+    noise = {key: _number(value) for key, value in data["noise"].items()}
     return CalibrationResult(
         _of(str, data["plan_id"]), error_map,
         ArtifactMap(_array(amap["ax"], artifact.shape, "ax"),
@@ -232,7 +279,10 @@ def _parse(data: dict) -> CalibrationResult:
         tuple(_of(str, line) for line in _of(list, data.get("warnings", []))),
         _of(str, data.get("method", "joint")),
         _of(str, data.get("measurement_sense", "microscope_moves")),
-        {key: value for key, value in data.items() if key not in _KNOWN})
+        {key: value for key, value in data.items() if key not in _KNOWN},
+        verdict_from_dict(data.get("verdict"), identifiable=seen["identifiable"]),
+        model_from_dict(data.get("model")), data.get("reference"),
+        provenance_from_dict(data.get("provenance")), _of(str, data.get("run_id", "")))
 
 
 def _view(v: dict) -> ViewResult:
@@ -241,7 +291,9 @@ def _view(v: dict) -> ViewResult:
         raise ValueError(f"the pose of view {v['name']!r} is not finite")
     found = [_number(v["misalignment"][key]) for key in ("phi", "tx", "ty")]
     return ViewResult(_of(str, v["name"]), *pose, *found, used=_of(int, v["used"]),
-                      rejected=_of(int, v["rejected"]))
+                      rejected=_of(int, v["rejected"]),
+                      read_grid=v.get("read", {}).get("grid"),
+                      read_angular=v.get("read", {}).get("angular"))
 
 
 def _array(value: Any, shape: tuple[int, ...], name: str) -> np.ndarray:

@@ -8,14 +8,16 @@ XY map, so they act on Gtheta alone, with slopes and rotations as the readings g
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import chdtri
+from scipy.special import chdtrc
 
+from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.normal.equations import NormalEquations
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.readings import Sense
 
-MISCLOSURE_LEVEL = 1e-4
-"""Level of the test of the three redundant axis conditions."""
+MISCLOSURE_LEVEL = 0.05
+"""Level of the test of the three redundant axis conditions: who names this datum claims that they
+hold."""
 
 CLOSED_RAD = 1e-12
 """Misclosure that is rounding, not a fault, rad."""
@@ -77,8 +79,6 @@ def conditions_for(system: NormalEquations, datum: ThetaDatum, sense: Sense,
                    half_width_m: float) -> Conditions:
     """Return the conditions of a datum on what was measured.
 
-    ``xy_axes`` becomes ``zero_mean`` if no half axis has two known sites.
-
     Parameters
     ----------
     system : NormalEquations
@@ -89,6 +89,11 @@ def conditions_for(system: NormalEquations, datum: ThetaDatum, sense: Sense,
         Who moves.
     half_width_m : float
         Length of the unit of the system's positions, m.
+
+    Raises
+    ------
+    InputError
+        For ``xy_axes`` if a half axis is not known as a whole.
     """
     key = ("conditions", datum, sense, half_width_m)
     if key not in system.memo:
@@ -109,13 +114,26 @@ def _conditions(system: NormalEquations, datum: ThetaDatum, sense: Sense,
         if flipped:
             rows = -rows[:, -np.arange(n_lines) % n_lines]
             slopes = -slopes[:, ::-1, ::-1]
-        use = np.array([known[row != 0].all() for row in rows]) & (slopes != 0).any(axis=(1, 2))
-        if use.any():
-            return _solve_conditions(system, rows[use], slopes[use])
+        _require_axes(sites, [bool(known[row != 0].all()) for row in rows])
+        return _solve_conditions(system, rows, slopes)
     rows = np.atleast_2d(known / max(known.sum(), 1))
     return Conditions(ThetaDatum.ZERO_MEAN, rows,
                       np.zeros((1, *system.grid.views.shape), dtype=complex),
                       np.ones((n_lines, 1)), np.zeros((system.angular.n_views, 1)))
+
+
+def _require_axes(known: np.ndarray, lines: list[bool]) -> None:
+    """Raise InputError unless all four half axes and their lines are known."""
+    hx, hy = (size // 2 for size in known.shape)
+    halves = (("+x", known[hx + 1:, hy]), ("+y", known[hx, hy + 1:]), ("-x", known[:hx, hy]),
+              ("-y", known[hx, :hy]))
+    for (name, half), line in zip(halves, lines, strict=True):
+        what = ("has one site and no slope" if len(half) < 2 else
+                f"is known at {int(half.sum())} of {len(half)} sites" if not half.all() else
+                "has no known angular line" if not line else "")
+        if what:
+            raise InputError("theta datum xy_axes", f"the half axis along {name} {what}",
+                             "read what is missing there, or use zero_mean")
 
 
 def _solve_conditions(system: NormalEquations, rows: np.ndarray, slopes: np.ndarray) -> Conditions:
@@ -137,8 +155,8 @@ def _solve_conditions(system: NormalEquations, rows: np.ndarray, slopes: np.ndar
     return Conditions(ThetaDatum.XY_AXES, rows, slopes, gain, phi_gain)
 
 
-def misclosure_warning(misclosure: np.ndarray, covariance: np.ndarray) -> str:
-    """Return a warning if the redundant axis conditions contradict the readings.
+def misclosure_test(misclosure: np.ndarray, covariance: np.ndarray) -> tuple[float, float]:
+    """Return probability and size (rad) of what the redundant axis conditions contradict.
 
     Parameters
     ----------
@@ -146,17 +164,18 @@ def misclosure_warning(misclosure: np.ndarray, covariance: np.ndarray) -> str:
         Slopes less Gtheta at the axes, up to one common constant, rad.
     covariance : float array (conditions, conditions)
         Its covariance, rad^2.
+
+    Returns
+    -------
+    p, size_rad : float
+        Probability of so large a misclosure if the conditions hold; its largest contrast. The
+        probability is 1 where there is nothing to test.
     """
     n = len(misclosure)
     if n < 2:
-        return ""
+        return 1.0, 0.0
     contrasts = np.linalg.qr(np.column_stack([np.ones(n), np.eye(n)[:, 1:]]))[0][:, 1:].T
     contrast = contrasts @ misclosure
     spread = contrasts @ covariance @ contrasts.T + CLOSED_RAD**2 * np.eye(n - 1)
     value = float(contrast @ np.linalg.solve(spread, contrast))
-    if not value > chdtri(n - 1, MISCLOSURE_LEVEL):
-        return ""
-    arcsec = np.degrees(np.abs(contrast).max()) * 3600
-    return (f"theta: the stage does not satisfy the axis conditions of the datum xy_axes: "
-            f"misclosure {arcsec:.3g} arcsec, chi2 {value:.3g} with {n - 1} degrees of freedom; "
-            "use zero_mean")
+    return float(chdtrc(n - 1, value)), float(np.abs(contrast).max())

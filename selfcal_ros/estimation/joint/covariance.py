@@ -4,7 +4,6 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import stdtrit
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.blas_threads import one_thread
@@ -15,14 +14,6 @@ from selfcal_ros.estimation.joint.solve import prepare
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Measurements, Sense
-
-COVERAGE = 0.9545
-"""Probability of the expanded uncertainty: that of k = 2 for many degrees of freedom."""
-
-
-def coverage_factor(dof: float, probability: float = COVERAGE) -> float:
-    """Return k such that value +- k u covers the truth with `probability` (Student's t)."""
-    return float(stdtrit(min(dof, 1e9), (1 + probability) / 2))
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,6 +9,7 @@ from selfcal_ros.estimation.datum.scale import scale_of
 from selfcal_ros.estimation.joint.iterated import solve_iterated
 from selfcal_ros.estimation.joint.noise import NoiseEstimate, noise_estimate
 from selfcal_ros.estimation.joint.problem import (
+    FLOOR,
     AngularPart,
     FreeNetworkSolution,
     Problem,
@@ -135,5 +136,5 @@ def _angular_part(problem: Problem) -> AngularPart:
     dof = angular.n_readings - problem.system.rank_angular
     total = float((angular.weight * residual**2).sum())
     found = noise_estimate(problem.repeats_theta, sigma_of(total, dof),
-                           problem.angular.sigma_declared)
+                           problem.angular.sigma_declared, floor=FLOOR)
     return AngularPart(free, d, found)

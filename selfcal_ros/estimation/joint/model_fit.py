@@ -7,6 +7,7 @@ what the terms make of the readings, are taken off with the last solution until 
 Every step solves the same factored equations (Gauss-Newton).
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -84,8 +85,16 @@ class ModelFit:
                           now.inverse(self.found.xy.sigma))
 
 
-def fit_model(problem: Problem) -> ModelFit:
+def fit_model(problem: Problem,
+              check: Callable[[TermEquations], None] = lambda equations: None) -> ModelFit:
     """Return the joint least-squares solution of the whole model.
+
+    Parameters
+    ----------
+    problem : Problem
+        Readings and model.
+    check : callable
+        Called with the equations of the terms before they are solved; may raise.
 
     Raises
     ------
@@ -94,6 +103,8 @@ def fit_model(problem: Problem) -> ModelFit:
     """
     found = fit(problem, problem.grid.y)
     state = _State(problem, found)
+    if state.equations is not None:
+        check(state.equations)
     if not (problem.rigid or problem.terms):
         return state.finished()
     before = np.inf
@@ -121,8 +132,11 @@ def equations_of(problem: Problem, found: JointFit, columns: TermColumns,
     if reduced is None:
         reduced = reduce_columns(problem.system.grid, columns.grid)
     inverse = found.inverse if len(found.inverse) else problem.system.grid_inverse
+    known = [sigma for sigma in (found.xy.declared, found.xy.repeats, found.xy.residuals)
+             if np.isfinite(sigma)]
     return TermEquations(problem.system, columns,
-                         project(problem.system, columns.grid, reduced, inverse))
+                         project(problem.system, columns.grid, reduced, inverse),
+                         min(known, default=0.0))
 
 
 class _State:

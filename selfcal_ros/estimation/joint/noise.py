@@ -2,16 +2,22 @@
 """The noise of one reading: from repeats, from residuals, and whether the two agree."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import fdtrc
+from scipy.special import fdtrc, stdtrit
 
 MIN_REPEAT_DOF = 30
 """Degrees of freedom from which the scatter of repeats is trusted; below, residuals are."""
 
 F_LEVEL = 1e-3
 """Two-sided level of the test that repeats and residuals show the same noise."""
+
+SAME = 1.1
+"""Ratio of two noises up to which they count as the same, however surely they differ."""
+
+COVERAGE = 0.9545
+"""Probability of an expanded uncertainty: k = 2 for many degrees of freedom."""
 
 
 @dataclass(frozen=True)
@@ -21,21 +27,52 @@ class NoiseEstimate:
     Attributes
     ----------
     sigma : float
-        Standard deviation of one reading behind the uncertainties; NaN if unknown.
+        Standard deviation of one reading behind the uncertainties; NaN if unknown. Where repeats
+        (or the declaration) and residuals contradict each other it is the larger of the two.
     dof : float
         Its degrees of freedom; infinite if the detections declare it.
     repeats, residuals : float
         The two estimates, NaN where there is none.
-    dof_repeats, dof_residuals : int
+    dof_repeats, dof_residuals : float
         Their degrees of freedom.
+    declared : float
+        As the detections declare it, NaN if they do not.
+    p : float
+        Two-sided probability that residuals and repeats (or declaration) differ as they do if
+        nothing but one noise is in both; NaN if there is nothing to compare.
     """
 
     sigma: float
     dof: float
     repeats: float
     residuals: float
-    dof_repeats: int
-    dof_residuals: int
+    dof_repeats: float
+    dof_residuals: float
+    declared: float = float("nan")
+    p: float = float("nan")
+
+    @property
+    def stated(self) -> float:
+        """What residuals are compared with: the declared noise, or that of repeats."""
+        return self.declared if np.isfinite(self.declared) else self.repeats
+
+    @property
+    def contradicted(self) -> bool:
+        """Whether residuals and repeats (or declaration) cannot come from one noise."""
+        if not self.p < F_LEVEL:
+            return False
+        small, large = sorted((self.stated, self.residuals))
+        return large > SAME * small
+
+    @property
+    def k(self) -> float:
+        """Coverage factor for 95.45 % (Student's t); NaN if the noise is not known."""
+        return coverage_factor(self.dof) if self.dof > 0 else float("nan")
+
+
+def coverage_factor(dof: float, probability: float = COVERAGE) -> float:
+    """Return k such that value +- k u covers the truth with `probability` (Student's t)."""
+    return float(stdtrit(min(dof, 1e9), (1 + probability) / 2))
 
 
 def pooled(parts: Iterable[tuple[float, int]]) -> tuple[float, int]:
@@ -47,9 +84,12 @@ def pooled(parts: Iterable[tuple[float, int]]) -> tuple[float, int]:
     return float(np.sqrt(sum(dof * sigma**2 for sigma, dof in good) / total)), total
 
 
-def noise_estimate(repeats: tuple[float, int], residuals: tuple[float, int],
-                   declared: float) -> NoiseEstimate:
-    """Return the noise to use: declared, else repeats, else residuals.
+def noise_estimate(repeats: tuple[float, float], residuals: tuple[float, float], declared: float, *,
+          floor: float = 0.0) -> NoiseEstimate:
+    """Return the noise level to use: declared, else repeats, else residuals.
+
+    Where a test contradicts that choice, the larger is used. Repeats that are identical to the
+    last bit tell the resolution of the sensor, not the noise, and do not count.
 
     Parameters
     ----------
@@ -57,42 +97,27 @@ def noise_estimate(repeats: tuple[float, int], residuals: tuple[float, int],
         (sigma, degrees of freedom) of each; dof 0 = none.
     declared : float
         As the detections declare it; NaN = not declared.
-    """
-    if np.isfinite(declared):
-        sigma, dof = declared, float("inf")
-    elif repeats[1] >= MIN_REPEAT_DOF or not residuals[1]:
-        sigma, dof = repeats
-    else:
-        sigma, dof = residuals
-    return NoiseEstimate(sigma, dof, repeats[0], residuals[0], repeats[1], residuals[1])
-
-
-def disagreement(found: NoiseEstimate, what: str, unit: tuple[float, str], floor: float) -> str:
-    """Return a warning if the residuals show another noise than repeats or declaration.
-
-    Parameters
-    ----------
-    found : NoiseEstimate
-        The noise.
-    what : str
-        Kind of readings.
-    unit : tuple
-        Factor and name of the unit in which a person reads it.
     floor : float
         Noise at the level of rounding, which is not tested.
     """
-    base, dof = found.repeats, found.dof_repeats
-    name = "repeats"
-    if not np.isfinite(found.dof):
-        base, dof, name = found.sigma, np.inf, "the detections' own sigma"
-    if not (found.dof_residuals and dof) or max(base, found.residuals) <= floor:
-        return ""
-    ratio = (found.residuals / max(base, 1e-300)) ** 2
-    upper = float(fdtrc(found.dof_residuals, min(dof, 1e9), ratio))
-    if min(upper, 1 - upper) >= F_LEVEL / 2:
-        return ""
-    factor, symbol = unit
-    return (f"{what}: residuals show a noise of {found.residuals * factor:.3g} {symbol}, {name} "
-            f"{base * factor:.3g} {symbol}; " + (
-                "something beside random noise is in the readings" if ratio > 1
-                else "the stated noise is too large"))
+    identical = repeats[1] > 0 and repeats[0] == 0 and residuals[1] > 0 and residuals[0] > floor
+    base = (declared, float("inf")) if np.isfinite(declared) else (
+        (float("nan"), 0) if identical else repeats)
+    p = _same_noise(base, residuals, floor)
+    if np.isfinite(declared) or base[1] >= MIN_REPEAT_DOF or not residuals[1]:
+        chosen = base
+    else:
+        chosen = residuals
+    found = NoiseEstimate(*chosen, repeats[0], residuals[0], repeats[1], residuals[1], declared, p)
+    if found.contradicted:
+        found = replace(found, **dict(zip(("sigma", "dof"), max(base, residuals), strict=True)))
+    return found
+
+
+def _same_noise(base: tuple[float, float], residuals: tuple[float, float], floor: float) -> float:
+    """Return the two-sided probability that both are estimates of one noise (F-test)."""
+    if not (base[1] > 0 and residuals[1] > 0) or not max(base[0], residuals[0]) > floor:
+        return float("nan")
+    ratio = np.square(min(residuals[0] / max(base[0], np.finfo(float).tiny), 1e100))
+    upper = float(fdtrc(residuals[1], min(base[1], 1e9), ratio))
+    return 2 * min(upper, 1 - upper)

@@ -6,16 +6,25 @@ from dataclasses import dataclass
 import numpy as np
 
 from selfcal_ros.estimation.datum.angular import Conditions
-from selfcal_ros.estimation.joint.noise import NoiseEstimate, noise_estimate, pooled
+from selfcal_ros.estimation.joint.noise import (
+    MIN_REPEAT_DOF,
+    NoiseEstimate,
+    noise_estimate,
+    pooled,
+)
 from selfcal_ros.estimation.lattice.readings import AngularData, GridData
 from selfcal_ros.estimation.normal.equations import NormalEquations
 from selfcal_ros.estimation.options import ReferenceLength
 from selfcal_ros.estimation.terms.ground import Ground
+from selfcal_ros.estimation.terms.visits import between_visits
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.terms import DRIFT_DEGREE, ModelTerm
 
 ROUNDING = 16 * np.finfo(float).eps
 """Noise below this part of the largest deviation is rounding."""
+
+FLOOR = 1e-13
+"""Noise, m or rad, that is rounding and not tested."""
 
 MAX_WEIGHT = 1e8
 """Largest weight of one kind of readings against the other, all together: beyond, the lighter one
@@ -94,18 +103,21 @@ class FreeNetworkSolution:
 def repeats_of(measurements: Measurements) -> tuple[tuple[float, int], tuple[float, int]]:
     """Return pooled (sigma, degrees of freedom) of the repeats, grid and angular."""
     views = measurements.views
-    return (pooled((v.sigma_xy, v.dof_xy) for v in views if len(v.m)),
+    return (between_visits(measurements, MIN_REPEAT_DOF) or pooled(
+                (v.sigma_xy, v.dof_xy) for v in views if len(v.m)),
             pooled((v.sigma_theta, v.dof_theta) for v in views if len(v.k)))
 
 
 def grid_noise(problem: Problem, residual: np.ndarray) -> NoiseEstimate:
     """Return the noise of the grid readings, given their residuals (views, nx, ny)."""
     if problem.residuals_xy is not None:
-        return noise_estimate(problem.repeats_xy, problem.residuals_xy, problem.grid.sigma_declared)
+        return noise_estimate(problem.repeats_xy, problem.residuals_xy, problem.grid.sigma_declared,
+                     floor=FLOOR)
     grid = problem.system.grid
     dof = grid_dof(problem)
     total = float((grid.weight * (residual.real**2 + residual.imag**2)).sum())
-    return noise_estimate(problem.repeats_xy, sigma_of(total, dof), problem.grid.sigma_declared)
+    return noise_estimate(problem.repeats_xy, sigma_of(total, dof), problem.grid.sigma_declared,
+                 floor=FLOOR)
 
 
 def grid_dof(problem: Problem) -> int:

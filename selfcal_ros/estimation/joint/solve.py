@@ -1,17 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """Calibration by joint least squares: readings to result."""
 
+from typing import Any
+
 import numpy as np
 
 from selfcal_ros.errors import InputError, NoDataError, NotIdentifiableError
 from selfcal_ros.estimation.blas_threads import one_thread
-from selfcal_ros.estimation.datum.angular import conditions_for, misclosure_warning
+from selfcal_ros.estimation.datum.angular import conditions_for, misclosure_test
 from selfcal_ros.estimation.datum.covariance import FieldCovariance, angular_variance
 from selfcal_ros.estimation.datum.scale import scale_datum
 from selfcal_ros.estimation.joint.fit import JointFit
 from selfcal_ros.estimation.joint.model_fit import ModelFit, fit_model
-from selfcal_ros.estimation.joint.noise import disagreement
 from selfcal_ros.estimation.joint.problem import Problem, repeats_of
+from selfcal_ros.estimation.joint.solved import Solved, noise_of
 from selfcal_ros.estimation.lattice.maps import PHASES
 from selfcal_ros.estimation.lattice.readings import angular_data, grid_data
 from selfcal_ros.estimation.normal.cache import system_for
@@ -24,23 +26,25 @@ from selfcal_ros.estimation.observability.rank import (
 )
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.terms.ground import ground_of
+from selfcal_ros.estimation.terms.identifiable import require_terms_told
 from selfcal_ros.model.error_map import ErrorMap, ThetaDatum
 from selfcal_ros.model.readings import Measurements, Sense
 from selfcal_ros.model.result import (
     ArtifactMap,
     CalibrationResult,
-    Noise,
     Observability,
     ViewResult,
 )
+from selfcal_ros.model.verdict import ModelResult, TermEstimate, TermResult
 from selfcal_ros.model.view import Plan
 
 
-def solve_joint(measurements: Measurements, options: Options) -> CalibrationResult:
+def solve_joint(measurements: Measurements, options: Options) -> Solved:
     """Calibrate by joint least squares; see `selfcal_ros.estimation.api.calibrate`."""
     with one_thread():
         problem, seen = prepare(measurements, options)
-        return _result(measurements, options, model=fit_model(problem), seen=seen)
+        model = fit_model(problem, lambda equations: require_terms_told(equations, seen))
+        return _solved(measurements, options, model=model, seen=seen)
 
 
 def prepare(measurements: Measurements, options: Options) -> tuple[Problem, Observability]:
@@ -76,25 +80,67 @@ def prepare(measurements: Measurements, options: Options) -> tuple[Problem, Obse
         options.drift_degree, ground_of(measurements, grid, half_width_m)), seen
 
 
-def _result(measurements: Measurements, options: Options, *, model: ModelFit,
-            seen: Observability) -> CalibrationResult:
+def _solved(measurements: Measurements, options: Options, *, model: ModelFit,
+            seen: Observability) -> Solved:
     problem, found = model.problem, model.found
     error_map, closure = _error_map(measurements, options, model=model)
-    xy, theta = found.xy, found.theta
-    noise = Noise(xy.sigma, theta.sigma, xy.repeats, theta.repeats, xy.residuals,
-                  theta.residuals, xy.dof_repeats, theta.dof_repeats, xy.dof_residuals,
-                  theta.dof_residuals)
-    warnings = (
-        disagreement(xy, "grid readings", (1e6, "µm"), 1e-13),
-        disagreement(theta, "angular readings", (np.degrees(3600), "arcsec"), 1e-13),
-        *_datum_warnings(options, problem, found, closure=closure),
-        "" if problem.direct or options.uncertainty is not None else
-        "no uncertainty map, because of the size of the field: ask for it (--uncertainty always)")
-    return CalibrationResult(
+    warnings = () if problem.direct or options.uncertainty is not None else (
+        "no uncertainty map, because of the size of the field: ask for it (--uncertainty always)",)
+    axes = (1.0, 0.0)
+    if problem.conditions.datum is ThetaDatum.XY_AXES and closure is not None:
+        axes = misclosure_test(found.misclosure, closure)
+    result = CalibrationResult(
         measurements.plan_id, error_map, _artifact_map(problem, found),
-        _views(measurements, problem, found), seen, noise, measurements.all_rejected(),
-        warnings=tuple(text for text in warnings if text), method="joint",
-        sense=str(measurements.sense), extra={"solver": found.solver})
+        _views(measurements, problem, found), seen, noise_of(found.xy, found.theta),
+        measurements.all_rejected(), warnings=warnings, method="joint",
+        sense=str(measurements.sense), extra={"solver": found.solver}, run_id=measurements.run_id,
+        model=ModelResult("rigid" if problem.rigid else "linear", term_results(model)))
+    return Solved(result, found.xy, found.theta, model, axes)
+
+
+def weights_read(problem: Problem, index: int) -> dict[str, Any]:
+    """Return the weights of what was read in a view, for `ViewResult`."""
+    out: dict[str, Any] = {"read_grid": 0, "read_angular": 0}
+    if index in problem.grid.index:
+        row = problem.grid.index.index(index)
+        weight, field = problem.grid.weight[row], problem.system.grid.views.in_field[row]
+        out["read_grid"] = _compact(weight, weight[field])
+    if index in problem.angular.index:
+        weight = problem.angular.weight[problem.angular.index.index(index)]
+        out["read_angular"] = _compact(weight, weight)
+    return out
+
+
+def _compact(weight: np.ndarray, expected: np.ndarray) -> Any:
+    """Return one number where all expected readings have it, else a number a reading."""
+    if len(expected) and (expected == expected.flat[0]).all():
+        return _short(float(expected.flat[0]))
+    return [[_short(w) for w in row] for row in weight.tolist()] if weight.ndim == 2 else [
+        _short(w) for w in weight.tolist()]
+
+
+def _short(weight: float) -> float | int:
+    """Return a weight as an integer where it is one, else with nine digits."""
+    return int(weight) if weight == int(weight) else float(f"{weight:.9g}")
+
+
+def term_results(model: ModelFit) -> tuple[TermResult, ...]:
+    """Return what was found of each term of the model."""
+    if model.equations is None:
+        return ()
+    columns, covariance = model.equations.columns.columns, model.covariance
+    told = np.abs(model.equations.untold(model.equations.free)).max(axis=1, initial=0.0) < 1e-6
+    names = (*model.problem.ground.names, "")  # -1: shared by all views
+    out = []
+    for term in model.problem.terms:
+        estimates = tuple(
+            TermEstimate(names[c.view], c.component,
+                         float(model.coefficients[i]) if told[i] else float("nan"),
+                         float(np.sqrt(max(covariance[i, i], 0.0)) * model.found.xy.sigma)
+                         if told[i] else float("nan"), c.unit)
+            for i, c in enumerate(columns) if c.term == term.name)
+        out.append(TermResult(str(term.name), None if term.free else term.size, estimates))
+    return tuple(out)
 
 
 def _error_map(measurements: Measurements, options: Options, *, model: ModelFit,
@@ -147,18 +193,5 @@ def _views(measurements: Measurements, problem: Problem, found: JointFit) -> tup
         ViewResult(v.view.name, v.view.rotation_rad, *v.view.translation_m,
                    phi=float(phi.get(i, np.nan) / problem.half_width_m),
                    tx=offset.get(i, nan).real, ty=offset.get(i, nan).imag, used=v.used,
-                   rejected=sum(v.rejected.values()))
+                   rejected=sum(v.rejected.values()), **weights_read(problem, i))
         for i, v in enumerate(measurements.views))
-
-
-def _datum_warnings(options: Options, problem: Problem, found: JointFit, *,
-                    closure: np.ndarray | None) -> list[str]:
-    if not problem.system.angular.n_views:
-        return []
-    if problem.conditions.datum is not options.datum_theta:
-        return ["theta: no half axis has two known sites, so the datum is zero_mean"]
-    if problem.conditions.datum is ThetaDatum.ZERO_MEAN or closure is None:
-        return []
-    return [misclosure_warning(found.misclosure, closure)]
-
-

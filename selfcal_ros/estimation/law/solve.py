@@ -7,7 +7,9 @@ import numpy as np
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.blas_threads import one_thread
-from selfcal_ros.estimation.joint.noise import noise_estimate, pooled
+from selfcal_ros.estimation.joint.noise import NoiseEstimate, noise_estimate, pooled
+from selfcal_ros.estimation.joint.problem import FLOOR
+from selfcal_ros.estimation.joint.solved import Solved, noise_of
 from selfcal_ros.estimation.law.equations import HuLaw, HuReadings, HuSolution
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact
@@ -35,7 +37,7 @@ _NAMES = ("0 deg with grid and lines", "90 deg with grid and lines", "one line, 
 
 
 @one_thread()
-def solve_law(measurements: Measurements, options: Options) -> CalibrationResult:
+def solve_law(measurements: Measurements, options: Options) -> Solved:
     """Calibrate by Hu's law from exactly his four views, each of them complete.
 
     Parameters
@@ -47,8 +49,8 @@ def solve_law(measurements: Measurements, options: Options) -> CalibrationResult
 
     Returns
     -------
-    CalibrationResult
-        With `method` "law". Uncertainties are propagated linearly through every step.
+    Solved
+        Its result has the `method` "law". Uncertainties are propagated linearly through every step.
 
     Raises
     ------
@@ -61,14 +63,15 @@ def solve_law(measurements: Measurements, options: Options) -> CalibrationResult
     law = law_for(measurements.artifact, ThetaDatum(options.datum_theta), measurements.sense)
     found = law.solve(hu_readings(measurements.artifact, views))
     spread = _propagate(law, views)
-    noise = _noise(found, spread, measurements.views)
+    xy, theta = _noise(found, spread, measurements.views)
+    noise = noise_of(xy, theta)
     u_g, u_theta = spread.uncertainty(noise)
     turn = _to_stage if measurements.sense is Sense.PLATE_MOVES else _as_is
     g, g_theta = turn(found.g[..., 0], found.g_theta[:, 0], -1)
     u_g, u_theta = turn(u_g, u_theta, 1)
     artifact = measurements.artifact
     sites = artifact.shape[0] * artifact.shape[1]
-    return CalibrationResult(
+    result = CalibrationResult(
         measurements.plan_id,
         ErrorMap(artifact, g[0], g[1], u_g[0], u_g[1], g_theta, u_theta, float(found.o[0]),
                  float(found.r[0]), law.datum),
@@ -77,12 +80,15 @@ def solve_law(measurements: Measurements, options: Options) -> CalibrationResult
               for i, view in enumerate(measurements.views)),
         Observability(4 * sites + 9, 4 * sites + 9, 0, True), noise,
         measurements.all_rejected(), warnings=_warnings(artifact), method="law",
-        sense=str(measurements.sense))
+        sense=str(measurements.sense), run_id=measurements.run_id)
+    return Solved(result, xy, theta)
 
 
 def _require_plain(options: Options) -> None:
     if options.reference is not None:
         raise InputError("method law", "Hu's law knows no reference length", _JOINT)
+    if options.terms:
+        raise InputError("method law", "Hu's law knows no terms beside stage and plate", _JOINT)
     if options.misalignment_model != "linear":
         raise InputError("method law", f"Hu's law is linear, not {options.misalignment_model}",
                          _JOINT)
@@ -273,18 +279,18 @@ def _per_mean(view: ViewReadings, artifact: Artifact, shape: tuple[int, ...]) ->
     return np.broadcast_to(1 / np.sqrt(counts[:shape[1]]), shape)
 
 
-def _noise(found: HuSolution, spread: _Spread, views: tuple[ViewReadings, ...]) -> Noise:
+def _noise(found: HuSolution, spread: _Spread,
+           views: tuple[ViewReadings, ...]) -> tuple[NoiseEstimate, NoiseEstimate]:
     """Estimate the noise of one reading from repeats, and from what the equations leave over."""
     rest = np.sqrt([(found.rest_xy**2).sum() / spread.rest[0],
                     (found.rest_theta**2).sum() / spread.rest[1]])
     dof = np.maximum(np.round(spread.rest_dof), 1).astype(int)
     declared = float("nan")
     xy = noise_estimate(pooled((v.sigma_xy, v.dof_xy) for v in views if len(v.m)),
-                        (float(rest[0]), int(dof[0])), declared)
+               (float(rest[0]), int(dof[0])), declared, floor=FLOOR)
     theta = noise_estimate(pooled((v.sigma_theta, v.dof_theta) for v in views if len(v.k)),
-                           (float(rest[1]), int(dof[1])), declared)
-    return Noise(xy.sigma, theta.sigma, xy.repeats, theta.repeats, xy.residuals, theta.residuals,
-                 xy.dof_repeats, theta.dof_repeats, xy.dof_residuals, theta.dof_residuals)
+                  (float(rest[1]), int(dof[1])), declared, floor=FLOOR)
+    return xy, theta
 
 
 def _to_stage(field: np.ndarray, theta: np.ndarray, sign: int) -> tuple[np.ndarray, np.ndarray]:

@@ -10,9 +10,14 @@ import numpy as np
 from selfcal_ros.estimation.normal.equations import NormalEquations
 from selfcal_ros.estimation.terms.columns import TermColumns
 from selfcal_ros.estimation.terms.projection import ProjectedColumns
+from selfcal_ros.model.terms import TermName
 
 UNTOLD = 1e-9
 """Relative size below which an eigenvalue of the scaled equations is a zero."""
+
+OVER_NOISE = 100.0
+"""Power of the offsets over that of their noise from which they tell a microscope: what is not told
+by offsets that differ would be told by their own noise, which is in the readings as well."""
 
 MOVES_THE_MAP = 1e-5
 """Root mean square that an untold combination of columns must give the map, in units of its own,
@@ -33,11 +38,14 @@ class TermEquations:
         The terms.
     projected : ProjectedColumns
         What the estimate makes of them.
+    noise_m : float
+        Noise of one grid reading, m: that of the offsets a microscope sees; 0 if not known.
     """
 
     system: NormalEquations
     columns: TermColumns
     projected: ProjectedColumns
+    noise_m: float = 0.0
 
     @property
     def n(self) -> int:
@@ -73,9 +81,19 @@ class TermEquations:
         scale = self.norm[rows]
         scaled = self.information[np.ix_(rows, rows)] / np.outer(scale, scale)
         values, vectors = np.linalg.eigh(scaled)
-        out = np.zeros((len(rows), int((values <= UNTOLD).sum())))
-        out[rows] = vectors[:, values <= UNTOLD]
+        hidden = values <= self.limit(rows)
+        out = np.zeros((len(rows), int(hidden.sum())))
+        out[rows] = vectors[:, hidden]
         return out
+
+    def limit(self, rows: np.ndarray) -> float:
+        """Return the eigenvalue of the scaled equations of `rows` up to which nothing is told."""
+        seen = rows & self.rows([TermName.MICROSCOPE])
+        if not seen.any():
+            return UNTOLD
+        # each column holds the noise of one coordinate of every mean
+        power = self.noise_m**2 * self.system.grid.n_readings
+        return max(UNTOLD, OVER_NOISE * power / float(self.norm[seen].min()) ** 2)
 
     @cached_property
     def maps(self) -> np.ndarray:

@@ -103,3 +103,27 @@ def view_time(stamps_ns: np.ndarray) -> np.ndarray:
     if first == last:
         return np.zeros(len(stamps_ns))
     return 2 * (stamps_ns - first) / (last - first) - 1
+
+
+def between_visits(measurements: Measurements, least_dof: int) -> tuple[float, int] | None:
+    """Return the noise of one reading as the visits of each mark show it, m, and its dof.
+
+    Repeats of one visit share whatever is slow, visits do not: where both are there, the visits
+    tell the noise of a mean. None where no visit has repeats, or fewer than `least_dof` degrees of
+    freedom are between visits: then all repeats count alike.
+    """
+    total, dof, repeated = 0.0, 0, False
+    for view in measurements.views:
+        visits = view.visits
+        if visits is None or not len(visits.mark):
+            continue
+        repeated |= bool(visits.dof)
+        n = len(view.m)
+        count = np.bincount(visits.mark, visits.count, n)
+        for values in (visits.dx, visits.dy):
+            mean = np.bincount(visits.mark, visits.count * values, n) / np.maximum(count, 1)
+            total += float(visits.count @ (values - mean[visits.mark]) ** 2)
+        dof += 2 * (len(visits.mark) - np.count_nonzero(count))
+    if not repeated or dof < least_dof:
+        return None
+    return float(np.sqrt(total / dof)), dof

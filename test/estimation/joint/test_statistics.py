@@ -9,8 +9,9 @@ from scipy.stats import binom, chi2
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.estimation.joint.covariance import coverage_factor, map_covariance
+from selfcal_ros.estimation.joint.covariance import map_covariance
 from selfcal_ros.estimation.joint.map_only import MapSolver
+from selfcal_ros.estimation.joint.noise import coverage_factor
 from selfcal_ros.estimation.options import Options, ReferenceKind, ReferenceLength
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ThetaDatum

@@ -1,0 +1,64 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Whether the readings tell the free terms from the stage, and what to do if they do not."""
+
+from dataclasses import replace
+
+from selfcal_ros.errors import NotIdentifiableError
+from selfcal_ros.estimation.terms.equations import TermEquations
+from selfcal_ros.model.result import Observability
+from selfcal_ros.model.terms import TermName
+
+CURES = {
+    TermName.MICROSCOPE: "let the stage stop off the marks by some tens of µm, on purpose, or "
+                         "align the microscope and leave the term out",
+    TermName.DRIFT: "visit the marks in more than one order, e.g. visit_order: x_back_y_back",
+    TermName.PLATE_SCALE: "add views that are turned and shifted",
+    TermName.PLATE_SHAPE: "add views shifted both ways",
+    TermName.APPROACH: "visit the marks from both sides, e.g. visit_order: x_back_y_back",
+}
+"""What makes a term visible, for a person."""
+
+
+def unseen_by_term(equations: TermEquations) -> dict[TermName, int]:
+    """Return for each free term that alone cannot be told from the stage how many modes it hides.
+
+    Terms that only together cannot be told are all named, with what they hide together.
+    """
+    free = {column.term for column in equations.columns.columns if column.size == float("inf")}
+    out = {}
+    for name in TermName:
+        if name in free:
+            modes = equations.unseen(equations.rows([name])).shape[1]
+            if modes:
+                out[name] = modes
+    together = equations.unseen(equations.free).shape[1]
+    if together and not out:
+        out = {name: together for name in TermName if name in free}
+    return out
+
+
+def require_terms_told(equations: TermEquations, seen: Observability) -> None:
+    """Raise NotIdentifiableError if free terms hide modes of the stage.
+
+    Parameters
+    ----------
+    equations : TermEquations
+        The terms.
+    seen : Observability
+        What the readings tell without terms.
+    """
+    modes = equations.unseen(equations.free).shape[1]
+    if not modes:
+        return
+    by_term = unseen_by_term(equations)
+    texts = tuple(f"{name}: {count} mode{'s' * (count != 1)} of the stage look like it"
+                  for name, count in by_term.items())
+    advice = tuple(f"{name}: {CURES[name]}, or give it a size, as in {name}:SIZE"
+                   for name in by_term)
+    free = int(equations.free.sum())
+    found = replace(seen, unknowns=seen.unknowns + free, rank=seen.rank + free - modes,
+                    deficiency=seen.deficiency + modes, identifiable=False, modes=texts,
+                    advice=advice)
+    raise NotIdentifiableError(
+        f"the readings do not tell {' and '.join(by_term)} from the stage "
+        f"({modes} mode{'s' * (modes != 1)} unseen): " + "; ".join(advice), found)

@@ -1,0 +1,214 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What else the readings show: each term, and a slip, scored by what it takes off the residuals.
+
+A term that the model does not hold is scored by the sum of squares that its columns explain, for
+the number of their combinations that the readings tell (F-test against what is then left). The
+likeliest (Bayesian information criterion) joins first, and the others are judged beside it, so
+that one cause does not appear under many names. Terms that explain the same equally well are both
+given: the readings do not tell which it is.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import f as f_distribution
+
+from selfcal_ros.estimation.joint.model_fit import ModelFit, equations_of
+from selfcal_ros.estimation.joint.problem import grid_dof
+from selfcal_ros.estimation.terms.columns import Column, TermColumns, joined, term_columns
+from selfcal_ros.estimation.terms.equations import TermEquations
+from selfcal_ros.estimation.terms.solution import Score, score
+from selfcal_ros.estimation.verdict.slip_columns import SLIP, slip_columns
+from selfcal_ros.model.terms import VISIT_TERMS, ModelTerm, TermName
+
+LEVEL = 5e-4
+"""Level of the test of each term: together they name a cause in about 0.3 % of clean runs."""
+
+MAX_CAUSES = 4
+
+SHARED = (TermName.MICROSCOPE, TermName.APPROACH)
+"""Terms whose coefficients all views share."""
+
+FLOOR_M = 1e-13
+"""Noise that is rounding, against which nothing is tested."""
+
+
+@dataclass(frozen=True, eq=False)
+class Explanation:
+    """A term that explains part of the residuals.
+
+    Attributes
+    ----------
+    name : str
+        Name of the term, or ``slip``.
+    columns : tuple of Column
+        Its coefficients.
+    values : float array (p,)
+        Their estimates.
+    covariance : float array (p, p)
+        Of the estimates, SI units.
+    p : float
+        Probability of explaining as much by chance.
+    whole : bool
+        Whether the readings tell all of its coefficients.
+    effect_m : float
+        Root mean square of what it does to a coordinate of the map, as far as it is told.
+    part : float
+        Part of the view's visits before a slip; NaN for a term.
+    """
+
+    name: str
+    columns: tuple[Column, ...]
+    values: np.ndarray
+    covariance: np.ndarray
+    p: float
+    whole: bool
+    effect_m: float
+    part: float = float("nan")
+
+
+@dataclass(frozen=True, eq=False)
+class Group:
+    """Columns that stand or fall together: a term, or a slip of `places` that were tried."""
+
+    name: str
+    rows: np.ndarray
+    view: int = -1
+    part: float = float("nan")
+    places: int = 1
+
+
+@dataclass(frozen=True, eq=False)
+class Pool:
+    """All candidate columns at once, and the residuals that they are to explain."""
+
+    equations: TermEquations
+    right: Score
+
+    def inverse(self, rows: np.ndarray) -> tuple[np.ndarray, int]:
+        """Return the pseudo-inverse of the information on `rows`, (p, p), and its rank."""
+        norm = self.equations.norm[rows]
+        scaled = self.equations.information[np.ix_(rows, rows)] / np.outer(norm, norm)
+        values, vectors = np.linalg.eigh(scaled)
+        told = values > self.equations.limit(rows)
+        part = (vectors[:, told] / values[told]) @ vectors[:, told].T
+        out = np.zeros((len(rows), len(rows)))
+        out[np.ix_(rows, rows)] = part / np.outer(norm, norm)
+        return out, int(told.sum())
+
+    def explained(self, rows: np.ndarray) -> tuple[float, int]:
+        """Return the sum of squares that `rows` explain, m^2, and their rank."""
+        inverse, rank = self.inverse(rows)
+        return float(self.right.total @ inverse @ self.right.total), rank
+
+    def left(self, rows: np.ndarray) -> tuple[float, float]:
+        """Return the variance of one reading that is left beside `rows`, m^2, and its dof.
+
+        Visits of one mark agree better than marks do where a cause is not held: the larger counts.
+        """
+        sums, gram = self.right.sums, self.equations.projected.gram
+        inverse, rank = self.inverse(rows)
+        values = inverse @ self.right.total
+        between = sums.between - 2 * values @ self.right.between + values @ gram @ values
+        dof = sums.dof_between - float(np.sum(inverse * gram))
+        if sums.dof_within >= 1:
+            both = sums.dof - rank
+            total = (sums.total - float(values @ self.right.total)) / both
+            if dof <= 0 or between / dof <= total:
+                return max(total, 0.0), both
+        return (max(between, 0.0) / dof, dof) if dof > 0 else (float("nan"), 0.0)
+
+
+def find_explanations(model: ModelFit, *, slips: bool) -> list[Explanation]:
+    """Return what explains the residuals of a fit significantly, the likeliest first.
+
+    Parameters
+    ----------
+    model : ModelFit
+        The fit; its own terms are not looked for again.
+    slips : bool
+        Whether slips of the plate within a view are looked for as well.
+    """
+    problem = model.problem
+    own = [term.name for term in problem.terms]
+    told = all(visits is not None for visits in problem.ground.visits)
+    more = [ModelTerm(name) for name in TermName
+            if name not in own and (told or name not in VISIT_TERMS)]
+    columns = term_columns(problem.ground, (*problem.terms, *more), problem.drift_degree)
+    groups = [Group(str(term.name), columns.rows([term.name])) for term in more]
+    if slips:
+        columns, groups = _with_slips(model, columns, groups)
+    equations = equations_of(problem, model.found, columns)
+    taken = np.zeros(equations.n)
+    taken[:len(model.coefficients)] = model.coefficients
+    right = score(equations, model.found.residuals, dof=grid_dof(problem), coefficients=taken)
+    return _select(Pool(equations, right), groups, columns.rows(own))
+
+
+def _with_slips(model: ModelFit, columns: TermColumns,
+                groups: list[Group]) -> tuple[TermColumns, list[Group]]:
+    steps, places = slip_columns(model.problem.ground)
+    both = joined(model.problem.ground, columns, steps)
+    before, after = len(columns.columns), len(steps.columns)
+    groups = [Group(g.name, np.pad(g.rows, (0, after))) for g in groups]
+    return both, groups + [
+        Group(SLIP, np.pad(rows, (before, 0)), view, part, len(places))
+        for (view, part), rows in places.items()]
+
+
+def _select(pool: Pool, groups: list[Group], taken: np.ndarray) -> list[Explanation]:
+    """Return the explanations, each judged beside `taken` and those before it."""
+    found: list[Explanation] = []
+    while groups and len(found) < MAX_CAUSES:
+        tests = [(_test(pool, taken, group), group) for group in groups]
+        good = [(test, group) for test, group in tests if test is not None and test[0] < LEVEL]
+        if not good:
+            break
+        (_, _), best = max(good, key=lambda item: item[0][1])
+        as_good = [(test[0], group) for test, group in good
+                   if group is best or _replaces(pool, taken, group, best)]
+        # what all views share is simpler than what each has of its own
+        as_good.sort(key=lambda item: (item[1].name not in SHARED, item[1] is not best))
+        found += [_explanation(pool, taken, group, p) for p, group in as_good]
+        taken = taken | best.rows
+        gone = [group.name for _, group in as_good if group.name != SLIP]
+        groups = [g for g in groups if g.name not in gone
+                  and not (best.name == SLIP == g.name and g.view == best.view)]
+    return found
+
+
+def _replaces(pool: Pool, taken: np.ndarray, group: Group, best: Group) -> bool:
+    """Return whether a term explains the residuals so well that `best` adds nothing to it."""
+    if SLIP in (group.name, best.name):
+        return False
+    more = _test(pool, taken | group.rows, best)
+    return more is None or more[0] >= LEVEL
+
+
+def _test(pool: Pool, taken: np.ndarray, group: Group) -> tuple[float, float] | None:
+    """Return probability and evidence of a group beside `taken`; None if nothing tells it."""
+    before, rank_before = pool.explained(taken)
+    after, rank = pool.explained(taken | group.rows)
+    gained, more = max(after - before, 0.0), rank - rank_before
+    variance, dof = pool.left(taken | group.rows)
+    if more <= 0 or dof <= 0 or not variance > FLOOR_M**2:
+        return None
+    p = float(f_distribution.sf(gained / more / variance, more, dof))
+    evidence = dof * np.log1p(gained / (variance * dof)) - more * np.log(dof + more)
+    return min(p * group.places, 1.0), float(evidence - 2 * np.log(group.places))
+
+
+def _explanation(pool: Pool, taken: np.ndarray, group: Group, p: float) -> Explanation:
+    rows = taken | group.rows
+    inverse, _ = pool.inverse(rows)
+    variance, _ = pool.left(rows)
+    values = inverse @ pool.right.total
+    system = pool.equations.system
+    moved = pool.equations.maps[:, group.rows] @ values[group.rows]
+    known = max(int(system.known_sites.sum()), 1)
+    effect = float(np.sqrt((abs(moved) ** 2).sum() / (2 * known)))
+    columns = tuple(column for column, here in zip(
+        pool.equations.columns.columns, group.rows, strict=True) if here)
+    return Explanation(group.name, columns, values[group.rows],
+                       variance * inverse[np.ix_(group.rows, group.rows)], p,
+                       pool.inverse(group.rows)[1] == int(group.rows.sum()), effect, group.part)

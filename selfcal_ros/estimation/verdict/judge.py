@@ -1,0 +1,158 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The verdict on a solution: one, with the tests that failed and what explains them.
+
+Tests: residuals against the scatter of repeats, or the declared noise, in either direction (F);
+each term that the model does not hold; the noise of each view against the others; the axis
+conditions where they are the datum. Together they fail about 0.7 % of clean measurements.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.stats import f as f_distribution
+
+from selfcal_ros.estimation.blas_threads import one_thread
+from selfcal_ros.estimation.datum.angular import MISCLOSURE_LEVEL
+from selfcal_ros.estimation.joint.model_fit import ModelFit
+from selfcal_ros.estimation.joint.noise import NoiseEstimate, pooled
+from selfcal_ros.estimation.joint.solved import Solved
+from selfcal_ros.estimation.options import Options
+from selfcal_ros.estimation.verdict.cause_text import cause_of, noise_cause
+from selfcal_ros.estimation.verdict.causes import LEVEL, Explanation, find_explanations
+from selfcal_ros.estimation.verdict.provenance import provenance_of
+from selfcal_ros.model.readings import Measurements
+from selfcal_ros.model.result import CalibrationResult
+from selfcal_ros.model.verdict import Cause, Verdict
+
+ALWAYS_SITES = 41 * 41
+"""Field up to which terms are looked for in any case; beyond, where another test fails."""
+
+MAX_SITES = 201 * 201
+"""Field up to which they are looked for at all."""
+
+NOISY = 1.5
+"""Ratio of the noise of a view to that of the others from which it matters."""
+
+MATTERS = 0.1
+"""Effect of a cause on the map, in standard uncertainties (rms), below which it is of no account
+where the readings tell all of it."""
+
+UM, ARCSEC = 1e6, float(np.degrees(3600))
+
+
+@one_thread()
+def judged(solved: Solved, measurements: Measurements, options: Options) -> CalibrationResult:
+    """Return the result with its verdict.
+
+    Parameters
+    ----------
+    solved : Solved
+        What is to be judged.
+    measurements : Measurements
+        The readings behind it.
+    options : Options
+        How it was calibrated.
+    """
+    reasons = [*_noise_reasons(solved), *_axes_reasons(solved)]
+    causes = _causes(solved, measurements, options, failed=bool(reasons))
+    reasons += [f"the readings show {_what(cause)}" for cause in causes]
+    verdict = Verdict(not reasons, _sentence(solved, reasons, causes), tuple(reasons),
+                      tuple(causes))
+    reference = options.reference
+    return replace(
+        solved.result, verdict=verdict, provenance=provenance_of(measurements),
+        reference=None if reference is None else {
+            "kind": str(reference.kind), "relative_error": reference.relative_error,
+            "u_relative": reference.u_relative, "certificate": reference.certificate})
+
+
+def _what(cause: Cause) -> str:
+    return cause.text.partition(": ")[0]
+
+
+def _sentence(solved: Solved, reasons: list[str], causes: list[Cause]) -> str:
+    if not reasons:
+        tested = np.isfinite(solved.xy.p) or np.isfinite(solved.theta.p)
+        return ("Qualified: residuals and the noise of readings agree" if tested else
+                "Qualified: residuals show the noise; there are no repeats to compare it with")
+    if causes:
+        return f"Not qualified: most likely {causes[0].text}"
+    return f"Not qualified: {reasons[0]}"
+
+
+def _noise_reasons(solved: Solved) -> list[str]:
+    out = []
+    for noise, kind, factor, unit in ((solved.xy, "grid", UM, "µm"),
+                                      (solved.theta, "angular", ARCSEC, "arcsec")):
+        if noise.contradicted:
+            out.append(_contradiction(noise, kind, factor, unit))
+    if not np.isfinite(solved.xy.sigma):
+        out.append("grid readings: neither repeats nor residuals tell the noise, so that the "
+                   "uncertainty is not known; read every mark twice")
+    return out
+
+
+def _contradiction(noise: NoiseEstimate, kind: str, factor: float, unit: str) -> str:
+    name = "the detections' own sigma" if np.isfinite(noise.declared) else "repeats"
+    larger = noise.residuals > noise.stated
+    return (f"{kind} readings: residuals show a noise of {noise.residuals * factor:.3g} {unit}, "
+            f"{name} {noise.stated * factor:.3g} {unit}; " + (
+                "something beside random noise is in the readings" if larger else
+                "repeats share what single readings do not (drift between passes), or the stated "
+                "noise is too large"))
+
+
+def _axes_reasons(solved: Solved) -> list[str]:
+    p, size_rad = solved.axes
+    if p >= MISCLOSURE_LEVEL:
+        return []
+    return [f"theta: the stage does not satisfy the axis conditions of the datum xy_axes "
+            f"(misclosure {size_rad * ARCSEC:.3g} arcsec, p = {p:.2g}); use zero_mean"]
+
+
+def _causes(solved: Solved, measurements: Measurements, options: Options, *,
+            failed: bool) -> list[Cause]:
+    """Return what the readings show beside the model, the likeliest first."""
+    model = solved.model
+    if model is None or not model.problem.direct or not np.isfinite(solved.xy.sigma):
+        return []
+    sites = model.problem.system.grid.n_sites
+    if options.causes is False or sites > MAX_SITES or not (
+            failed or sites <= ALWAYS_SITES or options.causes):
+        return []
+    found = [item for item in find_explanations(model, slips=False)
+             if failed or _counts(item, solved)]
+    if found or failed:
+        found = find_explanations(model, slips=True)
+    causes = [cause_of(item, model.problem.ground.names, model.problem.half_width_m)
+              for item in found]
+    return causes or _noisy_views(measurements, model)
+
+
+def _counts(found: Explanation, solved: Solved) -> bool:
+    """Return whether an explanation is worth a word: by what it does to the map."""
+    if not found.whole:
+        return True
+    emap = solved.result.error_map
+    u = np.concatenate([emap.u_gx[emap.valid], emap.u_gy[emap.valid]])
+    if not np.isfinite(u).any():
+        return True
+    return found.effect_m > MATTERS * float(np.sqrt(np.nanmean(u**2)))
+
+
+def _noisy_views(measurements: Measurements, model: ModelFit) -> list[Cause]:
+    """Return the views whose repeats scatter more than those of the others."""
+    if model.problem.terms:
+        return []  # their own scatter holds what the terms explain
+    views = [(v.view.name, v.sigma_xy, v.dof_xy) for v in measurements.views
+             if len(v.m) and v.dof_xy > 0 and np.isfinite(v.sigma_xy)]
+    out = []
+    for index, (name, sigma, dof) in enumerate(views):
+        others, rest = pooled((s, d) for i, (_, s, d) in enumerate(views) if i != index)
+        if not rest or not others > 0:
+            continue
+        ratio = sigma / others
+        p = float(f_distribution.sf(ratio**2, dof, rest)) * len(views)
+        if p < LEVEL and ratio > NOISY:
+            out.append(noise_cause(name, ratio, ratio * np.sqrt((1 / dof + 1 / rest) / 2), p))
+    return sorted(out, key=lambda cause: cause.p)

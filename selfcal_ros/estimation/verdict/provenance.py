@@ -1,0 +1,35 @@
+# SPDX-License-Identifier: Apache-2.0
+"""When and how the readings behind a result were measured."""
+
+from datetime import UTC, datetime
+from typing import Any
+
+from selfcal_ros import __version__
+from selfcal_ros.model.readings import Measurements
+from selfcal_ros.model.verdict import Provenance
+
+
+def provenance_of(measurements: Measurements) -> Provenance:
+    """Return what the readings tell of their origin: first and last exposure, visiting order.
+
+    The time of creation is left open: the same readings give the same result.
+    """
+    stamps = [stamp for view in measurements.views
+              if view.visits is not None and len(view.visits.stamp_ns)
+              for stamp in (int(view.visits.stamp_ns.min()), int(view.visits.stamp_ns.max()))]
+    extra: dict[str, Any] = {"visit_order": {
+        view.view.name: view.view.visit_order for view in measurements.views
+        if view.view.visit_order}}
+    duration = float("nan")
+    if stamps:
+        extra |= {"first_exposure": _iso(min(stamps)), "last_exposure": _iso(max(stamps))}
+        duration = (max(stamps) - min(stamps)) / 1e9
+    return Provenance("", duration, __version__, extra)
+
+
+def _iso(stamp_ns: int) -> str:
+    """Return a stamp as ISO 8601 in UTC; as it is where it is no date."""
+    try:
+        return datetime.fromtimestamp(stamp_ns / 1e9, UTC).isoformat(timespec="milliseconds")
+    except (OverflowError, ValueError, OSError):
+        return f"{stamp_ns} ns"
