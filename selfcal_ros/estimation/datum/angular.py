@@ -105,7 +105,7 @@ def _conditions(system: NormalEquations, datum: ThetaDatum, sense: Sense,
                 half_width_m: float) -> Conditions:
     known, n_lines = system.known_lines, system.angular.n_lines
     flipped = sense is Sense.PLATE_MOVES
-    if datum is ThetaDatum.XY_AXES and n_lines:
+    if datum is ThetaDatum.XY_AXES and system.angular.n_views:
         sites = system.known_sites[::-1, ::-1] if flipped else system.known_sites
         slopes = slope_rows(system.grid.views.z * half_width_m, sites)
         lines = np.arange(4) * (n_lines // 4)

@@ -202,10 +202,33 @@ class TestNoise:
         _, readings = measured(self.plan, sigma_m=1e-8, sigma_theta_rad=1e-6)
         calm = replace(readings, views=tuple(
             replace(view, sigma_xy=view.sigma_xy / 3) for view in readings.views))
-        text = " ".join(calibrate(calm).warnings)
+        found = calibrate(calm)
+        text = " ".join(found.verdict.reasons)
         assert "grid readings: residuals show a noise of" in text
         assert "something beside random noise" in text
         assert "angular readings" not in text
+        assert not found.verdict.qualified
+        assert found.noise.sigma_xy == found.noise.sigma_xy_residuals
+        assert found.noise.dof_xy == found.noise.dof_xy_residuals
+
+    def test_repeats_that_exceed_residuals_are_told_and_count(self):
+        _, readings = measured(self.plan, sigma_m=1e-8, sigma_theta_rad=1e-6)
+        wild = replace(readings, views=tuple(
+            replace(view, sigma_xy=view.sigma_xy * 2) for view in readings.views))
+        found = calibrate(wild)
+        assert "the stated noise is too large" in found.verdict.reasons[0]
+        assert found.noise.sigma_xy == found.noise.sigma_xy_repeats
+
+    @pytest.mark.parametrize("sigma_m", [1e-8, 0.0])
+    def test_repeats_identical_to_the_last_bit_tell_no_noise(self, sigma_m):
+        _, readings = measured(self.plan, sigma_m=sigma_m, sigma_theta_rad=1e-6)
+        stuck = replace(readings, views=tuple(
+            replace(view, sigma_xy=0.0) for view in readings.views))
+        found = calibrate(stuck)
+        assert found.verdict.qualified
+        if sigma_m:
+            assert found.noise.sigma_xy == found.noise.sigma_xy_residuals
+            assert np.isnan(found.noise.p_xy)
 
     def test_without_repeats_the_residuals_speak(self):
         _, readings = measured(hu_plan(Artifact(11, 0.01, 24)), sigma_m=1e-8)
@@ -230,25 +253,41 @@ def test_an_encoder_that_does_not_follow_the_axes_is_told_and_bends_nothing():
     g_theta[6] += 1e-4
     readings = simulate_measurements(replace(truth, g_theta=g_theta), plan, rng, sigma_m=1e-9,
                                      sigma_theta_rad=1e-6)
-    axes = calibrate(readings)
-    free = calibrate(readings, Options(datum_theta="zero_mean"))
-    assert len(axes.warnings) == 1
-    assert axes.warnings[0].startswith("theta: the stage does not satisfy the axis conditions")
-    assert axes.warnings[0].endswith("use zero_mean")
-    assert free.warnings == ()
+    axes = calibrate(readings, Options(datum_theta="xy_axes", misalignment_model="linear"))
+    free = calibrate(readings, Options(datum_theta="zero_mean", misalignment_model="linear"))
+    assert not axes.verdict.qualified and len(axes.verdict.reasons) == 1
+    reason = axes.verdict.reasons[0]
+    assert reason.startswith("theta: the stage does not satisfy the axis conditions")
+    assert reason.endswith("use zero_mean")
+    assert free.verdict.qualified
     assert axes.error_map.gx.tobytes() == free.error_map.gx.tobytes()
     assert np.abs(free.error_map.g_theta - (g_theta - g_theta.mean())).max() < 1e-5
 
 
-def test_small_fields_fall_back_to_zero_mean_and_say_so():
+def test_half_axes_that_are_not_known_as_a_whole_are_refused():
     plan, rng = plan_of("0,90,tx", Artifact(3, 0.01, 8), lines=1), np.random.default_rng(1)
-    truth = random_truth(plan.artifact, 4, rng)
-    truth = replace(truth, g_theta=rng.normal(0, 1e-4, 8))
-    readings = simulate_measurements(truth, plan, rng)
-    found = calibrate(readings)
-    assert found.error_map.datum_theta is ThetaDatum.ZERO_MEAN
-    assert any("the datum is zero_mean" in text for text in found.warnings)
-    assert np.abs(found.error_map.gx - truth.g[0]).max() < 1e-12
+    readings = simulate_measurements(random_truth(plan.artifact, 4, rng), plan, rng)
+    axes = Options(datum_theta="xy_axes")
+    with pytest.raises(InputError) as caught:
+        calibrate(readings, axes)
+    assert str(caught.value) == ("theta datum xy_axes: the half axis along +x has one site and no "
+                                 "slope; read what is missing there, or use zero_mean")
+    _, readings = measured(hu_plan(Artifact(7, 0.01, 24)))
+    end = replace(readings, views=tuple(  # the site at the end of -y is never visited
+        without_site(view, (0, -3), readings.artifact) for view in readings.views))
+    with pytest.raises(InputError, match="half axis along -y is known at 2 of 3 sites"):
+        calibrate(end, axes)
+    assert calibrate(end, Options(datum_theta="zero_mean")).observability.identifiable
+
+
+def without_site(view, site, artifact):
+    """Return readings without the mark that lay on one site."""
+    if not len(view.m):
+        return view
+    i, j = view.view.lattice_pose(artifact).site_of(view.m, view.n)
+    keep = (i != site[0]) | (j != site[1])
+    return replace(view, m=view.m[keep], n=view.n[keep], dx=view.dx[keep], dy=view.dy[keep],
+                   count=view.count[keep])
 
 
 @pytest.mark.parametrize("degrees", [0.3, 2.0])
