@@ -122,7 +122,7 @@ def error_map(result: CalibrationResult, stamp_ns: int, frame_id: str) -> Fields
         "scale_difference": emap.scale_difference, "sigma_xy": result.noise.sigma_xy,
         "sigma_theta": result.noise.sigma_theta,
         "identifiable": result.observability.identifiable,
-        "qualified": result.observability.identifiable, "run_id": ""}
+        "qualified": result.verdict.qualified, "run_id": result.run_id}
 
 
 def session_stamp_ns(timeline: Timeline, progress: ViewProgress) -> int:

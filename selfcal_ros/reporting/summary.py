@@ -42,26 +42,31 @@ def state_sentence(result: CalibrationResult) -> str:
                 f"be seen from the marks that were read{advice}.")
     if not figures.n_known and not figures.n_lines_known:
         return "No calibration: not one site of the error map is known."
-    return f"{_verdict(result, figures)}{_theta_clause(figures)}{_warnings(result)}."
+    k = result.noise.k_theta
+    text = f"{_map_clause(result, figures)}{_theta_clause(figures, k)}{_warnings(result)}."
+    if result.verdict.qualified:
+        return text
+    return f"{printable(result.verdict.sentence).rstrip('.')}. Map as it is: {text}"
 
 
-def _verdict(result: CalibrationResult, figures: MapFigures) -> str:
+def _map_clause(result: CalibrationResult, figures: MapFigures) -> str:
     share = "" if figures.n_known == figures.n_sites else (
         f" at {figures.n_known} of {figures.n_sites} sites")
     text = f"Calibrated{share} from {counted(views_done(result), 'view')}"
     if not figures.n_known:
         return text
-    known = (f"every site known to ±{um(2 * figures.max_u_m)} or better (k=2)"
+    k = result.noise.k_xy
+    known = (f"every site known to ±{um(k * figures.max_u_m)} or better (k={k:.3g})"
              if math.isfinite(figures.max_u_m) else "uncertainty not known")
     where = place_text(result.error_map, figures.max_site).partition(" (")[0]
     return f"{text}: largest error {um(figures.max_error_m)} {where}, {known}"
 
 
-def _theta_clause(figures: MapFigures) -> str:
+def _theta_clause(figures: MapFigures, k: float) -> str:
     if not figures.n_lines_known:
         return ""
     u = figures.max_u_theta_rad
-    spread = f", known to ±{arcsec(2 * u)}" if math.isfinite(u) else ""
+    spread = f", known to ±{arcsec(k * u)}" if math.isfinite(k * u) else ""
     return f"; largest θ error {arcsec(figures.max_theta_rad)}{spread}"
 
 

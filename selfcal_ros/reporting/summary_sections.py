@@ -6,7 +6,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import fdtr, fdtrc
 
 from selfcal_ros.model.error_map import ErrorMap
 from selfcal_ros.model.result import CalibrationResult, Noise, ViewResult
@@ -22,9 +21,6 @@ from selfcal_ros.reporting.summary_format import (
 )
 from selfcal_ros.reporting.summary_numbers import map_figures, truth_figures
 
-CHANCE = 1e-3
-"""Probability below which residuals and repeats are said to disagree."""
-
 
 @dataclass(frozen=True)
 class Section:
@@ -39,12 +35,37 @@ class Section:
 def all_sections(result: CalibrationResult,
                  truth: Mapping[str, np.ndarray] | None = None) -> list[Section]:
     """Return the sections of a summary in the order in which a person reads them."""
-    sections = [measurement_section(result), views_section(result), error_section(result),
-                noise_section(result.noise)]
+    sections = [verdict_section(result), measurement_section(result), views_section(result),
+                error_section(result), terms_section(result), noise_section(result.noise)]
     if truth is not None:
         sections.append(truth_section(result.error_map, truth))
     sections += [rejected_section(result), attention_section(result)]
     return [s for s in sections if s.facts or s.table or s.notes]
+
+
+def verdict_section(result: CalibrationResult) -> Section:
+    """Return the verdict with the tests that failed and their likely causes; empty if none did."""
+    verdict = result.verdict
+    notes = [printable(reason) for reason in verdict.reasons]
+    notes += [f"likely cause: {printable(cause.text)} (p = {cause.p:.1g})"
+              for cause in verdict.causes]
+    return Section("Verdict: NOT QUALIFIED" if not verdict.qualified else "Verdict",
+                   notes=tuple(notes))
+
+
+def terms_section(result: CalibrationResult) -> Section:
+    """Return what was estimated beside the map: the terms of the model."""
+    rows = []
+    for term in result.model.terms:
+        how = "free" if term.size is None else f"size {term.size:g}"
+        for item in term.estimates:
+            scale, unit = (UM, "µm") if item.unit == "m" else (UM, "µm/m")
+            rows.append((f"{term.name} ({how})", item.view or "all", item.component,
+                         f"{item.value * scale:.5g}", f"{item.u * scale:.2g}", unit))
+    if not rows:
+        return Section("Terms of the model")
+    header = ("term", "view", "component", "value", "u (k=1)", "unit")
+    return Section("Terms of the model", table=(header, *rows))
 
 
 def measurement_section(result: CalibrationResult) -> Section:
@@ -59,7 +80,8 @@ def measurement_section(result: CalibrationResult) -> Section:
     views = f"{counted(len(result.views), 'view')}, {views_done(result)} measured"
     facts = [("plan", f"{printable(result.plan_id) or UNKNOWN}: {views}"),
              ("plate", plate),
-             ("method", f"{printable(result.method)}, {printable(result.sense).replace('_', ' ')}"),
+             ("method", f"{printable(result.method)}, {printable(result.sense).replace('_', ' ')}, "
+              f"{result.model.misalignment} misalignments"),
              ("identifiable", f"{'yes' if seen.identifiable else 'NO'} (rank {seen.rank} of "
               f"{seen.unknowns} unknowns, {counted(seen.deficiency, 'unseen mode')})")]
     if result.input.get("file"):
@@ -115,13 +137,14 @@ def error_section(result: CalibrationResult) -> Section:
              ("rms error", f"{um(figures.rms_error_m)} per axis")]
     if figures.n_known < figures.n_sites:
         facts.append(("sites known", f"{figures.n_known} of {figures.n_sites}"))
-    facts += [*_spread_facts("uncertainty", um, figures.rms_u_m, figures.max_u_m),
+    facts += [*_spread_facts("uncertainty", um, (figures.rms_u_m, figures.max_u_m),
+                             (result.noise.k_xy, result.noise.dof_xy)),
               ("non-orthogonality", _slope_text(emap, emap.nonorthogonality, "O", "µrad",
                                                 "axes out of square by 2|O|")),
               ("scale difference", _slope_text(emap, emap.scale_difference, "R", "ppm",
                                                "scales of X and Y differ by 2|R|"))]
     if emap.artifact.angular_count:
-        facts += _theta_facts(emap)
+        facts += _theta_facts(result)
     return Section("Stage error (indicated − true)", tuple(facts))
 
 
@@ -132,7 +155,8 @@ def _slope_text(emap: ErrorMap, value: float, symbol: str, unit: str, meaning: s
             f"{unit}")
 
 
-def _theta_facts(emap: ErrorMap) -> list[tuple[str, str]]:
+def _theta_facts(result: CalibrationResult) -> list[tuple[str, str]]:
+    emap = result.error_map
     figures = map_figures(emap)
     at = ""
     if figures.max_line is not None:
@@ -142,22 +166,29 @@ def _theta_facts(emap: ErrorMap) -> list[tuple[str, str]]:
              ("rms θ error", arcsec(figures.rms_theta_rad))]
     if figures.n_lines_known < figures.n_lines:
         facts.append(("lines known", f"{figures.n_lines_known} of {figures.n_lines}"))
-    return [*facts, *_spread_facts("θ uncertainty", arcsec, figures.rms_u_theta_rad,
-                                   figures.max_u_theta_rad),
+    return [*facts, *_spread_facts("θ uncertainty", arcsec, (figures.rms_u_theta_rad,
+                                                             figures.max_u_theta_rad),
+                                   (result.noise.k_theta, result.noise.dof_theta)),
             ("θ datum", str(emap.datum_theta))]
 
 
-def _spread_facts(label: str, unit: Callable[[float], str], rms_u: float, max_u: float,
-                  ) -> list[tuple[str, str]]:
+def _spread_facts(label: str, unit: Callable[[float], str], u: tuple[float, float],
+                  student: tuple[float, float]) -> list[tuple[str, str]]:
+    """Return u and U (rms, largest), with coverage factor and degrees of freedom."""
+    (rms_u, max_u), (k, dof) = u, student
     if not math.isfinite(rms_u):
         return [(label, "not known")]
-    return [(label, f"u {unit(rms_u)} rms, {unit(max_u)} largest (k=1)"),
-            ("", f"U {unit(2 * rms_u)} rms, {unit(2 * max_u)} largest (k=2)")]
+    facts = [(label, f"u {unit(rms_u)} rms, {unit(max_u)} largest (k=1)")]
+    if math.isfinite(k):
+        known = f", {dof:.0f} degrees of freedom" if math.isfinite(dof) else ""
+        facts.append(("", f"U {unit(k * rms_u)} rms, {unit(k * max_u)} largest (k={k:.3g}, "
+                      f"95.45 %{known})"))
+    return facts
 
 
 def noise_section(noise: Noise) -> Section:
     """Return the noise of one reading: used, from repeats, from residuals, and their ratio."""
-    rows, notes = [], []
+    rows = []
     for label, name, scale, unit in (("x, y", "xy", UM, "µm"), ("θ", "theta", ARCSEC, "arcsec")):
         used, repeats, residuals = (getattr(noise, f"sigma_{name}{suffix}")
                                     for suffix in ("", "_repeats", "_residuals"))
@@ -166,28 +197,14 @@ def noise_section(noise: Noise) -> Section:
         dofs = [getattr(noise, f"dof_{name}_{kind}") for kind in ("repeats", "residuals")]
         ratio = residuals / repeats if repeats > 0 else float("nan")
         rows.append((f"{label} ({unit})", significant(used * scale),
-                     *(significant(v * scale) + (f" (dof {dof})" if dof else "")
+                     *(significant(v * scale) + (f" (dof {dof:.0f})" if dof else "")
                        for v, dof in zip((repeats, residuals), dofs, strict=True)),
                      significant(ratio)))
-        notes += _disagreement(label, ratio, dofs)
     header = ("one reading", "σ used", "repeats", "residuals", "residuals/repeats")
     if not rows:
         return Section("Noise", notes=("not known: no mark was read twice and no detection "
                                        "declared its uncertainty",))
-    return Section("Noise", table=(header, *rows), notes=tuple(notes))
-
-
-def _disagreement(label: str, ratio: float, dofs: list[int]) -> list[str]:
-    """Return a note if an F-test finds residuals and repeats in disagreement."""
-    if not math.isfinite(ratio) or min(dofs) <= 0:
-        return []
-    chance = 2 * min(fdtr(dofs[1], dofs[0], ratio ** 2), fdtrc(dofs[1], dofs[0], ratio ** 2))
-    if chance >= CHANCE:
-        return []
-    cause = ("something moved or drifted between the views, or a view lies askew" if ratio > 1
-             else "the repeats scatter for a reason that averages out within a view")
-    return [f"{label}: residuals are {significant(ratio)} times the repeats, by chance once in "
-            f"{significant(1 / max(chance, 1e-12), 1)}: {cause}"]
+    return Section("Noise", table=(header, *rows))
 
 
 def truth_section(emap: ErrorMap, truth: Mapping[str, np.ndarray]) -> Section:

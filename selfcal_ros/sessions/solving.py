@@ -128,7 +128,9 @@ class SolvingSession:
             "views_planned": self._planned.get(self._plan_id, 0),
             "identifiable": seen.identifiable, "rank_deficiency": seen.deficiency, **fields,
             "advice": [*seen.advice, *self.result.warnings],
-            "qualified": seen.identifiable, "causes": [], "run_id": ""})
+            "qualified": self.result.verdict.qualified,
+            "causes": [cause.text for cause in self.result.verdict.causes],
+            "run_id": self.result.run_id})
 
     def _unfinished(self) -> bool:
         """Return whether the plan has views that are still to come."""

@@ -15,6 +15,7 @@ from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ErrorMap, ThetaDatum
 from selfcal_ros.model.result import Noise, Observability, result_from_dict, result_to_dict
+from selfcal_ros.model.verdict import Cause, ModelResult, TermEstimate, TermResult, Verdict
 from selfcal_ros.reporting.summary import (
     can_print_symbols,
     state_sentence,
@@ -23,7 +24,7 @@ from selfcal_ros.reporting.summary import (
 )
 from selfcal_ros.reporting.summary_format import aligned, fixed_column, significant, to_ascii
 from selfcal_ros.reporting.summary_numbers import map_figures, truth_figures
-from selfcal_ros.reporting.summary_sections import noise_section, place_text, pose_text
+from selfcal_ros.reporting.summary_sections import place_text, pose_text
 from selfcal_ros.simulation.truth import hu_plan, random_truth, simulate_measurements
 from test.support.maps import random_map
 from test.support.results import known_result
@@ -118,7 +119,7 @@ def test_summary_shows_every_part():
     assert float(row[7]) == pytest.approx(1e6 * result.views[3].ty, abs=0.05)
     u_um = 1e6 * np.sqrt(np.mean(result.error_map.u_gx ** 2))
     assert f"u {u_um:.4f} µm rms, 0.0238 µm largest (k=1)" in text
-    assert f"U {2 * u_um:.4f} µm rms, 0.0476 µm largest (k=2)" in text
+    assert f"U {2 * u_um:.4f} µm rms, 0.0476 µm largest (k=2, 95.45 %)" in text
     assert line_with(text, "x, y").split() == [
         "x,", "y", "(µm)", "0.0200", "0.0200", "(dof", "2904)", "0.0204", "(dof", "220)", "1.02"]
     assert line_with(text, "outlier").split() == ["outlier", "12"]
@@ -156,24 +157,36 @@ def test_names_cannot_steer_the_terminal():
     assert "a?[2J?b" in text and "p?q" in text
 
 
-def test_residuals_that_contradict_the_repeats_are_named():
+def test_a_verdict_comes_before_everything_else():
     result, _ = known_result()
-    loud = replace(result.noise, sigma_xy_residuals=1.5 * result.noise.sigma_xy_repeats)
-    quiet = replace(result.noise, sigma_xy_residuals=0.5 * result.noise.sigma_xy_repeats)
-    assert "something moved or drifted" in summary_text(replace(result, noise=loud))
-    assert "averages out within a view" in summary_text(replace(result, noise=quiet))
-    assert "by chance" not in summary_text(result)
+    cause = Cause("drift", "drift of 51 ± 2 nm along x: solve with --model drift", 5.1e-8, 2e-9,
+                  "m", 1e-12)
+    bad = Verdict(False, "Not qualified: most likely drift of 51 nm", ("residuals exceed repeats",),
+                  (cause,))
+    text = summary_text(replace(result, verdict=bad))
+    assert text.startswith("Not qualified: most likely drift of 51 nm. Map as it is: Calibrated")
+    assert "Verdict: NOT QUALIFIED\n  residuals exceed repeats\n" in text
+    assert "likely cause: drift of 51 ± 2 nm along x: solve with --model drift (p = 1e-12)" in text
+    assert summary_text(result).startswith("Calibrated")
 
 
-def test_f_test_of_the_noise_raises_a_false_alarm_once_in_a_thousand():
-    rng = np.random.default_rng(5)
-    alarms, draws, dofs = 0, 4000, (40, 12)
-    for repeats, residuals in zip(*(np.sqrt(rng.chisquare(d, draws) / d) for d in dofs),
-                                  strict=True):
-        noise = Noise(1e-8, float("nan"), repeats * 1e-8, sigma_xy_residuals=residuals * 1e-8,
-                      dof_xy_repeats=dofs[0], dof_xy_residuals=dofs[1])
-        alarms += bool(noise_section(noise).notes)
-    assert alarms <= 13, "binomial(4000, 0.001) stays below 13 except once in 10,000"
+def test_terms_of_the_model_are_shown_with_their_uncertainties():
+    result, _ = known_result()
+    terms = (TermResult("microscope", None, (TermEstimate("", "xy", -2e-3, 3e-5, "m/m"),)),
+             TermResult("drift", 5e-8, (TermEstimate("rot90", "x P1", 4e-8, 1e-9, "m"),)))
+    text = summary_text(replace(result, model=ModelResult("rigid", terms)))
+    assert line_with(text, "microscope").split() == [
+        "microscope", "(free)", "all", "xy", "-2000", "30", "µm/m"]
+    assert line_with(text, "drift").split() == [
+        "drift", "(size", "5e-08)", "rot90", "x", "P1", "0.04", "0.001", "µm"]
+
+
+def test_few_degrees_of_freedom_widen_what_is_claimed():
+    result, _ = known_result()
+    few = replace(result, noise=replace(result.noise, dof_xy=5.0, k_xy=2.649))
+    text = summary_text(few)
+    assert "(k=2.65)" in text.splitlines()[0]
+    assert "(k=2.65, 95.45 %, 5 degrees of freedom)" in text
 
 
 def test_no_repeats_and_no_noise_at_all():

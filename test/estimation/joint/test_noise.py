@@ -1,0 +1,61 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which noise counts, and when residuals contradict it."""
+
+import numpy as np
+import pytest
+from scipy.stats import binom
+from scipy.stats import f as f_distribution
+
+from selfcal_ros.estimation.joint.noise import F_LEVEL, noise_estimate
+
+NAN = float("nan")
+
+
+def test_one_noise_is_contradicted_once_in_a_thousand():
+    rng = np.random.default_rng(5)
+    draws, dofs = 4000, (40, 12)
+    alarms = sum(
+        noise_estimate((a * 1e-8, dofs[0]), (b * 1e-8, dofs[1]), NAN).contradicted
+        for a, b in zip(*(np.sqrt(rng.chisquare(d, draws) / d) for d in dofs), strict=True))
+    assert binom.ppf(1e-4, draws, F_LEVEL) <= alarms <= binom.ppf(1 - 1e-4, draws, F_LEVEL)
+
+
+@pytest.mark.parametrize(("ratio", "larger"), [(3.0, "residuals"), (1 / 3, "repeats")])
+def test_the_larger_of_two_noises_that_contradict_each_other_counts(ratio, larger):
+    found = noise_estimate((1e-8, 100), (ratio * 1e-8, 50), NAN)
+    assert found.contradicted
+    wanted = f_distribution.sf(9, 50, 100) if ratio > 1 else f_distribution.cdf(1 / 9, 50, 100)
+    assert found.p == pytest.approx(2 * wanted, rel=1e-6)
+    assert found.sigma == max(1e-8, ratio * 1e-8)
+    assert found.dof == {"residuals": 50, "repeats": 100}[larger]
+
+
+@pytest.mark.parametrize(("dof", "used"), [(29, "residuals"), (30, "repeats")])
+def test_repeats_count_from_thirty_degrees_of_freedom(dof, used):
+    found = noise_estimate((1e-8, dof), (1.01e-8, 200), NAN)
+    assert found.sigma == {"repeats": 1e-8, "residuals": 1.01e-8}[used]
+    assert not found.contradicted
+
+
+@pytest.mark.parametrize(("ratio", "contradicted"), [(1.09, False), (1.11, True),
+                                                     (1 / 1.09, False), (1 / 1.11, True)])
+def test_noises_within_a_tenth_are_the_same_for_every_purpose(ratio, contradicted):
+    found = noise_estimate((1e-8, 1_000_000), (ratio * 1e-8, 1_000_000), NAN)
+    assert found.p < F_LEVEL and found.contradicted is contradicted
+
+
+def test_declared_noise_is_held_against_the_residuals():
+    found = noise_estimate((5e-8, 400), (2e-8, 60), 1e-8)
+    assert found.contradicted and found.sigma == 2e-8 and found.dof == 60
+    fine = noise_estimate((5e-8, 400), (1.05e-8, 60), 1e-8)
+    assert not fine.contradicted and fine.sigma == 1e-8 and fine.dof == np.inf
+    assert fine.k == pytest.approx(2.0, abs=1e-4)
+
+
+def test_nothing_to_compare_is_no_contradiction():
+    for repeats, residuals in (((NAN, 0), (1e-8, 9)), ((1e-8, 40), (NAN, 0)),
+                               ((0.0, 40), (1e-8, 9)), ((0.0, 40), (0.0, 9))):
+        found = noise_estimate(repeats, residuals, NAN, floor=1e-13)
+        assert np.isnan(found.p) and not found.contradicted
+    assert noise_estimate((0.0, 40), (1e-8, 9), NAN, floor=1e-13).sigma == 1e-8
+    assert noise_estimate((NAN, 0), (1e-8, 9), NAN).k == pytest.approx(2.32, abs=0.01)
