@@ -74,6 +74,15 @@ def _replacement(target: Path) -> Iterator[BinaryIO]:
         raise
 
 
+def sync_folder(folder: Path) -> None:
+    """Wait until the names in a folder are on the disk."""
+    fd = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(fd)
+    finally:
+        os.close(fd)
+
+
 def _mode(target: Path) -> int:
     """Return the permissions of a file that exists, or those that a new one gets."""
     if target.is_file():

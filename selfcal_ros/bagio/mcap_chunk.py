@@ -9,6 +9,7 @@ distance by numpy.
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import BinaryIO
 
 import numpy as np
 from mcap.opcode import Opcode
@@ -30,6 +31,8 @@ HEAD_TYPE = np.dtype({"names": ["opcode", "length"], "formats": ["u1", "<u8"],
 PATIENCE, MAX_PATIENCE = 3, 1024
 """Messages of one length in a row after which more are looked for; grows where there are none."""
 FIRST_LOOK = 64
+STRETCH = 1 << 20
+"""Bytes of a file without chunks in which messages are found at once."""
 
 
 @dataclass(frozen=True)
@@ -103,6 +106,16 @@ def message_block(data: bytes, at: int) -> tuple[Block, int]:
         FRONT_TYPE)
     length = fronts["length"].astype(np.int64) - MESSAGE_FRONT
     return Block(fronts, Payloads(data, start + FRONT, length)), end
+
+
+def stretch(file: BinaryIO, at: int) -> tuple[Block | None, int]:
+    """Return messages that stand by themselves from `at` on and where they end, or None."""
+    file.seek(at)
+    if file.read(1) != bytes([Opcode.MESSAGE]):
+        return None, at
+    file.seek(at)
+    block, end = message_block(file.read(STRETCH), 0)
+    return (block if len(block) else None), at + end
 
 
 class _Places:

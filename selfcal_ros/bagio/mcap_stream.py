@@ -27,7 +27,7 @@ from selfcal_ros.bagio.mcap_chunk import (
     block_of,
     chunk_items,
     gathered,
-    message_block,
+    stretch,
 )
 from selfcal_ros.bagio.mcap_index import MAGIC, read_summary
 from selfcal_ros.bagio.mcap_salvage import (
@@ -46,8 +46,6 @@ CHECKED = (Opcode.HEADER, Opcode.CHUNK, Opcode.MESSAGE_INDEX, Opcode.MESSAGE, Op
 INDEX = struct.Struct("<HI")
 """Channel and bytes of the entries of a message index."""
 INDEX_ENTRY = 16
-STRETCH = 1 << 20
-"""Bytes of a file without chunks in which messages are found at once."""
 SQLITE = b"SQLite format 3"
 CONVERT = ("convert it with `ros2 bag convert -i BAG -o OPTIONS.yaml`, where OPTIONS.yaml says "
            "output_bags: [{uri: NEW, storage_id: mcap, all_topics: true}]")
@@ -145,7 +143,7 @@ class McapStream:
         at = sure = clean = len(MAGIC)
         data_ended = passed = False
         while True:
-            block, end = _stretch(file, at)
+            block, end = stretch(file, at)
             if block is not None:
                 sure, clean = at + int(block.payloads.start[-1]) - FRONT, end
                 at = end
@@ -280,16 +278,6 @@ class McapStream:
         reason = "truncated" if isinstance(error, _Cut) else f"damaged ({first_line(error)})"
         self.lost.append(f"the file is {reason} after byte {start} of {size}: {count} messages "
                          "of the last chunk could be saved, what followed is lost")
-
-
-def _stretch(file: BinaryIO, at: int) -> tuple[Block | None, int]:
-    """Return messages that stand by themselves from `at` on and where they end, or None."""
-    file.seek(at)
-    if file.read(1) != bytes([Opcode.MESSAGE]):
-        return None, at
-    file.seek(at)
-    block, end = message_block(file.read(STRETCH), 0)
-    return (block if len(block) else None), at + end
 
 
 def _is_chunk(file: BinaryIO, at: int, end: int | None) -> bool:

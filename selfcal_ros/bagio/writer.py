@@ -16,32 +16,13 @@ import yaml
 from mcap.writer import CompressionType, Writer
 
 from selfcal_ros.bagio.build import build
+from selfcal_ros.bagio.metadata import FileEntry, Metadata, Topic, qos_profile
 from selfcal_ros.bagio.schemas import typestore
 from selfcal_ros.errors import InputError
-from selfcal_ros.files import write_text
 from selfcal_ros.messages.from_model import Fields
 
+__all__ = ["BagWriter", "qos_profile"]
 CHUNK_SIZE = 256 * 1024
-INFINITE = {"sec": 9223372036, "nsec": 854775807}
-
-
-def qos_profile(*, reliable: bool, transient_local: bool, depth: int) -> dict:
-    """Return one offered QoS profile as rosbag2 (Jazzy) writes it."""
-    return {"history": "keep_last", "depth": depth,
-            "reliability": "reliable" if reliable else "best_effort",
-            "durability": "transient_local" if transient_local else "volatile",
-            "deadline": INFINITE, "lifespan": INFINITE, "liveliness": "automatic",
-            "liveliness_lease_duration": INFINITE, "avoid_ros_namespace_conventions": False}
-
-
-@dataclass
-class _Topic:
-    type: str
-    qos: list[dict]
-    channel: int
-    count: int = 0
-
-
 @dataclass
 class BagWriter:
     """Writes one bag folder; use as a context manager.
@@ -61,10 +42,8 @@ class BagWriter:
 
     path: Path
     compression: str = "zstd"
-    _topics: dict[str, _Topic] = field(default_factory=dict)
+    _channels: dict[str, int] = field(default_factory=dict)
     _schemas: dict[str, int] = field(default_factory=dict)
-    _first_ns: int | None = None
-    _last_ns: int = 0
 
     def __post_init__(self) -> None:
         """Create the folder and start the file."""
@@ -77,8 +56,10 @@ class BagWriter:
         except OSError as error:
             raise InputError(str(self.path), f"cannot be made ({error.strerror})",
                              "name a folder that you may write") from error
+        self._entry = FileEntry(f"{self.path.name}_0.mcap")
+        self._metadata = Metadata(files=[self._entry])
         with self._said():
-            self._file = (self.path / f"{self.path.name}_0.mcap").open("wb")
+            self._file = (self.path / self._entry.name).open("wb")
             self._mcap = Writer(self._file, chunk_size=CHUNK_SIZE,
                                 compression=CompressionType[self.compression.upper()])
             self._mcap.start(profile="ros2", library="selfcal_ros")
@@ -109,31 +90,28 @@ class BagWriter:
             self._schemas[typename] = self._mcap.register_schema(typename, "ros2msg",
                                                                  text.encode())
         profile = yaml.safe_dump(qos, sort_keys=False) if qos else ""
-        channel = self._mcap.register_channel(
+        self._channels[topic] = self._mcap.register_channel(
             topic, "cdr", self._schemas[typename],
             {"offered_qos_profiles": profile, "topic_type_hash": store.hash_rihs01(typename)})
-        self._topics[topic] = _Topic(typename, qos, channel)
+        self._metadata.topics[topic] = Topic(typename, qos)
 
     def write(self, topic: str, fields: Fields, log_time_ns: int) -> None:
         """Write one message given by its fields."""
-        typename = self._topics[topic].type
+        typename = self._metadata.topics[topic].type
         message = build(typestore(), typename, fields)
         self.write_raw(topic, bytes(typestore().serialize_cdr(message, typename)), log_time_ns)
 
     def write_raw(self, topic: str, data: bytes, log_time_ns: int) -> None:
         """Write one message given by its CDR bytes."""
-        entry = self._topics[topic]
-        entry.count += 1
-        self._first_ns = log_time_ns if self._first_ns is None else min(self._first_ns,
-                                                                        log_time_ns)
-        self._last_ns = max(self._last_ns, log_time_ns)
+        self._metadata.topics[topic].count += 1
+        self._entry.add(log_time_ns)
         with self._said():
-            self._mcap.add_message(entry.channel, log_time_ns, data, log_time_ns)
+            self._mcap.add_message(self._channels[topic], log_time_ns, data, log_time_ns)
 
     @property
     def counts(self) -> dict[str, int]:
         """Messages written so far, topic -> count."""
-        return {topic: entry.count for topic, entry in self._topics.items()}
+        return {name: topic.count for name, topic in self._metadata.topics.items()}
 
     def flush(self) -> None:
         """Write everything so far to the disk."""
@@ -146,26 +124,7 @@ class BagWriter:
             return
         with self._said(), self._file:
             self._mcap.finish()
-        write_text(self.path / "metadata.yaml", yaml.safe_dump(self._metadata(), sort_keys=False))
-
-    def _metadata(self) -> dict:
-        total = sum(entry.count for entry in self._topics.values())
-        start = {"nanoseconds_since_epoch": self._first_ns or 0}
-        duration = {"nanoseconds": self._last_ns - (self._first_ns or 0)}
-        name = f"{self.path.name}_0.mcap"
-        topics = [{"topic_metadata": {
-            "name": topic, "type": entry.type, "serialization_format": "cdr",
-            "offered_qos_profiles": entry.qos,
-            "type_description_hash": typestore().hash_rihs01(entry.type)},
-            "message_count": entry.count} for topic, entry in self._topics.items()]
-        return {"rosbag2_bagfile_information": {
-            "version": 9, "storage_identifier": "mcap", "duration": duration,
-            "starting_time": start, "message_count": total,
-            "topics_with_message_count": topics, "compression_format": "", "compression_mode": "",
-            "relative_file_paths": [name],
-            "files": [{"path": name, "starting_time": start, "duration": duration,
-                       "message_count": total}],
-            "custom_data": None, "ros_distro": "jazzy"}}
+        self._metadata.write(self.path)
 
     def __enter__(self) -> Self:
         """Return the writer."""

@@ -15,6 +15,8 @@ from selfcal_ros.messages.cdr_layout import HEAD, WORD, Field, Layout, layout_of
 MAX_KNOWN = 16
 """Layouts of one length that are kept for the next messages."""
 MAX_LENGTHS = 256
+MAX_LENGTH = 1 << 16
+"""Bytes of a message beyond which it is not worth a layout of its own."""
 FREE_TRIES, WORTH = 16, 32
 """Layouts that may be new in one call, and messages that allow one more."""
 
@@ -127,7 +129,7 @@ class ColumnDecoder:
                        tries: int) -> tuple[int, np.ndarray]:
         """Decode messages of one length; return what is left of `tries`, and what remains."""
         length = int(messages.length[index[0]])
-        if not HEAD + WORD <= length <= len(messages.data):
+        if not HEAD + WORD <= length <= min(len(messages.data), MAX_LENGTH):
             return tries, index
         bytes_at = np.ndarray((len(messages.data) - length + 1,), f"V{length}", messages.data,
                               strides=(1,))

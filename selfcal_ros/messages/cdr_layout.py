@@ -19,8 +19,6 @@ SEQUENCE = -1
 """Count of a field whose number of elements stands in the message."""
 TEXT = "text"
 WORD = 8
-MAX_LENGTH = 1 << 16
-"""Bytes of a message beyond which it is not worth a layout of its own."""
 EVERY_BIT = (1 << 8 * WORD) - 1
 
 
@@ -112,7 +110,7 @@ def layout_of(fields: Sequence[Field], data: bytes) -> Layout | None:
     data : bytes
         The message with its encapsulation.
     """
-    if data[:2] not in (LITTLE, BIG) or not HEAD + WORD <= len(data) <= MAX_LENGTH:
+    if data[:2] not in (LITTLE, BIG) or len(data) < HEAD + WORD:
         return None
     walk = _Walk(data)
     try:

@@ -1,0 +1,302 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The journal: what a collector received, on the disk before it acts on it.
+
+A journal is a bag folder that grows. Killed at any instant, it holds every message that was
+flushed; `resume` gives the file an end and goes on in a new one of the same bag.
+"""
+
+import fcntl
+import os
+import re
+import threading
+import time
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+import yaml
+from mcap.records import Channel, Schema
+
+from selfcal_ros.bagio.channels import ChannelDecoder
+from selfcal_ros.bagio.journal_file import (
+    Content,
+    JournalFile,
+    finish_file,
+    message_record,
+    records,
+)
+from selfcal_ros.bagio.metadata import Metadata, Topic
+from selfcal_ros.bagio.schemas import store_of_schema, typestore
+from selfcal_ros.collection.messages import Phase
+from selfcal_ros.errors import InputError, SelfcalError
+from selfcal_ros.messages.to_model import stamp_ns
+from selfcal_ros.messages.topics import COMMAND_TOPIC
+
+SYNC_PERIOD_S = 0.5
+"""Time between two synchronisations with the disk, where there is something to synchronise."""
+OVER = (Phase.DONE, Phase.ABORT)
+
+
+def resume(folder: str | os.PathLike) -> "Journal | None":
+    """Return the journal of the plan that is running, ready to go on; None if there is none.
+
+    That is the journal in `folder` that was written last, unless its last command, by stamp, is
+    DONE or ABORT. Read it first (`BagReader(journal.path).columns()`), then go on writing.
+
+    Parameters
+    ----------
+    folder : path
+        Where journals lie, each a bag folder; need not exist.
+
+    Raises
+    ------
+    InputError
+        If another process writes this journal, or it cannot be read or written.
+    """
+    bag = _newest(Path(folder))
+    if bag is None:
+        return None
+    with _said(bag):
+        lock = _locked(bag)
+        try:
+            metadata, commands = _taken_up(bag)
+            if not commands or commands[-1][1] not in OVER:
+                return Journal(bag, lock, metadata)
+        except BaseException:
+            os.close(lock)
+            raise
+        os.close(lock)
+    return None
+
+
+def start(folder: str | os.PathLike, now_ns: int) -> "Journal":
+    """Begin a new journal in `folder`, which is made if need be; its name tells the time.
+
+    Raises
+    ------
+    InputError
+        If it cannot be made.
+    """
+    name = time.strftime("journal_%Y%m%dT%H%M%SZ", time.gmtime(now_ns // 10**9))
+    for suffix in ("", *(f"_{number}" for number in range(2, 1000))):
+        bag = Path(folder) / (name + suffix)
+        try:
+            bag.mkdir(parents=True)
+        except FileExistsError:
+            continue
+        except OSError as error:
+            raise InputError(str(bag), f"cannot be made ({error.strerror})",
+                             "name a folder that you may write") from error
+        with _said(bag):
+            return Journal(bag, _locked(bag), Metadata())
+    raise InputError(str(folder), f"holds a thousand journals of {name}", "remove some")
+
+
+class Journal:
+    """Writes raw messages to a bag folder; made by `start` or `resume`, to be closed.
+
+    Parameters
+    ----------
+    path : Path
+        The bag folder.
+    lock : int
+        The open lock on it, which the journal closes.
+    metadata : Metadata
+        Files and topics that are there already.
+
+    Attributes
+    ----------
+    n_lost : int
+        Messages that could not be written.
+    """
+
+    def __init__(self, path: Path, lock: int, metadata: Metadata) -> None:
+        self.path, self.n_lost = path, 0
+        self._lock, self._metadata = lock, metadata
+        self._channels: dict[str, int] = {}
+        self._waiting: list[tuple[str, int, bytes]] = []
+        self._sequence: Counter = Counter()
+        self._failed: OSError | None = None
+        self._file = JournalFile(path / f"{path.name}_{len(metadata.files)}.mcap")
+        metadata.files.append(self._file.content.entry)
+        for topic, known in metadata.topics.items():
+            self._declare(topic, known)
+        metadata.write(path)
+        self._stop, self._dirty = threading.Event(), threading.Event()
+        self._syncer = threading.Thread(target=self._sync_on, name="journal", daemon=True)
+        self._syncer.start()
+
+    def add_topic(self, topic: str, typename: str, qos: Sequence[dict] = ()) -> None:
+        """Declare a topic, with its namespace, before its first message; again does nothing.
+
+        Raises
+        ------
+        InputError
+            If the type is not known, or the journal cannot be written.
+        """
+        if topic in self._channels:
+            return
+        if typename not in typestore().fielddefs:
+            raise InputError(f"topic {topic}", f"no definition of {typename}",
+                             "record only topics of known types")
+        known = self._metadata.topics.setdefault(topic, Topic(typename, list(qos)))
+        self._declare(topic, known)
+
+    def _declare(self, topic: str, known: Topic) -> None:
+        store, number = typestore(), len(self._channels) + 1
+        text = store.generate_msgdef(known.type, ros_version=2)[0]
+        schema = Schema(id=number, name=known.type, encoding="ros2msg", data=text.encode())
+        channel = Channel(
+            id=number, topic=topic, message_encoding="cdr", schema_id=number,
+            metadata={"offered_qos_profiles": yaml.safe_dump(known.qos, sort_keys=False)
+                      if known.qos else "", "topic_type_hash": store.hash_rihs01(known.type)})
+        self.flush()
+        with _said(self.path):
+            self._file.append(records(schema, channel))
+        self._file.content.declare(schema)
+        self._file.content.declare(channel)
+        self._channels[topic] = number
+
+    def write(self, topic: str, data: bytes, log_time_ns: int) -> None:
+        """Take one message, as received; it is safe once `flush` has returned."""
+        record = message_record(self._channels[topic], self._sequence[topic], log_time_ns, data)
+        self._sequence[topic] += 1
+        self._waiting.append((topic, log_time_ns, record))
+
+    def flush(self) -> None:
+        """Hand what was taken to the system, all at once; the disk has it within a second.
+
+        Call it before acting on what was taken.
+
+        Raises
+        ------
+        InputError
+            If the disk is full or fails: what was taken since the last flush is not in the
+            journal and counts in `n_lost`.
+        """
+        waiting, self._waiting = self._waiting, []
+        with _said(self.path):
+            if waiting:
+                self._append(waiting)
+                self._dirty.set()
+            failed, self._failed = self._failed, None
+            if failed is not None:
+                raise failed
+
+    def _append(self, waiting: list[tuple[str, int, bytes]]) -> None:
+        try:
+            self._file.append(b"".join(record for _, _, record in waiting))
+        except OSError:
+            self.n_lost += len(waiting)
+            raise
+        for topic, log_time_ns, _ in waiting:
+            self._file.content.add(self._channels[topic], log_time_ns)
+            self._metadata.topics[topic].count += 1
+
+    def _sync_on(self) -> None:
+        """Synchronise with the disk, in a thread of its own: it may take its time."""
+        while not self._stop.wait(SYNC_PERIOD_S):
+            if self._dirty.is_set():
+                self._dirty.clear()
+                try:
+                    self._file.sync()
+                except OSError as error:
+                    self._failed = error
+
+    def close(self) -> None:
+        """Give the file its end and write metadata.yaml; again does nothing."""
+        if self._stop.is_set():
+            return
+        self._stop.set()
+        self._syncer.join()
+        try:
+            self.flush()
+        finally:
+            with _said(self.path):
+                try:
+                    self._file.close()
+                finally:
+                    os.close(self._lock)
+            self._metadata.write(self.path)
+
+    def __enter__(self) -> Self:
+        """Return the journal."""
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None,
+                 trace: TracebackType | None) -> None:
+        """Close the journal, also after an error."""
+        self.close()
+
+
+@contextmanager
+def _said(path: Path) -> Iterator[None]:
+    """Turn a full disk or a vanished folder into the package's own error."""
+    try:
+        yield
+    except OSError as error:
+        raise InputError(str(path), f"the journal cannot be written ({error.strerror})",
+                         "make room or name another folder") from error
+
+
+def _taken_up(bag: Path) -> tuple[Metadata, list[tuple[int, Phase]]]:
+    """Finish the files that are there; return what they hold, and their commands by stamp."""
+    metadata = Metadata()
+    commands: list[tuple[int, Phase]] = []
+    for file in sorted(bag.glob("*.mcap"), key=_number):
+        content = finish_file(file, COMMAND_TOPIC)
+        metadata.files.append(content.entry)
+        for channel in content.channels.values():
+            schema = content.schemas.get(channel.schema_id)
+            if schema is not None:
+                qos = yaml.safe_load(channel.metadata.get("offered_qos_profiles", "")) or []
+                topic = metadata.topics.setdefault(channel.topic, Topic(schema.name, qos))
+                topic.count += content.counts.get(channel.id, 0)
+        commands += _commands(content, str(file))
+    return metadata, sorted(commands)
+
+
+def _locked(path: Path) -> int:
+    """Return an open lock on a folder; the system opens it when the process ends."""
+    lock = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        os.close(lock)
+        raise InputError(str(path), "another process writes this journal",
+                         "end it or name another folder") from error
+    return lock
+
+
+def _newest(folder: Path) -> Path | None:
+    """Return the bag folder in `folder` whose file was written last."""
+    found: list[tuple[int, Path]] = []
+    with suppress(FileNotFoundError, NotADirectoryError):
+        for bag in folder.iterdir():
+            with suppress(NotADirectoryError):
+                found += [(file.stat().st_mtime_ns, bag) for file in bag.iterdir()
+                          if file.suffix == ".mcap"]
+    return max(found, default=(0, None))[1]
+
+
+def _number(file: Path) -> tuple[int, str]:
+    number = re.search(r"_(\d+)\.mcap$", file.name)
+    return int(number.group(1)) if number else -1, file.name
+
+
+def _commands(content: Content, where: str) -> list[tuple[int, Phase]]:
+    """Return stamps and phases of the commands that were kept; what is damaged is left out."""
+    found, bad = [], Counter()
+    for number, data in content.kept:
+        schema = content.schemas.get(content.channels[number].schema_id)
+        if schema is None:
+            continue
+        with suppress(SelfcalError, ValueError):
+            store = store_of_schema(schema.name, schema.encoding, schema.data.decode(), where)
+            message = ChannelDecoder(COMMAND_TOPIC, schema.name, (store,), bad, told=True).one(data)
+            if message is not None:
+                found.append((stamp_ns(message), Phase(int(message.phase))))
+    return found

@@ -1,0 +1,214 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One file of a journal: MCAP records one behind the other, so that any front part can be read.
+
+Messages stand by themselves, without chunks: what has been handed to the system is there, whatever
+becomes of the process. A file that was closed has a summary; `finish_file` gives one to a file
+whose writer was killed.
+"""
+
+import os
+import struct
+import zlib
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import BinaryIO
+
+from mcap.data_stream import RecordBuilder
+from mcap.opcode import Opcode
+from mcap.records import Channel, Footer, Header, McapRecord, Schema, Statistics
+
+from selfcal_ros.bagio.mcap_chunk import Block, message_block, stretch
+from selfcal_ros.bagio.mcap_index import FOOTER_SIZE, MAGIC
+from selfcal_ros.bagio.mcap_salvage import HEAD, MESSAGE_FRONT, parsed
+from selfcal_ros.bagio.metadata import FileEntry
+from selfcal_ros.files import sync_folder
+
+MESSAGE = struct.Struct("<BQHIQQ")
+"""A message record before its payload."""
+
+
+@dataclass
+class Content:
+    """What a file holds: its messages in numbers, what it declares, and where its records end.
+
+    Attributes
+    ----------
+    entry : FileEntry
+        Name, number of messages, first and last time of logging.
+    counts : dict
+        Channel -> number of messages.
+    schemas, channels : dict
+        By their numbers.
+    kept : list of (int, bytes)
+        Channel and payload of the messages that were asked for.
+    end : int
+        Behind the last whole record.
+    damaged : bool
+        Whether something else follows there than a record that was not finished, or an end.
+    """
+
+    entry: FileEntry
+    counts: dict[int, int] = field(default_factory=dict)
+    schemas: dict[int, Schema] = field(default_factory=dict)
+    channels: dict[int, Channel] = field(default_factory=dict)
+    kept: list[tuple[int, bytes]] = field(default_factory=list)
+    end: int = len(MAGIC)
+    damaged: bool = False
+
+    def declare(self, record: Schema | Channel) -> None:
+        """Add a schema or a channel."""
+        known = self.schemas if isinstance(record, Schema) else self.channels
+        known[record.id] = record
+
+    def add(self, channel: int, log_time_ns: int) -> None:
+        """Count one message."""
+        self.entry.add(log_time_ns)
+        self.counts[channel] = self.counts.get(channel, 0) + 1
+
+
+def message_record(channel: int, sequence: int, log_time_ns: int, data: bytes) -> bytes:
+    """Return the record of one message."""
+    return MESSAGE.pack(Opcode.MESSAGE, MESSAGE_FRONT + len(data), channel,
+                        sequence & 0xFFFFFFFF, log_time_ns, log_time_ns) + data
+
+
+def records(*items: McapRecord) -> bytes:
+    """Return the bytes of records."""
+    builder = RecordBuilder()
+    for item in items:
+        item.write(builder)
+    return builder.end()
+
+
+def front() -> bytes:
+    """Return how a file begins."""
+    return MAGIC + records(Header(profile="ros2", library="selfcal_ros journal"))
+
+
+def ending(content: Content) -> bytes:
+    """Return how a file ends: what it declares once more, its numbers, and checksums."""
+    entry = content.entry
+    summary = records(*content.schemas.values(), *content.channels.values(), Statistics(
+        attachment_count=0, channel_count=len(content.channels),
+        channel_message_counts=content.counts, chunk_count=0, message_count=entry.count,
+        message_end_time=entry.last_ns, message_start_time=entry.first_ns or 0, metadata_count=0,
+        schema_count=len(content.schemas)))
+    data_end = struct.pack("<BQI", Opcode.DATA_END, 4, 0)
+    start = content.end + len(data_end)
+    crc = zlib.crc32(struct.pack("<BQQQ", Opcode.FOOTER, FOOTER_SIZE, start, 0),
+                     zlib.crc32(summary))
+    footer = records(Footer(summary_start=start, summary_offset_start=0, summary_crc=crc))
+    return data_end + summary + footer + MAGIC
+
+
+class JournalFile:
+    """Appends records to a new file; what a failed write has begun is taken back."""
+
+    def __init__(self, path: Path) -> None:
+        self.content = Content(FileEntry(path.name), end=0)
+        part = path.with_suffix(".part")  # so that no file of a journal is ever empty
+        self._fd = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_APPEND
+                           | os.O_CLOEXEC, 0o666)
+        self.append(front())
+        os.fsync(self._fd)
+        os.rename(part, path)
+        sync_folder(path.parent)
+
+    def append(self, data: bytes) -> None:
+        """Hand whole records to the system; after an OSError the file is as it was before."""
+        rest = memoryview(data)
+        try:
+            while rest:
+                rest = rest[os.write(self._fd, rest):]
+        except OSError:
+            os.ftruncate(self._fd, self.content.end)
+            raise
+        self.content.end += len(data)
+
+    def sync(self) -> None:
+        """Wait until what was appended is on the disk."""
+        os.fsync(self._fd)
+
+    def close(self) -> None:
+        """Write the end of the file and close it."""
+        try:
+            self.append(ending(self.content))
+            self.sync()
+        finally:
+            os.close(self._fd)
+
+
+def finish_file(path: Path, keep: str) -> Content:
+    """Return what a file holds; one whose writer was killed gets its end, if nothing is damaged.
+
+    Parameters
+    ----------
+    path : Path
+        File of a journal.
+    keep : str
+        Topic, without a namespace, whose messages are kept.
+    """
+    with path.open("rb+") as file:
+        content = _scan(file, path.name, keep)
+        file.seek(-len(MAGIC), 2)
+        closed = file.tell() > content.end and file.read() == MAGIC
+        if not closed and not content.damaged:
+            file.truncate(content.end)
+            file.seek(content.end)
+            file.write(ending(content))
+            file.flush()
+            os.fsync(file.fileno())
+    return content
+
+
+def _scan(file: BinaryIO, name: str, keep: str) -> Content:
+    """Go through the records of a file up to the first that is not whole."""
+    content = Content(FileEntry(name))
+    size = file.seek(0, 2)
+    file.seek(0)
+    if file.read(len(MAGIC)) != MAGIC:
+        content.damaged = True
+        return content
+    while True:
+        block, end = stretch(file, content.end)
+        if block is None:
+            head = _next_head(file, content.end)
+            if head is None:
+                return content
+            opcode, length = head
+            end = content.end + HEAD.size + length
+            if end > size or opcode == Opcode.DATA_END:
+                return content
+            body = file.read(length)
+            if opcode == Opcode.MESSAGE and length >= MESSAGE_FRONT:  # longer than a stretch
+                block, _ = message_block(HEAD.pack(opcode, length) + body, 0)
+            elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+                content.declare(parsed(opcode, body)[0])
+            elif opcode != Opcode.HEADER:
+                content.damaged = True
+                return content
+        if block is not None:
+            _count(content, block, keep)
+        content.end = end
+
+
+def _next_head(file: BinaryIO, at: int) -> tuple[int, int] | None:
+    file.seek(at)
+    head = file.read(HEAD.size)
+    return HEAD.unpack(head) if len(head) == HEAD.size else None
+
+
+def _count(content: Content, block: Block, keep: str) -> None:
+    """Count the messages of a block, and keep those that are asked for."""
+    for number in block.channels():
+        part = block[block.fronts["channel"] == number]
+        times = part.fronts["log_time"]
+        content.counts[number] = content.counts.get(number, 0) + len(part)
+        entry = content.entry
+        first, last = int(times.min()), int(times.max())
+        entry.first_ns = first if entry.first_ns is None else min(entry.first_ns, first)
+        entry.last_ns = max(entry.last_ns, last)
+        entry.count += len(part)
+        channel = content.channels.get(number)
+        if channel is not None and f"/{channel.topic}".endswith(f"/{keep}"):
+            content.kept += [(number, data) for data in part.payloads]

@@ -1,0 +1,87 @@
+# SPDX-License-Identifier: Apache-2.0
+"""metadata.yaml of a bag folder, as rosbag2 (Jazzy) writes it."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from selfcal_ros.bagio.schemas import typestore
+from selfcal_ros.files import write_text
+
+INFINITE = {"sec": 9223372036, "nsec": 854775807}
+
+
+def qos_profile(*, reliable: bool, transient_local: bool, depth: int) -> dict:
+    """Return one offered QoS profile as rosbag2 (Jazzy) writes it."""
+    return {"history": "keep_last", "depth": depth,
+            "reliability": "reliable" if reliable else "best_effort",
+            "durability": "transient_local" if transient_local else "volatile",
+            "deadline": INFINITE, "lifespan": INFINITE, "liveliness": "automatic",
+            "liveliness_lease_duration": INFINITE, "avoid_ros_namespace_conventions": False}
+
+
+@dataclass
+class Topic:
+    """One topic of a bag: its type, the QoS offered, and how many messages it has."""
+
+    type: str
+    qos: list[dict]
+    count: int = 0
+
+
+@dataclass
+class FileEntry:
+    """One file of a bag: its messages, and when the first and the last were logged, ns."""
+
+    name: str
+    count: int = 0
+    first_ns: int | None = None
+    last_ns: int = 0
+
+    def add(self, log_time_ns: int) -> None:
+        """Count one message."""
+        self.count += 1
+        self.first_ns = log_time_ns if self.first_ns is None else min(self.first_ns, log_time_ns)
+        self.last_ns = max(self.last_ns, log_time_ns)
+
+    def about(self) -> dict[str, Any]:
+        """Return start, duration and count as metadata.yaml has them."""
+        start = self.first_ns or 0
+        return {"duration": {"nanoseconds": max(self.last_ns - start, 0)},
+                "starting_time": {"nanoseconds_since_epoch": start},
+                "message_count": self.count}
+
+
+@dataclass
+class Metadata:
+    """What metadata.yaml says of a bag."""
+
+    topics: dict[str, Topic] = field(default_factory=dict)
+    files: list[FileEntry] = field(default_factory=list)
+
+    def write(self, folder: Path) -> None:
+        """Write metadata.yaml into the bag's folder, atomically."""
+        write_text(folder / "metadata.yaml", yaml.safe_dump(
+            {"rosbag2_bagfile_information": self._information()}, sort_keys=False))
+
+    def _information(self) -> dict[str, Any]:
+        firsts = [file.first_ns for file in self.files if file.first_ns is not None]
+        whole = FileEntry("", sum(file.count for file in self.files), min(firsts, default=None),
+                          max((file.last_ns for file in self.files), default=0))
+        about = whole.about()
+        topics = [{"topic_metadata": {
+            "name": name, "type": topic.type, "serialization_format": "cdr",
+            "offered_qos_profiles": topic.qos,
+            "type_description_hash": typestore().hash_rihs01(topic.type)},
+            "message_count": topic.count} for name, topic in self.topics.items()]
+        return {
+            "version": 9, "storage_identifier": "mcap", "duration": about["duration"],
+            "starting_time": about["starting_time"], "message_count": about["message_count"],
+            "topics_with_message_count": topics, "compression_format": "", "compression_mode": "",
+            "relative_file_paths": [file.name for file in self.files],
+            "files": [{"path": file.name, "starting_time": file.about()["starting_time"],
+                       "duration": file.about()["duration"], "message_count": file.count}
+                      for file in self.files],
+            "custom_data": None, "ros_distro": "jazzy"}
