@@ -8,7 +8,7 @@ from selfcal_ros.bagio.simulated import read_truth
 from selfcal_ros.cli.main import main as selfcal
 from selfcal_ros.files import read_json
 from selfcal_ros.model.result import result_from_dict
-from selfcal_ros.reporting.map_plot import save_map_plot
+from selfcal_ros.reporting.maps.plot import save_map_plot
 
 ROOT = Path(__file__).parents[1]
 BAG = ROOT / "bags" / "hu_noise"

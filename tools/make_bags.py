@@ -19,7 +19,7 @@ from selfcal_ros.collection.parameters import parameter_values
 from selfcal_ros.errors import NotIdentifiableError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.files import write_text
-from selfcal_ros.reporting.summary_numbers import summary_numbers
+from selfcal_ros.reporting.summary.numbers import summary_numbers
 from selfcal_ros.simulation.spec import read_simulation
 
 ROOT = Path(__file__).parents[1]

@@ -17,7 +17,7 @@ from selfcal_ros.bagio.mcap_stream import McapStream
 from selfcal_ros.bagio.reader import BagReader
 from selfcal_ros.bagio.schemas import store_of_schema
 from selfcal_ros.errors import InputError, NoDataError
-from selfcal_ros.laser.zigzag import Series
+from selfcal_ros.laser.readings.zigzag import Series
 from selfcal_ros.messages.to_model import stamp_ns
 
 FIELDS = {"std_msgs/msg/Float64": "data", "std_msgs/msg/Float32": "data",

@@ -3,7 +3,7 @@
 
 import argparse
 
-from selfcal_ros.cli import cal_files, cal_lines, cal_maps
+from selfcal_ros.cli.aerotech import files, lines, maps
 
 HELP = "read, check, evaluate, write and verify calibration files of Aerotech controllers"
 
@@ -11,7 +11,7 @@ HELP = "read, check, evaluate, write and verify calibration files of Aerotech co
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the sub-verbs."""
     group = parser.add_subparsers(dest="sub_verb", metavar="WHAT", required=True)
-    for module in (cal_files, cal_maps, cal_lines):
+    for module in (files, maps, lines):
         module.add_to(group)
 
 

@@ -57,13 +57,13 @@ def run(args: argparse.Namespace) -> int:
     if args.output:
         write_json(args.output, result_to_dict(result))
     if not args.quiet:
-        from selfcal_ros.cli.shown import show
+        from selfcal_ros.cli.terminal.print_result import show
         show(result, args.bag, args.output)
     return 0
 
 
 def _play(args: argparse.Namespace, saved: Path, environment: dict) -> tuple[int, list[str]]:
-    from selfcal_ros.cli.progress import progress_bar
+    from selfcal_ros.cli.terminal.progress import progress_bar
 
     rest = ["--ros-args", "--params-file", args.params] if args.params else []
     quiet = ["--ros-args", "--log-level", "warn"]

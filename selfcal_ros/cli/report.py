@@ -24,8 +24,8 @@ def run(args: argparse.Namespace) -> int:
     from selfcal_ros.files import check_outputs, read_json
     from selfcal_ros.model.result import result_from_dict
     from selfcal_ros.reporting.html import save_report
-    from selfcal_ros.reporting.map_plot import save_map_plot
-    from selfcal_ros.reporting.summary import can_print_symbols, summary_text
+    from selfcal_ros.reporting.maps.plot import save_map_plot
+    from selfcal_ros.reporting.summary.text import can_print_symbols, summary_text
 
     output = Path(args.output) if args.output else Path(args.result).with_suffix(".html")
     check_outputs([args.result, args.truth], [output, args.plot])

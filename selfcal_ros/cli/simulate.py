@@ -16,7 +16,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Simulate and say what was written."""
     from selfcal_ros.bagio.simulated import write_simulation
-    from selfcal_ros.cli.progress import progress_bar
+    from selfcal_ros.cli.terminal.progress import progress_bar
     from selfcal_ros.simulation.spec import read_simulation
 
     simulation = read_simulation(args.sim)

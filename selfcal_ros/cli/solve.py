@@ -73,7 +73,7 @@ def _reference(text: str | None) -> dict[str, Any]:
 def run(args: argparse.Namespace) -> int:
     """Collect, calibrate, print the summary and write the result."""
     from selfcal_ros.bagio.offline import bag_input, collect_bag
-    from selfcal_ros.cli.progress import progress_bar
+    from selfcal_ros.cli.terminal.progress import progress_bar
     from selfcal_ros.collection.parameters import solver_options
     from selfcal_ros.collection.reasons import advice
     from selfcal_ros.errors import NotIdentifiableError
@@ -105,7 +105,7 @@ def run(args: argparse.Namespace) -> int:
     if args.output:
         write_json(args.output, result_to_dict(result))
     if not args.quiet:
-        from selfcal_ros.cli.shown import show
+        from selfcal_ros.cli.terminal.print_result import show
         show(result, args.bag, args.output)
         print("\n".join(lines), end="\n" * bool(lines))
     return 0

@@ -6,7 +6,7 @@ import json
 import math
 import sys
 
-from selfcal_ros.cli.cal_options import add_frame, frame_of
+from selfcal_ros.cli.aerotech.options import add_frame, frame_of
 from selfcal_ros.cli.step_diagonal_bag import (
     add_bag_options,
     is_bag,
@@ -66,11 +66,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Identify, write the result, and say what was found."""
     from selfcal_ros.files import write_json
-    from selfcal_ros.laser.conventional import EQUAL_READINGS, readings_are_equal
     from selfcal_ros.laser.data import Form, Method
     from selfcal_ros.laser.identify import Choice, identify
-    from selfcal_ros.laser.outcome import outcome, summary
     from selfcal_ros.laser.profiles import Line
+    from selfcal_ros.laser.result_json import outcome, summary
+    from selfcal_ros.laser.wang import EQUAL_READINGS, readings_are_equal
 
     _check_outputs(args)
     if args.sensitivity:
@@ -127,7 +127,7 @@ def _write_cal(args: argparse.Namespace, found: object) -> None:
     from selfcal_ros import __version__
     from selfcal_ros.compensation.aerotech.export import DECIMALS
     from selfcal_ros.compensation.aerotech.write import cal_text, write_cal
-    from selfcal_ros.laser.transfer import correction_tables
+    from selfcal_ros.laser.map_equivalent import correction_tables
 
     frame = frame_of(args)
     comments = [f"written by selfcal {__version__} from the step-diagonal measurement {args.data}",
@@ -165,7 +165,7 @@ def _sensitivity(args: argparse.Namespace) -> int:
 def _simulate(args: argparse.Namespace) -> int:
     """Write the readings of a simulated measurement as a table."""
     from selfcal_ros.files import read_yaml, write_json, write_text
-    from selfcal_ros.laser.table import table_text
+    from selfcal_ros.laser.readings.table import table_text
     from selfcal_ros.simulation.laser import simulate_step_diagonal
     from selfcal_ros.simulation.laser_config import simulation_from_dict, truth_of
 
@@ -190,7 +190,7 @@ def _simulate(args: argparse.Namespace) -> int:
 def _measurement(args: argparse.Namespace) -> tuple:
     """Return the measurement, its warnings, and where it came from."""
     from selfcal_ros.files import sha256_of
-    from selfcal_ros.laser.table import Columns, dimension_of, read_table
+    from selfcal_ros.laser.readings.table import Columns, dimension_of, read_table
 
     if is_bag(args.data):
         data, warnings = measurement_from_bag(args, _steps(args, len(joints_of(args))))

@@ -4,13 +4,9 @@
 from dataclasses import dataclass
 
 from selfcal_ros.errors import InputError
-from selfcal_ros.laser.conventional import (
-    EQUAL_READINGS,
-    identify_conventional,
-    readings_are_equal,
-)
 from selfcal_ros.laser.data import Form, Identified, Method, StepDiagonal
-from selfcal_ros.laser.new import identify_new
+from selfcal_ros.laser.ibaraki import identify_new
+from selfcal_ros.laser.wang import EQUAL_READINGS, identify_conventional, readings_are_equal
 
 
 @dataclass(frozen=True)

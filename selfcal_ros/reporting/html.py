@@ -16,11 +16,11 @@ from selfcal_ros.reporting.html_extras import (
     provenance_section,
 )
 from selfcal_ros.reporting.html_style import CSS
-from selfcal_ros.reporting.map_plot import error_map_svg, theta_svg, uncertainty_map_svg
-from selfcal_ros.reporting.summary import state_sentence
-from selfcal_ros.reporting.summary_format import printable
-from selfcal_ros.reporting.summary_numbers import truth_arrays
-from selfcal_ros.reporting.summary_sections import Section, all_sections
+from selfcal_ros.reporting.maps.plot import error_map_svg, theta_svg, uncertainty_map_svg
+from selfcal_ros.reporting.summary.format import printable
+from selfcal_ros.reporting.summary.numbers import truth_arrays
+from selfcal_ros.reporting.summary.sections import Section, all_sections
+from selfcal_ros.reporting.summary.text import state_sentence
 
 POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
 """Content security policy: a browser will not fetch anything, whatever a name contains."""

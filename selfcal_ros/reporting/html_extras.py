@@ -7,8 +7,8 @@ from typing import Any
 from selfcal_ros import __version__
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.result import SCHEMA, CalibrationResult
-from selfcal_ros.reporting.summary_format import ARCSEC, UM, UNKNOWN, printable, significant
-from selfcal_ros.reporting.summary_sections import Section
+from selfcal_ros.reporting.summary.format import ARCSEC, UM, UNKNOWN, printable, significant
+from selfcal_ros.reporting.summary.sections import Section
 
 MAX_ROWS = 200
 """Longest table of a report; the rest is in the result file."""

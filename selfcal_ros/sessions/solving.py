@@ -16,8 +16,8 @@ from selfcal_ros.model.result import (
     result_to_dict,
     unidentified_result,
 )
-from selfcal_ros.reporting.summary import state_sentence
-from selfcal_ros.reporting.summary_numbers import summary_numbers
+from selfcal_ros.reporting.summary.numbers import summary_numbers
+from selfcal_ros.reporting.summary.text import state_sentence
 from selfcal_ros.sessions.ports import Diagnosis, Level, Ports
 
 ECHO_LENGTH = 128

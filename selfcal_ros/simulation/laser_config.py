@@ -9,8 +9,8 @@ import numpy as np
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.laser.data import DIAGONALS, MAX_BLOCKS, Closure, Identified
-from selfcal_ros.laser.outcome import geometry
 from selfcal_ros.laser.profiles import Line, name_of
+from selfcal_ros.laser.result_json import geometry
 from selfcal_ros.simulation.laser import (
     LaserNoise,
     Measurement,

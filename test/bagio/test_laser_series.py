@@ -4,7 +4,7 @@ import pytest
 
 from selfcal_ros.bagio.laser_series import SeriesTopics, read_series
 from selfcal_ros.errors import InputError, NoDataError
-from selfcal_ros.laser.zigzag import Series
+from selfcal_ros.laser.readings.zigzag import Series
 from test.support.laser_bags import EPOCH_NS, write_laser_bag
 
 TOPICS = SeriesTopics("/cell/laser", "cell/axes")

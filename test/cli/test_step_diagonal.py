@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from selfcal_ros.cli.main import main
-from selfcal_ros.laser.table import write_table
+from selfcal_ros.laser.readings.table import write_table
 from selfcal_ros.simulation.laser import (
     LaserNoise,
     Measurement,

@@ -3,8 +3,8 @@ import numpy as np
 import pytest
 
 from selfcal_ros.laser.adjust import Geometry, adjust
-from selfcal_ros.laser.conventional import jacobian
 from selfcal_ros.laser.data import DIAGONALS, StepDiagonal
+from selfcal_ros.laser.wang import jacobian
 from selfcal_ros.simulation.laser import (
     Measurement,
     SetUp,

@@ -3,10 +3,10 @@ import numpy as np
 import pytest
 
 from selfcal_ros.errors import InputError
+from selfcal_ros.laser.ibaraki import identify_new
 from selfcal_ros.laser.map_axes import compare_axes
-from selfcal_ros.laser.new import identify_new
-from selfcal_ros.laser.outcome import outcome
 from selfcal_ros.laser.profiles import straightness
+from selfcal_ros.laser.result_json import outcome
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ErrorMap
 from selfcal_ros.simulation.laser import Measurement, case_study_machine, simulate_step_diagonal

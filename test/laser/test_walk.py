@@ -8,9 +8,9 @@ after every step. Nothing of the package is used but the containers.
 import numpy as np
 import pytest
 
-from selfcal_ros.laser.conventional import identify_conventional
 from selfcal_ros.laser.data import StepDiagonal
-from selfcal_ros.laser.new import identify_new
+from selfcal_ros.laser.ibaraki import identify_new
+from selfcal_ros.laser.wang import identify_conventional
 
 NAMES = {2: ("pp", "np"), 3: ("ppp", "npp", "pnp", "ppn")}
 

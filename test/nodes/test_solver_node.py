@@ -16,7 +16,7 @@ from selfcal_ros.model.result import result_to_dict
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes.base import fill
 from selfcal_ros.nodes.solver import Solver
-from selfcal_ros.reporting.map_markers import map_geometry
+from selfcal_ros.reporting.maps.markers import map_geometry
 from selfcal_ros.sessions.solving import short
 from test.support.maps import random_map, result_of
 from test.support.sessions import collected, events_of, small_plan

@@ -12,7 +12,7 @@ from selfcal_ros.bagio.simulated import read_truth
 from selfcal_ros.collection.parameters import parameter_values
 from selfcal_ros.errors import NotIdentifiableError
 from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.reporting.summary_numbers import summary_numbers
+from selfcal_ros.reporting.summary.numbers import summary_numbers
 
 BAGS = Path(__file__).parents[2] / "bags"
 MANIFEST = yaml.safe_load((BAGS / "manifest.yaml").read_text())

@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from selfcal_ros.laser.data import DIAGONALS
-from selfcal_ros.laser.new import identify_new
+from selfcal_ros.laser.ibaraki import identify_new
 from selfcal_ros.simulation.laser import (
     LaserNoise,
     Measurement,

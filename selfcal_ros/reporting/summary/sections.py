@@ -9,7 +9,7 @@ import numpy as np
 
 from selfcal_ros.model.error_map import ErrorMap
 from selfcal_ros.model.result import CalibrationResult, Noise, ViewResult
-from selfcal_ros.reporting.summary_format import (
+from selfcal_ros.reporting.summary.format import (
     ARCSEC,
     MM,
     UM,
@@ -19,7 +19,7 @@ from selfcal_ros.reporting.summary_format import (
     printable,
     significant,
 )
-from selfcal_ros.reporting.summary_numbers import map_figures, truth_figures
+from selfcal_ros.reporting.summary.numbers import map_figures, truth_figures
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from matplotlib.quiver import Quiver
 
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ErrorMap
-from selfcal_ros.reporting.map_plot_style import (
+from selfcal_ros.reporting.maps.style import (
     BAND,
     BAND_EDGE,
     GRID,
@@ -24,7 +24,7 @@ from selfcal_ros.reporting.map_plot_style import (
     round_down,
     uncertainty_colours,
 )
-from selfcal_ros.reporting.summary_format import MM, UM, significant
+from selfcal_ros.reporting.summary.format import MM, UM, significant
 
 MAX_ARROWS = 27
 """Most arrows along one side; larger fields show every second, third, ... site."""

@@ -9,10 +9,10 @@ from matplotlib.image import imread
 from matplotlib.quiver import Quiver
 
 from selfcal_ros.errors import InputError
-from selfcal_ros.reporting.map_plot import error_map_svg, save_map_plot, theta_svg
-from selfcal_ros.reporting.map_plot_style import RC, drawable, round_down
-from selfcal_ros.reporting.map_plot_theta import draw_theta
-from selfcal_ros.reporting.map_plot_xy import choose_arrows, draw_error_map
+from selfcal_ros.reporting.maps.plot import error_map_svg, save_map_plot, theta_svg
+from selfcal_ros.reporting.maps.style import RC, drawable, round_down
+from selfcal_ros.reporting.maps.theta import draw_theta
+from selfcal_ros.reporting.maps.xy import choose_arrows, draw_error_map
 from test.support.results import known_result
 
 

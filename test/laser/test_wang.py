@@ -5,15 +5,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from selfcal_ros.errors import InputError
-from selfcal_ros.laser.conventional import (
-    identify_conventional,
-    jacobian,
-    readings_are_equal,
-)
 from selfcal_ros.laser.data import DIAGONALS, Method, StepDiagonal, signs_of, step_vectors
 from selfcal_ros.laser.identify import Choice, identify
-from selfcal_ros.laser.paper import Erratum
 from selfcal_ros.laser.profiles import squareness
+from selfcal_ros.laser.published_equations import Erratum
+from selfcal_ros.laser.wang import identify_conventional, jacobian, readings_are_equal
 from selfcal_ros.simulation.laser import (
     Measurement,
     SetUp,

@@ -17,7 +17,7 @@ import numpy as np
 
 from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.laser.data import AXES, DIAGONALS, MAX_BLOCKS, StepDiagonal
-from selfcal_ros.laser.plausible import check_reading
+from selfcal_ros.laser.readings.plausible import check_reading
 
 OUTLIER = 10.0
 """Laser samples of a rest farther than this from its median are left out, in median distances: for

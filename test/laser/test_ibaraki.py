@@ -5,11 +5,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from selfcal_ros.errors import InputError, NotIdentifiableError
-from selfcal_ros.laser.conventional import identify_conventional
 from selfcal_ros.laser.data import DIAGONALS, Form, StepDiagonal
-from selfcal_ros.laser.new import identify_new
-from selfcal_ros.laser.paper import Erratum
+from selfcal_ros.laser.ibaraki import identify_new
 from selfcal_ros.laser.profiles import squareness, straightness
+from selfcal_ros.laser.published_equations import Erratum
+from selfcal_ros.laser.wang import identify_conventional
 from selfcal_ros.simulation.laser import (
     LaserNoise,
     Measurement,

@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from selfcal_ros.cli.cal_options import add_frame, frame_of, read_result
+from selfcal_ros.cli.aerotech.options import add_frame, frame_of, read_result
 from selfcal_ros.errors import ExitCode, InputError
 
 if TYPE_CHECKING:

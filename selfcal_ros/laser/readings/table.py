@@ -19,8 +19,8 @@ import numpy as np
 from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.files import read_text, write_text
 from selfcal_ros.laser.data import AXES, DIAGONALS, MAX_BLOCKS, StepDiagonal
-from selfcal_ros.laser.plausible import check_linear, check_reading
 from selfcal_ros.laser.profiles import name_of
+from selfcal_ros.laser.readings.plausible import check_linear, check_reading
 
 MM = 1e-3
 BLOCK = "block"

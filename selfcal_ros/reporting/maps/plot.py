@@ -17,11 +17,11 @@ from selfcal_ros import __version__
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import write_bytes
 from selfcal_ros.model.result import CalibrationResult
-from selfcal_ros.reporting.map_plot_style import RC, drawable
-from selfcal_ros.reporting.map_plot_theta import draw_theta
-from selfcal_ros.reporting.map_plot_xy import draw_error_map, draw_uncertainty_map
-from selfcal_ros.reporting.summary import state_sentence
-from selfcal_ros.reporting.summary_numbers import truth_arrays
+from selfcal_ros.reporting.maps.style import RC, drawable
+from selfcal_ros.reporting.maps.theta import draw_theta
+from selfcal_ros.reporting.maps.xy import draw_error_map, draw_uncertainty_map
+from selfcal_ros.reporting.summary.numbers import truth_arrays
+from selfcal_ros.reporting.summary.text import state_sentence
 
 DPI = 150
 

@@ -16,15 +16,15 @@ from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ErrorMap, ThetaDatum
 from selfcal_ros.model.result import Noise, Observability, result_from_dict, result_to_dict
 from selfcal_ros.model.verdict import Cause, ModelResult, TermEstimate, TermResult, Verdict
-from selfcal_ros.reporting.summary import (
+from selfcal_ros.reporting.summary.format import aligned, fixed_column, significant, to_ascii
+from selfcal_ros.reporting.summary.numbers import map_figures, truth_figures
+from selfcal_ros.reporting.summary.sections import place_text, pose_text
+from selfcal_ros.reporting.summary.text import (
     can_print_symbols,
     state_sentence,
     summary_numbers,
     summary_text,
 )
-from selfcal_ros.reporting.summary_format import aligned, fixed_column, significant, to_ascii
-from selfcal_ros.reporting.summary_numbers import map_figures, truth_figures
-from selfcal_ros.reporting.summary_sections import place_text, pose_text
 from selfcal_ros.simulation.truth import hu_plan, random_truth, simulate_measurements
 from test.support.maps import random_map
 from test.support.results import known_result
@@ -322,6 +322,6 @@ def test_symbols_only_where_the_stream_has_them():
 
 
 def test_summary_does_not_load_matplotlib():
-    code = ("import sys, selfcal_ros.reporting.summary; "
+    code = ("import sys, selfcal_ros.reporting.summary.text; "
             "sys.exit('matplotlib' in sys.modules)")
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

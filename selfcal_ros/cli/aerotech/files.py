@@ -5,7 +5,7 @@ import argparse
 import json
 import math
 
-from selfcal_ros.cli.cal_options import numbers, pairs
+from selfcal_ros.cli.aerotech.options import numbers, pairs
 from selfcal_ros.errors import ExitCode, InputError
 
 

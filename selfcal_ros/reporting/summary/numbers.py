@@ -10,7 +10,7 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.datum.modes import datum_modes, remove_modes
 from selfcal_ros.model.error_map import ErrorMap
 from selfcal_ros.model.result import CalibrationResult
-from selfcal_ros.reporting.summary_format import ARCSEC, UM
+from selfcal_ros.reporting.summary.format import ARCSEC, UM
 
 NAN = float("nan")
 

@@ -7,8 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from selfcal_ros.errors import InputError, NoDataError
-from selfcal_ros.laser.new import identify_new
-from selfcal_ros.laser.zigzag import CutRule, Series, cut_zigzag, find_rests
+from selfcal_ros.laser.ibaraki import identify_new
+from selfcal_ros.laser.readings.zigzag import CutRule, Series, cut_zigzag, find_rests
 from selfcal_ros.simulation.laser import (
     Measurement,
     SetUp,

@@ -8,8 +8,8 @@ from matplotlib.projections.polar import PolarAxes
 from matplotlib.ticker import MaxNLocator
 
 from selfcal_ros.model.error_map import ErrorMap
-from selfcal_ros.reporting.map_plot_style import BAND, GRID, INK, TRUTH
-from selfcal_ros.reporting.summary_format import ARCSEC
+from selfcal_ros.reporting.maps.style import BAND, GRID, INK, TRUTH
+from selfcal_ros.reporting.summary.format import ARCSEC
 
 MARKED_LINES = 120
 """Up to so many lines each gets a dot."""

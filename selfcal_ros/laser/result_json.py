@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from selfcal_ros.laser.data import AXES, Identified, Method, StepDiagonal
-from selfcal_ros.laser.noise import linear_noise, reading_noise
+from selfcal_ros.laser.map_equivalent import map_equivalent
 from selfcal_ros.laser.profiles import (
     Line,
     Value,
@@ -21,7 +21,7 @@ from selfcal_ros.laser.profiles import (
     straightness,
     u_profile_m,
 )
-from selfcal_ros.laser.transfer import map_equivalent
+from selfcal_ros.laser.readings.noise import linear_noise, reading_noise
 from selfcal_ros.model.result import plain
 
 SCHEMA = "selfcal.step_diagonal/1"

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from selfcal_ros.laser.data import DIAGONALS, StepDiagonal
-from selfcal_ros.laser.noise import (
+from selfcal_ros.laser.readings.noise import (
     linear_covariance,
     linear_noise,
     reading_covariance,

@@ -20,8 +20,8 @@ from selfcal_ros.laser.data import (
     step_vectors,
     turn_to_first_step,
 )
-from selfcal_ros.laser.noise import reading_covariance, reading_noise
-from selfcal_ros.laser.paper import Erratum
+from selfcal_ros.laser.published_equations import Erratum
+from selfcal_ros.laser.readings.noise import reading_covariance, reading_noise
 
 EQUAL_RELATIVE = 1e-12
 """Readings closer than this are the same number."""

@@ -4,7 +4,13 @@ import pytest
 
 from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.laser.data import DIAGONALS, StepDiagonal
-from selfcal_ros.laser.table import Columns, dimension_of, read_table, table_text, write_table
+from selfcal_ros.laser.readings.table import (
+    Columns,
+    dimension_of,
+    read_table,
+    table_text,
+    write_table,
+)
 from selfcal_ros.simulation.laser import (
     LaserNoise,
     Measurement,

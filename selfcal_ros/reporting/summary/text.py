@@ -7,20 +7,20 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from selfcal_ros.model.result import CalibrationResult
-from selfcal_ros.reporting.summary_format import (
+from selfcal_ros.reporting.summary.format import (
     aligned,
     can_print_symbols,
     counted,
     printable,
     to_ascii,
 )
-from selfcal_ros.reporting.summary_numbers import (
+from selfcal_ros.reporting.summary.numbers import (
     MapFigures,
     SummaryNumbers,
     map_figures,
     summary_numbers,
 )
-from selfcal_ros.reporting.summary_sections import (
+from selfcal_ros.reporting.summary.sections import (
     Section,
     all_sections,
     arcsec,

@@ -13,9 +13,9 @@ from selfcal_ros.laser.closure import (
     length_closure,
     propagated,
 )
-from selfcal_ros.laser.conventional import jacobian
 from selfcal_ros.laser.data import Closure, Form, Identified, Method, StepDiagonal
-from selfcal_ros.laser.paper import Erratum, solve_diagonal
+from selfcal_ros.laser.published_equations import Erratum, solve_diagonal
+from selfcal_ros.laser.wang import jacobian
 
 
 @one_thread()

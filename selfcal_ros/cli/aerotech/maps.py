@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from selfcal_ros.cli.cal_options import add_frame, frame_of, read_result
+from selfcal_ros.cli.aerotech.options import add_frame, frame_of, read_result
 from selfcal_ros.errors import ExitCode, InputError, NotIdentifiableError
 
 if TYPE_CHECKING:

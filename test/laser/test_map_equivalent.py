@@ -7,15 +7,15 @@ from selfcal_ros.compensation.machine import MachineFrame
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.datum.modes import first_order
 from selfcal_ros.estimation.options import ReferenceKind
-from selfcal_ros.laser.conventional import identify_conventional
-from selfcal_ros.laser.new import identify_new
-from selfcal_ros.laser.profiles import profile_m, squareness, squareness_rad
-from selfcal_ros.laser.transfer import (
+from selfcal_ros.laser.ibaraki import identify_new
+from selfcal_ros.laser.map_equivalent import (
     correction_lines,
     correction_tables,
     map_equivalent,
     reference_length,
 )
+from selfcal_ros.laser.profiles import profile_m, squareness, squareness_rad
+from selfcal_ros.laser.wang import identify_conventional
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.simulation.laser import (
     LaserNoise,

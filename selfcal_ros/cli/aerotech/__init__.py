@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The sub-verbs of ``selfcal cal``: files of Aerotech controllers."""
