@@ -68,7 +68,7 @@ def run(args: argparse.Namespace) -> int:
     from selfcal_ros.files import write_json
     from selfcal_ros.laser.data import Form, Method
     from selfcal_ros.laser.identify import Choice, identify
-    from selfcal_ros.laser.profiles import Line
+    from selfcal_ros.laser.profiles import ReferenceLine
     from selfcal_ros.laser.result_json import outcome, summary
     from selfcal_ros.laser.wang import EQUAL_READINGS, readings_are_equal
 
@@ -85,7 +85,7 @@ def run(args: argparse.Namespace) -> int:
     found = identify(data, choice)
     if readings_are_equal(data):
         warnings = [*warnings, EQUAL_READINGS]
-    result = outcome(found, data, line=Line(args.line), warnings=warnings)
+    result = outcome(found, data, line=ReferenceLine(args.line), warnings=warnings)
     result["input"] = source
     for warning in result["warnings"]:
         print(f"selfcal step-diagonal: warning: {warning}", file=sys.stderr)

@@ -182,7 +182,7 @@ class Closure:
 
 
 @dataclass(frozen=True, eq=False)
-class Identified:
+class StepDiagonalResult:
     """Errors of every block, turned so that the first X step has no transverse error.
 
     Attributes

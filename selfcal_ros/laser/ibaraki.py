@@ -13,14 +13,14 @@ from selfcal_ros.laser.closure import (
     length_closure,
     propagated,
 )
-from selfcal_ros.laser.data import Closure, Form, Identified, Method, StepDiagonal
+from selfcal_ros.laser.data import Closure, Form, Method, StepDiagonal, StepDiagonalResult
 from selfcal_ros.laser.published_equations import Erratum, solve_diagonal
 from selfcal_ros.laser.wang import jacobian
 
 
 @one_thread()
-def identify_new(data: StepDiagonal, *, form: Form = Form.EXACT,
-                 errata: Collection[Erratum] = ()) -> Identified:
+def identify_ibaraki(data: StepDiagonal, *, form: Form = Form.EXACT,
+                 errata: Collection[Erratum] = ()) -> StepDiagonalResult:
     """Identify the transverse errors from the readings and the measured linear errors.
 
     Parameters
@@ -53,13 +53,13 @@ def identify_new(data: StepDiagonal, *, form: Form = Form.EXACT,
         if data.dim == 2:
             alone = [adjust(data.pick([name])) for name in data.diagonals]
             between, u_between = between_diagonals(data, alone)
-    return Identified(data.steps_m, found.errors_m,
-                      propagated(data, found.by_readings, found.by_linear), Method.NEW, form,
-                      mirror, Closure(*lengths, between, u_between, residual))
+    return StepDiagonalResult(
+        data.steps_m, found.errors_m, propagated(data, found.by_readings, found.by_linear),
+        Method.NEW, form, mirror, Closure(*lengths, between, u_between, residual))
 
 
 def _paper(data: StepDiagonal, form: Form, errata: Collection[Erratum],
-           lengths: tuple[float | None, float | None]) -> Identified:
+           lengths: tuple[float | None, float | None]) -> StepDiagonalResult:
     """Return the mean of the diagonals by the paper's own equations."""
     def solve(readings: np.ndarray, linear: np.ndarray) -> np.ndarray:
         return solve_diagonal(data, readings, linear, form=form, errata=errata)
@@ -69,5 +69,6 @@ def _paper(data: StepDiagonal, form: Form, errata: Collection[Erratum],
     by_readings = jacobian(lambda r: solve(r, linear).mean(axis=0), readings)
     by_linear = jacobian(lambda e: solve(readings, e).mean(axis=0), linear)
     between = alone[0] - alone[1] if len(alone) == 2 else None
-    return Identified(data.steps_m, alone.mean(axis=0), propagated(data, by_readings, by_linear),
-                      Method.NEW, form, {}, Closure(*lengths, between))
+    return StepDiagonalResult(
+        data.steps_m, alone.mean(axis=0), propagated(data, by_readings, by_linear), Method.NEW,
+        form, {}, Closure(*lengths, between))

@@ -4,9 +4,9 @@
 from dataclasses import dataclass
 
 from selfcal_ros.errors import InputError
-from selfcal_ros.laser.data import Form, Identified, Method, StepDiagonal
-from selfcal_ros.laser.ibaraki import identify_new
-from selfcal_ros.laser.wang import EQUAL_READINGS, identify_conventional, readings_are_equal
+from selfcal_ros.laser.data import Form, Method, StepDiagonal, StepDiagonalResult
+from selfcal_ros.laser.ibaraki import identify_ibaraki
+from selfcal_ros.laser.wang import EQUAL_READINGS, identify_wang, readings_are_equal
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class Choice:
     allow_equal: bool = False
 
 
-def identify(data: StepDiagonal, choice: Choice) -> Identified:
+def identify(data: StepDiagonal, choice: Choice) -> StepDiagonalResult:
     """Identify the errors of a step-diagonal measurement by the chosen formulation.
 
     Raises
@@ -43,8 +43,8 @@ def identify(data: StepDiagonal, choice: Choice) -> Identified:
         if choice.form is not Form.EXACT:
             raise InputError("--form", "the conventional formulation has one form only",
                              "leave it out, or use --method new")
-        return identify_conventional(data)
+        return identify_wang(data)
     if readings_are_equal(data) and not choice.allow_equal:
         raise InputError("readings", EQUAL_READINGS, "turn the mirror square to the laser, or "
                          "allow equal readings if the linear errors truly are the same")
-    return identify_new(data, form=choice.form)
+    return identify_ibaraki(data, form=choice.form)

@@ -9,12 +9,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from selfcal_ros.compensation.aerotech.lines import Line, line_table
+from selfcal_ros.compensation.aerotech.lines import AxisCorrection, line_table
 from selfcal_ros.compensation.aerotech.model import Table1D
 from selfcal_ros.compensation.machine import MachineFrame
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.options import ReferenceKind, ReferenceLength
-from selfcal_ros.laser.data import Identified, Method
+from selfcal_ros.laser.data import Method, StepDiagonalResult
 from selfcal_ros.laser.profiles import (
     positions_m,
     profile_m,
@@ -44,7 +44,7 @@ class MapEquivalent:
     u_scale_difference: float | None = None
 
 
-def map_equivalent(found: Identified) -> MapEquivalent:
+def map_equivalent(found: StepDiagonalResult) -> MapEquivalent:
     """Return O and R of an error map that has this squareness and these linear errors."""
     u = squareness(found).u
     span = found.steps_m[1] * found.n_blocks
@@ -57,7 +57,7 @@ def map_equivalent(found: Identified) -> MapEquivalent:
     return MapEquivalent(o, u_o, (slope(found, 1, 1) - slope(found, 0, 0)) / 2, u_r)
 
 
-def reference_length(found: Identified, axis: int) -> ReferenceLength:
+def reference_length(found: StepDiagonalResult, axis: int) -> ReferenceLength:
     """Return the scale that the measured linear error of X (0) or Y (1) gives the stage.
 
     Raises
@@ -73,7 +73,7 @@ def reference_length(found: Identified, axis: int) -> ReferenceLength:
     return ReferenceLength(kind, -slope(found, axis, axis), u_slope(found, axis, axis) or 0.0)
 
 
-def correction_lines(found: Identified) -> dict[tuple[str, str], Line]:
+def axis_corrections(found: StepDiagonalResult) -> dict[tuple[str, str], AxisCorrection]:
     """Return (along, corrected) -> correction -E, m, of every profile of X and Y.
 
     The datum is turned from the first X step to the line of the X axis: the correction of Y along x
@@ -90,23 +90,23 @@ def correction_lines(found: Identified) -> dict[tuple[str, str], Line]:
                          "x and y", "export a measurement of face diagonals")
     x, y = (positions_m(found, axis) for axis in (0, 1))
     turn = slope(found, 0, 1)
-    lines = {("x", "y"): Line(x, turn * x - profile_m(found, 0, 1)),
-             ("y", "x"): Line(y, -turn * y - profile_m(found, 1, 0))}
+    lines = {("x", "y"): AxisCorrection(x, turn * x - profile_m(found, 0, 1)),
+             ("y", "x"): AxisCorrection(y, -turn * y - profile_m(found, 1, 0))}
     if found.method == Method.NEW:
-        lines[("x", "x")] = Line(x, -profile_m(found, 0, 0))
-        lines[("y", "y")] = Line(y, -profile_m(found, 1, 1))
+        lines[("x", "x")] = AxisCorrection(x, -profile_m(found, 0, 0))
+        lines[("y", "y")] = AxisCorrection(y, -profile_m(found, 1, 1))
     return lines
 
 
-def correction_tables(found: Identified, frame: MachineFrame) -> list[Table1D]:
+def correction_tables(found: StepDiagonalResult, frame: MachineFrame) -> list[Table1D]:
     """Return the 1D tables of all corrections, in the controller's coordinates.
 
     Parameters
     ----------
-    found : Identified
+    found : StepDiagonalResult
         Result of a 2D measurement.
     frame : MachineFrame
         The machine's axes; its home is counted from the start of the first block.
     """
     return [line_table(line, frame, along=along, corrected=corrected)
-            for (along, corrected), line in sorted(correction_lines(found).items())]
+            for (along, corrected), line in sorted(axis_corrections(found).items())]

@@ -16,10 +16,10 @@ from enum import StrEnum
 
 import numpy as np
 
-from selfcal_ros.laser.data import AXES, Identified
+from selfcal_ros.laser.data import AXES, StepDiagonalResult
 
 
-class Line(StrEnum):
+class ReferenceLine(StrEnum):
     """Reference line of a profile."""
 
     LEAST_SQUARES = "lsq"
@@ -34,17 +34,17 @@ class Value:
     u: float | None = None
 
 
-def positions_m(found: Identified, axis: int) -> np.ndarray:
+def positions_m(found: StepDiagonalResult, axis: int) -> np.ndarray:
     """Return the nominal positions of the ends of the blocks, (n+1,), m, from 0."""
     return np.arange(found.n_blocks + 1) * found.steps_m[axis]
 
 
-def profile_m(found: Identified, axis: int, direction: int) -> np.ndarray:
+def profile_m(found: StepDiagonalResult, axis: int, direction: int) -> np.ndarray:
     """Return the accumulated error in `direction` along `axis`, (n+1,), m, 0 at the start."""
     return np.concatenate([[0.0], np.cumsum(found.errors_m[axis, :, direction])])
 
 
-def u_profile_m(found: Identified, axis: int, direction: int) -> np.ndarray | None:
+def u_profile_m(found: StepDiagonalResult, axis: int, direction: int) -> np.ndarray | None:
     """Return the standard uncertainty of the profile, (n+1,), m; None if not known."""
     if found.covariance is None:
         return None
@@ -53,8 +53,8 @@ def u_profile_m(found: Identified, axis: int, direction: int) -> np.ndarray | No
     return np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", rows, block, rows), 0.0))
 
 
-def straightness(found: Identified, axis: int, direction: int,
-                 line: Line = Line.LEAST_SQUARES) -> Value:
+def straightness(found: StepDiagonalResult, axis: int, direction: int,
+                 line: ReferenceLine = ReferenceLine.LEAST_SQUARES) -> Value:
     """Return the straightness of `axis` in `direction`, m.
 
     Its uncertainty is that of the distance between the two extreme points; as a peak-to-valley
@@ -71,15 +71,15 @@ def straightness(found: Identified, axis: int, direction: int,
     return Value(value, float(np.sqrt(max(row @ block @ row, 0.0))))
 
 
-def slope(found: Identified, axis: int, direction: int,
-          line: Line = Line.LEAST_SQUARES) -> float:
+def slope(found: StepDiagonalResult, axis: int, direction: int,
+          line: ReferenceLine = ReferenceLine.LEAST_SQUARES) -> float:
     """Return the slope of a profile: rad for a transverse one, relative for a linear one."""
     row = _slope_row(found.n_blocks, line) / found.steps_m[axis]
     return float(row @ found.errors_m[axis, :, direction])
 
 
-def u_slope(found: Identified, axis: int, direction: int,
-            line: Line = Line.LEAST_SQUARES) -> float | None:
+def u_slope(found: StepDiagonalResult, axis: int, direction: int,
+            line: ReferenceLine = ReferenceLine.LEAST_SQUARES) -> float | None:
     """Return the standard uncertainty of `slope`; None if not known."""
     if found.covariance is None:
         return None
@@ -88,8 +88,8 @@ def u_slope(found: Identified, axis: int, direction: int,
     return float(np.sqrt(max(row @ block @ row, 0.0)))
 
 
-def squareness(found: Identified, first: int = 0, second: int = 1,
-               line: Line = Line.LEAST_SQUARES) -> Value:
+def squareness(found: StepDiagonalResult, first: int = 0, second: int = 1,
+               line: ReferenceLine = ReferenceLine.LEAST_SQUARES) -> Value:
     """Return the squareness of two axes over the range of the second, m (sign: see above)."""
     row = _slope_row(found.n_blocks, line)
     of_first = row * found.steps_m[second] / found.steps_m[first] * found.n_blocks
@@ -105,8 +105,8 @@ def squareness(found: Identified, first: int = 0, second: int = 1,
     return Value(value, float(np.sqrt(max(variance, 0.0))))
 
 
-def squareness_rad(found: Identified, first: int = 0, second: int = 1,
-                   line: Line = Line.LEAST_SQUARES) -> float:
+def squareness_rad(found: StepDiagonalResult, first: int = 0, second: int = 1,
+                   line: ReferenceLine = ReferenceLine.LEAST_SQUARES) -> float:
     """Return the squareness as an angle, rad: 90 deg less the angle between the axes."""
     return slope(found, second, first, line) + slope(found, first, second, line)
 
@@ -126,15 +126,15 @@ def _accumulate(n: int) -> np.ndarray:
     return np.tri(n + 1, n, -1)
 
 
-def _slope_row(n: int, line: Line) -> np.ndarray:
+def _slope_row(n: int, line: ReferenceLine) -> np.ndarray:
     """Return the row that takes block errors to the slope of their profile, per block."""
-    if line is Line.END_POINTS:
+    if line is ReferenceLine.END_POINTS:
         return np.full(n, 1.0 / n)
     centred = np.arange(n + 1) - n / 2
     return (centred / (centred @ centred)) @ _accumulate(n)
 
 
-def _block(found: Identified, one: tuple[int, int], other: tuple[int, int]) -> np.ndarray:
+def _block(found: StepDiagonalResult, one: tuple[int, int], other: tuple[int, int]) -> np.ndarray:
     """Return the covariance between two kinds (axis, direction) of errors, (n, n)."""
     dim, n = found.dim, found.n_blocks
     shaped = found.covariance.reshape(dim, n, dim, dim, n, dim)

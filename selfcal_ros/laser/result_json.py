@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from selfcal_ros.laser.data import AXES, Identified, Method, StepDiagonal
+from selfcal_ros.laser.data import AXES, Method, StepDiagonal, StepDiagonalResult
 from selfcal_ros.laser.map_equivalent import map_equivalent
 from selfcal_ros.laser.profiles import (
-    Line,
+    ReferenceLine,
     Value,
     axis_pairs,
     name_of,
@@ -36,15 +36,16 @@ CONVENTION = {
 }
 
 
-def outcome(found: Identified, data: StepDiagonal, *, line: Line = Line.LEAST_SQUARES,
+def outcome(found: StepDiagonalResult, data: StepDiagonal, *,
+            line: ReferenceLine = ReferenceLine.LEAST_SQUARES,
             warnings: Sequence[str] = ()) -> dict[str, Any]:
     """Return the JSON form of a result, lengths in mm.
 
     Parameters
     ----------
-    found, data : Identified, StepDiagonal
+    found, data : StepDiagonalResult, StepDiagonal
         Result and the measurement behind it.
-    line : Line
+    line : ReferenceLine
         Reference line of straightness and squareness.
     warnings : sequence of str
         What a reader has to know.
@@ -87,7 +88,7 @@ def _value(prefix: str, value: Value) -> dict[str, float | None]:
     return {prefix: value.value / MM, f"u_{prefix}": None if value.u is None else value.u / MM}
 
 
-def geometry(found: Identified, line: Line) -> dict[str, Any]:
+def geometry(found: StepDiagonalResult, line: ReferenceLine) -> dict[str, Any]:
     """Return squareness and straightness, mm: in 3D one name a pair beside the short names."""
     out: dict[str, Any] = _value("squareness", squareness(found, line=line))
     out["squareness_rad"] = squareness_rad(found, line=line)
@@ -105,7 +106,7 @@ def geometry(found: Identified, line: Line) -> dict[str, Any]:
     return out
 
 
-def _closure(found: Identified) -> dict[str, Any]:
+def _closure(found: StepDiagonalResult) -> dict[str, Any]:
     closure = found.closure
     out = {key: None if value is None else value / MM for key, value in (
         ("lengths", closure.lengths_m), ("u_lengths", closure.u_lengths_m),
@@ -121,7 +122,7 @@ CLOSURE_SHARE = 2e-6
 """Closure of the lengths, relative to the diagonal, that a set-up off by 2 mrad can cause."""
 
 
-def _advice(found: Identified) -> list[str]:
+def _advice(found: StepDiagonalResult) -> list[str]:
     out = []
     diagonal = found.n_blocks * float(np.linalg.norm(found.steps_m))
     lengths = found.closure.lengths_m

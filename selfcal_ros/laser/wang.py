@@ -14,9 +14,9 @@ from selfcal_ros.estimation.blas_threads import one_thread
 from selfcal_ros.laser.data import (
     Closure,
     Form,
-    Identified,
     Method,
     StepDiagonal,
+    StepDiagonalResult,
     step_vectors,
     turn_to_first_step,
 )
@@ -73,7 +73,7 @@ def solve_blocks(data: StepDiagonal, readings_m: np.ndarray, gain: np.ndarray,
 
 
 @one_thread()
-def identify_conventional(data: StepDiagonal, *, errata: Collection[Erratum] = ()) -> Identified:
+def identify_wang(data: StepDiagonal, *, errata: Collection[Erratum] = ()) -> StepDiagonalResult:
     """Identify all errors from the readings alone, trusting the nominal laser directions.
 
     Parameters
@@ -85,7 +85,7 @@ def identify_conventional(data: StepDiagonal, *, errata: Collection[Erratum] = (
 
     Returns
     -------
-    Identified
+    StepDiagonalResult
         ``closure`` has the least squares' residual in 3D; in 2D nothing is redundant.
 
     Raises
@@ -103,8 +103,8 @@ def identify_conventional(data: StepDiagonal, *, errata: Collection[Erratum] = (
     if noise.dof:
         jac = jacobian(lambda r: solve_blocks(data, r, gain, errata), readings)
         covariance = jac @ reading_covariance(data, noise) @ jac.T
-    return Identified(data.steps_m, errors, covariance, Method.CONVENTIONAL, Form.PRINTED, {},
-                      Closure(residual_rms_m=_residual(data, readings)))
+    return StepDiagonalResult(data.steps_m, errors, covariance, Method.CONVENTIONAL,
+                              Form.PRINTED, {}, Closure(residual_rms_m=_residual(data, readings)))
 
 
 def _residual(data: StepDiagonal, readings_m: np.ndarray) -> float | None:

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import write_bytes
-from selfcal_ros.laser.data import AXES, Identified
+from selfcal_ros.laser.data import AXES, StepDiagonalResult
 from selfcal_ros.laser.profiles import positions_m, profile_m, u_profile_m
 
 FORMATS = ("png", "svg", "pdf")
@@ -20,7 +20,7 @@ _STYLE = {"conventional": "--", "new": "-"}
 _COLOR = {"conventional": "0.6", "new": "C0"}
 
 
-def plot_profiles(found: Identified, path: str | os.PathLike) -> None:
+def plot_profiles(found: StepDiagonalResult, path: str | os.PathLike) -> None:
     """Draw every accumulated error over its axis, with its expanded uncertainty (k=2).
 
     Raises

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from selfcal_ros.errors import InputError
-from selfcal_ros.laser.data import DIAGONALS, MAX_BLOCKS, Closure, Identified
-from selfcal_ros.laser.profiles import Line, name_of
+from selfcal_ros.laser.data import DIAGONALS, MAX_BLOCKS, Closure, StepDiagonalResult
+from selfcal_ros.laser.profiles import ReferenceLine, name_of
 from selfcal_ros.laser.result_json import geometry
 from selfcal_ros.simulation.laser import (
     LaserNoise,
@@ -176,9 +176,9 @@ def _count(value: object, where: str, most: int) -> int:
 
 def truth_of(machine: StepMachine) -> dict[str, Any]:
     """Return what a perfect identification of a machine gives, mm, in the datum of the results."""
-    truth = Identified(machine.steps_m, machine.truth_m(), None, "", "", {}, Closure())
+    truth = StepDiagonalResult(machine.steps_m, machine.truth_m(), None, "", "", {}, Closure())
     errors = {name_of(j, c): (truth.errors_m[j, :, c] / MM).tolist()
               for j in range(machine.dim) for c in range(machine.dim)}
-    found = geometry(truth, Line.LEAST_SQUARES)
+    found = geometry(truth, ReferenceLine.LEAST_SQUARES)
     return {"unit": "mm", **errors,
             **{key: value for key, value in found.items() if not key.startswith("u_")}}

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from selfcal_ros.laser.data import DIAGONALS, Closure, Identified, Method, StepDiagonal
+from selfcal_ros.laser.data import DIAGONALS, Closure, Method, StepDiagonal, StepDiagonalResult
 from selfcal_ros.laser.identify import Choice, identify
 from selfcal_ros.laser.profiles import squareness, straightness
 from selfcal_ros.simulation.laser import (
@@ -122,7 +122,7 @@ FAULTS = (
 def effect(machine: StepMachine, data: StepDiagonal, method: Method) -> Effect:
     """Return how far one identification is from the truth of the machine."""
     found = identify(data, Choice(method, allow_equal=True))
-    truth = Identified(machine.steps_m, machine.truth_m(), None, "", "", {}, Closure())
+    truth = StepDiagonalResult(machine.steps_m, machine.truth_m(), None, "", "", {}, Closure())
     wrong = np.abs(found.errors_m - truth.errors_m)
     straight = [abs(straightness(found, axis, 1 - axis).value
                     - straightness(truth, axis, 1 - axis).value) for axis in (0, 1)]

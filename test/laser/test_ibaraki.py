@@ -6,10 +6,10 @@ from hypothesis import strategies as st
 
 from selfcal_ros.errors import InputError, NotIdentifiableError
 from selfcal_ros.laser.data import DIAGONALS, Form, StepDiagonal
-from selfcal_ros.laser.ibaraki import identify_new
+from selfcal_ros.laser.ibaraki import identify_ibaraki
 from selfcal_ros.laser.profiles import squareness, straightness
 from selfcal_ros.laser.published_equations import Erratum
-from selfcal_ros.laser.wang import identify_conventional
+from selfcal_ros.laser.wang import identify_wang
 from selfcal_ros.simulation.laser import (
     LaserNoise,
     Measurement,
@@ -30,7 +30,7 @@ angles = st.floats(-2e-3, 2e-3)
        st.integers(1, 8), st.tuples(angles, angles))
 def test_exact_form_recovers_the_truth_for_any_steps_and_mirrors(seed, a, b, n, mirrors):
     errors = random_errors(n, np.random.default_rng(seed))
-    found = identify_new(planar((a, b), errors, mirror_rad=mirrors))
+    found = identify_ibaraki(planar((a, b), errors, mirror_rad=mirrors))
     np.testing.assert_allclose(found.errors_m, errors, atol=1e-14)
     tilts = [found.mirror_rad["pp"][0], found.mirror_rad["np"][0]]
     np.testing.assert_allclose(tilts, mirrors, atol=1e-9)
@@ -42,7 +42,7 @@ def test_exact_form_recovers_the_truth_for_any_steps_and_mirrors(seed, a, b, n, 
 def test_recovery_within_1_nm_with_mirror_and_laser_off_by_1_mrad(steps, laser, mirror):
     errors = random_errors(6, np.random.default_rng(21))
     data = planar(steps, errors, laser_rad=(laser, laser), mirror_rad=(mirror, mirror))
-    found = identify_new(data)
+    found = identify_ibaraki(data)
     assert np.abs(found.errors_m - errors).max() < 0.01 * NM
     cosine_error = 6 * np.hypot(*steps) * (-laser**2 / 2 - laser * mirror)
     assert found.closure.lengths_m == pytest.approx(cosine_error, rel=1e-3)
@@ -54,7 +54,7 @@ def test_unequal_misalignment_errs_by_the_cosine_that_the_docs_state():
     data = planar((0.01, 0.01), errors, laser_rad=lasers, mirror_rad=mirrors)
     shrink = -lasers**2 / 2 - lasers * mirrors
     expected = errors[1, :, 0] + 0.01 * (shrink[0] - shrink[1])
-    np.testing.assert_allclose(identify_new(data).errors_m[1, :, 0], expected, atol=0.01 * NM)
+    np.testing.assert_allclose(identify_ibaraki(data).errors_m[1, :, 0], expected, atol=0.01 * NM)
 
 
 @pytest.mark.parametrize("diagonal", ["pp", "np"])
@@ -62,7 +62,7 @@ def test_unequal_misalignment_errs_by_the_cosine_that_the_docs_state():
 def test_one_diagonal_suffices(diagonal, form):
     errors = random_errors(6, np.random.default_rng(23))
     data = planar((0.01, 0.01), errors, mirror_rad=(1e-3, -1e-3)).pick([diagonal])
-    found = identify_new(data, form=form)
+    found = identify_ibaraki(data, form=form)
     assert np.abs(found.errors_m - errors).max() < 1 * NM
     assert found.closure.lengths_m is None and found.closure.between_m is None
 
@@ -70,12 +70,12 @@ def test_one_diagonal_suffices(diagonal, form):
 def test_eq_5_as_printed_errs_by_the_linear_errors_that_it_leaves_out():
     errors = random_errors(6, np.random.default_rng(24))
     data = planar((0.01, 0.01), errors, mirror_rad=(1e-3, 1e-3)).pick(["pp"])
-    worst = np.abs(identify_new(data, form=Form.PRINTED).errors_m - errors).max()
+    worst = np.abs(identify_ibaraki(data, form=Form.PRINTED).errors_m - errors).max()
     assert 60 * NM < worst < 400 * NM
     # Without variation of Ex(x) and of the half diagonal the printed form is right.
     same = random_errors(1, np.random.default_rng(25)).repeat(6, axis=1)
     data = planar((0.01, 0.01), same, mirror_rad=(1e-3, 1e-3))
-    assert np.abs(identify_new(data, form=Form.PRINTED).errors_m - same).max() < 1 * NM
+    assert np.abs(identify_ibaraki(data, form=Form.PRINTED).errors_m - same).max() < 1 * NM
 
 
 @pytest.mark.parametrize(("erratum", "at_least_m"),
@@ -85,8 +85,8 @@ def test_an_erratum_put_back_is_found_out(erratum, at_least_m, form):
     errors = random_errors(6, np.random.default_rng(26))
     data = planar((0.01, 0.01), errors, mirror_rad=(1e-3, 1e-3)).pick(["pp"])
     tolerance = 1 * NM if form is Form.STEPWISE else 1 * UM
-    assert np.abs(identify_new(data, form=form).errors_m - errors).max() < tolerance
-    wrong = np.abs(identify_new(data, form=form, errata=[erratum]).errors_m - errors).max()
+    assert np.abs(identify_ibaraki(data, form=form).errors_m - errors).max() < tolerance
+    wrong = np.abs(identify_ibaraki(data, form=form, errata=[erratum]).errors_m - errors).max()
     # The printed eq. 5 works on differences, where the sign of eq. 4 doubles Ey(x) instead.
     assert wrong > (at_least_m if (form, erratum) != (Form.PRINTED, Erratum.EQ4_SIGN)
                     else 60 * NM)
@@ -96,10 +96,10 @@ def test_the_closure_between_diagonals_is_zero_for_one_machine_and_the_differenc
     rng = np.random.default_rng(27)
     errors = random_errors(5, rng)
     data = planar((0.01, 0.01), errors, mirror_rad=(1e-3, -5e-4))
-    assert np.abs(identify_new(data).closure.between_m).max() < 1e-5 * NM
+    assert np.abs(identify_ibaraki(data).closure.between_m).max() < 1e-5 * NM
     samples = data.samples_m.copy()
     samples[:, 1, 1] += 10 * NM  # every Y reading of np too long
-    other = identify_new(StepDiagonal(data.steps_m, data.diagonals, samples, data.linear_m))
+    other = identify_ibaraki(StepDiagonal(data.steps_m, data.diagonals, samples, data.linear_m))
     # np alone: Ex(y) shrinks by sqrt(2) 10 nm, so pp - np grows by as much.
     np.testing.assert_allclose(other.closure.between_m[1, :, 0], np.sqrt(2) * 10 * NM, rtol=1e-3)
     np.testing.assert_allclose(other.errors_m[1, :, 0] - errors[1, :, 0],
@@ -115,7 +115,7 @@ def test_the_closures_scatter_as_their_uncertainties_say():
     z = []
     for seed in range(60):
         data = simulate_step_diagonal(machine, Measurement({}, noise), np.random.default_rng(seed))
-        closure = identify_new(data).closure
+        closure = identify_ibaraki(data).closure
         z.append([closure.lengths_m / closure.u_lengths_m,
                   closure.between_m[1, 2, 0] / closure.u_between_m[1, 2, 0],
                   closure.between_m[0, 4, 1] / closure.u_between_m[0, 4, 1]])
@@ -131,20 +131,20 @@ def test_body_diagonals_recover_all_transverse_errors_within_1_nm(steps, n):
     setups = {"ppp": SetUp(mirror_rad=(1e-3, -5e-4)), "npp": SetUp(mirror_rad=(-1e-3, 2e-4)),
               "pnp": SetUp(mirror_rad=(3e-4, 1e-3)), "ppn": SetUp(mirror_rad=(-8e-4, -1e-3))}
     data = simulate_step_diagonal(machine, Measurement(setups), rng)
-    found = identify_new(data)
+    found = identify_ibaraki(data)
     assert np.abs(found.errors_m - machine.errors_m).max() < 1e-4 * NM
     np.testing.assert_allclose([found.mirror_rad[name] for name in DIAGONALS[3]],
                                [setups[name].mirror_rad for name in DIAGONALS[3]], atol=3e-6)
     same = {name: SetUp(laser_rad=(1e-3, 1e-3), mirror_rad=(1e-3, 1e-3)) for name in DIAGONALS[3]}
     data = simulate_step_diagonal(machine, Measurement(same), rng)
-    assert np.abs(identify_new(data).errors_m - machine.errors_m).max() < 0.1 * NM
+    assert np.abs(identify_ibaraki(data).errors_m - machine.errors_m).max() < 0.1 * NM
 
 
 def test_two_body_diagonals_are_not_enough():
     machine = random_machine((0.01, 0.01, 0.01), 3, np.random.default_rng(32))
     data = simulate_step_diagonal(machine, Measurement(), np.random.default_rng(0))
     with pytest.raises(NotIdentifiableError, match="ppp, npp: they do not determine the errors"):
-        identify_new(data.pick(["ppp", "npp"]))
+        identify_ibaraki(data.pick(["ppp", "npp"]))
 
 
 def case_study(seed=2006):
@@ -159,11 +159,11 @@ def case_study(seed=2006):
 
 def test_case_study_new_is_within_20_nm_and_conventional_errs_as_the_geometry_predicts():
     machine, data = case_study()
-    found = identify_new(data)
+    found = identify_ibaraki(data)
     assert abs(squareness(found).value - -1.22 * UM) < 0.02 * UM
     assert abs(straightness(found, 0, 1).value - 0.05 * UM) < 0.02 * UM
     assert abs(straightness(found, 1, 0).value - 0.11 * UM) < 0.02 * UM
-    conventional = identify_conventional(data)
+    conventional = identify_wang(data)
     # phi = angle of the mirror to nominal = own diagonal's lean + mirror off the laser. A machine
     # with shear lean_pp: to first order Ex(x) errs by b/2 (phi_np - phi_pp), Ey(y) by the opposite.
     side = machine.errors_m.sum(axis=1) + np.diag((0.06, 0.06))
@@ -179,7 +179,7 @@ def test_case_study_new_is_within_20_nm_and_conventional_errs_as_the_geometry_pr
 def test_case_study_own_diagonal_alone_spoils_the_linear_errors_of_the_conventional_form():
     machine = case_study_machine()
     data = simulate_step_diagonal(machine, Measurement(), np.random.default_rng(0))
-    conventional = identify_conventional(data)
+    conventional = identify_wang(data)
     # Lasers along the own diagonals: both linear errors become their mean over the range
     # (a = b), as in case (a) of table 1; squareness and straightness stay right.
     total = conventional.errors_m.sum(axis=1)
@@ -198,7 +198,7 @@ def test_standard_uncertainties_match_the_scatter_of_simulated_measurements(nois
     z, u = [], []
     for seed in range(70):
         data = simulate_step_diagonal(machine, Measurement({}, noise), np.random.default_rng(seed))
-        found = identify_new(data)
+        found = identify_ibaraki(data)
         square = squareness(found)
         z.append((square.value + 1.22 * UM, found.errors_m[1, 2, 0] - machine.errors_m[1, 2, 0],
                   found.errors_m[0, 3, 1] - machine.errors_m[0, 3, 1]))
@@ -212,7 +212,8 @@ def test_joint_use_of_both_diagonals_halves_the_variance():
     machine = case_study_machine()
     noise = LaserNoise(reading_m=10 * NM, repeats=200)
     data = simulate_step_diagonal(machine, Measurement({}, noise), np.random.default_rng(5))
-    both, one = squareness(identify_new(data)).u, squareness(identify_new(data.pick(["pp"]))).u
+    both = squareness(identify_ibaraki(data)).u
+    one = squareness(identify_ibaraki(data.pick(["pp"]))).u
     assert one / both == pytest.approx(np.sqrt(2), rel=0.05)
 
 
@@ -222,7 +223,7 @@ def test_a_diagonal_with_more_repeats_counts_for_more():
     samples = data.samples_m.repeat(9, axis=0)
     samples[1:, 1] = np.nan  # pp nine times, np once
     samples[0, 1, 1] += 10 * NM
-    found = identify_new(StepDiagonal(data.steps_m, data.diagonals, samples, data.linear_m))
+    found = identify_ibaraki(StepDiagonal(data.steps_m, data.diagonals, samples, data.linear_m))
     np.testing.assert_allclose(found.errors_m[1, :, 0] - errors[1, :, 0],
                                -np.sqrt(2) * 10 * NM / 10, rtol=0.01)
 
@@ -230,7 +231,7 @@ def test_a_diagonal_with_more_repeats_counts_for_more():
 def test_missing_linear_errors_are_named():
     data = planar((0.01, 0.01), random_errors(3, np.random.default_rng(1)))
     with pytest.raises(InputError, match="linear errors: the new formulation needs them; measure"):
-        identify_new(StepDiagonal(data.steps_m, data.diagonals, data.samples_m))
+        identify_ibaraki(StepDiagonal(data.steps_m, data.diagonals, data.samples_m))
 
 
 def test_linear_errors_in_micrometres_are_found_out_by_the_diagonals():
@@ -238,14 +239,14 @@ def test_linear_errors_in_micrometres_are_found_out_by_the_diagonals():
     data = planar((0.01, 0.01), errors)
     wrong = StepDiagonal(data.steps_m, data.diagonals, data.samples_m, data.linear_m * 1000)
     with pytest.raises(InputError, match="the linear errors look like micrometres; give ex_x"):
-        identify_new(wrong)
+        identify_ibaraki(wrong)
 
 
 def test_paper_forms_are_planar():
     machine = random_machine((0.01, 0.01, 0.01), 3, np.random.default_rng(32))
     data = simulate_step_diagonal(machine, Measurement(), np.random.default_rng(0))
     with pytest.raises(InputError, match="in 2D only; use the exact form for body diagonals"):
-        identify_new(data, form=Form.PRINTED)
+        identify_ibaraki(data, form=Form.PRINTED)
 
 
 def test_eq_5_as_printed_has_the_right_sign():
@@ -256,7 +257,7 @@ def test_eq_5_as_printed_has_the_right_sign():
     errors[0, :, 1] = ey_x
     errors[1, :, 0] = -ey_x  # keeps the diagonal's length to first order
     data = planar((0.01, 0.01), errors, mirror_rad=(1e-3, -1e-3))
-    found = identify_new(data, form=Form.PRINTED)
+    found = identify_ibaraki(data, form=Form.PRINTED)
     np.testing.assert_allclose(found.errors_m[0, :, 1], ey_x, atol=1 * NM)
 
 
@@ -266,5 +267,5 @@ def test_paper_forms_hold_for_unequal_steps(form):
     errors[0, :, 1] = np.array([0, 1, -1, 2, 0, 1]) * 1e-7
     errors[1, :, 0] = -errors[0, :, 1] * 0.006 / 0.01
     data = planar((0.01, 0.006), errors, mirror_rad=(1e-3, -1e-3))
-    assert np.abs(identify_new(data, form=form).errors_m - errors).max() < (
+    assert np.abs(identify_ibaraki(data, form=form).errors_m - errors).max() < (
         1 * NM if form is Form.STEPWISE else 60 * NM)

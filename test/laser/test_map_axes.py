@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from selfcal_ros.errors import InputError
-from selfcal_ros.laser.ibaraki import identify_new
+from selfcal_ros.laser.ibaraki import identify_ibaraki
 from selfcal_ros.laser.map_axes import compare_axes
 from selfcal_ros.laser.profiles import straightness
 from selfcal_ros.laser.result_json import outcome
@@ -16,7 +16,7 @@ MACHINE = case_study_machine()
 
 def laser_result():
     data = simulate_step_diagonal(MACHINE, Measurement(), np.random.default_rng(0))
-    found = identify_new(data)
+    found = identify_ibaraki(data)
     return found, outcome(found, data)
 
 

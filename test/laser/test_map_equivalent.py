@@ -7,15 +7,15 @@ from selfcal_ros.compensation.machine import MachineFrame
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.datum.modes import first_order
 from selfcal_ros.estimation.options import ReferenceKind
-from selfcal_ros.laser.ibaraki import identify_new
+from selfcal_ros.laser.ibaraki import identify_ibaraki
 from selfcal_ros.laser.map_equivalent import (
-    correction_lines,
+    axis_corrections,
     correction_tables,
     map_equivalent,
     reference_length,
 )
 from selfcal_ros.laser.profiles import profile_m, squareness, squareness_rad
-from selfcal_ros.laser.wang import identify_conventional
+from selfcal_ros.laser.wang import identify_wang
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.simulation.laser import (
     LaserNoise,
@@ -37,7 +37,8 @@ def measured(machine, noise=None):
     MachineFrame(2, 1, reverse_x=True, home_x_m=0.06), MachineFrame(1, 2, reverse_y=True)])
 def test_a_corrected_machine_is_straight_square_and_true(frame):
     machine = case_study_machine()
-    tables = CalEvaluator(correction_tables(identify_new(measured(machine)), frame), frame.setup())
+    found = identify_ibaraki(measured(machine))
+    tables = CalEvaluator(correction_tables(found, frame), frame.setup())
     place = np.arange(7) * 0.01
     x, y = (grid.ravel() for grid in np.meshgrid(place, place, indexing="ij"))
     # E = Px(x) + Px(y), Py(x) + Py(y): what the steps of the machine add up to.
@@ -59,13 +60,13 @@ def test_a_corrected_machine_is_straight_square_and_true(frame):
 
 
 def test_the_correction_of_y_along_x_has_no_slope():
-    line = correction_lines(identify_new(measured(case_study_machine())))[("x", "y")]
+    line = axis_corrections(identify_ibaraki(measured(case_study_machine())))[("x", "y")]
     assert np.polyfit(line.positions_m, line.corrections_m, 1)[0] == pytest.approx(0, abs=1e-15)
 
 
 def test_the_conventional_formulation_corrects_no_linear_errors():
-    found = identify_conventional(measured(case_study_machine()))
-    assert sorted(correction_lines(found)) == [("x", "y"), ("y", "x")]
+    found = identify_wang(measured(case_study_machine()))
+    assert sorted(axis_corrections(found)) == [("x", "y"), ("y", "x")]
 
 
 def test_o_and_r_are_those_of_an_error_map_of_the_same_machine():
@@ -73,7 +74,7 @@ def test_o_and_r_are_those_of_an_error_map_of_the_same_machine():
     errors = np.zeros((2, 6, 2))
     errors[0] = [3e-7, 0.0]
     errors[1] = [-2e-7, 1e-7]
-    found = identify_new(measured(StepMachine((0.01, 0.01), errors)))
+    found = identify_ibaraki(measured(StepMachine((0.01, 0.01), errors)))
     artifact = Artifact(7, 0.01)
     sums = np.concatenate([np.zeros((2, 1, 2)), np.cumsum(errors, axis=1)], axis=1)
     g = -(sums[0][:, None] + sums[1][None])
@@ -86,7 +87,7 @@ def test_o_and_r_are_those_of_an_error_map_of_the_same_machine():
 
 
 def test_uncertainties_follow():
-    found = identify_new(measured(case_study_machine(), LaserNoise(1e-8, 0, 1e-8, 3)))
+    found = identify_ibaraki(measured(case_study_machine(), LaserNoise(1e-8, 0, 1e-8, 3)))
     equivalent = map_equivalent(found)
     assert equivalent.u_nonorthogonality == pytest.approx(squareness(found).u / 0.06 / 2)
     references = [reference_length(found, axis) for axis in (0, 1)]
@@ -97,7 +98,7 @@ def test_uncertainties_follow():
 def test_the_linear_error_sets_the_scale_with_the_sign_of_the_map():
     errors = np.zeros((2, 4, 2))
     errors[0, :, 0] = 1e-7  # X goes 10 ppm too far, so it indicates 10 ppm too little
-    found = identify_new(measured(StepMachine((0.01, 0.01), errors)))
+    found = identify_ibaraki(measured(StepMachine((0.01, 0.01), errors)))
     reference = reference_length(found, 0)
     assert reference.kind is ReferenceKind.STAGE_X
     assert reference.relative_error == pytest.approx(-1e-5, rel=1e-9)
@@ -106,7 +107,7 @@ def test_the_linear_error_sets_the_scale_with_the_sign_of_the_map():
 
 
 def test_the_conventional_formulation_sets_no_scale():
-    found = identify_conventional(measured(case_study_machine()))
+    found = identify_wang(measured(case_study_machine()))
     assert map_equivalent(found).scale_difference is None
     with pytest.raises(InputError, match="does not measure the linear errors; measure them"):
         reference_length(found, 0)
@@ -115,4 +116,4 @@ def test_the_conventional_formulation_sets_no_scale():
 def test_body_diagonals_have_no_table():
     machine = random_machine((0.01, 0.01, 0.01), 3, np.random.default_rng(0))
     with pytest.raises(InputError, match="body diagonals measure three axes"):
-        correction_lines(identify_new(measured(machine)))
+        axis_corrections(identify_ibaraki(measured(machine)))

@@ -4,9 +4,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from selfcal_ros.laser.data import Closure, Identified, step_vectors
+from selfcal_ros.laser.data import Closure, StepDiagonalResult, step_vectors
 from selfcal_ros.laser.profiles import (
-    Line,
+    ReferenceLine,
     axis_pairs,
     name_of,
     positions_m,
@@ -23,7 +23,7 @@ from test.support.laser import random_errors
 
 
 def identified(steps, errors, covariance=None):
-    return Identified(tuple(steps), errors, covariance, "new", "exact", {}, Closure())
+    return StepDiagonalResult(tuple(steps), errors, covariance, "new", "exact", {}, Closure())
 
 
 def test_profiles_start_at_zero_and_end_at_the_sum():
@@ -31,7 +31,7 @@ def test_profiles_start_at_zero_and_end_at_the_sum():
     found = identified((0.01, 0.02), errors)
     np.testing.assert_array_equal(profile_m(found, 1, 0), [0, 6, 14, 24])
     np.testing.assert_allclose(positions_m(found, 1), [0, 0.02, 0.04, 0.06])
-    assert slope(found, 1, 0, Line.END_POINTS) == pytest.approx(24 / 0.06)
+    assert slope(found, 1, 0, ReferenceLine.END_POINTS) == pytest.approx(24 / 0.06)
     assert slope(found, 1, 0) == pytest.approx(np.polyfit([0, .02, .04, .06], [0, 6, 14, 24], 1)[0])
     assert u_profile_m(found, 1, 0) is None
 
@@ -43,7 +43,8 @@ def test_straightness_about_both_lines_against_a_plain_fit():
     residual = p - np.polyval(np.polyfit(x, p, 1), x)
     assert straightness(found, 0, 1).value == pytest.approx(np.ptp(residual), rel=1e-9)
     residual = p - p[-1] * x / x[-1]
-    assert straightness(found, 0, 1, Line.END_POINTS).value == pytest.approx(np.ptp(residual))
+    chord = straightness(found, 0, 1, ReferenceLine.END_POINTS)
+    assert chord.value == pytest.approx(np.ptp(residual))
 
 
 def test_the_case_study_machine_has_the_published_errors():
@@ -57,7 +58,7 @@ def test_the_case_study_machine_has_the_published_errors():
     np.testing.assert_allclose(machine.truth_m(), machine.errors_m, atol=1e-18)
 
 
-@pytest.mark.parametrize("line", list(Line))
+@pytest.mark.parametrize("line", list(ReferenceLine))
 def test_squareness_is_positive_where_the_axes_enclose_less_than_90_deg(line):
     errors = np.zeros((2, 4, 2))
     errors[1, :, 0] = 1e-7  # Y leans towards +X
@@ -70,7 +71,7 @@ def test_squareness_is_positive_where_the_axes_enclose_less_than_90_deg(line):
 
 
 @settings(max_examples=25, deadline=None)
-@given(st.integers(0, 2**32 - 1), st.floats(-1e-5, 1e-5), st.sampled_from(list(Line)))
+@given(st.integers(0, 2**32 - 1), st.floats(-1e-5, 1e-5), st.sampled_from(list(ReferenceLine)))
 def test_a_turn_of_the_machine_changes_neither_straightness_nor_squareness(seed, turn, line):
     errors = random_errors(6, np.random.default_rng(seed))
     rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
@@ -92,8 +93,8 @@ def test_uncertainties_against_monte_carlo():
     draws = base + rng.multivariate_normal(np.zeros(24), covariance, 4000)
     drawn = [identified((0.01, 0.02), d.reshape(2, 6, 2)) for d in draws]
     for value, of in ((squareness(found).u, squareness),
-                      (squareness(found, line=Line.END_POINTS).u,
-                       lambda d: squareness(d, line=Line.END_POINTS)),
+                      (squareness(found, line=ReferenceLine.END_POINTS).u,
+                       lambda d: squareness(d, line=ReferenceLine.END_POINTS)),
                       (straightness(found, 1, 0).u, lambda d: straightness(d, 1, 0))):
         assert value == pytest.approx(np.std([of(d).value for d in drawn]), rel=0.05)
     assert u_slope(found, 1, 1) == pytest.approx(np.std([slope(d, 1, 1) for d in drawn]), rel=0.05)

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from selfcal_ros.laser.data import StepDiagonal
-from selfcal_ros.laser.ibaraki import identify_new
-from selfcal_ros.laser.wang import identify_conventional
+from selfcal_ros.laser.ibaraki import identify_ibaraki
+from selfcal_ros.laser.wang import identify_wang
 
 NAMES = {2: ("pp", "np"), 3: ("ppp", "npp", "pnp", "ppn")}
 
@@ -74,9 +74,9 @@ def test_new_finds_all_errors_whatever_the_mirrors(dim, n):
         laser = along(steps, errors, name)
         readings.append(walk(steps, errors, name, (laser, tilted(laser, 5e-3, rng))))
     data = StepDiagonal(steps, NAMES[dim], np.array([readings]), linear(errors)[None])
-    np.testing.assert_allclose(identify_new(data).errors_m, errors, rtol=0, atol=1e-14)
+    np.testing.assert_allclose(identify_ibaraki(data).errors_m, errors, rtol=0, atol=1e-14)
     for name in NAMES[2] if dim == 2 else ():
-        np.testing.assert_allclose(identify_new(data.pick([name])).errors_m, errors, rtol=0,
+        np.testing.assert_allclose(identify_ibaraki(data.pick([name])).errors_m, errors, rtol=0,
                                    atol=1e-14)
 
 
@@ -89,4 +89,4 @@ def test_conventional_finds_all_errors_where_laser_and_mirror_are_nominal(dim, n
         laser = along(steps, np.zeros_like(errors), name)
         readings.append(walk(steps, errors, name, (laser, laser)))
     data = StepDiagonal(steps, NAMES[dim], np.array([readings]))
-    np.testing.assert_allclose(identify_conventional(data).errors_m, errors, rtol=0, atol=1e-14)
+    np.testing.assert_allclose(identify_wang(data).errors_m, errors, rtol=0, atol=1e-14)

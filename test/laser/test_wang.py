@@ -9,7 +9,7 @@ from selfcal_ros.laser.data import DIAGONALS, Method, StepDiagonal, signs_of, st
 from selfcal_ros.laser.identify import Choice, identify
 from selfcal_ros.laser.profiles import squareness
 from selfcal_ros.laser.published_equations import Erratum
-from selfcal_ros.laser.wang import identify_conventional, jacobian, readings_are_equal
+from selfcal_ros.laser.wang import identify_wang, jacobian, readings_are_equal
 from selfcal_ros.simulation.laser import (
     Measurement,
     SetUp,
@@ -38,14 +38,14 @@ def exact_nominal(steps, errors):
 @pytest.mark.parametrize("case", TABLE_1)
 def test_table_1_of_the_source(case):
     given_mm, estimated_mm, decimals = TABLE_1[case]
-    found = identify_conventional(planar((0.01, 0.01), one_block(*given_mm)))
+    found = identify_wang(planar((0.01, 0.01), one_block(*given_mm)))
     np.testing.assert_allclose(found.errors_m.ravel() / MM, estimated_mm,
                                atol=0.5 * 10.0**-decimals)
 
 
 def test_table_1_needs_the_corrected_rows_of_eq_1():
     data = planar((0.01, 0.01), one_block(*TABLE_1["c"][0]))
-    wrong = identify_conventional(data, errata=[Erratum.EQ1_ROWS])
+    wrong = identify_wang(data, errata=[Erratum.EQ1_ROWS])
     assert abs(wrong.errors_m[1, 0, 0] / MM - 0.1) > 0.05
 
 
@@ -53,13 +53,13 @@ def test_table_1_needs_the_corrected_rows_of_eq_1():
 @given(st.integers(0, 2**32 - 1), st.floats(1e-3, 0.1), st.floats(1e-3, 0.1), st.integers(1, 8))
 def test_nominal_lasers_give_the_truth_for_any_steps_and_blocks(seed, a, b, n):
     errors = random_errors(n, np.random.default_rng(seed))
-    found = identify_conventional(exact_nominal((a, b), errors))
+    found = identify_wang(exact_nominal((a, b), errors))
     np.testing.assert_allclose(found.errors_m, errors, atol=1e-15)
 
 
 def test_body_diagonals_give_all_18_errors_at_nominal_lasers():
     machine = random_machine((0.01, 0.008, 0.006), 5, np.random.default_rng(3))
-    found = identify_conventional(exact_nominal(machine.steps_m, machine.errors_m))
+    found = identify_wang(exact_nominal(machine.steps_m, machine.errors_m))
     np.testing.assert_allclose(found.errors_m, machine.errors_m, atol=1e-15)
     assert found.closure.residual_rms_m < 1e-16
 
@@ -67,9 +67,9 @@ def test_body_diagonals_give_all_18_errors_at_nominal_lasers():
 def test_the_exchanged_rows_of_eq_1_change_the_sign_of_ex_y():
     errors = random_errors(4, np.random.default_rng(5))
     data = exact_nominal((0.01, 0.01), errors)
-    wrong = identify_conventional(data, errata=[Erratum.EQ1_ROWS])
+    wrong = identify_wang(data, errata=[Erratum.EQ1_ROWS])
     np.testing.assert_allclose(wrong.errors_m[1, :, 0], -errors[1, :, 0], atol=1e-15)
-    right = identify_conventional(data)
+    right = identify_wang(data)
     np.testing.assert_allclose(right.errors_m[1, :, 0], errors[1, :, 0], atol=1e-15)
 
 
@@ -79,7 +79,7 @@ def test_a_turn_of_the_whole_machine_changes_nothing():
     turn = 1e-4
     rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
     turned = step_vectors((0.01, 0.01), errors) @ rotation.T - np.diag((0.01, 0.01))[:, None]
-    np.testing.assert_allclose(identify_conventional(exact_nominal((0.01, 0.01), turned)).errors_m,
+    np.testing.assert_allclose(identify_wang(exact_nominal((0.01, 0.01), turned)).errors_m,
                                errors, atol=1e-15)
 
 
@@ -106,15 +106,15 @@ def test_one_diagonal_is_refused():
     data = planar((0.01, 0.01), random_errors(3, np.random.default_rng(0))).pick(["pp"])
     with pytest.raises(InputError, match="only pp measured; the conventional formulation needs "
                                          "every diagonal"):
-        identify_conventional(data)
+        identify_wang(data)
 
 
 def test_no_uncertainty_without_repeats_and_the_propagated_one_with_them():
     rng = np.random.default_rng(11)
     data = planar((0.01, 0.01), random_errors(6, rng))
-    assert identify_conventional(data).covariance is None
+    assert identify_wang(data).covariance is None
     samples = data.samples_m + rng.normal(0, 1e-8, (400, 2, 2, 6))
-    found = identify_conventional(StepDiagonal(data.steps_m, data.diagonals, samples))
+    found = identify_wang(StepDiagonal(data.steps_m, data.diagonals, samples))
     # v = s (Rx_pp - Rx_np) / (2b), s = sqrt(2) a, less the turn by the first block's v.
     expected = 1e-8 / np.sqrt(400)
     np.testing.assert_allclose(found.u_errors_m[0, :, 0], expected, rtol=0.05)
@@ -134,7 +134,7 @@ def test_body_diagonals_are_weighted_by_their_repeats():
     samples[:, 0] += 1e-8  # ppp is off, and measured nine times; the others once
     heavy = samples.copy()
     heavy[1:, 1:] = np.nan
-    residual = [identify_conventional(StepDiagonal(machine.steps_m, DIAGONALS[3], each))
+    residual = [identify_wang(StepDiagonal(machine.steps_m, DIAGONALS[3], each))
                 for each in (samples, heavy)]
     off = [np.abs(found.errors_m - machine.errors_m).max() for found in residual]
     # Four readings for three components: ppp alone pulls with 1/4 of its misfit left over, with
@@ -146,7 +146,7 @@ def test_equal_readings_of_one_diagonal_only_are_a_measurement():
     data = planar((0.01, 0.01), random_errors(3, np.random.default_rng(0)))
     samples = data.samples_m.copy()
     samples[:, 0, 1] = samples[:, 0, 0]
-    found = identify_conventional(StepDiagonal(data.steps_m, data.diagonals, samples))
+    found = identify_wang(StepDiagonal(data.steps_m, data.diagonals, samples))
     assert np.isfinite(found.errors_m).all()
 
 
@@ -156,7 +156,7 @@ def test_body_diagonals_take_a_mirror_for_a_lean_to_first_order():
     for angle in (1e-4, 2e-4):
         setups = {"npp": SetUp(mirror_rad=(angle, 0.0))}
         data = simulate_step_diagonal(machine, Measurement(setups), np.random.default_rng(0))
-        found = identify_conventional(data)
+        found = identify_wang(data)
         wrong.append(squareness(found, 0, 2).value)
     off = wrong[1] - wrong[0]
     assert abs(off) > 1e-4 * 0.04 / 10, "of the order of angle x range, not of its square"

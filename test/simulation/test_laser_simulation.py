@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from selfcal_ros.laser.data import DIAGONALS
-from selfcal_ros.laser.ibaraki import identify_new
+from selfcal_ros.laser.ibaraki import identify_ibaraki
 from selfcal_ros.simulation.laser import (
     LaserNoise,
     Measurement,
@@ -105,7 +105,7 @@ def test_a_random_machine_is_in_the_datum_of_the_results():
     machine = random_machine((0.01, 0.02, 0.03), 4, np.random.default_rng(0))
     np.testing.assert_allclose(machine.truth_m(), machine.errors_m, atol=1e-18)
     assert machine.errors_m[0, 0, 1] == machine.errors_m[0, 0, 2] == machine.errors_m[1, 0, 2] == 0
-    np.testing.assert_allclose(identify_new(simulate(machine)).errors_m, machine.errors_m,
+    np.testing.assert_allclose(identify_ibaraki(simulate(machine)).errors_m, machine.errors_m,
                                atol=1e-13)
 
 

@@ -10,7 +10,7 @@ from selfcal_ros.cli.aerotech.options import add_frame, frame_of, read_result
 from selfcal_ros.errors import ExitCode, InputError
 
 if TYPE_CHECKING:
-    from selfcal_ros.compensation.aerotech.lines import Line
+    from selfcal_ros.compensation.aerotech.lines import AxisCorrection
     from selfcal_ros.compensation.machine import MachineFrame
 
 _HOMES = {"end": "home at one end of travel", "middle": "home in the middle of travel",
@@ -131,7 +131,7 @@ def _refuse_frame(args: argparse.Namespace, what: str, mend: str) -> None:
                              "give positions and errors in the sense of the encoders")
 
 
-def _deliver(args: argparse.Namespace, line: "Line", frame: "MachineFrame",
+def _deliver(args: argparse.Namespace, line: "AxisCorrection", frame: "MachineFrame",
              axes: tuple[str, str]) -> int:
     """Write the table of a line to its file, or print it."""
     from datetime import UTC, datetime

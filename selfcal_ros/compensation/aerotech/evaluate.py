@@ -79,7 +79,7 @@ class MachineSetup:
 
 
 @dataclass(frozen=True)
-class Track:
+class AxisSamples:
     """Reference positions along one input axis, ascending, primary units.
 
     Attributes
@@ -118,19 +118,19 @@ class Track:
 
 
 def _track(axis: int, start: float, distance: float, count: int, rollover: float | None,
-           ) -> tuple[Track, bool]:
+           ) -> tuple[AxisSamples, bool]:
     """Return the track and whether the entries have to be reversed."""
     if distance < 0:
-        return Track(axis, start + (count - 1) * distance, -distance, count, rollover), True
-    return Track(axis, start, distance, count, rollover), False
+        return AxisSamples(axis, start + (count - 1) * distance, -distance, count, rollover), True
+    return AxisSamples(axis, start, distance, count, rollover), False
 
 
 @dataclass(frozen=True, eq=False)
-class Ready1D:
+class BoundTable1D:
     """A 1D table in primary units, with its zero bias applied."""
 
     axis: int
-    track: Track
+    track: AxisSamples
     values: np.ndarray
     expansion: float = 0.0
 
@@ -148,12 +148,12 @@ def _linear(values: np.ndarray, entry: np.ndarray, part: np.ndarray) -> np.ndarr
 
 
 @dataclass(frozen=True, eq=False)
-class Ready2D:
+class BoundTable2D:
     """A 2D or galvo table in primary units, with its zero bias applied: (outputs, rows, cols)."""
 
     outputs: tuple[int, ...]
-    rows: Track
-    columns: Track
+    rows: AxisSamples
+    columns: AxisSamples
     values: np.ndarray
 
     def at(self, row: np.ndarray, column: np.ndarray) -> np.ndarray:
@@ -172,7 +172,7 @@ class Ready2D:
             out[axis] += value
 
 
-def ready_1d(table: Table1D, setup: MachineSetup) -> Ready1D:
+def bound_1d(table: Table1D, setup: MachineSetup) -> BoundTable1D:
     """Return a 1D table in primary units; its correction at position 0 is always 0."""
     place = f"the table of line {table.line}" if table.line else "the table"
     reference = table.reference
@@ -188,7 +188,7 @@ def ready_1d(table: Table1D, setup: MachineSetup) -> Ready1D:
     values = table.values * (-scale if table.negcor else scale)
     values = values[::-1] if reverse else values
     bias = _linear(values, *track.locate(np.zeros(())))
-    return Ready1D(table.axis, track, values - bias, _expansion(table, setup))
+    return BoundTable1D(table.axis, track, values - bias, _expansion(table, setup))
 
 
 def _home_shift(table: Table1D, setup: MachineSetup) -> float:
@@ -219,7 +219,7 @@ def _expansion(table: Table1D, setup: MachineSetup) -> float:
     return table.expand_coeff * (setup.temperature_c - table.material_temp)
 
 
-def ready_2d(table: Table2D, setup: MachineSetup) -> Ready2D:
+def bound_2d(table: Table2D, setup: MachineSetup) -> BoundTable2D:
     """Return a 2D or galvo table in primary units, biased if position (0, 0) lies inside."""
     place = f"the table of line {table.line}" if table.line else "the table"
     tracks, values = [], np.moveaxis(table.values, 2, 0)
@@ -243,10 +243,10 @@ def ready_2d(table: Table2D, setup: MachineSetup) -> Ready2D:
              for axis in table.outputs]
     sign = -1.0 if table.negcor else 1.0
     values = values * (sign * np.array(scale))[:, None, None]
-    ready = Ready2D(table.outputs, tracks[0], tracks[1], values)
+    ready = BoundTable2D(table.outputs, tracks[0], tracks[1], values)
     if tracks[0].covers_zero() and tracks[1].covers_zero():
         bias = ready.at(np.zeros(()), np.zeros(()))
-        ready = Ready2D(table.outputs, tracks[0], tracks[1], values - bias[:, None, None])
+        ready = BoundTable2D(table.outputs, tracks[0], tracks[1], values - bias[:, None, None])
     return ready
 
 
@@ -268,7 +268,7 @@ class CalEvaluator:
 
     def __init__(self, tables: Sequence[Table], setup: MachineSetup | None = None) -> None:
         setup = setup or MachineSetup()
-        self._ready = [ready_1d(t, setup) if isinstance(t, Table1D) else ready_2d(t, setup)
+        self._bound = [bound_1d(t, setup) if isinstance(t, Table1D) else bound_2d(t, setup)
                        for t in tables]
         self.inputs = sorted({axis for t in tables for axis in t.inputs})
         self.outputs = sorted({axis for t in tables for axis in t.outputs})
@@ -294,6 +294,6 @@ class CalEvaluator:
             block = slice(start, start + BLOCK)
             part = {axis: array[block] for axis, array in zip(self.inputs, flat, strict=True)}
             out = {axis: array[block] for axis, array in total.items()}
-            for ready in self._ready:
-                ready.add_to(out, part)
+            for bound in self._bound:
+                bound.add_to(out, part)
         return {axis: array.reshape(shape) for axis, array in total.items()}

@@ -32,7 +32,7 @@ Home = Literal["end", "middle", "middle-balanced"]
 
 
 @dataclass(frozen=True, eq=False)
-class Line:
+class AxisCorrection:
     """A correction along one axis: positions ascending, both in m."""
 
     positions_m: np.ndarray
@@ -47,7 +47,8 @@ def length_m(text: str, what: str) -> float:
     return float(match[1]) * _LENGTH_UNITS_M[match[2]]
 
 
-def orthogonality(measured_m: float, over_m: float, travel_m: float, home: Home = "end") -> Line:
+def orthogonality(measured_m: float, over_m: float, travel_m: float,
+                  home: Home = "end") -> AxisCorrection:
     """Return the two-point correction for axes that are not perpendicular.
 
     Parameters
@@ -72,10 +73,10 @@ def orthogonality(measured_m: float, over_m: float, travel_m: float, home: Home 
     full = -measured_m / over_m * travel_m
     begin = 0.0 if home == "end" else -travel_m / 2
     first = -full / 2 if home == "middle-balanced" else 0.0
-    return Line(np.array([begin, begin + travel_m]), np.array([first, first + full]))
+    return AxisCorrection(np.array([begin, begin + travel_m]), np.array([first, first + full]))
 
 
-def measured_line(text: str, where: str, unit_m: float) -> Line:
+def measured_line(text: str, where: str, unit_m: float) -> AxisCorrection:
     """Return the correction for errors measured along an axis.
 
     Parameters
@@ -116,11 +117,11 @@ def measured_line(text: str, where: str, unit_m: float) -> Line:
         raise InputError(where, "the positions are not equidistant between "
                          f"{positions[worst] / unit_m:.9g} and {positions[worst + 1] / unit_m:.9g}",
                          "a table has one sample distance: measure at equal distances")
-    return Line(positions, corrections)
+    return AxisCorrection(positions, corrections)
 
 
 def map_line(error_map: ErrorMap, along: Literal["x", "y"],
-             corrected: Literal["x", "y"]) -> Line:
+             corrected: Literal["x", "y"]) -> AxisCorrection:
     """Return the correction +G of `corrected` along the middle line of an error map.
 
     `along` equal to `corrected` is accuracy, else straightness.
@@ -137,10 +138,10 @@ def map_line(error_map: ErrorMap, along: Literal["x", "y"],
     if not np.isfinite(values).all():
         raise InputError("error map", f"{int(np.isnan(values).sum())} sites on its {along} axis "
                          "are unknown", "measure them")
-    return Line((artifact.x_m if along == "x" else artifact.y_m)[line], values)
+    return AxisCorrection((artifact.x_m if along == "x" else artifact.y_m)[line], values)
 
 
-def map_orthogonality(error_map: ErrorMap, along: Literal["x", "y"]) -> Line:
+def map_orthogonality(error_map: ErrorMap, along: Literal["x", "y"]) -> AxisCorrection:
     """Return the two-point correction for the non-orthogonality O of an error map.
 
     Gx = O y and Gy = O x (Hu 6) are, but for a rotation, an error 2 O x of y alone.
@@ -148,22 +149,22 @@ def map_orthogonality(error_map: ErrorMap, along: Literal["x", "y"]) -> Line:
     artifact = error_map.artifact
     half = artifact.half[0 if along == "x" else 1] * artifact.grid_pitch_m
     ends = np.array([-half, half])
-    return Line(ends, 2 * error_map.nonorthogonality * ends)
+    return AxisCorrection(ends, 2 * error_map.nonorthogonality * ends)
 
 
-def without_slope(line: Line) -> Line:
+def without_slope(line: AxisCorrection) -> AxisCorrection:
     """Return `line` without its least-squares straight line: what straightness means."""
     x, c = line.positions_m - line.positions_m.mean(), line.corrections_m
-    return Line(line.positions_m, c - c.mean() - x * (x @ c) / (x @ x))
+    return AxisCorrection(line.positions_m, c - c.mean() - x * (x @ c) / (x @ x))
 
 
-def line_table(line: Line, frame: MachineFrame, *, along: Literal["x", "y"],
+def line_table(line: AxisCorrection, frame: MachineFrame, *, along: Literal["x", "y"],
                corrected: Literal["x", "y"]) -> Table1D:
     """Return the 1D table of a line, in the controller's coordinates.
 
     Parameters
     ----------
-    line : Line
+    line : AxisCorrection
         Positions and corrections in the stage frame.
     frame : MachineFrame
         The machine's axes.

@@ -8,7 +8,7 @@ import pytest
 
 from selfcal_ros.compensation.aerotech.evaluate import AxisSetup, CalEvaluator, MachineSetup
 from selfcal_ros.compensation.aerotech.export import DECIMALS, table_theta, table_xy, theta_decimals
-from selfcal_ros.compensation.aerotech.lines import Line, line_table
+from selfcal_ros.compensation.aerotech.lines import AxisCorrection, line_table
 from selfcal_ros.compensation.aerotech.model import Unit, UnitWord
 from selfcal_ros.compensation.aerotech.read import parse_cal, refuse_errors
 from selfcal_ros.compensation.aerotech.write import cal_text
@@ -105,8 +105,9 @@ def test_1d_tables_add_up_to_the_2d_table_of_their_sum(seed):
     px, py = frame.to_machine(*places)
     place = {frame.x_axis: px, frame.y_axis: py}
     plane = CalEvaluator(written([table_xy(both, frame)], DECIMALS).tables).corrections(place)
-    lines = CalEvaluator(written([line_table(Line(along[a], values), frame, along=a, corrected=c)
-                                  for (a, c), values in parts.items()], DECIMALS).tables)
+    tables = [line_table(AxisCorrection(along[a], values), frame, along=a, corrected=c)
+              for (a, c), values in parts.items()]
+    lines = CalEvaluator(written(tables, DECIMALS).tables)
     difference = metres(lines.corrections(place), frame) - metres(plane, frame)
     if not inside:  # 1D tables are always zero at home, a 2D table only where it holds home
         difference -= difference.mean(axis=1, keepdims=True)

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from selfcal_ros.errors import InputError, NoDataError
-from selfcal_ros.laser.ibaraki import identify_new
+from selfcal_ros.laser.ibaraki import identify_ibaraki
 from selfcal_ros.laser.readings.zigzag import CutRule, Series, cut_zigzag, find_rests
 from selfcal_ros.simulation.laser import (
     Measurement,
@@ -31,7 +31,7 @@ def test_a_recording_gives_back_the_machine(steps):
     rng = np.random.default_rng(2)
     machine = random_machine(steps, 4, rng)
     cut = cut_zigzag(recorded(machine, {}, rng=rng), CutRule(steps))
-    np.testing.assert_allclose(identify_new(cut.data).errors_m, machine.errors_m, atol=1e-13)
+    np.testing.assert_allclose(identify_ibaraki(cut.data).errors_m, machine.errors_m, atol=1e-13)
     assert set(cut.runs.values()) == {1} and set("xy") < set(cut.runs)
 
 
