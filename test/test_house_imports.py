@@ -1,0 +1,105 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The graph of imports: no circles, arrows downwards, imports in functions with a reason."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PACKAGE = ROOT / "selfcal_ros"
+SOURCES = sorted(PACKAGE.rglob("*.py"))
+ESTIMATION = ("options", "blas_threads", "lattice", "multifrontal", "normal", "datum", "terms",
+              "observability", "joint", "law", "verdict", "api", "quality", "comparison")
+"""The parts of estimation/: each imports only those before it."""
+
+MODULES_OF_A_FOLDER = 14
+ONE_MODULE_EACH = {"cli": "one module a verb", "nodes": "one module a node"}
+"""Folders that may hold more modules, and why."""
+
+
+def dotted(path: Path) -> str:
+    return ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
+
+
+NAMES = {dotted(path) for path in SOURCES}
+
+
+def imports(path: Path) -> set[str]:
+    """Return the modules of this package that a module names in its imports, wherever."""
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.ImportFrom):
+            for alias in node.names:
+                inner = f"{node.module}.{alias.name}"
+                found.add(inner if inner in NAMES else node.module)
+        elif isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+    return found & NAMES
+
+
+GRAPH = {dotted(path): imports(path) - {dotted(path)} for path in SOURCES}
+
+
+def circle_in(graph: dict[str, set[str]]) -> list[str]:
+    """Return the modules of a circle of imports; empty if there is none."""
+    done: set[str] = set()
+
+    def visit(module: str, way: list[str]) -> list[str]:
+        if module in way:
+            return [*way[way.index(module):], module]
+        if module in done:
+            return []
+        for other in sorted(graph.get(module, ())):
+            if found := visit(other, [*way, module]):
+                return found
+        done.add(module)
+        return []
+
+    for module in sorted(graph):
+        if found := visit(module, []):
+            return found
+    return []
+
+
+def test_a_circle_would_be_found():
+    assert circle_in({"a": {"b"}, "b": {"c"}, "c": {"b"}, "d": set()}) == ["b", "c", "b"]
+    assert circle_in({"a": {"b", "c"}, "b": {"c"}, "c": set()}) == []
+
+
+def test_no_module_imports_itself_through_others():
+    assert circle_in(GRAPH) == []
+
+
+def part_of(module: str) -> str:
+    return module.split(".")[2]
+
+
+@pytest.mark.parametrize("module", sorted(m for m in GRAPH if m.startswith(
+    "selfcal_ros.estimation.")))
+def test_the_parts_of_estimation_import_only_those_before_them(module):
+    place = ESTIMATION.index(part_of(module))
+    for other in GRAPH[module]:
+        if other.startswith("selfcal_ros.estimation."):
+            assert ESTIMATION.index(part_of(other)) <= place, f"{module} -> {other}"
+
+
+@pytest.mark.parametrize("folder", sorted({path.parent for path in SOURCES}),
+                         ids=lambda p: str(p.relative_to(ROOT)))
+def test_a_folder_holds_few_modules(folder):
+    modules = [path for path in folder.glob("*.py") if path.name != "__init__.py"]
+    if folder.name not in ONE_MODULE_EACH:
+        assert len(modules) <= MODULES_OF_A_FOLDER, f"{len(modules)} modules: make sub-packages"
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=dotted)
+def test_imports_in_functions_state_their_reason(path):
+    """Verbs import late, so that ``selfcal --help`` does not load numpy: cli/ need not say so."""
+    if path.relative_to(PACKAGE).parts[0] == "cli":
+        return
+    text = path.read_text()
+    lines, tree = text.splitlines(), ast.parse(text)
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import | ast.ImportFrom) and node not in tree.body:
+            line = lines[node.lineno - 1]
+            assert "  # " in line, f"{dotted(path)}:{node.lineno}: say why it is not at the top"
