@@ -5,9 +5,10 @@ import argparse
 import json
 import math
 
+from selfcal_ros.units import ARCSEC_PER_RAD, PPM_PER_ONE, UM_PER_M
+
 HELP = "compare two results after taking out the datum difference"
 
-UM, ARCSEC = 1e6, math.degrees(1) * 3600
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -49,9 +50,9 @@ def _json(found) -> dict:
     from selfcal_ros.model.result import plain
 
     return plain({
-        "rms_um": found.rms_m * UM, "max_um": found.max_m * UM,
-        "rms_theta_arcsec": found.rms_theta_rad * ARCSEC,
-        "max_theta_arcsec": found.max_theta_rad * ARCSEC,
+        "rms_um": found.rms_m * UM_PER_M, "max_um": found.max_m * UM_PER_M,
+        "rms_theta_arcsec": found.rms_theta_rad * ARCSEC_PER_RAD,
+        "max_theta_arcsec": found.max_theta_rad * ARCSEC_PER_RAD,
         "datum_difference": {"translation_x": found.translation_m[0],
                              "translation_y": found.translation_m[1],
                              "rotation": found.rotation_rad, "scale": found.scale,
@@ -65,18 +66,20 @@ def _json(found) -> dict:
 def _text(found) -> str:
     tx, ty = found.translation_m
     lines = ["B less A, datum difference taken out: translation "
-             f"({tx * UM:+.4g}, {ty * UM:+.4g}) um, rotation {found.rotation_rad * ARCSEC:+.4g} "
-             f"arcsec, scale {found.scale * 1e6:+.4g} ppm"
+             f"({tx * UM_PER_M:+.4g}, {ty * UM_PER_M:+.4g}) um, "
+             f"rotation {found.rotation_rad * ARCSEC_PER_RAD:+.4g} arcsec, "
+             f"scale {found.scale * PPM_PER_ONE:+.4g} ppm"
              + ("" if math.isnan(found.theta_rad)
-                else f", theta {found.theta_rad * ARCSEC:+.4g} arcsec"),
-             f"XY     rms {found.rms_m * UM:.5f} um per axis   largest {found.max_m * UM:.5f} um "
-             "on an axis"
+                else f", theta {found.theta_rad * ARCSEC_PER_RAD:+.4g} arcsec"),
+             f"XY     rms {found.rms_m * UM_PER_M:.5f} um per axis   "
+             f"largest {found.max_m * UM_PER_M:.5f} um on an axis"
              + _significance_text(found.xy),
-             f"       non-orthogonality {found.nonorthogonality * ARCSEC:+.4g} arcsec, scale "
-             f"difference {found.scale_difference * 1e6:+.4g} ppm"]
+             f"       non-orthogonality {found.nonorthogonality * ARCSEC_PER_RAD:+.4g} arcsec, "
+             f"scale difference {found.scale_difference * PPM_PER_ONE:+.4g} ppm"]
     if not math.isnan(found.rms_theta_rad):
-        lines.append(f"theta  rms {found.rms_theta_rad * ARCSEC:.4f} arcsec   largest "
-                     f"{found.max_theta_rad * ARCSEC:.4f} arcsec" + _significance_text(found.theta))
+        lines.append(f"theta  rms {found.rms_theta_rad * ARCSEC_PER_RAD:.4f} arcsec   "
+                     f"largest {found.max_theta_rad * ARCSEC_PER_RAD:.4f} arcsec"
+                     + _significance_text(found.theta))
     return "\n".join(lines)
 
 
@@ -100,8 +103,8 @@ def _laser_json(rows) -> dict:
 def _laser_text(rows) -> str:
     lines = ["first-order parts, map and laser:"]
     for row in rows:
-        test = "" if math.isnan(row.u) else f"  u {row.u * ARCSEC:.4g}, p = {row.p:.2g}"
-        lines.append(f"  {row.name.replace('_', ' ')}: {row.of_map * ARCSEC:+.4g} and "
-                     f"{row.of_laser * ARCSEC:+.4g} arcsec, difference "
-                     f"{row.difference * ARCSEC:+.4g}{test}")
+        test = "" if math.isnan(row.u) else f"  u {row.u * ARCSEC_PER_RAD:.4g}, p = {row.p:.2g}"
+        lines.append(f"  {row.name.replace('_', ' ')}: {row.of_map * ARCSEC_PER_RAD:+.4g} and "
+                     f"{row.of_laser * ARCSEC_PER_RAD:+.4g} arcsec, difference "
+                     f"{row.difference * ARCSEC_PER_RAD:+.4g}{test}")
     return "\n".join(lines)

@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from selfcal_ros.errors import InputError
+from selfcal_ros.units import M_PER, M_PER_UM
 
 if TYPE_CHECKING:
     from selfcal_ros.laser.data import StepDiagonal
 
-_UNITS_M = {"m": 1.0, "mm": 1e-3, "um": 1e-6, "nm": 1e-9}
 
 
 def add_bag_options(parser: argparse.ArgumentParser) -> None:
@@ -24,7 +24,7 @@ def add_bag_options(parser: argparse.ArgumentParser) -> None:
                             "--laser-field")
     group.add_argument("--laser-field", metavar="FIELD", default="",
                        help="field of the distance, or its joint in a JointState")
-    group.add_argument("--laser-unit", choices=tuple(_UNITS_M), default="m",
+    group.add_argument("--laser-unit", choices=tuple(M_PER), default="m",
                        help="unit of the distance (default m)")
     group.add_argument("--laser-sign", type=int, choices=(1, -1), default=1,
                        help="-1 if the distance shrinks along the diagonals (default 1)")
@@ -77,9 +77,9 @@ def measurement_from_bag(args: argparse.Namespace,
         if not (math.isfinite(value) and value >= 0):
             raise InputError(option, f"{value:g} is not a positive number", "give one")
     topics = SeriesTopics(args.laser_topic, args.position_topic, joints_of(args),
-                          args.laser_field, _UNITS_M[args.laser_unit])
+                          args.laser_field, M_PER[args.laser_unit])
     series, notes = read_series(Path(args.data), topics)
-    rule = CutRule(steps_m, args.rest_tolerance * 1e-6, args.min_rest, args.settle,
+    rule = CutRule(steps_m, args.rest_tolerance * M_PER_UM, args.min_rest, args.settle,
                    laser_sign=args.laser_sign)
     cut = cut_zigzag(series, rule)
     if args.save_csv:

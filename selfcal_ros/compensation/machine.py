@@ -12,8 +12,9 @@ from numpy.typing import ArrayLike
 from selfcal_ros.compensation.aerotech.evaluate import AxisSetup, CalEvaluator, MachineSetup
 from selfcal_ros.compensation.compensator import Compensator
 from selfcal_ros.errors import InputError
+from selfcal_ros.units import M_PER
 
-UNITS_M = {"m": 1.0, "mm": 1e-3, "um": 1e-6}
+UNITS_M = {name: M_PER[name] for name in ("m", "mm", "um")}
 """Primary units of linear axes; the primary unit of a rotary axis is the degree."""
 _MARK = "machine: "
 

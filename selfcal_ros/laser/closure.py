@@ -12,6 +12,7 @@ from selfcal_ros.laser.readings.noise import (
     reading_covariance,
     reading_noise,
 )
+from selfcal_ros.units import MM_PER_M
 
 LENGTH_TOLERANCE = 1e-3
 """Largest relative disagreement of diagonals and linear errors that a set-up can explain: laser
@@ -96,7 +97,7 @@ def check_lengths(data: StepDiagonal) -> None:
         return
     smaller = _excess(square, steps + 1e-3 * linear)[worst]
     what = (f"diagonals and linear errors disagree by "
-            f"{excess[worst] * np.linalg.norm(steps) * 1e3:.4g} mm")
+            f"{excess[worst] * np.linalg.norm(steps) * MM_PER_M:.4g} mm")
     if abs(smaller) < 0.1 * abs(excess[worst]):
         raise InputError(f"block {worst + 1}", what + "; the linear errors look like micrometres",
                          "give ex_x, ey_y in mm")

@@ -17,6 +17,7 @@ from enum import StrEnum
 import numpy as np
 
 from selfcal_ros.errors import InputError
+from selfcal_ros.units import MM_PER_M
 
 AXES = "xyz"
 DIAGONALS = {2: ("pp", "np"), 3: ("ppp", "npp", "pnp", "ppn")}
@@ -79,7 +80,7 @@ class StepDiagonal:
         """Refuse steps that are no lengths and arrays that do not belong together."""
         for axis, step in zip(AXES, self.steps_m, strict=False):
             if not (np.isfinite(step) and step > 0):
-                raise InputError(f"step {axis}", f"{step * 1e3:g} mm is not a length",
+                raise InputError(f"step {axis}", f"{step * MM_PER_M:g} mm is not a length",
                                  "give the nominal step in mm, greater than 0")
         dim = len(self.steps_m)
         known = DIAGONALS.get(dim, ())

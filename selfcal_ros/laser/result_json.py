@@ -23,9 +23,9 @@ from selfcal_ros.laser.profiles import (
 )
 from selfcal_ros.laser.readings.noise import linear_noise, reading_noise
 from selfcal_ros.model.result import plain
+from selfcal_ros.units import M_PER_MM, UM_PER_M
 
 SCHEMA = "selfcal.step_diagonal/1"
-MM = 1e-3
 CONVENTION = {
     "error": "actual - nominal; ey_x is the error in Y of a step along X",
     "reading": "positive on every diagonal; np: rx = -l.dx, ry = +l.dy",
@@ -56,7 +56,7 @@ def outcome(found: StepDiagonalResult, data: StepDiagonal, *,
         out["form"] = str(found.form)
     out |= {"unit": "mm", "line": str(line), "n_blocks": found.n_blocks,
             "diagonals": list(data.diagonals), "n_repeats": int(data.counts.max()),
-            **{f"step_{AXES[j]}": step / MM for j, step in enumerate(found.steps_m)}}
+            **{f"step_{AXES[j]}": step / M_PER_MM for j, step in enumerate(found.steps_m)}}
     out |= {name_of(j, c): _mm(found.errors_m[j, :, c]) for j, c in kinds}
     if found.covariance is not None:
         u = found.u_errors_m
@@ -72,8 +72,8 @@ def outcome(found: StepDiagonalResult, data: StepDiagonal, *,
     out["mirror_rad"] = found.mirror_rad
     out["closure"] = _closure(found)
     readings, linear = reading_noise(data), linear_noise(data)
-    out["noise"] = {"reading": readings.sigma_m / MM, "reading_dof": readings.dof,
-                    "correlation": readings.correlation, "linear": linear.sigma_m / MM,
+    out["noise"] = {"reading": readings.sigma_m / M_PER_MM, "reading_dof": readings.dof,
+                    "correlation": readings.correlation, "linear": linear.sigma_m / M_PER_MM,
                     "linear_dof": linear.dof}
     out["convention"] = CONVENTION
     out["warnings"] = [*warnings, *_advice(found)]
@@ -81,11 +81,12 @@ def outcome(found: StepDiagonalResult, data: StepDiagonal, *,
 
 
 def _mm(values_m: np.ndarray) -> list:
-    return (np.asarray(values_m) / MM).tolist()
+    return (np.asarray(values_m) / M_PER_MM).tolist()
 
 
 def _value(prefix: str, value: Value) -> dict[str, float | None]:
-    return {prefix: value.value / MM, f"u_{prefix}": None if value.u is None else value.u / MM}
+    return {prefix: value.value / M_PER_MM,
+            f"u_{prefix}": None if value.u is None else value.u / M_PER_MM}
 
 
 def geometry(found: StepDiagonalResult, line: ReferenceLine) -> dict[str, Any]:
@@ -108,7 +109,7 @@ def geometry(found: StepDiagonalResult, line: ReferenceLine) -> dict[str, Any]:
 
 def _closure(found: StepDiagonalResult) -> dict[str, Any]:
     closure = found.closure
-    out = {key: None if value is None else value / MM for key, value in (
+    out = {key: None if value is None else value / M_PER_MM for key, value in (
         ("lengths", closure.lengths_m), ("u_lengths", closure.u_lengths_m),
         ("residual_rms", closure.residual_rms_m))}
     for prefix, values in (("", closure.between_m), ("u_", closure.u_between_m)):
@@ -129,8 +130,8 @@ def _advice(found: StepDiagonalResult) -> list[str]:
     if found.method == Method.NEW and lengths is not None and \
             abs(lengths) > CLOSURE_SHARE * diagonal:
         out.append(f"the diagonals differ from what the linear errors make of them by "
-                   f"{lengths * 1e6:.3g} um: laser off the machine's diagonal, or linear errors "
-                   "of another state of the machine")
+                   f"{lengths * UM_PER_M:.3g} um: laser off the machine's diagonal, or linear "
+                   "errors of another state of the machine")
     if found.covariance is not None and not found.covariance.any():
         out.append("all repeats are identical: the uncertainty of zero is not to be believed")
     return out

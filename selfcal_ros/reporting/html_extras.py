@@ -7,8 +7,9 @@ from typing import Any
 from selfcal_ros import __version__
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.result import SCHEMA, CalibrationResult
-from selfcal_ros.reporting.summary.format import ARCSEC, UM, UNKNOWN, printable, significant
+from selfcal_ros.reporting.summary.format import UNKNOWN, printable, significant
 from selfcal_ros.reporting.summary.sections import Section
+from selfcal_ros.units import ARCSEC_PER_RAD, UM_PER_M
 
 MAX_ROWS = 200
 """Longest table of a report; the rest is in the result file."""
@@ -16,7 +17,7 @@ TITLES = {"budget": "Uncertainty budget (GUM)", "residuals": "Residuals of the f
           "outliers": "Marks removed or weighted down", "validation": "Held-out validation",
           "reference": "Reference length"}
 """Known extras, in the order in which they are reported; others follow by name."""
-_UNITS = (("_m", "µm", UM), ("_rad", "arcsec", ARCSEC), ("_um", "µm", 1.0),
+_UNITS = (("_m", "µm", UM_PER_M), ("_rad", "arcsec", ARCSEC_PER_RAD), ("_um", "µm", 1.0),
           ("_arcsec", "arcsec", 1.0), ("_mm", "mm", 1.0), ("_s", "s", 1.0))
 _THETA_DATUM = {
     ThetaDatum.XY_AXES: "xy_axes: the angular errors at 0°, 90°, 180° and 270° are tied to the "

@@ -13,6 +13,7 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.files import write_bytes
 from selfcal_ros.laser.data import AXES, StepDiagonalResult
 from selfcal_ros.laser.profiles import positions_m, profile_m, u_profile_m
+from selfcal_ros.units import MM_PER_M, UM_PER_M
 
 FORMATS = ("png", "svg", "pdf")
 COVERAGE = 2
@@ -33,9 +34,9 @@ def plot_profiles(found: StepDiagonalResult, path: str | os.PathLike) -> None:
     for j in range(found.dim):
         for c in range(found.dim):
             ax, along, across = axes[j, c], AXES[j].upper(), AXES[c].upper()
-            x, y = positions_m(found, j) * 1e3, profile_m(found, j, c) * 1e6
+            x, y = positions_m(found, j) * MM_PER_M, profile_m(found, j, c) * UM_PER_M
             u = u_profile_m(found, j, c)
-            ax.errorbar(x, y, None if u is None else COVERAGE * u * 1e6, marker="o", ms=3,
+            ax.errorbar(x, y, None if u is None else COVERAGE * u * UM_PER_M, marker="o", ms=3,
                         capsize=2)
             kind = "linear" if j == c else "transverse"
             ax.set(title=f"P{AXES[c]}({AXES[j]}), {kind}", xlabel=f"{along} / mm",
@@ -72,7 +73,7 @@ def plot_sensitivity(rows: list[dict], curves: list[dict], path: str | os.PathLi
 
 def _shown_um(values_m: list[float]) -> np.ndarray:
     """Return errors in um for a logarithmic scale, on which 1 pm stands for zero."""
-    return np.maximum(values_m, 1e-12) * 1e6
+    return np.maximum(values_m, 1e-12) * UM_PER_M
 
 
 def _draw_curves(ax: Axes, curves: list[dict], column: str) -> None:

@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 from selfcal_ros.files import write_bytes
 from selfcal_ros.simulation.reproduce.hu import HuReproduction, HuRun
 from selfcal_ros.simulation.reproduce.qiao import Program, QiaoReproduction
+from selfcal_ros.units import MM_PER_M, UM_PER_M
 
 DPI = 110
 
@@ -48,10 +49,10 @@ def _save(path: Path, draw: Callable[[Figure], None]) -> Path:
 def _truth_map(figure: Figure, found: HuReproduction) -> None:
     axes = figure.subplots()
     artifact = found.truth.artifact
-    axes.quiver(artifact.x_m * 1e3, artifact.y_m * 1e3, *(found.truth.g * 1e6), color="tab:red",
-                angles="xy", scale_units="xy", scale=0.1)
+    axes.quiver(artifact.x_m * MM_PER_M, artifact.y_m * MM_PER_M, *(found.truth.g * UM_PER_M),
+                color="tab:red", angles="xy", scale_units="xy", scale=0.1)
     axes.set(title=f"Hu, Figure 4: nominal stage error times 10000, within "
-             f"[{found.truth.g.min() * 1e6:.3f}, {found.truth.g.max() * 1e6:.3f}] µm",
+             f"[{found.truth.g.min() * UM_PER_M:.3f}, {found.truth.g.max() * UM_PER_M:.3f}] µm",
              xlabel="x, mm", ylabel="y, mm", aspect="equal")
 
 

@@ -19,8 +19,8 @@ from selfcal_ros.simulation.laser import (
     case_study_machine,
     random_machine,
 )
+from selfcal_ros.units import M_PER_MM, M_PER_NM, M_PER_UM, RAD_PER_MRAD, RAD_PER_URAD
 
-MM, UM, NM, MRAD, URAD = 1e-3, 1e-6, 1e-9, 1e-3, 1e-6
 MAX_REPEATS = 1000
 LARGEST = 1e9
 """No length, angle or ratio of a set-up is larger, in the units of the file."""
@@ -65,7 +65,7 @@ def simulation_from_dict(data: object, where: str) -> LaserSimulation:
     noise = _mapping(top.get("noise", {}), f"{where}: noise",
                      ("distance_nm", "reading_nm", "linear_nm", "repeats"))
     repeats = _count(noise.get("repeats", 1), f"{where}: noise: repeats", MAX_REPEATS)
-    sigmas = [_number(noise.get(key, 0), f"{where}: noise: {key}", positive=True) * NM
+    sigmas = [_number(noise.get(key, 0), f"{where}: noise: {key}", positive=True) * M_PER_NM
               for key in ("distance_nm", "reading_nm", "linear_nm")]
     return LaserSimulation(machine, Measurement(
         {name: _setup(raw, f"{where}: setups: {name}", machine.dim)
@@ -77,7 +77,7 @@ def _machine(raw: object, where: str, rng: np.random.Generator) -> StepMachine:
         return case_study_machine()
     kinds = [name_of(j, c) for j in range(3) for c in range(3)]
     raw = _mapping(raw, where, ("steps_mm", "blocks", "sigma_um", "stacked", "turns_urad", *kinds))
-    steps = tuple(np.array(_numbers(raw.get("steps_mm"), f"{where}: steps_mm", (2, 3))) * MM)
+    steps = tuple(np.array(_numbers(raw.get("steps_mm"), f"{where}: steps_mm", (2, 3))) * M_PER_MM)
     if min(steps) <= 0:
         raise InputError(f"{where}: steps_mm", "a step is not positive", "give lengths in mm")
     dim = len(steps)
@@ -88,7 +88,7 @@ def _machine(raw: object, where: str, rng: np.random.Generator) -> StepMachine:
         errors = _errors(raw, where, dim)
     else:
         blocks = _count(raw.get("blocks", 6), f"{where}: blocks", MAX_BLOCKS)
-        sigma = _number(raw.get("sigma_um", 0.1), f"{where}: sigma_um", positive=True) * UM
+        sigma = _number(raw.get("sigma_um", 0.1), f"{where}: sigma_um", positive=True) * M_PER_UM
         errors = random_machine(steps, blocks, rng, sigma_m=sigma).errors_m
     stacked = raw.get("stacked", False)
     if not isinstance(stacked, bool):
@@ -112,7 +112,7 @@ def _errors(raw: Mapping, where: str, dim: int) -> np.ndarray:
     errors = np.zeros((dim, counts.pop(), dim))
     for name, values in lists.items():
         j, c = kinds[name]
-        errors[j, :, c] = np.array(values) * UM
+        errors[j, :, c] = np.array(values) * M_PER_UM
     return errors
 
 
@@ -127,18 +127,20 @@ def _turns(raw: object, where: str, shape: tuple[int, int, int]) -> np.ndarray |
             raise InputError(f"{where}: {axis}", f"not {shape[1]} rotation vectors",
                              "give [rx, ry, rz] for every block")
         turns[axes.index(axis)] = [_numbers(row, f"{where}: {axis}", (3,)) for row in rows]
-    return turns * URAD
+    return turns * RAD_PER_URAD
 
 
 def _setup(raw: object, where: str, dim: int) -> SetUp:
     raw = _mapping(raw, where, ("laser_mrad", "mirror_mrad", "to_machine", "abbe_mm", "scale_ppm"))
     angles = [tuple(np.array(_numbers(raw.get(key, [0.0] * (dim - 1)), f"{where}: {key}",
-                                      (dim - 1,))) * MRAD) for key in ("laser_mrad", "mirror_mrad")]
+                                      (dim - 1,))) * RAD_PER_MRAD)
+              for key in ("laser_mrad", "mirror_mrad")]
     to_machine = raw.get("to_machine", True)
     if not isinstance(to_machine, bool):
         raise InputError(f"{where}: to_machine", f"{to_machine!r} is neither true nor false",
                          "give one")
-    abbe = tuple(np.array(_numbers(raw.get("abbe_mm", [0, 0, 0]), f"{where}: abbe_mm", (3,))) * MM)
+    abbe_mm = _numbers(raw.get("abbe_mm", [0, 0, 0]), f"{where}: abbe_mm", (3,))
+    abbe = tuple(np.array(abbe_mm) * M_PER_MM)
     scale = _number(raw.get("scale_ppm", 0.0), f"{where}: scale_ppm") * 1e-6
     return SetUp(*angles, to_machine, abbe, scale)
 
@@ -177,7 +179,7 @@ def _count(value: object, where: str, most: int) -> int:
 def truth_of(machine: StepMachine) -> dict[str, Any]:
     """Return what a perfect identification of a machine gives, mm, in the datum of the results."""
     truth = StepDiagonalResult(machine.steps_m, machine.truth_m(), None, "", "", {}, Closure())
-    errors = {name_of(j, c): (truth.errors_m[j, :, c] / MM).tolist()
+    errors = {name_of(j, c): (truth.errors_m[j, :, c] / M_PER_MM).tolist()
               for j in range(machine.dim) for c in range(machine.dim)}
     found = geometry(truth, ReferenceLine.LEAST_SQUARES)
     return {"unit": "mm", **errors,

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from selfcal_ros.cli.aerotech.options import add_frame, frame_of, read_result
 from selfcal_ros.errors import ExitCode, InputError
+from selfcal_ros.units import M_PER_UM, UM_PER_M
 
 if TYPE_CHECKING:
     from selfcal_ros.compensation.aerotech.lines import AxisCorrection
@@ -83,14 +84,14 @@ def _orthogonality(args: argparse.Namespace) -> int:
     homes = [args.home] if args.home else list(_HOMES)
     found = {home: cal_lines.orthogonality(*lengths, home) for home in homes}
     unit_m = UNITS_M[args.unit]
-    tables = {home: [[round(p / unit_m, 9), round(c / 1e-6, 9)] for p, c in
+    tables = {home: [[round(p / unit_m, 9), round(c / M_PER_UM, 9)] for p, c in
                      zip(line.positions_m, line.corrections_m, strict=True)]
               for home, line in found.items()}
     if args.json:
         print(json.dumps({"unit": args.unit, "correction_unit": "um", "tables": tables}, indent=1))
         return int(ExitCode.DONE)
     print(f"correction of {other} over the full travel of {args.along}: "
-          f"{-lengths[0] / lengths[1] * lengths[2] * 1e6:.9g} um")
+          f"{-lengths[0] / lengths[1] * lengths[2] * UM_PER_M:.9g} um")
     for home, rows in tables.items():
         print(f"{_HOMES[home]} (--home {home})\n  position {args.unit:<5} correction um")
         print("\n".join(f"  {position:<14.9g} {correction:.9g}" for position, correction in rows))

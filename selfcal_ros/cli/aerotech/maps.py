@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from selfcal_ros.cli.aerotech.options import add_frame, frame_of, read_result
 from selfcal_ros.errors import ExitCode, InputError, NotIdentifiableError
+from selfcal_ros.units import M_PER_UM, RAD_PER_ARCSEC
 
 if TYPE_CHECKING:
     from selfcal_ros.compensation.aerotech.verify import Verification
@@ -111,12 +112,10 @@ def _numbers(found: "Verification") -> dict:
 
 def _text(found: "Verification") -> str:
     """Return the residuals as a small table: um, and arcsec for angular lines."""
-    from selfcal_ros.compensation.aerotech.verify import ARCSEC_RAD
-
     lines = ["residual true - commanded, without its constant shift         before          after"]
     names = {"sites": "sites", "between": "cell centres (cubic stage)", "lines": "angular lines"}
     for r in found.residuals:
-        unit, scale = ("arcsec", ARCSEC_RAD) if r.place == "lines" else ("um", 1e-6)
+        unit, scale = ("arcsec", RAD_PER_ARCSEC) if r.place == "lines" else ("um", M_PER_UM)
         for what, value in (("rms", r.rms), ("max", r.largest)):
             name = f"{r.position.shape[1]} {names[r.place]}, {what}, {unit}"
             lines.append(f"{name:<48}{value('before') / scale:>16.6f}"

@@ -18,6 +18,7 @@ from selfcal_ros.compensation.machine import MachineFrame
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.error_map import ErrorMap
 from selfcal_ros.model.result import CalibrationResult
+from selfcal_ros.units import M_PER_UM, NM_PER_M, RAD_PER_ARCSEC
 
 DECIMALS = 5
 """Digits of a correction in um: rounding stays below 0.005 nm."""
@@ -28,7 +29,7 @@ PRIMARY = Unit(UnitWord.PRIMARY)
 
 def micrometres(unit_m: float) -> Unit:
     """Return the correction unit that means micrometres for a primary unit of `unit_m` m."""
-    return Unit(UnitWord.PRIMARY, tidy(unit_m / 1e-6))
+    return Unit(UnitWord.PRIMARY, tidy(unit_m / M_PER_UM))
 
 
 def tidy(value: float) -> float:
@@ -57,7 +58,7 @@ def table_xy(error_map: ErrorMap, frame: MachineFrame) -> Table2D:
     corrections = np.stack([frame.sign_x * error_map.gx.T, frame.sign_y * error_map.gy.T], axis=-1)
     return Table2D(
         frame.y_axis, frame.x_axis, (frame.x_axis, frame.y_axis), tidy(frame.sign_y * pitch),
-        tidy(frame.sign_x * pitch), np.round(corrections / 1e-6, DECIMALS), PRIMARY,
+        tidy(frame.sign_x * pitch), np.round(corrections / M_PER_UM, DECIMALS), PRIMARY,
         micrometres(unit_m), tidy(frame.sign_y * (hy + frame.home_y_m) / unit_m),
         tidy(frame.sign_x * (hx + frame.home_x_m) / unit_m))
 
@@ -66,7 +67,7 @@ def theta_decimals(error_map: ErrorMap) -> int:
     """Return the digits of an angular correction in arcsec that the field's size asks for."""
     artifact = error_map.artifact
     radius = np.hypot(*artifact.half) * artifact.grid_pitch_m
-    digits = int(np.ceil(np.log10(0.5 * np.deg2rad(1 / 3600) * radius / MAX_THETA_ROUNDING_M)))
+    digits = int(np.ceil(np.log10(0.5 * RAD_PER_ARCSEC * radius / MAX_THETA_ROUNDING_M)))
     return max(DECIMALS, digits + 1)
 
 
@@ -162,7 +163,7 @@ def provenance(result: CalibrationResult, frame: MachineFrame, *, filled: int = 
         Date of the export, UTC.
     """
     emap, source = result.error_map, result.input
-    u_nm = np.sqrt(np.nanmean(np.square([emap.u_gx, emap.u_gy]))) * 1e9 \
+    u_nm = np.sqrt(np.nanmean(np.square([emap.u_gx, emap.u_gy]))) * NM_PER_M \
         if np.isfinite(emap.u_gx).any() else float("nan")
     lines = [
         f"written by selfcal {__version__} on {(now or datetime.now(UTC)):%Y-%m-%dT%H:%M:%SZ}",

@@ -21,12 +21,13 @@ from selfcal_ros.compensation.aerotech.model import Table1D
 from selfcal_ros.compensation.machine import UNITS_M, MachineFrame
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.error_map import ErrorMap
+from selfcal_ros.units import M_PER_NM, M_PER_UM
 
 UNIFORM = 1e-6
 """Largest departure of measured positions from equal distances, in distances."""
 _LENGTH = re.compile(r"([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*(m|mm|um|µm|μm|nm)",
                      re.ASCII)
-_LENGTH_UNITS_M = {**UNITS_M, "µm": 1e-6, "μm": 1e-6, "nm": 1e-9}
+_LENGTH_UNITS_M = {**UNITS_M, "µm": M_PER_UM, "μm": M_PER_UM, "nm": M_PER_NM}
 
 Home = Literal["end", "middle", "middle-balanced"]
 
@@ -106,7 +107,7 @@ def measured_line(text: str, where: str, unit_m: float) -> AxisCorrection:
         except (ArgumentFault, ValueError):
             raise InputError(f"{where}:{number}", "not two numbers",
                              "give position,error") from None
-        values.append((position * unit_m, -error * 1e-6))
+        values.append((position * unit_m, -error * M_PER_UM))
     if len(values) < 2:
         raise InputError(where, f"{len(values)} measured positions", "give at least two")
     order = sorted(values)
@@ -179,6 +180,6 @@ def line_table(line: AxisCorrection, frame: MachineFrame, *, along: Literal["x",
     sign, unit_m = signs[along], frame.unit_m
     return Table1D(
         axes[corrected], tidy(sign * step / unit_m),
-        np.round(signs[corrected] * line.corrections_m / 1e-6, DECIMALS) + 0.0,
+        np.round(signs[corrected] * line.corrections_m / M_PER_UM, DECIMALS) + 0.0,
         reference_axis=None if along == corrected else axes[along], pos_unit=PRIMARY,
         cor_unit=micrometres(unit_m), offset=tidy(-sign * first / unit_m))

@@ -13,8 +13,6 @@ from selfcal_ros.compensation.machine import MachineFrame, SimulatedController
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.error_map import ErrorMap
 
-ARCSEC_RAD = float(np.deg2rad(1 / 3600))
-
 
 @dataclass(frozen=True, eq=False)
 class Residual:

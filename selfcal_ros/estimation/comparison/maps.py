@@ -17,6 +17,8 @@ from selfcal_ros.estimation.comparison.covariance import (
 from selfcal_ros.estimation.datum.modes import datum_modes
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.result import CalibrationResult
+from selfcal_ros.model.statistics import rms
+from selfcal_ros.units import MM_PER_M
 
 PITCH_TOLERANCE = 1e-9
 """Largest relative difference of pitch between two maps of the same lattice."""
@@ -100,12 +102,6 @@ class MapDifference:
         return float(np.abs(known).max()) if len(known) else float("nan")
 
 
-def rms(values: np.ndarray) -> float:
-    """Return the root mean square of the finite values; NaN if there are none."""
-    known = values[np.isfinite(values)]
-    return float(np.sqrt(np.mean(known**2))) if len(known) else float("nan")
-
-
 @one_thread()
 def compare(a: CalibrationResult, b: CalibrationResult, *, keep_scale: bool = False,
             names: tuple[str, str] = ("A", "B")) -> MapDifference:
@@ -157,7 +153,7 @@ def require_same_lattice(a: Artifact, b: Artifact, names: tuple[str, str]) -> No
                              f"{other} {what}", "compare maps of the same plate")
     if abs(a.grid_pitch_m - b.grid_pitch_m) > PITCH_TOLERANCE * a.grid_pitch_m:
         raise InputError(f"{names[0]} and {names[1]}", "the lattices differ: pitches of "
-                         f"{a.grid_pitch_m * 1e3:.9g} and {b.grid_pitch_m * 1e3:.9g} mm",
+                         f"{a.grid_pitch_m * MM_PER_M:.9g} and {b.grid_pitch_m * MM_PER_M:.9g} mm",
                          "compare maps of the same plate")
 
 

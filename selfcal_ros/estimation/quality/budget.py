@@ -11,6 +11,8 @@ from scipy.stats import t as student
 from selfcal_ros.estimation.options import ReferenceLength
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.result import CalibrationResult
+from selfcal_ros.model.statistics import rms
+from selfcal_ros.units import ARCSEC_PER_RAD, UM_PER_M
 
 COVERAGE = 0.9545
 """Probability of the expanded uncertainty: k = 2 for many degrees of freedom."""
@@ -110,7 +112,7 @@ def _noise_parts(u: np.ndarray, sigma: float, *, repeats: tuple[float, int],
     """Return what repeats show, and what residuals show beyond it, as they reach the map."""
     if not (np.isfinite(sigma) and sigma > 0):
         return [Component("reading noise", "A", 0.0, 0.0, np.inf, "no noise was found")]
-    gain_rms, gain_max = _rms(u) / sigma, float(np.nanmax(u)) / sigma
+    gain_rms, gain_max = rms(u) / sigma, float(np.nanmax(u)) / sigma
     if sigma not in (repeats[0], residuals[0]):
         level, dof, kind, base = sigma, np.inf, "B", "declaration"
         source = "declared by the detections"
@@ -133,7 +135,7 @@ def _reference_part(artifact: Artifact, reference: ReferenceLength | None) -> Co
         return Component("reference length", "B", 0.0, 0.0, np.inf,
                          "none: the scale is a convention, and not part of the map")
     coordinates = np.stack([artifact.x_m, artifact.y_m])
-    return Component("reference length", "B", reference.u_relative * _rms(coordinates),
+    return Component("reference length", "B", reference.u_relative * rms(coordinates),
                      reference.u_relative * float(abs(coordinates).max()), np.inf,
                      f"relative {reference.u_relative:.3g} of the distance from the centre, "
                      f"by {reference.kind.value}")
@@ -187,10 +189,6 @@ def _combine(quantity: str, unit: str, parts: list[Component]) -> Budget:
     return Budget(quantity, unit, tuple(parts), u_rms, u_max, float(dof), k)
 
 
-def _rms(values: np.ndarray) -> float:
-    return float(np.sqrt(np.nanmean(values**2)))
-
-
 def budget_json(found: list[Budget]) -> list[dict[str, Any]]:
     """Return the budgets for ``extra["budget"]`` of a result: a row a component, SI units."""
     rows = []
@@ -213,7 +211,7 @@ def budget_text(found: list[Budget]) -> list[str]:
     """Return the budgets as a table, um and arcsec."""
     lines = []
     for budget in found:
-        factor, unit = (1e6, "um") if budget.unit == "m" else (np.degrees(3600), "arcsec")
+        factor, unit = (UM_PER_M, "um") if budget.unit == "m" else (ARCSEC_PER_RAD, "arcsec")
         lines += [f"uncertainty of {budget.quantity}, {unit}",
                   f"  {'component':18}{'type':>5}{'u rms':>12}{'u max':>12}{'dof':>10}  from"]
         for part in budget.components:

@@ -19,6 +19,7 @@ from selfcal_ros.estimation.lattice.maps import PHASES
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.quality.leverage import Residuals, grid_residuals
 from selfcal_ros.model.readings import Measurements, ViewReadings
+from selfcal_ros.units import UM_PER_M
 
 AMBIGUOUS = 16.0
 """Difference of chi2 below which two places explain the readings equally well."""
@@ -78,7 +79,7 @@ class Slip:
 
     def text(self) -> str:
         """Return the slip in words."""
-        size = (f"({self.tx_m * 1e6:.3g}, {self.ty_m * 1e6:.3g}) um and "
+        size = (f"({self.tx_m * UM_PER_M:.3g}, {self.ty_m * UM_PER_M:.3g}) um and "
                 f"{self.phi_rad * 1e6:.3g} urad")
         if self.alternatives:
             return (f"view '{self.view}': the plate slipped by about {size}, {self.place} or "

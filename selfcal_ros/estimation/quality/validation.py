@@ -24,6 +24,8 @@ from selfcal_ros.estimation.quality.outliers import subset
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.readings import Measurements, Sense, ViewReadings
 from selfcal_ros.model.result import CalibrationResult
+from selfcal_ros.model.statistics import rms
+from selfcal_ros.units import ARCSEC_PER_RAD, UM_PER_M
 
 FRACTION = 0.1
 """Part of the readings that is held out at random."""
@@ -136,13 +138,9 @@ def _held_out(measurements: Measurements, options: Options,
         return HeldOut(name, note="nothing to predict: no held-out mark is known from the rest")
     scaled = residual[:, known] * np.sqrt(np.concatenate(weights)[known])
     return HeldOut(
-        name, int(known.sum()), int(angular.sum()), _rms(residual[:, known]),
+        name, int(known.sum()), int(angular.sum()), rms(residual[:, known]),
         float(abs(residual[:, known]).max()) if known.any() else float("nan"),
-        _rms(residual_theta[angular]), _rms(scaled) / max(result.noise.sigma_xy, 1e-300))
-
-
-def _rms(values: np.ndarray) -> float:
-    return float(np.sqrt(np.mean(values**2))) if values.size else float("nan")
+        rms(residual_theta[angular]), rms(scaled) / max(result.noise.sigma_xy, 1e-300))
 
 
 def prediction_errors(measurements: Measurements, result: CalibrationResult, index: int,
@@ -241,10 +239,11 @@ def validation_text(found: list[HeldOut]) -> list[str]:
             continue
         parts = []
         if item.n_grid:
-            parts.append(f"{item.n_grid} marks predicted within {item.rms_m * 1e6:.4g} um rms, "
-                         f"{item.max_m * 1e6:.4g} um at most ({item.ratio:.2f} times the noise)")
+            parts.append(f"{item.n_grid} marks predicted within {item.rms_m * UM_PER_M:.4g} um "
+                         f"rms, {item.max_m * UM_PER_M:.4g} um at most "
+                         f"({item.ratio:.2f} times the noise)")
         if item.n_angular:
             parts.append(f"{item.n_angular} lines within "
-                         f"{np.degrees(item.rms_rad) * 3600:.4g} arcsec rms")
+                         f"{item.rms_rad * ARCSEC_PER_RAD:.4g} arcsec rms")
         lines.append(f"{item.name}: " + ", ".join(parts))
     return lines

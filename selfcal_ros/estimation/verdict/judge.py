@@ -23,6 +23,7 @@ from selfcal_ros.estimation.verdict.provenance import provenance_of
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.verdict import Cause, Verdict
+from selfcal_ros.units import ARCSEC_PER_RAD, UM_PER_M
 
 ALWAYS_SITES = 41 * 41
 """Field up to which terms are looked for in any case; beyond, where another test fails."""
@@ -37,7 +38,6 @@ MATTERS = 0.1
 """Effect of a cause on the map, in standard uncertainties (rms), below which it is of no account
 where the readings tell all of it."""
 
-UM, ARCSEC = 1e6, float(np.degrees(3600))
 
 
 @one_thread()
@@ -82,8 +82,8 @@ def _sentence(solved: Solved, reasons: list[str], causes: list[Cause]) -> str:
 
 def _noise_reasons(solved: Solved) -> list[str]:
     out = []
-    for noise, kind, factor, unit in ((solved.xy, "grid", UM, "µm"),
-                                      (solved.theta, "angular", ARCSEC, "arcsec")):
+    for noise, kind, factor, unit in ((solved.xy, "grid", UM_PER_M, "µm"),
+                                      (solved.theta, "angular", ARCSEC_PER_RAD, "arcsec")):
         if noise.contradicted:
             out.append(_contradiction(noise, kind, factor, unit))
     if not np.isfinite(solved.xy.sigma):
@@ -107,7 +107,7 @@ def _axes_reasons(solved: Solved) -> list[str]:
     if p >= MISCLOSURE_LEVEL:
         return []
     return [f"theta: the stage does not satisfy the axis conditions of the datum xy_axes "
-            f"(misclosure {size_rad * ARCSEC:.3g} arcsec, p = {p:.2g}); use zero_mean"]
+            f"(misclosure {size_rad * ARCSEC_PER_RAD:.3g} arcsec, p = {p:.2g}); use zero_mean"]
 
 
 def _causes(solved: Solved, measurements: Measurements, options: Options, *,

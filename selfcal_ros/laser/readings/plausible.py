@@ -4,6 +4,7 @@
 import math
 
 from selfcal_ros.errors import InputError
+from selfcal_ros.units import MM_PER_M
 
 NEAR = 1.25
 """Largest ratio of a reading to its nominal value, either way."""
@@ -35,7 +36,7 @@ def check_reading(value_m: float, nominal_m: float, where: str) -> None:
     if not math.isfinite(value_m):
         raise InputError(where, "not a finite number", "measure the block again or mend the cell")
     ratio = value_m / nominal_m
-    shown = f"{value_m * 1e3:.6g} where {nominal_m * 1e3:.6g} mm is nominal"
+    shown = f"{value_m * MM_PER_M:.6g} where {nominal_m * MM_PER_M:.6g} mm is nominal"
     if _is_near(ratio):
         return
     if _is_near(-ratio):
@@ -62,5 +63,5 @@ def check_linear(value_m: float, step_m: float, where: str) -> None:
             hint = "it looks like micrometres; give millimetres"
         else:
             hint = "it looks like the step itself; give measured step - nominal step"
-        raise InputError(where, f"a linear error of {value_m * 1e3:.6g} mm in a step of "
-                         f"{step_m * 1e3:g} mm", hint)
+        raise InputError(where, f"a linear error of {value_m * MM_PER_M:.6g} mm in a step of "
+                         f"{step_m * MM_PER_M:g} mm", hint)

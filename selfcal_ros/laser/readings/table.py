@@ -21,8 +21,8 @@ from selfcal_ros.files import read_text, write_text
 from selfcal_ros.laser.data import AXES, DIAGONALS, MAX_BLOCKS, StepDiagonal
 from selfcal_ros.laser.profiles import name_of
 from selfcal_ros.laser.readings.plausible import check_linear, check_reading
+from selfcal_ros.units import M_PER_MM
 
-MM = 1e-3
 BLOCK = "block"
 
 
@@ -173,13 +173,13 @@ def _values(named: dict[str, str], columns: Columns, where: str) -> tuple[np.nda
         if not any(named[other] for other in of_diagonal):
             continue
         place = f"{where}: {name}"
-        readings[k, j] = _number(named[name], place) * MM
+        readings[k, j] = _number(named[name], place) * M_PER_MM
         check_reading(readings[k, j], nominal[j], place)
     linear = np.full(len(steps), np.nan)
     for index, name in enumerate(columns.errors):
         if named[name]:
             place = f"{where}: {name}"
-            linear[index] = _number(named[name], place) * MM
+            linear[index] = _number(named[name], place) * M_PER_MM
             check_linear(linear[index], steps[index], place)
     return readings, linear
 
@@ -228,7 +228,8 @@ def table_text(data: StepDiagonal, comments: Sequence[str] = ()) -> str:
             if columns.linear:
                 values += _row(data.linear_m[:, :, i], repeat)
             if not np.isnan(values).all():
-                writer.writerow([i + 1, *("" if np.isnan(v) else f"{v / MM:.8f}" for v in values)])
+                cells = ("" if np.isnan(v) else f"{v / M_PER_MM:.8f}" for v in values)
+                writer.writerow([i + 1, *cells])
     return out.getvalue()
 
 

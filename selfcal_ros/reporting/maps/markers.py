@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from selfcal_ros.model.error_map import ErrorMap
+from selfcal_ros.units import UM_PER_M
 
 MOST_SITES = 51
 """Sites shown along a side; larger fields show every second, third, ... site."""
@@ -61,7 +62,7 @@ def map_geometry(error_map: ErrorMap) -> MapGeometry:
     u = np.hypot(error_map.u_gx[shown], error_map.u_gy[shown])
     largest = float(np.max(u, where=np.isfinite(u), initial=0.0))
     legend = (f"stage error (indicated - true), enlarged {factor:,.0f} x, longest "
-              f"{longest * 1e6:.3g} um; dark: u = {largest * 1e6:.3g} um (k=1)")
+              f"{longest * UM_PER_M:.3g} um; dark: u = {largest * UM_PER_M:.3g} um (k=1)")
     below = -(artifact.half[1] * artifact.grid_pitch_m + 1.5 * spacing)
     return MapGeometry(factor, ends, sites, _colours(u, largest), spacing, legend,
                        (0.0, below, 0.0))

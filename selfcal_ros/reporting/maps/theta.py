@@ -9,7 +9,7 @@ from matplotlib.ticker import MaxNLocator
 
 from selfcal_ros.model.error_map import ErrorMap
 from selfcal_ros.reporting.maps.style import BAND, GRID, INK, TRUTH
-from selfcal_ros.reporting.summary.format import ARCSEC
+from selfcal_ros.units import ARCSEC_PER_RAD
 
 MARKED_LINES = 120
 """Up to so many lines each gets a dot."""
@@ -49,7 +49,7 @@ def draw_theta(axes: PolarAxes, emap: ErrorMap, *,
 
 def _closed(values_rad: np.ndarray) -> np.ndarray:
     """Return the values in arcsec with the first one repeated at 360° (circle closure)."""
-    return np.append(values_rad, values_rad[:1]) * ARCSEC
+    return np.append(values_rad, values_rad[:1]) * ARCSEC_PER_RAD
 
 
 def _finish(axes: PolarAxes, values: np.ndarray) -> None:

@@ -24,7 +24,8 @@ from selfcal_ros.reporting.maps.style import (
     round_down,
     uncertainty_colours,
 )
-from selfcal_ros.reporting.summary.format import MM, UM, significant
+from selfcal_ros.reporting.summary.format import significant
+from selfcal_ros.units import MM_PER_M, UM_PER_M
 
 MAX_ARROWS = 27
 """Most arrows along one side; larger fields show every second, third, ... site."""
@@ -56,7 +57,8 @@ def choose_arrows(emap: ErrorMap) -> Arrows:
     if lengths.size and lengths.max() > 0:
         typical = max(float(np.percentile(lengths, 95)), float(lengths.max()) / 2)
         magnification = round_down(1.3 * spacing / typical)
-    return Arrows(step, sites, artifact.x_m[sites] * MM, artifact.y_m[sites] * MM, magnification)
+    return Arrows(step, sites, artifact.x_m[sites] * MM_PER_M, artifact.y_m[sites] * MM_PER_M,
+                  magnification)
 
 
 def draw_error_map(axes: Axes, emap: ErrorMap, *, truth: Mapping[str, np.ndarray] | None = None,
@@ -105,7 +107,7 @@ def _reach(emap: ErrorMap, arrows: Arrows) -> tuple[float, float]:
     """Return how far arrow heads and circles reach from the centre along x and y, mm."""
     reach = []
     for at, part, u in ((arrows.x_mm, emap.gx, emap.u_gx), (arrows.y_mm, emap.gy, emap.u_gy)):
-        enlarge = MM * arrows.magnification
+        enlarge = MM_PER_M * arrows.magnification
         tips = np.abs(at + part[arrows.sites] * enlarge)
         tips = tips + 2 * np.nan_to_num(u[arrows.sites]) * enlarge
         reach.append(float(np.nanmax(tips, initial=0.0)))
@@ -122,11 +124,11 @@ def draw_uncertainty_map(axes: Axes, emap: ErrorMap) -> None:
 
 def _draw_size(axes: Axes, artifact: Artifact, size_m: np.ndarray, colours: Colormap, *,
                label: str, from_zero: bool = True) -> None:
-    half = [(h + 0.5) * artifact.grid_pitch_m * MM for h in artifact.half]
-    known = size_m[np.isfinite(size_m)] * UM
+    half = [(h + 0.5) * artifact.grid_pitch_m * MM_PER_M for h in artifact.half]
+    known = size_m[np.isfinite(size_m)] * UM_PER_M
     top = float(known.max()) if known.size and known.max() > 0 else 1.0
     low = 0.0 if from_zero or not known.size else 0.8 * float(known.min())
-    image = axes.imshow(np.ma.masked_invalid(size_m.T * UM), origin="lower", cmap=colours,
+    image = axes.imshow(np.ma.masked_invalid(size_m.T * UM_PER_M), origin="lower", cmap=colours,
                         extent=(-half[0], half[0], -half[1], half[1]), vmin=low,
                         vmax=max(top, low), interpolation="nearest", zorder=0)
     bar = axes.figure.colorbar(image, cax=axes.inset_axes((1.03, 0, 0.035, 1)))
@@ -136,14 +138,14 @@ def _draw_size(axes: Axes, artifact: Artifact, size_m: np.ndarray, colours: Colo
 
 def _draw_lattice(axes: Axes, artifact: Artifact, arrows: Arrows) -> None:
     """Draw the nominal grid through the sites that carry arrows."""
-    hx, hy = (h * artifact.grid_pitch_m * MM for h in artifact.half)
+    hx, hy = (h * artifact.grid_pitch_m * MM_PER_M for h in artifact.half)
     axes.vlines(arrows.x_mm[:, 0], -hy, hy, color=GRID, linewidth=0.5, zorder=1)
     axes.hlines(arrows.y_mm[0], -hx, hx, color=GRID, linewidth=0.5, zorder=1)
 
 
 def _quiver(axes: Axes, arrows: Arrows, g_m: tuple[np.ndarray, np.ndarray], *, color: str,
             zorder: float, thicker: float = 1.0, head: bool = True) -> Quiver:
-    gx, gy = (part[arrows.sites] * (MM * arrows.magnification) for part in g_m)
+    gx, gy = (part[arrows.sites] * (MM_PER_M * arrows.magnification) for part in g_m)
     known = np.isfinite(gx) & np.isfinite(gy)
     width = 0.012 / math.sqrt(max(gx.shape)) * thicker
     shape = ({"headwidth": 3.4, "headlength": 4.2, "headaxislength": 3.8} if head else
@@ -155,11 +157,11 @@ def _quiver(axes: Axes, arrows: Arrows, g_m: tuple[np.ndarray, np.ndarray], *, c
 
 def _draw_circles(axes: Axes, emap: ErrorMap, arrows: Arrows) -> bool:
     """Draw U (k=2) around the arrow heads; return whether it is large enough to be seen."""
-    enlarge = MM * arrows.magnification
+    enlarge = MM_PER_M * arrows.magnification
     gx, gy, ux, uy = (part[arrows.sites] * enlarge
                       for part in (emap.gx, emap.gy, emap.u_gx, emap.u_gy))
     known = np.isfinite(gx) & np.isfinite(gy) & np.isfinite(ux) & np.isfinite(uy)
-    spacing = arrows.step * emap.artifact.grid_pitch_m * MM
+    spacing = arrows.step * emap.artifact.grid_pitch_m * MM_PER_M
     if not known.any() or 4 * max(ux[known].max(), uy[known].max()) < 0.05 * spacing:
         return False
     tips = np.stack([(arrows.x_mm + gx)[known], (arrows.y_mm + gy)[known]], axis=1)
@@ -172,9 +174,9 @@ def _draw_circles(axes: Axes, emap: ErrorMap, arrows: Arrows) -> bool:
 
 def _draw_key(axes: Axes, emap: ErrorMap, quiver: Quiver, arrows: Arrows) -> None:
     """State the scale with an arrow of a round length, about one and a half spacings."""
-    field_um = (max(emap.artifact.shape) + 1) * emap.artifact.grid_pitch_m * UM
+    field_um = (max(emap.artifact.shape) + 1) * emap.artifact.grid_pitch_m * UM_PER_M
     round_um = round_down(0.16 * field_um / arrows.magnification)
-    key_mm = round_um / UM * MM * arrows.magnification
+    key_mm = round_um / UM_PER_M * MM_PER_M * arrows.magnification
     left, right = axes.get_xlim()
     axes.quiverkey(quiver, 0.02 + key_mm / (right - left), 0.035, key_mm,
                    f"{significant(round_um, 1)} µm", labelpos="E", coordinates="axes",
@@ -188,7 +190,7 @@ def _ordinal(number: int) -> str:
 def _finish(axes: Axes, artifact: Artifact, *, reach_mm: tuple[float, float] = (0.0, 0.0),
             strip: float = 0.0) -> None:
     """Set limits that hold the field and the arrows, and a free strip below for the key."""
-    x, y = (max((h + 0.6) * artifact.grid_pitch_m * MM, 1.03 * reach)
+    x, y = (max((h + 0.6) * artifact.grid_pitch_m * MM_PER_M, 1.03 * reach)
             for h, reach in zip(artifact.half, reach_mm, strict=True))
     axes.set(xlim=(-x, x), ylim=(-y - 2 * strip * max(x, y), y), xlabel="stage x in mm",
              ylabel="stage y in mm", aspect="equal")

@@ -6,13 +6,6 @@ import unicodedata
 from collections.abc import Sequence
 from typing import TextIO
 
-UM = 1e6
-"""Micrometres in a metre, and microradians in a radian."""
-MM = 1e3
-"""Millimetres in a metre, and milliradians in a radian."""
-ARCSEC = math.degrees(1) * 3600
-"""Arcseconds in a radian."""
-
 UNKNOWN = "–"
 _ASCII = {"µ": "u", "θ": "theta", "φ": "phi", "°": " deg", "±": "+/-", "–": "-", "×": "x",
           "σ": "sigma", "²": "^2", "−": "-"}

@@ -10,7 +10,8 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.datum.modes import datum_modes, remove_modes
 from selfcal_ros.model.error_map import ErrorMap
 from selfcal_ros.model.result import CalibrationResult
-from selfcal_ros.reporting.summary.format import ARCSEC, UM
+from selfcal_ros.model.statistics import rms
+from selfcal_ros.units import ARCSEC_PER_RAD, UM_PER_M
 
 NAN = float("nan")
 
@@ -88,12 +89,6 @@ class TruthFigures:
     theta_within_2u: float = NAN
 
 
-def rms(values: np.ndarray) -> float:
-    """Return the root mean square of the finite values; NaN if there is none."""
-    finite = values[np.isfinite(values)]
-    return float(np.sqrt(np.mean(finite ** 2))) if finite.size else NAN
-
-
 def largest(values: np.ndarray) -> tuple[float, tuple[int, ...] | None]:
     """Return the largest magnitude among the finite values and its index; NaN, None if none."""
     sizes = np.abs(values)
@@ -106,9 +101,9 @@ def largest(values: np.ndarray) -> tuple[float, tuple[int, ...] | None]:
 def summary_numbers(result: CalibrationResult) -> SummaryNumbers:
     """Return the numbers of a CalibrationSummary message."""
     figures = map_figures(result.error_map)
-    return SummaryNumbers(figures.max_error_m * UM, figures.rms_error_m * UM,
-                          figures.rms_u_m * UM, figures.max_theta_rad * ARCSEC,
-                          figures.rms_u_theta_rad * ARCSEC)
+    return SummaryNumbers(figures.max_error_m * UM_PER_M, figures.rms_error_m * UM_PER_M,
+                          figures.rms_u_m * UM_PER_M, figures.max_theta_rad * ARCSEC_PER_RAD,
+                          figures.rms_u_theta_rad * ARCSEC_PER_RAD)
 
 
 def map_figures(emap: ErrorMap) -> MapFigures:

@@ -10,9 +10,6 @@ import numpy as np
 from selfcal_ros.model.error_map import ErrorMap
 from selfcal_ros.model.result import CalibrationResult, Noise, ViewResult
 from selfcal_ros.reporting.summary.format import (
-    ARCSEC,
-    MM,
-    UM,
     UNKNOWN,
     counted,
     fixed_column,
@@ -20,6 +17,7 @@ from selfcal_ros.reporting.summary.format import (
     significant,
 )
 from selfcal_ros.reporting.summary.numbers import map_figures, truth_figures
+from selfcal_ros.units import ARCSEC_PER_RAD, MM_PER_M, UM_PER_M
 
 
 @dataclass(frozen=True)
@@ -59,7 +57,7 @@ def terms_section(result: CalibrationResult) -> Section:
     for term in result.model.terms:
         how = "free" if term.size is None else f"size {term.size:g}"
         for item in term.estimates:
-            scale, unit = (UM, "µm") if item.unit == "m" else (UM, "µm/m")
+            scale, unit = (UM_PER_M, "µm") if item.unit == "m" else (UM_PER_M, "µm/m")
             rows.append((f"{term.name} ({how})", item.view or "all", item.component,
                          f"{item.value * scale:.5g}", f"{item.u * scale:.2g}", unit))
     if not rows:
@@ -71,7 +69,7 @@ def terms_section(result: CalibrationResult) -> Section:
 def measurement_section(result: CalibrationResult) -> Section:
     """Return plan, plate, method and input."""
     artifact = result.artifact
-    (nx, ny), pitch = artifact.shape, artifact.grid_pitch_m * MM
+    (nx, ny), pitch = artifact.shape, artifact.grid_pitch_m * MM_PER_M
     plate = (f"{nx} × {ny} marks, pitch {pitch:.6g} mm, "
              f"field {(nx - 1) * pitch:.6g} × {(ny - 1) * pitch:.6g} mm, "
              + (f"{artifact.angular_count} angular lines" if artifact.angular_count
@@ -105,9 +103,10 @@ def views_section(result: CalibrationResult) -> Section:
     """Return the table of views: nominal pose, misalignment, detections."""
     pitch, views = result.artifact.grid_pitch_m, result.views
     columns = [[printable(v.name) for v in views], [pose_text(v, pitch) for v in views],
-               fixed_column([v.phi * MM for v in views]),
+               fixed_column([v.phi * MM_PER_M for v in views]),
                fixed_column([math.degrees(v.phi) for v in views]),
-               fixed_column([v.tx * UM for v in views]), fixed_column([v.ty * UM for v in views]),
+               fixed_column([v.tx * UM_PER_M for v in views]),
+               fixed_column([v.ty * UM_PER_M for v in views]),
                [str(v.used) for v in views], [str(v.rejected) for v in views]]
     header = ("view", "pose (pitches)", "φ mrad", "φ °", "tx µm", "ty µm", "used", "rejected")
     return Section("Views and their misalignment",
@@ -125,7 +124,7 @@ def place_text(emap: ErrorMap, site: tuple[int, int] | None) -> str:
     """Return a site and its position as ``at x 40 mm, y -20 mm (site 4, -2)``."""
     if site is None:
         return ""
-    x, y = (f"{index * emap.artifact.grid_pitch_m * MM:.6g}" for index in site)
+    x, y = (f"{index * emap.artifact.grid_pitch_m * MM_PER_M:.6g}" for index in site)
     return f"at x {x} mm, y {y} mm (site {site[0]}, {site[1]})"
 
 
@@ -150,8 +149,8 @@ def error_section(result: CalibrationResult) -> Section:
 
 def _slope_text(emap: ErrorMap, value: float, symbol: str, unit: str, meaning: str) -> str:
     length = (max(emap.artifact.shape) - 1) * emap.artifact.grid_pitch_m
-    return (f"{symbol} {significant(value * UM)} {unit} = {um(value * length)} over "
-            f"{length * MM:.6g} mm; {meaning} = {significant(2 * abs(value) * UM)} "
+    return (f"{symbol} {significant(value * UM_PER_M)} {unit} = {um(value * length)} over "
+            f"{length * MM_PER_M:.6g} mm; {meaning} = {significant(2 * abs(value) * UM_PER_M)} "
             f"{unit}")
 
 
@@ -189,7 +188,8 @@ def _spread_facts(label: str, unit: Callable[[float], str], u: tuple[float, floa
 def noise_section(noise: Noise) -> Section:
     """Return the noise of one reading: used, from repeats, from residuals, and their ratio."""
     rows = []
-    for label, name, scale, unit in (("x, y", "xy", UM, "µm"), ("θ", "theta", ARCSEC, "arcsec")):
+    for label, name, scale, unit in (("x, y", "xy", UM_PER_M, "µm"),
+                                     ("θ", "theta", ARCSEC_PER_RAD, "arcsec")):
         used, repeats, residuals = (getattr(noise, f"sigma_{name}{suffix}")
                                     for suffix in ("", "_repeats", "_residuals"))
         if not any(map(math.isfinite, (used, repeats, residuals))):
@@ -247,11 +247,11 @@ def attention_section(result: CalibrationResult) -> Section:
 
 def um(value_m: float) -> str:
     """Return a length in µm with its unit, or ``not known``."""
-    return f"{significant(value_m * UM)} µm" if math.isfinite(value_m) else "not known"
+    return f"{significant(value_m * UM_PER_M)} µm" if math.isfinite(value_m) else "not known"
 
 
 def arcsec(value_rad: float) -> str:
     """Return an angle in arcseconds with its unit, or ``not known``."""
     if not math.isfinite(value_rad):
         return "not known"
-    return f"{significant(value_rad * ARCSEC)} arcsec"
+    return f"{significant(value_rad * ARCSEC_PER_RAD)} arcsec"

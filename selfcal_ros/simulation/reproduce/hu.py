@@ -22,6 +22,7 @@ from selfcal_ros.simulation.truth import (
     random_truth,
     simulate_measurements,
 )
+from selfcal_ros.units import M_PER_UM, UM_PER_M
 
 ARTIFACT = Artifact(11, 0.01, 24)
 """Plate of Hu's section 4: 11 x 11 marks, 10 mm, lines every 15 deg."""
@@ -106,7 +107,7 @@ def reproduce_hu(n_draws: int, seed: int) -> HuReproduction:
 
 def _run(truth: Truth, table: Published, rng: np.random.Generator, n_draws: int) -> HuRun:
     plan = hu_plan(ARTIFACT)
-    draws = [simulate_measurements(truth, plan, rng, sigma_m=table.sigma_um * 1e-6,
+    draws = [simulate_measurements(truth, plan, rng, sigma_m=table.sigma_um * M_PER_UM,
                                    sigma_theta_rad=np.deg2rad(table.sigma_deg))
              for _ in range(n_draws)]
     gain = predict(planned_system(ARTIFACT, plan.views), ARTIFACT, ThetaDatum.XY_AXES)
@@ -120,7 +121,7 @@ def _law_errors(truth: Truth, draws: list[Measurements]) -> Errors:
     found = law.solve(HuReadings(*(np.concatenate([getattr(one, name) for one in each], axis=-1)
                                    for name in ("v0", "v1", "v3", "vt"))))
     xy = np.moveaxis(found.g, -1, 0) - truth.g
-    return Errors(xy * 1e6, np.rad2deg(found.g_theta.T - truth.g_theta))
+    return Errors(xy * UM_PER_M, np.rad2deg(found.g_theta.T - truth.g_theta))
 
 
 def _joint_errors(truth: Truth, draws: list[Measurements]) -> Errors:
@@ -129,7 +130,7 @@ def _joint_errors(truth: Truth, draws: list[Measurements]) -> Errors:
     maps = [calibrate(readings, options).error_map for readings in draws]
     xy = np.array([[m.gx - truth.g[0], m.gy - truth.g[1]] for m in maps])
     theta = np.array([m.g_theta - truth.g_theta for m in maps])
-    return Errors(xy * 1e6, np.rad2deg(theta))
+    return Errors(xy * UM_PER_M, np.rad2deg(theta))
 
 
 def hu_text(found: HuReproduction) -> str:

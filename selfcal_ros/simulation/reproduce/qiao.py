@@ -24,6 +24,7 @@ from selfcal_ros.simulation.truth import (
     random_truth,
     simulate_measurements,
 )
+from selfcal_ros.units import UM_PER_M
 
 SIZES = (3, 5, 7, 9, 11)
 ARTIFACT = Artifact(11, 0.01)
@@ -143,7 +144,7 @@ def reproduce_qiao(n_draws: int, seed: int) -> QiaoReproduction:
     return QiaoReproduction(
         np.array([[s.rank for s in row] for row in seen]),
         np.array([[s.unknowns for s in row] for row in seen]), programs, _rms(normal),
-        _rms(uniform), normal[0], gain * SIGMA_M * 1e6)
+        _rms(uniform), normal[0], gain * SIGMA_M * UM_PER_M)
 
 
 def _rms(errors: list[np.ndarray]) -> np.ndarray:
@@ -153,7 +154,7 @@ def _rms(errors: list[np.ndarray]) -> np.ndarray:
 def _errors_um(truth: Truth, readings: Measurements) -> np.ndarray:
     options = Options(misalignment_model="linear", uncertainty=False)
     found = calibrate(readings, options).error_map
-    return (np.stack([found.gx, found.gy]) - truth.g) * 1e6
+    return (np.stack([found.gx, found.gy]) - truth.g) * UM_PER_M
 
 
 def _with_uniform_noise(readings: Measurements, rng: np.random.Generator) -> Measurements:
@@ -172,10 +173,10 @@ def _program(truth: Truth, views: tuple[str, ...]) -> Program:
     seen = plan_observability(plan)
     if seen.identifiable:
         readings = simulate_measurements(truth, plan, np.random.default_rng(0))
-        found = truth.g * 1e6 + _errors_um(truth, readings)
+        found = truth.g * UM_PER_M + _errors_um(truth, readings)
     else:
-        found = _minimum_norm(truth, plan) * 1e6
-    return Program(views, truth.g * 1e6, found, seen.deficiency)
+        found = _minimum_norm(truth, plan) * UM_PER_M
+    return Program(views, truth.g * UM_PER_M, found, seen.deficiency)
 
 
 def _minimum_norm(truth: Truth, plan: Plan) -> np.ndarray:

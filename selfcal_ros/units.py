@@ -1,0 +1,18 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Factors between SI units and those in which people and files write, declared once.
+
+``A_PER_B`` is how many A are one B: a length in m times `MM_PER_M` is in mm.
+"""
+
+import math
+
+MM_PER_M, UM_PER_M, NM_PER_M = 1e3, 1e6, 1e9
+M_PER_MM, M_PER_UM, M_PER_NM = 1e-3, 1e-6, 1e-9
+RAD_PER_MRAD, RAD_PER_URAD = 1e-3, 1e-6
+ARCSEC_PER_RAD = math.degrees(1) * 3600
+RAD_PER_ARCSEC = math.radians(1 / 3600)
+PPM_PER_ONE = 1e6
+NS_PER_S = 1_000_000_000
+
+M_PER = {"m": 1.0, "mm": M_PER_MM, "um": M_PER_UM, "nm": M_PER_NM}
+"""Length of each unit by the name that options and files use."""
