@@ -13,7 +13,6 @@ from selfcal_ros.compensation.aerotech.lines import AxisCorrection, line_table
 from selfcal_ros.compensation.aerotech.model import Table1D
 from selfcal_ros.compensation.machine import MachineFrame
 from selfcal_ros.errors import InputError
-from selfcal_ros.estimation.options import ReferenceKind, ReferenceLength
 from selfcal_ros.laser.data import Method, StepDiagonalResult
 from selfcal_ros.laser.profiles import (
     positions_m,
@@ -55,22 +54,6 @@ def map_equivalent(found: StepDiagonalResult) -> MapEquivalent:
     each = [u_slope(found, axis, axis) for axis in (0, 1)]
     u_r = None if None in each else float(np.hypot(*each) / 2)
     return MapEquivalent(o, u_o, (slope(found, 1, 1) - slope(found, 0, 0)) / 2, u_r)
-
-
-def reference_length(found: StepDiagonalResult, axis: int) -> ReferenceLength:
-    """Return the scale that the measured linear error of X (0) or Y (1) gives the stage.
-
-    Raises
-    ------
-    InputError
-        If the linear errors are those of the conventional formulation, which a misaligned laser
-        spoils.
-    """
-    if found.method != Method.NEW:
-        raise InputError("reference length", "the conventional formulation does not measure the "
-                         "linear errors", "measure them directly and use the new formulation")
-    kind = (ReferenceKind.STAGE_X, ReferenceKind.STAGE_Y)[axis]
-    return ReferenceLength(kind, -slope(found, axis, axis), u_slope(found, axis, axis) or 0.0)
 
 
 def axis_corrections(found: StepDiagonalResult) -> dict[tuple[str, str], AxisCorrection]:

@@ -6,15 +6,13 @@ from selfcal_ros.compensation.aerotech.evaluate import CalEvaluator
 from selfcal_ros.compensation.machine import MachineFrame
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.datum.modes import first_order
-from selfcal_ros.estimation.options import ReferenceKind
 from selfcal_ros.laser.ibaraki import identify_ibaraki
 from selfcal_ros.laser.map_equivalent import (
     axis_corrections,
     correction_tables,
     map_equivalent,
-    reference_length,
 )
-from selfcal_ros.laser.profiles import profile_m, squareness, squareness_rad
+from selfcal_ros.laser.profiles import squareness, squareness_rad, u_slope
 from selfcal_ros.laser.wang import identify_wang
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.simulation.laser import (
@@ -90,27 +88,13 @@ def test_uncertainties_follow():
     found = identify_ibaraki(measured(case_study_machine(), LaserNoise(1e-8, 0, 1e-8, 3)))
     equivalent = map_equivalent(found)
     assert equivalent.u_nonorthogonality == pytest.approx(squareness(found).u / 0.06 / 2)
-    references = [reference_length(found, axis) for axis in (0, 1)]
-    expected = np.hypot(*[reference.u_relative for reference in references]) / 2
+    expected = np.hypot(*(u_slope(found, axis, axis) for axis in (0, 1))) / 2
     assert equivalent.u_scale_difference == pytest.approx(expected)
 
 
-def test_the_linear_error_sets_the_scale_with_the_sign_of_the_map():
-    errors = np.zeros((2, 4, 2))
-    errors[0, :, 0] = 1e-7  # X goes 10 ppm too far, so it indicates 10 ppm too little
-    found = identify_ibaraki(measured(StepMachine((0.01, 0.01), errors)))
-    reference = reference_length(found, 0)
-    assert reference.kind is ReferenceKind.STAGE_X
-    assert reference.relative_error == pytest.approx(-1e-5, rel=1e-9)
-    assert reference_length(found, 1).relative_error == pytest.approx(0, abs=1e-12)
-    assert profile_m(found, 0, 0)[-1] == pytest.approx(4e-7)
-
-
-def test_the_conventional_formulation_sets_no_scale():
+def test_the_conventional_formulation_tells_no_scale():
     found = identify_wang(measured(case_study_machine()))
     assert map_equivalent(found).scale_difference is None
-    with pytest.raises(InputError, match="does not measure the linear errors; measure them"):
-        reference_length(found, 0)
 
 
 def test_body_diagonals_have_no_table():

@@ -16,12 +16,10 @@ from selfcal_ros.estimation.options import ReferenceKind, ReferenceLength
 
 @dataclass(frozen=True, eq=False)
 class ScaleDatum:
-    """How the scale depends on a solution: c = offset + Re(rows^H G) + params . p + noise.
+    """How the scale varies with a solution: c = const + Re(rows^H G) + parameters . p + noise.
 
     Attributes
     ----------
-    offset_m : float
-        Constant part of c, m at the unit of position.
     rows : complex array (sites,)
         On the map in no particular datum.
     parameters : float array (3 views,)
@@ -32,7 +30,6 @@ class ScaleDatum:
         Standard uncertainty of the reference itself, m at the unit of position.
     """
 
-    offset_m: float
     rows: np.ndarray
     parameters: np.ndarray
     variance: float
@@ -53,19 +50,19 @@ def scale_datum(system: NormalEquations, reference: ReferenceLength,
         Unit of the system's positions, m.
     """
     grid, n = system.grid, 3 * system.grid.n_views
-    value, u = reference.relative_error * half_width_m, reference.u_relative * half_width_m
+    u = reference.u_relative * half_width_m
     if reference.kind is not ReferenceKind.ARTIFACT:
         rows = _slope(grid.views.z, system.known_sites, reference.kind)
         basis = system.gauge.orthonormal
         rows = rows - basis @ np.real(basis.conj().T @ rows)
-        return ScaleDatum(value, -rows, np.zeros(n), 0.0, u)
+        return ScaleDatum(-rows, np.zeros(n), 0.0, u)
     dual = Gauge(grid.views.z, system.known_marks, scale=True).dual(3)
     rows = system.gauge.dual(3).ravel() - grid.views.scatter(grid.relative_weight * dual).ravel()
     sums = -np.einsum("cij,vij->vc", np.conj(grid.shapes), grid.relative_weight * dual)
     parameters = np.stack([sums[:, 0].real, sums[:, 1].real, sums[:, 1].imag], axis=1).ravel()
     total = grid.weight.sum(axis=0)
     variance = float((abs(dual) ** 2 / np.where(grid.mark_read, total, np.inf)).sum())
-    return ScaleDatum(-value, rows, parameters, variance, u)
+    return ScaleDatum(rows, parameters, variance, u)
 
 
 def scale_of(system: NormalEquations, reference: ReferenceLength, *, field: np.ndarray,

@@ -20,8 +20,6 @@ from selfcal_ros.estimation.normal.grid import GridSystem
 MATCH = 1e-9
 """Relative sum of squares that a reading of a field may leave if the field is unseen."""
 
-MAX_MAPS = 400
-"""Largest number of maps that are made of one plan."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,28 +214,3 @@ def as_map(field: np.ndarray) -> np.ndarray:
     """Return a complex field (nx, ny) as (2, nx, ny), largest value 1."""
     both = np.stack([field.real, field.imag]).astype(float)
     return both / max(float(abs(both).max()), np.finfo(float).tiny)
-
-
-def mode_maps(system: NormalEquations) -> np.ndarray:
-    """Return an orthonormal basis of the unseen fields of the stage, (modes, 2, nx, ny).
-
-    Fields of the datum are taken out; sites that no mark visits are not counted. At most
-    MAX_MAPS are returned.
-    """
-    grid = system.grid
-    parts, phase = grid.components, PHASES[phases(grid)]
-    fields = []
-    for component in np.flatnonzero(parts.balanced)[:MAX_MAPS]:
-        here = np.where(parts.of_site == component, phase, 0)
-        fields += [here, 1j * here]
-    fields += list((grid.response @ system.unseen[:3 * grid.n_views]).T)
-    if not fields:
-        return np.zeros((0, 2, *grid.views.shape))
-    basis = np.array(fields)
-    real = np.concatenate([basis.real, basis.imag], axis=1).T
-    z, seen = grid.views.z.ravel(), parts.of_site >= 0
-    datum = np.array([np.ones_like(z), 1j * np.ones_like(z), 1j * z, z]) * seen
-    rigid = np.linalg.qr(np.concatenate([datum.real, datum.imag], axis=1).T)[0]
-    real = real - rigid @ (rigid.T @ real)
-    u, s, _ = np.linalg.svd(real, full_matrices=False)
-    return u[:, s > 1e-8].T.reshape(-1, 2, *grid.views.shape)[:MAX_MAPS]

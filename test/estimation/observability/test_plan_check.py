@@ -23,7 +23,7 @@ from selfcal_ros.estimation.observability.plan_check import (
     unseen_modes,
 )
 from selfcal_ros.estimation.observability.rank import plan_observability
-from selfcal_ros.estimation.observability.unseen import is_unseen, mode_maps
+from selfcal_ros.estimation.observability.unseen import is_unseen
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.view import View
 from selfcal_ros.simulation.truth import random_truth, simulate_measurements
@@ -81,21 +81,6 @@ def test_rank_is_that_of_the_dense_matrix(names, shape):
         names = [name for name in names if POSES[name][0] % 2 == 0] or ["0"]
     plan = plan_of(", ".join(names), shape[0], size_y=shape[1])
     assert plan_observability(plan).rank == dense_rank(plan)
-
-
-@pytest.mark.parametrize("views", [row[0] for row in QIAO_TABLES])
-def test_maps_of_the_unseen_modes_are_as_many_as_the_deficiency_and_are_unseen(views):
-    plan = plan_of(views, 5)
-    system = planned_system(plan.artifact, plan.views)
-    maps = mode_maps(system)
-    visited = int((system.grid.components.of_site >= 0).sum())
-    unread = 25 - visited
-    # sites that are never visited and marks that are never read have no map
-    assert len(maps) == plan_observability(plan).deficiency - 4 * unread
-    for field in maps:
-        assert is_unseen(system, field[0] + 1j * field[1])
-    gram = np.einsum("acij,bcij->ab", maps, maps)
-    assert np.allclose(gram, np.eye(len(maps)), atol=1e-9)
 
 
 def test_an_arbitrary_field_is_seen_by_hus_plan_and_not_by_one_view():
