@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The compensator: a calibrated error map put to use (method, section 1).
+"""The compensator: a calibrated error map put to use (method eqs. 1.4, 1.5).
 
 The error map holds G = indicated - true at the true position of the marks, hence
 

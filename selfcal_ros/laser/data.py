@@ -3,7 +3,7 @@
 
 Vectors of a block: axis j moves by d[j, i] = step_j e_j + E[j, i] in block i. On diagonal k the
 axis runs with the sign s[k, j], so that its reading is R[k, j, i] = s[k, j] w_k . d[j, i], with
-w = n/(l . n) for the laser direction l and the mirror's normal n (method, section 8). Nominal
+w = n/(l . n) for the laser direction l and the mirror's normal n (method eq. 9.1). Nominal
 readings are positive on every diagonal: in np, R_x = -l_np . dx.
 
 A block is named by its place on the axis, not by the time of its measurement: where an axis

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Profiles, straightness and squareness from the errors of the blocks (method, section 8).
+"""Profiles, straightness and squareness from the errors of the blocks (method eq. 9.8).
 
 Definitions
 -----------

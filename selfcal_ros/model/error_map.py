@@ -10,7 +10,7 @@ from selfcal_ros.model.artifact import Artifact
 
 
 class ThetaDatum(StrEnum):
-    """What fixes the free constant of the angular map (method, section 3)."""
+    """What fixes the free constant of the angular map (method eqs. 3.6, 3.7)."""
 
     XY_AXES = "xy_axes"
     ZERO_MEAN = "zero_mean"

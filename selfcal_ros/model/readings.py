@@ -14,7 +14,7 @@ class Sense(StrEnum):
     """Who moves: the microscope over a resting plate, or the plate under the microscope.
 
     With ``plate_moves`` the mark at X is measured with the stage at p = -X, so that the
-    stage's part of a deviation is -G(-X), and -Gtheta(-k) (method, section 1).
+    stage's part of a deviation is -G(-X), and -Gtheta(-k) (method eq. 1.6).
     """
 
     MICROSCOPE_MOVES = "microscope_moves"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A machine with known truth, and the readings that it gives (method, section 2)."""
+"""A machine with known truth, and the readings that it gives (method eqs. 2.2, 2.3)."""
 
 from dataclasses import replace
 

@@ -36,3 +36,20 @@ def test_every_verb_explains_itself(verb, capsys):
         main([verb, "--help"])
     assert ended.value.code == 0
     assert f"usage: selfcal {verb}" in capsys.readouterr().out
+
+
+METHOD = (ROOT / "docs/method.md").read_text()
+CITED = re.compile(r"method eqs?\. (\d+\.\d+)(?:(-|, )(\d+\.\d+))?")
+
+
+def test_every_equation_that_the_code_cites_exists():
+    """A citation leads to a formula with that number, and numbers are given once."""
+    numbers = re.findall(r" {2,}\((\d+\.\d+)\)$", METHOD, re.M)
+    assert len(set(numbers)) == len(numbers) > 50
+    cited = 0
+    for path in sorted((ROOT / "selfcal_ros").rglob("*.py")):
+        for first, _, last in CITED.findall(path.read_text()):
+            cited += 1
+            for number in filter(None, (first, last)):
+                assert number in numbers, f"{path.name}: method eq. {number}"
+    assert cited > 20

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Evaluate calibration tables as the controller does (Aerotech text; method, section 9).
+"""Evaluate calibration tables as the controller does (Aerotech text; method eq. 10.1).
 
 Positions and corrections are in primary units and follow the sign of the encoder. Each table
 adds its own correction. A table's reference positions are n * distance - offset (NEGPOS: with

@@ -149,7 +149,7 @@ def _solve_conditions(system: NormalEquations, rows: np.ndarray, slopes: np.ndar
     border[:n, :n] = rows @ spread
     border[:n, n] = border[n, :n] = ones
     solved = np.linalg.pinv(border)[:, :n]
-    gain = spread @ solved[:n] + solved[n]
+    gain = spread @ solved[:n] + solved[n]  # method eq. 3.8
     phi_gain = np.zeros((angular.n_views, n))
     phi_gain[free] = -inverse @ (response.T @ rows.T) @ solved[:n]
     return Conditions(ThetaDatum.XY_AXES, rows, slopes, gain, phi_gain)

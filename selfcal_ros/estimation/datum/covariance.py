@@ -2,7 +2,7 @@
 """Covariance of the calibrated maps: exact, with the datum, without forming it as a whole.
 
 For unit noise the sites have the covariance S = M^-1 + Y P Y', with M the eliminated matrix,
-Y its answer to the misalignments and P their covariance; the datum projects it.
+Y its answer to the misalignments and P their covariance; the datum projects it (method eq. 4.8).
 """
 
 from dataclasses import dataclass

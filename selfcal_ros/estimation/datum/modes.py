@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The datum: what no view can tell, and the first-order parts of a map (method, section 3)."""
+"""The datum: what no view can tell, and the first-order parts of a map (method eqs. 3.1-3.4)."""
 
 import numpy as np
 

@@ -2,7 +2,7 @@
 """The scale of the map from a reference length: a certified plate or a laser-measured axis.
 
 No view tells the magnification: G = s z, A = -s m with offsets to match changes no reading. The
-map in its datum (no scale) becomes G + c z, with c such that the reference holds.
+map in its datum (no scale) becomes G + c z, with c such that the reference holds (method eq. 3.5).
 """
 
 from dataclasses import dataclass

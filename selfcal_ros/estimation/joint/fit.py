@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The joint least squares of one set of readings (method, sections 2-4)."""
+"""The joint least squares of one set of readings (method eq. 4.1)."""
 
 from dataclasses import dataclass
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Large fields: conjugate gradients with a cosine-transform preconditioner (method, section 7).
+"""Large fields: conjugate gradients with a cosine-transform preconditioner (method eq. 8.2).
 
 The plate and the misalignments are eliminated exactly in every product; what is iterated is the
 stage map alone. The fields that a quarter turn maps to themselves meet only differences over a

@@ -126,7 +126,7 @@ def grid_dof(problem: Problem) -> int:
 
 
 def sigma_of(total: float, dof: float) -> tuple[float, float]:
-    """Return (sigma, dof) of a weighted sum of squares."""
+    """Return (sigma, dof) of a weighted sum of squares (method eq. 4.7)."""
     return (float(np.sqrt(total / dof)), dof) if dof > 0 else (float("nan"), 0)
 
 
@@ -140,6 +140,6 @@ def weight_ratio(problem: Problem, sigma_xy: float, sigma_theta: float, y: np.nd
     sigma_xy = max(sigma_xy, ROUNDING * float(np.abs(y).max()), 1e-300)
     peak = float(np.abs(problem.angular.y).max())
     sigma_theta = max(sigma_theta, ROUNDING * peak, 1e-300)
-    ratio = (sigma_xy / (sigma_theta * problem.half_width_m)) ** 2
+    ratio = (sigma_xy / (sigma_theta * problem.half_width_m)) ** 2  # method eq. 4.2
     equal = problem.system.grid_scale / problem.system.angular_scale
     return float(np.clip(ratio, equal / MAX_WEIGHT, equal * MAX_WEIGHT))

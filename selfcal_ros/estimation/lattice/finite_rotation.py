@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a finite rotation of the plate adds to the linear model, reading by reading.
+"""What a finite rotation of the plate adds to the linear model, by reading (method eq. 2.6).
 
 A mark lies at R(phi) R^q (m + A) + t. The linear model has R^q A + phi J R^q m + t of it; what is
 left is (R(phi) - 1 - phi J) R^q m + (R(phi) - 1) R^q A. As complex numbers, R(phi) is exp(i phi).
@@ -29,4 +29,4 @@ def turned_plate(view: ViewReadings, artifact: Artifact, plate: ArtifactMap) -> 
 def rotation_excess(phi_rad: float, marks: np.ndarray, plate: np.ndarray) -> np.ndarray:
     """Return what the rotation adds to the linear model at the marks, complex (P,), m."""
     turn = np.expm1(1j * phi_rad)
-    return (turn - 1j * phi_rad) * marks + turn * plate
+    return (turn - 1j * phi_rad) * marks + turn * plate  # method eq. 2.6

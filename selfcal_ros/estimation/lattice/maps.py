@@ -2,7 +2,7 @@
 """The lattice maps of a set of views: from fields over sites to fields over marks, and back.
 
 Vectors are complex numbers, z = x + iy, so that a quarter turn is a multiplication by i. In the
-plate frame the model of method, section 2 (Hu 12-15) reads, for view v with q quarter turns,
+plate frame the model (method eq. 2.4, Hu 12-15) reads, for view v with q quarter turns,
     y_v(m) = i^-q G(X_v(m)) + A(m) + phi_v i z(m) + tau_v,     y_v = i^-q V_v,  tau_v = i^-q t_v.
 """
 
@@ -190,7 +190,7 @@ def rigid_parameters(views: LatticeViews) -> np.ndarray:
 
     Modes: stage translation x, y, rotation, scale; plate translation x, y, rotation; unit
     length (or unit angle times the longer half width). A mode G, A with these misalignments
-    changes no reading (method, section 3).
+    changes no reading (method eq. 3.1).
     """
     out = np.zeros((7, len(views.poses), 3))
     for v, pose in enumerate(views.poses):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Hu's law as linear maps on arrays, step by step (Hu eqs. 16-28, signs as in method, section 4).
+"""Hu's law as linear maps on arrays, step by step (Hu eqs. 16-28, method eqs. 5.1-5.10).
 
 Every array carries a last axis of columns, so that the same code solves the readings (one column)
 and propagates the noise of each reading (one column a reading).

@@ -5,7 +5,7 @@ With G(X) = i^k h(X), k the quadrant of X, and the like for marks, a reading who
 lie k quarter turns apart, as the view turns them, joins h and A by the real number 1. Only a
 shift across an axis leaves a factor i^g. The few sites that such readings touch are the cut:
 each gets one real copy for every g, and copies are joined by i^g h(X) at the very end. All the
-rest of the elimination is real.
+rest of the elimination is real (method eq. 8.1).
 """
 
 from dataclasses import dataclass

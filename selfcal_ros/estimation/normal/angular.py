@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Normal equations of the angular readings with the plate's lines eliminated.
 
-Model (method, section 2): V(k) = Gtheta((k + s) mod K) + Atheta(k) + phi + noise.
+Model (method eq. 2.3): V(k) = Gtheta((k + s) mod K) + Atheta(k) + phi + noise.
 """
 
 from functools import cached_property

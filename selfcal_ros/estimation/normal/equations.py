@@ -83,7 +83,7 @@ class NormalEquations:
         return out
 
     def normal(self, ratio: float) -> np.ndarray:
-        """Return the normal matrix of all misalignments; `ratio` weighs the angular readings."""
+        """Return the normal matrix of all misalignments; `ratio` weighs lines (method eq. 4.6)."""
         return self._joined(self.grid.schur, ratio)
 
     def _joined(self, of_grid: np.ndarray, ratio: float) -> np.ndarray:
@@ -140,14 +140,14 @@ class NormalEquations:
 
     @cached_property
     def rank_grid(self) -> int:
-        """Rank of the grid readings."""
+        """Rank of the grid readings (method eq. 6.1)."""
         parts = self.grid.components
         nodes = np.count_nonzero(parts.of_site >= 0) + np.count_nonzero(parts.of_mark >= 0)
         return int(2 * (nodes - np.count_nonzero(parts.balanced)) + self.rank_schur)
 
     @cached_property
     def rank_angular(self) -> int:
-        """Rank of the angular readings."""
+        """Rank of the angular readings (method eq. 6.2)."""
         parts = self.angular.components
         nodes = np.count_nonzero(parts.of_site >= 0) + np.count_nonzero(parts.of_mark >= 0)
         rank = _rank(np.linalg.eigvalsh(self.angular.schur), self.angular_scale)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Normal equations of the grid readings with the plate eliminated (method, section 7).
+"""Normal equations of the grid readings with the plate eliminated (method eqs. 4.3-4.5).
 
 The plate's error at a mark is the weighted mean of what its readings leave, so eliminating it
 is exact and local. What remains couples the stage error G at sites that one mark visits, and
@@ -37,7 +37,7 @@ class GridSystem:
         total = weight.sum(axis=0)
         self.mark_read = total > 0
         self.relative_weight = weight / np.where(self.mark_read, total, 1.0)
-        """Part of each reading in the mean of its mark, (views, nx, ny)."""
+        """Part of each reading in the mean of its mark, (views, nx, ny) (method eq. 4.3)."""
 
     @property
     def n_views(self) -> int:
@@ -148,7 +148,7 @@ class GridSystem:
 
     @cached_property
     def schur(self) -> np.ndarray:
-        """Normal matrix of the misalignments alone, real symmetric (3 views, 3 views)."""
+        """Normal matrix of the misalignments alone, (3 views, 3 views) (method eq. 4.5)."""
         out = self.block - self.coupled(self.response)
         return (out + out.T) / 2
 

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Exact rank: what a set of views, or the marks that were read in them, can tell (section 6).
+"""Exact rank: what a set of views, or the marks that were read in them, can tell.
 
 The rank is not found by a tolerance on a large matrix. With misalignments known, it is a count
 of graph components (`lattice.connectivity`); what the misalignments add is the rank of a matrix of
-three rows a view, whose zeros and non-zeros lie ten orders of magnitude apart.
+three rows a view, whose zeros and non-zeros lie ten orders of magnitude apart (method eqs. 6.1,
+6.2).
 """
 
 import math

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a deficient plan cannot see: the unseen fields of the stage, named and as maps.
 
-Two sources (method, section 6). A component of sites and marks that no closed path of readings
+Two sources (method eq. 6.1). A component of sites and marks that no closed path of readings
 turns leaves a vector free, which goes along with the readings. And combinations of misalignments
 that no reading tells move whole fields.
 """

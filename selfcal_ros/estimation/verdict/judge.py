@@ -39,7 +39,6 @@ MATTERS = 0.1
 where the readings tell all of it."""
 
 
-
 @one_thread()
 def judged(solved: Solved, measurements: Measurements, options: Options) -> CalibrationResult:
     """Return the result with its verdict.

@@ -19,7 +19,7 @@ from selfcal_ros.model.readings import Sense
 from selfcal_ros.simulation.truth import hu_plan, random_truth, simulate_measurements
 from test.support.lattice_plans import in_datum, plan_of
 
-TABLE = {  # method, section 5: rms of u(G) / sigma of a reading for N = 5, 11, 21
+TABLE = {  # method, section 11: rms of u(G) / sigma of a reading for N = 5, 11, 21
     "0,90,tx": (0.800, 0.890, 0.949), "0,90,180,tx": (0.664, 0.763, 0.825),
     "0,90,tx,ty": (0.622, 0.660, 0.686), "0,90,180,tx,ty": (0.532, 0.581, 0.612),
     "0,90,180,270,tx,ty": (0.477, 0.530, 0.563)}
@@ -45,7 +45,7 @@ def test_rms_uncertainty_is_the_published_bound(names, size):
     (24, "xy_axes", 0.752), (24, "zero_mean", 0.677), (72, "xy_axes", 1.129),
     (72, "zero_mean", 0.891)])
 def test_angular_bounds(lines, datum, bound):
-    """With XY readings so good that the rotations are known (method, section 5)."""
+    """With XY readings so good that the rotations are known (method, section 11)."""
     _, readings = measured(hu_plan(Artifact(11, 0.01, lines)), sigma_m=1e-12,
                            sigma_theta_rad=1e-5)
     found = calibrate(readings, Options(datum_theta=ThetaDatum(datum)))

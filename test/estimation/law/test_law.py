@@ -91,7 +91,7 @@ def test_published_calibration_errors_lie_within_the_spread_of_200_draws():
     mean, spread = std.mean(axis=1), std.std(axis=1, ddof=1)
     published = np.array([0.0195, 0.0196, 7.1184e-4])
     assert (np.abs(published - mean) < 2 * spread).all()
-    # our own earlier check of 20 draws (method, section 5), within its Monte Carlo error
+    # our own earlier check of 20 draws (method, section 11), within its Monte Carlo error
     checked = np.array([0.0207, 0.0218, 8.3e-4])
     assert (np.abs(checked - mean) < 4 * spread / np.sqrt(20)).all()
 

@@ -24,7 +24,7 @@ from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.simulation.truth import hu_plan, random_truth, simulate_measurements
 from test.support.plans import plan_of
 
-BOUNDS = {  # method, section 5: rms gain at N = 5, 11, 21
+BOUNDS = {  # method, section 11: rms gain at N = 5, 11, 21
     "0, 90, tx": (0.800, 0.890, 0.949),
     "0, 90, 180, tx": (0.664, 0.763, 0.825),
     "0, 90, tx, ty": (0.622, 0.660, 0.686),
