@@ -6,20 +6,20 @@ from dataclasses import dataclass
 from selfcal_ros.errors import InputError
 
 ORDERS = ("raster", "serpentine", "there_and_back", "x_then_y", "x_back_y_back", "random")
-"""raster: rows along x, one after another, each from its first mark to its last. serpentine:
-the same, every other row backwards. there_and_back: a raster pass, then exactly the same
-backwards. x_then_y: a raster pass with rows along x, then one with rows along y. x_back_y_back:
-rows along x, back, rows along y, back. random: every mark once in each pass, in any order."""
+"""raster: line by line along x, each line along y from its first mark to its last. serpentine:
+the same, every other line backwards. there_and_back: a raster pass, then exactly the same
+backwards. x_then_y: a raster pass, then one that goes line by line along y. x_back_y_back: line by
+line along x, back, along y, back. random: every mark once in each pass, in any order."""
 PLATE_SUFFIX = "@plate"
-"""Rows are those of the plate's marks, the same marks in the same order in every view. Without
-it rows are those of the stage's sites, the same sites in the same order in every view."""
+"""Lines are those of the plate's marks, the same marks in the same order in every view. Without
+it they are those of the stage's sites, the same sites in the same order in every view."""
 DEFAULT_ORDER = "serpentine"
 """What a cell does that is not told otherwise."""
 
 
 @dataclass(frozen=True)
 class VisitOrder:
-    """A visiting order: one of `ORDERS`, along the rows of the stage or of the plate."""
+    """A visiting order: one of `ORDERS`, along the lines of the stage or of the plate."""
 
     name: str
     of_plate: bool = False

@@ -93,9 +93,10 @@ def _passes(order: VisitOrder, places: np.ndarray, n_passes: int,
             raise ValueError("a random visiting order needs a source of chance")
         return np.stack([rng.permutation(places.shape[1]) for _ in range(n_passes)])
     x, y = places
-    along_x, along_y = np.lexsort((x, y)), np.lexsort((y, x))
+    # line by line along x: the lines themselves run along y
+    along_x, along_y = np.lexsort((y, x)), np.lexsort((x, y))
     cycle = {"raster": (along_x,),
-             "serpentine": (np.lexsort((np.where((y - y.min()) % 2, -x, x), y)),),
+             "serpentine": (np.lexsort((np.where((x - x.min()) % 2, -y, y), x)),),
              "there_and_back": (along_x, along_x[::-1]),
              "x_then_y": (along_x, along_y),
              "x_back_y_back": (along_x, along_x[::-1], along_y, along_y[::-1])}[order.name]

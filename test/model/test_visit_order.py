@@ -27,15 +27,15 @@ def marks(order, *, plate=PLATE, view=ONCE):
     return list(zip(found.m.tolist(), found.n.tolist(), strict=True))
 
 
-ALONG_X = [(i, j) for j in (-2, -1, 0, 1, 2) for i in (-1, 0, 1)]
-ALONG_Y = [(i, j) for i in (-1, 0, 1) for j in (-2, -1, 0, 1, 2)]
+ALONG_X = [(i, j) for i in (-1, 0, 1) for j in (-2, -1, 0, 1, 2)]
+ALONG_Y = [(i, j) for j in (-2, -1, 0, 1, 2) for i in (-1, 0, 1)]
 
 
 def test_the_orders_written_out():
     assert sites("raster") == ALONG_X
     assert sites("serpentine") == [
-        (-1, -2), (0, -2), (1, -2), (1, -1), (0, -1), (-1, -1), (-1, 0), (0, 0), (1, 0),
-        (1, 1), (0, 1), (-1, 1), (-1, 2), (0, 2), (1, 2)]
+        (-1, -2), (-1, -1), (-1, 0), (-1, 1), (-1, 2), (0, 2), (0, 1), (0, 0), (0, -1), (0, -2),
+        (1, -2), (1, -1), (1, 0), (1, 1), (1, 2)]
     four = View("v", repeats=4)
     # where a pass ends on the mark on which the next begins, that is one visit of two exposures
     assert sites("there_and_back", view=four) == [
@@ -73,22 +73,25 @@ def test_the_stage_goes_the_same_way_and_the_marks_turn():
     turned = View("v", math.pi / 2)
     assert sites("raster", plate=plate, view=turned) == sites("raster", plate=plate)
     # a quarter turn brings mark (m, n) to site (-n, m): the first site, (-1, -1), holds (-1, 1)
-    assert marks("raster", plate=plate, view=turned)[:4] == [(-1, 1), (-1, 0), (-1, -1), (0, 1)]
+    assert marks("raster", plate=plate, view=turned)[:4] == [(-1, 1), (0, 1), (1, 1), (-1, 0)]
 
 
 def test_of_the_plate_the_same_marks_follow_each_other_in_every_view():
     plate = Artifact(3, 0.01)
     turned = View("v", math.pi / 2)
     assert marks("raster@plate", plate=plate, view=turned) == marks("raster", plate=plate)
-    assert sites("raster@plate", plate=plate, view=turned)[:4] == [(1, -1), (1, 0), (1, 1), (0, -1)]
+    assert sites("raster@plate", plate=plate, view=turned)[:4] == [
+        (1, -1), (0, -1), (-1, -1), (1, 0)]
 
 
 def test_marks_off_the_field_are_not_visited():
     shifted = View("v", 0.0, (0.01, 0.0))
     assert sites("raster", view=shifted) == [(i, j) for i, j in ALONG_X if i >= 0]
     assert marks("raster", view=shifted)[0] == (-1, -2)
-    # rows still turn about at their own ends
-    assert sites("serpentine", view=shifted)[:4] == [(0, -2), (1, -2), (1, -1), (0, -1)]
+    # lines still turn about at their own ends
+    raised = View("v", 0.0, (0.0, 0.01))
+    assert sites("serpentine", view=raised)[:6] == [
+        (-1, -1), (-1, 0), (-1, 1), (-1, 2), (0, 2), (0, 1)]
 
 
 @pytest.mark.parametrize("suffix", ["", "@plate"])

@@ -119,7 +119,7 @@ def test_the_stage_comes_from_minus_and_goes_from_mark_to_mark(sense, sign):
     assert samples[0].positions[:2] == pytest.approx((-sign * 0.02 - 0.005, -sign * 0.02 - 0.005))
     for number, seen in enumerate(first):
         (before,) = [s for s in samples if 0 < seen.stamp_ns - s.stamp_ns < 2_000_000]
-        i, j = (number % 5 - 2, -2 + number // 5)
+        i, j = (number // 5 - 2, number % 5 - 2)
         assert before.positions[:2] == pytest.approx((sign * i * 0.01, sign * j * 0.01))
         assert (seen.m, seen.n) == (i, j)
 
@@ -133,9 +133,9 @@ def test_a_view_that_asks_for_an_order_gets_it_and_others_that_of_the_cell():
     asked, free = ([(e.m, e.n) for e in view_events(truth, plan, index, settings=settings, rng=rng,
                                                     start_ns=START_NS)
                     if isinstance(e, Detection) and e.kind == Kind.GRID] for index in range(2))
-    along_x = [(m, n) for n in range(-2, 3) for m in range(-2, 3)]
-    assert free == along_x * 2
-    assert asked == along_x + sorted(along_x)
+    along_y = [(m, n) for n in range(-2, 3) for m in range(-2, 3)]
+    assert free == sorted(along_y) * 2
+    assert asked == sorted(along_y) + along_y
 
 
 def test_an_order_that_is_not_known_is_refused():

@@ -184,8 +184,8 @@ def test_a_random_walk_is_followed_step_by_step(sense):
     walk = np.array([[[0.0, 1 * UM, 4 * UM], [0.0, 0.0, -2 * UM]]])
     found = measured(truth_with(walk_m=walk), sense)
     # the third exposure of nine comes after a quarter of the time, the seventh after three
-    assert deviation(found, 1, -1) == pytest.approx([0.5 * UM, 0])
-    assert deviation(found, -1, 1) == pytest.approx([2.5 * UM, -1 * UM])
+    assert deviation(found, -1, 1) == pytest.approx([0.5 * UM, 0])
+    assert deviation(found, 1, -1) == pytest.approx([2.5 * UM, -1 * UM])
 
 
 @SENSES
@@ -232,8 +232,8 @@ def test_backlash_goes_with_the_last_motion_of_each_axis():
     truth = truth_with(backlash_m=np.array([2 * UM, 5 * UM]))
     found = measured(truth)
     assert deviation(found, -1, -1) == pytest.approx([2 * UM, 5 * UM])  # from minus, both
-    assert deviation(found, 0, -1) == pytest.approx([2 * UM, 5 * UM])
-    assert deviation(found, -1, 0) == pytest.approx([-2 * UM, 5 * UM])  # back to a row's first
+    assert deviation(found, -1, 0) == pytest.approx([2 * UM, 5 * UM])
+    assert deviation(found, 0, -1) == pytest.approx([2 * UM, -5 * UM])  # back to a line's first
     assert deviation(found, 0, 0) == pytest.approx([2 * UM, 5 * UM])
     back = measured(truth, view=View("v", repeats=2), visit_order="there_and_back").visits
     last = back.stamp_ns.argmax()  # the first mark again, from plus in x; y from plus as well
@@ -242,15 +242,15 @@ def test_backlash_goes_with_the_last_motion_of_each_axis():
 
 
 def test_backlash_of_a_stage_that_carries_the_plate():
-    """From mark to mark with rising x the stage goes towards minus: it is read as too far."""
+    """From mark to mark with rising y the stage goes towards minus: it is read as too far."""
     truth = truth_with(backlash_m=np.array([2 * UM, 5 * UM]))
     found = measured(truth, Sense.PLATE_MOVES)
     assert deviation(found, -1, -1) == pytest.approx([-2 * UM, -5 * UM])  # it came from minus
-    assert deviation(found, 0, -1) == pytest.approx([2 * UM, -5 * UM])
     assert deviation(found, -1, 0) == pytest.approx([-2 * UM, 5 * UM])
+    assert deviation(found, 0, -1) == pytest.approx([2 * UM, -5 * UM])
     signs = {(int(m), int(n)): (int(x), int(y)) for m, n, x, y in zip(
         found.m, found.n, found.visits.approach_x, found.visits.approach_y, strict=True)}
-    assert [signs[mark] for mark in ((-1, -1), (0, -1), (-1, 0))] == [(1, 1), (-1, 1), (1, -1)]
+    assert [signs[mark] for mark in ((-1, -1), (-1, 0), (0, -1))] == [(1, 1), (1, -1), (-1, 1)]
 
 
 @SENSES
