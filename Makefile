@@ -3,15 +3,16 @@
 SHELL := /bin/bash
 BIN := .venv/bin
 
-.PHONY: setup demo test lint bench clean help
+.PHONY: setup demo test lint bench mutants clean help
 help:
-	@echo "make setup | demo | test | lint | bench | clean"
+	@echo "make setup | demo | test | lint | bench | mutants | clean"
 setup:
 	@tools/setup.sh
 demo: setup
 	@$(BIN)/python tools/demo.py
 lint: setup
 	@$(BIN)/ruff check .
+	@$(BIN)/mypy
 test: lint
 	@$(BIN)/python -m pytest -n 2 --dist worksteal
 bench: setup
@@ -21,6 +22,8 @@ bench: setup
 		--target build/rivals "$$rival" || echo "bench: $$rival is left out: no such wheel here"; \
 		done; touch build/rivals/.complete; }
 	@PYTHONPATH=build/rivals $(BIN)/python test/bench/run.py
+mutants: setup  # e.g. make mutants MUTANTS="--number 200 --only selfcal_ros/estimation"
+	@$(BIN)/python tools/mutants.py $(MUTANTS)
 clean:
 	rm -rf .venv build install log selfcal_ros.egg-info
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

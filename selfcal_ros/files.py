@@ -109,7 +109,9 @@ def check_outputs(inputs: Iterable[str | os.PathLike | None],
     taken = {os.path.realpath(name) for name in inputs if name}
     taken |= {os.path.realpath(file) for folder in map(Path, list(taken)) if folder.is_dir()
               for file in folder.iterdir()}
-    for name in filter(None, outputs):
+    for name in outputs:
+        if not name:
+            continue
         target = Path(os.path.realpath(name))
         if target.exists() and not target.is_file() and not target.is_dir():
             continue  # a pipe or /dev/null takes any number of outputs

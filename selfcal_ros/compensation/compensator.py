@@ -118,7 +118,7 @@ class Compensator:
             With ``outside="refuse"``, if a position lies outside of the field.
         """
         gx, gy = self.error(x_m, y_m)
-        return x_m + gx, y_m + gy
+        return np.asarray(x_m) + gx, np.asarray(y_m) + gy
 
     def correct(self, x_m: ArrayLike, y_m: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
         """Return the true position behind the indicated position `x_m`, `y_m`.
@@ -175,7 +175,7 @@ class Compensator:
         InputError
             If the map has no angular lines.
         """
-        return theta_rad + self.error_theta(theta_rad)
+        return np.asarray(theta_rad) + self.error_theta(theta_rad)
 
     def correct_theta(self, theta_rad: ArrayLike) -> np.ndarray:
         """Return the true angle behind the indicated angle `theta_rad`.

@@ -178,6 +178,7 @@ class SimulatedController:
         frame = self._frame
         position = frame.theta_to_machine(theta_rad)
         if self._tables is not None:
-            position = position + self._tables.corrections(
-                {frame.theta_axis: position}).get(frame.theta_axis, 0.0)
+            axis = frame.theta_axis
+            add = self._tables.corrections({} if axis is None else {axis: position})
+            position = position + (0.0 if axis is None else add.get(axis, 0.0))
         return self._stage.correct_theta(frame.theta_from_machine(position))

@@ -75,10 +75,10 @@ class Geometry:
         for signs in self.signs:
             along = signs * self.steps / np.linalg.norm(self.steps)
             if self.dim == 2:
-                out.append([[-along[1], along[0]]])
+                out.append(np.array([[-along[1], along[0]]]))
                 continue
             level = np.array([-along[1], along[0], 0.0]) / np.hypot(along[0], along[1])
-            out.append([level, np.cross(along, level)])
+            out.append(np.array([level, np.cross(along, level)]))
         return np.array(out)
 
     def readings(self, errors_m: np.ndarray, tilt: np.ndarray) -> np.ndarray:

@@ -231,7 +231,7 @@ class StepDiagonalResult:
         return np.sqrt(variance).reshape(self.errors_m.shape)
 
 
-def step_vectors(steps_m: Sequence[float], errors_m: np.ndarray) -> np.ndarray:
+def step_vectors(steps_m: Sequence[float] | np.ndarray, errors_m: np.ndarray) -> np.ndarray:
     """Return the displacement vectors d = step e + E, (D, n, D), m."""
     return errors_m + np.diag(steps_m)[:, None, :]
 

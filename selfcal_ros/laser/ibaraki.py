@@ -55,7 +55,7 @@ def identify_ibaraki(data: StepDiagonal, *, form: Form = Form.EXACT,
             between, u_between = between_diagonals(data, alone)
     return StepDiagonalResult(
         data.steps_m, found.errors_m, propagated(data, found.by_readings, found.by_linear),
-        Method.NEW, form, mirror, Closure(*lengths, between, u_between, residual))
+        Method.NEW, form, mirror, Closure(lengths[0], lengths[1], between, u_between, residual))
 
 
 def _paper(data: StepDiagonal, form: Form, errata: Collection[Erratum],

@@ -6,6 +6,7 @@ from the start of the first block.
 """
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -22,6 +23,8 @@ from selfcal_ros.laser.profiles import (
     squareness_rad,
     u_slope,
 )
+
+Axis = Literal["x", "y"]
 
 
 @dataclass(frozen=True)
@@ -51,12 +54,12 @@ def map_equivalent(found: StepDiagonalResult) -> MapEquivalent:
     u_o = None if u is None else u / span / 2
     if found.method != Method.NEW:
         return MapEquivalent(o, u_o)
-    each = [u_slope(found, axis, axis) for axis in (0, 1)]
-    u_r = None if None in each else float(np.hypot(*each) / 2)
+    u_x, u_y = (u_slope(found, axis, axis) for axis in (0, 1))
+    u_r = None if u_x is None or u_y is None else float(np.hypot(u_x, u_y) / 2)
     return MapEquivalent(o, u_o, (slope(found, 1, 1) - slope(found, 0, 0)) / 2, u_r)
 
 
-def axis_corrections(found: StepDiagonalResult) -> dict[tuple[str, str], AxisCorrection]:
+def axis_corrections(found: StepDiagonalResult) -> dict[tuple[Axis, Axis], AxisCorrection]:
     """Return (along, corrected) -> correction -E, m, of every profile of X and Y.
 
     The datum is turned from the first X step to the line of the X axis: the correction of Y along x
@@ -73,8 +76,9 @@ def axis_corrections(found: StepDiagonalResult) -> dict[tuple[str, str], AxisCor
                          "x and y", "export a measurement of face diagonals")
     x, y = (positions_m(found, axis) for axis in (0, 1))
     turn = slope(found, 0, 1)
-    lines = {("x", "y"): AxisCorrection(x, turn * x - profile_m(found, 0, 1)),
-             ("y", "x"): AxisCorrection(y, -turn * y - profile_m(found, 1, 0))}
+    lines: dict[tuple[Axis, Axis], AxisCorrection] = {
+        ("x", "y"): AxisCorrection(x, turn * x - profile_m(found, 0, 1)),
+        ("y", "x"): AxisCorrection(y, -turn * y - profile_m(found, 1, 0))}
     if found.method == Method.NEW:
         lines[("x", "x")] = AxisCorrection(x, -profile_m(found, 0, 0))
         lines[("y", "y")] = AxisCorrection(y, -profile_m(found, 1, 1))

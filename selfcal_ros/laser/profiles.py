@@ -136,6 +136,7 @@ def _slope_row(n: int, line: ReferenceLine) -> np.ndarray:
 
 def _block(found: StepDiagonalResult, one: tuple[int, int], other: tuple[int, int]) -> np.ndarray:
     """Return the covariance between two kinds (axis, direction) of errors, (n, n)."""
+    assert found.covariance is not None, "asked for where nothing is known of the noise"
     dim, n = found.dim, found.n_blocks
     shaped = found.covariance.reshape(dim, n, dim, dim, n, dim)
     return shaped[one[0], :, one[1], other[0], :, other[1]]

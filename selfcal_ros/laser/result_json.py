@@ -58,13 +58,13 @@ def outcome(found: StepDiagonalResult, data: StepDiagonal, *,
             "diagonals": list(data.diagonals), "n_repeats": int(data.counts.max()),
             **{f"step_{AXES[j]}": step / M_PER_MM for j, step in enumerate(found.steps_m)}}
     out |= {name_of(j, c): _mm(found.errors_m[j, :, c]) for j, c in kinds}
-    if found.covariance is not None:
-        u = found.u_errors_m
+    u = found.u_errors_m
+    if u is not None:
         out |= {f"u_{name_of(j, c)}": _mm(u[j, :, c]) for j, c in kinds}
     out |= geometry(found, line)
     out["profiles"] = {f"p{name_of(j, c)[1:]}": {
         "position": _mm(positions_m(found, j)), "error": _mm(profile_m(found, j, c)),
-        "u": None if found.covariance is None else _mm(u_profile_m(found, j, c))}
+        "u": _mm_or_none(u_profile_m(found, j, c))}
         for j, c in kinds}
     out["scale"] = {AXES[j]: slope(found, j, j, line) for j in range(found.dim)}
     if found.dim == 2:
@@ -82,6 +82,10 @@ def outcome(found: StepDiagonalResult, data: StepDiagonal, *,
 
 def _mm(values_m: np.ndarray) -> list:
     return (np.asarray(values_m) / M_PER_MM).tolist()
+
+
+def _mm_or_none(values_m: np.ndarray | None) -> list | None:
+    return None if values_m is None else _mm(values_m)
 
 
 def _value(prefix: str, value: Value) -> dict[str, float | None]:
@@ -109,7 +113,7 @@ def geometry(found: StepDiagonalResult, line: ReferenceLine) -> dict[str, Any]:
 
 def _closure(found: StepDiagonalResult) -> dict[str, Any]:
     closure = found.closure
-    out = {key: None if value is None else value / M_PER_MM for key, value in (
+    out: dict[str, Any] = {key: None if value is None else value / M_PER_MM for key, value in (
         ("lengths", closure.lengths_m), ("u_lengths", closure.u_lengths_m),
         ("residual_rms", closure.residual_rms_m))}
     for prefix, values in (("", closure.between_m), ("u_", closure.u_between_m)):

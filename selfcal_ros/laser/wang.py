@@ -5,7 +5,7 @@ Valid only if the laser lies along the nominal diagonals and the mirror stands s
 *Erratum*: eq. 1 is printed with its rows for R_y,pp and R_y,np exchanged.
 """
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 
 import numpy as np
 
@@ -116,7 +116,8 @@ def _residual(data: StepDiagonal, readings_m: np.ndarray) -> float | None:
     return float(np.sqrt(np.mean(np.square(misfit))))
 
 
-def jacobian(function: object, x: np.ndarray, step_m: float = 1e-7) -> np.ndarray:
+def jacobian(function: Callable[[np.ndarray], np.ndarray], x: np.ndarray,
+             step_m: float = 1e-7) -> np.ndarray:
     """Return d function / d x by central differences, (outputs, inputs) in C order.
 
     The formulations are linear but for terms of (error / step)^2, so that the differences are

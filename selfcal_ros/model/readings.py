@@ -3,6 +3,7 @@
 
 from dataclasses import dataclass, field
 from enum import StrEnum
+from typing import Any
 
 import numpy as np
 
@@ -21,7 +22,7 @@ class Sense(StrEnum):
     PLATE_MOVES = "plate_moves"
 
 
-def _empty(kind: type) -> field:
+def _empty(kind: type) -> Any:
     return field(default_factory=lambda: np.zeros(0, dtype=kind))
 
 

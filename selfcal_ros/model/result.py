@@ -255,7 +255,7 @@ def _parse(data: dict) -> CalibrationResult:
     artifact = Artifact(raw["grid_size"], float(raw["grid_pitch"]), raw["angular_count"],
                         raw.get("grid_size_y", 0))
     emap, amap = data["error_map"], data["artifact_map"]
-    shapes = dict.fromkeys(_MAP_ARRAYS[:4], artifact.shape)
+    shapes: dict[str, tuple[int, ...]] = dict.fromkeys(_MAP_ARRAYS[:4], artifact.shape)
     shapes |= dict.fromkeys(_MAP_ARRAYS[4:], (artifact.angular_count,))
     error_map = ErrorMap(
         artifact, **{key: _array(emap[key], shape, key) for key, shape in shapes.items()},
@@ -286,11 +286,11 @@ def _parse(data: dict) -> CalibrationResult:
 
 
 def _view(v: dict) -> ViewResult:
-    pose = [_number(v[key]) for key in ("rotation", "translation_x", "translation_y")]
-    if not np.isfinite(pose).all():
+    turn, x, y = (_number(v[key]) for key in ("rotation", "translation_x", "translation_y"))
+    if not np.isfinite([turn, x, y]).all():
         raise ValueError(f"the pose of view {v['name']!r} is not finite")
-    found = [_number(v["misalignment"][key]) for key in ("phi", "tx", "ty")]
-    return ViewResult(_of(str, v["name"]), *pose, *found, used=_of(int, v["used"]),
+    phi, tx, ty = (_number(v["misalignment"][key]) for key in ("phi", "tx", "ty"))
+    return ViewResult(_of(str, v["name"]), turn, x, y, phi, tx, ty, used=_of(int, v["used"]),
                       rejected=_of(int, v["rejected"]),
                       read_grid=v.get("read", {}).get("grid"),
                       read_angular=v.get("read", {}).get("angular"))

@@ -75,7 +75,8 @@ def visit_sequence(artifact: Artifact, view: View, *, order: str = "", consecuti
     """
     chosen = parse_order(order or view.visit_order or DEFAULT_ORDER)
     if not view.grid:
-        return VisitSequence(*np.zeros((6, 0), dtype=int), np.zeros(0))
+        m, n, i, j, count, index = np.zeros((6, 0), dtype=int)
+        return VisitSequence(m, n, i, j, count, index, np.zeros(0))
     marks = np.stack([artifact.m.ravel(), artifact.n.ravel()])
     sites = np.stack(view.lattice_pose(artifact).site_of(*marks))
     inside = (np.abs(sites) <= np.array(artifact.half)[:, None]).all(axis=0)
@@ -111,7 +112,8 @@ def _visits(marks: np.ndarray, sites: np.ndarray, passes: np.ndarray,
     count = np.diff(first, append=len(index)) * together
     time = first * together + (count - 1) / 2
     index = index[first]
-    return VisitSequence(*marks[:, index], *sites[:, index], count, first // passes.shape[1], time)
+    (m, n), (i, j) = marks[:, index], sites[:, index]
+    return VisitSequence(m, n, i, j, count, first // passes.shape[1], time)
 
 
 def approach_signs(position: np.ndarray, threshold: float = 0.0) -> np.ndarray:

@@ -214,7 +214,8 @@ def _feedback_shift(axis_then: tuple[int, float | None], setup: MachineSetup, pl
 
 def _expansion(table: Table1D, setup: MachineSetup) -> float:
     """Return alpha * (T - MATERIALTEMP): the scale has grown and indicates too little."""
-    if None in (table.expand_coeff, table.material_temp, setup.temperature_c):
+    if (table.expand_coeff is None or table.material_temp is None
+            or setup.temperature_c is None):
         return 0.0
     return table.expand_coeff * (setup.temperature_c - table.material_temp)
 

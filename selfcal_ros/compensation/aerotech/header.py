@@ -46,6 +46,7 @@ def read_header(kind: Kind, heads: list[tuple[int, str]], findings: Findings) ->
         text = text.rstrip(" \t")
         while at < len(text):
             match = _WORD.match(text, at)
+            assert match is not None, "the pattern takes any text"
             at = match.end()
             if match["key"]:
                 if match["blank"] or match["blank2"]:

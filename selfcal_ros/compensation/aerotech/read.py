@@ -73,6 +73,7 @@ class _Reader:
         self._finish(len(lines))
 
     def _numbers(self, block: list[str], first: int) -> None:
+        assert self.open is not None, "numbers outside a table go to `_line`"
         counts = np.array([len(line.split()) for line in block])
         said = np.flatnonzero(counts)
         self.open.words.extend(" ".join(block).split())
@@ -122,6 +123,7 @@ class _Reader:
 
     def _directive(self, line: int, text: str) -> None:
         match = _TOKEN.match(text)
+        assert match is not None, "the pattern takes any text"
         word, rest = match[1], text[match.end():]
         if word.upper() == "END":
             self._end(line, word, rest)
@@ -182,10 +184,12 @@ class _Reader:
         else:
             self.findings.error(line, "odd characters between the numbers",
                                 "separate numbers by blanks or tabs")
-        self.open.broken = True
+        if self.open is not None:
+            self.open.broken = True
 
     def _close(self) -> None:
         table, self.open = self.open, None
+        assert table is not None, "called with a table open"
         header = read_header(table.kind, table.heads, self.findings)
         header.broken |= table.broken_head
         values = _numbers(table, self.findings) if not table.broken else None
@@ -239,7 +243,9 @@ def _table_2d(header: Header, values: np.ndarray | None, layout: tuple[list[int]
               findings: Findings) -> Table2D | None:
     if header.broken:
         return None
-    row, column, first, second, sample_row, sample_col, columns = header.positional
+    *axes, sample_row, sample_col, n_columns = header.positional
+    row, column, first, second = (int(axis) for axis in axes)
+    columns = int(n_columns)
     third = header.values.pop("outaxis3", None)
     outputs = (first, second) if third is None else (first, second, third)
     if columns < 1:

@@ -73,9 +73,9 @@ def decode(data: bytes, findings: Findings) -> tuple[list[str], set[int]]:
     except UnicodeDecodeError:
         lines = _split(data.decode("latin-1"), findings)
     odd = set()
-    for index, line in enumerate(lines):
-        if not line.isascii():
-            raw = line.encode("latin-1")
+    for index, text in enumerate(lines):
+        if not text.isascii():
+            raw = text.encode("latin-1")
             try:
                 lines[index] = raw.decode()
             except UnicodeDecodeError:

@@ -83,7 +83,7 @@ def verify_tables(error_map: ErrorMap, tables: Sequence[Table],
     InputError
         If a table corrects or needs an axis that is not one of the frame.
     """
-    stage = {frame.x_axis, frame.y_axis}
+    stage: set[int | None] = {frame.x_axis, frame.y_axis}
     xy = [table for table in tables if stage & set(table.outputs)]
     theta = [table for table in tables if frame.theta_axis in table.outputs]
     for table in tables:

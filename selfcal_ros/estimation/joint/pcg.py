@@ -123,7 +123,7 @@ class GridIteration:
         Lengths with large prime factors are slow in a fast transform; up to `DENSE_DCT` a matrix
         product is faster for them.
         """
-        if self._cosines is None:
+        if self._cosines is None or self._pool is None:
             return transform(field, type=2, norm="ortho", workers=-1)
         cosines = self._cosines if transform is dctn else self._cosines.T
         out = np.empty_like(field)

@@ -126,8 +126,8 @@ def hu_views(measurements: Measurements) -> list[ViewReadings]:
     if artifact.shape[0] != artifact.shape[1] or not artifact.angular_count:
         raise InputError("method law", "Hu's law needs a square plate with angular lines",
                          _JOINT)
-    wanted = {(0, (0, 0), 0): 0, (1, (0, 0), artifact.angular_count // 4): 1,
-              (0, (1, 0), 0): 3}
+    wanted: dict[tuple, int] = {
+        (0, (0, 0), 0): 0, (1, (0, 0), artifact.angular_count // 4): 1, (0, (1, 0), 0): 3}
     found: dict[int, ViewReadings] = {}
     for view in measurements.views:
         pose = view.view.lattice_pose(artifact)
@@ -231,12 +231,12 @@ def law_covariance(result: CalibrationResult) -> tuple[np.ndarray, np.ndarray] |
 
 def _full_views(artifact: Artifact) -> list[ViewReadings]:
     """Return Hu's four views with every mark read once."""
-    lines = {"k": np.arange(artifact.angular_count),
-             "count_theta": np.ones(artifact.angular_count, dtype=int)}
+    k = np.arange(artifact.angular_count)
     out = []
     for marks in (artifact.grid_size, artifact.grid_size, 0, artifact.grid_size - 1):
         m, n = artifact.m[:marks].ravel(), artifact.n[:marks].ravel()
-        out.append(ViewReadings(View(""), m, n, count=np.ones(len(m), dtype=int), **lines))
+        out.append(ViewReadings(View(""), m, n, count=np.ones(len(m), dtype=int), k=k,
+                                count_theta=np.ones(len(k), dtype=int)))
     return out
 
 
@@ -303,8 +303,9 @@ def _as_is(field: np.ndarray, theta: np.ndarray, sign: int) -> tuple[np.ndarray,
 
 
 def _view_result(view: ViewReadings, index: int, found: HuSolution) -> ViewResult:
+    tx, ty = (float(t) for t in found.t[index, :, 0])
     return ViewResult(view.view.name, view.view.rotation_rad, *view.view.translation_m,
-                      float(found.phi[index, 0]), *(float(t) for t in found.t[index, :, 0]),
+                      phi=float(found.phi[index, 0]), tx=tx, ty=ty,
                       used=view.used, rejected=sum(view.rejected.values()))
 
 

@@ -112,7 +112,7 @@ class NormalEquations:
 
     @cached_property
     def _core_spectrum(self) -> tuple[np.ndarray, np.ndarray]:
-        return np.linalg.eigh(self._core.schur)
+        return _spectrum(self._core.schur)
 
     @cached_property
     def rank_schur(self) -> int:
@@ -122,14 +122,15 @@ class NormalEquations:
     @cached_property
     def grid_inverse(self) -> np.ndarray:
         """Pseudo-inverse of the grid's misalignment matrix: their covariance, unit noise."""
-        spectrum = (self._core_spectrum if self._core is self.grid
-                    else np.linalg.eigh(self.grid.schur))
-        return pseudo_inverse(*spectrum, self.grid_scale)
+        values, vectors = (self._core_spectrum if self._core is self.grid
+                           else _spectrum(self.grid.schur))
+        return pseudo_inverse(values, vectors, self.grid_scale)
 
     @cached_property
     def angular_inverse(self) -> np.ndarray:
         """Pseudo-inverse of the angular misalignment matrix."""
-        return pseudo_inverse(*np.linalg.eigh(self.angular.schur), self.angular_scale)
+        values, vectors = _spectrum(self.angular.schur)
+        return pseudo_inverse(values, vectors, self.angular_scale)
 
     def inverse(self, ratio: float) -> np.ndarray:
         """Return the pseudo-inverse of `normal`: covariance of the misalignments, unit noise."""
@@ -268,6 +269,11 @@ def core_of(grid: GridSystem) -> GridSystem:
     weight = grid.weight[(slice(None), *part)]
     inside = GridSystem(grid.views.poses, weight, grid.views.unit).views.in_field
     return GridSystem(grid.views.poses, weight * inside, grid.views.unit)
+
+
+def _spectrum(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    values, vectors = np.linalg.eigh(matrix)
+    return values, vectors
 
 
 def _trace(grid: GridSystem) -> float:

@@ -122,12 +122,12 @@ def advice_for(artifact: Artifact, views: Iterable[View]) -> tuple[str, ...]:
     views = tuple(views)
     poses = [view.lattice_pose(artifact) for view in views if view.grid]
     advice = []
-    if len({pose.quarter_turns % 2 for pose in poses}) < 2:
+    if len({(pose.quarter_turns or 0) % 2 for pose in poses}) < 2:
         advice.append("add a view turned by 90 deg")
     if len({pose.shift for pose in poses}) < 2:
         advice.append("add a view shifted by one pitch along X")
     if any(view.angular for view in views) and artifact.angular_count:
-        turns = [v.lattice_pose(artifact).turn_lines for v in views if v.angular]
+        turns = [v.lattice_pose(artifact).turn_lines or 0 for v in views if v.angular]
         if _common_step([turn - turns[0] for turn in turns], artifact.angular_count) > 1:
             advice.append(f"add an angular view turned by one line "
                           f"({360 / artifact.angular_count:g} deg)")

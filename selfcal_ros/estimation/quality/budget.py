@@ -107,8 +107,8 @@ def budgets(result: CalibrationResult, reference: ReferenceLength | None = None)
     return out
 
 
-def _noise_parts(u: np.ndarray, sigma: float, *, repeats: tuple[float, int],
-                 residuals: tuple[float, int]) -> list[Component]:
+def _noise_parts(u: np.ndarray, sigma: float, *, repeats: tuple[float, float],
+                 residuals: tuple[float, float]) -> list[Component]:
     """Return what repeats show, and what residuals show beyond it, as they reach the map."""
     if not (np.isfinite(sigma) and sigma > 0):
         return [Component("reading noise", "A", 0.0, 0.0, np.inf, "no noise was found")]
@@ -199,7 +199,7 @@ def budget_json(found: list[Budget]) -> list[dict[str, Any]]:
                   ("expanded", "", budget.U_rms, budget.U_max, budget.dof,
                    f"k = {budget.k:.3f}, 95.45 % coverage")]
         for label, kind, u_rms, u_max, dof, note in lines:
-            row = {"quantity": budget.quantity, "component": label, "type": kind}
+            row: dict[str, Any] = {"quantity": budget.quantity, "component": label, "type": kind}
             for name in ("m", "rad"):
                 row |= {f"u_rms_{name}": u_rms if name == unit else None,
                         f"u_max_{name}": u_max if name == unit else None}

@@ -244,7 +244,7 @@ def _worst(residuals: Residuals, measurements: Measurements) -> dict[Key, Remove
         above = max((taken[node] for node in nodes if node in taken), default=0.0)
         if above > (1 + TIED) * ratio[v, i, j]:
             continue
-        taken |= {node: ratio[v, i, j] for node in nodes if node not in taken}
+        taken |= {node: float(ratio[v, i, j]) for node in nodes if node not in taken}
         index, (hx, hy) = problem.grid.index[v], grid.views.half
         mark = (int(i) - hx, int(j) - hy)
         found[index, "grid", mark] = Removed(
@@ -289,6 +289,7 @@ def _taken_back(measurements: Measurements, options: Options, gone: dict[Key, Re
 def _agrees(residuals: Residuals, key: Key) -> bool:
     """Return whether a reading can be checked against the others and agrees with them."""
     index, kind, mark = key
+    at: tuple[int, ...]
     if kind == "grid":
         hx, hy = residuals.problem.system.grid.views.half
         squares, dof = residuals.squares, 2

@@ -110,6 +110,7 @@ def reading_covariance(data: StepDiagonal, noise: ReadingNoise) -> np.ndarray:
 
 def linear_covariance(data: StepDiagonal, noise: ReadingNoise) -> np.ndarray:
     """Return the covariance of the mean linear errors in C order, (D*n, D*n), m^2."""
+    assert data.linear_m is not None, "asked for where linear errors were not measured"
     counts = np.isfinite(data.linear_m).sum(axis=0)
     out = np.zeros((counts.size,) * 2)
     for j, count in enumerate(counts):

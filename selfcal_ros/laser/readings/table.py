@@ -216,17 +216,18 @@ def _assemble(blocks: list[list], columns: Columns) -> StepDiagonal:
 
 def table_text(data: StepDiagonal, comments: Sequence[str] = ()) -> str:
     """Return a measurement as CSV text, mm, to 0.01 nm."""
-    columns = Columns(data.steps_m, data.diagonals, data.linear_m is not None)
+    linear = data.linear_m
+    columns = Columns(data.steps_m, data.diagonals, linear is not None)
     out = io.StringIO()
     for comment in comments:
         out.write(f"# {comment}\n")
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow([BLOCK, *columns.readings, *columns.errors])
-    for repeat in range(max(len(data.samples_m), len(data.linear_m) if columns.linear else 0)):
+    for repeat in range(max(len(data.samples_m), 0 if linear is None else len(linear))):
         for i in range(data.n_blocks):
             values = _row(data.samples_m[:, :, :, i], repeat)
-            if columns.linear:
-                values += _row(data.linear_m[:, :, i], repeat)
+            if linear is not None:
+                values += _row(linear[:, :, i], repeat)
             if not np.isnan(values).all():
                 cells = ("" if np.isnan(v) else f"{v / M_PER_MM:.8f}" for v in values)
                 writer.writerow([i + 1, *cells])
