@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Readings: what was measured of the marks, view by view."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from typing import Any
 
@@ -67,6 +67,14 @@ class GridVisits:
     u: np.ndarray = _empty(float)
     sigma_m: float = float("nan")
     dof: int = 0
+
+    def of_marks(self, keep: np.ndarray) -> "GridVisits":
+        """Return the visits of the marks where `keep` (P,) is true, numbered among these."""
+        stay = keep[self.mark]
+        columns = {name: getattr(self, name)[stay] for name in (
+            "dx", "dy", "count", "stamp_ns", "offset_x", "offset_y", "approach_x", "approach_y")}
+        return replace(self, mark=(np.cumsum(keep) - 1)[self.mark[stay]], **columns,
+                       u=self.u[stay] if len(self.u) else self.u)
 
 
 @dataclass(frozen=True, eq=False)

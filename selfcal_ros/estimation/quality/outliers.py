@@ -333,7 +333,8 @@ def subset(view: ViewReadings, grid: np.ndarray, lines: np.ndarray) -> ViewReadi
         view, **{name: getattr(view, name)[grid] for name in ("m", "n", "dx", "dy", "count")},
         **{name: getattr(view, name)[lines] for name in ("k", "dtheta", "count_theta")},
         u=view.u[grid] if len(view.u) else view.u,
-        u_theta=view.u_theta[lines] if len(view.u_theta) else view.u_theta)
+        u_theta=view.u_theta[lines] if len(view.u_theta) else view.u_theta,
+        visits=view.visits.of_marks(grid) if view.visits is not None else None)
 
 
 def _noisy_views(residuals: Residuals, measurements: Measurements) -> tuple[tuple[str, float], ...]:

@@ -17,9 +17,9 @@ from selfcal_ros.estimation.quality.leverage import (
     exact_redundancy,
     residuals_of,
 )
-from selfcal_ros.estimation.quality.outliers import LEVEL, REASON, robust_calibrate
+from selfcal_ros.estimation.quality.outliers import LEVEL, REASON, robust_calibrate, subset
 from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.model.readings import Sense
+from selfcal_ros.model.readings import GridVisits, Sense, ViewReadings
 from selfcal_ros.model.result import plain, result_from_dict, result_to_dict
 from selfcal_ros.model.view import View
 from selfcal_ros.simulation.truth import hu_plan, random_truth, simulate_measurements
@@ -261,3 +261,27 @@ def test_a_view_whose_slip_cannot_be_placed_is_left_out_if_it_can_be_spared(monk
     assert view.name == "shift_x" and view.used == 0 and view.rejected == lost
     assert np.isnan(view.tx) and result.rejected[REASON] == lost
     assert error_rms(result, truth) < 1.5 * error_rms(calibrate(readings, ZERO_MEAN), truth)
+
+
+def test_a_part_of_a_view_keeps_the_visits_of_its_marks():
+    """By hand: of four marks the second and the last stay, with the visits that were theirs."""
+    visits = GridVisits(np.array([0, 1, 1, 3, 3]), *(np.arange(5.0) + k for k in (0, 10)),
+                        np.array([1, 2, 3, 4, 5]), np.arange(5) * 10**9,
+                        *(np.arange(5.0) + k for k in (20, 30)),
+                        *(np.array([1, -1, 0, 1, -1], dtype=np.int8) * k for k in (1, -1)),
+                        u=np.arange(5.0) + 40, sigma_m=1e-8, dof=9)
+    view = ViewReadings(View("a"), np.arange(4), np.zeros(4, int), np.zeros(4), np.zeros(4),
+                        np.array([1, 5, 0, 9]), visits=visits)
+    found = subset(view, np.array([False, True, False, True]), np.zeros(0, dtype=bool))
+    assert found.m.tolist() == [1, 3]
+    kept = found.visits
+    assert kept.mark.tolist() == [0, 0, 1, 1] and kept.count.tolist() == [2, 3, 4, 5]
+    assert kept.dx.tolist() == [1, 2, 3, 4] and kept.dy.tolist() == [11, 12, 13, 14]
+    assert kept.stamp_ns.tolist() == [10**9, 2 * 10**9, 3 * 10**9, 4 * 10**9]
+    assert kept.offset_x.tolist() == [21, 22, 23, 24]
+    assert kept.offset_y.tolist() == [31, 32, 33, 34]
+    assert kept.approach_x.tolist() == [-1, 0, 1, -1]
+    assert kept.approach_y.tolist() == [1, 0, -1, 1]
+    assert kept.u.tolist() == [41, 42, 43, 44] and (kept.sigma_m, kept.dof) == (1e-8, 9)
+    assert subset(replace(view, visits=None), np.ones(4, dtype=bool),
+                  np.zeros(0, dtype=bool)).visits is None
