@@ -5,6 +5,15 @@ import argparse
 import json
 import math
 
+from selfcal_ros.cli.plan_terms import (
+    add_term_options,
+    assumed_of,
+    model_of,
+    sizes_of,
+    terms_json,
+    terms_text,
+)
+
 HELP = "check a plan of views before it is measured, or suggest views"
 
 
@@ -20,8 +29,15 @@ def configure(parser: argparse.ArgumentParser) -> None:
         sub.add_argument("--theta-datum", choices=("xy_axes", "zero_mean"), default="xy_axes",
                          help="convention of the angular map (default xy_axes)")
         sub.add_argument("--json", action="store_true", help="print JSON")
+        add_term_options(sub)
     check.add_argument("--map", action="store_true",
                        help="also print the predicted uncertainty at every site")
+    check.add_argument("--model", metavar="TERM[:SIZE][,...]", action="append", default=[],
+                       help="terms that are to be estimated with the map, beside the plan's "
+                       "model_terms; without a size they are free, and exit code 3 says that the "
+                       "plan does not tell them")
+    check.add_argument("--repeats", type=int, metavar="N",
+                       help="judge the plan as if every mark were measured N times a view")
     suggest.add_argument("--views", type=int, metavar="N",
                          help="find the best plan of N views for the plan's plate")
     suggest.add_argument("--criterion", choices=("rms", "max"), default="rms",
@@ -46,14 +62,55 @@ def _check(args: argparse.Namespace, plan) -> int:
     from selfcal_ros.estimation.observability.plan_check import check_plan, predict_plan
     from selfcal_ros.model.error_map import ThetaDatum
 
-    found = check_plan(plan)
-    seen = found.observability
-    predicted = predict_plan(plan, ThetaDatum(args.theta_datum)) if seen.identifiable else None
+    assumed, sizes, model = assumed_of(args), sizes_of(args), model_of(args, plan)
+    plan = _repeated(plan, args.repeats)
+    seen = check_plan(plan).observability
+    alone, joint, checks = None, None, ()
+    if seen.identifiable:
+        alone = predict_plan(plan, ThetaDatum(args.theta_datum))
+        seen, joint, checks = _judge(plan, model, assumed, sizes, (seen, alone))
     if args.json:
-        print(json.dumps(_check_json(plan, seen, predicted, maps=args.map), indent=1))
+        found = _check_json(plan, seen, alone, maps=args.map)
+        if alone is not None:
+            found["predicted"] |= {
+                "rms_gain_xy_with_terms": joint and joint.rms_xy,
+                "max_gain_xy_with_terms": joint and joint.max_xy}
+        print(json.dumps(found | {"terms": terms_json(checks)}, indent=1))
     else:
-        print("\n".join(_check_text(plan, seen, predicted, maps=args.map)))
+        lines = _check_text(plan, seen, alone)
+        if model and joint is not None:
+            lines += [f"  XY with {', '.join(map(str, model))}: rms {joint.rms_xy:.4f}   "
+                      f"largest {joint.max_xy:.4f}"]
+        lines += terms_text(plan, checks, assumed) if checks else []
+        lines += _map_text(alone) if args.map and seen.identifiable else []
+        print("\n".join(lines))
     return int(ExitCode.DONE if seen.identifiable else ExitCode.NOT_IDENTIFIABLE)
+
+
+def _repeated(plan, repeats: int | None):
+    from dataclasses import replace
+
+    from selfcal_ros.errors import InputError
+
+    if repeats is None:
+        return plan
+    if repeats < 1:
+        raise InputError("--repeats", f"{repeats} is not positive", "give 1 or more")
+    return replace(plan, views=tuple(replace(view, repeats=repeats) for view in plan.views))
+
+
+def _judge(plan, model, assumed, sizes: dict, without: tuple) -> tuple:
+    """Return what the plan tells with its terms, the prediction with them, and their checks.
+
+    `without`: observability and prediction without terms.
+    """
+    from selfcal_ros.estimation.observability.resistance import PlannedTerms, check_terms
+    from selfcal_ros.estimation.verdict.causes import LEVEL
+
+    terms = PlannedTerms(plan, model, assumed)
+    seen = terms.told(without[0])
+    joint = terms.predicted(without[1]) if seen.identifiable else None
+    return seen, joint, check_terms(terms, sizes, LEVEL)
 
 
 def _check_json(plan, seen, predicted, *, maps: bool) -> dict:
@@ -72,7 +129,7 @@ def _check_json(plan, seen, predicted, *, maps: bool) -> dict:
     return out
 
 
-def _check_text(plan, seen, predicted, *, maps: bool) -> list[str]:
+def _check_text(plan, seen, predicted) -> list[str]:
     artifact = plan.artifact
     lines = [f"plan {plan.plan_id}: {len(plan.views)} views of {artifact.shape[0]} x "
              f"{artifact.shape[1]} marks, {artifact.angular_count} angular lines",
@@ -88,11 +145,13 @@ def _check_text(plan, seen, predicted, *, maps: bool) -> list[str]:
     if len(predicted.u_theta):
         lines.append(f"  theta  rms {predicted.rms_theta:.4f}")
     lines += [f"  ({predicted.note})"] if predicted.note else []
-    if maps:
-        lines += ["sqrt(u_gx^2 + u_gy^2), one line for each y from the top, x to the right:"]
-        both = (predicted.ux**2 + predicted.uy**2) ** 0.5
-        lines += [" ".join(f"{value:5.2f}" for value in row) for row in both.T[::-1]]
     return lines
+
+
+def _map_text(predicted) -> list[str]:
+    both = (predicted.ux**2 + predicted.uy**2) ** 0.5
+    return ["sqrt(u_gx^2 + u_gy^2), one line for each y from the top, x to the right:",
+            *(" ".join(f"{value:5.2f}" for value in row) for row in both.T[::-1])]
 
 
 def _suggest(args: argparse.Namespace, plan) -> int:
@@ -195,4 +254,5 @@ def _write_plan(path: str, plan) -> None:
     if artifact.grid_size_y:
         plate["grid_size_y"] = artifact.grid_size_y
     write_yaml(path, {"plan_id": plan.plan_id, "artifact": plate,
-                      "views": [view_to_dict(view, artifact) for view in plan.views]})
+                      "views": [view_to_dict(view, artifact) for view in plan.views],
+                  **({"model_terms": list(plan.model_terms)} if plan.model_terms else {})})

@@ -10,6 +10,8 @@ ORDERS = ("raster", "serpentine", "there_and_back", "x_then_y", "x_back_y_back",
 the same, every other line backwards. there_and_back: a raster pass, then exactly the same
 backwards. x_then_y: a raster pass, then one that goes line by line along y. x_back_y_back: line by
 line along x, back, along y, back. random: every mark once in each pass, in any order."""
+PASSES = {"there_and_back": 2, "x_then_y": 2, "x_back_y_back": 4}
+"""Passes after which an order begins again; one where it is not named."""
 PLATE_SUFFIX = "@plate"
 """Lines are those of the plate's marks, the same marks in the same order in every view. Without
 it they are those of the stage's sites, the same sites in the same order in every view."""
@@ -23,6 +25,11 @@ class VisitOrder:
 
     name: str
     of_plate: bool = False
+
+    @property
+    def passes(self) -> int:
+        """Passes after which it begins again: a view takes as many repeats, or a multiple."""
+        return PASSES.get(self.name, 1)
 
     def __str__(self) -> str:
         """Return the text that names the order."""

@@ -9,6 +9,7 @@ import numpy as np
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.orders import parse_order
+from selfcal_ros.model.terms import parse_terms
 
 LATTICE_TOLERANCE = 1e-3
 """Largest distance of a commanded pose from the lattice, in pitches or lines."""
@@ -115,11 +116,24 @@ def _whole(value: float, where: str, unit: str) -> int:
 
 @dataclass(frozen=True)
 class Plan:
-    """An artifact and the views in which it is to be measured, in their order."""
+    """An artifact and the views in which it is to be measured, in their order.
+
+    Attributes
+    ----------
+    plan_id : str
+        Its name.
+    artifact : Artifact
+        The plate.
+    views : tuple of View
+        What is measured.
+    model_terms : tuple of str
+        Terms that are to be estimated with the map, see `selfcal_ros.model.terms`.
+    """
 
     plan_id: str
     artifact: Artifact
     views: tuple[View, ...]
+    model_terms: tuple[str, ...] = ()
 
 
 def plan_from_dict(data: object, where: str) -> Plan:
@@ -129,19 +143,20 @@ def plan_from_dict(data: object, where: str) -> Plan:
     ----------
     data : object
         Parsed YAML: ``plan_id``, ``artifact {grid_size, grid_pitch, angular_count}`` (m),
-        ``views [{name, rotation_deg, translation_pitch, grid, angular, repeats, visit_order}]``
-        and ``visit_order``, which holds for views that have none of their own.
+        ``views [{name, rotation_deg, translation_pitch, grid, angular, repeats, visit_order}]``,
+        ``visit_order``, which holds for views that have none of their own, and ``model_terms``,
+        a list of ``TERM`` or ``TERM:SIZE``.
     where : str
         File name, for messages.
 
     Raises
     ------
     InputError
-        For a missing or unknown key, a wrong type, an unknown visiting order, or a pose off the
-        lattice.
+        For a missing or unknown key, a wrong type, an unknown visiting order or term, or a pose
+        off the lattice.
     """
     fields = _fields(data, where, {"plan_id": str, "artifact": dict, "views": list},
-                     {"visit_order": (str, "")})
+                     {"visit_order": (str, ""), "model_terms": (list, [])})
     raw = _fields(fields["artifact"], f"{where}: artifact",
                   {"grid_size": int, "grid_pitch": float, "angular_count": int},
                   {"grid_size_y": (int, 0)})
@@ -156,7 +171,15 @@ def plan_from_dict(data: object, where: str) -> Plan:
         if view.name in [other.name for other in views[:index]]:
             raise InputError(f"{where}: views[{index}]", f"the name '{view.name}' is used twice",
                              "give every view its own name")
-    return Plan(fields["plan_id"], artifact, views)
+    return Plan(fields["plan_id"], artifact, views, _terms(fields["model_terms"], where))
+
+
+def _terms(texts: list, where: str) -> tuple[str, ...]:
+    where = f"{where}: model_terms"
+    for text in texts:
+        if not isinstance(text, str):
+            raise InputError(where, f"{text!r} is not a text", "write TERM or TERM:SIZE")
+    return tuple(str(term) for term in parse_terms(texts, where))
 
 
 def _order(text: str, where: str) -> str:

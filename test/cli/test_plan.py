@@ -8,6 +8,7 @@ import pytest
 import yaml
 
 from selfcal_ros.cli.main import main
+from selfcal_ros.cli.plan_terms import length_m
 from selfcal_ros.files import read_yaml
 from selfcal_ros.model.view import plan_from_dict
 
@@ -56,6 +57,86 @@ def test_check_in_words(capsys):
     text = capsys.readouterr().out
     assert "XY     rms 0.8905   largest 1.2154" in text and "theta  rms 0.7523" in text
     assert len(text.splitlines()[-1].split()) == 11
+
+
+def test_check_judges_every_term(capsys):
+    assert main(["plan", "check", shipped("hu_repeated"), "--json", "--sigma", "20nm"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    terms = {term["name"]: term for term in found["terms"]}
+    assert list(terms) == ["microscope", "drift", "plate_scale", "plate_shape", "approach"]
+    assert {"name", "told", "unseen_modes", "size", "unit", "effect_rms_m", "effect_max_m",
+            "power"} < set(terms["drift"])
+    assert (terms["plate_shape"]["told"], terms["plate_shape"]["unseen_modes"]) == (False, 7)
+    assert terms["drift"]["told"] is True and terms["drift"]["unit"] == "m"
+    assert terms["plate_shape"]["effect_rms_m"] == pytest.approx(13.32e-9, abs=5e-12)
+    assert found["predicted"]["rms_gain_xy_with_terms"] == found["predicted"]["rms_gain_xy"]
+    # half the noise notices more; an effect does not depend on noise, and grows with its size
+    assert main(["plan", "check", shipped("hu_repeated"), "--json", "--sigma", "10e-9",
+                 "--against", "plate_shape:20e-9"]) == 0
+    other = {term["name"]: term for term in json.loads(capsys.readouterr().out)["terms"]}
+    assert other["approach"]["power"] > terms["approach"]["power"]
+    assert other["approach"]["effect_rms_m"] == pytest.approx(terms["approach"]["effect_rms_m"])
+    assert other["plate_shape"]["effect_rms_m"] == pytest.approx(
+        2 * terms["plate_shape"]["effect_rms_m"])
+    assert main(["plan", "check", shipped("deficient_shifts"), "--json"]) == 3
+    assert json.loads(capsys.readouterr().out)["terms"] == []
+
+
+def test_free_terms_that_a_plan_does_not_tell_are_refused(capsys, tmp_path):
+    asked = ["--model", "drift", "--order", "there_and_back", "--repeats", "2"]
+    assert main(["plan", "check", shipped("qiao"), *asked, "--drift-degree", "1"]) == 0
+    text = capsys.readouterr().out
+    assert "  XY with drift: rms 0.8905   largest 1.2154\n" in text
+    assert "  drift       free   yes" in text
+    assert "assumed: order there_and_back; drifts of degree 1; 20 nm noise of a reading;" in text
+    assert main(["plan", "check", shipped("qiao"), *asked, "--drift-degree", "2"]) == 3
+    text = capsys.readouterr().out
+    assert "  - drift: 2 modes of the stage look like it\n" in text
+    assert "  - drift: visit the marks in more than one order" in text
+    assert main(["plan", "check", shipped("qiao"), *asked, "--json"]) == 3
+    found = json.loads(capsys.readouterr().out)
+    assert (found["identifiable"], found["deficiency"]) == (False, 2)
+    assert found["predicted"]["rms_gain_xy_with_terms"] is None
+    # the plan's own terms count as well, and an option goes before them
+    data = yaml.safe_load(Path(shipped("qiao")).read_text())
+    path = tmp_path / "own.yaml"
+    path.write_text(yaml.safe_dump(data | {"model_terms": ["plate_shape"]}))
+    assert main(["plan", "check", str(path)]) == 3
+    assert "  - plate_shape: add views shifted both ways" in capsys.readouterr().out
+    assert main(["plan", "check", str(path), "--model", "plate_shape:30e-9"]) == 0
+    assert "XY with plate_shape:3e-08: rms" in capsys.readouterr().out
+
+
+def test_an_order_that_is_cut_off_is_said(capsys):
+    assert main(["plan", "check", shipped("hu_repeated"), "--order", "x_back_y_back"]) == 0
+    assert ("  the order x_back_y_back takes repeats by 4: it is cut off in the views 'identity', "
+            "'rot90', 'shift_x'\n") in capsys.readouterr().out
+    assert main(["plan", "check", shipped("hu_repeated"), "--order", "x_back_y_back",
+                 "--repeats", "8"]) == 0
+    assert "cut off" not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("arguments", "message"), [
+    (["--sigma", "20 miles"], "--sigma: '20 miles' is not a positive length; give m, or a number "
+     "and one of m, mm, um, nm"),
+    (["--sigma=-1nm"], "--sigma: '-1nm' is not a positive length"),
+    (["--stop-error", "0"], "--stop-error: '0' is not a positive length"),
+    (["--drift-degree", "10"], "--drift-degree: 10 is no degree of a drift; give 1 to 9"),
+    (["--drift-degree", "0"], "--drift-degree: 0 is no degree of a drift; give 1 to 9"),
+    (["--order", "spiral"], "--order: 'spiral' is no visiting order"),
+    (["--model", "creep"], "--model: the term 'creep' is unknown"),
+    (["--against", "drift"], "--against: drift: a size is missing; write drift:SIZE"),
+    (["--repeats", "0"], "--repeats: 0 is not positive; give 1 or more"),
+])
+def test_bad_options_of_check(arguments, message, capsys):
+    assert main(["plan", "check", shipped("qiao"), *arguments]) == 2
+    error = capsys.readouterr().err
+    assert message in error and len(error.splitlines()) == 1
+
+
+@pytest.mark.parametrize("text", ["20e-9", "20nm", "20 nm", "0.02um", "0.02µm", "2e-5mm", "2E-8 m"])
+def test_lengths_with_and_without_a_unit(text):
+    assert length_m(text, "--sigma") == pytest.approx(20e-9, rel=1e-12)
 
 
 def test_suggest_next_views(capsys, tmp_path):

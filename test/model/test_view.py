@@ -148,3 +148,18 @@ def test_plans_that_are_refused(data, message):
     with pytest.raises(InputError) as caught:
         plan_from_dict(data, "f")
     assert str(caught.value).startswith(message)
+
+
+def test_terms_of_a_plan_are_read_and_checked():
+    plan = plan_from_dict(plan_with(model_terms=["plate_shape:30e-9", "drift"]), "here")
+    assert plan.model_terms == ("drift", "plate_shape:3e-08")
+    assert plan_from_dict(PLAN, "here").model_terms == ()
+    for terms, message in (
+            (["creep"], "here: model_terms: the term 'creep' is unknown; known are microscope, "
+             "drift, plate_scale, plate_shape, approach"),
+            ([{"drift": 1e-9}], "here: model_terms: {'drift': 1e-09} is not a text; write TERM or "
+             "TERM:SIZE"),
+            ("drift", "here: model_terms: 'drift' is not of type list; mend the value")):
+        with pytest.raises(InputError) as caught:
+            plan_from_dict(plan_with(model_terms=terms), "here")
+        assert str(caught.value) == message

@@ -151,3 +151,16 @@ def test_the_side_from_which_a_place_is_reached():
     assert approach_signs(np.array([0.0, 0.1, 1.0, 0.9, 0.0]), 0.2).tolist() == [0, 0, 1, 1, -1]
     assert approach_signs(np.array([0.0, 0.2, 0.0]), 0.2).tolist() == [0, 0, 0]
     assert approach_signs(np.zeros(0)).tolist() == []
+
+
+@pytest.mark.parametrize("order", ORDERS)
+def test_an_order_begins_again_after_its_passes(order):
+    if order == "random":
+        assert parse_order(order).passes == 1
+        return
+    n = PLATE.m.size
+    # exposures, not visits: where passes meet on a mark there is one visit less
+    found = visit_sequence(PLATE, View("v", repeats=8), order=order)
+    each = np.repeat(found.i * 100 + found.j, found.count).reshape(8, n)
+    same = [p for p in (1, 2, 4, 8) if (each == np.tile(each[:p], (8 // p, 1))).all()]
+    assert parse_order(order + "@plate").passes == same[0]

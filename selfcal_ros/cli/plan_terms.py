@@ -1,0 +1,155 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``selfcal plan``: its options about the terms of the model, and what it prints of them."""
+
+import argparse
+import math
+import re
+
+from selfcal_ros.errors import InputError
+from selfcal_ros.units import M_PER, NM_PER_M, UM_PER_M
+
+SIGMA = "20e-9"
+STOP_ERROR = "10e-6"
+
+
+def add_term_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options that say what a plan is judged against."""
+    parser.add_argument("--against", metavar="TERM:SIZE[,...]", action="append", default=[],
+                        help="size of a term, a standard deviation in SI units, that the plan is "
+                        "judged against; TERM is microscope, drift, plate_scale, plate_shape or "
+                        "approach")
+    parser.add_argument("--drift-degree", type=int, metavar="D",
+                        help="degree of the polynomial by which a view drifts (default 3)")
+    parser.add_argument("--order", metavar="ORDER", default="",
+                        help="visiting order of all views, instead of the plan's")
+    parser.add_argument("--sigma", metavar="LENGTH", default=SIGMA,
+                        help="noise of one reading, m or with a unit as in 20nm (default 20 nm)")
+    parser.add_argument("--stop-error", metavar="LENGTH", default=STOP_ERROR,
+                        help="how far off a mark the stage stops, standard deviation of an axis, "
+                        "m or with a unit (default 10 um)")
+
+
+def length_m(text: str, option: str) -> float:
+    """Return a length such as ``20e-9`` or ``20nm`` in m.
+
+    Raises
+    ------
+    InputError
+        If it is not a positive length.
+    """
+    found = re.fullmatch(r"\s*([-+.\deE]*[\d.])\s*([a-zµ]*)\s*", text)
+    unit = found[2].replace("µ", "u") or "m" if found else ""
+    try:
+        value = float(found[1]) * M_PER[unit] if found else math.nan
+    except (ValueError, KeyError):
+        value = math.nan
+    if not 0 < value < math.inf:
+        raise InputError(option, f"'{text}' is not a positive length",
+                         "give m, or a number and one of " + ", ".join(M_PER))
+    return value
+
+
+def assumed_of(args: argparse.Namespace):
+    """Return what the options say about the measurement to come.
+
+    Raises
+    ------
+    InputError
+        For a length, an order or a degree that cannot be.
+    """
+    from selfcal_ros.estimation.terms.planned import Assumed
+    from selfcal_ros.model.orders import parse_order
+    from selfcal_ros.model.terms import DRIFT_DEGREE, MAX_DRIFT_DEGREE
+
+    degree = DRIFT_DEGREE if args.drift_degree is None else args.drift_degree
+    if not 1 <= degree <= MAX_DRIFT_DEGREE:
+        raise InputError("--drift-degree", f"{degree} is no degree of a drift",
+                         f"give 1 to {MAX_DRIFT_DEGREE}")
+    order = str(parse_order(args.order, "--order")) if args.order else ""
+    return Assumed(length_m(args.sigma, "--sigma"), length_m(args.stop_error, "--stop-error"),
+                   degree, order)
+
+
+def sizes_of(args: argparse.Namespace) -> dict:
+    """Return the sizes that ``--against`` gives, by term.
+
+    Raises
+    ------
+    InputError
+        For an unknown term or one without a size.
+    """
+    from selfcal_ros.model.terms import parse_terms
+
+    terms = parse_terms(args.against, "--against")
+    for term in terms:
+        if term.free:
+            raise InputError(f"--against: {term.name}", "a size is missing",
+                             f"write {term.name}:SIZE, a standard deviation in SI units")
+    return {term.name: term.size for term in terms}
+
+
+def model_of(args: argparse.Namespace, plan) -> tuple:
+    """Return the terms of the model: the plan's, and those of ``--model`` in their place."""
+    from selfcal_ros.model.terms import TermName, parse_terms
+
+    found = {term.name: term for terms in (parse_terms(plan.model_terms, "model_terms"),
+                                           parse_terms(args.model, "--model")) for term in terms}
+    return tuple(found[name] for name in TermName if name in found)
+
+
+def terms_json(checks) -> list[dict]:
+    """Return the checks of terms in the form of the contract."""
+    return [{"name": str(c.name), "told": c.told, "unseen_modes": c.unseen_modes,
+             "model": c.model, "size": c.size, "unit": c.unit, "effect_rms_m": c.effect_rms_m,
+             "effect_max_m": c.effect_max_m, "power": c.power} for c in checks]
+
+
+def terms_text(plan, checks, assumed) -> list[str]:
+    """Return the checks of terms as a table, with what was assumed."""
+    lines = ["terms: told from the stage or not; what a size that the model does not hold does to "
+             "the map;", "how surely it would be noticed",
+             f"  {'term':<12}{'model':<7}{'told':<17}{'size':>12}  {'map rms':>9} {'largest':>10}"
+             f" {'noticed':>9}"]
+    for c in checks:
+        told = "yes" if c.told else f"no, {_modes(c.unseen_modes)}"
+        lines.append(f"  {c.name:<12}{c.model or '-':<7}{told:<17}{size_text(c):>12}"
+                     f"  {c.effect_rms_m * NM_PER_M:6.2f} nm {c.effect_max_m * NM_PER_M:7.2f} nm"
+                     f" {100 * c.power:7.1f} %")
+    return [*lines, *_assumptions(plan, assumed)]
+
+
+def _modes(number: int) -> str:
+    return f"{number} unseen"
+
+
+def size_text(check) -> str:
+    """Return the size of a term in a person's unit."""
+    from selfcal_ros.model.terms import TermName
+
+    if check.unit == "m":
+        return f"{check.size * NM_PER_M:.6g} nm"
+    if check.name is TermName.PLATE_SCALE:
+        return f"{check.size * UM_PER_M:.6g} um/m"
+    return f"{check.size * 1e3:.6g} mrad"
+
+
+def _assumptions(plan, assumed) -> list[str]:
+    from selfcal_ros.estimation.terms.planned import MISALIGNMENT_M, MISALIGNMENT_RAD
+    from selfcal_ros.model.orders import DEFAULT_ORDER, parse_order
+
+    views = [view for view in plan.views if view.grid]
+    orders = {view.name: parse_order(assumed.order or view.visit_order or DEFAULT_ORDER)
+              for view in views}
+    cut = [view for view in views if view.repeats % orders[view.name].passes]
+    lines = [f"  assumed: order {', '.join(sorted({str(o) for o in orders.values()}))}; drifts of "
+             f"degree {assumed.drift_degree}; {assumed.sigma_m * NM_PER_M:.6g} nm noise of a "
+             "reading;",
+             f"  plates laid down to {math.degrees(MISALIGNMENT_RAD):g} deg and "
+             f"{MISALIGNMENT_M * UM_PER_M:g} um, stops {assumed.stop_error_m * UM_PER_M:.6g} um "
+             "off the marks, drawn with a fixed seed"]
+    if cut:
+        names = ", ".join(f"'{view.name}'" for view in cut)
+        first = orders[cut[0].name]
+        lines.append(f"  the order {first} takes repeats by {first.passes}: it is cut off in the "
+                     f"views {names}")
+    return lines

@@ -1,0 +1,221 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a plan makes of the terms of the model: told or not, what they do to the map, if noticed.
+
+With c the columns of a term that the model does not hold, b its coefficients, F = G(c) the maps of
+its columns, and the model's own columns m (method, terms of the model), the map moves by
+    (F_c - F_m Q m'Rc) b,     Q = cov of the model's coefficients, R = what the estimate leaves,
+and the residuals explain, in units of the noise, a sum of squares distributed as
+    sum_k (1 + lambda_k s^2 / sigma^2) chi^2(1)     for coefficients of standard deviation s,
+with lambda_k the eigenvalues of the information on b beside the model.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.stats import f as f_distribution
+
+from selfcal_ros.errors import NotIdentifiableError
+from selfcal_ros.estimation.blas_threads import one_thread
+from selfcal_ros.estimation.normal.planned import planned_system
+from selfcal_ros.estimation.observability.plan_check import PROXY_SIZE, smaller, unit_repeats
+from selfcal_ros.estimation.observability.prediction import MAX_SITES, Prediction
+from selfcal_ros.estimation.terms.equations import TermEquations
+from selfcal_ros.estimation.terms.identifiable import require_terms_told
+from selfcal_ros.estimation.terms.planned import (
+    SEED,
+    Assumed,
+    planned_equations,
+    planned_ground,
+    rows_of,
+    with_terms,
+)
+from selfcal_ros.model.result import Observability
+from selfcal_ros.model.terms import UNITS, ModelTerm, TermName
+from selfcal_ros.model.view import Plan
+
+SIZES = {TermName.MICROSCOPE: 1e-3, TermName.DRIFT: 10e-9, TermName.PLATE_SCALE: 1e-6,
+         TermName.PLATE_SHAPE: 10e-9, TermName.APPROACH: 10e-9}
+"""Sizes against which a plan is judged: 1 mrad and 0.1 %, 10 nm, 1 um/m."""
+
+DRAWS = 20_000
+"""Draws of the power: its standard error is at most 0.4 %."""
+
+
+@dataclass(frozen=True)
+class TermCheck:
+    """What a plan makes of one term.
+
+    Attributes
+    ----------
+    name : TermName
+        Which.
+    model : str
+        How the model holds it: ``free``, ``sized``, or empty if it does not.
+    unseen_modes : int
+        Modes of the stage that it hides if it is free, beside the model's other free terms.
+    size : float
+        Standard deviation of its coefficients that the following are for, in `unit`.
+    effect_rms_m, effect_max_m : float
+        Standard deviation of a coordinate of the map where the model does not hold it: root mean
+        square over the sites, and largest, m.
+    power : float
+        Probability that the test for causes finds it then, 0 to 1.
+    """
+
+    name: TermName
+    model: str
+    unseen_modes: int
+    size: float
+    effect_rms_m: float
+    effect_max_m: float
+    power: float
+
+    @property
+    def told(self) -> bool:
+        """Whether the readings tell it from the stage."""
+        return self.unseen_modes == 0
+
+    @property
+    def unit(self) -> str:
+        """SI unit of `size`."""
+        return UNITS[self.name]
+
+
+class PlannedTerms:
+    """All terms beside the grid readings of a plan that identifies the stage.
+
+    Fields above MAX_SITES are judged on a smaller one.
+
+    Parameters
+    ----------
+    plan : Plan
+        The views.
+    model : sequence of ModelTerm
+        Terms that are to be estimated with the map.
+    assumed : Assumed
+        Noise, stop errors, visiting order.
+    """
+
+    @one_thread()
+    def __init__(self, plan: Plan, model: Sequence[ModelTerm], assumed: Assumed) -> None:
+        artifact = plan.artifact
+        if artifact.shape[0] * artifact.shape[1] > MAX_SITES:
+            plan = smaller(plan, PROXY_SIZE)
+        self.model, self.assumed = tuple(model), assumed
+        self.repeats = unit_repeats(plan)
+        system = planned_system(plan.artifact, plan.views)
+        ground = planned_ground(plan.artifact, plan.views, system, assumed)
+        sized = [ModelTerm(name, SIZES[name]) for name in TermName]
+        self.every = planned_equations(system, ground, sized, assumed)
+        self.of_model = with_terms(self.every, self.model)
+
+    def require_told(self, seen: Observability) -> None:
+        """Raise NotIdentifiableError if free terms of the model hide modes of the stage."""
+        if self.of_model.free.any():
+            require_terms_told(self.of_model, seen)
+
+    def told(self, seen: Observability) -> Observability:
+        """Return what the plan identifies with the free terms of its model as further unknowns.
+
+        Parameters
+        ----------
+        seen : Observability
+            What it identifies without them.
+        """
+        try:
+            self.require_told(seen)
+        except NotIdentifiableError as error:
+            return error.observability
+        free = int(self.of_model.free.sum())
+        return replace(seen, rank=seen.rank + free, unknowns=seen.unknowns + free)
+
+    @one_thread()
+    def check(self, name: TermName, size: float, level: float) -> TermCheck:
+        """Return what the plan makes of a term.
+
+        Parameters
+        ----------
+        name : TermName
+            Which.
+        size : float
+            Standard deviation of its coefficients.
+        level : float
+            Level of the test for causes.
+        """
+        rms, largest = self._effect(name, size)
+        kinds = {term.name: "free" if term.free else "sized" for term in self.model}
+        return TermCheck(name, kinds.get(name, ""), self._unseen_modes(name), size, rms, largest,
+                         self._power(name, size, level))
+
+    @one_thread()
+    def predicted(self, alone: Prediction) -> Prediction:
+        """Return the prediction `alone`, made without terms, with those of the model."""
+        maps = self.of_model.maps
+        spread = self.of_model.inverse(self.assumed.sigma_m) * self.repeats
+        shape = alone.ux.shape
+        more = [np.einsum("sp,pq,sq->s", part, spread, part, optimize=True).reshape(shape)
+                for part in (maps.real, maps.imag)]
+        return replace(alone, ux=np.sqrt(alone.ux**2 + more[0]), uy=np.sqrt(alone.uy**2 + more[1]))
+
+    def _others(self, name: TermName) -> list[ModelTerm]:
+        return [term for term in self.model if term.name != name]
+
+    def _unseen_modes(self, name: TermName) -> int:
+        others = [term for term in self._others(name) if term.free]
+        return (_n_unseen(with_terms(self.every, [*others, ModelTerm(name)]))
+                - _n_unseen(with_terms(self.every, others)))
+
+    def _effect(self, name: TermName, size: float) -> tuple[float, float]:
+        """Return the root mean square and the largest of what the term does to the map."""
+        every, others = self.every, self._others(name)
+        term, model = every.rows([name]), rows_of(every.columns, others)
+        inverse = with_terms(every, others).inverse(self.assumed.sigma_m)
+        taken = inverse @ every.information[np.ix_(model, term)]
+        fields = every.maps[:, term] - every.maps[:, model] @ taken
+        known = every.system.known_sites.ravel()
+        spread = size * np.sqrt(np.stack([(fields.real**2).sum(axis=1),
+                                          (fields.imag**2).sum(axis=1)])[:, known])
+        return float(np.sqrt((spread**2).mean())), float(spread.max())
+
+    def _power(self, name: TermName, size: float, level: float) -> float:
+        every, others = self.every, self._others(name)
+        beside = with_terms(every, [ModelTerm(term.name) for term in others])
+        values, rank = self._information(name, beside)
+        grid = every.system.grid
+        dof = (2 * grid.n_readings - every.system.rank_grid + every.columns.within.dof
+               - beside.rank() - rank)
+        if rank == 0 or dof <= 0:
+            return 0.0
+        rng = np.random.default_rng(SEED)
+        ratio = (size / self.assumed.sigma_m) ** 2
+        explained = rng.chisquare(1, (DRAWS, rank)) @ (1 + ratio * values)
+        left = rng.chisquare(dof, DRAWS) / dof
+        return float(np.mean(explained / rank / left > f_distribution.isf(level, rank, dof)))
+
+    def _information(self, name: TermName, beside: TermEquations) -> tuple[np.ndarray, int]:
+        """Return the eigenvalues of the information on a term beside others, and its rank."""
+        every = self.every
+        term = every.rows([name])
+        others = rows_of(every.columns,
+                         [ModelTerm(TermName(n)) for n in {c.term for c in beside.columns.columns}])
+        cross = every.information[np.ix_(others, term)]
+        rest = every.information[np.ix_(term, term)] - cross.T @ beside.inverse(0.0) @ cross
+        norm = every.norm[term]
+        scaled = np.linalg.eigvalsh(rest / np.outer(norm, norm))
+        rank = int((scaled > every.limit(term)).sum())
+        return np.linalg.eigvalsh(rest)[len(rest) - rank:], rank
+
+
+def check_terms(planned: PlannedTerms, sizes: Mapping[TermName, float],
+                level: float) -> tuple[TermCheck, ...]:
+    """Return what a plan makes of every term; `sizes` where they are not `SIZES`."""
+    own = {term.name: term.size for term in planned.model if not term.free}
+    wanted = SIZES | own | dict(sizes)
+    return tuple(planned.check(name, wanted[name], level) for name in TermName)
+
+
+def _n_unseen(equations: TermEquations) -> int:
+    if not equations.n:
+        return 0
+    return equations.unseen(np.ones(equations.n, dtype=bool)).shape[1]

@@ -1,0 +1,158 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the terms of a plan stand on before anything is measured: visits as they are planned.
+
+Visits follow each other in equal steps of time, each from where the one before it was. How far the
+microscope sees a mark off its centre is not known yet: misalignments and stop errors are drawn,
+always the same for the same plan.
+"""
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from selfcal_ros.estimation.lattice.maps import PHASES
+from selfcal_ros.estimation.normal.equations import NormalEquations
+from selfcal_ros.estimation.terms.columns import (
+    Column,
+    TermColumns,
+    WithinMarks,
+    term_columns,
+)
+from selfcal_ros.estimation.terms.equations import TermEquations
+from selfcal_ros.estimation.terms.ground import Ground
+from selfcal_ros.estimation.terms.projection import ProjectedColumns, project, reduce_columns
+from selfcal_ros.estimation.terms.visits import ViewVisits
+from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.terms import DRIFT_DEGREE, ModelTerm, TermName
+from selfcal_ros.model.view import View
+from selfcal_ros.model.visit_order import VisitSequence, approach_signs, visit_sequence
+
+MISALIGNMENT_RAD = math.radians(0.3)
+"""Standard deviation of the turn by which a person lays the plate down."""
+
+MISALIGNMENT_M = 30e-6
+"""Standard deviation of its place along each axis."""
+
+SEED = 1
+"""Of the misalignments, stop errors and random visiting orders that a plan assumes."""
+
+
+@dataclass(frozen=True)
+class Assumed:
+    """What a plan assumes of the measurement that is to come.
+
+    Attributes
+    ----------
+    sigma_m : float
+        Noise of one grid reading, m.
+    stop_error_m : float
+        Standard deviation of where the stage stops about a mark, each axis, m.
+    drift_degree : int
+        Degree of a drift's polynomial.
+    order : str
+        Visiting order of all views; empty = that of each view.
+    """
+
+    sigma_m: float = 20e-9
+    stop_error_m: float = 10e-6
+    drift_degree: int = DRIFT_DEGREE
+    order: str = ""
+
+
+def planned_ground(artifact: Artifact, views: Sequence[View], system: NormalEquations,
+                   assumed: Assumed) -> Ground:
+    """Return the ground of views as they are planned.
+
+    Parameters
+    ----------
+    artifact : Artifact
+        The plate.
+    views : sequence of View
+        The plan.
+    system : NormalEquations
+        Their equations, see `planned_system`.
+    assumed : Assumed
+        Visiting order and stop errors.
+    """
+    rng = np.random.default_rng(SEED)
+    grid_views = [views[i] for i in system.grid_index]
+    visits = tuple(_visits(artifact, view, assumed, rng) for view in grid_views)
+    return Ground(system.grid.views.z, artifact.grid_pitch_m * max(artifact.half),
+                  system.grid.weight, visits, tuple(view.name for view in grid_views))
+
+
+def _visits(artifact: Artifact, view: View, assumed: Assumed,
+            rng: np.random.Generator) -> ViewVisits:
+    turn, x, y = rng.normal(size=3) * (MISALIGNMENT_RAD, MISALIGNMENT_M, MISALIGNMENT_M)
+    found = visit_sequence(artifact, view, order=assumed.order, rng=rng)
+    n = len(found)
+    sites = (found.i + 1j * found.j) * artifact.grid_pitch_m
+    stops = assumed.stop_error_m * (rng.normal(size=n) + 1j * rng.normal(size=n))
+    (hx, hy), phase = artifact.half, PHASES[-view.lattice_pose(artifact).quarter_turns % 4]
+    mark = (found.m + hx) * artifact.shape[1] + found.n + hy
+    # which way the stage carries the plate changes nothing: its motion and its part of a reading
+    # both change their sign
+    return ViewVisits(mark, found.count.astype(float), np.zeros(n, dtype=complex),
+                      _view_time(found), 1j * turn * sites + complex(x, y) - stops,
+                      approach_signs(found.i.astype(float)).astype(float),
+                      approach_signs(found.j.astype(float)).astype(float), phase)
+
+
+def _view_time(found: VisitSequence) -> np.ndarray:
+    """Return the visits' times in the view's time: -1 at the first, +1 at the last."""
+    if len(found) < 2:
+        return np.zeros(len(found))
+    return 2 * (found.time - found.time[0]) / (found.time[-1] - found.time[0]) - 1
+
+
+def planned_equations(system: NormalEquations, ground: Ground, terms: Iterable[ModelTerm],
+                      assumed: Assumed) -> TermEquations:
+    """Return the equations of terms beside the grid readings of a plan.
+
+    Rotations are those that the grid tells, as in `predict`: lines add little to them.
+    """
+    columns = term_columns(ground, terms, assumed.drift_degree)
+    reduced = reduce_columns(system.grid, columns.grid)
+    n = 3 * system.grid.n_views
+    inverse = np.zeros((system.size, system.size))
+    inverse[:n, :n] = system.grid_inverse
+    return TermEquations(system, columns, project(system, columns.grid, reduced, inverse),
+                         assumed.sigma_m)
+
+
+def with_terms(every: TermEquations, terms: Iterable[ModelTerm]) -> TermEquations:
+    """Return the equations of some of the terms that `every` holds with sizes of their own.
+
+    Parameters
+    ----------
+    every : TermEquations
+        Sized terms: a plate's columns are there for all views.
+    terms : iterable of ModelTerm
+        Free ones have no columns of the plate in the first view, as in `term_columns`.
+    """
+    sizes = {term.name: term.size for term in terms}
+    known = every.columns
+    rows = rows_of(known, terms)
+    columns = tuple(replace(column, size=sizes[column.term])
+                    for column, here in zip(known.columns, rows, strict=True) if here)
+    inner = known.within
+    within = WithinMarks(inner.gram[np.ix_(rows, rows)], inner.right[rows], inner.total, inner.dof)
+    seen = [values for values, here in zip(known.seen, rows, strict=True) if here]
+    part = every.projected
+    return TermEquations(
+        every.system, TermColumns(columns, known.grid[rows], within, seen),
+        ProjectedColumns(part.fields[:, rows], part.parameters[:, rows],
+                         part.gram[np.ix_(rows, rows)]), every.noise_m)
+
+
+def rows_of(columns: TermColumns, terms: Iterable[ModelTerm]) -> np.ndarray:
+    """Return which columns the terms have, bool (p,)."""
+    free = {term.name: term.free for term in terms}
+    return np.array([column.term in free and not (free[column.term] and _first(column))
+                     for column in columns.columns], dtype=bool)
+
+
+def _first(column: Column) -> bool:
+    return column.view == 0 and column.term in (TermName.PLATE_SCALE, TermName.PLATE_SHAPE)

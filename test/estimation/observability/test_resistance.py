@@ -1,0 +1,335 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Terms of a plan against one dense least squares: all unknowns and columns in one matrix."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from scipy.stats import f as central_f
+from scipy.stats import ncf
+
+from selfcal_ros.errors import NotIdentifiableError
+from selfcal_ros.estimation.normal.planned import planned_system
+from selfcal_ros.estimation.observability import resistance
+from selfcal_ros.estimation.observability.plan_check import check_plan, predict_plan
+from selfcal_ros.estimation.observability.resistance import PlannedTerms, check_terms
+from selfcal_ros.estimation.terms.planned import Assumed, planned_ground
+from selfcal_ros.model.error_map import ThetaDatum
+from selfcal_ros.model.orders import ORDERS
+from selfcal_ros.model.readings import Sense
+from selfcal_ros.model.terms import ModelTerm, TermName, parse_terms
+from selfcal_ros.model.visit_order import visit_sequence
+from test.support.plans import plan_of
+
+SIGMA = 20e-9
+LEVEL = 5e-4
+TURNS = [np.array(rows) for rows in ([[1, 0], [0, 1]], [[0, -1], [1, 0]], [[-1, 0], [0, -1]],
+                                     [[0, 1], [-1, 0]])]
+
+
+class Dense:
+    """Every visit of a plan as two rows of one matrix, in the stage frame, for unit noise."""
+
+    def __init__(self, plan, assumed, sense=Sense.MICROSCOPE_MOVES):
+        self.plan, self.assumed, self.sense = plan, assumed, sense
+        self.nx, self.ny = plan.artifact.shape
+        self.half = plan.artifact.grid_pitch_m * max(plan.artifact.half)
+        system = planned_system(plan.artifact, plan.views)
+        # offsets and random orders are an assumption of the plan: they are taken as they are
+        self.visits = planned_ground(plan.artifact, plan.views, system, assumed).visits
+        self.rows, self.weight, self.about, self.times = [], [], [], []
+        for v, visits in enumerate(self.visits):
+            self._view(v, visits)
+        self.base = np.array(self.rows)
+        self.root = np.sqrt(np.array(self.weight))
+
+    def _view(self, v, visits):
+        pose = self.plan.views[v].lattice_pose(self.plan.artifact)
+        turn = TURNS[pose.quarter_turns]
+        hx, hy = self.plan.artifact.half
+        exposures, last, came = 0.0, None, np.zeros(2)
+        times = []
+        for mark, weight, offset in zip(visits.mark, visits.weight, visits.offset, strict=True):
+            place = np.array([mark // self.ny - hx, mark % self.ny - hy])
+            at = turn @ place + np.array(pose.shift)
+            stage = at if self.sense is Sense.MICROSCOPE_MOVES else -at
+            if last is not None:
+                moved = np.sign(stage - last)
+                came = np.where(moved == 0, came, moved)
+            last = stage
+            times.append(exposures + (weight - 1) / 2)
+            exposures += weight
+            self._reading(v, mark, stage, place * self.plan.artifact.grid_pitch_m, turn)
+            self.weight += [weight] * 2
+            self.about.append((v, place * self.plan.artifact.grid_pitch_m / self.half, turn,
+                               np.array([offset.real, offset.imag]), came.copy()))
+        self.times += list(2 * (np.array(times) - times[0]) / (times[-1] - times[0]) - 1)
+
+    def _reading(self, v, mark, stage, place, turn):
+        hx, hy = self.plan.artifact.half
+        sites, indicated = self.nx * self.ny, self._indicated()
+        site = (stage[0] + hx) * self.ny + stage[1] + hy
+        for axis in range(2):
+            row = np.zeros(4 * sites + 3 * len(self.visits))
+            row[2 * site + axis] = indicated
+            row[2 * sites + 2 * mark:2 * sites + 2 * mark + 2] = turn[axis]
+            k = 4 * sites + 3 * v
+            turned = turn @ place / self.half
+            row[k:k + 3] = (-turned[1], 1, 0) if axis == 0 else (turned[0], 0, 1)
+            self.rows.append(row)
+
+    def _indicated(self):
+        return 1 if self.sense is Sense.MICROSCOPE_MOVES else -1
+
+    def columns(self, name, *, free):
+        """Columns of a term at every row: what a unit of each coefficient does to a reading."""
+        out = []
+        views = range(len(self.visits))
+        if name is TermName.MICROSCOPE:
+            one = np.eye(4).reshape(4, 2, 2)
+            out = [[-(e @ offset) for _, _, _, offset, _ in self.about] for e in one]
+        elif name is TermName.APPROACH:
+            out = [[self._indicated() * np.array(h) * came for *_, came in self.about]
+                   for h in ((1, 0), (0, 1))]
+        elif name is TermName.DRIFT:
+            for v in views:
+                for degree in range(1, self.assumed.drift_degree + 1):
+                    legendre = np.polynomial.Legendre.basis(degree)
+                    out += [[np.array(d) * legendre(t) * (about[0] == v) for about, t in zip(
+                        self.about, self.times, strict=True)] for d in ((1, 0), (0, 1))]
+        else:
+            shapes = ([lambda x, y: np.array([x, y]) * self.half]
+                      if name is TermName.PLATE_SCALE else
+                      [lambda x, y, d=d, q=q: np.array(d) * (x * x, x * y, y * y)[q]
+                       for d in ((1, 0), (0, 1)) for q in range(3)])
+            out = [[turn @ shape(*place) * (u == v) for u, place, turn, *_ in self.about]
+                   for v in views[int(free):] for shape in shapes]
+        return np.array(out).reshape(len(out), -1).T
+
+    def design(self, terms):
+        """Weighted rows: unknowns, then the terms' coefficients; sizes as rows below."""
+        blocks = [self.columns(t.name, free=t.free) for t in terms]
+        whole = self.root[:, None] * np.hstack([self.base, *blocks])
+        sizes = np.concatenate([np.zeros(self.base.shape[1])] + [
+            np.full(block.shape[1], 0 if t.free else SIGMA / t.size)
+            for t, block in zip(terms, blocks, strict=True)])
+        prior = np.diag(sizes)[sizes > 0]
+        return np.vstack([whole, prior])
+
+    @property
+    def datum(self):
+        """Projection of a map on what remains without translation, rotation and scale."""
+        hx, hy = self.plan.artifact.half
+        place = np.array([(i, j) for i in range(-hx, hx + 1) for j in range(-hy, hy + 1)])
+        one, none = np.ones(len(place)), np.zeros(len(place))
+        modes = np.array([np.stack(pair, axis=1).ravel() for pair in (
+            (one, none), (none, one), (-place[:, 1], place[:, 0]), (place[:, 0], place[:, 1]))])
+        q = np.linalg.qr(modes.T.astype(float))[0]
+        return np.eye(len(q)) - q @ q.T
+
+    def to_map(self, unknowns):
+        return self.datum @ unknowns[:2 * self.nx * self.ny]
+
+    def n_unseen(self, terms):
+        """Independent maps that can be added without changing any reading."""
+        design = self.design(terms)
+        scaled = design / np.linalg.norm(design, axis=0)
+        _, size, right = np.linalg.svd(scaled)
+        null = right[(size > 1e-9 * size[0]).sum():].T / np.linalg.norm(design, axis=0)[:, None]
+        maps = self.to_map(null / np.linalg.norm(null, axis=0))
+        return int((np.linalg.svd(maps, compute_uv=False) > 1e-7).sum())
+
+    def solver(self, terms):
+        """Matrix that takes weighted readings to unknowns, and the design."""
+        design = self.design(terms)
+        norm = np.linalg.norm(design, axis=0)
+        return np.linalg.pinv(design / norm, rcond=1e-11) / norm[:, None], design
+
+    def gain(self, terms):
+        """Root mean square of the standard uncertainty for unit noise of one reading."""
+        solve, _ = self.solver(terms)
+        return np.sqrt((self.to_map(solve) ** 2).sum(axis=1).mean())
+
+    def effect(self, terms, name, size):
+        solve, _ = self.solver(terms)
+        column = self.root[:, None] * self.columns(name, free=False)
+        moved = self.to_map(solve[:, :len(column)] @ column) * size
+        spread = np.sqrt((moved**2).sum(axis=1))
+        return np.sqrt((spread**2).mean()), spread.max()
+
+    def power(self, terms, name, size, draws=300):
+        """Mean over drawn coefficients of the power of the noncentral F-test."""
+        free = [ModelTerm(term.name) for term in terms]
+        _, before = self.solver(free)
+        column = self.root[:, None] * self.columns(name, free=False)
+        norm = np.linalg.norm(before, axis=0)
+        left = column - (before / norm) @ (
+            np.linalg.pinv(before / norm, rcond=1e-11) @ column)
+        rank_before = np.linalg.matrix_rank(before / norm, tol=1e-9)
+        rank = np.linalg.matrix_rank(left / np.linalg.norm(column, axis=0), tol=1e-5)
+        dof = len(before) - rank_before - rank
+        b = np.random.default_rng(5).normal(size=(draws, column.shape[1])) * size
+        shift = ((left @ b.T) ** 2).sum(axis=0) / SIGMA**2
+        limit = central_f.isf(LEVEL, rank, dof)
+        return float(np.mean(np.where(shift > 2000, 1.0, ncf.sf(
+            limit, rank, dof, np.minimum(shift, 2000)))))
+
+
+SMALL = plan_of("0, 90, tx", 5, repeats=4)
+
+
+@cache
+def both(order, sense=Sense.MICROSCOPE_MOVES, degree=3):
+    assumed = Assumed(SIGMA, 10e-6, degree, order)
+    return PlannedTerms(SMALL, (), assumed), Dense(SMALL, assumed, sense)
+
+
+@pytest.mark.parametrize("sense", Sense)
+@pytest.mark.parametrize("order", [*ORDERS, "raster@plate"])
+@pytest.mark.parametrize("name", TermName)
+def test_each_term_as_the_dense_matrix_has_it(name, order, sense):
+    planned, dense = both(order, sense)
+    size = {TermName.MICROSCOPE: 1e-4}.get(name, resistance.SIZES[name])
+    found = planned.check(name, size, LEVEL)
+    assert found.unseen_modes == dense.n_unseen([ModelTerm(name)])
+    assert found.told is (found.unseen_modes == 0)
+    assert (found.effect_rms_m, found.effect_max_m) == pytest.approx(
+        dense.effect([], name, size), rel=1e-6)
+    assert found.power == pytest.approx(dense.power([], name, size), abs=0.08)
+
+
+MODELS = ["drift", "drift,approach", "plate_scale:1e-7", "plate_shape:30e-9,drift",
+          "microscope,plate_scale:2e-6,approach:5e-9", "plate_shape:1e-9,drift:3e-9"]
+UNLIKE = replace(plan_of("0, 90, tx, -ty", 5, size_y=3), views=tuple(
+    replace(view, repeats=repeats) for view, repeats in zip(
+        plan_of("0, 90, tx, -ty", 5).views, (2, 4, 3, 2), strict=True)))
+"""A plate of 5 x 3 marks, and views of unlike repeats."""
+
+
+@pytest.mark.parametrize("sense", Sense)
+@pytest.mark.parametrize("text", MODELS)
+@pytest.mark.parametrize(("plan", "order"), [(SMALL, "x_back_y_back"),
+                                             (UNLIKE, "serpentine@plate")])
+def test_models_as_the_dense_matrix_has_them(text, plan, order, sense):
+    model = parse_terms([text], "test")
+    assumed = Assumed(SIGMA, 10e-6, 2, order)
+    planned, dense = PlannedTerms(plan, model, assumed), Dense(plan, assumed, sense)
+    alone = predict_plan(plan, ThetaDatum.ZERO_MEAN)
+    seen = planned.told(check_plan(plan).observability)
+    free = [term for term in model if term.free]
+    assert seen.deficiency == dense.n_unseen(free)
+    if seen.identifiable:
+        unit = min(view.repeats for view in plan.views) ** 0.5
+        assert planned.predicted(alone).rms_xy == pytest.approx(dense.gain(model) * unit, rel=1e-6)
+        assert alone.rms_xy == pytest.approx(dense.gain([]) * unit, rel=1e-9)
+    sizes = resistance.SIZES | {TermName.MICROSCOPE: 1e-4}
+    for found in check_terms(planned, sizes, LEVEL):
+        others = [term for term in model if term.name != found.name]
+        held = [term for term in others if term.free]
+        assert found.unseen_modes == (dense.n_unseen([*held, ModelTerm(found.name)])
+                                      - dense.n_unseen(held))
+        if dense.n_unseen(held) == 0:
+            assert (found.effect_rms_m, found.effect_max_m) == pytest.approx(
+                dense.effect(others, found.name, sizes[found.name]), rel=1e-5)
+            assert found.power == pytest.approx(
+                dense.power(others, found.name, sizes[found.name]), abs=0.08)
+
+
+ORDER_TABLE = {  # order, repeats that are one turn of it: degree 1, 2, 3, 5
+    ("raster", 1): (2, 5, 7, 11),
+    ("there_and_back", 2): (0.843, 2, 2, 4),
+    ("x_then_y", 2): (0.844, 0.847, 0.860, 0.887),
+    ("x_back_y_back", 4): (0.843, 0.843, 0.845, 0.850),
+    ("random", 1): (0.876, 0.907, 0.941, 1.046),
+}
+"""Hu's three grid views, N = 7: modes that a drift hides, or the gain for an averaged reading."""
+
+
+@pytest.mark.parametrize(("order", "repeats"), ORDER_TABLE)
+def test_what_a_drift_hides_depends_on_the_visiting_order(order, repeats):
+    plan = plan_of("0, 90, tx", 7, repeats=repeats)
+    alone = predict_plan(plan, ThetaDatum.ZERO_MEAN)
+    assert alone.rms_xy == pytest.approx(0.843, abs=5e-4)
+    row = []
+    for degree in (1, 2, 3, 5):
+        planned = PlannedTerms(plan, [ModelTerm(TermName.DRIFT)],
+                               Assumed(SIGMA, 10e-6, degree, order))
+        hidden = planned.check(TermName.DRIFT, 1e-8, LEVEL).unseen_modes
+        row.append(hidden or round(planned.predicted(alone).rms_xy, 3))
+    assert tuple(row) == pytest.approx(ORDER_TABLE[order, repeats], abs=1e-9)
+
+
+def test_free_terms_that_are_not_told_are_named_with_their_cure():
+    plan = plan_of("0, 90, tx", 5)
+    seen = check_plan(plan).observability
+    planned = PlannedTerms(plan, parse_terms(["drift"], ""), Assumed(order="raster"))
+    with pytest.raises(NotIdentifiableError, match=r"do not tell drift from the stage \(7 modes"):
+        planned.require_told(seen)
+    found = planned.told(seen)
+    assert (found.rank, found.unknowns) == (seen.rank + 18 - 7, seen.unknowns + 18)
+    assert (found.deficiency, found.identifiable) == (7, False)
+    assert found.advice[0].startswith("drift: visit the marks in more than one order")
+    sized = PlannedTerms(plan, parse_terms(["drift:1e-8"], ""), Assumed(order="raster"))
+    assert sized.told(seen) == seen
+
+
+def test_shifts_of_both_signs_damp_bent_plates():
+    """Plates bent by 10 nm in each view: both shifts take most of it off the map."""
+    def effect(text):
+        return PlannedTerms(plan_of(text, 11), (), Assumed()).check(
+            TermName.PLATE_SHAPE, 10e-9, LEVEL).effect_rms_m
+
+    one_sided, both_sides = effect("0, 90, tx"), effect("0, 90, tx, -tx, ty, -ty")
+    assert both_sides < 0.5 * one_sided
+
+
+@pytest.mark.parametrize(("views", "worst"), [("0, 90, tx", 34.8),
+                                              ("0, 90, tx, -tx, ty, -ty", 8.5)])
+def test_a_plate_bent_in_one_view_only(views, worst):
+    """10 nm of (x^2 - y^2, -2xy), which no turn and no single shift tells from the stage."""
+    plan = plan_of(views, 11)
+    every = PlannedTerms(plan, (), Assumed()).every
+    form = {"x xx": 1, "x yy": -1, "y xy": -2}
+    found = []
+    for view in range(len(plan.views)):
+        b = [10 * form.get(c.component, 0) * (c.term == "plate_shape" and c.view == view)
+             for c in every.columns.columns]
+        moved = every.maps @ b
+        found.append(max(abs(moved.real).max(), abs(moved.imag).max()))
+    assert max(found) == pytest.approx(worst, abs=0.05)
+
+
+def test_the_assumed_offsets_are_misalignments_and_stop_errors():
+    plan = plan_of("0, 90, tx", 31)
+    system = planned_system(plan.artifact, plan.views)
+    exact = planned_ground(plan.artifact, plan.views, system, Assumed(stop_error_m=1e-15)).visits
+    for view, visits in zip(plan.views, exact, strict=True):
+        found = visit_sequence(plan.artifact, view)
+        place = 0.01 * (found.i + 1j * found.j)
+        design = np.stack([np.ones_like(place), place], axis=1)
+        (shift, slope), *_ = np.linalg.lstsq(design, visits.offset, rcond=None)
+        np.testing.assert_allclose(design @ (shift, slope), visits.offset, atol=1e-12)
+        assert abs(slope.real) < 1e-9
+        assert 1e-5 < abs(slope.imag) < 3 * np.radians(0.3)
+        assert 1e-6 < abs(shift) < 3 * 30e-6 * 2**0.5
+        # the same draws with stop errors: what they add has their size
+        rough = planned_ground(plan.artifact, plan.views, system, Assumed(stop_error_m=5e-6))
+        added = rough.visits[plan.views.index(view)].offset - visits.offset
+        n = len(added)
+        assert np.var(added.real) * n / 25e-12 == pytest.approx(n, abs=5 * (2 * n) ** 0.5)
+        assert np.var(added.imag) * n / 25e-12 == pytest.approx(n, abs=5 * (2 * n) ** 0.5)
+
+
+def test_a_power_is_the_rate_of_drawn_tests():
+    """No term at all: the test finds one as often as its level says."""
+    found = PlannedTerms(SMALL, (), Assumed()).check(TermName.APPROACH, 1e-15, 0.05)
+    assert found.power == pytest.approx(0.05, abs=5 * (0.05 * 0.95 / resistance.DRAWS) ** 0.5)
+    assert PlannedTerms(SMALL, (), Assumed()).check(TermName.APPROACH, 1e-5, 0.05).power == 1.0
+
+
+def test_large_fields_are_judged_on_a_smaller_one(monkeypatch):
+    monkeypatch.setattr(resistance, "MAX_SITES", 100)
+    monkeypatch.setattr(resistance, "PROXY_SIZE", 9)
+    large, small = (PlannedTerms(plan_of("0, 90, tx", size), (), Assumed()) for size in (21, 9))
+    assert check_terms(large, {}, LEVEL) == check_terms(small, {}, LEVEL)
