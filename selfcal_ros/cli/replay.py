@@ -35,6 +35,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Start the nodes, play, collect the result, stop the nodes."""
     from selfcal_ros.bagio.offline import bag_input
+    from selfcal_ros.cli.terminal.print_result import exit_code, show
     from selfcal_ros.errors import InputError
     from selfcal_ros.files import check_outputs, read_json, write_json
     from selfcal_ros.model.result import result_from_dict, result_to_dict, with_input
@@ -57,9 +58,8 @@ def run(args: argparse.Namespace) -> int:
     if args.output:
         write_json(args.output, result_to_dict(result))
     if not args.quiet:
-        from selfcal_ros.cli.terminal.print_result import show
         show(result, args.bag, args.output)
-    return 0
+    return exit_code(result)
 
 
 def _play(args: argparse.Namespace, saved: Path, environment: dict) -> tuple[int, list[str]]:

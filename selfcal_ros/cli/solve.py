@@ -27,6 +27,14 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--reference", metavar="KIND:ERROR:U", help="known length that sets the "
                         "scale: artifact, stage_x or stage_y, its relative error and the standard "
                         "uncertainty of that, e.g. artifact:1.2e-6:3e-7")
+    parser.add_argument("--certificate", metavar="TEXT",
+                        help="what states the reference: number and issuer of its certificate")
+    parser.add_argument("--model", metavar="TERM[:SIZE],...", action="append",
+                        help="terms estimated with the map: microscope, drift, plate_scale, "
+                        "plate_shape, approach; SIZE is a standard deviation known from elsewhere "
+                        "(SI), e.g. drift,plate_shape:30e-9")
+    parser.add_argument("--drift-degree", type=int, metavar="D",
+                        help="degree of a drift's polynomial (default: 3)")
     parser.add_argument("--namespace", metavar="NAME", help="namespace of the cell's topics, "
                         "for bags that hold several cells; / is the root")
     parser.add_argument("--robust", action="store_true",
@@ -49,6 +57,8 @@ def parameters(args: argparse.Namespace) -> tuple[dict[str, Any], dict[str, Any]
     options = {"measurement_collector": {"measurement_sense": args.sense},
                "solver": {"method": args.method, "theta_datum": args.theta_datum,
                           "uncertainty": args.uncertainty,
+                          "model_terms": args.model, "drift_degree": args.drift_degree,
+                          "reference_certificate": args.certificate,
                           **_reference(args.reference)}}
     values = []
     for node, given in options.items():
@@ -73,13 +83,19 @@ def _reference(text: str | None) -> dict[str, Any]:
 def run(args: argparse.Namespace) -> int:
     """Collect, calibrate, print the summary and write the result."""
     from selfcal_ros.bagio.offline import bag_input, collect_bag
+    from selfcal_ros.cli.terminal.print_result import exit_code, show
     from selfcal_ros.cli.terminal.progress import progress_bar
     from selfcal_ros.collection.parameters import solver_options
     from selfcal_ros.collection.reasons import advice
     from selfcal_ros.errors import NotIdentifiableError
     from selfcal_ros.estimation.api import calibrate
     from selfcal_ros.files import check_outputs, write_json
-    from selfcal_ros.model.result import result_to_dict, unidentified_result, with_input
+    from selfcal_ros.model.result import (
+        created_now,
+        result_to_dict,
+        unidentified_result,
+        with_input,
+    )
 
     check_outputs([args.bag, args.params], [args.output])
     collector_values, solver_values = parameters(args)
@@ -101,14 +117,13 @@ def run(args: argparse.Namespace) -> int:
             write_json(args.output, result_to_dict(with_input(result, bag_input(args.bag), lost)))
         raise
     result, lines = _extended(args, measurements, options, result)
-    result = with_input(result, bag_input(args.bag), lost)
+    result = created_now(with_input(result, bag_input(args.bag), lost))
     if args.output:
         write_json(args.output, result_to_dict(result))
     if not args.quiet:
-        from selfcal_ros.cli.terminal.print_result import show
         show(result, args.bag, args.output)
         print("\n".join(lines), end="\n" * bool(lines))
-    return 0
+    return exit_code(result)
 
 
 def _extended(args: argparse.Namespace, measurements: Any, options: Any,

@@ -12,6 +12,7 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.options import Options, ReferenceKind, ReferenceLength
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.readings import Sense
+from selfcal_ros.model.terms import DRIFT_DEGREE, MAX_DRIFT_DEGREE, TermName, parse_terms
 
 
 @dataclass(frozen=True)
@@ -29,11 +30,16 @@ class Parameter:
     def check(self, value: Any, where: str) -> Any:
         """Return `value` as the parameter's type, or raise InputError."""
         kind = type(self.default)
+        if kind is list and isinstance(value, str | tuple):
+            value = [value] if isinstance(value, str) else list(value)
         if kind is float and isinstance(value, int) and not isinstance(value, bool):
             value = float(value)
         if not isinstance(value, kind) or (kind is int and isinstance(value, bool)):
             raise InputError(f"{where}: {self.name}", f"{value!r} is not of type {kind.__name__}",
                              "put it in quotes" if kind is str else "mend the value")
+        if kind is list and not all(isinstance(item, str) for item in value):
+            raise InputError(f"{where}: {self.name}", f"{value!r} is not a list of texts",
+                             "put each item in quotes")
         if self.choices and value not in self.choices:
             raise InputError(f"{where}: {self.name}", f"{value!r} is not known",
                              f"choose one of {', '.join(self.choices)}")
@@ -101,6 +107,12 @@ SOLVER = (
               "nominal, stage axis (indicated - true) / nominal", "m/m", -0.09, 0.09),
     Parameter("reference_u", 0.0, "standard uncertainty of reference_error (k=1)",
               "m/m", 0.0, 0.09),
+    Parameter("reference_certificate", "", "what states that length: number and issuer of a "
+              "certificate"),
+    Parameter("model_terms", [""], "terms estimated with the map, each TERM or TERM:SIZE of "
+              + ", ".join(TermName) + "; the size is a standard deviation, SI"),
+    Parameter("drift_degree", DRIFT_DEGREE, "degree of the polynomial of time by which views "
+              "drift, where drift is a term", "", 1, MAX_DRIFT_DEGREE),
     Parameter("save_path", "", "RESULT.json to write whenever the map changes; empty = none"),
 )
 SEQUENCER = (
@@ -269,7 +281,10 @@ def solver_options(values: dict[str, Any]) -> Options:
     """Return the estimator's options in a solver's parameter values."""
     kind = values["reference_kind"]
     reference = None if kind == "none" else ReferenceLength(
-        ReferenceKind(kind), values["reference_error"], values["reference_u"])
+        ReferenceKind(kind), values["reference_error"], values["reference_u"],
+        values["reference_certificate"])
     return Options(method=values["method"], datum_theta=ThetaDatum(values["theta_datum"]),
                    misalignment_model=values["misalignment_model"], reference=reference,
-                   uncertainty=_UNCERTAINTY[values["uncertainty"]])
+                   uncertainty=_UNCERTAINTY[values["uncertainty"]],
+                   terms=parse_terms(values["model_terms"], "model_terms"),
+                   drift_degree=values["drift_degree"])

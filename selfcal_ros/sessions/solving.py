@@ -12,6 +12,7 @@ from selfcal_ros.messages import from_model, to_model
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.result import (
     CalibrationResult,
+    created_now,
     result_from_dict,
     result_to_dict,
     unidentified_result,
@@ -108,7 +109,7 @@ class SolvingSession:
             self.result = unidentified_result(measurements, error.observability)
         self._publish()
         if self._values["save_path"] and self._problem is None:
-            write_json(self._values["save_path"], result_to_dict(self.result))
+            write_json(self._values["save_path"], result_to_dict(created_now(self.result)))
 
     def _publish(self) -> None:
         stamp = max((to_model.stamp_ns(m) for m in self._messages.values()), default=0)
@@ -154,7 +155,7 @@ class SolvingSession:
             raise self._problem
         if self.result is None:
             raise NoDataError("solver", "there is no map yet", "measure the views of the plan")
-        write_json(_named(path), result_to_dict(self.result))
+        write_json(_named(path), result_to_dict(created_now(self.result)))
         return f"saved to {path}; readings {self.digest() or 'of a loaded map'}"
 
     def load(self, path: str) -> str:

@@ -17,3 +17,18 @@ def show(result: "CalibrationResult", bag: str, output: str | None) -> None:
     print(summary_text(result, truth=read_truth(bag), ascii_only=not can_print_symbols(sys.stdout)))
     if output:
         print(f"result: {output}")
+
+
+def exit_code(result: "CalibrationResult") -> int:
+    """Return the exit code of a result that was computed: 0, or 5 if it is not qualified.
+
+    Why not is said in one line on stderr, whatever else is printed.
+    """
+    from selfcal_ros.errors import ExitCode
+    from selfcal_ros.reporting.summary_format import can_print_symbols, printable, to_ascii
+
+    if result.verdict.qualified:
+        return int(ExitCode.DONE)
+    line = printable(result.verdict.sentence)
+    print(f"selfcal: {line if can_print_symbols(sys.stderr) else to_ascii(line)}", file=sys.stderr)
+    return int(ExitCode.NOT_QUALIFIED)

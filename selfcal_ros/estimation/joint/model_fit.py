@@ -18,6 +18,7 @@ from selfcal_ros.estimation.joint.fit import JointFit, fit
 from selfcal_ros.estimation.joint.problem import ROUNDING, Problem, grid_dof, sigma_of
 from selfcal_ros.estimation.terms.columns import TermColumns, term_columns
 from selfcal_ros.estimation.terms.equations import TermEquations
+from selfcal_ros.estimation.terms.ground import without_noise
 from selfcal_ros.estimation.terms.projection import ReducedColumns, project, reduce_columns
 from selfcal_ros.estimation.terms.solution import Sums, next_coefficients, noise_left, score
 from selfcal_ros.model.terms import TermName
@@ -33,6 +34,13 @@ ROUGH_RESOLUTION = 1e-11
 OF_NOISE = 1e-6
 """Change of a misalignment, against its standard uncertainty, that is none once steps no longer
 shrink: where weights lie far apart rounding moves it."""
+
+LINEAR = 1e-3
+"""Relative change of the misalignments' covariance from which the terms' equations are set up
+anew."""
+
+OFFSET_STEPS = 4
+"""Steps in which the offsets that a microscope saw are freed from noise anew; then they stand."""
 
 SHRINKS = 0.5
 """Ratio of two steps above which they no longer shrink."""
@@ -121,9 +129,10 @@ def fit_model(problem: Problem,
                      "check the readings for misalignments of more than a few degrees")
 
 
-def columns_of(problem: Problem) -> TermColumns:
-    """Return the columns of the problem's terms."""
-    return term_columns(problem.ground, problem.terms, problem.drift_degree)
+def columns_of(problem: Problem, found: JointFit) -> TermColumns:
+    """Return the columns of the problem's terms, offsets freed from the noise of `found`."""
+    ground = without_noise(problem.ground, found.residuals)
+    return term_columns(ground, problem.terms, problem.drift_degree)
 
 
 def equations_of(problem: Problem, found: JointFit, columns: TermColumns,
@@ -143,20 +152,38 @@ class _State:
     """Where the iteration stands."""
 
     def __init__(self, problem: Problem, found: JointFit) -> None:
-        self.problem, self.found = problem, found
+        self.problem, self.found, self.steps = problem, found, 0
         self.equations, self.reduced = None, None
+        self.of_offsets = any(term.name is TermName.MICROSCOPE for term in problem.terms)
         if problem.terms:
-            columns = columns_of(problem)
-            self.reduced = reduce_columns(problem.system.grid, columns.grid)
-            self.equations = equations_of(problem, found, columns, self.reduced)
+            self._linearise()
         equations = self.equations
         self.coefficients = np.zeros(equations.n if equations else 0)
         self.sums = self._sums()
         self.y = problem.grid.y
 
+    def _linearise(self) -> None:
+        """Set up the equations of the terms about the present solution."""
+        self.weights = self.found.inverse
+        if self.reduced is None or self.of_offsets:
+            columns = columns_of(self.problem, self.found)
+            self.reduced = reduce_columns(self.problem.system.grid, columns.grid)
+        else:
+            columns = self.equations.columns
+        self.equations = equations_of(self.problem, self.found, columns, self.reduced)
+
+    def _stale(self) -> bool:
+        """Return whether the angular readings now weigh otherwise than in the equations."""
+        now, then = self.found.inverse, self.weights
+        return bool(len(now) and np.abs(now - then).max() > LINEAR * np.abs(then).max())
+
     def step(self) -> float:
         """Take one step; return the largest change of a misalignment, m."""
         before = self.found.parameters
+        if self.equations is not None and (self._stale() or (
+                self.of_offsets and self.steps <= OFFSET_STEPS)):
+            self._linearise()
+        self.steps += 1
         if self.equations is not None:
             self._solve_terms()
         self.y = np.where(self.problem.system.grid.read,

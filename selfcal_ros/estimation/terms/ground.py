@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the columns of terms stand on: plate, views and visits of a measurement."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -45,3 +45,26 @@ def ground_of(measurements: Measurements, grid: GridData, half_width_m: float) -
     names = tuple(measurements.views[i].view.name for i in grid.index)
     return Ground(z, half_width_m, grid.weight, visits_of(measurements, grid), names,
                   approach_sign(measurements.sense))
+
+
+def without_noise(ground: Ground, residuals: np.ndarray) -> Ground:
+    """Return the ground with offsets from which the noise of the readings is taken off.
+
+    The offset that a microscope saw holds the noise of its reading. As a column it would explain
+    just that noise, and nothing else where offsets hardly differ. What the estimate leaves of each
+    visit is taken off the offset: the rest owes nothing to the residuals.
+
+    Parameters
+    ----------
+    ground : Ground
+        With the offsets as they were seen.
+    residuals : complex array (views, nx, ny)
+        Residuals of the means of the marks, plate frame, m.
+    """
+    visits = []
+    for view, residual in zip(ground.visits, residuals, strict=True):
+        if view is not None:
+            rest = view.about_means(view.y[None], residual.size)[0] + residual.reshape(-1)[view.mark]
+            view = replace(view, offset=view.offset - rest * np.conj(view.phase))
+        visits.append(view)
+    return replace(ground, visits=tuple(visits))

@@ -17,6 +17,7 @@ from selfcal_ros.estimation.joint.model_fit import ModelFit, equations_of
 from selfcal_ros.estimation.joint.problem import grid_dof
 from selfcal_ros.estimation.terms.columns import Column, TermColumns, joined, term_columns
 from selfcal_ros.estimation.terms.equations import TermEquations
+from selfcal_ros.estimation.terms.ground import Ground, without_noise
 from selfcal_ros.estimation.terms.solution import Score, score
 from selfcal_ros.estimation.verdict.slip_columns import SLIP, slip_columns
 from selfcal_ros.model.terms import VISIT_TERMS, ModelTerm, TermName
@@ -130,14 +131,15 @@ def find_explanations(model: ModelFit, *, slips: bool) -> list[Explanation]:
         Whether slips of the plate within a view are looked for as well.
     """
     problem = model.problem
+    ground = without_noise(problem.ground, model.found.residuals)
     own = [term.name for term in problem.terms]
-    told = all(visits is not None for visits in problem.ground.visits)
+    told = all(visits is not None for visits in ground.visits)
     more = [ModelTerm(name) for name in TermName
             if name not in own and (told or name not in VISIT_TERMS)]
-    columns = term_columns(problem.ground, (*problem.terms, *more), problem.drift_degree)
-    groups = [Group(str(term.name), columns.rows([term.name])) for term in more]
+    columns = term_columns(ground, (*problem.terms, *more), problem.drift_degree)
+    groups = [group for term in more for group in _groups(columns, term.name)]
     if slips:
-        columns, groups = _with_slips(model, columns, groups)
+        columns, groups = _with_slips(ground, columns, groups)
     equations = equations_of(problem, model.found, columns)
     taken = np.zeros(equations.n)
     taken[:len(model.coefficients)] = model.coefficients
@@ -145,12 +147,24 @@ def find_explanations(model: ModelFit, *, slips: bool) -> list[Explanation]:
     return _select(Pool(equations, right), groups, columns.rows(own))
 
 
-def _with_slips(model: ModelFit, columns: TermColumns,
+def _groups(columns: TermColumns, name: TermName) -> list[Group]:
+    """Return the columns of a term as a whole, and those of each view, steady drift apart."""
+    whole = columns.rows([name])
+    parts = [whole]
+    for view in sorted({c.view for c in columns.columns if c.term == name and c.view >= 0}):
+        here = whole & np.array([c.view == view for c in columns.columns])
+        parts.append(here)
+        if name is TermName.DRIFT:
+            parts.append(here & np.array([c.component.endswith("P1") for c in columns.columns]))
+    return [Group(str(name), rows, places=len(parts)) for rows in parts]
+
+
+def _with_slips(ground: Ground, columns: TermColumns,
                 groups: list[Group]) -> tuple[TermColumns, list[Group]]:
-    steps, places = slip_columns(model.problem.ground)
-    both = joined(model.problem.ground, columns, steps)
+    steps, places = slip_columns(ground)
+    both = joined(ground, columns, steps)
     before, after = len(columns.columns), len(steps.columns)
-    groups = [Group(g.name, np.pad(g.rows, (0, after))) for g in groups]
+    groups = [Group(g.name, np.pad(g.rows, (0, after)), places=g.places) for g in groups]
     return both, groups + [
         Group(SLIP, np.pad(rows, (before, 0)), view, part, len(places))
         for (view, part), rows in places.items()]
@@ -165,15 +179,19 @@ def _select(pool: Pool, groups: list[Group], taken: np.ndarray) -> list[Explanat
         if not good:
             break
         (_, _), best = max(good, key=lambda item: item[0][1])
-        as_good = [(test[0], group) for test, group in good
+        as_good = [(test, group) for test, group in good
                    if group is best or _replaces(pool, taken, group, best)]
-        # what all views share is simpler than what each has of its own
-        as_good.sort(key=lambda item: (item[1].name not in SHARED, item[1] is not best))
-        found += [_explanation(pool, taken, group, p) for p, group in as_good]
+        # of each term the likeliest part; what all views share is simpler than what each has
+        as_good.sort(key=lambda item: (item[1].name not in SHARED, -item[0][1]))
+        names: list[str] = []
+        for (p, _), group in as_good:
+            if group.name not in names:
+                names.append(group.name)
+                found.append(_explanation(pool, taken, group, p))
         taken = taken | best.rows
-        gone = [group.name for _, group in as_good if group.name != SLIP]
-        groups = [g for g in groups if g.name not in gone
-                  and not (best.name == SLIP == g.name and g.view == best.view)]
+        groups = [g for g in groups if (g.rows & ~taken).any() and (
+            g.name == best.name or g.name not in names) and not (
+            best.name == SLIP == g.name and g.view == best.view)]
     return found
 
 
