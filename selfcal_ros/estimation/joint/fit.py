@@ -43,6 +43,8 @@ class JointFit:
         Covariance of the misalignments for unit grid noise; empty if the sites were iterated.
     solver : dict
         How the equations were solved, and to what residual.
+    ratio : float
+        Weight of an angular reading (times the half width) against a grid reading; 0 = none.
     """
 
     field: np.ndarray
@@ -57,6 +59,7 @@ class JointFit:
     theta: NoiseEstimate
     inverse: np.ndarray
     solver: dict
+    ratio: float = 0.0
 
 
 def fit(problem: Problem, y: np.ndarray) -> JointFit:
@@ -102,7 +105,7 @@ def fit(problem: Problem, y: np.ndarray) -> JointFit:
     parameters[system.phi_at] = phi * length
     a_theta, residuals_theta = angular.plate(problem.angular.y, g_theta, phi)
     return JointFit(field, plate, residuals, parameters, g_theta, a_theta, residuals_theta,
-                    misclosure, xy, theta.noise, raw.inverse, raw.solver)
+                    misclosure, xy, theta.noise, raw.inverse, raw.solver, raw.ratio)
 
 
 def _solve_direct(problem: Problem, y: np.ndarray, theta: AngularPart) -> FreeNetworkSolution:
@@ -122,7 +125,7 @@ def _solve_direct(problem: Problem, y: np.ndarray, theta: AngularPart) -> FreeNe
     inverse = system.inverse(ratio)
     parameters = inverse @ right
     field = (free - grid.response @ parameters[:n]).reshape(grid.views.shape)
-    return FreeNetworkSolution(field, parameters, xy, inverse, {"method": "multifrontal"})
+    return FreeNetworkSolution(field, parameters, xy, inverse, {"method": "multifrontal"}, ratio)
 
 
 def _angular_part(problem: Problem) -> AngularPart:

@@ -205,7 +205,7 @@ class _State:
                         self.y, self.reduced)
 
     def _solve_terms(self) -> None:
-        now = score(self.equations, self.found.residuals, dof=grid_dof(self.problem),
+        now = score(self.equations, self.found.residuals, squares(self.problem, self.found),
                     coefficients=self.coefficients)
         left = noise_left(self.equations, now)
         self.problem = with_noise(self.problem, left)
@@ -236,12 +236,28 @@ class _State:
 
     def _sums(self) -> Sums:
         if self.equations is not None:
-            now = score(self.equations, self.found.residuals, dof=grid_dof(self.problem),
+            now = score(self.equations, self.found.residuals, squares(self.problem, self.found),
                         coefficients=self.coefficients)
             return noise_left(self.equations, now)
-        grid = self.problem.system.grid
-        total = float((grid.weight * abs(self.found.residuals) ** 2).sum())
-        return Sums(total, grid_dof(self.problem), float("nan"), 0)
+        return Sums(*squares(self.problem, self.found), float("nan"), 0)
+
+
+def squares(problem: Problem, found: JointFit) -> tuple[float, float]:
+    """Return the weighted squares of all residuals, m^2, and their degrees of freedom.
+
+    Grid and angular readings together, as they share the rotations: angular residuals in units of
+    the grid's, by the ratio with which they were fitted.
+    """
+    system = problem.system
+    total = float((system.grid.weight * abs(found.residuals) ** 2).sum())
+    dof = grid_dof(problem)
+    if found.ratio > 0:
+        length = problem.half_width_m
+        total += found.ratio * length**2 * float(
+            (system.angular.weight * found.residuals_theta**2).sum())
+        shared = len(set(system.angular_index) & set(system.grid_index))
+        dof += system.angular.n_readings - system.rank_angular + max(shared - 1, 0)
+    return total, dof
 
 
 def with_noise(problem: Problem, left: Sums) -> Problem:

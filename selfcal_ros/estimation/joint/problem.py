@@ -91,13 +91,17 @@ class AngularPart:
 
 @dataclass(frozen=True, eq=False)
 class FreeNetworkSolution:
-    """A solution in no particular datum; `xy` is None where it is yet to be taken from it."""
+    """A solution in no particular datum; `xy` is None where it is yet to be taken from it.
+
+    `ratio` is the weight of an angular reading against a grid reading, 0 without angular ones.
+    """
 
     field: np.ndarray
     parameters: np.ndarray
     xy: NoiseEstimate | None
     inverse: np.ndarray
     solver: dict
+    ratio: float = 0.0
 
 
 def repeats_of(measurements: Measurements) -> tuple[tuple[float, int], tuple[float, int]]:

@@ -64,7 +64,8 @@ def without_noise(ground: Ground, residuals: np.ndarray) -> Ground:
     visits = []
     for view, residual in zip(ground.visits, residuals, strict=True):
         if view is not None:
-            rest = view.about_means(view.y[None], residual.size)[0] + residual.reshape(-1)[view.mark]
+            rest = view.about_means(view.y[None], residual.size)[0]
+            rest = rest + residual.reshape(-1)[view.mark]
             view = replace(view, offset=view.offset - rest * np.conj(view.phase))
         visits.append(view)
     return replace(ground, visits=tuple(visits))

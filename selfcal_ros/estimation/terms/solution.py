@@ -53,7 +53,7 @@ class Score:
         return self.between + self.within
 
 
-def score(equations: TermEquations, residuals: np.ndarray, *, dof: float,
+def score(equations: TermEquations, residuals: np.ndarray, squares: tuple[float, float], *,
           coefficients: np.ndarray | None = None) -> Score:
     """Return the right-hand side of the coefficients that are still to come.
 
@@ -63,8 +63,9 @@ def score(equations: TermEquations, residuals: np.ndarray, *, dof: float,
         The columns.
     residuals : complex array (views, nx, ny)
         Residuals of the estimate, plate frame, m, from deviations less `coefficients` columns.
-    dof : float
-        Degrees of freedom of the estimate without terms.
+    squares : tuple of float
+        Weighted squares of all residuals, angular ones included, m^2, and their degrees of
+        freedom without terms.
     coefficients : float array (p,), optional
         What has been taken off already.
     """
@@ -73,8 +74,8 @@ def score(equations: TermEquations, residuals: np.ndarray, *, dof: float,
     taken = np.zeros(equations.n) if coefficients is None else coefficients
     weighted = (weight * residuals).reshape(-1)
     between = (np.conj(columns.grid.reshape(len(taken), weighted.size)) @ weighted).real
-    squares = within.total - 2 * taken @ within.right + taken @ within.gram @ taken
-    sums = Sums(float((weight * abs(residuals) ** 2).sum()), dof, float(squares), within.dof)
+    inner = within.total - 2 * taken @ within.right + taken @ within.gram @ taken
+    sums = Sums(*squares, float(inner), within.dof)
     return Score(between, within.right - within.gram @ taken, sums)
 
 

@@ -13,8 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import f as f_distribution
 
-from selfcal_ros.estimation.joint.model_fit import ModelFit, equations_of
-from selfcal_ros.estimation.joint.problem import grid_dof
+from selfcal_ros.estimation.joint.model_fit import ModelFit, equations_of, squares
 from selfcal_ros.estimation.terms.columns import Column, TermColumns, joined, term_columns
 from selfcal_ros.estimation.terms.equations import TermEquations
 from selfcal_ros.estimation.terms.ground import Ground, without_noise
@@ -143,7 +142,8 @@ def find_explanations(model: ModelFit, *, slips: bool) -> list[Explanation]:
     equations = equations_of(problem, model.found, columns)
     taken = np.zeros(equations.n)
     taken[:len(model.coefficients)] = model.coefficients
-    right = score(equations, model.found.residuals, dof=grid_dof(problem), coefficients=taken)
+    right = score(equations, model.found.residuals, squares(problem, model.found),
+                  coefficients=taken)
     return _select(Pool(equations, right), groups, columns.rows(own))
 
 
