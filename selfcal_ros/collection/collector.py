@@ -13,9 +13,10 @@ from typing import Any
 import numpy as np
 
 from selfcal_ros.collection.encoder import JointTrack, TrackLimits
+from selfcal_ros.collection.expected import Missing, expected_marks, missing_marks
 from selfcal_ros.collection.exposures import Exposures, Tracks, look_up
 from selfcal_ros.collection.identify import IdentityRules
-from selfcal_ros.collection.messages import Command, Detection, EncoderSample
+from selfcal_ros.collection.messages import Command, Detection, EncoderSample, check_command
 from selfcal_ros.collection.reasons import Reason
 from selfcal_ros.collection.reduce import DETECTION, Rules, clean, reduce_view
 from selfcal_ros.collection.timeline import Timeline, build_timeline
@@ -37,6 +38,14 @@ class ViewProgress:
     angular_done: int
     readings: ViewReadings
     end_ns: int
+    artifact: Artifact | None = None
+
+    @property
+    def missing(self) -> Missing:
+        """Marks that have not been read as often as the plan asks, at most 200 of each kind."""
+        if self.artifact is None:
+            return Missing()
+        return missing_marks(self.artifact, self.view, self.readings)
 
     @property
     def complete(self) -> bool:
@@ -78,7 +87,7 @@ class Collector:
         self.tracks = Tracks(JointTrack(linear), JointTrack(linear), JointTrack(turn))
         self._rules = Rules(
             self.sense, IdentityRules(values["max_deviation"], values["ambiguity_ratio"],
-                                      values["max_rotation"]),
+                                      values["max_rotation"], values["max_stage_distance"]),
             values["min_score"], values["outlier_limit"])
         self._approach_threshold_m = values["approach_threshold"]
         self._detections: list[tuple] = []
@@ -116,9 +125,8 @@ class Collector:
                                  d.offset_y, d.offset_theta, d.sigma, d.score))
 
     def add_command(self, command: Command) -> None:
-        """Take one view command; one whose pose lies off the lattice raises InputError."""
-        if command.view is not None and command.artifact is not None:
-            command.view.lattice_pose(command.artifact)
+        """Take one view command; one that cannot be followed raises InputError."""
+        check_command(command)
         self.received["command"] += 1
         self._commands[command] = None
         self._timeline = None
@@ -172,7 +180,7 @@ class Collector:
                                              exposures, scored=scored)
         views = tuple(item.readings for item in progress.values())
         return Measurements(timeline.plan_id, timeline.artifact, views, self.sense,
-                            dict(sorted(loose.items()))), progress
+                            dict(sorted(loose.items())), timeline.run_id), progress
 
     def _progress(self, timeline: Timeline, index: int, view: View, detections: np.ndarray,
                   exposures: Exposures, *, scored: bool) -> ViewProgress:
@@ -185,13 +193,4 @@ class Collector:
         grid, angular = expected_marks(timeline.artifact, view)
         return ViewProgress(index, view, grid, int((readings.count >= view.repeats).sum()),
                             angular, int((readings.count_theta >= view.repeats).sum()), readings,
-                            max(i.end_ns for i in timeline.of_view(index)))
-
-
-def expected_marks(artifact: Artifact, view: View) -> tuple[int, int]:
-    """Return how many grid marks and angular lines are to be read in a view."""
-    grid = 0
-    if view.grid:
-        i, j = view.lattice_pose(artifact).site_of(artifact.m, artifact.n)
-        grid = int(((abs(i) <= artifact.half[0]) & (abs(j) <= artifact.half[1])).sum())
-    return grid, artifact.angular_count if view.angular else 0
+                            max(i.end_ns for i in timeline.of_view(index)), timeline.artifact)

@@ -2,6 +2,7 @@
 """A fingerprint of readings: equal digests mean equal readings, to the last bit."""
 
 import hashlib
+from dataclasses import replace
 
 import numpy as np
 
@@ -23,7 +24,8 @@ def readings_digest(readings: ViewReadings, rejected: dict[str, int]) -> str:
             digest.update(np.ascontiguousarray(getattr(table, name), dtype=kind).tobytes())
     if visits:
         digest.update(repr((visits.sigma_m, visits.dof)).encode())
-    digest.update(repr((readings.view, readings.sigma_xy, readings.sigma_theta, readings.dof_xy,
+    view = replace(readings.view, visit_order="")  # how it was to be measured, not what was read
+    digest.update(repr((view, readings.sigma_xy, readings.sigma_theta, readings.dof_xy,
                         readings.dof_theta, readings.used, readings.rejected,
                         dict(sorted(rejected.items())))).encode())
     return digest.hexdigest()

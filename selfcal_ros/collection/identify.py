@@ -28,6 +28,15 @@ class IdentityRules:
     max_deviation_m: float
     ambiguity_ratio: float
     max_rotation_rad: float
+    max_stage_distance_m: float = 0.0
+
+    def stage_limit_m(self, artifact: Artifact) -> float:
+        """Return how far the stage may be from the site of the mark that it shows, m.
+
+        Unless stated: half a pitch, and what the largest rotation moves the plate's rim.
+        """
+        rim = self.max_rotation_rad * float(np.hypot(*artifact.half))
+        return self.max_stage_distance_m or (0.5 + rim) * artifact.grid_pitch_m
 
 
 @dataclass(frozen=True)
@@ -47,8 +56,11 @@ class Identified:
 
 
 def identify_grid(artifact: Artifact, view: View, reading_m: np.ndarray, *, ids: np.ndarray,
-                  has_id: np.ndarray, rules: IdentityRules) -> Identified:
+                  has_id: np.ndarray, rules: IdentityRules,
+                  stage_m: np.ndarray | None = None) -> Identified:
     """Identify grid marks and return their deviations from the nominal places of the view.
+
+    A mark at whose site the stage does not stand is rejected, and tells nothing of the others.
 
     Parameters
     ----------
@@ -62,6 +74,8 @@ def identify_grid(artifact: Artifact, view: View, reading_m: np.ndarray, *, ids:
         Whether the detection names its mark.
     rules : IdentityRules
         Limits.
+    stage_m : float array (2, n), optional
+        Site at which the stage stood, by its own indication; None = at the mark.
     """
     pose = view.lattice_pose(artifact)
     pitch = artifact.grid_pitch_m
@@ -74,7 +88,8 @@ def identify_grid(artifact: Artifact, view: View, reading_m: np.ndarray, *, ids:
     marks = np.where(has_id & ~named_unknown, ids, 0)
     reading_m = np.clip(reading_m, -OFF_ANY_PLATE_M, OFF_ANY_PLATE_M)  # squares stay finite
     centred = reading_m - np.array(pose.shift)[:, None] * pitch  # about the plate's centre
-    named = has_id & ~named_unknown
+    astray = has_id & _astray(pose, marks, stage_m, artifact, rules)
+    named = has_id & ~named_unknown & ~astray
     free = ~has_id
     known, fit = _settle(pose, centred, half, marks, (named, free), pitch, rules)
     rigid = known.rigid if fit.marks < 3 else fit.rigid
@@ -94,12 +109,24 @@ def identify_grid(artifact: Artifact, view: View, reading_m: np.ndarray, *, ids:
         limit = pitch / 4  # too few marks to know the view's own rotation and offset
     residual = deviation - rigid.at(about)
     far |= ~ambiguous & (np.hypot(*residual) > limit)
+    astray |= free & ~far & _astray(pose, marks, stage_m, artifact, rules)
     reasons[far] = Reason.TOO_FAR
+    reasons[astray] = Reason.NOT_AT_MARK
     reasons[ambiguous] = Reason.AMBIGUOUS
     reasons[unsure] = Reason.ROTATION
     reasons[(np.abs(site) > half).any(axis=0) & ~unsure] = Reason.NOT_IN_VIEW
     reasons[named_unknown] = Reason.UNKNOWN_MARK
     return Identified(marks, deviation, residual, reasons, rigid, fit.phi_error_rad)
+
+
+def _astray(pose, marks: np.ndarray, stage_m: np.ndarray | None, artifact: Artifact,
+            rules: IdentityRules) -> np.ndarray:
+    """Return for which marks (2, n) the stage stood further from their sites than it may."""
+    if stage_m is None:
+        return np.zeros(marks.shape[1], dtype=bool)
+    site = np.stack(pose.site_of(marks[0], marks[1])) * artifact.grid_pitch_m
+    away = np.clip(stage_m - site, -OFF_ANY_PLATE_M, OFF_ANY_PLATE_M)
+    return np.hypot(*away) > rules.stage_limit_m(artifact)
 
 
 def _nearest(pose, centred: np.ndarray, pitch: float, half: np.ndarray,

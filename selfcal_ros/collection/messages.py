@@ -4,8 +4,14 @@
 from dataclasses import dataclass
 from enum import IntEnum
 
+from selfcal_ros.errors import InputError
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.view import View
+
+MAX_VIEWS = 10_000
+"""Views of a plan."""
+MAX_REPEATS = 1_000_000
+"""Repeats of a mark in a view."""
 
 
 class Kind(IntEnum):
@@ -63,3 +69,22 @@ class Command:
     artifact: Artifact | None = None
     views_planned: int = 0
     run_id: str = ""
+
+
+def check_command(command: Command) -> None:
+    """Raise InputError for a command that no cell can follow.
+
+    It has a pose off the lattice, asks for no marks, or a number in it cannot be meant.
+    """
+    where = f"view command {command.view_index}"
+    if not 0 <= command.view_index <= MAX_VIEWS or not 0 <= command.views_planned <= MAX_VIEWS:
+        raise InputError(where, f"a plan has at most {MAX_VIEWS} views", "mend the view_index")
+    if command.view is None or command.artifact is None:
+        if command.phase in (Phase.PLACE, Phase.MEASURE):
+            raise InputError(where, "it describes no view", "fill its pose and its plate")
+        return
+    if not (command.view.grid or command.view.angular):
+        raise InputError(where, "neither grid nor angular marks are wanted", "set one to true")
+    if not 1 <= command.view.repeats <= MAX_REPEATS:
+        raise InputError(where, f"{command.view.repeats} repeats", f"ask for 1 to {MAX_REPEATS}")
+    command.view.lattice_pose(command.artifact)

@@ -82,6 +82,9 @@ COLLECTOR = (
     Parameter("max_rotation", 0.035, "largest misalignment in rotation to reckon with when marks "
               "have no ids; where lines alone are read it must be below 0.45 of a line",
               "rad", 0.0, 0.2),
+    Parameter("max_stage_distance", 0.0, "largest distance of the indicated stage position from "
+              "the nominal site of the mark seen; 0 = half a pitch, and max_rotation times the "
+              "radius of the plate", "m", 0.0, 10.0),
     Parameter("outlier_limit", 6.0, "distance from the median of a mark's repeats, in standard "
               "deviations of one reading, beyond which a repeat is an outlier; 0 = keep all",
               "", 0.0, 1000.0),

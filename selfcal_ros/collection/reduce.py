@@ -57,6 +57,8 @@ def clean(detections: np.ndarray, rules: Rules, *, scored: bool,
         d[field] = np.where(used, d[field] + 0.0, 0.0)
     for field, used in (("m", grid), ("n", grid), ("k", angular)):
         d[field] = np.where(used & d["has_id"], d[field], 0)
+    for field in ("sigma", "score"):
+        d[field] += 0.0  # -0.0 and 0.0 are one number
     finite = np.all([np.isfinite(d[f]) for f in ("ox", "oy", "ot", "sigma", "score")], axis=0)
     finite &= d["sigma"] >= 0
     rejected[Reason.NOT_FINITE] = int((~finite).sum())
@@ -94,7 +96,8 @@ def _reduce_grid(artifact: Artifact, view: View, d: np.ndarray, exposures: Expos
                                  *stage.approach)
     reading = _reading(rules.sense, np.stack([x, y]), np.stack([d["ox"], d["oy"]]))
     found = identify_grid(artifact, view, reading, ids=np.stack([d["m"], d["n"]]),
-                          has_id=d["has_id"], rules=rules.identity)
+                          has_id=d["has_id"], rules=rules.identity,
+                          stage_m=_reading(rules.sense, np.stack([x, y]), 0.0))
     d, (m, n, vx, vy, rx, ry, *approach) = _keep(
         d, found.reasons, rejected, *found.index, *found.deviation, *found.residual, *approach)
     hx, hy = artifact.half
@@ -131,7 +134,8 @@ def _reduce_angular(artifact: Artifact, view: View, d: np.ndarray, exposures: Ex
             "u_theta": means.u, "sigma_theta": means.sigma, "dof_theta": means.dof}
 
 
-def _reading(sense: Sense, position: np.ndarray, offset: np.ndarray) -> np.ndarray:
+def _reading(sense: Sense, position: np.ndarray,
+             offset: np.ndarray | float) -> np.ndarray:
     """Return where the mark lies: over a moved microscope, or on a moved plate (method 1)."""
     return offset - position if sense is Sense.PLATE_MOVES else position + offset
 

@@ -1,5 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which view an instant belongs to: by the stamps of the commands, never by arrival."""
+"""Which view an instant belongs to: by the stamps of the commands, never by arrival.
+
+A plan may be measured again and again: each run counts for itself, and readings of different runs
+are never mixed. Commands name their run (`run_id`). Where they do not, a run begins with a command
+of view 0 that follows DONE or ABORT, or that places the plate anew once a later view has been
+measured; it is then named by the stamp of its first command.
+"""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -45,6 +51,8 @@ class Timeline:
         Whether the last command is DONE or ABORT.
     last_stamp_ns : int
         Stamp of the last command.
+    run_id : str
+        Run of the last MEASURE; views of other runs are not used. Empty before the first MEASURE.
     """
 
     plan_id: str = ""
@@ -54,6 +62,7 @@ class Timeline:
     views_planned: int = 0
     finished: bool = False
     last_stamp_ns: int = 0
+    run_id: str = ""
 
     def assign(self, stamps_ns: np.ndarray) -> np.ndarray:
         """Return the index of the interval of each stamp, int array; -1 before the first."""
@@ -78,23 +87,49 @@ def build_timeline(commands: Iterable[Command]) -> Timeline:
         If two commands of the plan describe different plates.
     """
     ordered = sorted(set(commands), key=_sort_key)
-    measures = [command for command in ordered if command.phase == Phase.MEASURE]
+    measures = [number for number, c in enumerate(ordered) if c.phase == Phase.MEASURE]
     if not measures:
         last = ordered[-1].stamp_ns if ordered else 0
         return Timeline(intervals=tuple(_unused(ordered)), views={}, last_stamp_ns=last)
-    plan_id, artifact = measures[-1].plan_id, measures[-1].artifact
+    newest = ordered[measures[-1]]
+    plan_id, artifact = newest.plan_id, newest.artifact
+    runs = _runs(ordered, plan_id)
+    run_id = runs[measures[-1]]
+    mine = [c for c, run in zip(ordered, runs, strict=True) if run == run_id]
     views: dict[int, View] = {}
-    for command in measures:
-        if command.plan_id != plan_id:
+    for command in mine:
+        if command.phase != Phase.MEASURE:
             continue
         if command.artifact != artifact:
             raise InputError(f"view command of '{command.view.name}'", "describes another plate "
                              f"than the rest of plan '{plan_id}'", "use one plate in one plan")
         views[command.view_index] = command.view
-    planned = max([c.views_planned for c in ordered if c.plan_id == plan_id] + [max(views) + 1])
+    planned = max([c.views_planned for c in mine] + [max(views) + 1])
     return Timeline(plan_id, artifact, dict(sorted(views.items())),
-                    tuple(_intervals(ordered, plan_id)), planned,
-                    ordered[-1].phase in (Phase.DONE, Phase.ABORT), ordered[-1].stamp_ns)
+                    tuple(_intervals(ordered, runs, run_id)), planned,
+                    ordered[-1].phase in (Phase.DONE, Phase.ABORT), ordered[-1].stamp_ns, run_id)
+
+
+def _runs(ordered: list[Command], plan_id: str) -> list[str | None]:
+    """Return the run of each command, None for those of other plans."""
+    placed = any(c.phase == Phase.PLACE and c.plan_id == plan_id for c in ordered)
+    first = Phase.PLACE if placed else Phase.MEASURE
+    out: list[str | None] = []
+    run, ended, later = "", False, False
+    for command in ordered:
+        if command.plan_id != plan_id:
+            out.append(None)
+            continue
+        over = command.phase in (Phase.DONE, Phase.ABORT)
+        anew = not over and command.view_index == 0 and (
+            ended or (later and command.phase == first))
+        fresh = command.run_id or (str(command.stamp_ns) if anew or not run else run)
+        if fresh != run:
+            run, ended, later = fresh, False, False
+        ended |= over
+        later |= command.phase == Phase.MEASURE and command.view_index > 0
+        out.append(run)
+    return out
 
 
 def _sort_key(command: Command) -> tuple:
@@ -108,24 +143,24 @@ def _unused(ordered: list[Command]) -> list[Interval]:
             for c, end in zip(ordered, ends, strict=True)]
 
 
-def _intervals(ordered: list[Command], plan_id: str) -> list[Interval]:
+def _intervals(ordered: list[Command], runs: list[str | None], run_id: str) -> list[Interval]:
     began: dict[int, int] = {}  # view_index -> stamp from which its MEASUREs count
     placed: dict[int, int] = {}  # view_index -> stamp of a PLACE that no MEASURE has followed yet
     poses: dict[int, tuple] = {}
-    for command in ordered:
+    for command, run in zip(ordered, runs, strict=True):
         index = command.view_index
-        if command.plan_id == plan_id and command.phase == Phase.PLACE:
+        if run == run_id and command.phase == Phase.PLACE:
             placed[index] = command.stamp_ns
-        elif command.plan_id == plan_id and command.phase == Phase.MEASURE:
+        elif run == run_id and command.phase == Phase.MEASURE:
             pose = (command.view.rotation_rad, command.view.translation_m)
             start = placed.pop(index, began.get(index, command.stamp_ns))
             began[index] = start if poses.get(index, pose) == pose else command.stamp_ns
             poses[index] = pose
     out = []
-    for interval, command in zip(_unused(ordered), ordered, strict=True):
+    for interval, command, run in zip(_unused(ordered), ordered, runs, strict=True):
         index, reason = None, interval.reason
-        if command.phase == Phase.MEASURE and command.plan_id != plan_id:
-            reason = Reason.OTHER_PLAN
+        if command.phase == Phase.MEASURE and run != run_id:
+            reason = Reason.OTHER_PLAN if run is None else Reason.OTHER_RUN
         elif command.phase == Phase.MEASURE and command.stamp_ns < began[command.view_index]:
             reason = Reason.SUPERSEDED
         elif command.phase == Phase.MEASURE:

@@ -64,7 +64,7 @@ def command(c: Command, frame_id: str) -> Fields:
 def view_status(progress: ViewProgress, plan_id: str, stamp_ns: int, frame_id: str, *,
                 run_id: str = "") -> Fields:
     """Return the fields of a selfcal_msgs/ViewStatus."""
-    readings = progress.readings
+    readings, missing = progress.readings, progress.missing
     return {
         "header": header(stamp_ns, frame_id), "plan_id": plan_id,
         "view_index": progress.view_index, "view_name": progress.view.name,
@@ -75,7 +75,8 @@ def view_status(progress: ViewProgress, plan_id: str, stamp_ns: int, frame_id: s
         **_rejected(readings.rejected, "reject"),
         "sigma_xy": readings.sigma_xy, "sigma_theta": readings.sigma_theta,
         "complete": progress.complete,
-        "missing_m": [], "missing_n": [], "missing_k": [], "run_id": run_id}
+        "missing_m": list(missing.m), "missing_n": list(missing.n),
+        "missing_k": list(missing.k), "run_id": run_id}
 
 
 def view_measurement(progress: ViewProgress, measurements: Measurements, stamp_ns: int,

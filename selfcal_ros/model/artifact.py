@@ -10,6 +10,8 @@ from selfcal_ros.errors import InputError
 
 MAX_GRID_SIZE = 4001
 MAX_ANGULAR_COUNT = 1_000_000
+PITCH_RANGE_M = (1e-7, 1.0)
+"""Distances between marks that a plate can have."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +32,7 @@ class Artifact:
     Raises
     ------
     InputError
-        If a size is even, out of range, or K is not a multiple of 4.
+        If a size is even, a size or the pitch is out of range, or K is not a multiple of 4.
     """
 
     grid_size: int
@@ -47,6 +49,10 @@ class Artifact:
         if not (np.isfinite(self.grid_pitch_m) and self.grid_pitch_m > 0):
             raise InputError("artifact grid_pitch", f"{self.grid_pitch_m} m is not a length",
                              "give the distance between marks in metres")
+        if not PITCH_RANGE_M[0] <= self.grid_pitch_m <= PITCH_RANGE_M[1]:
+            raise InputError("artifact grid_pitch", f"{self.grid_pitch_m:g} m is no pitch of a "
+                             f"plate ({PITCH_RANGE_M[0]:g} to {PITCH_RANGE_M[1]:g} m)",
+                             "is it in mm? give the distance between marks in metres")
         if self.angular_count % 4 or not 0 <= self.angular_count <= MAX_ANGULAR_COUNT:
             raise InputError("artifact angular_count", f"{self.angular_count} is not a multiple "
                              "of 4", "give 0 for a plate without angular lines")

@@ -14,6 +14,9 @@ from selfcal_ros.model.terms import parse_terms
 LATTICE_TOLERANCE = 1e-3
 """Largest distance of a commanded pose from the lattice, in pitches or lines."""
 
+MAX_SHIFT = 100_000
+"""Largest translation of a view, in pitches."""
+
 
 @dataclass(frozen=True)
 class LatticePose:
@@ -88,6 +91,9 @@ class View:
         where = f"view '{self.name}'"
         steps = [value / artifact.grid_pitch_m for value in self.translation_m]
         shift = [_whole(step, f"{where} translation", "pitch") for step in steps]
+        if max(abs(step) for step in shift) > MAX_SHIFT:
+            raise InputError(f"{where} translation", f"{max(shift, key=abs)} pitches are beyond "
+                             "every field", "is it in mm? give the translation in metres")
         if not math.isfinite(self.rotation_rad):
             raise InputError(f"{where} rotation", f"{self.rotation_rad} is not an angle",
                              "give a finite turn")

@@ -30,7 +30,7 @@ class CollectingSession:
         self.collector = Collector(values)
         self._dirty, self._next_status = False, 0.0
         self._published: dict[int, str] = {}
-        self._plan_id, self._advised = "", set()
+        self._run, self._advised = ("", ""), set()
         self.missed: dict[tuple[str, int], str] = {}  # views that began before this node
         self._placed: set[tuple[str, int]] = set()
         self._problem = ""
@@ -104,15 +104,16 @@ class CollectingSession:
     def _publish(self, measurements: Measurements, progress: dict[int, ViewProgress], *,
                  final: bool) -> None:
         timeline, frame_id = self.collector.timeline, self._values["frame_id"]
-        if timeline.plan_id != self._plan_id:
-            self._plan_id, self._published, self._advised = timeline.plan_id, {}, set()
+        if (timeline.plan_id, timeline.run_id) != self._run:
+            self._run, self._published = (timeline.plan_id, timeline.run_id), {}
+            self._advised = set()
         for index, view in progress.items():
             stamp = from_model.session_stamp_ns(timeline, view)
             current = index == timeline.intervals[-1].view_index or not view.complete
             key = readings_digest(view.readings, measurements.rejected)
             closed = view.end_ns <= timeline.last_stamp_ns
             ready = final or closed or view.complete
-            worth = view.readings.used or index in self._published
+            worth = view.readings.used or view.readings.rejected or index in self._published
             if ready and worth and self._published.get(index) != key:
                 self._published[index] = key
                 self._ports.publish("measurement", from_model.view_measurement(
@@ -120,7 +121,7 @@ class CollectingSession:
             # after the readings: what is called complete can be solved
             if current or index == max(progress) or final:
                 self._ports.publish("status", from_model.view_status(
-                    view, timeline.plan_id, stamp, frame_id))
+                    view, timeline.plan_id, stamp, frame_id, run_id=timeline.run_id))
             if closed or final:
                 self._advise(index, view)
 

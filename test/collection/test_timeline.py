@@ -38,6 +38,11 @@ def owners(commands, *stamps):
 WHOLE = [command(10, PLACE), command(20, MEASURE), command(30, PLACE, 1), command(40, MEASURE, 1),
          command(50, DONE, 3)]
 OUT, OLD, OTHER = Reason.OUTSIDE_VIEWS, Reason.SUPERSEDED, Reason.OTHER_PLAN
+RUN = Reason.OTHER_RUN
+
+
+def of_run(commands, run_id):
+    return [replace(c, run_id=run_id) for c in commands]
 
 
 def test_a_view_lasts_from_its_stamp_to_just_before_the_next():
@@ -82,7 +87,8 @@ def test_place_and_measure_of_one_stamp_are_taken_in_their_order():
 
 def test_a_redo_supersedes_only_its_own_view():
     redo = [*WHOLE[:-1], command(50, PLACE), command(60, MEASURE), command(70, DONE)]
-    assert owners(redo, 20, 40, 55, 60, 70) == [OLD, 1, OUT, 0, OUT]
+    assert owners(of_run(redo, "7"), 20, 40, 55, 60, 70) == [OLD, 1, OUT, 0, OUT]
+    assert build_timeline(of_run(redo, "7")).run_id == "7"
 
 
 def test_only_the_last_of_many_redos_counts():
@@ -126,3 +132,57 @@ def test_two_plates_in_one_plan_are_refused():
     with pytest.raises(InputError, match=r"^view command of '0': describes another plate than the "
                        r"rest of plan '0, 90, tx'; use one plate in one plan$"):
         build_timeline([*WHOLE[:2], odd])
+
+
+@pytest.mark.parametrize("end", [[command(50, DONE, 3)], [command(50, ABORT, 2)], []])
+def test_a_plan_that_is_started_again_is_another_run(end):
+    again = [command(60, PLACE), command(70, MEASURE)]
+    commands = [*WHOLE[:-1], *end, *again]
+    assert owners(commands, 20, 40, 65, 70) == [RUN, RUN, OUT, 0]
+    timeline = build_timeline(commands)
+    assert timeline.run_id == "60"
+    assert list(timeline.views) == [0]
+    further = [command(80, PLACE, 1), command(90, MEASURE, 1)]
+    assert owners([*commands, *further], 20, 40, 70, 90) == [RUN, RUN, 0, 1]
+    assert build_timeline(WHOLE).run_id == "10"
+
+
+def test_a_run_counts_from_its_first_measure_on():
+    assert owners([*WHOLE, command(60, PLACE)], 20, 40, 60) == [0, 1, OUT]
+
+
+def test_a_view_that_is_redone_within_a_run_is_no_other_run():
+    later = [command(60, PLACE, 1), command(70, MEASURE, 1), command(80, DONE, 3)]
+    assert owners([*WHOLE[:-1], *later], 20, 40, 70) == [0, OLD, 1]
+    assert owners([*WHOLE, *later], 20, 40, 70) == [0, OLD, 1]  # after DONE, too
+
+
+def test_without_any_place_a_second_measure_of_view_0_after_others_is_another_run():
+    commands = [command(10, MEASURE), command(20, MEASURE, 1), command(30, MEASURE)]
+    assert owners(commands, 10, 20, 30) == [RUN, RUN, 0]
+    assert owners([commands[0], replace(commands[2], stamp_ns=15)], 10, 15) == [0, 0]
+
+
+def test_runs_that_are_named_are_kept_apart_by_their_names():
+    first, second = of_run(WHOLE, "a"), [replace(c, stamp_ns=c.stamp_ns + 100, run_id="b")
+                                         for c in WHOLE[2:4]]
+    assert owners([*first, *second], 20, 40, 135, 140) == [RUN, RUN, OUT, 1]
+    assert build_timeline([*first, *second]).run_id == "b"
+    going_on = [replace(c, stamp_ns=c.stamp_ns + 100, run_id="a") for c in WHOLE[2:4]]
+    assert owners([*first, *going_on], 20, 40, 140) == [0, OLD, 1]
+
+
+def test_two_runs_may_have_two_plates_and_two_numbers_of_views():
+    other = Artifact(7, 0.01)
+    again = [command(60, PLACE, artifact=other), command(70, MEASURE, artifact=other),
+             command(80, DONE, 1, views_planned=1)]
+    again = [replace(c, views_planned=1) for c in again]
+    timeline = build_timeline([*WHOLE, *again])
+    assert (timeline.artifact, timeline.views_planned) == (other, 1)
+
+
+@given(st.permutations([*WHOLE, command(60, PLACE), command(70, MEASURE), command(80, DONE, 3)]))
+def test_the_order_of_arrival_changes_no_run(commands):
+    timeline = build_timeline(commands)
+    assert timeline.run_id == "60"
+    assert timeline == build_timeline(sorted(commands, key=lambda c: c.stamp_ns))

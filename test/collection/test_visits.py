@@ -103,9 +103,9 @@ def test_an_outlier_is_in_no_visit_and_still_ends_the_one_of_another_mark():
     again = replace(before, stamp_ns=d.stamp_ns + 100, offset_x=before.offset_x + (
         before.m - d.m) * 0.01, offset_y=before.offset_y + (before.n - d.n) * 0.01)
     cell.detections.append(again)
-    whole = collect(cell.events)[0].views[0]
+    whole = collect(cell.events, max_stage_distance=0.02)[0].views[0]
     cell.spoil(index, offset_x=d.offset_x + 2e-6)
-    spoilt = collect(cell.events)[0].views[0]
+    spoilt = collect(cell.events, max_stage_distance=0.02)[0].views[0]
     assert spoilt.rejected == {"outlier_among_repeats": 1}
     assert len(whole.visits.mark) == 101
     assert len(spoilt.visits.mark) == 100

@@ -35,7 +35,7 @@ SAMPLES = st.lists(st.tuples(TEXTS, FLOATS, FLOATS), max_size=4).flatmap(
     lambda rows: st.builds(EncoderSample, STAMPS, *(
         st.just(tuple(row[i] for row in rows)) for i in range(3))))
 ARTIFACTS = st.builds(Artifact, st.integers(1, 50).map(lambda h: 2 * h + 1),
-                      st.floats(1e-9, 1.0), st.integers(0, 90).map(lambda q: 4 * q),
+                      st.floats(1e-7, 1.0), st.integers(0, 90).map(lambda q: 4 * q),
                       st.integers(0, 50).map(lambda h: 2 * h + 1 if h else 0))
 VIEWS = st.builds(View, TEXTS, FLOATS, st.tuples(FLOATS, FLOATS), st.booleans(), st.booleans(),
                   st.integers(1, 2**32 - 1))

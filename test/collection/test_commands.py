@@ -1,0 +1,74 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Commands that no cell can follow are refused before anything is made of their numbers."""
+
+from dataclasses import replace
+
+import pytest
+
+from selfcal_ros.collection.messages import Command, Phase
+from selfcal_ros.errors import InputError
+from selfcal_ros.model.artifact import Artifact
+from test.support.collecting import collect, gathered, scene, table
+
+ODD = [
+    ({"translation_m": (1e17, 0.0)}, {}, "view '0' translation: 10000000000000000000 pitches are "
+     "beyond every field; is it in mm? give the translation in metres"),
+    ({"translation_m": (0.0, -1e300)}, {}, "view '0' translation: -"),
+    ({"grid": False, "angular": False}, {},
+     "view command 0: neither grid nor angular marks are wanted; set one to true"),
+    ({"repeats": 2**32 - 1}, {}, "view command 0: 4294967295 repeats; ask for 1 to 1000000"),
+    ({"repeats": 0}, {}, "view command 0: 0 repeats; ask for 1 to 1000000"),
+    ({}, {"view_index": 2**31}, "view command 2147483648: a plan has at most 10000 views; mend "),
+    ({}, {"views_planned": 2**32 - 1}, "view command 0: a plan has at most 10000 views; mend the"),
+    ({}, {"view": None}, "view command 0: it describes no view; fill its pose and its plate"),
+]
+
+
+@pytest.mark.parametrize(("of_view", "of_command", "message"), ODD)
+def test_a_command_with_impossible_numbers_is_refused(of_view, of_command, message):
+    cell = scene()
+    collector = gathered(cell.events)
+    measure = cell.commands[1]
+    bad = replace(measure, stamp_ns=measure.stamp_ns + 1, view=replace(measure.view, **of_view))
+    with pytest.raises(InputError) as caught:
+        collector.add_command(replace(bad, **of_command))
+    assert str(caught.value).startswith(message)
+    collector.refuse_command()
+    found, _ = collector.collect()
+    assert found.all_rejected() == {"command_unusable": 1}
+    assert table(found.views[0]) == table(collect(cell.events)[0].views[0])
+
+
+def test_limits_themselves_are_kept():
+    cell = scene(count=0)
+    measure = cell.commands[1]
+    collector = gathered([])
+    collector.add_command(replace(measure, view_index=10_000, views_planned=10_000,
+                                  view=replace(measure.view, repeats=1_000_000)))
+    collector.add_command(Command(0, Phase.ABORT, "p", 10_000))
+    collector.add_command(replace(measure, view=replace(
+        measure.view, translation_m=(1000.0, 0.0))))
+    assert collector.received["command"] == 3
+
+
+def test_a_plate_of_4001_marks_a_side_of_which_25_were_read():
+    cell = scene(count=0)
+    wide = [replace(c, artifact=Artifact(4001, 0.01)) if c.artifact else c for c in cell.commands]
+    _, progress = collect([*wide, *cell.samples, *cell.detections])
+    assert (progress[0].grid_expected, progress[0].grid_done) == (4001**2, 25)
+    assert (progress[0].missing.m[0], progress[0].missing.n[199]) == (-2000, -1801)
+
+
+@pytest.mark.parametrize("field", ["sigma", "score"])
+def test_minus_zero_is_zero(field):
+    cell = scene(repeats=2)
+    for index in range(len(cell.detections)):
+        cell.spoil(index, **{field: 0.0})
+    want, _ = collect(cell.events)
+    for index in range(0, len(cell.detections), 3):
+        cell.spoil(index, **{field: -0.0})
+    cell.detections.append(replace(cell.detections[0], **{field: 0.0}))
+    found, _ = collect(cell.events)
+    assert found.all_rejected() == {"duplicate": 1}
+    assert found.views[0].u.tobytes() == want.views[0].u.tobytes()
+    assert table(found.views[0]) == table(want.views[0])

@@ -1,0 +1,88 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which marks a view asks for, counted one by one, and which of them are missing."""
+
+import tracemalloc
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from selfcal_ros.collection.expected import (
+    NAMED_AT_MOST,
+    expected_marks,
+    first_missing,
+    mark_range,
+    missing_marks,
+)
+from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.readings import ViewReadings
+from selfcal_ros.model.view import View
+from test.support.collecting import collect, scene
+
+TURNS = st.integers(0, 3).map(lambda q: q * np.pi / 2)
+
+
+@given(st.integers(1, 4), st.integers(1, 4), TURNS, st.integers(-9, 9), st.integers(-9, 9))
+def test_the_marks_in_the_field_are_those_whose_sites_are_sites(hx, hy, turn, a, b):
+    plate = Artifact(2 * hx + 1, 0.01, 0, 2 * hy + 1)
+    view = View("v", turn, (a * 0.01, b * 0.01), angular=False)
+    i, j = view.lattice_pose(plate).site_of(plate.m, plate.n)
+    inside = (abs(i) <= hx) & (abs(j) <= hy)
+    assert expected_marks(plate, view) == (inside.sum(), 0)
+    (m_low, m_high), (n_low, n_high) = mark_range(plate, view)
+    ranged = (plate.m >= m_low) & (plate.m <= m_high) & (plate.n >= n_low) & (plate.n <= n_high)
+    np.testing.assert_array_equal(ranged, inside)
+
+
+@given(st.sets(st.integers(0, 300)), st.integers(0, 600))
+def test_the_first_missing_numbers(done, total):
+    done = np.array(sorted(number for number in done if number < total), dtype=int)
+    want = [number for number in range(total) if number not in set(done)][:NAMED_AT_MOST]
+    assert first_missing(done, total).tolist() == want
+
+
+def test_missing_marks_are_named_until_they_are_read_often_enough():
+    cell = scene("90", repeats=2)
+    lost = [cell.detections[i] for i in (cell.grid(3), cell.grid(30), cell.angular(5))]
+    cell.detections = [d for d in cell.detections if d not in lost]
+    _, progress = collect(cell.events)
+    missing = progress[0].missing
+    marks = sorted({(d.m, d.n) for d in lost if d.kind == 0})
+    assert list(zip(missing.m, missing.n, strict=True)) == marks
+    assert missing.k == (lost[2].k,)
+    assert len(marks) == progress[0].grid_expected - progress[0].grid_done
+    assert not progress[0].complete
+    whole = collect([*cell.events, *lost])[1][0]
+    assert (whole.complete, whole.missing.m, whole.missing.k) == (True, (), ())
+    assert replace(whole, artifact=None).missing.m == ()
+
+
+def test_a_large_plate_of_which_little_was_read_takes_no_room():
+    plate, view = Artifact(4001, 1e-4, 1_000_000), View("v", np.pi / 2, (3e-4, 0.0))
+    three = np.array([-2000, 0, 2000])
+    readings = ViewReadings(view, m=three, n=three - 1000, count=np.ones(3, dtype=int))
+    tracemalloc.start()
+    missing = missing_marks(plate, view, readings)
+    assert expected_marks(plate, view) == (4001 * 3998, 1_000_000)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 1_000_000
+    assert len(missing.m) == len(missing.n) == len(missing.k) == 200
+
+
+def test_a_view_of_lines_alone_lacks_no_grid_marks():
+    view = View("v", np.pi / 12, grid=False)
+    plate = Artifact(5, 0.01, 24)
+    missing = missing_marks(plate, view, ViewReadings(view, k=np.array([0, 2]),
+                                                      count_theta=np.array([1, 1])))
+    assert (missing.m, missing.n) == ((), ())
+    assert missing.k == (1, *range(3, 24))
+
+
+@pytest.mark.parametrize("shift", [5, -7, 100])
+def test_a_view_beyond_the_field_lacks_nothing(shift):
+    view = View("v", 0.0, (shift * 0.01, 0.0), angular=False)
+    assert expected_marks(Artifact(5, 0.01), view) == (0, 0)
+    assert missing_marks(Artifact(5, 0.01), view, ViewReadings(view)).m == ()
