@@ -56,7 +56,7 @@ def record(bag: Path) -> None:
 
 def entry(name: str, made: str) -> dict:
     """Return the manifest entry of a bag: digest, how it was made, what it must give."""
-    measurements, _, lost = collect_bag(BAGS / name, parameter_values(
+    measurements, _, lost, _ = collect_bag(BAGS / name, parameter_values(
         "measurement_collector", {}, "defaults"))
     expected: dict = {"rejected": measurements.all_rejected(), "lost": lost}
     try:

@@ -4,7 +4,7 @@
 import hashlib
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -22,10 +22,30 @@ MAX_SAID = 3
 """Lines of what was lost that an error repeats."""
 
 
+class BagSession(NamedTuple):
+    """What a bag gives.
+
+    Attributes
+    ----------
+    measurements : Measurements
+        The readings.
+    views : dict
+        view_index -> how far the view came.
+    lost : list of str
+        What could not be read, one line each.
+    findings : list of str
+        Why most detections of the bag, or of views, were rejected, one line each.
+    """
+
+    measurements: Measurements
+    views: dict[int, ViewProgress]
+    lost: list[str]
+    findings: list[str]
+
+
 def collect_bag(path: str | Path, values: dict[str, Any], *, namespace: str | None = None,
-                progress: Callable[[int], None] = lambda count: None,
-                ) -> tuple[Measurements, dict[int, ViewProgress], list[str]]:
-    """Return the readings in a bag, how far each view came, and what could not be read.
+                progress: Callable[[int], None] = lambda count: None) -> BagSession:
+    """Return the readings in a bag, how far each view came, and what is wrong with it.
 
     Parameters
     ----------
@@ -63,13 +83,15 @@ def collect_bag(path: str | Path, values: dict[str, Any], *, namespace: str | No
             raise NoDataError(str(path), f"no message on {topic}{tail}",
                               "record this topic too, see the README")
     measurements, views = collector.collect()
+    findings = [(f"view '{views[index].view.name}': " if index is not None else "") + str(finding)
+                for index, finding in collector.findings(measurements, views).items()]
     if not any(view.used for view in measurements.views):
         reasons = ", ".join(f"{reason} {count}" for reason, count in
                             sorted(measurements.all_rejected().items(), key=lambda i: -i[1])[:4])
         raise NoDataError(str(path), f"none of {received['detection']} detections became a "
                           f"reading (rejected: {reasons}){tail}",
-                          "mend the cause that is named first")
-    return measurements, views, reader.lost
+                          findings[0] if findings else "mend the cause that is named first")
+    return BagSession(measurements, views, reader.lost, findings)
 
 
 def feeder(collector: Collector, complaints: list[str]) -> dict[str, Callable[[Any], None]]:

@@ -100,9 +100,10 @@ def run(args: argparse.Namespace) -> int:
     check_outputs([args.bag, args.params], [args.output])
     collector_values, solver_values = parameters(args)
     with progress_bar("reading") as bar:
-        measurements, _, lost = collect_bag(args.bag, collector_values, namespace=args.namespace,
-                                            progress=lambda count: bar(count, None))
-    for line in (*lost, *advice(measurements.all_rejected())):
+        measurements, _, lost, findings = collect_bag(
+            args.bag, collector_values, namespace=args.namespace,
+            progress=lambda count: bar(count, None))
+    for line in (*findings, *lost, *(() if findings else advice(measurements.all_rejected()))):
         print(f"selfcal solve: {args.bag}: {line}", file=sys.stderr)
     options = solver_options(solver_values)
     try:
@@ -115,6 +116,9 @@ def run(args: argparse.Namespace) -> int:
         if args.output and error.observability is not None:
             result = unidentified_result(measurements, error.observability)
             write_json(args.output, result_to_dict(with_input(result, bag_input(args.bag), lost)))
+        if findings:  # what the plan lacks is told by readings that are not there
+            raise NotIdentifiableError(f"{args.bag}: {findings[0]}; mend this first (as it is: "
+                                       f"{error})", error.observability) from error
         raise
     result, lines = _extended(args, measurements, options, result)
     result = created_now(with_input(result, bag_input(args.bag), lost))

@@ -12,7 +12,9 @@ from typing import Any
 
 import numpy as np
 
+from selfcal_ros.collection.diagnosis import Finding
 from selfcal_ros.collection.encoder import JointTrack, TrackLimits
+from selfcal_ros.collection.evidence import EncoderFacts, Seen
 from selfcal_ros.collection.expected import Missing, expected_marks, missing_marks
 from selfcal_ros.collection.exposures import Exposures, Tracks, look_up
 from selfcal_ros.collection.identify import IdentityRules
@@ -24,6 +26,9 @@ from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Measurements, Sense, ViewReadings
 from selfcal_ros.model.view import View
+
+MOST_NAMES = 20
+"""Names of foreign joints that are remembered."""
 
 
 @dataclass(frozen=True)
@@ -94,6 +99,8 @@ class Collector:
         self._commands: dict[Command, None] = {}
         self._rejected_input: Counter = Counter()
         self._timeline: Timeline | None = None
+        self._foreign: dict[str, None] = {}  # joint names that are not ours
+        self._seen: Seen | None = None
         self.received = {"encoder": 0, "detection": 0, "command": 0}
 
     def add_encoder(self, sample: EncoderSample) -> None:
@@ -107,6 +114,8 @@ class Collector:
         for name, position, speed in zip(sample.names, sample.positions, velocities, strict=True):
             joint = self._joints.get(name)
             if joint is None:
+                if len(self._foreign) < MOST_NAMES:
+                    self._foreign[name] = None
                 continue
             known = True
             if math.isfinite(position):
@@ -178,9 +187,33 @@ class Collector:
         for index, view in timeline.views.items():
             progress[index] = self._progress(timeline, index, view, table[view_of == index],
                                              exposures, scored=scored)
+        stamps = [command.stamp_ns for command in self._commands]
+        self._seen = Seen(table, view_of, exposures, self._facts(), (min(stamps), max(stamps)),
+                          timeline.artifact, self._rules.identity, self.sense)
         views = tuple(item.readings for item in progress.values())
         return Measurements(timeline.plan_id, timeline.artifact, views, self.sense,
                             dict(sorted(loose.items())), timeline.run_id), progress
+
+    def findings(self, measurements: Measurements,
+                 progress: dict[int, ViewProgress]) -> dict[int | None, Finding]:
+        """Return what spoilt most detections of the session (key None), else of single views.
+
+        `measurements` and `progress` are what `collect` returned last.
+        """
+        if self._seen is None:
+            return {}
+        return self._seen.findings({index: view.readings for index, view in progress.items()},
+                                   measurements.rejected)
+
+    def _facts(self) -> EncoderFacts:
+        """Return what came of the encoder."""
+        tracks = {axis: getattr(self.tracks, axis) for axis in self._joints.values()}
+        spans = [track.span() for track in tracks.values() if len(track)]
+        return EncoderFacts(
+            {axis: name for name, axis in self._joints.items()},
+            {axis: len(track) > 0 for axis, track in tracks.items()}, tuple(self._foreign),
+            (min(s[0] for s in spans), max(s[1] for s in spans)) if spans else None,
+            self.tracks.x.usual_step_s(), self.tracks.x.limits.max_gap_ns / 1e9)
 
     def _progress(self, timeline: Timeline, index: int, view: View, detections: np.ndarray,
                   exposures: Exposures, *, scored: bool) -> ViewProgress:

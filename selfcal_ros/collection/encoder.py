@@ -46,6 +46,16 @@ class JointTrack:
         self._speeds.append(speed)
         self._sorted = self._noise = None
 
+    def span(self) -> tuple[int, int]:
+        """Return the first and the last stamp; there must be samples."""
+        t = self._series()[0]
+        return int(t[0]), int(t[-1])
+
+    def usual_step_s(self) -> float:
+        """Return the median time between the last samples, NaN with fewer than two."""
+        t = self._series()[0][-1000:] if len(self) else np.zeros(0)
+        return float(np.median(np.diff(t)) / 1e9) if len(t) > 1 else float("nan")
+
     def _difference(self, a: np.ndarray) -> np.ndarray:
         return np.remainder(a + np.pi, 2 * np.pi) - np.pi if self.limits.wraps else a
 

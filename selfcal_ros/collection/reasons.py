@@ -39,6 +39,34 @@ ADVICE = {
 }
 """What to do about a reason that is mended in the plan or in the parameters, one line each."""
 
+REMEDY = {
+    Reason.NO_ENCODER: "the encoder has a gap around the exposures; let it send without gaps, or "
+                       "raise max_encoder_gap",
+    Reason.MOVING: "the stage moved at the exposure; expose at rest, stamp the exposure itself, or "
+                   "raise max_speed and max_angular_speed",
+    Reason.OUTSIDE_VIEWS: "they were exposed when no view was being measured; expose between "
+                          "MEASURE and the next command, stamped by one clock",
+    Reason.CONTRADICTION: "encoder samples contradict each other; let one source publish the "
+                          "joints, with a clock that does not step",
+    Reason.NOT_FINITE: "NaN, infinite or negative where a length or an angle is wanted; mend the "
+                       "publisher of the detections",
+    Reason.UNKNOWN_KIND: "kind is neither GRID nor ANGULAR; mend the publisher of the detections",
+    Reason.UNKNOWN_MARK: "their ids are not on the plate; check grid_size, angular_count and the "
+                         "numbering of the marks (m, n from -h to h, k from 0)",
+    Reason.NOT_IN_VIEW: "the view does not ask for these marks; check its pose and its kinds of "
+                        "marks in the plan",
+    Reason.AMBIGUOUS: "two marks are about equally near; let the detections carry ids",
+    Reason.ROTATION: ADVICE[Reason.ROTATION],
+    Reason.TOO_FAR: "the marks are not where the view has them; check how the plate lies, the unit "
+                    "of the offsets (m, stage axes) and the ids, or raise max_deviation",
+    Reason.NOT_AT_MARK: "the stage does not stand at the marks that are seen; check joint_x, "
+                        "joint_y and measurement_sense, or set max_stage_distance",
+    Reason.LOW_SCORE: "their score is below min_score; mend the detection, or lower min_score",
+    Reason.OUTLIER: "repeats of a mark contradict each other; check that each id is of one mark, "
+                    "or raise outlier_limit",
+}
+"""What to do when most detections are rejected for a reason; reasons not here are no fault."""
+
 
 def advice(rejected: Mapping[str, int]) -> list[str]:
     """Return one line for each reason in `rejected` that has an advice, with its count."""

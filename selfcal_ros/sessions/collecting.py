@@ -31,6 +31,7 @@ class CollectingSession:
         self._dirty, self._next_status = False, 0.0
         self._published: dict[int, str] = {}
         self._run, self._advised = ("", ""), set()
+        self._warned: set[tuple[int | None, str]] = set()
         self.missed: dict[tuple[str, int], str] = {}  # views that began before this node
         self._placed: set[tuple[str, int]] = set()
         self._problem = ""
@@ -106,7 +107,7 @@ class CollectingSession:
         timeline, frame_id = self.collector.timeline, self._values["frame_id"]
         if (timeline.plan_id, timeline.run_id) != self._run:
             self._run, self._published = (timeline.plan_id, timeline.run_id), {}
-            self._advised = set()
+            self._advised, self._warned = set(), set()
         for index, view in progress.items():
             stamp = from_model.session_stamp_ns(timeline, view)
             current = index == timeline.intervals[-1].view_index or not view.complete
@@ -124,6 +125,15 @@ class CollectingSession:
                     view, timeline.plan_id, stamp, frame_id, run_id=timeline.run_id))
             if closed or final:
                 self._advise(index, view)
+        self._warn(measurements, progress)
+
+    def _warn(self, measurements: Measurements, progress: dict[int, ViewProgress]) -> None:
+        """Say once for each view and reason that most of its detections were rejected."""
+        for index, finding in self.collector.findings(measurements, progress).items():
+            if (index, finding.reason) not in self._warned:
+                self._warned.add((index, finding.reason))
+                where = f"view '{progress[index].view.name}': " if index is not None else ""
+                self._ports.say(Level.WARN, f"{where}{finding}")
 
     def _advise(self, index: int, view: ViewProgress) -> None:
         """Say once for each view that is over what would mend its rejections."""

@@ -35,7 +35,7 @@ def expected(events):
 
 
 def solved(path, **more):
-    measurements, _, lost = collect_bag(path, VALUES, **more)
+    measurements, _, lost, _ = collect_bag(path, VALUES, **more)
     return result_to_dict(calibrate(measurements, Options())), lost
 
 

@@ -145,6 +145,19 @@ def test_nothing_usable(tmp_path, capsys, events):
     count = len([e for e in events if isinstance(e, Detection)])
     assert (f"none of {count} detections became a reading (rejected: no_encoder_sample_near "
             f"{count})") in line
+    assert line.strip().endswith("the detections are stamped about 1000 s after the encoder "
+                                 "samples; let both be stamped by one clock")
+
+
+def test_a_wrong_sense_is_said_before_any_advice_on_views(capsys):
+    assert main(["solve", "bags/hu_noise", "--sense", "plate_moves"]) == 3
+    first, last = capsys.readouterr().err.splitlines()
+    for line in (first, last):
+        assert line.startswith(
+            "selfcal solve: bags/hu_noise: 1745 of 2240 detections were rejected as "
+            "stage_not_at_mark: the stage is indicated at minus the marks' sites; the sense is the "
+            "other one: measurement_sense microscope_moves (--sense microscope_moves)")
+    assert "mend this first (as it is: the marks that were read do not identify the stage" in last
 
 
 def check_keys(found):
@@ -198,10 +211,11 @@ def params(tmp_path, **nodes):
 def test_parameters_reach_collector_and_solver_and_options_win(tmp_path, capsys, bag):
     path = params(tmp_path, solver={"theta_datum": "zero_mean"},
                   measurement_collector={"measurement_sense": "plate_moves"})
-    # but for what lies at the origin, where the sense makes no difference, nothing is read
-    by_file = refused(capsys, 3, bag, "--params", path)
-    assert by_file == refused(capsys, 3, bag, "--sense", "plate_moves")
-    assert by_file.startswith("the marks that were read do not identify the stage")
+    assert solve(bag, "--params", path) == 3
+    by_file = capsys.readouterr().err
+    assert solve(bag, "--sense", "plate_moves") == 3
+    assert by_file == capsys.readouterr().err
+    assert "129 of 198 detections were rejected as stage_not_at_mark: the stage is" in by_file
     sense = ("--sense", "microscope_moves")
     zero_mean = result_of(tmp_path, bag, "--params", path, *sense)
     assert zero_mean == result_of(tmp_path, bag, "--theta-datum", "zero_mean")

@@ -16,8 +16,10 @@ def test_lines_that_cannot_be_told_apart_are_said_with_their_mend(tmp_path, caps
     path = Foreign().write(tmp_path / "x.mcap", events)
     code = main(["solve", str(path), "--quiet"])
     first, *rest = capsys.readouterr().err.splitlines()
-    assert first.startswith(f"selfcal solve: {path}: 96 detections rejected as rotation_not_known:")
+    finding = "96 of 96 detections were rejected as rotation_not_known: the view's rotation is not"
+    assert first.startswith(f"selfcal solve: {path}: view 'line': {finding}")
     assert code == 3 and len(rest) == 1  # the view of lines alone is what identifies theta
+    assert rest[0].startswith(f"selfcal solve: {path}: view 'line': {finding}")
     mended = tmp_path / "p.yaml"
     mended.write_text("measurement_collector: {ros__parameters: {max_rotation: 0.02}}\n")
     assert main(["solve", str(path), "--quiet", "--params", str(mended)]) == 0

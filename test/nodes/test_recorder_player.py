@@ -32,7 +32,7 @@ def content(bag: Path) -> Counter:
 
 
 def digests(bag: Path) -> list[str]:
-    measurements, _, _ = collect_bag(bag, parameter_values("measurement_collector", {}, "test"))
+    measurements, _, _, _ = collect_bag(bag, parameter_values("measurement_collector", {}, "test"))
     return [readings_digest(view, {}) for view in measurements.views]
 
 

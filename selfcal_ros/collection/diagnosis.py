@@ -1,0 +1,204 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Why most detections were rejected, in one line that says what to mend.
+
+A wrong parameter or a wrong clock spoils nearly all detections at once, and each is rejected for a
+reason of its own that does not name it. Here the rejections are looked at together.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from itertools import product
+
+import numpy as np
+
+from selfcal_ros.collection.reasons import REMEDY, Reason
+from selfcal_ros.model.readings import Sense
+
+MOST = 0.5
+"""Part of the detections beyond which one reason of rejection is a matter of its own."""
+AT_LEAST = 5
+"""Detections below which nothing is said."""
+SCALES = {1.0: "", 1e3: "1000 times what the marks ask for: they are in mm",
+          1e-3: "a thousandth of what the marks ask for: they are in km, or their unit is unknown",
+          1e6: "a million times what the marks ask for: they are in µm"}
+"""Indicated position over true position -> what it means."""
+PLACED = (Reason.NOT_AT_MARK, Reason.TOO_FAR, Reason.MOVING, Reason.CONTRADICTION,
+          Reason.NOT_IN_VIEW, Reason.AMBIGUOUS, Reason.OUTLIER, Reason.ROTATION)
+"""Reasons behind which the stage may stand where no mark is."""
+
+Span = tuple[int, int] | None
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """What is known of the detections of a view, or of a session.
+
+    Attributes
+    ----------
+    rejected : dict
+        Reason -> number of detections.
+    used : int
+        Detections that became readings.
+    missing_joints, seen_joints : tuple of str
+        Names of needed joints without any sample, and other names in the encoder messages.
+    detections_ns, encoder_ns, commands_ns : tuple of int or None
+        First and last stamp of each.
+    encoder_step_s, max_gap_s : float
+        Usual time between encoder samples (NaN = not known), and the largest that is allowed.
+    stage_m, site_m : float array (2, n)
+        Indicated positions at grid detections with ids, and the nominal sites of their marks.
+    pitch_m, limit_m : float
+        Distance between marks, and from a mark's site at which the stage still stands at it.
+    sense : Sense
+        Sense of measurement.
+    """
+
+    rejected: Mapping[str, int]
+    used: int
+    missing_joints: tuple[str, ...] = ()
+    seen_joints: tuple[str, ...] = ()
+    detections_ns: Span = None
+    encoder_ns: Span = None
+    commands_ns: Span = None
+    encoder_step_s: float = float("nan")
+    max_gap_s: float = 0.0
+    stage_m: np.ndarray = field(default_factory=lambda: np.zeros((2, 0)))
+    site_m: np.ndarray = field(default_factory=lambda: np.zeros((2, 0)))
+    pitch_m: float = 0.0
+    limit_m: float = 0.0
+    sense: Sense = Sense.MICROSCOPE_MOVES
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One reason for which most detections were rejected: counts, cause and what to do."""
+
+    reason: str
+    count: int
+    total: int
+    text: str
+
+    def __str__(self) -> str:
+        """Return it as one line."""
+        return (f"{self.count} of {self.total} detections were rejected as {self.reason}: "
+                f"{self.text}")
+
+
+def main_reason(rejected: Mapping[str, int], used: int) -> tuple[str, int, int] | None:
+    """Return the reason of most rejections, its count, and the detections that count; or None.
+
+    Detections of other runs and plans, redone views, and duplicates are as they should be.
+    """
+    bad = {reason: count for reason, count in rejected.items() if reason in REMEDY}
+    total = used + sum(bad.values())
+    if total < AT_LEAST or not bad:
+        return None
+    reason = max(sorted(bad), key=lambda name: bad[name])
+    return (reason, bad[reason], total) if bad[reason] > MOST * total else None
+
+
+def diagnose(evidence: Evidence) -> Finding | None:
+    """Return what spoilt most of the detections; None where no reason stands out."""
+    found = main_reason(evidence.rejected, evidence.used)
+    if found is None:
+        return None
+    reason, count, total = found
+    cause = None
+    if reason == Reason.NO_ENCODER:
+        cause = _joints(evidence) or _clock(evidence) or _rate(evidence)
+    elif reason == Reason.OUTSIDE_VIEWS:
+        cause = _command_clock(evidence)
+    elif reason in PLACED:
+        cause = _stage(evidence)
+    return Finding(reason, count, total, cause or REMEDY[Reason(reason)])
+
+
+def _joints(e: Evidence) -> str | None:
+    if not e.missing_joints:
+        return None
+    seen = ", ".join(repr(name) for name in e.seen_joints) or "none"
+    missing = ", ".join(repr(name) for name in e.missing_joints)
+    return (f"no encoder sample of the joint {missing} came; names that came: {seen}; set joint_x, "
+            "joint_y, joint_theta")
+
+
+def _clock(e: Evidence) -> str | None:
+    if e.detections_ns is None or e.encoder_ns is None:
+        return None
+    (first, last), (begin, end) = e.detections_ns, e.encoder_ns
+    if first <= end and last >= begin:
+        return None
+    offset = (last - end) / 1e9
+    return (f"the detections are stamped about {_seconds(offset)} "
+            f"{'after' if offset > 0 else 'before'} the encoder samples; let both be stamped by "
+            "one clock")
+
+
+def _rate(e: Evidence) -> str | None:
+    if not e.encoder_step_s > e.max_gap_s:
+        return None
+    return (f"the encoder sends a sample every {e.encoder_step_s:.3g} s, and max_encoder_gap is "
+            f"{e.max_gap_s:g} s; send more, or raise max_encoder_gap")
+
+
+def _command_clock(e: Evidence) -> str | None:
+    if e.detections_ns is None or e.commands_ns is None:
+        return None
+    (first, last), (begin, end) = e.detections_ns, e.commands_ns
+    if first <= end and last >= begin:
+        return None
+    offset = (first - begin if last < begin else last - end) / 1e9
+    return (f"all detections are stamped {'before the first' if offset < 0 else 'after the last'} "
+            f"view command, about {_seconds(offset)} off; let the cell and the sequencer have one "
+            "clock")
+
+
+def _seconds(offset_s: float) -> str:
+    return f"{abs(offset_s):.0f} s" if abs(offset_s) >= 10 else f"{abs(offset_s):.2g} s"
+
+
+def _stage(e: Evidence) -> str | None:
+    """Return why the stage does not stand where the marks are, None if it does or cannot tell."""
+    where = e.stage_m * (-1 if e.sense is Sense.PLATE_MOVES else 1)
+    if where.shape[1] < AT_LEAST or (np.ptp(e.site_m, axis=1) < e.pitch_m).any():
+        return None
+    if _away(where, e) <= e.limit_m:
+        return None
+    for scale, swapped, signs in product(SCALES, (False, True), ((1, 1), (-1, -1), (-1, 1),
+                                                                 (1, -1))):
+        tried = (where[::-1] if swapped else where) * np.array(signs)[:, None] / scale
+        if _away(tried, e) <= e.limit_m:
+            return _said(scale, swapped=swapped, signs=signs, sense=e.sense)
+    middle = np.median(where, axis=1)
+    if np.quantile(np.hypot(*(where - middle[:, None])), 0.9) < e.pitch_m / 4:
+        return (f"the stage did not move: it is indicated at x = {middle[0]:.6g} m, y = "
+                f"{middle[1]:.6g} m at all of them; name the joints that move, in joint_x and "
+                "joint_y")
+    return (f"the stage stands {_away(where, e):.3g} m from the sites of the marks that are seen "
+            "(median); check joint_x and joint_y, the ids of the marks and how the plate lies")
+
+
+def _away(where: np.ndarray, e: Evidence) -> float:
+    """Return the median distance from the sites, of marks that are not at the centre."""
+    outer = np.hypot(*e.site_m) > e.pitch_m / 4
+    return float(np.median(np.hypot(*(where - e.site_m))[outer]))
+
+
+def _said(scale: float, *, swapped: bool, signs: tuple[int, int], sense: Sense) -> str:
+    """Return what is wrong and what to set, for a combination that fits."""
+    what, remedy = [], []
+    if SCALES[scale]:
+        what.append(f"the indicated positions are {SCALES[scale]}")
+        remedy.append("publish joint positions in metres")
+    if swapped:
+        what.append("x and y are exchanged")
+        remedy.append("exchange joint_x and joint_y")
+    if signs == (-1, -1):
+        other = next(s for s in Sense if s is not sense)
+        what.append("the stage is indicated at minus the marks' sites")
+        remedy.append(f"the sense is the other one: measurement_sense {other} (--sense {other})")
+    elif signs != (1, 1):
+        axis = "x" if signs[0] < 0 else "y"
+        what.append(f"{axis} is indicated with the wrong sign")
+        remedy.append(f"turn the sign of {axis}")
+    return f"{' and '.join(what)}; {', and '.join(remedy)}"

@@ -1,0 +1,164 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What spoilt most detections is named, with numbers and what to set, each cause by itself."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from selfcal_ros.collection.diagnosis import Evidence, diagnose, main_reason
+from selfcal_ros.collection.reasons import REMEDY, Reason
+from selfcal_ros.model.readings import Sense
+from test.support.collecting import gathered, scene
+
+S = 1_000_000_000
+
+
+def findings(events, **parameters):
+    """Return view_index (None = all) -> the line that is said."""
+    collector = gathered(events, **parameters)
+    return {index: str(finding)
+            for index, finding in collector.findings(*collector.collect()).items()}
+
+
+def with_positions(cell, change):
+    """Let every encoder sample indicate change(x, y)."""
+    cell.samples = [replace(s, positions=(*change(*s.positions[:2]), s.positions[2]))
+                    for s in cell.samples]
+    return cell.events
+
+
+def test_nothing_is_said_of_good_readings():
+    assert findings(scene("0, 90", repeats=2).events) == {}
+    assert findings(scene(with_ids=False).events) == {}
+
+
+def test_joints_of_other_names_are_named():
+    cell = scene(count=0)
+    cell.samples = [replace(s, names=("X1", "Y1", "theta")) for s in cell.samples]
+    assert findings(cell.events) == {None: (
+        "25 of 25 detections were rejected as no_encoder_sample_near: no encoder sample of the "
+        "joint 'x', 'y' came; names that came: 'X1', 'Y1'; set joint_x, joint_y, joint_theta")}
+    cell.samples = [replace(s, names=("x", "Y1", "theta")) for s in cell.samples]
+    assert "of the joint 'y' came; names that came: 'Y1';" in findings(cell.events)[None]
+    cell.samples = []
+    assert "of the joint 'x', 'y' came; names that came: none;" in findings(cell.events)[None]
+
+
+def test_an_angle_that_is_not_there_is_missed_by_lines_alone():
+    cell = scene("0", line=True)
+    cell.samples = [replace(s, names=("x", "y", "rz")) for s in cell.samples]
+    found = findings(cell.events)
+    assert list(found) == [1]
+    assert found[1].startswith("8 of 8 detections were rejected as no_encoder_sample_near: no "
+                               "encoder sample of the joint 'theta' came; names that came: 'rz';")
+
+
+@pytest.mark.parametrize("sense", list(Sense))
+def test_the_other_sense(sense):
+    other = next(s for s in Sense if s is not sense)
+    assert findings(scene(count=0, sense=sense).events, measurement_sense=str(other)) == {None: (
+        "24 of 25 detections were rejected as stage_not_at_mark: the stage is indicated at minus "
+        f"the marks' sites; the sense is the other one: measurement_sense {sense} "
+        f"(--sense {sense})")}
+
+
+@pytest.mark.parametrize(("change", "text"), [
+    (lambda x, y: (y, x), "x and y are exchanged; exchange joint_x and joint_y"),
+    (lambda x, y: (-x, y), "x is indicated with the wrong sign; turn the sign of x"),
+    (lambda x, y: (x, -y), "y is indicated with the wrong sign; turn the sign of y"),
+    (lambda x, y: (1e3 * x, 1e3 * y), "the indicated positions are 1000 times what the marks ask "
+     "for: they are in mm; publish joint positions in metres"),
+    (lambda x, y: (1e6 * x, 1e6 * y), "a million times what the marks ask for: they are in µm"),
+    (lambda x, y: (1e-3 * x, 1e-3 * y), "a thousandth of what the marks ask for"),
+    (lambda x, y: (1e3 * y, 1e3 * x), "they are in mm and x and y are exchanged; publish joint "
+     "positions in metres, and exchange joint_x and joint_y")])
+def test_positions_that_are_not_what_they_should_be(change, text):
+    found = findings(with_positions(scene(count=0, servo_sigma_m=0.0), change))[None]
+    assert text in found
+    assert "of 25 detections were rejected as stage_not_at_mark" in found
+
+
+def test_mm_are_named_though_the_stage_seems_to_jump():
+    rng = np.random.default_rng(1)
+    found = findings(with_positions(scene(count=0), lambda x, y: tuple(
+        1e3 * np.array([x, y]) + rng.normal(0, 2e-4, 2))))[None]
+    assert "rejected as encoder_contradiction: the indicated positions are 1000 times" in found
+    assert "they are in mm" in found
+
+
+def test_a_parked_stage():
+    found = findings(with_positions(scene(count=0), lambda x, y: (0.0301, -0.002)))[None]
+    assert found == (
+        "25 of 25 detections were rejected as stage_not_at_mark: the stage did not move: it is "
+        "indicated at x = 0.0301 m, y = -0.002 m at all of them; name the joints that move, in "
+        "joint_x and joint_y")
+
+
+def test_positions_that_nothing_explains():
+    found = findings(with_positions(scene(count=0), lambda x, y: (x + 0.05, 2 * y)))[None]
+    assert "the stage stands 0.0" in found
+    assert "m from the sites of the marks that are seen (median); check joint_x" in found
+
+
+@pytest.mark.parametrize(("ahead_s", "side"), [(37.0, "after"), (-3600.0, "before")])
+def test_a_clock_of_its_own(ahead_s, side):
+    cell = scene(count=0)
+    shift = round(ahead_s * S)
+    cell.samples = [replace(s, stamp_ns=s.stamp_ns - shift) for s in cell.samples]
+    assert findings(cell.events) == {None: (
+        "25 of 25 detections were rejected as no_encoder_sample_near: the detections are stamped "
+        f"about {abs(ahead_s):g} s {side} the encoder samples; let both be stamped by one clock")}
+
+
+@pytest.mark.parametrize(("ahead_s", "side"), [(37.0, "after the last"),
+                                               (-37.0, "before the first")])
+def test_commands_by_another_clock(ahead_s, side):
+    cell = scene(count=0)
+    cell.commands = [replace(c, stamp_ns=c.stamp_ns - round(ahead_s * S)) for c in cell.commands]
+    found = findings(cell.events)[None]
+    assert found.startswith("25 of 25 detections were rejected as outside_every_view: all "
+                            f"detections are stamped {side} view command, about 37 s off; let")
+
+
+def test_an_encoder_that_sends_too_seldom():
+    cell = scene(count=0, exposure_period_s=0.2)
+    cell.samples = cell.samples[::75]
+    assert findings(cell.events)[None].endswith(
+        "the encoder sends a sample every 0.15 s, and max_encoder_gap is 0.1 s; send more, or "
+        "raise max_encoder_gap")
+
+
+def test_a_view_is_named_where_the_session_as_a_whole_is_good():
+    cell = scene("0, 90, 180", count=0)
+    begin = cell.commands[2].stamp_ns
+    end = cell.commands[4].stamp_ns
+    for index, d in enumerate(cell.detections):
+        if begin < d.stamp_ns < end:
+            cell.spoil(index, m=77)
+    assert findings(cell.events) == {1: "25 of 25 detections were rejected as unknown_mark: "
+                                     + REMEDY[Reason.UNKNOWN_MARK]}
+
+
+def test_what_is_no_fault_does_not_count():
+    rejected = {"superseded_by_redo": 90, "other_run": 50, "duplicate": 70, "stage_moving": 6}
+    assert main_reason(rejected, 6) is None
+    assert main_reason(rejected, 5) == ("stage_moving", 6, 11)
+    assert main_reason({"stage_moving": 4}, 0) is None
+    assert main_reason({"stage_moving": 5}, 0) == ("stage_moving", 5, 5)
+    assert main_reason({"encoder_sample_not_finite": 50}, 0) is None
+    assert diagnose(Evidence(rejected, 6)) is None
+
+
+@pytest.mark.parametrize("reason", list(REMEDY))
+def test_every_reason_has_its_remedy_without_further_evidence(reason):
+    finding = diagnose(Evidence({str(reason): 9}, 1))
+    assert str(finding) == f"9 of 10 detections were rejected as {reason}: {REMEDY[reason]}"
+    assert "\n" not in str(finding)
+
+
+def test_marks_on_one_line_do_not_tell_x_from_y():
+    site = np.stack([np.arange(-5, 6) * 0.01, np.zeros(11)])
+    told = diagnose(Evidence({"stage_not_at_mark": 10}, 0, stage_m=-site, site_m=site,
+                             pitch_m=0.01, limit_m=0.006))
+    assert told.text == REMEDY[Reason.NOT_AT_MARK]

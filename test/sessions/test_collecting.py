@@ -1,0 +1,98 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the collector publishes and says while messages come, without any middleware."""
+
+from dataclasses import replace
+
+import pytest
+
+from selfcal_ros.collection.messages import Command, Detection
+from selfcal_ros.collection.parameters import parameter_values
+from selfcal_ros.model.readings import Sense
+from selfcal_ros.sessions.collecting import CollectingSession
+from selfcal_ros.sessions.ports import Level, Ports
+from test.support.collecting import scene
+
+
+class Cell:
+    """A session, what it published and said, and a clock that moves by itself."""
+
+    def __init__(self, **parameters):
+        self.published, self.said, self.now = [], [], 0.0
+        values = parameter_values("measurement_collector", parameters, "test")
+        self.session = CollectingSession(values, Ports(
+            lambda output, fields: self.published.append((output, fields)),
+            lambda level, line: self.said.append((level, line)), self._now, lambda: 0))
+
+    def _now(self):
+        self.now += 1e-3
+        return self.now
+
+    def feed(self, events):
+        collector = self.session.collector
+        for event in events:
+            (collector.add_command if isinstance(event, Command) else collector.add_detection
+             if isinstance(event, Detection) else collector.add_encoder)(event)
+        self.now += 10.0
+        self.session._dirty = True
+        self.session.tick()
+        return self
+
+    def of(self, output):
+        return [fields for name, fields in self.published if name == output]
+
+
+def test_a_wrong_sense_is_said_once_while_the_view_is_measured():
+    cell, events = Cell(), scene(count=0, sense=Sense.PLATE_MOVES)
+    half = events.detections[12].stamp_ns
+    cell.feed(e for e in events.events if e.stamp_ns < half)
+    assert [level for level, _ in cell.said] == [Level.WARN]
+    assert cell.said[0][1].startswith("12 of 12 detections were rejected as stage_not_at_mark: the "
+                                      "stage is indicated at minus the marks' sites; the sense is")
+    cell.feed(e for e in events.events if e.stamp_ns >= half)
+    assert len(cell.said) == 1
+
+
+def test_a_view_of_which_all_was_rejected_is_published_as_it_is_offline():
+    cell, events = Cell(), scene("0, 90", count=0)
+    for index in range(25):
+        events.spoil(index, m=77)
+    cell.feed(events.events)
+    rejected, good = cell.of("measurement")
+    assert (rejected["view_index"], rejected["m"].size) == (0, 0)
+    assert (rejected["reject_reasons"], rejected["reject_counts"]) == (["unknown_mark"], [25])
+    assert good["detections_used"] == 25
+    assert cell.said[0][1].startswith("view '0': 25 of 25 detections were rejected as unknown_mark")
+
+
+def test_a_view_of_which_nothing_came_is_not_published():
+    events = scene("0, 90", count=0)
+    begin = next(c for c in events.commands if c.view_index == 1).stamp_ns
+    cell = Cell().feed(e for e in events.events
+                       if isinstance(e, Command) or e.stamp_ns > begin)
+    assert [fields["view_index"] for fields in cell.of("measurement")] == [1]
+
+
+def test_status_names_the_run_and_what_is_missing():
+    events = scene(count=0)
+    events.commands = [replace(c, run_id="77") for c in events.commands]
+    lost = events.detections.pop(7)
+    status = Cell().feed(events.events).of("status")[-1]
+    assert (status["missing_m"], status["missing_n"]) == ([lost.m], [lost.n])
+    assert (status["run_id"], status["complete"]) == ("77", False)
+
+
+@pytest.mark.parametrize("run_id", ["", "b"])
+def test_a_second_run_is_published_anew(run_id):
+    events = scene("0, 90", count=0)
+    cell = Cell().feed(events.events)
+    first = cell.of("measurement")
+    later = [replace(e, stamp_ns=e.stamp_ns + 10**12) for e in events.events]
+    later = [replace(e, run_id=run_id) if isinstance(e, Command) else e for e in later]
+    begin = next(e.stamp_ns for e in later if isinstance(e, Command) and e.view_index == 1)
+    cell.feed(e for e in later if e.stamp_ns < begin)
+    second = cell.of("measurement")[len(first):]
+    assert [fields["view_index"] for fields in first] == [0, 1]
+    assert [fields["view_index"] for fields in second] == [0]
+    assert first[0]["run_id"] != second[0]["run_id"] == (run_id or str(
+        events.commands[0].stamp_ns + 10**12))
+    assert second[0]["session_reject_reasons"] == ["other_run"]
