@@ -108,6 +108,7 @@ class CollectingSession:
         if (timeline.plan_id, timeline.run_id) != self._run:
             self._run, self._published = (timeline.plan_id, timeline.run_id), {}
             self._advised, self._warned = set(), set()
+        self._warn(measurements, progress)
         for index, view in progress.items():
             stamp = from_model.session_stamp_ns(timeline, view)
             current = index == timeline.intervals[-1].view_index or not view.complete
@@ -125,7 +126,6 @@ class CollectingSession:
                     view, timeline.plan_id, stamp, frame_id, run_id=timeline.run_id))
             if closed or final:
                 self._advise(index, view)
-        self._warn(measurements, progress)
 
     def _warn(self, measurements: Measurements, progress: dict[int, ViewProgress]) -> None:
         """Say once for each view and reason that most of its detections were rejected."""
@@ -137,7 +137,9 @@ class CollectingSession:
 
     def _advise(self, index: int, view: ViewProgress) -> None:
         """Say once for each view that is over what would mend its rejections."""
-        lines = advice(view.readings.rejected) if index not in self._advised else []
+        rejected = {reason: count for reason, count in view.readings.rejected.items()
+                    if not {(index, reason), (None, reason)} & self._warned}
+        lines = advice(rejected) if index not in self._advised else []
         for line in lines:
             self._ports.say(Level.WARN, f"view '{view.view.name}': {line}")
             self._advised.add(index)
