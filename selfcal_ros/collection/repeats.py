@@ -9,6 +9,8 @@ repeats that contradict each other both are outliers: neither can be believed. S
 of a mark of which fewer than half are left: the median of a mark whose repeats are mostly
 outliers is itself an outlier, and would be kept in place of the good one.
 Of clean Gaussian readings fewer than 1 in 100,000 are rejected (test_repeats.py).
+Where most pairs agree to the bit and the others differ by whole steps of one size, the step is that
+of a sensor which resolves no finer, and a few steps are no outlier.
 """
 
 from dataclasses import dataclass, replace
@@ -17,6 +19,10 @@ import numpy as np
 
 MIN_PAIRS = 12
 """Pairs of repeats below which a view is too small to tell outliers."""
+ALL_PAIRS = 33
+"""Repeats of a mark up to which all their pairs are looked at; of more, 16 for each repeat."""
+STEPS = 3
+"""Steps of a sensor by which repeats may differ that otherwise agree to the bit."""
 
 
 @dataclass(frozen=True)
@@ -131,6 +137,8 @@ def _outliers(key: np.ndarray, values: np.ndarray, relative: np.ndarray,
     # more where few pairs make its distribution skew
     cut = limit * scale * (1 + 4 / np.sqrt(pairs) + 8 / pairs)
     floor = 16 * np.finfo(float).eps * max(extent, np.abs(values).max())
+    if cut <= floor:
+        floor = max(floor, (STEPS + 0.5) * _sensor_step(groups, values, floor))
     for group in groups:
         away = np.abs(values[:, group] - np.median(values[:, group], axis=2, keepdims=True))
         share = np.sqrt(0.5) if group.shape[1] == 2 else 1.0  # of two, each is half-way off
@@ -147,12 +155,36 @@ def _groups(key: np.ndarray) -> list[np.ndarray]:
     return [order[start[count == r][:, None] + np.arange(r)] for r in np.unique(count) if r > 1]
 
 
+def _sensor_step(groups: list[np.ndarray], values: np.ndarray, floor: float) -> float:
+    """Return the step in which repeats of most marks differ, 0 if there is none.
+
+    It is that of at least three marks, and three quarters of those that differ do so by one to
+    `STEPS` of it.
+    """
+    spread = np.concatenate([np.ptp(values[:, group], axis=2).ravel() for group in groups])
+    spread = spread[spread > floor]
+    if len(spread) < 3:
+        return 0.0
+    steps = spread / spread.min()
+    whole = (np.abs(steps - np.rint(steps)) < 1e-3) & (steps < STEPS + 0.5)
+    return float(spread.min()) if whole.sum() >= max(3, 0.75 * len(steps)) else 0.0
+
+
+def _pairs(count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return pairs of `count` repeats: all, or of many repeats each with 16 others, evenly."""
+    if count <= ALL_PAIRS:
+        return np.triu_indices(count, 1)
+    lags = np.rint(np.linspace(1, count // 2, ALL_PAIRS // 2)).astype(int)
+    i = np.tile(np.arange(count), len(lags))
+    return i, (i + np.repeat(lags, count)) % count
+
+
 def _pair_scale(groups: list[np.ndarray], values: np.ndarray,
                 relative: np.ndarray) -> tuple[float, int]:
     """Return the robust standard deviation of one reading, and how many pairs told it."""
     differences = []
     for group in groups:
-        i, j = np.triu_indices(group.shape[1], 1)
+        i, j = _pairs(group.shape[1])
         norm = np.hypot(relative[group][:, i], relative[group][:, j])
         differences.append((np.abs(values[:, group[:, i]] - values[:, group[:, j]]) / norm).ravel())
     if not differences:

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Repeats: clean Gaussian readings stay, outliers go, means and repeatability as by hand."""
 
+import tracemalloc
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -154,3 +156,42 @@ def test_the_pooled_repeatability_is_unbiased():
     means = reduce_repeats(key, values, sigma, limit=LIMIT)
     # a standard deviation with n degrees of freedom scatters by 1/sqrt(2 n)
     assert abs(means.sigma / SIGMA - 1) < 4 / np.sqrt(2 * means.dof)
+
+
+@pytest.mark.parametrize("step", [1e-9, 1e-7])
+def test_a_sensor_that_resolves_no_finer_than_its_step_has_no_outliers_of_one_step(step):
+    rng = np.random.default_rng(3)
+    key = np.tile(np.arange(121), 6)
+    values = step * np.rint(rng.normal(0, 0.22, (2, len(key)))) + 0.01 * np.stack([key, -key])
+    means = reduce_repeats(key, values, np.zeros(len(key)), limit=LIMIT, extent=1.21)
+    assert 0.02 < (np.abs(values - 0.01 * np.stack([key, -key])) > step / 2).mean() < 0.25
+    assert not means.outlier.any()
+    values[0, 77] += 4.2 * step
+    assert np.flatnonzero(reduce_repeats(key, values, np.zeros(len(key)), limit=LIMIT,
+                                         extent=1.21).outlier).tolist() == [77]
+
+
+def test_repeats_equal_to_the_bit_keep_their_degrees_of_freedom():
+    key = np.tile(np.arange(9), 4)
+    means = reduce_repeats(key, np.full((2, 36), 1e-7), np.zeros(36), limit=LIMIT)
+    assert (means.sigma, means.dof) == (0.0, 2 * 9 * 3)
+
+
+def test_outliers_of_exact_readings_are_no_steps_of_a_sensor():
+    key = np.tile(np.arange(50), 4)
+    values = np.zeros((2, 200))
+    values[0, [3, 60, 130]] = [1e-6, 2.3e-6, 4.1e-6]
+    assert np.flatnonzero(reduce_repeats(key, values, np.zeros(200), limit=LIMIT,
+                                         extent=0.1).outlier).tolist() == [3, 60, 130]
+
+
+def test_a_thousand_repeats_do_not_cost_their_square():
+    key, values, sigma = readings(25, 1000, np.random.default_rng(7))
+    values[0, 12_345] += 1e-6
+    tracemalloc.start()
+    means = reduce_repeats(key, values, sigma, limit=LIMIT)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 60e6  # all pairs of one mark alone would be 8 MB, of 25 marks 200 MB
+    assert np.flatnonzero(means.outlier).tolist() == [12_345]
+    assert means.sigma == pytest.approx(SIGMA, rel=0.02)
