@@ -6,11 +6,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from selfcal_ros.bagio.reader import BagReader
 from selfcal_ros.collection.collector import Collector, ViewProgress
-from selfcal_ros.collection.messages import Detection, EncoderSample
 from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.files import add_file
 from selfcal_ros.messages import to_model
@@ -115,18 +112,10 @@ def block_feeder(collector: Collector,
                  complaints: list[str]) -> dict[str, Callable[[Any], None]]:
     """Return topic -> handler that gives the collector what `BagReader.columns` yields of it."""
     def take_encoder(block: EncoderBlock) -> None:
-        n_speeds = 0 if block.velocities is None else block.velocities.shape[1]
-        speeds = block.velocities.tolist() if n_speeds else [()] * len(block)
-        for stamp_ns, positions, velocities in zip(block.stamps_ns.tolist(),
-                                                   block.positions.tolist(), speeds, strict=True):
-            collector.add_encoder(EncoderSample(stamp_ns, block.names, tuple(positions),
-                                                tuple(velocities)))
+        collector.add_encoder_block(block.stamps_ns, block.names, block.positions,
+                                    block.velocities)
 
-    def take_detections(table: np.ndarray) -> None:
-        for row in table.tolist():
-            collector.add_detection(Detection(*row))
-
-    return {ENCODER_TOPIC: take_encoder, DETECTION_TOPIC: take_detections,
+    return {ENCODER_TOPIC: take_encoder, DETECTION_TOPIC: collector.add_detection_block,
             COMMAND_TOPIC: feeder(collector, complaints)[COMMAND_TOPIC]}
 
 

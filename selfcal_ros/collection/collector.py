@@ -7,7 +7,8 @@ What it gives is a function of the set of messages alone, so that live nodes, a 
 
 import math
 from collections import Counter
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -16,12 +17,14 @@ from selfcal_ros.collection.diagnosis import Finding
 from selfcal_ros.collection.encoder import JointTrack, TrackLimits
 from selfcal_ros.collection.evidence import EncoderFacts, Seen
 from selfcal_ros.collection.expected import Missing, expected_marks, missing_marks
-from selfcal_ros.collection.exposures import Exposures, Tracks, look_up
+from selfcal_ros.collection.exposures import Exposures, Tracks
 from selfcal_ros.collection.identify import IdentityRules
 from selfcal_ros.collection.messages import Command, Detection, EncoderSample, check_command
 from selfcal_ros.collection.reasons import Reason
-from selfcal_ros.collection.reduce import DETECTION, Rules, clean, reduce_view
+from selfcal_ros.collection.reduce import DETECTION, Rules
+from selfcal_ros.collection.samples import Limits
 from selfcal_ros.collection.timeline import Timeline, build_timeline
+from selfcal_ros.collection.view_cache import ViewCache
 from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Measurements, Sense, ViewReadings
@@ -29,6 +32,8 @@ from selfcal_ros.model.view import View
 
 MOST_NAMES = 20
 """Names of foreign joints that are remembered."""
+SETTLE_EVERY = 100_000
+"""Messages after which exposures are looked up, whether or not anybody asks for readings."""
 
 
 @dataclass(frozen=True)
@@ -68,10 +73,15 @@ class ViewProgress:
 class Collector:
     """Collects encoder samples, detections and commands and reduces them to readings.
 
+    Only what is new costs: where the stage was at an exposure is looked up once, and a view is
+    reduced again only if something of it has changed.
+
     Parameters
     ----------
     values : dict
         Values of the measurement_collector's parameters (`parameters.parameter_values`).
+    store : Limits, optional
+        How many encoder samples are kept in memory.
 
     Raises
     ------
@@ -79,7 +89,7 @@ class Collector:
         If two joints have one name.
     """
 
-    def __init__(self, values: dict[str, Any]) -> None:
+    def __init__(self, values: dict[str, Any], store: Limits | None = None) -> None:
         gap_ns = round(values["max_encoder_gap"] * 1e9)
         linear = TrackLimits(gap_ns, values["max_speed"], values["encoder_agreement"])
         turn = TrackLimits(gap_ns, values["max_angular_speed"], values["encoder_agreement"], True)
@@ -89,13 +99,17 @@ class Collector:
         if len(self._joints) < 3:
             raise InputError("measurement_collector: joint_x, joint_y, joint_theta",
                              "two of them are the same joint", "give each its own name")
-        self.tracks = Tracks(JointTrack(linear), JointTrack(linear), JointTrack(turn))
+        self.tracks = Tracks(JointTrack(linear, store), JointTrack(linear, store),
+                             JointTrack(turn, store))
         self._rules = Rules(
             self.sense, IdentityRules(values["max_deviation"], values["ambiguity_ratio"],
                                       values["max_rotation"], values["max_stage_distance"]),
             values["min_score"], values["outlier_limit"])
-        self._approach_threshold_m = values["approach_threshold"]
-        self._detections: list[tuple] = []
+        self._exposures = Exposures(self.tracks,
+                                    approach_threshold_m=values["approach_threshold"])
+        self._views = ViewCache(self._rules)
+        self._single: list[tuple] = []  # detections that were added one by one
+        self._unsettled = 0
         self._commands: dict[Command, None] = {}
         self._rejected_input: Counter = Counter()
         self._timeline: Timeline | None = None
@@ -112,38 +126,107 @@ class Collector:
             return
         known, finite = False, True
         for name, position, speed in zip(sample.names, sample.positions, velocities, strict=True):
-            joint = self._joints.get(name)
+            joint = self._joint(name)
             if joint is None:
-                if len(self._foreign) < MOST_NAMES:
-                    self._foreign[name] = None
                 continue
             known = True
             if math.isfinite(position):
-                getattr(self.tracks, joint).add(sample.stamp_ns, position, speed)
+                joint.add(sample.stamp_ns, position, speed)
             else:
                 finite = False
         if not finite:
             self._rejected_input[Reason.ENCODER_NOT_FINITE] += 1
         if not known:
             self._rejected_input[Reason.ENCODER_UNKNOWN_JOINT] += 1
+        self._grow(1)
+
+    def add_encoder_block(self, stamps_ns: np.ndarray, names: Sequence[str], positions: np.ndarray,
+                          velocities: np.ndarray | None = None) -> None:
+        """Take many encoder messages of the same joints, as `add_encoder` takes each.
+
+        Parameters
+        ----------
+        stamps_ns : int64 array (n,)
+            Stamps.
+        names : sequence of str
+            Joints, as the messages name them.
+        positions : float array (n, j)
+            Indicated positions, m or rad.
+        velocities : float array (n, i), optional
+            m/s or rad/s; None or without columns where they are not told.
+        """
+        count = len(stamps_ns)
+        self.received["encoder"] += count
+        told = velocities is not None and velocities.shape[1] > 0
+        if positions.shape[1] != len(names) or (told and velocities.shape[1] != len(names)):
+            self._rejected_input[Reason.ENCODER_MALFORMED] += count
+            return
+        finite, known = np.ones(count, dtype=bool), False
+        for column, name in enumerate(names):
+            joint = self._joint(name)
+            if joint is None:
+                continue
+            known = True
+            good = np.isfinite(positions[:, column])
+            finite &= good
+            joint.store.add_block(stamps_ns[good], positions[good, column],
+                                  velocities[good, column] if told else None)
+        if not finite.all():
+            self._rejected_input[Reason.ENCODER_NOT_FINITE] += int((~finite).sum())
+        if not known and count:
+            self._rejected_input[Reason.ENCODER_UNKNOWN_JOINT] += count
+        self._grow(count)
+
+    def _joint(self, name: str) -> JointTrack | None:
+        axis = self._joints.get(name)
+        if axis is not None:
+            return getattr(self.tracks, axis)
+        if len(self._foreign) < MOST_NAMES:
+            self._foreign[name] = None
+        return None
 
     def add_detection(self, d: Detection) -> None:
         """Take one detection."""
         self.received["detection"] += 1
-        self._detections.append((d.stamp_ns, d.kind, d.has_id, d.m, d.n, d.k, d.offset_x,
-                                 d.offset_y, d.offset_theta, d.sigma, d.score))
+        self._single.append((d.stamp_ns, d.kind, d.has_id, d.m, d.n, d.k, d.offset_x,
+                             d.offset_y, d.offset_theta, d.sigma, d.score))
+
+    def add_detection_block(self, table: np.ndarray) -> None:
+        """Take many detections: a structured array of `reduce.DETECTION`."""
+        self.received["detection"] += len(table)
+        self._views.append(table)
+        self._grow(len(table))
+
+    def _grow(self, count: int) -> None:
+        """Look up exposures now and then, while the samples beside them are in memory."""
+        self._unsettled += count
+        if self._unsettled >= SETTLE_EVERY:
+            self._settle()
+
+    def _settle(self) -> None:
+        if self._single:
+            self._views.append(np.array(self._single, dtype=DETECTION))
+            self._single = []
+        self._views.changed_at(self._exposures.update(self._views.new_stamps()))
+        self._unsettled = 0
 
     def add_command(self, command: Command) -> None:
         """Take one view command; one that cannot be followed raises InputError."""
         check_command(command)
         self.received["command"] += 1
-        self._commands[command] = None
-        self._timeline = None
+        if command not in self._commands:
+            self._commands[command] = None
+            self._timeline = None
 
     def refuse_command(self) -> None:
         """Count a command that could not be used."""
         self.received["command"] += 1
         self._rejected_input[Reason.COMMAND_BAD] += 1
+
+    @property
+    def storage_problem(self) -> str:
+        """Why more encoder samples are in memory than should be; empty if all is well."""
+        return next((track.store.problem for track in self.tracks if track.store.problem), "")
 
     @property
     def unusable(self) -> dict[str, int]:
@@ -169,30 +252,17 @@ class Collector:
         if timeline.artifact is None:
             raise NoDataError("selfcal/view_command", "no MEASURE command",
                               "readings cannot be assigned to views without one")
-        table = np.array(self._detections, dtype=DETECTION)
-        scored = bool((np.isfinite(table["score"]) & (table["score"] > 0)).any())
-        interval_of = timeline.assign(table["stamp"])
-        loose = Counter({str(reason): count for reason, count in self._rejected_input.items()})
-        view_of = np.full(len(table), -1)
-        for number in np.unique(interval_of):
-            here = interval_of == number
-            interval = timeline.intervals[number] if number >= 0 else None
-            if interval is not None and interval.view_index is not None:
-                view_of[here] = interval.view_index
-            else:
-                loose[str(interval.reason if interval else Reason.OUTSIDE_VIEWS)] += int(here.sum())
-        exposures = look_up(self.tracks, table["stamp"],
-                            approach_threshold_m=self._approach_threshold_m)
-        progress = {}
-        for index, view in timeline.views.items():
-            progress[index] = self._progress(timeline, index, view, table[view_of == index],
-                                             exposures, scored=scored)
+        self._settle()
+        readings, loose = self._views.readings(timeline, self._exposures)
+        loose.update({str(reason): count for reason, count in self._rejected_input.items()})
         stamps = [command.stamp_ns for command in self._commands]
-        self._seen = Seen(table, view_of, exposures, self._facts(), (min(stamps), max(stamps)),
-                          timeline.artifact, self._rules.identity, self.sense)
-        views = tuple(item.readings for item in progress.values())
-        return Measurements(timeline.plan_id, timeline.artifact, views, self.sense,
-                            dict(sorted(loose.items())), timeline.run_id), progress
+        self._seen = Seen(self._views.table, self._views.view_of, self._exposures, self._facts(),
+                          (min(stamps), max(stamps)), timeline.artifact, self._rules.identity,
+                          self.sense)
+        progress = {index: view_progress(timeline, index, found)
+                    for index, found in readings.items()}
+        return Measurements(timeline.plan_id, timeline.artifact, tuple(readings.values()),
+                            self.sense, dict(sorted(loose.items())), timeline.run_id), progress
 
     def findings(self, measurements: Measurements,
                  progress: dict[int, ViewProgress]) -> dict[int | None, Finding]:
@@ -208,22 +278,18 @@ class Collector:
     def _facts(self) -> EncoderFacts:
         """Return what came of the encoder."""
         tracks = {axis: getattr(self.tracks, axis) for axis in self._joints.values()}
-        spans = [track.span() for track in tracks.values() if len(track)]
+        spans = [span for span in (track.store.span() for track in self.tracks) if span]
         return EncoderFacts(
             {axis: name for name, axis in self._joints.items()},
             {axis: len(track) > 0 for axis, track in tracks.items()}, tuple(self._foreign),
             (min(s[0] for s in spans), max(s[1] for s in spans)) if spans else None,
             self.tracks.x.usual_step_s(), self.tracks.x.limits.max_gap_ns / 1e9)
 
-    def _progress(self, timeline: Timeline, index: int, view: View, detections: np.ndarray,
-                  exposures: Exposures, *, scored: bool) -> ViewProgress:
-        good, reasons = clean(detections, self._rules, scored=scored)
-        readings = reduce_view(timeline.artifact, view, good, exposures=exposures,
-                               rules=self._rules)
-        total = Counter(readings.rejected)
-        total.update({str(reason): count for reason, count in reasons.items()})
-        readings = replace(readings, rejected=dict(sorted(total.items())))
-        grid, angular = expected_marks(timeline.artifact, view)
-        return ViewProgress(index, view, grid, int((readings.count >= view.repeats).sum()),
-                            angular, int((readings.count_theta >= view.repeats).sum()), readings,
-                            max(i.end_ns for i in timeline.of_view(index)), timeline.artifact)
+
+def view_progress(timeline: Timeline, index: int, readings: ViewReadings) -> ViewProgress:
+    """Return how far a view has come."""
+    view = timeline.views[index]
+    grid, angular = expected_marks(timeline.artifact, view)
+    return ViewProgress(index, view, grid, int((readings.count >= view.repeats).sum()), angular,
+                        int((readings.count_theta >= view.repeats).sum()), readings,
+                        max(i.end_ns for i in timeline.of_view(index)), timeline.artifact)

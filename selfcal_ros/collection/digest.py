@@ -3,6 +3,7 @@
 
 import hashlib
 from dataclasses import replace
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -17,8 +18,17 @@ _VISITS = (("mark", "i8"), ("dx", "f8"), ("dy", "f8"), ("count", "i8"), ("stamp_
 
 def readings_digest(readings: ViewReadings, rejected: dict[str, int]) -> str:
     """Return the SHA-256 of one view's readings, visits, and the rejections outside of views."""
-    digest = hashlib.sha256()
-    visits = readings.visits
+    if readings not in _KNOWN:
+        _KNOWN[readings] = _digest(readings)
+    return hashlib.sha256(repr((_KNOWN[readings], sorted(rejected.items()))).encode()).hexdigest()
+
+
+_KNOWN: WeakKeyDictionary[ViewReadings, str] = WeakKeyDictionary()
+"""Digests of readings that are still in use: those of a view that is over are asked for again."""
+
+
+def _digest(readings: ViewReadings) -> str:
+    digest, visits = hashlib.sha256(), readings.visits
     for table, columns in ((readings, _ARRAYS), *(((visits, _VISITS),) if visits else ())):
         for name, kind in columns:
             digest.update(np.ascontiguousarray(getattr(table, name), dtype=kind).tobytes())
@@ -26,8 +36,7 @@ def readings_digest(readings: ViewReadings, rejected: dict[str, int]) -> str:
         digest.update(repr((visits.sigma_m, visits.dof)).encode())
     view = replace(readings.view, visit_order="")  # how it was to be measured, not what was read
     digest.update(repr((view, readings.sigma_xy, readings.sigma_theta, readings.dof_xy,
-                        readings.dof_theta, readings.used, readings.rejected,
-                        dict(sorted(rejected.items())))).encode())
+                        readings.dof_theta, readings.used, readings.rejected)).encode())
     return digest.hexdigest()
 
 

@@ -1,19 +1,30 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The encoder's story: where the stage was at the instant of an exposure."""
+"""Stage position at the instant of exposure, from the encoder samples of one joint.
 
-from array import array
+What is said of an exposure depends on the samples beside it alone: on the `DEPTH` stamps on either
+side, on what contradicts itself within half a gap, and, for the direction of approach, on the time
+since the exposure before. So an exposure is settled once these have come.
+"""
+
 from dataclasses import dataclass
 
 import numpy as np
 
 from selfcal_ros.collection.reasons import Reason
+from selfcal_ros.collection.samples import Limits, Samples, SampleStore
 
 BEYOND_NOISE = 6.0
 """Standard deviations by which two samples must differ to show that a joint has moved."""
 NEAR = 16
 """Samples on either side of an exposure that tell the noise of a joint at rest there."""
+DEPTH = 2 * NEAR + 4
+"""Stamps on either side of an exposure on which it depends: where one side has too few samples
+for the noise, the other gives as many more."""
 LOOK_BACK_NS = 60_000_000_000
 """Time before an exposure in which a motion is looked for."""
+NEVER, EVER = np.iinfo(np.int64).min, np.iinfo(np.int64).max
+AS_BEFORE = 2
+"""Direction of approach of an exposure before which there was no motion: that of the last one."""
 
 
 @dataclass(frozen=True)
@@ -29,52 +40,108 @@ class TrackLimits:
 class JointTrack:
     """Samples of one joint, in whatever order they arrive; queries depend on the set alone."""
 
-    def __init__(self, limits: TrackLimits) -> None:
+    def __init__(self, limits: TrackLimits, store: Limits | None = None) -> None:
         self.limits = limits
-        self._stamps, self._positions, self._speeds = array("q"), array("d"), array("d")
-        self._sorted: tuple[np.ndarray, ...] | None = None
-        self._noise: tuple[float, float] | None = None
+        self.store = SampleStore(store)
 
     def __len__(self) -> int:
         """Return the number of samples."""
-        return len(self._stamps)
+        return len(self.store)
 
     def add(self, stamp_ns: int, position: float, speed: float) -> None:
         """Add one sample; `speed` is NaN where the encoder does not tell it."""
-        self._stamps.append(stamp_ns)
-        self._positions.append(position + 0.0)  # -0.0 and 0.0 sort alike: keep one of them
-        self._speeds.append(speed)
-        self._sorted = self._noise = None
+        self.store.add(stamp_ns, position, speed)
 
-    def span(self) -> tuple[int, int]:
-        """Return the first and the last stamp; there must be samples."""
-        t = self._series()[0]
-        return int(t[0]), int(t[-1])
+    def between(self, start_ns: int, end_ns: int) -> "Series":
+        """Return the samples that decide about exposures from `start_ns` to `end_ns`."""
+        half_gap = self.limits.max_gap_ns // 2
+        return Series(self.limits, self.store.near(max(start_ns, NEVER + half_gap) - half_gap,
+                                                   min(end_ns, EVER - half_gap) + half_gap,
+                                                   DEPTH + 2))
 
     def usual_step_s(self) -> float:
         """Return the median time between the last samples, NaN with fewer than two."""
-        t = self._series()[0][-1000:] if len(self) else np.zeros(0)
+        span = self.store.span()
+        if span is None:
+            return float("nan")
+        t = np.unique(self.store.near(span[1], span[1], 1000)[0])
         return float(np.median(np.diff(t)) / 1e9) if len(t) > 1 else float("nan")
+
+    def query(self, stamps_ns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return `Series.query` of all samples."""
+        return self._all().query(stamps_ns)
+
+    def moving(self, stamps_ns: np.ndarray) -> np.ndarray:
+        """Return `Series.moving` of all samples."""
+        return self._all().moving(stamps_ns)
+
+    def approach(self, stamps_ns: np.ndarray, positions: np.ndarray, *,
+                 threshold: float) -> np.ndarray:
+        """Return the sign of the last motion before each exposure, int8 array (Q,); 0 = unknown.
+
+        Arguments as for `Series.approach`.
+        """
+        return filled(self._all().approach(stamps_ns, positions, threshold=threshold))
+
+    def _all(self) -> "Series":
+        return self.between(NEVER, EVER)
+
+
+def filled(approach: np.ndarray) -> np.ndarray:
+    """Return directions of approach with those that are as before; unknown before the first."""
+    told = np.where(approach == AS_BEFORE, 0, np.arange(len(approach)))
+    out = approach[np.maximum.accumulate(told)] if len(approach) else approach
+    return np.where(out == AS_BEFORE, 0, out).astype(np.int8)
+
+
+class Series:
+    """Samples of one joint in the order of their stamps, each stamp once."""
+
+    def __init__(self, limits: TrackLimits, samples: Samples) -> None:
+        self.limits = limits
+        stamps, positions, speeds = samples
+        if not (stamps[1:] > stamps[:-1]).all():
+            order = np.lexsort((positions, stamps))
+            stamps, positions, speeds = stamps[order], positions[order], speeds[order]
+        first = np.flatnonzero(np.diff(stamps, prepend=stamps[:1] - 1))
+        # from the first of each stamp to all of it: on a circle the last may lie nearer
+        beside = np.repeat(positions[first], np.diff(first, append=len(stamps)))
+        spread = np.abs(self._difference(positions - beside))
+        self.t, self.p = stamps[first], positions[first]
+        self.bad = (np.maximum.reduceat(spread, first) if len(first) else spread) > limits.agreement
+        self.speed = _fastest(speeds, first)  # with its sign
+        self.v = np.abs(self.speed)
+
+    def __len__(self) -> int:
+        """Return the number of stamps."""
+        return len(self.t)
+
+    def decided_by(self, stamps_ns: np.ndarray, since_ns: np.ndarray | None = None,
+                   ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the first and last stamps on which what is said of each exposure depends.
+
+        Parameters
+        ----------
+        stamps_ns : int64 array (Q,)
+            Instants of exposure.
+        since_ns : int64 array (Q,), optional
+            Instants from which on a motion before each is looked for.
+        """
+        half_gap = self.limits.max_gap_ns // 2
+        low = np.searchsorted(self.t, stamps_ns, "left") - DEPTH
+        high = np.searchsorted(self.t, stamps_ns, "right") + DEPTH - 1
+        first, last = np.full(len(stamps_ns), NEVER), np.full(len(stamps_ns), EVER)
+        enough = low >= 0
+        first[enough] = np.minimum(self.t[low[enough]], stamps_ns[enough] - half_gap)
+        enough = high < len(self.t)
+        last[enough] = np.maximum(self.t[high[enough]], stamps_ns[enough] + half_gap)
+        if since_ns is not None and len(self):
+            at = np.searchsorted(self.t, since_ns, "right") - 1
+            first = np.where(at >= 0, np.minimum(first, self.t[at]), NEVER)
+        return first, last
 
     def _difference(self, a: np.ndarray) -> np.ndarray:
         return np.remainder(a + np.pi, 2 * np.pi) - np.pi if self.limits.wraps else a
-
-    def _series(self) -> tuple[np.ndarray, ...]:
-        """Return stamps (unique, rising), positions, speeds and which stamps contradict."""
-        if self._sorted is None:
-            stamps = np.array(self._stamps, dtype=np.int64)
-            positions = np.array(self._positions)
-            speeds = np.array(self._speeds)
-            order = np.lexsort((positions, stamps))
-            stamps, positions, speeds = stamps[order], positions[order], speeds[order]
-            first = np.flatnonzero(np.diff(stamps, prepend=stamps[:1] - 1))
-            # from the first of each stamp to all of it: on a circle the last may lie nearer
-            beside = np.repeat(positions[first], np.diff(first, append=len(stamps)))
-            spread = np.abs(self._difference(positions - beside))
-            bad = np.maximum.reduceat(spread, first) > self.limits.agreement
-            speeds = np.fmax.reduceat(np.abs(speeds), first)
-            self._sorted = stamps[first], positions[first], speeds, bad
-        return self._sorted
 
     def query(self, stamps_ns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the interpolated positions and the reason why each cannot be used.
@@ -95,7 +162,7 @@ class JointTrack:
         if not len(self) or not len(stamps_ns):
             reasons[:] = Reason.NO_ENCODER
             return np.full(len(stamps_ns), np.nan), reasons
-        t, p, _, _ = self._series()
+        t, p = self.t, self.p
         before, after, exact, outside = self._around(stamps_ns)
         gap = t[after] - t[before]
         step = self._difference(p[after] - p[before])
@@ -115,14 +182,15 @@ class JointTrack:
         _, reasons = self.query(stamps_ns)
         fast = reasons == Reason.MOVING
         if fast.any():
-            t, p, v, _ = self._series()
+            t, p, v = self.t, self.p, self.v
             before, after, exact, _ = self._around(stamps_ns)
             # at a sample: the longer way to one of its neighbours
             left = np.where(exact, np.maximum(before - 1, 0), before)
             right = np.where(exact, np.minimum(after + 1, len(t) - 1), after)
             way = np.fmax(np.abs(self._difference(p[right] - p[after])),
                           np.abs(self._difference(p[after] - p[left])))
-            noise, speed_noise = self._noise_of_rest()
+            noise = self._noise_near(stamps_ns)
+            speed_noise = self._speed_noise_near(stamps_ns)
             told = np.where(np.isfinite(v[before]) & np.isfinite(v[after]),
                             np.fmax(v[before], v[after]), 0.0)
             told = np.where(told > BEYOND_NOISE * speed_noise, told, 0.0)
@@ -132,12 +200,12 @@ class JointTrack:
 
     def approach(self, stamps_ns: np.ndarray, positions: np.ndarray, *, threshold: float,
                  ) -> np.ndarray:
-        """Return the sign of the last motion before each exposure, int8 array (Q,); 0 = unknown.
+        """Return the sign of the last motion before each exposure, int8 array (Q,).
 
         A motion is a displacement beyond `threshold`, m, and beyond the noise at rest. It is
-        looked for from the exposure back to the one before; where there is none, the sign is that
-        of the exposure before. A gap in the samples and a time of more than `LOOK_BACK_NS` without
-        motion since the last exposure leave it unknown.
+        looked for from the exposure back to the one before; where there is none, the sign is
+        `AS_BEFORE`. It is 0, not known, after a gap in the samples, and where the last exposure is
+        more than `LOOK_BACK_NS` ago.
 
         Parameters
         ----------
@@ -148,10 +216,10 @@ class JointTrack:
         threshold : float
             Smallest displacement that counts as a motion, m.
         """
-        out = np.zeros(len(stamps_ns), dtype=np.int8)
+        out = np.full(len(stamps_ns), AS_BEFORE, dtype=np.int8)
         if not len(self) or not len(stamps_ns):
-            return out
-        t, p, _, _ = self._series()
+            return np.zeros_like(out)
+        t, p = self.t, self.p
         limit = np.fmax(threshold, BEYOND_NOISE * np.sqrt(2) * self._noise_near(stamps_ns))
         owner = np.searchsorted(stamps_ns, t, "left")  # the first exposure at or after a sample
         sample = np.flatnonzero(owner < len(stamps_ns))
@@ -166,45 +234,50 @@ class JointTrack:
         resumed[owner[broken[sample]]] = sample[broken[sample]]
         told = (last >= 0) & (last >= resumed)
         out[told] = np.sign(positions[told] - p[last[told]])
-        lost = ~told & ((resumed >= 0) | ~np.isfinite(positions))
-        lost |= ~told & (np.diff(stamps_ns, prepend=stamps_ns[0]) > LOOK_BACK_NS)
-        settled = np.where(told | lost, np.arange(len(out)), 0)
-        return out[np.maximum.accumulate(settled)]
+        lost = (resumed >= 0) | ~np.isfinite(positions)
+        lost |= np.diff(stamps_ns, prepend=stamps_ns[0]) > LOOK_BACK_NS
+        out[lost & ~told] = 0
+        return out
 
     def _noise_near(self, stamps_ns: np.ndarray) -> np.ndarray:
         """Return the standard deviation of one position beside each exposure, robustly, (Q,).
 
-        From each sample's distance to the line through its neighbours, as in `_noise_of_rest`.
+        From each sample's distance to the line through its neighbours, whose variance is 1.5 times
+        as large: motion at a steady speed adds nothing to it.
         """
-        t, p, _, _ = self._series()
-        if len(t) < 3:
+        if len(self) < 3:
             return np.zeros(len(stamps_ns))
-        step, dt = self._difference(np.diff(p)), np.diff(t)
+        step, dt = self._difference(np.diff(self.p)), np.diff(self.t)
         off = np.abs(step[:-1] * dt[1:] - step[1:] * dt[:-1]) / (dt[:-1] + dt[1:])
-        width = min(2 * NEAR, len(off))
-        start = np.clip(np.searchsorted(t, stamps_ns, "left") - 1 - NEAR, 0, len(off) - width)
-        near = np.lib.stride_tricks.sliding_window_view(off, width)
-        return np.median(near[start], axis=1) / (0.6744897501960817 * np.sqrt(1.5))
+        return self._median_near(off, stamps_ns) / np.sqrt(1.5)
 
-    def _noise_of_rest(self) -> tuple[float, float]:
-        """Return the standard deviations of one position and of one told speed, robustly.
+    def _speed_noise_near(self, stamps_ns: np.ndarray) -> np.ndarray:
+        """Return the standard deviation of one told speed beside each exposure, robustly, (Q,).
 
-        That of a position comes from each sample's distance to the line through its neighbours,
-        whose variance is 1.5 times as large: motion at a steady speed adds nothing to it.
+        From the second differences: a steady speed and a steady acceleration add nothing to it.
         """
-        if self._noise is None:
-            t, p, v, _ = self._series()
-            step, dt = self._difference(np.diff(p)), np.diff(t)
-            off = (step[:-1] * dt[1:] - step[1:] * dt[:-1]) / (dt[:-1] + dt[1:])
-            self._noise = _spread(off / np.sqrt(1.5)), _spread(v[np.isfinite(v)])
-        return self._noise
+        if len(self) < 3:
+            return np.zeros(len(stamps_ns))
+        v = np.where(np.isfinite(self.speed), self.speed, 0.0)
+        return self._median_near(np.abs(np.diff(v, 2)), stamps_ns) / np.sqrt(6)
+
+    def _median_near(self, values: np.ndarray, stamps_ns: np.ndarray) -> np.ndarray:
+        """Return the standard deviation about 0 of the values near each exposure, most are noise.
+
+        `values` are not negative, one for each sample but the first and the last.
+        """
+        width = min(2 * NEAR, len(values))
+        start = np.searchsorted(self.t, stamps_ns, "left") - 1 - NEAR
+        near = np.lib.stride_tricks.sliding_window_view(values, width)
+        near = near[np.clip(start, 0, len(values) - width)]
+        return np.median(near, axis=1) / 0.6744897501960817
 
     def _around(self, stamps_ns: np.ndarray) -> tuple[np.ndarray, ...]:
         """Return the samples before and after each instant, where they are one, where too far.
 
         They are one where the instant is that sample's stamp.
         """
-        t = self._series()[0]
+        t = self.t
         after = np.searchsorted(t, stamps_ns, "left")
         outside = after >= len(t)
         after = np.minimum(after, len(t) - 1)
@@ -218,7 +291,7 @@ class JointTrack:
     def _motion(self, before: np.ndarray, after: np.ndarray, exact: np.ndarray,
                 ) -> tuple[np.ndarray, np.ndarray]:
         """Return which exposures saw the stage moving, and which saw it jump to and fro."""
-        t, p, v, _ = self._series()
+        t, p, v = self.t, self.p, self.v
         dt = np.diff(t)
         step = self._difference(np.diff(p))
         speed = np.abs(step) / np.where(dt > 0, dt, 1) * 1e9
@@ -243,7 +316,7 @@ class JointTrack:
     def _contradicted(self, stamps_ns: np.ndarray, before: np.ndarray,
                       after: np.ndarray) -> np.ndarray:
         """Return which exposures lie beside, or within half a gap of, a contradicted stamp."""
-        t, _, _, bad = self._series()
+        t, bad = self.t, self.bad
         if not bad.any():
             return np.zeros(len(stamps_ns), dtype=bool)
         at = np.flatnonzero(bad)
@@ -260,6 +333,9 @@ class JointTrack:
         return out
 
 
-def _spread(values: np.ndarray) -> float:
-    """Return the standard deviation about 0 of values most of which are noise; 0 without any."""
-    return float(np.median(np.abs(values)) / 0.6744897501960817) if len(values) else 0.0
+def _fastest(speeds: np.ndarray, first: np.ndarray) -> np.ndarray:
+    """Return of the speeds of each stamp, which begin at `first`, that of the largest size."""
+    if not len(first):
+        return speeds
+    most, least = np.fmax.reduceat(speeds, first), np.fmin.reduceat(speeds, first)
+    return np.where(most >= -least, most, least)

@@ -1,11 +1,33 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where the stage was at each exposure, whether it rested, and from where it had come."""
+"""Where the stage was at each exposure, whether it rested, and from where it had come.
+
+Each instant of exposure is looked up once the samples beside it have come, and again only if a
+sample or an exposure comes that could change what was found: late ones cost, new ones do not.
+"""
 
 from dataclasses import dataclass
 
 import numpy as np
 
-from selfcal_ros.collection.encoder import JointTrack
+from selfcal_ros.collection.encoder import (
+    EVER,
+    LOOK_BACK_NS,
+    NEVER,
+    JointTrack,
+    Series,
+    filled,
+)
+from selfcal_ros.collection.growing import GrowingTable
+from selfcal_ros.collection.reasons import Reason
+
+REASONS = np.array([None, Reason.NO_ENCODER, Reason.MOVING, Reason.CONTRADICTION], dtype=object)
+"""Reasons that the encoder gives, by the code that is kept of them."""
+MOST_SAMPLES = 300_000
+"""Samples of a joint that are looked at together."""
+ROW = np.dtype([
+    ("stamp", "i8"), ("position", "f8", 3), ("reason", "i1", 3), ("moving", "?", 3),
+    ("approach", "i1", 2), ("first", "i8"), ("last", "i8")])
+"""One instant: what is known of x, y, theta, and the stamps of samples between which it depends."""
 
 
 @dataclass(frozen=True)
@@ -15,6 +37,10 @@ class Tracks:
     x: JointTrack
     y: JointTrack
     theta: JointTrack
+
+    def __iter__(self):
+        """Yield the joints in their order."""
+        return iter((self.x, self.y, self.theta))
 
 
 @dataclass(frozen=True)
@@ -35,46 +61,172 @@ class JointAt:
     reason: np.ndarray
     moving: np.ndarray
 
-    def at(self, index: np.ndarray) -> "JointAt":
-        """Return the rows `index`."""
-        return JointAt(self.position[index], self.reason[index], self.moving[index])
-
 
 @dataclass(frozen=True)
-class Exposures:
-    """The stage at each instant of exposure; stamps rise, each once.
+class StageAt:
+    """The stage at instants of exposure; `approach` (2, Q) are signs of the last motions."""
 
-    `approach` (2, Q) holds the signs of the last motions of x and y (`JointTrack.approach`).
-    """
-
-    stamps_ns: np.ndarray
     x: JointAt
     y: JointAt
     theta: JointAt
     approach: np.ndarray
 
-    def at(self, stamps_ns: np.ndarray) -> "Exposures":
-        """Return the rows of some of the instants, in the order that is asked for."""
-        index = np.searchsorted(self.stamps_ns, stamps_ns)
-        return Exposures(stamps_ns, self.x.at(index), self.y.at(index), self.theta.at(index),
-                         self.approach[:, index])
 
-
-def look_up(tracks: Tracks, stamps_ns: np.ndarray, *, approach_threshold_m: float) -> Exposures:
-    """Return the stage at each of the instants of exposure of a session.
+class Exposures:
+    """The stage at all instants of exposure of a session.
 
     Parameters
     ----------
     tracks : Tracks
-        Encoder samples.
-    stamps_ns : int64 array (n,)
-        Instants of all detections, in any order.
+        Encoder samples; they may grow.
     approach_threshold_m : float
         Smallest displacement that counts as a motion of x or y.
     """
-    stamps = np.unique(stamps_ns)
-    joints = [JointAt(*track.query(stamps), track.moving(stamps))
-              for track in (tracks.x, tracks.y, tracks.theta)]
-    approach = [track.approach(stamps, joint.position, threshold=approach_threshold_m)
-                for track, joint in zip((tracks.x, tracks.y), joints, strict=False)]
-    return Exposures(stamps, *joints, np.stack(approach))
+
+    def __init__(self, tracks: Tracks, *, approach_threshold_m: float) -> None:
+        self._tracks, self._threshold_m = tracks, approach_threshold_m
+        self._table = GrowingTable(ROW)
+        self._approach = np.zeros((2, 0), dtype=np.int8)
+
+    def __len__(self) -> int:
+        """Return the number of instants."""
+        return len(self._table)
+
+    def at(self, stamps_ns: np.ndarray) -> StageAt:
+        """Return the stage at some of the instants, in the order that is asked for."""
+        index = np.searchsorted(self._table.rows["stamp"], stamps_ns)
+        rows = self._table.rows[index]
+        joints = [JointAt(rows["position"][:, j], REASONS[rows["reason"][:, j]],
+                          np.where(rows["moving"][:, j], Reason.MOVING, None)) for j in range(3)]
+        return StageAt(*joints, self._approach[:, index])
+
+    def update(self, stamps_ns: np.ndarray) -> np.ndarray:
+        """Take further instants of exposure and what came of the encoder since the last time.
+
+        Parameters
+        ----------
+        stamps_ns : int64 array (n,)
+            Instants in any order, known ones among them or not.
+
+        Returns
+        -------
+        int64 array (c,)
+            Instants, known before, of which something else is known now.
+        """
+        due = self._due_to_samples()
+        due = self._insert(np.unique(stamps_ns), due)
+        before = self._table.rows[due].copy()
+        for group in self._groups(np.flatnonzero(due)):
+            self._look_up(group)
+        changed = np.zeros(len(due), dtype=bool)
+        changed[due] = _differ(before, self._table.rows[due])
+        return self._fill(changed)
+
+    def _due_to_samples(self) -> np.ndarray:
+        """Return which instants may depend on samples that came since the last time."""
+        rows = self._table.rows
+        due = np.zeros(len(rows), dtype=bool)
+        for track in self._tracks:
+            new = track.store.new_stamps()
+            if len(new) and len(rows):
+                near = np.flatnonzero((rows["last"] >= new[0]) & (rows["first"] <= new[-1]))
+                due[near] |= (np.searchsorted(new, rows["first"][near], "left")
+                              < np.searchsorted(new, rows["last"][near], "right"))
+        return due
+
+    def _insert(self, stamps_ns: np.ndarray, due: np.ndarray) -> np.ndarray:
+        """Add the instants that are new; return `due` with them and with those behind them."""
+        known = self._table.rows["stamp"]
+        at = np.searchsorted(known, stamps_ns)
+        fresh = np.ones(len(stamps_ns), dtype=bool)
+        inside = at < len(known)
+        fresh[inside] = known[at[inside]] != stamps_ns[inside]
+        at, stamps_ns = at[fresh], stamps_ns[fresh]
+        behind = at[at < len(known)]
+        due[behind] = True  # the time since the exposure before is another one
+        rows = np.zeros(len(at), dtype=ROW)
+        rows["stamp"] = stamps_ns
+        rows["first"], rows["last"] = NEVER, EVER
+        self._table.insert(at, rows)
+        self._approach = np.insert(self._approach, at, NEW, axis=1)
+        return np.insert(due, at, True)
+
+    def _groups(self, due: np.ndarray) -> list[np.ndarray]:
+        """Return the instants that are due in groups with few enough samples each, (n,) each."""
+        groups, waiting = [], [due] if len(due) else []
+        while waiting:
+            group = waiting.pop()
+            start, end = self._window(group)
+            if len(group) > 1 and any(track.store.count_between(start, end) > MOST_SAMPLES
+                                      for track in self._tracks):
+                half = len(group) // 2
+                waiting += [group[half:], group[:half]]
+            else:
+                groups.append(group)
+        return groups
+
+    def _since(self, index: np.ndarray) -> np.ndarray:
+        """Return from when on a motion before each instant is looked for."""
+        stamps = self._table.rows["stamp"]
+        earliest = np.maximum(stamps[index], NEVER + LOOK_BACK_NS) - LOOK_BACK_NS
+        before = np.where(index > 0, stamps[np.maximum(index - 1, 0)], NEVER)
+        return np.maximum(before, earliest)
+
+    def _window(self, group: np.ndarray) -> tuple[int, int]:
+        return int(self._since(group[:1])[0]), int(self._table.rows["stamp"][group[-1]])
+
+    def _look_up(self, group: np.ndarray) -> None:
+        """Look up a group of instants, all that lie between its ends."""
+        start, end = self._window(group)
+        index = np.arange(group[0], group[-1] + 1)
+        rows, since = self._table.rows[index], self._since(index)
+        rows["first"], rows["last"] = EVER, NEVER
+        for joint, track in enumerate(self._tracks):
+            series = track.between(start, end)
+            position, reason = series.query(rows["stamp"])
+            rows["position"][:, joint] = position
+            rows["reason"][:, joint] = _codes(reason)
+            rows["moving"][:, joint] = series.moving(rows["stamp"]) == Reason.MOVING
+            linear = joint < 2
+            if linear:
+                rows["approach"][:, joint] = self._approach_of(series, index, position)
+            first, last = series.decided_by(rows["stamp"], since if linear else None)
+            rows["first"] = np.minimum(rows["first"], first)
+            rows["last"] = np.maximum(rows["last"], last)
+        self._table.rows[index] = rows
+
+    def _approach_of(self, series: Series, index: np.ndarray, position: np.ndarray) -> np.ndarray:
+        stamps, first = self._table.rows["stamp"], index[0]
+        if first == 0:
+            return series.approach(stamps[index], position, threshold=self._threshold_m)
+        # behind the exposure before, whose own samples may not all be here
+        both = np.concatenate([stamps[first - 1:first], stamps[index]])
+        return series.approach(both, np.concatenate([[np.nan], position]),
+                               threshold=self._threshold_m)[1:]
+
+    def _fill(self, changed: np.ndarray) -> np.ndarray:
+        """Work out the directions of approach; return the stamps of what has changed."""
+        found = np.stack([filled(column) for column in self._table.rows["approach"].T])
+        old = self._approach
+        changed |= ((found != old) & (old != NEW)).any(axis=0)
+        changed &= (old != NEW).all(axis=0)
+        self._approach = found
+        return self._table.rows["stamp"][changed]
+
+
+NEW = 9
+"""Direction of approach of an instant that has not been looked up yet."""
+
+
+def _codes(reasons: np.ndarray) -> np.ndarray:
+    out = np.zeros(len(reasons), dtype=np.int8)
+    for code, reason in enumerate(REASONS[1:], 1):
+        out[reasons == reason] = code
+    return out
+
+
+def _differ(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return in which rows positions, reasons or motions are not the same."""
+    same = (a["position"] == b["position"]) | (np.isnan(a["position"]) & np.isnan(b["position"]))
+    same &= (a["reason"] == b["reason"]) & (a["moving"] == b["moving"])
+    return ~same.all(axis=1)

@@ -63,13 +63,24 @@ def clean(detections: np.ndarray, rules: Rules, *, scored: bool,
     finite &= d["sigma"] >= 0
     rejected[Reason.NOT_FINITE] = int((~finite).sum())
     d = d[finite]
-    unique = np.unique(d)
+    unique = _canonical(d)
     rejected[Reason.DUPLICATE] += len(d) - len(unique)
     if scored:
         low = unique["score"] < rules.min_score
         rejected[Reason.LOW_SCORE] += int(low.sum())
         unique = unique[~low]
     return unique, +rejected
+
+
+def _canonical(d: np.ndarray) -> np.ndarray:
+    """Return the detections in the order of all their fields, each once: `numpy.unique`, faster."""
+    d = d[np.argsort(d["stamp"], kind="stable")]
+    same = d["stamp"][1:] == d["stamp"][:-1]
+    if not same.any():
+        return d
+    beside = np.append(same, False) | np.append(False, same)
+    d = np.concatenate([d[~beside], np.unique(d[beside])])
+    return d[np.argsort(d["stamp"], kind="stable")]
 
 
 def reduce_view(artifact: Artifact, view: View, detections: np.ndarray, *,

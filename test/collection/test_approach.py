@@ -115,7 +115,7 @@ def test_it_is_what_a_search_backwards_finds(steps, asked_at):
     samples = list(zip(at, (p for _, p in steps), strict=True))
     joint, stamps = track(samples), sorted(asked_at)
     positions = joint.query(np.array(stamps) * MS)[0]
-    assume(not joint._noise_near(np.array(stamps) * MS).any())
+    assume(not joint._all()._noise_near(np.array(stamps) * MS).any())
     found = asked(joint, *stamps)
     assert found == looked_for(samples, stamps, positions.tolist())
     assert asked(track(samples[::-1]), *stamps) == found

@@ -1,0 +1,39 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A table that grows at its end at no cost, and elsewhere at that of a copy."""
+
+import numpy as np
+
+
+class GrowingTable:
+    """Rows of a structured type."""
+
+    def __init__(self, dtype: np.dtype) -> None:
+        self._room = np.zeros(64, dtype=dtype)
+        self._count = 0
+
+    def __len__(self) -> int:
+        """Return the number of rows."""
+        return self._count
+
+    @property
+    def rows(self) -> np.ndarray:
+        """The rows, as a view that may be written to; valid until rows are added."""
+        return self._room[:self._count]
+
+    def append(self, rows: np.ndarray) -> None:
+        """Add rows at the end."""
+        total = self._count + len(rows)
+        if total > len(self._room):
+            room = np.zeros(max(total, 2 * len(self._room)), dtype=self._room.dtype)
+            room[:self._count] = self.rows
+            self._room = room
+        self._room[self._count:total] = rows
+        self._count = total
+
+    def insert(self, at: np.ndarray, rows: np.ndarray) -> None:
+        """Add rows in front of the rows `at` (rising), as `numpy.insert` does."""
+        if not len(rows) or at[0] == self._count:
+            self.append(rows)
+            return
+        self._room = np.insert(self.rows, at, rows)
+        self._count = len(self._room)

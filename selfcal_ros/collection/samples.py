@@ -1,0 +1,249 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Encoder samples of one joint for a whole shift: in any order, all of them, in bounded memory.
+
+Samples stand in blocks of rising stamps. The newest blocks are in memory; older ones go to a
+temporary file without a name, from where a message that comes very late can still have its
+neighbours. What is asked for is always the whole set, whatever came when.
+"""
+
+import tempfile
+import weakref
+from array import array
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+
+NO_STAMPS = np.zeros(0, dtype=np.int64)
+LARGE_TEMPORARY = Path("/var/tmp")
+"""Where large temporary files belong: /tmp may lie in memory."""
+
+Samples = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""Stamps (int64, ns), positions and speeds (float; NaN = not told)."""
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Samples of a block, and blocks that are kept in memory."""
+
+    block: int = 65_536
+    in_memory: int = 6
+
+
+@dataclass(frozen=True)
+class _Block:
+    """Samples with rising stamps, in memory or at a place in the file; `speeds` may be none."""
+
+    first_ns: int
+    last_ns: int
+    count: int
+    has_speeds: bool
+    columns: tuple[np.ndarray, ...] = ()
+    place: int = 0
+
+
+class SampleStore:
+    """All samples of one joint.
+
+    Attributes
+    ----------
+    problem : str
+        Why blocks stay in memory that should not; empty while the file can be written.
+    """
+
+    def __init__(self, limits: Limits | None = None) -> None:
+        self._limits = limits or Limits()
+        self._single = (array("q"), array("d"), array("d"))  # added one by one
+        self._parts: list[Samples] = []  # of the block that is being filled
+        self._filled, self._rising, self._last_ns = 0, True, np.iinfo(np.int64).min
+        self._blocks: list[_Block] = []
+        self._unseen: list[np.ndarray] = []
+        self._count, self._end = 0, 0
+        self._file: BinaryIO | None = None
+        self._read: tuple[_Block, Samples] | None = None  # the block read last
+        self.problem = ""
+
+    def __len__(self) -> int:
+        """Return the number of samples."""
+        return self._count + len(self._single[0])
+
+    def add(self, stamp_ns: int, position: float, speed: float) -> None:
+        """Add one sample; `speed` is NaN where the encoder does not tell it."""
+        for column, value in zip(self._single, (stamp_ns, position, speed), strict=True):
+            column.append(value)
+
+    def add_block(self, stamps_ns: np.ndarray, positions: np.ndarray,
+                  speeds: np.ndarray | None = None) -> None:
+        """Add samples in any order; `speeds` None or NaN where they are not told."""
+        self._flush()
+        self._append(np.array(stamps_ns, dtype=np.int64), np.array(positions, dtype=float),
+                     np.full(len(stamps_ns), np.nan) if speeds is None
+                     else np.array(speeds, dtype=float))
+
+    def _flush(self) -> None:
+        if len(self._single[0]):
+            columns = [np.array(column) for column in self._single]
+            self._single = (array("q"), array("d"), array("d"))
+            self._append(*columns)
+
+    def _append(self, stamps: np.ndarray, positions: np.ndarray, speeds: np.ndarray) -> None:
+        """Fill the open block, closing it whenever it is full."""
+        positions = positions + 0.0  # -0.0 and 0.0 sort alike: keep one of them
+        for start in range(0, len(stamps), self._limits.block):
+            part = tuple(c[start:start + self._limits.block] for c in (stamps, positions, speeds))
+            t = part[0]
+            self._rising &= bool(t[0] >= self._last_ns and (t[1:] >= t[:-1]).all())
+            self._last_ns = max(self._last_ns, int(t[-1]))
+            self._parts.append(part)
+            self._unseen.append(t)
+            self._filled += len(t)
+            self._count += len(t)
+            if self._filled >= self._limits.block:
+                self._close()
+
+    def _open(self) -> Samples:
+        """Return the samples of the block that is being filled, in the order of their stamps."""
+        if len(self._parts) > 1 or not self._rising:
+            columns = tuple(np.concatenate(column) for column in zip(*self._parts, strict=True))
+            if not self._rising:
+                order = np.argsort(columns[0], kind="stable")
+                columns = tuple(column[order] for column in columns)
+            self._parts, self._rising = [columns], True
+            self._last_ns = int(columns[0][-1])
+        return self._parts[0] if self._parts else (NO_STAMPS, np.zeros(0), np.zeros(0))
+
+    def _close(self) -> None:
+        stamps, positions, speeds = self._open()
+        told = bool(np.isfinite(speeds).any() or np.isinf(speeds).any())
+        columns = (stamps, positions, speeds) if told else (stamps, positions)
+        self._blocks.append(_Block(int(stamps[0]), int(stamps[-1]), len(stamps), told, columns))
+        self._parts, self._filled, self._rising = [], 0, True
+        self._last_ns = np.iinfo(np.int64).min
+        held = [number for number, block in enumerate(self._blocks) if block.columns]
+        if len(held) > self._limits.in_memory and not self.problem:
+            self._store(min(held, key=lambda number: self._blocks[number].last_ns))
+
+    def _store(self, number: int) -> None:
+        """Move a block to the file."""
+        block = self._blocks[number]
+        try:
+            if self._file is None:
+                folder = LARGE_TEMPORARY if LARGE_TEMPORARY.is_dir() else None
+                self._file = tempfile.TemporaryFile(dir=folder, buffering=0)  # noqa: SIM115
+                weakref.finalize(self, self._file.close)
+            self._file.seek(self._end)
+            for column in block.columns:
+                data = memoryview(column).cast("B")
+                while len(data):
+                    data = data[self._file.write(data):]
+        except OSError as error:
+            self.problem = (f"encoder samples stay in memory: no temporary file can be written "
+                            f"({error.strerror})")
+            return
+        self._blocks[number] = _Block(block.first_ns, block.last_ns, block.count, block.has_speeds,
+                                      place=self._end)
+        self._end += sum(column.nbytes for column in block.columns)
+
+    def _samples(self, block: _Block) -> Samples:
+        """Return the samples of a block, read back if it is not in memory."""
+        if block.columns:
+            columns = block.columns
+        elif self._read is not None and self._read[0] is block:
+            return self._read[1]
+        else:
+            kinds = (np.int64, np.float64, np.float64)[:3 if block.has_speeds else 2]
+            data = bytearray(8 * block.count * len(kinds))
+            self._file.seek(block.place)
+            view = memoryview(data)
+            while len(view):
+                view = view[self._file.readinto(view):]
+            columns = tuple(np.frombuffer(data, kind, block.count, 8 * block.count * at)
+                            for at, kind in enumerate(kinds))
+        if not block.has_speeds:
+            columns = (*columns, np.full(block.count, np.nan))
+        if not block.columns:
+            self._read = block, columns
+        return columns
+
+    def new_stamps(self) -> np.ndarray:
+        """Return the stamps that were added since the last call, rising."""
+        self._flush()
+        unseen, self._unseen = self._unseen, []
+        stamps = np.concatenate([NO_STAMPS, *unseen])
+        return stamps if (stamps[1:] >= stamps[:-1]).all() else np.sort(stamps)
+
+    def span(self) -> tuple[int, int] | None:
+        """Return the first and the last stamp, None without samples."""
+        self._flush()
+        stamps = self._open()[0]
+        ends = [(b.first_ns, b.last_ns) for b in self._blocks]
+        ends += [(int(stamps[0]), int(stamps[-1]))] if len(stamps) else []
+        return (min(e[0] for e in ends), max(e[1] for e in ends)) if ends else None
+
+    def count_between(self, start_ns: int, end_ns: int) -> int:
+        """Return about how many samples lie between two stamps; never fewer than there are."""
+        self._flush()
+        stamps = self._open()[0]
+        inside = int(np.searchsorted(stamps, end_ns, "right") - np.searchsorted(stamps, start_ns))
+        return inside + sum(_share(block, start_ns, end_ns) for block in self._blocks)
+
+    def near(self, start_ns: int, end_ns: int, beside: int) -> Samples:
+        """Return the samples from `start_ns` to `end_ns`, and their neighbours, in any order.
+
+        Of each side at least the `beside` nearest stamps are there with all of their samples, or
+        as many as exist.
+        """
+        self._flush()
+        blocks = [*self._blocks]
+        open_samples = self._open()
+        parts = [_cut(open_samples, start_ns, end_ns, beside)] if len(open_samples[0]) else []
+        rest = []
+        for block in blocks:
+            if block.last_ns >= start_ns and block.first_ns <= end_ns:
+                parts.append(_cut(self._samples(block), start_ns, end_ns, beside))
+            else:
+                rest.append(block)
+        before = sorted((b for b in rest if b.last_ns < start_ns), key=lambda b: -b.last_ns)
+        after = sorted((b for b in rest if b.last_ns >= start_ns), key=lambda b: b.first_ns)
+        for side, sign in ((before, -1), (after, 1)):
+            for block in side:
+                edge, known = (start_ns, -block.last_ns) if sign < 0 else (end_ns, block.first_ns)
+                if known > _nth(parts, sign * edge, sign, beside):
+                    break
+                parts.append(_cut(self._samples(block), start_ns, end_ns, beside))
+        if not parts:
+            return NO_STAMPS, np.zeros(0), np.zeros(0)
+        return tuple(np.concatenate(column) for column in zip(*parts, strict=True))
+
+
+def _share(block: _Block, start_ns: int, end_ns: int) -> int:
+    return block.count if block.last_ns >= start_ns and block.first_ns <= end_ns else 0
+
+
+def _nth(parts: list[Samples], edge: int, sign: int, n: int) -> float:
+    """Return the n-th stamp times sign beyond an edge, infinity if there are fewer."""
+    stamps = np.unique(np.concatenate([NO_STAMPS, *(sign * part[0] for part in parts)]))
+    beyond = stamps[np.searchsorted(stamps, edge, "right"):]
+    return float("inf") if len(beyond) < n else int(beyond[n - 1])
+
+
+def _cut(samples: Samples, start_ns: int, end_ns: int, beside: int) -> Samples:
+    """Return the samples between two stamps and of at least `beside` stamps on either side."""
+    t = samples[0]
+    low = _reach(t[:np.searchsorted(t, start_ns)][::-1], beside)
+    high = _reach(t[np.searchsorted(t, end_ns, "right"):], beside)
+    first = int(np.searchsorted(t, start_ns)) - low
+    last = int(np.searchsorted(t, end_ns, "right")) + high
+    return tuple(column[first:last] for column in samples)
+
+
+def _reach(stamps: np.ndarray, n: int) -> int:
+    """Return how many of the samples to take from the front to have n whole stamps."""
+    take = 2 * n
+    while take < len(stamps):
+        change = np.flatnonzero(stamps[1:take] != stamps[:take - 1])
+        if len(change) >= n:
+            return int(change[n - 1]) + 1
+        take *= 2
+    return len(stamps)

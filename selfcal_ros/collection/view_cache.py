@@ -1,0 +1,112 @@
+# SPDX-License-Identifier: Apache-2.0
+"""All detections of a session, the view of each, and readings that are made anew if need be."""
+
+from collections import Counter
+from dataclasses import replace
+
+import numpy as np
+
+from selfcal_ros.collection.exposures import Exposures
+from selfcal_ros.collection.growing import GrowingTable
+from selfcal_ros.collection.reasons import Reason
+from selfcal_ros.collection.reduce import DETECTION, Rules, clean, reduce_view
+from selfcal_ros.collection.timeline import Timeline
+from selfcal_ros.model.readings import ViewReadings
+
+NO_STAMPS = np.zeros(0, dtype=np.int64)
+PLACE = np.dtype([("interval", "i4"), ("view", "i4")])
+"""Interval of the timeline and view of a detection; -1 = before the first, in no view."""
+
+
+class ViewCache:
+    """Detections as they come, and the readings made of them: each view when it has changed."""
+
+    def __init__(self, rules: Rules) -> None:
+        self._rules = rules
+        self._table, self._place = GrowingTable(DETECTION), GrowingTable(PLACE)
+        self._looked_up = 0  # detections whose stamps were handed out
+        self._scored = False
+        self._timeline: Timeline | None = None
+        self._changed = [NO_STAMPS]
+        self._readings: dict[int, ViewReadings] = {}
+
+    @property
+    def table(self) -> np.ndarray:
+        """All detections in the order of their arrival, structured array of `DETECTION`."""
+        return self._table.rows
+
+    @property
+    def view_of(self) -> np.ndarray:
+        """View of each detection, -1 for none; as of the last `readings`."""
+        return self._place.rows["view"]
+
+    def append(self, table: np.ndarray) -> None:
+        """Take detections."""
+        self._table.append(table)
+        scored = bool((np.isfinite(table["score"]) & (table["score"] > 0)).any())
+        if scored and not self._scored:  # low scores count from now on
+            self._scored = True
+            self._readings = {}
+
+    def new_stamps(self) -> np.ndarray:
+        """Return the stamps of the detections since the last call."""
+        new = self.table["stamp"][self._looked_up:]
+        self._looked_up = len(self._table)
+        return new
+
+    def changed_at(self, stamps_ns: np.ndarray) -> None:
+        """Take note that something else is known of the stage at these instants."""
+        if len(stamps_ns):
+            self._changed.append(stamps_ns)
+
+    def readings(self, timeline: Timeline, exposures: Exposures,
+                 ) -> tuple[dict[int, ViewReadings], Counter]:
+        """Return the readings of every view, and reason -> detections that belong to none."""
+        for index in self._assign(timeline):
+            self._readings.pop(index, None)
+        for index, view in timeline.views.items():
+            found = self._readings.get(index)
+            if found is None or found.view != view:
+                self._readings[index] = self._reduce(timeline, index, exposures)
+        return {index: self._readings[index] for index in timeline.views}, self._loose(timeline)
+
+    def _assign(self, timeline: Timeline) -> set[int]:
+        """Find the view of each detection; return the views whose detections have changed."""
+        known = len(self._place)
+        old = self.view_of[:known].copy() if timeline is not self._timeline else None
+        if self._timeline is None or timeline.artifact != self._timeline.artifact:
+            self._readings = {}
+        start = 0 if old is not None else known
+        self._place.append(np.zeros(len(self._table) - known, dtype=PLACE))
+        view_of = np.array([-1 if interval.view_index is None else interval.view_index
+                            for interval in timeline.intervals] + [-1])
+        interval = timeline.assign(self.table["stamp"][start:])
+        place = self._place.rows[start:]
+        place["interval"], place["view"] = interval, view_of[interval]
+        touched = [np.unique(self.view_of[known:])]
+        if old is not None:
+            moved = old != self.view_of[:known]
+            touched += [np.unique(old[moved]), np.unique(self.view_of[:known][moved])]
+        stamps = np.concatenate(self._changed)
+        touched.append(np.unique(view_of[timeline.assign(stamps)]))
+        self._timeline, self._changed = timeline, [NO_STAMPS]
+        return set(np.concatenate(touched).tolist())
+
+    def _loose(self, timeline: Timeline) -> Counter:
+        """Return reason -> number of detections that belong to no view."""
+        counts = np.bincount(self._place.rows["interval"] + 1,
+                             minlength=len(timeline.intervals) + 1).tolist()
+        loose = Counter({str(Reason.OUTSIDE_VIEWS): counts[0]})
+        for interval, count in zip(timeline.intervals, counts[1:], strict=True):
+            if interval.view_index is None:
+                loose[str(interval.reason)] += count
+        return +loose
+
+    def _reduce(self, timeline: Timeline, index: int, exposures: Exposures) -> ViewReadings:
+        detections = self.table[self.view_of == index]
+        good, reasons = clean(detections, self._rules, scored=self._scored)
+        readings = reduce_view(timeline.artifact, timeline.views[index], good,
+                               exposures=exposures, rules=self._rules)
+        total = Counter(readings.rejected)
+        total.update({str(reason): count for reason, count in reasons.items()})
+        return replace(readings, rejected=dict(sorted(total.items())))
