@@ -152,15 +152,19 @@ class Exposures:
         return np.insert(due, at, True)
 
     def _groups(self, due: np.ndarray) -> list[np.ndarray]:
-        """Return the instants that are due in groups with few enough samples each, (n,) each."""
-        groups, waiting = [], [due] if len(due) else []
+        """Return the instants that are due in groups with few enough samples each, (n,) each.
+
+        Where halves have as many samples beside them as the whole, as in a session that came
+        shuffled from end to end, a group stays whole.
+        """
+        groups, waiting = [], [(due, np.inf)] if len(due) else []
         while waiting:
-            group = waiting.pop()
+            group, before = waiting.pop()
             start, end = self._window(group)
-            if len(group) > 1 and any(track.store.count_between(start, end) > MOST_SAMPLES
-                                      for track in self._tracks):
+            count = max(track.store.count_between(start, end) for track in self._tracks)
+            if len(group) > 1 and MOST_SAMPLES < count < 0.9 * before:
                 half = len(group) // 2
-                waiting += [group[half:], group[:half]]
+                waiting += [(group[half:], count), (group[:half], count)]
             else:
                 groups.append(group)
         return groups

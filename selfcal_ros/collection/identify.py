@@ -105,7 +105,8 @@ def identify_grid(artifact: Artifact, view: View, reading_m: np.ndarray, *, ids:
     deviation = reading_m - site * pitch
     about = (site - np.array(pose.shift)[:, None]) * pitch
     limit = min(rules.max_deviation_m, pitch / 4)
-    if np.unique(marks[:, ~far & ~ambiguous & ~unsure], axis=1).shape[1] < 3:
+    number = marks[0] * (2 * artifact.half[1] + 1) + marks[1]
+    if len(np.unique(number[~far & ~ambiguous & ~unsure])) < 3:
         limit = pitch / 4  # too few marks to know the view's own rotation and offset
     residual = deviation - rigid.at(about)
     far |= ~ambiguous & (np.hypot(*residual) > limit)

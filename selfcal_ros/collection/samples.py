@@ -209,7 +209,7 @@ class SampleStore:
         for side, sign in ((before, -1), (after, 1)):
             for block in side:
                 edge, known = (start_ns, -block.last_ns) if sign < 0 else (end_ns, block.first_ns)
-                if known > _nth(parts, sign * edge, sign, beside):
+                if known > _nth(parts, edge, sign, beside):
                     break
                 parts.append(_cut(self._samples(block), start_ns, end_ns, beside))
         if not parts:
@@ -222,10 +222,11 @@ def _share(block: _Block, start_ns: int, end_ns: int) -> int:
 
 
 def _nth(parts: list[Samples], edge: int, sign: int, n: int) -> float:
-    """Return the n-th stamp times sign beyond an edge, infinity if there are fewer."""
-    stamps = np.unique(np.concatenate([NO_STAMPS, *(sign * part[0] for part in parts)]))
-    beyond = stamps[np.searchsorted(stamps, edge, "right"):]
-    return float("inf") if len(beyond) < n else int(beyond[n - 1])
+    """Return sign times the n-th stamp before or behind an edge, infinity if there are fewer."""
+    beyond = [t[:np.searchsorted(t, edge)] if sign < 0 else t[np.searchsorted(t, edge, "right"):]
+              for t, _, _ in parts]
+    stamps = np.unique(sign * np.concatenate([NO_STAMPS, *beyond]))
+    return float("inf") if len(stamps) < n else int(stamps[n - 1])
 
 
 def _cut(samples: Samples, start_ns: int, end_ns: int, beside: int) -> Samples:

@@ -160,7 +160,9 @@ class CollectingSession:
         missed = ", ".join(self.missed.values())
         state = self._problem or self._state
         state += f"; began before this node: {missed}" if missed else ""
-        bad = missed or self._problem or self.collector.unusable
+        stored = self.collector.storage_problem
+        state += f"; {stored}" if stored else ""
+        bad = missed or self._problem or self.collector.unusable or stored
         return Diagnosis(Level.WARN if bad else Level.OK, state, {
             **received, "views": len(self._published),
             **{f"rejected {reason}": n for reason, n in sorted(self._rejected.items())}})

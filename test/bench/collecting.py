@@ -19,13 +19,13 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
-from selfcal_ros.collection.collector import Collector  # noqa: E402
-from selfcal_ros.collection.digest import readings_digest  # noqa: E402
-from selfcal_ros.collection.messages import Command, EncoderSample, Kind, Phase  # noqa: E402
-from selfcal_ros.collection.parameters import parameter_values  # noqa: E402
-from selfcal_ros.collection.reduce import DETECTION  # noqa: E402
-from selfcal_ros.model.artifact import Artifact  # noqa: E402
-from selfcal_ros.model.view import View  # noqa: E402
+from selfcal_ros.collection.collector import Collector
+from selfcal_ros.collection.digest import readings_digest
+from selfcal_ros.collection.messages import Command, EncoderSample, Kind, Phase
+from selfcal_ros.collection.parameters import parameter_values
+from selfcal_ros.collection.reduce import DETECTION
+from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.view import View
 
 SIZE, PITCH_M = 21, 0.01
 START_NS, S = 1_700_000_000_000_000_000, 1_000_000_000

