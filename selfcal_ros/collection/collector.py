@@ -14,15 +14,15 @@ from typing import Any
 import numpy as np
 
 from selfcal_ros.collection.diagnosis import Finding
-from selfcal_ros.collection.encoder import JointTrack, TrackLimits
 from selfcal_ros.collection.evidence import EncoderFacts, Seen
 from selfcal_ros.collection.expected import Missing, expected_marks, missing_marks
-from selfcal_ros.collection.exposures import Exposures, Tracks
-from selfcal_ros.collection.identify import IdentityRules
+from selfcal_ros.collection.marks.identify import IdentityRules
 from selfcal_ros.collection.messages import Command, Detection, EncoderSample, check_command
 from selfcal_ros.collection.reasons import Reason
 from selfcal_ros.collection.reduce import DETECTION, Rules
-from selfcal_ros.collection.samples import Limits
+from selfcal_ros.collection.stage.encoder import JointTrack, TrackLimits
+from selfcal_ros.collection.stage.exposures import Exposures, Tracks
+from selfcal_ros.collection.stage.samples import Limits
 from selfcal_ros.collection.timeline import Timeline, build_timeline
 from selfcal_ros.collection.view_cache import ViewCache
 from selfcal_ros.errors import InputError, NoDataError

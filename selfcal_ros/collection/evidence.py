@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from selfcal_ros.collection.diagnosis import Evidence, Finding, Span, diagnose, main_reason
-from selfcal_ros.collection.exposures import Exposures
-from selfcal_ros.collection.identify import IdentityRules
+from selfcal_ros.collection.marks.identify import IdentityRules
 from selfcal_ros.collection.messages import Kind
+from selfcal_ros.collection.stage.exposures import Exposures
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Sense, ViewReadings
 from selfcal_ros.model.view import View

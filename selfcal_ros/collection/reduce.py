@@ -6,16 +6,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from selfcal_ros.collection.exposures import Exposures
-from selfcal_ros.collection.identify import (
+from selfcal_ros.collection.marks.identify import (
     IdentityRules,
     identify_angular,
     identify_grid,
 )
+from selfcal_ros.collection.marks.repeats import reduce_repeats
+from selfcal_ros.collection.marks.visits import grid_visits
 from selfcal_ros.collection.messages import Kind
 from selfcal_ros.collection.reasons import Reason
-from selfcal_ros.collection.repeats import reduce_repeats
-from selfcal_ros.collection.visits import grid_visits
+from selfcal_ros.collection.stage.exposures import Exposures
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Sense, ViewReadings
 from selfcal_ros.model.view import View

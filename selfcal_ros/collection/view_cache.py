@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from selfcal_ros.collection.exposures import Exposures
-from selfcal_ros.collection.growing import GrowingTable
 from selfcal_ros.collection.reasons import Reason
 from selfcal_ros.collection.reduce import DETECTION, Rules, clean, reduce_view
+from selfcal_ros.collection.stage.exposures import Exposures
+from selfcal_ros.collection.stage.growing import GrowingTable
 from selfcal_ros.collection.timeline import Timeline
 from selfcal_ros.model.readings import ViewReadings
 

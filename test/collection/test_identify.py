@@ -6,13 +6,13 @@ from math import pi
 import numpy as np
 import pytest
 
-from selfcal_ros.collection.identify import (
+from selfcal_ros.collection.marks.identify import (
     IdentityRules,
     identify_angular,
     identify_grid,
     wrap,
 )
-from selfcal_ros.collection.rigid import Rigid, fit_motion
+from selfcal_ros.collection.marks.rigid import Rigid, fit_motion
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.view import View

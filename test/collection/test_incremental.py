@@ -11,11 +11,11 @@ from hypothesis import strategies as st
 
 from selfcal_ros.collection.collector import Collector
 from selfcal_ros.collection.digest import readings_digest, session_digest
-from selfcal_ros.collection.exposures import Exposures
 from selfcal_ros.collection.messages import Command, Detection, EncoderSample
 from selfcal_ros.collection.parameters import parameter_values
 from selfcal_ros.collection.reduce import DETECTION
-from selfcal_ros.collection.samples import Limits
+from selfcal_ros.collection.stage.exposures import Exposures
+from selfcal_ros.collection.stage.samples import Limits
 from selfcal_ros.errors import NoDataError
 from selfcal_ros.simulation.faults import Faults, apply_faults
 from test.support.collecting import collect, digest, scene

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import binom
 
-from selfcal_ros.collection.repeats import reduce_repeats
+from selfcal_ros.collection.marks.repeats import reduce_repeats
 
 SIGMA = 2e-8
 LIMIT = 6.0

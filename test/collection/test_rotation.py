@@ -7,15 +7,15 @@ from math import pi
 import numpy as np
 import pytest
 
-from selfcal_ros.collection.identify import (
+from selfcal_ros.collection.marks.identify import (
     IdentityRules,
     _middle,
     identify_angular,
     identify_grid,
 )
+from selfcal_ros.collection.marks.rigid import LARGEST_TURN_RAD, Rigid, fit_motion
 from selfcal_ros.collection.messages import Kind
 from selfcal_ros.collection.reasons import Reason, advice
-from selfcal_ros.collection.rigid import LARGEST_TURN_RAD, Rigid, fit_motion
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.view import View
 from selfcal_ros.simulation.cell import CellSettings, plan_events

@@ -6,10 +6,10 @@ import math
 import numpy as np
 
 from selfcal_ros.collection.collector import Collector
+from selfcal_ros.collection.marks.repeats import reduce_repeats
 from selfcal_ros.collection.messages import Command, EncoderSample, Phase
 from selfcal_ros.collection.parameters import parameter_values
 from selfcal_ros.collection.reasons import Reason
-from selfcal_ros.collection.repeats import reduce_repeats
 from selfcal_ros.collection.timeline import build_timeline
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.view import View

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from selfcal_ros.collection.reasons import Reason
-from selfcal_ros.collection.samples import Limits, Samples, SampleStore
+from selfcal_ros.collection.stage.samples import Limits, Samples, SampleStore
 
 BEYOND_NOISE = 6.0
 """Standard deviations by which two samples must differ to show that a joint has moved."""

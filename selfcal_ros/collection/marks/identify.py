@@ -5,8 +5,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from selfcal_ros.collection.marks.rigid import LARGEST_TURN_RAD, Fit, Known, Rigid, fit_motion
 from selfcal_ros.collection.reasons import Reason
-from selfcal_ros.collection.rigid import LARGEST_TURN_RAD, Fit, Known, Rigid, fit_motion
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.view import View
 

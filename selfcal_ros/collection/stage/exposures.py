@@ -9,7 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from selfcal_ros.collection.encoder import (
+from selfcal_ros.collection.reasons import Reason
+from selfcal_ros.collection.stage.encoder import (
     EVER,
     LOOK_BACK_NS,
     NEVER,
@@ -17,8 +18,7 @@ from selfcal_ros.collection.encoder import (
     Series,
     filled,
 )
-from selfcal_ros.collection.growing import GrowingTable
-from selfcal_ros.collection.reasons import Reason
+from selfcal_ros.collection.stage.growing import GrowingTable
 
 REASONS = np.array([None, Reason.NO_ENCODER, Reason.MOVING, Reason.CONTRADICTION], dtype=object)
 """Reasons that the encoder gives, by the code that is kept of them."""

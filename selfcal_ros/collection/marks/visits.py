@@ -3,7 +3,7 @@
 
 import numpy as np
 
-from selfcal_ros.collection.repeats import Means, average
+from selfcal_ros.collection.marks.repeats import Means, average
 from selfcal_ros.model.readings import GridVisits
 
 
