@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """``selfcal solve`` says in one line what mends detections that nothing identifies."""
 
+import json
 from dataclasses import replace
 
 from selfcal_ros.cli.main import main
-from selfcal_ros.collection.messages import Detection
+from selfcal_ros.collection.messages import Command, Detection, Phase
 from test.support.bags import Foreign
 from test.support.plans import plan_of
 from test.support.sessions import events_of
@@ -24,3 +25,25 @@ def test_lines_that_cannot_be_told_apart_are_said_with_their_mend(tmp_path, caps
     mended.write_text("measurement_collector: {ros__parameters: {max_rotation: 0.02}}\n")
     assert main(["solve", str(path), "--quiet", "--params", str(mended)]) == 0
     assert capsys.readouterr().err == ""
+
+
+def test_commands_that_cannot_be_followed_are_said_and_change_nothing(tmp_path, capsys):
+    events = events_of(plan_of("0, 90, tx", 5, count=8, line=True))
+    plain = Foreign().write(tmp_path / "plain.mcap", events)
+    measure = next(e for e in events if isinstance(e, Command) and e.phase == Phase.MEASURE)
+    view = measure.view
+    odd = [replace(measure, view=replace(view, translation_m=(1e17, 0.0))),
+           replace(measure, view=replace(view, grid=False, angular=False)),
+           replace(measure, view=replace(view, repeats=2**32 - 1)),
+           replace(measure, view_index=2**31)]
+    spoilt = Foreign().write(tmp_path / "spoilt.mcap", [*events, *odd])
+    outputs = []
+    for bag, lines in ((plain, 0), (spoilt, 4)):
+        output = tmp_path / "result.json"
+        assert main(["solve", str(bag), "--quiet", "-o", str(output)]) == 0
+        said = capsys.readouterr().err.splitlines()
+        assert len(said) == lines
+        assert all(": a view command was not used: view " in line for line in said)
+        outputs.append(json.loads(output.read_text()))
+    assert outputs[1]["rejected"] == {"command_unusable": 4}
+    assert outputs[0]["error_map"] == outputs[1]["error_map"]
