@@ -42,7 +42,7 @@ class BagPlayer(SelfcalNode):
         self.player.step()
         if self.player.done and not self.finished.done():
             self.player.drain()
-            for line in self.player.reader.lost:
+            for line in self.player.playlist.lost:
                 self.get_logger().warning(line)
             self.get_logger().info(f"played {self.player.sent}")
             self.finished.set_result(None)

@@ -5,11 +5,10 @@ import time
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.duration import Duration
 
-from selfcal_ros.bagio.reader import BagReader
+from selfcal_ros.bagio.playlist import Playlist
 from selfcal_ros.errors import NoDataError
 from selfcal_ros.messages.topics import COMMAND_TOPIC, DETECTION_TOPIC, ENCODER_TOPIC
 from selfcal_ros.nodes import names
@@ -33,17 +32,12 @@ class Player:
     def __init__(self, node: SelfcalNode, bag: str, *, rate: float, seed: int,
                  namespace: str | None = None) -> None:
         self.node, self.rate = node, rate
-        self.reader = BagReader(Path(bag), namespace)
-        items = list(self.reader.cdr_messages())
-        if not items:
+        self.playlist = Playlist(Path(bag), namespace, seed)
+        if not len(self.playlist):
             raise NoDataError(bag, "no message on the topics of the contract", "see the README")
-        items.sort(key=lambda item: item[1])
-        if seed >= 0:
-            order = np.random.default_rng(seed).permutation(len(items))
-            times = [item[1] for item in items]
-            items = [(items[i][0], stamp, items[i][2])
-                     for i, stamp in zip(order, times, strict=True)]
-        self._items = items
+        self._messages = iter(self.playlist)
+        self._next = next(self._messages)
+        self._first_ns = self._next[1]
         self._publishers = {topic.name: node.publisher(topic) for topic in names.INPUTS}
         self.sent = dict.fromkeys(KINDS.values(), 0)
         self.heard: dict[str, int] | None = None
@@ -53,12 +47,12 @@ class Player:
     @property
     def total(self) -> int:
         """Messages to play."""
-        return len(self._items)
+        return len(self.playlist)
 
     @property
     def done(self) -> bool:
         """Whether every message has been published."""
-        return self._at >= len(self._items)
+        return self._at >= len(self.playlist)
 
     @property
     def played(self) -> int:
@@ -67,26 +61,25 @@ class Player:
 
     def matched(self) -> list[str]:
         """Return the topics that have messages to play but no subscriber yet."""
-        used = {topic for topic, _, _ in self._items}
         return [topic for topic, publisher in self._publishers.items()
-                if topic in used and publisher.get_subscription_count() == 0]
+                if topic in self.playlist.counts and publisher.get_subscription_count() == 0]
 
     def step(self) -> None:
         """Publish what is due now."""
         now = time.monotonic()
         if self._began is None:
             self._began = now
-        first = self._items[0][1]
         stop = now + 0.02
         while not self.done and time.monotonic() < stop:
-            topic, stamp, data = self._items[self._at]
-            if self.rate > 0 and (stamp - first) * 1e-9 / self.rate > now - self._began:
+            topic, stamp, data = self._next
+            if self.rate > 0 and (stamp - self._first_ns) * 1e-9 / self.rate > now - self._began:
                 return
             if not self._room():
                 return
             self._publishers[topic].publish(data)
             self.sent[KINDS[topic]] += 1
             self._at += 1
+            self._next = next(self._messages, self._next)
 
     def _room(self) -> bool:
         """Return whether the subscribers keep up."""

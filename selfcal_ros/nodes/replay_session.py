@@ -117,7 +117,7 @@ class ReplaySession(SelfcalNode):
     def _end(self, message: str, code: ExitCode) -> None:
         if message:
             print(f"selfcal replay: {message}", file=sys.stderr, flush=True)
-        for line in self.player.reader.lost:
+        for line in self.player.playlist.lost:
             print(f"lost {line}", flush=True)
         self.exit_code = code
         if not self.finished.done():

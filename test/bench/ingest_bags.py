@@ -93,8 +93,10 @@ def _rows(event, fields, topic: str, channel: int, stamps: np.ndarray) -> tuple:
     """Return a table of message records like that of `event`, and where their payloads begin."""
     make = from_model.joint_state if topic == ENCODER_TOPIC else from_model.detection
     name = INPUT_TOPICS[topic]
-    message = build(typestore(), name, make(event, "stage"))
-    payload = bytes(typestore().serialize_cdr(message, name))
+    values = make(event, "stage")
+    if "effort" in values:  # pybag-sdk cannot read a message that ends in an empty sequence
+        values |= {"effort": [0.0] * len(event.names)}
+    payload = bytes(typestore().serialize_cdr(build(typestore(), name, values), name))
     layout = layout_of(fields, payload)
     size = FRONT.itemsize + len(payload)
     formats = [(code if count is None else (code, (count,)), FRONT.itemsize + at)
