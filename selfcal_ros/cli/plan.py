@@ -13,6 +13,8 @@ from selfcal_ros.cli.plan_terms import (
     terms_json,
     terms_text,
 )
+from selfcal_ros.cli.terminal.progress import late_progress
+from selfcal_ros.units import NM_PER_M
 
 HELP = "check a plan of views before it is measured, or suggest views"
 
@@ -165,74 +167,113 @@ def _suggest(args: argparse.Namespace, plan) -> int:
     if args.top < 1:
         raise InputError("--top", f"{args.top} is not positive", "give 1 or more")
     check_outputs([args.plan], [args.output])
+    plan = _in_order(plan, args.order)
+    against = _against(args, plan)
+    datum = ThetaDatum(args.theta_datum)
+    with late_progress("judging plans") as progress:
+        if args.views is not None:
+            angular = any(view.angular for view in plan.views) and plan.artifact.angular_count > 0
+            repeats = min(view.repeats for view in plan.views)
+            best, score, how = best_plan(
+                plan.artifact, args.views, angular=angular, criterion=args.criterion,
+                repeats=repeats, datum=datum, against=against, progress=progress)
+        else:
+            now, ranked = rank_next(plan, criterion=args.criterion, datum=datum, against=against,
+                                    progress=progress)
+    unit = _unit_nm(plan, against)
     if args.views is not None:
-        angular = any(view.angular for view in plan.views) and plan.artifact.angular_count > 0
-        repeats = min(view.repeats for view in plan.views)
-        best, score, how = best_plan(plan.artifact, args.views, angular=angular,
-                                     criterion=args.criterion, repeats=repeats)
-        best = replace(best, plan_id=f"{plan.plan_id}_best{args.views}")
-        _show_best(args, best, score, how)
+        best = replace(best, plan_id=f"{plan.plan_id}_best{args.views}",
+                       model_terms=plan.model_terms)
+        best = _in_order(best, next((v.visit_order for v in plan.views if v.grid), ""))
+        _show_best(args, best, (score, unit), how)
     else:
-        now, ranked = rank_next(plan, criterion=args.criterion,
-                                datum=ThetaDatum(args.theta_datum))
-        best = _with(plan, ranked[0])
-        _show_ranked(args, plan, now, ranked[:args.top])
+        best = replace(plan, views=ranked[0].views)
+        _show_ranked(args, plan, (now, unit), ranked[:args.top])
     if args.output:
         _write_plan(args.output, best)
     return int(ExitCode.DONE)
 
 
-def _with(plan, suggestion):
+def _in_order(plan, order: str):
+    """Return the plan with all grid marks visited in `order`, unless it is empty."""
     from dataclasses import replace
 
-    views = list(plan.views)
-    if suggestion.repeat_of is None:
-        views.append(suggestion.view)
-    else:
-        views[suggestion.repeat_of] = suggestion.view
-    return replace(plan, views=tuple(views))
+    from selfcal_ros.model.orders import parse_order
+
+    if not order:
+        return plan
+    order = str(parse_order(order, "--order"))
+    return replace(plan, views=tuple(replace(view, visit_order=order) if view.grid else view
+                                     for view in plan.views))
 
 
-def _show_ranked(args: argparse.Namespace, plan, now, ranked: list) -> None:
+def _against(args: argparse.Namespace, plan):
+    """Return the terms that count in the uncertainty: the plan's own and those of --against."""
+    from selfcal_ros.estimation.observability.suggest import Against
+    from selfcal_ros.model.terms import ModelTerm, TermName, parse_terms
+
+    found = {term.name: term for term in parse_terms(plan.model_terms, "model_terms")}
+    found |= {name: ModelTerm(name, size) for name, size in sizes_of(args).items()}
+    assumed = assumed_of(args)
+    return Against(tuple(found[n] for n in TermName if n in found), assumed) if found else None
+
+
+def _unit_nm(plan, against) -> float | None:
+    """Return the noise of an averaged reading in nm where a plan is judged against terms."""
+    repeats = min(view.repeats for view in plan.views)
+    return None if against is None else against.assumed.sigma_m * NM_PER_M / repeats**0.5
+
+
+def _show_ranked(args: argparse.Namespace, plan, now: tuple, ranked: list) -> None:
+    """Print the next steps; `now`: score of the plan and the unit of an uncertainty, nm."""
+    unit = now[1]
     if args.json:
         print(json.dumps({
-            "plan_id": plan.plan_id, "criterion": args.criterion, "now": _score_json(now),
-            "suggestions": [{"text": item.text, "view": view_to_dict(item.view, plan.artifact),
-                             "repeat_of": item.repeat_of, **_score_json(item.score)}
-                            for item in ranked]}, indent=1))
+            "plan_id": plan.plan_id, "criterion": args.criterion, "now": _score_json(*now),
+            "suggestions": [{"text": item.text,
+                             "view": item.view and view_to_dict(item.view, plan.artifact),
+                             "repeat_of": item.repeat_of, "visit_order": item.order or None,
+                             **_score_json(item.score, unit)} for item in ranked]}, indent=1))
         return
-    print(f"plan {plan.plan_id}: {_score_text(now)}")
+    print(f"plan {plan.plan_id}: {_score_text(*now)}")
     print(f"next steps, the best first by {args.criterion} XY uncertainty:")
     for item in ranked:
-        print(f"  {_score_text(item.score)}   {item.text}")
+        print(f"  {_score_text(item.score, unit)}   {item.text}")
 
 
-def _show_best(args: argparse.Namespace, best, score, how: str) -> None:
+def _show_best(args: argparse.Namespace, best, score: tuple, how: str) -> None:
     views = [view_to_dict(view, best.artifact) for view in best.views]
     if args.json:
         print(json.dumps({"plan_id": best.plan_id, "criterion": args.criterion, "views": views,
-                          "how": how, **_score_json(score)}, indent=1))
+                          "how": how, **_score_json(*score)}, indent=1))
         return
     print(f"best plan of {len(views)} views by {args.criterion} XY uncertainty ({how}):")
     for view in views:
         a, b = view["translation_pitch"]
         kind = "" if view["grid"] else ", lines only"
         print(f"  {view['name']}: turn {view['rotation_deg']:g} deg, shift [{a}, {b}]{kind}")
-    print(_score_text(score))
+    print(_score_text(*score))
 
 
-def _score_json(score) -> dict:
+def _score_json(score, unit_nm: float | None) -> dict:
     def number(value: float) -> float | None:
         return value if math.isfinite(value) else None
 
-    return {"deficiency": score.deficiency, "rms_gain_xy": number(score.rms_xy),
-            "max_gain_xy": number(score.max_xy), "rms_gain_theta": number(score.rms_theta)}
+    out = {"deficiency": score.deficiency, "rms_gain_xy": number(score.rms_xy),
+           "max_gain_xy": number(score.max_xy), "rms_gain_theta": number(score.rms_theta)}
+    if unit_nm is not None:
+        out |= {"u_rms_m": number(score.rms_xy * unit_nm / NM_PER_M),
+                "u_max_m": number(score.max_xy * unit_nm / NM_PER_M)}
+    return out
 
 
-def _score_text(score) -> str:
+def _score_text(score, unit_nm: float | None) -> str:
     if score.deficiency:
         return f"{score.deficiency} modes unseen"
     theta = f"  theta rms {score.rms_theta:.3f}" if score.rms_theta else ""
+    if unit_nm is not None:
+        return (f"u XY rms {score.rms_xy * unit_nm:.2f} nm  max {score.max_xy * unit_nm:.2f} nm"
+                f"{theta}")
     return f"XY rms {score.rms_xy:.3f}  max {score.max_xy:.3f}{theta}"
 
 
@@ -255,4 +296,4 @@ def _write_plan(path: str, plan) -> None:
         plate["grid_size_y"] = artifact.grid_size_y
     write_yaml(path, {"plan_id": plan.plan_id, "artifact": plate,
                       "views": [view_to_dict(view, artifact) for view in plan.views],
-                  **({"model_terms": list(plan.model_terms)} if plan.model_terms else {})})
+                      **({"model_terms": list(plan.model_terms)} if plan.model_terms else {})})

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """``selfcal plan``: every shipped plan, exit codes, JSON keys, files written."""
 
+import contextlib
 import json
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import yaml
 
 from selfcal_ros.cli.main import main
 from selfcal_ros.cli.plan_terms import length_m
+from selfcal_ros.cli.terminal import progress
 from selfcal_ros.files import read_yaml
 from selfcal_ros.model.view import plan_from_dict
 
@@ -154,6 +156,30 @@ def test_suggest_next_views(capsys, tmp_path):
     assert text.startswith("plan deficient_qiao_180: 10 modes unseen\n")
 
 
+def test_suggest_against_terms(capsys, tmp_path):
+    out = tmp_path / "next.yaml"
+    asked = ["plan", "suggest", shipped("qiao"), "--against", "drift:500e-9", "--order", "raster"]
+    assert main([*asked, "--top", "1", "-o", str(out)]) == 0
+    text = capsys.readouterr().out
+    assert text.startswith("plan qiao: u XY rms ") and " nm " in text.splitlines()[0]
+    assert "visit the marks in the order x_back_y_back, 4 repeats for 1" in text
+    plan = plan_from_dict(read_yaml(out), "next")
+    assert {(v.visit_order, v.repeats) for v in plan.views} == {("x_back_y_back", 4)}
+    assert main([*asked, "--json", "--sigma", "10nm"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    first = found["suggestions"][0]
+    assert first["view"] is None and first["visit_order"] == "x_back_y_back"
+    assert first["u_rms_m"] == pytest.approx(first["rms_gain_xy"] * 10e-9)
+    assert found["now"]["u_max_m"] == pytest.approx(found["now"]["max_gain_xy"] * 10e-9)
+    # terms of the plan itself count as well, and stay in what is written
+    data = yaml.safe_load(Path(shipped("qiao")).read_text())
+    path = tmp_path / "own.yaml"
+    path.write_text(yaml.safe_dump(data | {"model_terms": ["plate_shape:30e-9"]}))
+    assert main(["plan", "suggest", str(path), "-o", str(out)]) == 0
+    assert "  u XY rms " in capsys.readouterr().out
+    assert plan_from_dict(read_yaml(out), "next").model_terms == ("plate_shape:3e-08",)
+
+
 def test_suggest_does_not_write_over_its_plan(capsys, tmp_path):
     plan = tmp_path / "plan.yaml"
     plan.write_bytes(Path(shipped("qiao")).read_bytes())
@@ -196,3 +222,24 @@ def test_bad_plans_name_the_place(tmp_path, capsys):
     assert "view 'rot90'" in error and len(error.splitlines()) == 1
     assert main(["plan", "check", str(tmp_path / "none.yaml")]) == 2
     assert "no such file" in capsys.readouterr().err
+
+
+def test_progress_shows_only_what_takes_long(monkeypatch):
+    clock, drawn = [100.0], []
+
+    @contextlib.contextmanager
+    def bar(label):
+        drawn.append(label)
+        yield lambda *at: drawn.append(at)
+
+    monkeypatch.setattr(progress.time, "monotonic", lambda: clock[0])
+    monkeypatch.setattr(progress, "progress_bar", bar)
+    with progress.late_progress("plans") as advance:
+        advance(1, 9)
+        clock[0] = 101.9
+        advance(2, 9)
+        assert drawn == []
+        clock[0] = 102.0
+        advance(3, 9)
+        advance(4, None)
+    assert drawn == ["plans", (3, 9), (4, None)]

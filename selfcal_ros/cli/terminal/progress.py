@@ -3,6 +3,7 @@
 
 import contextlib
 import sys
+import time
 from collections.abc import Callable, Iterator
 
 
@@ -18,3 +19,19 @@ def progress_bar(label: str) -> Iterator[Callable[[int, int | None], None]]:
     with Progress(console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task(label, total=None)
         yield lambda done, total=None: bar.update(task, completed=done, total=total)
+
+
+@contextlib.contextmanager
+def late_progress(label: str, after_s: float = 2.0) -> Iterator[Callable[[int, int | None], None]]:
+    """Yield the function of `progress_bar`; its bar appears only once `after_s` have passed."""
+    began, draw = time.monotonic(), None
+    with contextlib.ExitStack() as stack:
+
+        def advance(done: int, total: int | None = None) -> None:
+            nonlocal draw
+            if draw is None and time.monotonic() - began >= after_s:
+                draw = stack.enter_context(progress_bar(label))
+            if draw is not None:
+                draw(done, total)
+
+        yield advance

@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import f as f_distribution
+from scipy.special import fdtri
 
 from selfcal_ros.errors import NotIdentifiableError
 from selfcal_ros.estimation.blas_threads import one_thread
@@ -151,12 +151,7 @@ class PlannedTerms:
     @one_thread()
     def predicted(self, alone: Prediction) -> Prediction:
         """Return the prediction `alone`, made without terms, with those of the model."""
-        maps = self.of_model.maps
-        spread = self.of_model.inverse(self.assumed.sigma_m) * self.repeats
-        shape = alone.ux.shape
-        more = [np.einsum("sp,pq,sq->s", part, spread, part, optimize=True).reshape(shape)
-                for part in (maps.real, maps.imag)]
-        return replace(alone, ux=np.sqrt(alone.ux**2 + more[0]), uy=np.sqrt(alone.uy**2 + more[1]))
+        return with_part_of_terms(alone, self.of_model, self.repeats)
 
     def _others(self, name: TermName) -> list[ModelTerm]:
         return [term for term in self.model if term.name != name]
@@ -191,7 +186,7 @@ class PlannedTerms:
         ratio = (size / self.assumed.sigma_m) ** 2
         explained = rng.chisquare(1, (DRAWS, rank)) @ (1 + ratio * values)
         left = rng.chisquare(dof, DRAWS) / dof
-        return float(np.mean(explained / rank / left > f_distribution.isf(level, rank, dof)))
+        return float(np.mean(explained / rank / left > fdtri(rank, dof, 1 - level)))
 
     def _information(self, name: TermName, beside: TermEquations) -> tuple[np.ndarray, int]:
         """Return the eigenvalues of the information on a term beside others, and its rank."""
@@ -205,6 +200,24 @@ class PlannedTerms:
         scaled = np.linalg.eigvalsh(rest / np.outer(norm, norm))
         rank = int((scaled > every.limit(term)).sum())
         return np.linalg.eigvalsh(rest)[len(rest) - rank:], rank
+
+
+def with_part_of_terms(alone: Prediction, terms: TermEquations, repeats: int) -> Prediction:
+    """Return a prediction that was made without terms, with their part.
+
+    Parameters
+    ----------
+    alone : Prediction
+        Without terms.
+    terms : TermEquations
+        Their equations.
+    repeats : int
+        Repeats of the averaged reading whose noise is the unit.
+    """
+    spread, shape = terms.inverse(terms.noise_m) * repeats, alone.ux.shape
+    more = [np.einsum("sp,pq,sq->s", part, spread, part, optimize=True).reshape(shape)
+            for part in (terms.maps.real, terms.maps.imag)]
+    return replace(alone, ux=np.sqrt(alone.ux**2 + more[0]), uy=np.sqrt(alone.uy**2 + more[1]))
 
 
 def check_terms(planned: PlannedTerms, sizes: Mapping[TermName, float],

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Which view to measure next, and the best plan for a given number of views."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from itertools import combinations_with_replacement
 from math import comb, inf
@@ -9,6 +9,7 @@ from math import comb, inf
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.blas_threads import one_thread
 from selfcal_ros.estimation.normal.planned import planned_system
+from selfcal_ros.estimation.observability.equivalent import equivalent_key
 from selfcal_ros.estimation.observability.plan_check import (
     candidate_views,
     describe_view,
@@ -17,8 +18,12 @@ from selfcal_ros.estimation.observability.plan_check import (
 )
 from selfcal_ros.estimation.observability.prediction import Prediction, predict
 from selfcal_ros.estimation.observability.rank import full_observability
+from selfcal_ros.estimation.observability.resistance import with_part_of_terms
+from selfcal_ros.estimation.terms.planned import Assumed, planned_equations, planned_ground
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ThetaDatum
+from selfcal_ros.model.orders import ORDERS, parse_order
+from selfcal_ros.model.terms import VISIT_TERMS, ModelTerm, TermName
 from selfcal_ros.model.view import Plan, View
 
 SEARCH_SIZE = 11
@@ -29,6 +34,12 @@ FULL_SIZE = 41
 
 EXHAUSTIVE = 2000
 """Largest number of plans that are all tried; beyond it greedy choice and exchange."""
+
+FEW = 200
+"""The same where every plan counts, as terms are involved that a mirror image does not share."""
+
+MAX_TIES = 64
+"""Plans that are equal but for their lines that are judged with them."""
 
 FINALISTS = 5
 """Plans of a search on a smaller field that are judged on the plan's own field."""
@@ -54,42 +65,96 @@ class Score:
 
 
 @dataclass(frozen=True)
+class Against:
+    """Terms whose part in the uncertainty counts, and what is assumed of the visits.
+
+    A size is what is known of a term, whether the readings tell it better or not at all; what a
+    free term hides of the stage counts as a deficiency.
+    """
+
+    terms: tuple[ModelTerm, ...]
+    assumed: Assumed = Assumed()
+
+    @property
+    def of_visits(self) -> bool:
+        """Whether when, whence and with which offset a mark is read matters."""
+        return any(term.name in VISIT_TERMS for term in self.terms)
+
+    @property
+    def of_order(self) -> bool:
+        """Whether the visiting order matters."""
+        return any(term.name in (TermName.DRIFT, TermName.APPROACH) for term in self.terms)
+
+
+@dataclass(frozen=True)
 class Suggestion:
     """A next step and the score that the plan then has.
 
-    `view` is the view to add; for one more repeat of a view of the plan `repeat_of` is its index.
+    Attributes
+    ----------
+    text : str
+        What to do.
+    view : View or None
+        The view to add, or the one to repeat; None for another visiting order.
+    score : Score
+        Of the plan with it.
+    views : tuple of View
+        All views of the plan with it.
+    repeat_of : int or None
+        Index of the view that is measured more often.
+    order : str
+        The visiting order, if another is suggested.
     """
 
     text: str
-    view: View
+    view: View | None
     score: Score
+    views: tuple[View, ...]
     repeat_of: int | None = None
+    order: str = ""
+
+
+Progress = Callable[[int, int | None], None]
+
+
+def no_progress(done: int, total: int | None = None) -> None:
+    """Show nothing."""
 
 
 @one_thread()
-def score_plan(plan: Plan, datum: ThetaDatum = ThetaDatum.XY_AXES, *,
-               repeats: int | None = None) -> Score:
+def score_plan(plan: Plan, datum: ThetaDatum = ThetaDatum.ZERO_MEAN, *,
+               repeats: int | None = None, against: Against | None = None) -> Score:
     """Return the score of a plan with every mark read.
 
     The unit of noise is an averaged reading of `repeats` repeats, by default the plan's fewest.
+    The part of the terms that it is judged `against` is in the XY uncertainty.
     """
     system = planned_system(plan.artifact, plan.views)
     seen = full_observability(system, plan.artifact, plan.views)
     if not seen.identifiable:
         return Score(seen.deficiency, inf, inf, inf)
-    found: Prediction = predict(system, plan.artifact, datum,
-                                repeats=repeats or unit_repeats(plan))
+    repeats = repeats or unit_repeats(plan)
+    found: Prediction = predict(system, plan.artifact, datum, repeats=repeats)
+    if against is not None and against.terms:
+        ground = planned_ground(plan.artifact, plan.views, system, against.assumed)
+        terms = planned_equations(system, ground, against.terms, against.assumed)
+        hidden = terms.unseen(terms.free).shape[1]
+        if hidden:
+            return Score(hidden, inf, inf, inf)
+        found = with_part_of_terms(found, terms, repeats)
     theta = found.rms_theta if len(found.u_theta) else 0.0
     return Score(0, found.rms_xy, found.max_xy, theta)
 
 
 @one_thread()
-def rank_next(plan: Plan, *, criterion: str = "rms",
-              datum: ThetaDatum = ThetaDatum.XY_AXES) -> tuple[Score, list[Suggestion]]:
+def rank_next(plan: Plan, *, criterion: str = "rms", datum: ThetaDatum = ThetaDatum.ZERO_MEAN,
+              against: Against | None = None, progress: Progress = no_progress
+              ) -> tuple[Score, list[Suggestion]]:
     """Return the plan's score and every candidate for the next step, the best first.
 
-    Candidates are the views of `candidate_views` and as many repeats more of a view of the plan.
-    Fields above FULL_SIZE are judged on a smaller field of SEARCH_SIZE sites a side.
+    Candidates are the views of `candidate_views`, as many repeats more of a view of the plan, and,
+    where the order of the visits matters to the terms, other visiting orders. Fields above
+    FULL_SIZE are judged on a smaller field of SEARCH_SIZE sites a side.
 
     Parameters
     ----------
@@ -99,33 +164,85 @@ def rank_next(plan: Plan, *, criterion: str = "rms",
         ``rms`` or ``max``: which XY uncertainty is to become small.
     datum : ThetaDatum
         Convention of the angular map.
+    against : Against, optional
+        Terms whose part in the uncertainty counts.
+    progress : callable
+        Called with the number of plans judged and that of all.
     """
-    angular = any(view.angular for view in plan.views) and plan.artifact.angular_count > 0
     judged = smaller(plan, SEARCH_SIZE) if max(plan.artifact.shape) > FULL_SIZE else plan
+    unit = unit_repeats(plan)
+
+    def score(views: tuple[View, ...]) -> Score:
+        return score_plan(replace(judged, views=views), datum, repeats=unit, against=against)
+
+    steps = [*_more_views(plan), *_more_repeats(plan)]
+    if against is not None and against.of_order:
+        steps += _other_orders(plan)
+    out = []
+    for number, (text, view, views, more) in enumerate(steps):
+        out.append(Suggestion(text, view, score(views), views, **more))
+        progress(number + 1, len(steps))
+    out.sort(key=lambda item: item.score.key(criterion))
+    return score(plan.views), out
+
+
+Step = tuple[str, View | None, tuple[View, ...], dict]
+
+
+def _more_views(plan: Plan) -> list[Step]:
+    angular = any(view.angular for view in plan.views) and plan.artifact.angular_count > 0
     unit, out = unit_repeats(plan), []
+    order = next((view.visit_order for view in plan.views if view.grid), "")
     for view in candidate_views(plan.artifact, angular=angular):
-        named = replace(view, name=unused_name(view.name, plan.views), repeats=unit)
-        out.append(Suggestion("add " + describe_view(view, plan.artifact), named,
-                              score_plan(replace(judged, views=(*judged.views, named)), datum,
-                                         repeats=unit)))
+        named = replace(view, name=unused_name(view.name, plan.views), repeats=unit,
+                        visit_order=order if view.grid else "")
+        out.append(("add " + describe_view(view, plan.artifact), named, (*plan.views, named), {}))
+    return out
+
+
+def _more_repeats(plan: Plan) -> list[Step]:
+    unit, out = unit_repeats(plan), []
     for index, view in enumerate(plan.views):
         more = replace(view, repeats=view.repeats + unit)
-        views = (*judged.views[:index], more, *judged.views[index + 1:])
-        out.append(Suggestion(f"measure view '{view.name}' {more.repeats} times, not "
-                              f"{view.repeats}", more,
-                              score_plan(replace(judged, views=views), datum, repeats=unit), index))
-    out.sort(key=lambda item: item.score.key(criterion))
-    return score_plan(judged, datum, repeats=unit), out
+        out.append((f"measure view '{view.name}' {more.repeats} times, not {view.repeats}", more,
+                    (*plan.views[:index], more, *plan.views[index + 1:]), {"repeat_of": index}))
+    return out
+
+
+def _other_orders(plan: Plan) -> list[Step]:
+    """Return the visiting orders, with as many repeats as complete them."""
+    out: list[Step] = []
+    for order in ORDERS:
+        views = tuple(_in_order(view, order) for view in plan.views)
+        if views == plan.views:
+            continue
+        pairs = zip(plan.views, views, strict=True)
+        more = sorted({(old.repeats, new.repeats) for old, new in pairs
+                       if old.repeats != new.repeats})
+        text = f"visit the marks in the order {order}"
+        text += "".join(f", {new} repeats for {old}" for old, new in more)
+        out.append((text, None, views, {"order": order}))
+    return out
+
+
+def _in_order(view: View, order: str) -> View:
+    if not view.grid:
+        return view
+    passes = parse_order(order).passes
+    return replace(view, visit_order=order, repeats=-(-view.repeats // passes) * passes)
 
 
 @one_thread()
 def best_plan(artifact: Artifact, n_views: int, *, angular: bool, criterion: str = "rms",
-              repeats: int = 1) -> tuple[Plan, Score, str]:
+              repeats: int = 1, datum: ThetaDatum = ThetaDatum.ZERO_MEAN,
+              against: Against | None = None,
+              progress: Progress = no_progress) -> tuple[Plan, Score, str]:
     """Return the best plan of `n_views` views among the candidates, its score, how it was found.
 
     The first view is the one without turn: turning all views together only renames the plate. With
     angular lines one view is the turn by one line. Up to EXHAUSTIVE plans are all tried, more are
-    searched by greedy choice and exchange of single views until no exchange helps.
+    searched by greedy choice and exchange of single views until no exchange helps. Of plans that
+    are each other's mirror image only one is computed; lines decide between those that are best.
 
     Raises
     ------
@@ -138,31 +255,62 @@ def best_plan(artifact: Artifact, n_views: int, *, angular: bool, criterion: str
                          f"give {3 + fixed} or more")
     candidates = candidate_views(artifact, angular=angular)
     pool = [view for view in candidates if view.grid]
-    last = candidates[-1:] if angular else []
     whole = Plan("best", artifact, ())
     small = smaller(whole, SEARCH_SIZE) if max(artifact.shape) > SEARCH_SIZE else whole
-    free = n_views - 1 - fixed
-
-    def key(chosen: tuple[int, ...], field: Plan) -> tuple[float, ...]:
-        views = (pool[0], *(pool[i] for i in chosen), *last)
-        return score_plan(replace(field, views=views)).key(criterion)
-
-    n_plans = comb(len(pool) + free - 1, free)
-    if n_plans <= EXHAUSTIVE:
-        how = f"all {n_plans} plans tried"
-        tried = {c: key(c, small) for c in combinations_with_replacement(range(len(pool)), free)}
-    else:
-        how = "greedy choice, then exchange of single views"
-        tried = _exchange(lambda chosen: key(chosen, small), len(pool), free)
-    finalists = sorted(tried, key=lambda chosen: (tried[chosen], chosen))[:FINALISTS]
+    searched = _Searched(small, pool, repeats, criterion, against, progress)
+    tried, how = _search(searched, n_views - 1 - fixed)
     if small is not whole:
         how += f" on a field of {SEARCH_SIZE} x {SEARCH_SIZE} sites"
-        finalists.sort(key=lambda chosen: key(chosen, whole)
-                       if max(artifact.shape) <= FULL_SIZE else tried[chosen])
-    views = _named((pool[0], *(pool[i] for i in finalists[0]), *last), repeats)
-    plan = replace(whole, views=views)
-    judged = plan if max(artifact.shape) <= FULL_SIZE else smaller(plan, SEARCH_SIZE)
-    return plan, score_plan(judged), how
+    judged = whole if max(artifact.shape) <= FULL_SIZE else small
+
+    def with_lines(chosen: tuple[int, ...]) -> Plan:
+        views = (pool[0], *(pool[i] for i in chosen), *(candidates[-1:] if angular else []))
+        return replace(judged, views=_named(views, repeats))
+
+    finalists = sorted(tried, key=lambda chosen: (tried[chosen], chosen))
+    ties = sum(tried[chosen] == tried[finalists[0]] for chosen in finalists)
+    finalists = finalists[:max(FINALISTS, min(ties, MAX_TIES) if angular else 0)]
+    scores = [score_plan(with_lines(chosen), datum, against=against) for chosen in finalists]
+    best = min(range(len(scores)), key=lambda at: scores[at].key(criterion))
+    return replace(with_lines(finalists[best]), artifact=artifact), scores[best], how
+
+
+class _Searched:
+    """Keys of plans by their grid marks alone; of plans that are each other's mirror image one."""
+
+    def __init__(self, field: Plan, pool: list[View], repeats: int, criterion: str,
+                 against: Against | None, progress: Progress) -> None:
+        self.field, self.repeats, self.criterion = field, repeats, criterion
+        self.against, self.progress = against, progress
+        self.pool = [replace(view, angular=False) for view in pool]
+        self._known: dict[tuple, tuple[float, ...]] = {}
+
+    @property
+    def one_by_one(self) -> bool:
+        """Whether every plan counts: what depends on the visits does not survive a mirror."""
+        return self.against is not None and self.against.of_visits
+
+    def key(self, chosen: tuple[int, ...]) -> tuple[float, ...]:
+        """Return the order of the first view of the pool with those chosen."""
+        views = (self.pool[0], *(self.pool[i] for i in chosen))
+        same = (tuple(sorted(chosen)) if self.one_by_one
+                else equivalent_key(self.field.artifact, views))
+        if same not in self._known:
+            plan = replace(self.field, views=_named(views, self.repeats))
+            self._known[same] = score_plan(plan, against=self.against).key(self.criterion)
+            self.progress(len(self._known), None)
+        return self._known[same]
+
+
+def _search(searched: _Searched, free: int) -> tuple[dict[tuple[int, ...], tuple], str]:
+    """Return the plans that were tried with their keys, and how they were found."""
+    n_pool = len(searched.pool)
+    n_plans = comb(n_pool + free - 1, free)
+    if n_plans <= (FEW if searched.one_by_one else EXHAUSTIVE):
+        every = combinations_with_replacement(range(n_pool), free)
+        return {chosen: searched.key(chosen) for chosen in every}, f"all {n_plans} plans tried"
+    return (_exchange(searched.key, n_pool, free),
+            "greedy choice, then exchange of single views")
 
 
 def _exchange(key, n_pool: int, free: int) -> dict[tuple[int, ...], tuple[float, ...]]:

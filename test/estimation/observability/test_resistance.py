@@ -6,8 +6,6 @@ from functools import cache
 
 import numpy as np
 import pytest
-from scipy.stats import f as central_f
-from scipy.stats import ncf
 
 from selfcal_ros.errors import NotIdentifiableError
 from selfcal_ros.estimation.normal.planned import planned_system
@@ -20,160 +18,10 @@ from selfcal_ros.model.orders import ORDERS
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.terms import ModelTerm, TermName, parse_terms
 from selfcal_ros.model.visit_order import visit_sequence
+from test.support.dense_terms import SIGMA, Dense
 from test.support.plans import plan_of
 
-SIGMA = 20e-9
 LEVEL = 5e-4
-TURNS = [np.array(rows) for rows in ([[1, 0], [0, 1]], [[0, -1], [1, 0]], [[-1, 0], [0, -1]],
-                                     [[0, 1], [-1, 0]])]
-
-
-class Dense:
-    """Every visit of a plan as two rows of one matrix, in the stage frame, for unit noise."""
-
-    def __init__(self, plan, assumed, sense=Sense.MICROSCOPE_MOVES):
-        self.plan, self.assumed, self.sense = plan, assumed, sense
-        self.nx, self.ny = plan.artifact.shape
-        self.half = plan.artifact.grid_pitch_m * max(plan.artifact.half)
-        system = planned_system(plan.artifact, plan.views)
-        # offsets and random orders are an assumption of the plan: they are taken as they are
-        self.visits = planned_ground(plan.artifact, plan.views, system, assumed).visits
-        self.rows, self.weight, self.about, self.times = [], [], [], []
-        for v, visits in enumerate(self.visits):
-            self._view(v, visits)
-        self.base = np.array(self.rows)
-        self.root = np.sqrt(np.array(self.weight))
-
-    def _view(self, v, visits):
-        pose = self.plan.views[v].lattice_pose(self.plan.artifact)
-        turn = TURNS[pose.quarter_turns]
-        hx, hy = self.plan.artifact.half
-        exposures, last, came = 0.0, None, np.zeros(2)
-        times = []
-        for mark, weight, offset in zip(visits.mark, visits.weight, visits.offset, strict=True):
-            place = np.array([mark // self.ny - hx, mark % self.ny - hy])
-            at = turn @ place + np.array(pose.shift)
-            stage = at if self.sense is Sense.MICROSCOPE_MOVES else -at
-            if last is not None:
-                moved = np.sign(stage - last)
-                came = np.where(moved == 0, came, moved)
-            last = stage
-            times.append(exposures + (weight - 1) / 2)
-            exposures += weight
-            self._reading(v, mark, stage, place * self.plan.artifact.grid_pitch_m, turn)
-            self.weight += [weight] * 2
-            self.about.append((v, place * self.plan.artifact.grid_pitch_m / self.half, turn,
-                               np.array([offset.real, offset.imag]), came.copy()))
-        self.times += list(2 * (np.array(times) - times[0]) / (times[-1] - times[0]) - 1)
-
-    def _reading(self, v, mark, stage, place, turn):
-        hx, hy = self.plan.artifact.half
-        sites, indicated = self.nx * self.ny, self._indicated()
-        site = (stage[0] + hx) * self.ny + stage[1] + hy
-        for axis in range(2):
-            row = np.zeros(4 * sites + 3 * len(self.visits))
-            row[2 * site + axis] = indicated
-            row[2 * sites + 2 * mark:2 * sites + 2 * mark + 2] = turn[axis]
-            k = 4 * sites + 3 * v
-            turned = turn @ place / self.half
-            row[k:k + 3] = (-turned[1], 1, 0) if axis == 0 else (turned[0], 0, 1)
-            self.rows.append(row)
-
-    def _indicated(self):
-        return 1 if self.sense is Sense.MICROSCOPE_MOVES else -1
-
-    def columns(self, name, *, free):
-        """Columns of a term at every row: what a unit of each coefficient does to a reading."""
-        out = []
-        views = range(len(self.visits))
-        if name is TermName.MICROSCOPE:
-            one = np.eye(4).reshape(4, 2, 2)
-            out = [[-(e @ offset) for _, _, _, offset, _ in self.about] for e in one]
-        elif name is TermName.APPROACH:
-            out = [[self._indicated() * np.array(h) * came for *_, came in self.about]
-                   for h in ((1, 0), (0, 1))]
-        elif name is TermName.DRIFT:
-            for v in views:
-                for degree in range(1, self.assumed.drift_degree + 1):
-                    legendre = np.polynomial.Legendre.basis(degree)
-                    out += [[np.array(d) * legendre(t) * (about[0] == v) for about, t in zip(
-                        self.about, self.times, strict=True)] for d in ((1, 0), (0, 1))]
-        else:
-            shapes = ([lambda x, y: np.array([x, y]) * self.half]
-                      if name is TermName.PLATE_SCALE else
-                      [lambda x, y, d=d, q=q: np.array(d) * (x * x, x * y, y * y)[q]
-                       for d in ((1, 0), (0, 1)) for q in range(3)])
-            out = [[turn @ shape(*place) * (u == v) for u, place, turn, *_ in self.about]
-                   for v in views[int(free):] for shape in shapes]
-        return np.array(out).reshape(len(out), -1).T
-
-    def design(self, terms):
-        """Weighted rows: unknowns, then the terms' coefficients; sizes as rows below."""
-        blocks = [self.columns(t.name, free=t.free) for t in terms]
-        whole = self.root[:, None] * np.hstack([self.base, *blocks])
-        sizes = np.concatenate([np.zeros(self.base.shape[1])] + [
-            np.full(block.shape[1], 0 if t.free else SIGMA / t.size)
-            for t, block in zip(terms, blocks, strict=True)])
-        prior = np.diag(sizes)[sizes > 0]
-        return np.vstack([whole, prior])
-
-    @property
-    def datum(self):
-        """Projection of a map on what remains without translation, rotation and scale."""
-        hx, hy = self.plan.artifact.half
-        place = np.array([(i, j) for i in range(-hx, hx + 1) for j in range(-hy, hy + 1)])
-        one, none = np.ones(len(place)), np.zeros(len(place))
-        modes = np.array([np.stack(pair, axis=1).ravel() for pair in (
-            (one, none), (none, one), (-place[:, 1], place[:, 0]), (place[:, 0], place[:, 1]))])
-        q = np.linalg.qr(modes.T.astype(float))[0]
-        return np.eye(len(q)) - q @ q.T
-
-    def to_map(self, unknowns):
-        return self.datum @ unknowns[:2 * self.nx * self.ny]
-
-    def n_unseen(self, terms):
-        """Independent maps that can be added without changing any reading."""
-        design = self.design(terms)
-        scaled = design / np.linalg.norm(design, axis=0)
-        _, size, right = np.linalg.svd(scaled)
-        null = right[(size > 1e-9 * size[0]).sum():].T / np.linalg.norm(design, axis=0)[:, None]
-        maps = self.to_map(null / np.linalg.norm(null, axis=0))
-        return int((np.linalg.svd(maps, compute_uv=False) > 1e-7).sum())
-
-    def solver(self, terms):
-        """Matrix that takes weighted readings to unknowns, and the design."""
-        design = self.design(terms)
-        norm = np.linalg.norm(design, axis=0)
-        return np.linalg.pinv(design / norm, rcond=1e-11) / norm[:, None], design
-
-    def gain(self, terms):
-        """Root mean square of the standard uncertainty for unit noise of one reading."""
-        solve, _ = self.solver(terms)
-        return np.sqrt((self.to_map(solve) ** 2).sum(axis=1).mean())
-
-    def effect(self, terms, name, size):
-        solve, _ = self.solver(terms)
-        column = self.root[:, None] * self.columns(name, free=False)
-        moved = self.to_map(solve[:, :len(column)] @ column) * size
-        spread = np.sqrt((moved**2).sum(axis=1))
-        return np.sqrt((spread**2).mean()), spread.max()
-
-    def power(self, terms, name, size, draws=300):
-        """Mean over drawn coefficients of the power of the noncentral F-test."""
-        free = [ModelTerm(term.name) for term in terms]
-        _, before = self.solver(free)
-        column = self.root[:, None] * self.columns(name, free=False)
-        norm = np.linalg.norm(before, axis=0)
-        left = column - (before / norm) @ (
-            np.linalg.pinv(before / norm, rcond=1e-11) @ column)
-        rank_before = np.linalg.matrix_rank(before / norm, tol=1e-9)
-        rank = np.linalg.matrix_rank(left / np.linalg.norm(column, axis=0), tol=1e-5)
-        dof = len(before) - rank_before - rank
-        b = np.random.default_rng(5).normal(size=(draws, column.shape[1])) * size
-        shift = ((left @ b.T) ** 2).sum(axis=0) / SIGMA**2
-        limit = central_f.isf(LEVEL, rank, dof)
-        return float(np.mean(np.where(shift > 2000, 1.0, ncf.sf(
-            limit, rank, dof, np.minimum(shift, 2000)))))
 
 
 SMALL = plan_of("0, 90, tx", 5, repeats=4)
@@ -196,7 +44,7 @@ def test_each_term_as_the_dense_matrix_has_it(name, order, sense):
     assert found.told is (found.unseen_modes == 0)
     assert (found.effect_rms_m, found.effect_max_m) == pytest.approx(
         dense.effect([], name, size), rel=1e-6)
-    assert found.power == pytest.approx(dense.power([], name, size), abs=0.08)
+    assert found.power == pytest.approx(dense.power([], name, size, LEVEL), abs=0.08)
 
 
 MODELS = ["drift", "drift,approach", "plate_scale:1e-7", "plate_shape:30e-9,drift",
@@ -233,7 +81,7 @@ def test_models_as_the_dense_matrix_has_them(text, plan, order, sense):
             assert (found.effect_rms_m, found.effect_max_m) == pytest.approx(
                 dense.effect(others, found.name, sizes[found.name]), rel=1e-5)
             assert found.power == pytest.approx(
-                dense.power(others, found.name, sizes[found.name]), abs=0.08)
+                dense.power(others, found.name, sizes[found.name], LEVEL), abs=0.08)
 
 
 ORDER_TABLE = {  # order, repeats that are one turn of it: degree 1, 2, 3, 5

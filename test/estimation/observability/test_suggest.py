@@ -17,11 +17,20 @@ from selfcal_ros.estimation.observability.plan_check import (
     predict_plan,
 )
 from selfcal_ros.estimation.observability.prediction import predict
-from selfcal_ros.estimation.observability.suggest import best_plan, rank_next, score_plan
+from selfcal_ros.estimation.observability.suggest import (
+    Against,
+    best_plan,
+    rank_next,
+    score_plan,
+)
 from selfcal_ros.estimation.options import Options
+from selfcal_ros.estimation.terms.planned import Assumed
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ThetaDatum
+from selfcal_ros.model.orders import ORDERS
+from selfcal_ros.model.terms import parse_terms
 from selfcal_ros.simulation.truth import hu_plan, random_truth, simulate_measurements
+from test.support.dense_terms import Dense
 from test.support.plans import plan_of
 
 BOUNDS = {  # method, section 11: rms gain at N = 5, 11, 21
@@ -170,3 +179,73 @@ def test_gain_is_the_scatter_of_recalibrations():
             calibrate(simulate_measurements(truth, plan, rng, sigma_m=1e-8), Options()).error_map
             for _ in range(250))]) / 1e-8
     assert np.sqrt((errors**2).mean()) == pytest.approx(found.rms_xy, rel=0.035)
+
+
+BENT = parse_terms(["plate_shape:30e-9"], "")
+
+
+def test_a_score_against_terms_is_that_of_one_dense_least_squares():
+    plan = plan_of("0, 90, tx", 5, repeats=2)
+    terms = parse_terms(["plate_shape:30e-9,drift:5e-8"], "")
+    found = score_plan(plan, against=Against(terms, Assumed(order="serpentine")))
+    dense = Dense(plan, Assumed(order="serpentine"))
+    assert found.rms_xy == pytest.approx(dense.gain(terms) * 2**0.5, rel=1e-6)
+    assert found.rms_xy > 1.5 * score_plan(plan).rms_xy
+
+
+def test_bent_plates_ask_for_a_shift_the_other_way():
+    plan = plan_of("0, 90, tx", 11, repeats=5)
+    _, alone = rank_next(plan)
+    now, ranked = rank_next(plan, against=Against(BENT))
+    assert ranked[0].score.rms_xy < 0.5 * now.rms_xy
+
+    def shifts(items):
+        return [item.view.lattice_pose(plan.artifact).shift for item in items]
+
+    assert shifts(ranked[:4]) == [(-1, 0)] * 4
+    # by noise alone a shift along y is as good
+    assert set(shifts(alone[:3])) == {(-1, 0), (0, 1), (0, -1)}
+    by_text = {item.text: item.score.rms_xy for item in ranked}
+    back, on = (by_text[f"add a view without turn and shifted by {a} pitch along X"]
+                for a in ("-1", "+1"))
+    assert back < 0.7 * on
+    # a plate's shape does not ask in which order it is visited
+    assert not any(item.order for item in ranked)
+
+
+def test_a_drift_asks_for_another_order():
+    plan = plan_of("0, 90, tx", 7)
+    plan = replace(plan, views=tuple(replace(view, visit_order="raster") for view in plan.views))
+    drift = Against(parse_terms(["drift:5e-7"], ""))
+    now, ranked = rank_next(plan, against=drift)
+    orders = {item.order: item for item in ranked if item.order}
+    assert set(orders) == set(ORDERS) - {"raster"}
+    best = orders["x_back_y_back"]
+    assert best.text == "visit the marks in the order x_back_y_back, 4 repeats for 1"
+    assert {view.visit_order for view in best.views} == {"x_back_y_back"}
+    assert {view.repeats for view in best.views} == {4} and best.view is None
+    assert best.score.rms_xy < orders["x_then_y"].score.rms_xy < now.rms_xy
+    assert best.score.rms_xy == pytest.approx(0.845 / 2, abs=1e-3)
+    added = next(item for item in ranked if item.text.startswith("add a view turned by 180"))
+    assert added.views == (*plan.views, added.view) and added.view.visit_order == "raster"
+
+
+def test_free_terms_that_are_not_told_are_a_deficiency():
+    plan = plan_of("0, 90, tx", 5)
+    free = Against(parse_terms(["drift"], ""), Assumed(order="raster"))
+    assert score_plan(plan, against=free).deficiency == 7
+    assert score_plan(plan, against=free).rms_xy == np.inf
+
+
+def test_the_best_plan_against_bent_plates_shifts_both_ways(few_candidates):
+    plan, found, _ = best_plan(Artifact(5, 0.01), 4, angular=False, against=Against(BENT))
+    every = [score_plan(replace(plan, views=(few_candidates[0], *views)), against=Against(BENT))
+             for views in combinations_with_replacement(few_candidates, 3)]
+    assert found.key("rms") == min(score.key("rms") for score in every)
+
+
+def test_progress_tells_how_many_plans_were_judged(few_candidates):
+    calls = []
+    rank_next(plan_of("0, 90, tx", 3), progress=lambda *at: calls.append(at))
+    n = len(few_candidates) + 3
+    assert calls == [(k, n) for k in range(1, n + 1)]

@@ -1,0 +1,39 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Plans that are each other's mirror image, or turned: they promise the same uncertainty."""
+
+from collections.abc import Iterable
+from itertools import product
+
+from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.view import View
+
+TURNS = (1, 1j, -1, -1j)
+
+
+def equivalent_key(artifact: Artifact, views: Iterable[View]) -> tuple:
+    """Return what plans have in common that turn into each other: their turns and shifts.
+
+    Turning stage and plate together renames sites and marks; so does mirroring both; turning the
+    plate in all views renames the marks. A field that is not square has half of these. The
+    uncertainty of XY is the same; that of theta need not be.
+
+    Parameters
+    ----------
+    artifact : Artifact
+        The plate.
+    views : iterable of View
+        Views of grid marks.
+    """
+    poses = [view.lattice_pose(artifact) for view in views]
+    steps = [(pose.quarter_turns, complex(*pose.shift)) for pose in poses]
+    turns = range(0, 4, 1 if artifact.shape[0] == artifact.shape[1] else 2)
+    forms = list(product((False, True), turns, turns))
+    return min(tuple(sorted(_moved(q, shift, *form) for q, shift in steps)) for form in forms)
+
+
+def _moved(q: int, shift: complex, mirror: bool, stage: int,
+           plate: int) -> tuple[int, float, float]:
+    if mirror:
+        q, shift = -q, shift.conjugate()
+    shift = shift * TURNS[stage]
+    return (q + plate) % 4, shift.real + 0.0, shift.imag + 0.0
