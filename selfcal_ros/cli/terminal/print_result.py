@@ -25,7 +25,7 @@ def exit_code(result: "CalibrationResult") -> int:
     Why not is said in one line on stderr, whatever else is printed.
     """
     from selfcal_ros.errors import ExitCode
-    from selfcal_ros.reporting.summary_format import can_print_symbols, printable, to_ascii
+    from selfcal_ros.reporting.summary.format import can_print_symbols, printable, to_ascii
 
     if result.verdict.qualified:
         return int(ExitCode.DONE)
