@@ -149,10 +149,12 @@ def fit_motion(p: np.ndarray, deviation: np.ndarray) -> Fit:
     cross = _cross(arm, deviation - offset[:, None])
     rigid = _through(_turn(np.median(cross[rim] / radius2[rim])) if rim.any() else 0.0,
                      tuple(middle), offset)
-    keep = np.ones(p.shape[1], dtype=bool)
+    keep = np.zeros(p.shape[1], dtype=bool)
     for _ in range(5):
         distance = np.hypot(*(deviation - rigid.at(p)))
-        keep = distance <= 3 * np.median(distance) + 1e-9
+        before, keep = keep, distance <= 3 * np.median(distance) + 1e-9
+        if (keep == before).all():  # the same marks give the same motion again
+            break
         middle, mean = p[:, keep].mean(axis=1), deviation[:, keep].mean(axis=1)
         arm = p[:, keep] - middle[:, None]
         power = (arm**2).sum()
