@@ -25,7 +25,7 @@ def equivalent_key(artifact: Artifact, views: Iterable[View]) -> tuple:
         Views of grid marks.
     """
     poses = [view.lattice_pose(artifact) for view in views]
-    steps = [(pose.quarter_turns, complex(*pose.shift)) for pose in poses]
+    steps = [(pose.quarter_turns or 0, complex(*pose.shift)) for pose in poses]
     turns = range(0, 4, 1 if artifact.shape[0] == artifact.shape[1] else 2)
     forms = list(product((False, True), turns, turns))
     return min(tuple(sorted(_moved(q, shift, *form) for q, shift in steps)) for form in forms)

@@ -126,7 +126,8 @@ class PlannedTerms:
         try:
             self.require_told(seen)
         except NotIdentifiableError as error:
-            return error.observability
+            found = error.observability
+            return found if isinstance(found, Observability) else seen
         free = int(self.of_model.free.sum())
         return replace(seen, rank=seen.rank + free, unknowns=seen.unknowns + free)
 

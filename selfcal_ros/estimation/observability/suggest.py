@@ -191,7 +191,8 @@ Step = tuple[str, View | None, tuple[View, ...], dict]
 
 def _more_views(plan: Plan) -> list[Step]:
     angular = any(view.angular for view in plan.views) and plan.artifact.angular_count > 0
-    unit, out = unit_repeats(plan), []
+    unit = unit_repeats(plan)
+    out: list[Step] = []
     order = next((view.visit_order for view in plan.views if view.grid), "")
     for view in candidate_views(plan.artifact, angular=angular):
         named = replace(view, name=unused_name(view.name, plan.views), repeats=unit,
@@ -201,7 +202,8 @@ def _more_views(plan: Plan) -> list[Step]:
 
 
 def _more_repeats(plan: Plan) -> list[Step]:
-    unit, out = unit_repeats(plan), []
+    unit = unit_repeats(plan)
+    out: list[Step] = []
     for index, view in enumerate(plan.views):
         more = replace(view, repeats=view.repeats + unit)
         out.append((f"measure view '{view.name}' {more.repeats} times, not {view.repeats}", more,
