@@ -104,7 +104,8 @@ def test_free_terms_that_a_plan_does_not_tell_are_refused(capsys, tmp_path):
     path = tmp_path / "own.yaml"
     path.write_text(yaml.safe_dump(data | {"model_terms": ["plate_shape"]}))
     assert main(["plan", "check", str(path)]) == 3
-    assert "  - plate_shape: add views shifted both ways" in capsys.readouterr().out
+    assert ("  - plate_shape: add views shifted both ways along both axes, and one "
+            "along a diagonal, or give it a size") in capsys.readouterr().out
     assert main(["plan", "check", str(path), "--model", "plate_shape:30e-9"]) == 0
     assert "XY with plate_shape:3e-08: rms" in capsys.readouterr().out
 

@@ -13,7 +13,7 @@ CURES = {
                          "align the microscope and leave the term out",
     TermName.DRIFT: "visit the marks in more than one order, e.g. visit_order: x_back_y_back",
     TermName.PLATE_SCALE: "add views that are turned and shifted",
-    TermName.PLATE_SHAPE: "add views shifted both ways",
+    TermName.PLATE_SHAPE: "add views shifted both ways along both axes, and one along a diagonal",
     TermName.APPROACH: "visit the marks from both sides, e.g. visit_order: x_back_y_back",
 }
 """What makes a term visible, for a person."""

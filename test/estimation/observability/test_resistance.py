@@ -17,6 +17,7 @@ from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.orders import ORDERS
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.terms import ModelTerm, TermName, parse_terms
+from selfcal_ros.model.view import View
 from selfcal_ros.model.visit_order import visit_sequence
 from test.support.dense_terms import SIGMA, Dense
 from test.support.plans import plan_of
@@ -181,3 +182,14 @@ def test_large_fields_are_judged_on_a_smaller_one(monkeypatch):
     monkeypatch.setattr(resistance, "PROXY_SIZE", 9)
     large, small = (PlannedTerms(plan_of("0, 90, tx", size), (), Assumed()) for size in (21, 9))
     assert check_terms(large, {}, LEVEL) == check_terms(small, {}, LEVEL)
+
+
+def test_a_shift_along_a_diagonal_tells_bent_plates_from_the_stage():
+    plan = plan_of("0, 90, tx, -tx, ty, -ty", 5)
+    corner = View("corner", 0.0, (0.01, 0.01), True, False)
+    found = [PlannedTerms(replace(plan, views=views), (), Assumed()).check(
+        TermName.PLATE_SHAPE, 1e-8, LEVEL).unseen_modes
+        for views in (plan.views, (*plan.views, corner))]
+    assert found == [1, 0]
+    assert Dense(replace(plan, views=(*plan.views, corner)), Assumed()).n_unseen(
+        [ModelTerm(TermName.PLATE_SHAPE)]) == 0
