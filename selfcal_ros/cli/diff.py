@@ -50,6 +50,7 @@ def _json(found) -> dict:
     from selfcal_ros.model.result import plain
 
     return plain({
+        "significant": found.significant,
         "rms_um": found.rms_m * UM_PER_M, "max_um": found.max_m * UM_PER_M,
         "rms_theta_arcsec": found.rms_theta_rad * ARCSEC_PER_RAD,
         "max_theta_arcsec": found.max_theta_rad * ARCSEC_PER_RAD,
@@ -72,24 +73,36 @@ def _text(found) -> str:
              + ("" if math.isnan(found.theta_rad)
                 else f", theta {found.theta_rad * ARCSEC_PER_RAD:+.4g} arcsec"),
              f"XY     rms {found.rms_m * UM_PER_M:.5f} um per axis   "
-             f"largest {found.max_m * UM_PER_M:.5f} um on an axis"
-             + _significance_text(found.xy),
+             f"largest {found.max_m * UM_PER_M:.5f} um on an axis",
+             *_test_text(found.xy),
              f"       non-orthogonality {found.nonorthogonality * ARCSEC_PER_RAD:+.4g} arcsec, "
              f"scale difference {found.scale_difference * PPM_PER_ONE:+.4g} ppm"]
     if not math.isnan(found.rms_theta_rad):
-        lines.append(f"theta  rms {found.rms_theta_rad * ARCSEC_PER_RAD:.4f} arcsec   "
-                     f"largest {found.max_theta_rad * ARCSEC_PER_RAD:.4f} arcsec"
-                     + _significance_text(found.theta))
-    return "\n".join(lines)
+        lines += [f"theta  rms {found.rms_theta_rad * ARCSEC_PER_RAD:.4f} arcsec   "
+                  f"largest {found.max_theta_rad * ARCSEC_PER_RAD:.4f} arcsec",
+                  *_test_text(found.theta)]
+    return "\n".join([*lines, _verdict_text(found)])
 
 
-def _significance_text(test) -> str:
+def _test_text(test) -> list[str]:
+    """Return both tests of a difference, one line each."""
     if test is None:
-        return "   (no uncertainties to test against)"
-    verdict = "significant" if test.p < 1e-3 else "not significant"
+        return ["       no uncertainties to test against"]
     doubt = "" if test.correlated else "; correlations between nodes not known"
-    return (f"   chi2/dof {test.chi2_ratio:.3f}, {test.dof:.0f} dof, p = {test.p:.2g}: "
-            f"{verdict}{doubt}")
+    return [f"       Mahalanobis distance^2/dof {test.chi2_ratio:.3f}, {test.dof:.0f} dof, "
+            f"p = {test.p:.2g}{doubt}",
+            f"       largest |z| {test.largest_z:.2f}, limit {test.z_limit:.2f}, "
+            f"p = {test.p_z:.2g}"]
+
+
+def _verdict_text(found) -> str:
+    tests = {"XY": found.xy, "theta": found.theta}
+    if found.significant is None:
+        return "verdict: none, as there are no uncertainties to test against"
+    differ = [name for name, test in tests.items() if test is not None and test.significant]
+    if differ:
+        return f"verdict: significant, the maps differ in {' and '.join(differ)}"
+    return "verdict: not significant, the maps agree within their uncertainties"
 
 
 def _laser_json(rows) -> dict:

@@ -12,7 +12,7 @@ from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.files import read_json, write_json
 from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.model.result import result_to_dict
+from selfcal_ros.model.result import plain, result_to_dict
 from selfcal_ros.simulation.truth import hu_plan, random_truth, simulate_measurements
 
 
@@ -47,7 +47,28 @@ def test_two_results_as_text_and_as_json(files, capsys):
     assert found["datum_difference"]["translation_x"] == pytest.approx(1e-6, rel=1e-6)
     assert 0.005 < found["rms_um"] < found["max_um"] < 0.1
     assert found["significance_xy"]["correlated"] is True
-    assert 1e-3 < found["significance_xy"]["p"] < 1 and len(found["dx"]) == 5
+    test = found["significance_xy"]
+    assert 1e-3 < test["p"] < 1 and len(found["dx"]) == 5 and found["significant"] is False
+    assert f"largest |z| {test['largest_z']:.2f}, limit {test['z_limit']:.2f}, p = " in text
+    assert f"Mahalanobis distance^2/dof {test['chi2_ratio']:.3f}, {test['dof']:.0f} dof" in text
+    assert text.splitlines()[-1] == ("verdict: not significant, the maps agree within their "
+                                     "uncertainties")
+
+
+def test_maps_that_differ_and_maps_without_uncertainty_have_their_verdicts(files, tmp_path,
+                                                                           capsys):
+    data = read_json(files[1])
+    data["error_map"]["gy"][2][3] += 1e-6
+    other = str(tmp_path / "other.json")
+    write_json(other, data)
+    assert main(["diff", files[0], other]) == 0
+    assert capsys.readouterr().out.splitlines()[-1] == "verdict: significant, the maps differ in XY"
+    for key in ("u_gx", "u_gy", "u_g_theta"):
+        data["error_map"][key] = plain(np.array(data["error_map"][key], dtype=float) * np.nan)
+    write_json(other, data)
+    assert main(["diff", files[0], other]) == 0
+    assert capsys.readouterr().out.splitlines()[-1] == (
+        "verdict: none, as there are no uncertainties to test against")
 
 
 def test_different_theta_datums_are_said(files, tmp_path, capsys):

@@ -1,25 +1,33 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Covariances of saved maps: their correlations follow from the views, their sizes from the map.
+"""Covariances of saved maps, from the weights of what was read, which a RESULT.json keeps.
 
-A RESULT.json holds standard uncertainties, not covariances. The correlations depend on the views
-alone, as long as few marks are missing, so that they are computed anew.
+They are exact: reference length and terms of the model included. A RESULT.json of version 0.1 does
+not tell what was read: then the correlations are those of its views without a missing mark, and
+the sizes those of the map.
 """
+
+from typing import Any
 
 import numpy as np
 from scipy.optimize import nnls
 
+from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.datum.covariance import FieldCovariance
+from selfcal_ros.estimation.datum.scale import scale_datum
+from selfcal_ros.estimation.joint.problem import bounded_ratio
+from selfcal_ros.estimation.joint.saved_terms import KEY, MAX_SITES, factors_of
+from selfcal_ros.estimation.lattice.maps import GridPose
 from selfcal_ros.estimation.law.solve import law_covariance
+from selfcal_ros.estimation.normal.angular import AngularSystem
 from selfcal_ros.estimation.normal.equations import NormalEquations
+from selfcal_ros.estimation.normal.grid import GridSystem
 from selfcal_ros.estimation.normal.planned import planned_system
 from selfcal_ros.estimation.observability.prediction import theta_matrix
 from selfcal_ros.estimation.observability.rank import full_observability
+from selfcal_ros.estimation.options import ReferenceLength
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.view import View
-
-MAX_SITES = 31 * 31
-"""Largest field whose covariance is formed as a whole."""
 
 MAX_LINES = 1024
 """Largest number of lines whose covariance is formed as a whole."""
@@ -38,18 +46,28 @@ def xy_covariance(result: CalibrationResult, known: np.ndarray) -> tuple[np.ndar
     if result.method == "law":
         cover, both = law_covariance(result), np.tile(known.ravel(), 2)
         return (u**2, False) if cover is None else (_sized(cover[0][np.ix_(both, both)], u), True)
+    if tells_what_was_read(result) and result.model.terms and KEY not in result.extra:
+        return u**2, False
+    rows = _unit_rows(known)
+    if _flipped(result):
+        rows = rows[:, ::-1, ::-1]
+    if not tells_what_was_read(result):
+        cover = _field(system).of(rows)
+        noise, scale = _powers(result, system)
+        place = np.concatenate([result.artifact.x_m[known], result.artifact.y_m[known]])
+        return _sized(noise * cover + scale * np.outer(place, place), u), True
+    cover = _exact_field(result, system).of(rows)
+    factors = factors_of(result)[:, :, known].reshape(-1, 2 * int(known.sum()))
+    return _sized(cover + factors.T @ factors, u), True
+
+
+def _unit_rows(known: np.ndarray) -> np.ndarray:
+    """Return the functionals Gx, then Gy, at the known sites, complex (2n, nx, ny)."""
     at = np.flatnonzero(known.ravel())
     rows = np.zeros((2 * len(at), known.size), dtype=complex)
     rows[np.arange(len(at)), at] = 1.0
     rows[len(at) + np.arange(len(at)), at] = 1j
-    rows = rows.reshape(-1, *known.shape)
-    if _flipped(result):
-        rows = rows[:, ::-1, ::-1]
-    cover = _field(system).of(rows)
-    noise, scale = _powers(result, system)
-    place = np.concatenate([result.artifact.x_m[known], result.artifact.y_m[known]])
-    cover = noise * cover + scale * np.outer(place, place)
-    return _sized(cover, u), True
+    return rows.reshape(-1, *known.shape)
 
 
 def theta_covariance(result: CalibrationResult, known: np.ndarray) -> tuple[np.ndarray, bool]:
@@ -83,8 +101,15 @@ def first_order_u(result: CalibrationResult) -> tuple[float, float]:
     if system is None:
         return float("nan"), float("nan")
     length = result.artifact.grid_pitch_m * max(result.artifact.half)
-    cover = _field(system).of(system.gauge.shear)
-    u = np.sqrt(_powers(result, system)[0] * np.diag(cover)) / length
+    if tells_what_was_read(result):
+        variance = np.diag(_exact_field(result, system).of(system.gauge.shear))
+        shear = system.gauge.shear[:, ::-1, ::-1] if _flipped(result) else system.gauge.shear
+        moved = np.einsum("rij,cij->cr", factors_of(result)[:, 0], shear.real) + np.einsum(
+            "rij,cij->cr", factors_of(result)[:, 1], shear.imag)
+        variance = (variance + (moved**2).sum(axis=1)) * result.noise.sigma_xy**2
+    else:
+        variance = _powers(result, system)[0] * np.diag(_field(system).of(system.gauge.shear))
+    u = np.sqrt(variance) / length
     return float(u[0]), float(u[1])
 
 
@@ -120,10 +145,30 @@ def _field(system: NormalEquations) -> FieldCovariance:
     return FieldCovariance(system, inverse)
 
 
+def _exact_field(result: CalibrationResult, system: NormalEquations) -> FieldCovariance:
+    """Return the covariance of the map for unit noise, terms of the model apart."""
+    noise = result.noise
+    length = result.artifact.grid_pitch_m * max(result.artifact.half)
+    inverse = system.inverse(bounded_ratio(system, noise.sigma_xy, noise.sigma_theta, length)
+                             if system.angular.n_views else 1.0)
+    scale = None
+    if result.reference is not None:
+        scale = scale_datum(system, ReferenceLength(**result.reference), length)
+    return FieldCovariance(system, inverse, scale, noise.sigma_xy)
+
+
+def tells_what_was_read(result: CalibrationResult) -> bool:
+    """Return whether a result keeps the weights of what was read in its views."""
+    return bool(result.views) and all(
+        v.read_grid is not None and v.read_angular is not None for v in result.views)
+
+
 def _system(result: CalibrationResult) -> NormalEquations | None:
-    """Return the system of the views behind a result; None if they do not identify the stage."""
+    """Return the system behind a result; None if the stage is not identified, or not told."""
     if np.isnan(result.error_map.u_gx).all() or not result.views:
         return None
+    if tells_what_was_read(result):
+        return _read_system(result) if result.observability.identifiable else None
     views = _views(result)
     if not any(view.grid for view in views):
         return None
@@ -131,6 +176,49 @@ def _system(result: CalibrationResult) -> NormalEquations | None:
     if not full_observability(system, result.artifact, views).identifiable:
         return None
     return system
+
+
+def _read_system(result: CalibrationResult) -> NormalEquations:
+    """Return the system of the weights that a result keeps."""
+    artifact = result.artifact
+    grid, lines = [], []
+    for index, v in enumerate(result.views):
+        pose = View(v.name, v.rotation, (v.translation_x, v.translation_y),
+                    bool(np.any(v.read_grid))).lattice_pose(artifact)
+        field = np.ones(artifact.angular_count)
+        weight = _weights(v.read_angular, field, f"view '{v.name}', read.angular")
+        if weight.any():
+            lines.append((index, pose.turn_lines, weight))
+        if np.any(v.read_grid):
+            at = GridPose(pose.quarter_turns, *pose.shift)
+            field = GridSystem((at,), np.zeros((1, *artifact.shape))).views.in_field[0]
+            grid.append((index, at, _weights(v.read_grid, field, f"view '{v.name}', read.grid")))
+    angular = np.array([weight for *_, weight in lines]).reshape(len(lines),
+                                                                artifact.angular_count)
+    return NormalEquations(
+        GridSystem(tuple(at for _, at, _ in grid), np.array([weight for *_, weight in grid])),
+        AngularSystem(tuple(turn for _, turn, _ in lines), angular),
+        tuple(index for index, *_ in grid), tuple(index for index, *_ in lines))
+
+
+def _weights(kept: Any, field: np.ndarray, where: str) -> np.ndarray:
+    """Return weights in full: one number stands for all of the field.
+
+    Raises
+    ------
+    InputError
+        If they are no weights of this field.
+    """
+    try:
+        weight = np.array(kept, dtype=float)
+    except (TypeError, ValueError):
+        weight = np.array(np.nan)
+    if weight.ndim == 0:
+        weight = weight * field
+    if weight.shape != field.shape or not (np.isfinite(weight).all() and (weight >= 0).all()):
+        raise InputError(where, "no weights of this field",
+                         "write the result anew with `selfcal solve`")
+    return weight
 
 
 def _views(result: CalibrationResult) -> tuple[View, ...]:

@@ -4,8 +4,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2, norm
-from scipy.stats import f as f_test
+from scipy.stats import norm
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.blas_threads import one_thread
@@ -14,40 +13,15 @@ from selfcal_ros.estimation.comparison.covariance import (
     theta_covariance,
     xy_covariance,
 )
+from selfcal_ros.estimation.comparison.significance import Significance, significance
 from selfcal_ros.estimation.datum.modes import datum_modes
 from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.model.result import CalibrationResult
+from selfcal_ros.model.result import CalibrationResult, Noise
 from selfcal_ros.model.statistics import rms
 from selfcal_ros.units import MM_PER_M
 
 PITCH_TOLERANCE = 1e-9
 """Largest relative difference of pitch between two maps of the same lattice."""
-
-MANY_DOF = 1e6
-"""Degrees of freedom from which a noise counts as known."""
-
-
-@dataclass(frozen=True)
-class Significance:
-    """Test of a difference against both uncertainties.
-
-    Attributes
-    ----------
-    chi2_ratio : float
-        Mean of (difference / its standard uncertainty)^2: 1 if the maps agree.
-    dof : float
-        Effective degrees of freedom; less than the number of values, as nodes are correlated.
-    p : float
-        Probability of so large a ratio if the maps agree; NaN without uncertainties.
-    correlated : bool
-        Whether correlations between nodes were taken from the views; without them dof is
-        too large and p too small.
-    """
-
-    chi2_ratio: float
-    dof: float
-    p: float
-    correlated: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,6 +53,12 @@ class MapDifference:
     scale_difference: float
     xy: Significance | None
     theta: Significance | None
+
+    @property
+    def significant(self) -> bool | None:
+        """Verdict of all tests; None where there was nothing to test against."""
+        tests = [test for test in (self.xy, self.theta) if test is not None]
+        return any(test.significant for test in tests) if tests else None
 
     @property
     def rms_m(self) -> float:
@@ -135,7 +115,7 @@ def compare(a: CalibrationResult, b: CalibrationResult, *, keep_scale: bool = Fa
     rest = difference - np.tensordot(parts, modes, axes=1)
     d_theta = b.error_map.g_theta - a.error_map.g_theta
     constant = float(np.nanmean(d_theta)) if np.isfinite(d_theta).any() else float("nan")
-    xy = _significance(rest[:, known].ravel(), [xy_covariance(r, known) for r in (a, b)], basis,
+    xy = significance(rest[:, known].ravel(), [xy_covariance(r, known) for r in (a, b)], basis,
                        _noise_dof(a, b, "xy"))
     return MapDifference(
         rest[0], rest[1], d_theta - constant, (float(parts[0]), float(parts[1])), float(parts[2]),
@@ -163,40 +143,8 @@ def _theta_test(a: CalibrationResult, b: CalibrationResult,
     if known.sum() < 2:
         return None
     values = d_theta[known] - d_theta[known].mean()
-    return _significance(values, [theta_covariance(r, known) for r in (a, b)],
+    return significance(values, [theta_covariance(r, known) for r in (a, b)],
                          np.ones((int(known.sum()), 1)), _noise_dof(a, b, "theta"))
-
-
-def _significance(values: np.ndarray, covariances: list[tuple[np.ndarray, bool]],
-                  removed: np.ndarray, noise_dof: float) -> Significance | None:
-    """Test values from which the columns `removed` were taken out by least squares.
-
-    The mean of the squares over their variances is compared with its own distribution,
-    approximated by a scaled chi^2 with the same mean and variance (Satterthwaite), or F where
-    the noise itself is known from few residuals.
-    """
-    correlated = all(flag for _, flag in covariances)
-    total = sum(covariance if correlated or covariance.ndim == 1 else np.diag(covariance)
-                for covariance, _ in covariances)
-    if not np.isfinite(total).all() or not total.any():
-        return None
-    q = np.linalg.qr(removed)[0]
-    if total.ndim == 1:
-        variance = total * (1 - (q**2).sum(axis=1))
-        twice_squares = 2.0 * len(values) ** 2 / (len(values) - q.shape[1])
-    else:
-        total = total - q @ (q.T @ total)
-        total = total - (total @ q) @ q.T
-        variance = np.diag(total).copy()
-    good = variance > 1e-9 * variance.max()
-    weights = np.where(good, 1 / np.where(good, variance, 1.0), 0.0)
-    ratio = float(weights @ values**2 / good.sum())
-    if total.ndim == 2:
-        scaled = total * np.sqrt(weights)[:, None] * np.sqrt(weights)
-        twice_squares = 2 * float((scaled**2).sum())
-    dof = 2 * float(good.sum()) ** 2 / twice_squares
-    p = chi2.sf(ratio * dof, dof) if noise_dof > MANY_DOF else f_test.sf(ratio, dof, noise_dof)
-    return Significance(ratio, dof, float(p), correlated)
 
 
 def _noise_dof(a: CalibrationResult, b: CalibrationResult, kind: str) -> float:
@@ -205,12 +153,24 @@ def _noise_dof(a: CalibrationResult, b: CalibrationResult, kind: str) -> float:
     Welch and Satterthwaite; what the detections declare counts as known.
     """
     parts = []
-    for noise in (a.noise, b.noise):
-        sigma = getattr(noise, f"sigma_{kind}")
-        dofs = {getattr(noise, f"sigma_{kind}_{way}"): getattr(noise, f"dof_{kind}_{way}")
-                for way in ("repeats", "residuals")}
-        parts.append((sigma**2, dofs.get(sigma) or np.inf))
-    return sum(v for v, _ in parts)**2 / max(sum(v**2 / dof for v, dof in parts), 1e-300)
+    for result in (a, b):
+        emap = result.error_map
+        u = emap.u_g_theta if kind == "theta" else np.stack([emap.u_gx, emap.u_gy])
+        known = u[np.isfinite(u)]
+        parts.append((float(np.mean(known**2)) if len(known) else 0.0,
+                      _dof_of(result.noise, kind)))
+    return sum(v for v, _ in parts)**2 / max(sum(v**2 / dof for v, dof in parts),
+                                             np.finfo(float).tiny)
+
+
+def _dof_of(noise: Noise, kind: str) -> float:
+    """Return the degrees of freedom of a noise; results of version 0.1 do not name them."""
+    dof = getattr(noise, f"dof_{kind}")
+    if dof > 0:
+        return dof
+    dofs = {getattr(noise, f"sigma_{kind}_{way}"): getattr(noise, f"dof_{kind}_{way}")
+            for way in ("repeats", "residuals")}
+    return dofs.get(getattr(noise, f"sigma_{kind}")) or np.inf
 
 
 @dataclass(frozen=True)

@@ -119,6 +119,16 @@ class FieldCovariance:
         variance += float(of_terms @ terms.covariance @ of_terms)
         return spread - basis @ np.real(basis.conj().T @ spread), variance
 
+    def maps_of_terms(self) -> np.ndarray:
+        """Return the map of a unit of each coefficient in the datum, complex (sites, p)."""
+        maps = self.project(self.terms.fields)
+        if self.scale is None:
+            return maps
+        n = 3 * self.system.grid.n_views
+        grown = np.real(self.scale.rows.conj() @ self.terms.fields) + (
+            self.scale.parameters @ self.terms.parameters[:n])
+        return maps + np.outer(self.system.grid.views.z.ravel(), grown)
+
     def diagonal(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the variances of Gx and Gy at every site, (nx, ny) each; NaN if unknown."""
         grid = self.system.grid

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Covariance of a calibration on request, and the uncertainty of its use between the nodes."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -120,14 +120,15 @@ def map_covariance(measurements: Measurements, options: Options | None = None) -
     if options.method != "joint":
         raise InputError("covariance", f"that of the method '{options.method}' is not known",
                          "calibrate with the method joint")
-    wanted = Options(options.method, options.datum_theta, options.reference,
-                     options.misalignment_model, uncertainty=True)
+    wanted = replace(options, uncertainty=True)
     with one_thread():
         problem, _ = prepare(measurements, wanted)
-        found = fit_model(problem).found
+        model = fit_model(problem)
+        found = model.found
         scale = (scale_datum(problem.system, options.reference, problem.half_width_m)
                  if options.reference else None)
-        field = FieldCovariance(problem.system, found.inverse, scale, found.xy.sigma)
+        field = FieldCovariance(problem.system, found.inverse, scale, found.xy.sigma,
+                                model.spread)
     known = problem.system.known_sites
     if measurements.sense is Sense.PLATE_MOVES:
         known = known[::-1, ::-1]

@@ -141,9 +141,28 @@ def weight_ratio(problem: Problem, sigma_xy: float, sigma_theta: float, y: np.nd
     """
     if not (np.isfinite(sigma_xy) and np.isfinite(sigma_theta)):
         return 1.0
-    sigma_xy = max(sigma_xy, ROUNDING * float(np.abs(y).max()), 1e-300)
+    sigma_xy = max(sigma_xy, ROUNDING * float(np.abs(y).max()))
     peak = float(np.abs(problem.angular.y).max())
-    sigma_theta = max(sigma_theta, ROUNDING * peak, 1e-300)
-    ratio = (sigma_xy / (sigma_theta * problem.half_width_m)) ** 2  # method eq. 4.2
-    equal = problem.system.grid_scale / problem.system.angular_scale
+    sigma_theta = max(sigma_theta, ROUNDING * peak)
+    return bounded_ratio(problem.system, sigma_xy, sigma_theta, problem.half_width_m)
+
+
+def bounded_ratio(system: NormalEquations, sigma_xy: float, sigma_theta: float,
+                  half_width_m: float) -> float:
+    """Return the weight of an angular reading against a grid reading, within what rounding bears.
+
+    Parameters
+    ----------
+    system : NormalEquations
+        With angular views.
+    sigma_xy, sigma_theta : float
+        Noise of one reading, m and rad; 1 where either is not known.
+    half_width_m : float
+        Unit of the system's positions, m.
+    """
+    if not (np.isfinite(sigma_xy) and np.isfinite(sigma_theta)):
+        return 1.0
+    sigma_xy, sigma_theta = max(sigma_xy, 1e-300), max(sigma_theta, 1e-300)
+    ratio = (sigma_xy / (sigma_theta * half_width_m)) ** 2  # method eq. 4.2
+    equal = system.grid_scale / system.angular_scale
     return float(np.clip(ratio, equal / MAX_WEIGHT, equal * MAX_WEIGHT))

@@ -13,6 +13,7 @@ from selfcal_ros.estimation.datum.scale import scale_datum
 from selfcal_ros.estimation.joint.fit import JointFit
 from selfcal_ros.estimation.joint.model_fit import ModelFit, fit_model
 from selfcal_ros.estimation.joint.problem import Problem, repeats_of
+from selfcal_ros.estimation.joint.saved_terms import saved_terms
 from selfcal_ros.estimation.joint.solved import Solved, noise_of
 from selfcal_ros.estimation.lattice.maps import PHASES
 from selfcal_ros.estimation.lattice.readings import angular_data, grid_data
@@ -83,7 +84,7 @@ def prepare(measurements: Measurements, options: Options) -> tuple[Problem, Obse
 def _solved(measurements: Measurements, options: Options, *, model: ModelFit,
             seen: Observability) -> Solved:
     problem, found = model.problem, model.found
-    error_map, closure = _error_map(measurements, options, model=model)
+    error_map, closure, kept = _error_map(measurements, options, model=model)
     warnings = () if problem.direct or options.uncertainty is not None else (
         "no uncertainty map, because of the size of the field: ask for it (--uncertainty always)",)
     axes = (1.0, 0.0)
@@ -93,7 +94,8 @@ def _solved(measurements: Measurements, options: Options, *, model: ModelFit,
         measurements.plan_id, error_map, _artifact_map(problem, found),
         _views(measurements, problem, found), seen, noise_of(found.xy, found.theta),
         measurements.all_rejected(), warnings=warnings, method="joint",
-        sense=str(measurements.sense), extra={"solver": found.solver}, run_id=measurements.run_id,
+        sense=str(measurements.sense), extra={"solver": found.solver, **kept},
+        run_id=measurements.run_id,
         model=ModelResult("rigid" if problem.rigid else "linear", term_results(model)))
     return Solved(result, found.xy, found.theta, model, axes)
 
@@ -144,16 +146,22 @@ def term_results(model: ModelFit) -> tuple[TermResult, ...]:
 
 
 def _error_map(measurements: Measurements, options: Options, *, model: ModelFit,
-               ) -> tuple[ErrorMap, np.ndarray | None]:
-    """Return the map in the stage frame, and the covariance of the angular misclosure."""
+               ) -> tuple[ErrorMap, np.ndarray | None, dict[str, Any]]:
+    """Return the map in the stage frame, the covariance of the angular misclosure, factors.
+
+    The factors are those of `selfcal_ros.estimation.joint.saved_terms`.
+    """
     problem, found = model.problem, model.found
     system, length = problem.system, problem.half_width_m
     u_x = u_y = np.full(system.grid.views.shape, np.nan)
     u_theta, closure = np.full(system.angular.n_lines, np.nan), None
+    kept: dict[str, Any] = {}
     if problem.direct and options.uncertainty is not False:
         scale = (scale_datum(system, options.reference, length) if options.reference else None)
         cover = FieldCovariance(system, found.inverse, scale, found.xy.sigma, model.spread)
         u_x, u_y = (np.sqrt(v) * found.xy.sigma for v in cover.diagonal())
+        if model.equations is not None:
+            kept = saved_terms(cover, model.equations.columns, measurements.sense)
     if problem.direct and options.uncertainty is not False and system.angular.n_views:
         variance, closure = angular_variance(
             cover, problem.conditions, sigma=(found.xy.sigma, found.theta.sigma),
@@ -169,7 +177,7 @@ def _error_map(measurements: Measurements, options: Options, *, model: ModelFit,
         g_theta, u_theta = -g_theta[back], u_theta[back]
     return ErrorMap(measurements.artifact, field.real.copy(), field.imag.copy(), u_x, u_y,
                     g_theta, u_theta, o / length, r / length,
-                    problem.conditions.datum), closure
+                    problem.conditions.datum), closure, kept
 
 
 def _artifact_map(problem: Problem, found: JointFit) -> ArtifactMap:

@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Covariances computed anew from a saved map are those of the calibration behind it."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.comparison.covariance import first_order_u, xy_covariance
 from selfcal_ros.estimation.comparison.maps import compare
@@ -13,21 +15,24 @@ from selfcal_ros.estimation.joint.covariance import map_covariance
 from selfcal_ros.estimation.options import Options, ReferenceLength
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Sense
+from selfcal_ros.model.result import result_from_dict, result_to_dict
+from selfcal_ros.model.terms import ModelTerm, TermName
 from selfcal_ros.model.view import View
 from selfcal_ros.simulation.truth import hu_plan, random_truth, simulate_measurements
 from test.support.lattice_plans import plan_of
 
 PLAN = plan_of("0,90,tx,2ty", Artifact(5, 0.01, 12), lines=1)
+TURNED = plan_of("0,90+tx,2ty,270-2tx+ty,tx", Artifact(5, 0.01, 12), lines=1)
 HU, SMALL = hu_plan(Artifact(7, 0.01, 12)), hu_plan(Artifact(5, 0.01, 8))
 _BARE = plan_of("0,90,tx,ty", Artifact(7, 0.01, 24))
 APART = replace(_BARE, views=(*(replace(view, angular=False) for view in _BARE.views), *(
     View(f"lines {k}", k * np.pi / 12, (0.0, 0.0), False, True) for k in (0, 1, 6))))
 
 
-def measured(plan, seed, truth_seed=99, sense=Sense.MICROSCOPE_MOVES):
+def measured(plan, seed, truth_seed=99, sense=Sense.MICROSCOPE_MOVES, missing=0.0):
     truth = random_truth(plan.artifact, len(plan.views), np.random.default_rng(truth_seed))
     return simulate_measurements(truth, plan, np.random.default_rng(seed), sense=sense,
-                                 sigma_m=2e-8, sigma_theta_rad=2e-5)
+                                 missing=missing, sigma_m=2e-8, sigma_theta_rad=2e-5)
 
 
 @pytest.mark.parametrize("sense", Sense)
@@ -42,8 +47,50 @@ def test_covariance_of_a_saved_map(sense, reference):
     found, correlated = xy_covariance(result, known)
     wanted = map_covariance(readings, options).nodes(*np.nonzero(known))
     assert correlated
-    # a reference on an axis correlates the scale with the errors of that axis, by less than this
+    assert abs(found - wanted).max() < 1e-6 * wanted.max()
+    # as version 0.1 wrote it: a reference on an axis correlates the scale with that axis
+    found, correlated = xy_covariance(replace(result, views=tuple(
+        replace(v, read_grid=None, read_angular=None) for v in result.views)), known)
+    assert correlated
     assert abs(found - wanted).max() < (0.02 if reference is None else 0.1) * wanted.max()
+
+
+@pytest.mark.parametrize("sense", Sense)
+@pytest.mark.parametrize("reference", [None, ReferenceLength("stage_x", 1e-6, 2e-6)])
+def test_covariance_of_a_saved_map_with_missing_marks_and_terms(sense, reference):
+    readings = measured(TURNED, 1, sense=sense, missing=0.1)
+    options = Options(reference=reference, terms=(
+        ModelTerm(TermName.PLATE_SCALE), ModelTerm(TermName.PLATE_SHAPE, 3e-8)))
+    result = calibrate(readings, options)
+    saved = result_from_dict(json.loads(json.dumps(result_to_dict(result))), "r")
+    known = result.error_map.valid
+    found, correlated = xy_covariance(saved, known)
+    wanted = map_covariance(readings, options).nodes(*np.nonzero(known))
+    assert correlated
+    assert abs(found - wanted).max() < 1e-4 * wanted.max()
+    u = np.concatenate([result.error_map.u_gx[known], result.error_map.u_gy[known]])
+    assert np.sqrt(np.diag(wanted)) == pytest.approx(u, rel=1e-6)
+    shear = first_order_u(saved)
+    assert shear[0] > 1.5 * first_order_u(calibrate(readings, Options(reference=reference)))[0]
+    bare = replace(saved, extra={})
+    assert xy_covariance(bare, known)[1] is False
+
+
+@pytest.mark.parametrize(("read", "message"), [
+    ("x", "no weights of this field"), ([[1, 2], [3, 4]], "no weights of this field"),
+    (-1, "no weights of this field")])
+def test_weights_that_are_none_are_refused(read, message):
+    result = calibrate(measured(PLAN, 1))
+    views = (replace(result.views[0], read_grid=read), *result.views[1:])
+    with pytest.raises(InputError, match=f"view '0', read.grid: {message}; write the result anew"):
+        xy_covariance(replace(result, views=views), result.error_map.valid)
+
+
+def test_factors_of_another_lattice_are_refused():
+    result = calibrate(measured(PLAN, 1))
+    extra = {"covariance_terms": {"terms": [""], "factors": [[[1.0, 2.0], [3.0, 4.0]]]}}
+    with pytest.raises(InputError, match="covariance_terms: no factors of this lattice"):
+        xy_covariance(replace(result, extra=extra), result.error_map.valid)
 
 
 def test_a_reference_adds_nothing_to_the_uncertainty_of_squareness():

@@ -124,7 +124,6 @@ def test_views_that_tell_no_correlation_are_said_so():
     sites, lines = ARTIFACT.shape[0] * ARTIFACT.shape[1], ARTIFACT.angular_count
     assert found.xy.dof == pytest.approx(2 * sites - 4)  # translation, rotation, magnification
     assert found.theta.dof == pytest.approx(lines - 1)
-    assert found.xy.dof > compare(A, B).xy.dof
 
 
 @pytest.mark.parametrize(("artifact", "message"), [
