@@ -5,17 +5,17 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.stats import norm
-from scipy.stats import t as student
 
+from selfcal_ros.estimation.joint.noise import F_LEVEL, coverage_factor
+from selfcal_ros.estimation.joint.saved_terms import variance_of_terms
 from selfcal_ros.estimation.options import ReferenceLength
 from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.model.result import CalibrationResult
+from selfcal_ros.model.result import CalibrationResult, Noise
 from selfcal_ros.model.statistics import rms
 from selfcal_ros.units import ARCSEC_PER_RAD, UM_PER_M
 
-COVERAGE = 0.9545
-"""Probability of the expanded uncertainty: k = 2 for many degrees of freedom."""
+TOLD = 0.5
+"""Part of a term's size that readings leave, below which it is they that tell the term."""
 
 MANY_DOF = 1e5
 """Degrees of freedom above which a number of them says nothing more."""
@@ -81,6 +81,9 @@ class Budget:
 def budgets(result: CalibrationResult, reference: ReferenceLength | None = None) -> list[Budget]:
     """Return the budgets of the XY map (one coordinate) and, if there is one, of the angular map.
 
+    Two of each: at the nodes of the map, where it was calibrated, and anywhere between them, where
+    the interpolation errs as well.
+
     Parameters
     ----------
     result : CalibrationResult
@@ -89,45 +92,71 @@ def budgets(result: CalibrationResult, reference: ReferenceLength | None = None)
         What set the scale.
     """
     emap, noise, artifact = result.error_map, result.noise, result.artifact
-    u = np.stack([emap.u_gx, emap.u_gy])
+    power = np.stack([emap.u_gx, emap.u_gy]) ** 2
+    of_terms = variance_of_terms(result)
+    # the map's uncertainty holds the reference's and the terms', which have lines of their own
+    power = power - sum(of_terms.values())
     if reference is not None:
-        # the map's uncertainty holds the reference's, which has a line of its own
-        own = reference.u_relative * np.stack([artifact.x_m, artifact.y_m])
-        u = np.sqrt(np.maximum(u**2 - own**2, 0.0))
-    parts = _noise_parts(u, noise.sigma_xy, repeats=(noise.sigma_xy_repeats,
-                                                     noise.dof_xy_repeats),
-                         residuals=(noise.sigma_xy_residuals, noise.dof_xy_residuals))
-    parts += [_reference_part(artifact, reference), _interpolation_xy(result)]
-    out = [_combine("XY, one coordinate at any point of the field", "m", parts)]
+        power = power - (reference.u_relative * np.stack([artifact.x_m, artifact.y_m])) ** 2
+    dof = _dof(noise, "xy")
+    parts = [_noise_part(np.sqrt(np.maximum(power, 0.0)), noise, "xy"),
+             *(_term_part(result, name, variance, dof) for name, variance in of_terms.items()),
+             _reference_part(artifact, reference)]
+    out = [_combine("XY, one coordinate at the nodes of the map", "m", parts),
+           _combine("XY, one coordinate anywhere in the field, map interpolated between its nodes",
+                    "m", [*parts, _interpolation_xy(result)])]
     if np.isfinite(emap.u_g_theta).any():
-        parts = _noise_parts(emap.u_g_theta, noise.sigma_theta,
-                             repeats=(noise.sigma_theta_repeats, noise.dof_theta_repeats),
-                             residuals=(noise.sigma_theta_residuals, noise.dof_theta_residuals))
-        out.append(_combine("theta at any angle", "rad", [*parts, _interpolation_theta(result)]))
+        part = _noise_part(emap.u_g_theta, noise, "theta")
+        out += [_combine("theta at the lines of the map", "rad", [part]),
+                _combine("theta at any angle, map interpolated between its lines", "rad",
+                         [part, _interpolation_theta(result)])]
     return out
 
 
-def _noise_parts(u: np.ndarray, sigma: float, *, repeats: tuple[float, float],
-                 residuals: tuple[float, float]) -> list[Component]:
-    """Return what repeats show, and what residuals show beyond it, as they reach the map."""
+def _dof(noise: Noise, kind: str) -> float:
+    """Return the degrees of freedom of the noise behind the map; infinite if it is declared."""
+    dof = getattr(noise, f"dof_{kind}")
+    if dof > 0:
+        return dof
+    sigma = getattr(noise, f"sigma_{kind}")  # results of version 0.1 do not name them
+    return next((getattr(noise, f"dof_{kind}_{way}") or np.inf for way in ("repeats", "residuals")
+                 if getattr(noise, f"sigma_{kind}_{way}") == sigma), np.inf)
+
+
+def _noise_part(u: np.ndarray, noise: Noise, kind: str) -> Component:
+    """Return the noise of readings as it reaches the map."""
+    sigma, repeats, residuals, p = (getattr(noise, name) for name in (
+        f"sigma_{kind}", f"sigma_{kind}_repeats", f"sigma_{kind}_residuals", f"p_{kind}"))
     if not (np.isfinite(sigma) and sigma > 0):
-        return [Component("reading noise", "A", 0.0, 0.0, np.inf, "no noise was found")]
-    gain_rms, gain_max = rms(u) / sigma, float(np.nanmax(u)) / sigma
-    if sigma not in (repeats[0], residuals[0]):
-        level, dof, kind, base = sigma, np.inf, "B", "declaration"
-        source = "declared by the detections"
-    elif repeats[1] > 0:
-        (level, dof), kind, base, source = repeats, "A", "repeats", "scatter of repeats"
+        return Component("reading noise", "A", 0.0, 0.0, np.inf, "no noise was found")
+    dof = _dof(noise, kind)
+    if sigma == residuals:
+        source = "residuals of the fit"
+    elif sigma == repeats:
+        source = "scatter of repeats"
     else:
-        level, dof, kind, base, source = sigma, residuals[1], "A", "", "residuals of the fit"
-    out = [Component("reading noise", kind, gain_rms * level, gain_max * level, dof, source)]
-    if base:
-        beyond_what = "scatter of repeats" if base == "repeats" else "declared noise"
-        beyond = float(np.sqrt(max(residuals[0]**2 - level**2, 0.0))) if residuals[1] else 0.0
-        out.append(Component(f"beyond {base}", "A", gain_rms * beyond, gain_max * beyond,
-                             residuals[1] or np.inf, f"residuals beyond the {beyond_what}: drift, "
-                             "seating, slow vibration"))
-    return out
+        source = "declared by the detections"
+    if p < F_LEVEL:
+        source += ", the larger of two that contradict each other (see the verdict)"
+    return Component("reading noise", "A" if np.isfinite(dof) else "B", rms(u),
+                     float(np.nanmax(u)), dof, source)
+
+
+def _term_part(result: CalibrationResult, name: str, variance: np.ndarray,
+               dof: float) -> Component:
+    """Return what a term with a size makes of the map's uncertainty.
+
+    Of type A if the readings tell the term, of type B if its size does.
+    """
+    term = next(term for term in result.model.terms if term.name == name)
+    u = np.array([estimate.u for estimate in term.estimates])
+    size = term.size or np.inf
+    left = float(np.sqrt(np.mean(u[np.isfinite(u)] ** 2))) / size
+    told = left < TOLD
+    known = variance[:, result.error_map.valid]
+    note = (f"known to {size:.3g} beforehand; the readings leave {left:.0%} of it")
+    return Component(f"term {name}", "A" if told else "B", float(np.sqrt(known.mean())),
+                     float(np.sqrt(known.max())), dof if told else np.inf, note)
 
 
 def _reference_part(artifact: Artifact, reference: ReferenceLength | None) -> Component:
@@ -184,8 +213,7 @@ def _combine(quantity: str, unit: str, parts: list[Component]) -> Budget:
                     for name in ("u_rms", "u_max"))
     spread = sum(part.u_rms**4 / part.dof for part in parts)
     dof = u_rms**4 / spread if spread > 0 else np.inf
-    tail = (1 - COVERAGE) / 2
-    k = float(student.isf(tail, dof) if np.isfinite(dof) else norm.isf(tail))
+    k = coverage_factor(float(dof))
     return Budget(quantity, unit, tuple(parts), u_rms, u_max, float(dof), k)
 
 
