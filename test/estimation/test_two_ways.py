@@ -11,7 +11,9 @@ from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.joint.covariance import map_covariance
 from selfcal_ros.estimation.options import Options, ReferenceLength
 from selfcal_ros.estimation.quality.leverage import residuals_of
-from selfcal_ros.estimation.quality.outliers import _noisy_views, clean, robust_calibrate, subset
+from selfcal_ros.estimation.quality.noisy import noisy_views
+from selfcal_ros.estimation.quality.outliers import clean, robust_calibrate
+from selfcal_ros.estimation.quality.thinning import subset
 from selfcal_ros.estimation.quality.validation import validate
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Sense, ViewReadings
@@ -122,7 +124,7 @@ def test_views_with_too_few_readings_to_tell_are_not_called_noisy():
     plan = plan_of("0,90,tx", Artifact(5, 0.01))
     for seed in range(25):
         readings = measured(plan, seed)[1]
-        assert _noisy_views(residuals_of(readings, Options()), readings) == ()
+        assert noisy_views(residuals_of(readings, Options()), readings) == ()
 
 
 @pytest.mark.parametrize(("sigma_m", "sigma_rad", "limit_m"), [

@@ -3,13 +3,18 @@
 
 The leverage h of a reading is the part of it that the fit follows; its residual has the standard
 deviation sigma sqrt((1 - h) / weight). For a grid reading of weight w in a mark of total weight W,
-h = w (1/W + var(x - mean x)), with x the part of the model other than the plate's error.
+h = w (1/W + var(x - mean x)), with x the part of the model other than the plate's error. Its two
+coordinates share a 2 x 2 matrix h + (a, b; b, -a): `skew` is a + ib, which rotations make.
+
+Grid and angular readings are fitted apart here, so that each kind is judged by itself and the sums
+of squares have exactly known distributions.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import nnls
+from scipy.stats import f as f_distribution
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.joint.fit import JointFit, fit
@@ -32,6 +37,9 @@ N_DRAWS = 64
 VIEW_DRAWS = 16
 """Draws of unit noise in each view, to unmix the noises of views."""
 
+ROUNDING = 1e-13
+"""Noise below this, m or rad, is rounding, against which nothing is an outlier."""
+
 CHECKED = 0.05
 """Smallest 1 - h of a reading that can be checked against the others."""
 
@@ -48,26 +56,55 @@ class Residuals:
         The joint solution.
     redundancy, redundancy_theta : float array (views, nx, ny), (views, K)
         1 - h; 0 where not read.
+    skew : complex array (views, nx, ny)
+        By how much h differs between the coordinates.
     """
 
     problem: Problem
     found: JointFit
     redundancy: np.ndarray
     redundancy_theta: np.ndarray
+    skew: np.ndarray
 
     @property
     def squares(self) -> np.ndarray:
-        """|residual|^2 weight / (1 - h), m^2, (views, nx, ny): 2 sigma^2 on average.
+        """Residual' (1 - h)^-1 residual weight, m^2, (views, nx, ny): 2 sigma^2 on average.
 
-        NaN where the reading cannot be checked.
+        What the sum of squares loses without the reading. NaN where it cannot be checked.
         """
-        return _scaled(abs(self.found.residuals) ** 2, self.problem.grid.weight, self.redundancy)
+        left, skew = self.found.residuals, abs(self.skew)
+        good = self.redundancy - skew > CHECKED
+        both = np.where(good, self.redundancy**2 - skew**2, 1.0)
+        form = self.redundancy * abs(left) ** 2 + np.real(np.conj(self.skew) * left**2)
+        return np.where(good, form / both * self.problem.grid.weight, np.nan)
 
     @property
     def squares_theta(self) -> np.ndarray:
         """The same for angular readings, rad^2, (views, K); sigma^2 on average."""
         return _scaled(self.found.residuals_theta**2, self.problem.angular.weight,
                        self.redundancy_theta)
+
+
+    def p_outlier(self, kind: str, at: tuple[int, ...]) -> float:
+        """Return the probability that a good reading fits the others as badly; NaN if not known.
+
+        F-test of what the reading adds to the sum of squares against what is left without it.
+        """
+        if kind == "grid":
+            system, squares, weight, left, columns = (
+                self.problem.system, self.squares, self.problem.grid.weight,
+                abs(self.found.residuals), 2)
+            dof = 2 * system.grid.n_readings - system.rank_grid
+        else:
+            system, squares, weight, left, columns = (
+                self.problem.system, self.squares_theta, self.problem.angular.weight,
+                self.found.residuals_theta, 1)
+            dof = system.angular.n_readings - system.rank_angular
+        rest = float((weight * left**2).sum()) - float(squares[at])
+        if not np.isfinite(rest) or dof <= columns:
+            return float("nan")
+        noise = max(rest / (dof - columns), ROUNDING**2)
+        return float(f_distribution.sf(squares[at] / columns / noise, columns, dof - columns))
 
 
 def _scaled(squares: np.ndarray, weight: np.ndarray, redundancy: np.ndarray) -> np.ndarray:
@@ -87,17 +124,24 @@ def residuals_of(measurements: Measurements, options: Options) -> Residuals:
     if not problem.direct:
         raise InputError("--robust", f"{problem.system.grid.n_sites} sites are too many for the "
                          "leverage of each reading", "solve without it")
-    found = fit(problem, problem.grid.y)
     system = problem.system
+    found = replace(fit(problem, problem.grid.y), residuals=grid_residuals(system, problem.grid.y),
+                    residuals_theta=angular_residuals(system, problem.angular.y))
     if system.grid.n_sites <= EXACT_SITES:
-        redundancy = exact_redundancy(system)
+        redundancy, skew = _exact_leverage(system)
     else:
         redundancy = drawn_redundancy(system)
-    return Residuals(problem, found, redundancy, angular_redundancy(system))
+        skew = np.zeros(redundancy.shape, dtype=complex)
+    return Residuals(problem, found, redundancy, angular_redundancy(system), skew)
 
 
 def exact_redundancy(system: NormalEquations) -> np.ndarray:
     """Return 1 - h of every grid reading, (views, nx, ny), mean of both coordinates."""
+    return _exact_leverage(system)[0]
+
+
+def _exact_leverage(system: NormalEquations) -> tuple[np.ndarray, np.ndarray]:
+    """Return 1 - h and the skew of every grid reading, (views, nx, ny)."""
     grid = system.grid
     inverse = grid.factor.solve(np.eye(grid.n_sites, dtype=complex))
     index = np.maximum(grid.views.site_index, 0)
@@ -113,8 +157,10 @@ def exact_redundancy(system: NormalEquations) -> np.ndarray:
     basis = np.array([grid.centred(grid.views.gather(-column.reshape(grid.views.shape))
                                    + grid.misaligned(unit)) for column, unit in
                       zip(grid.response.T, np.eye(3 * grid.n_views), strict=True)])
-    spread = np.einsum("pvij,pq,qvij->vij", np.conj(basis), system.grid_inverse, basis).real / 2
-    return _redundancy(grid.weight, variance + spread)
+    answer = np.einsum("pq,qvij->pvij", system.grid_inverse, basis)
+    spread = np.einsum("pvij,pvij->vij", np.conj(basis), answer).real / 2
+    skew = np.einsum("pvij,pvij->vij", basis, answer) / 2
+    return _redundancy(grid.weight, variance + spread), grid.weight * skew
 
 
 def _redundancy(weight: np.ndarray, variance: np.ndarray) -> np.ndarray:
@@ -143,6 +189,16 @@ def grid_residuals(system: NormalEquations, y: np.ndarray) -> np.ndarray:
     parameters = system.grid_inverse @ d
     field = (free - grid.response @ parameters).reshape(grid.views.shape)
     return grid.plate(y, field, parameters)[1]
+
+
+def angular_residuals(system: NormalEquations, y: np.ndarray) -> np.ndarray:
+    """Return what the angular readings `y` (views, K) leave over when fitted alone."""
+    angular = system.angular
+    if not angular.n_views:
+        return np.zeros(y.shape)
+    free, d = angular.reduced(y)
+    phi = system.angular_inverse @ d
+    return angular.plate(y, free - angular.response @ phi, phi)[1]
 
 
 def view_noise(residuals: Residuals) -> np.ndarray:

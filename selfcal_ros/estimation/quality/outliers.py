@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Calibration that finds, removes and lists readings that contradict the others.
 
-The rule. The noise is the median of the standardised squares over that of chi^2. A grid reading is
-an outlier if its squared standardised residual (leverage included) exceeds the level that one of n
-good readings exceeds with probability LEVEL; an angular one likewise. The largest are removed
-first, at most one for each mark and site in a round, then the fit is repeated; readings that
-contradict each other so that the largest is not unique all go. At the end a removed reading is
-taken back if it can be checked and agrees after all. A slipped view is split before that.
+The rule. Suspects are sought with the noise as the median of the standardised squares over that of
+chi^2, which outliers do not spoil: the largest first, at most one for each mark and site in a
+round, then the fit is repeated; readings that contradict each other so that the largest is not
+unique all go. At the end each is put back, and stays if it fits the others after all: an F-test of
+what it adds to the sum of squares, at the level that one of n good readings passes with
+probability LEVEL, all kinds together. Before that a slipped view is split, if no term of the model
+explains the readings better.
 """
 
 from dataclasses import asdict, dataclass, replace
@@ -18,17 +19,20 @@ from scipy.stats import chi2
 from selfcal_ros.errors import InputError, NotIdentifiableError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.blas_threads import one_thread
-from selfcal_ros.estimation.lattice.finite_rotation import (
-    rotation_excess,
-    turned_marks,
-    turned_plate,
-)
+from selfcal_ros.estimation.joint.model_fit import fit_model
+from selfcal_ros.estimation.joint.solve import prepare
+from selfcal_ros.estimation.lattice.maps import PHASES
 from selfcal_ros.estimation.options import Options
-from selfcal_ros.estimation.quality.leverage import Residuals, residuals_of, view_noise
+from selfcal_ros.estimation.quality.leverage import ROUNDING, Residuals, residuals_of
+from selfcal_ros.estimation.quality.noisy import noisy_views
 from selfcal_ros.estimation.quality.slip import Slip, find_slip, split_view
+from selfcal_ros.estimation.quality.slip_or_term import likelier_term
+from selfcal_ros.estimation.quality.thinning import Key, left_out, without
+from selfcal_ros.estimation.terms.identifiable import require_terms_told
 from selfcal_ros.model.error_map import ThetaDatum
-from selfcal_ros.model.readings import Measurements, ViewReadings
+from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.result import CalibrationResult
+from selfcal_ros.model.terms import ModelTerm, TermName
 
 LEVEL = 0.01
 """Probability that a measurement without outliers loses a reading."""
@@ -45,18 +49,8 @@ TIED = 1e-6
 """Readings whose ratios differ by less contradict each other, no one knows which is wrong."""
 
 MAX_SLIPS = 3
-NOISY_VIEW = 3.0
-"""A view is named if its noise is this many times that of the others together."""
-MIN_VIEW_DOF = 5.0
-"""Degrees of freedom of a view's own noise below which it is not judged: chance does as much."""
-
-MAX_RATIO = 20.0
-"""Largest ratio of noises that residuals can tell: a noisy view hides the noise of the others."""
-
-ROUNDING = 1e-13
-"""Noise below this, m or rad, is rounding, against which nothing is an outlier."""
-
-REASON = "outlier_among_views"
+MAX_TERMS = 3
+"""Terms that are taken off the readings, one after the other, before outliers are looked for."""
 
 
 @dataclass(frozen=True)
@@ -142,8 +136,8 @@ def _listed(cleaned: OutlierScreening) -> dict[str, Any]:
         "residual_m": item.residual if item.kind == "grid" else None,
         "residual_rad": item.residual if item.kind == "angular" else None,
     } for item in cleaned.removed]
-    outliers = {"rule": f"removed if the squared standardised residual is above chi2 (2 degrees of "
-                        f"freedom for a mark, 1 for a line) at level {LEVEL}/n",
+    outliers = {"rule": f"removed if its squared standardised residual fails an F-test at level "
+                        f"{LEVEL}/n, for marks and lines together",
                 "unchecked": cleaned.unchecked, "removed": removed}
     return {"outliers": outliers, "slips": [
         asdict(item) | {"alternatives": "; ".join(item.alternatives)} for item in cleaned.slips],
@@ -154,56 +148,81 @@ def _listed(cleaned: OutlierScreening) -> dict[str, Any]:
 def clean(measurements: Measurements, options: Options) -> OutlierScreening:
     """Return the measurement split at slips and without outliers, and what was found."""
     # a pure datum: the redundant axis conditions of xy_axes would show in the angular residuals
-    linear = replace(options, misalignment_model="linear", reference=None,
+    linear = replace(options, misalignment_model="linear", reference=None, terms=(),
                      datum_theta=ThetaDatum.ZERO_MEAN)
-    flattened = measurements
-    if options.misalignment_model != "linear":
-        flattened = _flattened(measurements, options)
-    slips: list[Slip] = []
-    notes: list[str] = []
-    residuals = residuals_of(flattened, linear)
-    while len(slips) < MAX_SLIPS:
-        sigma = max(robust_sigma(residuals.squares, 2), ROUNDING)
-        slip = find_slip(residuals, sigma, flattened, linear)
-        if slip is None:
-            break
-        slips.append(slip)
-        notes.append(slip.text())
-        try:
-            mend = _left_out if slip.alternatives else split_view
-            residuals = residuals_of(mend(flattened, slip), linear)
-        except NotIdentifiableError:
-            notes[-1] += "; the map is spoiled by it: measure the view again"
-            break
-        flattened, measurements = mend(flattened, slip), mend(measurements, slip)
-        notes[-1] += "; the view is left out" if slip.alternatives else ""
-    gone, residuals, stopped = _reject(flattened, linear, residuals)
+    screened = _without_slips(measurements, options, linear)
+    gone, residuals, stopped = _reject(screened.flattened, linear, screened.residuals)
     removed = tuple(sorted(gone.values(), key=lambda item: (item.kind, item.view, item.mark)))
-    noisy = _noisy_views(residuals, flattened)
-    warnings = notes + _warnings(removed, noisy, stopped)
+    noisy = noisy_views(residuals, screened.measurements)
+    warnings = [*screened.notes, *_warnings(removed, noisy, stopped)]
     unchecked = int((np.isnan(residuals.squares) & (residuals.problem.grid.weight > 0)).sum())
-    return OutlierScreening(_without(measurements, gone, mark=True), removed, tuple(slips), noisy,
-                            unchecked, tuple(warnings))
+    return OutlierScreening(without(screened.measurements, gone, mark=True), removed,
+                            screened.slips, noisy, unchecked, tuple(warnings))
 
 
-def _left_out(measurements: Measurements, slip: Slip) -> Measurements:
-    """Return the measurement without the readings of the slipped view."""
-    view = measurements.views[slip.index]
-    lost = int(view.count.sum() + view.count_theta.sum())
-    empty = subset(view, np.zeros(len(view.m), dtype=bool), np.zeros(len(view.k), dtype=bool))
-    empty = replace(empty, used=view.used - lost,
-                    rejected={**view.rejected, REASON: view.rejected.get(REASON, 0) + lost})
-    views = (*measurements.views[:slip.index], empty, *measurements.views[slip.index + 1:])
-    return replace(measurements, views=views)
+@dataclass(frozen=True, eq=False)
+class _Screened:
+    """Readings split at slips, the same without what the model holds, and what was found."""
+
+    measurements: Measurements
+    flattened: Measurements
+    residuals: Residuals
+    slips: tuple[Slip, ...] = ()
+    notes: tuple[str, ...] = ()
+
+
+def _without_slips(measurements: Measurements, options: Options, linear: Options) -> _Screened:
+    """Return the readings split at slips, and less what explains them better than a slip."""
+    flattened = _flattened(measurements, options)
+    at = _Screened(measurements, flattened, residuals_of(flattened, linear))
+    for _ in range(MAX_SLIPS + MAX_TERMS + 1):
+        sigma = max(robust_sigma(at.residuals.squares, 2), ROUNDING)
+        slip = find_slip(at.residuals, sigma, at.flattened, linear)
+        if slip is None:
+            return at
+        if len(at.slips) == MAX_SLIPS:
+            break
+        cause = likelier_term(at.measurements, options, slip)
+        if cause is None:
+            at, mended = _mended(at, slip, linear)
+            if not mended:
+                return at
+            continue
+        at = replace(at, notes=(*at.notes, f"view '{slip.view}' looks as if the plate slipped, but "
+                                f"the readings show {cause.text.partition(': ')[0]}, which explains"
+                                " them better: no view was split"))
+        options = replace(options, terms=(*options.terms, ModelTerm(TermName(cause.name))))
+        try:
+            flattened = _flattened(at.measurements, options)
+        except (NotIdentifiableError, InputError):
+            return at
+        at = replace(at, flattened=flattened, residuals=residuals_of(flattened, linear))
+    return replace(at, notes=(*at.notes, f"gave up on slips after {len(at.slips)}: more of them "
+                              "seem to be in the readings; measure again"))
+
+
+def _mended(at: _Screened, slip: Slip, linear: Options) -> tuple[_Screened, bool]:
+    """Return the readings split at a slip, or without its view, and whether that could be done."""
+    text = slip.text()
+
+    def mend(readings: Measurements) -> Measurements:
+        return left_out(readings, slip.index) if slip.alternatives else split_view(readings, slip)
+
+    flattened = mend(at.flattened)
+    try:
+        residuals = residuals_of(flattened, linear)
+    except NotIdentifiableError:
+        text += "; the map is spoiled by it: measure the view again"
+        return replace(at, slips=(*at.slips, slip), notes=(*at.notes, text)), False
+    text += "; the view is left out" if slip.alternatives else ""
+    return _Screened(mend(at.measurements), flattened, residuals, (*at.slips, slip),
+                     (*at.notes, text)), True
 
 
 def robust_sigma(squares: np.ndarray, dof: int) -> float:
     """Return the noise whose chi^2 has the median of the standardised squares; NaN if none."""
     known = squares[np.isfinite(squares)]
     return float(np.sqrt(np.median(known) / chi2.median(dof))) if len(known) else float("nan")
-
-
-Key = tuple[int, str, tuple[int, ...]]
 
 
 def _reject(measurements: Measurements, options: Options, residuals: Residuals
@@ -220,23 +239,27 @@ def _reject(measurements: Measurements, options: Options, residuals: Residuals
                 f"more than {MAX_REMOVED:.0%} of the readings contradict the others: none was "
                 "removed; look for a wrong plan or a faulty view")
         try:
-            residuals = residuals_of(_without(measurements, gone | found), options)
+            residuals = residuals_of(without(measurements, gone | found), options)
         except NotIdentifiableError:
             return gone, residuals, "removing more outliers would leave the stage undetermined"
         gone |= found
-    return _taken_back(measurements, options, gone, residuals)
+    else:
+        return (*_taken_back(measurements, options, gone, residuals),
+                f"gave up on outliers after {MAX_ROUNDS} rounds: more of them seem to be in the "
+                "readings; look for a wrong plan or a faulty view")
+    return (*_taken_back(measurements, options, gone, residuals), "")
 
 
 def _worst(residuals: Residuals, measurements: Measurements) -> dict[Key, Removed]:
     """Return the outliers of one round: the largest first, one for each mark and site."""
     found: dict[Key, Removed] = {}
     grid, problem = residuals.problem.system.grid, residuals.problem
-    sigma, n = robust_sigma(residuals.squares, 2), np.isfinite(residuals.squares).sum()
+    sigma = robust_sigma(residuals.squares, 2)
     ratio = _ratio(residuals.squares, sigma)
     taken: dict[tuple[str, int], float] = {}
     # in the order of ratios rounded, so that ties have the order of the readings
     order = np.argsort(-np.round(ratio.ravel(), 6), kind="stable")
-    floor = max(chi2.isf(LEVEL / n, 2), NEAR_LARGEST * float(ratio.max()))
+    floor = max(chi2.isf(_level(residuals), 2), NEAR_LARGEST * float(ratio.max()))
     for at in order[:int((ratio > floor).sum())]:
         v, i, j = np.unravel_index(at, ratio.shape)
         nodes = (("mark", int(i * ratio.shape[2] + j)),
@@ -257,12 +280,11 @@ def _worst(residuals: Residuals, measurements: Measurements) -> dict[Key, Remove
 def _worst_theta(residuals: Residuals, measurements: Measurements) -> dict[Key, Removed]:
     """Return the largest angular outlier of a round, if there is one."""
     squares = residuals.squares_theta
-    n = np.isfinite(squares).sum()
-    if not n:
+    if not np.isfinite(squares).any():
         return {}
     ratio = _ratio(squares, robust_sigma(squares, 1))
     v, k = np.unravel_index(int(np.argmax(ratio)), ratio.shape)
-    if ratio[v, k] <= chi2.isf(LEVEL / n, 1):
+    if ratio[v, k] <= chi2.isf(_level(residuals), 1):
         return {}
     index = residuals.problem.angular.index[v]
     return {(index, "angular", (int(k),)): Removed(
@@ -275,15 +297,30 @@ def _ratio(squares: np.ndarray, sigma: float) -> np.ndarray:
     return np.nan_to_num(squares, nan=0.0) / max(sigma, ROUNDING) ** 2
 
 
+def _level(residuals: Residuals) -> float:
+    """Return the level of the test of one reading: LEVEL over all that can be checked."""
+    return LEVEL / max(np.isfinite(residuals.squares).sum()
+                       + np.isfinite(residuals.squares_theta).sum(), 1)
+
+
 def _taken_back(measurements: Measurements, options: Options, gone: dict[Key, Removed],
-                residuals: Residuals) -> tuple[dict[Key, Removed], Residuals, str]:
-    """Take back, one by one, what is no outlier in the company of the good readings."""
+                residuals: Residuals) -> tuple[dict[Key, Removed], Residuals]:
+    """Take back, one by one, what is no outlier in the company of the good readings.
+
+    Readings that went together because each was the other's only check come back together.
+    """
     for key in sorted(gone, key=lambda k: gone[k].standardised):
-        rest = {k: v for k, v in gone.items() if k != key}
-        again = residuals_of(_without(measurements, rest), options)
-        if _agrees(again, key):
-            gone, residuals = rest, again
-    return gone, residuals, ""
+        if key not in gone:
+            continue
+        mates = {k for k in gone if k[1] == key[1] and abs(
+            gone[k].standardised - gone[key].standardised) <= TIED * gone[key].standardised}
+        for back in ({key}, mates)[:1 + (len(mates) > 1)]:
+            rest = {k: v for k, v in gone.items() if k not in back}
+            again = residuals_of(without(measurements, rest), options)
+            if all(_agrees(again, one) for one in back):
+                gone, residuals = rest, again
+                break
+    return gone, residuals
 
 
 def _agrees(residuals: Residuals, key: Key) -> bool:
@@ -292,62 +329,11 @@ def _agrees(residuals: Residuals, key: Key) -> bool:
     at: tuple[int, ...]
     if kind == "grid":
         hx, hy = residuals.problem.system.grid.views.half
-        squares, dof = residuals.squares, 2
         at = (residuals.problem.grid.index.index(index), mark[0] + hx, mark[1] + hy)
     else:
-        squares, dof = residuals.squares_theta, 1
         at = (residuals.problem.angular.index.index(index), *mark)
-    limit = chi2.isf(LEVEL / np.isfinite(squares).sum(), dof)
     # NaN: a reading that cannot be checked does not agree
-    return bool(_ratio(squares, robust_sigma(squares, dof))[at] <= limit
-                and np.isfinite(squares[at]))
-
-
-def _without(measurements: Measurements, gone: dict[Key, Removed], *,
-             mark: bool = False) -> Measurements:
-    """Return the measurement without some readings; `mark` counts them as rejected."""
-    views = []
-    for index, view in enumerate(measurements.views):
-        grid = {key[2] for key in gone if key[0] == index and key[1] == "grid"}
-        lines = {key[2][0] for key in gone if key[0] == index and key[1] == "angular"}
-        views.append(_thinned(view, grid, lines, mark=mark) if grid or lines else view)
-    return replace(measurements, views=tuple(views))
-
-
-def _thinned(view: ViewReadings, marks: set[tuple[int, ...]], lines: set[int], *,
-             mark: bool) -> ViewReadings:
-    keep = np.array([(int(m), int(n)) not in marks for m, n in zip(view.m, view.n, strict=True)],
-                    dtype=bool)
-    stay = np.array([int(k) not in lines for k in view.k], dtype=bool)
-    lost = int(view.count[~keep].sum() + view.count_theta[~stay].sum())
-    thinned = subset(view, keep, stay)
-    if not mark:
-        return thinned
-    rejected = {**view.rejected, REASON: view.rejected.get(REASON, 0) + lost}
-    return replace(thinned, rejected=rejected, used=view.used - lost)
-
-
-def subset(view: ViewReadings, grid: np.ndarray, lines: np.ndarray) -> ViewReadings:
-    """Return the readings of a view where the masks over its marks and lines are true."""
-    return replace(
-        view, **{name: getattr(view, name)[grid] for name in ("m", "n", "dx", "dy", "count")},
-        **{name: getattr(view, name)[lines] for name in ("k", "dtheta", "count_theta")},
-        u=view.u[grid] if len(view.u) else view.u,
-        u_theta=view.u_theta[lines] if len(view.u_theta) else view.u_theta,
-        visits=view.visits.of_marks(grid) if view.visits is not None else None)
-
-
-def _noisy_views(residuals: Residuals, measurements: Measurements) -> tuple[tuple[str, float], ...]:
-    """Return the views whose noise stands out, with its ratio to that of the others."""
-    if residuals.problem.system.grid.n_views < 2:
-        return ()
-    out = []
-    for index, (own, others, dof) in zip(residuals.problem.grid.index, view_noise(residuals),
-                                         strict=True):
-        ratio = float(own / max(others, own / MAX_RATIO, ROUNDING))
-        if ratio > NOISY_VIEW and dof >= MIN_VIEW_DOF:
-            out.append((measurements.views[index].view.name, ratio))
-    return tuple(out)
+    return residuals.p_outlier(kind, at) >= _level(residuals)
 
 
 def _warnings(removed: tuple[Removed, ...], noisy: tuple[tuple[str, float], ...],
@@ -364,13 +350,14 @@ def _warnings(removed: tuple[Removed, ...], noisy: tuple[tuple[str, float], ...]
 
 
 def _flattened(measurements: Measurements, options: Options) -> Measurements:
-    """Return the readings less what finite rotations add to the linear model."""
-    found = calibrate(measurements, replace(options, uncertainty=False))
-    artifact, views = measurements.artifact, []
-    for view, result in zip(measurements.views, found.views, strict=True):
-        if len(view.m) and np.isfinite(result.phi):
-            plate = np.nan_to_num(turned_plate(view, artifact, found.artifact_map))
-            more = rotation_excess(result.phi, turned_marks(view, artifact), plate)
-            view = replace(view, dx=view.dx - more.real, dy=view.dy - more.imag)
-        views.append(view)
+    """Return the readings less what finite rotations and terms add to the linear model."""
+    if options.misalignment_model == "linear" and not options.terms:
+        return measurements
+    problem, seen = prepare(measurements, options)
+    model = fit_model(problem, lambda equations: require_terms_told(equations, seen))
+    views, (hx, hy) = list(measurements.views), measurements.artifact.half
+    for row, index in enumerate(problem.grid.index):
+        view = views[index]
+        left = model.y[row][view.m + hx, view.n + hy] * PHASES[problem.grid.poses[row].q]
+        views[index] = replace(view, dx=left.real, dy=left.imag, visits=None)
     return replace(measurements, views=tuple(views))

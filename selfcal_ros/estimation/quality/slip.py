@@ -221,4 +221,5 @@ def _grid_part(view: ViewReadings, keep: np.ndarray, suffix: str) -> ViewReading
     return ViewReadings(named, view.m[keep], view.n[keep], view.dx[keep], view.dy[keep],
                         view.count[keep], view.u[keep] if len(view.u) else view.u,
                         sigma_xy=view.sigma_xy, dof_xy=int(view.dof_xy * keep.mean()), used=used,
-                        rejected={} if suffix else view.rejected)
+                        rejected={} if suffix else view.rejected,
+                        visits=None if view.visits is None else view.visits.of_marks(keep))

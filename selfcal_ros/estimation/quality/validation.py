@@ -20,7 +20,7 @@ from selfcal_ros.estimation.lattice.finite_rotation import (
     turned_plate,
 )
 from selfcal_ros.estimation.options import Options
-from selfcal_ros.estimation.quality.outliers import subset
+from selfcal_ros.estimation.quality.thinning import subset
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.readings import Measurements, Sense, ViewReadings
 from selfcal_ros.model.result import CalibrationResult

@@ -8,7 +8,7 @@ that one cause does not appear under many names. Terms that explain the same equ
 given: the readings do not tell which it is.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.stats import f as f_distribution
@@ -119,7 +119,17 @@ class Pool:
         return (max(between, 0.0) / dof, dof) if dof > 0 else (float("nan"), 0.0)
 
 
-def find_explanations(model: ModelFit, *, slips: bool) -> list[Explanation]:
+@dataclass(frozen=True, eq=False)
+class PlacedSlip:
+    """A slip at a place that was found in another way: its columns, grid view, places tried."""
+
+    columns: TermColumns
+    view: int
+    places: int
+
+
+def find_explanations(model: ModelFit, *, slips: bool,
+                      placed: PlacedSlip | None = None) -> list[Explanation]:
     """Return what explains the residuals of a fit significantly, the likeliest first.
 
     Parameters
@@ -128,6 +138,8 @@ def find_explanations(model: ModelFit, *, slips: bool) -> list[Explanation]:
         The fit; its own terms are not looked for again.
     slips : bool
         Whether slips of the plate within a view are looked for as well.
+    placed : PlacedSlip, optional
+        A slip that competes with the others.
     """
     problem = model.problem
     ground = without_noise(problem.ground, model.found.residuals)
@@ -139,6 +151,12 @@ def find_explanations(model: ModelFit, *, slips: bool) -> list[Explanation]:
     groups = [group for term in more for group in _groups(columns, term.name)]
     if slips:
         columns, groups = _with_slips(ground, columns, groups)
+    if placed is not None:
+        before, after = len(columns.columns), len(placed.columns.columns)
+        columns = joined(ground, columns, placed.columns)
+        groups = [replace(g, rows=np.pad(g.rows, (0, after))) for g in groups]
+        groups.append(Group(SLIP, np.arange(before + after) >= before, placed.view,
+                            places=placed.places))
     equations = equations_of(problem, model.found, columns)
     taken = np.zeros(equations.n)
     taken[:len(model.coefficients)] = model.coefficients
