@@ -140,13 +140,13 @@ def _extended(args: argparse.Namespace, measurements: Any, options: Any,
         from selfcal_ros.estimation.quality.outliers import clean
         from selfcal_ros.estimation.quality.validation import (
             validate,
-            validation_json,
             validation_text,
+            with_validation,
         )
 
         used = clean(measurements, options).measurements if args.robust else measurements
         found = validate(used, options)
-        result = replace(result, extra={**result.extra, "validation": validation_json(found)})
+        result = with_validation(result, found)
         lines += ["", "held-out readings:", *(f"  {line}" for line in validation_text(found))]
     if args.budget:
         from selfcal_ros.estimation.quality.budget import budget_json, budget_text, budgets

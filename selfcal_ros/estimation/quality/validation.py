@@ -14,23 +14,44 @@ import numpy as np
 from selfcal_ros.errors import InputError, NoDataError, NotIdentifiableError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.blas_threads import one_thread
+from selfcal_ros.estimation.joint.model_fit import ModelFit
+from selfcal_ros.estimation.joint.solve import solve_joint
+from selfcal_ros.estimation.joint.solved import Solved
 from selfcal_ros.estimation.lattice.finite_rotation import (
     rotation_excess,
     turned_marks,
     turned_plate,
 )
+from selfcal_ros.estimation.observability.plan_check import (
+    candidate_views,
+    describe_view,
+    smaller,
+)
+from selfcal_ros.estimation.observability.rank import plan_observability
+from selfcal_ros.estimation.observability.suggest import FULL_SIZE, SEARCH_SIZE
 from selfcal_ros.estimation.options import Options
+from selfcal_ros.estimation.quality.held_terms import (
+    OF_A_VIEW,
+    HeldReadings,
+    held_readings,
+    of_terms,
+)
+from selfcal_ros.estimation.quality.leverage import ROUNDING
+from selfcal_ros.estimation.quality.prediction_limit import prediction_limit
 from selfcal_ros.estimation.quality.thinning import subset
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.readings import Measurements, Sense, ViewReadings
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.statistics import rms
+from selfcal_ros.model.view import Plan
 from selfcal_ros.units import ARCSEC_PER_RAD, UM_PER_M
 
 FRACTION = 0.1
 """Part of the readings that is held out at random."""
 
 MAX_FOLDS = 10
+
+NOTHING = float("nan")
 
 RIGID_STEPS = 8
 """Steps to a finite rotation of a view held out; each gains a factor of its size."""
@@ -54,7 +75,9 @@ class HeldOut:
         rms over the noise of one reading; the noise alone gives 1, the map's own uncertainty
         adds to it.
     note : str
-        Why nothing could be predicted; empty otherwise.
+        Why nothing could be predicted, or why it is not judged; empty otherwise.
+    limit : float
+        What `ratio` exceeds in one of a thousand good sets; NaN if it is not judged.
     """
 
     name: str
@@ -65,6 +88,12 @@ class HeldOut:
     rms_rad: float = float("nan")
     ratio: float = float("nan")
     note: str = ""
+    limit: float = NOTHING
+
+    @property
+    def exceeds(self) -> bool:
+        """Whether the prediction is worse than noise and the map's uncertainty allow."""
+        return self.ratio > self.limit
 
 
 @one_thread()
@@ -117,30 +146,78 @@ def validate(measurements: Measurements, options: Options | None = None, *, seed
 def _held_out(measurements: Measurements, options: Options,
               chosen: list[tuple[np.ndarray, np.ndarray]], name: str) -> HeldOut:
     """Calibrate from the readings that are not chosen and predict the chosen ones."""
-    kept = replace(measurements, views=tuple(
-        subset(view, ~grid, ~lines)
+    kept, held = (replace(measurements, views=tuple(
+        subset(view, grid ^ flip, lines ^ flip)
         for view, (grid, lines) in zip(measurements.views, chosen, strict=True)))
+        for flip in (True, False))
     try:
-        result = calibrate(kept, options)
+        solved = solve_joint(kept, options)
     except (NotIdentifiableError, NoDataError):
-        return HeldOut(name, note="cannot be held out: the rest does not identify the stage")
-    errors, angles, weights = [], [], []
+        return HeldOut(name, note="cannot be held out: the rest does not identify the stage"
+                       + _further_view(kept, held))
+    model = solved.model
+    if model is None:
+        raise AssertionError("the joint solution always has its model")
+    of = held_readings(model, kept, held)
     rigid = options.misalignment_model == "rigid"
-    for index, (view, (grid, lines)) in enumerate(zip(measurements.views, chosen, strict=True)):
-        residual, residual_theta = prediction_errors(measurements, result, index,
-                                                     subset(view, grid, lines), rigid=rigid)
+    errors, angles = [], []
+    known_at, error_at = np.zeros(of.grid.weight.shape, dtype=bool), np.zeros_like(of.grid.y)
+    for index, view in enumerate(held.views):
+        at = view.m + measurements.artifact.half[0], view.n + measurements.artifact.half[1]
+        more = of_terms(model, of, index, at)
+        less = replace(view, dx=view.dx - more.real, dy=view.dy - more.imag)
+        residual, residual_theta = prediction_errors(measurements, solved.result, index, less,
+                                                     rigid=rigid)
         errors.append(residual)
         angles.append(residual_theta)
-        weights.append(view.count[grid])
-    residual, residual_theta = np.concatenate(errors, axis=1), np.concatenate(angles)
-    known, angular = np.isfinite(residual).all(axis=0), np.isfinite(residual_theta)
-    if not known.any() and not angular.any():
+        if index in of.grid.index:
+            row, good = of.grid.index.index(index), np.isfinite(residual).all(axis=0)
+            known_at[row][at] = good
+            error_at[row][at] = np.where(good, residual[0] + 1j * residual[1], 0.0)
+    both, lines_off = np.concatenate(errors, axis=1), np.concatenate(angles)
+    both = both[:, np.isfinite(both).all(axis=0)]
+    lines_off = lines_off[np.isfinite(lines_off)]
+    if not both.size and not lines_off.size:
         return HeldOut(name, note="nothing to predict: no held-out mark is known from the rest")
-    scaled = residual[:, known] * np.sqrt(np.concatenate(weights)[known])
-    return HeldOut(
-        name, int(known.sum()), int(angular.sum()), rms(residual[:, known]),
-        float(abs(residual[:, known]).max()) if known.any() else float("nan"),
-        rms(residual_theta[angular]), rms(scaled) / max(result.noise.sigma_xy, 1e-300))
+    ratio, limit, note = _judged(solved, model, of, known=known_at, error=error_at)
+    return HeldOut(name, both.shape[1], len(lines_off), rms(both) if both.size else NOTHING,
+                   float(abs(both).max()) if both.size else NOTHING,
+                   rms(lines_off) if lines_off.size else NOTHING, ratio, note, limit)
+
+
+def _judged(solved: Solved, model: ModelFit, held: HeldReadings, *, known: np.ndarray,
+            error: np.ndarray) -> tuple[float, float, str]:
+    """Return error over noise, its limit, and why there is none."""
+    noise = solved.result.noise
+    if not known.any():
+        return NOTHING, NOTHING, ""
+    weight = held.grid.weight
+    if np.isfinite(held.grid.sigma_declared) and np.isfinite(noise.sigma_xy_declared):
+        # each is relative to what its own detections declare on average
+        weight = weight * (noise.sigma_xy_declared / held.grid.sigma_declared) ** 2
+    square = float((weight * abs(error) ** 2)[known].sum()) / (2 * int(known.sum()))
+    ratio = float(np.sqrt(square)) / max(noise.sigma_xy, 1e-300)
+    own = [str(term.name) for term in model.problem.terms if term.name in OF_A_VIEW]
+    if own and -1 in held.rows:
+        return ratio, NOTHING, f"its own {' and '.join(own)} cannot be known: not judged"
+    if not (noise.sigma_xy > ROUNDING and noise.dof_xy > 0 and model.problem.direct):
+        return ratio, NOTHING, ""
+    return ratio, prediction_limit(model, held, known, weight).ratio(noise.dof_xy), ""
+
+
+def _further_view(kept: Measurements, held: Measurements) -> str:
+    """Return which view more would let a view be held out, in words."""
+    views = tuple(replace(v.view, grid=bool(len(v.m)), angular=bool(len(v.k)))
+                  for v in kept.views if len(v.m) or len(v.k))
+    gone = {v.view.lattice_pose(held.artifact) for v in held.views if len(v.m) or len(v.k)}
+    plan = Plan("", kept.artifact, views)
+    if max(kept.artifact.shape) > FULL_SIZE and views:
+        plan = smaller(plan, SEARCH_SIZE)
+    for more in candidate_views(plan.artifact, angular=any(view.angular for view in views)):
+        if more.lattice_pose(plan.artifact) not in gone and plan_observability(
+                replace(plan, views=(*plan.views, more))).identifiable:
+            return f"; with {describe_view(more, plan.artifact)} measured as well it could be"
+    return "; no single further view would change that"
 
 
 def prediction_errors(measurements: Measurements, result: CalibrationResult, index: int,
@@ -225,25 +302,47 @@ def _misalignment(residual: np.ndarray, marks: np.ndarray) -> tuple[float, float
     return float(phi), float(tx), float(ty)
 
 
+def with_validation(result: CalibrationResult, found: list[HeldOut]) -> CalibrationResult:
+    """Return a result with its validation; a prediction beyond its limit disqualifies it."""
+    reasons = tuple(
+        f"{item.name} is predicted with {item.ratio:.2f} times the noise, beyond the limit of "
+        f"{item.limit:.2f}" for item in found if item.exceeds)
+    result = replace(result, extra={**result.extra, "validation": validation_json(found)})
+    if not reasons:
+        return result
+    verdict = result.verdict
+    sentence = f"Not qualified: {reasons[0]}" if verdict.qualified else verdict.sentence
+    return replace(result, verdict=replace(verdict, qualified=False, sentence=sentence,
+                                           reasons=(*verdict.reasons, *reasons)))
+
+
 def validation_json(found: list[HeldOut]) -> list[dict[str, Any]]:
     """Return the validation for ``extra["validation"]`` of a result: SI units."""
-    return [vars(item) for item in found]
+    return [vars(item) | {"exceeds": item.exceeds} for item in found]
 
 
 def validation_text(found: list[HeldOut]) -> list[str]:
     """Return one line a held-out set, um and arcsec."""
     lines = []
     for item in found:
-        if item.note:
+        if not item.n_grid and not item.n_angular:
             lines.append(f"{item.name}: {item.note}")
             continue
         parts = []
         if item.n_grid:
             parts.append(f"{item.n_grid} marks predicted within {item.rms_m * UM_PER_M:.4g} um "
                          f"rms, {item.max_m * UM_PER_M:.4g} um at most "
-                         f"({item.ratio:.2f} times the noise)")
+                         f"({item.ratio:.2f} times the noise{_limit_text(item)})")
         if item.n_angular:
             parts.append(f"{item.n_angular} lines within "
                          f"{item.rms_rad * ARCSEC_PER_RAD:.4g} arcsec rms")
         lines.append(f"{item.name}: " + ", ".join(parts))
     return lines
+
+
+def _limit_text(item: HeldOut) -> str:
+    if item.note:
+        return f"; {item.note}"
+    if not np.isfinite(item.limit):
+        return ""
+    return f", {'EXCEEDS' if item.exceeds else 'within'} the limit of {item.limit:.2f}"

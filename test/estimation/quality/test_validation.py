@@ -6,14 +6,23 @@ from math import pi
 
 import numpy as np
 import pytest
+from scipy.stats import binom
 
 from selfcal_ros.errors import InputError, NotIdentifiableError
+from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.options import Options
-from selfcal_ros.estimation.quality.validation import validate, validation_json, validation_text
+from selfcal_ros.estimation.quality.validation import (
+    validate,
+    validation_json,
+    validation_text,
+    with_validation,
+)
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Sense
+from selfcal_ros.model.terms import ModelTerm, TermName
 from selfcal_ros.model.view import View
 from selfcal_ros.simulation.truth import hu_plan, random_truth, simulate_measurements
+from test.support.lattice_plans import plan_of
 
 ARTIFACT = Artifact(9, 0.01, 24)
 SIGMA_M, SIGMA_RAD = 2e-8, 2e-5
@@ -65,10 +74,98 @@ def test_a_spoiled_view_is_predicted_badly():
 
 
 def test_views_that_are_needed_cannot_be_held_out():
-    notes = {item.name: item.note for item in validate(measured(more=False), folds=1)}
+    readings = measured(more=False)
+    notes = {item.name: item.note for item in validate(readings, folds=1)}
     assert notes["a random tenth (1)"] == ""
     for name in ("identity", "rot90", "line", "shift_x"):
         assert "does not identify the stage" in notes[f"view '{name}'"]
+    assert notes["view 'shift_x'"] == (
+        "cannot be held out: the rest does not identify the stage; with a view turned by "
+        "90 deg and shifted by +1 pitch along X measured as well it could be")
+    rng = np.random.default_rng(3)
+    plan = hu_plan(ARTIFACT)
+    plan = replace(plan, views=(*plan.views, View("more", pi / 2, (0.01, 0.0), True, True)))
+    truth = random_truth(ARTIFACT, 5, rng)
+    more = simulate_measurements(truth, plan, rng, sigma_m=SIGMA_M, sigma_theta_rad=SIGMA_RAD)
+    held = {item.name: item for item in validate(more, folds=1)}
+    assert held["view 'shift_x'"].note == "" and held["view 'shift_x'"].n_grid > 0
+
+
+def drawn(seed, plan, **how):
+    rng = np.random.default_rng(seed)
+    truth = random_truth(plan.artifact, len(plan.views), rng)
+    return simulate_measurements(truth, plan, rng, sigma_m=SIGMA_M, linear=True, **how)
+
+
+SMALL = plan_of("0,90,180,tx,ty", Artifact(5, 0.01))
+LINEAR = Options(datum_theta="zero_mean", misalignment_model="linear")
+
+
+@pytest.mark.parametrize("repeats", [1, 3])
+def test_the_limit_is_that_of_good_readings(repeats, monkeypatch):
+    """At a level of 5 % as many good sets exceed it as should; at 0.1 % hardly any."""
+    monkeypatch.setattr("selfcal_ros.estimation.quality.prediction_limit.LEVEL", 0.05)
+    plan = replace(SMALL, views=tuple(replace(v, repeats=repeats) for v in SMALL.views))
+    found = [item for seed in range(12) for item in validate(
+        drawn(seed, plan, missing=0.1), LINEAR, folds=2) if np.isfinite(item.limit)]
+    tenths = [item for item in found if "tenth" in item.name]
+    views = [item for item in found if "view" in item.name]
+    for items in (tenths, views):
+        assert len(items) >= 20
+        bad = sum(item.exceeds for item in items)
+        assert bad <= binom.ppf(0.9995, len(items), 0.05)
+        # ratio over limit: half of the sets lie above the median of their distribution
+        assert sum(item.ratio > 0.7 * item.limit for item in items) > len(items) / 4
+
+
+def test_a_spoiled_view_exceeds_its_limit_and_disqualifies_the_result():
+    readings = drawn(3, SMALL)
+    right = validate(readings, LINEAR, folds=1)
+    assert not any(item.exceeds for item in right)
+    assert "times the noise, within the limit of " in validation_text(right)[0]
+    result = calibrate(readings, LINEAR)
+    assert with_validation(result, right).verdict == result.verdict
+    view = readings.views[4]
+    wrong = replace(readings, views=(*readings.views[:4], replace(view, dx=view.dy, dy=view.dx)))
+    found = validate(wrong, LINEAR, folds=1)
+    bad = next(item for item in found if item.name == "view 'ty'")
+    assert bad.exceeds and ", EXCEEDS the limit of " in "\n".join(validation_text(found))
+    judged = with_validation(result, [bad])
+    assert not judged.verdict.qualified
+    assert judged.verdict.reasons == (
+        f"view 'ty' is predicted with {bad.ratio:.2f} times the noise, beyond the limit of "
+        f"{bad.limit:.2f}",)
+    assert judged.verdict.sentence == f"Not qualified: {judged.verdict.reasons[0]}"
+    assert judged.extra["validation"][0]["exceeds"] is True
+
+
+def test_terms_are_predicted_with_the_readings():
+    """A turned microscope and a drift: within the limit with the terms, beyond it without."""
+    plan = replace(SMALL, artifact=Artifact(7, 0.01))
+    readings, rng, views = drawn(5, plan, visits=True), np.random.default_rng(1), []
+    for view in readings.views:
+        visits, n = view.visits, len(view.visits.mark)
+        offset = rng.normal(0, 3e-5, n) + 1j * rng.normal(0, 3e-5, n)
+        order = rng.permutation(n)
+        # (1 + E) o should be read, E = 5 mrad of turn; 200 nm of drift along y
+        moved = -5e-3j * offset + 1j * 2e-7 * (2 * order / (n - 1) - 1)
+        visits = replace(visits, dx=visits.dx + moved.real, dy=visits.dy + moved.imag,
+                         offset_x=offset.real, offset_y=offset.imag, stamp_ns=order * 10**9)
+        views.append(replace(view, dx=visits.dx[np.argsort(visits.mark)],
+                             dy=visits.dy[np.argsort(visits.mark)], visits=visits))
+    readings = replace(readings, views=tuple(views))
+    terms = (ModelTerm(TermName.MICROSCOPE), ModelTerm(TermName.DRIFT))
+    found = validate(readings, replace(LINEAR, terms=terms, drift_degree=1), folds=2)
+    tenths, whole = found[:2], found[2]
+    for item in tenths:
+        assert item.ratio < item.limit < 3
+    assert whole.note == "its own drift cannot be known: not judged"
+    assert "its own drift cannot be known: not judged)" in validation_text(found)[2]
+    for left_out in (terms[:1], terms[1:]):
+        poor = validate(readings, replace(LINEAR, terms=left_out, drift_degree=1), folds=1)[0]
+        assert poor.rms_m > 2 * tenths[0].rms_m
+    shared = validate(readings, replace(LINEAR, terms=terms[:1]), folds=1)[1]
+    assert shared.note == "" and np.isfinite(shared.limit)
 
 
 def test_seeds_and_folds():

@@ -1,0 +1,132 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How well readings that were held out should be predicted: the distribution of the error.
+
+A prediction errs by the noise of the reading and by what the fit is off. Their sum of squares over
+the noise is a weighted sum of chi^2; seeded draws of unit noise through the same fit give its mean
+and variance, and with these a scaled chi^2 (Satterthwaite), or F, as the noise is estimated.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import f as f_distribution
+
+from selfcal_ros.estimation.joint.model_fit import ModelFit, equations_of
+from selfcal_ros.estimation.lattice.maps import LatticeViews
+from selfcal_ros.estimation.quality.held_terms import HeldReadings
+from selfcal_ros.estimation.terms.projection import reduce_columns
+
+LEVEL = 1e-3
+"""Probability that a good set of readings exceeds its limit."""
+
+DRAWS = 200
+"""Draws in a small field: a tenth of uncertainty of the degrees of freedom."""
+
+READINGS_DRAWN = 2_000_000
+"""Readings that are drawn at most, all draws together: larger fields vary less."""
+
+MIN_DRAWS = 16
+
+
+@dataclass(frozen=True)
+class PredictionLimit:
+    """Distribution of the mean square of scaled prediction errors for unit noise.
+
+    `mean` and `dof`: of the scaled chi^2 that has its mean and variance.
+    """
+
+    mean: float
+    dof: float
+
+    def ratio(self, noise_dof: float) -> float:
+        """Return the ratio of error to noise that is exceeded with the probability LEVEL."""
+        dof = min(noise_dof, 1e9)
+        return float(np.sqrt(self.mean * f_distribution.isf(LEVEL, self.dof, dof)))
+
+
+def prediction_limit(model: ModelFit, held: HeldReadings, known: np.ndarray,
+                     weight: np.ndarray) -> PredictionLimit:
+    """Return the distribution of the prediction error of held-out grid readings.
+
+    Parameters
+    ----------
+    model : ModelFit
+        The fit without them.
+    held : HeldReadings
+        The readings that are predicted.
+    known : bool array (views, nx, ny)
+        Which of them can be.
+    weight : float array (views, nx, ny)
+        Their weights.
+    """
+    grid = model.problem.system.grid
+    n = int(np.clip(READINGS_DRAWN // grid.weight.size, MIN_DRAWS, DRAWS))
+    rng = np.random.default_rng(0)
+    noise = _noise(rng, (n, *grid.weight.shape), grid.weight)
+    fields, parameters, coefficients = _fitted(model, noise, rng)
+    own = _noise(rng, (n, *weight.shape), weight)
+    views = LatticeViews(grid.views.shape, held.grid.poses)
+    squares = np.zeros(n)
+    for draw in range(n):
+        field = fields[:, draw].reshape(grid.views.shape)
+        taken = noise[draw]
+        if model.equations is not None:
+            taken = taken - np.tensordot(coefficients[:, draw], model.equations.columns.grid,
+                                         axes=1)
+        plate = grid.plate(taken, field, parameters[:, draw])[0]
+        misaligned = grid.misaligned(parameters[:, draw])
+        error = own[draw] - views.gather(field) - plate
+        if len(coefficients):
+            error = error - np.tensordot(coefficients[:, draw], held.columns, axes=1)
+        for row, fitted in enumerate(held.rows):
+            here = known[row]
+            error[row] -= misaligned[fitted] if fitted >= 0 else placed(
+                error[row], views.z, here)
+        squares[draw] = float((weight * abs(error) ** 2)[known].sum()) / (2 * known.sum())
+    mean = float(squares.mean())
+    return PredictionLimit(mean, 2 * mean**2 / float(squares.var(ddof=1)))
+
+
+def _noise(rng: np.random.Generator, shape: tuple[int, ...], weight: np.ndarray) -> np.ndarray:
+    root = np.sqrt(np.where(weight > 0, weight, 1.0))
+    both = rng.standard_normal((2, *shape)) / root * (weight > 0)
+    return both[0] + 1j * both[1]
+
+
+def _fitted(model: ModelFit, noise: np.ndarray, rng: np.random.Generator
+            ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return maps (sites, k), misalignments (3 views, k), coefficients (p, k) of unit noise."""
+    problem = model.problem
+    grid, n = problem.system.grid, 3 * problem.system.grid.n_views
+    found = model.found
+    inverse = found.inverse if len(found.inverse) else problem.system.grid_inverse
+    reduced = reduce_columns(grid, noise)
+    parameters = inverse[:n, :n] @ reduced.right
+    fields = reduced.free - grid.response @ parameters
+    if model.equations is None:
+        return fields, parameters, np.zeros((0, len(noise)))
+    now = equations_of(problem, found, model.equations.columns, model.reduced)
+    columns = now.columns.grid.reshape(now.n, -1)
+    right = np.zeros((now.n, len(noise)))
+    for draw, one in enumerate(noise):
+        left = grid.plate(one, fields[:, draw].reshape(grid.views.shape), parameters[:, draw])[1]
+        right[:, draw] = (np.conj(columns) @ (grid.weight * left).ravel()).real
+    values, vectors = np.linalg.eigh(now.columns.within.gram)
+    within = vectors * np.sqrt(np.maximum(values, 0.0))
+    right += within @ rng.standard_normal((now.n, len(noise)))
+    # a term with a size is not zero: what is drawn is its estimate less what it is
+    prior = np.where(now.free, 0.0, found.xy.sigma / now.columns.size)
+    right -= prior[:, None] * rng.standard_normal((now.n, len(noise)))
+    coefficients = now.inverse(found.xy.sigma) @ right
+    return (fields - now.projected.fields @ coefficients,
+            parameters - now.projected.parameters[:n] @ coefficients, coefficients)
+
+
+def placed(error: np.ndarray, z: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Return the misalignment (nx, ny) that fits the known errors of one view best, plate frame."""
+    columns = np.stack([1j * z, np.ones_like(z), np.full_like(z, 1j)])
+    at = columns[:, known]
+    rows = np.concatenate([at.real, at.imag], axis=1).T
+    values = np.concatenate([error[known].real, error[known].imag])
+    found = np.linalg.lstsq(rows, values, rcond=None)[0]
+    return np.tensordot(found, columns, axes=1)
