@@ -3,9 +3,9 @@
 SHELL := /bin/bash
 BIN := .venv/bin
 
-.PHONY: setup demo test lint bench mutants clean help
+.PHONY: setup demo test lint bench mutants reality clean help
 help:
-	@echo "make setup | demo | test | lint | bench | mutants | clean"
+	@echo "make setup | demo | test | lint | bench | mutants | reality | clean"
 setup:
 	@tools/setup.sh
 demo: setup
@@ -24,6 +24,8 @@ bench: setup
 	@PYTHONPATH=build/rivals $(BIN)/python test/bench/run.py
 mutants: setup  # e.g. make mutants MUTANTS="--number 200 --only selfcal_ros/estimation"
 	@$(BIN)/python tools/mutants.py $(MUTANTS)
+reality: setup  # minutes; e.g. make reality REALITY="--runs 10 --only drift"
+	@$(BIN)/python tools/reality.py $(REALITY)
 clean:
 	rm -rf .venv build install log selfcal_ros.egg-info
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

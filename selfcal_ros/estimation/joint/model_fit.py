@@ -7,7 +7,7 @@ what the terms make of the readings, are taken off with the last solution until 
 Every step solves the same factored equations (Gauss-Newton).
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -39,7 +39,7 @@ LINEAR = 1e-3
 """Relative change of the misalignments' covariance from which the terms' equations are set up
 anew."""
 
-OFFSET_STEPS = 4
+OFFSET_STEPS = 10
 """Steps in which the offsets that a microscope saw are freed from noise anew; then they stand."""
 
 SHRINKS = 0.5
@@ -129,9 +129,10 @@ def fit_model(problem: Problem,
                      "check the readings for misalignments of more than a few degrees")
 
 
-def columns_of(problem: Problem, found: JointFit) -> TermColumns:
+def columns_of(problem: Problem, found: JointFit,
+               of_terms: Sequence[np.ndarray | float] = ()) -> TermColumns:
     """Return the columns of the problem's terms, offsets freed from the noise of `found`."""
-    ground = without_noise(problem.ground, found.residuals)
+    ground = without_noise(problem.ground, found.residuals, of_terms)
     return term_columns(ground, problem.terms, problem.drift_degree)
 
 
@@ -166,7 +167,9 @@ class _State:
         """Set up the equations of the terms about the present solution."""
         self.weights = self.found.inverse
         if self.reduced is None or self.of_offsets:
-            columns = columns_of(self.problem, self.found)
+            known = (self.equations.columns.at_visits(self.coefficients)
+                     if self.equations is not None else ())
+            columns = columns_of(self.problem, self.found, known)
             self.reduced = reduce_columns(self.problem.system.grid, columns.grid)
         else:
             columns = self.equations.columns

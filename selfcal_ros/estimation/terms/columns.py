@@ -87,6 +87,16 @@ class TermColumns:
         """Known standard deviation of every coefficient, (p,); infinite if free."""
         return np.array([column.size for column in self.columns])
 
+    def at_visits(self, coefficients: np.ndarray) -> list[np.ndarray | float]:
+        """Return what the terms make of each visit of each view, (V,), plate frame, m.
+
+        Up to what is the same at all visits of a mark.
+        """
+        views = len(self.seen[0]) if self.seen else 0
+        return [sum((value * column[view] for value, column in zip(
+            coefficients, self.seen, strict=True) if column[view] is not None), start=0.0)
+            for view in range(views)]
+
     def rows(self, names: Iterable[str]) -> np.ndarray:
         """Return which columns belong to the terms `names`, bool (p,)."""
         wanted = set(names)

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the columns of terms stand on: plate, views and visits of a measurement."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -47,7 +48,8 @@ def ground_of(measurements: Measurements, grid: GridData, half_width_m: float) -
                   approach_sign(measurements.sense))
 
 
-def without_noise(ground: Ground, residuals: np.ndarray) -> Ground:
+def without_noise(ground: Ground, residuals: np.ndarray,
+                  of_terms: Sequence[np.ndarray | float] = ()) -> Ground:
     """Return the ground with offsets from which the noise of the readings is taken off.
 
     The offset that a microscope saw holds the noise of its reading. As a column it would explain
@@ -60,11 +62,14 @@ def without_noise(ground: Ground, residuals: np.ndarray) -> Ground:
         With the offsets as they were seen.
     residuals : complex array (views, nx, ny)
         Residuals of the means of the marks, plate frame, m.
+    of_terms : sequence, optional
+        What terms make of each visit of each view, (V,), plate frame, m; none without terms.
     """
     visits = []
-    for view, residual in zip(ground.visits, residuals, strict=True):
+    terms = of_terms or [0.0] * len(ground.visits)
+    for view, residual, known in zip(ground.visits, residuals, terms, strict=True):
         if view is not None:
-            rest = view.about_means(view.y[None], residual.size)[0]
+            rest = view.about_means((view.y - known)[None], residual.size)[0]
             rest = rest + residual.reshape(-1)[view.mark]
             view = replace(view, offset=view.offset - rest * np.conj(view.phase))
         visits.append(view)

@@ -142,7 +142,9 @@ def find_explanations(model: ModelFit, *, slips: bool,
         A slip that competes with the others.
     """
     problem = model.problem
-    ground = without_noise(problem.ground, model.found.residuals)
+    known = () if model.equations is None else model.equations.columns.at_visits(
+        model.coefficients)
+    ground = without_noise(problem.ground, model.found.residuals, known)
     own = [term.name for term in problem.terms]
     told = all(visits is not None for visits in ground.visits)
     more = [ModelTerm(name) for name in TermName
