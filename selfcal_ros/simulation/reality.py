@@ -204,17 +204,20 @@ def bent(size_m: float) -> Callable[[Truth, np.random.Generator], Truth]:
 
 HIDDEN_BEND = ("turns and shifts leave most bendings of the plate unseen: give their size "
                "(--model plate_shape:SIZE), and shift both ways")
-HIDDEN_ORDER = ("visited in the stage's order the direction of approach is a function of the "
-                "site, and its error a part of the map: visit both ways")
+HIDDEN_ORDER = ("where every view reaches a site from the same side the direction of approach is "
+                "a part of the map, and right for a machine that arrives so: else visit both ways")
 
 
 def _plates() -> list[Case]:
     back = replace(MODEL, backlash_x_m=20e-9, backlash_y_m=20e-9)
     plate = replace(SETTINGS, visit_order="serpentine@plate")
+    raster = replace(SETTINGS, visit_order="raster")
     return [Case("plate grown by 1 um/m in one view", change=grown),
             Case("plate bent in each view, 30 nm", change=bent(30e-9), hidden=HIDDEN_BEND),
             Case("plate bent in each view, 10 nm", change=bent(10e-9), hidden=HIDDEN_BEND),
-            Case("backlash 20 nm, the stage's order", back, hidden=HIDDEN_ORDER),
+            Case("backlash 20 nm, every site reached from one side", back, settings=raster,
+                 hidden=HIDDEN_ORDER),
+            Case("backlash 20 nm, the stage's order, back and forth", back),
             Case("backlash 20 nm, the plate's order", back, settings=plate)]
 
 

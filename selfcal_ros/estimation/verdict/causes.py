@@ -96,6 +96,13 @@ class Pool:
         out[np.ix_(rows, rows)] = part / np.outer(norm, norm)
         return out, int(told.sum())
 
+    @property
+    def everything(self) -> tuple[float, float]:
+        """Squares of all residuals, m^2, and their degrees of freedom, without any column."""
+        sums = self.right.sums
+        return (sums.total, sums.dof) if sums.dof_within >= 1 else (sums.between,
+                                                                   sums.dof_between)
+
     def explained(self, rows: np.ndarray) -> tuple[float, int]:
         """Return the sum of squares that `rows` explain, m^2, and their rank."""
         inverse, rank = self.inverse(rows)
@@ -232,7 +239,10 @@ def _test(pool: Pool, taken: np.ndarray, group: Group) -> tuple[float, float] | 
     if more <= 0 or dof <= 0 or not variance > FLOOR_M**2:
         return None
     p = float(f_distribution.sf(gained / more / variance, more, dof))
-    evidence = dof * np.log1p(gained / (variance * dof)) - more * np.log(dof + more)
+    # all readings together, so that explanations compare: by what each leaves of the same squares
+    whole, n = pool.everything
+    rest = max(whole - after, FLOOR_M**2)
+    evidence = n * np.log1p(gained / rest) - more * np.log(n)
     return min(p * group.places, 1.0), float(evidence - 2 * np.log(group.places))
 
 
