@@ -121,7 +121,8 @@ def encoder_rows(part: Recording, stamps: np.ndarray, channel: int) -> np.ndarra
     t, *axes = part.knots
     for axis, values in enumerate(axes):
         rows["position"][:, axis] = np.interp(stamps - START_NS, t - START_NS, values)
-    step = np.abs(np.diff(rows["position"][:, :2], axis=0, append=0, prepend=0))
+    step = np.zeros((len(rows) + 1, 2))  # at the edges of a chunk the next sample is not known
+    step[1:-1] = np.abs(np.diff(rows["position"][:, :2], axis=0))
     rows["velocity"][:, :2] = np.where(np.minimum(step[1:], step[:-1]) > 1e-9, 0.05, 0.0)
     return rows
 
