@@ -13,9 +13,12 @@ ESTIMATION = ("options", "blas_threads", "lattice", "multifrontal", "normal", "d
               "observability", "joint", "law", "verdict", "api", "quality", "comparison")
 """The parts of estimation/: each imports only those before it."""
 
-MODULES_OF_A_FOLDER = 14
+MODULES_OF_A_FOLDER = 12
 ONE_MODULE_EACH = {"cli": "one module a verb", "nodes": "one module a node"}
 """Folders that may hold more modules, and why."""
+
+LONGER = {"selfcal_ros/collection": 14, "selfcal_ros/simulation": 13}
+"""Folders that hold more today: these numbers may only become smaller."""
 
 
 def dotted(path: Path) -> str:
@@ -88,8 +91,9 @@ def test_the_parts_of_estimation_import_only_those_before_them(module):
                          ids=lambda p: str(p.relative_to(ROOT)))
 def test_a_folder_holds_few_modules(folder):
     modules = [path for path in folder.glob("*.py") if path.name != "__init__.py"]
+    limit = LONGER.get(str(folder.relative_to(ROOT)), MODULES_OF_A_FOLDER)
     if folder.name not in ONE_MODULE_EACH:
-        assert len(modules) <= MODULES_OF_A_FOLDER, f"{len(modules)} modules: make sub-packages"
+        assert len(modules) <= limit, f"{len(modules)} modules: make sub-packages"
 
 
 @pytest.mark.parametrize("path", SOURCES, ids=dotted)

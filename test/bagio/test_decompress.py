@@ -14,8 +14,8 @@ import pytest
 import zstandard
 from mcap.opcode import Opcode
 
-from selfcal_ros.bagio import decompress
-from selfcal_ros.bagio.decompress import (
+from selfcal_ros.bagio.mcap import decompress
+from selfcal_ros.bagio.mcap.decompress import (
     FREE,
     RATIO,
     TooLargeError,

@@ -18,7 +18,7 @@ from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, McapRecord, Message, Schema, Statistics
 
-from selfcal_ros.bagio.decompress import limit_of
+from selfcal_ros.bagio.mcap.decompress import limit_of
 
 HEAD = struct.Struct("<BQ")
 """Opcode and length of a record."""

@@ -16,8 +16,8 @@ from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.records import Channel, ChunkIndex, Schema
 
-from selfcal_ros.bagio.decompress import FREE
-from selfcal_ros.bagio.mcap_salvage import HEAD
+from selfcal_ros.bagio.mcap.decompress import FREE
+from selfcal_ros.bagio.mcap.salvage import HEAD
 
 END = struct.Struct("<BQQQI8s")
 """The footer and what closes the file."""

@@ -16,8 +16,8 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, McapRecord, Message, Schema
 from mcap.stream_reader import CRCValidationError, breakup_chunk
 
-from selfcal_ros.bagio.decompress import ZSTD, lz4_chunk, zstd_chunk
-from selfcal_ros.bagio.mcap_salvage import HEAD, MESSAGE_FRONT, parsed
+from selfcal_ros.bagio.mcap.decompress import ZSTD, lz4_chunk, zstd_chunk
+from selfcal_ros.bagio.mcap.salvage import HEAD, MESSAGE_FRONT, parsed
 from selfcal_ros.messages.cdr_columns import Payloads
 
 FRONT = HEAD.size + MESSAGE_FRONT

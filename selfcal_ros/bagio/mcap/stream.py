@@ -20,23 +20,10 @@ import zstandard
 from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, McapRecord, Message, Schema, Statistics
 
-from selfcal_ros.bagio.decompress import TooLargeError, plain_file, zstd_message
-from selfcal_ros.bagio.mcap_chunk import (
-    FRONT,
-    Block,
-    block_of,
-    chunk_items,
-    gathered,
-    stretch,
-)
-from selfcal_ros.bagio.mcap_index import MAGIC, read_summary
-from selfcal_ros.bagio.mcap_salvage import (
-    HEAD,
-    declarations,
-    front_of_chunk,
-    next_record,
-    parsed,
-)
+from selfcal_ros.bagio.mcap.chunk import FRONT, Block, block_of, chunk_items, gathered, stretch
+from selfcal_ros.bagio.mcap.decompress import TooLargeError, plain_file, zstd_message
+from selfcal_ros.bagio.mcap.index import MAGIC, read_summary
+from selfcal_ros.bagio.mcap.salvage import HEAD, declarations, front_of_chunk, next_record, parsed
 from selfcal_ros.errors import InputError, first_line
 from selfcal_ros.messages.cdr_columns import Payloads
 
