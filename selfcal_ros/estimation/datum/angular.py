@@ -12,6 +12,7 @@ from scipy.special import chdtrc
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.normal.equations import NormalEquations
+from selfcal_ros.estimation.normal.memo import Memo
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.readings import Sense
 
@@ -48,6 +49,9 @@ class Conditions:
     slopes: np.ndarray
     gain: np.ndarray
     phi_gain: np.ndarray
+
+
+_of_system: Memo[tuple[ThetaDatum, Sense, float], Conditions] = Memo()
 
 
 def slope_rows(z_m: np.ndarray, known: np.ndarray) -> np.ndarray:
@@ -95,10 +99,8 @@ def conditions_for(system: NormalEquations, datum: ThetaDatum, sense: Sense,
     InputError
         For ``xy_axes`` if a half axis is not known as a whole.
     """
-    key = ("conditions", datum, sense, half_width_m)
-    if key not in system.memo:
-        system.memo[key] = _conditions(system, datum, sense, half_width_m)
-    return system.memo[key]
+    return _of_system.get(system, (datum, sense, half_width_m),
+                          lambda: _conditions(system, datum, sense, half_width_m))
 
 
 def _conditions(system: NormalEquations, datum: ThetaDatum, sense: Sense,

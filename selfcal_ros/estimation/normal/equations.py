@@ -48,8 +48,6 @@ class NormalEquations:
         """Misalignments: (phi, Re tau, Im tau) of each grid view, phi of each other view."""
         of_view = {i: 3 * row for row, i in enumerate(grid_index)}
         of_view |= {i: 3 * len(grid_index) + row for row, i in enumerate(extra)}
-        self.memo: dict = {}
-        """What others derive from this system alone, by their own keys."""
         self.phi_at = np.array([of_view[i] for i in angular_index], dtype=int)
         """Place of phi of each angular view among the misalignments."""
 

@@ -11,6 +11,7 @@ import math
 from collections.abc import Iterable
 
 from selfcal_ros.estimation.normal.equations import NormalEquations
+from selfcal_ros.estimation.normal.memo import Memo
 from selfcal_ros.estimation.normal.planned import planned_system
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.result import Observability
@@ -21,6 +22,9 @@ DATUM_ROWS = 7
 
 DETERMINED = 0.5
 """Part of the field's sites that must be determined; below, a map is refused."""
+
+
+_measured: Memo[tuple[Artifact, tuple[View, ...]], Observability] = Memo()
 
 
 def plan_observability(plan: Plan) -> Observability:
@@ -84,10 +88,8 @@ def measured_observability(system: NormalEquations, artifact: Artifact,
     views : tuple of View
         The views that were read.
     """
-    key = ("observability", artifact, views)
-    if key not in system.memo:
-        system.memo[key] = _measured_observability(system, artifact, views)
-    return system.memo[key]
+    return _measured.get(system, (artifact, views),
+                         lambda: _measured_observability(system, artifact, views))
 
 
 def _measured_observability(system: NormalEquations, artifact: Artifact,

@@ -59,7 +59,7 @@ def dense_theta(turns, repeats, free, k):
     return np.diag(centre @ cov @ centre)
 
 
-@pytest.mark.parametrize("repeats", [(1, 1, 1, 1), (1, 2, 5, 3), (4, 1, 2, 1)])
+@pytest.mark.parametrize("repeats", [(1, 1, 1, 1), (1, 2, 5, 3), (4, 3, 2, 3)])
 def test_the_prediction_for_lines_counts_the_repeats_of_each_view(repeats):
     plan = hu_plan(Artifact(5, 0.01, 12))
     views = tuple(replace(v, repeats=n) for v, n in zip(plan.views, repeats, strict=True))
