@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Sections of a report for what a result carries beyond its fixed fields, and for conventions."""
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -110,8 +111,9 @@ def convention_section(result: CalibrationResult) -> Section:
     if result.artifact.angular_count:
         facts.append(("θ datum", _THETA_DATUM[result.error_map.datum_theta]))
     facts += [("sense", _SENSE.get(result.sense, printable(result.sense))),
-              ("uncertainty", "u is the standard uncertainty (k=1), U = 2 u the expanded one "
-                              "(k=2, about 95 % for Gaussian noise)"),
+              ("uncertainty", "u is the standard uncertainty (k=1), U = k u the expanded one, "
+                              "k from Student's t for 95.45 % at the degrees of freedom of the "
+                              "noise; pictures show 2 u"),
               ("misalignment", "φ is the turn of the plate about its centre, counter-clockwise, "
                                "tx and ty its offset, beyond the nominal pose of the view")]
     return Section("Conventions", tuple(facts))
@@ -125,4 +127,13 @@ def provenance_section(result: CalibrationResult) -> Section:
                           "law": "Hu's closed-form law"}.get(result.method,
                                                              printable(result.method))),
               ("result schema", SCHEMA), ("software", f"selfcal_ros {__version__}")]
+    made = result.provenance
+    facts += [(_words(key), printable(str(value))) for key, value in (
+        ("created", made.created), ("solved_by", made.version and f"selfcal_ros {made.version}"),
+        ("run", result.run_id), *made.extra.items()) if value]
+    if math.isfinite(made.duration_s):
+        facts.append(("duration", f"{made.duration_s:.0f} s from the first exposure to the last"))
+    if result.reference:
+        facts += [(f"reference {_words(key)}", printable(str(value)))
+                  for key, value in result.reference.items() if value != ""]
     return Section("Provenance", tuple(facts))

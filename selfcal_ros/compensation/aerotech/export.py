@@ -169,7 +169,13 @@ def provenance(result: CalibrationResult, frame: MachineFrame, *, filled: int = 
         f"written by selfcal {__version__} on {(now or datetime.now(UTC)):%Y-%m-%dT%H:%M:%SZ}",
         f"plan: {result.plan_id}; sense: {result.sense}; method: {result.method}",
         f"bag: {source.get('file', 'unknown')}; sha256: {source.get('sha256', 'unknown')}",
-        f"standard uncertainty of the corrections (k=1): {u_nm:.3g} nm rms",
+        *_verdict_lines(result),
+        f"standard uncertainty of the corrections (k=1): {u_nm:.3g} nm rms; U: k = "
+        f"{result.noise.k_xy:.3g} for 95.45 %",
+        f"model: {result.model.misalignment} misalignments" + "".join(
+            f", {term.name}" + ("" if term.size is None else f":{term.size:g}")
+            for term in result.model.terms),
+        *_reference_lines(result),
         f"datum: no translation, rotation, magnification; theta: {emap.datum_theta}",
         "correction = + (indicated - true), added to the command; zero at home by the controller",
         frame.comment(),
@@ -177,3 +183,22 @@ def provenance(result: CalibrationResult, frame: MachineFrame, *, filled: int = 
     if filled:
         lines.append(f"{filled} sites were not measured: mean of their neighbours")
     return lines
+
+
+def _verdict_lines(result: CalibrationResult) -> list[str]:
+    """Return the verdict, and why it is none where it is none."""
+    verdict, when = result.verdict, result.provenance.extra.get("last_exposure", "")
+    lines = [f"measured until {when}"] if when else []
+    if verdict.qualified:
+        return [*lines, "verdict: qualified, the readings agree with the model"]
+    return [*lines, "verdict: NOT QUALIFIED, the readings contradict the model",
+            *(f"because: {reason}" for reason in verdict.reasons)]
+
+
+def _reference_lines(result: CalibrationResult) -> list[str]:
+    reference = result.reference
+    if not reference:
+        return ["reference length: none, the scale is a convention"]
+    certificate = reference.get("certificate") or "no certificate named"
+    return [f"reference length: {reference['kind']}, relative error {reference['relative_error']:g}"
+            f", u {reference['u_relative']:g} ({certificate})"]
