@@ -238,8 +238,9 @@ def _plate_shapes(ground: Ground, name: TermName) -> list[tuple[str, np.ndarray]
     if name is TermName.PLATE_SCALE:
         return [("scale", ground.z * ground.half_width_m)]
     x, y = ground.z.real, ground.z.imag
+    # 2xy beside x^2 and y^2: a bending (x^2 - y^2, -2xy) then has coefficients of one size
     return [(f"{axis} {text}", unit * form) for axis, unit in (("x", 1), ("y", 1j))
-            for text, form in (("xx", x * x), ("xy", x * y), ("yy", y * y))]
+            for text, form in (("xx", x * x), ("xy", 2 * x * y), ("yy", y * y))]
 
 
 def _within(ground: Ground, seen: list[list[np.ndarray | None]]) -> WithinMarks:

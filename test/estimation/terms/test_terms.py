@@ -124,7 +124,7 @@ def effect(column, seen, k, turn, m, tau, h):
     if column.term == TermName.PLATE_SCALE:
         return turn @ (m * PITCH)
     u, v = m / h
-    form = {"xx": u * u, "xy": u * v, "yy": v * v}[column.component[2:]]
+    form = {"xx": u * u, "xy": 2 * u * v, "yy": v * v}[column.component[2:]]
     return turn @ (axis[column.component[0]] * form)
 
 
