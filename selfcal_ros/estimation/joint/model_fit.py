@@ -26,14 +26,14 @@ from selfcal_ros.model.terms import TermName
 MAX_STEPS = 30
 
 RESOLUTION = 1e-12
-"""Change of a misalignment, against the largest, at which rotations stand still."""
+"""Change of a reading, against the largest misalignment, at which rotations stand still."""
 
 ROUGH_RESOLUTION = 1e-11
 """The same once steps no longer shrink."""
 
 OF_NOISE = 1e-6
-"""Change of a misalignment, against its standard uncertainty, that is none once steps no longer
-shrink: where weights lie far apart rounding moves it."""
+"""Change of a reading, against the standard uncertainty of a misalignment, that is none once steps
+no longer shrink: where weights lie far apart rounding moves it."""
 
 LINEAR = 1e-3
 """Relative change of the misalignments' covariance from which the terms' equations are set up
@@ -181,8 +181,12 @@ class _State:
         return bool(len(now) and np.abs(now - then).max() > LINEAR * np.abs(then).max())
 
     def step(self) -> float:
-        """Take one step; return the largest change of a misalignment, m."""
-        before = self.found.parameters
+        """Take one step; return the largest change of what is taken off a reading, m.
+
+        Nothing else goes from step to step. Misalignments may move by rounding for ever where
+        nothing depends on them: all rotations together, that of a view of lines alone.
+        """
+        before = self.y
         if self.equations is not None and (self._stale() or (
                 self.of_offsets and self.steps <= OFFSET_STEPS)):
             self._linearise()
@@ -192,7 +196,7 @@ class _State:
         self.y = np.where(self.problem.system.grid.read,
                           self.problem.grid.y - self._excess() - self._of_terms(), 0.0)
         self.found = fit(self.problem, self.y)
-        return float(np.abs(self.found.parameters - before).max())
+        return float(np.abs(self.y - before).max())
 
     def within_noise(self, change: float) -> bool:
         """Return whether a change of the misalignments is nothing against their uncertainty."""
