@@ -24,7 +24,7 @@ def generate_launch_description() -> LaunchDescription:
         DeclareLaunchArgument("namespace", default_value="", description="namespace of the cell"),
         DeclareLaunchArgument("params", default_value=str(share / "config/params/cell.yaml"),
                               description="ROS parameter file for all nodes"),
-        DeclareLaunchArgument("plan", default_value=str(share / "config/plans/hu_repeated.yaml"),
+        DeclareLaunchArgument("plan", default_value=str(share / "config/plans/resistant.yaml"),
                               description="PLAN.yaml with plate and views"),
         DeclareLaunchArgument("compensate", default_value="false",
                               description="publish corrected joint states as well"),

@@ -28,8 +28,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "suggest", help="rank the next views, or find the best plan for a number of views")
     for sub in (check, suggest):
         sub.add_argument("plan", metavar="PLAN.yaml")
-        sub.add_argument("--theta-datum", choices=("xy_axes", "zero_mean"), default="xy_axes",
-                         help="convention of the angular map (default xy_axes)")
+        sub.add_argument("--theta-datum", choices=("xy_axes", "zero_mean"), default="zero_mean",
+                         help="convention of the angular map (default zero_mean)")
         sub.add_argument("--json", action="store_true", help="print JSON")
         add_term_options(sub)
     check.add_argument("--map", action="store_true",

@@ -17,7 +17,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--method", choices=("joint", "law"),
                         help="joint least squares (default) or Hu's published law")
     parser.add_argument("--theta-datum", choices=("xy_axes", "zero_mean"),
-                        help="what fixes the constant of the angular map (default: xy_axes)")
+                        help="what fixes the constant of the angular map (default: zero_mean)")
+    parser.add_argument("--misalignment", choices=("rigid", "linear"),
+                        help="how the plate turns: by a rotation (default), or as the papers "
+                        "write it (Hu's law knows nothing else)")
     parser.add_argument("--uncertainty", choices=("auto", "always", "never"),
                         help="uncertainty map; auto (default): up to 201 x 201 sites")
     parser.add_argument("--sense", choices=("microscope_moves", "plate_moves"),
@@ -56,6 +59,7 @@ def parameters(args: argparse.Namespace) -> tuple[dict[str, Any], dict[str, Any]
     where = args.params or "options"
     options = {"measurement_collector": {"measurement_sense": args.sense},
                "solver": {"method": args.method, "theta_datum": args.theta_datum,
+                          "misalignment_model": args.misalignment,
                           "uncertainty": args.uncertainty,
                           "model_terms": args.model, "drift_degree": args.drift_degree,
                           "reference_certificate": args.certificate,
@@ -65,6 +69,9 @@ def parameters(args: argparse.Namespace) -> tuple[dict[str, Any], dict[str, Any]
         overrides = overrides_in(data, node, where)
         overrides |= {name: value for name, value in given.items() if value is not None}
         values.append(parameter_values(node, overrides, where))
+    if args.misalignment == "rigid" and values[1]["method"] == "law":
+        raise InputError("--misalignment", "Hu's law is linear, not rigid",
+                         "leave it out, or use --method joint")
     return values[0], values[1]
 
 

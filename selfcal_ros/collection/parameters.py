@@ -97,9 +97,10 @@ _UNCERTAINTY = {"auto": None, "always": True, "never": False}
 SOLVER = (
     _FRAME,
     Parameter("method", "joint", "estimator", choices=("joint", "law")),
-    Parameter("theta_datum", str(ThetaDatum.XY_AXES), "what fixes the constant of the angular map",
-              choices=tuple(str(datum) for datum in ThetaDatum)),
-    Parameter("misalignment_model", "linear", "linear: as published; rigid: exact rotation",
+    Parameter("theta_datum", str(ThetaDatum.ZERO_MEAN), "what fixes the constant of the "
+              "angular map", choices=tuple(str(datum) for datum in ThetaDatum)),
+    Parameter("misalignment_model", "rigid", "how the plate turns in the joint method: rigid, by a "
+              "rotation, or linear, as published; the law is always linear",
               choices=("linear", "rigid")),
     Parameter("uncertainty", "auto", "uncertainty map of the joint solution: auto = up to "
               "201 x 201 sites; always = up to 1001 x 1001, in minutes",
@@ -197,9 +198,9 @@ SIMULATOR = (
     Parameter("drift_quadratic", 0.0, _DRIFT + "with its square", **_LENGTH),
     Parameter("drift_cubic", 0.0, _DRIFT + "with its cube", **_LENGTH),
     Parameter("drift_walk", 0.0, _DRIFT + "as a random walk", **_LENGTH),
-    Parameter("encoder", "xy_axes", "the rotary encoder's error: of its own, or as the slopes of "
-              "the axes", choices=("independent", "xy_axes")),
-    Parameter("rotation", "linear", "how the plate turns: by a rotation, or as the papers write "
+    Parameter("encoder", "independent", "the rotary encoder's error: of its own, or as the "
+              "slopes of the axes", choices=("independent", "xy_axes")),
+    Parameter("rotation", "finite", "how the plate turns: by a rotation, or as the papers write "
               "it", choices=("finite", "linear")),
 )
 NODE_PARAMETERS: dict[str, tuple[Parameter, ...]] = {
@@ -287,7 +288,8 @@ def solver_options(values: dict[str, Any]) -> Options:
         ReferenceKind(kind), values["reference_error"], values["reference_u"],
         values["reference_certificate"])
     return Options(method=values["method"], datum_theta=ThetaDatum(values["theta_datum"]),
-                   misalignment_model=values["misalignment_model"], reference=reference,
+                   misalignment_model="" if values["method"] == "law" else
+                   values["misalignment_model"], reference=reference,
                    uncertainty=_UNCERTAINTY[values["uncertainty"]],
                    terms=parse_terms(values["model_terms"], "model_terms"),
                    drift_degree=values["drift_degree"])

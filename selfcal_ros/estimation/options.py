@@ -72,7 +72,8 @@ class Options:
     reference : ReferenceLength, optional
         Sets the scale; without it the map has none (Hu eq. 5).
     misalignment_model : str
-        ``linear`` as published, or ``rigid``: finite rotations of the plate.
+        ``rigid``: finite rotations of the plate, or ``linear``, as published. Empty = rigid, or
+        linear for the law, which knows nothing else.
     uncertainty : bool, optional
         Whether to compute the uncertainty map; None decides by the size of the field.
     terms : tuple of ModelTerm
@@ -90,16 +91,19 @@ class Options:
     """
 
     method: str = "joint"
-    datum_theta: ThetaDatum = ThetaDatum.XY_AXES
+    datum_theta: ThetaDatum = ThetaDatum.ZERO_MEAN
     reference: ReferenceLength | None = None
-    misalignment_model: str = "linear"
+    misalignment_model: str = ""
     uncertainty: bool | None = None
     terms: tuple[ModelTerm, ...] = ()
     drift_degree: int = DRIFT_DEGREE
     causes: bool | None = None
 
     def __post_init__(self) -> None:
-        """Refuse unknown names."""
+        """Fill in the model of the method; refuse unknown names."""
+        if not self.misalignment_model:
+            object.__setattr__(self, "misalignment_model",
+                               "linear" if self.method == "law" else "rigid")
         for name, known in (("method", METHODS), ("misalignment_model", MISALIGNMENT_MODELS)):
             if getattr(self, name) not in known:
                 raise InputError(name, f"'{getattr(self, name)}' is unknown",

@@ -50,8 +50,8 @@ class Spread:
     a_theta_rad: float = np.deg2rad(0.01)
     phi_rad: float = np.deg2rad(0.3)
     t_m: float = 30e-6
-    encoder: str = "xy_axes"
-    rotation: str = "linear"
+    encoder: str = "independent"
+    rotation: str = "finite"
     microscope_scale: float = 0.0
     microscope_stretch: float = 0.0
     microscope_rotation_rad: float = 0.0

@@ -176,9 +176,9 @@ def check_keys(found):
         assert set(view["misalignment"]) == {"phi", "tx", "ty"}
 
 
-def result_of(tmp_path, bag, *options):
+def result_of(tmp_path, bag, *options, codes=(0,)):
     output = tmp_path / "result.json"
-    assert solve(bag, *options, output=output) == 0
+    assert solve(bag, *options, output=output) in codes
     return output.read_text()
 
 
@@ -209,7 +209,7 @@ def params(tmp_path, **nodes):
 
 
 def test_parameters_reach_collector_and_solver_and_options_win(tmp_path, capsys, bag):
-    path = params(tmp_path, solver={"theta_datum": "zero_mean"},
+    path = params(tmp_path, solver={"theta_datum": "xy_axes", "misalignment_model": "linear"},
                   measurement_collector={"measurement_sense": "plate_moves"})
     assert solve(bag, "--params", path) == 3
     by_file = capsys.readouterr().err
@@ -217,12 +217,26 @@ def test_parameters_reach_collector_and_solver_and_options_win(tmp_path, capsys,
     assert by_file == capsys.readouterr().err
     assert " of 198 detections were rejected as stage_not_at_mark: the stage is ind" in by_file
     sense = ("--sense", "microscope_moves")
-    zero_mean = result_of(tmp_path, bag, "--params", path, *sense)
-    assert zero_mean == result_of(tmp_path, bag, "--theta-datum", "zero_mean")
-    assert sum(json.loads(zero_mean)["error_map"]["g_theta"]) == pytest.approx(0, abs=1e-15)
+    papers = ("--theta-datum", "xy_axes", "--misalignment", "linear")
+    linear = {"codes": (0, 5)}  # whether the readings contradict it is another question
+    assert (result_of(tmp_path, bag, "--params", path, *sense, **linear)
+            == result_of(tmp_path, bag, *papers, **linear))
     plain = result_of(tmp_path, bag)
-    assert plain == result_of(tmp_path, bag, "--params", path, *sense, "--theta-datum", "xy_axes")
-    assert plain != zero_mean
+    mine = ("--theta-datum", "zero_mean", "--misalignment", "rigid")
+    assert plain == result_of(tmp_path, bag, *mine)
+    assert plain == result_of(tmp_path, bag, "--params", path, *sense, *mine)
+    assert sum(json.loads(plain)["error_map"]["g_theta"]) == pytest.approx(0, abs=1e-15)
+    other = result_of(tmp_path, bag, "--misalignment", "linear", **linear)
+    assert json.loads(other)["error_map"]["gx"] != json.loads(plain)["error_map"]["gx"]
+    assert plain != result_of(tmp_path, bag, "--theta-datum", "xy_axes", **linear)
+
+
+def test_the_law_is_linear_and_says_so(tmp_path, capsys, bag):
+    law = result_of(tmp_path, bag, "--method", "law", codes=(0, 5))
+    assert law == result_of(tmp_path, bag, "--method", "law", "--misalignment", "linear",
+                            codes=(0, 5))
+    assert refused(capsys, 2, bag, "--method", "law", "--misalignment", "rigid") == (
+        "--misalignment: Hu's law is linear, not rigid; leave it out, or use --method joint")
 
 
 def test_the_uncertainty_map_on_request(tmp_path, bag):

@@ -27,13 +27,14 @@ def test_a_reference_length_adds_its_scale_and_its_uncertainty(tmp_path, kind):
     x = (np.arange(11) - 5)[:, None] * 0.01 * np.ones(11)
     grown_x, grown_y = fixed["gx"] - free["gx"], fixed["gy"] - free["gy"]
     scale = (grown_x * x).sum() / (x * x).sum()
-    # one scale for x and y: only the magnification moves
-    np.testing.assert_allclose(grown_x, scale * x, atol=1e-15)
-    np.testing.assert_allclose(grown_y, scale * x.T, atol=1e-15)
+    # one scale for x and y: only the magnification moves, and what misalignments, below 0.5 mm,
+    # make of it: offsets do not grow with the stage
+    np.testing.assert_allclose(grown_x, scale * x, rtol=0, atol=abs(scale) * 5e-4)
+    np.testing.assert_allclose(grown_y, scale * x.T, rtol=0, atol=abs(scale) * 5e-4)
     if kind == "artifact":
         # a longer plate (A grows) is a stage that indicates too little (G falls)
         plate = ((free["ax"] * x + free["ay"] * x.T).sum()) / (2 * (x * x).sum())
-        assert scale == pytest.approx(plate - 2e-6, abs=1e-12)
+        assert scale == pytest.approx(plate - 2e-6, rel=0.01)
     else:
         along = fixed["gx"] if kind == "stage_x" else fixed["gy"]
         axis = x if kind == "stage_x" else x.T

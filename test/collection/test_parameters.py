@@ -13,6 +13,7 @@ from selfcal_ros.collection.parameters import (
     solver_options,
 )
 from selfcal_ros.errors import InputError
+from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.error_map import ThetaDatum
 
 EVERY = [(node, p) for node, table in NODE_PARAMETERS.items() for p in table]
@@ -124,12 +125,20 @@ def test_an_empty_section_sets_nothing():
 
 
 def test_the_estimator_gets_what_the_solver_was_given():
-    values = parameter_values("solver", {"method": "law", "theta_datum": "zero_mean",
-                                         "misalignment_model": "rigid"}, "here")
+    values = parameter_values("solver", {"theta_datum": "xy_axes",
+                                         "misalignment_model": "linear"}, "here")
     options = solver_options(values)
     assert (options.method, options.datum_theta, options.misalignment_model) == (
-        "law", ThetaDatum.ZERO_MEAN, "rigid")
+        "joint", ThetaDatum.XY_AXES, "linear")
     assert options.uncertainty is None
+
+
+def test_without_being_told_plates_turn_and_the_encoder_owes_nothing_to_the_axes():
+    options = solver_options(parameter_values("solver", {}, "here"))
+    assert options == Options()
+    assert (options.datum_theta, options.misalignment_model) == (ThetaDatum.ZERO_MEAN, "rigid")
+    law = solver_options(parameter_values("solver", {"method": "law"}, "here"))
+    assert (law.method, law.misalignment_model) == ("law", "linear")
 
 
 @pytest.mark.parametrize(("word", "wanted"), [("auto", None), ("always", True), ("never", False)])

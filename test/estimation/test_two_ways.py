@@ -86,23 +86,23 @@ def test_the_angular_datum_decides_nothing_about_outliers(sense):
 def test_robust_knows_finite_rotations_of_a_rough_plate():
     """A plate error of 20 um turned by a degree moves 0.3 um: seventeen times the noise."""
     spread = Spread(a_m=20e-6, phi_rad=0.02)
-    truth, readings = measured(plan_of("0,90,180,tx,ty", Artifact(9, 0.01)), spread=spread)
-    rigid = Options(misalignment_model="rigid")
+    truth, readings = measured(plan_of("0,90,180,tx,ty", Artifact(9, 0.01)), spread=spread,
+                               linear=True)
     bent = with_finite_rotations(readings, truth)
-    result = robust_calibrate(bent, rigid)
+    result = robust_calibrate(bent)
     assert result.extra["outliers"]["removed"] == [] and result.extra["slips"] == []
     assert result.extra["noisy_views"] == []
-    require_same(maps_of(result), maps_of(calibrate(bent, rigid)))
+    require_same(maps_of(result), maps_of(calibrate(bent)))
 
 
 @pytest.mark.parametrize("sense", Sense)
 def test_validation_predicts_by_the_model_that_was_fitted(sense):
     plan = plan_of("0,90,180,tx,ty", Artifact(7, 0.01))
-    truth, readings = measured(plan, sense=sense, spread=Spread(a_m=20e-6, phi_rad=0.02))
-    wanted = validate(readings, folds=1)
+    truth, readings = measured(plan, sense=sense, spread=Spread(a_m=20e-6, phi_rad=0.02),
+                               linear=True)
+    wanted = validate(readings, Options(misalignment_model="linear"), folds=1)
     bent = with_finite_rotations(readings, truth)
-    for one, two in zip(validate(bent, Options(misalignment_model="rigid"), folds=1), wanted,
-                        strict=True):
+    for one, two in zip(validate(bent, folds=1), wanted, strict=True):
         assert one.n_grid == two.n_grid and one.note == two.note
         if one.n_grid:
             # a held-out whole view is placed anew, so that only the noise turns a little
@@ -177,17 +177,19 @@ def test_a_line_of_a_fine_circle_that_is_read_once_cannot_be_checked():
 
 
 ROUGH = Spread(a_m=20e-6, phi_rad=0.02)
+PAPERS = Options(datum_theta="xy_axes", misalignment_model="linear")
 SHIFTS = plan_of("0,90+tx,2ty,270-2tx+ty,tx", Artifact(7, 0.01, 12), lines=1)
 FOUR = plan_of("0,90,tx", Artifact(5, 0.01, 4), lines=1)
 
 
 @pytest.mark.parametrize(("plan", "sense", "missing", "options"), [
-    (SHIFTS, Sense.PLATE_MOVES, 0.2, Options()), (FOUR, Sense.MICROSCOPE_MOVES, 0.0, Options()),
-    (CASES["square"], Sense.MICROSCOPE_MOVES, 0.0, Options(misalignment_model="rigid"))])
+    (SHIFTS, Sense.PLATE_MOVES, 0.2, PAPERS), (FOUR, Sense.MICROSCOPE_MOVES, 0.0, PAPERS),
+    (SHIFTS, Sense.PLATE_MOVES, 0.2, Options()),
+    (CASES["square"], Sense.MICROSCOPE_MOVES, 0.0, Options())])
 def test_uncertainties_are_the_scatter_of_recalibrations(plan, sense, missing, options):
     rng, rigid = np.random.default_rng(11), options.misalignment_model == "rigid"
     truth, clean = measured(plan, sense=sense, missing=missing, sigma_m=0.0, sigma_theta_rad=0.0,
-                            spread=ROUGH if rigid else None)
+                            spread=ROUGH if rigid else None, linear=True)
     if rigid:
         clean = with_finite_rotations(clean, truth)
     wanted, squares = maps_of(calibrate(clean, options)), {"xy": [], "theta": []}
@@ -208,10 +210,8 @@ def test_uncertainties_are_the_scatter_of_recalibrations(plan, sense, missing, o
 
 @pytest.mark.parametrize("factor", [1e-3, 1e3])
 def test_finite_rotations_settle_in_any_unit(factor):
-    options = Options(misalignment_model="rigid")
-    truth, clean = measured(CASES["square"], spread=ROUGH)
-    readings = with_finite_rotations(clean, truth)
-    wanted, found = calibrate(readings, options), calibrate(scaled(readings, factor), options)
+    _, readings = measured(CASES["square"], spread=ROUGH)
+    wanted, found = calibrate(readings), calibrate(scaled(readings, factor))
     assert np.allclose(found.error_map.gx / factor, wanted.error_map.gx, rtol=0, atol=1e-14)
     assert [v.phi for v in found.views] == pytest.approx([v.phi for v in wanted.views], abs=1e-13)
 
@@ -219,5 +219,5 @@ def test_finite_rotations_settle_in_any_unit(factor):
 def test_a_plate_laid_exactly_has_settled():
     straight = Spread(phi_rad=0.0, t_m=0.0)
     truth, readings = measured(CASES["square"], spread=straight, sigma_m=0.0, sigma_theta_rad=0.0)
-    found = calibrate(readings, Options(misalignment_model="rigid"))
+    found = calibrate(readings)
     assert np.abs(found.error_map.gx - truth.g[0]).max() < 1e-15

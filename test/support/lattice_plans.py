@@ -1,13 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """Plans by name and truths moved to the datum of what was found."""
 
+from collections.abc import Callable
+from copy import deepcopy
+from dataclasses import replace
 from math import pi
+from typing import Any
 
 import numpy as np
 
 from selfcal_ros.estimation.datum.modes import datum_modes, remove_modes
 from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.view import Plan, View
+from selfcal_ros.simulation.truth import Truth, random_truth, simulate_measurements
 
 POSES = {"0": (0, 0, 0), "90": (1, 0, 0), "180": (2, 0, 0), "270": (3, 0, 0), "+tx": (0, 1, 0),
          "tx": (0, 1, 0), "-tx": (0, -1, 0), "ty": (0, 0, 1), "90+tx": (1, 1, 0),
@@ -25,6 +31,31 @@ def plan_of(names: str, artifact: Artifact, *, lines: int | None = None) -> Plan
         views.append(View("lines", lines * 2 * pi / artifact.angular_count, (0.0, 0.0), False,
                           True))
     return Plan(names, artifact, tuple(views))
+
+
+def measured_in_datum(plan: Plan, seed: int, calibrated: Callable[[Measurements], np.ndarray],
+                      **how: Any) -> tuple[Truth, Measurements]:
+    """Return readings with missing marks, of a stage in the datum over the sites that they tell.
+
+    A stage that is turned or grown against that datum by d gives the same readings to d times
+    the misalignments only, some 1e-10 m: offsets as the microscope tells them do not turn with it.
+
+    Parameters
+    ----------
+    plan, seed
+        What is measured, and the seed of truth, noise and missing marks.
+    calibrated : callable
+        Returns which sites readings tell, bool array (nx, ny).
+    how
+        As `simulate_measurements`.
+    """
+    rng = np.random.default_rng(seed)
+    truth = random_truth(plan.artifact, len(plan.views), rng)
+    again = deepcopy(rng)
+    known = calibrated(simulate_measurements(truth, plan, rng, **how))
+    g = np.where(known, in_datum(truth.g, known, plan.artifact, scale=True), truth.g)
+    truth = replace(truth, g=g)
+    return truth, simulate_measurements(truth, plan, again, **how)
 
 
 def in_datum(field: np.ndarray, known: np.ndarray, artifact: Artifact, *,

@@ -29,7 +29,7 @@ from selfcal_ros.units import UM_PER_M
 SIZES = (3, 5, 7, 9, 11)
 ARTIFACT = Artifact(11, 0.01)
 SPREAD = Spread(g_m=1e-6, a_m=1e-6, phi_rad=np.deg2rad(30 / 3600), t_m=30e-6,
-                rotation="linear")
+                encoder="xy_axes", rotation="linear")
 SIGMA_M = 0.1e-6
 PUBLISHED_RMS_UM = (0.0563, 0.0572)
 PUBLISHED_MEAN_UM = 0.05

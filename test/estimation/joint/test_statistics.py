@@ -16,7 +16,7 @@ from selfcal_ros.estimation.options import Options, ReferenceKind, ReferenceLeng
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.readings import Sense
-from selfcal_ros.simulation.truth import hu_plan, random_truth, simulate_measurements
+from selfcal_ros.simulation.truth import Spread, hu_plan, random_truth, simulate_measurements
 from test.support.lattice_plans import in_datum, plan_of
 
 TABLE = {  # method, section 11: rms of u(G) / sigma of a reading for N = 5, 11, 21
@@ -136,11 +136,13 @@ def test_coverage_factor_grows_with_few_degrees_of_freedom():
 @pytest.mark.parametrize("kind", ReferenceKind)
 @pytest.mark.parametrize("sense", Sense)
 def test_a_reference_length_sets_the_scale_and_its_uncertainty(kind, sense):
+    """In the linear model, where a scale is a datum and nothing else."""
     n, sigma, scale = 300, 2e-8, 3e-6
     artifact = Artifact(5, 0.01)
     plan = plan_of("0,90,tx", artifact)
-    _, clean = measured(plan, seed=2, sense=sense, missing=0.05)
-    free = calibrate(clean)
+    _, clean = measured(plan, seed=2, sense=sense, missing=0.05, linear=True)
+    linear = Options(misalignment_model="linear")
+    free = calibrate(clean, linear)
     grown = np.stack([artifact.x_m, artifact.y_m])
     if kind is ReferenceKind.ARTIFACT:
         reached = in_datum(np.stack([free.artifact_map.ax, free.artifact_map.ay]),
@@ -154,7 +156,7 @@ def test_a_reference_length_sets_the_scale_and_its_uncertainty(kind, sense):
         known = np.isfinite(error)
         value = np.polyfit(grown[axis][known], error[known], 1)[0]
         reference = ReferenceLength(kind, value + scale, 2e-6)
-    found = calibrate(clean, Options(reference=reference))
+    found = calibrate(clean, replace(linear, reference=reference))
     known = found.error_map.valid
     assert found.error_map.gx[known] == pytest.approx(
         (free.error_map.gx + scale * artifact.x_m)[known], abs=1e-14)
@@ -163,17 +165,32 @@ def test_a_reference_length_sets_the_scale_and_its_uncertainty(kind, sense):
     assert np.nanmax(abs(found.artifact_map.ax - free.artifact_map.ax
                          + scale * artifact.x_m)) < 1e-14
     rng = np.random.default_rng(5)
-    predicted = calibrate(noisy(clean, rng, sigma, 1.0), Options(reference=reference)).error_map
+    predicted = calibrate(noisy(clean, rng, sigma, 1.0),
+                          replace(linear, reference=reference)).error_map
     draws = []
     for _ in range(n):
         drawn = replace(reference, relative_error=reference.relative_error + rng.normal(0, 2e-6))
         draws.append(calibrate(noisy(clean, rng, sigma, 1.0),
-                               Options(reference=drawn, uncertainty=False)).error_map)
+                               replace(linear, reference=drawn, uncertainty=False)).error_map)
     for name in ("gx", "gy"):
         spread = np.std([getattr(draw, name)[known] for draw in draws], axis=0)
         ratio = spread / getattr(predicted, "u_" + name)[known]
         assert ratio == pytest.approx(1.0, abs=0.25)
         assert np.sqrt(np.mean(ratio**2)) == pytest.approx(1.0, abs=0.08)
+
+
+@pytest.mark.parametrize("sense", Sense)
+def test_a_reference_length_of_a_plate_that_turns_is_met_exactly(sense):
+    """A stage that indicates 3e-6 too much, and a plate whose length is certified."""
+    plan = plan_of("0,90,tx", Artifact(5, 0.01))
+    truth = random_truth(plan.artifact, 3, np.random.default_rng(2))
+    grown = np.stack([plan.artifact.x_m, plan.artifact.y_m])
+    plate_scale = (truth.a * grown).sum() / (grown**2).sum()
+    long = replace(truth, g=truth.g + 3e-6 * grown)
+    readings = simulate_measurements(long, plan, np.random.default_rng(1), sense=sense)
+    found = calibrate(readings, Options(reference=ReferenceLength("artifact", plate_scale)))
+    assert np.abs(found.error_map.gx - long.g[0]).max() < 1e-12
+    assert np.abs(found.error_map.gy - long.g[1]).max() < 1e-12
 
 
 def test_a_reference_must_be_a_small_number():
@@ -248,13 +265,13 @@ class TestNoise:
 def test_an_encoder_that_does_not_follow_the_axes_is_told_and_bends_nothing():
     plan = hu_plan(Artifact(11, 0.01, 24))
     rng = np.random.default_rng(1)
-    truth = random_truth(plan.artifact, 4, rng)
+    truth = random_truth(plan.artifact, 4, rng, Spread(encoder="xy_axes"))
     g_theta = truth.g_theta.copy()
     g_theta[6] += 1e-4
     readings = simulate_measurements(replace(truth, g_theta=g_theta), plan, rng, sigma_m=1e-9,
                                      sigma_theta_rad=1e-6)
-    axes = calibrate(readings, Options(datum_theta="xy_axes", misalignment_model="linear"))
-    free = calibrate(readings, Options(datum_theta="zero_mean", misalignment_model="linear"))
+    axes = calibrate(readings, Options(datum_theta="xy_axes"))
+    free = calibrate(readings, Options(datum_theta="zero_mean"))
     assert not axes.verdict.qualified and len(axes.verdict.reasons) == 1
     reason = axes.verdict.reasons[0]
     assert reason.startswith("theta: the stage does not satisfy the axis conditions")
@@ -310,8 +327,8 @@ def test_finite_rotations_need_and_take_the_rigid_model(degrees):
             + complex(*truth.t_m[index])
         views.append(replace(view, dx=v.real, dy=v.imag))
     bent = replace(readings, views=tuple(views))
-    rigid = calibrate(bent, Options(misalignment_model="rigid"))
-    linear = calibrate(bent)
+    rigid = calibrate(bent)
+    linear = calibrate(bent, Options(misalignment_model="linear"))
     assert np.abs(rigid.error_map.gx - truth.g[0]).max() < 1e-12
     assert np.abs(rigid.error_map.gy - truth.g[1]).max() < 1e-12
     assert [view.phi for view in rigid.views] == pytest.approx(list(phi), abs=1e-12)

@@ -15,16 +15,17 @@ from selfcal_ros.estimation.options import Options, ReferenceKind, ReferenceLeng
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.readings import Sense
-from selfcal_ros.simulation.truth import hu_plan, random_truth, simulate_measurements
+from selfcal_ros.simulation.truth import Spread, hu_plan, random_truth, simulate_measurements
 
 SIGMA_M, SIGMA_RAD = 0.02e-6, np.deg2rad(0.001)
-LAW = Options(method="law")
+LAW = Options(method="law", datum_theta="xy_axes")
+AS_PUBLISHED = Spread(encoder="xy_axes", rotation="linear")
 
 
 def measured(size=5, count=8, *, seed=1, repeats=1, sense=Sense.MICROSCOPE_MOVES, **noise):
     artifact = Artifact(size, 0.01, count)
     rng = np.random.default_rng(seed)
-    truth = random_truth(artifact, 4, rng)
+    truth = random_truth(artifact, 4, rng, AS_PUBLISHED)
     plan = hu_plan(artifact, repeats)
     return truth, simulate_measurements(truth, plan, rng, sense=sense, **noise)
 
@@ -75,7 +76,7 @@ def published_draws(n_draws):
     artifact = Artifact(11, 0.01, 24)
     law = law_for(artifact, ThetaDatum.XY_AXES, Sense.MICROSCOPE_MOVES)
     rng = np.random.default_rng(2024)
-    truth = random_truth(artifact, 4, rng)
+    truth = random_truth(artifact, 4, rng, AS_PUBLISHED)
     errors = []
     for _ in range(n_draws):
         readings = simulate_measurements(truth, hu_plan(artifact), rng, sigma_m=SIGMA_M,
@@ -99,7 +100,7 @@ def test_published_calibration_errors_lie_within_the_spread_of_200_draws():
 def test_uncertainty_agrees_with_the_scatter_of_repeated_calibrations():
     g, theta = published_draws(1000)
     artifact = Artifact(11, 0.01, 24)
-    truth = random_truth(artifact, 4, np.random.default_rng(3))
+    truth = random_truth(artifact, 4, np.random.default_rng(3), AS_PUBLISHED)
     readings = simulate_measurements(truth, hu_plan(artifact, 2), np.random.default_rng(3),
                                      sigma_m=SIGMA_M * np.sqrt(2),
                                      sigma_theta_rad=SIGMA_RAD * np.sqrt(2))

@@ -26,7 +26,7 @@ from selfcal_ros.estimation.observability.rank import plan_observability
 from selfcal_ros.estimation.observability.unseen import is_unseen
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.view import View
-from selfcal_ros.simulation.truth import random_truth, simulate_measurements
+from selfcal_ros.simulation.truth import Spread, random_truth, simulate_measurements
 from test.support.plans import POSES, QIAO_TABLES, plan_of
 
 
@@ -250,7 +250,8 @@ def test_lines_may_be_measured_in_views_of_their_own(datum):
     assert plan_observability(plan).identifiable
     assert plan_observability(replace(plan, views=(*grid, lines[0]))).deficiency == 11
     rng = np.random.default_rng(2)
-    truth = random_truth(plan.artifact, 5, rng)
+    truth = random_truth(plan.artifact, 5, rng, Spread(
+        encoder="xy_axes" if datum == "xy_axes" else "independent"))
     result = calibrate(simulate_measurements(truth, plan, rng), Options(datum_theta=datum))
     shift = truth.g_theta.mean() if datum == "zero_mean" else 0.0
     assert np.abs(result.error_map.g_theta - truth.g_theta + shift).max() < 1e-15

@@ -63,7 +63,7 @@ def test_prediction_is_the_uncertainty_that_the_solver_reports():
     readings = simulate_measurements(random_truth(plan.artifact, 5, rng), plan, rng,
                                      sigma_m=1e-8, sigma_theta_rad=1e-3)
     result = calibrate(readings, Options())
-    found = predict_plan(plan, ThetaDatum.XY_AXES)
+    found = predict_plan(plan, ThetaDatum.ZERO_MEAN)
     assert np.allclose(result.error_map.u_gx / result.noise.sigma_xy, found.ux, rtol=1e-4)
     assert np.allclose(result.error_map.u_gy / result.noise.sigma_xy, found.uy, rtol=1e-4)
     assert np.allclose(result.error_map.u_g_theta / result.noise.sigma_theta, found.u_theta,

@@ -25,7 +25,7 @@ from selfcal_ros.reporting.summary.text import (
     summary_numbers,
     summary_text,
 )
-from selfcal_ros.simulation.truth import hu_plan, random_truth, simulate_measurements
+from selfcal_ros.simulation.truth import Spread, hu_plan, random_truth, simulate_measurements
 from test.support.maps import random_map
 from test.support.results import known_result
 
@@ -251,7 +251,8 @@ def test_theta_of_a_real_calibration_lies_within_its_uncertainty_in_either_datum
     """The lines that the datum fixes have a tiny u: a plain mean would put them many u off."""
     artifact, rng = Artifact(5, 0.01, 72), np.random.default_rng(8)
     plan = hu_plan(artifact, 4)
-    truth = random_truth(artifact, len(plan.views), rng)
+    truth = random_truth(artifact, len(plan.views), rng, Spread(
+        encoder="xy_axes" if datum is ThetaDatum.XY_AXES else "independent"))
     found = calibrate(simulate_measurements(truth, plan, rng, sigma_m=2e-9, sigma_theta_rad=2e-5),
                       Options(datum_theta=datum))
     figures = truth_figures(found.error_map, {"gx": truth.g[0], "gy": truth.g[1],
