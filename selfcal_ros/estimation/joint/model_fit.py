@@ -23,7 +23,7 @@ from selfcal_ros.estimation.terms.projection import ReducedColumns, project, red
 from selfcal_ros.estimation.terms.solution import Sums, next_coefficients, noise_left, score
 from selfcal_ros.model.terms import TermName
 
-MAX_STEPS = 30
+MAX_STEPS = 100
 
 RESOLUTION = 1e-12
 """Change of a reading, against the largest misalignment, at which rotations stand still."""
@@ -181,12 +181,13 @@ class _State:
         return bool(len(now) and np.abs(now - then).max() > LINEAR * np.abs(then).max())
 
     def step(self) -> float:
-        """Take one step; return the largest change of what is taken off a reading, m.
+        """Take one step; return the largest change of a misalignment or of a reading, m.
 
-        Nothing else goes from step to step. Misalignments may move by rounding for ever where
-        nothing depends on them: all rotations together, that of a view of lines alone.
+        The smaller of the two. Misalignments may move by rounding for ever where nothing depends
+        on them: all rotations together, that of a view of lines alone. What is taken off the
+        readings may where the misalignments take it up.
         """
-        before = self.y
+        parameters, y = self.found.parameters, self.y
         if self.equations is not None and (self._stale() or (
                 self.of_offsets and self.steps <= OFFSET_STEPS)):
             self._linearise()
@@ -196,7 +197,8 @@ class _State:
         self.y = np.where(self.problem.system.grid.read,
                           self.problem.grid.y - self._excess() - self._of_terms(), 0.0)
         self.found = fit(self.problem, self.y)
-        return float(np.abs(self.y - before).max())
+        return float(min(np.abs(self.found.parameters - parameters).max(),
+                         np.abs(self.y - y).max()))
 
     def within_noise(self, change: float) -> bool:
         """Return whether a change of the misalignments is nothing against their uncertainty."""
