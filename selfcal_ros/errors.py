@@ -42,7 +42,7 @@ class InputError(SelfcalError):
 
     def __init__(self, where: str, what: str, mend: str = "") -> None:
         self.where, self.what, self.mend = where, what, mend
-        super().__init__(f"{where}: {what}" + (f"; {mend}" if mend else ""))
+        super().__init__(printable(f"{where}: {what}" + (f"; {mend}" if mend else "")))
 
 
 class NotIdentifiableError(SelfcalError):
@@ -72,3 +72,13 @@ class NoDataError(InputError):
 def first_line(error: BaseException) -> str:
     """Return the first line of another library's error text, or its type if it has none."""
     return (str(error).splitlines() or [type(error).__name__])[0]
+
+
+def printable(text: str) -> str:
+    r"""Return `text` as one line without anything that a terminal acts on.
+
+    Names in bags, plans and messages are other people's: an escape sequence, a line break or a
+    change of the direction of writing in them is shown as ``\x1b``, ``\n``, ``\u202e``.
+    """
+    return "".join(c if c.isprintable() else c.encode("unicode_escape", "surrogatepass").decode()
+                   for c in text)

@@ -16,9 +16,63 @@ import yaml
 
 from selfcal_ros.errors import InputError, first_line
 
+MAX_YAML_NODES = 1_000_000
+"""Values in a YAML file, each alias counted as often as what it stands for."""
+WHOLE_LIMIT = 1 << 63
+"""Whole numbers in files must fit into 64 bits: everything that is one here does."""
+
 
 class YamlLoader(yaml.SafeLoader):
-    """PyYAML's safe loader that reads floats as YAML 1.2 and rcl do: 5e-4, 1.0e3, -.5."""
+    """PyYAML's safe loader that reads floats as YAML 1.2 and rcl do: 5e-4, 1.0e3, -.5.
+
+    It refuses a key that is given twice, a whole number beyond 64 bits, and aliases that would
+    grow to more than `MAX_YAML_NODES` values.
+    """
+
+    def get_single_node(self) -> yaml.Node | None:
+        """Compose the document, and see how large its aliases make it."""
+        node = super().get_single_node()
+        if node is not None and _yaml_size(node, {}) > MAX_YAML_NODES:
+            raise yaml.composer.ComposerError(None, None, "its aliases stand for more than "
+                                              f"{MAX_YAML_NODES} values", node.start_mark)
+        return node
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict:
+        """Return the mapping of a node without a key that is given twice."""
+        seen = set()
+        for key, _ in node.value:
+            if isinstance(key, yaml.ScalarNode) and key.tag != "tag:yaml.org,2002:merge":
+                if (key.tag, key.value) in seen:
+                    raise yaml.constructor.ConstructorError(
+                        None, None, f"the key '{key.value}' is given twice", key.start_mark)
+                seen.add((key.tag, key.value))
+        return super().construct_mapping(node, deep)
+
+    def construct_yaml_int(self, node: yaml.ScalarNode) -> int:
+        """Return a whole number that fits into 64 bits."""
+        return _whole(super().construct_yaml_int(node) if len(node.value) < 70 else node.value)
+
+
+YamlLoader.add_constructor("tag:yaml.org,2002:int", YamlLoader.construct_yaml_int)
+
+
+def _yaml_size(node: yaml.Node, known: dict[int, int]) -> int:
+    """Return the number of values below a node; a node that holds itself has no end."""
+    if id(node) not in known:
+        known[id(node)] = MAX_YAML_NODES + 1  # until it is known
+        children = [item for pair in node.value for item in pair] if isinstance(
+            node, yaml.MappingNode) else node.value if isinstance(node, yaml.SequenceNode) else ()
+        known[id(node)] = 1 + sum(_yaml_size(child, known) for child in children)
+    return known[id(node)]
+
+
+def _whole(value: int | str) -> int:
+    """Return a whole number; ValueError, without its digits, for one beyond 64 bits."""
+    if isinstance(value, str) and len(value) < 25:
+        value = int(value)
+    if isinstance(value, str) or not -WHOLE_LIMIT <= value < WHOLE_LIMIT:
+        raise ValueError("a whole number beyond 64 bits")
+    return value
 
 
 class YamlDumper(yaml.SafeDumper):
@@ -176,7 +230,7 @@ def read_json(path: str | os.PathLike) -> Any:
     """Return the JSON value in `path`; InputError names line and column of a fault."""
     text = read_text(path)
     try:
-        return json.loads(text)
+        return json.loads(text, parse_int=_whole)
     except json.JSONDecodeError as error:
         raise InputError(f"{path}:{error.lineno}:{error.colno}", f"not JSON ({error.msg})",
                          "give a file that `selfcal` wrote") from error

@@ -153,7 +153,7 @@ def test_what_cannot_be_read(tmp_path, source, message):
     for read in (read_bytes, read_text, read_json, read_yaml):
         with pytest.raises(InputError) as caught:
             read(tmp_path / source)
-        assert str(caught.value) == f"{tmp_path / source}: {message}"
+        assert str(caught.value) == f"{tmp_path / source}: {message}".replace("\0", "\\x00")
 
 
 def test_text_that_is_not_utf8(tmp_path):
@@ -166,7 +166,7 @@ def test_text_that_is_not_utf8(tmp_path):
 @pytest.mark.parametrize(("text", "message"), [
     ('{"a": 1,\n "b": }', ":2:7: not JSON (Expecting value)"),
     ("", ":1:1: not JSON (Expecting value)"),
-    ("[" * 100_000, ": not usable JSON ("), ("9" * 5000, ": not usable JSON (Exceeds the limit")])
+    ("[" * 100_000, ": not usable JSON ("), ("9" * 5000, ": not usable JSON (a whole number")])
 def test_faults_in_json(tmp_path, text, message):
     (tmp_path / "a.json").write_text(text)
     with pytest.raises(InputError) as caught:
@@ -227,7 +227,8 @@ def test_the_loader_of_others_is_left_alone():
     assert yaml.safe_load("5e-4") == "5e-4"
 
 
-PLAIN = st.one_of(st.none(), st.booleans(), st.integers(), st.floats(allow_nan=False), st.text(),
+WHOLE = st.integers(-2**63, 2**63 - 1)
+PLAIN = st.one_of(st.none(), st.booleans(), WHOLE, st.floats(allow_nan=False), st.text(),
                   st.from_regex(r"\A[-+]?[0-9]*\.?[0-9]*[eE]?[-+]?[0-9]*\Z"))
 
 
@@ -276,3 +277,41 @@ def test_outputs_are_refused_that_cannot_all_be_written(tmp_path, monkeypatch):
 def test_what_json_writes_is_what_json_reads(tmp_path):
     write_json(tmp_path / "a", [0.1, 1e-300, -0.0])
     assert json.loads((tmp_path / "a").read_text()) == [0.1, 1e-300, -0.0]
+
+
+@pytest.mark.parametrize("text, problem", [
+    ("a: 1\nb: 2\na: 3\n", r"f\.yaml:3:1: not YAML \(the key 'a' is given twice\); mend the line"),
+    ("a: {b: 1, b: 1}\n", r"f\.yaml:1:11: not YAML \(the key 'b' is given twice\)"),
+    ("a: " + "9" * 400, r"f\.yaml: not usable YAML \(a whole number beyond 64 bits\); mend"),
+    ("a: 9223372036854775808", "a whole number beyond 64 bits"),
+    ("a: -9223372036854775809", "a whole number beyond 64 bits"),
+    ("a: &a [*a]", "its aliases stand for more than 1000000 values"),
+    ("\n".join(["a0: &a0 [0, 0]"] + [f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 10)}]"
+                                     for i in range(1, 12)]),
+     r"f\.yaml:1:1: not YAML \(its aliases stand for more than 1000000 values\)")])
+def test_yaml_that_means_harm_or_is_ambiguous_is_refused(tmp_path, text, problem):
+    path = tmp_path / "f.yaml"
+    path.write_text(text)
+    with pytest.raises(InputError, match=problem):
+        files.read_yaml(path)
+
+
+@pytest.mark.parametrize("text, value", [
+    ("a: &a [1, 2]\nb: *a\n", {"a": [1, 2], "b": [1, 2]}),
+    ("a: &a {x: 1}\nb:\n  <<: *a\n  x: 2\n", {"a": {"x": 1}, "b": {"x": 2}}),
+    ("a: 9223372036854775807", {"a": 2**63 - 1}), ("a: -9223372036854775808", {"a": -2**63}),
+    ("a: 0x1F", {"a": 31}), ("1: a\n'1': b\n", {1: "a", "1": "b"})])
+def test_honest_yaml_is_read(tmp_path, text, value):
+    path = tmp_path / "f.yaml"
+    path.write_text(text)
+    assert files.read_yaml(path) == value
+
+
+@pytest.mark.parametrize("digits", [20, 400, 5000])
+def test_json_with_a_whole_number_beyond_64_bits_is_refused_without_its_digits(tmp_path, digits):
+    path = tmp_path / "f.json"
+    path.write_text('{"a": ' + "9" * digits + "}")
+    with pytest.raises(InputError) as caught:
+        files.read_json(path)
+    assert str(caught.value) == (f"{path}: not usable JSON (a whole number beyond 64 bits); give a "
+                                 "file that `selfcal` wrote")
