@@ -3,15 +3,12 @@
 
 import argparse
 import contextlib
-import fcntl
-import importlib.util
-import os
-import signal
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
 from pathlib import Path
+
+from selfcal_ros.cli.processes import domain, ended_by_signals, need_ros, process
 
 HELP = "play a bag into the live nodes and take the map from them"
 NODES = ("measurement_collector", "pose_sequencer", "solver")
@@ -40,16 +37,13 @@ def run(args: argparse.Namespace) -> int:
     from selfcal_ros.files import check_outputs, read_json, write_json
     from selfcal_ros.model.result import result_from_dict, result_to_dict, with_input
 
-    for package in ("rclpy", "selfcal_msgs"):
-        if importlib.util.find_spec(package) is None:
-            raise InputError("environment", f"there is no {package} in this environment",
-                             "source a ROS 2 installation with this package built, use the "
-                             "environment of `make setup`, or use `selfcal solve`")
+    need_ros(", or use `selfcal solve`")
     if not args.fast and not args.rate > 0:
         raise InputError("--rate", f"{args.rate:g} is not a speed", "give a number above 0")
     check_outputs([args.bag, args.params], [args.output])
     source = bag_input(args.bag)
-    with tempfile.TemporaryDirectory() as folder, domain() as environment:
+    with (ended_by_signals(), tempfile.TemporaryDirectory() as folder,
+          domain() as environment):
         saved = Path(folder, "result.json")
         code, lost = _play(args, saved, environment)
         if code or not saved.exists():
@@ -70,8 +64,10 @@ def _play(args: argparse.Namespace, saved: Path, environment: dict) -> tuple[int
     rate = 0.0 if args.fast else args.rate
     cell = "" if args.namespace is None else f"/{args.namespace.strip('/')}"
     with contextlib.ExitStack() as stack:
+        own = {"solver": ["--ros-args", "-p", f"result_folder:={saved.parent}"]}
         for node in NODES:
-            stack.enter_context(process(f"selfcal_ros.nodes.{node}", [*rest, *quiet], environment))
+            stack.enter_context(process(f"selfcal_ros.nodes.{node}",
+                                        [*rest, *own.get(node, []), *quiet], environment))
         session = stack.enter_context(process(
             "selfcal_ros.nodes.replay_session",
             [args.bag, str(rate), str(args.shuffle), str(saved), cell, *quiet], environment,
@@ -87,56 +83,3 @@ def _play(args: argparse.Namespace, saved: Path, environment: dict) -> tuple[int
                 lost.append(tail)
                 print(f"selfcal replay: {args.bag}: {tail}", file=sys.stderr)
         return session.wait(), lost
-
-
-@contextlib.contextmanager
-def process(module: str, arguments: list[str], environment: dict, **kwargs,
-            ) -> Iterator[subprocess.Popen]:
-    """Run a module as a process that is stopped, at worst killed, at the end of the block.
-
-    Ctrl-C reaches the process from the terminal too. It is blocked there from the start, and let
-    through by `nodes.running.run` once the imports are done and it can be handled.
-    """
-    child, before = None, signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        child = subprocess.Popen([sys.executable, "-m", module, *arguments], env=environment,
-                                 **kwargs)
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
-        yield child
-    finally:
-        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-        if child is not None:
-            _stop(child)
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
-def _stop(child: subprocess.Popen) -> None:
-    for stop in (child.terminate, child.kill):
-        if child.poll() is None:
-            stop()
-            with contextlib.suppress(subprocess.TimeoutExpired):
-                child.wait(10)
-    if child.stdout:
-        child.stdout.close()
-
-
-@contextlib.contextmanager
-def domain() -> Iterator[dict]:
-    """Yield an environment with a ROS domain of its own on this machine.
-
-    A ROS_DOMAIN_ID that is set already is kept, so that `ros2 topic echo` can watch.
-    """
-    environment = dict(os.environ)
-    environment.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-    if environment.get("ROS_DOMAIN_ID"):
-        yield environment
-        return
-    for number in range(50, 100):
-        with Path(tempfile.gettempdir(), f"selfcal_domain_{number}.lock").open("w") as lock:
-            try:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError:
-                continue
-            yield environment | {"ROS_DOMAIN_ID": str(number)}
-            return
-    raise RuntimeError("fifty replays at once")

@@ -58,8 +58,11 @@ _SENSE = Parameter(
 _FRAME = Parameter("frame_id", "stage", "frame of published messages (REP-103)")
 _PLAN = Parameter("plan", "", "path of PLAN.yaml")
 
+_AUTOSTART = Parameter("autostart", True, "configure and activate by itself; false = wait for a "
+                       "lifecycle manager")
+
 COLLECTOR = (
-    _SENSE, _FRAME,
+    _SENSE, _FRAME, _AUTOSTART,
     Parameter("joint_x", "x", "joint that indicates x"),
     Parameter("joint_y", "y", "joint that indicates y"),
     Parameter("joint_theta", "theta", "joint that indicates theta"),
@@ -91,11 +94,20 @@ COLLECTOR = (
     Parameter("approach_threshold", 1e-6, "displacement of x or y before an exposure that counts "
               "as a motion and tells the direction of approach", "m", 0.0, 1e-2),
     Parameter("status_period", 0.5, "time between two ViewStatus messages", "s", 0.02, 60.0),
+    Parameter("clock_limit", 0.1, "offset between the cell's clock and this machine's that is a "
+              "warning; a view is not called complete on stamps that far in the future",
+              "s", 0.001, 3600.0),
+    Parameter("encoder_rate_min", 0.0, "encoder samples a second below which there is a warning "
+              "while a view is measured; 0 = none", "Hz", 0.0, 1e5),
+    Parameter("repeatability_xy_limit", 0.0, "repeatability of one grid reading above which there "
+              "is a warning; 0 = none", "m", 0.0, 1e-3),
+    Parameter("repeatability_theta_limit", 0.0, "repeatability of one angular reading above which "
+              "there is a warning; 0 = none", "rad", 0.0, 0.1),
 )
 _UNCERTAINTY = {"auto": None, "always": True, "never": False}
 
 SOLVER = (
-    _FRAME,
+    _FRAME, _AUTOSTART,
     Parameter("method", "joint", "estimator", choices=("joint", "law")),
     Parameter("theta_datum", str(ThetaDatum.ZERO_MEAN), "what fixes the constant of the "
               "angular map", choices=tuple(str(datum) for datum in ThetaDatum)),
@@ -118,26 +130,41 @@ SOLVER = (
     Parameter("drift_degree", DRIFT_DEGREE, "degree of the polynomial of time by which views "
               "drift, where drift is a term", "", 1, MAX_DRIFT_DEGREE),
     Parameter("save_path", "", "RESULT.json to write whenever the map changes; empty = none"),
+    Parameter("result_folder", "", "folder in which save_map may write, and from which relative "
+              "paths count; empty = the working directory"),
 )
 SEQUENCER = (
-    _PLAN, _FRAME,
+    _PLAN, _FRAME, _AUTOSTART,
     Parameter("auto_start", False, "start the plan without waiting for the start service"),
+    Parameter("start_checks", True, "start only when collector, encoder, detections and solver "
+              "are there; false = start without"),
+    Parameter("resume", True, "the first start takes up the unfinished run of the plan that the "
+              "collector knows"),
+    Parameter("stall_time", 5.0, "time without a detection after which a view is said to stall",
+              "s", 0.1, 3600.0),
     Parameter("auto_confirm", False, "measure without waiting for confirm_view (robot loaders)"),
     Parameter("settle_time", 0.5, "time between PLACE and MEASURE when auto_confirm is set",
               "s", 0.0, 3600.0),
     Parameter("view_timeout", 0.0, "give up waiting for a view's completion; 0 = wait for ever",
               "s", 0.0, 1e6),
     Parameter("max_redos", 0, "times an incomplete view is redone after a time-out", "", 0, 100),
-    Parameter("result_path", "", "where run_calibration has the solver save the map"),
+    Parameter("result_path", "", "where run_calibration has the solver save the map; empty = "
+              "PLAN_ID.json in the solver's result_folder"),
+    Parameter("save_timeout", 60.0, "longest wait of run_calibration for the solver to save",
+              "s", 0.1, 3600.0),
 )
 COMPENSATOR = (
-    _FRAME,
+    _FRAME, _AUTOSTART,
     Parameter("joint_x", "x", "joint that indicates x"),
     Parameter("joint_y", "y", "joint that indicates y"),
     Parameter("joint_theta", "theta", "joint that indicates theta"),
     Parameter("interpolation", "bilinear", "between nodes", choices=("bilinear", "bicubic")),
     Parameter("outside", "clamp", "outside the field", choices=("clamp", "refuse")),
     Parameter("map", "", "RESULT.json to start with; empty = wait for selfcal/error_map"),
+    Parameter("require_qualified", True, "use only maps that are qualified, of one run, and of "
+              "all planned views; false = any map"),
+    Parameter("max_map_age", 0.0, "age of the map in use above which there is a warning; "
+              "0 = none", "s", 0.0, 1e9),
 )
 PLAYER = (
     Parameter("bag", "", "MCAP file or rosbag2 folder"),

@@ -59,6 +59,16 @@ class Sequencer:
         self.skipped, self.index = [], 0
         return self._place()
 
+    def resume(self, index: int, phase: Phase) -> Command:
+        """Take up a run at the view and the command (PLACE or MEASURE) that it had reached."""
+        if self.state not in ENDED:
+            raise InputError("pose_sequencer", f"cannot resume while {self.state}",
+                             "abort the plan first")
+        self.need_plan()
+        self.skipped, self.index = [], index
+        self.state = State.PLACING if phase == Phase.PLACE else State.MEASURING
+        return self._command(phase)
+
     def need_plan(self) -> None:
         """Raise InputError if there is no plan to start."""
         if self.plan is None:

@@ -27,9 +27,12 @@ class BagPlayer(SelfcalNode):
                              seed=self.values["seed"])
         self._patience = time.monotonic() + self.values["wait_for_subscribers"]
         self._started = False
-        self.create_timer(0.002, self.guarded(self._step))
-        self.create_timer(1.0, lambda: self.diagnose(Diagnosis(Level.OK, "playing", {
-            "played": self.player.played, "total": self.player.total})))
+        self.every(0.002, self._step)
+
+    def diagnosis(self) -> Diagnosis:
+        """Return how far it is."""
+        return Diagnosis(Level.OK, "playing", {
+            "played": self.player.played, "total": self.player.total})
 
     def _step(self) -> None:
         if not self._started:

@@ -36,19 +36,46 @@ class BagRecorder(SelfcalNode):
                 self.subscribe(topic, partial(self._record, name), raw=True)
         encoder = self.resolve_topic_name(names.ENCODER.name)
         EncoderInput(self, partial(self._record, encoder), raw=True)
-        self.create_timer(1.0, self._flush)
+        self._failed, self._unrecorded = "", 0
+        self.every(1.0, self._flush)
 
     def _record(self, topic: str, data: bytes) -> None:
-        self._writer.write_raw(topic, bytes(data), self.get_clock().now().nanoseconds)
+        if self._failed:
+            self._unrecorded += 1
+            return
+        try:
+            self._writer.write_raw(topic, bytes(data), self.get_clock().now().nanoseconds)
+        except InputError as error:
+            self._fail(error)
+
+    def _fail(self, error: InputError) -> None:
+        """Record no more: after a write that was cut off, what follows could not be read."""
+        self._failed, self._unrecorded = str(error), self._unrecorded + 1
+        self.say(Level.ERROR, f"recording has ended: {error}; what was recorded is readable, "
+                 "start anew in another folder")
 
     def _flush(self) -> None:
-        self._writer.flush()
-        self.diagnose(Diagnosis(Level.OK, "recording", self._writer.counts))
+        if not self._failed:
+            try:
+                self._writer.flush()
+            except InputError as error:
+                self._fail(error)
+
+    def diagnosis(self) -> Diagnosis:
+        """Return what was recorded, or why nothing is any more."""
+        if self._failed:
+            return Diagnosis(Level.ERROR, f"recording has ended: {self._failed}",
+                             self._writer.counts | {"unrecorded": self._unrecorded})
+        return Diagnosis(Level.OK, "recording", self._writer.counts)
 
     def close(self) -> None:
         """Finish the bag."""
-        self._writer.close()
-        self.get_logger().info(f"{self.values['bag']}: {self._writer.counts}")
+        try:
+            self._writer.close()
+            self.say(Level.OK, f"{self.values['bag']}: {self._writer.counts}")
+        except InputError as error:
+            if not self._failed:
+                self._fail(error)
 
 
 def main() -> None:

@@ -1,60 +1,73 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What all nodes share: checked parameters, ports for the session, diagnostics."""
+"""What all nodes share: checked parameters, ports for the session, guarded callbacks, health."""
 
-import array
 import inspect
 import time
 from collections.abc import Callable
 from typing import Any
 
-import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rclpy.clock import Clock, ClockType
+from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 
 from selfcal_ros.collection.parameters import NODE_PARAMETERS, Parameter, parameter_values
-from selfcal_ros.errors import SelfcalError
-from selfcal_ros.nodes.names import Topic
+from selfcal_ros.errors import ExitCode, SelfcalError, printable
+from selfcal_ros.nodes.names import HEALTH, Topic, private
+from selfcal_ros.nodes.publishers import mismatched, others_publishing
+from selfcal_ros.sessions.health import Losses, Refusals, merged
 from selfcal_ros.sessions.ports import Diagnosis, Level, Ports
 
 
-class SelfcalNode(Node):
-    """A node whose parameters come from the package's one table.
+class NodeBase:
+    """Mixed into a node of rclpy: parameters from the package's one table, health once a second.
 
-    Parameters
-    ----------
-    name : str
-        Key of `NODE_PARAMETERS`; also the node's name.
-    **kwargs
-        For rclpy.node.Node, e.g. parameter_overrides.
-
-    Raises
-    ------
-    InputError
-        For an unknown parameter name, a wrong type or a value out of bounds.
+    Work and health follow a steady clock: a simulated or stepped ROS time does not stop them.
     """
 
-    def __init__(self, name: str, **kwargs: Any) -> None:
-        super().__init__(name, **kwargs)
+    def prepare(self, name: str) -> None:
+        """Check the parameters and begin to tell the health.
+
+        Raises
+        ------
+        InputError
+            For an unknown parameter name, a wrong type or a value out of bounds.
+        """
         overrides = {key: value.value for key, value in self._parameter_overrides.items()}
         self.values = parameter_values(name, overrides, f"parameters of {name}")
         for parameter in NODE_PARAMETERS[name]:  # the checked value: 2 is a good 2.0 here
             self.declare_parameter(parameter.name, self.values[parameter.name],
                                    _descriptor(parameter), ignore_override=True)
         self.frame_id = self.values.get("frame_id", "stage")
+        self.refusals = Refusals(self.say, time.monotonic)
+        self.losses = Losses(self.say, time.monotonic)
+        self.alone_on: list[str] = []
+        self._heard_on: dict[str, Topic] = {}
+        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
+        self._health = self.publisher(private(HEALTH))
+        self._beat = self.create_timer(1.0, self.guarded(self.report), clock=self._steady)
 
     def publisher(self, topic: Topic) -> Publisher:
         """Return a publisher of `topic`."""
-        return self.create_publisher(topic.type, topic.name, topic.qos)
+        return self.own(self.create_publisher(topic.type, topic.name, topic.qos),
+                        self.destroy_publisher)
 
-    def subscribe(self, topic: Topic, callback: Callable[[Any], None], **kwargs: Any):
-        """Subscribe `callback` to `topic`; what it raises is logged and does not end the node."""
-        return self.create_subscription(topic.type, topic.name, self.guarded(callback), topic.qos,
-                                        **kwargs)
+    def subscribe(self, topic: Topic, callback: Callable[..., None], **kwargs: Any) -> Any:
+        """Subscribe `callback` to `topic`; what it raises is counted and does not end the node."""
+        name = self.resolve_topic_name(topic.name)
+        guarded = callback if hasattr(callback, "__signature__") else self.guarded(
+            callback, topic.name)
+        self._heard_on[name] = topic
+        events = SubscriptionEventCallbacks(message_lost=lambda event: self.losses.add(
+            topic.name, event.total_count_change))
+        return self.own(self.create_subscription(
+            topic.type, topic.name, guarded, topic.qos, event_callbacks=events, **kwargs),
+            self.destroy_subscription)
 
-    def subscribe_with_age(self, topic: Topic, callback: Callable[[Any, bool], None]):
+    def subscribe_with_age(self, topic: Topic, callback: Callable[[Any, bool], None]) -> Any:
         """Subscribe `callback`; its second argument says if the message is older than this call.
 
         Only a latched message can be: it was published before this node listened.
@@ -65,17 +78,54 @@ class SelfcalNode(Node):
             # the events executor of rclpy 7.1 passes message and info as one pair
             message, info = received[0] if len(received) == 1 else received
             callback(message, info["source_timestamp"] < began_ns)
-        guarded = self.guarded(call)
+        guarded = self.guarded(call, topic.name)
         guarded.__signature__ = inspect.signature(lambda message, info: None)  # rclpy counts them
-        return self.create_subscription(topic.type, topic.name, guarded, topic.qos)
+        return self.subscribe(topic, guarded)
 
-    def guarded(self, callback: Callable[..., Any]) -> Callable[..., Any]:
-        """Return `callback` with the package's errors logged in one line instead of raised."""
+    def service(self, kind: type, name: str, answer: Callable[..., str]) -> Any:
+        """Offer a service whose response is filled from `answer` (request), or from its error.
+
+        `answer` may take the response as well, for fields beside success and message.
+        """
+        parameters = inspect.signature(answer).parameters.values()
+        arguments = sum(parameter.default is parameter.empty for parameter in parameters)
+
+        def call(request: Any, response: Any) -> Any:
+            try:
+                message = answer(*(request, response)[:arguments])
+                response.success, response.message = True, printable(message)
+            except Exception as error:
+                self._answer_error(response, error)
+            return response
+        return self.own(self.create_service(kind, name, call), self.destroy_service)
+
+    def _answer_error(self, response: Any, error: Exception) -> None:
+        known = isinstance(error, SelfcalError)
+        response.success = False
+        response.message = str(error) if known else f"{type(error).__name__}: {error}"
+        if not known:
+            self.refusals.add("service", error)
+        if hasattr(response, "error_code"):
+            response.error_code = int(error.exit_code if known else ExitCode.INTERNAL)
+
+    def every(self, seconds: float, callback: Callable[[], None]) -> Any:
+        """Call `callback` every so many seconds of a steady clock."""
+        return self.own(self.create_timer(seconds, self.guarded(callback), clock=self._steady),
+                        self.destroy_timer)
+
+    def own(self, entity: Any, destroy: Callable[[Any], Any]) -> Any:
+        """Return `entity`; a managed node notes how to take it down."""
+        return entity
+
+    def guarded(self, callback: Callable[..., Any], place: str = "") -> Callable[..., Any]:
+        """Return `callback` with whatever it raises counted and logged instead of raised."""
+        place = place or getattr(callback, "__name__", "callback").strip("_")
+
         def call(*args: Any) -> Any:
             try:
                 return callback(*args)
-            except SelfcalError as error:
-                self.get_logger().error(str(error))
+            except Exception as error:  # nothing that is received may end a node
+                self.refusals.add(place, error)
                 return None
         return call
 
@@ -86,34 +136,51 @@ class SelfcalNode(Node):
 
     def say(self, level: Level, line: str) -> None:
         """Write one line to the log."""
-        logger = self.get_logger()  # a line each: rclpy tells call sites apart by their place
-        if level == Level.OK:
+        logger, line = self.get_logger(), printable(line)
+        if level == Level.OK:  # a line each: rclpy tells call sites apart by their place
             logger.info(line)
         elif level == Level.WARN:
             logger.warning(line)
         else:
             logger.error(line)
 
+    def diagnosis(self) -> Diagnosis:
+        """Return what this node has to say of itself."""
+        return Diagnosis(Level.OK, "running")
+
+    def report(self) -> None:
+        """Tell the health of this node."""
+        graph = [mismatched(self, self._heard_on), others_publishing(self, self.alone_on)]
+        self.diagnose(merged(self.diagnosis(), [
+            self.refusals.diagnosis(), self.losses.diagnosis(), *graph]))
+
     def diagnose(self, diagnosis: Diagnosis) -> None:
-        """Publish one diagnostic status of this node."""
+        """Publish one diagnostic status of this node, for everybody and for its companions."""
         status = DiagnosticStatus(
             level=bytes([diagnosis.level]), name=self.get_fully_qualified_name().lstrip("/"),
-            message=diagnosis.message, hardware_id="selfcal",
-            values=[KeyValue(key=key, value=str(value))
+            message=printable(diagnosis.message), hardware_id="selfcal",
+            values=[KeyValue(key=printable(key), value=printable(str(value)))
                     for key, value in diagnosis.values.items()])
         array_message = DiagnosticArray(status=[status])
         array_message.header.stamp = self.get_clock().now().to_msg()
         self._diagnostics.publish(array_message)
+        self._health.publish(status)
 
-    def trigger(self, request: Any, response: Any, act: Callable[[], str]) -> Any:
-        """Fill a Trigger or map-service response from `act`, or from the error it raises."""
-        try:
-            response.success, response.message = True, act()
-        except SelfcalError as error:
-            response.success, response.message = False, str(error)
-            if hasattr(response, "error_code"):
-                response.error_code = int(error.exit_code)
-        return response
+
+class SelfcalNode(NodeBase, Node):
+    """A node that works from its construction on.
+
+    Parameters
+    ----------
+    name : str
+        Key of `NODE_PARAMETERS`; also the node's name.
+    **kwargs
+        For rclpy.node.Node, e.g. parameter_overrides.
+    """
+
+    def __init__(self, name: str, **kwargs: Any) -> None:
+        super().__init__(name, **kwargs)
+        self.prepare(name)
 
 
 def _descriptor(parameter: Parameter) -> ParameterDescriptor:
@@ -128,18 +195,3 @@ def _descriptor(parameter: Parameter) -> ParameterDescriptor:
         descriptor.integer_range = [IntegerRange(from_value=int(parameter.low),
                                                  to_value=int(parameter.high), step=1)]
     return descriptor
-
-
-def fill(message: Any, fields: dict[str, Any]) -> Any:
-    """Return an rclpy message with its fields set from a plain nested dict."""
-    for name, value in fields.items():
-        if isinstance(value, dict):
-            fill(getattr(message, name), value)
-        elif isinstance(value, np.ndarray):
-            current = getattr(message, name)
-            if isinstance(current, array.array):
-                value = array.array(current.typecode, value.tolist())
-            setattr(message, name, value)
-        else:
-            setattr(message, name, value)
-    return message

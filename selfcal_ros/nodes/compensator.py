@@ -5,27 +5,44 @@ import sys
 from typing import Any
 
 from selfcal_ros.nodes import names
-from selfcal_ros.nodes.base import SelfcalNode
+from selfcal_ros.nodes.managed import ManagedNode
 from selfcal_ros.nodes.running import run
 from selfcal_ros.sessions.compensating import CompensatingSession
+from selfcal_ros.sessions.ports import Diagnosis
 
 
-class CompensatorNode(SelfcalNode):
+class CompensatorNode(ManagedNode):
     """Publishes stage/corrected_joint_states: each sample with the stage's error taken off."""
 
     def __init__(self, **kwargs: Any) -> None:
+        self.session: CompensatingSession | None = None
         super().__init__("compensator", **kwargs)
-        self.session = CompensatingSession(self.values)
+
+    def configure(self) -> None:
+        """Make the session, with the map of a file if one is named."""
+        self.session = CompensatingSession(self.values, self.ports(lambda *_: None))
         self._corrected = self.publisher(names.CORRECTED)
+        self.alone_on += [names.CORRECTED.name]
+
+    def activate(self) -> None:
+        """Listen to the maps and to the encoder."""
+        self.subscribe(names.SUMMARY, self.session.take_summary)
         self.subscribe(names.ERROR_MAP, self.session.take_map)
         self.subscribe(names.ENCODER_BEST_EFFORT, self._on_sample)
-        self.create_timer(1.0, lambda: self.diagnose(self.session.diagnosis()))
+
+    def take_down(self) -> None:
+        """Forget the map."""
+        self.session = None
 
     def _on_sample(self, message: Any) -> None:
         corrected = self.session.correct(list(message.name), list(message.position))
         if corrected is not None:
             message.position = corrected
             self._corrected.publish(message)
+
+    def diagnose_session(self) -> Diagnosis:
+        """Return what the session says."""
+        return self.session.diagnosis()
 
 
 def main() -> None:

@@ -7,7 +7,7 @@ from typing import Any
 from rclpy.qos import ReliabilityPolicy
 
 from selfcal_ros.nodes import names
-from selfcal_ros.nodes.base import SelfcalNode
+from selfcal_ros.nodes.base import NodeBase
 
 
 class EncoderInput:
@@ -16,13 +16,14 @@ class EncoderInput:
     It is looked at ten times a second: a driver may come late, or come back with another offer.
     """
 
-    def __init__(self, node: SelfcalNode, callback: Callable[[Any], None], **kwargs: Any) -> None:
+    def __init__(self, node: NodeBase, callback: Callable[[Any], None], **kwargs: Any) -> None:
         self._node, self._callback, self._kwargs = node, callback, kwargs
         self._name = node.resolve_topic_name(names.ENCODER.name)
         self._topic: names.Topic | None = None
         self._subscription: Any = None
         self._match()
-        node.create_timer(0.1, self._match)
+        node.own(self, EncoderInput.close)
+        node.every(0.1, self._match)
 
     def _match(self) -> None:
         offers = self._node.get_publishers_info_by_topic(self._name)
@@ -32,7 +33,12 @@ class EncoderInput:
         topic = names.ENCODER if reliable else names.ENCODER_BEST_EFFORT
         if topic is self._topic:
             return
-        if self._subscription is not None:
-            self._node.destroy_subscription(self._subscription)
+        self.close()
         self._topic = topic
         self._subscription = self._node.subscribe(topic, self._callback, **self._kwargs)
+
+    def close(self) -> None:
+        """Hear the encoder no longer."""
+        if self._subscription is not None:
+            self._node.destroy_subscription(self._subscription)
+        self._subscription = None

@@ -3,6 +3,7 @@
 
 from dataclasses import dataclass
 
+from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from selfcal_msgs.msg import (
     CalibrationSummary,
@@ -13,6 +14,7 @@ from selfcal_msgs.msg import (
     ViewStatus,
 )
 from sensor_msgs.msg import JointState
+from std_msgs.msg import String, UInt64MultiArray
 from visualization_msgs.msg import MarkerArray
 
 from selfcal_ros.messages import topics
@@ -45,6 +47,24 @@ ERROR_MAP = Topic(topics.ERROR_MAP_TOPIC, ErrorMap, _qos(1, latched=True))
 SUMMARY = Topic(topics.SUMMARY_TOPIC, CalibrationSummary, _qos(1, latched=True))
 MAP_MARKERS = Topic(topics.MAP_MARKERS_TOPIC, MarkerArray, _qos(1, latched=True))
 CORRECTED = Topic(topics.CORRECTED_TOPIC, JointState, _qos(100, reliable=False))
+
+# below the node's own name (~/)
+HEALTH = Topic("health", DiagnosticStatus, _qos(1, latched=True))
+RECEIVED = Topic("received", UInt64MultiArray, _qos(1, latched=True))
+"""The collector's counts of encoder samples, detections and commands, for the pace of a player."""
+SOLVED = Topic("solved", String, _qos(1, latched=True))
+"""The solver's fingerprint of the readings behind what it publishes."""
+
+
+def of_node(node: str, topic: Topic) -> Topic:
+    """Return the topic below a node's own name as others in its namespace see it."""
+    return Topic(f"{node}/{topic.name}", topic.type, topic.qos)
+
+
+def private(topic: Topic) -> Topic:
+    """Return the topic as the node itself names it."""
+    return Topic(f"~/{topic.name}", topic.type, topic.qos)
+
 
 INPUTS = (ENCODER, DETECTIONS, COMMAND)
 RESULTS = (STATUS, MEASUREMENT, ERROR_MAP, SUMMARY, CORRECTED)

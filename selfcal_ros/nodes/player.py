@@ -5,7 +5,6 @@ import time
 from pathlib import Path
 from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.duration import Duration
 
 from selfcal_ros.bagio.playlist import Playlist
@@ -42,7 +41,7 @@ class Player:
         self.sent = dict.fromkeys(KINDS.values(), 0)
         self.heard: dict[str, int] | None = None
         self._at, self._began = 0, None
-        node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 50)
+        node.subscribe(names.of_node("measurement_collector", names.RECEIVED), self._on_received)
 
     @property
     def total(self) -> int:
@@ -87,14 +86,9 @@ class Player:
             return self._at < WINDOW + UNHEARD_RATE * (time.monotonic() - self._began) / 2
         return self._at - sum(self.heard.values()) < WINDOW
 
-    def _on_diagnostics(self, message: Any) -> None:
-        own = self.node.get_namespace().strip("/")
-        for status in message.status:
-            if status.name.rpartition("/")[0] != own:
-                continue  # the collector of another cell
-            values = {item.key: item.value for item in status.values}
-            if "encoder_received" in values:
-                self.heard = {kind: int(values[f"{kind}_received"]) for kind in self.sent}
+    def _on_received(self, message: Any) -> None:
+        if len(message.data) == len(self.sent):
+            self.heard = dict(zip(self.sent, map(int, message.data), strict=True))
 
     def drain(self) -> None:
         """Wait until everything has been acknowledged."""

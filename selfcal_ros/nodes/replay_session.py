@@ -13,12 +13,12 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.task import Future
 from selfcal_msgs.srv import SaveMap
 from std_srvs.srv import Trigger
 
 from selfcal_ros.errors import ExitCode, SelfcalError
+from selfcal_ros.nodes import names
 from selfcal_ros.nodes.base import SelfcalNode
 from selfcal_ros.nodes.player import Player
 from selfcal_ros.nodes.running import run
@@ -41,8 +41,8 @@ class ReplaySession(SelfcalNode):
         self._deadline = time.monotonic() + PATIENCE_S
         self._said = 0.0
         self._digest, self._solved = "", None
-        self.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 50)
-        self.create_timer(0.002, self._step)
+        self.subscribe(names.of_node("solver", names.SOLVED), self._on_solved)
+        self.every(0.002, self._step)
 
     def _step(self) -> None:
         if self.finished.done():
@@ -51,6 +51,8 @@ class ReplaySession(SelfcalNode):
             self._act()
         except SelfcalError as error:
             self._end(str(error), error.exit_code)
+        except Exception as error:  # the command waits for an end
+            self._end(f"{type(error).__name__}: {error}", ExitCode.INTERNAL)
 
     def _go(self, act: Callable[[], None]) -> None:
         self._act, self._deadline = act, time.monotonic() + PATIENCE_S
@@ -108,11 +110,8 @@ class ReplaySession(SelfcalNode):
         elif self._late():
             self._end("the solver did not receive the readings of all views", ExitCode.INTERNAL)
 
-    def _on_diagnostics(self, message: Any) -> None:
-        for status in message.status:
-            for item in status.values:
-                if item.key == "readings":
-                    self._solved = item.value
+    def _on_solved(self, message: Any) -> None:
+        self._solved = message.data
 
     def _end(self, message: str, code: ExitCode) -> None:
         if message:

@@ -54,6 +54,7 @@ def run(make_node: Callable[[], Node], argv: list[str] | None = None) -> int:
     try:
         _init(argv)
         node = make_node()
+        getattr(node, "autostart", lambda: None)()
         finished = getattr(node, "finished", None)
         if finished is not None:
             finished.add_done_callback(lambda _: stop.set_result(None))

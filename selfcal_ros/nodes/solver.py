@@ -2,35 +2,61 @@
 """solver: readings of the views in, calibrated error map out."""
 
 import sys
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
 from selfcal_msgs.srv import LoadMap, SaveMap
 
-from selfcal_ros.errors import SelfcalError
 from selfcal_ros.nodes import names
-from selfcal_ros.nodes.base import SelfcalNode, fill
+from selfcal_ros.nodes.filling import fill
+from selfcal_ros.nodes.managed import ManagedNode
 from selfcal_ros.nodes.markers import map_markers
 from selfcal_ros.nodes.running import run
-from selfcal_ros.sessions.solving import SolvingSession
+from selfcal_ros.sessions.ports import Diagnosis
+from selfcal_ros.sessions.solving import Outcome, SolvingSession, solve
+
+TICK_S = 0.02
 
 
-class Solver(SelfcalNode):
-    """Solves whenever a view's readings arrive; publishes ErrorMap and CalibrationSummary."""
+class Solver(ManagedNode):
+    """Solves whenever a view's readings arrive; publishes ErrorMap and CalibrationSummary.
+
+    Solving runs in a thread beside the executor; what arrives meanwhile is solved next, together.
+    """
 
     def __init__(self, **kwargs: Any) -> None:
+        self.session: SolvingSession | None = None
+        self._worker: ThreadPoolExecutor | None = None
+        self._running: Future[Outcome] | None = None
         super().__init__("solver", **kwargs)
+
+    def configure(self) -> None:
+        """Make the session, the worker and the publishers."""
         self.session = SolvingSession(self.values, self.ports(self._publish))
+        self._worker = ThreadPoolExecutor(1, thread_name_prefix="solver")
         self._outputs = {"map": self.publisher(names.ERROR_MAP),
                          "summary": self.publisher(names.SUMMARY)}
         self._markers = self.publisher(names.MAP_MARKERS)
+        self._solved = self.publisher(names.private(names.SOLVED))
+        self.alone_on += [names.ERROR_MAP.name, names.MEASUREMENT.name]
+
+    def activate(self) -> None:
+        """Listen to the collector and to the commands."""
         self.subscribe(names.MEASUREMENT, self.session.take_measurement)
         self.subscribe(names.COMMAND, self.session.take_command)
-        self.create_timer(0.05, self.guarded(self._on_timer))
-        self.create_timer(1.0, self._report)
-        self.create_service(SaveMap, "~/save_map", lambda request, response: self.trigger(
-            request, response, lambda: self._save(request.path)))
-        self.create_service(LoadMap, "~/load_map", lambda request, response: self.trigger(
-            request, response, lambda: self.session.load(request.path)))
+        self.every(TICK_S, self._on_timer)
+        self.service(LoadMap, "~/load_map", lambda request: self.session.load(request.path))
+        self.service(SaveMap, "~/save_map", self._save)
+
+    def take_down(self) -> None:
+        """Forget the readings; what still runs in the worker is not waited for."""
+        if self._worker is not None:
+            self._worker.shutdown(wait=False, cancel_futures=True)
+        self.session = self._worker = self._running = None
+
+    def close(self) -> None:
+        """Let the worker end."""
+        self.take_down()
 
     def _publish(self, output: str, fields: dict[str, Any]) -> None:
         if output == "markers":
@@ -40,19 +66,36 @@ class Solver(SelfcalNode):
             publisher.publish(fill(publisher.msg_type(), fields))
 
     def _on_timer(self) -> None:
+        if self._running is not None and self._running.done():
+            self._take()
+        if self._running is None:
+            self._begin()
+
+    def _begin(self) -> None:
+        job = self.session.next_job()
+        self._running = self._worker.submit(solve, job) if job is not None else None
+
+    def _take(self) -> None:
+        outcome, self._running = self._running.result(), None
         try:
-            if self.session.tick():
-                self._report()
-        except SelfcalError:
-            self._report()
-            raise
+            self.session.take(outcome)
+        finally:
+            self._solved.publish(names.SOLVED.type(data=self.session.digest()))
 
-    def _save(self, path: str) -> str:
-        self._on_timer()
-        return self.session.save(path)
+    def _save(self, request: Any, response: Any) -> str:
+        """Save the map of the newest readings: what runs or waits is solved first."""
+        while True:
+            if self._running is not None:
+                self._take()
+            self._begin()
+            if self._running is None:
+                break
+        message, response.path = self.session.save(request.path)
+        return message
 
-    def _report(self) -> None:
-        self.diagnose(self.session.diagnosis())
+    def diagnose_session(self) -> Diagnosis:
+        """Return what the session says."""
+        return self.session.diagnosis()
 
 
 def main() -> None:

@@ -14,7 +14,8 @@ from selfcal_ros.collection.messages import Command, Detection, EncoderSample, P
 from selfcal_ros.messages import to_model
 from selfcal_ros.model.view import Plan, View
 from selfcal_ros.nodes import names
-from selfcal_ros.nodes.base import SelfcalNode, fill
+from selfcal_ros.nodes.base import SelfcalNode
+from selfcal_ros.nodes.filling import fill
 from selfcal_ros.nodes.running import run
 from selfcal_ros.sessions.ports import Diagnosis, Level
 from selfcal_ros.sessions.sequencing import load_plan
@@ -43,10 +44,12 @@ class StageSimulator(SelfcalNode):
         self._encoder = self.publisher(names.ENCODER)
         self._detection = self.publisher(names.DETECTIONS)
         self.subscribe(names.COMMAND, self._on_command)
-        self.create_timer(0.005, self.guarded(self._on_timer))
+        self.every(0.005, self._on_timer)
         self._sent = {"encoder_sent": 0, "detection_sent": 0}
-        self.create_timer(1.0, lambda: self.diagnose(Diagnosis(
-            Level.OK, "at home" if self._next is None else "measuring", self._sent)))
+
+    def diagnosis(self) -> Diagnosis:
+        """Return what it does and how much it has sent."""
+        return Diagnosis(Level.OK, "at home" if self._next is None else "measuring", self._sent)
 
     def _on_command(self, message: Any) -> None:
         command = to_model.command(message)

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The session of measurement_collector: what is published of the readings, and when."""
 
+import math
 from collections import Counter
 from typing import Any
 
@@ -11,7 +12,12 @@ from selfcal_ros.collection.reasons import advice
 from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.messages import from_model, to_model
 from selfcal_ros.model.readings import Measurements
+from selfcal_ros.sessions.clocks import ClockWatch
+from selfcal_ros.sessions.health import Rate, merged
 from selfcal_ros.sessions.ports import Diagnosis, Level, Ports
+
+HEARD_S = 1.0
+"""Time without an encoder sample after which the encoder is not heard."""
 
 
 class CollectingSession:
@@ -32,6 +38,12 @@ class CollectingSession:
         self._published: dict[int, str] = {}
         self._run, self._advised = ("", ""), set()
         self._warned: set[tuple[int | None, str]] = set()
+        self._findings: list[str] = []
+        self._last: Command | None = None  # by its stamp
+        self._clock = ClockWatch(values["clock_limit"])
+        self._encoder_rate = Rate(ports.now_s)
+        self._encoder_s = float("-inf")
+        self._noise: tuple[float, float] = (math.nan, math.nan)
         self.missed: dict[tuple[str, int], str] = {}  # views that began before this node
         self._placed: set[tuple[str, int]] = set()
         self._problem = ""
@@ -39,14 +51,17 @@ class CollectingSession:
 
     def take_encoder(self, message: Any) -> None:
         """Take a sensor_msgs/JointState."""
+        stamp, self._encoder_s = to_model.stamp_ns(message), self._ports.now_s()
         self.collector.add_encoder(EncoderSample(
-            to_model.stamp_ns(message), tuple(message.name), tuple(message.position),
-            tuple(message.velocity)))
+            stamp, tuple(message.name), tuple(message.position), tuple(message.velocity)))
+        self._encoder_rate.add(stamp)
+        self._clock.data(stamp, self._ports.now_ns(), self._encoder_s)
         self._dirty = True
 
     def take_detection(self, message: Any) -> None:
         """Take a selfcal_msgs/MarkDetection."""
         self.collector.add_detection(to_model.detection(message))
+        self._clock.data(to_model.stamp_ns(message), self._ports.now_ns(), self._ports.now_s())
         self._dirty = True
 
     def take_command(self, message: Any, is_older: bool) -> None:
@@ -54,6 +69,8 @@ class CollectingSession:
         try:
             command = to_model.command(message)
             self.collector.add_command(command)
+            self._clock.command(command.stamp_ns, self._ports.now_ns(), is_older=is_older)
+            self._note_newest(command)
             self._note_missed(command, is_older=is_older)
         except InputError:
             self.collector.refuse_command()
@@ -61,6 +78,10 @@ class CollectingSession:
         finally:
             self._next_status = 0.0
             self._dirty = True
+
+    def _note_newest(self, command: Command) -> None:
+        if self._last is None or command.stamp_ns >= self._last.stamp_ns:
+            self._last = command
 
     def _note_missed(self, command: Command, *, is_older: bool) -> None:
         """Say which views began before this node: their detections up to now are not here."""
@@ -122,18 +143,22 @@ class CollectingSession:
                     view, measurements, stamp, frame_id))
             # after the readings: what is called complete can be solved
             if current or index == max(progress) or final:
-                self._ports.publish("status", from_model.view_status(
-                    view, timeline.plan_id, stamp, frame_id, run_id=timeline.run_id))
+                fields = from_model.view_status(view, timeline.plan_id, stamp, frame_id,
+                                                 run_id=timeline.run_id)
+                fields["complete"] &= not self._clock.ahead  # its detections may be of another view
+                self._ports.publish("status", fields)
             if closed or final:
                 self._advise(index, view)
 
     def _warn(self, measurements: Measurements, progress: dict[int, ViewProgress]) -> None:
         """Say once for each view and reason that most of its detections were rejected."""
+        self._findings = []
         for index, finding in self.collector.findings(measurements, progress).items():
+            where = f"view '{progress[index].view.name}': " if index is not None else ""
+            self._findings.append(f"{where}{finding}")
             if (index, finding.reason) not in self._warned:
                 self._warned.add((index, finding.reason))
-                where = f"view '{progress[index].view.name}': " if index is not None else ""
-                self._ports.say(Level.WARN, f"{where}{finding}")
+                self._ports.say(Level.WARN, self._findings[-1])
 
     def _advise(self, index: int, view: ViewProgress) -> None:
         """Say once for each view that is over what would mend its rejections."""
@@ -150,12 +175,22 @@ class CollectingSession:
         for view in progress.values():
             self._rejected.update(view.readings.rejected)
         index = self.collector.timeline.intervals[-1].view_index
+        for number in sorted(progress):  # of the last view that tells it
+            told = progress[number].readings
+            self._noise = tuple(new if math.isfinite(new) else old for new, old in zip(
+                (told.sigma_xy, told.sigma_theta), self._noise, strict=True))
         self._state = "between views" if index is None else (
             f"view '{progress[index].view.name}': {100 * progress[index].coverage:.0f} % of the "
             "marks read")
 
-    def diagnosis(self) -> Diagnosis:
-        """Return what the node says of itself."""
+    def diagnosis(self, *, detections_matched: bool) -> Diagnosis:
+        """Return what the node says of itself.
+
+        Parameters
+        ----------
+        detections_matched : bool
+            Whether a publisher of detections has been found.
+        """
         received = {f"{kind}_received": n for kind, n in self.collector.received.items()}
         missed = ", ".join(self.missed.values())
         state = self._problem or self._state
@@ -163,6 +198,53 @@ class CollectingSession:
         stored = self.collector.storage_problem
         state += f"; {stored}" if stored else ""
         bad = missed or self._problem or self.collector.unusable or stored
-        return Diagnosis(Level.WARN if bad else Level.OK, state, {
-            **received, "views": len(self._published),
+        main = Diagnosis(Level.WARN if bad else Level.OK, state, {
+            **received, "views": len(self._published), **self._newest(),
+            "detections_matched": "yes" if detections_matched else "no",
             **{f"rejected {reason}": n for reason, n in sorted(self._rejected.items())}})
+        found = Diagnosis(Level.WARN if self._findings else Level.OK, "; ".join(self._findings))
+        return merged(main, [
+            found, self._clock.diagnosis(),
+            self._encoder(), self._repeatability()])
+
+    def _newest(self) -> dict[str, Any]:
+        """Return where the run is: what a sequencer that was restarted takes up."""
+        command = self._last
+        if command is None:
+            return {}
+        return {"plan_id": command.plan_id, "run_id": command.run_id,
+                "phase": command.phase.name, "view": command.view_index,
+                "view_name": command.view.name if command.view else "",
+                "command_stamp": command.stamp_ns}
+
+    def _encoder(self) -> Diagnosis:
+        """Return rate and largest gap of the encoder, WARN beyond the limits."""
+        heard = self._ports.now_s() - self._encoder_s <= HEARD_S
+        gap = self._encoder_rate.take_gap_ns() * 1e-9
+        rate, least = self._encoder_rate.per_second, self._values["encoder_rate_min"]
+        values = {"encoder_heard": "yes" if heard else "no", "encoder_rate": f"{rate:.0f}",
+                  "encoder_gap_s": f"{gap:.4f}"}
+        measuring = self._last is not None and self._last.phase == Phase.MEASURE
+        problems = []
+        if measuring and not heard:
+            problems.append("the encoder is not heard")
+        elif measuring and gap > self._values["max_encoder_gap"]:
+            problems.append(f"a gap of {gap:.3g} s between encoder samples: exposures in it are "
+                            "rejected")
+        elif measuring and rate < least:
+            problems.append(f"{rate:.0f} encoder samples a second, {least:g} are wanted")
+        return Diagnosis(Level.WARN if problems else Level.OK, "; ".join(problems), values)
+
+    def _repeatability(self) -> Diagnosis:
+        """Return the repeatability of the newest view, WARN beyond the limits."""
+        values, problems = {}, []
+        for value, name, scale, unit in ((self._noise[0], "repeatability_xy", 1e6, "um"),
+                                         (self._noise[1], "repeatability_theta", 1.0, "rad")):
+            limit = self._values[f"{name}_limit"]
+            if math.isfinite(value):
+                values[f"{name}_{unit}"] = f"{value * scale:.4g}"
+            if 0 < limit < value:
+                problems.append(f"{name.replace('_', ' ')} is {value * scale:.3g} {unit}, the "
+                                f"limit {limit * scale:.3g} {unit}")
+        return Diagnosis(Level.WARN if problems else Level.OK, "; ".join(problems), values)
+

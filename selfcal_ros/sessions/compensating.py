@@ -2,6 +2,7 @@
 """The session of compensator: which map is used, and what is done with a sample."""
 
 import math
+from pathlib import Path
 from typing import Any
 
 from selfcal_ros.compensation.compensator import Compensator
@@ -10,33 +11,85 @@ from selfcal_ros.files import read_json
 from selfcal_ros.messages import to_model
 from selfcal_ros.model.error_map import ErrorMap
 from selfcal_ros.model.result import result_from_dict
-from selfcal_ros.sessions.ports import Diagnosis, Level
+from selfcal_ros.sessions.ports import Diagnosis, Level, Ports
+from selfcal_ros.sessions.verdicts import is_qualified
 
 
 class CompensatingSession:
-    """Corrects samples by the newest map; counts what it cannot correct.
+    """Corrects samples by the newest map that may be used; counts what it cannot correct.
+
+    With ``require_qualified`` a map counts once the summary of the same run and stamp says that
+    it is qualified and that all planned views are behind it. A map takes over between two
+    samples, as a whole.
 
     Parameters
     ----------
     values : dict
         Values of the compensator's parameters.
+    ports : Ports
+        Log and clocks.
     """
 
-    def __init__(self, values: dict[str, Any]) -> None:
-        self._values = values
+    def __init__(self, values: dict[str, Any], ports: Ports) -> None:
+        self._values, self._ports = values, ports
         self.compensator: Compensator | None = None
         self.counts = {"corrected": 0, "without_map": 0, "refused": 0}
+        self._map: Any = None  # newest message of each, until they are judged together
+        self._summary: Any = None
+        self._waits = ""
+        self._used, self._since_s, self._map_ns = "", 0.0, 0
         if values["map"]:
-            path = values["map"]
-            self._load(result_from_dict(read_json(path), path).error_map)
+            self._load_file(values["map"])
+
+    def _load_file(self, path: str) -> None:
+        result = result_from_dict(read_json(path), path)
+        if self._values["require_qualified"] and not is_qualified(result):
+            raise InputError(path, "the map is not qualified", "measure again, or set "
+                             "require_qualified to false")
+        self._use(result.error_map, f"{Path(path).resolve()}, plan {result.plan_id}", 0)
 
     def take_map(self, message: Any) -> None:
-        """Use the map of a selfcal_msgs/ErrorMap from now on."""
-        self._load(to_model.error_map(message))
+        """Take a selfcal_msgs/ErrorMap: use it, now or once its summary says that it is good."""
+        self._map = message
+        self._judge()
 
-    def _load(self, error_map: ErrorMap) -> None:
+    def take_summary(self, message: Any) -> None:
+        """Take the selfcal_msgs/CalibrationSummary that belongs to a map."""
+        self._summary = message
+        self._judge()
+
+    def _judge(self) -> None:
+        if self._map is None:
+            return
+        waits = self._doubt() if self._values["require_qualified"] else ""
+        if waits != self._waits and waits:
+            self._ports.say(Level.OK, f"the newest map is not used: {waits}")
+        self._waits = waits
+        if not waits:
+            message, self._map = self._map, None
+            self._use(to_model.error_map(message), _source(message),
+                      to_model.stamp_ns(message))
+
+    def _doubt(self) -> str:
+        """Return why the newest map must not be used; "" if it may."""
+        message, summary = self._map, self._summary
+        if not message.qualified:
+            return f"{_source(message)} is not qualified"
+        if summary is None or summary.run_id != message.run_id or (
+                to_model.stamp_ns(summary) != to_model.stamp_ns(message)):
+            return f"no selfcal/summary tells yet whether {_source(message)} is complete"
+        if not summary.qualified:
+            return f"{_source(message)} is not qualified: {summary.state}"
+        if summary.views_done < summary.views_planned:
+            return (f"{_source(message)} is of {summary.views_done} of {summary.views_planned} "
+                    "views")
+        return ""
+
+    def _use(self, error_map: ErrorMap, source: str, stamp_ns: int) -> None:
         self.compensator = Compensator(error_map, method=self._values["interpolation"],
                                        outside=self._values["outside"])
+        self._used, self._since_s, self._map_ns = source, self._ports.now_s(), stamp_ns
+        self._ports.say(Level.OK, f"correcting by the map of {source} from now on")
 
     def correct(self, names: list[str], positions: list[float]) -> list[float] | None:
         """Return the positions of all joints, stage joints corrected; None if it cannot be told.
@@ -79,6 +132,18 @@ class CompensatingSession:
 
     def diagnosis(self) -> Diagnosis:
         """Return what the node says of itself."""
+        waits = f"; not used: {self._waits}" if self._waits else ""
         if self.compensator is None:
-            return Diagnosis(Level.WARN, "no error map yet", self.counts)
-        return Diagnosis(Level.OK, "correcting", self.counts)
+            return Diagnosis(Level.WARN, f"no error map yet{waits}", self.counts)
+        age = (self._ports.now_ns() - self._map_ns) * 1e-9 if self._map_ns else math.nan
+        values = self.counts | {
+            "map": self._used, "since_s": f"{self._ports.now_s() - self._since_s:.0f}",
+            **({"map_age_s": f"{age:.0f}"} if math.isfinite(age) else {})}
+        if 0 < self._values["max_map_age"] < age:
+            return Diagnosis(Level.WARN, f"the map is {age:.0f} s old: calibrate again", values)
+        return Diagnosis(Level.OK, f"correcting by the map of {self._used}{waits}", values)
+
+
+def _source(message: Any) -> str:
+    """Return plan and run of a map, for people."""
+    return f"plan {message.plan_id}" + (f", run {message.run_id}" if message.run_id else "")

@@ -1,16 +1,26 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The session of pose_sequencer: time-outs, redos, other publishers of commands, the goal."""
+"""The session of pose_sequencer: runs, who is missing, time-outs, redos, other sequencers."""
 
 from collections.abc import Callable
 from dataclasses import replace
+from operator import ge
 from typing import Any
 
-from selfcal_ros.collection.messages import Command
+import numpy as np
+
+from selfcal_ros.collection.collector import expected_marks
+from selfcal_ros.collection.messages import Command, Phase
 from selfcal_ros.collection.sequencer import ENDED, Sequencer, State
+from selfcal_ros.errors import InputError
 from selfcal_ros.files import read_yaml
 from selfcal_ros.messages import from_model, to_model
 from selfcal_ros.model.view import Plan, View, plan_from_dict
+from selfcal_ros.sessions.health import Presence
 from selfcal_ros.sessions.ports import Diagnosis, Level, Ports
+from selfcal_ros.sessions.stalls import StallWatch, missing_marks
+
+PATIENCE_S = 3.0
+"""Time without a sign of life after which a node is missing; it tells its health each second."""
 
 
 def load_plan(path: str) -> Plan:
@@ -27,29 +37,31 @@ class SequencingSession:
         Values of the sequencer's parameters.
     ports : Ports
         Publishes ``command``.
-    collectors : callable
-        Returns how many collectors are seen.
     """
 
-    def __init__(self, values: dict[str, Any], ports: Ports,
-                 collectors: Callable[[], int]) -> None:
-        self._values, self._ports, self._collectors = values, ports, collectors
+    def __init__(self, values: dict[str, Any], ports: Ports) -> None:
+        self._values, self._ports = values, ports
         path = values["plan"]
         self.machine = Sequencer(load_plan(path) if path else None)
+        self.presence = Presence(ports.now_s, PATIENCE_S)
         self.waiting = values["auto_start"]
-        self.coverage = 0.0
+        self.run_id, self.coverage = "", 0.0
         self.on_end: Callable[[], None] | None = None
         self._own: set[tuple] = set()
+        self._fresh = True  # has neither sent nor followed a command
         self._deadline, self._confirm_at, self._redos = 0.0, 0.0, 0
         self._commanded_ns = 0
-        self._measured: dict[str, dict[int, str]] = {}
+        self._measured: dict[tuple[str, str], dict[int, str]] = {}
+        self._stall = StallWatch(values["stall_time"], ports.now_s)
+        self._status: Any = None  # newest of the current view
+        self._stalled = ""
         if self.waiting:
             self.machine.need_plan()
 
     @property
     def ended(self) -> bool:
-        """Whether no plan runs."""
-        return self.machine.state in ENDED
+        """Whether no plan runs or waits."""
+        return self.machine.state in ENDED and not self.waiting
 
     @property
     def current(self) -> View | None:
@@ -57,52 +69,116 @@ class SequencingSession:
         busy = self.machine.state in (State.PLACING, State.MEASURING)
         return self.machine.plan.views[self.machine.index] if busy else None
 
+    def missing(self) -> list[str]:
+        """Return who is needed for a run and is not there."""
+        if not self._values["start_checks"]:
+            return []
+        collector = self.presence.of("measurement_collector")
+        found = []
+        if collector is None:
+            found.append("measurement_collector (no sign of life)")
+        else:
+            if collector.values.get("encoder_heard") != "yes":
+                found.append("the encoder (measurement_collector hears no sample)")
+            if collector.values.get("detections_matched") != "yes":
+                found.append("a publisher of stage/mark_detections")
+        if self.presence.of("solver") is None:
+            found.append("solver (no sign of life)")
+        return found
+
     def begin(self) -> str:
-        """Start the plan; say what is known of it and who is missing."""
-        self.waiting = False
-        answer = self.act(self.machine.start)
-        known = self._measured.get(self.machine.plan.plan_id, {})
-        if known:
-            views = ", ".join(known[index] for index in sorted(known))
-            answer += f"; measured already: {views} (skip_view keeps a view as it is)"
-        if not self._collectors():
-            answer += "; no measurement_collector is seen yet: make sure that one runs"
-        self._ports.say(Level.OK, answer)
+        """Start the plan, or take up its run; wait for who is missing and say for whom."""
+        if self.machine.state not in ENDED:
+            raise InputError("pose_sequencer", f"cannot start while {self.machine.state}",
+                             "abort the plan first")
+        self.machine.need_plan()
+        missing = self.missing()
+        self.waiting = bool(missing)
+        if missing:
+            answer = f"waiting for {', '.join(missing)}; starts by itself when they are there"
+        else:
+            answer = self._resume() or self._start()
+        self._ports.say(Level.WARN if missing else Level.OK, answer)
         return answer
+
+    def _start(self) -> str:
+        self.run_id = ""
+        return self.act(self.machine.start)
+
+    def _resume(self) -> str:
+        """Go on where the collector is in an unfinished run of this plan; "" if there is none."""
+        collector = self.presence.of("measurement_collector")
+        plan = self.machine.plan
+        if not (self._values["resume"] and self._fresh and collector):
+            return ""
+        told = collector.values
+        index = int(told["view"]) if told.get("view", "").isdecimal() else len(plan.views)
+        phase = told.get("phase", "")
+        if (told.get("plan_id") != plan.plan_id or not told.get("run_id")
+                or phase not in ("PLACE", "MEASURE") or index >= len(plan.views)
+                or told.get("view_name") != plan.views[index].name):
+            return ""
+        self.run_id = told["run_id"]
+        command = self.machine.resume(index, Phase[phase])
+        self._send([command], stamp_ns=int(told["command_stamp"]))  # as it was: it is latched anew
+        known = self._measured.get((plan.plan_id, self.run_id), {})
+        names = ", ".join(known[number] for number in sorted(known))
+        return (f"took up run {self.run_id} in view '{plan.views[index].name}', {phase}"
+                + (f"; measured already: {names}" if names else ""))
 
     def act(self, request: Callable[[], list[Command]]) -> str:
         """Carry out a request to the state machine and say where that leads."""
         self._send(request())
         return f"{self.machine.state}: view {self.machine.index}"
 
-    def abort(self) -> None:
-        """Give the plan up if one runs."""
-        if not self.ended:
-            self._send(self.machine.abort())
+    def give_up(self) -> str:
+        """Abort the plan that runs, or stop waiting for who is missing."""
+        if self.waiting:
+            self.waiting = False
+            self._end()
+            return f"{self.machine.state}: no longer waiting"
+        return self.act(self.machine.abort)
 
     def take_measurement(self, message: Any) -> None:
-        """Note a view that has been measured."""
-        self._measured.setdefault(message.plan_id, {})[message.view_index] = message.view_name
+        """Note a view of this plan that has been measured to its end."""
+        plan = self.machine.plan
+        if plan is None or message.plan_id != plan.plan_id or (
+                to_model.artifact_of(message) != plan.artifact):
+            return
+        view = to_model.view_of(message, repeats=message.repeats, grid=message.grid,
+                                  angular=message.angular)
+        done = [np.count_nonzero(np.asarray(counts) >= message.repeats)
+                for counts in (message.count, message.count_theta)]
+        views = self._measured.setdefault((message.plan_id, message.run_id), {})
+        if all(map(ge, done, expected_marks(plan.artifact, view))):
+            views[message.view_index] = message.view_name
+        else:
+            views.pop(message.view_index, None)
 
     def take_command(self, message: Any) -> None:
         """Follow a command that somebody else published."""
         if _key(to_model.command(message)) in self._own:
             return
         said = "another publisher sends view commands: following them; abort ends that"
-        if self.ended:
+        if self.machine.state in ENDED:
             self._ports.say(Level.OK, said)
         elif self.machine.state is not State.FOLLOWING:  # its own plan stops here
             self._ports.say(Level.WARN, said)
         self.machine.foreign_command()
+        self.waiting = self._fresh = False
         self._end()
 
     def take_status(self, message: Any) -> None:
         """Note how far the view is; move on when it is complete."""
         if to_model.stamp_ns(message) < self._commanded_ns:
             return  # of before the command: a redone view would look complete
+        if message.run_id and message.run_id != self.run_id:
+            return  # of another run
         expected = message.grid_expected + message.angular_expected
         if message.view_index == self.machine.index and expected:
             self.coverage = (message.grid_done + message.angular_done) / expected
+            self._status = message
+            self._stall.take(message.detections_used + message.detections_rejected)
         moved_on = self.machine.status(message.plan_id, message.view_index, message.complete)
         self._redos = 0 if moved_on else self._redos
         self._send(moved_on)
@@ -110,36 +186,71 @@ class SequencingSession:
     def tick(self) -> None:
         """Do what is due by the clock."""
         now = self._ports.now_s()
-        if self.waiting and self._collectors():
+        if self.waiting and not self.missing():
             self.begin()
         if (self.machine.state is State.PLACING and self._values["auto_confirm"]
                 and now >= self._confirm_at):
             self._send(self.machine.confirm())
-        timed_out = self._values["view_timeout"] > 0 and now >= self._deadline
-        if self.machine.state is State.MEASURING and timed_out:
-            self._ports.say(Level.WARN, f"view {self.current.name} is not complete in time")
-            again = self._redos < self._values["max_redos"]
-            self._redos = self._redos + 1 if again else 0
-            self._send(self.machine.redo() if again else self.machine.skip())
+        if self.machine.state is State.MEASURING:
+            self._tell_stall()
+            if self._values["view_timeout"] > 0 and now >= self._deadline:
+                self._time_out()
+
+    def _tell_stall(self) -> None:
+        if not self._stall.stalled:
+            self._stalled = ""
+        elif not self._stalled:
+            self._stalled = self._stall_line()
+            self._ports.say(Level.WARN, self._stalled)
+
+    def _stall_line(self) -> str:
+        status, name = self._status, self.current.name
+        if status is None or not status.detections_used + status.detections_rejected:
+            line = f"view '{name}' stalls: no detection has come since MEASURE"
+        else:
+            missing = missing_marks(status) or "nothing, but it is not called complete"
+            line = f"view '{name}' stalls at {100 * self.coverage:.1f} %: missing {missing}"
+        collector = self.presence.of("measurement_collector")
+        if collector is None:
+            return line + "; measurement_collector gives no sign of life"
+        return line + (f"; measurement_collector: {collector.message}" if collector.level else
+                       "; redo_view measures it again, skip_view goes on without")
+
+    def _time_out(self) -> None:
+        self._ports.say(Level.WARN, f"view {self.current.name} is not complete in time")
+        again = self._redos < self._values["max_redos"]
+        self._redos = self._redos + 1 if again else 0
+        self._send(self.machine.redo() if again else self.machine.skip())
 
     def diagnosis(self) -> Diagnosis:
         """Return what the node says of itself."""
-        state = "waiting for a measurement_collector" if self.waiting else str(self.machine.state)
-        return Diagnosis(Level.OK, state, {"view": self.machine.index,
-                                           "coverage": f"{self.coverage:.3f}"})
+        state, level = str(self.machine.state), Level.OK
+        if self.waiting:
+            state, level = f"waiting for {', '.join(self.missing())}", Level.WARN
+        elif self.machine.state is State.MEASURING and self._stalled:
+            state, level = self._stalled, Level.WARN
+        plan, view = self.machine.plan, self.current
+        return Diagnosis(level, state, {
+            "state": self.machine.state.name, "plan_id": plan.plan_id if plan else "",
+            "run_id": self.run_id, "view": self.machine.index,
+            "view_name": view.name if view else "", "views": len(plan.views) if plan else 0,
+            "coverage": f"{self.coverage:.3f}"})
 
-    def _send(self, commands: list[Command]) -> None:
+    def _send(self, commands: list[Command], stamp_ns: int = 0) -> None:
         for command in commands:
-            command = replace(command, stamp_ns=self._ports.now_ns())
+            stamp = stamp_ns or max(self._ports.now_ns(), self._commanded_ns + 1)
+            self.run_id = self.run_id or str(stamp)
+            command = replace(command, stamp_ns=stamp, run_id=self.run_id)
             self._own.add(_key(command))
-            self._commanded_ns = command.stamp_ns
+            self._commanded_ns, self._fresh = stamp, False
             self._ports.publish("command", from_model.command(command, self._values["frame_id"]))
             name = command.view.name if command.view else self.machine.plan.plan_id
             self._ports.say(Level.OK, f"{command.phase.name} {name}")
-            self.coverage = 0.0
+            self.coverage, self._status, self._stalled = 0.0, None, ""
+            self._stall.restart()
             self._confirm_at = self._ports.now_s() + self._values["settle_time"]
             self._deadline = self._ports.now_s() + self._values["view_timeout"]
-        if self.ended:
+        if self.machine.state in ENDED:
             self._end()
 
     def _end(self) -> None:

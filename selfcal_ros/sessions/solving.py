@@ -1,68 +1,132 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The session of solver: which readings are solved, what is published, saved and loaded."""
+"""The session of solver: which readings are solved together, what is published and saved."""
 
+from dataclasses import dataclass, field
 from typing import Any
 
 from selfcal_ros.collection.digest import readings_digest, session_digest
 from selfcal_ros.collection.parameters import solver_options
 from selfcal_ros.errors import InputError, NoDataError, NotIdentifiableError, SelfcalError
-from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.files import read_json, write_json
+from selfcal_ros.estimation.api import Options, calibrate
+from selfcal_ros.files import write_json
 from selfcal_ros.messages import from_model, to_model
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.result import (
     CalibrationResult,
     created_now,
-    result_from_dict,
     result_to_dict,
     unidentified_result,
 )
 from selfcal_ros.reporting.summary.numbers import summary_numbers
 from selfcal_ros.reporting.summary.text import state_sentence
+from selfcal_ros.sessions.map_files import read_result, result_file
 from selfcal_ros.sessions.ports import Diagnosis, Level, Ports
+from selfcal_ros.sessions.runs import Run, supersedes
+from selfcal_ros.sessions.verdicts import is_qualified
 
 ECHO_LENGTH = 128
 """Characters of a string that `ros2 topic echo` shows."""
 
 
+@dataclass(frozen=True, eq=False)
+class Job:
+    """Readings to be solved, with what identifies them; handed to a worker as a whole."""
+
+    run: Run
+    measurements: Measurements
+    options: Options
+    digest: str
+    stamp_ns: int
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """What solving a job gave; `problem` where the readings do not identify the stage, or worse."""
+
+    job: Job
+    result: CalibrationResult | None
+    problem: Exception | None
+
+
+def solve(job: Job) -> Outcome:
+    """Solve a job; needs nothing but the job, so that it can run anywhere."""
+    try:
+        return Outcome(job, calibrate(job.measurements, job.options), None)
+    except NotIdentifiableError as error:
+        return Outcome(job, unidentified_result(job.measurements, error.observability), error)
+    except Exception as error:  # told by `take`, in the thread of the session
+        return Outcome(job, None, error)
+
+
+@dataclass
+class Shown:
+    """What is published now: a result, of which run, or why there is none."""
+
+    result: CalibrationResult | None = None
+    problem: Exception | None = None
+    run: Run = field(default_factory=Run)
+    views_done: int = 0
+    stamp_ns: int = 0
+    digest: str = ""
+
+
 class SolvingSession:
-    """Solves when the readings of a view have arrived; publishes ``map`` and ``summary``.
+    """Hands out jobs when readings have arrived; publishes ``map``, ``markers``, ``summary``.
+
+    Readings of different runs are never solved together: the newest run counts, and what comes
+    later of an older one is left aside.
 
     Parameters
     ----------
     values : dict
         Values of the solver's parameters.
     ports : Ports
-        Publishes ``map``, ``markers`` (the result's map, its stamp in ns) and ``summary``.
+        Publishes ``map``, ``summary`` and ``markers`` (the map and its stamp in ns).
     """
 
     def __init__(self, values: dict[str, Any], ports: Ports) -> None:
         self._values, self._ports = values, ports
         self._messages: dict[int, Any] = {}
-        self._plan_id: str | None = None
-        self._planned: dict[str, int] = {}
-        self._digest = ""
+        self._run = Run()
+        self._planned: dict[Run, int] = {}
         self._stale = False
-        self.result: CalibrationResult | None = None
-        self._problem: SelfcalError | None = None
+        self._left_aside = 0
+        self.shown = Shown()
+
+    @property
+    def result(self) -> CalibrationResult | None:
+        """The result that is published."""
+        return self.shown.result
 
     def take_command(self, message: Any) -> None:
         """Learn from a view command how many views are planned."""
-        known = self._planned.get(message.plan_id, 0)
-        self._planned[message.plan_id] = max(known, message.views_planned)
-        if message.plan_id == self._plan_id and message.views_planned > known:
+        run = Run(message.plan_id, message.run_id)
+        known = self._planned.get(run, 0)
+        self._planned[run] = max(known, message.views_planned)
+        if run == self._run and message.views_planned > known:
             self._stale = True  # the summary says how many views are planned
 
     def take_measurement(self, message: Any) -> None:
-        """Take the readings of a view."""
-        if message.plan_id != self._plan_id:
-            self._plan_id, self._messages = message.plan_id, {}
+        """Take the readings of a view; those of an older run are left aside.
+
+        Raises
+        ------
+        InputError
+            If the message contradicts itself.
+        """
+        to_model.view_readings(message)
+        run = Run(message.plan_id, message.run_id)
+        if run != self._run:
+            if self._messages and not supersedes(run, self._run):
+                self._left_aside += 1
+                return
+            self._run, self._messages = run, {}
         # one collector, delivered in order: its newest word on a view holds
         self._messages[message.view_index] = message
         self._stale = True
 
     def measurements(self) -> Measurements:
-        """Return the readings of all views so far."""
+        """Return the readings of all views of the run so far."""
         if not self._messages:
             raise NoDataError("selfcal/view_measurement", "no view has been measured",
                               "start the collector and measure")
@@ -75,110 +139,122 @@ class SolvingSession:
         return Measurements(ordered[0].plan_id, artifacts.pop(),
                             tuple(to_model.view_readings(message) for message in ordered),
                             to_model.sense_of(ordered[0]),
-                            to_model.counts(newest, "session_reject"))
+                            to_model.counts(newest, "session_reject"), self._run.run_id)
 
-    def tick(self) -> bool:
-        """Solve if readings have come since; return whether it did.
+    def next_job(self) -> Job | None:
+        """Return what is to be solved, if readings have come since the last job.
 
         Raises
         ------
         SelfcalError
-            If the readings cannot be used.
+            If the readings cannot be used together; it is shown as the state as well.
         """
         if not self._stale:
-            return False
+            return None
         self._stale = False
         try:
-            self._solve()
+            measurements = self.measurements()
+            digest = session_digest({
+                index: readings_digest(readings, measurements.rejected) for index, readings
+                in zip(sorted(self._messages), measurements.views, strict=True)})
         except SelfcalError as error:
-            self._problem = error
+            self.shown.problem, self.shown.digest = error, ""
             raise
-        return True
+        stamp = max(to_model.stamp_ns(message) for message in self._messages.values())
+        return Job(self._run, measurements, solver_options(self._values), digest, stamp)
 
-    def _solve(self) -> None:
-        self._digest = ""
-        measurements = self.measurements()
-        self._digest = session_digest({
-            index: readings_digest(to_model.view_readings(message), measurements.rejected)
-            for index, message in self._messages.items()})
-        self._problem = None
-        try:
-            self.result = calibrate(measurements, solver_options(self._values))
-        except NotIdentifiableError as error:
-            self._problem = error
-            self.result = unidentified_result(measurements, error.observability)
+    def take(self, outcome: Outcome) -> None:
+        """Publish what solving a job gave, unless another run has begun meanwhile."""
+        job = outcome.job
+        if job.run != self._run:
+            return
+        if outcome.result is None:
+            self.shown.problem, self.shown.digest = outcome.problem, ""
+            raise outcome.problem
+        self.shown = Shown(outcome.result, outcome.problem, job.run, len(job.measurements.views),
+                           job.stamp_ns, job.digest)
         self._publish()
-        if self._values["save_path"] and self._problem is None:
-            write_json(self._values["save_path"], result_to_dict(created_now(self.result)))
+        if self._values["save_path"] and outcome.problem is None:
+            self._save_by_itself()
+
+    def _save_by_itself(self) -> None:
+        try:
+            write_json(self._values["save_path"],
+                       result_to_dict(created_now(self.shown.result)))
+        except InputError as error:  # the map itself is good, and save_map may go elsewhere
+            self._ports.say(Level.ERROR, f"save_path: {error}")
 
     def _publish(self) -> None:
-        stamp = max((to_model.stamp_ns(m) for m in self._messages.values()), default=0)
-        frame_id = self._values["frame_id"]
-        if self._problem is None:
-            self._ports.publish("map", from_model.error_map(self.result, stamp, frame_id))
-            self._ports.publish("markers", {"error_map": self.result.error_map, "stamp_ns": stamp})
-        numbers = summary_numbers(self.result)
-        seen = self.result.observability
+        shown, frame_id = self.shown, self._values["frame_id"]
+        result, run = shown.result, shown.run
+        verdict = {"qualified": is_qualified(result), "run_id": run.run_id}
+        if shown.problem is None:
+            self._ports.publish("map", from_model.error_map(
+                result, shown.stamp_ns, frame_id) | verdict)
+            self._ports.publish("markers", {"error_map": result.error_map,
+                                            "stamp_ns": shown.stamp_ns})
+        numbers = summary_numbers(result)
+        seen = result.observability
         fields = {name: getattr(numbers, name) for name in (
             "max_error_um", "rms_error_um", "rms_uncertainty_um", "max_theta_error_arcsec",
             "rms_theta_uncertainty_arcsec")}
         self._ports.publish("summary", {
-            "header": from_model.header(stamp, frame_id),
-            "state": short(self._state()),
-            "views_done": len(self._messages),
-            "views_planned": self._planned.get(self._plan_id, 0),
+            "header": from_model.header(shown.stamp_ns, frame_id),
+            "state": short(self._state()), "views_done": shown.views_done,
+            "views_planned": self._planned.get(run, 0),
             "identifiable": seen.identifiable, "rank_deficiency": seen.deficiency, **fields,
-            "advice": [*seen.advice, *self.result.warnings],
-            "qualified": self.result.verdict.qualified,
-            "causes": [cause.text for cause in self.result.verdict.causes],
-            "run_id": self.result.run_id})
+            "advice": [*seen.advice, *result.warnings], "causes": [
+                cause.text for cause in result.verdict.causes], **verdict})
 
     def _unfinished(self) -> bool:
         """Return whether the plan has views that are still to come."""
-        return (isinstance(self._problem, NotIdentifiableError)
-                and len(self._messages) < self._planned.get(self._plan_id, 0))
+        return (isinstance(self.shown.problem, NotIdentifiableError)
+                and self.shown.views_done < self._planned.get(self.shown.run, 0))
 
     def _state(self) -> str:
         if self._unfinished():
-            return (f"{len(self._messages)} of {self._planned[self._plan_id]} views measured, "
+            return (f"{self.shown.views_done} of {self._planned[self.shown.run]} views measured, "
                     "not yet enough to identify the stage.")
-        return str(self._problem or state_sentence(self.result))
+        return str(self.shown.problem or state_sentence(self.shown.result))
 
     def digest(self) -> str:
         """Return the fingerprint of the readings behind the published map; "" = of none."""
-        return "" if self._stale else self._digest
+        return "" if self._stale else self.shown.digest
 
-    def save(self, path: str) -> str:
-        """Write the result of the newest readings and say so."""
-        self.tick()
-        if self._problem is not None:
-            raise self._problem
-        if self.result is None:
+    def save(self, path: str) -> tuple[str, str]:
+        """Write the result that is shown; return a line that says so, and the absolute path.
+
+        Raises
+        ------
+        SelfcalError
+            If there is no map, or `path` lies outside of the folder for results.
+        """
+        if self.shown.problem is not None:
+            raise self.shown.problem
+        if self.shown.result is None:
             raise NoDataError("solver", "there is no map yet", "measure the views of the plan")
-        write_json(_named(path), result_to_dict(created_now(self.result)))
-        return f"saved to {path}; readings {self.digest() or 'of a loaded map'}"
+        target = result_file(path, self._values["result_folder"])
+        write_json(target, result_to_dict(created_now(self.shown.result)))
+        return f"saved to {target}; readings {self.digest() or 'of a loaded map'}", str(target)
 
     def load(self, path: str) -> str:
         """Publish the map of a RESULT.json and say so."""
-        self.result = result_from_dict(read_json(_named(path)), path)
-        self._problem, self._digest = None, ""
+        result = read_result(path)
+        self.shown = Shown(result, views_done=len(result.views), run=Run(result.plan_id, result.run_id))
         self._publish()
-        return f"loaded {path}: plan {self.result.plan_id}"
+        return f"loaded {path}: plan {result.plan_id}"
 
     def diagnosis(self) -> Diagnosis:
         """Return what the node says of itself."""
-        known = self.result is not None or self._problem is not None
-        fine = self._problem is None or self._unfinished()
+        shown = self.shown
+        known = shown.result is not None or shown.problem is not None
+        fine = (shown.problem is None or self._unfinished()) and (
+            shown.problem is not None or shown.result is None or is_qualified(shown.result))
         return Diagnosis(Level.OK if fine else Level.WARN,
                          self._state() if known else "waiting for views",
-                         {"views": len(self._messages), "readings": self.digest()})
-
-
-def _named(path: str) -> str:
-    """Return `path`, or raise InputError if it is empty."""
-    if not path:
-        raise InputError("path", "is empty", "name a file")
-    return path
+                         {"views": len(self._messages), "readings": self.digest(),
+                          "plan_id": self._run.plan_id, "run_id": self._run.run_id,
+                          "left_aside": self._left_aside})
 
 
 def short(sentence: str) -> str:

@@ -15,7 +15,7 @@ from selfcal_ros.collection.digest import readings_digest, session_digest
 from selfcal_ros.collection.messages import Command, Detection, Phase
 from selfcal_ros.messages import from_model, to_model
 from selfcal_ros.nodes import names
-from selfcal_ros.nodes.base import fill
+from selfcal_ros.nodes.filling import fill
 from selfcal_ros.nodes.measurement_collector import MeasurementCollector
 from test.support.plans import plan_of
 from test.support.ros import publish_events
@@ -184,8 +184,8 @@ def test_a_collector_that_starts_within_a_view_names_it_until_it_is_placed_anew(
                     "the command")
     diagnostics.clear()
     graph.until(lambda: diagnostics, "diagnostics")
-    assert diagnostics[-1].status[0].message == "view '0': 0 % of the marks read"
-    assert diagnostics[-1].status[0].level == DiagnosticStatus.OK
+    assert diagnostics[-1].status[0].message == (
+        "the encoder is not heard; view '0': 0 % of the marks read")
 
 
 def test_another_plate_under_the_same_plan_is_said_once_and_in_the_diagnostics(
@@ -251,7 +251,7 @@ def test_a_view_whose_lines_cannot_be_told_apart_says_once_what_to_do(graph, mon
     for _ in range(2):
         assert graph.call(Trigger, FINISH).success
     (line,) = said
-    assert line.startswith("view 'line': 96 detections rejected as rotation_not_known: ")
+    assert line.startswith("view 'line': 96 of 96 detections are rejected as rotation_not_known; ")
 
 
 def test_diagnostics_count_what_was_received(graph):

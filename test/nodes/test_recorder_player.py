@@ -6,7 +6,6 @@ from pathlib import Path
 
 import pytest
 import yaml
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from mcap.reader import make_reader
 
 from selfcal_ros.bagio.offline import collect_bag
@@ -115,15 +114,14 @@ def test_an_encoder_that_comes_back_with_best_effort_is_recorded(graph, tmp_path
 
 def test_a_player_does_not_take_the_collector_of_another_cell_for_its_own(graph, tmp_path):
     player = graph.node(BagPlayer, bag=str(small_bag(tmp_path)), rate=0.001).player
-    diagnostics = graph.hand.create_publisher(DiagnosticArray, "/diagnostics", 10)
-    graph.until(lambda: diagnostics.get_subscription_count() == 1, "the player")
-    for name, count in (("measurement_collector", "7"), ("cell2/measurement_collector", "9")):
-        diagnostics.publish(DiagnosticArray(status=[DiagnosticStatus(name=name, values=[
-            KeyValue(key=f"{kind}_received", value=count) for kind in player.sent])]))
-    other = []
-    graph.hand.create_subscription(DiagnosticArray, "/diagnostics", other.append, 10)
-    graph.until(lambda: player.heard and other, "the counts, and the player's next word")
-    assert set(player.heard.values()) == {7}
+    own, other = (graph.hand.create_publisher(topic.type, f"{cell}{topic.name}", topic.qos)
+                  for topic in [names.of_node("measurement_collector", names.RECEIVED)]
+                  for cell in ("", "/cell2/"))
+    other.publish(names.RECEIVED.type(data=[9, 9, 9]))
+    own.publish(names.RECEIVED.type(data=[8, 8]))  # not the collector's form
+    own.publish(names.RECEIVED.type(data=[7, 7, 7]))
+    graph.until(lambda: player.heard, "the counts")
+    assert player.heard == dict.fromkeys(player.sent, 7)
 
 
 def test_what_was_flushed_survives_a_crash(graph, tmp_path):

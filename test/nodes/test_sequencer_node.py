@@ -7,6 +7,7 @@ import pytest
 from action_msgs.msg import GoalStatus
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.action import ActionClient
+from rclpy.task import Future
 from selfcal_msgs.action import RunCalibration
 from selfcal_msgs.srv import SaveMap
 from std_srvs.srv import Trigger
@@ -15,7 +16,7 @@ from selfcal_ros.collection.messages import Command, Phase
 from selfcal_ros.collection.sequencer import State
 from selfcal_ros.messages import from_model, to_model
 from selfcal_ros.nodes import names
-from selfcal_ros.nodes.base import fill
+from selfcal_ros.nodes.filling import fill
 from selfcal_ros.nodes.pose_sequencer import PoseSequencer
 from test.support.ros import Graph
 from test.support.sessions import plan_file, small_plan
@@ -30,7 +31,8 @@ class Desk:
     def __init__(self, graph: Graph, folder, **parameters) -> None:
         self.graph = graph
         self.plan = plan_file(folder, PLAN)
-        self.node = graph.node(PoseSequencer, **({"plan": self.plan} | parameters))
+        self.node = graph.node(PoseSequencer, **(
+            {"plan": self.plan, "start_checks": False} | parameters))
         self.heard = graph.listen(names.COMMAND)
         self.status = graph.publisher(names.STATUS)
 
@@ -51,7 +53,8 @@ class Desk:
         self.status.publish(fill(names.STATUS.type(), {
             "header": from_model.header(stamp, "stage"), "plan_id": plan_id,
             "view_index": index, "complete": complete, "grid_expected": 25,
-            "grid_done": 25 if complete else 5, "angular_expected": 0}))
+            "grid_done": 25 if complete else 5, "angular_expected": 0,
+            "run_id": self.heard[-1].run_id if self.heard else ""}))
 
 
 @pytest.fixture
@@ -84,7 +87,7 @@ def test_commands_carry_plan_plate_and_pose_with_growing_stamps(desk):
     stamps = [command.stamp_ns for command in commands]
     assert stamps == sorted(set(stamps))
     assert commands == [Command(stamp, phase, PLAN.plan_id, index, PLAN.views[index],
-                                PLAN.artifact, len(PLAN.views))
+                                PLAN.artifact, len(PLAN.views), str(stamps[0]))
                         for stamp, (phase, index) in zip(stamps, desk.commands, strict=True)]
 
 
@@ -144,38 +147,66 @@ def test_recorded_commands_win_over_its_own(desk):
     desk.graph.until(lambda: len(desk.heard) == 6, "a command of its own")
 
 
-def test_a_start_names_the_views_that_are_measured_already(desk):
-    readings = desk.graph.publisher(names.MEASUREMENT)
-    for plan_id, index in (("another plan", 3), (PLAN.plan_id, 1), (PLAN.plan_id, 0)):
-        readings.publish(names.MEASUREMENT.type(plan_id=plan_id, view_index=index,
-                                                view_name=PLAN.views[index].name))
-    known = desk.node.session._measured
-    desk.graph.until(lambda: len(known.get(PLAN.plan_id, {})) == 2, "both views")
-    first, second = (view.name for view in PLAN.views[:2])
-    assert desk.ask("start").message == (
-        "waiting for the plate to be placed: view 0; measured already: "
-        f"{first}, {second} (skip_view keeps a view as it is)")
-    assert desk.ask("skip_view").success
-    desk.expect((PLACE, 0), (PLACE, 1))
-
-
-def test_a_start_without_a_collector_says_so(graph, tmp_path):
-    graph.node(PoseSequencer, plan=plan_file(tmp_path, PLAN))
-    answer = graph.call(Trigger, "pose_sequencer/start")
+def test_a_start_waits_for_who_is_missing_and_names_them(graph, tmp_path):
+    desk = Desk(graph, tmp_path, start_checks=True)
+    answer = desk.ask("start")
     assert answer.success
-    assert answer.message.endswith(
-        "; no measurement_collector is seen yet: make sure that one runs")
+    assert answer.message == (
+        "waiting for measurement_collector (no sign of life), solver (no sign of life); starts by "
+        "itself when they are there")
+    heard: list = []
+    graph.hand.create_subscription(DiagnosticArray, "/diagnostics", heard.append, 10)
+    for said, values in (
+            ("waiting for the encoder (measurement_collector hears no sample), a publisher of "
+             "stage/mark_detections", {"encoder_heard": "no", "detections_matched": "no"}),
+            ("waiting for a publisher of stage/mark_detections",
+             {"encoder_heard": "yes", "detections_matched": "no"})):
+        def told(said=said, values=values):
+            graph.health("solver")
+            graph.health("measurement_collector", **values)
+            return any(s.message == said for m in heard for s in m.status)
+        graph.until(told, said)
+    assert desk.commands == []
+    graph.health("measurement_collector", encoder_heard="yes", detections_matched="yes")
+    graph.health("solver")
+    desk.expect((PLACE, 0))
 
 
-def test_an_automatic_start_waits_for_a_collector(graph, tmp_path):
-    node = graph.node(PoseSequencer, plan=plan_file(tmp_path, PLAN), auto_start=True)
-    diagnostics: list = []
-    graph.hand.create_subscription(DiagnosticArray, "/diagnostics", diagnostics.append, 10)
-    graph.until(lambda: diagnostics, "its diagnostics")
-    assert diagnostics[-1].status[0].message == "waiting for a measurement_collector"
-    assert node.session.machine.state is State.IDLE
-    graph.hand.create_publisher(names.STATUS.type, names.STATUS.name, names.STATUS.qos)
-    graph.until(lambda: node.session.machine.state is State.PLACING, "the start")
+def test_a_start_that_waits_can_be_given_up(graph, tmp_path):
+    desk = Desk(graph, tmp_path, start_checks=True)
+    assert desk.ask("start").message.startswith("waiting for ")
+    assert desk.ask("abort").message == "idle: no longer waiting"
+    graph.health("measurement_collector", encoder_heard="yes", detections_matched="yes")
+    graph.health("solver")
+    graph.until(lambda: not desk.node.session.missing(), "all of them")
+    assert not desk.ask("confirm_view").success
+    assert desk.commands == []
+
+
+def test_an_automatic_start_waits_too(graph, tmp_path):
+    desk = Desk(graph, tmp_path, auto_start=True, start_checks=True)
+    graph.until(lambda: desk.node.session.waiting, "the node")
+    assert desk.node.session.machine.state is State.IDLE
+    graph.health("measurement_collector", encoder_heard="yes", detections_matched="yes")
+    graph.health("solver")
+    desk.expect((PLACE, 0))
+
+
+def test_a_restarted_sequencer_takes_up_the_run_in_its_view(graph, tmp_path):
+    desk = Desk(graph, tmp_path, start_checks=True)
+    told = {"encoder_heard": "yes", "detections_matched": "yes", "plan_id": PLAN.plan_id,
+            "run_id": "17", "phase": "MEASURE", "view": "1", "view_name": PLAN.views[1].name,
+            "command_stamp": "1700"}
+    graph.health("measurement_collector", **told)
+    graph.health("solver")
+    graph.until(lambda: not desk.node.session.missing(), "all of them")
+    assert desk.ask("start").message == f"took up run 17 in view '{PLAN.views[1].name}', MEASURE"
+    desk.expect((MEASURE, 1))
+    assert to_model.command(desk.heard[0]) == Command(
+        1700, MEASURE, PLAN.plan_id, 1, PLAN.views[1], PLAN.artifact, len(PLAN.views), "17")
+    desk.complete(1)
+    desk.expect((MEASURE, 1), (PLACE, 2))
+    assert desk.heard[1].run_id == "17"
 
 
 def test_following_is_a_warning_only_where_a_plan_is_given_up(desk, monkeypatch):
@@ -210,7 +241,8 @@ class Actor(Desk):
         super().__init__(graph, folder, auto_confirm=True, settle_time=0.0,
                          result_path=str(folder / "map.json"), **parameters)
         self.saved, self.feedback = [], []
-        self.answer = SaveMap.Response(success=True, message="saved")
+        self.answer = SaveMap.Response(success=True, message="saved",
+                                       path=str(folder / "map.json"))
         graph.hand.create_service(SaveMap, "solver/save_map", self._save)
         self.client = ActionClient(graph.hand, RunCalibration, "pose_sequencer/run_calibration")
         graph.until(self.client.server_is_ready, "the action server")
@@ -296,6 +328,31 @@ def test_a_map_that_cannot_be_saved_fails_with_the_solvers_words(actor):
     status, result = actor.result(handle)
     assert status == GoalStatus.STATUS_ABORTED
     assert (result.error_code, result.message, result.map_path) == (3, "modes are unseen", "")
+
+
+def test_a_solver_that_does_not_answer_is_told_in_time(graph, tmp_path):
+    actor = Actor(graph, tmp_path, save_timeout=0.1)
+    held = []
+
+    class Hung:
+        def service_is_ready(self):
+            return True
+
+        def call_async(self, request):
+            held.append(Future())
+            return held[0]
+
+        def remove_pending_request(self, future):
+            assert future is held[0]
+
+    actor.node._action._saver = Hung()
+    handle = actor.send()
+    actor.measure_all()
+    status, result = actor.result(handle)
+    assert status == GoalStatus.STATUS_ABORTED
+    assert (result.error_code, result.map_path) == (4, "")
+    assert result.message == ("run_calibration: the solver has not saved the map in 0.1 s; look at "
+                              "the solver, then call save_map")
 
 
 def test_a_status_of_before_the_command_does_not_complete_a_redone_view(desk):

@@ -14,7 +14,7 @@ from selfcal_ros.messages import from_model, to_model
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.result import result_to_dict
 from selfcal_ros.nodes import names
-from selfcal_ros.nodes.base import fill
+from selfcal_ros.nodes.filling import fill
 from selfcal_ros.nodes.solver import Solver
 from selfcal_ros.reporting.maps.markers import map_geometry
 from selfcal_ros.sessions.solving import short
@@ -32,10 +32,10 @@ def measured(plan=PLAN, seed: int = 5) -> tuple:
 
 
 @pytest.fixture
-def solve(graph):
+def solve(graph, tmp_path):
     """Return a function that gives a fresh solver the views of a plan and waits for its word."""
     def run(plan=PLAN, **parameters):
-        graph.node(Solver, **parameters)
+        graph.node(Solver, result_folder=str(tmp_path), **parameters)
         maps, summaries = graph.listen(names.ERROR_MAP), graph.listen(names.SUMMARY)
         messages, measurements = measured(plan)
         publisher = graph.publisher(names.MEASUREMENT)

@@ -11,7 +11,7 @@ from selfcal_ros.messages import from_model
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.view import View
 from selfcal_ros.nodes import names
-from selfcal_ros.nodes.base import fill
+from selfcal_ros.nodes.filling import fill
 from selfcal_ros.nodes.stage_simulator import LEAD_NS, StageSimulator
 
 PLATE = Artifact(3, 0.01, 4)

@@ -71,3 +71,15 @@ def test_readme_names_every_verb_and_every_page_of_the_documentation():
         assert f"docs/{page.name}" in readme
     for link in re.findall(r"\]\((docs/[\w.]+)\)", readme):
         assert (ROOT / link).is_file(), link
+
+
+@pytest.mark.parametrize("prefix", ["", "cell1/", "hall/cell1/"])
+def test_every_node_belongs_to_one_group_of_the_aggregator(prefix):
+    data = read_yaml(ROOT / "config/diagnostics/analyzers.yaml")
+    groups = data["analyzers"]["ros__parameters"]["calibration"]["analyzers"]
+    for node in NODE_PARAMETERS:
+        hits = [name for name, group in groups.items()
+                if any(re.search(pattern, prefix + node) for pattern in group["regex"])]
+        assert len(hits) == 1, node
+    assert not [name for name, group in groups.items()
+                if any(re.search(pattern, "my_solver_2") for pattern in group["regex"])]

@@ -6,13 +6,14 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 import rclpy
+from diagnostic_msgs.msg import KeyValue
 from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from selfcal_ros.bagio.simulated import event_fields
 from selfcal_ros.nodes import names
-from selfcal_ros.nodes.base import fill
+from selfcal_ros.nodes.filling import fill
 from selfcal_ros.nodes.names import Topic
 from selfcal_ros.simulation.cell import Event
 
@@ -29,6 +30,7 @@ class Graph:
         self.nodes: list[Node] = []
         self.hand = self.add(Node("hand", context=self.context))
         self._clients: dict[str, Any] = {}
+        self._voices: dict[str, Any] = {}
 
     def add(self, node: Node) -> Node:
         self.executor.add_node(node)
@@ -38,11 +40,14 @@ class Graph:
     def node(self, make: Callable[..., Node], **parameters: Any) -> Any:
         """Make a node of the package with these parameters and spin it with the others."""
         overrides = [Parameter(name, value=value) for name, value in parameters.items()]
-        return self.add(make(context=self.context, parameter_overrides=overrides))
+        node = self.add(make(context=self.context, parameter_overrides=overrides))
+        getattr(node, "autostart", lambda: None)()
+        return node
 
     def remove(self, node: Node) -> None:
         self.executor.remove_node(node)
         self.nodes.remove(node)
+        getattr(node, "take_down", lambda: None)()
         node.destroy_node()
 
     def listen(self, topic: Topic) -> list:
@@ -57,6 +62,14 @@ class Graph:
         self.until(lambda: publisher.get_subscription_count() >= readers,
                    f"{readers} subscribers of {topic.name}")
         return publisher
+
+    def health(self, node: str, **values: str) -> None:
+        """Tell once, as `node` does each second, that it is alive."""
+        topic = names.of_node(node, names.HEALTH)
+        if node not in self._voices:
+            self._voices[node] = self.hand.create_publisher(topic.type, topic.name, topic.qos)
+        self._voices[node].publish(topic.type(level=b"\0", name=node, message="as told", values=[
+            KeyValue(key=key, value=value) for key, value in values.items()]))
 
     def until(self, condition: Callable[[], Any], what: str) -> None:
         """Spin until `condition` holds; fail when patience ends."""

@@ -1,0 +1,110 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Nodes as processes of a command: they end when it ends, however it ends."""
+
+import contextlib
+import ctypes
+import fcntl
+import importlib.util
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+from selfcal_ros.errors import InputError
+
+PR_SET_PDEATHSIG = 1
+"""Of prctl(2): the signal that a process gets when its parent has died, also by SIGKILL."""
+
+
+def need_ros(alternative: str) -> None:
+    """Raise InputError if there is no ROS in this environment."""
+    for package in ("rclpy", "selfcal_msgs"):
+        if importlib.util.find_spec(package) is None:
+            raise InputError("environment", f"there is no {package} in this environment",
+                             "source a ROS 2 installation with this package built, or use the "
+                             f"environment of `make setup`{alternative}")
+
+
+@contextlib.contextmanager
+def process(module: str, arguments: list[str], environment: dict, **kwargs,
+            ) -> Iterator[subprocess.Popen]:
+    """Run a module as a process that is stopped, at worst killed, at the end of the block.
+
+    Ctrl-C reaches the process from the terminal too. It is blocked there from the start, and let
+    through by `nodes.running.run` once the imports are done and it can be handled.
+    """
+    child, before = None, signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        child = subprocess.Popen([sys.executable, "-m", module, *arguments], env=environment,
+                                 preexec_fn=_die_with_parent(os.getpid()), **kwargs)
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        yield child
+    finally:
+        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        if child is not None:
+            stop(child)
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _die_with_parent(parent: int):
+    """Return what a child does before it becomes the node: ask for SIGTERM when `parent` dies."""
+    if not sys.platform.startswith("linux"):
+        return None
+    prctl = ctypes.CDLL(None, use_errno=True).prctl
+
+    def ask() -> None:
+        prctl(PR_SET_PDEATHSIG, signal.SIGTERM, 0, 0, 0)
+        if os.getppid() != parent:  # it died in between
+            os._exit(128 + signal.SIGTERM)
+    return ask
+
+
+def stop(child: subprocess.Popen) -> None:
+    """End a process: asked first, killed if it does not answer within ten seconds."""
+    for end in (child.terminate, child.kill):
+        if child.poll() is None:
+            end()
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                child.wait(10)
+    for stream in (child.stdin, child.stdout, child.stderr):
+        if stream:
+            with contextlib.suppress(BrokenPipeError):
+                stream.close()
+
+
+@contextlib.contextmanager
+def ended_by_signals() -> Iterator[None]:
+    """Let SIGTERM and SIGHUP end the block as an exception would, so that it cleans up."""
+    def end(number: int, _: object) -> None:
+        raise SystemExit(128 + number)
+    before = {number: signal.signal(number, end) for number in (signal.SIGTERM, signal.SIGHUP)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@contextlib.contextmanager
+def domain() -> Iterator[dict]:
+    """Yield an environment with a ROS domain of its own on this machine.
+
+    A ROS_DOMAIN_ID that is set already is kept, so that `ros2 topic echo` can watch.
+    """
+    environment = dict(os.environ)
+    environment.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    if environment.get("ROS_DOMAIN_ID"):
+        yield environment
+        return
+    for number in range(50, 100):
+        with Path(tempfile.gettempdir(), f"selfcal_domain_{number}.lock").open("w") as lock:
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError:
+                continue
+            yield environment | {"ROS_DOMAIN_ID": str(number)}
+            return
+    raise RuntimeError("fifty replays at once")

@@ -1,0 +1,147 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Managed nodes: configured, activated and taken down in steps, by themselves or by a manager."""
+
+import traceback
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+from rclpy._rclpy_pybind11 import RCLError
+from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+
+from selfcal_ros.errors import SelfcalError, first_line
+from selfcal_ros.nodes.base import NodeBase
+from selfcal_ros.sessions.ports import Diagnosis, Level
+
+
+class ManagedNode(NodeBase, LifecycleNode):
+    """A lifecycle node whose errors in transitions are told, and which leaves nothing behind.
+
+    `configure` makes the session and what it publishes on, `activate` what it hears, answers and
+    does by the clock. Deactivated, it keeps its session and its latched messages; cleaned up,
+    nothing. An error in a transition is logged, told in the health at level ERROR, and leads
+    through the state of error processing to ``unconfigured``.
+
+    Parameters
+    ----------
+    name : str
+        Key of `NODE_PARAMETERS`; also the node's name.
+    **kwargs
+        For rclpy.node.Node, e.g. parameter_overrides.
+    """
+
+    def __init__(self, name: str, **kwargs: Any) -> None:
+        self.problem: Exception | None = None
+        self._made: dict[str, list[Callable[[], Any]]] = {"configure": [], "activate": []}
+        self._making = ""
+        super().__init__(name, **kwargs)
+        self.prepare(name)
+        change = self._service_change_state
+        change.callback = partial(self._change_state, change.callback)
+
+    def configure(self) -> None:
+        """Make the session and the publishers."""
+
+    def activate(self) -> None:
+        """Make subscriptions, services and timers."""
+
+    def diagnose_session(self) -> Diagnosis:
+        """Return what the session has to say; asked in the state ``active`` only."""
+        return Diagnosis(Level.OK, "running")
+
+    def autostart(self) -> None:
+        """Configure and activate, if the parameter ``autostart`` says so; raise what fails."""
+        if self.values["autostart"]:
+            for step in (self.trigger_configure, self.trigger_activate):
+                step()
+                if self.problem is not None:
+                    raise self.problem
+
+    @property
+    def state(self) -> str:
+        """Label of the lifecycle state."""
+        return self._state_machine.current_state[1]
+
+    def own(self, entity: Any, destroy: Callable[[Any], Any]) -> Any:
+        """Return `entity`, to be destroyed when the step that makes it is undone."""
+        if self._making:
+            self._made[self._making].append(partial(destroy, entity))
+        return entity
+
+    def diagnosis(self) -> Diagnosis:
+        """Return the state of the node where it is not active, else what the session says."""
+        if self.state == "active":
+            return self.diagnose_session()
+        if self.problem is not None:
+            return Diagnosis(Level.ERROR, f"{self.state}: {first_line(self.problem)}")
+        return Diagnosis(Level.WARN, f"{self.state}: a managed node that waits to be activated")
+
+    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Make what `configure` makes."""
+        return self._make("configure", self.configure)
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Make what `activate` makes."""
+        return self._make("activate", self.activate)
+
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Take down what `activate` made."""
+        return self._unmake("activate")
+
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Take down everything."""
+        return self._unmake("activate", "configure")
+
+    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Take down everything."""
+        return self._unmake("activate", "configure")
+
+    def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Take down everything; the node can be configured anew."""
+        return self._unmake("activate", "configure")
+
+    def take_down(self) -> None:
+        """Let go of what configuring made that is no entity of ROS."""
+
+    def _make(self, step: str, make: Callable[[], None]) -> TransitionCallbackReturn:
+        self.problem, self._making = None, step
+        try:
+            make()
+        except Exception as error:  # rclpy would swallow it without a word
+            return self._fail(step, error)
+        finally:
+            self._making = ""
+        return TransitionCallbackReturn.SUCCESS
+
+    def _unmake(self, *steps: str) -> TransitionCallbackReturn:
+        try:
+            for step in steps:
+                while self._made[step]:
+                    self._made[step].pop()()
+            if "configure" in steps:
+                self._heard_on.clear()
+                self.alone_on.clear()
+                self.take_down()
+        except Exception as error:
+            return self._fail(f"take down {steps[0]}", error)
+        return TransitionCallbackReturn.SUCCESS
+
+    def _fail(self, step: str, error: Exception) -> TransitionCallbackReturn:
+        self.problem = error
+        self.say(Level.ERROR, f"cannot {step}: {first_line(error)}")
+        if not isinstance(error, SelfcalError):
+            for line in traceback.format_exception(error):
+                for part in line.splitlines():
+                    self.say(Level.ERROR, part)
+        self.report()
+        return TransitionCallbackReturn.ERROR
+
+    def _change_state(self, change: Callable[[Any, Any], Any], request: Any, response: Any) -> Any:
+        """Answer a transition that does not exist in this state with False; rclpy would raise."""
+        try:
+            response = change(request, response)
+        except RCLError as error:
+            self.say(Level.WARN, f"no such transition while {self.state}: {first_line(error)}")
+            response.success = False
+        self.report()
+        return response

@@ -1,0 +1,38 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Who else publishes: offers that do not match, and second publishers where one is right."""
+
+from collections.abc import Iterable, Mapping
+
+from rclpy.node import Node
+from rclpy.qos import QoSCompatibility, qos_check_compatible
+
+from selfcal_ros.nodes.names import Topic
+from selfcal_ros.sessions.ports import Diagnosis, Level
+
+
+def mismatched(node: Node, heard_on: Mapping[str, Topic]) -> Diagnosis:
+    """Name the publishers whose quality of service keeps their messages from this node."""
+    found = []
+    for name, topic in heard_on.items():
+        for offer in node.get_publishers_info_by_topic(name):
+            verdict, reason = qos_check_compatible(offer.qos_profile, topic.qos)
+            if verdict == QoSCompatibility.ERROR:
+                why = reason.removeprefix("ERROR: ").rstrip(";. ")
+                found.append(f"{topic.name}: nothing is heard of {_name(offer)} ({why}); offer "
+                             "what docs/ros2.md lists")
+    return Diagnosis(Level.ERROR if found else Level.OK, "; ".join(found))
+
+
+def others_publishing(node: Node, topics: Iterable[str]) -> Diagnosis:
+    """Name all publishers of a topic that has more than one."""
+    found = []
+    for topic in topics:
+        offers = node.get_publishers_info_by_topic(node.resolve_topic_name(topic))
+        if len(offers) > 1:
+            found.append(f"{topic} has {len(offers)} publishers: "
+                         f"{', '.join(sorted(map(_name, offers)))}; one is right")
+    return Diagnosis(Level.WARN if found else Level.OK, "; ".join(found))
+
+
+def _name(offer: object) -> str:
+    return f"{offer.node_namespace.rstrip('/')}/{offer.node_name}"

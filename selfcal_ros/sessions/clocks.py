@@ -1,0 +1,69 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Whether the clock of the cell is that of this machine: stamps against reception."""
+
+from collections import deque
+
+from selfcal_ros.sessions.ports import Diagnosis, Level
+
+LIVE_NS = 1_000_000_000
+"""A command received later than this after its stamp is recorded or latched, not live."""
+WINDOW_S = 2.0
+BIN_S = 0.1
+
+
+class ClockWatch:
+    """Compares the stamps of the cell with the instants at which its messages arrive.
+
+    A message arrives after its stamp, by an unknown delay; the smallest delay of the last seconds
+    is the offset of the cell's clock, to within the transport. Nothing is said while recorded
+    messages are played: the commands then have stamps of the past as well.
+
+    Parameters
+    ----------
+    limit_s : float
+        Largest offset that is no matter.
+    """
+
+    def __init__(self, limit_s: float) -> None:
+        self._limit_ns = round(limit_s * 1e9)
+        self._live = False
+        self._bins: deque[tuple[float, int]] = deque()
+
+    def command(self, stamp_ns: int, now_ns: int, *, is_older: bool) -> None:
+        """Learn from a command whether the session is live; a latched one tells nothing."""
+        if not is_older:
+            self._live = abs(now_ns - stamp_ns) <= LIVE_NS
+
+    def data(self, stamp_ns: int, now_ns: int, now_s: float) -> None:
+        """Take the stamp and the reception of a message of the cell."""
+        offset = stamp_ns - now_ns
+        if self._bins and now_s - self._bins[-1][0] < BIN_S:
+            when, largest = self._bins[-1]
+            self._bins[-1] = (when, max(largest, offset))
+        else:
+            self._bins.append((now_s, offset))
+            while now_s - self._bins[0][0] > WINDOW_S:
+                self._bins.popleft()
+
+    @property
+    def offset_ns(self) -> int | None:
+        """How much the cell's clock is ahead, ns; None while nothing live is heard."""
+        return max(offset for _, offset in self._bins) if self._live and self._bins else None
+
+    @property
+    def ahead(self) -> bool:
+        """Whether stamps come from the future, by more than the limit."""
+        return self.offset_ns is not None and self.offset_ns > self._limit_ns
+
+    def diagnosis(self) -> Diagnosis:
+        """Return WARN with the offset where it is beyond the limit."""
+        offset = self.offset_ns
+        if offset is None:
+            return Diagnosis(Level.OK, "")
+        values = {"clock_offset_s": f"{offset * 1e-9:.3f}"}
+        if abs(offset) <= self._limit_ns:
+            return Diagnosis(Level.OK, "", values)
+        side = "ahead of" if offset > 0 else "behind"
+        return Diagnosis(Level.WARN, f"the cell's clock is {abs(offset) * 1e-9:.3g} s {side} this "
+                         "machine's: detections fall into wrong views; synchronise the clocks "
+                         "(PTP, NTP)", values)

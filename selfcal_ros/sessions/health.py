@@ -1,0 +1,159 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a node says of itself once a second, put together from its parts."""
+
+from collections import Counter, deque
+from collections.abc import Callable, Iterable
+
+from selfcal_ros.errors import SelfcalError, first_line, printable
+from selfcal_ros.sessions.ports import Diagnosis, Level
+
+FIRST_LINES = 5
+"""Refusals of one kind that are logged line by line; then only the 10th, 100th, ..."""
+MEMORY_S = 10.0
+"""Time for which a refusal or a loss keeps the state at WARN."""
+
+
+def merged(main: Diagnosis, others: Iterable[Diagnosis]) -> Diagnosis:
+    """Return one diagnosis: the worst level, what is wrong first, all values."""
+    others = list(others)
+    wrong = [item.message for item in others if item.level > Level.OK and item.message]
+    values = dict(main.values)
+    for item in others:
+        values |= item.values
+    return Diagnosis(max([main.level, *(item.level for item in others)]),
+                     "; ".join(dict.fromkeys([*wrong, main.message])), values)
+
+
+class Refusals:
+    """Counts what callbacks could not use, by place, and says why without flooding the log.
+
+    Parameters
+    ----------
+    say : callable (level, line)
+        Writes to the log.
+    now_s : callable
+        Monotonic seconds.
+    """
+
+    def __init__(self, say: Callable[[Level, str], None], now_s: Callable[[], float]) -> None:
+        self._say, self._now_s = say, now_s
+        self.counts: Counter = Counter()
+        self._last: dict[str, tuple[float, str]] = {}
+
+    def add(self, place: str, error: Exception) -> None:
+        """Count an error of the callback at `place`; one not of this package shows its type."""
+        line = str(error) if isinstance(error, SelfcalError) else (
+            f"{place}: cannot be used ({type(error).__name__}: {printable(first_line(error))})")
+        self.counts[place] += 1
+        self._last[place] = (self._now_s(), line)
+        count = self.counts[place]
+        if count <= FIRST_LINES or str(count).rstrip("0") == "1":
+            self._say(Level.ERROR, line + (f" (refused {count} times)" if count > 1 else ""))
+
+    def diagnosis(self) -> Diagnosis:
+        """Return WARN and the newest reasons for some time after a refusal."""
+        now = self._now_s()
+        recent = [line for when, line in self._last.values() if now - when < MEMORY_S]
+        return Diagnosis(Level.WARN if recent else Level.OK, "; ".join(recent),
+                         {f"refused {place}": n for place, n in sorted(self.counts.items())})
+
+
+class Losses:
+    """Counts messages that the middleware reports as lost, by topic, and says so.
+
+    Parameters
+    ----------
+    say : callable (level, line)
+        Writes to the log.
+    now_s : callable
+        Monotonic seconds.
+    """
+
+    def __init__(self, say: Callable[[Level, str], None], now_s: Callable[[], float]) -> None:
+        self._say, self._now_s = say, now_s
+        self.counts: Counter = Counter()
+        self._when: dict[str, float] = {}
+
+    def add(self, topic: str, number: int) -> None:
+        """Count `number` messages of `topic` as lost."""
+        now = self._now_s()
+        if now - self._when.get(topic, -MEMORY_S) >= MEMORY_S:
+            self._say(Level.WARN, f"{topic}: {number} messages were lost on the way; the machine "
+                      "or the network is too slow for them")
+        self.counts[topic] += number
+        self._when[topic] = now
+
+    def diagnosis(self) -> Diagnosis:
+        """Return WARN with the numbers for some time after a loss."""
+        now = self._now_s()
+        recent = [topic for topic, when in self._when.items() if now - when < MEMORY_S]
+        line = "; ".join(f"{topic}: {self.counts[topic]} messages lost" for topic in recent)
+        return Diagnosis(Level.WARN if recent else Level.OK, line,
+                         {f"lost {topic}": n for topic, n in sorted(self.counts.items())})
+
+
+class Presence:
+    """Which other nodes are alive, by the health that each of them tells once a second.
+
+    Parameters
+    ----------
+    now_s : callable
+        Monotonic seconds.
+    patience_s : float
+        A node that has told nothing for longer is not there.
+    """
+
+    def __init__(self, now_s: Callable[[], float], patience_s: float) -> None:
+        self._now_s, self._patience_s = now_s, patience_s
+        self._heard: dict[str, tuple[float, Diagnosis]] = {}
+
+    def take(self, node: str, diagnosis: Diagnosis) -> None:
+        """Take what a node says of itself."""
+        self._heard[node] = (self._now_s(), diagnosis)
+
+    def of(self, node: str) -> Diagnosis | None:
+        """Return what `node` said last; None if that was too long ago."""
+        when, diagnosis = self._heard.get(node, (float("-inf"), None))
+        return diagnosis if self._now_s() - when <= self._patience_s else None
+
+
+class Rate:
+    """Rate and longest gap of a stream over the last seconds.
+
+    Parameters
+    ----------
+    now_s : callable
+        Monotonic seconds.
+    """
+
+    WINDOW_S = 2.0
+
+    def __init__(self, now_s: Callable[[], float]) -> None:
+        self._now_s = now_s
+        self._bins: deque[tuple[float, int]] = deque()
+        self._last_ns = 0
+        self.longest_gap_ns = 0
+
+    def add(self, stamp_ns: int, count: int = 1) -> None:
+        """Take a message, or `count` of them of which `stamp_ns` is the newest stamp."""
+        now = self._now_s()
+        if self._bins and now - self._bins[-1][0] < 0.1:
+            self._bins[-1] = (self._bins[-1][0], self._bins[-1][1] + count)
+        else:
+            self._bins.append((now, count))
+        if self._last_ns and count == 1:
+            self.longest_gap_ns = max(self.longest_gap_ns, stamp_ns - self._last_ns)
+        self._last_ns = max(self._last_ns, stamp_ns)
+
+    @property
+    def per_second(self) -> float:
+        """Messages a second by reception."""
+        now = self._now_s()
+        while self._bins and now - self._bins[0][0] > self.WINDOW_S:
+            self._bins.popleft()
+        return sum(count for _, count in self._bins) / self.WINDOW_S
+
+    def take_gap_ns(self) -> int:
+        """Return the longest gap between stamps since the last call."""
+        gap, self.longest_gap_ns = self.longest_gap_ns, 0
+        return gap

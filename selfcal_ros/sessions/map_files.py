@@ -1,0 +1,68 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Files of maps that others name: where they may be written, and what may be read."""
+
+import os
+import re
+from pathlib import Path
+
+from selfcal_ros.errors import InputError
+from selfcal_ros.files import read_json
+from selfcal_ros.model.result import CalibrationResult, result_from_dict
+
+LARGEST_FILE = 1 << 30
+"""Bytes of the largest result that is read: 1001 x 1001 sites take a quarter of it."""
+
+
+def result_file(path: str, folder: str) -> Path:
+    """Return the absolute path of a result to be written.
+
+    Parameters
+    ----------
+    path : str
+        What the caller names; a relative path counts from `folder`.
+    folder : str
+        Folder in which results may be written; empty = the working directory.
+
+    Raises
+    ------
+    InputError
+        If `path` is empty or lies outside of the folder.
+    """
+    if not path:
+        raise InputError("path", "is empty", "name a file")
+    root = Path(os.path.realpath(folder or os.curdir))
+    target = Path(os.path.realpath(root / path))
+    if not target.is_relative_to(root):
+        raise InputError(path, f"lies outside of {root}", "name a file in it, or set the parameter "
+                         "result_folder of the solver")
+    return target
+
+
+def plan_file_name(plan_id: str) -> str:
+    """Return PLAN_ID.json; what is no letter, digit, dot, dash or underscore becomes ``_``."""
+    name = re.sub(r"[^\w.-]", "_", plan_id).lstrip(".")[:200]
+    return f"{name or 'plan'}.json"
+
+
+def read_result(path: str) -> CalibrationResult:
+    """Return the result in a file that another process names.
+
+    Raises
+    ------
+    InputError
+        If it is no regular file of a sensible size, or holds no result.
+    """
+    if not path:
+        raise InputError("path", "is empty", "name a file")
+    file = Path(path)
+    try:
+        if file.exists() and not file.is_file():
+            raise InputError(path, "is not a regular file", "name a RESULT.json")
+        if file.exists() and file.stat().st_size > LARGEST_FILE:
+            raise InputError(path, "is larger than 1 GiB", "name a RESULT.json")
+    except OSError as error:
+        raise InputError(path, f"cannot be read ({error.strerror})", "name a readable file") \
+            from error
+    except ValueError as error:  # a NUL in the name
+        raise InputError(path, f"is no file name ({error})", "name a RESULT.json") from error
+    return result_from_dict(read_json(path), path)

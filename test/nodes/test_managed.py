@@ -1,0 +1,178 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Managed nodes: bring-up and tear-down ten times over, errors in transitions, health."""
+
+import gc
+import time
+import weakref
+
+import pytest
+from diagnostic_msgs.msg import DiagnosticStatus
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState, GetState
+from std_srvs.srv import Trigger
+
+from selfcal_ros.errors import InputError
+from selfcal_ros.nodes import names
+from selfcal_ros.nodes.compensator import CompensatorNode
+from selfcal_ros.nodes.measurement_collector import MeasurementCollector
+from selfcal_ros.nodes.pose_sequencer import PoseSequencer
+from selfcal_ros.nodes.solver import Solver
+from test.support.sessions import plan_file, small_plan
+
+MANAGED = {"measurement_collector": MeasurementCollector, "pose_sequencer": PoseSequencer,
+           "solver": Solver, "compensator": CompensatorNode}
+
+
+def entities(node) -> dict[str, int]:
+    """Return how many entities of each kind a node holds."""
+    return {kind: len(list(getattr(node, kind))) for kind in (
+        "publishers", "subscriptions", "services", "clients", "timers", "waitables")}
+
+
+def change(graph, node: str, transition: int) -> bool:
+    return graph.call(ChangeState, f"{node}/change_state",
+                      transition=Transition(id=transition)).success
+
+
+def state(graph, node: str) -> str:
+    return graph.call(GetState, f"{node}/get_state").current_state.label
+
+
+@pytest.mark.parametrize("name", MANAGED)
+def test_ten_bring_ups_and_tear_downs_leave_nothing_behind(graph, name):
+    node = graph.node(MANAGED[name], autostart=False)
+    steps = (Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_ACTIVATE,
+             Transition.TRANSITION_DEACTIVATE, Transition.TRANSITION_CLEANUP)
+    bare, full, sessions = entities(node), [], []
+    for _ in range(10):
+        for step in steps:
+            assert change(graph, name, step)
+            if step == Transition.TRANSITION_ACTIVATE:
+                full.append(entities(node))
+                sessions.append(weakref.ref(node.session))
+        assert entities(node) == bare
+    assert all(counts == full[0] for counts in full)
+    assert full[0]["subscriptions"] > bare["subscriptions"]
+    gc.collect()
+    assert [session() for session in sessions] == [None] * 10
+    assert state(graph, name) == "unconfigured"
+
+
+def test_an_active_node_works_as_one_that_starts_by_itself(graph, tmp_path):
+    graph.node(PoseSequencer, autostart=False, plan=plan_file(tmp_path, small_plan()),
+               start_checks=False)
+    assert change(graph, "pose_sequencer", Transition.TRANSITION_CONFIGURE)
+    heard = graph.listen(names.COMMAND)
+    assert change(graph, "pose_sequencer", Transition.TRANSITION_ACTIVATE)
+    assert graph.call(Trigger, "pose_sequencer/start").success
+    graph.until(lambda: heard, "the command")
+    assert change(graph, "pose_sequencer", Transition.TRANSITION_DEACTIVATE)
+    late = graph.listen(names.COMMAND)  # an inactive node keeps what it has latched
+    graph.until(lambda: late, "the latched command")
+
+
+def test_an_error_in_a_transition_is_told_and_can_be_mended(graph, tmp_path):
+    plan = tmp_path / "plan.yaml"
+    graph.node(PoseSequencer, autostart=False, plan=str(plan))
+    health: list = []
+    topic = names.of_node("pose_sequencer", names.HEALTH)
+    graph.hand.create_subscription(topic.type, topic.name, health.append, topic.qos)
+    assert not change(graph, "pose_sequencer", Transition.TRANSITION_CONFIGURE)
+    assert state(graph, "pose_sequencer") == "unconfigured"
+    line = f"unconfigured: {plan}: no such file; check the path"
+    graph.until(lambda: any(s.message == line and s.level == DiagnosticStatus.ERROR
+                            for s in health), "the reason")
+    plan_file(tmp_path, small_plan())
+    assert change(graph, "pose_sequencer", Transition.TRANSITION_CONFIGURE)
+    assert state(graph, "pose_sequencer") == "inactive"
+
+
+def test_an_internal_error_in_a_transition_is_told_too(graph, monkeypatch):
+    def broken(self):
+        raise ZeroDivisionError("within")
+    monkeypatch.setattr(Solver, "configure", broken)
+    node = graph.node(Solver, autostart=False)
+    assert not change(graph, "solver", Transition.TRANSITION_CONFIGURE)
+    assert node.diagnosis().message == "unconfigured: within"
+    assert state(graph, "solver") == "unconfigured"
+
+
+def test_a_node_that_cannot_start_by_itself_raises(graph, tmp_path):
+    with pytest.raises(InputError, match=r"no\.yaml: no such file; check the path"):
+        graph.node(PoseSequencer, plan=str(tmp_path / "no.yaml"))
+
+
+def test_a_transition_that_does_not_exist_is_refused_and_ends_nothing(graph):
+    graph.node(Solver)
+    assert state(graph, "solver") == "active"
+    assert not change(graph, "solver", Transition.TRANSITION_CONFIGURE)
+    assert not change(graph, "solver", 250)
+    assert state(graph, "solver") == "active"
+    assert change(graph, "solver", Transition.TRANSITION_ACTIVE_SHUTDOWN)
+    assert state(graph, "solver") == "finalized"
+
+
+def test_an_inactive_node_says_so(graph):
+    node = graph.node(Solver, autostart=False)
+    assert node.diagnosis().message == "unconfigured: a managed node that waits to be activated"
+
+
+def test_work_goes_on_under_a_simulated_time_that_stands_still(graph, tmp_path):
+    graph.node(PoseSequencer, use_sim_time=True, plan=plan_file(tmp_path, small_plan()),
+               start_checks=False, auto_start=True, auto_confirm=True, settle_time=0.0)
+    heard = graph.listen(names.COMMAND)
+    graph.until(lambda: len(heard) == 2, "PLACE and MEASURE")
+
+
+def test_whatever_a_message_does_is_counted_and_told(graph):
+    node = graph.node(Solver)
+    publisher = graph.publisher(names.MEASUREMENT)
+    publisher.publish(names.MEASUREMENT.type(grid_size=5, grid_pitch=0.01, dx=[0.0]))
+    graph.until(lambda: node.refusals.counts["selfcal/view_measurement"] == 1, "the count")
+
+    def broken(_):
+        raise OverflowError("int too large")
+    guarded = node.guarded(broken, "selfcal/view_command")
+    assert guarded(None) is None
+    told = node.refusals.diagnosis()
+    assert told.values == {"refused selfcal/view_command": 1,
+                           "refused selfcal/view_measurement": 1}
+    assert "selfcal/view_command: cannot be used (OverflowError: int too large)" in told.message
+
+
+def test_a_publisher_that_cannot_be_heard_is_named(graph):
+    node = graph.node(MeasurementCollector)
+    deaf = names._qos(10, reliable=False)
+    graph.hand.create_publisher(names.DETECTIONS.type, names.DETECTIONS.name, deaf)
+    heard: list = []
+    topic = names.of_node("measurement_collector", names.HEALTH)
+    graph.hand.create_subscription(topic.type, topic.name, heard.append, topic.qos)
+    graph.until(lambda: any("stage/mark_detections: nothing is heard of /hand (" in s.message
+                            and s.level == DiagnosticStatus.ERROR for s in heard), "its name")
+    assert node.get_name() == "measurement_collector"
+
+
+def test_two_solvers_are_named(graph):
+    first = graph.node(Solver)
+    graph.hand.create_publisher(names.ERROR_MAP.type, names.ERROR_MAP.name, names.ERROR_MAP.qos)
+    heard: list = []
+    topic = names.of_node("solver", names.HEALTH)
+    graph.hand.create_subscription(topic.type, topic.name, heard.append, topic.qos)
+    line = "selfcal/error_map has 2 publishers: /hand, /solver; one is right"
+    graph.until(lambda: any(line in s.message and s.level == DiagnosticStatus.WARN
+                            for s in heard), line)
+    assert first.get_name() == "solver"
+
+
+def test_diagnostics_come_once_a_second_whatever_is_received(graph):
+    node = graph.node(MeasurementCollector)
+    told: list = []
+    original = node.diagnose
+    node.diagnose = lambda diagnosis: (told.append(1), original(diagnosis))
+    encoder = graph.publisher(names.ENCODER)
+    for _ in range(3000):
+        encoder.publish(names.ENCODER.type(name=["x"], position=[0.0]))
+    began, before = time.monotonic(), len(told)
+    graph.until(lambda: node.session.collector.received["encoder"] >= 3000, "the samples")
+    graph.until(lambda: len(told) > before, "a report")
+    assert len(told) - before <= time.monotonic() - began + 2

@@ -1,0 +1,176 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The session of the collector: when it publishes what, and what it warns of."""
+
+from types import SimpleNamespace
+
+import pytest
+
+from selfcal_ros.bagio.simulated import event_fields
+from selfcal_ros.collection.messages import Command, Detection, EncoderSample
+from selfcal_ros.sessions.collecting import CollectingSession
+from selfcal_ros.sessions.ports import Level
+from test.support.ports import START_NS, Hands, values_of
+from test.support.sessions import events_of, small_plan
+
+
+def as_message(fields: dict) -> object:
+    """Return nested fields as an object with attributes."""
+    return SimpleNamespace(**{key: as_message(value) if isinstance(value, dict) else value
+                              for key, value in fields.items()})
+
+
+class Desk:
+    """A session that is fed simulated messages at the instants of their stamps."""
+
+    def __init__(self, **parameters) -> None:
+        self.hands = Hands()
+        self.session = CollectingSession(values_of("measurement_collector", **parameters),
+                                         self.hands.ports)
+
+    def feed(self, events: list, *, ahead_s: float = 0.0, run_id: str = "") -> None:
+        """Give events; the cell's clock is ahead by so much, commands are on this machine's."""
+        for event in events:
+            at = (event.stamp_ns - START_NS) * 1e-9 + 100.0
+            self.hands.seconds = max(self.hands.seconds, at)
+            message = as_message(event_fields(event, "stage")[1])
+            if isinstance(event, Command):
+                message.run_id = run_id
+                self.session.take_command(message, False)
+            else:
+                shifted = event.stamp_ns + round(ahead_s * 1e9)
+                message.header.stamp = SimpleNamespace(sec=shifted // 10**9,
+                                                       nanosec=shifted % 10**9)
+                take = (self.session.take_detection if isinstance(event, Detection)
+                        else self.session.take_encoder)
+                take(message)
+
+    def told(self, matched: bool = True):
+        return self.session.diagnosis(detections_matched=matched)
+
+
+def first_view(plan: str = "0", **changes) -> list:
+    """Return the messages of the first view alone, still open."""
+    events = events_of(small_plan(plan, repeats=1))
+    commands = [index for index, event in enumerate(events) if isinstance(event, Command)]
+    return events[:commands[2]]
+
+
+@pytest.mark.parametrize("seconds, published", [(0.49, 0), (0.5, 1)])
+def test_status_period(seconds, published):
+    desk = Desk(status_period=0.5)
+    desk.feed(first_view()[:-1])
+    desk.session.tick()
+    before, began = len(desk.hands.of("status")), desk.hands.seconds
+    assert before == 1
+    desk.feed(first_view()[-1:])
+    desk.hands.seconds += seconds - (desk.hands.seconds - began)
+    desk.session.tick()
+    assert len(desk.hands.of("status")) == before + published
+
+
+def test_nothing_new_is_not_told_again():
+    desk = Desk()
+    desk.feed(first_view())
+    desk.session.tick()
+    desk.hands.pass_time(60)
+    desk.session.tick()
+    assert len(desk.hands.of("status")) == 1
+
+
+def test_a_view_is_published_when_it_is_complete_and_again_only_when_it_changes():
+    desk = Desk(status_period=0.02)
+    events = first_view()
+    desk.feed(events[:-40])
+    desk.session.tick()
+    assert not desk.hands.of("measurement")
+    desk.feed(events[-40:])
+    desk.hands.pass_time(1)
+    desk.session.tick()
+    assert len(desk.hands.of("measurement")) == 1
+    desk.feed([event for event in events if isinstance(event, EncoderSample)][-1:])
+    desk.hands.pass_time(1)
+    desk.session.tick()
+    assert len(desk.hands.of("measurement")) == 1
+    assert [name for name, _ in desk.hands.published][-2:] == ["status", "status"]
+
+
+def test_every_message_of_a_run_names_it():
+    desk = Desk()
+    desk.feed(events_of(small_plan("0", repeats=1)), run_id="17")
+    desk.session.tick()
+    assert {fields["run_id"] for _, fields in desk.hands.published} == {"17"}
+    assert desk.told().values["run_id"] == "17"
+    assert desk.told().values["phase"] == "DONE"
+
+
+@pytest.mark.parametrize("ahead_s, complete", [
+    (0.0, True), (0.1, True), (0.101, False), (1.0, False), (37.0, False), (-0.0001, True)])
+def test_a_view_is_not_called_complete_on_stamps_from_the_future(ahead_s, complete):
+    desk = Desk(clock_limit=0.1)
+    desk.feed(first_view(), ahead_s=ahead_s)
+    desk.session.tick()
+    assert desk.hands.of("status")[-1]["complete"] is complete
+    told = desk.told()
+    assert ("clock" in told.message) is not complete
+    if not complete:
+        assert told.level == Level.WARN
+        assert f"the cell's clock is {ahead_s:.3g} s ahead of this machine's" in told.message
+
+
+def test_a_clock_behind_is_told():
+    desk = Desk(clock_limit=0.1)
+    desk.feed(first_view(), ahead_s=-1.0)
+    assert "the cell's clock is 1 s behind this machine's" in desk.told().message
+
+
+@pytest.mark.parametrize("late_s, checked", [(1.0, True), (1.01, False)])
+def test_recorded_messages_are_not_held_against_the_clock(late_s, checked):
+    desk = Desk()
+    desk.hands.pass_time(late_s)  # all stamps lie in the past by that
+    events = first_view()
+    for event in events:
+        desk.hands.seconds = (event.stamp_ns - START_NS) * 1e-9 + 100.0 + late_s
+        desk.feed([event])
+    assert ("clock_offset_s" in desk.told().values) is checked
+
+
+@pytest.mark.parametrize("seconds, heard", [(1.0, "yes"), (1.01, "no")])
+def test_the_encoder_is_heard_for_a_second(seconds, heard):
+    desk = Desk()
+    desk.feed(first_view())
+    desk.hands.pass_time(seconds)
+    told = desk.told(matched=False)
+    assert (told.values["encoder_heard"], told.values["detections_matched"]) == (heard, "no")
+    assert (told.level == Level.WARN) is (heard == "no")
+
+
+def test_a_gap_of_the_encoder_is_told_while_a_view_is_measured():
+    desk = Desk(max_encoder_gap=0.1)
+    events = first_view()
+    encoder = [event for event in events if isinstance(event, EncoderSample)]
+    cut = encoder[10].stamp_ns
+    desk.feed([event for event in events if isinstance(event, Command)
+               or not cut < event.stamp_ns < cut + 150_000_000])
+    assert "s between encoder samples: exposures in it are rejected" in desk.told().message
+    assert "between encoder samples" not in desk.told().message  # of the last second only
+
+
+@pytest.mark.parametrize("limit, level", [(1e-12, Level.WARN), (1e-3, Level.OK), (0.0, Level.OK)])
+def test_repeatability_against_its_limit(limit, level):
+    desk = Desk(repeatability_xy_limit=limit)
+    desk.feed(events_of(small_plan("0", repeats=2)))
+    desk.session.tick()
+    told = desk.told()
+    assert told.level == level
+    assert float(told.values["repeatability_xy_um"]) == pytest.approx(0.02, rel=0.5)
+
+
+def test_a_wrong_sense_is_told_in_the_log_and_in_the_health():
+    desk = Desk(measurement_sense="plate_moves", status_period=0.02)
+    desk.feed(first_view())
+    desk.session.tick()
+    [line] = desk.hands.lines(Level.WARN)
+    assert "measurement_sense" in line
+    told = desk.told()
+    assert told.level == Level.WARN
+    assert told.message.startswith(line)

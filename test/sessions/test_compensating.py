@@ -1,0 +1,133 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The session of the compensator: which map is used, since when, and why another is not."""
+
+import json
+
+import numpy as np
+import pytest
+
+from selfcal_ros.errors import InputError
+from selfcal_ros.messages import from_model
+from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.result import result_to_dict
+from selfcal_ros.sessions.compensating import CompensatingSession
+from selfcal_ros.sessions.ports import Level
+from test.support.maps import random_map, result_of
+from test.support.ports import START_NS, Hands, message, values_of
+
+ONE, TWO = (random_map(Artifact(5, 0.01, 8), seed) for seed in (3, 4))
+NAMES = ["x", "y", "theta"]
+
+
+def map_of(error_map=ONE, stamp_ns: int = START_NS, **changes) -> object:
+    return message("ErrorMap", from_model.error_map(result_of(error_map), stamp_ns, "stage")
+                   | {"run_id": "7"} | changes)
+
+
+def summary_of(stamp_ns: int = START_NS, **changes) -> object:
+    numbers = dict.fromkeys(
+        ("max_error_um", "rms_error_um", "rms_uncertainty_um", "max_theta_error_arcsec",
+         "rms_theta_uncertainty_arcsec"), 0.0)
+    return message("CalibrationSummary", {
+        "header": from_model.header(stamp_ns, "stage"), "state": "as it is", "views_done": 4,
+        "views_planned": 4, "identifiable": True, "rank_deficiency": 0, "advice": [],
+        "qualified": True, "causes": [], "run_id": "7", **numbers} | changes)
+
+
+class Desk:
+    def __init__(self, **parameters) -> None:
+        self.hands = Hands()
+        self.session = CompensatingSession(values_of("compensator", **parameters),
+                                           self.hands.ports)
+
+    def x_at(self, x: float) -> float | None:
+        corrected = self.session.correct(NAMES, [x, 0.0, 0.0])
+        return corrected and corrected[0]
+
+
+@pytest.fixture
+def desk():
+    return Desk()
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_a_map_is_used_once_its_summary_says_that_it_is_complete(desk, order):
+    for take in [lambda: desk.session.take_map(map_of()),
+                 lambda: desk.session.take_summary(summary_of())][::order]:
+        assert desk.x_at(0.0) is None
+        take()
+    assert desk.x_at(ONE.gx[2, 2]) == pytest.approx(0.0, abs=1e-8)
+    assert desk.hands.lines(Level.OK)[-1] == (
+        "correcting by the map of plan demo, run 7 from now on")
+    desk.hands.pass_time(12)
+    told = desk.session.diagnosis()
+    assert (told.level, told.message) == (Level.OK, "correcting by the map of plan demo, run 7")
+    assert (told.values["since_s"], told.values["map_age_s"]) == ("12", "12")
+
+
+@pytest.mark.parametrize("the_map, the_summary, why", [
+    ({"qualified": False}, {}, "plan demo, run 7 is not qualified"),
+    ({}, {"qualified": False}, "plan demo, run 7 is not qualified: as it is"),
+    ({}, {"views_done": 3}, "plan demo, run 7 is of 3 of 4 views"),
+    ({}, {"run_id": "6"}, "no selfcal/summary tells yet whether plan demo, run 7 is complete"),
+    ({}, {"stamp_ns": START_NS + 1},
+     "no selfcal/summary tells yet whether plan demo, run 7 is complete")])
+def test_a_map_that_must_not_be_used_leaves_the_former_one_in_use(
+        desk, the_map, the_summary, why):
+    desk.session.take_map(map_of(TWO, START_NS - 5))
+    desk.session.take_summary(summary_of(START_NS - 5))
+    before = desk.x_at(0.01)
+    desk.session.take_map(map_of(ONE, **the_map))
+    desk.session.take_summary(summary_of(**the_summary))
+    assert desk.x_at(0.01) == before
+    assert desk.hands.lines(Level.OK)[-1] == f"the newest map is not used: {why}"
+    assert desk.session.diagnosis().message.endswith(f"; not used: {why}")
+
+
+@pytest.mark.parametrize("planned, used", [(0, True), (4, True), (5, False)])
+def test_complete_means_all_planned_views(desk, planned, used):
+    desk.session.take_map(map_of())
+    desk.session.take_summary(summary_of(views_planned=planned))
+    assert (desk.session.compensator is not None) is used
+
+
+def test_any_map_is_used_where_that_is_asked_for():
+    desk = Desk(require_qualified=False)
+    desk.session.take_map(map_of(qualified=False))
+    assert desk.x_at(0.0) is not None
+
+
+def test_a_sample_is_corrected_by_one_map_as_a_whole(desk):
+    for error_map, stamp in ((ONE, START_NS), (TWO, START_NS + 1)):
+        desk.session.take_map(map_of(error_map, stamp))
+        desk.session.take_summary(summary_of(stamp))
+        x, y, _ = desk.session.correct(NAMES, [error_map.gx[2, 2], error_map.gy[2, 2], 0.0])
+        assert np.hypot(x, y) < 1e-15
+
+
+@pytest.mark.parametrize("age_s, level", [(10.0, Level.OK), (10.1, Level.WARN)])
+def test_an_old_map_is_a_warning(age_s, level):
+    desk = Desk(max_map_age=10.0)
+    desk.session.take_map(map_of())
+    desk.session.take_summary(summary_of())
+    desk.hands.pass_time(age_s)
+    assert desk.session.diagnosis().level == level
+
+
+def test_a_file_that_does_not_identify_the_stage_is_refused(tmp_path):
+    data = result_to_dict(result_of(ONE))
+    data["observability"]["identifiable"] = False
+    path = tmp_path / "map.json"
+    path.write_text(json.dumps(data))
+    with pytest.raises(InputError, match="the map is not qualified; measure again, or set "
+                                         "require_qualified to false"):
+        Desk(map=str(path))
+    assert Desk(map=str(path), require_qualified=False).x_at(0.0) is not None
+
+
+def test_a_malformed_map_leaves_the_former_one(desk):
+    desk.session.take_map(map_of())
+    desk.session.take_summary(summary_of())
+    with pytest.raises(InputError, match="gx has 3 values, the plate 25"):
+        desk.session.take_map(map_of(gx=np.zeros(3)))
+    assert desk.x_at(0.0) is not None

@@ -1,0 +1,68 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Health put together: levels, refusals and losses without a flood, presence, rates."""
+
+import pytest
+
+from selfcal_ros.errors import InputError
+from selfcal_ros.sessions.health import Losses, Presence, Rate, Refusals, merged
+from selfcal_ros.sessions.ports import Diagnosis, Level
+from test.support.ports import Hands
+
+
+@pytest.fixture
+def hands():
+    return Hands()
+
+
+def test_the_worst_comes_first_and_nothing_twice():
+    assert merged(Diagnosis(Level.OK, "main", {"a": 1}), [
+        Diagnosis(Level.OK, "fine", {"b": 2}), Diagnosis(Level.ERROR, "bad"),
+        Diagnosis(Level.WARN, "main")]) == Diagnosis(Level.ERROR, "bad; main", {"a": 1, "b": 2})
+
+
+def test_a_flood_of_refusals_is_counted_and_logged_at_powers_of_ten(hands):
+    refusals = Refusals(hands.ports.say, hands.ports.now_s)
+    for _ in range(1234):
+        refusals.add("topic", InputError("topic", "bad", "mend it"))
+    assert hands.lines(Level.ERROR) == ["topic: bad; mend it"] + [
+        f"topic: bad; mend it (refused {n} times)" for n in (2, 3, 4, 5, 10, 100, 1000)]
+    assert refusals.diagnosis() == Diagnosis(Level.WARN, "topic: bad; mend it",
+                                             {"refused topic": 1234})
+
+
+@pytest.mark.parametrize("seconds, level", [(9.9, Level.WARN), (10.0, Level.OK)])
+def test_a_refusal_and_a_loss_are_warnings_for_a_while(hands, seconds, level):
+    refusals = Refusals(hands.ports.say, hands.ports.now_s)
+    losses = Losses(hands.ports.say, hands.ports.now_s)
+    refusals.add("topic", ZeroDivisionError("\x1b[2Jdivision"))
+    losses.add("topic", 3)
+    losses.add("topic", 4)
+    assert hands.lines(Level.ERROR) == [
+        "topic: cannot be used (ZeroDivisionError: \\x1b[2Jdivision)"]
+    assert len(hands.lines(Level.WARN)) == 1
+    hands.pass_time(seconds)
+    assert refusals.diagnosis().level == losses.diagnosis().level == level
+    assert losses.diagnosis().values == {"lost topic": 7}
+    assert (losses.diagnosis().message == "topic: 7 messages lost") is (level == Level.WARN)
+
+
+@pytest.mark.parametrize("seconds, there", [(3.0, True), (3.1, False)])
+def test_presence(hands, seconds, there):
+    presence = Presence(hands.ports.now_s, 3.0)
+    told = Diagnosis(Level.OK, "here")
+    presence.take("node", told)
+    hands.pass_time(seconds)
+    assert presence.of("node") == (told if there else None)
+    assert presence.of("other") is None
+
+
+def test_the_rate_is_of_the_last_seconds_and_the_gap_since_it_was_asked(hands):
+    rate = Rate(hands.ports.now_s)
+    for index in range(400):
+        hands.pass_time(0.01)
+        rate.add(10_000_000 * (index + 1 + 30 * (index > 200)))
+    assert rate.per_second == pytest.approx(100, rel=0.06)
+    assert rate.take_gap_ns() == 310_000_000
+    assert rate.take_gap_ns() == 0
+    hands.pass_time(5)
+    assert rate.per_second == 0

@@ -1,0 +1,225 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The session of the solver: which readings count, runs kept apart, files, and what is told."""
+
+import json
+import os
+
+import numpy as np
+import pytest
+
+from selfcal_ros.errors import InputError, NoDataError, NotIdentifiableError
+from selfcal_ros.estimation.api import calibrate
+from selfcal_ros.messages import from_model, to_model
+from selfcal_ros.sessions.map_files import plan_file_name, read_result, result_file
+from selfcal_ros.sessions.ports import Level
+from selfcal_ros.sessions.runs import Run, supersedes
+from selfcal_ros.sessions.solving import SolvingSession, solve
+from test.support.ports import Hands, message, values_of
+from test.support.sessions import collected, events_of, small_plan
+
+PLAN = small_plan()
+
+
+def views_of(plan=PLAN, seed: int = 5, run_id: str = "", **changes) -> list:
+    """Return the ViewMeasurement messages of a run, stamps 10, 11, ..."""
+    _, measurements, progress = collected(events_of(plan, seed))
+    return [message("ViewMeasurement", from_model.view_measurement(
+        view, measurements, 10 + index, "stage") | {"run_id": run_id} | changes)
+        for index, view in progress.items()]
+
+
+def command(views: int, run_id: str = "", plan_id: str = PLAN.plan_id) -> object:
+    return type("Command", (), {"plan_id": plan_id, "run_id": run_id, "views_planned": views})
+
+
+class Desk:
+    def __init__(self, **parameters) -> None:
+        self.hands = Hands()
+        self.session = SolvingSession(values_of("solver", **parameters), self.hands.ports)
+
+    def take(self, messages: list) -> None:
+        for item in messages:
+            self.session.take_measurement(item)
+        self.solve()
+
+    def solve(self) -> bool:
+        job = self.session.next_job()
+        if job is not None:
+            self.session.take(solve(job))
+        return job is not None
+
+
+@pytest.fixture
+def desk():
+    return Desk()
+
+
+def test_readings_of_two_runs_are_never_mixed(desk):
+    old, new = views_of(seed=5, run_id="100"), views_of(seed=6, run_id="200")
+    desk.take(old)
+    desk.take(new[:2])
+    summary = desk.hands.of("summary")[-1]
+    assert (summary["views_done"], summary["run_id"], summary["identifiable"]) == (2, "200", False)
+    desk.take([*new[2:], old[3]])
+    last = desk.hands.of("map")[-1]
+    _, fresh, _ = collected(events_of(PLAN, 6))
+    np.testing.assert_array_equal(last["gx"], calibrate(fresh).error_map.gx.ravel())
+    assert last["run_id"] == "200"
+    assert desk.session.diagnosis().values["left_aside"] == 1
+
+
+@pytest.mark.parametrize("new, current, later", [
+    (Run("a", "2"), Run("a", "1"), True), (Run("a", "1"), Run("a", "2"), False),
+    (Run("a", "10"), Run("a", "9"), True), (Run("b", "1"), Run("a", "2"), False),
+    (Run("b"), Run("a", "2"), True), (Run("a", "2"), Run("a"), True),
+    (Run("a", "x"), Run("a", "2"), True), (Run("a", "9" * 21), Run("a", "2"), True)])
+def test_the_later_run_supersedes(new, current, later):
+    assert supersedes(new, current) is later
+
+
+def test_what_arrives_while_a_job_runs_is_solved_next_and_a_newer_run_discards_it(desk):
+    old, new = views_of(seed=5, run_id="1"), views_of(seed=6, run_id="2")
+    for item in old[:3]:
+        desk.session.take_measurement(item)
+    running = desk.session.next_job()
+    assert desk.session.next_job() is None
+    desk.session.take_measurement(old[3])
+    desk.session.take(solve(running))
+    assert desk.session.digest() == ""  # not of the newest readings
+    assert desk.solve()
+    assert desk.session.digest() != ""
+    late = solve(running)
+    for item in new:
+        desk.session.take_measurement(item)
+    shown = len(desk.hands.published)
+    desk.session.take(late)
+    assert len(desk.hands.published) == shown
+
+
+@pytest.mark.parametrize("first, second, counts", [(1, 2, 2), (2, 1, 2)])
+def test_the_session_rejections_are_those_of_the_newest_view(desk, first, second, counts):
+    messages = views_of()[:2]
+    for item, number in zip(messages, (first, second), strict=True):
+        item.session_reject_reasons, item.session_reject_counts = ["outside_every_view"], [number]
+    desk.take(messages)
+    assert desk.session.measurements().rejected == {"outside_every_view": counts}
+
+
+def test_the_stamp_is_that_of_the_newest_reading(desk):
+    desk.take(list(reversed(views_of())))
+    assert desk.hands.of("map")[-1]["header"]["stamp"]["nanosec"] == 13
+
+
+@pytest.mark.parametrize("planned, level, line", [
+    (4, Level.OK, "1 of 4 views measured, not yet enough to identify the stage."),
+    (1, Level.WARN, None)])
+def test_a_deficient_plan_is_a_warning_once_all_its_views_are_measured(desk, planned, level, line):
+    desk.session.take_command(command(planned))
+    desk.take(views_of()[:1])
+    told = desk.session.diagnosis()
+    assert told.level == level
+    assert (told.message == line) is (line is not None)
+    with pytest.raises(NotIdentifiableError):
+        desk.session.save("x.json")
+
+
+def test_more_planned_views_are_told_and_fewer_change_nothing(desk):
+    desk.take(views_of())
+    for views, solved in ((4, True), (4, False), (3, False), (5, True)):
+        desk.session.take_command(command(views))
+        assert desk.solve() is solved
+    assert desk.hands.of("summary")[-1]["views_planned"] == 5
+    desk.session.take_command(command(9, run_id="other"))
+    assert not desk.solve()
+
+
+@pytest.mark.parametrize("field, value, problem", [
+    ("dx", np.zeros(3), "m, n, dx, dy, count differ in length"),
+    ("reject_reasons", ["one"], "reject_reasons and reject_counts differ in length")])
+def test_readings_that_contradict_themselves_are_refused_at_once(desk, field, value, problem):
+    bad = views_of()[0]
+    setattr(bad, field, value)
+    with pytest.raises(InputError, match=problem):
+        desk.session.take_measurement(bad)
+    assert desk.session.next_job() is None
+
+
+def test_two_plates_in_one_run_are_told(desk):
+    one, two = views_of()[:2]
+    two.grid_pitch *= 2
+    desk.session.take_measurement(one)
+    desk.session.take_measurement(two)
+    with pytest.raises(InputError, match="views of different plates in one plan; measure one"):
+        desk.session.next_job()
+    assert desk.session.diagnosis().level == Level.WARN
+
+
+def test_nothing_to_save_yet(desk):
+    with pytest.raises(NoDataError, match="there is no map yet; measure the views of the plan"):
+        desk.session.save("map.json")
+
+
+def test_maps_are_saved_in_the_folder_of_results_alone(tmp_path):
+    desk = Desk(result_folder=str(tmp_path))
+    desk.take(views_of())
+    line, path = desk.session.save("map.json")
+    assert path == str(tmp_path / "map.json")
+    assert line.startswith(f"saved to {path}; readings ")
+    assert json.loads((tmp_path / "map.json").read_text())["plan_id"] == PLAN.plan_id
+    for outside in ("../map.json", "/tmp/map.json", f"{tmp_path}/../x.json"):
+        with pytest.raises(InputError, match=r"lies outside of .*; name a file in it, or set the "):
+            desk.session.save(outside)
+
+
+def test_a_link_out_of_the_folder_is_outside(tmp_path):
+    (tmp_path / "in").mkdir()
+    (tmp_path / "in" / "link").symlink_to(tmp_path)
+    with pytest.raises(InputError, match="lies outside of"):
+        result_file("link/map.json", str(tmp_path / "in"))
+
+
+@pytest.mark.parametrize("plan_id, name", [
+    ("hu", "hu.json"), ("../../x", "_.._x.json"), ("/etc/passwd", "_etc_passwd.json"),
+    ("", "plan.json"), ("..", "plan.json"), ("a b\x1b[2J", "a_b__2J.json")])
+def test_a_plan_names_no_file_elsewhere(plan_id, name):
+    assert plan_file_name(plan_id) == name
+
+
+def test_a_map_that_cannot_be_saved_by_itself_is_still_published(tmp_path):
+    desk = Desk(save_path=str(tmp_path / "no" / "map.json"), result_folder=str(tmp_path))
+    desk.take(views_of())
+    [line] = desk.hands.lines(Level.ERROR)
+    assert line.startswith(f"save_path: {tmp_path}/no/map.json: cannot be written")
+    assert desk.hands.of("map")
+    assert desk.session.save("map.json")[1] == str(tmp_path / "map.json")
+
+
+def test_only_regular_files_are_loaded(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    for path, problem in ((tmp_path / "pipe", "is not a regular file; name a RESULT.json"),
+                          ("/dev/zero", "is not a regular file; name a RESULT.json"),
+                          (tmp_path, "is not a regular file; name a RESULT.json"),
+                          (tmp_path / "no", "no such file; check the path"),
+                          ("a\0b", "no such file|is no file name|embedded null")):
+        with pytest.raises(InputError, match=problem):
+            read_result(str(path))
+
+
+def test_a_number_of_400_digits_is_refused(tmp_path):
+    desk = Desk(result_folder=str(tmp_path))
+    desk.take(views_of())
+    desk.session.save("map.json")
+    text = (tmp_path / "map.json").read_text()
+    data = json.loads(text)
+    data["error_map"]["gx"][0][0] = int("9" * 400)
+    (tmp_path / "map.json").write_text(json.dumps(data))
+    with pytest.raises(InputError, match=r"map\.json"):
+        desk.session.load(str(tmp_path / "map.json"))
+
+
+def test_a_map_tells_run_and_verdict(desk):
+    desk.take(views_of(run_id="7"))
+    published, summary = desk.hands.of("map")[-1], desk.hands.of("summary")[-1]
+    assert (published["qualified"], published["run_id"]) == (True, "7")
+    assert (summary["qualified"], summary["run_id"], summary["causes"]) == (True, "7", [])
+    assert to_model.error_map(message("ErrorMap", published)).artifact == PLAN.artifact

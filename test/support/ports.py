@@ -1,0 +1,47 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Ports of a session that a test holds in its hands: what was published, said, and the time."""
+
+
+from selfcal_ros.bagio.build import build
+from selfcal_ros.bagio.schemas import typestore
+from selfcal_ros.collection.parameters import parameter_values
+from selfcal_ros.sessions.ports import Level, Ports
+
+START_NS = 1_700_000_000_000_000_000
+
+
+class Hands:
+    """A clock that stands until it is moved, and lists of what a session did."""
+
+    def __init__(self) -> None:
+        self.seconds = 100.0
+        self.published: list[tuple[str, dict]] = []
+        self.said: list[tuple[Level, str]] = []
+        self.ports = Ports(lambda output, fields: self.published.append((output, fields)),
+                           lambda level, line: self.said.append((level, line)),
+                           lambda: self.seconds, lambda: self.now_ns)
+
+    @property
+    def now_ns(self) -> int:
+        return START_NS + round((self.seconds - 100.0) * 1e9)
+
+    def pass_time(self, seconds: float) -> None:
+        self.seconds += seconds
+
+    def of(self, output: str) -> list[dict]:
+        return [fields for name, fields in self.published if name == output]
+
+    def lines(self, level: Level) -> list[str]:
+        return [line for at, line in self.said if at == level]
+
+
+def values_of(node: str, **overrides) -> dict:
+    return parameter_values(node, overrides, "test")
+
+
+def message(kind: str, fields: dict) -> object:
+    """Return a message as sessions get it, from the fields that another session published."""
+    return build(typestore(), f"selfcal_msgs/msg/{kind}", fields)
+
+
+
