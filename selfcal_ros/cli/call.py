@@ -1,0 +1,33 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``selfcal call``: one request to the sequencer of a cell, and its answer."""
+
+import argparse
+import contextlib
+
+from selfcal_ros.errors import ExitCode
+
+HELP = "ask the sequencer of a running cell: start, confirm, redo, skip or abort"
+REQUESTS = ("start", "confirm", "redo", "skip", "abort")
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the verb."""
+    parser.add_argument("request", choices=REQUESTS, help="start: begin the plan; confirm: the "
+                        "plate lies as asked; redo: measure the view again; skip: go on without "
+                        "it; abort: give the plan up")
+    parser.add_argument("--namespace", metavar="NS", default="", help="namespace of the cell")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Ask, print the answer; exit code 2 if the request was refused."""
+    from selfcal_ros.cli.processes import ended_by_signals
+    from selfcal_ros.cli.watching import eyes
+
+    with ended_by_signals(), contextlib.ExitStack() as stack:
+        monitor = stack.enter_context(eyes(args.namespace))
+        monitor.ask(args.request)
+        for message in monitor.messages():
+            if "answer" in message:
+                print(message["answer"])
+                return int(ExitCode.DONE if message["success"] else ExitCode.BAD_INPUT)
+    return int(ExitCode.INTERNAL)

@@ -1,0 +1,142 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``selfcal monitor``: one screen of a running cell, and keys for its sequencer."""
+
+import argparse
+import contextlib
+import sys
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from selfcal_ros.cli.watching import Eyes
+
+HELP = "watch a running cell on one screen, and drive its sequencer by keys"
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the verb."""
+    parser.add_argument("--namespace", metavar="NS", default="", help="namespace of the cell")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Show the screen until q, Ctrl-C or the end of the input."""
+    from selfcal_ros.cli.processes import ended_by_signals
+    from selfcal_ros.cli.watching import eyes
+
+    with ended_by_signals(), eyes(args.namespace) as monitor:
+        return watch(monitor, [], lambda: None)
+
+
+def watch(monitor: "Eyes", log: list[str], step: Callable[[], None]) -> int:
+    """Draw what the monitor sends and pass keys on; call `step` several times a second.
+
+    Without a terminal every change of state is a line on stdout instead, and requests are read
+    as words from stdin.
+    """
+    show = _lines if not sys.stdout.isatty() else _live
+    with _keys() as pressed, show(log) as draw:
+        while True:
+            step()
+            message = monitor.next(0.1)
+            if message is None:
+                return 1
+            if "picture" in message:
+                draw(message["picture"])
+            elif "answer" in message:
+                log.append(message["answer"])
+                draw(None)
+            for word in pressed():
+                if word == "quit":
+                    return 0
+                monitor.ask(word)
+
+
+@contextlib.contextmanager
+def _live(log: list[str]) -> Iterator[Callable[[Any], None]]:
+    """Draw on the whole terminal, which is given back as it was."""
+    from rich.console import Console
+    from rich.live import Live
+
+    from selfcal_ros.cli.screen import screen
+
+    newest: dict[str, Any] = {}
+    with Live(console=Console(), screen=True, auto_refresh=False) as live:
+        def draw(picture: Any) -> None:
+            newest.update(picture or {})
+            if newest:
+                live.update(screen(newest, log), refresh=True)
+        yield draw
+
+
+@contextlib.contextmanager
+def _lines(log: list[str]) -> Iterator[Callable[[Any], None]]:
+    """Print a line where something a script may wait for has changed."""
+    from selfcal_ros.cli.screen import what_now
+    from selfcal_ros.errors import printable
+
+    said: dict[str, str] = {}
+
+    def draw(picture: Any) -> None:
+        while log:
+            print(printable(log.pop(0)), flush=True)
+        if picture is None:
+            return
+        now = {"now": what_now(picture)}
+        if picture["summary"]:
+            now["map"] = picture["summary"]["state"]
+        for node, told in picture["health"].items():
+            if told is not None and told["level"]:
+                now[node] = told["message"]
+        for key, line in now.items():
+            if said.get(key) != line:
+                said[key] = line
+                print(printable(f"{key}: {line}"), flush=True)
+    yield draw
+
+
+@contextlib.contextmanager
+def _keys() -> Iterator[Callable[[], list[str]]]:
+    """Yield a function that returns what was pressed, or written as words, since the last call."""
+    import select
+
+    from selfcal_ros.cli.screen import KEYS
+
+    if not sys.stdin.isatty():
+        yield _words()
+        return
+    import termios
+    import tty
+
+    before = termios.tcgetattr(sys.stdin)
+    try:
+        tty.setcbreak(sys.stdin)
+
+        def pressed() -> list[str]:
+            found = []
+            while select.select([sys.stdin], [], [], 0)[0]:
+                key = sys.stdin.read(1)
+                found += ["quit"] if key in ("q", "") else [KEYS[key]] if key in KEYS else []
+            return found
+        yield pressed
+    finally:
+        termios.tcsetattr(sys.stdin, termios.TCSADRAIN, before)
+
+
+def _words() -> Callable[[], list[str]]:
+    """Return a function that returns the lines of stdin since the last call; its end is no end."""
+    import queue
+    import threading
+
+    lines: queue.SimpleQueue = queue.SimpleQueue()
+
+    def read() -> None:
+        for line in sys.stdin:
+            lines.put(line.strip())
+    threading.Thread(target=read, name="stdin", daemon=True).start()
+
+    def taken() -> list[str]:
+        found = []
+        while not lines.empty():
+            found.append(lines.get())
+        return [word for word in found if word]
+    return taken

@@ -1,0 +1,70 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``selfcal up``: the nodes of a cell, supervised, and one screen to run a calibration."""
+
+import argparse
+import contextlib
+import os
+from pathlib import Path
+
+HELP = "bring up the nodes of a cell, supervise them, and run a calibration on one screen"
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the verb."""
+    parser.add_argument("--plan", metavar="PLAN.yaml", required=True, help="plate and views")
+    parser.add_argument("--params", metavar="NODES.yaml", help="ROS parameter file for the nodes")
+    parser.add_argument("--namespace", metavar="NS", default="", help="namespace of the cell")
+    parser.add_argument("--bag", metavar="FOLDER", help="record the session to this new folder")
+    parser.add_argument("--results", metavar="FOLDER", default=".",
+                        help="folder for the maps that are saved (default: the working directory)")
+    parser.add_argument("--compensate", action="store_true",
+                        help="publish corrected joint states as well")
+    parser.add_argument("--simulate", action="store_true",
+                        help="run a simulated cell beside the nodes, to try it out")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Start the nodes, watch over them, show the screen; take them along at the end."""
+    from selfcal_ros.cli.monitor import watch
+    from selfcal_ros.cli.processes import ended_by_signals, need_ros
+    from selfcal_ros.cli.supervisor import Supervisor
+    from selfcal_ros.cli.watching import eyes
+    from selfcal_ros.errors import InputError
+    from selfcal_ros.files import read_bytes, read_yaml
+    from selfcal_ros.model.view import plan_from_dict
+
+    need_ros("")
+    plan_from_dict(read_yaml(args.plan), args.plan)
+    if args.params:
+        read_bytes(args.params)
+    if args.bag and Path(args.bag).exists():
+        raise InputError(args.bag, "exists already", "remove it or name another folder")
+    if not Path(args.results).is_dir():
+        raise InputError(args.results, "is not a folder", "name one that exists")
+    with ended_by_signals(), contextlib.ExitStack() as stack:
+        supervisor = stack.enter_context(Supervisor(commands(args), dict(os.environ)))
+        monitor = stack.enter_context(eyes(args.namespace))
+        return watch(monitor, supervisor.log, supervisor.step)
+
+
+def commands(args: argparse.Namespace) -> dict[str, list[str]]:
+    """Return node -> its arguments."""
+    common = ["--ros-args"]
+    if args.namespace.strip("/"):
+        common += ["-r", f"__ns:=/{args.namespace.strip('/')}"]
+    if args.params:
+        common += ["--params-file", str(Path(args.params).resolve())]
+
+    def with_parameters(**values: str) -> list[str]:
+        return common + [word for name, value in values.items()
+                         for word in ("-p", f"{name}:={value}")]
+    nodes = {"measurement_collector": with_parameters(),
+             "solver": with_parameters(result_folder=str(Path(args.results).resolve())),
+             "pose_sequencer": with_parameters(plan=str(Path(args.plan).resolve()))}
+    if args.compensate:
+        nodes["compensator"] = with_parameters()
+    if args.bag:
+        nodes["bag_recorder"] = with_parameters(bag=str(Path(args.bag).resolve()))
+    if args.simulate:
+        nodes["stage_simulator"] = with_parameters()
+    return nodes

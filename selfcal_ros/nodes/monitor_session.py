@@ -1,0 +1,119 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The eyes and hands of `selfcal up`, `monitor` and `call` on the graph.
+
+Run as a process: ``python -m selfcal_ros.nodes.monitor_session NAMESPACE``. It writes a line of
+JSON to stdout when something has changed, ``{"picture": ...}``, and takes requests from stdin, one
+word a line: start, confirm, redo, skip, abort. Each is answered by a line
+``{"answer": TEXT, "success": true|false}``. It ends when stdin does.
+"""
+
+import json
+import os
+import sys
+import threading
+import time
+from typing import Any
+
+from rclpy.clock import Clock, ClockType
+from rclpy.node import Node
+from rclpy.task import Future
+from std_srvs.srv import Trigger
+
+from selfcal_ros.nodes import names
+from selfcal_ros.nodes.filling import diagnosis_of
+from selfcal_ros.nodes.running import run
+from selfcal_ros.sessions.ports import Ports
+from selfcal_ros.sessions.watching import Watch
+
+REQUESTS = {"start": "start", "confirm": "confirm_view", "redo": "redo_view",
+            "skip": "skip_view", "abort": "abort"}
+WATCHED = ("measurement_collector", "pose_sequencer", "solver", "compensator", "bag_recorder",
+           "stage_simulator", "bag_player")
+PERIOD_S = 0.2
+PATIENCE_S = 10.0
+
+
+class MonitorSession(Node):
+    """Shows what the topics of a cell say, and asks its sequencer for what a person wants."""
+
+    def __init__(self, namespace: str) -> None:
+        super().__init__(f"monitor_{os.getpid()}", namespace=namespace)
+        self.finished = Future()
+        self._watch = Watch(Ports(lambda *_: None, lambda *_: None, time.monotonic, time.time_ns))
+        for topic, take in ((names.COMMAND, self._watch.take_command),
+                            (names.STATUS, self._watch.take_status),
+                            (names.SUMMARY, self._watch.take_summary),
+                            (names.ERROR_MAP, self._watch.take_map)):
+            self.create_subscription(topic.type, topic.name, take, topic.qos)
+        for node in WATCHED:
+            topic = names.of_node(node, names.HEALTH)
+            self.create_subscription(topic.type, topic.name, lambda status, node=node:
+                                     self._watch.take_health(node, diagnosis_of(status)), topic.qos)
+        self._askers = {word: self.create_client(Trigger, f"pose_sequencer/{service}")
+                        for word, service in REQUESTS.items()}
+        self._words: list[str] = []
+        self._asked: list[tuple[str, float, Any]] = []
+        self._shown = ""
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self.create_timer(PERIOD_S, self._show, clock=steady)
+        self.create_timer(0.05, self._serve, clock=steady)
+        threading.Thread(target=self._listen, name="stdin", daemon=True).start()
+
+    def _listen(self) -> None:
+        for line in sys.stdin:
+            self._words.append(line.strip())
+        self._words.append("")
+
+    def _show(self) -> None:
+        text = json.dumps({"picture": self._watch.picture()})
+        if text != self._shown:
+            self._shown = text
+            self._write(text)
+
+    def _serve(self) -> None:
+        """Send what was asked for, and pass on what was answered or is overdue."""
+        while self._words:
+            word = self._words.pop(0)
+            if not word:
+                self._end()
+            elif word not in self._askers:
+                self._answer(f"{word}: not known", success=False)
+            else:
+                self._asked.append((word, time.monotonic() + PATIENCE_S, None))
+        waiting = []
+        for word, until, future in self._asked:
+            client = self._askers[word]
+            if future is None and client.service_is_ready():
+                future = client.call_async(Trigger.Request())
+            if future is not None and future.done():
+                self._answer(f"{word}: {future.result().message}",
+                             success=future.result().success)
+            elif time.monotonic() > until:
+                self._answer(f"{word}: pose_sequencer does not answer; is it running in this "
+                             "namespace and ROS_DOMAIN_ID?", success=False)
+            else:
+                waiting.append((word, until, future))
+        self._asked = waiting
+
+    def _answer(self, text: str, *, success: bool) -> None:
+        self._write(json.dumps({"answer": text, "success": success}))
+
+    def _write(self, text: str) -> None:
+        try:
+            print(text, flush=True)
+        except BrokenPipeError:
+            self._end()
+
+    def _end(self) -> None:
+        if not self.finished.done():
+            self.finished.set_result(None)
+
+
+def main() -> None:
+    """Run the session: NAMESPACE."""
+    namespace = sys.argv[1] if len(sys.argv) > 1 else ""
+    sys.exit(run(lambda: MonitorSession(namespace), sys.argv[2:]))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,153 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a person who watches a cell wants to see, gathered from its topics as plain values."""
+
+import math
+from typing import Any
+
+import numpy as np
+
+from selfcal_ros.collection.messages import Phase
+from selfcal_ros.messages import to_model
+from selfcal_ros.sessions.health import Presence
+from selfcal_ros.sessions.ports import Diagnosis, Ports
+
+PATIENCE_S = 3.0
+NODES = ("measurement_collector", "pose_sequencer", "solver")
+"""Nodes that a calibration needs; others are shown when they tell something."""
+MOST_SITES = 41
+"""Sites a side of the pictures; a larger plate is shown by every second, third, ... mark."""
+
+
+class Watch:
+    """Keeps the newest word of everybody, and makes one picture of it.
+
+    Parameters
+    ----------
+    ports : Ports
+        Clocks.
+    """
+
+    def __init__(self, ports: Ports) -> None:
+        self._presence = Presence(ports.now_s, PATIENCE_S)
+        self._seen: set[str] = set(NODES)
+        self._command: Any = None
+        self._status: Any = None
+        self._summary: Any = None
+        self._map: Any = None
+
+    def take_health(self, node: str, diagnosis: Diagnosis) -> None:
+        """Take what a node says of itself."""
+        self._seen.add(node)
+        self._presence.take(node, diagnosis)
+
+    def take_command(self, message: Any) -> None:
+        """Take a view command; the newest by its stamp counts."""
+        if self._command is None or to_model.stamp_ns(message) >= to_model.stamp_ns(self._command):
+            self._command = message
+
+    def take_status(self, message: Any) -> None:
+        """Take how far a view is; that of the commanded view counts."""
+        command = self._command
+        if command is None or (message.plan_id, message.view_index) == (
+                command.plan_id, command.view_index):
+            self._status = message
+
+    def take_summary(self, message: Any) -> None:
+        """Take where the calibration stands."""
+        self._summary = message
+
+    def take_map(self, message: Any) -> None:
+        """Take the error map."""
+        self._map = message
+
+    def picture(self) -> dict[str, Any]:
+        """Return everything as values that JSON knows."""
+        return {"health": {node: self._health(node) for node in sorted(self._seen)},
+                "command": self._commanded(), "view": self._view(),
+                "summary": self._summed(), "map": self._mapped()}
+
+    def _health(self, node: str) -> dict[str, Any] | None:
+        told = self._presence.of(node)
+        return told and {"level": int(told.level), "message": told.message,
+                         "values": told.values}
+
+    def _commanded(self) -> dict[str, Any] | None:
+        command = self._command
+        return command and {
+            "phase": Phase(command.phase).name if command.phase in list(Phase) else "?",
+            "plan_id": command.plan_id, "run_id": command.run_id,
+            "view_index": command.view_index, "view_name": command.view_name,
+            "views_planned": command.views_planned,
+            "rotation_deg": _finite(math.degrees(command.rotation)),
+            "translation_mm": [_finite(command.translation_x * 1e3),
+                               _finite(command.translation_y * 1e3)]}
+
+    def _view(self) -> dict[str, Any] | None:
+        status = self._status
+        if status is None:
+            return None
+        return {
+            "view_name": status.view_name, "complete": bool(status.complete),
+            "grid": [status.grid_done, status.grid_expected],
+            "angular": [status.angular_done, status.angular_expected],
+            "used": status.detections_used,
+            "rejected": dict(zip(status.reject_reasons, map(int, status.reject_counts),
+                                 strict=False)),
+            "repeatability_um": _finite(status.sigma_xy * 1e6),
+            "repeatability_arcsec": _finite(math.degrees(status.sigma_theta) * 3600),
+            "missing_lines": [int(k) for k in status.missing_k], "plate": self._plate()}
+
+    def _plate(self) -> list[str]:
+        """Return the plate as lines of characters, top line first; empty if it is not known.
+
+        ``o`` a mark that is read, ``.`` one that is missing, blank: not in this view.
+        """
+        command, status = self._command, self._status
+        try:
+            artifact = to_model.artifact_of(command)
+            pose = to_model.view_of(command, repeats=1, grid=True,
+                                    angular=False).lattice_pose(artifact)
+        except Exception:  # a picture is no place for the faults of a command
+            return []
+        if not command.grid or pose.quarter_turns is None:
+            return []
+        shape, half = artifact.shape, artifact.half
+        step = max(1, math.ceil(max(shape) / MOST_SITES))
+        m, n = np.meshgrid(np.arange(-half[0], half[0] + 1, step),
+                           np.arange(-half[1], half[1] + 1, step), indexing="ij")
+        i, j = pose.site_of(m, n)
+        inside = (abs(i) <= half[0]) & (abs(j) <= half[1])
+        missing = set(zip(map(int, status.missing_m), map(int, status.missing_n), strict=False))
+        if not missing and status.grid_done < status.grid_expected:
+            return []  # the collector does not tell which
+        return ["".join(" " if not inside[a, b] else
+                        "." if (int(m[a, b]), int(n[a, b])) in missing else "o"
+                        for a in range(m.shape[0])) for b in reversed(range(m.shape[1]))]
+
+    def _summed(self) -> dict[str, Any] | None:
+        summary = self._summary
+        return summary and {
+            "state": summary.state, "views": [summary.views_done, summary.views_planned],
+            "identifiable": bool(summary.identifiable), "qualified": bool(summary.qualified),
+            "max_error_um": _finite(summary.max_error_um),
+            "rms_uncertainty_um": _finite(summary.rms_uncertainty_um),
+            "advice": list(summary.advice), "causes": list(summary.causes),
+            "run_id": summary.run_id}
+
+    def _mapped(self) -> dict[str, Any] | None:
+        """Return |G| in um by site, rows from the top, sites thinned out; None where unknown."""
+        message = self._map
+        if message is None:
+            return None
+        try:
+            error_map = to_model.error_map(message)
+        except Exception:  # the solver's own health tells of it
+            return None
+        size = np.hypot(error_map.gx, error_map.gy) * 1e6
+        step = max(1, math.ceil(max(size.shape) / MOST_SITES))
+        return {"run_id": message.run_id, "qualified": bool(message.qualified), "um": [
+            [_finite(value) for value in row] for row in size[::step, ::step].T[::-1].tolist()]}
+
+
+def _finite(value: float) -> float | None:
+    return float(value) if math.isfinite(value) else None

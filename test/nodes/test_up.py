@@ -1,0 +1,197 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`selfcal up`, `monitor`, `call`: a whole calibration, nodes that die, nothing left behind."""
+
+import contextlib
+import os
+import queue
+import signal
+import subprocess
+import sys
+import threading
+import time
+from types import SimpleNamespace
+
+import pytest
+
+from selfcal_ros.cli import supervisor as supervising
+from selfcal_ros.cli.supervisor import MOST_RESTARTS, Supervisor
+from test.support.sessions import plan_file, small_plan
+
+PATIENCE_S = 120.0
+SELFCAL = "import sys; from selfcal_ros.cli.main import main; sys.exit(main())"
+
+
+class Screen:
+    """A command of `selfcal` whose lines are read and whose words are written."""
+
+    def __init__(self, environment: dict, *words: str) -> None:
+        self.process = subprocess.Popen(
+            [sys.executable, "-c", SELFCAL, *words], env=environment, stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True)
+        self.lines: list[str] = []
+        self._queue: queue.Queue = queue.Queue()
+        threading.Thread(target=self._read, daemon=True).start()
+
+    def _read(self) -> None:
+        for line in self.process.stdout:
+            self._queue.put(line.rstrip("\n"))
+
+    def write(self, word: str) -> None:
+        self.process.stdin.write(f"{word}\n")
+        self.process.stdin.flush()
+
+    def until(self, text: str) -> str:
+        """Return the next line that holds `text`."""
+        deadline = time.monotonic() + PATIENCE_S
+        while True:
+            left = deadline - time.monotonic()
+            assert left > 0, f"waited in vain for {text!r} in {self.lines}"
+            with contextlib.suppress(queue.Empty):
+                self.lines.append(self._queue.get(timeout=left))
+                if text in self.lines[-1]:
+                    return self.lines[-1]
+
+    def close(self) -> None:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(self.process.pid, signal.SIGKILL)
+        self.process.communicate()
+
+
+@pytest.fixture
+def start(ros_environment):
+    screens = []
+
+    def run(*words: str) -> Screen:
+        screens.append(Screen(ros_environment, *words))
+        return screens[-1]
+    yield run
+    for screen in screens:
+        screen.close()
+
+
+def pid_of(session: int, node: str) -> int:
+    """Return the process of a session that runs a node."""
+    for line in subprocess.run(["ps", "-o", "pid=,args=", "-s", str(session)], text=True,
+                               capture_output=True, check=False).stdout.splitlines():
+        pid, _, command = line.strip().partition(" ")
+        if f"selfcal_ros.nodes.{node}" in command:
+            return int(pid)
+    raise AssertionError(f"no {node}")
+
+
+def test_a_calibration_by_words_past_the_death_of_two_nodes(start, tmp_path):
+    plan = small_plan()
+    up = start("up", "--plan", plan_file(tmp_path, plan), "--simulate", "--results", str(tmp_path))
+    up.until("now: Press s to start the plan.")
+    up.write("start")
+    for index, view in enumerate(plan.views):
+        up.until(f"now: Place the plate for view '{view.name}'")
+        if index == 1:  # the sequencer comes back in the view where it was
+            os.kill(pid_of(up.process.pid, "pose_sequencer"), signal.SIGKILL)
+            up.until("pose_sequencer has ended with signal 9: started again")
+            up.until("now: Press s to start the plan.")
+            up.write("start")
+            assert f"in view '{view.name}', PLACE" in up.until("took up run ")
+        if index == 2:
+            os.kill(pid_of(up.process.pid, "solver"), signal.SIGKILL)
+            up.until("solver has ended with signal 9: started again")
+        up.write("confirm")
+    up.until("now: Done. s starts another run.")
+    up.until("map: Calibrated from 4 views: largest error ")
+    asked = start("call", "confirm")
+    assert asked.process.wait(PATIENCE_S) == 2
+    asked.until("confirm: pose_sequencer: confirm_view does not fit while done")
+    up.write("quit")
+    assert up.process.wait(PATIENCE_S) == 0
+    with pytest.raises(AssertionError, match="no solver"):
+        pid_of(up.process.pid, "solver")
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
+def test_a_killed_command_takes_its_nodes_along(start, tmp_path, number):
+    up = start("up", "--plan", plan_file(tmp_path, small_plan()))
+    up.until("now: Press s to start the plan.")
+    session = up.process.pid
+    up.process.send_signal(number)
+    assert up.process.wait(PATIENCE_S) == (143 if number == signal.SIGTERM else -9)
+    deadline = time.monotonic() + PATIENCE_S
+    while subprocess.run(["ps", "-o", "pid=", "-s", str(session)], capture_output=True,
+                         check=False).stdout.split():
+        assert time.monotonic() < deadline, "a node stays behind"
+
+
+def test_a_request_without_a_cell_says_so(start):
+    asked = start("call", "start")
+    asked.until("start: pose_sequencer does not answer; is it running in this namespace and "
+                "ROS_DOMAIN_ID?")
+    assert asked.process.wait(PATIENCE_S) == 2
+
+
+@pytest.mark.parametrize("words, line", [
+    (["--plan", "/no/plan.yaml"], "selfcal up: /no/plan.yaml: no such file; check the path"),
+    (["--plan", "PLAN", "--bag", "/tmp"], "selfcal up: /tmp: exists already; remove it or name "
+                                          "another folder"),
+    (["--plan", "PLAN", "--results", "/no"], "selfcal up: /no: is not a folder; name one that "
+                                             "exists")])
+def test_bad_input_is_one_line_before_anything_is_started(start, tmp_path, words, line):
+    plan = plan_file(tmp_path, small_plan())
+    up = start("up", *[plan if word == "PLAN" else word for word in words])
+    assert up.process.wait(PATIENCE_S) == 2
+    assert up.process.stderr.read() == f"{line}\n"
+
+
+class Child:
+    def __init__(self, code: int | None) -> None:
+        self.code, self.stderr = code, iter(())
+
+    def poll(self) -> int | None:
+        return self.code
+
+    def terminate(self) -> None:
+        self.code = -15
+
+
+@pytest.fixture
+def dying(monkeypatch):
+    """Return a supervisor whose nodes end with the codes that are given, and its clock."""
+    def make(codes: list, node: str = "solver"):
+        left, clock = list(codes), SimpleNamespace(now=0.0)
+
+        @contextlib.contextmanager
+        def process(*_, **__):
+            yield Child(left.pop(0) if left else None)
+        monkeypatch.setattr(supervising, "process", process)
+        return Supervisor({node: []}, {}, lambda: clock.now), clock
+    return make
+
+
+def test_a_node_that_dies_again_and_again_is_given_up(dying):
+    supervisor, _ = dying([-9] * (MOST_RESTARTS + 3))
+    with supervisor:
+        for _ in range(MOST_RESTARTS + 3):
+            supervisor.step()
+        assert supervisor.log == ["solver has ended with signal 9: started again"] * (
+            MOST_RESTARTS) + ["solver has ended with signal 9, for the 6th time within 60 s: not "
+                              "started again"]
+
+
+@pytest.mark.parametrize("seconds, kept", [(59.9, False), (60.0, True)])
+def test_deaths_of_long_ago_do_not_count(dying, seconds, kept):
+    supervisor, clock = dying([1] * (MOST_RESTARTS + 1))
+    with supervisor:
+        for _ in range(MOST_RESTARTS):
+            supervisor.step()
+        clock.now = seconds
+        supervisor.step()
+        assert supervisor.log[-1].endswith(": started again") is kept
+
+
+@pytest.mark.parametrize("code, node, line", [
+    (2, "solver", "solver has ended with code 2 and is not started again"),
+    (-9, "bag_recorder", "bag_recorder has ended with signal 9 and is not started again")])
+def test_what_would_only_fail_again_is_not_started_again(dying, code, node, line):
+    supervisor, _ = dying([code], node)
+    with supervisor:
+        supervisor.step()
+        supervisor.step()
+        assert supervisor.log == [line]

@@ -1,0 +1,99 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the monitor makes of the topics of a cell."""
+
+import json
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from selfcal_ros.collection.messages import Command, Phase
+from selfcal_ros.messages import from_model
+from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.sessions.ports import Diagnosis, Level
+from selfcal_ros.sessions.watching import Watch
+from test.support.maps import random_map, result_of
+from test.support.ports import Hands, message
+from test.support.sessions import small_plan
+
+PLAN = small_plan("0, 90, tx")
+
+
+@pytest.fixture
+def hands():
+    return Hands()
+
+
+@pytest.fixture
+def watch(hands):
+    return Watch(hands.ports)
+
+
+def command(index: int, stamp_ns: int = 5) -> object:
+    return message("ViewCommand", from_model.command(Command(
+        stamp_ns, Phase.MEASURE, PLAN.plan_id, index, PLAN.views[index], PLAN.artifact,
+        len(PLAN.views), "17"), "stage"))
+
+
+def status(index: int, missing: list, **fields) -> object:
+    return SimpleNamespace(**({
+        "plan_id": PLAN.plan_id, "view_index": index, "view_name": PLAN.views[index].name,
+        "complete": False, "grid_done": 25 - len(missing), "grid_expected": 25, "angular_done": 7,
+        "angular_expected": 8, "detections_used": 50, "reject_reasons": ["duplicate"],
+        "reject_counts": [2], "sigma_xy": 2e-8, "sigma_theta": float("nan"),
+        "missing_m": [m for m, _ in missing], "missing_n": [n for _, n in missing],
+        "missing_k": [3]} | fields))
+
+
+def test_before_anything_is_heard(watch):
+    picture = json.loads(json.dumps(watch.picture()))
+    assert picture == {"health": {"measurement_collector": None, "pose_sequencer": None,
+                                  "solver": None},
+                       "command": None, "view": None, "summary": None, "map": None}
+
+
+def test_the_plate_is_drawn_in_its_own_frame_top_line_first(watch):
+    watch.take_command(command(0))
+    watch.take_status(status(0, [(-2, 2), (1, 0)]))
+    view = watch.picture()["view"]
+    assert view["plate"] == [".oooo", "ooooo", "ooo.o", "ooooo", "ooooo"]
+    assert (view["grid"], view["angular"], view["rejected"]) == ([23, 25], [7, 8],
+                                                                 {"duplicate": 2})
+    assert view["repeatability_um"] == pytest.approx(0.02)
+    assert view["repeatability_arcsec"] is None
+
+
+def test_marks_outside_of_the_field_are_blank(watch):
+    index = [view.name for view in PLAN.views].index("tx")
+    watch.take_command(command(index))
+    watch.take_status(status(index, [], grid_done=20, grid_expected=20))
+    assert watch.picture()["view"]["plate"] == ["oooo "] * 5
+
+
+def test_only_the_newest_command_and_its_view_count(watch):
+    watch.take_command(command(1, stamp_ns=9))
+    watch.take_command(command(0, stamp_ns=8))  # latched, and late
+    watch.take_status(status(1, []))
+    watch.take_status(status(0, []))
+    picture = watch.picture()
+    assert picture["command"]["view_name"] == picture["view"]["view_name"] == PLAN.views[1].name
+    assert picture["command"]["rotation_deg"] == pytest.approx(90)
+
+
+@pytest.mark.parametrize("seconds, there", [(3.0, True), (3.1, False)])
+def test_a_node_is_gone_after_a_while(watch, hands, seconds, there):
+    watch.take_health("compensator", Diagnosis(Level.WARN, "no map", {"a": "1"}))
+    hands.pass_time(seconds)
+    assert watch.picture()["health"]["compensator"] == (
+        {"level": 1, "message": "no map", "values": {"a": "1"}} if there else None)
+
+
+def test_the_map_is_thinned_out_and_stands_upright(watch):
+    error_map = random_map(Artifact(5, 0.01, 8), 3, unknown=[(0, 4)])
+    watch.take_map(message("ErrorMap", from_model.error_map(result_of(error_map), 1, "stage")))
+    um = watch.picture()["map"]["um"]
+    assert um[0][0] is None  # x smallest, y largest: top left
+    assert um[-1][0] == pytest.approx(1e6 * np.hypot(error_map.gx[0, 0], error_map.gy[0, 0]))
+    big = random_map(Artifact(101, 0.01, 8), 3)
+    watch.take_map(message("ErrorMap", from_model.error_map(result_of(big), 1, "stage")))
+    assert len(watch.picture()["map"]["um"]) == 34
