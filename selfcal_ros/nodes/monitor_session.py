@@ -36,8 +36,8 @@ PATIENCE_S = 10.0
 class MonitorSession(Node):
     """Shows what the topics of a cell say, and asks its sequencer for what a person wants."""
 
-    def __init__(self, namespace: str) -> None:
-        super().__init__(f"monitor_{os.getpid()}", namespace=namespace)
+    def __init__(self, namespace: str, **kwargs: Any) -> None:
+        super().__init__(f"monitor_{os.getpid()}", namespace=namespace, **kwargs)
         self.finished = Future()
         self._watch = Watch(Ports(lambda *_: None, lambda *_: None, time.monotonic, time.time_ns))
         for topic, take in ((names.COMMAND, self._watch.take_command),

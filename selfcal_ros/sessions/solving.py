@@ -240,7 +240,8 @@ class SolvingSession:
     def load(self, path: str) -> str:
         """Publish the map of a RESULT.json and say so."""
         result = read_result(path)
-        self.shown = Shown(result, views_done=len(result.views), run=Run(result.plan_id, result.run_id))
+        self.shown = Shown(result, run=Run(result.plan_id, result.run_id),
+                           views_done=len(result.views))
         self._publish()
         return f"loaded {path}: plan {result.plan_id}"
 

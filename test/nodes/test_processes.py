@@ -15,7 +15,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from selfcal_ros.collection.parameters import NODE_PARAMETERS
 from test.support.sessions import plan_file, small_bag, small_plan
 
-PATIENCE_S = 30.0
+PATIENCE_S = 120.0
 SELFCAL = "import sys; from selfcal_ros.cli.main import main; sys.exit(main())"
 
 

@@ -17,7 +17,7 @@ from selfcal_ros.nodes.filling import fill
 from selfcal_ros.nodes.names import Topic
 from selfcal_ros.simulation.cell import Event
 
-PATIENCE_S = 30.0
+PATIENCE_S = 60.0
 
 
 class Graph:
