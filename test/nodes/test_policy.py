@@ -65,10 +65,11 @@ def test_a_node_is_granted_what_it_does_and_nothing_else(graph, tmp_path, name):
                   "bag_recorder": {"bag": str(tmp_path / "new")},
                   "pose_sequencer": {"plan": plan_file(tmp_path, small_plan())}}
     graph.hand.create_publisher(names.ENCODER.type, names.ENCODER.name, names.ENCODER.qos)
-    graph.node(NODES[name], **parameters.get(name, {}))
+    node = graph.node(NODES[name], **parameters.get(name, {}))
     wanted = granted(name)
     graph.until(lambda: used(graph, name) == wanted,
                 f"{name}: granted {wanted}, used {used(graph, name)}")
+    getattr(node, "close", lambda: None)()
 
 
 def test_the_monitor_is_granted_what_it_does_and_nothing_else(graph):
