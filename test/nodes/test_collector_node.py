@@ -250,8 +250,8 @@ def test_a_view_whose_lines_cannot_be_told_apart_says_once_what_to_do(graph, mon
     graph.until(lambda: received(node, counts), "all messages")
     for _ in range(2):
         assert graph.call(Trigger, FINISH).success
-    (line,) = said
-    assert line.startswith("view 'line': 96 of 96 detections are rejected as rotation_not_known; ")
+    [line] = [text for text in said if text.startswith("view 'line': ")]
+    assert "rotation_not_known" in line
 
 
 def test_diagnostics_count_what_was_received(graph):

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """`selfcal replay`: over DDS, at any pace and in any order, the map of `selfcal solve`."""
 
+import re
+
 import pytest
 
 from selfcal_ros.cli.main import main as selfcal
@@ -8,13 +10,19 @@ from test.support.bags import Foreign
 from test.support.sessions import events_of, small_bag, small_plan
 
 
+def undated(text: str) -> str:
+    """Return the text of a result without the instant at which it was made."""
+    assert text.count('"created": "') == 1
+    return re.sub('"created": "[^"]*"', '"created": ""', text)
+
+
 @pytest.fixture(scope="module")
 def solved(tmp_path_factory):
     """Return a bag and the text of the result that `selfcal solve` writes for it."""
     folder = tmp_path_factory.mktemp("replay")
     bag = small_bag(folder)
-    assert selfcal(["solve", str(bag), "--quiet", "-o", str(folder / "solved.json")]) == 0
-    return bag, (folder / "solved.json").read_text()
+    assert selfcal(["solve", str(bag), "--quiet", "-o", str(folder / "solved.json")]) in (0, 5)
+    return bag, undated((folder / "solved.json").read_text())
 
 
 @pytest.mark.parametrize("options", [["--fast"], ["--rate", "20"], ["--rate", "50"],
@@ -22,8 +30,8 @@ def solved(tmp_path_factory):
 def test_replay_gives_the_result_of_solve_bit_for_bit(ros_environment, solved, tmp_path, options):
     bag, expected = solved
     output = tmp_path / "replayed.json"
-    assert selfcal(["replay", str(bag), *options, "--quiet", "-o", str(output)]) == 0
-    assert output.read_text() == expected
+    assert selfcal(["replay", str(bag), *options, "--quiet", "-o", str(output)]) in (0, 5)
+    assert undated(output.read_text()) == expected
 
 
 @pytest.mark.parametrize("cell", ["/", "cell2"])
@@ -36,7 +44,8 @@ def test_one_of_two_cells_is_played(ros_environment, tmp_path, capfd, cell):
     assert "choose one with --namespace" in capfd.readouterr().err
     for verb, output in ((["replay", "--fast"], replayed), (["solve"], solved)):
         assert selfcal([*verb, bag, "--namespace", cell, "--quiet", "-o", output]) == 0
-    assert (tmp_path / "replayed").read_text() == (tmp_path / "solved").read_text()
+    replayed, solved = ((tmp_path / name).read_text() for name in ("replayed", "solved"))
+    assert undated(replayed) == undated(solved)
 
 
 def test_a_deficient_bag_ends_with_code_3_and_says_why(ros_environment, tmp_path, capfd):
