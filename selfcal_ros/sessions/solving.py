@@ -103,8 +103,12 @@ class SolvingSession:
         run = Run(message.plan_id, message.run_id)
         known = self._planned.get(run, 0)
         self._planned[run] = max(known, message.views_planned)
-        if run == self._run and message.views_planned > known:
+        if run in (self._run, Run(self._run.plan_id)) and message.views_planned > known:
             self._stale = True  # the summary says how many views are planned
+
+    def _planned_views(self, run: Run) -> int:
+        """Return the number of views planned; commands that tell no run count for all of a plan."""
+        return max(self._planned.get(run, 0), self._planned.get(Run(run.plan_id), 0))
 
     def take_measurement(self, message: Any) -> None:
         """Take the readings of a view; those of an older run are left aside.
@@ -201,7 +205,7 @@ class SolvingSession:
         self._ports.publish("summary", {
             "header": from_model.header(shown.stamp_ns, frame_id),
             "state": short(self._state()), "views_done": shown.views_done,
-            "views_planned": self._planned.get(run, 0),
+            "views_planned": self._planned_views(run),
             "identifiable": seen.identifiable, "rank_deficiency": seen.deficiency, **fields,
             "advice": [*seen.advice, *result.warnings], "causes": [
                 cause.text for cause in result.verdict.causes], **verdict})
@@ -209,11 +213,12 @@ class SolvingSession:
     def _unfinished(self) -> bool:
         """Return whether the plan has views that are still to come."""
         return (isinstance(self.shown.problem, NotIdentifiableError)
-                and self.shown.views_done < self._planned.get(self.shown.run, 0))
+                and self.shown.views_done < self._planned_views(self.shown.run))
 
     def _state(self) -> str:
         if self._unfinished():
-            return (f"{self.shown.views_done} of {self._planned[self.shown.run]} views measured, "
+            planned = self._planned_views(self.shown.run)
+            return (f"{self.shown.views_done} of {planned} views measured, "
                     "not yet enough to identify the stage.")
         return str(self.shown.problem or state_sentence(self.shown.result))
 
