@@ -86,7 +86,7 @@ def events():
 
 
 def solved(path):
-    measurements, _, lost = collect_bag(path, VALUES)
+    measurements, _, lost, _ = collect_bag(path, VALUES)
     return result_to_dict(calibrate(measurements, Options())), lost
 
 

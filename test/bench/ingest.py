@@ -138,7 +138,7 @@ def worker(benchmark: str, method: str, bag: Path) -> dict:
     total = json.loads((bag / "done.json").read_text())
     error, who = None, resource.RUSAGE_SELF
     if method == SOLVE:
-        who, out = resource.RUSAGE_CHILDREN, bag / "result.json"
+        who, out = resource.RUSAGE_CHILDREN, bag.with_name(f"{bag.name}_result.json")
         seconds, _ = timed(lambda: subprocess.run(
             [sys.executable, "-m", "selfcal_ros", "solve", str(bag), "--quiet", "-o", str(out)],
             check=True))

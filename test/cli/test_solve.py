@@ -2,6 +2,7 @@
 """``selfcal solve``: exit codes, one clear line for each fault, the keys of RESULT.json."""
 
 import json
+import re
 
 import pytest
 import yaml
@@ -179,7 +180,7 @@ def check_keys(found):
 def result_of(tmp_path, bag, *options, codes=(0,)):
     output = tmp_path / "result.json"
     assert solve(bag, *options, output=output) in codes
-    return output.read_text()
+    return re.sub(r'"created": "[^"]*"', '"created": ""', output.read_text())
 
 
 def test_the_result_has_the_keys_of_the_contract(tmp_path, bag):
@@ -262,7 +263,7 @@ def test_methods(tmp_path):
     complete = small_bag(tmp_path, small_plan("0, 90, tx"))
     joint = json.loads(result_of(tmp_path, complete))
     assert joint == json.loads(result_of(tmp_path, complete, "--method", "joint"))
-    law = json.loads(result_of(tmp_path, complete, "--method", "law"))
+    law = json.loads(result_of(tmp_path, complete, "--method", "law", codes=(0, 5)))
     assert (joint["method"], law["method"]) == ("joint", "law")
 
 

@@ -88,7 +88,7 @@ class Dense:
         else:
             shapes = ([lambda x, y: np.array([x, y]) * self.half]
                       if name is TermName.PLATE_SCALE else
-                      [lambda x, y, d=d, q=q: np.array(d) * (x * x, x * y, y * y)[q]
+                      [lambda x, y, d=d, q=q: np.array(d) * (x * x, 2 * x * y, y * y)[q]
                        for d in ((1, 0), (0, 1)) for q in range(3)])
             out = [[turn @ shape(*place) * (u == v) for u, place, turn, *_ in self.about]
                    for v in views[int(free):] for shape in shapes]

@@ -203,7 +203,7 @@ def test_rounding_stays_below_a_hundredth_of_a_nanometre(unit):
 
 
 def test_theta_digits_follow_the_size_of_the_field():
-    for pitch in (1e-3, 0.1, 10.0):
+    for pitch in (1e-4, 1e-2, 1.0):
         emap = random_map(Artifact(11, pitch, 24), 1)
         half_digit_rad = np.deg2rad(0.5 * 10.0 ** -theta_decimals(emap) / 3600)
         assert half_digit_rad * np.hypot(5, 5) * pitch < 0.01e-9

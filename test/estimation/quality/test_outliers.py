@@ -156,12 +156,12 @@ def test_a_turned_microscope_is_no_slip():
     dy = view.dy - 5e-3 * step
     turned = replace(seen, views=(*seen.views[:3], replace(view, dy=dy, visits=replace(
         view.visits, offset_x=view.visits.offset_x + step, dy=dy)), *seen.views[4:]))
-    result = robust_calibrate(turned, ZERO_MEAN)
+    result = robust_calibrate(turned, LINEAR)
     assert result.extra["slips"] == []
     assert [v.name for v in result.views] == [v.view.name for v in readings.views]
     assert not result.verdict.qualified and result.verdict.causes[0].name == "microscope"
     assert "no view was split" in " ".join(result.warnings)
-    with_term = replace(ZERO_MEAN, terms=(ModelTerm(TermName.MICROSCOPE),))
+    with_term = replace(LINEAR, terms=(ModelTerm(TermName.MICROSCOPE),))
     bad = with_errors(turned, 1, dx={(-4, 2): 1e-6})
     bad = replace(bad, views=tuple(
         view if view.visits is None else replace(view, visits=replace(view.visits, dx=view.dx))
