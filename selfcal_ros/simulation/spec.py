@@ -61,7 +61,7 @@ FAULTS = {name: (name, PART) for name in PARTS} | {
 """Key of a section -> field of the dataclass, unit and bounds; type and default are the field's."""
 
 TOP = (
-    Parameter("seed", 0, "of truth, noise and faults", low=0, high=2**63),
+    Parameter("seed", 0, "of truth, noise and faults", low=0, high=2**61),
     Parameter("start_time", 1.7e9, "first stamp", "s", 0.0, LAST_START_S),
     Parameter("compression", "zstd", "of the bag", choices=("zstd", "lz4", "none")),
 )

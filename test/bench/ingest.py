@@ -160,7 +160,7 @@ def in_parts(bag: Path, method: str) -> tuple[float, float | None]:
     from selfcal_ros.estimation.api import Options, calibrate
 
     values = parameter_values("measurement_collector", {}, "bench")
-    reading, (measurements, _, lost) = timed(lambda: collect_bag(bag, values))
+    reading, (measurements, _, lost, _) = timed(lambda: collect_bag(bag, values))
     assert not lost and not measurements.all_rejected()
     if method == READ:
         return reading, None

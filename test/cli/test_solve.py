@@ -236,6 +236,7 @@ def test_the_law_is_linear_and_says_so(tmp_path, capsys, bag):
     law = result_of(tmp_path, bag, "--method", "law", codes=(0, 5))
     assert law == result_of(tmp_path, bag, "--method", "law", "--misalignment", "linear",
                             codes=(0, 5))
+    capsys.readouterr()
     assert refused(capsys, 2, bag, "--method", "law", "--misalignment", "rigid") == (
         "--misalignment: Hu's law is linear, not rigid; leave it out, or use --method joint")
 

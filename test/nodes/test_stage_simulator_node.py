@@ -54,12 +54,12 @@ def test_the_order_that_a_command_asks_for(graph):
     view = View("a", angular=False)
     measure(graph, replace(view, visit_order="raster"))
     graph.until(lambda: len(seen) == 9, "9 marks")
-    assert [(d.m, d.n) for d in seen] == [(m, n) for n in (-1, 0, 1) for m in (-1, 0, 1)]
+    assert [(d.m, d.n) for d in seen] == [(m, n) for m in (-1, 0, 1) for n in (-1, 0, 1)]
     seen.clear()
     measure(graph, view)
     graph.until(lambda: len(seen) == 9, "9 marks again")
-    assert [(d.m, d.n) for d in seen] == [(-1, -1), (0, -1), (1, -1), (1, 0), (0, 0), (-1, 0),
-                                          (-1, 1), (0, 1), (1, 1)]
+    assert [(d.m, d.n) for d in seen] == [(-1, -1), (-1, 0), (-1, 1), (0, 1), (0, 0), (0, -1),
+                                          (1, -1), (1, 0), (1, 1)]
 
 
 def test_the_truth_that_its_parameters_ask_for_is_recorded(graph, tmp_path):

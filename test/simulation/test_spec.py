@@ -124,7 +124,7 @@ def test_a_plan_that_is_not_there(tmp_path):
 
 
 KEYS = {
-    None: {"seed": (int, 0, 2**63), "start_time": (float, 0.0, 2.1e9), "compression": str},
+    None: {"seed": (int, 0, 2**61), "start_time": (float, 0.0, 2.1e9), "compression": str},
     "truth": dict.fromkeys(("g", "a", "t"), (float, 0.0, 1e-3))
     | dict.fromkeys(("g_theta", "a_theta", "phi"), (float, 0.0, 0.1))
     | {"encoder": str, "rotation": str},
