@@ -22,7 +22,7 @@ from selfcal_ros.estimation.verdict.slip_columns import SLIP, slip_columns
 from selfcal_ros.model.terms import VISIT_TERMS, ModelTerm, TermName
 
 LEVEL = 5e-4
-"""Level of the test of each term: together they name a cause in about 0.3 % of clean runs."""
+"""Level of the test of each term, for all its parts that are tried together."""
 
 MAX_CAUSES = 4
 
