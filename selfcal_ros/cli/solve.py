@@ -139,10 +139,14 @@ def run(args: argparse.Namespace) -> int:
 
 def _extended(args: argparse.Namespace, measurements: Any, options: Any,
               result: Any) -> tuple[Any, list[str]]:
-    """Return the result with validation and budget where they are wanted, and what to print."""
+    """Return the result with places, and validation and budget as wanted, and what to print."""
     from dataclasses import replace
 
+    from selfcal_ros.collection.marks.places import places_json
+
     lines: list[str] = []
+    if places := places_json(measurements.views):
+        result = replace(result, extra={**result.extra, "rejected_at": places})
     if args.validate:
         from selfcal_ros.estimation.quality.outliers import clean
         from selfcal_ros.estimation.quality.validation import (

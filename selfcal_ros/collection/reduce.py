@@ -11,6 +11,7 @@ from selfcal_ros.collection.marks.identify import (
     identify_angular,
     identify_grid,
 )
+from selfcal_ros.collection.marks.places import PlaceList
 from selfcal_ros.collection.marks.repeats import reduce_repeats
 from selfcal_ros.collection.marks.visits import grid_visits
 from selfcal_ros.collection.messages import Kind
@@ -72,6 +73,18 @@ def clean(detections: np.ndarray, rules: Rules, *, scored: bool,
     return unique, +rejected
 
 
+def with_low_scores(readings: ViewReadings, detections: np.ndarray, *, exposures: Exposures,
+                    rules: Rules) -> ViewReadings:
+    """Return `readings` with the places of grid detections that went for their score."""
+    low = detections[(detections["kind"] == Kind.GRID) & (detections["score"] < rules.min_score)]
+    if not len(low):
+        return readings
+    stage, places = exposures.at(low["stamp"]), PlaceList(readings.places)
+    places.add(np.full(len(low), Reason.LOW_SCORE, dtype=object), stage.x.position,
+               stage.y.position)
+    return replace(readings, places=places.places())
+
+
 def _canonical(d: np.ndarray) -> np.ndarray:
     """Return the detections in the order of all their fields, each once: `numpy.unique`, faster."""
     d = d[np.argsort(d["stamp"], kind="stable")]
@@ -102,21 +115,25 @@ def reduce_view(artifact: Artifact, view: View, detections: np.ndarray, *,
 def _reduce_grid(artifact: Artifact, view: View, d: np.ndarray, exposures: Exposures, rules: Rules,
                  rejected: Counter) -> tuple[dict, float | None]:
     stage = exposures.at(d["stamp"])
-    why = _first(stage.x.reason, stage.y.reason, stage.theta.moving)
+    why, places = _first(stage.x.reason, stage.y.reason, stage.theta.moving), PlaceList()
+    places.add(why, stage.x.position, stage.y.position)
     d, (x, y, *approach) = _keep(d, why, rejected, stage.x.position, stage.y.position,
                                  *stage.approach)
     reading = _reading(rules.sense, np.stack([x, y]), np.stack([d["ox"], d["oy"]]))
     found = identify_grid(artifact, view, reading, ids=np.stack([d["m"], d["n"]]),
                           has_id=d["has_id"], rules=rules.identity,
                           stage_m=_reading(rules.sense, np.stack([x, y]), 0.0))
-    d, (m, n, vx, vy, rx, ry, *approach) = _keep(
-        d, found.reasons, rejected, *found.index, *found.deviation, *found.residual, *approach)
+    places.add(found.reasons, x, y)
+    d, (m, n, vx, vy, rx, ry, x, y, *approach) = _keep(
+        d, found.reasons, rejected, *found.index, *found.deviation, *found.residual, x, y,
+        *approach)
     hx, hy = artifact.half
     key, deviation = (m + hx) * (2 * hy + 1) + n + hy, np.stack([vx, vy])
     means = reduce_repeats(key, deviation, d["sigma"], limit=rules.outlier_limit,
                            extent=2 * max(hx, hy) * artifact.grid_pitch_m,
                            residual=np.stack([rx, ry]))
     _count(rejected, Reason.OUTLIER, means.outlier)
+    places.add(np.where(means.outlier, Reason.OUTLIER, None), x, y)
     visits = grid_visits(means, key, d["sigma"], stamps_ns=d["stamp"], deviation=deviation,
                          offset=np.stack([d["ox"], d["oy"]]), approach=np.stack(approach))
     mark = means.key.astype(np.int64)
@@ -124,7 +141,7 @@ def _reduce_grid(artifact: Artifact, view: View, d: np.ndarray, exposures: Expos
     phi = found.rigid.phi_rad if told else None
     return {"m": mark // (2 * hy + 1) - hx, "n": mark % (2 * hy + 1) - hy, "dx": means.mean[0],
             "dy": means.mean[1], "count": means.count, "u": means.u, "sigma_xy": means.sigma,
-            "dof_xy": means.dof, "visits": visits}, phi
+            "dof_xy": means.dof, "visits": visits, "places": places.places()}, phi
 
 
 def _reduce_angular(artifact: Artifact, view: View, d: np.ndarray, exposures: Exposures,

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from selfcal_ros.collection.reasons import Reason
-from selfcal_ros.collection.reduce import DETECTION, Rules, clean, reduce_view
+from selfcal_ros.collection.reduce import DETECTION, Rules, clean, reduce_view, with_low_scores
 from selfcal_ros.collection.stage.exposures import Exposures
 from selfcal_ros.collection.stage.growing import GrowingTable
 from selfcal_ros.collection.timeline import Timeline
@@ -107,6 +107,9 @@ class ViewCache:
         good, reasons = clean(detections, self._rules, scored=self._scored)
         readings = reduce_view(timeline.artifact, timeline.views[index], good,
                                exposures=exposures, rules=self._rules)
+        if self._scored:
+            readings = with_low_scores(readings, detections, exposures=exposures,
+                                       rules=self._rules)
         total = Counter(readings.rejected)
         total.update({str(reason): count for reason, count in reasons.items()})
         return replace(readings, rejected=dict(sorted(total.items())))

@@ -3,7 +3,7 @@
 
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -78,6 +78,25 @@ class GridVisits:
 
 
 @dataclass(frozen=True, eq=False)
+class RejectedPlaces:
+    """Where the stage stood at detections of grid marks that were rejected, at most MOST of a view.
+
+    Attributes
+    ----------
+    reason : tuple of str
+        Why, one a detection.
+    x, y : float array (R,)
+        Indicated position at the exposure, m; NaN where the encoder does not tell it.
+    """
+
+    MOST: ClassVar[int] = 500
+
+    reason: tuple[str, ...] = ()
+    x: np.ndarray = _empty(float)
+    y: np.ndarray = _empty(float)
+
+
+@dataclass(frozen=True, eq=False)
 class ViewReadings:
     """Deviations of one view: reading minus nominal position, stage frame, m and rad.
 
@@ -108,6 +127,8 @@ class ViewReadings:
         Reason -> number of detections that were rejected.
     visits : GridVisits, optional
         The visits behind the means of the grid marks; None where they are not known.
+    places : RejectedPlaces
+        Where grid detections were rejected; empty where that is not known.
     """
 
     view: View
@@ -128,6 +149,7 @@ class ViewReadings:
     used: int = 0
     rejected: dict[str, int] = field(default_factory=dict)
     visits: GridVisits | None = None
+    places: RejectedPlaces = RejectedPlaces()
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,10 +14,12 @@ from selfcal_ros.units import ARCSEC_PER_RAD, UM_PER_M
 
 MAX_ROWS = 200
 """Longest table of a report; the rest is in the result file."""
-TITLES = {"budget": "Uncertainty budget (GUM)", "residuals": "Residuals of the fit",
+TITLES = {"budget": "Uncertainty budget (GUM)",
           "outliers": "Marks removed or weighted down", "validation": "Held-out validation",
           "reference": "Reference length"}
 """Known extras, in the order in which they are reported; others follow by name."""
+DRAWN = {"residuals", "rejected_at"}
+"""Extras that are drawn, not tabulated."""
 _UNITS = (("_m", "µm", UM_PER_M), ("_rad", "arcsec", ARCSEC_PER_RAD), ("_um", "µm", 1.0),
           ("_arcsec", "arcsec", 1.0), ("_mm", "mm", 1.0), ("_s", "s", 1.0))
 _THETA_DATUM = {
@@ -36,6 +38,7 @@ def extra_sections(extra: Mapping[str, Any]) -> list[Section]:
     and deeper structures have no place on paper and stay in the result file.
     """
     names = [*(n for n in TITLES if n in extra), *sorted(n for n in extra if n not in TITLES)]
+    names = [name for name in names if name not in DRAWN]
     sections = [_extra_section(name, extra[name]) for name in names]
     return [section for section in sections if section is not None]
 

@@ -3,10 +3,13 @@
 
 import math
 
+import numpy as np
 import pytest
 
+from selfcal_ros.collection.marks.places import PlaceList
 from selfcal_ros.collection.messages import Kind
 from selfcal_ros.collection.reasons import Reason
+from selfcal_ros.model.readings import RejectedPlaces, Sense
 from test.support.collecting import collect, scene, table
 
 PITCH = 0.01
@@ -63,6 +66,42 @@ def test_a_bad_grid_detection_is_counted_under_its_reason(fault):
     mark = ("grid", spoilt.detections[index].m, spoilt.detections[index].n)
     spoilt.spoil(index, **fields)
     assert_only_this_is_lost(spoilt, mark, reason)
+
+
+@pytest.mark.parametrize("fault", ["low score", "m off the plate", "one pitch off"])
+@pytest.mark.parametrize("sense", ["microscope_moves", "plate_moves"])
+def test_the_place_of_a_rejected_grid_detection_is_where_the_stage_stood(fault, sense):
+    fields, reason = GRID_FAULTS[fault]
+    spoilt = scene(sense=Sense(sense))
+    index = spoilt.grid(7)
+    m, n = spoilt.detections[index].m, spoilt.detections[index].n
+    spoilt.spoil(index, **fields)
+    places = collect(spoilt.events, measurement_sense=sense)[0].views[0].places
+    sign = -1 if sense == "plate_moves" else 1
+    assert places.reason == (str(reason),)
+    assert places.x == pytest.approx([sign * m * PITCH], abs=1e-4)
+    assert places.y == pytest.approx([sign * n * PITCH], abs=1e-4)
+
+
+def test_a_place_that_the_encoder_does_not_tell_is_unknown_and_lines_have_none():
+    spoilt = scene()
+    spoilt.spoil(spoilt.angular(3), k=8)
+    begins = spoilt.detections[spoilt.grid(3)].stamp_ns + 1
+    spoilt.samples = [sample for sample in spoilt.samples if sample.stamp_ns > begins]
+    places = collect(spoilt.events)[0].views[0].places
+    assert places.reason == ("no_encoder_sample_near",) * len(places.reason)
+    assert len(places.reason) >= 3
+    assert np.isnan(places.x).all() and np.isnan(places.y).all()
+
+
+def test_of_many_places_an_even_choice_is_kept():
+    gathered = PlaceList()
+    at = np.arange(2 * RejectedPlaces.MOST - 1.0)
+    gathered.add(np.full(len(at), Reason.TOO_FAR, dtype=object), at, -at)
+    places = gathered.places()
+    np.testing.assert_array_equal(places.x, at[::2])
+    np.testing.assert_array_equal(places.y, -at[::2])
+    assert set(places.reason) == {"too_far_from_nominal"}
 
 
 @pytest.mark.parametrize("fault", ANGULAR_FAULTS)

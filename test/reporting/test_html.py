@@ -109,9 +109,9 @@ def test_unknown_maps_and_plates_without_lines():
 def test_budget_and_residuals_are_tabulated_with_units():
     budget = [{"component": "reading noise", "u_xy_m": 1.7e-8, "dof": 220},
               {"component": "reference", "u_xy_m": None, "active": True}]
-    sections = extra_sections({"residuals": {"largest_rad": 1e-6, "n": 968, "map": [[1.0]]},
+    sections = extra_sections({"left_over": {"largest_rad": 1e-6, "n": 968, "map": [[1.0]]},
                                "budget": budget})
-    assert [s.title for s in sections] == ["Uncertainty budget (GUM)", "Residuals of the fit"]
+    assert [s.title for s in sections] == ["Uncertainty budget (GUM)", "Left over"]
     assert sections[0].table == (("component", "u xy in µm", "dof", "active"),
                                  ("reading noise", "0.0170", "220", "–"),
                                  ("reference", "–", "–", "yes"))

@@ -11,6 +11,7 @@ from selfcal_ros.estimation.datum.angular import conditions_for, misclosure_test
 from selfcal_ros.estimation.datum.covariance import FieldCovariance, angular_variance
 from selfcal_ros.estimation.datum.scale import scale_datum
 from selfcal_ros.estimation.joint.fit import JointFit
+from selfcal_ros.estimation.joint.kept_residuals import kept_residuals
 from selfcal_ros.estimation.joint.model_fit import ModelFit, fit_model
 from selfcal_ros.estimation.joint.problem import Problem, repeats_of
 from selfcal_ros.estimation.joint.saved_terms import saved_terms
@@ -94,7 +95,8 @@ def _solved(measurements: Measurements, options: Options, *, model: ModelFit,
         measurements.plan_id, error_map, _artifact_map(problem, found),
         _views(measurements, problem, found), seen, noise_of(found.xy, found.theta),
         measurements.all_rejected(), warnings=warnings, method="joint",
-        sense=str(measurements.sense), extra={"solver": found.solver, **kept},
+        sense=str(measurements.sense),
+        extra={"solver": found.solver, **kept, **kept_residuals(measurements, problem, found)},
         run_id=measurements.run_id,
         model=ModelResult("rigid" if problem.rigid else "linear", term_results(model)))
     return Solved(result, found.xy, found.theta, model, axes)

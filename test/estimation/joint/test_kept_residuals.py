@@ -1,0 +1,89 @@
+# SPDX-License-Identifier: Apache-2.0
+import numpy as np
+import pytest
+
+from selfcal_ros.estimation.api import calibrate
+from selfcal_ros.estimation.joint import kept_residuals
+from selfcal_ros.estimation.options import Options
+from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.readings import Sense
+from selfcal_ros.model.result import result_from_dict, result_to_dict
+from selfcal_ros.simulation.truth import hu_plan, random_truth, simulate_measurements
+
+
+def measured(sense=Sense.MICROSCOPE_MOVES, *, visits=False, missing=0.0):
+    """Return noisy readings in Hu's views, by the papers' linear model."""
+    rng = np.random.default_rng(11)
+    artifact = Artifact(7, 0.01, 8)
+    plan = hu_plan(artifact, 2)
+    truth = random_truth(artifact, len(plan.views), rng)
+    return simulate_measurements(truth, plan, rng, sigma_m=2e-8, sigma_theta_rad=1e-5,
+                                 sense=sense, missing=missing, visits=visits, linear=True)
+
+
+@pytest.mark.parametrize("sense", list(Sense))
+def test_residuals_are_what_maps_and_misalignment_leave_of_the_readings(sense):
+    """Written out mark by mark from the published model, in the stage frame."""
+    measurements = measured(sense, missing=0.1)
+    result = calibrate(measurements, Options(misalignment_model="linear"))
+    emap, amap, artifact = result.error_map, result.artifact_map, result.artifact
+    h, pitch, lines = artifact.half[0], artifact.grid_pitch_m, artifact.angular_count
+    seen = 0
+    for view, found, kept in zip(measurements.views, result.views,
+                                 result.extra["residuals"]["views"], strict=True):
+        assert kept["view"] == view.view.name
+        pose = view.view.lattice_pose(artifact)
+        turns = pose.turn_lines
+        for k, value in zip(view.k, view.dtheta, strict=True):
+            at = (k + turns) % lines
+            stage = -emap.g_theta[-at] if sense is Sense.PLATE_MOVES else emap.g_theta[at]
+            expected = value - (stage + amap.a_theta[k] + found.phi)
+            assert kept["dtheta"][k] == pytest.approx(expected, abs=2e-12)
+        if not len(view.m):
+            assert "dx" not in kept
+            continue
+        for m, n, dx, dy in zip(view.m, view.n, view.dx, view.dy, strict=True):
+            turn = 1j ** pose.quarter_turns
+            arm = turn * complex(m, n) * pitch
+            i, j = pose.site_of(m, n)
+            sites = (-i + h, -j + h) if sense is Sense.PLATE_MOVES else (i + h, j + h)
+            stage = complex(emap.gx[sites], emap.gy[sites])
+            if sense is Sense.PLATE_MOVES:
+                stage = -stage
+            plate = turn * complex(amap.ax[m + h, n + h], amap.ay[m + h, n + h])
+            expected = complex(dx, dy) - (
+                stage + plate + 1j * found.phi * arm + complex(found.tx, found.ty))
+            assert kept["dx"][m + h, n + h] == pytest.approx(expected.real, abs=2e-13)
+            assert kept["dy"][m + h, n + h] == pytest.approx(expected.imag, abs=2e-13)
+            seen += 1
+        assert np.isfinite(kept["dx"]).sum() == len(view.m)
+    assert seen > 100
+
+
+def test_times_are_those_of_the_visits():
+    measurements = measured(visits=True)
+    kept = calibrate(measurements).extra["residuals"]["views"]
+    first = min(v.visits.stamp_ns.min() for v in measurements.views if len(v.m))
+    for view, entry in zip(measurements.views, kept, strict=True):
+        if not len(view.m):
+            continue
+        for row, (m, n) in enumerate(zip(view.m, view.n, strict=True)):
+            own = view.visits.mark == row
+            expected = np.average(view.visits.stamp_ns[own] - first,
+                                  weights=view.visits.count[own]) / 1e9
+            assert entry["time_s"][m + 3, n + 3] == pytest.approx(expected, abs=6e-4)
+
+
+def test_residuals_survive_the_json_form_and_are_left_out_of_large_results(monkeypatch):
+    measurements = measured()
+    result = calibrate(measurements)
+    data = result_to_dict(result)
+    again = result_from_dict(data, "r.json").extra["residuals"]["views"]
+    own = result.extra["residuals"]["views"]
+    assert [e["view"] for e in again] == [e["view"] for e in own]
+    assert again[3]["dx"] == [[None if np.isnan(v) else v for v in row]
+                              for row in own[3]["dx"].tolist()]
+    monkeypatch.setattr(kept_residuals, "MAX_READINGS", 49 + 49 + 42 - 1)
+    assert "residuals" not in calibrate(measurements).extra
+    monkeypatch.setattr(kept_residuals, "MAX_READINGS", 49 + 49 + 42)
+    assert "residuals" in calibrate(measurements).extra
