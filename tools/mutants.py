@@ -2,36 +2,60 @@
 # SPDX-License-Identifier: Apache-2.0
 """Change the code a little, run the tests that watch it, and print the changes that no test sees.
 
-    tools/mutants.py [--number N] [--seed S] [--only PATH]... [--workers W]
+    tools/mutants.py [--number N] [--seed S] [--only PATH]... [--skip N] [--near]
 
 A sample of small changes (a sign, a comparison, a factor, sin for cos, min for max, an index) over
 selfcal_ros, without text and plots. Each is made in a copy of the tree, never in the tree itself.
-Tests that mirror the module run first, then those of the packages that use it. A change that makes
-the tests hang counts as seen.
+Tests that mirror the module run first, then those that import it, then those of the packages that
+use it, in one process and up to the first that fails. A change that makes the tests hang counts as
+seen; a test that fails without any change does not count.
 """
 
 import argparse
 import ast
+import contextlib
+import importlib
+import os
 import random
+import resource
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
+
+import pytest
+
+for _libraries in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+    os.environ.setdefault(_libraries, "1")
+
+for _name in ("scipy.linalg", "scipy.sparse.linalg", "scipy.stats"):
+    importlib.import_module(_name)  # once, for every fork
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "selfcal_ros"
 LEFT_OUT = ("cli", "reporting", "start.py", "__main__.py", "units.py", "errors.py")
 """Text, plots, and what is nothing but names."""
 
-TIMEOUT_S = 900
+TEST_CPU_S = 120
+"""Processor time of one test beyond which it hangs."""
+
+TIMEOUT_S = 3600
+"""Time of a group of tests beyond which it waits for what does not come."""
+
 WIDER = {"estimation": ["test/estimation"], "laser": ["test/laser", "test/simulation"],
          "compensation": ["test/compensation"], "model": ["test/model", "test/estimation"],
          "simulation": ["test/simulation"], "collection": ["test/collection"],
          "messages": ["test/messages", "test/bagio"], "bagio": ["test/bagio"],
-         "sessions": ["test/sessions", "test/nodes"], "nodes": ["test/nodes"]}
+         "sessions": ["test/sessions"], "nodes": ["test/nodes"]}
+WITH_PROCESSES = ("nodes", "cli", "launch", "shipped", "bench")
+"""Tests that start processes of their own: they watch the modules of their own package alone."""
+
 COMPARE = {ast.Lt: ("<", "<="), ast.LtE: ("<=", "<"), ast.Gt: (">", ">="), ast.GtE: (">=", ">"),
            ast.Eq: ("==", "!="), ast.NotEq: ("!=", "==")}
 ARITHMETIC = {ast.Add: ("+", "-"), ast.Sub: ("-", "+"), ast.Mult: ("*", "/"), ast.Div: ("/", "*")}
@@ -103,6 +127,7 @@ def _name_or_number(node: ast.AST, source: Source) -> tuple | None:
     return None
 
 
+@cache
 def mutants_of(path: str, text: str) -> list[Mutant]:
     """Return all changes of one file."""
     source = Source(text)
@@ -132,46 +157,192 @@ def _code(tree: ast.AST) -> Iterator[ast.AST]:
         yield from _code(child)
 
 
-def sample(number: int, seed: int, only: list[str]) -> list[Mutant]:
+def sample(number: int, seed: int, only: list[str], *, root: Path = ROOT) -> list[Mutant]:
     """Return a seeded sample, as many from a long module as its length asks for."""
     found: list[Mutant] = []
-    for path in sorted(PACKAGE.rglob("*.py")):
-        name = str(path.relative_to(ROOT))
-        inner = path.relative_to(PACKAGE).parts[0]
+    package = root / PACKAGE.name
+    for path in sorted(package.rglob("*.py")):
+        name = str(path.relative_to(root))
+        inner = path.relative_to(package).parts[0]
         if (any(name.startswith(part.rstrip("/")) for part in only) if only
                 else inner not in LEFT_OUT):
             found += mutants_of(name, path.read_text())
     return random.Random(seed).sample(found, min(number, len(found)))
 
 
-def tests_for(path: str) -> list[list[str]]:
-    """Return the tests that watch a module: its mirror first, then its package's."""
+def _imported(path: Path, known: set[str]) -> set[str]:
+    """Return the modules among `known` that a file names in its imports."""
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.ImportFrom) and node.module:
+            names = {f"{node.module}.{alias.name}" for alias in node.names} | {node.module}
+            found |= names & known
+        elif isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names} & known
+    return found
+
+
+def _dotted(path: Path) -> str:
+    return ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
+
+
+@cache
+def _steps() -> dict[str, set[str]]:
+    """Return the modules that each file of the package and of the tests imports."""
+    files = {_dotted(path): path for folder in (PACKAGE, ROOT / "test")
+             for path in sorted(folder.rglob("*.py"))}
+    return {name: _imported(path, set(files)) for name, path in files.items()}
+
+
+def users_of(path: str, distance: int) -> list[str]:
+    """Return the test files that import a module over at most `distance` steps."""
+    users, near = {_dotted(ROOT / path)}, {_dotted(ROOT / path)}
+    for _ in range(distance):
+        near = {name for name, imported in _steps().items() if imported & near} - users
+        users |= near
+    return sorted(f"{name.replace('.', '/')}.py" for name in users
+                  if name.split(".")[-1].startswith("test_"))
+
+
+def tests_for(path: str, *, near: bool = False) -> list[list[str]]:
+    """Return the tests that watch a module, the likeliest first, each named once.
+
+    First its mirror, then the tests that import it, then those of its folder, then those of the
+    packages that use it as far as they reach it through imports. `near`: those that mirror or
+    import it, or else those of its folder.
+    """
     parts = Path(path).with_suffix("").parts[1:]
-    mirror = Path("test", *parts[:-1])
-    own = sorted(str(p.relative_to(ROOT)) for p in (ROOT / mirror).glob(f"test_{parts[-1]}*.py"))
-    near = [str(mirror)] if (ROOT / mirror).is_dir() else []
-    wider = [folder for folder in WIDER.get(parts[0], []) if (ROOT / folder).is_dir()]
-    return [group for group in (own, near, wider) if group]
+    mirror = ROOT.joinpath("test", *parts[:-1])
+    folders = [ROOT / folder for folder in WIDER.get(parts[0], [])]
+    reached = set(users_of(path, 99))
+    own = sorted(mirror.glob(f"test_{parts[-1]}*.py"))
+    groups = [own, [ROOT / name for name in users_of(path, 1)],
+              sorted(mirror.glob("test_*.py")),
+              [file for folder in folders for file in sorted(folder.rglob("test_*.py"))
+               if str(file.relative_to(ROOT)) in reached]]
+    done: set[Path] = set()
+    found = []
+    for group in groups:
+        names = [file for file in group if file not in done]
+        done |= set(group)
+        found.append([str(file.relative_to(ROOT)) for file in names
+                      if parts[0] in WITH_PROCESSES
+                      or file.relative_to(ROOT).parts[1] not in WITH_PROCESSES])
+    if near:
+        found = found[:2] if any(found[:2]) else found[2:3]
+    return [group for group in found if group]
 
 
-def survives(mutant: Mutant, tree: Path, workers: int) -> bool:
-    """Return whether no test sees the change in the copy `tree`."""
-    path = tree / mutant.path
-    text = path.read_text()
-    path.write_text(mutant.applied(text))
+def _in_a_fork(run: Callable[[], int], cwd: Path) -> int | None:
+    """Return what `run` returns in a process of its own, None if it takes too long.
+
+    A fork has pytest and the numerical libraries already: starting them anew for each change
+    takes longer than most tests. What it prints is lost.
+    """
+    child = os.fork()
+    if child == 0:
+        os.setsid()
+        os.chdir(cwd)
+        status = 1
+        try:
+            with open(os.devnull, "w") as nowhere:
+                sys.stdout = sys.stderr = nowhere
+                for stream in (1, 2):
+                    os.dup2(nowhere.fileno(), stream)
+                status = int(run())
+        finally:
+            os._exit(status)
+    stop = time.monotonic() + TIMEOUT_S
     try:
-        for group in tests_for(mutant.path):
-            command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider",
-                       "-n", str(workers), *group]
-            done = subprocess.run(command, cwd=tree, capture_output=True, timeout=TIMEOUT_S,
-                                  check=False)
-            if done.returncode != 0:
-                return False
-        return True
-    except subprocess.TimeoutExpired:
-        return False
+        while time.monotonic() < stop:
+            done, status = os.waitpid(child, os.WNOHANG)
+            if done:
+                return os.waitstatus_to_exitcode(status)
+            time.sleep(0.05)
+        return None
     finally:
-        path.write_text(text)
+        with contextlib.suppress(ProcessLookupError):  # and what the tests have started
+            os.killpg(child, signal.SIGKILL)
+        with contextlib.suppress(ChildProcessError):
+            os.waitpid(child, 0)
+
+
+class FirstFailed:
+    """A plugin of pytest: ends tests that hang, keeps the name of the first that fails."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def pytest_runtest_setup(self) -> None:
+        """Give the next test its processor time."""
+        used = resource.getrusage(resource.RUSAGE_SELF)
+        limit = int(used.ru_utime + used.ru_stime) + TEST_CPU_S
+        resource.setrlimit(resource.RLIMIT_CPU, (limit, resource.RLIM_INFINITY))
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        """Keep a test that failed."""
+        self._keep(report)
+
+    def pytest_collectreport(self, report: pytest.CollectReport) -> None:
+        """Keep a file that could not be read."""
+        self._keep(report)
+
+    def _keep(self, report: pytest.TestReport | pytest.CollectReport) -> None:
+        if report.failed and not self.path.exists():
+            self.path.write_text(report.nodeid)
+
+
+class Tree:
+    """A copy of the files that git knows, in which changes are tried one after the other."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.sound: dict[str, bool] = {}  # test: whether it passes without any change
+        names = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True,
+                               check=True).stdout.split("\n")
+        for name in filter(None, names):
+            if (ROOT / name).is_file():
+                (folder / name).parent.mkdir(parents=True, exist_ok=True)
+                shutil.copy2(ROOT / name, folder / name)
+
+    def failing(self, tests: list[str]) -> str | None:
+        """Return the first test that fails, or "time" if they take too long; None if all pass."""
+        unsound = [f"--deselect={test}" for test, sound in self.sound.items() if not sound]
+        options = ["-x", "-q", "-p", "no:cacheprovider", "-p", "no:xdist", *unsound]
+        first = self.folder.with_name("first_failed")
+        first.unlink(missing_ok=True)
+        status = _in_a_fork(
+            lambda: pytest.main([*options, *tests], plugins=[FirstFailed(first)]), self.folder)
+        if status in (None, -signal.SIGXCPU):
+            return "time"
+        if status in (pytest.ExitCode.OK, pytest.ExitCode.NO_TESTS_COLLECTED):
+            return None
+        return first.read_text() if first.exists() else "start"
+
+    def survives(self, mutant: Mutant, *, near: bool = False) -> bool:
+        """Return whether no test sees the change; `near`: none that imports the module."""
+        path = self.folder / mutant.path
+        text = path.read_text()
+        for group in tests_for(mutant.path, near=near):
+            while True:
+                path.write_text(mutant.applied(text))
+                try:
+                    failed = self.failing(group)
+                finally:
+                    path.write_text(text)
+                if failed is None:
+                    break
+                if failed == "start" and self.failing(group) == "start":
+                    raise SystemExit(f"the tests do not start, also without a change: {group}")
+                if failed in ("time", "start") or self._is_sound(failed):
+                    return False
+        return True
+
+    def _is_sound(self, test: str) -> bool:
+        """Return whether a test passes without any change; it is left out from now on if not."""
+        if test not in self.sound:
+            self.sound[test] = self.failing([test]) is None
+        return self.sound[test]
 
 
 def main() -> int:
@@ -181,27 +352,25 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--only", action="append", default=[], metavar="PATH",
                         help="file or folder, e.g. selfcal_ros/estimation; may be repeated")
-    parser.add_argument("--workers", type=int, default=2, help="tests at a time (default: 2)")
+    parser.add_argument("--skip", type=int, default=0, help="leave out the first of the sample")
+    parser.add_argument("--near", action="store_true",
+                        help="only the tests that mirror or import the module: minutes instead of "
+                        "hours; what survives is to be tried again without")
     args = parser.parse_args()
-    chosen = sample(args.number, args.seed, args.only)
-    survivors = []
+    survivors = 0
     with tempfile.TemporaryDirectory(prefix="mutants") as folder:
-        tree = Path(folder) / "tree"
-        tree.mkdir()
-        names = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True,
-                               check=True).stdout.split("\n")
-        for name in filter(None, names):
-            (tree / name).parent.mkdir(parents=True, exist_ok=True)
-            shutil.copy2(ROOT / name, tree / name)
-        for number, mutant in enumerate(chosen, 1):
-            line = (tree / mutant.path).read_text().splitlines()[mutant.line - 1].strip()
-            alive = survives(mutant, tree, args.workers)
-            said = "SURVIVED" if alive else "seen"
-            print(f"{number}/{len(chosen)} {said}: {mutant.path}:{mutant.line}: {line}  "
-                  f"-> {mutant.new}", flush=True)
-            survivors += [mutant] * alive
-    print(f"{len(survivors)} of {len(chosen)} changes survived (seed {args.seed})")
-    return int(bool(survivors))
+        tree = Tree(Path(folder) / "tree")
+        chosen = sample(args.number, args.seed, args.only, root=tree.folder)[args.skip:]
+        for number, mutant in enumerate(chosen, args.skip + 1):
+            line = (tree.folder / mutant.path).read_text().splitlines()[mutant.line - 1].strip()
+            alive = tree.survives(mutant, near=args.near)
+            survivors += alive
+            print(f"{number}/{args.number} {'SURVIVED' if alive else 'seen'}: {mutant.path}:"
+                  f"{mutant.line}: {line}  -> {mutant.new}", flush=True)
+        for test in sorted(test for test, sound in tree.sound.items() if not sound):
+            print(f"not counted, fails without any change: {test}")
+    print(f"{survivors} of {len(chosen)} changes survived (seed {args.seed})")
+    return int(survivors > 0)
 
 
 if __name__ == "__main__":

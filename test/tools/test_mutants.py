@@ -5,6 +5,8 @@ import ast
 import importlib.util
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).parents[2]
 SPEC = importlib.util.spec_from_file_location("mutants", ROOT / "tools/mutants.py")
 mutants = importlib.util.module_from_spec(SPEC)
@@ -53,6 +55,57 @@ def test_a_sample_is_the_same_for_the_same_seed():
     assert not inner & {"cli", "reporting"} and {"estimation", "laser"} <= inner
 
 
-def test_the_tests_that_mirror_a_module_run_first():
-    assert mutants.tests_for("selfcal_ros/estimation/joint/noise.py") == [
-        ["test/estimation/joint/test_noise.py"], ["test/estimation/joint"], ["test/estimation"]]
+def test_the_tests_that_mirror_a_module_run_first_and_each_runs_once():
+    groups = mutants.tests_for("selfcal_ros/estimation/joint/noise.py")
+    assert groups[0] == ["test/estimation/joint/test_noise.py"]
+    assert "test/estimation/joint/test_statistics.py" in groups[1]  # imports the module
+    assert "test/estimation/joint/test_recovery.py" in groups[2]  # stands beside it
+    named = [name for group in groups for name in group]
+    assert len(set(named)) == len(named) and all((ROOT / name).is_file() for name in named)
+    assert "test/estimation/comparison/test_maps.py" in named  # reaches it through others
+
+
+def test_near_tests_mirror_or_import_the_module_or_stand_in_its_folder():
+    path = "selfcal_ros/estimation/joint/noise.py"
+    assert mutants.tests_for(path, near=True) == mutants.tests_for(path)[:2]
+    alone = "selfcal_ros/collection/approach.py"
+    assert "test/collection/test_approach.py" in mutants.tests_for(alone, near=True)[0]
+
+
+def test_the_users_of_a_module_are_those_that_import_it_over_some_steps():
+    near = mutants.users_of("selfcal_ros/estimation/joint/noise.py", 1)
+    assert "test/estimation/joint/test_noise.py" in near
+    assert set(near) < set(mutants.users_of("selfcal_ros/estimation/joint/noise.py", 3))
+    far = mutants.users_of("selfcal_ros/estimation/joint/noise.py", 99)
+    assert "test/model/test_visit_order.py" not in far
+
+
+def small_tree(tmp_path, monkeypatch, test):
+    """Return a copy in which `half` of a module is watched by one test."""
+    monkeypatch.setattr(mutants.Tree, "__init__", lambda self, folder: self.__dict__.update(
+        folder=folder, sound={}))
+    monkeypatch.setattr(mutants, "tests_for", lambda path, near: [["test/test_half.py"]])
+    folder = tmp_path / "tree"
+    (folder / "test").mkdir(parents=True)
+    (folder / "half.py").write_text(HALF)
+    (folder / "test/test_half.py").write_text(test)
+    return mutants.Tree(folder)
+
+
+HALF = "def half(x):\n    return x / 2\n"
+GOOD = ("import sys\nfrom pathlib import Path\nsys.path.insert(0, str(Path(__file__).parents[1]))\n"
+        "from half import half\n\n\ndef test_half():\n    assert half({}) == {}\n")
+RED = "\n\ndef test_red():\n    assert half(2) is None\n"
+
+
+@pytest.mark.parametrize(("test", "survives"), [
+    (GOOD.format(3, 1.5), False), (GOOD.format(0, 0), True),
+    (GOOD.format(3, 1.5) + RED, False), (GOOD.format(0, 0) + RED, True)])
+def test_a_change_survives_what_does_not_see_it_and_what_fails_anyway(
+        tmp_path, monkeypatch, test, survives):
+    tree = small_tree(tmp_path, monkeypatch, test)
+    divided, = (m for m in mutants.mutants_of("half.py", HALF) if m.new == "*")
+    assert tree.survives(divided) is survives
+    assert (tree.folder / "half.py").read_text() == HALF  # as before
+    assert [name for name, sound in tree.sound.items() if not sound] == (
+        ["test/test_half.py::test_red"] if "test_red" in test and survives else [])
