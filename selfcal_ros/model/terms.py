@@ -35,8 +35,9 @@ class TermName(StrEnum):
 VISIT_TERMS = frozenset({TermName.MICROSCOPE, TermName.DRIFT, TermName.APPROACH})
 """Terms that need to know when, with which offset or from where a mark was read."""
 
-UNITS = {TermName.MICROSCOPE: "m/m", TermName.DRIFT: "m", TermName.PLATE_SCALE: "m/m",
-         TermName.PLATE_SHAPE: "m", TermName.APPROACH: "m"}
+UNITS: dict[str, str] = {
+    TermName.MICROSCOPE: "m/m", TermName.DRIFT: "m", TermName.PLATE_SCALE: "m/m",
+    TermName.PLATE_SHAPE: "m", TermName.APPROACH: "m"}
 """Unit of each term's size: a standard deviation known from elsewhere. For a drift it is that at
 the edge of the view's time, for a shape at the middle of the plate's edge."""
 

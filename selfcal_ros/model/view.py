@@ -36,8 +36,9 @@ class LatticePose:
     shift: tuple[int, int]
     turn_lines: int | None
 
-    def site_of(self, m: np.ndarray, n: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the site (i, j) on which mark (m, n) lies: R^q (m, n) + (a, b).
+    @property
+    def q(self) -> int:
+        """Quarter turns of a pose in which grid marks lie on sites.
 
         Raises
         ------
@@ -46,8 +47,41 @@ class LatticePose:
         """
         if self.quarter_turns is None:
             raise ValueError("a grid mark lies on a site only after whole quarter turns")
-        x, y = ((m, n), (-n, m), (-m, -n), (n, -m))[self.quarter_turns]
-        return x + self.shift[0], y + self.shift[1]
+        return self.quarter_turns
+
+    @property
+    def a(self) -> int:
+        """Shift along stage x, pitches."""
+        return self.shift[0]
+
+    @property
+    def b(self) -> int:
+        """Shift along stage y, pitches."""
+        return self.shift[1]
+
+    @property
+    def s(self) -> int:
+        """Turn in angular lines of a plate that has lines.
+
+        Raises
+        ------
+        ValueError
+            If the plate has none.
+        """
+        if self.turn_lines is None:
+            raise ValueError("the turn is counted in lines only on a plate with angular lines")
+        return self.turn_lines
+
+    def site_of(self, m: np.ndarray, n: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the site (i, j) on which mark (m, n) lies: R^q (m, n) + (a, b).
+
+        Raises
+        ------
+        ValueError
+            If the turn is not a whole quarter.
+        """
+        x, y = ((m, n), (-n, m), (-m, -n), (n, -m))[self.q]
+        return x + self.a, y + self.b
 
 
 @dataclass(frozen=True)

@@ -82,14 +82,14 @@ def _grid(readings: ViewReadings, truth: Truth, found: GridExposures, *, setting
     return replace(
         readings, m=marks // (2 * hy + 1) - hx, n=marks % (2 * hy + 1) - hy, dx=by_mark[0],
         dy=by_mark[1], count=np.bincount(mark, count).astype(int), sigma_xy=sigma, dof_xy=dof,
-        visits=GridVisits(mark[order], dx, dy, count[order], stamp[order], ox, oy, *approach,
-                          sigma_m=sigma_visit, dof=dof_visit))
+        visits=GridVisits(mark[order], dx, dy, count[order], stamp[order], ox, oy, approach[0],
+                          approach[1], sigma_m=sigma_visit, dof=dof_visit))
 
 
 def _angular(readings: ViewReadings, truth: Truth, k: np.ndarray, reading: np.ndarray, *,
              lost: np.ndarray) -> ViewReadings:
     count = truth.artifact.angular_count
-    turn = readings.view.lattice_pose(truth.artifact).turn_lines
+    turn = readings.view.lattice_pose(truth.artifact).s
     nominal = (k + turn) % count * (2 * np.pi / count)
     kept = ~lost[k]
     lines, line = np.unique(k[kept], return_inverse=True)

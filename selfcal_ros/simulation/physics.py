@@ -54,8 +54,8 @@ def mark_places(truth: Truth, index: int, view: View,
     m, n = marks
     pose, pitch = view.lattice_pose(truth.artifact), truth.artifact.grid_pitch_m
     site = np.stack(pose.site_of(m, n)) * pitch
-    arm = rotate(pose.quarter_turns, np.stack([m, n]) * pitch)
-    error = rotate(pose.quarter_turns, plate_displacement(truth, index, m, n))
+    arm = rotate(pose.q, np.stack([m, n]) * pitch)
+    error = rotate(pose.q, plate_displacement(truth, index, m, n))
     phi = truth.phi_rad[index]
     if truth.linear:
         away = phi * rotate(1, arm) + error
@@ -124,7 +124,7 @@ def line_directions(truth: Truth, index: int, view: View) -> tuple[np.ndarray, n
     The nominal direction is within one turn, 0 included.
     """
     count = truth.artifact.angular_count
-    turn = (np.arange(count) + view.lattice_pose(truth.artifact).turn_lines) % count
+    turn = (np.arange(count) + view.lattice_pose(truth.artifact).s) % count
     nominal = turn * (2 * np.pi / count)
     return nominal + (truth.a_theta + truth.phi_rad[index]), nominal
 

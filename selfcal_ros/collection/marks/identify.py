@@ -134,7 +134,7 @@ def _nearest(pose, centred: np.ndarray, pitch: float, half: np.ndarray,
              ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return nearest mark (2, n), distance ratio to the second nearest, and distance in m."""
     step = centred / pitch
-    back = type(pose)((4 - pose.quarter_turns) % 4, (0, 0), None)
+    back = type(pose)((4 - pose.q) % 4, (0, 0), None)
     plate = np.stack(back.site_of(step[0], step[1]))
     mark = np.clip(np.rint(plate), -half, half)
     away = np.abs(plate - mark)
@@ -228,7 +228,7 @@ def identify_angular(artifact: Artifact, view: View, reading_rad: np.ndarray, *,
         reasons[:] = Reason.NOT_IN_VIEW
         return Identified(np.zeros(len(ids), int), *np.zeros((2, len(ids))), reasons, Rigid())
     step = 2 * np.pi / count
-    base = view.lattice_pose(artifact).turn_lines
+    base = view.lattice_pose(artifact).s
     known = has_id & (ids >= 0) & (ids < count)
     told = phi_rad is not None or known.any()
     if phi_rad is None:

@@ -16,7 +16,6 @@ from selfcal_ros.estimation.datum.covariance import FieldCovariance
 from selfcal_ros.estimation.datum.scale import scale_datum
 from selfcal_ros.estimation.joint.problem import bounded_ratio
 from selfcal_ros.estimation.joint.saved_terms import KEY, MAX_SITES, factors_of
-from selfcal_ros.estimation.lattice.maps import GridPose
 from selfcal_ros.estimation.law.solve import law_covariance
 from selfcal_ros.estimation.normal.angular import AngularSystem
 from selfcal_ros.estimation.normal.equations import NormalEquations
@@ -44,8 +43,8 @@ def xy_covariance(result: CalibrationResult, known: np.ndarray) -> tuple[np.ndar
     if system is None or known.size > MAX_SITES or not np.isfinite(u).all():
         return u**2, False
     if result.method == "law":
-        cover, both = law_covariance(result), np.tile(known.ravel(), 2)
-        return (u**2, False) if cover is None else (_sized(cover[0][np.ix_(both, both)], u), True)
+        law, both = law_covariance(result), np.tile(known.ravel(), 2)
+        return (u**2, False) if law is None else (_sized(law[0][np.ix_(both, both)], u), True)
     if tells_what_was_read(result) and result.model.terms and KEY not in result.extra:
         return u**2, False
     rows = _unit_rows(known)
@@ -78,8 +77,8 @@ def theta_covariance(result: CalibrationResult, known: np.ndarray) -> tuple[np.n
             or not np.isfinite(u).all():
         return u**2, False
     if result.method == "law":
-        cover = law_covariance(result)
-        return (u**2, False) if cover is None else (_sized(cover[1][np.ix_(known, known)], u), True)
+        law = law_covariance(result)
+        return (u**2, False) if law is None else (_sized(law[1][np.ix_(known, known)], u), True)
     cover = theta_matrix(system, result.artifact, result.error_map.datum_theta,
                          sense=Sense(result.sense))
     if _flipped(result):
@@ -188,11 +187,10 @@ def _read_system(result: CalibrationResult) -> NormalEquations:
         field = np.ones(artifact.angular_count)
         weight = _weights(v.read_angular, field, f"view '{v.name}', read.angular")
         if weight.any():
-            lines.append((index, pose.turn_lines, weight))
+            lines.append((index, pose.s, weight))
         if np.any(v.read_grid):
-            at = GridPose(pose.quarter_turns, *pose.shift)
-            field = GridSystem((at,), np.zeros((1, *artifact.shape))).views.in_field[0]
-            grid.append((index, at, _weights(v.read_grid, field, f"view '{v.name}', read.grid")))
+            field = GridSystem((pose,), np.zeros((1, *artifact.shape))).views.in_field[0]
+            grid.append((index, pose, _weights(v.read_grid, field, f"view '{v.name}', read.grid")))
     angular = np.array([weight for *_, weight in lines]).reshape(len(lines),
                                                                 artifact.angular_count)
     return NormalEquations(

@@ -90,8 +90,8 @@ def significance(values: np.ndarray, covariances: list[tuple[np.ndarray, bool]],
         None where there is no uncertainty to test against.
     """
     correlated = all(flag for _, flag in covariances)
-    total = sum(covariance if correlated or covariance.ndim == 1 else np.diag(covariance)
-                for covariance, _ in covariances)
+    total = np.sum([covariance if correlated or covariance.ndim == 1 else np.diag(covariance)
+                    for covariance, _ in covariances], axis=0)
     if not np.isfinite(total).all() or not total.any():
         return None
     q = np.linalg.qr(removed)[0]

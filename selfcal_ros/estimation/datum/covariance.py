@@ -90,7 +90,7 @@ class FieldCovariance:
     def of(self, rows: np.ndarray) -> np.ndarray:
         """Return the covariance (k, k) of functionals Re(conj(row) G), complex (k, nx, ny)."""
         flat = rows.reshape(len(rows), -1).T
-        out, extra = self.project(flat), 0.0
+        out, extra = self.project(flat), np.zeros((len(rows), len(rows)))
         moved = np.zeros((self.system.grid.response.shape[1], len(rows)))
         if self.scale is not None:
             grown = np.real(self.system.grid.views.z.ravel().conj() @ flat)
@@ -104,17 +104,17 @@ class FieldCovariance:
         cov += of_terms.T @ self.terms.covariance @ of_terms
         return (cov + cov.T) / 2
 
-    def _of_scale(self) -> tuple[np.ndarray, float]:
+    def _of_scale(self, scale: ScaleDatum) -> tuple[np.ndarray, float]:
         """Return the covariance of the scale with G in its datum (sites,), and its variance."""
-        grid, rows = self.system.grid, self.scale.rows
-        answer = np.real(grid.response.conj().T @ rows) - self.scale.parameters
+        grid, rows = self.system.grid, scale.rows
+        answer = np.real(grid.response.conj().T @ rows) - scale.parameters
         solved = grid.factor.solve(rows)
         spread = solved + grid.response @ (self._p @ answer)
         basis = self.system.gauge.orthonormal
         variance = float(np.real(np.vdot(rows, solved)) + answer @ self._p @ answer) + self._u2
         terms, n = self.terms, len(answer)
         of_terms = np.real(terms.fields.conj().T @ rows) + terms.parameters[:n].T @ (
-            self.scale.parameters)
+            scale.parameters)
         spread = spread + terms.fields @ (terms.covariance @ of_terms)
         variance += float(of_terms @ terms.covariance @ of_terms)
         return spread - basis @ np.real(basis.conj().T @ spread), variance
@@ -136,7 +136,7 @@ class FieldCovariance:
         out = []
         response = grid.response
         common = grid.factor.inverse_diagonal()
-        with_scale, of_scale = (None, 0.0) if self.scale is None else self._of_scale()
+        with_scale, of_scale = (None, 0.0) if self.scale is None else self._of_scale(self.scale)
         for part in (np.real, np.imag):
             b, s, y = part(basis), part(spread), part(response)
             f = part(self.terms.fields)

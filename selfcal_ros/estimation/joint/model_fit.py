@@ -154,7 +154,8 @@ class _State:
 
     def __init__(self, problem: Problem, found: JointFit) -> None:
         self.problem, self.found, self.steps = problem, found, 0
-        self.equations, self.reduced = None, None
+        self.equations: TermEquations | None = None
+        self.reduced: ReducedColumns | None = None
         self.of_offsets = any(term.name is TermName.MICROSCOPE for term in problem.terms)
         if problem.terms:
             self._linearise()
@@ -166,7 +167,7 @@ class _State:
     def _linearise(self) -> None:
         """Set up the equations of the terms about the present solution."""
         self.weights = self.found.inverse
-        if self.reduced is None or self.of_offsets:
+        if self.equations is None or self.of_offsets:
             known = (self.equations.columns.at_visits(self.coefficients)
                      if self.equations is not None else ())
             columns = columns_of(self.problem, self.found, known)
@@ -193,7 +194,7 @@ class _State:
             self._linearise()
         self.steps += 1
         if self.equations is not None:
-            self._solve_terms()
+            self._solve_terms(self.equations)
         self.y = np.where(self.problem.system.grid.read,
                           self.problem.grid.y - self._excess() - self._of_terms(), 0.0)
         self.found = fit(self.problem, self.y)
@@ -213,13 +214,13 @@ class _State:
         return ModelFit(self.problem, self.found, self.equations, self.coefficients, self.sums,
                         self.y, self.reduced)
 
-    def _solve_terms(self) -> None:
-        now = score(self.equations, self.found.residuals, squares(self.problem, self.found),
+    def _solve_terms(self, equations: TermEquations) -> None:
+        now = score(equations, self.found.residuals, squares(self.problem, self.found),
                     coefficients=self.coefficients)
-        left = noise_left(self.equations, now)
+        left = noise_left(equations, now)
         self.problem = with_noise(self.problem, left)
         sigma = self.found.xy.sigma if np.isfinite(self.found.xy.sigma) else 0.0
-        self.coefficients = next_coefficients(self.equations, now, self.coefficients, sigma)
+        self.coefficients = next_coefficients(equations, now, self.coefficients, sigma)
 
     def _of_terms(self) -> np.ndarray | float:
         if self.equations is None:

@@ -108,9 +108,12 @@ def noise_estimate(repeats: tuple[float, float], residuals: tuple[float, float],
         chosen = base
     else:
         chosen = residuals
-    found = NoiseEstimate(*chosen, repeats[0], residuals[0], repeats[1], residuals[1], declared, p)
+    found = NoiseEstimate(
+        sigma=chosen[0], dof=chosen[1], repeats=repeats[0], residuals=residuals[0],
+        dof_repeats=repeats[1], dof_residuals=residuals[1], declared=declared, p=p)
     if found.contradicted:
-        found = replace(found, **dict(zip(("sigma", "dof"), max(base, residuals), strict=True)))
+        sigma, dof = max(base, residuals)
+        found = replace(found, sigma=sigma, dof=dof)
     return found
 
 

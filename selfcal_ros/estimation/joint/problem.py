@@ -57,8 +57,6 @@ class Problem:
         Terms of the model beside stage, plate and misalignments.
     drift_degree : int
         Degree of a drift's polynomial.
-    ground : Ground, optional
-        What the columns of terms stand on; always there if there are terms.
     residuals_xy : tuple, optional
         (sigma, degrees of freedom) of the residuals where they are not those of the grid alone:
         after terms were taken off.
@@ -67,16 +65,16 @@ class Problem:
     system: NormalEquations
     grid: GridData
     angular: AngularData
-    repeats_xy: tuple[float, int]
+    repeats_xy: tuple[float, float]
     repeats_theta: tuple[float, int]
     half_width_m: float
     conditions: Conditions
     direct: bool
+    ground: Ground
     reference: ReferenceLength | None = None
     rigid: bool = True
     terms: tuple[ModelTerm, ...] = ()
     drift_degree: int = DRIFT_DEGREE
-    ground: Ground | None = None
     residuals_xy: tuple[float, float] | None = None
 
 

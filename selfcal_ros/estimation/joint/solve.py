@@ -78,8 +78,8 @@ def prepare(measurements: Measurements, options: Options) -> tuple[Problem, Obse
                          f"the limit of {MAX_DIRECT_SITES}", "solve without the uncertainty")
     return Problem(
         system, grid, angular, *repeats_of(measurements), half_width_m, conditions, direct,
-        options.reference, options.misalignment_model == "rigid", options.terms,
-        options.drift_degree, ground_of(measurements, grid, half_width_m)), seen
+        ground_of(measurements, grid, half_width_m), options.reference,
+        options.misalignment_model == "rigid", options.terms, options.drift_degree), seen
 
 
 def _solved(measurements: Measurements, options: Options, *, model: ModelFit,

@@ -15,13 +15,13 @@ from selfcal_ros.model.result import ArtifactMap
 
 def turned_marks(view: ViewReadings, artifact: Artifact) -> np.ndarray:
     """Return R^q m of the marks read, from the plate's centre, complex (P,), stage frame, m."""
-    turn = PHASES[view.view.lattice_pose(artifact).quarter_turns]
+    turn = PHASES[view.view.lattice_pose(artifact).q]
     return turn * (view.m + 1j * view.n) * artifact.grid_pitch_m
 
 
 def turned_plate(view: ViewReadings, artifact: Artifact, plate: ArtifactMap) -> np.ndarray:
     """Return R^q A of the marks read, complex (P,), stage frame, m; NaN where not known."""
-    turn = PHASES[view.view.lattice_pose(artifact).quarter_turns]
+    turn = PHASES[view.view.lattice_pose(artifact).q]
     at = view.m + artifact.half[0], view.n + artifact.half[1]
     return turn * (plate.ax[at] + 1j * plate.ay[at])
 

@@ -11,17 +11,10 @@ from functools import cached_property
 
 import numpy as np
 
+from selfcal_ros.model.view import LatticePose
+
 PHASES = np.array([1, 1j, -1, -1j])
 """i^q for q = 0..3, exact."""
-
-
-@dataclass(frozen=True)
-class GridPose:
-    """Pose of one grid view on the lattice: quarter turns q, shift (a, b) in pitches."""
-
-    q: int
-    a: int
-    b: int
 
 
 @dataclass(frozen=True)
@@ -33,7 +26,7 @@ class Window:
     transposed: bool
 
 
-def window(pose: GridPose, half: tuple[int, int]) -> Window:
+def window(pose: LatticePose, half: tuple[int, int]) -> Window:
     """Return the marks of a view that lie in the field, and their sites, as slices.
 
     Site = R^q (m, n) + (a, b); a field with half widths `half`.
@@ -67,13 +60,13 @@ class LatticeViews:
     ----------
     shape : tuple of int
         Marks (and sites) along x and y.
-    poses : tuple of GridPose
+    poses : tuple of LatticePose
         One a view.
     unit : int
         Pitches in the unit of positions; 0 = the longer half width.
     """
 
-    def __init__(self, shape: tuple[int, int], poses: tuple[GridPose, ...],
+    def __init__(self, shape: tuple[int, int], poses: tuple[LatticePose, ...],
                  unit: int = 0) -> None:
         self.shape, self.poses = shape, poses
         self.half = (shape[0] - 1) // 2, (shape[1] - 1) // 2

@@ -7,7 +7,7 @@ from functools import lru_cache
 import numpy as np
 
 from selfcal_ros.errors import InputError
-from selfcal_ros.estimation.lattice.maps import PHASES, GridPose
+from selfcal_ros.estimation.lattice.maps import PHASES
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Measurements, ViewReadings
 from selfcal_ros.model.view import LatticePose, View
@@ -21,7 +21,7 @@ class GridData:
     ----------
     index : tuple of int
         Position in `Measurements.views` of every grid view.
-    poses : tuple of GridPose
+    poses : tuple of LatticePose
         Their poses.
     y : complex array (views, nx, ny)
         Deviations turned into the plate frame, m; 0 where not read.
@@ -32,7 +32,7 @@ class GridData:
     """
 
     index: tuple[int, ...]
-    poses: tuple[GridPose, ...]
+    poses: tuple[LatticePose, ...]
     y: np.ndarray
     weight: np.ndarray
     sigma_declared: float
@@ -88,7 +88,7 @@ def angular_data(measurements: Measurements) -> AngularData:
     for row, i in enumerate(index):
         readings = measurements.views[i]
         where = f"view '{readings.view.name}' angular readings"
-        turn = _pose_of(readings.view, artifact).turn_lines
+        turn = _pose_of(readings.view, artifact).s
         k = np.asarray(readings.k)
         if turn is None or k.min() < 0 or k.max() >= artifact.angular_count:
             raise InputError(where, "a line that the plate does not have",
@@ -106,23 +106,23 @@ def _pose_of(view: View, artifact: Artifact) -> LatticePose:
     return view.lattice_pose(artifact)
 
 
-def _grid_pose(readings: ViewReadings, artifact: Artifact) -> GridPose:
+def _grid_pose(readings: ViewReadings, artifact: Artifact) -> LatticePose:
     pose = _pose_of(readings.view, artifact)
     if pose.quarter_turns is None:
         raise InputError(f"view '{readings.view.name}'", "grid marks were read at a turn that is "
                          "not a multiple of 90 deg", "turn by a multiple of 90 deg")
-    return GridPose(pose.quarter_turns, *pose.shift)
+    return pose
 
 
-def _flat_marks(readings: ViewReadings, artifact: Artifact, pose: GridPose, *,
+def _flat_marks(readings: ViewReadings, artifact: Artifact, pose: LatticePose, *,
                 where: str) -> np.ndarray:
     """Return the flat index of every mark read, checked against plate and field."""
     (hx, hy), m, n = artifact.half, np.asarray(readings.m), np.asarray(readings.n)
     if m.shape != n.shape:
         raise InputError(where, "m and n differ in length", "give one value a mark")
-    i, j = ((m, n), (-n, m), (-m, -n), (n, -m))[pose.q]
+    i, j = pose.site_of(m, n)
     for name, a, la, b, lb in (("off the plate", m, hx, n, hy),
-                               ("off the stage's field", i + pose.a, hx, j + pose.b, hy)):
+                               ("off the stage's field", i, hx, j, hy)):
         bad = (np.maximum(a, -a) > la) | (np.maximum(b, -b) > lb)
         if bad.any():
             k = int(np.argmax(bad))

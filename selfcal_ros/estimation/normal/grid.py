@@ -12,9 +12,10 @@ from itertools import combinations
 import numpy as np
 
 from selfcal_ros.estimation.lattice.connectivity import Components, components
-from selfcal_ros.estimation.lattice.maps import GridPose, LatticeViews, rigid_parameters
+from selfcal_ros.estimation.lattice.maps import LatticeViews, rigid_parameters
 from selfcal_ros.estimation.multifrontal.factor import Factor
 from selfcal_ros.estimation.multifrontal.symmetry import fold
+from selfcal_ros.model.view import LatticePose
 
 
 class GridSystem:
@@ -22,7 +23,7 @@ class GridSystem:
 
     Parameters
     ----------
-    poses : tuple of GridPose
+    poses : tuple of LatticePose
         One a view.
     weight : float array (views, nx, ny)
         Weight of each reading; 0 = not read.
@@ -30,7 +31,7 @@ class GridSystem:
         Pitches in the unit of positions; 0 = the longer half width.
     """
 
-    def __init__(self, poses: tuple[GridPose, ...], weight: np.ndarray, unit: int = 0) -> None:
+    def __init__(self, poses: tuple[LatticePose, ...], weight: np.ndarray, unit: int = 0) -> None:
         self.weight = weight
         self.views = LatticeViews(weight.shape[1:], poses, unit)
         self.read = weight > 0

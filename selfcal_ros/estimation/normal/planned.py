@@ -3,7 +3,6 @@
 
 import numpy as np
 
-from selfcal_ros.estimation.lattice.maps import GridPose
 from selfcal_ros.estimation.normal.angular import AngularSystem
 from selfcal_ros.estimation.normal.equations import NormalEquations
 from selfcal_ros.estimation.normal.grid import GridSystem
@@ -22,17 +21,14 @@ def planned_system(artifact, views, *, rank_only: bool = False) -> NormalEquatio
         Whether its rank alone will be asked for.
     """
     grid_views = [(i, v) for i, v in enumerate(views) if v.grid]
-    poses = []
-    for _, view in grid_views:
-        pose = view.lattice_pose(artifact)
-        poses.append(GridPose(pose.quarter_turns, *pose.shift))
+    poses = tuple(view.lattice_pose(artifact) for _, view in grid_views)
     angular = [(i, v) for i, v in enumerate(views) if v.angular and artifact.angular_count]
-    turns = tuple(v.lattice_pose(artifact).turn_lines for _, v in angular)
+    turns = tuple(v.lattice_pose(artifact).s for _, v in angular)
     empty = np.zeros((len(poses), *artifact.shape))
-    field = GridSystem(tuple(poses), empty).views.in_field
+    field = GridSystem(poses, empty).views.in_field
     repeats = np.array([v.repeats for _, v in grid_views], dtype=float)
     lines = np.array([v.repeats for _, v in angular], dtype=float)
     return NormalEquations(
-        GridSystem(tuple(poses), field * repeats[:, None, None]),
+        GridSystem(poses, field * repeats[:, None, None]),
         AngularSystem(turns, np.ones((len(turns), artifact.angular_count)) * lines[:, None]),
         tuple(i for i, _ in grid_views), tuple(i for i, _ in angular), rank_only=rank_only)

@@ -35,8 +35,6 @@ def likelier_term(measurements: Measurements, options: Options, slip: Slip) -> C
     model = fit_model(problem, lambda equations: require_terms_told(equations, seen))
     row = problem.grid.index.index(slip.index)
     ground = problem.ground
-    if ground is None:
-        raise AssertionError("prepare() always gives the ground of the readings")
     placed = PlacedSlip(slip_at_line(ground, row, slip, PHASES[-problem.grid.poses[row].q % 4]),
                         row, 2 * MAX_PLACES)
     found = find_explanations(model, slips=True, placed=placed)

@@ -246,7 +246,7 @@ def prediction_errors(measurements: Measurements, result: CalibrationResult, ind
     if len(view.k):
         sign = -1 if measurements.sense is Sense.PLATE_MOVES else 1
         count = measurements.artifact.angular_count
-        site = sign * (view.k + view.view.lattice_pose(measurements.artifact).turn_lines) % count
+        site = sign * (view.k + view.view.lattice_pose(measurements.artifact).s) % count
         theta = (view.dtheta - sign * result.error_map.g_theta[site]
                  - result.artifact_map.a_theta[view.k])
         phi = known.phi

@@ -140,6 +140,8 @@ def columns_from(ground: Ground, columns: Iterable[Column],
     for column, values in zip(columns, shapes, strict=True):
         block = np.zeros(ground.weight.shape, dtype=complex)
         visits = ground.visits[column.view]
+        if visits is None:
+            raise ValueError(f"column of view {column.view}: its visits are not known")
         block[column.view] = visits.means(values[None], ground.z.size).reshape(ground.z.shape)
         seen: list[np.ndarray | None] = [None] * len(ground.names)
         seen[column.view] = values
@@ -186,8 +188,8 @@ def _visit_columns(ground: Ground, term: ModelTerm,
 
 
 def _drift_parts(order: int) -> Parts:
-    return [(f"{axis} P{order}", lambda v, unit=unit: unit * eval_legendre(order, v.time))
-            for axis, unit in (("x", 1), ("y", 1j))]
+    return [(f"x P{order}", lambda v: eval_legendre(order, v.time) + 0j),
+            (f"y P{order}", lambda v: 1j * eval_legendre(order, v.time))]
 
 
 def _microscope_parts() -> Parts:

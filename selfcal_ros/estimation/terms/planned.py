@@ -90,7 +90,7 @@ def _visits(artifact: Artifact, view: View, assumed: Assumed,
     n = len(found)
     sites = (found.i + 1j * found.j) * artifact.grid_pitch_m
     stops = assumed.stop_error_m * (rng.normal(size=n) + 1j * rng.normal(size=n))
-    (hx, hy), phase = artifact.half, PHASES[-view.lattice_pose(artifact).quarter_turns % 4]
+    (hx, hy), phase = artifact.half, PHASES[-view.lattice_pose(artifact).q % 4]
     mark = (found.m + hx) * artifact.shape[1] + found.n + hy
     # which way the stage carries the plate changes nothing: its motion and its part of a reading
     # both change their sign
@@ -132,7 +132,7 @@ def with_terms(every: TermEquations, terms: Iterable[ModelTerm]) -> TermEquation
     terms : iterable of ModelTerm
         Free ones have no columns of the plate in the first view, as in `term_columns`.
     """
-    sizes = {term.name: term.size for term in terms}
+    sizes: dict[str, float] = {term.name: term.size for term in terms}
     known = every.columns
     rows = rows_of(known, terms)
     columns = tuple(replace(column, size=sizes[column.term])
@@ -149,7 +149,7 @@ def with_terms(every: TermEquations, terms: Iterable[ModelTerm]) -> TermEquation
 
 def rows_of(columns: TermColumns, terms: Iterable[ModelTerm]) -> np.ndarray:
     """Return which columns the terms have, bool (p,)."""
-    free = {term.name: term.free for term in terms}
+    free: dict[str, bool] = {term.name: term.free for term in terms}
     return np.array([column.term in free and not (free[column.term] and _first(column))
                      for column in columns.columns], dtype=bool)
 

@@ -123,7 +123,7 @@ def between_visits(measurements: Measurements, least_dof: int) -> tuple[float, i
         for values in (visits.dx, visits.dy):
             mean = np.bincount(visits.mark, visits.count * values, n) / np.maximum(count, 1)
             total += float(visits.count @ (values - mean[visits.mark]) ** 2)
-        dof += 2 * (len(visits.mark) - np.count_nonzero(count))
+        dof += 2 * (len(visits.mark) - int(np.count_nonzero(count)))
     if not repeated or dof < least_dof:
         return None
     return float(np.sqrt(total / dof)), dof

@@ -6,12 +6,13 @@ import pytest
 
 from selfcal_ros.errors import NotIdentifiableError
 from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.estimation.lattice.maps import PHASES, GridPose, LatticeViews
+from selfcal_ros.estimation.lattice.maps import PHASES, LatticeViews
 from selfcal_ros.estimation.normal.angular import AngularSystem
 from selfcal_ros.estimation.normal.equations import NormalEquations
 from selfcal_ros.estimation.normal.grid import GridSystem
 from selfcal_ros.estimation.observability.rank import plan_observability
 from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.view import LatticePose
 from selfcal_ros.simulation.truth import random_truth, simulate_measurements
 from test.support.lattice_plans import plan_of
 
@@ -41,7 +42,7 @@ def dense(grid: GridSystem) -> np.ndarray:
 @pytest.mark.parametrize("missing", [0.0, 0.2, 0.5, 0.8])
 def test_rank_is_that_of_the_full_matrix(poses, shape, missing):
     rng = np.random.default_rng(int(100 * missing))
-    views = tuple(GridPose(*pose) for pose in poses)
+    views = tuple(LatticePose(pose[0], pose[1:], None) for pose in poses)
     field = LatticeViews(shape, views).in_field
     weight = field * (rng.random(field.shape) >= missing) * rng.integers(1, 5, field.shape)
     grid = GridSystem(views, weight.astype(float))
