@@ -48,7 +48,7 @@ class ErrorMap:
     u_g_theta: np.ndarray = field(default_factory=lambda: np.zeros(0))
     nonorthogonality: float = 0.0
     scale_difference: float = 0.0
-    datum_theta: ThetaDatum = ThetaDatum.XY_AXES
+    datum_theta: ThetaDatum = ThetaDatum.ZERO_MEAN
 
     @property
     def valid(self) -> np.ndarray:

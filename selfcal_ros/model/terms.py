@@ -53,10 +53,22 @@ class ModelTerm:
     size : float
         Standard deviation of its coefficients as known from elsewhere, in `UNITS`; infinite if
         the readings alone are to tell them.
+
+    Raises
+    ------
+    InputError
+        For an unknown term.
     """
 
     name: TermName
     size: float = math.inf
+
+    def __post_init__(self) -> None:
+        """Take a name that is given as plain text, too."""
+        if self.name not in list(TermName):
+            raise InputError("ModelTerm", f"the term '{self.name}' is unknown",
+                             "known are " + ", ".join(TermName))
+        object.__setattr__(self, "name", TermName(self.name))
 
     @property
     def free(self) -> bool:
