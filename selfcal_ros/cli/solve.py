@@ -35,7 +35,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--model", metavar="TERM[:SIZE],...", action="append",
                         help="terms estimated with the map: microscope, drift, plate_scale, "
                         "plate_shape, approach; SIZE is a standard deviation known from elsewhere "
-                        "(SI), e.g. drift,plate_shape:30e-9")
+                        "(SI), e.g. drift,plate_shape:30e-9; default: those of the plan; none: no "
+                        "terms")
     parser.add_argument("--drift-degree", type=int, metavar="D",
                         help="degree of a drift's polynomial (default: 3)")
     parser.add_argument("--namespace", metavar="NAME", help="namespace of the cell's topics, "
@@ -112,7 +113,7 @@ def run(args: argparse.Namespace) -> int:
             progress=lambda count: bar(count, None))
     for line in (*findings, *lost, *(() if findings else advice(measurements.all_rejected()))):
         print(f"selfcal solve: {args.bag}: {line}", file=sys.stderr)
-    options = solver_options(solver_values)
+    options = solver_options(solver_values, measurements)
     try:
         if args.robust:
             from selfcal_ros.estimation.quality.outliers import robust_calibrate

@@ -262,7 +262,8 @@ class Collector:
         progress = {index: view_progress(timeline, index, found)
                     for index, found in readings.items()}
         return Measurements(timeline.plan_id, timeline.artifact, tuple(readings.values()),
-                            self.sense, dict(sorted(loose.items())), timeline.run_id), progress
+                            self.sense, dict(sorted(loose.items())), timeline.run_id,
+                            timeline.model_terms), progress
 
     def findings(self, measurements: Measurements,
                  progress: dict[int, ViewProgress]) -> dict[int | None, Finding]:

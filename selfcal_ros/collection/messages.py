@@ -59,7 +59,10 @@ class Detection:
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """One view command. `artifact` and `view` are None for DONE and ABORT."""
+    """One view command. `artifact` and `view` are None for DONE and ABORT.
+
+    `model_terms` are those that the plan wants estimated with the map, as it writes them.
+    """
 
     stamp_ns: int
     phase: Phase
@@ -69,6 +72,7 @@ class Command:
     artifact: Artifact | None = None
     views_planned: int = 0
     run_id: str = ""
+    model_terms: tuple[str, ...] = ()
 
 
 def check_command(command: Command) -> None:

@@ -11,8 +11,14 @@ from typing import Any
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.options import Options, ReferenceKind, ReferenceLength
 from selfcal_ros.model.error_map import ThetaDatum
-from selfcal_ros.model.readings import Sense
-from selfcal_ros.model.terms import DRIFT_DEGREE, MAX_DRIFT_DEGREE, TermName, parse_terms
+from selfcal_ros.model.readings import Measurements, Sense
+from selfcal_ros.model.terms import (
+    DRIFT_DEGREE,
+    MAX_DRIFT_DEGREE,
+    ModelTerm,
+    TermName,
+    parse_terms,
+)
 
 
 @dataclass(frozen=True)
@@ -104,6 +110,9 @@ COLLECTOR = (
     Parameter("repeatability_theta_limit", 0.0, "repeatability of one angular reading above which "
               "there is a warning; 0 = none", "rad", 0.0, 0.1),
 )
+NO_TERMS = "none"
+"""The word for no terms, where the plan asks for some."""
+
 _UNCERTAINTY = {"auto": None, "always": True, "never": False}
 
 SOLVER = (
@@ -126,7 +135,8 @@ SOLVER = (
     Parameter("reference_certificate", "", "what states that length: number and issuer of a "
               "certificate"),
     Parameter("model_terms", [""], "terms estimated with the map, each TERM or TERM:SIZE of "
-              + ", ".join(TermName) + "; the size is a standard deviation, SI"),
+              + ", ".join(TermName) + "; the size is a standard deviation, SI; empty = those of "
+              f"the plan, {NO_TERMS} = none"),
     Parameter("drift_degree", DRIFT_DEGREE, "degree of the polynomial of time by which views "
               "drift, where drift is a term", "", 1, MAX_DRIFT_DEGREE),
     Parameter("save_path", "", "RESULT.json to write whenever the map changes; empty = none"),
@@ -308,15 +318,35 @@ def _flatten(section: dict, prefix: str) -> list[tuple[str, Any]]:
     return out
 
 
-def solver_options(values: dict[str, Any]) -> Options:
-    """Return the estimator's options in a solver's parameter values."""
+def solver_options(values: dict[str, Any], measurements: Measurements | None = None) -> Options:
+    """Return the estimator's options in a solver's parameter values.
+
+    Where `model_terms` is not given the terms that the plan of the `measurements` asks for hold.
+
+    Raises
+    ------
+    InputError
+        For terms that cannot be.
+    """
     kind = values["reference_kind"]
     reference = None if kind == "none" else ReferenceLength(
         ReferenceKind(kind), values["reference_error"], values["reference_u"],
         values["reference_certificate"])
+    terms, origin = _terms(values["model_terms"], measurements)
     return Options(method=values["method"], datum_theta=ThetaDatum(values["theta_datum"]),
                    misalignment_model="" if values["method"] == "law" else
                    values["misalignment_model"], reference=reference,
                    uncertainty=_UNCERTAINTY[values["uncertainty"]],
-                   terms=parse_terms(values["model_terms"], "model_terms"),
+                   terms=terms, terms_from=origin if terms else "",
                    drift_degree=values["drift_degree"])
+
+
+def _terms(given: list[str],
+           measurements: Measurements | None) -> tuple[tuple[ModelTerm, ...], str]:
+    """Return the terms of the model, and where they come from: ``options`` or ``plan``."""
+    if [text.strip() for text in given] == [NO_TERMS]:
+        return (), ""
+    if any(text.strip() for text in given) or measurements is None:
+        return parse_terms(given, "model_terms"), "options"
+    where = f"plan '{measurements.plan_id}': model_terms"
+    return parse_terms(measurements.model_terms, where), "plan"

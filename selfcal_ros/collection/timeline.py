@@ -53,6 +53,8 @@ class Timeline:
         Stamp of the last command.
     run_id : str
         Run of the last MEASURE; views of other runs are not used. Empty before the first MEASURE.
+    model_terms : tuple of str
+        Terms that the plan wants estimated, as the last MEASURE tells them.
     """
 
     plan_id: str = ""
@@ -63,6 +65,7 @@ class Timeline:
     finished: bool = False
     last_stamp_ns: int = 0
     run_id: str = ""
+    model_terms: tuple[str, ...] = ()
 
     def assign(self, stamps_ns: np.ndarray) -> np.ndarray:
         """Return the index of the interval of each stamp, int array; -1 before the first."""
@@ -107,7 +110,8 @@ def build_timeline(commands: Iterable[Command]) -> Timeline:
     planned = max([c.views_planned for c in mine] + [max(views) + 1])
     return Timeline(plan_id, artifact, dict(sorted(views.items())),
                     tuple(_intervals(ordered, runs, run_id)), planned,
-                    ordered[-1].phase in (Phase.DONE, Phase.ABORT), ordered[-1].stamp_ns, run_id)
+                    ordered[-1].phase in (Phase.DONE, Phase.ABORT), ordered[-1].stamp_ns, run_id,
+                    newest.model_terms)
 
 
 def _runs(ordered: list[Command], plan_id: str) -> list[str | None]:
@@ -134,7 +138,8 @@ def _runs(ordered: list[Command], plan_id: str) -> list[str | None]:
 
 def _sort_key(command: Command) -> tuple:
     return (command.stamp_ns, int(command.phase), command.plan_id, command.view_index,
-            repr(command.view), repr(command.artifact), command.views_planned, command.run_id)
+            repr(command.view), repr(command.artifact), command.views_planned, command.run_id,
+            command.model_terms)
 
 
 def _unused(ordered: list[Command]) -> list[Interval]:

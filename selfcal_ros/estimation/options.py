@@ -83,6 +83,8 @@ class Options:
     causes : bool, optional
         Whether to look for terms that the readings show and the model does not hold; None does
         in fields of up to 41 x 41 sites, and where a test fails.
+    terms_from : str
+        Who asks for the terms, for the provenance: ``options``, ``plan`` or empty.
 
     Raises
     ------
@@ -98,6 +100,7 @@ class Options:
     terms: tuple[ModelTerm, ...] = ()
     drift_degree: int = DRIFT_DEGREE
     causes: bool | None = None
+    terms_from: str = ""
 
     def __post_init__(self) -> None:
         """Fill in the model of the method; refuse unknown names."""

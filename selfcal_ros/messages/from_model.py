@@ -58,7 +58,8 @@ def command(c: Command, frame_id: str) -> Fields:
         "grid_size": 0, "grid_pitch": 0.0, "angular_count": 0, "grid_size_y": 0}
     return {"header": header(c.stamp_ns, frame_id), "phase": int(c.phase), "plan_id": c.plan_id,
             "view_index": c.view_index, **view, **plate, "views_planned": c.views_planned,
-            "visit_order": c.view.visit_order if c.view else "", "run_id": c.run_id}
+            "visit_order": c.view.visit_order if c.view else "", "run_id": c.run_id,
+            "model_terms": list(c.model_terms)}
 
 
 def view_status(progress: ViewProgress, plan_id: str, stamp_ns: int, frame_id: str, *,
@@ -95,7 +96,8 @@ def view_measurement(progress: ViewProgress, measurements: Measurements, stamp_n
         **_rejected(readings.rejected, "reject"),
         "measurement_sense": str(measurements.sense),
         **_rejected(measurements.rejected, "session_reject"),
-        **_visits(readings.visits), "run_id": measurements.run_id}
+        **_visits(readings.visits), "run_id": measurements.run_id,
+        "model_terms": list(measurements.model_terms)}
 
 
 def _visits(visits: GridVisits | None) -> Fields:

@@ -57,12 +57,17 @@ def command(message: Any) -> Command:
                          "use PLACE, MEASURE, DONE or ABORT") from error
     base = (stamp_ns(message), phase, str(message.plan_id), int(message.view_index))
     more = {"views_planned": int(getattr(message, "views_planned", 0)),
-            "run_id": str(getattr(message, "run_id", ""))}
+            "run_id": str(getattr(message, "run_id", "")), "model_terms": terms_of(message)}
     if phase not in (Phase.PLACE, Phase.MEASURE):
         return Command(*base, **more)
     return Command(*base, view_of(message, repeats=max(1, int(message.repeats)),
                                   grid=bool(message.grid), angular=bool(message.angular)),
                    artifact_of(message), **more)
+
+
+def terms_of(message: Any) -> tuple[str, ...]:
+    """Return the terms that a ViewCommand or ViewMeasurement wants estimated; none in old bags."""
+    return tuple(map(str, getattr(message, "model_terms", ())))
 
 
 def artifact_of(message: Any) -> Artifact:

@@ -170,6 +170,8 @@ class Measurements:
         Reason -> number of detections that belong to no view.
     run_id : str
         Run of the plan: the stamp of its first command, ns, as text; empty if not told.
+    model_terms : tuple of str
+        Terms that the plan wants estimated with the map, see `selfcal_ros.model.terms`.
     """
 
     plan_id: str
@@ -178,6 +180,7 @@ class Measurements:
     sense: Sense = Sense.MICROSCOPE_MOVES
     rejected: dict[str, int] = field(default_factory=dict)
     run_id: str = ""
+    model_terms: tuple[str, ...] = ()
 
     def all_rejected(self) -> dict[str, int]:
         """Return reason -> count over all views and outside of them, sorted by reason."""

@@ -143,7 +143,8 @@ class SolvingSession:
         return Measurements(ordered[0].plan_id, artifacts.pop(),
                             tuple(to_model.view_readings(message) for message in ordered),
                             to_model.sense_of(ordered[0]),
-                            to_model.counts(newest, "session_reject"), self._run.run_id)
+                            to_model.counts(newest, "session_reject"), self._run.run_id,
+                            to_model.terms_of(newest))
 
     def next_job(self) -> Job | None:
         """Return what is to be solved, if readings have come since the last job.
@@ -161,11 +162,12 @@ class SolvingSession:
             digest = session_digest({
                 index: readings_digest(readings, measurements.rejected) for index, readings
                 in zip(sorted(self._messages), measurements.views, strict=True)})
+            options = solver_options(self._values, measurements)
         except SelfcalError as error:
             self.shown.problem, self.shown.digest = error, ""
             raise
         stamp = max(to_model.stamp_ns(message) for message in self._messages.values())
-        return Job(self._run, measurements, solver_options(self._values), digest, stamp)
+        return Job(self._run, measurements, options, digest, stamp)
 
     def take(self, outcome: Outcome) -> None:
         """Publish what solving a job gave, unless another run has begun meanwhile."""

@@ -3,6 +3,7 @@
 
 import json
 import re
+from dataclasses import replace
 
 import pytest
 import yaml
@@ -56,6 +57,21 @@ def refused(capsys, code, path, *options):
 
 def without(events, kind):
     return [event for event in events if not isinstance(event, kind)]
+
+
+def test_the_terms_of_the_plan_travel_in_the_bag_and_options_win(tmp_path):
+    plan = replace(small_plan(), model_terms=("plate_scale:1e-06",))
+    bag = small_bag(tmp_path, plan)
+    found = {}
+    for name, options in {"plan": (), "options": ("--model", "drift:1e-08"),
+                          "none": ("--model", "none")}.items():
+        out = tmp_path / f"{name}.json"
+        assert solve(bag, *options, output=out) in (0, 5)
+        result = json.loads(out.read_text())
+        found[name] = ([term["name"] for term in result["model"]["terms"]],
+                       result["provenance"].get("model_terms_from"))
+    assert found == {"plan": (["plate_scale"], "plan"), "options": (["drift"], "options"),
+                     "none": ([], None)}
 
 
 def test_what_is_no_bag(tmp_path, capsys):

@@ -14,7 +14,9 @@ from selfcal_ros.collection.parameters import (
 )
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.options import Options
+from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ThetaDatum
+from selfcal_ros.model.readings import Measurements
 
 EVERY = [(node, p) for node, table in NODE_PARAMETERS.items() for p in table]
 
@@ -139,6 +141,33 @@ def test_without_being_told_plates_turn_and_the_encoder_owes_nothing_to_the_axes
     assert (options.datum_theta, options.misalignment_model) == (ThetaDatum.ZERO_MEAN, "rigid")
     law = solver_options(parameter_values("solver", {"method": "law"}, "here"))
     assert (law.method, law.misalignment_model) == ("law", "linear")
+
+
+def asked(*terms: str) -> Measurements:
+    return Measurements("p", Artifact(3, 0.01), (), model_terms=terms)
+
+
+@pytest.mark.parametrize(("given", "planned", "terms", "origin"), [
+    ([""], (), [], ""), ([""], ("drift:1e-08",), ["drift:1e-08"], "plan"),
+    (["approach,microscope"], ("drift:1e-08",), ["microscope", "approach"], "options"),
+    (["none"], ("drift:1e-08",), [], ""), ([" none "], (), [], ""),
+    (["drift"], (), ["drift"], "options")])
+def test_given_terms_win_over_those_of_the_plan(given, planned, terms, origin):
+    values = parameter_values("solver", {"model_terms": given}, "here")
+    options = solver_options(values, asked(*planned))
+    assert ([str(term) for term in options.terms], options.terms_from) == (terms, origin)
+
+
+@pytest.mark.parametrize(("given", "planned", "message"), [
+    ([""], ("creep",), "plan 'p': model_terms: the term 'creep' is unknown; known are "),
+    (["creep"], (), "model_terms: the term 'creep' is unknown; known are "),
+    (["none,drift"], (), "model_terms: the term 'none' is unknown; known are microscope, "),
+    ([""], ("drift:x",), "plan 'p': model_terms: drift: the size 'x' is not a positive number; ")])
+def test_terms_that_cannot_be(given, planned, message):
+    values = parameter_values("solver", {"model_terms": given}, "here")
+    with pytest.raises(InputError) as caught:
+        solver_options(values, asked(*planned))
+    assert str(caught.value).startswith(message)
 
 
 @pytest.mark.parametrize(("word", "wanted"), [("auto", None), ("always", True), ("never", False)])

@@ -100,13 +100,15 @@ def test_fields_of_a_detection_by_name():
 def test_fields_of_a_command_by_name():
     view = View("turned", math.pi / 2, (0.01, -0.02), True, False, 7, "x_then_y")
     made = from_model.command(Command(STAMP_NS, Phase.MEASURE, "p", 3, view,
-                                       Artifact(5, 0.0125, 8, 7), 9), "f")
+                                       Artifact(5, 0.0125, 8, 7), 9,
+                                       model_terms=("drift:1e-08",)), "f")
     del made["header"]
     assert made == {
         "phase": 1, "plan_id": "p", "view_index": 3, "view_name": "turned",
         "rotation": math.pi / 2, "translation_x": 0.01, "translation_y": -0.02, "grid": True,
         "angular": False, "repeats": 7, "grid_size": 5, "grid_pitch": 0.0125, "angular_count": 8,
-        "grid_size_y": 7, "views_planned": 9, "visit_order": "x_then_y", "run_id": ""}
+        "grid_size_y": 7, "views_planned": 9, "visit_order": "x_then_y", "run_id": "",
+        "model_terms": ["drift:1e-08"]}
 
 
 @pytest.mark.parametrize(("changes", "message"), [
@@ -188,7 +190,7 @@ READ = ViewReadings(
     np.array([9]), np.array([1e-5]), 1.1e-8, 1.2e-6, 13, 14, 15, {"low_score": 16},
     VISITS)
 MEASURED = Measurements("p", Artifact(5, 0.01, 8, 7), (READ,), Sense.PLATE_MOVES, {"other": 17},
-                        "77")
+                        "77", ("approach",))
 PROGRESS = ViewProgress(18, READ.view, 19, 20, 21, 22, READ, 23)
 
 
@@ -214,7 +216,8 @@ def test_fields_of_a_view_measurement_by_name():
         "u_theta": 1e-5, "sigma_xy": 1.1e-8, "sigma_theta": 1.2e-6, "dof_xy": 13, "dof_theta": 14,
         "detections_used": 15, "reject_reasons": ["low_score"], "reject_counts": [16],
         "measurement_sense": "plate_moves", "session_reject_reasons": ["other"],
-        "session_reject_counts": [17], "run_id": "77", "sigma_visit": 9e-9, "dof_visit": 6}
+        "session_reject_counts": [17], "run_id": "77", "sigma_visit": 9e-9, "dof_visit": 6,
+        "model_terms": ["approach"]}
 
 
 def test_fields_of_a_view_status_by_name():

@@ -3,6 +3,7 @@
 
 import json
 import os
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -52,6 +53,32 @@ class Desk:
 @pytest.fixture
 def desk():
     return Desk()
+
+
+def test_the_solver_estimates_the_terms_that_the_plan_asks_for(desk):
+    plan = replace(PLAN, model_terms=("plate_scale:1e-06",))
+    desk.take(views_of(plan))
+    result = desk.session.result
+    assert [term.name for term in result.model.terms] == ["plate_scale"]
+    assert result.provenance.extra["model_terms_from"] == "plan"
+    own = Desk(model_terms=["plate_shape:1e-08"])
+    own.take(views_of(plan))
+    assert [term.name for term in own.session.result.model.terms] == ["plate_shape"]
+    assert own.session.result.provenance.extra["model_terms_from"] == "options"
+    without = Desk(model_terms=["none"])
+    without.take(views_of(plan))
+    assert without.session.result.model.terms == ()
+    assert "model_terms_from" not in without.session.result.provenance.extra
+
+
+def test_terms_that_nobody_knows_are_told_and_the_solver_lives(desk):
+    with pytest.raises(InputError) as caught:
+        desk.take(views_of(model_terms=["creep"]))
+    told = f"plan '{PLAN.plan_id}': model_terms: the term 'creep' is unknown"
+    assert str(caught.value).startswith(told)
+    assert str(desk.session.shown.problem).startswith(told)
+    desk.take(views_of())
+    assert desk.session.result.model.terms == ()
 
 
 def test_readings_of_two_runs_are_never_mixed(desk):

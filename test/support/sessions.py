@@ -49,7 +49,7 @@ def plan_file(folder: Path, plan: Plan) -> str:
                       "repeats": view.repeats})
     path = folder / "plan.yaml"
     path.write_text(yaml.safe_dump({
-        "plan_id": plan.plan_id, "views": views,
+        "plan_id": plan.plan_id, "views": views, "model_terms": list(plan.model_terms),
         "artifact": {"grid_size": artifact.grid_size, "grid_pitch": artifact.grid_pitch_m,
                      "angular_count": artifact.angular_count}}))
     return str(path)

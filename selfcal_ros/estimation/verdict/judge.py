@@ -59,7 +59,7 @@ def judged(solved: Solved, measurements: Measurements, options: Options) -> Cali
                       tuple(causes))
     reference = options.reference
     return replace(
-        solved.result, verdict=verdict, provenance=provenance_of(measurements),
+        solved.result, verdict=verdict, provenance=provenance_of(measurements, options),
         reference=None if reference is None else {
             "kind": str(reference.kind), "relative_error": reference.relative_error,
             "u_relative": reference.u_relative, "certificate": reference.certificate})

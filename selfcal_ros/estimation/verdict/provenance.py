@@ -5,12 +5,15 @@ from datetime import UTC, datetime
 from typing import Any
 
 from selfcal_ros import __version__
+from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.verdict import Provenance
 
 
-def provenance_of(measurements: Measurements) -> Provenance:
+def provenance_of(measurements: Measurements, options: Options) -> Provenance:
     """Return what the readings tell of their origin: first and last exposure, visiting order.
+
+    Where terms were estimated, who asked for them: ``options`` or ``plan``.
 
     The time of creation is left open: the same readings give the same result.
     """
@@ -20,6 +23,8 @@ def provenance_of(measurements: Measurements) -> Provenance:
     extra: dict[str, Any] = {"visit_order": {
         view.view.name: view.view.visit_order for view in measurements.views
         if view.view.visit_order}}
+    if options.terms_from:
+        extra["model_terms_from"] = options.terms_from
     duration = float("nan")
     if stamps:
         extra |= {"first_exposure": _iso(min(stamps)), "last_exposure": _iso(max(stamps))}
