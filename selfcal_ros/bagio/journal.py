@@ -91,7 +91,14 @@ def start(folder: str | os.PathLike, now_ns: int) -> "Journal":
             raise InputError(str(bag), f"cannot be made ({error.strerror})",
                              "name a folder that you may write") from error
         with _said(bag):
-            return Journal(bag, _locked(bag), Metadata())
+            lock = _locked(bag)
+            try:
+                return Journal(bag, lock, Metadata())
+            except BaseException:
+                os.close(lock)
+                with suppress(OSError):
+                    bag.rmdir()
+                raise
     raise InputError(str(folder), f"holds a thousand journals of {name}", "remove some")
 
 
@@ -111,10 +118,13 @@ class Journal:
     ----------
     n_lost : int
         Messages that could not be written.
+    earlier : list of Path
+        Files that were there already, in their order.
     """
 
     def __init__(self, path: Path, lock: int, metadata: Metadata) -> None:
         self.path, self.n_lost = path, 0
+        self.earlier = [path / file.name for file in metadata.files]
         self._lock, self._metadata = lock, metadata
         self._channels: dict[str, int] = {}
         self._waiting: list[tuple[str, int, bytes]] = []
@@ -125,7 +135,9 @@ class Journal:
         for topic, known in metadata.topics.items():
             self._declare(topic, known)
         metadata.write(path)
-        self._stop, self._dirty = threading.Event(), threading.Event()
+        self._stop = threading.Event()
+        self._unsynced_s: float | None = None  # since when there is something to synchronise
+        self._syncing_s: float | None = None  # the same of what is being synchronised
         self._syncer = threading.Thread(target=self._sync_on, name="journal", daemon=True)
         self._syncer.start()
 
@@ -181,7 +193,7 @@ class Journal:
         with _said(self.path):
             if waiting:
                 self._append(waiting)
-                self._dirty.set()
+                self._unsynced_s = self._unsynced_s or time.monotonic()
             failed, self._failed = self._failed, None
             if failed is not None:
                 raise failed
@@ -199,12 +211,19 @@ class Journal:
     def _sync_on(self) -> None:
         """Synchronise with the disk, in a thread of its own: it may take its time."""
         while not self._stop.wait(SYNC_PERIOD_S):
-            if self._dirty.is_set():
-                self._dirty.clear()
+            if self._unsynced_s is not None:
+                self._syncing_s, self._unsynced_s = self._unsynced_s, None
                 try:
                     self._file.sync()
                 except OSError as error:
                     self._failed = error
+                self._syncing_s = None
+
+    @property
+    def lag_s(self) -> float:
+        """Age of the oldest message that was flushed and is not on the disk, s; 0 = none is."""
+        since = [when for when in (self._syncing_s, self._unsynced_s) if when is not None]
+        return time.monotonic() - min(since) if since else 0.0
 
     def close(self) -> None:
         """Give the file its end and write metadata.yaml; again does nothing."""

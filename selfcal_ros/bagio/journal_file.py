@@ -109,9 +109,14 @@ class JournalFile:
         part = path.with_suffix(".part")  # so that no file of a journal is ever empty
         self._fd = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_APPEND
                            | os.O_CLOEXEC, 0o666)
-        self.append(front())
-        os.fsync(self._fd)
-        os.rename(part, path)
+        try:
+            self.append(front())
+            os.fsync(self._fd)
+            os.rename(part, path)
+        except OSError:
+            os.close(self._fd)
+            part.unlink(missing_ok=True)
+            raise
         sync_folder(path.parent)
 
     def append(self, data: bytes) -> None:

@@ -58,6 +58,13 @@ class ViewProgress:
         return missing_marks(self.artifact, self.view, self.readings)
 
     @property
+    def needed(self) -> int:
+        """Number of readings without which the view cannot be complete."""
+        told, repeats = self.readings, self.view.repeats
+        have = [int(np.minimum(count, repeats).sum()) for count in (told.count, told.count_theta)]
+        return repeats * (self.grid_expected + self.angular_expected) - sum(have)
+
+    @property
     def complete(self) -> bool:
         """Whether every expected mark has been read as often as the plan asks."""
         return (self.grid_done >= self.grid_expected
@@ -222,6 +229,15 @@ class Collector:
         """Count a command that could not be used."""
         self.received["command"] += 1
         self._rejected_input[Reason.COMMAND_BAD] += 1
+
+    def knows(self, command: Command) -> bool:
+        """Return whether a command has come before."""
+        return command in self._commands
+
+    @property
+    def newest_command(self) -> Command | None:
+        """The command with the latest stamp, of equal ones that which came last."""
+        return max(reversed(self._commands), key=lambda c: c.stamp_ns, default=None)
 
     @property
     def storage_problem(self) -> str:

@@ -109,6 +109,10 @@ COLLECTOR = (
               "is a warning; 0 = none", "m", 0.0, 1e-3),
     Parameter("repeatability_theta_limit", 0.0, "repeatability of one angular reading above which "
               "there is a warning; 0 = none", "rad", 0.0, 0.1),
+    Parameter("journal", "", "folder for journals: what is received, written before it is used, "
+              "and taken up again after a crash; empty = none"),
+    Parameter("journal_lag_limit", 5.0, "time by which the disk may lag behind the journal before "
+              "there is a warning", "s", 0.1, 3600.0),
 )
 NO_TERMS = "none"
 """The word for no terms, where the plan asks for some."""

@@ -5,13 +5,12 @@ import sys
 from functools import partial
 from typing import Any
 
-from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
-
-from selfcal_ros.bagio.writer import BagWriter, qos_profile
+from selfcal_ros.bagio.writer import BagWriter
 from selfcal_ros.errors import InputError
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes.base import SelfcalNode
 from selfcal_ros.nodes.encoder_input import EncoderInput
+from selfcal_ros.nodes.publishers import offered
 from selfcal_ros.nodes.running import run
 from selfcal_ros.sessions.ports import Diagnosis, Level
 
@@ -28,10 +27,7 @@ class BagRecorder(SelfcalNode):
         for topic in topics:
             name = self.resolve_topic_name(topic.name)
             typename = f"{topic.type.__module__.split('.')[0]}/msg/{topic.type.__name__}"
-            self._writer.add_topic(name, typename, [qos_profile(
-                reliable=topic.qos.reliability == ReliabilityPolicy.RELIABLE,
-                transient_local=topic.qos.durability == DurabilityPolicy.TRANSIENT_LOCAL,
-                depth=topic.qos.depth)])
+            self._writer.add_topic(name, typename, [offered(topic)])
             if topic is not names.ENCODER:
                 self.subscribe(topic, partial(self._record, name), raw=True)
         encoder = self.resolve_topic_name(names.ENCODER.name)

@@ -67,7 +67,8 @@ class NodeBase:
             topic.type, topic.name, guarded, topic.qos, event_callbacks=events, **kwargs),
             self.destroy_subscription)
 
-    def subscribe_with_age(self, topic: Topic, callback: Callable[[Any, bool], None]) -> Any:
+    def subscribe_with_age(self, topic: Topic, callback: Callable[[Any, bool], None],
+                           **kwargs: Any) -> Any:
         """Subscribe `callback`; its second argument says if the message is older than this call.
 
         Only a latched message can be: it was published before this node listened.
@@ -80,7 +81,7 @@ class NodeBase:
             callback(message, info["source_timestamp"] < began_ns)
         guarded = self.guarded(call, topic.name)
         guarded.__signature__ = inspect.signature(lambda message, info: None)  # rclpy counts them
-        return self.subscribe(topic, guarded)
+        return self.subscribe(topic, guarded, **kwargs)
 
     def service(self, kind: type, name: str, answer: Callable[..., str]) -> Any:
         """Offer a service whose response is filled from `answer` (request), or from its error.

@@ -2,92 +2,117 @@
 """measurement_collector: encoder samples and detections in, readings of each view out."""
 
 import sys
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from typing import Any
 
 from std_srvs.srv import Trigger
 
+from selfcal_ros.errors import InputError
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes.encoder_input import EncoderInput
 from selfcal_ros.nodes.filling import fill
 from selfcal_ros.nodes.managed import ManagedNode
+from selfcal_ros.nodes.publishers import offered
 from selfcal_ros.nodes.running import run
 from selfcal_ros.sessions.collecting import CollectingSession
+from selfcal_ros.sessions.health import merged
 from selfcal_ros.sessions.ports import Diagnosis
+from selfcal_ros.sessions.receiving.journal_keeper import JournalKeeper
+from selfcal_ros.sessions.receiving.reception import Reception
 
-TELL_EVERY = 500
-"""Messages after which the counts are told at once, so that a player can keep pace."""
 TICK_S = 0.02
 
 
 class MeasurementCollector(ManagedNode):
-    """Feeds a `CollectingSession`; publishes ViewStatus and ViewMeasurement."""
+    """Feeds a `CollectingSession`; publishes ViewStatus and ViewMeasurement.
+
+    Messages are received as bytes; a tick writes those that have come to the journal, decodes them
+    together, and gives them to the session.
+    """
 
     def __init__(self, **kwargs: Any) -> None:
         self.session: CollectingSession | None = None
-        self._untold = 0
+        self._reception: Reception | None = None
+        self._worker: ThreadPoolExecutor | None = None
         super().__init__("measurement_collector", **kwargs)
 
     def configure(self) -> None:
-        """Make the session and the publishers."""
-        self.session = CollectingSession(self.values, self.ports(self._publish))
+        """Make the session, the journal and the publishers."""
+        ports = self.ports(self._publish)
+        self.session = CollectingSession(self.values, ports)
+        journal = JournalKeeper(self._journal_folder(), {
+            topic.name: (self.resolve_topic_name(topic.name), offered(topic))
+            for topic in names.INPUTS}, self.values, ports)
+        self._reception = Reception(self.session, journal, say=self.say, refuse=self.refusals.add)
+        self._worker = ThreadPoolExecutor(1, thread_name_prefix="journal")
+        self._reception.open(self._worker)
         self._outputs = {"status": self.publisher(names.STATUS),
                          "measurement": self.publisher(names.MEASUREMENT)}
         self._received = self.publisher(names.private(names.RECEIVED))
         self.alone_on += [names.STATUS.name, names.ENCODER.name]
 
+    def _journal_folder(self) -> str:
+        """Return the folder of this cell's journals: one of its own for each namespace."""
+        folder = self.values["journal"]
+        return folder and str(Path(folder, self.get_namespace().strip("/")))
+
     def activate(self) -> None:
         """Listen to the cell and to the commands."""
-        self._detections = self.subscribe(names.DETECTIONS, self._on_detection)
-        self.subscribe_with_age(names.COMMAND, self._on_command)
-        EncoderInput(self, self._on_encoder)
+        self._detections = self.subscribe(names.DETECTIONS, self._on_detection, raw=True)
+        self.subscribe_with_age(names.COMMAND, self._reception.command, raw=True)
+        EncoderInput(self, self._on_encoder, raw=True)
         self.every(TICK_S, self._on_timer)
-        self.service(Trigger, "~/finish", lambda request: self.session.finish())
+        self.service(Trigger, "~/finish", lambda request: self._finish())
 
     def take_down(self) -> None:
-        """Forget what was collected."""
-        self.session = None
+        """Forget what was collected, close the journal."""
+        if self._worker is not None:
+            self._worker.shutdown(wait=False, cancel_futures=True)
+        if self._reception is not None:
+            self._reception.close()
+        self.session = self._reception = self._worker = None
+
+    def close(self) -> None:
+        """Write what has come to the journal."""
+        self.take_down()
 
     def _publish(self, output: str, fields: dict[str, Any]) -> None:
         publisher = self._outputs[output]
         publisher.publish(fill(publisher.msg_type(), fields))
 
-    def _on_encoder(self, message: Any) -> None:
-        try:
-            self.session.take_encoder(message)
-        finally:
-            self._count()
+    def _on_encoder(self, data: bytes) -> None:
+        self._reception.encoder(data)
+        if self._reception.full:
+            self._drain()
 
-    def _on_detection(self, message: Any) -> None:
-        try:
-            self.session.take_detection(message)
-        finally:
-            self._count()
-
-    def _on_command(self, message: Any, is_older: bool) -> None:
-        try:
-            self.session.take_command(message, is_older)
-        finally:
-            self._count()
-
-    def _count(self) -> None:
-        self._untold += 1
-        if self._untold >= TELL_EVERY:
-            self._tell()
+    def _on_detection(self, data: bytes) -> None:
+        self._reception.detection(data)
+        if self._reception.full:
+            self._drain()
 
     def _on_timer(self) -> None:
-        if self._untold:
-            self._tell()
-        self.session.tick()
+        self._drain()
+        if not self._reception.restoring:
+            self.session.tick()
 
-    def _tell(self) -> None:
-        self._untold = 0
-        self._received.publish(names.RECEIVED.type(
-            data=list(self.session.collector.received.values())))
+    def _drain(self) -> None:
+        """Take what has come and tell the counts, so that a player can keep pace."""
+        if self._reception.drain():
+            self._received.publish(names.RECEIVED.type(
+                data=list(self.session.collector.received.values())))
+
+    def _finish(self) -> str:
+        self._drain()
+        if self._reception.restoring:
+            raise InputError("measurement_collector", "a journal is being read", "ask again later")
+        return self.session.finish()
 
     def diagnose_session(self) -> Diagnosis:
         """Return what the session says."""
-        return self.session.diagnosis(
-            detections_matched=self._detections.get_publisher_count() > 0)
+        return merged(self.session.diagnosis(
+            detections_matched=self._detections.get_publisher_count() > 0),
+            [self._reception.diagnosis()])
 
 
 def main() -> None:

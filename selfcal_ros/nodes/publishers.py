@@ -4,8 +4,14 @@
 from collections.abc import Iterable, Mapping
 
 from rclpy.node import Node
-from rclpy.qos import QoSCompatibility, qos_check_compatible
+from rclpy.qos import (
+    DurabilityPolicy,
+    QoSCompatibility,
+    ReliabilityPolicy,
+    qos_check_compatible,
+)
 
+from selfcal_ros.bagio.metadata import qos_profile
 from selfcal_ros.nodes.names import Topic
 from selfcal_ros.sessions.ports import Diagnosis, Level
 
@@ -32,6 +38,13 @@ def others_publishing(node: Node, topics: Iterable[str]) -> Diagnosis:
             found.append(f"{topic} has {len(offers)} publishers: "
                          f"{', '.join(sorted(map(_name, offers)))}; one is right")
     return Diagnosis(Level.WARN if found else Level.OK, "; ".join(found))
+
+
+def offered(topic: Topic) -> dict:
+    """Return the quality of service of a topic as rosbag2 writes it down."""
+    return qos_profile(reliable=topic.qos.reliability == ReliabilityPolicy.RELIABLE,
+                       transient_local=topic.qos.durability == DurabilityPolicy.TRANSIENT_LOCAL,
+                       depth=topic.qos.depth)
 
 
 def _name(offer: object) -> str:

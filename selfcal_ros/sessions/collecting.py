@@ -2,15 +2,19 @@
 """The session of measurement_collector: what is published of the readings, and when."""
 
 import math
-from collections import Counter
+import statistics
+from collections import Counter, deque
 from typing import Any
+
+import numpy as np
 
 from selfcal_ros.collection.collector import Collector, ViewProgress
 from selfcal_ros.collection.digest import readings_digest, session_digest
-from selfcal_ros.collection.messages import Command, EncoderSample, Phase
+from selfcal_ros.collection.messages import Command, Phase
 from selfcal_ros.collection.reasons import advice
 from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.messages import from_model, to_model
+from selfcal_ros.messages.input_columns import EncoderBlock
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.sessions.clocks import ClockWatch
 from selfcal_ros.sessions.health import Rate, merged
@@ -32,14 +36,16 @@ class CollectingSession:
     """
 
     def __init__(self, values: dict[str, Any], ports: Ports) -> None:
-        self._values, self._ports = values, ports
+        self.values, self._ports = values, ports
         self.collector = Collector(values)
-        self._dirty, self._next_status = False, 0.0
+        self._dirty, self._next_status, self._rested = False, 0.0, 0.0
+        self._needed, self._unseen = 0, 0  # readings of the open view, detections since its status
+        self._encoder_ns = self._exposed_ns = 0  # newest stamps
+        self._costs: deque[float] = deque(maxlen=1000)
         self._published: dict[int, str] = {}
         self._run, self._advised = ("", ""), set()
         self._warned: set[tuple[int | None, str]] = set()
         self._findings: list[str] = []
-        self._last: Command | None = None  # by its stamp
         self._clock = ClockWatch(values["clock_limit"])
         self._encoder_rate = Rate(ports.now_s)
         self._encoder_s = float("-inf")
@@ -49,39 +55,57 @@ class CollectingSession:
         self._problem = ""
         self._state, self._rejected = "waiting for a MEASURE command", Counter()
 
-    def take_encoder(self, message: Any) -> None:
-        """Take a sensor_msgs/JointState."""
-        stamp, self._encoder_s = to_model.stamp_ns(message), self._ports.now_s()
-        self.collector.add_encoder(EncoderSample(
-            stamp, tuple(message.name), tuple(message.position), tuple(message.velocity)))
-        self._encoder_rate.add(stamp)
-        self._clock.data(stamp, self._ports.now_ns(), self._encoder_s)
+    def take_encoder(self, block: EncoderBlock, age_ns: int = 0) -> None:
+        """Take encoder samples, the newest of which was received `age_ns` ago."""
+        if not len(block):
+            return
+        self._encoder_s = self._ports.now_s() - age_ns * 1e-9
+        self.collector.add_encoder_block(block.stamps_ns, block.names, block.positions,
+                                         block.velocities)
+        self._encoder_rate.add(block.stamps_ns)
+        self._encoder_ns = max(self._encoder_ns, self._note_clock(block.stamps_ns, age_ns))
         self._dirty = True
 
-    def take_detection(self, message: Any) -> None:
-        """Take a selfcal_msgs/MarkDetection."""
-        self.collector.add_detection(to_model.detection(message))
-        self._clock.data(to_model.stamp_ns(message), self._ports.now_ns(), self._ports.now_s())
+    def take_detections(self, table: np.ndarray, age_ns: int = 0) -> None:
+        """Take detections (`collection.reduce.DETECTION`), received as `take_encoder` says."""
+        if not len(table):
+            return
+        self.collector.add_detection_block(table)
+        self._exposed_ns = max(self._exposed_ns, self._note_clock(table["stamp"], age_ns))
+        self._unseen += len(table)
         self._dirty = True
+
+    def _note_clock(self, stamps_ns: np.ndarray, age_ns: int) -> int:
+        """Hold stamps against their reception; return the newest."""
+        newest = int(stamps_ns.max())
+        self._clock.data(newest, self._ports.now_ns() - age_ns, self._ports.now_s())
+        return newest
+
+    def adopt(self, collector: Collector, journal: str) -> None:
+        """Go on with a collector that has taken what a journal holds of the run."""
+        self.collector, self._dirty, self._next_status = collector, True, 0.0
+        last = collector.newest_command
+        where = "between views" if last is None or last.phase != Phase.MEASURE else (
+            f"in view '{last.view.name}'; marks that were detected since and are missing have to "
+            "be measured again, by the cell or with redo_view")
+        messages = sum(collector.received.values())
+        self._ports.say(Level.OK, f"took up {journal} with {messages} messages, {where}")
 
     def take_command(self, message: Any, is_older: bool) -> None:
         """Take a selfcal_msgs/ViewCommand; `is_older`: published before this node listened."""
         try:
             command = to_model.command(message)
+            known = self.collector.knows(command)
             self.collector.add_command(command)
             self._clock.command(command.stamp_ns, self._ports.now_ns(), is_older=is_older)
-            self._note_newest(command)
-            self._note_missed(command, is_older=is_older)
+            if not known:
+                self._note_missed(command, is_older=is_older)
         except InputError:
             self.collector.refuse_command()
             raise
         finally:
             self._next_status = 0.0
             self._dirty = True
-
-    def _note_newest(self, command: Command) -> None:
-        if self._last is None or command.stamp_ns >= self._last.stamp_ns:
-            self._last = command
 
     def _note_missed(self, command: Command, *, is_older: bool) -> None:
         """Say which views began before this node: their detections up to now are not here."""
@@ -99,9 +123,10 @@ class CollectingSession:
     def tick(self) -> None:
         """Publish how far the views are, if something has come and it is time for it."""
         now = self._ports.now_s()
-        if not self._dirty or now < self._next_status:
+        if not self._dirty or not (now >= self._next_status or (
+                now >= self._rested and self._may_complete())):
             return
-        self._dirty = False
+        self._dirty, self._unseen = False, 0
         try:
             measurements, progress = self.collector.collect()
         except NoDataError:
@@ -115,7 +140,13 @@ class CollectingSession:
         self._publish(measurements, progress, final=False)
         self._describe(measurements, progress)
         spent = self._ports.now_s() - now
-        self._next_status = now + max(self._values["status_period"], 5 * spent)
+        self._costs.append(spent)
+        self._rested = now + 5 * spent
+        self._next_status = now + max(self.values["status_period"], 5 * spent)
+
+    def _may_complete(self) -> bool:
+        """Return whether enough has come to complete the view that is measured."""
+        return 0 < self._needed <= self._unseen and self._encoder_ns > self._exposed_ns
 
     def finish(self) -> str:
         """Publish every view as it is and return the digest of all readings."""
@@ -125,7 +156,7 @@ class CollectingSession:
 
     def _publish(self, measurements: Measurements, progress: dict[int, ViewProgress], *,
                  final: bool) -> None:
-        timeline, frame_id = self.collector.timeline, self._values["frame_id"]
+        timeline, frame_id = self.collector.timeline, self.values["frame_id"]
         if (timeline.plan_id, timeline.run_id) != self._run:
             self._run, self._published = (timeline.plan_id, timeline.run_id), {}
             self._advised, self._warned = set(), set()
@@ -179,6 +210,7 @@ class CollectingSession:
             told = progress[number].readings
             self._noise = tuple(new if math.isfinite(new) else old for new, old in zip(
                 (told.sigma_xy, told.sigma_theta), self._noise, strict=True))
+        self._needed = progress[index].needed if index is not None else 0
         self._state = "between views" if index is None else (
             f"view '{progress[index].view.name}': {100 * progress[index].coverage:.0f} % of the "
             "marks read")
@@ -199,7 +231,7 @@ class CollectingSession:
         state += f"; {stored}" if stored else ""
         bad = missed or self._problem or self.collector.unusable or stored
         main = Diagnosis(Level.WARN if bad else Level.OK, state, {
-            **received, "views": len(self._published), **self._newest(),
+            **received, "views": len(self._published), **self._newest(), **self._cost(),
             "detections_matched": "yes" if detections_matched else "no",
             **{f"rejected {reason}": n for reason, n in sorted(self._rejected.items())}})
         found = Diagnosis(Level.WARN if self._findings else Level.OK, "; ".join(self._findings))
@@ -207,9 +239,15 @@ class CollectingSession:
             found, self._clock.diagnosis(),
             self._encoder(), self._repeatability()])
 
+    def _cost(self) -> dict[str, str]:
+        """Return what the last statuses cost."""
+        costs = [1e3 * cost for cost in self._costs] or [0.0]
+        return {"status_ms": f"{statistics.median(costs):.1f}",
+                "status_ms_max": f"{max(costs):.1f}"}
+
     def _newest(self) -> dict[str, Any]:
         """Return where the run is: what a sequencer that was restarted takes up."""
-        command = self._last
+        command = self.collector.newest_command
         if command is None:
             return {}
         return {"plan_id": command.plan_id, "run_id": command.run_id,
@@ -221,14 +259,15 @@ class CollectingSession:
         """Return rate and largest gap of the encoder, WARN beyond the limits."""
         heard = self._ports.now_s() - self._encoder_s <= HEARD_S
         gap = self._encoder_rate.take_gap_ns() * 1e-9
-        rate, least = self._encoder_rate.per_second, self._values["encoder_rate_min"]
+        rate, least = self._encoder_rate.per_second, self.values["encoder_rate_min"]
         values = {"encoder_heard": "yes" if heard else "no", "encoder_rate": f"{rate:.0f}",
                   "encoder_gap_s": f"{gap:.4f}"}
-        measuring = self._last is not None and self._last.phase == Phase.MEASURE
+        last = self.collector.newest_command
+        measuring = last is not None and last.phase == Phase.MEASURE
         problems = []
         if measuring and not heard:
             problems.append("the encoder is not heard")
-        elif measuring and gap > self._values["max_encoder_gap"]:
+        elif measuring and gap > self.values["max_encoder_gap"]:
             problems.append(f"a gap of {gap:.3g} s between encoder samples: exposures in it are "
                             "rejected")
         elif measuring and rate < least:
@@ -240,7 +279,7 @@ class CollectingSession:
         values, problems = {}, []
         for value, name, scale, unit in ((self._noise[0], "repeatability_xy", 1e6, "um"),
                                          (self._noise[1], "repeatability_theta", 1.0, "rad")):
-            limit = self._values[f"{name}_limit"]
+            limit = self.values[f"{name}_limit"]
             if math.isfinite(value):
                 values[f"{name}_{unit}"] = f"{value * scale:.4g}"
             if 0 < limit < value:

@@ -4,6 +4,8 @@
 from collections import Counter, deque
 from collections.abc import Callable, Iterable
 
+import numpy as np
+
 from selfcal_ros.errors import SelfcalError, first_line, printable
 from selfcal_ros.sessions.ports import Diagnosis, Level
 
@@ -134,16 +136,16 @@ class Rate:
         self._last_ns = 0
         self.longest_gap_ns = 0
 
-    def add(self, stamp_ns: int, count: int = 1) -> None:
-        """Take a message, or `count` of them of which `stamp_ns` is the newest stamp."""
-        now = self._now_s()
+    def add(self, stamps_ns: np.ndarray) -> None:
+        """Take messages by their stamps, int64 array (n,) in the order of arrival, n > 0."""
+        now, count = self._now_s(), len(stamps_ns)
         if self._bins and now - self._bins[-1][0] < 0.1:
             self._bins[-1] = (self._bins[-1][0], self._bins[-1][1] + count)
         else:
             self._bins.append((now, count))
-        if self._last_ns and count == 1:
-            self.longest_gap_ns = max(self.longest_gap_ns, stamp_ns - self._last_ns)
-        self._last_ns = max(self._last_ns, stamp_ns)
+        newest = np.maximum.accumulate(np.append(self._last_ns or stamps_ns[0], stamps_ns))
+        self.longest_gap_ns = max(self.longest_gap_ns, int(np.diff(newest).max()))
+        self._last_ns = int(newest[-1])
 
     @property
     def per_second(self) -> float:

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The session of the collector: when it publishes what, and what it warns of."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
@@ -9,6 +10,7 @@ from selfcal_ros.bagio.simulated import event_fields
 from selfcal_ros.collection.messages import Command, Detection, EncoderSample
 from selfcal_ros.sessions.collecting import CollectingSession
 from selfcal_ros.sessions.ports import Level
+from test.support.collecting import detection_table, encoder_block
 from test.support.ports import START_NS, Hands, values_of
 from test.support.sessions import events_of, small_plan
 
@@ -32,17 +34,16 @@ class Desk:
         for event in events:
             at = (event.stamp_ns - START_NS) * 1e-9 + 100.0
             self.hands.seconds = max(self.hands.seconds, at)
-            message = as_message(event_fields(event, "stage")[1])
             if isinstance(event, Command):
+                message = as_message(event_fields(event, "stage")[1])
                 message.run_id = run_id
                 self.session.take_command(message, False)
+                continue
+            event = replace(event, stamp_ns=event.stamp_ns + round(ahead_s * 1e9))
+            if isinstance(event, Detection):
+                self.session.take_detections(detection_table(event))
             else:
-                shifted = event.stamp_ns + round(ahead_s * 1e9)
-                message.header.stamp = SimpleNamespace(sec=shifted // 10**9,
-                                                       nanosec=shifted % 10**9)
-                take = (self.session.take_detection if isinstance(event, Detection)
-                        else self.session.take_encoder)
-                take(message)
+                self.session.take_encoder(encoder_block(event))
 
     def told(self, matched: bool = True):
         return self.session.diagnosis(detections_matched=matched)

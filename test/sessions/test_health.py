@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Health put together: levels, refusals and losses without a flood, presence, rates."""
 
+import numpy as np
 import pytest
 
 from selfcal_ros.errors import InputError
@@ -60,9 +61,23 @@ def test_the_rate_is_of_the_last_seconds_and_the_gap_since_it_was_asked(hands):
     rate = Rate(hands.ports.now_s)
     for index in range(400):
         hands.pass_time(0.01)
-        rate.add(10_000_000 * (index + 1 + 30 * (index > 200)))
+        rate.add(np.array([10_000_000 * (index + 1 + 30 * (index > 200))]))
     assert rate.per_second == pytest.approx(100, rel=0.06)
     assert rate.take_gap_ns() == 310_000_000
     assert rate.take_gap_ns() == 0
     hands.pass_time(5)
     assert rate.per_second == 0
+
+
+@pytest.mark.parametrize("stamps, gap", [
+    ([5], 0), ([5, 9, 20], 11), ([20, 5, 9], 0), ([5, 20, 9, 26], 15), ([9, 5, 12], 3)])
+def test_a_gap_lies_between_a_stamp_and_the_newest_before(hands, stamps, gap):
+    together, single = Rate(hands.ports.now_s), Rate(hands.ports.now_s)
+    together.add(np.array(stamps))
+    for stamp in stamps:
+        single.add(np.array([stamp]))
+    assert together.take_gap_ns() == single.take_gap_ns() == gap
+    hands.pass_time(0.05)
+    together.add(np.array([30]))
+    assert together.take_gap_ns() == 30 - max(stamps)
+    assert together.per_second == (len(stamps) + 1) / Rate.WINDOW_S

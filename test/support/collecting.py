@@ -2,7 +2,7 @@
 """Messages of a small cell to spoil one by one, and what the collector makes of them."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -11,6 +11,8 @@ from selfcal_ros.collection.collector import Collector, ViewProgress
 from selfcal_ros.collection.digest import readings_digest, session_digest
 from selfcal_ros.collection.messages import Command, Detection, EncoderSample, Kind
 from selfcal_ros.collection.parameters import parameter_values
+from selfcal_ros.collection.reduce import DETECTION
+from selfcal_ros.messages.input_columns import EncoderBlock
 from selfcal_ros.model.readings import Measurements, ViewReadings
 from selfcal_ros.model.view import Plan
 from selfcal_ros.simulation.cell import CellSettings, Event, plan_events
@@ -83,6 +85,18 @@ def digest(events: Iterable[Event], **parameters: Any) -> str:
     measurements, progress = collect(events, **parameters)
     return session_digest({index: readings_digest(item.readings, measurements.rejected)
                            for index, item in progress.items()})
+
+
+def encoder_block(sample: EncoderSample) -> EncoderBlock:
+    """Return a block of one sample."""
+    velocities = np.array([sample.velocities]) if sample.velocities else None
+    return EncoderBlock(np.array([sample.stamp_ns]), sample.names, np.array([sample.positions]),
+                        velocities)
+
+
+def detection_table(detection: Detection) -> np.ndarray:
+    """Return a table of one detection."""
+    return np.array([astuple(detection)], dtype=DETECTION)
 
 
 def table(readings: ViewReadings) -> dict[tuple, tuple]:

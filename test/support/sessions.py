@@ -6,8 +6,11 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from selfcal_ros.bagio.simulated import write_simulation
+from selfcal_ros.bagio.build import build
+from selfcal_ros.bagio.schemas import typestore
+from selfcal_ros.bagio.simulated import event_fields, write_simulation
 from selfcal_ros.collection.collector import Collector, ViewProgress
+from selfcal_ros.messages.topics import INPUT_TOPICS
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.view import Plan
 from selfcal_ros.simulation.cell import CellSettings, Event, plan_events
@@ -17,6 +20,8 @@ from test.support.collecting import gathered
 from test.support.plans import plan_of
 
 START_NS = 1_700_000_000_000_000_000
+TAIL = b"\x81\x9f\x93\x01"
+"""What the middleware may leave behind a message."""
 NOISE = {"sigma_xy_m": 2e-8, "sigma_theta_rad": 2e-5}
 
 
@@ -37,6 +42,13 @@ def collected(events: list[Event]) -> tuple[Collector, Measurements, dict[int, V
     """Return what the collector makes of them without any node."""
     collector = gathered(events)
     return collector, *collector.collect()
+
+
+def cdr_of(event: Event) -> bytes:
+    """Return the bytes of an event as a raw subscription of rclpy hands them over."""
+    topic, fields = event_fields(event, "stage")
+    name = INPUT_TOPICS[topic]
+    return bytes(typestore().serialize_cdr(build(typestore(), name, fields), name)) + TAIL
 
 
 def plan_file(folder: Path, plan: Plan) -> str:

@@ -1,0 +1,182 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The journal of a collector: opened or taken up, kept in spite of a full disk, told in the health.
+
+A journal that cannot be written ends nothing: what is not in it is counted and said.
+"""
+
+import errno
+from collections import Counter
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from selfcal_ros.bagio.journal import Journal, resume, start
+from selfcal_ros.bagio.offline import block_feeder
+from selfcal_ros.bagio.reader import BagReader
+from selfcal_ros.collection.collector import Collector
+from selfcal_ros.errors import InputError
+from selfcal_ros.messages.topics import INPUT_TOPICS
+from selfcal_ros.sessions.ports import Diagnosis, Level, Ports
+
+RETRY_S = 10.0
+"""Time after which a journal that could not be opened is tried again."""
+NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS)
+"""Errors that a disk may get over; others are those of the parameter."""
+
+
+@dataclass(frozen=True)
+class TakenUp:
+    """What a journal that is taken up gave: a collector that has it, and what was lost of it."""
+
+    collector: Collector
+    lost: tuple[str, ...]
+
+
+def take_up(files: list[Path], values: dict[str, Any]) -> TakenUp:
+    """Return a collector with what the files of a journal hold.
+
+    Parameters
+    ----------
+    files : list of Path
+        Its MCAP files.
+    values : dict
+        Values of the collector's parameters.
+    """
+    collector, lost = Collector(values), []
+    feed = block_feeder(collector, lost)
+    for file in files:
+        reader = BagReader(file)
+        for topic, item in reader.columns():
+            feed[topic](item)
+        lost += reader.lost
+    return TakenUp(collector, tuple(lost))
+
+
+class JournalKeeper:
+    """Keeps a journal in a folder; a `Journal` may come, fail and come back.
+
+    Parameters
+    ----------
+    folder : str
+        Where journals lie; empty = keep none.
+    topics : dict
+        Topic of the contract -> its name with the namespace, and the quality of service offered.
+    values : dict
+        Values of the collector's parameters.
+    ports : Ports
+        Log and clocks.
+    """
+
+    def __init__(self, folder: str, topics: dict[str, tuple[str, dict]], values: dict[str, Any],
+                 ports: Ports) -> None:
+        self._folder, self._topics, self._ports = folder, topics, ports
+        self._lag_limit_s = values["journal_lag_limit"]
+        self._journal: Journal | None = None
+        self._unwritten = 0  # while there was no journal
+        self._problem, self._retry_s = "", 0.0
+
+    @property
+    def path(self) -> Path | None:
+        """The bag folder that is written, None without one."""
+        return self._journal.path if self._journal else None
+
+    @property
+    def lost(self) -> int:
+        """Messages that are not in the journal and should be."""
+        return self._unwritten + (self._journal.n_lost if self._journal else 0)
+
+    def open(self) -> list[Path]:
+        """Take up the journal of the run that is not over, or begin one; return its older files.
+
+        Raises
+        ------
+        InputError
+            If the folder cannot be used; not if the disk is full.
+        """
+        return self._open() if self._folder else []
+
+    def _open(self) -> list[Path]:
+        with ExitStack() as undo:
+            try:
+                journal = resume(self._folder) or start(self._folder, self._ports.now_ns())
+                undo.callback(_given_up, journal)
+                for topic, typename in INPUT_TOPICS.items():
+                    name, qos = self._topics[topic]
+                    journal.add_topic(name, typename, [qos])
+            except InputError as error:
+                if getattr(error.__cause__, "errno", None) not in NO_ROOM:
+                    raise
+                self._fail(error)
+                return []
+            undo.pop_all()
+        self._journal = journal
+        return journal.earlier
+
+    def write(self, topic: str, data: bytes, received_ns: int) -> None:
+        """Take one message as received."""
+        if self._journal is not None:
+            self._journal.write(self._topics[topic][0], data, received_ns)
+        elif self._folder:
+            self._unwritten += 1
+
+    def flush(self) -> None:
+        """Hand what was taken to the system; a failure is said once, and when it is over."""
+        if self._journal is None:
+            if self._folder and self._ports.now_s() >= self._retry_s:
+                self._open()
+            return
+        lost = self._journal.n_lost
+        try:
+            self._journal.flush()
+        except InputError as error:
+            self._fail(error)
+            return
+        if self._problem and self._journal.n_lost == lost:
+            self._problem = ""
+            self._ports.say(Level.WARN, f"{self._journal.path}: the journal is written again; "
+                            f"{self.lost} messages are not in it")
+
+    def _fail(self, error: InputError) -> None:
+        self._retry_s = self._ports.now_s() + RETRY_S
+        if not self._problem:
+            self._ports.say(Level.WARN, f"{error}; collecting goes on without")
+        self._problem = str(error)
+
+    def close(self) -> None:
+        """Give the journal its end."""
+        if self._journal is not None:
+            journal, self._journal = self._journal, None
+            self._unwritten += journal.n_lost
+            try:
+                journal.close()
+            except InputError as error:
+                self._fail(error)
+
+    def diagnosis(self) -> Diagnosis:
+        """Return where the journal is, how far the disk lags, and what is not in it."""
+        if not self._folder:
+            return Diagnosis(Level.OK, "")
+        lag_s = self._journal.lag_s if self._journal else 0.0
+        wrong = [self._problem] if self._problem else []
+        if self.lost:
+            wrong.append(f"{self.lost} messages are not in the journal")
+        if lag_s > self._lag_limit_s:
+            wrong.append(f"the disk is {lag_s:.1f} s behind with the journal")
+        return Diagnosis(Level.WARN if wrong else Level.OK, "; ".join(wrong), {
+            "journal": str(self.path or ""), "journal_lag_s": f"{lag_s:.2f}",
+            "journal_lost": self.lost})
+
+
+def _given_up(journal: Journal) -> None:
+    with suppress(InputError):
+        journal.close()
+
+
+def bad_input(bad: Counter) -> InputError | None:
+    """Return an error that tells what could not be decoded and empties the count of it."""
+    if not bad:
+        return None
+    line = "; ".join(f"{count} messages on {topic}" for (topic, _), count in bad.items())
+    bad.clear()
+    return InputError(line, "cannot be decoded", "mend their publisher")

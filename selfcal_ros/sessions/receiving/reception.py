@@ -1,0 +1,147 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From the bytes that a node receives to its session: to the journal first, then as columns.
+
+Bytes are decoded by what decodes a bag, and given to the collector in the same form: so a live
+session and its journal cannot differ.
+"""
+
+import time
+from collections import Counter
+from collections.abc import Callable
+from concurrent.futures import Executor, Future
+from typing import Any
+
+from selfcal_ros.bagio.channels import ChannelDecoder
+from selfcal_ros.bagio.schemas import typestore
+from selfcal_ros.messages.cdr_columns import Payloads
+from selfcal_ros.messages.topics import COMMAND_TOPIC, DETECTION_TOPIC, ENCODER_TOPIC, INPUT_TOPICS
+from selfcal_ros.sessions.collecting import CollectingSession
+from selfcal_ros.sessions.ports import Diagnosis, Level
+from selfcal_ros.sessions.receiving.journal_keeper import JournalKeeper, TakenUp, bad_input, take_up
+
+FULL = 500
+"""Messages that are taken at once, whatever the time."""
+
+
+class Reception:
+    """Holds what has been received until `drain`.
+
+    Parameters
+    ----------
+    session : CollectingSession
+        Gets blocks and commands.
+    journal : JournalKeeper
+        Gets the bytes beforehand.
+    say : callable (level, line)
+        Writes to the log.
+    refuse : callable (place, error)
+        Counts and tells what cannot be used.
+    """
+
+    def __init__(self, session: CollectingSession, journal: JournalKeeper, *,
+                 say: Callable[[Level, str], None],
+                 refuse: Callable[[str, Exception], None]) -> None:
+        self.session, self.journal, self._say, self._refuse = session, journal, say, refuse
+        self._waiting: list[tuple[str, bytes, int, bool]] = []
+        self._held: list[tuple[str, bytes, int, bool]] = []
+        self._restoring: Future[TakenUp] | None = None
+        self._bad: Counter = Counter()
+        self._decoders = {topic: ChannelDecoder(topic, name, (typestore(),), self._bad, told=True)
+                          for topic, name in INPUT_TOPICS.items()}
+
+    def open(self, worker: Executor) -> None:
+        """Open the journal; what it holds of a run that is not over is read by `worker`."""
+        files = self.journal.open()
+        if files:
+            self._restoring = worker.submit(take_up, files, self.session.values)
+
+    @property
+    def restoring(self) -> bool:
+        """Whether a journal is still being read."""
+        return self._restoring is not None
+
+    def encoder(self, data: bytes) -> None:
+        """Take a sensor_msgs/JointState as received."""
+        self._put(ENCODER_TOPIC, data, is_older=False)
+
+    def detection(self, data: bytes) -> None:
+        """Take a selfcal_msgs/MarkDetection as received."""
+        self._put(DETECTION_TOPIC, data, is_older=False)
+
+    def command(self, data: bytes, is_older: bool) -> None:
+        """Take a selfcal_msgs/ViewCommand as received; `is_older` than this node's listening."""
+        self._put(COMMAND_TOPIC, data, is_older=is_older)
+
+    def _put(self, topic: str, data: bytes, *, is_older: bool) -> None:
+        self._waiting.append((topic, data, time.time_ns(), is_older))
+
+    @property
+    def full(self) -> bool:
+        """Whether so much waits that it should be taken now."""
+        return len(self._waiting) >= FULL
+
+    def drain(self) -> bool:
+        """Write what has come to the journal, then give it to the session; tell if it has anything.
+
+        While a journal is being taken up, what comes meanwhile is written and held back.
+        """
+        adopted, waiting, self._waiting = False, self._waiting, []
+        for topic, data, received_ns, _ in waiting:
+            self.journal.write(topic, data, received_ns)
+        self.journal.flush()
+        if self._restoring is not None:
+            self._held += waiting
+            if not self._restoring.done():
+                return False
+            waiting, self._held = self._held, []
+            self._adopt()
+            adopted = True
+        self._feed(waiting)
+        return adopted or bool(waiting)
+
+    def _adopt(self) -> None:
+        """Go on from what the journal held."""
+        taken, self._restoring = self._restoring, None
+        try:
+            found = taken.result()
+        except Exception as error:  # a journal that cannot be read ends nothing
+            self._refuse("journal", error)
+            return
+        self.session.adopt(found.collector, str(self.journal.path))
+        for line in found.lost:
+            self._say(Level.WARN, f"{self.journal.path}: {line}")
+
+    def _feed(self, waiting: list[tuple[str, bytes, int, bool]]) -> None:
+        for _, data, _, is_older in (item for item in waiting if item[0] == COMMAND_TOPIC):
+            message = self._decoders[COMMAND_TOPIC].one(data)
+            if message is not None:
+                self._guarded(COMMAND_TOPIC, self.session.take_command, message, is_older)
+        now_ns = time.time_ns()
+        for topic, take in ((ENCODER_TOPIC, self.session.take_encoder),
+                            (DETECTION_TOPIC, self.session.take_detections)):
+            mine = [item for item in waiting if item[0] == topic]
+            if mine:
+                age_ns = now_ns - mine[-1][2]
+                for block in self._decoders[topic].many(Payloads.joined([m[1] for m in mine])):
+                    self._guarded(topic, take, block, age_ns)
+        error = bad_input(self._bad)
+        if error is not None:
+            self._refuse("decoding", error)
+
+    def _guarded(self, place: str, take: Callable[..., None], *what: Any) -> None:
+        try:
+            take(*what)
+        except Exception as error:  # nothing that is received may end a node
+            self._refuse(place, error)
+
+    def diagnosis(self) -> Diagnosis:
+        """Return what is to be said of the journal."""
+        told = self.journal.diagnosis()
+        if self.restoring:
+            return Diagnosis(Level.WARN, f"reading the journal {self.journal.path}", told.values)
+        return told
+
+    def close(self) -> None:
+        """Take what waits, and close the journal."""
+        self.drain()
+        self.journal.close()

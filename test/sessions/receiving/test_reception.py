@@ -1,0 +1,286 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Bytes on their way to the session: written first, decoded as a bag's, held back, refused."""
+
+from collections import Counter
+from concurrent.futures import Future
+
+import pytest
+
+from selfcal_ros.bagio import journal_file
+from selfcal_ros.bagio.journal import resume
+from selfcal_ros.bagio.offline import collect_bag
+from selfcal_ros.collection.digest import readings_digest
+from selfcal_ros.collection.messages import Command, Detection, EncoderSample, Phase
+from selfcal_ros.errors import InputError
+from selfcal_ros.messages.topics import COMMAND_TOPIC, DETECTION_TOPIC, ENCODER_TOPIC, INPUT_TOPICS
+from selfcal_ros.sessions.collecting import CollectingSession
+from selfcal_ros.sessions.ports import Level
+from selfcal_ros.sessions.receiving.journal_keeper import JournalKeeper
+from selfcal_ros.sessions.receiving.reception import Reception
+from test.support.bags import Foreign
+from test.support.ports import Hands, values_of
+from test.support.sessions import cdr_of, collected, events_of, small_plan
+
+QOS = {"reliability": "reliable"}
+TOPICS = {topic: (f"/cell/{topic}", QOS) for topic in INPUT_TOPICS}
+
+
+class Desk:
+    """A reception with its session and journal, the hands around it, and what was refused."""
+
+    def __init__(self, folder="", worker=None, **parameters):
+        self.hands, self.refused = Hands(), Counter()
+        values = values_of("measurement_collector", journal=str(folder), **parameters)
+        self.session = CollectingSession(values, self.hands.ports)
+        self.keeper = JournalKeeper(values["journal"], TOPICS, values, self.hands.ports)
+        self.reception = Reception(
+            self.session, self.keeper, say=self.hands.ports.say,
+            refuse=lambda place, error: self.refused.update([f"{place}: {error}"]))
+        self.reception.open(worker or AtOnce())
+
+    def receive(self, events, *, is_older=False):
+        for event in events:
+            data = cdr_of(event)
+            if isinstance(event, Command):
+                self.reception.command(data, is_older)
+            else:
+                (self.reception.detection if isinstance(event, Detection)
+                 else self.reception.encoder)(data)
+        return self
+
+    def read(self):
+        """Return a digest of each view, as the session has it now."""
+        self.reception.drain()
+        measurements, progress = self.session.collector.collect()
+        return {index: readings_digest(item.readings, measurements.rejected)
+                for index, item in progress.items()}
+
+
+class AtOnce:
+    """A worker that has done its work when it is asked."""
+
+    def submit(self, work, *arguments):
+        future = Future()
+        future.set_result(work(*arguments))
+        return future
+
+
+class Later:
+    """A worker that works when it is told to."""
+
+    def submit(self, work, *arguments):
+        self.future, self._work = Future(), lambda: work(*arguments)
+        return self.future
+
+    def finish(self):
+        self.future.set_result(self._work())
+
+
+@pytest.fixture(scope="module")
+def events():
+    return events_of(small_plan())
+
+
+@pytest.fixture(scope="module")
+def expected(events):
+    _, measurements, progress = collected(events)
+    return {index: readings_digest(item.readings, measurements.rejected)
+            for index, item in progress.items()}
+
+
+def test_bytes_give_the_readings_of_the_messages(events, expected):
+    desk = Desk().receive(events)
+    assert desk.session.collector.received == {"encoder": 0, "detection": 0, "command": 0}
+    assert desk.read() == expected
+    assert sum(desk.session.collector.received.values()) == len(events)
+    assert not desk.refused
+
+
+@pytest.mark.parametrize("number, full", [(499, False), (500, True)])
+def test_it_is_full_at_500_messages(number, full):
+    desk = Desk().receive([EncoderSample(i, ("x",), (0.0,)) for i in range(number)])
+    assert desk.reception.full is full
+    assert desk.reception.drain()
+    assert not desk.reception.full
+    assert not desk.reception.drain()
+
+
+def test_what_cannot_be_decoded_is_counted_by_topic_and_the_rest_is_used(events, expected):
+    desk = Desk()
+    for _ in range(2):
+        desk.reception.encoder(b"\0\1\0\0\xff\xff")
+    desk.reception.detection(b"")
+    desk.reception.command(b"\0\1\0\0" + b"\xff" * 40, False)
+    assert desk.receive(events).read() == expected
+    assert desk.refused == {f"decoding: 1 messages on {COMMAND_TOPIC}; 2 messages on "
+                            f"{ENCODER_TOPIC}; 1 messages on {DETECTION_TOPIC}: cannot be "
+                            "decoded; mend their publisher": 1}
+
+
+def test_a_command_that_cannot_be_used_is_refused_and_the_others_are_used(events, expected):
+    bad = Command(events[0].stamp_ns, Phase.ABORT, "plan", view_index=10_001)
+    desk = Desk().receive([bad, *events])
+    desk.read()
+    [line] = desk.refused
+    assert line.startswith(f"{COMMAND_TOPIC}: view command 10001: a plan has at most")
+    assert desk.session.collector.unusable == {"command_unusable": 1}
+
+
+def test_what_is_received_is_in_the_journal_before_it_is_used(tmp_path, events, expected):
+    desk = Desk(tmp_path)
+    used = []
+    collector = desk.session.collector
+    collector.add_detection_block = lambda table: used.append(
+        (len(table), desk.keeper.path.stat() and sum(
+            file.read_bytes().count(cdr_of(found)) for file in desk.keeper.path.glob("*.mcap"))))
+    found = next(event for event in events if isinstance(event, Detection))
+    desk.receive([found]).reception.drain()
+    assert used == [(1, 1)]
+
+
+def test_the_journal_is_a_bag_that_gives_what_the_session_gave(tmp_path, events, expected):
+    desk = Desk(tmp_path).receive(events)
+    assert desk.read() == expected
+    desk.reception.close()
+    values = values_of("measurement_collector")
+    offline = collect_bag(desk_path(tmp_path), values)
+    bag = collect_bag(Foreign().write(tmp_path / "x.mcap", events), values)
+    for session in (offline, bag):
+        assert {index: readings_digest(item.readings, session.measurements.rejected)
+                for index, item in session.views.items()} == expected
+    assert resume(tmp_path) is None  # the run is over
+
+
+def desk_path(folder):
+    [path] = (path for path in folder.iterdir() if path.is_dir())
+    return path
+
+
+@pytest.mark.parametrize("share", [0.1, 0.5, 0.9])
+def test_a_session_that_takes_up_a_journal_goes_on_as_if_nothing_had_been(
+        tmp_path, events, expected, share):
+    cut = round(share * len(events))
+    first = Desk(tmp_path).receive(events[:cut])
+    first.reception.drain()
+    first.keeper.close()
+    second = Desk(tmp_path)
+    assert second.reception.restoring
+    second.receive([event for event in events if isinstance(event, Command)
+                    and event.stamp_ns <= events[cut - 1].stamp_ns], is_older=True)  # latched
+    second.receive(events[cut:])
+    assert second.read() == expected
+    assert not second.session.missed
+    assert second.session.diagnosis(detections_matched=True).values["phase"] == "DONE"
+    [line] = [line for line in second.hands.lines(Level.OK) if line.startswith("took up")]
+    assert f"with {cut} messages" in line
+
+
+def test_what_comes_while_the_journal_is_read_is_written_and_held_back(
+        tmp_path, events, expected):
+    cut = len(events) // 2
+    first = Desk(tmp_path).receive(events[:cut])
+    first.reception.drain()
+    first.keeper.close()
+    worker = Later()
+    second = Desk(tmp_path, worker).receive(events[cut:-3])
+    assert not second.reception.drain()
+    told = second.reception.diagnosis()
+    assert (told.level, told.message) == (Level.WARN, f"reading the journal {second.keeper.path}")
+    second.receive(events[-3:])
+    worker.finish()
+    assert second.reception.drain()
+    assert second.reception.diagnosis().level == Level.OK
+    assert second.read() == expected
+    second.reception.close()
+    offline = collect_bag(desk_path(tmp_path), values_of("measurement_collector"))
+    assert sum(view.used for view in offline.measurements.views) == sum(
+        view.used for view in second.session.collector.collect()[0].views)
+
+
+def test_a_journal_that_cannot_be_read_is_refused_and_collecting_goes_on(
+        tmp_path, events, expected):
+    first = Desk(tmp_path).receive(events[:50])
+    first.reception.drain()
+    first.keeper.close()
+    worker = Later()
+    second = Desk(tmp_path, worker).receive(events)
+    worker.future.set_exception(InputError("journal", "is gone", "look for it"))
+    assert second.read() == expected
+    assert second.refused == {"journal: journal: is gone; look for it": 1}
+
+
+class FullDisk:
+    """A system on whose disk there is no room while it is told so."""
+
+    def __init__(self, monkeypatch):
+        self.full, write = False, journal_file.os.write
+
+        def guarded(fd, data):
+            if self.full:
+                raise OSError(28, "No space left on device")
+            return write(fd, data)
+        monkeypatch.setattr(journal_file.os, "write", guarded)
+
+
+def test_a_full_disk_is_said_counted_and_ends_nothing(tmp_path, events, expected, monkeypatch):
+    disk, desk = FullDisk(monkeypatch), Desk(tmp_path)
+    desk.receive(events[:40]).reception.drain()
+    disk.full = True
+    for event in events[40:70]:
+        desk.receive([event]).reception.drain()
+    told = desk.reception.diagnosis()
+    assert (told.level, told.values["journal_lost"]) == (Level.WARN, 30)
+    assert told.message == (f"{desk.keeper.path}: the journal cannot be written (No space left on "
+                            "device); make room or name another folder; 30 messages are not in "
+                            "the journal")
+    disk.full = False
+    desk.receive(events[70:])
+    assert desk.read() == expected
+    assert desk.hands.lines(Level.WARN) == [
+        f"{desk.keeper.path}: the journal cannot be written (No space left on device); make room "
+        "or name another folder; collecting goes on without",
+        f"{desk.keeper.path}: the journal is written again; 30 messages are not in it"]
+    told = desk.reception.diagnosis()
+    assert (told.level, told.message) == (Level.WARN, "30 messages are not in the journal")
+
+
+def test_a_disk_that_is_full_from_the_beginning_is_tried_again(tmp_path, events, monkeypatch):
+    disk = FullDisk(monkeypatch)
+    disk.full = True
+    desk = Desk(tmp_path / "journals").receive(events[:5])
+    desk.reception.drain()
+    assert desk.keeper.path is None
+    assert desk.reception.diagnosis().values["journal_lost"] == 5
+    disk.full = False
+    desk.receive(events[5:7]).reception.drain()
+    assert desk.keeper.path is None  # not every time
+    desk.hands.pass_time(10)
+    desk.reception.drain()
+    desk.receive(events[7:10]).reception.drain()
+    assert desk.reception.diagnosis().values["journal_lost"] == 7
+    assert desk.reception.diagnosis().message == "7 messages are not in the journal"
+    assert [path.name for path in (tmp_path / "journals").iterdir()] == [desk.keeper.path.name]
+    assert desk.hands.lines(Level.WARN)[1:] == [
+        f"{desk.keeper.path}: the journal is written again; 7 messages are not in it"]
+
+
+def test_a_folder_that_may_not_be_written_is_a_mistake_of_the_parameter(tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(InputError, match=r"cannot be made \(Not a directory\); name a folder"):
+        Desk(tmp_path / "file")
+
+
+@pytest.mark.parametrize("lag_s, level", [(4.9, Level.OK), (5.1, Level.WARN)])
+def test_a_disk_that_lags_is_told(tmp_path, monkeypatch, lag_s, level):
+    desk = Desk(tmp_path)
+    monkeypatch.setattr(type(desk.keeper._journal), "lag_s", lag_s)
+    told = desk.reception.diagnosis()
+    assert told.level == level
+    assert ("the disk is 5.1 s behind with the journal" in told.message) is (level > Level.OK)
+    assert told.values["journal_lag_s"] == f"{lag_s:.2f}"
+
+
+def test_without_a_folder_there_is_no_journal(events, expected):
+    desk = Desk().receive(events)
+    assert desk.read() == expected
+    assert desk.reception.diagnosis().values == {}
