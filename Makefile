@@ -3,9 +3,9 @@
 SHELL := /bin/bash
 BIN := .venv/bin
 
-.PHONY: setup demo test lint bench mutants reality clean help
+.PHONY: setup demo test test-oldest lint bench mutants reality clean help
 help:
-	@echo "make setup | demo | test | lint | bench | mutants | reality | clean"
+	@echo "make setup | demo | test | test-oldest | lint | bench | mutants | reality | clean"
 setup:
 	@tools/setup.sh
 demo: setup
@@ -15,6 +15,9 @@ lint: setup
 	@$(BIN)/mypy
 test: lint
 	@$(BIN)/python -m pytest -n 2 --dist worksteal
+test-oldest:  # with the libraries of Ubuntu 24.04; e.g. make test-oldest TESTS=test/laser
+	@VENV=.venv-oldest PINS=tools/oldest.txt tools/setup.sh
+	@.venv-oldest/bin/python -m pytest -n 2 --dist worksteal $(TESTS)
 bench: setup
 	@test build/rivals/.complete -nt tools/bench-requirements.txt || { mkdir -p build/rivals; \
 		grep -v '^#' tools/bench-requirements.txt | while read -r rival; do \
@@ -27,5 +30,5 @@ mutants: setup  # e.g. make mutants MUTANTS="--number 200 --only selfcal_ros/est
 reality: setup  # minutes; e.g. make reality REALITY="--runs 10 --only drift"
 	@$(BIN)/python tools/reality.py $(REALITY)
 clean:
-	rm -rf .venv build install log selfcal_ros.egg-info
+	rm -rf .venv .venv-oldest build install log selfcal_ros.egg-info
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

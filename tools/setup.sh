@@ -1,9 +1,12 @@
 #!/usr/bin/env bash
 # SPDX-License-Identifier: Apache-2.0
 # Build the environment .venv of a user without ROS 2; does nothing when nothing has changed.
+# VENV names another folder for it, PINS a file whose pins replace those of tools/requirements.txt.
 set -euo pipefail
 cd "$(dirname "$0")/.."
-venv="$PWD/.venv"
+venv="$PWD/${VENV:-.venv}"
+build="build${VENV:+/${VENV#.}}"
+pins="${PINS:-/dev/null}"
 die() { echo "setup: $*" >&2; exit 2; }
 
 suitable() {  # runs, and is a version for which the ROS 2 wheels exist and the code is written
@@ -22,17 +25,22 @@ find_python() {
 digest() { cat "$@" | sha256sum | cut -d' ' -f1; }
 fresh() { [ -f "$venv/.stamp-$1" ] && [ "$(cat "$venv/.stamp-$1")" = "$2" ]; }
 stamp() { echo "$2" > "$venv/.stamp-$1"; }
-log="$PWD/build/setup.log"
-mkdir -p build
+log="$PWD/$build/setup.log"
+mkdir -p "$build"
 step() {  # say what is done; show the log only when it fails
   echo "setup: $1"; shift
   if ! "$@" >> "$log" 2>&1; then
     tail -n 40 "$log" >&2
-    die "failed; the whole log is in build/setup.log"
+    die "failed; the whole log is in $build/setup.log"
   fi
 }
 
-wheels=$(digest tools/requirements.txt tools/mend_wheels.py)
+replaced() {  # the pins of tools/requirements.txt, those of $pins in place of theirs
+  awk -F== '/^#/ {next} NR == FNR {own[$1] = $0; next} !($1 in own); END {for (name in own) print own[name]}' \
+    "$pins" tools/requirements.txt
+}
+
+wheels=$(digest tools/requirements.txt "$pins" tools/mend_wheels.py)
 if ! fresh wheels "$wheels"; then
   : > "$log"
   [ "$(uname -sm)" = "Linux x86_64" ] || die "the ROS 2 wheels are for Linux on x86_64; on other machines use a ROS 2 Jazzy installation and colcon (README)"
@@ -40,25 +48,28 @@ if ! fresh wheels "$wheels"; then
   if ! { [ -x "$venv/bin/python" ] && suitable "$venv/bin/python"; }; then
     python=$(find_python) || die "no Python 3.12 or 3.13 with venv; install one, e.g. 'apt install python3.12 python3.12-venv python3.12-dev', or set PYTHON to its path"
     rm -rf "$venv"
-    step "creating .venv with $("$python" --version)" "$python" -m venv "$venv"
+    step "creating ${venv##*/} with $("$python" --version)" "$python" -m venv "$venv"
   fi
   include=$("$venv/bin/python" -c 'import sysconfig; print(sysconfig.get_path("include"))')
   [ -f "$include/Python.h" ] || die "Python.h is missing; install the headers, e.g. 'apt install python3.12-dev'"
+  replaced > "$build/requirements.txt"
   step "installing the pinned wheels (about a minute)" "$venv/bin/python" -m pip install \
-    --disable-pip-version-check --no-deps --no-compile --only-binary :all: --no-binary empy -r tools/requirements.txt
+    --disable-pip-version-check --no-deps --no-compile --only-binary :all: --no-binary empy -r "$build/requirements.txt"
   step "mending the wheels' CMake paths" "$venv/bin/python" tools/mend_wheels.py
+  numpy=$("$venv/bin/python" -c 'import sysconfig; print(sysconfig.get_path("purelib"))')/numpy
+  [ -d "$numpy/_core/include" ] || ln -s ../core/include "$numpy/_core/include"  # NumPy 1; the wheels name 2's
   rm -f "$venv/.stamp-messages"
   stamp wheels "$wheels"
 fi
 
 messages=$(find msg_defs -type f | LC_ALL=C sort | xargs sha256sum | sha256sum | cut -d' ' -f1)
 if ! fresh messages "$messages"; then
-  rm -rf build/selfcal_msgs
+  rm -rf "$build/selfcal_msgs"
   # -j in MAKEFLAGS: else colcon has ninja wait while the load is high, and everything is serial
   step "building selfcal_msgs" env PATH="$venv/bin:$PATH" LD_LIBRARY_PATH="$venv/lib" \
     MAKEFLAGS="-j$(nproc)" \
     AMENT_PREFIX_PATH="$venv" CMAKE_PREFIX_PATH="$venv" \
-    "$venv/bin/colcon" --log-base build/colcon_log build --base-paths msg_defs --build-base build \
+    "$venv/bin/colcon" --log-base "$build/colcon_log" build --base-paths msg_defs --build-base "$build" \
     --merge-install --install-base "$venv" --cmake-args -G Ninja -DBUILD_TESTING=OFF \
     "-DPython3_EXECUTABLE=$venv/bin/python" --no-warn-unused-cli
   stamp messages "$messages"

@@ -136,18 +136,28 @@ def _columns(part: np.ndarray) -> np.ndarray:
     return part.reshape(-1, part.shape[-1])
 
 
+def _diagonals(values: tuple[float, ...], shape: tuple[int, int]) -> sparse.csr_array:
+    """Return a matrix of constant diagonals, the main one first; SciPy 1.11 has no diags_array."""
+    return sparse.dia_array((np.outer(values, np.ones(shape[1])), range(len(values))),
+                            shape=shape).tocsr()
+
+
+def _identity(size: int) -> sparse.csr_array:
+    return _diagonals((1.0,), (size, size))
+
+
 def _rows_xy(size: int) -> sparse.csr_array:
     """Return the left sides of eqs. 23 and 25 on F as (2, N, N) flattened."""
-    one = sparse.eye_array(size, format="csr")
-    first = sparse.diags_array([-1.0, 1.0], offsets=[0, 1], shape=(size - 1, size), format="csr")
+    one = _identity(size)
+    first = _diagonals((-1.0, 1.0), (size - 1, size))
     second = first[:-1, :-1] @ first
     curve = sparse.kron(second, one)                       # F(m+2,n) - 2 F(m+1,n) + F(m,n)
     twist = sparse.kron(first, first)                      # the mixed difference
-    full = sparse.eye_array(size * size, format="csr")
+    full = _identity(size * size)
     i, j = (index.ravel() for index in np.indices((size, size)))
     turned = full[(size - 1 - j) * size + i]               # value at (-n, m)
-    return sparse.block_array([[full, -turned], [turned, full], [curve, None], [twist, None],
-                               [None, curve], [None, twist]], format="csr")
+    return sparse.csr_array(sparse.bmat([[full, -turned], [turned, full], [curve, None],
+                                         [twist, None], [None, curve], [None, twist]]))
 
 
 def _first_order_rows(artifact: Artifact) -> np.ndarray:
@@ -161,12 +171,13 @@ def _first_order_rows(artifact: Artifact) -> np.ndarray:
 
 def _rows_theta(count: int, datum: ThetaDatum, axis_lines: np.ndarray,
                 ) -> tuple[sparse.csr_array, np.ndarray]:
-    one = sparse.eye_array(count, format="csr")
+    one = _identity(count)
     k = np.arange(count)
-    rows = sparse.vstack([one[(k + count // 4) % count] - one, one[(k + 1) % count] - one])
+    rows = sparse.csr_array(sparse.vstack([one[(k + count // 4) % count] - one,
+                                           one[(k + 1) % count] - one]))
     if datum is ThetaDatum.ZERO_MEAN:
-        return rows.tocsr(), np.full((1, count), 1 / np.sqrt(count))
-    return rows.tocsr(), one[axis_lines].toarray()
+        return rows, np.full((1, count), 1 / np.sqrt(count))
+    return rows, one[axis_lines].toarray()
 
 
 def _bordered(rows: sparse.csr_array, ties: np.ndarray):
@@ -176,9 +187,9 @@ def _bordered(rows: sparse.csr_array, ties: np.ndarray):
     right sides of both and returns the solution and what is left over of `rows`.
     """
     unknowns = rows.shape[1]
-    bordered = sparse.block_array(
+    bordered = sparse.csc_array(sparse.bmat(
         [[rows.T @ rows, sparse.csr_array(ties).T],
-         [sparse.csr_array(ties), -sparse.eye_array(len(ties))]], format="csc")
+         [sparse.csr_array(ties), -_identity(len(ties))]]))
     factor = splu(bordered, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.01,
                   options={"SymmetricMode": True})
 
