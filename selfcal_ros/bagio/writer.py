@@ -23,6 +23,8 @@ from selfcal_ros.messages.from_model import Fields
 
 __all__ = ["BagWriter", "qos_profile"]
 CHUNK_SIZE = 256 * 1024
+
+
 @dataclass
 class BagWriter:
     """Writes one bag folder; use as a context manager.

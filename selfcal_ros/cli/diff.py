@@ -10,7 +10,6 @@ from selfcal_ros.units import ARCSEC_PER_RAD, PPM_PER_ONE, UM_PER_M
 HELP = "compare two results after taking out the datum difference"
 
 
-
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the verb."""
     parser.add_argument("a", metavar="A.json", help="RESULT.json of `selfcal solve`")

@@ -13,7 +13,6 @@ if TYPE_CHECKING:
     from selfcal_ros.laser.data import StepDiagonal
 
 
-
 def add_bag_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of a bag."""
     group = parser.add_argument_group(

@@ -286,4 +286,3 @@ class CollectingSession:
                 problems.append(f"{name.replace('_', ' ')} is {value * scale:.3g} {unit}, the "
                                 f"limit {limit * scale:.3g} {unit}")
         return Diagnosis(Level.WARN if problems else Level.OK, "; ".join(problems), values)
-

@@ -42,6 +42,3 @@ def values_of(node: str, **overrides) -> dict:
 def message(kind: str, fields: dict) -> object:
     """Return a message as sessions get it, from the fields that another session published."""
     return build(typestore(), f"selfcal_msgs/msg/{kind}", fields)
-
-
-

@@ -154,4 +154,3 @@ def write_cal(path: str | os.PathLike, text: str, *, force: bool = False,
         write_bytes(backup, read_bytes(target))
     write_bytes(target, text.encode())
     return backup
-

@@ -21,7 +21,6 @@ MATCH = 1e-9
 """Relative sum of squares that a reading of a field may leave if the field is unseen."""
 
 
-
 @dataclass(frozen=True, eq=False)
 class UnseenMode:
     """A family of stage errors that the readings cannot tell from plate errors.

@@ -84,7 +84,6 @@ class Residuals:
         return _scaled(self.found.residuals_theta**2, self.problem.angular.weight,
                        self.redundancy_theta)
 
-
     def p_outlier(self, kind: str, at: tuple[int, ...]) -> float:
         """Return the probability that a good reading fits the others as badly; NaN if not known.
 

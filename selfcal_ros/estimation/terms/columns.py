@@ -261,4 +261,3 @@ def _within(ground: Ground, seen: list[list[np.ndarray | None]]) -> WithinMarks:
             gram[np.ix_(here, here)] += (weighted @ moved.T).real
             right[here] += (weighted @ rest).real
     return WithinMarks(gram, right, total, dof)
-
