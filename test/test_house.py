@@ -12,7 +12,7 @@ SOURCES = sorted(PACKAGE.rglob("*.py"))
 BASE = {"errors", "files", "units"}
 DOMAIN = {"model"} | BASE
 ESTIMATION = {"estimation", "compensation", "laser"}
-MIDDLE = {"messages", "bagio", "reporting", "collection", "simulation"}
+MIDDLE = {"messages", "bagio", "reporting", "collection", "simulation", "parallel"}
 MAY_IMPORT = {
     "errors": set(),
     "units": set(),
@@ -20,9 +20,11 @@ MAY_IMPORT = {
     "model": BASE,
     **{name: DOMAIN | ESTIMATION for name in ESTIMATION},
     **{name: DOMAIN | ESTIMATION | MIDDLE for name in MIDDLE},
+    "parallel": {"errors"},
+    "batch": DOMAIN | ESTIMATION | MIDDLE,
     "sessions": DOMAIN | ESTIMATION | MIDDLE,
     "nodes": DOMAIN | ESTIMATION | MIDDLE | {"sessions"},
-    "cli": DOMAIN | ESTIMATION | MIDDLE,
+    "cli": DOMAIN | ESTIMATION | MIDDLE | {"batch"},
 }
 ONLY_IN = {
     "rclpy": "nodes", "mcap": "bagio", "rosbags": "bagio", "matplotlib": "reporting",

@@ -14,6 +14,16 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the verb."""
     parser.add_argument("bag", metavar="BAG", help="MCAP file or rosbag2 folder")
     parser.add_argument("-o", "--output", metavar="RESULT.json", help="where to write the result")
+    add_options(parser)
+    parser.add_argument("--validate", action="store_true",
+                        help="hold out tenths of the readings and whole views, and predict them")
+    parser.add_argument("--budget", action="store_true",
+                        help="print the uncertainty budget of the map (GUM)")
+    parser.add_argument("--quiet", action="store_true", help="print no summary")
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options that say how a bag is collected and solved."""
     parser.add_argument("--method", choices=("joint", "law"),
                         help="joint least squares (default) or Hu's published law")
     parser.add_argument("--theta-datum", choices=("xy_axes", "zero_mean"),
@@ -44,11 +54,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--robust", action="store_true",
                         help="find and remove outliers among the marks, name bad views "
                         "(docs/identifiability.md)")
-    parser.add_argument("--validate", action="store_true",
-                        help="hold out tenths of the readings and whole views, and predict them")
-    parser.add_argument("--budget", action="store_true",
-                        help="print the uncertainty budget of the map (GUM)")
-    parser.add_argument("--quiet", action="store_true", help="print no summary")
 
 
 def parameters(args: argparse.Namespace) -> tuple[dict[str, Any], dict[str, Any]]:

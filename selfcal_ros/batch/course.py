@@ -1,0 +1,165 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How a quantity goes over time: a trend, a change, or neither.
+
+Both tests are of ranks, so that a single wild value decides nothing: Mann and Kendall's test of a
+trend with Theil and Sen's slope, and Pettitt's test of a change (Appl. Statist. 28 (1979) 126),
+whose probability is that of random orders of the same values; where it is, the step of least
+moduli says. They hold for values that are
+independent of each other where nothing goes on.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from enum import StrEnum
+
+import numpy as np
+from scipy import stats
+
+FEWEST = 8
+"""Values below which no order is unlikely enough to say anything."""
+LEVEL = 0.05
+"""Part of the batches in which nothing goes on and yet something is named, all quantities
+together."""
+ORDERS = 9999
+"""Random orders behind the probability of a change."""
+SEED = 20240229
+
+
+class Finding(StrEnum):
+    """What is named."""
+
+    NONE = "none"
+    TREND = "trend"
+    CHANGE = "change"
+
+
+@dataclass(frozen=True)
+class Course:
+    """What the values of a quantity do in the order of their times.
+
+    Attributes
+    ----------
+    n : int
+        Values.
+    slope_per_day : tuple of float
+        Theil and Sen's slope, and the limits between which it lies with 95 %.
+    p_trend, p_change : float
+        Probability of as much, or more, if nothing goes on.
+    change : int
+        Number of the first value after the most likely change.
+    before, after : float
+        Medians on both sides of it.
+    adjusted_p : float
+        The smaller of the two, as it counts among all tests of a batch (Benjamini, Hochberg).
+    finding : Finding
+        What is significant; of two the one that leaves less.
+    """
+
+    n: int
+    slope_per_day: tuple[float, float, float]
+    p_trend: float
+    p_change: float
+    change: int
+    before: float
+    after: float
+    adjusted_p: float = 1.0
+    finding: Finding = Finding.NONE
+
+
+def course_of(days: np.ndarray, values: np.ndarray, rng: np.random.Generator, *,
+              orders: int = ORDERS) -> Course:
+    """Return the course of `values` (n,) at the times `days` (n,), which rise.
+
+    Nothing is judged yet: `courses` does, among all quantities.
+    """
+    nothing = Course(len(values), (0.0, 0.0, 0.0), 1.0, 1.0, 0, float(values[0]),
+                     float(values[0]))
+    if len(values) < FEWEST or np.ptp(values) == 0 or np.ptp(days) == 0:
+        return nothing
+    slope, _, low, high = stats.theilslopes(values, days, 0.95)
+    change, p_change = step_of(values), pettitt(values, rng, orders=orders)
+    return Course(len(values), (float(slope), float(low), float(high)),
+                  float(stats.kendalltau(days, values).pvalue), p_change, change,
+                  float(np.median(values[:change])), float(np.median(values[change:])))
+
+
+def pettitt(values: np.ndarray, rng: np.random.Generator, *,
+            orders: int = ORDERS) -> float:
+    """Return the probability of as large a change in a random order of `values` (n,).
+
+    Pettitt's statistic is the largest |2 sum of the first t ranks - t (n + 1)| over t.
+    """
+    ranks = stats.rankdata(values)
+    size = _imbalance(ranks[None]).max()
+    shuffled = rng.permuted(np.broadcast_to(ranks, (orders, len(ranks))), axis=1)
+    as_large = int((_imbalance(shuffled).max(axis=1) >= size - 1e-9).sum())
+    return (1 + as_large) / (1 + orders)
+
+
+def step_of(values: np.ndarray) -> int:
+    """Return the number of the first value after the step that fits best, in least moduli.
+
+    Where Pettitt's statistic is largest is no good place: it is drawn to the middle.
+    """
+    left = [np.abs(values[:t] - np.median(values[:t])).sum()
+            + np.abs(values[t:] - np.median(values[t:])).sum() for t in range(1, len(values))]
+    return int(np.argmin(left)) + 1
+
+
+def _imbalance(ranks: np.ndarray) -> np.ndarray:
+    """Return |2 sum of the first t ranks - t (n + 1)| for t = 1..n-1, (orders, n - 1)."""
+    n = ranks.shape[1]
+    return np.abs(2 * np.cumsum(ranks, axis=1)[:, :-1] - np.arange(1, n) * (n + 1))
+
+
+def courses(days: np.ndarray, table: Mapping[str, np.ndarray], *, seed: int = SEED,
+            orders: int = ORDERS) -> dict[str, Course]:
+    """Return the course of every quantity, judged together.
+
+    Parameters
+    ----------
+    days : float array (n,)
+        Times, rising, in days.
+    table : mapping
+        Quantity -> values (n,), NaN where not known.
+    seed, orders : int
+        Of the random orders.
+    """
+    rng, found = np.random.default_rng(seed), {}
+    for name, values in table.items():
+        known = np.isfinite(values)
+        if known.sum() >= FEWEST:
+            course = course_of(days[known], values[known], rng, orders=orders)
+            found[name] = replace(course, change=int(np.flatnonzero(known)[course.change]))
+    adjusted = _adjusted([p for course in found.values()
+                          for p in (course.p_trend, course.p_change)])
+    return {name: _judged(course, pair, days, table[name]) for (name, course), pair in
+            zip(found.items(), adjusted, strict=True)}
+
+
+def _adjusted(p: Sequence[float]) -> np.ndarray:
+    """Return the probabilities of all tests of a batch as they count together, (n, 2)."""
+    return stats.false_discovery_control(p).reshape(-1, 2) if p else np.zeros((0, 2))
+
+
+def _judged(course: Course, adjusted: np.ndarray, days: np.ndarray,
+            values: np.ndarray) -> Course:
+    finding = Finding.NONE
+    if adjusted.min() <= LEVEL:
+        finding = _of_both(course, days, values) if adjusted.max() <= LEVEL else (
+            Finding.TREND if adjusted[0] <= LEVEL else Finding.CHANGE)
+    return replace(course, adjusted_p=float(adjusted.min()), finding=finding)
+
+
+def _of_both(course: Course, days: np.ndarray, values: np.ndarray) -> Finding:
+    """Return which of a line and a step leaves less (BIC of Laplace errors, 2 and 3 unknowns)."""
+    known = np.isfinite(values)
+    t, x, n = days[known], values[known], int(known.sum())
+    line = x - course.slope_per_day[0] * t
+    after = np.flatnonzero(known) >= course.change
+    step = x - np.where(after, course.after, course.before)
+    sizes = [np.abs(line - np.median(line)).sum(), np.abs(step).sum()]
+    tiny = np.finfo(float).tiny
+    line_bic, step_bic = (n * np.log(max(size, tiny)) + k * np.log(n) / 2
+                          for size, k in zip(sizes, (2, 3), strict=True))
+    return Finding.TREND if line_bic <= step_bic else Finding.CHANGE

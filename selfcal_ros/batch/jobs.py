@@ -1,0 +1,166 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One bag of a batch: solved, and kept under what it holds and how it was solved.
+
+The key of a record is a digest of the bag's content and of everything that decides the result, so
+that a batch that was interrupted, moved or made larger does only what is new.
+"""
+
+import hashlib
+import json
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from selfcal_ros import __version__
+from selfcal_ros.bagio.offline import bag_input, collect_bag
+from selfcal_ros.batch.bags import stat_of
+from selfcal_ros.batch.quantities import quantities
+from selfcal_ros.collection.parameters import solver_options
+from selfcal_ros.errors import ExitCode, InputError, NotIdentifiableError, SelfcalError
+from selfcal_ros.estimation.api import calibrate
+from selfcal_ros.estimation.quality.outliers import robust_calibrate
+from selfcal_ros.files import read_json, write_json
+from selfcal_ros.model.readings import Measurements
+from selfcal_ros.model.result import (
+    CalibrationResult,
+    Observability,
+    created_now,
+    result_to_dict,
+    unidentified_result,
+    with_input,
+)
+
+SCHEMA = "selfcal.batch/1"
+RECORDS, RESULTS = "records", "results"
+NO_INFLUENCE = ("save_path", "result_folder", "autostart", "status_period", "frame_id")
+"""Parameters that decide nothing about a result."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How every bag of a batch is solved.
+
+    Attributes
+    ----------
+    collector, solver : dict
+        Values of the parameters of the collector and the solver.
+    robust : bool
+        Whether outliers are looked for.
+    namespace : str or None
+        Of the cell's topics, see `selfcal_ros.bagio.offline.collect_bag`.
+    """
+
+    collector: dict[str, Any]
+    solver: dict[str, Any]
+    robust: bool = False
+    namespace: str | None = None
+
+    def digest(self) -> str:
+        """Return a digest of all that decides a result beside the bag."""
+        values = asdict(self) | {"schema": SCHEMA, "version": __version__}
+        for node in ("collector", "solver"):
+            values[node] = {k: v for k, v in values[node].items() if k not in NO_INFLUENCE}
+        return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
+
+
+@dataclass(frozen=True)
+class Job:
+    """A bag to be solved into the folder of a batch."""
+
+    bag: Path
+    folder: Path
+    settings: Settings
+
+
+Record = dict[str, Any]
+"""What is kept of a bag: JSON, schema `SCHEMA`, see docs/batch.md."""
+
+
+def run_job(job: Job) -> Record:
+    """Return the record of a bag: the one that is there, or that of a new solution.
+
+    A bag that cannot be used has a record too, with the exit code and the line of `selfcal
+    solve`. Only where its content cannot even be read nothing is kept.
+
+    Raises
+    ------
+    InputError
+        If the folder of the batch cannot be written.
+    """
+    record: Record = {"schema": SCHEMA, "bag": str(job.bag.resolve()),
+                      "settings": job.settings.digest()}
+    try:
+        source = bag_input(job.bag)
+        record["files"] = stat_of(job.bag)
+    except SelfcalError as error:
+        return record | _without_result(error)
+    key = hashlib.sha256(f"{source['sha256']} {record['settings']}".encode()).hexdigest()[:24]
+    path = job.folder / RECORDS / f"{key}.json"
+    kept = read_record(path)
+    if kept is not None and is_whole(job.folder, kept):
+        if not Path(kept["bag"]).exists():  # it was moved here
+            write_json(path, kept | record)
+        return kept | record
+    record |= {"key": key, "sha256": source["sha256"]}
+    result: CalibrationResult | None = None
+    try:
+        result, problem = solved(job, source)
+        record |= _with_result(result) if problem is None else _without_result(problem)
+    except SelfcalError as error:
+        record |= _without_result(error)
+    if result is not None:
+        record["result"] = f"{RESULTS}/{key}.json"
+        write_json(job.folder / record["result"], result_to_dict(created_now(result)))
+    write_json(path, record)
+    return record
+
+
+def solved(job: Job, source: dict[str, str],
+           ) -> tuple[CalibrationResult, NotIdentifiableError | None]:
+    """Return the result in a bag, as `selfcal solve` gives it, and why it has no map if so."""
+    settings = job.settings
+    session = collect_bag(job.bag, settings.collector, namespace=settings.namespace)
+    options = solver_options(settings.solver, session.measurements)
+    solve: Callable[[Measurements, Any], CalibrationResult] = (
+        robust_calibrate if settings.robust else calibrate)
+    problem = None
+    try:
+        result = solve(session.measurements, options)
+    except NotIdentifiableError as error:
+        if not isinstance(error.observability, Observability):
+            raise
+        result, problem = unidentified_result(session.measurements, error.observability), error
+    return with_input(result, source, session.lost), problem
+
+
+def _without_result(error: SelfcalError) -> Record:
+    return {"exit_code": int(error.exit_code), "message": str(error), "qualified": None}
+
+
+def _with_result(result: CalibrationResult) -> Record:
+    good, artifact = result.verdict.qualified, result.artifact
+    return {
+        "exit_code": int(ExitCode.DONE if good else ExitCode.NOT_QUALIFIED), "qualified": good,
+        "message": result.verdict.sentence, "plan_id": result.plan_id, "run_id": result.run_id,
+        "plate": [*artifact.shape, artifact.grid_pitch_m, artifact.angular_count],
+        "first_exposure": result.provenance.extra.get("first_exposure"),
+        "quantities": quantities(result)}
+
+
+def read_record(path: Path) -> Record | None:
+    """Return the record in a file; None if there is none, or none that can be used."""
+    try:
+        record = read_json(path)
+    except InputError:
+        return None
+    good = isinstance(record, dict) and record.get("schema") == SCHEMA and all(
+        isinstance(record.get(name), kind) for name, kind in (
+            ("bag", str), ("settings", str), ("files", list), ("exit_code", int),
+            ("message", str)))
+    return record if good else None
+
+
+def is_whole(folder: Path, record: Record) -> bool:
+    """Return whether the result that a record names is there."""
+    return "result" not in record or (folder / str(record["result"])).is_file()

@@ -1,0 +1,84 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The folder of a batch: what is done already, what is to do, and one batch in it at a time."""
+
+import contextlib
+import fcntl
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from selfcal_ros.batch.bags import stat_of
+from selfcal_ros.batch.jobs import (
+    RECORDS,
+    RESULTS,
+    Job,
+    Record,
+    Settings,
+    is_whole,
+    read_record,
+)
+from selfcal_ros.errors import InputError
+
+LOCK = ".lock"
+
+
+@contextlib.contextmanager
+def opened(folder: Path) -> Iterator[None]:
+    """Make the folder of a batch, and hold it against other batches while the block runs.
+
+    Raises
+    ------
+    InputError
+        If it cannot be made, or another batch works in it.
+    """
+    try:
+        for part in (folder / RECORDS, folder / RESULTS):
+            part.mkdir(parents=True, exist_ok=True)
+        lock = (folder / LOCK).open("w")
+    except OSError as error:
+        raise InputError(str(folder), f"cannot be made ({error.strerror})",
+                         "name a folder that you may write") from error
+    with lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            raise InputError(str(folder), "another batch works in this folder",
+                             "wait for its end or name another folder") from error
+        for part in (folder / RECORDS, folder / RESULTS):
+            for left in part.glob(".selfcal.*"):  # of a batch that was killed as it wrote
+                left.unlink()
+        yield
+
+
+def done_and_to_do(folder: Path, bags: Sequence[Path], settings: Settings,
+                   ) -> tuple[dict[int, Record], list[int]]:
+    """Return the records of bags that are done, by their place in `bags`, and the others' places.
+
+    A bag is done if it has a record of these settings and its files are as they were. The largest
+    of the others come first, so that no core ends long after the others.
+    """
+    digest, known = settings.digest(), {}
+    for path in sorted((folder / RECORDS).glob("*.json")):
+        record = read_record(path)
+        if record is not None and record["settings"] == digest and is_whole(folder, record):
+            known[record["bag"]] = record
+    done, sizes = {}, {}
+    for index, bag in enumerate(bags):
+        files = stat_of(bag)
+        record = known.get(str(bag.resolve()))
+        if record is not None and record["files"] == files:
+            done[index] = record
+        else:
+            sizes[index] = sum(size for _, size, _ in files)
+    return done, sorted(sizes, key=lambda index: -sizes[index])
+
+
+def forget(folder: Path, records: Sequence[Record]) -> None:
+    """Remove records, so that their bags are solved anew."""
+    for record in records:
+        (folder / RECORDS / f"{record['key']}.json").unlink(missing_ok=True)
+
+
+def jobs_of(folder: Path, bags: Sequence[Path], settings: Settings,
+            places: Sequence[int]) -> list[Job]:
+    """Return the jobs of the bags at `places`."""
+    return [Job(bags[index], folder, settings) for index in places]

@@ -1,0 +1,117 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``selfcal batch``: hundreds of bags on all cores, one table, what changes over time."""
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from selfcal_ros.cli.solve import add_options, parameters
+from selfcal_ros.errors import ExitCode, InputError, SelfcalError, first_line, printable
+
+if TYPE_CHECKING:
+    from selfcal_ros.batch.jobs import Record, Settings
+
+HELP = "calibrate from many bags on all cores: one table, trends and changes over time"
+LOCAL = "local"
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the verb."""
+    parser.add_argument("bags", metavar="DIR|BAG", nargs="+", help="MCAP files, rosbag2 folders, "
+                        "or folders that hold them at any depth")
+    parser.add_argument("-o", "--output", metavar="FOLDER", required=True,
+                        help="folder for results, table.csv, index.html and batch.json; what is "
+                        "done there already is not done again")
+    how = parser.add_mutually_exclusive_group()
+    how.add_argument("--workers", type=int, metavar="N",
+                     help="processes (default: one a core)")
+    how.add_argument("--dask", metavar="ADDRESS", nargs="?", const=LOCAL,
+                     help="work in a dask.distributed cluster: its scheduler's address, which sees "
+                     "the same files, or 'local' (default) for one made for this run")
+    parser.add_argument("--redo", action="store_true", help="solve all of the bags anew")
+    parser.add_argument("--json", action="store_true",
+                        help="print the content of batch.json instead of a summary")
+    add_options(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Solve what is not done yet, write the table and the page, say what was found."""
+    from selfcal_ros.batch.bags import find_bags
+    from selfcal_ros.batch.jobs import Settings
+    from selfcal_ros.batch.page import page_html
+    from selfcal_ros.batch.store import done_and_to_do, forget, opened
+    from selfcal_ros.batch.table import batch_json, csv_text, series_of, summary_lines
+    from selfcal_ros.files import write_json, write_text
+
+    if args.dask and args.dask != LOCAL and ":" not in args.dask:
+        raise InputError("--dask", f"'{args.dask}' is no address of a scheduler",
+                         f"write HOST:PORT, or --dask {LOCAL} in front of a bag")
+    settings = Settings(*parameters(args), args.robust, args.namespace)
+    bags, folder = find_bags(args.bags), Path(args.output)
+    with opened(folder):
+        done, places = done_and_to_do(folder, bags, settings)
+        if args.redo:
+            forget(folder, list(done.values()))
+            done, places = done_and_to_do(folder, bags, settings)
+        for record in (done[index] for index in sorted(done)):
+            _say(record)
+        before = len(done)
+        done |= _worked(args, bags, settings, places)
+        records = [done[index] for index in sorted(done)]
+        found = series_of(records)
+        lines, content = (form(records, found, before) for form in (summary_lines, batch_json))
+        write_text(folder / "table.csv", csv_text(records))
+        write_text(folder / "index.html", page_html(records, found, lines))
+        write_json(folder / "batch.json", content)
+    print(json.dumps(content, indent=1) if args.json else "\n".join(
+        [*map(printable, lines), f"written: {folder / 'table.csv'}, index.html, batch.json"]))
+    return exit_code(records)
+
+
+def _worked(args: argparse.Namespace, bags: Sequence[Path], settings: "Settings",
+            places: Sequence[int]) -> dict[int, "Record"]:
+    """Return the records of the bags at `places`, and say each that gave no qualified result."""
+    from selfcal_ros.batch.jobs import run_job
+    from selfcal_ros.batch.store import jobs_of
+    from selfcal_ros.cli.terminal.progress import late_progress
+    from selfcal_ros.parallel import check_workers, outcomes
+
+    found: dict[int, Record] = {}
+    workers = check_workers(args.workers)
+    jobs = jobs_of(Path(args.output).resolve(), bags, settings, places)
+    with late_progress("solving bags") as progress:
+        for outcome in outcomes(run_job, jobs, workers=workers, dask=args.dask or ""):
+            place = places[outcome.index]
+            if isinstance(outcome.error, SelfcalError):  # the folder cannot be written
+                raise outcome.error
+            found[place] = outcome.value or _failed(bags[place], outcome.error)
+            _say(found[place])
+            progress(len(found), len(jobs))
+    return found
+
+
+def _failed(bag: Path, error: BaseException | None) -> dict[str, Any]:
+    """Return the record of a bag that met a fault of ours; it is not kept."""
+    said = first_line(error) if error is not None else "no outcome"
+    return {"bag": str(bag.resolve()), "exit_code": int(ExitCode.INTERNAL), "qualified": None,
+            "message": f"{type(error).__name__}: {said}"}
+
+
+def _say(record: "Record") -> None:
+    if record["exit_code"]:
+        line = record["message"]
+        where = "" if line.startswith(record["bag"]) else f"{record['bag']}: "
+        print(printable(f"selfcal batch: {where}{line}"), file=sys.stderr)
+
+
+def exit_code(records: Sequence["Record"]) -> int:
+    """Return 0 if every bag gave a qualified result, else the code of the worst bag.
+
+    From bad to worse: not qualified (5), no usable data (4), not identified (3), bad input (2),
+    a fault of ours (1).
+    """
+    return min((record["exit_code"] for record in records if record["exit_code"]),
+               default=int(ExitCode.DONE))

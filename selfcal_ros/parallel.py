@@ -1,0 +1,202 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One function over many items on all cores: a pool of processes, or dask.distributed.
+
+Outcomes come as they are ready. An item whose worker dies (out of memory, a signal) costs that
+item alone. Every worker has one BLAS thread, and ends with the process that started it.
+"""
+
+import contextlib
+import ctypes
+import multiprocessing
+import os
+import signal
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass
+from typing import Any
+
+from threadpoolctl import threadpool_limits
+
+from selfcal_ros.errors import InputError
+
+AHEAD = 2
+"""Items in the hands of the pool, a worker: enough that none waits for work."""
+LOCAL = "local"
+"""Instead of a scheduler's address: a dask cluster in this machine, made for the run."""
+_PR_SET_PDEATHSIG = 1
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What came of an item: its place in the order of the items, and a value or an error."""
+
+    index: int
+    value: Any = None
+    error: BaseException | None = None
+
+
+class WorkerDied(Exception):
+    """Says that the process in which an item was worked on ended without an answer."""
+
+
+def cores() -> int:
+    """Return the number of cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (
+        os.cpu_count() or 1)
+
+
+def check_workers(number: int | None, option: str = "--workers") -> int:
+    """Return the number of workers wanted, all cores if None; InputError if it is none."""
+    if number is None:
+        return cores()
+    if not 1 <= number <= 1024:
+        raise InputError(option, f"{number} is no number of workers", "give 1 to 1024")
+    return number
+
+
+def outcomes(function: Callable[[Any], Any], items: Sequence[Any], *,
+             workers: int = 1, dask: str = "") -> Iterator[Outcome]:
+    """Yield what `function` makes of each item, as it becomes ready.
+
+    Parameters
+    ----------
+    function : callable
+        Of one item; of a module, so that workers can import it.
+    items : sequence
+        What it is called with.
+    workers : int
+        Processes; 1 = in this process, one after the other.
+    dask : str
+        Address of a dask scheduler, or `LOCAL`; empty = processes of the standard library.
+
+    Raises
+    ------
+    InputError
+        If dask is wanted and not there, or its scheduler does not answer.
+    """
+    if dask:
+        yield from _with_dask(function, items, workers, dask)
+    elif workers == 1 or len(items) < 2:
+        yield from (_tried(function, items, index) for index in range(len(items)))
+    else:
+        yield from _with_processes(function, items, min(workers, len(items)))
+
+
+def mapped(function: Callable[[Any], Any], items: Sequence[Any], *, workers: int = 1,
+           progress: Callable[[int, int], None] = lambda done, total: None) -> list[Any]:
+    """Return `function` of each item, in their order; the first error met is raised.
+
+    `progress` is called with how many are done, and of how many.
+    """
+    found: list[Any] = [None] * len(items)
+    for done, outcome in enumerate(outcomes(function, items, workers=workers), 1):
+        if outcome.error is not None:
+            raise outcome.error
+        found[outcome.index] = outcome.value
+        progress(done, len(items))
+    return found
+
+
+def _tried(function: Callable[[Any], Any], items: Sequence[Any], index: int) -> Outcome:
+    try:
+        return Outcome(index, function(items[index]))
+    except Exception as error:
+        return Outcome(index, error=error)
+
+
+def _with_processes(function: Callable[[Any], Any], items: Sequence[Any],
+                    workers: int) -> Iterator[Outcome]:
+    """Yield outcomes of a pool; where it breaks, each item in its hands is tried by itself."""
+    waiting = list(reversed(range(len(items))))
+    while waiting:
+        suspects: list[int] = []
+        with _pool(workers) as pool:
+            running: dict[Future, int] = {}
+            while waiting or running:
+                while waiting and len(running) < AHEAD * workers and not suspects:
+                    index = waiting.pop()
+                    try:
+                        running[pool.submit(function, items[index])] = index
+                    except BrokenProcessPool:
+                        suspects.append(index)
+                ready, _ = wait(running, return_when=FIRST_COMPLETED)
+                for future in ready:
+                    index = running.pop(future)
+                    if isinstance(future.exception(), BrokenProcessPool):
+                        suspects.append(index)
+                    else:
+                        yield _told(index, future)
+                if suspects and not running:
+                    break
+        for index in sorted(suspects):
+            yield _alone(function, items, index)
+
+
+def _alone(function: Callable[[Any], Any], items: Sequence[Any], index: int) -> Outcome:
+    """Return the outcome of an item in a process of its own."""
+    with _pool(1) as pool:
+        future = pool.submit(function, items[index])
+        wait([future])
+        if isinstance(future.exception(), BrokenProcessPool):
+            return Outcome(index, error=WorkerDied(
+                "the process that worked on it was killed (out of memory?)"))
+        return _told(index, future)
+
+
+def _told(index: int, future: Any) -> Outcome:
+    error = future.exception()
+    return Outcome(index, error=error) if error is not None else Outcome(index, future.result())
+
+
+@contextlib.contextmanager
+def _pool(workers: int) -> Iterator[ProcessPoolExecutor]:
+    """Yield a pool whose processes are gone when the block ends, however it ends."""
+    method = "forkserver" if "forkserver" in multiprocessing.get_all_start_methods() else "spawn"
+    context = multiprocessing.get_context(method)
+    before = set(multiprocessing.active_children())
+    pool = ProcessPoolExecutor(workers, mp_context=context, initializer=begin_worker)
+    try:
+        yield pool
+        pool.shutdown()
+    finally:
+        for child in set(multiprocessing.active_children()) - before:
+            child.terminate()
+        pool.shutdown(cancel_futures=True)
+
+
+def begin_worker() -> None:
+    """Prepare a worker: one BLAS thread, Ctrl-C left to its parent, no life without that."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    if sys.platform.startswith("linux"):
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
+    threadpool_limits(limits=1, user_api="blas")
+
+
+def _with_dask(function: Callable[[Any], Any], items: Sequence[Any], workers: int,
+               address: str) -> Iterator[Outcome]:
+    """Yield outcomes of a dask cluster."""
+    try:
+        from distributed import Client, LocalCluster, as_completed  # an extra, large
+    except ImportError as error:
+        raise InputError("--dask", "there is no dask.distributed in this environment",
+                         "install it: pip install 'selfcal_ros[dask]'") from error
+    with contextlib.ExitStack() as stack:
+        try:
+            if address == LOCAL:
+                address = stack.enter_context(LocalCluster(
+                    n_workers=workers, threads_per_worker=1, dashboard_address=None))
+            client = stack.enter_context(Client(address, set_as_default=False))
+        except (OSError, ValueError, TimeoutError) as error:
+            raise InputError("--dask", f"no scheduler answers at {address} ({error})",
+                             f"start one, or write --dask {LOCAL}") from error
+        futures = {client.submit(_in_dask, function, item, pure=False):
+                   index for index, item in enumerate(items)}
+        for future in as_completed(futures):
+            yield _told(futures[future], future)
+
+
+def _in_dask(function: Callable[[Any], Any], item: Any) -> Any:
+    with threadpool_limits(limits=1, user_api="blas"):
+        return function(item)

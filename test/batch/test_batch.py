@@ -1,0 +1,248 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``selfcal batch``: bags found, kept by what they hold, bad ones passed, table and page."""
+
+import csv
+import html.parser
+import io
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from selfcal_ros.batch.bags import find_bags
+from selfcal_ros.batch.jobs import RECORDS, RESULTS
+from selfcal_ros.batch.page import page_html
+from selfcal_ros.batch.quantities import described
+from selfcal_ros.batch.store import opened
+from selfcal_ros.batch.table import csv_text, series_of, summary_lines
+from selfcal_ros.cli.main import main
+from selfcal_ros.errors import InputError, NoDataError
+from test.support.bags import Foreign
+from test.support.sessions import events_of, small_plan
+
+
+@pytest.fixture(scope="module")
+def shelf(tmp_path_factory):
+    """A folder with four good bags, one that lacks views, one that is no bag."""
+    folder = tmp_path_factory.mktemp("shelf")
+    (folder / "deep" / "deeper").mkdir(parents=True)
+    for seed, place in enumerate(("a.mcap", "b.mcap", "deep/c.mcap", "deep/deeper/d.mcap")):
+        Foreign().write(folder / place, events_of(small_plan(), seed))
+    Foreign().write(folder / "few.mcap", events_of(small_plan("0, 90")))
+    (folder / "text.mcap").write_text("some words, and no bag at all")
+    return folder
+
+
+def batch(*arguments) -> int:
+    return main(["batch", *map(str, arguments)])
+
+
+def content(folder: Path) -> dict:
+    return json.loads((folder / "batch.json").read_text())
+
+
+def stamps(folder: Path) -> dict[str, int]:
+    return {path.name: path.stat().st_mtime_ns for path in (folder / RESULTS).iterdir()}
+
+
+def test_good_bags_are_solved_as_solve_does_and_bad_ones_are_passed(shelf, tmp_path, capsys):
+    out = tmp_path / "out"
+    assert batch(shelf, "-o", out, "--workers", 1) == 2
+    printed = capsys.readouterr()
+    assert printed.out.splitlines()[0] == (
+        "6 bags: 4 calibrated, 4 of them qualified, 2 without a result; 0 were done before")
+    lines = sorted(printed.err.splitlines())
+    assert len(lines) == 2
+    assert lines[0].startswith(f"selfcal batch: {shelf / 'few.mcap'}: the marks that were read do "
+                               "not identify the stage")
+    assert lines[1] == (f"selfcal batch: {shelf / 'text.mcap'}: not an MCAP file; give an .mcap "
+                        "file or a rosbag2 folder")
+    assert main(["solve", str(shelf / "a.mcap"), "--quiet", "-o", str(tmp_path / "a.json")]) == 0
+    record = next(r for r in content(out)["records"] if r["bag"].endswith("a.mcap"))
+    ours, theirs = (json.loads(path.read_text()) for path in
+                    (out / record["result"], tmp_path / "a.json"))
+    for result in (ours, theirs):
+        assert result["provenance"].pop("created")
+    assert ours == theirs
+    assert record["quantities"]["nonorthogonality_arcsec"] == pytest.approx(
+        np.degrees(theirs["error_map"]["nonorthogonality"]) * 3600, rel=1e-12)
+    assert {r["bag"]: r["exit_code"] for r in content(out)["records"]} == {
+        str(shelf / name): code for name, code in (
+            ("a.mcap", 0), ("b.mcap", 0), ("deep/c.mcap", 0), ("deep/deeper/d.mcap", 0),
+            ("few.mcap", 3), ("text.mcap", 2))}
+
+
+def test_only_what_is_new_is_done(shelf, tmp_path, capsys):
+    mine, out = tmp_path / "mine", tmp_path / "out"
+    mine.mkdir()
+    for name in ("a.mcap", "b.mcap"):
+        shutil.copy(shelf / name, mine / name)
+    assert batch(mine, "-o", out, "--workers", 1) == 0
+    first = stamps(out)
+    (mine / "a.mcap").rename(mine / "moved.mcap")
+    shutil.copy(shelf / "deep/c.mcap", mine / "c.mcap")
+    capsys.readouterr()
+    assert batch(mine, "-o", out, "--workers", 1, "--json") == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told == content(out)
+    assert (told["bags"], told["done_before"]) == (3, 1)
+    second = stamps(out)
+    assert len(second) == 3 and first.items() <= second.items()
+    assert sorted(r["bag"] for r in told["records"]) == [
+        str(mine / name) for name in ("b.mcap", "c.mcap", "moved.mcap")]
+    assert batch(mine, "-o", out, "--workers", 1, "--model", "plate_scale:1e-6") == 0
+    third = stamps(out)
+    assert len(third) == 6 and second.items() <= third.items()
+    assert batch(mine, "-o", out, "--workers", 1, "--redo") == 0
+    assert not (second.items() & stamps(out).items())
+    Foreign().write(mine / "b.mcap", events_of(small_plan(), 9))
+    assert batch(mine, "-o", out, "--workers", 1) == 0
+    assert content(out)["done_before"] == 2
+
+
+def test_a_copy_of_a_bag_counts_once_over_time(shelf, tmp_path):
+    shutil.copy(shelf / "a.mcap", tmp_path / "again.mcap")
+    assert batch(shelf / "a.mcap", tmp_path / "again.mcap", "-o", tmp_path / "out") == 0
+    told = content(tmp_path / "out")
+    assert (told["bags"], len(told["series"][0]["bags"])) == (2, 1)
+    assert len(list((tmp_path / "out" / RECORDS).iterdir())) == 1
+
+
+def test_killed_in_the_middle_it_does_only_the_rest(tmp_path):
+    bags, out = tmp_path / "bags", tmp_path / "out"
+    bags.mkdir()
+    for seed in range(12):
+        Foreign().write(bags / f"{seed}.mcap", events_of(small_plan(), seed))
+    command = [sys.executable, "-m", "selfcal_ros", "batch", str(bags), "-o", str(out),
+               "--workers", "2"]
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL) as running:
+        while running.poll() is None and len(list((out / RECORDS).glob("*.json"))) < 3:
+            os.sched_yield()
+        running.send_signal(signal.SIGKILL)
+    assert running.returncode == -signal.SIGKILL
+    assert subprocess.run(command, capture_output=True, check=False).returncode == 0
+    told = content(out)
+    assert 3 <= told["done_before"] < 12 and told["qualified"] == 12
+    names = [path.name for part in (RECORDS, RESULTS) for path in (out / part).iterdir()]
+    assert len(names) == 24 and not any(name.startswith(".selfcal") for name in names)
+
+
+def test_two_batches_do_not_work_in_one_folder(shelf, tmp_path, capsys):
+    with opened(tmp_path / "out"):
+        assert batch(shelf / "a.mcap", "-o", tmp_path / "out") == 2
+    assert capsys.readouterr().err == (f"selfcal batch: {tmp_path / 'out'}: another batch works in "
+                                       "this folder; wait for its end or name another folder\n")
+
+
+@pytest.mark.parametrize(("options", "message"), [
+    (["--workers", "0"], "--workers: 0 is no number of workers; give 1 to 1024"),
+    (["--dask", "x.mcap"], "--dask: 'x.mcap' is no address of a scheduler; write HOST:PORT, or "
+     "--dask local in front of a bag")])
+def test_options_that_cannot_be(shelf, tmp_path, capsys, options, message):
+    assert batch(shelf / "a.mcap", "-o", tmp_path / "out", *options) == 2
+    assert capsys.readouterr().err == f"selfcal batch: {message}\n"
+
+
+def test_bags_are_found_at_any_depth_once(shelf, tmp_path):
+    names = ["a.mcap", "b.mcap", "deep/c.mcap", "deep/deeper/d.mcap", "few.mcap", "text.mcap"]
+    assert find_bags([str(shelf), str(shelf / "a.mcap")]) == [shelf / name for name in names]
+    (tmp_path / "bag").mkdir()
+    (tmp_path / "bag" / "metadata.yaml").touch()
+    (tmp_path / "bag" / "part_0.mcap").touch()
+    (tmp_path / ".trash").mkdir()
+    (tmp_path / ".trash" / "old.mcap").touch()
+    assert find_bags([str(tmp_path)]) == [tmp_path / "bag"]
+    with pytest.raises(InputError) as caught:
+        find_bags([str(tmp_path / "none")])
+    assert str(caught.value) == f"{tmp_path / 'none'}: no such file or folder; check the path"
+    with pytest.raises(NoDataError) as nothing:
+        find_bags([str(_empty(tmp_path))])
+    assert str(nothing.value).startswith(f"{tmp_path / 'empty'}: no bag in it; give MCAP files")
+
+
+def _empty(folder: Path) -> Path:
+    (folder / "empty").mkdir()
+    return folder / "empty"
+
+
+def records(number: int = 30, change: int = 18, **more) -> list[dict]:
+    """Return records of one plan, a day apart, whose squareness steps by 1 arcsec."""
+    values = np.random.default_rng(2).normal(0, 0.1, number) + (np.arange(number) >= change)
+    return [{"bag": f"/bags/{day:02}", "exit_code": 0, "qualified": True, "message": "Qualified",
+             "plan_id": "p", "plate": [5, 5, 0.01, 8], "sha256": str(day), "run_id": "",
+             "first_exposure": f"2026-03-{day + 1:02}T12:00:00.000+00:00",
+             "quantities": {"nonorthogonality_arcsec": value, "sigma_xy_nm": None}, **more}
+            for day, value in enumerate(values)]
+
+
+def test_a_change_is_named_with_its_date_whatever_the_order_of_the_bags():
+    shuffled = np.random.default_rng(4).permutation(np.array(records(), dtype=object)).tolist()
+    series, = series_of(shuffled)
+    line, = series.sentences()
+    assert line.startswith("nonorthogonality: changed between 2026-03-18 12:00 and 2026-03-19 "
+                           "12:00 by +1")
+    head, plan, said = summary_lines(shuffled, [series], 4)
+    assert head == ("30 bags: 30 calibrated, 30 of them qualified, 0 without a result; 4 were done "
+                    "before")
+    assert plan == "plan p, 30 bags from 2026-03-01 12:00 to 2026-03-30 12:00:"
+    assert said == f"  {line}"
+
+
+def test_plans_and_plates_are_not_mixed():
+    other = records(plan_id="q") + records(plate=[7, 7, 0.01, 8])
+    assert [len(series.records) for series in series_of(records() + other)] == [30, 30, 30]
+    assert series_of([record | {"first_exposure": None} for record in records()]) == []
+
+
+def test_the_table_has_a_line_a_bag_in_the_order_of_time():
+    failed = {"bag": "/bags/bad, or \"worse\"", "exit_code": 2, "qualified": None, "message": "no"}
+    rows = list(csv.DictReader(io.StringIO(csv_text([failed, *records()[::-1]]))))
+    assert [row["bag"] for row in rows] == [f"/bags/{day:02}" for day in range(30)] + [
+        failed["bag"]]
+    assert (rows[0]["qualified"], rows[0]["sigma_xy_nm"], rows[30]["qualified"]) == ("true", "", "")
+    assert float(rows[0]["nonorthogonality_arcsec"]) == pytest.approx(
+        records()[0]["quantities"]["nonorthogonality_arcsec"], rel=1e-15)
+
+
+class Page(html.parser.HTMLParser):
+    """Tags that are open, and how often each came."""
+
+    VOID = ("meta", "br", "rect", "circle", "line")
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.open, self.seen = [], {}
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        self.seen[tag] = self.seen.get(tag, 0) + 1
+        assert not any(name.startswith("on") or name in ("src", "href") for name, _ in attrs)
+        if tag not in self.VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        if tag in self.VOID:
+            return
+        assert self.open.pop() == tag
+
+
+def test_the_page_is_whole_asks_for_nothing_and_shows_what_is_named():
+    found = records(plan_id="<script>alert(1)</script>\x1b[31m")
+    series = series_of(found)
+    page = Page(text := page_html(found, series, summary_lines(found, series, 0)))
+    assert page.open == [] and "script" not in page.seen and "\x1b" not in text
+    assert page.seen["tr"] == 31 and page.seen["circle"] == 30
+    assert text.count('class="change"') == 1 and text.count('class="course"') == 2
+
+
+def test_names_of_quantities_in_words():
+    assert described("nonorthogonality_arcsec") == ("nonorthogonality", "arcsec")
+    assert described("max_error_um") == ("max error", "µm")
+    assert described("rejected_percent") == ("rejected", "%")
+    assert described("microscope_scale_m_per_m") == ("microscope scale", "m/m")

@@ -1,0 +1,81 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The pool: outcomes in any order, errors, workers that die, one BLAS thread, no dask."""
+
+import math
+import operator
+import os
+import sys
+from functools import partial
+
+import pytest
+from threadpoolctl import threadpool_info
+
+from selfcal_ros.errors import InputError
+from selfcal_ros.parallel import WorkerDied, check_workers, cores, mapped, outcomes
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_values_come_back_in_their_places(workers):
+    numbers, seen = list(range(20)), []
+    assert mapped(math.factorial, numbers, workers=workers,
+                  progress=lambda *at: seen.append(at)) == [math.factorial(n) for n in numbers]
+    assert seen == [(n, 20) for n in range(1, 21)]
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_an_error_is_the_outcome_of_its_item_alone(workers):
+    found = {o.index: o for o in outcomes(math.sqrt, [4.0, -1.0, 9.0], workers=workers)}
+    assert (found[0].value, found[2].value) == (2.0, 3.0)
+    assert isinstance(found[1].error, ValueError) and found[1].value is None
+    with pytest.raises(ValueError):
+        mapped(math.sqrt, [4.0, -1.0], workers=workers)
+
+
+def test_a_worker_that_dies_costs_its_own_item():
+    jobs = [partial(int, n) for n in range(6)]
+    jobs[2] = partial(os._exit, 9)
+    found = {o.index: o for o in outcomes(operator.call, jobs, workers=2)}
+    assert {i: o.value for i, o in found.items() if i != 2} == {0: 0, 1: 1, 3: 3, 4: 4, 5: 5}
+    assert isinstance(found[2].error, WorkerDied)
+    assert str(found[2].error) == "the process that worked on it was killed (out of memory?)"
+
+
+def test_work_is_done_by_other_processes_with_one_blas_thread_each():
+    jobs = [partial(__import__, "numpy"), os.getpid, os.getpid]
+    pids = [o.value for o in outcomes(operator.call, jobs[1:], workers=2)]
+    assert os.getpid() not in pids
+    for info in mapped(operator.call, [threadpool_info] * 4, workers=2):
+        assert all(pool["num_threads"] == 1 for pool in info if pool["user_api"] == "blas")
+
+
+def test_a_consumer_that_stops_takes_the_workers_along():
+    import multiprocessing
+
+    running = outcomes(operator.call, [os.getpid] * 40, workers=2)
+    next(running)
+    running.close()
+    assert multiprocessing.active_children() == []
+
+
+def test_numbers_of_workers():
+    assert check_workers(None) == cores() >= 1
+    assert check_workers(3) == 3
+    for number in (0, -1, 1025):
+        with pytest.raises(InputError) as caught:
+            check_workers(number)
+        assert str(caught.value) == f"--workers: {number} is no number of workers; give 1 to 1024"
+
+
+def test_without_dask_it_is_said_how_to_get_it(monkeypatch):
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(InputError) as caught:
+        list(outcomes(math.sqrt, [1.0], dask="local"))
+    assert str(caught.value) == ("--dask: there is no dask.distributed in this environment; "
+                                 "install it: pip install 'selfcal_ros[dask]'")
+
+
+def test_dask_gives_the_same(monkeypatch):
+    pytest.importorskip("distributed")
+    found = {o.index: o for o in outcomes(math.sqrt, [4.0, -1.0, 9.0], workers=2, dask="local")}
+    assert (found[0].value, found[2].value) == (2.0, 3.0)
+    assert isinstance(found[1].error, ValueError)
