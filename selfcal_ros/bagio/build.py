@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Messages of rosbags from the fields that `selfcal_ros.messages.from_model` gives."""
 
+from typing import Any
+
 import numpy as np
 from rosbags.interfaces import Nodetype
 from rosbags.typesys.store import Typestore
@@ -16,10 +18,10 @@ def build(store: Typestore, typename: str, fields: Fields) -> object:
     KeyError
         If a field of the type is not given.
     """
-    values = {}
+    values: dict[str, Any] = {}
     for name, (kind, argument) in store.fielddefs[typename][1]:
         value = fields[name]
-        if kind == Nodetype.NAME:
+        if isinstance(argument, str):  # a type of its own
             values[name] = build(store, argument, value)
         elif kind == Nodetype.BASE:
             values[name] = value

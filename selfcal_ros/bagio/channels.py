@@ -22,7 +22,6 @@ from selfcal_ros.messages.input_columns import DetectionColumns, EncoderBlock, E
 from selfcal_ros.messages.to_model import detection, encoder_sample
 from selfcal_ros.messages.topics import DETECTION_TOPIC, ENCODER_TOPIC, INPUT_TOPICS
 
-COLUMNS = {ENCODER_TOPIC: EncoderColumns, DETECTION_TOPIC: DetectionColumns}
 Input = EncoderBlock | np.ndarray | object
 """Encoder samples, a table of detections, or a command as rosbags has it."""
 PADDING = 3
@@ -64,9 +63,12 @@ class ChannelDecoder:
         self._own = same_layout(self.stores[0], self.name) if self.told else False
         self._why = "" if self.told else (
             f": the bag holds no definition of {self.name}, and they do not fit the one known here")
-        self._columns = None
-        if self._fields is not None and self.role in COLUMNS:
-            self._columns = COLUMNS[self.role](self._fields, None if self._any_tail else PADDING)
+        self._columns: EncoderColumns | DetectionColumns | None = None
+        tail = None if self._any_tail else PADDING
+        if self._fields is not None and self.role == ENCODER_TOPIC:
+            self._columns = EncoderColumns(self._fields, tail)
+        elif self._fields is not None and self.role == DETECTION_TOPIC:
+            self._columns = DetectionColumns(self._fields, tail)
 
     def one(self, data: bytes) -> Any:
         """Return a message as rosbags has it; None if it cannot be decoded, which is counted."""

@@ -308,7 +308,8 @@ def _number(file: Path) -> tuple[int, str]:
 
 def _commands(content: Content, where: str) -> list[tuple[int, Phase]]:
     """Return stamps and phases of the commands that were kept; what is damaged is left out."""
-    found, bad = [], Counter()
+    found: list[tuple[int, Phase]] = []
+    bad: Counter = Counter()
     for number, data in content.kept:
         schema = content.schemas.get(content.channels[number].schema_id)
         if schema is None:

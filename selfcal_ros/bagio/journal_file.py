@@ -57,8 +57,10 @@ class Content:
 
     def declare(self, record: Schema | Channel) -> None:
         """Add a schema or a channel."""
-        known = self.schemas if isinstance(record, Schema) else self.channels
-        known[record.id] = record
+        if isinstance(record, Schema):
+            self.schemas[record.id] = record
+        else:
+            self.channels[record.id] = record
 
     def add(self, channel: int, log_time_ns: int) -> None:
         """Count one message."""
@@ -188,7 +190,9 @@ def _scan(file: BinaryIO, name: str, keep: str) -> Content:
             if opcode == Opcode.MESSAGE and length >= MESSAGE_FRONT:  # longer than a stretch
                 block, _ = message_block(HEAD.pack(opcode, length) + body, 0)
             elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-                content.declare(parsed(opcode, body)[0])
+                record, _ = parsed(opcode, body)
+                if isinstance(record, Schema | Channel):
+                    content.declare(record)
             elif opcode != Opcode.HEADER:
                 content.damaged = True
                 return content

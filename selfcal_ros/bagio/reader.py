@@ -117,7 +117,9 @@ class BagReader:
             if key not in decoders:
                 decoders[key] = self._decoder(stream, channel, bad)
             decoder = decoders[key]
-            decoded = None if decoder is None else decoder.one(message.data)
+            if decoder is None:
+                continue
+            decoded = decoder.one(message.data)
             if decoded is not None:
                 yield decoder.role, message.log_time, decoded
         self._say(bad)

@@ -60,8 +60,8 @@ def store_of_schema(name: str, encoding: str, text: str, where: str) -> Typestor
                              "record it with message definitions")
         return typestore()
     try:
-        parse = get_types_from_idl if encoding == "ros2idl" else get_types_from_msg
-        types = parse(text) if encoding == "ros2idl" else parse(text, name)
+        types = (get_types_from_idl(text) if encoding == "ros2idl"
+                 else get_types_from_msg(text, name))
         store = get_typestore(Stores.EMPTY)
         for known in ("std_msgs/msg/Header", "builtin_interfaces/msg/Time"):
             types.setdefault(known, typestore().fielddefs[known])
@@ -124,7 +124,7 @@ def same_layout(store: Typestore, name: str) -> bool:
     """Return whether a type has the fields of the one known here and no others, in their order."""
     wanted = typestore().fielddefs[name][1]
     return store.fielddefs[name][1] == wanted and all(
-        same_layout(store, inner) for _, (kind, inner) in wanted if kind == Nodetype.NAME)
+        same_layout(store, inner) for _, (_, inner) in wanted if isinstance(inner, str))
 
 
 def own_message(message: Any, name: str) -> object:
@@ -132,9 +132,9 @@ def own_message(message: Any, name: str) -> object:
 
     Fields that it does not have are 0 or empty.
     """
-    values = {}
+    values: dict[str, Any] = {}
     for field, (kind, inner) in typestore().fielddefs[name][1]:
-        if kind == Nodetype.NAME:
+        if isinstance(inner, str):  # a type of its own
             values[field] = own_message(getattr(message, field), inner)
         else:
             missing = np.zeros(0) if kind != Nodetype.BASE else "" if inner[0] == "string" else 0
@@ -154,8 +154,8 @@ def other_field(store: Typestore, name: str, last: str) -> str:
             return f"no field '{field}'"
         if field in found and _free_of_bounds(found[field]) != _free_of_bounds(wanted):
             return f"the field '{field}' has another type"
-        kind, inner = wanted
-        if kind == Nodetype.NAME and field in found:
+        inner = wanted[1]
+        if isinstance(inner, str) and field in found:  # a type of its own
             other = other_field(store, inner, typestore().fielddefs[inner][1][-1][0])
             if other:
                 return f"in '{field}', {other}"

@@ -164,8 +164,9 @@ class Collector:
         """
         count = len(stamps_ns)
         self.received["encoder"] += count
-        told = velocities is not None and velocities.shape[1] > 0
-        if positions.shape[1] != len(names) or (told and velocities.shape[1] != len(names)):
+        speeds = None if velocities is None or not velocities.shape[1] else velocities
+        if positions.shape[1] != len(names) or (
+                speeds is not None and speeds.shape[1] != len(names)):
             self._rejected_input[Reason.ENCODER_MALFORMED] += count
             return
         finite, known = np.ones(count, dtype=bool), False
@@ -177,7 +178,7 @@ class Collector:
             good = np.isfinite(positions[:, column])
             finite &= good
             joint.store.add_block(stamps_ns[good], positions[good, column],
-                                  velocities[good, column] if told else None)
+                                  None if speeds is None else speeds[good, column])
         if not finite.all():
             self._rejected_input[Reason.ENCODER_NOT_FINITE] += int((~finite).sum())
         if not known and count:
@@ -305,8 +306,8 @@ class Collector:
 
 def view_progress(timeline: Timeline, index: int, readings: ViewReadings) -> ViewProgress:
     """Return how far a view has come."""
-    view = timeline.views[index]
-    grid, angular = expected_marks(timeline.artifact, view)
+    artifact, view = timeline.planned_view(index)
+    grid, angular = expected_marks(artifact, view)
     return ViewProgress(index, view, grid, int((readings.count >= view.repeats).sum()), angular,
                         int((readings.count_theta >= view.repeats).sum()), readings,
-                        max(i.end_ns for i in timeline.of_view(index)), timeline.artifact)
+                        max(i.end_ns for i in timeline.of_view(index)), artifact)

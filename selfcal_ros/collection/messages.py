@@ -74,6 +74,18 @@ class Command:
     run_id: str = ""
     model_terms: tuple[str, ...] = ()
 
+    def placed(self) -> View:
+        """Return the view that a PLACE or MEASURE names.
+
+        Raises
+        ------
+        ValueError
+            For a command without one.
+        """
+        if self.view is None:
+            raise ValueError(f"{self.phase.name} names no view")
+        return self.view
+
 
 def check_command(command: Command) -> None:
     """Raise InputError for a command that no cell can follow.

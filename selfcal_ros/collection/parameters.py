@@ -193,9 +193,9 @@ RECORDER = (
     Parameter("bag", "", "folder to write"),
     Parameter("all_topics", True, "record selfcal/* results beside the inputs"),
 )
-_LENGTH = {"unit": "m", "low": 0.0, "high": 1e-3}
-_ANGLE = {"unit": "rad", "low": 0.0, "high": 0.1}
-_RATIO = {"unit": "m/m", "low": -0.1, "high": 0.1}
+_LENGTH: dict[str, Any] = {"unit": "m", "low": 0.0, "high": 1e-3}
+_ANGLE: dict[str, Any] = {"unit": "rad", "low": 0.0, "high": 0.1}
+_RATIO: dict[str, Any] = {"unit": "m/m", "low": -0.1, "high": 0.1}
 _DRIFT = "motion of the plate at the last grid exposure of a view, standard deviation: "
 
 SIMULATOR = (

@@ -15,7 +15,7 @@ from selfcal_ros.collection.marks.places import PlaceList
 from selfcal_ros.collection.marks.repeats import reduce_repeats
 from selfcal_ros.collection.marks.visits import grid_visits
 from selfcal_ros.collection.messages import Kind
-from selfcal_ros.collection.reasons import Reason
+from selfcal_ros.collection.reasons import Reason, reason_where
 from selfcal_ros.collection.stage.exposures import Exposures
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Sense, ViewReadings
@@ -133,7 +133,7 @@ def _reduce_grid(artifact: Artifact, view: View, d: np.ndarray, exposures: Expos
                            extent=2 * max(hx, hy) * artifact.grid_pitch_m,
                            residual=np.stack([rx, ry]))
     _count(rejected, Reason.OUTLIER, means.outlier)
-    places.add(np.where(means.outlier, Reason.OUTLIER, None), x, y)
+    places.add(reason_where(means.outlier, Reason.OUTLIER), x, y)
     visits = grid_visits(means, key, d["sigma"], stamps_ns=d["stamp"], deviation=deviation,
                          offset=np.stack([d["ox"], d["oy"]]), approach=np.stack(approach))
     mark = means.key.astype(np.int64)

@@ -69,10 +69,11 @@ class Sequencer:
         self.state = State.PLACING if phase == Phase.PLACE else State.MEASURING
         return self._command(phase)
 
-    def need_plan(self) -> None:
-        """Raise InputError if there is no plan to start."""
+    def need_plan(self) -> Plan:
+        """Return the plan to run; raise InputError if there is none."""
         if self.plan is None:
             raise InputError("pose_sequencer", "there is no plan", "set the parameter 'plan'")
+        return self.plan
 
     def confirm(self) -> list[Command]:
         """Take the plate as placed: measure."""
@@ -98,7 +99,7 @@ class Sequencer:
         if self.state not in (State.PLACING, State.MEASURING):
             raise InputError("pose_sequencer", f"nothing to skip while {self.state}",
                              "start a plan first")
-        self.skipped.append(self.plan.views[self.index].name)
+        self.skipped.append(self.need_plan().views[self.index].name)
         return self._advance()
 
     def abort(self) -> list[Command]:
@@ -131,13 +132,14 @@ class Sequencer:
 
     def _advance(self) -> list[Command]:
         self.index += 1
-        if self.index < len(self.plan.views):
+        if self.index < len(self.need_plan().views):
             return self._place()
         self.state = State.DONE
         return [self._command(Phase.DONE)]
 
     def _command(self, phase: Phase) -> Command:
-        plan, number = self.plan, len(self.plan.views)
+        plan = self.need_plan()
+        number = len(plan.views)
         if phase in (Phase.DONE, Phase.ABORT):
             return Command(0, phase, plan.plan_id, self.index, views_planned=number)
         return Command(0, phase, plan.plan_id, self.index, plan.views[self.index], plan.artifact,

@@ -8,7 +8,7 @@ measured; it is then named by the stamp of its first command.
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -59,7 +59,7 @@ class Timeline:
 
     plan_id: str = ""
     artifact: Artifact | None = None
-    views: dict[int, View] | None = None
+    views: dict[int, View] = field(default_factory=dict)
     intervals: tuple[Interval, ...] = ()
     views_planned: int = 0
     finished: bool = False
@@ -71,6 +71,19 @@ class Timeline:
         """Return the index of the interval of each stamp, int array; -1 before the first."""
         starts = np.array([interval.start_ns for interval in self.intervals], dtype=np.int64)
         return np.searchsorted(starts, stamps_ns, "right") - 1
+
+    def planned_view(self, view_index: int) -> tuple[Artifact, View]:
+        """Return the plate and a view of it.
+
+        Raises
+        ------
+        KeyError
+            If no MEASURE of the view is there.
+        """
+        view = self.views[view_index]
+        if self.artifact is None:
+            raise KeyError(view_index)
+        return self.artifact, view
 
     def of_view(self, view_index: int) -> list[Interval]:
         """Return the intervals in which readings of a view count."""
@@ -97,16 +110,17 @@ def build_timeline(commands: Iterable[Command]) -> Timeline:
     newest = ordered[measures[-1]]
     plan_id, artifact = newest.plan_id, newest.artifact
     runs = _runs(ordered, plan_id)
-    run_id = runs[measures[-1]]
+    run_id = str(runs[measures[-1]])  # of its own plan, so there is one
     mine = [c for c, run in zip(ordered, runs, strict=True) if run == run_id]
     views: dict[int, View] = {}
     for command in mine:
         if command.phase != Phase.MEASURE:
             continue
+        view = command.placed()
         if command.artifact != artifact:
-            raise InputError(f"view command of '{command.view.name}'", "describes another plate "
-                             f"than the rest of plan '{plan_id}'", "use one plate in one plan")
-        views[command.view_index] = command.view
+            raise InputError(f"view command of '{view.name}'", "describes another plate than the "
+                             f"rest of plan '{plan_id}'", "use one plate in one plan")
+        views[command.view_index] = view
     planned = max([c.views_planned for c in mine] + [max(views) + 1])
     return Timeline(plan_id, artifact, dict(sorted(views.items())),
                     tuple(_intervals(ordered, runs, run_id)), planned,
@@ -153,17 +167,18 @@ def _intervals(ordered: list[Command], runs: list[str | None], run_id: str) -> l
     placed: dict[int, int] = {}  # view_index -> stamp of a PLACE that no MEASURE has followed yet
     poses: dict[int, tuple] = {}
     for command, run in zip(ordered, runs, strict=True):
-        index = command.view_index
+        view = command.view_index
         if run == run_id and command.phase == Phase.PLACE:
-            placed[index] = command.stamp_ns
+            placed[view] = command.stamp_ns
         elif run == run_id and command.phase == Phase.MEASURE:
-            pose = (command.view.rotation_rad, command.view.translation_m)
-            start = placed.pop(index, began.get(index, command.stamp_ns))
-            began[index] = start if poses.get(index, pose) == pose else command.stamp_ns
-            poses[index] = pose
+            pose = (command.placed().rotation_rad, command.placed().translation_m)
+            start = placed.pop(view, began.get(view, command.stamp_ns))
+            began[view] = start if poses.get(view, pose) == pose else command.stamp_ns
+            poses[view] = pose
     out = []
     for interval, command, run in zip(_unused(ordered), ordered, runs, strict=True):
-        index, reason = None, interval.reason
+        index: int | None = None
+        reason: Reason | None = interval.reason
         if command.phase == Phase.MEASURE and run != run_id:
             reason = Reason.OTHER_PLAN if run is None else Reason.OTHER_RUN
         elif command.phase == Phase.MEASURE and command.stamp_ns < began[command.view_index]:

@@ -105,7 +105,7 @@ class ViewCache:
     def _reduce(self, timeline: Timeline, index: int, exposures: Exposures) -> ViewReadings:
         detections = self.table[self.view_of == index]
         good, reasons = clean(detections, self._rules, scored=self._scored)
-        readings = reduce_view(timeline.artifact, timeline.views[index], good,
+        readings = reduce_view(*timeline.planned_view(index), good,
                                exposures=exposures, rules=self._rules)
         if self._scored:
             readings = with_low_scores(readings, detections, exposures=exposures,

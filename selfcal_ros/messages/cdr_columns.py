@@ -134,8 +134,8 @@ class ColumnDecoder:
         bytes_at = np.ndarray((len(messages.data) - length + 1,), f"V{length}", messages.data,
                               strides=(1,))
         rows = bytes_at[messages.start[index]]
-        for layout in tuple(self._known.get(length, ())):
-            index, rows = _take(layout, index, rows, groups)
+        for known in tuple(self._known.get(length, ())):
+            index, rows = _take(known, index, rows, groups)
         failed = []
         while len(index) and tries > 0:
             tries -= 1

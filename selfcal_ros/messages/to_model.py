@@ -55,14 +55,14 @@ def command(message: Any) -> Command:
     except ValueError as error:
         raise InputError(COMMAND_TOPIC, f"unknown phase {message.phase}",
                          "use PLACE, MEASURE, DONE or ABORT") from error
-    base = (stamp_ns(message), phase, str(message.plan_id), int(message.view_index))
-    more = {"views_planned": int(getattr(message, "views_planned", 0)),
-            "run_id": str(getattr(message, "run_id", "")), "model_terms": terms_of(message)}
-    if phase not in (Phase.PLACE, Phase.MEASURE):
-        return Command(*base, **more)
-    return Command(*base, view_of(message, repeats=max(1, int(message.repeats)),
-                                  grid=bool(message.grid), angular=bool(message.angular)),
-                   artifact_of(message), **more)
+    placed = phase in (Phase.PLACE, Phase.MEASURE)
+    return Command(
+        stamp_ns(message), phase, str(message.plan_id), int(message.view_index),
+        view_of(message, repeats=max(1, int(message.repeats)), grid=bool(message.grid),
+                angular=bool(message.angular)) if placed else None,
+        artifact_of(message) if placed else None,
+        views_planned=int(getattr(message, "views_planned", 0)),
+        run_id=str(getattr(message, "run_id", "")), model_terms=terms_of(message))
 
 
 def terms_of(message: Any) -> tuple[str, ...]:
@@ -113,7 +113,10 @@ def view_readings(message: Any) -> ViewReadings:
                              f"{', '.join(names)} differ in length", "mend the publisher")
     return ViewReadings(
         view_of(message, repeats=int(message.repeats), grid=bool(message.grid),
-                angular=bool(message.angular)), **table,
+                angular=bool(message.angular)),
+        m=table["m"], n=table["n"], dx=table["dx"], dy=table["dy"], count=table["count"],
+        u=table["u"], k=table["k"], dtheta=table["dtheta"], count_theta=table["count_theta"],
+        u_theta=table["u_theta"],
         sigma_xy=float(message.sigma_xy), sigma_theta=float(message.sigma_theta),
         dof_xy=int(message.dof_xy), dof_theta=int(message.dof_theta),
         used=int(message.detections_used), rejected=counts(message, "reject"),

@@ -99,6 +99,7 @@ def _position(stops: np.ndarray, elapsed_ns: int, settings: CellSettings) -> tup
 def _detection(stamp_ns: int, offset: np.ndarray, mark: tuple, settings: CellSettings) -> Detection:
     kind, m, n, k = mark
     sigma = settings.sigma_xy_m if kind == Kind.GRID else settings.sigma_theta_rad
-    ids = (m, n, k) if settings.with_ids else (0, 0, 0)
-    return Detection(stamp_ns, int(kind), settings.with_ids, *ids, *offset.tolist(),
+    m, n, k = (m, n, k) if settings.with_ids else (0, 0, 0)
+    x, y, theta = offset.tolist()
+    return Detection(stamp_ns, int(kind), settings.with_ids, m, n, k, x, y, theta,
                      sigma if settings.declare_sigma else 0.0, 0.95)

@@ -65,11 +65,13 @@ def simulation_from_dict(data: object, where: str) -> LaserSimulation:
     noise = _mapping(top.get("noise", {}), f"{where}: noise",
                      ("distance_nm", "reading_nm", "linear_nm", "repeats"))
     repeats = _count(noise.get("repeats", 1), f"{where}: noise: repeats", MAX_REPEATS)
-    sigmas = [_number(noise.get(key, 0), f"{where}: noise: {key}", positive=True) * M_PER_NM
-              for key in ("distance_nm", "reading_nm", "linear_nm")]
+    distance_m, reading_m, linear_m = (
+        _number(noise.get(key, 0), f"{where}: noise: {key}", positive=True) * M_PER_NM
+        for key in ("distance_nm", "reading_nm", "linear_nm"))
     return LaserSimulation(machine, Measurement(
         {name: _setup(raw, f"{where}: setups: {name}", machine.dim)
-         for name, raw in setups.items()}, LaserNoise(*sigmas, repeats=repeats)), rng)
+         for name, raw in setups.items()},
+        LaserNoise(distance_m, reading_m, linear_m, repeats)), rng)
 
 
 def _machine(raw: object, where: str, rng: np.random.Generator) -> StepMachine:
@@ -132,17 +134,17 @@ def _turns(raw: object, where: str, shape: tuple[int, int, int]) -> np.ndarray |
 
 def _setup(raw: object, where: str, dim: int) -> SetUp:
     raw = _mapping(raw, where, ("laser_mrad", "mirror_mrad", "to_machine", "abbe_mm", "scale_ppm"))
-    angles = [tuple(np.array(_numbers(raw.get(key, [0.0] * (dim - 1)), f"{where}: {key}",
-                                      (dim - 1,))) * RAD_PER_MRAD)
-              for key in ("laser_mrad", "mirror_mrad")]
+    laser_rad, mirror_rad = (
+        tuple(np.array(_numbers(raw.get(key, [0.0] * (dim - 1)), f"{where}: {key}", (dim - 1,)))
+              * RAD_PER_MRAD) for key in ("laser_mrad", "mirror_mrad"))
     to_machine = raw.get("to_machine", True)
     if not isinstance(to_machine, bool):
         raise InputError(f"{where}: to_machine", f"{to_machine!r} is neither true nor false",
                          "give one")
     abbe_mm = _numbers(raw.get("abbe_mm", [0, 0, 0]), f"{where}: abbe_mm", (3,))
-    abbe = tuple(np.array(abbe_mm) * M_PER_MM)
+    x, y, z = np.array(abbe_mm) * M_PER_MM
     scale = _number(raw.get("scale_ppm", 0.0), f"{where}: scale_ppm") * 1e-6
-    return SetUp(*angles, to_machine, abbe, scale)
+    return SetUp(laser_rad, mirror_rad, to_machine, (x, y, z), scale)
 
 
 def _mapping(data: object, where: str, known: tuple[str, ...]) -> dict[str, Any]:
@@ -156,8 +158,8 @@ def _mapping(data: object, where: str, known: tuple[str, ...]) -> dict[str, Any]
 
 
 def _number(value: object, where: str, *, positive: bool = False) -> float:
-    is_number = isinstance(value, int | float) and not isinstance(value, bool)
-    if not is_number or not abs(value) <= LARGEST or (positive and value < 0):
+    if (not isinstance(value, int | float) or isinstance(value, bool)
+            or not abs(value) <= LARGEST or (positive and value < 0)):
         raise InputError(where, f"{value!r} is not a number" + " from 0" * positive,
                          f"give one within +-{LARGEST:g}")
     return float(value)

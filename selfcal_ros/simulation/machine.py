@@ -2,6 +2,7 @@
 """What is true of a machine, of a plate, and of each view in which the plate lies on it."""
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -73,7 +74,7 @@ class Spread:
         return np.array([[scale + stretch, shear - turn], [shear + turn, scale - stretch]])
 
 
-def _zeros(*shape: int) -> field:
+def _zeros(*shape: int) -> Any:
     return field(default_factory=lambda: np.zeros(shape))
 
 

@@ -9,6 +9,7 @@ truth: how wrong is the map, does its expanded uncertainty cover that, and is it
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -228,7 +229,7 @@ def _noises() -> list[Case]:
 
 
 def _with_terms() -> list[Case]:
-    def case(name: str, terms: str, **more: object) -> Case:
+    def case(name: str, terms: str, **more: Any) -> Case:
         return Case(f"{name}; model {terms}", plan=resistant(),
                     options=Options(terms=parse_terms([terms], "reality")), **more)
 

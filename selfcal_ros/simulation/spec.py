@@ -18,34 +18,41 @@ from selfcal_ros.simulation.faults import PARTS, Faults, apply_faults
 from selfcal_ros.simulation.machine import ENCODERS, ROTATIONS, Spread, Truth, random_truth
 from selfcal_ros.simulation.settings import CellSettings
 
-PART = {"low": 0.0, "high": 1.0}
-LENGTH = {"unit": "m", "low": 0.0, "high": 1e-3}
-ANGLE = {"unit": "rad", "low": 0.0, "high": 0.1}
-TIME = {"unit": "s", "low": 0.0, "high": 3600.0}
+Bounds = dict[str, Any]
+"""Unit, limits and choices of a key, as `Parameter` takes them."""
+
+Section = dict[str, tuple[str, Bounds]]
+"""Key -> field of the dataclass, and its bounds; type and default are the field's."""
+
+PART: Bounds = {"low": 0.0, "high": 1.0}
+LENGTH: Bounds = {"unit": "m", "low": 0.0, "high": 1e-3}
+ANGLE: Bounds = {"unit": "rad", "low": 0.0, "high": 0.1}
+TIME: Bounds = {"unit": "s", "low": 0.0, "high": 3600.0}
 LAST_START_S = 2.1e9
 """Stamps are 32 bit seconds; this leaves room for the longest recording."""
 
-RATIO = {"unit": "m/m", "low": 0.0, "high": 0.1}
+RATIO: Bounds = {"unit": "m/m", "low": 0.0, "high": 0.1}
 SIGNED_RATIO = RATIO | {"low": -0.1}
 
-TRUTH = {"g": ("g_m", LENGTH), "a": ("a_m", LENGTH), "g_theta": ("g_theta_rad", ANGLE),
-         "a_theta": ("a_theta_rad", ANGLE), "phi": ("phi_rad", ANGLE), "t": ("t_m", LENGTH),
-         "encoder": ("encoder", {"choices": ENCODERS}),
-         "rotation": ("rotation", {"choices": ROTATIONS})}
-NOISE = {"sigma_xy": ("sigma_xy_m", LENGTH), "sigma_theta": ("sigma_theta_rad", ANGLE),
-         "visit_xy": ("visit_xy_m", LENGTH), "flicker_xy": ("flicker_xy_m", LENGTH),
-         "flicker_theta": ("flicker_theta_rad", ANGLE),
-         "resolution_xy": ("resolution_xy_m", LENGTH),
-         "resolution_theta": ("resolution_theta_rad", ANGLE)}
-CELL = {"sense": ("sense", {"choices": tuple(str(sense) for sense in Sense)}),
-        "encoder_rate": ("encoder_rate_hz", {"unit": "Hz", "low": 1.0, "high": 10000.0}),
-        "exposure_period": ("exposure_period_s", {"unit": "s", "low": 0.001, "high": 10.0}),
-        "with_ids": ("with_ids", {}), "declare_sigma": ("declare_sigma", {}),
-        "servo_sigma": ("servo_sigma_m", LENGTH), "servo_sigma_theta": ("servo_sigma_rad", ANGLE),
-        "stop_sigma": ("stop_sigma_m", LENGTH), "stop_sigma_theta": ("stop_sigma_rad", ANGLE),
-        "follow_mark": ("follow_mark", {}), "visit_order": ("visit_order", {}),
-        "consecutive": ("consecutive", {})}
-PHYSICS = {
+TRUTH: Section = {
+    "g": ("g_m", LENGTH), "a": ("a_m", LENGTH), "g_theta": ("g_theta_rad", ANGLE),
+    "a_theta": ("a_theta_rad", ANGLE), "phi": ("phi_rad", ANGLE), "t": ("t_m", LENGTH),
+    "encoder": ("encoder", {"choices": ENCODERS}), "rotation": ("rotation", {"choices": ROTATIONS})}
+NOISE: Section = {
+    "sigma_xy": ("sigma_xy_m", LENGTH), "sigma_theta": ("sigma_theta_rad", ANGLE),
+    "visit_xy": ("visit_xy_m", LENGTH), "flicker_xy": ("flicker_xy_m", LENGTH),
+    "flicker_theta": ("flicker_theta_rad", ANGLE), "resolution_xy": ("resolution_xy_m", LENGTH),
+    "resolution_theta": ("resolution_theta_rad", ANGLE)}
+CELL: Section = {
+    "sense": ("sense", {"choices": tuple(str(sense) for sense in Sense)}),
+    "encoder_rate": ("encoder_rate_hz", {"unit": "Hz", "low": 1.0, "high": 10000.0}),
+    "exposure_period": ("exposure_period_s", {"unit": "s", "low": 0.001, "high": 10.0}),
+    "with_ids": ("with_ids", {}), "declare_sigma": ("declare_sigma", {}),
+    "servo_sigma": ("servo_sigma_m", LENGTH), "servo_sigma_theta": ("servo_sigma_rad", ANGLE),
+    "stop_sigma": ("stop_sigma_m", LENGTH), "stop_sigma_theta": ("stop_sigma_rad", ANGLE),
+    "follow_mark": ("follow_mark", {}), "visit_order": ("visit_order", {}),
+    "consecutive": ("consecutive", {})}
+PHYSICS: Section = {
     "microscope_scale": ("microscope_scale", SIGNED_RATIO),
     "microscope_stretch": ("microscope_stretch", SIGNED_RATIO),
     "microscope_rotation": ("microscope_rotation_rad", ANGLE | {"low": -0.1}),
@@ -55,11 +62,9 @@ PHYSICS = {
     "plate_scale": ("plate_scale", RATIO), "plate_shape": ("plate_shape_m", LENGTH),
     **{f"drift_{name}": (f"drift_{name}_m", LENGTH)
        for name in ("linear", "quadratic", "cubic", "walk")}}
-FAULTS = {name: (name, PART) for name in PARTS} | {
+FAULTS: Section = {name: (name, PART) for name in PARTS} | {
     key: (f"{key.removesuffix('_s')}_s", TIME)
     for key in ("delay", "clock_step", "encoder_gap", "delay_s", "clock_step_s", "encoder_gap_s")}
-"""Key of a section -> field of the dataclass, unit and bounds; type and default are the field's."""
-
 TOP = (
     Parameter("seed", 0, "of truth, noise and faults", low=0, high=2**61),
     Parameter("start_time", 1.7e9, "first stamp", "s", 0.0, LAST_START_S),
@@ -157,7 +162,7 @@ def _mapping(data: Any, where: str, known: tuple[str, ...]) -> dict:
     return data
 
 
-def _section(data: Any, where: str, keys: dict[str, tuple[str, dict]], defaults: Any) -> dict:
+def _section(data: Any, where: str, keys: Section, defaults: Any) -> dict:
     """Return field -> value of a section, each of the type of its default and within bounds."""
     out: dict[str, Any] = {}
     for key, value in _mapping(data, where, tuple(keys)).items():

@@ -187,7 +187,8 @@ def chunk_items(chunk: Chunk) -> list[Block | Schema | Channel]:
         return _items(data)
     except Exception:  # a form that only the library's own reader takes, or does not
         chunk.data, chunk.compression = data, ""
-        return gathered(breakup_chunk(chunk))
+        return [item for item in gathered(breakup_chunk(chunk))
+                if isinstance(item, Block | Schema | Channel)]
 
 
 def _items(data: bytes) -> list[Block | Schema | Channel]:
@@ -207,7 +208,8 @@ def _items(data: bytes) -> list[Block | Schema | Channel]:
             record, used = parsed(opcode, data[start:at])
             if used != length:
                 raise ValueError("the length of a record is wrong")
-            items.append(record)
+            if isinstance(record, Schema | Channel):
+                items.append(record)
     return items
 
 

@@ -55,10 +55,10 @@ def parsed(opcode: int, body: bytes) -> tuple[McapRecord | None, int]:
         return Message.read(stream, len(body)), len(body)
     if opcode == Opcode.CHUNK and chunk_length(body, 0) > len(body):
         raise ValueError("the length of a chunk is wrong")
-    if opcode not in PARSERS:
-        return None, len(body)
-    record = PARSERS[opcode](stream)
-    return record, stream.count
+    for known, parse in PARSERS.items():
+        if opcode == known:
+            return parse(stream), stream.count
+    return None, len(body)
 
 
 def chunk_length(data: Buffer, at: int) -> int:
@@ -80,7 +80,8 @@ def declarations(data: mmap) -> Iterator[Schema | Channel]:
                 record, _ = parsed(opcode, data[at:at + length])
             except Exception:  # no summary, or a damaged one
                 return
-            yield record
+            if isinstance(record, Schema | Channel):
+                yield record
         at += length
 
 
@@ -109,7 +110,7 @@ def next_record(data: mmap, start: int, channels: Collection[int] | None) -> int
             fits = length >= CHUNK_FRONT - HEAD.size and length == chunk_length(
                 data, at + HEAD.size)
         else:
-            fits = (struct.unpack_from("<H", data, at + HEAD.size)[0] in channels
+            fits = (struct.unpack_from("<H", data, at + HEAD.size)[0] in (channels or ())
                     and (end == len(data) or data[end] in (Opcode.MESSAGE, Opcode.DATA_END)))
         if fits:
             return at

@@ -243,8 +243,10 @@ class McapStream:
         """Take from the summary what was declared in the part that is lost."""
         with mmap(file.fileno(), 0, access=ACCESS_READ) as data:
             for record in declarations(data):
-                known = self.schemas if isinstance(record, Schema) else self.channels
-                known.setdefault(record.id, record)
+                if isinstance(record, Schema):
+                    self.schemas.setdefault(record.id, record)
+                else:
+                    self.channels.setdefault(record.id, record)
 
     def _salvage(self, file: BinaryIO, start: int,
                  error: Exception) -> Iterator[Block]:

@@ -82,7 +82,8 @@ def identify_grid(artifact: Artifact, view: View, reading_m: np.ndarray, *, ids:
     reasons = np.full(reading_m.shape[1], None, dtype=object)
     if not view.grid or pose.quarter_turns is None:
         reasons[:] = Reason.NOT_IN_VIEW
-        return Identified(ids, *np.zeros((2, *reading_m.shape)), reasons, Rigid())
+        return Identified(ids, np.zeros(reading_m.shape), np.zeros(reading_m.shape), reasons,
+                          Rigid())
     half = np.array(artifact.half)[:, None]
     named_unknown = has_id & (np.abs(ids) > half).any(axis=0)
     marks = np.where(has_id & ~named_unknown, ids, 0)
@@ -226,7 +227,8 @@ def identify_angular(artifact: Artifact, view: View, reading_rad: np.ndarray, *,
     count = artifact.angular_count
     if not count or not view.angular:
         reasons[:] = Reason.NOT_IN_VIEW
-        return Identified(np.zeros(len(ids), int), *np.zeros((2, len(ids))), reasons, Rigid())
+        return Identified(np.zeros(len(ids), int), np.zeros(len(ids)), np.zeros(len(ids)),
+                          reasons, Rigid())
     step = 2 * np.pi / count
     base = view.lattice_pose(artifact).s
     known = has_id & (ids >= 0) & (ids < count)

@@ -43,12 +43,13 @@ def grid_visits(means: Means, key: np.ndarray, sigma: np.ndarray, *, stamps_ns: 
     mark = np.searchsorted(means.key, key[first])
     order = np.argsort(mark, kind="stable")  # the numbers of visits rise with their stamps
     offset_x, offset_y, since = found.companions[:, order]
-    came = [np.where(_differs(row[kept], visit, first), 0, row[kept][first]).astype(np.int8)[order]
-            for row in approach]
+    came_x, came_y = (
+        np.where(_differs(row[kept], visit, first), 0, row[kept][first]).astype(np.int8)[order]
+        for row in approach)
     return GridVisits(
-        mark[order], *found.mean[:, order], found.count[order],
-        stamps_ns[first][order] + np.rint(since).astype(np.int64), offset_x, offset_y, *came,
-        u=found.u[order] if len(found.u) else found.u, sigma_m=found.sigma, dof=found.dof)
+        mark[order], found.mean[0, order], found.mean[1, order], found.count[order],
+        stamps_ns[first][order] + np.rint(since).astype(np.int64), offset_x, offset_y, came_x,
+        came_y, u=found.u[order] if len(found.u) else found.u, sigma_m=found.sigma, dof=found.dof)
 
 
 def _differs(values: np.ndarray, visit: np.ndarray, first: np.ndarray) -> np.ndarray:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from selfcal_ros.collection.reasons import Reason
+from selfcal_ros.collection.reasons import Reason, reason_where
 from selfcal_ros.collection.stage.samples import Limits, Samples, SampleStore
 
 BEYOND_NOISE = 6.0
@@ -196,7 +196,7 @@ class Series:
             told = np.where(told > BEYOND_NOISE * speed_noise, told, 0.0)
             told *= (t[right] - t[left]) / 1e9
             fast &= np.fmax(way, told) > BEYOND_NOISE * np.sqrt(2) * noise
-        return np.where(fast, Reason.MOVING, None)
+        return reason_where(fast, Reason.MOVING)
 
     def approach(self, stamps_ns: np.ndarray, positions: np.ndarray, *, threshold: float,
                  ) -> np.ndarray:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from selfcal_ros.collection.reasons import Reason
+from selfcal_ros.collection.reasons import Reason, reason_where
 from selfcal_ros.collection.stage.encoder import (
     EVER,
     LOOK_BACK_NS,
@@ -96,9 +96,10 @@ class Exposures:
         """Return the stage at some of the instants, in the order that is asked for."""
         index = np.searchsorted(self._table.rows["stamp"], stamps_ns)
         rows = self._table.rows[index]
-        joints = [JointAt(rows["position"][:, j], REASONS[rows["reason"][:, j]],
-                          np.where(rows["moving"][:, j], Reason.MOVING, None)) for j in range(3)]
-        return StageAt(*joints, self._approach[:, index])
+        x, y, theta = (JointAt(rows["position"][:, j], REASONS[rows["reason"][:, j]],
+                               reason_where(rows["moving"][:, j], Reason.MOVING))
+                       for j in range(3))
+        return StageAt(x, y, theta, self._approach[:, index])
 
     def update(self, stamps_ns: np.ndarray) -> np.ndarray:
         """Take further instants of exposure and what came of the encoder since the last time.

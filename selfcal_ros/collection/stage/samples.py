@@ -6,12 +6,12 @@ temporary file without a name, from where a message that comes very late can sti
 neighbours. What is asked for is always the whole set, whatever came when.
 """
 
+import io
 import tempfile
 import weakref
 from array import array
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
 
 import numpy as np
 
@@ -60,7 +60,7 @@ class SampleStore:
         self._blocks: list[_Block] = []
         self._unseen: list[np.ndarray] = []
         self._count, self._end = 0, 0
-        self._file: BinaryIO | None = None
+        self._file: io.FileIO | None = None
         self._read: tuple[_Block, Samples] | None = None  # the block read last
         self.problem = ""
 
@@ -70,8 +70,10 @@ class SampleStore:
 
     def add(self, stamp_ns: int, position: float, speed: float) -> None:
         """Add one sample; `speed` is NaN where the encoder does not tell it."""
-        for column, value in zip(self._single, (stamp_ns, position, speed), strict=True):
-            column.append(value)
+        stamps, positions, speeds = self._single
+        stamps.append(stamp_ns)
+        positions.append(position)
+        speeds.append(speed)
 
     def add_block(self, stamps_ns: np.ndarray, positions: np.ndarray,
                   speeds: np.ndarray | None = None) -> None:
@@ -83,19 +85,19 @@ class SampleStore:
 
     def _flush(self) -> None:
         if len(self._single[0]):
-            columns = [np.array(column) for column in self._single]
+            stamps, positions, speeds = (np.array(column) for column in self._single)
             self._single = (array("q"), array("d"), array("d"))
-            self._append(*columns)
+            self._append(stamps, positions, speeds)
 
     def _append(self, stamps: np.ndarray, positions: np.ndarray, speeds: np.ndarray) -> None:
         """Fill the open block, closing it whenever it is full."""
         positions = positions + 0.0  # -0.0 and 0.0 sort alike: keep one of them
         for start in range(0, len(stamps), self._limits.block):
-            part = tuple(c[start:start + self._limits.block] for c in (stamps, positions, speeds))
-            t = part[0]
+            part = slice(start, start + self._limits.block)
+            t = stamps[part]
             self._rising &= bool(t[0] >= self._last_ns and (t[1:] >= t[:-1]).all())
             self._last_ns = max(self._last_ns, int(t[-1]))
-            self._parts.append(part)
+            self._parts.append((t, positions[part], speeds[part]))
             self._unseen.append(t)
             self._filled += len(t)
             self._count += len(t)
@@ -105,12 +107,12 @@ class SampleStore:
     def _open(self) -> Samples:
         """Return the samples of the block that is being filled, in the order of their stamps."""
         if len(self._parts) > 1 or not self._rising:
-            columns = tuple(np.concatenate(column) for column in zip(*self._parts, strict=True))
+            stamps, positions, speeds = _joined(self._parts)
             if not self._rising:
-                order = np.argsort(columns[0], kind="stable")
-                columns = tuple(column[order] for column in columns)
-            self._parts, self._rising = [columns], True
-            self._last_ns = int(columns[0][-1])
+                order = np.argsort(stamps, kind="stable")
+                stamps, positions, speeds = stamps[order], positions[order], speeds[order]
+            self._parts, self._rising = [(stamps, positions, speeds)], True
+            self._last_ns = int(stamps[-1])
         return self._parts[0] if self._parts else (NO_STAMPS, np.zeros(0), np.zeros(0))
 
     def _close(self) -> None:
@@ -148,23 +150,23 @@ class SampleStore:
     def _samples(self, block: _Block) -> Samples:
         """Return the samples of a block, read back if it is not in memory."""
         if block.columns:
-            columns = block.columns
-        elif self._read is not None and self._read[0] is block:
-            return self._read[1]
-        else:
-            kinds = (np.int64, np.float64, np.float64)[:3 if block.has_speeds else 2]
-            data = bytearray(8 * block.count * len(kinds))
-            self._file.seek(block.place)
-            view = memoryview(data)
-            while len(view):
-                view = view[self._file.readinto(view):]
-            columns = tuple(np.frombuffer(data, kind, block.count, 8 * block.count * at)
-                            for at, kind in enumerate(kinds))
-        if not block.has_speeds:
-            columns = (*columns, np.full(block.count, np.nan))
-        if not block.columns:
-            self._read = block, columns
-        return columns
+            return _with_speeds(block.columns)
+        if self._read is None or self._read[0] is not block:
+            self._read = block, _with_speeds(self._read_back(block))
+        return self._read[1]
+
+    def _read_back(self, block: _Block) -> tuple[np.ndarray, ...]:
+        """Return the columns of a block from the file."""
+        if self._file is None:
+            raise ValueError("a block that is not in memory has been stored")
+        kinds = (np.int64, np.float64, np.float64)[:3 if block.has_speeds else 2]
+        data = bytearray(8 * block.count * len(kinds))
+        self._file.seek(block.place)
+        view = memoryview(data)
+        while len(view):
+            view = view[self._file.readinto(view):]
+        return tuple(np.frombuffer(data, kind, block.count, 8 * block.count * at)
+                     for at, kind in enumerate(kinds))
 
     def new_stamps(self) -> np.ndarray:
         """Return the stamps that were added since the last call, rising."""
@@ -214,7 +216,18 @@ class SampleStore:
                 parts.append(_cut(self._samples(block), start_ns, end_ns, beside))
         if not parts:
             return NO_STAMPS, np.zeros(0), np.zeros(0)
-        return tuple(np.concatenate(column) for column in zip(*parts, strict=True))
+        return _joined(parts)
+
+
+def _joined(parts: list[Samples]) -> Samples:
+    stamps, positions, speeds = (np.concatenate(column) for column in zip(*parts, strict=True))
+    return stamps, positions, speeds
+
+
+def _with_speeds(columns: tuple[np.ndarray, ...]) -> Samples:
+    """Return samples from their columns; speeds that were not told are NaN."""
+    stamps, positions, *speeds = columns
+    return stamps, positions, speeds[0] if speeds else np.full(len(stamps), np.nan)
 
 
 def _share(block: _Block, start_ns: int, end_ns: int) -> int:
@@ -236,7 +249,7 @@ def _cut(samples: Samples, start_ns: int, end_ns: int, beside: int) -> Samples:
     high = _reach(t[np.searchsorted(t, end_ns, "right"):], beside)
     first = int(np.searchsorted(t, start_ns)) - low
     last = int(np.searchsorted(t, end_ns, "right")) + high
-    return tuple(column[first:last] for column in samples)
+    return t[first:last], samples[1][first:last], samples[2][first:last]
 
 
 def _reach(stamps: np.ndarray, n: int) -> int:

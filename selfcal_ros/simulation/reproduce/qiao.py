@@ -59,7 +59,7 @@ class RankRow:
     def formula(self) -> str:
         """The printed rank as text."""
         a, b, c = self.printed
-        middle = {0: "", -1: "-n"}.get(b, f"{b:g}n")
+        middle = "" if b == 0 else "-n" if b == -1 else f"{b:g}n"
         return f"{a:g}n^2{middle}+{c:g}"
 
     def rank(self, n: int) -> float:
@@ -134,7 +134,7 @@ def reproduce_qiao(n_draws: int, seed: int) -> QiaoReproduction:
             for row in ROWS]
     rng = np.random.default_rng(seed)
     truth = random_truth(ARTIFACT, 3, rng, SPREAD)
-    programs = tuple(_program(truth, views) for views in PROGRAMS)
+    first, second = (_program(truth, views) for views in PROGRAMS)
     plan = plan_of(PROGRAMS[0])
     normal = [_errors_um(truth, simulate_measurements(truth, plan, rng, sigma_m=SIGMA_M))
               for _ in range(n_draws)]
@@ -143,7 +143,7 @@ def reproduce_qiao(n_draws: int, seed: int) -> QiaoReproduction:
     gain = predict(planned_system(ARTIFACT, plan.views), ARTIFACT, ThetaDatum.XY_AXES).rms_xy
     return QiaoReproduction(
         np.array([[s.rank for s in row] for row in seen]),
-        np.array([[s.unknowns for s in row] for row in seen]), programs, _rms(normal),
+        np.array([[s.unknowns for s in row] for row in seen]), (first, second), _rms(normal),
         _rms(uniform), normal[0], gain * SIGMA_M * UM_PER_M)
 
 
