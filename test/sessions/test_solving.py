@@ -99,7 +99,8 @@ def test_readings_of_two_runs_are_never_mixed(desk):
     (Run("a", "2"), Run("a", "1"), True), (Run("a", "1"), Run("a", "2"), False),
     (Run("a", "10"), Run("a", "9"), True), (Run("b", "1"), Run("a", "2"), False),
     (Run("b"), Run("a", "2"), True), (Run("a", "2"), Run("a"), True),
-    (Run("a", "x"), Run("a", "2"), True), (Run("a", "9" * 21), Run("a", "2"), True)])
+    (Run("a", "x"), Run("a", "2"), True), (Run("a", "9" * 21), Run("a", "2"), True),
+    (Run("a", "2"), Run("a", "9" * 21), True), (Run("a", "2"), Run("a", "9" * 20), False)])
 def test_the_later_run_supersedes(new, current, later):
     assert supersedes(new, current) is later
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.stats import binom
+from scipy.stats import f as f_distribution
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.api import calibrate
@@ -109,6 +110,12 @@ def test_good_readings_stay():
     assert lost <= binom.ppf(0.999, 150, LEVEL)
 
 
+def dof_of(residuals):
+    """Return the degrees of freedom of the grid readings that were fitted."""
+    system = residuals.problem.system
+    return 2 * system.grid.n_readings - system.rank_grid
+
+
 def test_what_a_reading_adds_to_the_sum_of_squares_is_exact():
     """Its square is what the sum of squares loses when the fit is made without it."""
     plan = hu_plan(Artifact(5, 0.01, 8))
@@ -120,12 +127,19 @@ def test_what_a_reading_adds_to_the_sum_of_squares_is_exact():
     total = (abs(whole.found.residuals) ** 2).sum()
     for mark in ((-2, 1), (0, 0), (2, 2)):
         rest = residuals_of(without(readings, [(1, "grid", mark)]), LINEAR)
-        lost = total - (abs(rest.found.residuals) ** 2).sum()
-        assert whole.squares[1, mark[0] + 2, mark[1] + 2] == pytest.approx(lost, rel=1e-6)
+        left = (abs(rest.found.residuals) ** 2).sum()
+        at, dof = (1, mark[0] + 2, mark[1] + 2), dof_of(rest)
+        assert whole.squares[at] == pytest.approx(total - left, rel=1e-6)
+        assert whole.p_outlier("grid", at) == pytest.approx(
+            f_distribution.sf((total - left) / 2 / (left / dof), 2, dof), rel=1e-5)
     total = (whole.found.residuals_theta**2).sum()
     rest = residuals_of(without(readings, [(0, "angular", (3,))]), LINEAR)
-    lost = total - (rest.found.residuals_theta**2).sum()
-    assert whole.squares_theta[0, 3] == pytest.approx(lost, rel=1e-6)
+    left = (rest.found.residuals_theta**2).sum()
+    assert whole.squares_theta[0, 3] == pytest.approx(total - left, rel=1e-6)
+    angular = rest.problem.system
+    dof = angular.angular.n_readings - angular.rank_angular
+    assert whole.p_outlier("angular", (0, 3)) == pytest.approx(
+        f_distribution.sf((total - left) / (left / dof), 1, dof), rel=1e-5)
 
 
 def seen_by_a_turned_microscope(readings, seed=2, *, turn=5e-3):

@@ -1,0 +1,43 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A growing table holds what a list would, wherever rows are added."""
+
+import numpy as np
+import pytest
+
+from selfcal_ros.collection.stage.growing import GrowingTable
+
+PAIR = np.dtype([("a", np.int64), ("b", float)])
+
+
+def rows_of(first, count):
+    return np.array([(first + i, 0.5 * i) for i in range(count)], dtype=PAIR)
+
+
+@pytest.mark.parametrize("sizes", [(0,), (1,), (64,), (65,), (3, 61, 1), (60, 5, 500, 0, 2)])
+def test_rows_appended_stay_in_their_order(sizes):
+    table, want, at = GrowingTable(PAIR), [], 0
+    for size in sizes:
+        table.append(rows_of(at, size))
+        want += rows_of(at, size).tolist()
+        at += size
+        assert table.rows.tolist() == want and len(table) == len(want)
+
+
+def test_rows_are_inserted_as_into_a_list_and_nothing_is_lost():
+    rng, table, want = np.random.default_rng(2), GrowingTable(PAIR), []
+    for step in range(60):
+        at = np.sort(rng.integers(0, len(want) + 1, rng.integers(0, 5)))
+        new = rows_of(1000 * step, len(at))
+        table.insert(at, new)
+        for place, row in zip(at[::-1].tolist(), new[::-1].tolist(), strict=True):
+            want.insert(place, row)
+        table.append(rows_of(-step, 2))
+        want += rows_of(-step, 2).tolist()
+        assert table.rows.tolist() == want and len(table) == len(want)
+
+
+def test_rows_may_be_changed_in_place():
+    table = GrowingTable(PAIR)
+    table.append(rows_of(0, 3))
+    table.rows["a"][1] = 7
+    assert table.rows["a"].tolist() == [0, 7, 2]
