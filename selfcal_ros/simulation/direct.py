@@ -41,7 +41,7 @@ def measured_view(truth: Truth, item: tuple[int, View], rng: np.random.Generator
         exposures = grid_exposures(truth, index, view, settings=settings, rng=rng)
         readings = _grid(readings, truth, exposures, settings=settings,
                          lost=_lost(rng, missing, truth.artifact.shape), start_ns=start_ns)
-    if view.angular:
+    if view.angular and truth.artifact.angular_count:
         found = angular_exposures(truth, index, view, settings=settings, rng=rng)
         readings = _angular(readings, truth, found.k, _read(settings.sense, found),
                             lost=_lost(rng, missing, truth.artifact.angular_count))

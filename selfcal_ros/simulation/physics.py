@@ -124,6 +124,8 @@ def line_directions(truth: Truth, index: int, view: View) -> tuple[np.ndarray, n
     The nominal direction is within one turn, 0 included.
     """
     count = truth.artifact.angular_count
+    if not count:
+        return np.zeros(0), np.zeros(0)
     turn = (np.arange(count) + view.lattice_pose(truth.artifact).s) % count
     nominal = turn * (2 * np.pi / count)
     return nominal + (truth.a_theta + truth.phi_rad[index]), nominal

@@ -88,7 +88,7 @@ def angular_data(measurements: Measurements) -> AngularData:
     for row, i in enumerate(index):
         readings = measurements.views[i]
         where = f"view '{readings.view.name}' angular readings"
-        turn = _pose_of(readings.view, artifact).s
+        turn = _pose_of(readings.view, artifact).turn_lines
         k = np.asarray(readings.k)
         if turn is None or k.min() < 0 or k.max() >= artifact.angular_count:
             raise InputError(where, "a line that the plate does not have",

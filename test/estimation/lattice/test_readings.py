@@ -60,3 +60,11 @@ def test_marks_off_a_rectangular_field_are_refused(q, m, n, fits):
     else:
         with pytest.raises(InputError, match=rf"mark \({m}, {n}\) lies off the"):
             grid_data(measurements(view))
+
+
+def test_a_line_on_a_plate_without_lines_is_refused():
+    view = ViewReadings(View("a", angular=False), k=np.array([0]), dtheta=np.zeros(1),
+                        count_theta=np.ones(1, dtype=int))
+    with pytest.raises(InputError, match="view 'a' angular readings: a line that the plate does "
+                       "not have"):
+        angular_data(Measurements("p", Artifact(5, 0.01), (view,)))

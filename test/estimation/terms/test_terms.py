@@ -10,7 +10,10 @@ from selfcal_ros.errors import InputError, NotIdentifiableError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.joint.model_fit import fit_model
 from selfcal_ros.estimation.joint.solve import prepare
+from selfcal_ros.estimation.lattice.readings import grid_data
 from selfcal_ros.estimation.options import Options
+from selfcal_ros.estimation.terms.columns import term_columns
+from selfcal_ros.estimation.terms.ground import ground_of
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.terms import ModelTerm, TermName, parse_terms
@@ -219,3 +222,15 @@ def test_terms_are_read_in_one_order():
         ModelTerm(TermName.MICROSCOPE), ModelTerm(TermName.DRIFT),
         ModelTerm(TermName.APPROACH, 2e-8))
     assert [str(t) for t in parse_terms(["drift:5e-8,approach"], "")] == ["drift:5e-08", "approach"]
+
+
+def test_no_columns_make_nothing_of_any_visit():
+    rng = np.random.default_rng(1)
+    plan = Plan("one", Artifact(5, 0.01), (View("a"),))
+    readings = simulate_measurements(random_truth(plan.artifact, 1, rng), plan, rng, visits=True)
+    ground = ground_of(readings, grid_data(readings), 0.02)
+    columns = term_columns(ground, [ModelTerm(TermName.PLATE_SCALE)], 2)
+    assert columns.columns == () and columns.at_visits(np.zeros(0)) == []
+    free = term_columns(ground, [ModelTerm(TermName.DRIFT)], 1)
+    (drift,) = free.at_visits(np.array([2.0, 3.0]))
+    np.testing.assert_allclose(drift, (2 + 3j) * ground.visits[0].time)
