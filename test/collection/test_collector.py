@@ -10,10 +10,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from selfcal_ros.collection.collector import ViewProgress
 from selfcal_ros.collection.messages import Command, Detection, EncoderSample, Phase
 from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.model.readings import Sense
+from selfcal_ros.model.readings import Sense, ViewReadings
+from selfcal_ros.model.view import View
 from selfcal_ros.simulation.faults import Faults, apply_faults
 from selfcal_ros.simulation.truth import angular_deviation, grid_deviation
 from test.support.collecting import START_NS, collect, digest, gathered, scene, table
@@ -366,6 +368,12 @@ def test_collecting_early_does_not_change_what_is_collected_later():
     found, _ = collector.collect()
     want, _ = collect(events)
     assert [table(v) for v in found.views] == [table(v) for v in want.views]
+
+
+def test_a_view_that_asks_for_nothing_in_the_field_is_covered():
+    readings = ViewReadings(View("off"))
+    assert ViewProgress(0, readings.view, 0, 0, 0, 0, readings, 0).coverage == 1.0
+    assert ViewProgress(0, readings.view, 3, 1, 5, 1, readings, 0).coverage == 0.25
 
 
 def test_progress_counts_marks_and_repeats():

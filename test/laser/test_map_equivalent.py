@@ -92,6 +92,18 @@ def test_uncertainties_follow():
     assert equivalent.u_scale_difference == pytest.approx(expected)
 
 
+@pytest.mark.parametrize("steps_m", [(0.01, 0.016), (0.016, 0.01)])
+def test_the_uncertainty_of_o_is_the_spread_of_measurements_with_unequal_steps(steps_m):
+    machine = StepMachine(steps_m, np.zeros((2, 4, 2)))
+    rng = np.random.default_rng(11)
+    noise = Measurement({}, LaserNoise(1e-8, 0, 1e-8, 4))
+    found = [map_equivalent(identify_ibaraki(simulate_step_diagonal(machine, noise, rng)))
+             for _ in range(400)]
+    spread = np.std([one.nonorthogonality for one in found])
+    said = np.sqrt(np.mean([one.u_nonorthogonality**2 for one in found]))
+    assert said == pytest.approx(spread, rel=0.12)
+
+
 def test_the_conventional_formulation_tells_no_scale():
     found = identify_wang(measured(case_study_machine()))
     assert map_equivalent(found).scale_difference is None

@@ -4,6 +4,7 @@
 import numpy as np
 import pytest
 
+from selfcal_ros.simulation.reproduce import hu as module
 from selfcal_ros.simulation.reproduce.hu import hu_text, reproduce_hu
 from selfcal_ros.simulation.reproduce.qiao import ROWS, SIZES, qiao_text, reproduce_qiao
 
@@ -40,6 +41,20 @@ def test_errors_scale_with_the_noise_and_vanish_without(hu):
     assert hu.noise_free_um < 1e-10 and hu.noise_free_deg < 1e-13
     first, second = (run.law.std.mean(axis=0) for run in hu.runs)
     assert first / second == pytest.approx([10, 10, 10], rel=0.15)
+
+
+def test_the_worst_site_and_line_without_noise_are_reported(monkeypatch):
+    def spoilt(truth, draws):
+        found = real(truth, draws)
+        if len(draws) == 1:
+            found.xy[0, 1, 3, 4] = -2.0
+            found.theta[0, 5] = -3.0
+        return found
+
+    real = module._law_errors
+    monkeypatch.setattr(module, "_law_errors", spoilt)
+    found = reproduce_hu(2, seed=1)
+    assert (found.noise_free_um, found.noise_free_deg) == (2.0, 3.0)
 
 
 def test_seeds_decide(hu):

@@ -41,8 +41,8 @@ CLIP = 4.0
 
 
 @dataclass(frozen=True)
-class Slip:
-    """A slip of the plate within a view.
+class SlipPlace:
+    """Where in a view the plate may have slipped.
 
     Attributes
     ----------
@@ -54,28 +54,38 @@ class Slip:
         ``m`` or ``n``: index of the marks along which the view was read.
     first : int
         First value of that index after the slip.
-    tx_m, ty_m, phi_rad : float
-        Change of offset and rotation, stage frame.
     chi2 : float
         Explained sum of squares over the noise variance; 3 on average without a slip.
-    alternatives : tuple of str
-        Other places that explain the readings as well: few views do not always tell where.
     """
 
     view: str
     index: int
     axis: str
     first: int
-    tx_m: float
-    ty_m: float
-    phi_rad: float
     chi2: float
-    alternatives: tuple[str, ...] = ()
 
     @property
     def place(self) -> str:
         """Where it slipped, in words."""
         return f"before {self.axis} = {self.first}"
+
+
+@dataclass(frozen=True)
+class Slip(SlipPlace):
+    """A slip of the plate within a view, at a place.
+
+    Attributes
+    ----------
+    tx_m, ty_m, phi_rad : float
+        Change of offset and rotation, stage frame.
+    alternatives : tuple of str
+        Other places that explain the readings as well: few views do not always tell where.
+    """
+
+    tx_m: float
+    ty_m: float
+    phi_rad: float
+    alternatives: tuple[str, ...] = ()
 
     def text(self) -> str:
         """Return the slip in words."""
@@ -104,28 +114,23 @@ def find_slip(residuals: Residuals, sigma_m: float, measurements: Measurements,
         The readings and how they were fitted.
     """
     grid = residuals.problem.system.grid
-    found: list[Slip] = []
+    found: list[SlipPlace] = []
     limit = CLIP * sigma_m / np.sqrt(np.where(grid.read, grid.weight, 1.0))
     size = abs(residuals.found.residuals)
     clipped = residuals.found.residuals * np.minimum(1.0, limit / np.maximum(size, 1e-300))
     for v, i in enumerate(residuals.problem.grid.index):
         for axis in (0, 1):
             for place in _places(grid.read[v], axis):
-                tested = _test(residuals, clipped, v, axis, place)
-                if tested is None or tested[0] / sigma_m**2 < chi2.isf(SLIP_LEVEL, 3):
-                    continue
-                gain, parameters = tested
-                half = grid.views.half[axis]
-                t = PHASES[grid.views.poses[v].q] * complex(*parameters[1:])
-                found.append(Slip(measurements.views[i].view.name, i, "mn"[axis],
-                                  int(place) - half, t.real, t.imag,
-                                  float(parameters[0] / residuals.problem.half_width_m),
-                                  gain / sigma_m**2))
+                gain = _explained(residuals, clipped, v, axis, place)
+                if gain is not None and gain / sigma_m**2 >= chi2.isf(SLIP_LEVEL, 3):
+                    found.append(SlipPlace(measurements.views[i].view.name, i, "mn"[axis],
+                                           int(place) - grid.views.half[axis],
+                                           gain / sigma_m**2))
     found.sort(key=lambda slip: -slip.chi2)
     return _best(found[:TRIED], measurements, options)
 
 
-def _best(found: list[Slip], measurements: Measurements, options: Options) -> Slip | None:
+def _best(found: list[SlipPlace], measurements: Measurements, options: Options) -> Slip | None:
     """Return the slip whose split leaves the smallest clipped sum of squares."""
     fits = []
     for slip in found:
@@ -149,16 +154,18 @@ def _best(found: list[Slip], measurements: Measurements, options: Options) -> Sl
     others = tuple(f"before {fits[i][0].axis} = {fits[i][0].first}" + (
         "" if fits[i][0].view == slip.view else f" in view '{fits[i][0].view}'")
         for i in order[1:] if losses[i] < near)
-    return replace(slip, tx_m=size[0], ty_m=size[1], phi_rad=size[2], alternatives=others)
+    tx_m, ty_m, phi_rad = size
+    return Slip(slip.view, slip.index, slip.axis, slip.first, slip.chi2, tx_m, ty_m, phi_rad,
+                others)
 
 
-def _followed(measurements: Measurements, slip: Slip, options: Options) -> float:
+def _followed(measurements: Measurements, slip: SlipPlace, options: Options) -> float:
     """Return the mean leverage after the split."""
     system = prepare(split_view(measurements, slip), options)[0].system
     return system.rank_grid / (2 * system.grid.n_readings)
 
 
-def _size(slip: Slip, fitted: JointFit, problem: Problem) -> tuple[float, float, float]:
+def _size(slip: SlipPlace, fitted: JointFit, problem: Problem) -> tuple[float, float, float]:
     """Return offset and rotation of the second placement less those of the first."""
     row = problem.grid.index.index(slip.index)
     before, after = fitted.parameters[:3 * problem.system.grid.n_views].reshape(-1, 3)[row:row + 2]
@@ -176,9 +183,9 @@ def _places(read: np.ndarray, axis: int) -> np.ndarray:
     return inner[np.linspace(0, len(inner) - 1, MAX_PLACES).round().astype(int)]
 
 
-def _test(residuals: Residuals, clipped: np.ndarray, v: int, axis: int,
-          place: int) -> tuple[float, np.ndarray] | None:
-    """Return the sum of squares that a slip explains, m^2, and its size (phi, Re, Im tau)."""
+def _explained(residuals: Residuals, clipped: np.ndarray, v: int, axis: int,
+               place: int) -> float | None:
+    """Return the sum of squares that a slip explains, m^2; None where it cannot be tested."""
     system = residuals.problem.system
     grid = system.grid
     after = grid.read[v].copy()
@@ -194,11 +201,10 @@ def _test(residuals: Residuals, clipped: np.ndarray, v: int, axis: int,
     if np.linalg.matrix_rank(normal, tol=1e-9 * max(np.trace(normal), 1e-300)) < 3:
         return None
     right = np.einsum("avij,vij,vij->a", np.conj(projected), clipped, grid.weight).real
-    parameters = np.linalg.solve(normal, right)
-    return float(right @ parameters), parameters
+    return float(right @ np.linalg.solve(normal, right))
 
 
-def split_view(measurements: Measurements, slip: Slip) -> Measurements:
+def split_view(measurements: Measurements, slip: SlipPlace) -> Measurements:
     """Return the measurement with the view as two placements, before and after the slip.
 
     Its angular lines become a placement of their own: when they were read is not known.

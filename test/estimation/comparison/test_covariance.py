@@ -103,6 +103,14 @@ def test_a_reference_adds_nothing_to_the_uncertainty_of_squareness():
     assert scaled == pytest.approx(plain, rel=0.05)
 
 
+def test_the_uncertainty_of_squareness_of_an_old_result_has_its_size():
+    """A result that does not keep what was read tells its noise by its uncertainty map."""
+    result = calibrate(measured(PLAN, 1))
+    old = replace(result, views=tuple(replace(v, read_grid=None, read_angular=None)
+                                      for v in result.views))
+    assert first_order_u(old) == pytest.approx(first_order_u(result), rel=0.02)
+
+
 def ratios(plan, seeds, *, options=None, keep_scale=False, shaken=0.0):
     """Return the chi2 ratios (pairs, 2) of calibrations of one stage, XY and theta."""
     options, out = options or Options(), []

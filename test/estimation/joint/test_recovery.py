@@ -53,6 +53,23 @@ def test_hu_simulation_comes_back_exactly(size, pitch, lines, sense):
     assert np.nanmax(found.error_map.u_gx) < EXACT
 
 
+@pytest.mark.parametrize("shape", [(7, 7), (9, 5)])
+@pytest.mark.parametrize("sense", Sense)
+def test_squareness_and_scale_difference_are_those_of_a_straight_fit_to_the_map(shape, sense):
+    """O and R of Gx = O y + R x + Fx, Gy = O x - R y + Fy (Hu eq. 6), also where marks miss."""
+    artifact = Artifact(shape[0], 0.01, 0, shape[1])
+    _, readings = measured(plan_of("0,90,tx,ty", artifact), sense=sense, missing=0.2)
+    emap = calibrate(readings).error_map
+    x, y, known = artifact.x_m, artifact.y_m, emap.valid
+    one, zero = np.ones_like(x), np.zeros_like(x)
+    columns = [(y, x), (x, -y), (one, zero), (zero, one), (-y, x), (x, y)]
+    design = np.array([np.concatenate([cx[known], cy[known]]) for cx, cy in columns]).T
+    right = np.concatenate([emap.gx[known], emap.gy[known]])
+    wanted = np.linalg.lstsq(design, right, rcond=None)[0][:2]
+    assert np.abs(wanted).min() > 1e-8
+    assert (emap.nonorthogonality, emap.scale_difference) == pytest.approx(tuple(wanted), rel=1e-6)
+
+
 @pytest.mark.parametrize("names", ["0,90,tx", "0,90,180,tx", "90,180,tx", "0,270-2tx+ty,tx,ty",
                                    "0,90,180,270,tx,ty", "90+tx,-tx,ty"])
 @pytest.mark.parametrize("shape", [(7, 7), (9, 5), (5, 9)])

@@ -78,6 +78,7 @@ def test_the_prediction_for_marks_counts_the_repeats_of_each_view():
     def of(*repeats):
         views = tuple(replace(v, repeats=n) for v, n in zip(plan.views, repeats, strict=True))
         found = predict(planned_system(plan.artifact, views), plan.artifact, ThetaDatum.ZERO_MEAN)
+        assert found.u_theta.shape == (0,)  # a plate without lines
         return found.ux[np.isfinite(found.ux)] ** 2
 
     once, twice, one_more = of(1, 1, 1), of(2, 2, 2), of(1, 1, 2)

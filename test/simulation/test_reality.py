@@ -1,0 +1,42 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The cases of `make reality`: how the plates lie, and how a result is compared with the truth."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from selfcal_ros.estimation.api import calibrate
+from selfcal_ros.simulation.machine import random_truth
+from selfcal_ros.simulation.reality import MODEL, compared, resistant
+from selfcal_ros.simulation.truth import simulate_measurements
+
+
+def test_the_plan_that_resists_turns_and_shifts_both_ways():
+    plan = resistant()
+    poses = {view.name: view.lattice_pose(plan.artifact) for view in plan.views}
+    assert {name: (pose.quarter_turns, pose.shift) for name, pose in poses.items()
+            if name != "line"} == {
+        "identity": (0, (0, 0)), "rot90": (1, (0, 0)), "shift_x": (0, (1, 0)),
+        "shift_-x": (0, (-1, 0)), "shift_y": (0, (0, 1))}
+    assert (poses["line"].shift, poses["line"].turn_lines) == ((0, 0), 1)
+    assert [view.grid for view in plan.views] == [True] * 5 + [False]
+    assert all(view.angular for view in plan.views)
+
+
+def test_a_site_that_is_wrong_by_more_than_its_u_is_counted_and_sized():
+    plan, rng = resistant(1), np.random.default_rng(3)
+    truth = random_truth(plan.artifact, len(plan.views), rng, MODEL)
+    result = calibrate(simulate_measurements(truth, plan, rng, sigma_m=20e-9,
+                                             sigma_theta_rad=1e-5))
+    right = compared(replace(result, error_map=replace(
+        result.error_map, gx=truth.g[0].copy(), gy=truth.g[1].copy(),
+        g_theta=truth.g_theta + 1e-3)), truth)
+    assert right.error_m < 1e-15 and right.within == 1.0
+    assert right.z_theta < 1e-6  # a common angle is no error
+    gx = truth.g[0].copy()
+    gx[3, 4] += 2e-7
+    wrong = compared(replace(result, error_map=replace(
+        result.error_map, gx=gx, gy=truth.g[1].copy())), truth)
+    assert wrong.error_m == pytest.approx(2e-7, rel=0.05)
+    assert wrong.within == pytest.approx(1 - 1 / 242, abs=1e-9)
