@@ -3,9 +3,9 @@
 SHELL := /bin/bash
 BIN := .venv/bin
 
-.PHONY: setup demo test test-oldest lint bench mutants reality clean help
+.PHONY: setup demo test test-oldest lint bench soak mutants reality clean help
 help:
-	@echo "make setup | demo | test | test-oldest | lint | bench | mutants | reality | clean"
+	@echo "make setup | demo | test | test-oldest | lint | bench | soak | mutants | reality | clean"
 setup:
 	@tools/setup.sh
 demo: setup
@@ -25,6 +25,8 @@ bench: setup
 		--target build/rivals "$$rival" || echo "bench: $$rival is left out: no such wheel here"; \
 		done; touch build/rivals/.complete; }
 	@PYTHONPATH=build/rivals $(BIN)/python test/bench/run.py
+soak: setup  # e.g. make soak HOURS=8 SIZE=21
+	@$(BIN)/python tools/soak.py --hours $(or $(HOURS),1) --size $(or $(SIZE),21)
 mutants: setup  # e.g. make mutants MUTANTS="--number 200 --only selfcal_ros/estimation"
 	@$(BIN)/python tools/mutants.py $(MUTANTS)
 reality: setup  # minutes; e.g. make reality REALITY="--runs 10 --only drift"

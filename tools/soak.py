@@ -1,0 +1,289 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`make soak`: a whole shift through the real nodes, as fast as they take it without a loss.
+
+An encoder at 1 kHz and a detection a second by their stamps; collector with a journal, solver and
+sequencer as processes of their own. A first part runs in real time and tells the collector's share
+of a core. At the end the map is compared with that of the journal.
+
+    make soak [HOURS=8] [SIZE=101]
+"""
+
+import argparse
+import contextlib
+import os
+import shutil
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import rclpy
+from rclpy.experimental.events_executor import EventsExecutor
+from rclpy.node import Node
+from selfcal_msgs.srv import SaveMap
+from std_srvs.srv import Trigger
+
+from selfcal_ros.bagio.build import build
+from selfcal_ros.bagio.schemas import typestore
+from selfcal_ros.cli.processes import domain, process
+from selfcal_ros.collection.messages import Phase
+from selfcal_ros.files import read_json
+from selfcal_ros.messages import from_model
+from selfcal_ros.nodes import names
+
+ROOT = Path(__file__).parents[1]
+sys.path.insert(0, str(ROOT / "test" / "bench"))
+
+from ingest import simulated  # noqa: E402
+from ingest_bags import FRONT, Recording, detection_rows, encoder_rows, recording  # noqa: E402
+
+FOLDER = ROOT / "build" / "soak"
+ENCODER_NS, SIGMA_M = 1_000_000, 2e-8
+WINDOW, BATCH = 1500, 100
+PATIENCE_S = 300.0
+TICKS = os.sysconf("SC_CLK_TCK")
+NODES = ("measurement_collector", "solver", "pose_sequencer")
+
+
+def shift(hours: float, size: int) -> Recording:
+    """Return a run of three views, a detection a second on average, with noise."""
+    plan, _, measurements, _ = simulated(size, 1)
+    marks = sum(len(view.m) for view in measurements.views)
+    repeats = max(1, round(3600 * hours / marks))
+    part = recording(plan, measurements, repeats=repeats, encoder_ns=ENCODER_NS,
+                     visit_ns=max(round(3600e9 * hours / marks), 50_000_000))
+    rng = np.random.default_rng(1)
+    for axis in ("x", "y"):
+        part.detections[axis] += rng.normal(0, SIGMA_M, len(part.detections[axis]))
+    return part
+
+
+def payloads(rows: np.ndarray) -> list[bytes]:
+    """Return the CDR bytes in message records."""
+    return [row.tobytes()[FRONT.itemsize:] for row in rows]
+
+
+def batches(part: Recording) -> Iterator[tuple[object, list[tuple[str, bytes]]]]:
+    """Yield all messages in the order of their stamps, a tenth of a second at a time.
+
+    With each batch comes the command before which a view is over, or None.
+    """
+    marks = part.detections["stamp"]
+    edges = [command.stamp_ns for command in part.commands] + [np.iinfo(np.int64).max]
+    for command, end in zip(part.commands, edges[1:], strict=True):
+        message = build(typestore(), "selfcal_msgs/msg/ViewCommand",
+                        from_model.command(command, "stage"))
+        yield command, [("command", bytes(typestore().serialize_cdr(
+            message, "selfcal_msgs/msg/ViewCommand")))]
+        first, last = np.searchsorted(part.stamps_ns, (command.stamp_ns, end))
+        for start in range(int(first), int(last), BATCH):
+            stamps = part.stamps_ns[start:min(start + BATCH, last)]
+            chosen = slice(*np.searchsorted(marks, (stamps[0], stamps[-1] + ENCODER_NS)).tolist())
+            found = [(int(t), "encoder", data) for t, data in zip(
+                stamps, payloads(encoder_rows(part, stamps, 1)), strict=True)]
+            found += [(int(t), "detection", data) for t, data in zip(
+                marks[chosen], payloads(detection_rows(part, chosen, 2)), strict=True)]
+            yield None, [item[1:] for item in sorted(found, key=lambda item: item[0])]
+
+
+class Cell:
+    """Publishes what a cell would, and listens to what the nodes tell."""
+
+    def __init__(self) -> None:
+        rclpy.init()
+        self.node, self.executor = Node("soak"), EventsExecutor()
+        self.executor.add_node(self.node)
+        self.publishers = {kind: self.node.create_publisher(topic.type, topic.name, topic.qos)
+                           for kind, topic in (("encoder", names.ENCODER), ("command",
+                                               names.COMMAND), ("detection", names.DETECTIONS))}
+        self.sent = dict.fromkeys(("encoder", "detection", "command"), 0)
+        self.heard = (0, 0, 0)
+        self.health: dict[str, str] = {}
+        self.status_ms: list[float] = []
+        self.worst_ms, self.views_solved, self.warned = 0.0, 0, set()
+        for topic, take in ((names.of_node(NODES[0], names.RECEIVED), self._on_received),
+                            (names.of_node(NODES[0], names.HEALTH), self._on_health),
+                            (names.SUMMARY, self._on_summary)):
+            self.node.create_subscription(topic.type, topic.name, take, topic.qos)
+
+    def _on_received(self, message: object) -> None:
+        self.heard = tuple(message.data)
+
+    def _on_health(self, status: object) -> None:
+        self.health = {item.key: item.value for item in status.values}
+        if status.level != b"\0":
+            self.warned.add(status.message)
+        if float(self.health.get("status_ms", 0)) > 0:
+            self.status_ms.append(float(self.health["status_ms"]))
+            self.worst_ms = max(self.worst_ms, float(self.health["status_ms_max"]))
+
+    def _on_summary(self, message: object) -> None:
+        self.views_solved = message.views_done
+
+    def until(self, condition: Callable[[], bool], what: str) -> None:
+        """Spin until `condition` holds."""
+        end = time.monotonic() + PATIENCE_S
+        while not condition():
+            if time.monotonic() > end:
+                raise SystemExit(f"soak: waited in vain for {what}")
+            self.executor.spin_once(timeout_sec=0.002)
+
+    @property
+    def under_way(self) -> int:
+        """Messages that the collector has not told as received."""
+        return sum(self.sent.values()) - sum(self.heard)
+
+    def publish(self, batch: list[tuple[str, bytes]]) -> None:
+        """Publish a batch once the collector has kept up."""
+        self.until(lambda: self.under_way < WINDOW, "the collector")
+        for kind, data in batch:
+            self.publishers[kind].publish(data)
+            self.sent[kind] += 1
+
+    def call(self, kind: type, name: str, **fields: object) -> object:
+        """Call a service and return its answer."""
+        client = self.node.create_client(kind, name)
+        self.until(client.service_is_ready, name)
+        future = client.call_async(kind.Request(**fields))
+        self.until(future.done, f"the answer of {name}")
+        return future.result()
+
+
+def cpu_s(pid: int) -> float:
+    """Return the CPU time of a process, s."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / TICKS
+
+
+def peak_mb(pid: int) -> float:
+    """Return the largest resident memory of a process."""
+    [line] = (line for line in Path(f"/proc/{pid}/status").read_text().splitlines()
+              if line.startswith("VmHWM"))
+    return int(line.split()[1]) / 1024
+
+
+def in_time(cell: Cell, stream: Iterator, seconds: float, pid: int) -> float:
+    """Publish for some seconds in real time; return the collector's share of a core."""
+    began, used = time.monotonic(), cpu_s(pid)
+    for tenth, (_, batch) in enumerate(stream):
+        for number, item in enumerate(batch):
+            due = began + (tenth + number / len(batch)) * BATCH * ENCODER_NS * 1e-9
+            while time.monotonic() < due:
+                cell.executor.spin_once(timeout_sec=max(due - time.monotonic(), 0))
+            cell.publish([item])
+        if time.monotonic() - began >= seconds:
+            break
+    return (cpu_s(pid) - used) / (time.monotonic() - began)
+
+
+def run_shift(cell: Cell, part: Recording, pid: int, realtime_s: float) -> dict[str, object]:
+    """Feed the shift; return what was measured on the way."""
+    stream, last = batches(part), [int(part.detections["stamp"].searchsorted(c.stamp_ns))
+                                   for c in part.commands[2:]]
+    ends = set(last)
+    share, latencies = float("nan"), []
+    began = time.monotonic()
+    for command, batch in stream:
+        closing = any(cell.sent["detection"] + number + 1 in ends for number in range(
+            sum(kind == "detection" for kind, _ in batch)))
+        if closing:
+            latencies.append(closing_view(cell, batch, ends))
+        else:
+            cell.publish(batch)
+        if command is not None and command.phase == Phase.MEASURE and command.view_index == 0:
+            share = in_time(cell, stream, realtime_s, pid)
+            began = time.monotonic()
+    cell.until(lambda: cell.under_way <= 0, "the last messages")
+    return {"share": share, "latencies": latencies, "seconds": time.monotonic() - began}
+
+
+def closing_view(cell: Cell, batch: list[tuple[str, bytes]], ends: set[int]) -> float:
+    """Publish the batch with the last reading of a view at leisure; return the time to its map."""
+    cell.until(lambda: cell.under_way <= 0, "all but the last reading")
+    views, began = cell.views_solved, None
+    for item in batch:
+        cell.publish([item])
+        if began is None and item[0] == "detection" and cell.sent["detection"] in ends:
+            began = time.monotonic()
+        end = time.monotonic() + ENCODER_NS * 1e-9
+        while began is not None and time.monotonic() < end:
+            cell.executor.spin_once(timeout_sec=max(end - time.monotonic(), 0))
+    cell.until(lambda: cell.views_solved > views, "the solution")
+    return time.monotonic() - began
+
+
+def same_maps(live: Path, journal: Path) -> bool:
+    """Return whether a saved map is, bit for bit, that of the journal."""
+    out = FOLDER / "offline.json"
+    done = subprocess.run([sys.executable, "-m", "selfcal_ros", "solve", str(journal), "--quiet",
+                           "-o", str(out)], check=False)
+    if done.returncode not in (0, 5):
+        raise SystemExit(f"soak: selfcal solve {journal} ends with code {done.returncode}")
+    return read_json(live)["error_map"] == read_json(out)["error_map"]
+
+
+def soak(args: argparse.Namespace, environment: dict) -> int:
+    """Run the nodes, feed them, print the figures; 1 if something was lost or differs."""
+    part = shift(args.hours, args.size)
+    shutil.rmtree(FOLDER, ignore_errors=True)
+    FOLDER.mkdir(parents=True)
+    more = {"measurement_collector": [f"journal:={FOLDER}"],
+            "solver": [f"result_folder:={FOLDER}"]}
+    with contextlib.ExitStack() as stack:
+        running = {node: stack.enter_context(process(
+            f"selfcal_ros.nodes.{node}",
+            ["--ros-args", "--log-level", "error",
+             *(word for p in more.get(node, []) for word in ("-p", p))],
+            environment)) for node in NODES}
+        cell, pid = Cell(), running["measurement_collector"].pid
+        for kind, readers in (("encoder", 1), ("detection", 1), ("command", 3)):
+            cell.until(lambda kind=kind, readers=readers: cell.publishers[
+                kind].get_subscription_count() >= readers, f"subscribers of {kind}")
+        used = cpu_s(pid)
+        found = run_shift(cell, part, pid, args.realtime)
+        used = cpu_s(pid) - used
+        finished = cell.call(Trigger, "measurement_collector/finish")
+        saved = cell.call(SaveMap, "solver/save_map", path=str(FOLDER / "live.json"))
+        lost = sum(cell.sent.values()) - sum(cell.heard)
+        memory = {node: peak_mb(child.pid) for node, child in running.items()}
+    if not (finished.success and saved.success):
+        raise SystemExit(f"soak: {finished.message}; {saved.message}")
+    [journal] = FOLDER.glob("journal_*")
+    equal = same_maps(FOLDER / "live.json", journal)
+    total = sum(cell.sent.values())
+    size = sum(file.stat().st_size for file in journal.iterdir()) / 1e9
+    print(f"hours {args.hours:g}  plate {args.size} x {args.size}  encoder {cell.sent['encoder']}  "
+          f"detections {cell.sent['detection']}")
+    print(f"speed           {total / found['seconds'] / 1e3:.1f} k messages/s, lost {lost}")
+    print("memory          " + ", ".join(f"{node} {mb:.0f} MB" for node, mb in memory.items()))
+    print(f"status          median {statistics.median(cell.status_ms):.1f} ms, "
+          f"max {cell.worst_ms:.1f} ms")
+    print(f"collector's CPU {100 * found['share']:.1f} % of a core in real time at 1 kHz "
+          f"({args.realtime:g} s), {1e6 * used / total:.1f} us a message at full speed")
+    print("latency         last reading to published solution, ms: "
+          + ", ".join(f"{1e3 * latency:.0f}" for latency in found["latencies"]))
+    print(f"journal         {size:.2f} GB, lag {cell.health.get('journal_lag_s')} s, lost "
+          f"{cell.health.get('journal_lost')}; its map is "
+          + ("the live one, bit for bit" if equal else "ANOTHER than the live one"))
+    for line in sorted(cell.warned):
+        print(f"warned          {line}")
+    return 0 if equal and not lost else 1
+
+
+def main() -> int:
+    """Read the arguments and run in a ROS domain of its own."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--hours", type=float, default=1.0, help="length by the stamps")
+    parser.add_argument("--size", type=int, default=21, help="marks a side of the plate")
+    parser.add_argument("--realtime", type=float, default=30.0, help="seconds in real time, s")
+    args = parser.parse_args()
+    with domain() as environment:
+        os.environ.update(environment)
+        return soak(args, environment)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
