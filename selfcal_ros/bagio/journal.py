@@ -127,7 +127,7 @@ class Journal:
         self.earlier = [path / file.name for file in metadata.files]
         self._lock, self._metadata = lock, metadata
         self._channels: dict[str, int] = {}
-        self._waiting: list[tuple[str, int, bytes]] = []
+        self._waiting: list[tuple[str, bytes, int]] = []
         self._sequence: Counter = Counter()
         self._failed: OSError | None = None
         self._file = JournalFile(path / f"{path.name}_{len(metadata.files)}.mcap")
@@ -174,9 +174,7 @@ class Journal:
 
     def write(self, topic: str, data: bytes, log_time_ns: int) -> None:
         """Take one message, as received; it is safe once `flush` has returned."""
-        record = message_record(self._channels[topic], self._sequence[topic], log_time_ns, data)
-        self._sequence[topic] += 1
-        self._waiting.append((topic, log_time_ns, record))
+        self._waiting.append((topic, data, log_time_ns))
 
     def flush(self) -> None:
         """Hand what was taken to the system, all at once; the disk has it within a second.
@@ -198,15 +196,21 @@ class Journal:
             if failed is not None:
                 raise failed
 
-    def _append(self, waiting: list[tuple[str, int, bytes]]) -> None:
+    def _append(self, waiting: list[tuple[str, bytes, int]]) -> None:
+        records, times = [], {topic: [] for topic in {item[0] for item in waiting}}
+        for topic, data, log_time_ns in waiting:
+            records.append(message_record(self._channels[topic], self._sequence[topic],
+                                          log_time_ns, data))
+            self._sequence[topic] += 1
+            times[topic].append(log_time_ns)
         try:
-            self._file.append(b"".join(record for _, _, record in waiting))
+            self._file.append(b"".join(records))
         except OSError:
             self.n_lost += len(waiting)
             raise
-        for topic, log_time_ns, _ in waiting:
-            self._file.content.add(self._channels[topic], log_time_ns)
-            self._metadata.topics[topic].count += 1
+        for topic, logged in times.items():
+            self._file.content.add(self._channels[topic], logged)
+            self._metadata.topics[topic].count += len(logged)
 
     def _sync_on(self) -> None:
         """Synchronise with the disk, in a thread of its own: it may take its time."""

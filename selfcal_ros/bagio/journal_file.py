@@ -62,10 +62,13 @@ class Content:
         else:
             self.channels[record.id] = record
 
-    def add(self, channel: int, log_time_ns: int) -> None:
-        """Count one message."""
-        self.entry.add(log_time_ns)
-        self.counts[channel] = self.counts.get(channel, 0) + 1
+    def add(self, channel: int, log_times_ns: list[int]) -> None:
+        """Count messages by their times of logging, at least one."""
+        entry, first, last = self.entry, min(log_times_ns), max(log_times_ns)
+        entry.first_ns = first if entry.first_ns is None else min(entry.first_ns, first)
+        entry.last_ns = max(entry.last_ns, last)
+        entry.count += len(log_times_ns)
+        self.counts[channel] = self.counts.get(channel, 0) + len(log_times_ns)
 
 
 def message_record(channel: int, sequence: int, log_time_ns: int, data: bytes) -> bytes:
@@ -211,13 +214,7 @@ def _count(content: Content, block: Block, keep: str) -> None:
     """Count the messages of a block, and keep those that are asked for."""
     for number in block.channels():
         part = block[block.fronts["channel"] == number]
-        times = part.fronts["log_time"]
-        content.counts[number] = content.counts.get(number, 0) + len(part)
-        entry = content.entry
-        first, last = int(times.min()), int(times.max())
-        entry.first_ns = first if entry.first_ns is None else min(entry.first_ns, first)
-        entry.last_ns = max(entry.last_ns, last)
-        entry.count += len(part)
+        content.add(number, part.fronts["log_time"].tolist())
         channel = content.channels.get(number)
         if channel is not None and f"/{channel.topic}".endswith(f"/{keep}"):
             content.kept += [(number, data) for data in part.payloads]

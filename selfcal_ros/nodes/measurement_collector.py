@@ -12,7 +12,7 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes.encoder_input import EncoderInput
 from selfcal_ros.nodes.filling import fill
-from selfcal_ros.nodes.managed import ManagedNode
+from selfcal_ros.nodes.polling import ByTheClock, PollingNode
 from selfcal_ros.nodes.publishers import offered
 from selfcal_ros.nodes.running import run
 from selfcal_ros.sessions.collecting import CollectingSession
@@ -21,13 +21,14 @@ from selfcal_ros.sessions.ports import Diagnosis
 from selfcal_ros.sessions.receiving.journal_keeper import JournalKeeper
 from selfcal_ros.sessions.receiving.reception import Reception
 
-TICK_S = 0.02
+TICK_S = 0.04
+"""Time between two looks at what has come: much longer would be seen in the latency of a map."""
 
 
-class MeasurementCollector(ManagedNode):
+class MeasurementCollector(PollingNode):
     """Feeds a `CollectingSession`; publishes ViewStatus and ViewMeasurement.
 
-    Messages are received as bytes; a tick writes those that have come to the journal, decodes them
+    A tick takes the messages that have come as bytes, writes them to the journal, decodes them
     together, and gives them to the session.
     """
 
@@ -35,6 +36,7 @@ class MeasurementCollector(ManagedNode):
         self.session: CollectingSession | None = None
         self._reception: Reception | None = None
         self._worker: ThreadPoolExecutor | None = None
+        self._detections: Any = None
         super().__init__("measurement_collector", **kwargs)
 
     def configure(self) -> None:
@@ -59,9 +61,10 @@ class MeasurementCollector(ManagedNode):
 
     def activate(self) -> None:
         """Listen to the cell and to the commands."""
-        self._detections = self.subscribe(names.DETECTIONS, self._on_detection, raw=True)
+        self._detections = self.subscribe(
+            names.DETECTIONS, ByTheClock(self._reception.detection), raw=True)
         self.subscribe_with_age(names.COMMAND, self._reception.command, raw=True)
-        EncoderInput(self, self._on_encoder, raw=True)
+        EncoderInput(self, ByTheClock(self._reception.encoder), raw=True)
         self.every(TICK_S, self._on_timer)
         self.service(Trigger, "~/finish", lambda request: self._finish())
 
@@ -71,7 +74,7 @@ class MeasurementCollector(ManagedNode):
             self._worker.shutdown(wait=False, cancel_futures=True)
         if self._reception is not None:
             self._reception.close()
-        self.session = self._reception = self._worker = None
+        self.session = self._reception = self._worker = self._detections = None
 
     def close(self) -> None:
         """Write what has come to the journal."""
@@ -81,16 +84,6 @@ class MeasurementCollector(ManagedNode):
         publisher = self._outputs[output]
         publisher.publish(fill(publisher.msg_type(), fields))
 
-    def _on_encoder(self, data: bytes) -> None:
-        self._reception.encoder(data)
-        if self._reception.full:
-            self._drain()
-
-    def _on_detection(self, data: bytes) -> None:
-        self._reception.detection(data)
-        if self._reception.full:
-            self._drain()
-
     def _on_timer(self) -> None:
         self._drain()
         if not self._reception.restoring:
@@ -98,6 +91,7 @@ class MeasurementCollector(ManagedNode):
 
     def _drain(self) -> None:
         """Take what has come and tell the counts, so that a player can keep pace."""
+        self.poll()
         if self._reception.drain():
             self._received.publish(names.RECEIVED.type(
                 data=list(self.session.collector.received.values())))

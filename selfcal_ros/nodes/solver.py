@@ -42,7 +42,7 @@ class Solver(ManagedNode):
 
     def activate(self) -> None:
         """Listen to the collector and to the commands."""
-        self.subscribe(names.MEASUREMENT, self.session.take_measurement)
+        self.subscribe(names.MEASUREMENT, self._on_measurement)
         self.subscribe(names.COMMAND, self.session.take_command)
         self.every(TICK_S, self._on_timer)
         self.service(LoadMap, "~/load_map", lambda request: self.session.load(request.path))
@@ -64,6 +64,11 @@ class Solver(ManagedNode):
         else:
             publisher = self._outputs[output]
             publisher.publish(fill(publisher.msg_type(), fields))
+
+    def _on_measurement(self, message: Any) -> None:
+        self.session.take_measurement(message)
+        if self._running is None:
+            self._begin()
 
     def _on_timer(self) -> None:
         if self._running is not None and self._running.done():

@@ -175,3 +175,42 @@ def test_a_wrong_sense_is_told_in_the_log_and_in_the_health():
     told = desk.told()
     assert told.level == Level.WARN
     assert told.message.startswith(line)
+
+
+def complete(desk) -> bool:
+    return desk.hands.of("status")[-1]["complete"]
+
+
+@pytest.mark.parametrize("missing, told", [(0, True), (1, False)])
+def test_a_view_is_told_complete_at_once_whatever_the_period(missing, told):
+    desk, events = Desk(status_period=60.0), first_view()
+    last = max(event.stamp_ns for event in events if isinstance(event, Detection))
+    before = [event for event in events if event.stamp_ns < last]
+    dropped = [event for event in before[60:] if isinstance(event, Detection)][:missing]
+    desk.feed(before[:60])
+    desk.session.tick()
+    desk.feed([event for event in before[60:] if event not in dropped])
+    desk.session.tick()
+    desk.feed([event for event in events if event.stamp_ns == last])
+    desk.hands.pass_time(0.001)
+    desk.session.tick()
+    assert len(desk.hands.of("status")) == 1  # no sample beside the last exposure yet
+    desk.feed([event for event in events if event.stamp_ns > last])
+    desk.session.tick()
+    assert complete(desk) is told
+    assert len(desk.hands.of("status")) == 1 + told
+    assert len(desk.hands.of("measurement")) == told
+
+
+def test_the_health_tells_what_a_status_costs():
+    desk = Desk(status_period=0.02)
+    assert desk.told().values["status_ms"] == desk.told().values["status_ms_max"] == "0.0"
+    desk.feed(first_view())
+    for spent in (0.001, 0.007, 0.002):
+        desk.hands.costs = spent
+        desk.hands.pass_time(1)
+        desk.session.take_detections(detection_table(next(
+            event for event in first_view() if isinstance(event, Detection))))
+        desk.session.tick()
+    assert desk.told().values["status_ms"] == "2.0"
+    assert desk.told().values["status_ms_max"] == "7.0"

@@ -14,12 +14,17 @@ class Hands:
     """A clock that stands until it is moved, and lists of what a session did."""
 
     def __init__(self) -> None:
-        self.seconds = 100.0
+        self.seconds, self.costs = 100.0, 0.0
         self.published: list[tuple[str, dict]] = []
         self.said: list[tuple[Level, str]] = []
-        self.ports = Ports(lambda output, fields: self.published.append((output, fields)),
+        self.ports = Ports(self._publish,
                            lambda level, line: self.said.append((level, line)),
                            lambda: self.seconds, lambda: self.now_ns)
+
+    def _publish(self, output: str, fields: dict) -> None:
+        """Take what is published; a status takes the time `costs`."""
+        self.published.append((output, fields))
+        self.seconds += self.costs if output == "status" else 0.0
 
     @property
     def now_ns(self) -> int:

@@ -19,9 +19,6 @@ from selfcal_ros.sessions.collecting import CollectingSession
 from selfcal_ros.sessions.ports import Diagnosis, Level
 from selfcal_ros.sessions.receiving.journal_keeper import JournalKeeper, TakenUp, bad_input, take_up
 
-FULL = 500
-"""Messages that are taken at once, whatever the time."""
-
 
 class Reception:
     """Holds what has been received until `drain`.
@@ -60,25 +57,17 @@ class Reception:
         """Whether a journal is still being read."""
         return self._restoring is not None
 
-    def encoder(self, data: bytes) -> None:
+    def encoder(self, data: bytes, received_ns: int) -> None:
         """Take a sensor_msgs/JointState as received."""
-        self._put(ENCODER_TOPIC, data, is_older=False)
+        self._waiting.append((ENCODER_TOPIC, data, received_ns, False))
 
-    def detection(self, data: bytes) -> None:
+    def detection(self, data: bytes, received_ns: int) -> None:
         """Take a selfcal_msgs/MarkDetection as received."""
-        self._put(DETECTION_TOPIC, data, is_older=False)
+        self._waiting.append((DETECTION_TOPIC, data, received_ns, False))
 
     def command(self, data: bytes, is_older: bool) -> None:
         """Take a selfcal_msgs/ViewCommand as received; `is_older` than this node's listening."""
-        self._put(COMMAND_TOPIC, data, is_older=is_older)
-
-    def _put(self, topic: str, data: bytes, *, is_older: bool) -> None:
-        self._waiting.append((topic, data, time.time_ns(), is_older))
-
-    @property
-    def full(self) -> bool:
-        """Whether so much waits that it should be taken now."""
-        return len(self._waiting) >= FULL
+        self._waiting.append((COMMAND_TOPIC, data, time.time_ns(), is_older))
 
     def drain(self) -> bool:
         """Write what has come to the journal, then give it to the session; tell if it has anything.

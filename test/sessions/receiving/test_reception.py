@@ -10,7 +10,7 @@ from selfcal_ros.bagio import journal_file
 from selfcal_ros.bagio.journal import resume
 from selfcal_ros.bagio.offline import collect_bag
 from selfcal_ros.collection.digest import readings_digest
-from selfcal_ros.collection.messages import Command, Detection, EncoderSample, Phase
+from selfcal_ros.collection.messages import Command, Detection, Phase
 from selfcal_ros.errors import InputError
 from selfcal_ros.messages.topics import COMMAND_TOPIC, DETECTION_TOPIC, ENCODER_TOPIC, INPUT_TOPICS
 from selfcal_ros.sessions.collecting import CollectingSession
@@ -45,7 +45,7 @@ class Desk:
                 self.reception.command(data, is_older)
             else:
                 (self.reception.detection if isinstance(event, Detection)
-                 else self.reception.encoder)(data)
+                 else self.reception.encoder)(data, 0)
         return self
 
     def read(self):
@@ -96,20 +96,11 @@ def test_bytes_give_the_readings_of_the_messages(events, expected):
     assert not desk.refused
 
 
-@pytest.mark.parametrize("number, full", [(499, False), (500, True)])
-def test_it_is_full_at_500_messages(number, full):
-    desk = Desk().receive([EncoderSample(i, ("x",), (0.0,)) for i in range(number)])
-    assert desk.reception.full is full
-    assert desk.reception.drain()
-    assert not desk.reception.full
-    assert not desk.reception.drain()
-
-
 def test_what_cannot_be_decoded_is_counted_by_topic_and_the_rest_is_used(events, expected):
     desk = Desk()
     for _ in range(2):
-        desk.reception.encoder(b"\0\1\0\0\xff\xff")
-    desk.reception.detection(b"")
+        desk.reception.encoder(b"\0\1\0\0\xff\xff", 0)
+    desk.reception.detection(b"", 0)
     desk.reception.command(b"\0\1\0\0" + b"\xff" * 40, False)
     assert desk.receive(events).read() == expected
     assert desk.refused == {f"decoding: 1 messages on {COMMAND_TOPIC}; 2 messages on "
