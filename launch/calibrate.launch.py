@@ -10,6 +10,8 @@ from launch.conditions import IfCondition
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
+from selfcal_ros.nodes.launching import end_if_it_cannot_start
+
 
 def generate_launch_description() -> LaunchDescription:
     share = Path(get_package_share_directory("selfcal_ros"))
@@ -18,7 +20,7 @@ def generate_launch_description() -> LaunchDescription:
     def node(name: str, *more: dict, **kwargs) -> Node:
         return Node(package="selfcal_ros", executable=name, name=name, output="screen",
                     namespace=argument("namespace"), parameters=[argument("params"), *more],
-                    **kwargs)
+                    on_exit=end_if_it_cannot_start, **kwargs)
 
     return LaunchDescription([
         DeclareLaunchArgument("namespace", default_value="", description="namespace of the cell"),

@@ -11,6 +11,8 @@ from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 
+from selfcal_ros.nodes.launching import end_if_it_cannot_start
+
 
 def generate_launch_description() -> LaunchDescription:
     share = Path(get_package_share_directory("selfcal_ros"))
@@ -23,7 +25,7 @@ def generate_launch_description() -> LaunchDescription:
             PythonLaunchDescriptionSource(str(share / "launch/calibrate.launch.py")),
             launch_arguments={"namespace": LaunchConfiguration("namespace")}.items()),
         Node(package="selfcal_ros", executable="bag_player", name="bag_player", output="screen",
-             namespace=LaunchConfiguration("namespace"),
+             namespace=LaunchConfiguration("namespace"), on_exit=end_if_it_cannot_start,
              parameters=[{"bag": LaunchConfiguration("bag"),
                           "rate": ParameterValue(LaunchConfiguration("rate"), value_type=float)}]),
     ])

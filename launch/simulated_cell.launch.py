@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A simulated cell that runs a plan by itself, optionally recorded."""
+"""A simulated cell that runs a plan by itself, optionally recorded by bag_recorder.
+
+`ros2 bag record` beside it wants --qos-profile-overrides-path config/rosbag2/record_qos.yaml.
+"""
 
 from pathlib import Path
 
@@ -11,22 +14,31 @@ from launch.launch_description_sources import PythonLaunchDescriptionSource
 from launch.substitutions import LaunchConfiguration, NotEqualsSubstitution
 from launch_ros.actions import Node
 
+from selfcal_ros.nodes.launching import end_if_it_cannot_start
+
 
 def generate_launch_description() -> LaunchDescription:
     share = Path(get_package_share_directory("selfcal_ros"))
-    params = str(share / "config/params/simulated_cell.yaml")
+    argument = LaunchConfiguration
+
+    def node(name: str, **kwargs) -> Node:
+        return Node(package="selfcal_ros", executable=name, name=name, output="screen",
+                    namespace=argument("namespace"), on_exit=end_if_it_cannot_start, **kwargs)
+
     return LaunchDescription([
         DeclareLaunchArgument("namespace", default_value="", description="namespace of the cell"),
         DeclareLaunchArgument("bag", default_value="", description="folder to record to; "
                               "empty = do not record"),
-        Node(package="selfcal_ros", executable="bag_recorder", name="bag_recorder",
-             namespace=LaunchConfiguration("namespace"), output="screen",
-             parameters=[{"bag": LaunchConfiguration("bag")}],
-             condition=IfCondition(NotEqualsSubstitution(LaunchConfiguration("bag"), ""))),
-        Node(package="selfcal_ros", executable="stage_simulator", name="stage_simulator",
-             namespace=LaunchConfiguration("namespace"), output="screen", parameters=[params]),
+        DeclareLaunchArgument("params", default_value=str(
+            share / "config/params/simulated_cell.yaml"), description="ROS parameter file for "
+            "all nodes"),
+        DeclareLaunchArgument("plan", default_value=str(share / "config/plans/resistant.yaml"),
+                              description="PLAN.yaml with plate and views"),
+        node("bag_recorder", parameters=[{"bag": argument("bag")}],
+             condition=IfCondition(NotEqualsSubstitution(argument("bag"), ""))),
+        node("stage_simulator", parameters=[argument("params")]),
         IncludeLaunchDescription(
             PythonLaunchDescriptionSource(str(share / "launch/calibrate.launch.py")),
-            launch_arguments={"params": params,
-                              "namespace": LaunchConfiguration("namespace")}.items()),
+            launch_arguments={name: argument(name)
+                              for name in ("params", "plan", "namespace")}.items()),
     ])

@@ -11,7 +11,7 @@ FILES = sorted((ROOT / "launch").glob("*.launch.py"))
 ARGUMENTS = {
     "calibrate.launch.py": {"namespace", "params", "plan", "compensate"},
     "replay.launch.py": {"bag", "rate", "namespace"},
-    "simulated_cell.launch.py": {"namespace", "bag"},
+    "simulated_cell.launch.py": {"namespace", "bag", "params", "plan"},
 }
 STARTED = {
     "calibrate.launch.py": {"measurement_collector", "solver", "pose_sequencer", "compensator"},

@@ -1,0 +1,94 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The launch files, run by the real launch and launch_testing; skipped where they are not."""
+
+import os
+import subprocess
+import sys
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+import yaml
+
+ROOT = Path(__file__).parents[2]
+NEEDED = ("rclpy", "selfcal_msgs", "launch", "launch_ros", "launch_testing")
+MISSING = [name for name in NEEDED if find_spec(name) is None]
+pytestmark = [pytest.mark.ros,
+              pytest.mark.skipif(bool(MISSING), reason=f"needs {' and '.join(MISSING)}")]
+PLAN = {"plan_id": "small", "artifact": {"grid_size": 5, "grid_pitch": 0.01, "angular_count": 8},
+        "views": [{"name": "identity"}, {"name": "turned", "rotation_deg": 90},
+                  {"name": "line", "rotation_deg": 45, "grid": False},
+                  {"name": "shifted", "translation_pitch": [1, 0]},
+                  {"name": "back", "translation_pitch": [-1, 0]}]}
+
+
+@pytest.fixture
+def run(monkeypatch):
+    """Return a function that runs a module in a ROS domain of its own."""
+    from selfcal_ros.cli.replay import domain
+
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    monkeypatch.delenv("ROS_DOMAIN_ID", raising=False)
+    with domain() as environment:
+        def call(*words: str) -> subprocess.CompletedProcess:
+            return subprocess.run([sys.executable, *words], check=False, capture_output=True,
+                                  text=True, timeout=400, cwd=ROOT,
+                                  env=os.environ | dict(environment))
+        yield call
+
+
+LAUNCH = """
+import sys
+from launch import LaunchDescription, LaunchService
+from launch.actions import IncludeLaunchDescription
+from launch.launch_description_sources import PythonLaunchDescriptionSource
+file, *arguments = sys.argv[1:]
+service = LaunchService(noninteractive=True)
+service.include_launch_description(LaunchDescription([IncludeLaunchDescription(
+    PythonLaunchDescriptionSource(file),
+    launch_arguments=[tuple(word.split(":=")) for word in arguments])]))
+sys.exit(service.run())
+"""
+
+
+def launched(run, name: str, *arguments: str) -> subprocess.CompletedProcess:
+    """Run a launch file to its end; return what it said."""
+    return run("-c", LAUNCH, f"launch/{name}", *arguments)
+
+
+def test_a_whole_calibration(run, tmp_path):
+    plan, params = tmp_path / "plan.yaml", tmp_path / "params.yaml"
+    plan.write_text(yaml.safe_dump(PLAN))
+    params.write_text((ROOT / "config/params/simulated_cell.yaml").read_text())
+    done = run("-m", "launch_testing.launch_test", "test/launch/whole_calibration.py",
+               f"plan:={plan}", f"params:={params}")
+    assert done.returncode == 0, done.stdout[-6000:] + done.stderr[-6000:]
+
+
+def test_a_recorder_that_cannot_start_ends_the_launch_with_the_reason(run, tmp_path):
+    (tmp_path / "bag").mkdir()
+    (tmp_path / "bag" / "kept").write_text("of somebody")
+    done = launched(run, "simulated_cell.launch.py", f"bag:={tmp_path / 'bag'}")
+    said = done.stdout + done.stderr
+    assert "cannot start; its last line above says why" in said
+    assert str(tmp_path / "bag") in said
+    assert "bag_recorder" in said
+
+
+def test_a_sequencer_without_its_plan_ends_the_launch_with_the_reason(run, tmp_path):
+    done = launched(run, "calibrate.launch.py", f"plan:={tmp_path / 'no.yaml'}")
+    said = done.stdout + done.stderr
+    assert "no.yaml: no such file; check the path" in said
+    assert "cannot start; its last line above says why" in said
+
+
+def test_an_exit_later_ends_nothing():
+    from types import SimpleNamespace
+
+    from selfcal_ros.nodes.launching import end_if_it_cannot_start
+
+    for code in (0, 1, -9, -2):
+        event = SimpleNamespace(process_name="solver-2", returncode=code)
+        assert end_if_it_cannot_start(event, None) == []
+    event = SimpleNamespace(process_name="solver-2", returncode=2)
+    assert len(end_if_it_cannot_start(event, None)) == 2
