@@ -20,6 +20,9 @@ from selfcal_ros.model.terms import (
     parse_terms,
 )
 
+BARE_Y = "y"
+"""ROS reads a bare y in a parameter file as true, and `ros2 param dump` writes it bare."""
+
 
 @dataclass(frozen=True)
 class Parameter:
@@ -36,6 +39,8 @@ class Parameter:
     def check(self, value: Any, where: str) -> Any:
         """Return `value` as the parameter's type, or raise InputError."""
         kind = type(self.default)
+        if value is True and self.default == BARE_Y:
+            value = BARE_Y
         if kind is list and isinstance(value, str | tuple):
             value = [value] if isinstance(value, str) else list(value)
         if kind is float and isinstance(value, int) and not isinstance(value, bool):
@@ -63,6 +68,8 @@ _SENSE = Parameter(
     choices=tuple(str(sense) for sense in Sense))
 _FRAME = Parameter("frame_id", "stage", "frame of published messages (REP-103)")
 _PLAN = Parameter("plan", "", "path of PLAN.yaml")
+_HARDWARE = Parameter("hardware_id", "", "name or serial number of the stage, in the health; "
+                      "empty = the namespace, or 'stage'")
 
 _AUTOSTART = Parameter("autostart", True, "configure and activate by itself; false = wait for a "
                        "lifecycle manager")
@@ -245,13 +252,15 @@ SIMULATOR = (
               "it", choices=("finite", "linear")),
 )
 NODE_PARAMETERS: dict[str, tuple[Parameter, ...]] = {
-    "measurement_collector": COLLECTOR,
-    "solver": SOLVER,
-    "pose_sequencer": SEQUENCER,
-    "compensator": COMPENSATOR,
-    "bag_player": PLAYER,
-    "bag_recorder": RECORDER,
-    "stage_simulator": SIMULATOR,
+    node: (*table, _HARDWARE) for node, table in {
+        "measurement_collector": COLLECTOR,
+        "solver": SOLVER,
+        "pose_sequencer": SEQUENCER,
+        "compensator": COMPENSATOR,
+        "bag_player": PLAYER,
+        "bag_recorder": RECORDER,
+        "stage_simulator": SIMULATOR,
+    }.items()
 }
 ROS_OWN = ("use_sim_time", "start_type_description_service")
 

@@ -6,17 +6,19 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.clock import Clock, ClockType
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 
-from selfcal_ros.collection.parameters import NODE_PARAMETERS, Parameter, parameter_values
+from selfcal_ros.collection.parameters import BARE_Y, NODE_PARAMETERS, parameter_values
 from selfcal_ros.errors import ExitCode, SelfcalError, printable
+from selfcal_ros.nodes.descriptors import descriptor
+from selfcal_ros.nodes.filling import status_of
 from selfcal_ros.nodes.names import HEALTH, Topic, private
 from selfcal_ros.nodes.publishers import mismatched, others_publishing
+from selfcal_ros.sessions.clocks import RosTime
 from selfcal_ros.sessions.health import Losses, Refusals, merged
 from selfcal_ros.sessions.ports import Diagnosis, Level, Ports
 
@@ -39,10 +41,14 @@ class NodeBase:
         self.values = parameter_values(name, overrides, f"parameters of {name}")
         for parameter in NODE_PARAMETERS[name]:  # the checked value: 2 is a good 2.0 here
             self.declare_parameter(parameter.name, self.values[parameter.name],
-                                   _descriptor(parameter), ignore_override=True)
+                                   descriptor(parameter), ignore_override=True)
+        for key in (key for key, value in overrides.items() if value is True):
+            if self.values.get(key) == BARE_Y:
+                self.say(Level.OK, f"{key}: true is a bare y as ROS reads it; taken as 'y'")
         self.frame_id = self.values.get("frame_id", "stage")
         self.refusals = Refusals(self.say, time.monotonic)
         self.losses = Losses(self.say, time.monotonic)
+        self._ros_time = RosTime(self.say)
         self.alone_on: list[str] = []
         self._heard_on: dict[str, Topic] = {}
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
@@ -152,16 +158,15 @@ class NodeBase:
     def report(self) -> None:
         """Tell the health of this node."""
         graph = [mismatched(self, self._heard_on), others_publishing(self, self.alone_on)]
+        clock = self._ros_time.look(simulated=self.get_parameter("use_sim_time").value,
+                                    now_ns=self.get_clock().now().nanoseconds)
         self.diagnose(merged(self.diagnosis(), [
-            self.refusals.diagnosis(), self.losses.diagnosis(), *graph]))
+            self.refusals.diagnosis(), self.losses.diagnosis(), clock, *graph]))
 
     def diagnose(self, diagnosis: Diagnosis) -> None:
         """Publish one diagnostic status of this node, for everybody and for its companions."""
-        status = DiagnosticStatus(
-            level=bytes([diagnosis.level]), name=self.get_fully_qualified_name().lstrip("/"),
-            message=printable(diagnosis.message), hardware_id="selfcal",
-            values=[KeyValue(key=printable(key), value=printable(str(value)))
-                    for key, value in diagnosis.values.items()])
+        stage = self.values["hardware_id"] or self.get_namespace().strip("/") or "stage"
+        status = status_of(diagnosis, self.get_fully_qualified_name().lstrip("/"), stage)
         array_message = DiagnosticArray(status=[status])
         array_message.header.stamp = self.get_clock().now().to_msg()
         self._diagnostics.publish(array_message)
@@ -182,17 +187,3 @@ class SelfcalNode(NodeBase, Node):
     def __init__(self, name: str, **kwargs: Any) -> None:
         super().__init__(name, **kwargs)
         self.prepare(name)
-
-
-def _descriptor(parameter: Parameter) -> ParameterDescriptor:
-    unit = f" [{parameter.unit}]" if parameter.unit else ""
-    descriptor = ParameterDescriptor(description=parameter.description + unit, read_only=True)
-    if parameter.choices:
-        descriptor.additional_constraints = "one of " + ", ".join(parameter.choices)
-    if parameter.low is not None and isinstance(parameter.default, float):
-        descriptor.floating_point_range = [FloatingPointRange(
-            from_value=float(parameter.low), to_value=float(parameter.high))]
-    elif parameter.low is not None:
-        descriptor.integer_range = [IntegerRange(from_value=int(parameter.low),
-                                                 to_value=int(parameter.high), step=1)]
-    return descriptor

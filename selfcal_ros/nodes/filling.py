@@ -5,8 +5,9 @@ import array
 from typing import Any
 
 import numpy as np
-from diagnostic_msgs.msg import DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 
+from selfcal_ros.errors import printable
 from selfcal_ros.sessions.ports import Diagnosis, Level
 
 
@@ -23,6 +24,15 @@ def fill(message: Any, fields: dict[str, Any]) -> Any:
         else:
             setattr(message, name, value)
     return message
+
+
+def status_of(diagnosis: Diagnosis, name: str, hardware_id: str) -> DiagnosticStatus:
+    """Return the status message of a diagnosis; what a terminal would obey is made visible."""
+    return DiagnosticStatus(
+        level=bytes([diagnosis.level]), name=name, message=printable(diagnosis.message),
+        hardware_id=printable(hardware_id),
+        values=[KeyValue(key=printable(key), value=printable(str(value)))
+                for key, value in diagnosis.values.items()])
 
 
 def diagnosis_of(status: DiagnosticStatus) -> Diagnosis:

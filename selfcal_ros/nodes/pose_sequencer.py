@@ -35,7 +35,7 @@ class PoseSequencer(ManagedNode):
         """Listen to the companions, offer services and the action."""
         session = self.session
         self.subscribe(names.COMMAND, session.take_command)
-        self.subscribe(names.STATUS, session.take_status)
+        self.subscribe(names.STATUS_AS_IT_COMES, session.take_status)
         self.subscribe(names.MEASUREMENT, session.take_measurement)
         for node in COMPANIONS:
             self.subscribe(names.of_node(node, names.HEALTH), lambda status, node=node:

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether the clock of the cell is that of this machine: stamps against reception."""
+"""Whose time it is: whether the cell's clock is this machine's, and what ROS time follows."""
 
 from collections import deque
+from collections.abc import Callable
 
 from selfcal_ros.sessions.ports import Diagnosis, Level
 
@@ -67,3 +68,40 @@ class ClockWatch:
         return Diagnosis(Level.WARN, f"the cell's clock is {abs(offset) * 1e-9:.3g} s {side} this "
                          "machine's: detections fall into wrong views; synchronise the clocks "
                          "(PTP, NTP)", values)
+
+
+class RosTime:
+    """Says what ROS time follows; work and health go by a steady clock whatever it does.
+
+    Parameters
+    ----------
+    say : callable (level, line)
+        Writes to the log: one line when what ROS time does changes.
+    """
+
+    NOTHING = ("use_sim_time is set and nothing is heard on /clock: what this node stamps is "
+               "stamped 0; play the bag with --clock, or set use_sim_time to false")
+
+    def __init__(self, say: Callable[[Level, str], None]) -> None:
+        self._say = say
+        self._last_ns, self._state = 0, "system"
+
+    def look(self, *, simulated: bool, now_ns: int) -> Diagnosis:
+        """Return what ROS time does, now that it is `now_ns`; called once a second."""
+        if not simulated:
+            return Diagnosis(Level.OK, "")
+        moves, self._last_ns = now_ns != self._last_ns, now_ns
+        state = "not heard" if now_ns == 0 else "moves" if moves else "stands"
+        if state != self._state:
+            self._state = state
+            self._say(*self._line(state))
+        return Diagnosis(Level.WARN if now_ns == 0 else Level.OK,
+                         self.NOTHING if now_ns == 0 else "", {"/clock": state})
+
+    def _line(self, state: str) -> tuple[Level, str]:
+        if state == "not heard":
+            return Level.WARN, self.NOTHING
+        if state == "moves":
+            return Level.OK, "stamps follow /clock (use_sim_time); work and health do not"
+        return Level.OK, (f"/clock stands at {self._last_ns * 1e-9:.3f} s; work and health go on, "
+                          "stamps do not")

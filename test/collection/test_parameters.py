@@ -57,7 +57,8 @@ def test_names_are_unique_in_a_node():
     ("max_speed", math.nan, "nan is outside 0.0 to 1.0 m/s; mend the value"),
     ("max_speed", math.inf, "inf is outside 0.0 to 1.0 m/s; mend the value"),
     ("joint_x", 3, "3 is not of type str; put it in quotes"),
-    ("joint_y", True, "True is not of type str; put it in quotes"),
+    ("joint_y", False, "False is not of type str; put it in quotes"),
+    ("joint_x", True, "True is not of type str; put it in quotes"),
     ("measurement_sense", "plate", "'plate' is not known; choose one of microscope_moves, plate_"),
 ])
 def test_what_is_refused_and_how(name, value, message):
@@ -74,6 +75,11 @@ def test_whole_numbers_are_floats_where_floats_are_wanted_but_not_the_other_way(
             parameter_values("bag_player", {"seed": value}, "here")
     with pytest.raises(InputError, match="is not of type bool"):
         parameter_values("bag_recorder", {"all_topics": 1}, "here")
+
+
+@pytest.mark.parametrize("node", ["measurement_collector", "compensator"])
+def test_a_bare_y_that_ros_has_read_as_true_is_the_joint_y(node):
+    assert parameter_values(node, {"joint_y": True}, "here")["joint_y"] == "y"
 
 
 def test_parameters_that_ros_adds_itself_are_let_pass():

@@ -6,8 +6,10 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.qos import ReliabilityPolicy
+from rosgraph_msgs.msg import Clock
 from selfcal_msgs.msg import MarkDetection, ViewCommand
 from std_srvs.srv import Trigger
 
@@ -263,3 +265,40 @@ def test_diagnostics_count_what_was_received(graph):
     graph.until(lambda: any(wanted == (v.key, v.value) for m in heard for s in m.status
                             for v in s.values), "the count")
     assert heard[-1].status[0].name == "measurement_collector"
+
+
+def test_simulated_time_that_ends_without_done_loses_no_view(graph):
+    events = events_of(small_plan("0, 90", repeats=1))
+    assert events[-1].phase == Phase.DONE
+    measure = max(index for index, event in enumerate(events)
+                  if isinstance(event, Command) and event.phase == Phase.MEASURE)
+    marks = sum(isinstance(event, Detection) for event in events[measure:])
+    node = graph.node(MeasurementCollector, use_sim_time=True)
+    heard = graph.listen(names.MEASUREMENT)
+    clock = graph.hand.create_publisher(Clock, "/clock", names.STATUS.qos)
+    graph.until(lambda: clock.get_subscription_count() > 0, "the node's ear for /clock")
+    stamp_s, stamp_ns = divmod(events[0].stamp_ns, 10**9)
+    clock.publish(Clock(clock=Time(sec=stamp_s, nanosec=stamp_ns)))  # then it stands
+    graph.until(lambda: node.get_clock().now().nanoseconds == events[0].stamp_ns, "the time")
+    publish_events(graph, events[:-1])
+    graph.until(lambda: {m.view_index: len(m.m) + len(m.k) for m in heard}.get(
+        events[measure].view_index) == marks, "the readings of the last view")
+
+
+def test_who_comes_late_gets_the_newest_status(graph):
+    events = events_of(small_plan("0", repeats=1))
+    graph.node(MeasurementCollector, status_period=0.02)
+    status = graph.listen(names.STATUS)
+    publish_events(graph, events)
+    graph.until(lambda: status and status[-1].complete, "the view")
+    late = graph.listen(names.STATUS)
+    graph.until(lambda: late and late[-1].complete, "the newest status")
+    assert late[-1].view_index == status[-1].view_index
+
+
+@pytest.mark.parametrize(("given", "told"), [({}, "stage"), ({"hardware_id": "XY-7"}, "XY-7")])
+def test_the_health_names_the_stage(graph, given, told):
+    heard = graph.listen(names.of_node("measurement_collector", names.HEALTH))
+    graph.node(MeasurementCollector, **given)
+    graph.until(lambda: heard, "the health")
+    assert heard[-1].hardware_id == told

@@ -96,10 +96,23 @@ def test_every_node_takes_the_shipped_parameter_files(graph, needed, file, name,
 
 def test_a_word_that_the_file_makes_a_bool_is_refused_with_the_mend(graph, tmp_path):
     file = tmp_path / "cell.yaml"
-    file.write_text("measurement_collector: {ros__parameters: {joint_y: y}}")
-    with pytest.raises(InputError, match="joint_y: True is not of type str; put it in quotes"):
+    file.write_text("measurement_collector: {ros__parameters: {joint_x: y}}")
+    with pytest.raises(InputError, match="joint_x: True is not of type str; put it in quotes"):
         MeasurementCollector(context=graph.context, cli_args=[
             "--ros-args", "--params-file", str(file)])
+
+
+def test_a_dump_of_all_parameters_is_a_file_that_a_node_takes(graph, tmp_path):
+    """As `ros2 param dump` writes it: a joint called y comes out bare, and ROS reads it as true."""
+    first = graph.node(MeasurementCollector, max_speed=0.25)
+    told = {name: parameter.value for name, parameter in
+            first.get_parameters_by_prefix("").items()}
+    file = tmp_path / "dump.yaml"
+    file.write_text(yaml.dump({"/**": {"ros__parameters": told}}, default_flow_style=False))
+    assert "joint_y: y\n" in file.read_text()
+    second = graph.add(MeasurementCollector(context=graph.context, cli_args=[
+        "--ros-args", "--params-file", str(file)]))
+    assert {name: second.get_parameter(name).value for name in told} == told
 
 
 def test_a_parameter_cannot_be_changed_while_the_node_runs(graph):

@@ -1,0 +1,21 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What ROS tells of a parameter: description, unit, bounds, choices."""
+
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+
+from selfcal_ros.collection.parameters import Parameter
+
+
+def descriptor(parameter: Parameter) -> ParameterDescriptor:
+    """Return the descriptor of a parameter; nobody changes one while the node runs."""
+    unit = f" [{parameter.unit}]" if parameter.unit else ""
+    told = ParameterDescriptor(description=parameter.description + unit, read_only=True)
+    if parameter.choices:
+        told.additional_constraints = "one of " + ", ".join(parameter.choices)
+    if parameter.low is not None and isinstance(parameter.default, float):
+        told.floating_point_range = [FloatingPointRange(
+            from_value=float(parameter.low), to_value=float(parameter.high))]
+    elif parameter.low is not None:
+        told.integer_range = [IntegerRange(from_value=int(parameter.low),
+                                                 to_value=int(parameter.high), step=1)]
+    return told
