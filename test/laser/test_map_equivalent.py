@@ -98,10 +98,10 @@ def test_the_uncertainty_of_o_is_the_spread_of_measurements_with_unequal_steps(s
     rng = np.random.default_rng(11)
     noise = Measurement({}, LaserNoise(1e-8, 0, 1e-8, 4))
     found = [map_equivalent(identify_ibaraki(simulate_step_diagonal(machine, noise, rng)))
-             for _ in range(400)]
+             for _ in range(100)]
     spread = np.std([one.nonorthogonality for one in found])
     said = np.sqrt(np.mean([one.u_nonorthogonality**2 for one in found]))
-    assert said == pytest.approx(spread, rel=0.12)
+    assert said == pytest.approx(spread, rel=0.25)
 
 
 def test_the_conventional_formulation_tells_no_scale():
