@@ -6,6 +6,7 @@ The same codes are the ``error_code`` of services and actions.
 """
 
 from enum import IntEnum
+from typing import Any
 
 
 class ExitCode(IntEnum):
@@ -58,7 +59,7 @@ class NotIdentifiableError(SelfcalError):
 
     exit_code = ExitCode.NOT_IDENTIFIABLE
 
-    def __init__(self, message: str, observability: object = None) -> None:
+    def __init__(self, message: str, observability: Any = None) -> None:
         self.observability = observability
         super().__init__(message)
 

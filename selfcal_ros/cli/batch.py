@@ -62,7 +62,8 @@ def run(args: argparse.Namespace) -> int:
         done |= _worked(args, bags, settings, places)
         records = [done[index] for index in sorted(done)]
         found = series_of(records)
-        lines, content = (form(records, found, before) for form in (summary_lines, batch_json))
+        lines = summary_lines(records, found, before)
+        content = batch_json(records, found, before)
         write_text(folder / "table.csv", csv_text(records))
         write_text(folder / "index.html", page_html(records, found, lines))
         write_json(folder / "batch.json", content)

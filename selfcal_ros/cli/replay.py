@@ -74,7 +74,7 @@ def _play(args: argparse.Namespace, saved: Path, environment: dict) -> tuple[int
             stdout=subprocess.PIPE, text=True))
         bar = stack.enter_context(progress_bar("replaying"))
         lost = []
-        for line in session.stdout:
+        for line in session.stdout or ():
             word, _, tail = line.rstrip("\n").partition(" ")
             if word == "progress":
                 done, total = tail.split()

@@ -5,6 +5,7 @@ import argparse
 import json
 import math
 import sys
+from typing import TYPE_CHECKING
 
 from selfcal_ros.cli.aerotech.options import add_frame, frame_of
 from selfcal_ros.cli.step_diagonal_bag import (
@@ -14,6 +15,9 @@ from selfcal_ros.cli.step_diagonal_bag import (
     measurement_from_bag,
 )
 from selfcal_ros.errors import ExitCode, InputError
+
+if TYPE_CHECKING:
+    from selfcal_ros.laser.data import StepDiagonalResult
 
 HELP = "identify linear, straightness and squareness errors from a laser step-diagonal measurement"
 SHORTEST_MM = 1e-6
@@ -122,7 +126,7 @@ def _check_outputs(args: argparse.Namespace) -> None:
         refuse_existing([args.cal], force=args.force)
 
 
-def _write_cal(args: argparse.Namespace, found: object) -> None:
+def _write_cal(args: argparse.Namespace, found: "StepDiagonalResult") -> None:
     """Write the corrections as 1D tables."""
     from selfcal_ros import __version__
     from selfcal_ros.compensation.aerotech.export import DECIMALS

@@ -87,7 +87,7 @@ class Supervisor:
 
     def _read(self, child: subprocess.Popen) -> None:
         with contextlib.suppress(ValueError):  # closed while it is read
-            for line in child.stderr:
+            for line in child.stderr or ():
                 self._say(line.rstrip("\n"))
 
     def _say(self, line: str) -> None:

@@ -28,13 +28,15 @@ class Eyes:
         threading.Thread(target=self._read, name="monitor", daemon=True).start()
 
     def _read(self) -> None:
-        for line in self._child.stdout:
+        for line in self._child.stdout or ():
             with contextlib.suppress(ValueError):
                 self._queue.put(json.loads(line))
         self._queue.put(None)
 
     def ask(self, request: str) -> None:
         """Ask the sequencer for something."""
+        if self._child.stdin is None:
+            return
         with contextlib.suppress(BrokenPipeError):
             self._child.stdin.write(f"{request}\n")
             self._child.stdin.flush()

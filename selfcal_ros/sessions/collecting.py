@@ -43,7 +43,8 @@ class CollectingSession:
         self._encoder_ns = self._exposed_ns = 0  # newest stamps
         self._costs: deque[float] = deque(maxlen=1000)
         self._published: dict[int, str] = {}
-        self._run, self._advised = ("", ""), set()
+        self._run = ("", "")
+        self._advised: set[int] = set()
         self._warned: set[tuple[int | None, str]] = set()
         self._findings: list[str] = []
         self._clock = ClockWatch(values["clock_limit"])
@@ -53,7 +54,8 @@ class CollectingSession:
         self.missed: dict[tuple[str, int], str] = {}  # views that began before this node
         self._placed: set[tuple[str, int]] = set()
         self._problem = ""
-        self._state, self._rejected = "waiting for a MEASURE command", Counter()
+        self._state = "waiting for a MEASURE command"
+        self._rejected: Counter = Counter()
 
     def take_encoder(self, block: EncoderBlock, age_ns: int = 0) -> None:
         """Take encoder samples, the newest of which was received `age_ns` ago."""
@@ -86,8 +88,8 @@ class CollectingSession:
         self.collector, self._dirty, self._next_status = collector, True, 0.0
         last = collector.newest_command
         where = "between views" if last is None or last.phase != Phase.MEASURE else (
-            f"in view '{last.view.name}'; marks that were detected since and are missing have to "
-            "be measured again, by the cell or with redo_view")
+            f"in view '{last.placed().name}'; marks that were detected since and are missing have "
+            "to be measured again, by the cell or with redo_view")
         messages = sum(collector.received.values())
         self._ports.say(Level.OK, f"took up {journal} with {messages} messages, {where}")
 
@@ -115,9 +117,9 @@ class CollectingSession:
         elif command.phase == Phase.MEASURE and view in self._placed:
             self.missed.pop(view, None)
         elif command.phase == Phase.MEASURE and is_older:
-            self.missed[view] = command.view.name
+            self.missed[view] = name = command.placed().name
             self._ports.say(
-                Level.WARN, f"view '{command.view.name}' began before this node: what was "
+                Level.WARN, f"view '{name}' began before this node: what was "
                 "detected until now is missing here; redo_view measures it again")
 
     def tick(self) -> None:
@@ -208,8 +210,9 @@ class CollectingSession:
         index = self.collector.timeline.intervals[-1].view_index
         for number in sorted(progress):  # of the last view that tells it
             told = progress[number].readings
-            self._noise = tuple(new if math.isfinite(new) else old for new, old in zip(
+            xy, theta = (new if math.isfinite(new) else old for new, old in zip(
                 (told.sigma_xy, told.sigma_theta), self._noise, strict=True))
+            self._noise = xy, theta
         self._needed = progress[index].needed if index is not None else 0
         self._state = "between views" if index is None else (
             f"view '{progress[index].view.name}': {100 * progress[index].coverage:.0f} % of the "

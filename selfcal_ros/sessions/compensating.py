@@ -119,7 +119,9 @@ class CompensatingSession:
             return None
         place = {name: index for index, name in enumerate(names)}
         x, y, theta = (place.get(self._values[f"joint_{axis}"]) for axis in ("x", "y", "theta"))
-        corrected = {}
+        corrected: dict[int, float] = {}
+        if self.compensator is None:
+            return None
         try:
             if x is not None and y is not None:
                 corrected |= zip((x, y), map(float, self.compensator.correct(

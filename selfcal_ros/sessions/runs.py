@@ -20,8 +20,8 @@ def supersedes(new: Run, current: Run) -> bool:
 
     The later run does. Where one of them does not tell its beginning, the one that came last.
     """
-    begun = [_begun_ns(run) for run in (new, current)]
-    return None in begun or begun[0] > begun[1]
+    begun, before = _begun_ns(new), _begun_ns(current)
+    return begun is None or before is None or begun > before
 
 
 def _begun_ns(run: Run) -> int | None:

@@ -67,7 +67,11 @@ class SequencingSession:
     def current(self) -> View | None:
         """The view that is being placed or measured."""
         busy = self.machine.state in (State.PLACING, State.MEASURING)
-        return self.machine.plan.views[self.machine.index] if busy else None
+        return self.machine.need_plan().views[self.machine.index] if busy else None
+
+    @property
+    def _view_name(self) -> str:
+        return "" if self.current is None else self.current.name
 
     def missing(self) -> list[str]:
         """Return who is needed for a run and is not there."""
@@ -108,7 +112,7 @@ class SequencingSession:
     def _resume(self) -> str:
         """Go on where the collector is in an unfinished run of this plan; "" if there is none."""
         collector = self.presence.of("measurement_collector")
-        plan = self.machine.plan
+        plan = self.machine.need_plan()
         if not (self._values["resume"] and self._fresh and collector):
             return ""
         told = collector.values
@@ -204,7 +208,7 @@ class SequencingSession:
             self._ports.say(Level.WARN, self._stalled)
 
     def _stall_line(self) -> str:
-        status, name = self._status, self.current.name
+        status, name = self._status, self._view_name
         if status is None or not status.detections_used + status.detections_rejected:
             line = f"view '{name}' stalls: no detection has come since MEASURE"
         else:
@@ -217,7 +221,7 @@ class SequencingSession:
                        "; redo_view measures it again, skip_view goes on without")
 
     def _time_out(self) -> None:
-        self._ports.say(Level.WARN, f"view {self.current.name} is not complete in time")
+        self._ports.say(Level.WARN, f"view {self._view_name} is not complete in time")
         again = self._redos < self._values["max_redos"]
         self._redos = self._redos + 1 if again else 0
         self._send(self.machine.redo() if again else self.machine.skip())
@@ -244,7 +248,7 @@ class SequencingSession:
             self._own.add(_key(command))
             self._commanded_ns, self._fresh = stamp, False
             self._ports.publish("command", from_model.command(command, self._values["frame_id"]))
-            name = command.view.name if command.view else self.machine.plan.plan_id
+            name = command.view.name if command.view else command.plan_id
             self._ports.say(Level.OK, f"{command.phase.name} {name}")
             self.coverage, self._status, self._stalled = 0.0, None, ""
             self._stall.restart()

@@ -176,23 +176,23 @@ class SolvingSession:
             return
         if outcome.result is None:
             self.shown.problem, self.shown.digest = outcome.problem, ""
-            raise outcome.problem
+            raise outcome.problem or ValueError("neither a result nor a problem")
         self.shown = Shown(outcome.result, outcome.problem, job.run, len(job.measurements.views),
                            job.stamp_ns, job.digest)
-        self._publish()
+        self._publish(outcome.result)
         if self._values["save_path"] and outcome.problem is None:
-            self._save_by_itself()
+            self._save_by_itself(outcome.result)
 
-    def _save_by_itself(self) -> None:
+    def _save_by_itself(self, result: CalibrationResult) -> None:
         try:
             write_json(self._values["save_path"],
-                       result_to_dict(created_now(self.shown.result)))
+                       result_to_dict(created_now(result)))
         except InputError as error:  # the map itself is good, and save_map may go elsewhere
             self._ports.say(Level.ERROR, f"save_path: {error}")
 
-    def _publish(self) -> None:
+    def _publish(self, result: CalibrationResult) -> None:
         shown, frame_id = self.shown, self._values["frame_id"]
-        result, run = shown.result, shown.run
+        run = shown.run
         verdict = {"qualified": is_qualified(result), "run_id": run.run_id}
         if shown.problem is None:
             self._ports.publish("map", from_model.error_map(
@@ -222,7 +222,9 @@ class SolvingSession:
             planned = self._planned_views(self.shown.run)
             return (f"{self.shown.views_done} of {planned} views measured, "
                     "not yet enough to identify the stage.")
-        return str(self.shown.problem or state_sentence(self.shown.result))
+        if self.shown.problem is not None or self.shown.result is None:
+            return str(self.shown.problem)
+        return state_sentence(self.shown.result)
 
     def digest(self) -> str:
         """Return the fingerprint of the readings behind the published map; "" = of none."""
@@ -249,7 +251,7 @@ class SolvingSession:
         result = read_result(path)
         self.shown = Shown(result, run=Run(result.plan_id, result.run_id),
                            views_done=len(result.views))
-        self._publish()
+        self._publish(result)
         return f"loaded {path}: plan {result.plan_id}"
 
     def diagnosis(self) -> Diagnosis:

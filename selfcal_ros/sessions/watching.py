@@ -68,8 +68,8 @@ class Watch:
 
     def _health(self, node: str) -> dict[str, Any] | None:
         told = self._presence.of(node)
-        return told and {"level": int(told.level), "message": told.message,
-                         "values": told.values}
+        return None if told is None else {"level": int(told.level), "message": told.message,
+                                          "values": told.values}
 
     def _commanded(self) -> dict[str, Any] | None:
         command = self._command

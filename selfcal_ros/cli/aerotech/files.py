@@ -4,9 +4,14 @@
 import argparse
 import json
 import math
+from typing import TYPE_CHECKING, Any
 
 from selfcal_ros.cli.aerotech.options import numbers, pairs
 from selfcal_ros.errors import ExitCode, InputError
+
+if TYPE_CHECKING:
+    from selfcal_ros.compensation.aerotech.evaluate import MachineSetup
+    from selfcal_ros.compensation.aerotech.model import Table1D, Table2D
 
 
 def add_to(group: argparse._SubParsersAction) -> None:
@@ -70,7 +75,7 @@ def _check(args: argparse.Namespace) -> int:
     return int(ExitCode.DONE)
 
 
-def _described(table: object) -> dict:
+def _described(table: "Table1D | Table2D") -> dict:
     shape = " x ".join(map(str, table.values.shape[:2]))
     outputs = ", ".join(map(str, table.outputs))
     inputs = " and ".join(map(str, table.inputs))
@@ -92,7 +97,7 @@ def _evaluate(args: argparse.Namespace) -> int:
     return int(ExitCode.DONE)
 
 
-def _setup(args: argparse.Namespace) -> "object":
+def _setup(args: argparse.Namespace) -> "MachineSetup":
     from selfcal_ros.compensation.aerotech.evaluate import AxisSetup, MachineSetup
 
     if args.temperature is not None and not math.isfinite(args.temperature):
@@ -102,7 +107,7 @@ def _setup(args: argparse.Namespace) -> "object":
         if word not in ("CW", "CCW"):
             raise InputError("--home-direction", f"'{word}' is not a home direction",
                              f"write {axis}=CW or {axis}=CCW")
-    found = {
+    found: dict[str, dict[int, Any]] = {
         "counts_per_unit": numbers(args.counts_per_unit, "--counts-per-unit", positive=True),
         "counts_per_secondary": numbers(args.counts_per_secondary, "--counts-per-secondary",
                                         positive=True),
@@ -111,7 +116,7 @@ def _setup(args: argparse.Namespace) -> "object":
         "absolute_feedback_offset": numbers(args.absolute_feedback_offset,
                                             "--absolute-feedback-offset"),
     }
-    axes = set().union(*found.values())
+    axes: set[int] = set().union(*found.values())
     return MachineSetup({axis: AxisSetup(**{name: values.get(axis)
                                             for name, values in found.items()})
                          for axis in axes}, args.temperature)

@@ -4,7 +4,7 @@
 import argparse
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from selfcal_ros.cli.aerotech.options import add_frame, frame_of, read_result
 from selfcal_ros.errors import ExitCode, InputError
@@ -14,8 +14,11 @@ if TYPE_CHECKING:
     from selfcal_ros.compensation.aerotech.lines import AxisCorrection
     from selfcal_ros.compensation.machine import MachineFrame
 
-_HOMES = {"end": "home at one end of travel", "middle": "home in the middle of travel",
-          "middle-balanced": "home in the middle of travel, balanced"}
+Axis = Literal["x", "y"]
+
+_HOMES: dict[Literal["end", "middle", "middle-balanced"], str] = {
+    "end": "home at one end of travel", "middle": "home in the middle of travel",
+    "middle-balanced": "home in the middle of travel, balanced"}
 
 
 def add_to(group: argparse._SubParsersAction) -> None:
@@ -61,7 +64,7 @@ def _orthogonality(args: argparse.Namespace) -> int:
     from selfcal_ros.compensation.machine import UNITS_M
 
     frame = frame_of(args)
-    other = "y" if args.along == "x" else "x"
+    other: Axis = "y" if args.along == "x" else "x"
     measured = (args.measured, args.over, args.travel)
     if args.source is not None:
         if any(measured) or args.home:
@@ -73,16 +76,17 @@ def _orthogonality(args: argparse.Namespace) -> int:
         raise InputError("arguments", "the measurement is not complete",
                          "give --measured, --over and --travel, or a RESULT.json")
     _refuse_frame(args, "a measured square", "take --home")
-    lengths = [cal_lines.length_m(text, name) for text, name in
-               zip(measured, ("--measured", "--over", "--travel"), strict=True)]
+    measured_m, over_m, travel_m = (
+        cal_lines.length_m(text, name) for text, name in
+        zip(measured, ("--measured", "--over", "--travel"), strict=True))
     if args.output:
         if args.home is None:
             raise InputError("--home", "it is not said where the home position lies",
                              "take end, middle or middle-balanced")
-        return _deliver(args, cal_lines.orthogonality(*lengths, args.home), frame,
-                        (args.along, other))
+        line = cal_lines.orthogonality(measured_m, over_m, travel_m, args.home)
+        return _deliver(args, line, frame, (args.along, other))
     homes = [args.home] if args.home else list(_HOMES)
-    found = {home: cal_lines.orthogonality(*lengths, home) for home in homes}
+    found = {home: cal_lines.orthogonality(measured_m, over_m, travel_m, home) for home in homes}
     unit_m = UNITS_M[args.unit]
     tables = {home: [[round(p / unit_m, 9), round(c / M_PER_UM, 9)] for p, c in
                      zip(line.positions_m, line.corrections_m, strict=True)]
@@ -91,7 +95,7 @@ def _orthogonality(args: argparse.Namespace) -> int:
         print(json.dumps({"unit": args.unit, "correction_unit": "um", "tables": tables}, indent=1))
         return int(ExitCode.DONE)
     print(f"correction of {other} over the full travel of {args.along}: "
-          f"{-lengths[0] / lengths[1] * lengths[2] * UM_PER_M:.9g} um")
+          f"{-measured_m / over_m * travel_m * UM_PER_M:.9g} um")
     for home, rows in tables.items():
         print(f"{_HOMES[home]} (--home {home})\n  position {args.unit:<5} correction um")
         print("\n".join(f"  {position:<14.9g} {correction:.9g}" for position, correction in rows))
@@ -106,7 +110,7 @@ def _straightness(args: argparse.Namespace) -> int:
     return _line(args, "y" if args.along == "x" else "x")
 
 
-def _line(args: argparse.Namespace, corrected: str) -> int:
+def _line(args: argparse.Namespace, corrected: Axis) -> int:
     from selfcal_ros.compensation.aerotech import lines as cal_lines
     from selfcal_ros.files import read_text
 
@@ -133,7 +137,7 @@ def _refuse_frame(args: argparse.Namespace, what: str, mend: str) -> None:
 
 
 def _deliver(args: argparse.Namespace, line: "AxisCorrection", frame: "MachineFrame",
-             axes: tuple[str, str]) -> int:
+             axes: tuple[Axis, Axis]) -> int:
     """Write the table of a line to its file, or print it."""
     from datetime import UTC, datetime
 

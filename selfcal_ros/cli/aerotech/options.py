@@ -3,7 +3,7 @@
 
 import argparse
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from selfcal_ros.errors import InputError
 
@@ -75,8 +75,9 @@ def frame_of(args: argparse.Namespace, base: "MachineFrame | None" = None) -> "M
     from selfcal_ros.compensation.machine import UNITS_M, MachineFrame
 
     base = base or MachineFrame()
-    changes = {name: getattr(args, name) for name in ("x_axis", "y_axis", "theta_axis", "unit")
-               if getattr(args, name, None) is not None}
+    changes: dict[str, Any] = {
+        name: getattr(args, name) for name in ("x_axis", "y_axis", "theta_axis", "unit")
+        if getattr(args, name, None) is not None}
     unit_m = UNITS_M[changes.get("unit", base.unit)]
     for name in ("x", "y", "theta"):
         home = getattr(args, f"home_{name}", None)
@@ -88,9 +89,9 @@ def frame_of(args: argparse.Namespace, base: "MachineFrame | None" = None) -> "M
             changes[f"home_{name}_m"] = home * unit_m
         if getattr(args, f"reverse_{name}", False):
             changes[f"reverse_{name}"] = True
-    for axis in ("x_axis", "y_axis", "theta_axis"):
-        if not 1 <= changes.get(axis, 1) <= 32:
-            raise InputError(f"--{axis.replace('_', '-')}", f"{changes[axis]} is not in 1..32",
+    for name in ("x_axis", "y_axis", "theta_axis"):
+        if not 1 <= changes.get(name, 1) <= 32:
+            raise InputError(f"--{name.replace('_', '-')}", f"{changes[name]} is not in 1..32",
                              "indices in calibration files count from 1")
     counts = numbers(getattr(args, "counts_per_unit", None), "--counts-per-unit", positive=True)
     theta_axis = changes.get("theta_axis", base.theta_axis)

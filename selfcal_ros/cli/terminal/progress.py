@@ -11,20 +11,29 @@ from collections.abc import Callable, Iterator
 def progress_bar(label: str) -> Iterator[Callable[[int, int | None], None]]:
     """Yield a function (done, total) that draws on stderr if that is a terminal."""
     if not sys.stderr.isatty():
-        yield lambda done, total=None: None
+        yield _nothing
         return
     from rich.console import Console
     from rich.progress import Progress
 
     with Progress(console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task(label, total=None)
-        yield lambda done, total=None: bar.update(task, completed=done, total=total)
+
+        def draw(done: int, total: int | None = None) -> None:
+            bar.update(task, completed=done, total=total)
+
+        yield draw
+
+
+def _nothing(done: int, total: int | None = None) -> None:
+    """Draw nothing."""
 
 
 @contextlib.contextmanager
 def late_progress(label: str, after_s: float = 2.0) -> Iterator[Callable[[int, int | None], None]]:
     """Yield the function of `progress_bar`; its bar appears only once `after_s` have passed."""
-    began, draw = time.monotonic(), None
+    began = time.monotonic()
+    draw: Callable[[int, int | None], None] | None = None
     with contextlib.ExitStack() as stack:
 
         def advance(done: int, total: int | None = None) -> None:

@@ -43,7 +43,8 @@ def take_up(files: list[Path], values: dict[str, Any]) -> TakenUp:
     values : dict
         Values of the collector's parameters.
     """
-    collector, lost = Collector(values), []
+    collector = Collector(values)
+    lost: list[str] = []
     feed = block_feeder(collector, lost)
     for file in files:
         reader = BagReader(file)

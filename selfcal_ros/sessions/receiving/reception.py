@@ -83,14 +83,14 @@ class Reception:
             if not self._restoring.done():
                 return False
             waiting, self._held = self._held, []
-            self._adopt()
+            self._adopt(self._restoring)
             adopted = True
         self._feed(waiting)
         return adopted or bool(waiting)
 
-    def _adopt(self) -> None:
+    def _adopt(self, taken: Future[TakenUp]) -> None:
         """Go on from what the journal held."""
-        taken, self._restoring = self._restoring, None
+        self._restoring = None
         try:
             found = taken.result()
         except Exception as error:  # a journal that cannot be read ends nothing
