@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The exceptions of the package and the exit code that each one stands for.
 
-A message is one line that names the place, what is wrong, and how to mend it.
+A message is one line that names the place, what is wrong, and how to correct it.
 The same codes are the ``error_code`` of services and actions.
 """
 
@@ -35,15 +35,15 @@ class InputError(SelfcalError):
         File, topic, view or parameter, with line or index where there is one.
     what : str
         What is wrong.
-    mend : str, optional
+    remedy : str, optional
         What the user can do about it.
     """
 
     exit_code = ExitCode.BAD_INPUT
 
-    def __init__(self, where: str, what: str, mend: str = "") -> None:
-        self.where, self.what, self.mend = where, what, mend
-        super().__init__(printable(f"{where}: {what}" + (f"; {mend}" if mend else "")))
+    def __init__(self, where: str, what: str, remedy: str = "") -> None:
+        self.where, self.what, self.remedy = where, what, remedy
+        super().__init__(printable(f"{where}: {what}" + (f"; {remedy}" if remedy else "")))
 
 
 class NotIdentifiableError(SelfcalError):

@@ -250,12 +250,12 @@ def read_yaml(path: str | os.PathLike) -> Any:
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark
         place = f"{path}:{mark.line + 1}:{mark.column + 1}" if mark else str(path)
-        raise InputError(place, f"not YAML ({error.problem})", "mend the line") from error
+        raise InputError(place, f"not YAML ({error.problem})", "correct the line") from error
     except yaml.YAMLError as error:
         raise InputError(str(path), "not YAML", "give a YAML text file") from error
     except (ValueError, RecursionError) as error:  # the 40th of a month, brackets too deep
         raise InputError(str(path), f"not usable YAML ({first_line(error)})",
-                         "mend the value") from error
+                         "correct the value") from error
 
 
 def sha256_of(path: str | os.PathLike) -> str:

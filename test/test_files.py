@@ -180,7 +180,7 @@ def test_faults_in_json(tmp_path, text, message):
     ("a: &x 1\nb: *y", ":2:4: not YAML (found undefined alias 'y')"),
     ("a: !!python/name:os.system ''", ":1:4: not YAML (could not determine a constructor"),
     ("a: \x01", ": not YAML; give a YAML text file"),
-    ("a: 2001-13-40", ": not usable YAML (month must be in 1..12); mend the value"),
+    ("a: 2001-13-40", ": not usable YAML (month must be in 1..12); correct the value"),
     ("[" * 100_000, ": not usable YAML (maximum recursion depth")])
 def test_faults_in_yaml(tmp_path, text, message):
     with pytest.raises(InputError) as caught:
@@ -280,9 +280,10 @@ def test_what_json_writes_is_what_json_reads(tmp_path):
 
 
 @pytest.mark.parametrize("text, problem", [
-    ("a: 1\nb: 2\na: 3\n", r"f\.yaml:3:1: not YAML \(the key 'a' is given twice\); mend the line"),
+    ("a: 1\nb: 2\na: 3\n",
+     r"f\.yaml:3:1: not YAML \(the key 'a' is given twice\); correct the line"),
     ("a: {b: 1, b: 1}\n", r"f\.yaml:1:11: not YAML \(the key 'b' is given twice\)"),
-    ("a: " + "9" * 400, r"f\.yaml: not usable YAML \(a whole number beyond 64 bits\); mend"),
+    ("a: " + "9" * 400, r"f\.yaml: not usable YAML \(a whole number beyond 64 bits\); correct"),
     ("a: 9223372036854775808", "a whole number beyond 64 bits"),
     ("a: -9223372036854775809", "a whole number beyond 64 bits"),
     ("a: &a [*a]", "its aliases stand for more than 1000000 values"),

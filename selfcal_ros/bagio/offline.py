@@ -87,7 +87,7 @@ def collect_bag(path: str | Path, values: dict[str, Any], *, namespace: str | No
                             sorted(measurements.all_rejected().items(), key=lambda i: -i[1])[:4])
         raise NoDataError(str(path), f"none of {received['detection']} detections became a "
                           f"reading (rejected: {reasons}){tail}",
-                          findings[0] if findings else "mend the cause that is named first")
+                          findings[0] if findings else "correct the cause that is named first")
     return BagSession(measurements, views, reader.lost, findings)
 
 

@@ -130,7 +130,7 @@ def run(args: argparse.Namespace) -> int:
             result = unidentified_result(measurements, error.observability)
             write_json(args.output, result_to_dict(with_input(result, bag_input(args.bag), lost)))
         if findings:  # what the plan lacks is told by readings that are not there
-            raise NotIdentifiableError(f"{args.bag}: {findings[0]}; mend this first (as it is: "
+            raise NotIdentifiableError(f"{args.bag}: {findings[0]}; correct this first (as it is: "
                                        f"{error})", error.observability) from error
         raise
     result, lines = _extended(args, measurements, options, result)

@@ -112,14 +112,14 @@ def _check_outputs(args: argparse.Namespace) -> None:
     from selfcal_ros.files import check_outputs
 
     measured = not (args.sensitivity or args.simulate)
-    for option, path, there, mend in (
+    for option, path, there, remedy in (
             ("--truth", args.truth, args.simulate, "it belongs to --simulate"),
             ("--plot", args.plot, not args.simulate, "leave it out with --simulate"),
             ("--cal", args.cal, measured, "it belongs to a measurement"),
             ("--save-csv", args.save_csv, measured and args.data and is_bag(args.data),
              "it belongs to a bag")):
         if path and not there:
-            raise InputError(option, "nothing would be written", mend)
+            raise InputError(option, "nothing would be written", remedy)
     check_outputs([args.data, args.simulate],
                   [args.output, args.plot, args.cal, args.truth, args.save_csv])
     if args.cal:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Why most detections were rejected, in one line that says what to mend.
+"""Why most detections were rejected, in one line that says what to correct.
 
 A wrong parameter or a wrong clock spoils nearly all detections at once, and each is rejected for a
 reason of its own that does not name it. Here the rejections are looked at together.

@@ -94,7 +94,7 @@ def check_command(command: Command) -> None:
     """
     where = f"view command {command.view_index}"
     if not 0 <= command.view_index <= MAX_VIEWS or not 0 <= command.views_planned <= MAX_VIEWS:
-        raise InputError(where, f"a plan has at most {MAX_VIEWS} views", "mend the view_index")
+        raise InputError(where, f"a plan has at most {MAX_VIEWS} views", "correct the view_index")
     if command.view is None or command.artifact is None:
         if command.phase in (Phase.PLACE, Phase.MEASURE):
             raise InputError(where, "it describes no view", "fill its pose and its plate")

@@ -47,7 +47,7 @@ class Parameter:
             value = float(value)
         if not isinstance(value, kind) or (kind is int and isinstance(value, bool)):
             raise InputError(f"{where}: {self.name}", f"{value!r} is not of type {kind.__name__}",
-                             "put it in quotes" if kind is str else "mend the value")
+                             "put it in quotes" if kind is str else "correct the value")
         if kind is list and not all(isinstance(item, str) for item in value):
             raise InputError(f"{where}: {self.name}", f"{value!r} is not a list of texts",
                              "put each item in quotes")
@@ -58,7 +58,7 @@ class Parameter:
                 (self.low is None or value >= self.low)
                 and (self.high is None or value <= self.high)):
             raise InputError(f"{where}: {self.name}", f"{value} is outside {self.low} to "
-                             f"{self.high} {self.unit}".rstrip(), "mend the value")
+                             f"{self.high} {self.unit}".rstrip(), "correct the value")
         return value
 
 

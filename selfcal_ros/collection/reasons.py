@@ -39,7 +39,7 @@ ADVICE = {
                      "from their neighbours; let the detections carry ids, or measure grid marks "
                      "in the same view, or state a max_rotation of less than half a line",
 }
-"""What to do about a reason that is mended in the plan or in the parameters, one line each."""
+"""What to do about a reason that is put right in the plan or in the parameters, one line each."""
 
 REMEDY = {
     Reason.NO_ENCODER: "the encoder has a gap around the exposures; let it send without gaps, or "
@@ -50,9 +50,10 @@ REMEDY = {
                           "MEASURE and the next command, stamped by one clock",
     Reason.CONTRADICTION: "encoder samples contradict each other; let one source publish the "
                           "joints, with a clock that does not step",
-    Reason.NOT_FINITE: "NaN, infinite or negative where a length or an angle is wanted; mend the "
-                       "publisher of the detections",
-    Reason.UNKNOWN_KIND: "kind is neither GRID nor ANGULAR; mend the publisher of the detections",
+    Reason.NOT_FINITE: "NaN, infinite or negative where a length or an angle is wanted; correct "
+                       "the publisher of the detections",
+    Reason.UNKNOWN_KIND: "kind is neither GRID nor ANGULAR; correct the publisher of the "
+                         "detections",
     Reason.UNKNOWN_MARK: "their ids are not on the plate; check grid_size, angular_count and the "
                          "numbering of the marks (m, n from -h to h, k from 0)",
     Reason.NOT_IN_VIEW: "the view does not ask for these marks; check its pose and its kinds of "
@@ -63,7 +64,7 @@ REMEDY = {
                     "of the offsets (m, stage axes) and the ids, or raise max_deviation",
     Reason.NOT_AT_MARK: "the stage does not stand at the marks that are seen; check joint_x, "
                         "joint_y and measurement_sense, or set max_stage_distance",
-    Reason.LOW_SCORE: "their score is below min_score; mend the detection, or lower min_score",
+    Reason.LOW_SCORE: "their score is below min_score; correct the detection, or lower min_score",
     Reason.OUTLIER: "repeats of a mark contradict each other; check that each id is of one mark, "
                     "or raise outlier_limit",
 }

@@ -110,7 +110,7 @@ def view_readings(message: Any) -> ViewReadings:
         names += [u] * (len(table[u]) > 0)
         if len({len(table[name]) for name in names}) > 1:
             raise InputError(f"{MEASUREMENT_TOPIC} of '{message.view_name}'",
-                             f"{', '.join(names)} differ in length", "mend the publisher")
+                             f"{', '.join(names)} differ in length", "correct the publisher")
     return ViewReadings(
         view_of(message, repeats=int(message.repeats), grid=bool(message.grid),
                 angular=bool(message.angular)),
@@ -140,7 +140,7 @@ def _visits_of(message: Any) -> GridVisits | None:
     if len(lengths) > 1 or table["mark"].min() < 0 or table["mark"].max() >= len(message.m):
         raise InputError(f"{MEASUREMENT_TOPIC} of '{message.view_name}'",
                          "the visits differ in length or name marks that were not read",
-                         "mend the publisher")
+                         "correct the publisher")
     return GridVisits(**table, u=u, sigma_m=float(message.sigma_visit),
                       dof=int(message.dof_visit))
 
@@ -157,7 +157,7 @@ def counts(message: Any, prefix: str) -> dict[str, int]:
     if len(reasons) != len(numbers):
         raise InputError(f"{MEASUREMENT_TOPIC} of '{message.view_name}'",
                          f"{prefix}_reasons and {prefix}_counts differ in length",
-                         "mend the publisher")
+                         "correct the publisher")
     return {str(reason): int(number) for reason, number in zip(reasons, numbers, strict=True)}
 
 
@@ -185,7 +185,7 @@ def error_map(message: Any) -> ErrorMap:
                        ("valid", sites), ("g_theta", lines), ("u_g_theta", lines)):
         if len(getattr(message, name)) != size:
             raise InputError(ERROR_MAP_TOPIC, f"{name} has {len(getattr(message, name))} "
-                             f"values, the plate {size}", "mend the publisher")
+                             f"values, the plate {size}", "correct the publisher")
     if message.datum_theta not in list(ThetaDatum):
         raise InputError(ERROR_MAP_TOPIC, f"datum_theta {message.datum_theta!r} is not known",
                          f"use one of {', '.join(ThetaDatum)}")

@@ -267,6 +267,6 @@ def _fields(data: object, where: str, required: dict, optional: dict | None = No
             value = float(value)
         if not isinstance(value, kind) or (kind is int and isinstance(value, bool)):
             raise InputError(f"{where}: {key}", f"{value!r} is not of type {kind.__name__}",
-                             "mend the value")
+                             "correct the value")
         out[key] = value
     return out

@@ -39,7 +39,7 @@ def _init(argv: list[str] | None) -> None:
         rclpy.init(args=argv, signal_handler_options=SignalHandlerOptions.NO)
     except (RCLError, UnknownROSArgsError) as error:
         what = re.sub(r",? at /\S+", "", " ".join(str(error).split()))
-        raise InputError("arguments after --ros-args", what, "mend them") from error
+        raise InputError("arguments after --ros-args", what, "correct them") from error
 
 
 def run(make_node: Callable[[], Node], argv: list[str] | None = None) -> int:

@@ -194,7 +194,7 @@ class CollectingSession:
                 self._ports.say(Level.WARN, self._findings[-1])
 
     def _advise(self, index: int, view: ViewProgress) -> None:
-        """Say once for each view that is over what would mend its rejections."""
+        """Say once for each view that is over what would correct its rejections."""
         rejected = {reason: count for reason, count in view.readings.rejected.items()
                     if not {(index, reason), (None, reason)} & self._warned}
         lines = advice(rejected) if index not in self._advised else []

@@ -124,7 +124,7 @@ def read_simulation(path: str | Path) -> Simulation:
         settings = CellSettings(**read["noise"], **read["cell"])
         faults = Faults(**read["faults"])
     except InputError as error:
-        raise InputError(f"{where}: {error.where}", error.what, error.mend) from error
+        raise InputError(f"{where}: {error.where}", error.what, error.remedy) from error
     return Simulation(_plan(data["plan"], Path(path)), top["seed"],
                       Spread(**read["truth"], **read["physics"]), settings, faults,
                       round(top["start_time"] * 1e9), top["compression"])

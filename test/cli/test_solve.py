@@ -174,7 +174,8 @@ def test_a_wrong_sense_is_said_before_any_advice_on_views(capsys):
             "selfcal solve: bags/hu_noise: 1745 of 2240 detections were rejected as "
             "stage_not_at_mark: the stage is indicated at minus the marks' sites; the sense is the "
             "other one: measurement_sense microscope_moves (--sense microscope_moves)")
-    assert "mend this first (as it is: the marks that were read do not identify the stage" in last
+    assert ("correct this first (as it is: the marks that were read do not identify the stage"
+            in last)
 
 
 def check_keys(found):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``selfcal solve`` says in one line what mends detections that nothing identifies."""
+"""``selfcal solve`` says in one line what helps detections that nothing identifies."""
 
 import json
 from dataclasses import replace

@@ -18,8 +18,8 @@ ODD = [
      "view command 0: neither grid nor angular marks are wanted; set one to true"),
     ({"repeats": 2**32 - 1}, {}, "view command 0: 4294967295 repeats; ask for 1 to 1000000"),
     ({"repeats": 0}, {}, "view command 0: 0 repeats; ask for 1 to 1000000"),
-    ({}, {"view_index": 2**31}, "view command 2147483648: a plan has at most 10000 views; mend "),
-    ({}, {"views_planned": 2**32 - 1}, "view command 0: a plan has at most 10000 views; mend the"),
+    ({}, {"view_index": 2**31}, "view command 2147483648: a plan has at most 10000 views; "),
+    ({}, {"views_planned": 2**32 - 1}, "view command 0: a plan has at most 10000 views; correct"),
     ({}, {"view": None}, "view command 0: it describes no view; fill its pose and its plate"),
 ]
 

@@ -52,10 +52,10 @@ def test_names_are_unique_in_a_node():
 
 @pytest.mark.parametrize(("name", "value", "message"), [
     ("max_sped", 1.0, "measurement_collector has no such parameter; known are measurement_sense"),
-    ("max_speed", "fast", "'fast' is not of type float; mend the value"),
-    ("max_speed", True, "True is not of type float; mend the value"),
-    ("max_speed", math.nan, "nan is outside 0.0 to 1.0 m/s; mend the value"),
-    ("max_speed", math.inf, "inf is outside 0.0 to 1.0 m/s; mend the value"),
+    ("max_speed", "fast", "'fast' is not of type float; correct the value"),
+    ("max_speed", True, "True is not of type float; correct the value"),
+    ("max_speed", math.nan, "nan is outside 0.0 to 1.0 m/s; correct the value"),
+    ("max_speed", math.inf, "inf is outside 0.0 to 1.0 m/s; correct the value"),
     ("joint_x", 3, "3 is not of type str; put it in quotes"),
     ("joint_y", False, "False is not of type str; put it in quotes"),
     ("joint_x", True, "True is not of type str; put it in quotes"),

@@ -118,11 +118,11 @@ def test_a_view_of_fine_lines_alone_is_never_identified_silently(phi_deg):
         np.testing.assert_allclose(found.views[index].dtheta, expected, atol=1e-12)
 
 
-@pytest.mark.parametrize(("phi_deg", "mend"), [
+@pytest.mark.parametrize(("phi_deg", "remedy"), [
     (0.6, {"with_ids": True}), (-0.8, {"with_ids": True}),
     (0.4, {"max_rotation": 0.0078}), (-0.4, {"max_rotation": 0.0078})])
-def test_each_mend_that_the_advice_names_works(phi_deg, mend):
-    truth, plan, found = session(phi_deg, **mend)
+def test_each_remedy_that_the_advice_names_works(phi_deg, remedy):
+    truth, plan, found = session(phi_deg, **remedy)
     assert found.all_rejected() == {}
     np.testing.assert_allclose(found.views[3].dtheta, angular_deviation(truth, 3, plan.views[3]),
                                atol=1e-12)
@@ -133,8 +133,8 @@ def test_the_advice_is_one_line_with_the_count():
     (line,) = advice({"rotation_not_known": 360, "duplicate": 3})
     assert line.startswith("360 detections rejected as rotation_not_known: ")
     assert "\n" not in line
-    for mend in ("ids", "grid marks in the same view", "max_rotation"):
-        assert mend in line
+    for remedy in ("ids", "grid marks in the same view", "max_rotation"):
+        assert remedy in line
 
 
 def turned(degrees, *, named, size=101, pitch=0.001, kept=1.0, offset=(1e-4, -5e-5), seed=0,

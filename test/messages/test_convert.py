@@ -245,7 +245,7 @@ def test_arrays_that_do_not_belong_together(changes, said):
     values = from_model.view_measurement(PROGRESS, MEASURED, STAMP_NS, "f")
     with pytest.raises(InputError) as caught:
         to_model.view_readings(through_cdr("ViewMeasurement", values | changes))
-    assert str(caught.value) == (f"selfcal/view_measurement of 'a': {said}; mend the publisher")
+    assert str(caught.value) == (f"selfcal/view_measurement of 'a': {said}; correct the publisher")
 
 
 def test_the_sense_of_a_measurement():
@@ -290,9 +290,9 @@ def test_an_error_map_comes_back(result):
 
 
 @pytest.mark.parametrize(("changes", "said"), [
-    ({"gx": [1.0]}, "gx has 1 values, the plate 35; mend the publisher"),
-    ({"valid": []}, "valid has 0 values, the plate 35; mend the publisher"),
-    ({"u_g_theta": [1.0]}, "u_g_theta has 1 values, the plate 8; mend the publisher"),
+    ({"gx": [1.0]}, "gx has 1 values, the plate 35; correct the publisher"),
+    ({"valid": []}, "valid has 0 values, the plate 35; correct the publisher"),
+    ({"u_g_theta": [1.0]}, "u_g_theta has 1 values, the plate 8; correct the publisher"),
     ({"datum_theta": "none"}, "datum_theta 'none' is not known; use one of xy_axes, zero_mean")])
 def test_error_maps_that_cannot_be(result, changes, said):
     values = from_model.error_map(result, STAMP_NS, "f") | changes

@@ -119,7 +119,7 @@ def test_a_plan_with_its_defaults_and_with_all_its_keys():
     (None, "f: not a mapping of keys to values; see config/plans"),
     ({}, "f: the key 'plan_id' is missing; add it"),
     (plan_with(extra=1), "f: extra: unknown key; known are plan_id, artifact, views, visit"),
-    (plan_with(plan_id=3), "f: plan_id: 3 is not of type str; mend the value"),
+    (plan_with(plan_id=3), "f: plan_id: 3 is not of type str; correct the value"),
     (plan_with(views=[]), "f: the plan has no views; add at least one view"),
     (plan_with(views=[3]), "f: views[0]: not a mapping of keys to values"),
     (plan_with(views=[{"name": "a"}] * 2), "f: views[1]: the name 'a' is used twice; give every"),
@@ -162,7 +162,7 @@ def test_terms_of_a_plan_are_read_and_checked():
              "drift, plate_scale, plate_shape, approach"),
             ([{"drift": 1e-9}], "here: model_terms: {'drift': 1e-09} is not a text; write TERM or "
              "TERM:SIZE"),
-            ("drift", "here: model_terms: 'drift' is not of type list; mend the value")):
+            ("drift", "here: model_terms: 'drift' is not of type list; correct the value")):
         with pytest.raises(InputError) as caught:
             plan_from_dict(plan_with(model_terms=terms), "here")
         assert str(caught.value) == message

@@ -24,10 +24,10 @@ def test_the_worst_comes_first_and_nothing_twice():
 def test_a_flood_of_refusals_is_counted_and_logged_at_powers_of_ten(hands):
     refusals = Refusals(hands.ports.say, hands.ports.now_s)
     for _ in range(1234):
-        refusals.add("topic", InputError("topic", "bad", "mend it"))
-    assert hands.lines(Level.ERROR) == ["topic: bad; mend it"] + [
-        f"topic: bad; mend it (refused {n} times)" for n in (2, 3, 4, 5, 10, 100, 1000)]
-    assert refusals.diagnosis() == Diagnosis(Level.WARN, "topic: bad; mend it",
+        refusals.add("topic", InputError("topic", "bad", "correct it"))
+    assert hands.lines(Level.ERROR) == ["topic: bad; correct it"] + [
+        f"topic: bad; correct it (refused {n} times)" for n in (2, 3, 4, 5, 10, 100, 1000)]
+    assert refusals.diagnosis() == Diagnosis(Level.WARN, "topic: bad; correct it",
                                              {"refused topic": 1234})
 
 

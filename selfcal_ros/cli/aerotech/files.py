@@ -59,7 +59,7 @@ def _check(args: argparse.Namespace) -> int:
             "file": args.file, "tables": [_described(table) for table in cal.tables],
             **{f"{severity}s" if severity is not Severity.TOLERATED else "tolerated": number
                for severity, number in counts.items()},
-            "findings": [{"line": f.line, "severity": f.severity, "what": f.what, "mend": f.mend}
+            "findings": [{"line": f.line, "severity": f.severity, "what": f.what, "mend": f.remedy}
                          for f in cal.findings]}, indent=1))
     else:
         for finding in cal.findings:
@@ -71,7 +71,7 @@ def _check(args: argparse.Namespace) -> int:
     refuse_errors(cal)
     if args.strict and cal.findings:
         first = cal.findings[0]
-        raise InputError(f"{args.file}:{first.line}", first.what, first.mend)
+        raise InputError(f"{args.file}:{first.line}", first.what, first.remedy)
     return int(ExitCode.DONE)
 
 

@@ -126,11 +126,11 @@ def _line(args: argparse.Namespace, corrected: Axis) -> int:
     return _deliver(args, line, frame, (args.along, corrected))
 
 
-def _refuse_frame(args: argparse.Namespace, what: str, mend: str) -> None:
+def _refuse_frame(args: argparse.Namespace, what: str, remedy: str) -> None:
     """Refuse options that place the stage frame: what a machine shows is not in that frame."""
     for axis in "xy":
         if getattr(args, f"home_{axis}") is not None:
-            raise InputError(f"--home-{axis}", f"it has no meaning for {what}", mend)
+            raise InputError(f"--home-{axis}", f"it has no meaning for {what}", remedy)
         if getattr(args, f"reverse_{axis}"):
             raise InputError(f"--reverse-{axis}", f"it has no meaning for {what}",
                              "give positions and errors in the sense of the encoders")

@@ -94,7 +94,7 @@ def _argument(header: Header, place: tuple[int, str], text: str, findings: Findi
     except ArgumentFault as fault:
         header.broken = True
         findings.error(line, f"{strict}: {fault.what}" if strict not in fault.what else fault.what,
-                       fault.mend)
+                       fault.remedy)
         return
     _tolerances(line, strict, (text, value), findings)
     _set(header, (line, strict), (keyword.field, value), findings)
@@ -166,6 +166,6 @@ def _positional(header: Header, place: tuple[int, int], words: list[str],
             value = number(word) if name.startswith("Samp") else integer(word)
         except ArgumentFault as fault:
             header.broken = True
-            findings.error(line, f"{name}: {fault.what}", fault.mend)
+            findings.error(line, f"{name}: {fault.what}", fault.remedy)
             value = 0
         header.positional.append(value)

@@ -22,10 +22,10 @@ _INTEGER = re.compile(r"[+-]?\d{1,9}", re.ASCII)
 
 
 class ArgumentFault(Exception):
-    """An argument that cannot be used: what is wrong, and how to mend it."""
+    """An argument that cannot be used: what is wrong, and how to correct it."""
 
-    def __init__(self, what: str, mend: str) -> None:
-        self.what, self.mend = what, mend
+    def __init__(self, what: str, remedy: str) -> None:
+        self.what, self.remedy = what, remedy
         super().__init__(what)
 
 
@@ -44,8 +44,8 @@ def number(text: str) -> float:
         If it is no plain decimal number, or beyond `LIMIT`.
     """
     if len(text) > 400 or not _NUMBER.fullmatch(text):
-        mend = "use a point as decimal mark" if "," in text else "write a plain decimal number"
-        raise ArgumentFault(f"{short(text)} is not a number", mend)
+        remedy = "use a point as decimal mark" if "," in text else "write a plain decimal number"
+        raise ArgumentFault(f"{short(text)} is not a number", remedy)
     value = float(text)
     if abs(value) > LIMIT:
         raise ArgumentFault(f"{short(text)} is too large", f"stay within +-{LIMIT:g}")

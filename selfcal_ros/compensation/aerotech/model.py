@@ -30,7 +30,7 @@ class Severity(StrEnum):
 
 @dataclass(frozen=True, order=True)
 class Finding:
-    """One remark about a file: where, what and how to mend it.
+    """One remark about a file: where, what and how to correct it.
 
     Attributes
     ----------
@@ -39,19 +39,20 @@ class Finding:
     severity : Severity
         ERROR: the file must not be loaded. WARNING: legal, but probably not what was meant.
         TOLERATED: not the strict form, yet its meaning is plain.
-    what, mend : str
+    what, remedy : str
         What is wrong, and what to do about it.
     """
 
     line: int
     severity: Severity
     what: str
-    mend: str = ""
+    remedy: str = ""
 
     def text(self, where: str) -> str:
         """Return the finding as one line for the file `where`."""
         place = f"{where}:{self.line}" if self.line else where
-        return f"{place}: {self.severity}: {self.what}" + (f"; {self.mend}" if self.mend else "")
+        remedy = f"; {self.remedy}" if self.remedy else ""
+        return f"{place}: {self.severity}: {self.what}{remedy}"
 
 
 class UnitWord(StrEnum):

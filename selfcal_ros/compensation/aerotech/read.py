@@ -179,7 +179,7 @@ class _Reader:
             try:
                 number(word)
             except ArgumentFault as fault:
-                self.findings.error(line, fault.what, fault.mend)
+                self.findings.error(line, fault.what, fault.remedy)
                 break
         else:
             self.findings.error(line, "odd characters between the numbers",
@@ -217,7 +217,7 @@ def _numbers(table: _Open, findings: Findings) -> np.ndarray | None:
             try:
                 number(word)
             except ArgumentFault as fault:
-                findings.error(line, fault.what, fault.mend)
+                findings.error(line, fault.what, fault.remedy)
                 return None
         index += count
     return values
@@ -278,10 +278,10 @@ def _rows_are_whole(columns: int, outputs: int, layout: tuple[list[int], list[in
     if mostly_rows or straddles.any():
         wrong = int(np.argmax(on_lines != width if mostly_rows else straddles))
         findings.error(lines[wrong], f"{on_lines[wrong]} values on the line; {want}",
-                       "mend the line or NumCols")
+                       "correct the line or NumCols")
     else:
         findings.error(lines[-1], f"the last row has {ends[-1] % width} values; {want}",
-                       "complete the row or mend NumCols")
+                       "complete the row or correct NumCols")
     return False
 
 
@@ -317,14 +317,14 @@ def refuse_errors(cal: CalFile) -> CalFile:
     Raises
     ------
     InputError
-        For the first error, with its line and mend.
+        For the first error, with its line and remedy.
     """
     errors = cal.of(Severity.ERROR)
     if errors:
         first = errors[0]
         more = f" ({len(errors) - 1} more errors)" if len(errors) > 1 else ""
         place = f"{cal.where}:{first.line}" if first.line else cal.where
-        raise InputError(place, first.what, first.mend + more)
+        raise InputError(place, first.what, first.remedy + more)
     return cal
 
 

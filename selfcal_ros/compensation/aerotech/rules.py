@@ -61,8 +61,9 @@ def check_table(table: Table, findings: Findings, *, gi4: Gi4 | None = None) -> 
 def _axes(table: Table, findings: Findings) -> None:
     for axis in {*table.inputs, *table.outputs}:
         if not 1 <= axis <= MAX_AXIS:
-            mend = "indices in calibration files count from 1" if axis == 0 else "mend the index"
-            findings.error(table.line, f"axis {axis} is not in 1..{MAX_AXIS}", mend)
+            remedy = ("indices in calibration files count from 1" if axis == 0 else
+                      "correct the index")
+            findings.error(table.line, f"axis {axis} is not in 1..{MAX_AXIS}", remedy)
 
 
 def _distance(table: Table, name: str, value: float, findings: Findings) -> None:

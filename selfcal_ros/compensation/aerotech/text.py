@@ -21,36 +21,36 @@ class Findings:
         self._listed: list[Finding] = []
         self._tolerated: dict[tuple[str, str], list[int]] = {}
 
-    def error(self, line: int, what: str, mend: str) -> None:
+    def error(self, line: int, what: str, remedy: str) -> None:
         """Note that the file must not be loaded."""
-        self._add(Finding(line, Severity.ERROR, what, mend))
+        self._add(Finding(line, Severity.ERROR, what, remedy))
 
-    def warning(self, line: int, what: str, mend: str) -> None:
+    def warning(self, line: int, what: str, remedy: str) -> None:
         """Note something legal that was probably not meant."""
-        self._add(Finding(line, Severity.WARNING, what, mend))
+        self._add(Finding(line, Severity.WARNING, what, remedy))
 
-    def tolerated(self, line: int, what: str, mend: str) -> None:
+    def tolerated(self, line: int, what: str, remedy: str) -> None:
         """Note a departure from the strict form whose meaning is plain."""
-        self._tolerated.setdefault((what, mend), []).append(line)
+        self._tolerated.setdefault((what, remedy), []).append(line)
 
-    def stop(self, line: int, what: str, mend: str) -> None:
+    def stop(self, line: int, what: str, remedy: str) -> None:
         """Note an error after which reading on makes no sense."""
-        self._listed.append(Finding(line, Severity.ERROR, what, mend))
+        self._listed.append(Finding(line, Severity.ERROR, what, remedy))
         raise TooManyFindings
 
     def sorted(self) -> tuple[Finding, ...]:
         """Return all findings by line."""
         out = list(self._listed)
-        for (what, mend), lines in self._tolerated.items():
+        for (what, remedy), lines in self._tolerated.items():
             more = f" (and in {len(lines) - 1} more lines)" if len(lines) > 1 else ""
-            out.append(Finding(lines[0], Severity.TOLERATED, what + more, mend))
+            out.append(Finding(lines[0], Severity.TOLERATED, what + more, remedy))
         return tuple(sorted(out, key=lambda finding: finding.line))
 
     def _add(self, finding: Finding) -> None:
         self._listed.append(finding)
         if len(self._listed) >= MAX_FINDINGS:
             self.stop(finding.line, f"reading stopped after {MAX_FINDINGS} findings",
-                      "mend the first ones")
+                      "correct the first ones")
 
 
 def decode(data: bytes, findings: Findings) -> tuple[list[str], set[int]]:

@@ -184,8 +184,8 @@ def _without_slips(measurements: Measurements, options: Options, linear: Options
             break
         cause = likelier_term(at.measurements, options, slip)
         if cause is None:
-            at, mended = _mended(at, slip, linear)
-            if not mended:
+            at, done = _split(at, slip, linear)
+            if not done:
                 return at
             continue
         at = replace(at, notes=(*at.notes, f"view '{slip.view}' looks as if the plate slipped, but "
@@ -201,21 +201,21 @@ def _without_slips(measurements: Measurements, options: Options, linear: Options
                               "seem to be in the readings; measure again"))
 
 
-def _mended(at: _Screened, slip: Slip, linear: Options) -> tuple[_Screened, bool]:
+def _split(at: _Screened, slip: Slip, linear: Options) -> tuple[_Screened, bool]:
     """Return the readings split at a slip, or without its view, and whether that could be done."""
     text = slip.text()
 
-    def mend(readings: Measurements) -> Measurements:
+    def split(readings: Measurements) -> Measurements:
         return left_out(readings, slip.index) if slip.alternatives else split_view(readings, slip)
 
-    flattened = mend(at.flattened)
+    flattened = split(at.flattened)
     try:
         residuals = residuals_of(flattened, linear)
     except NotIdentifiableError:
         text += "; the map is spoiled by it: measure the view again"
         return replace(at, slips=(*at.slips, slip), notes=(*at.notes, text)), False
     text += "; the view is left out" if slip.alternatives else ""
-    return _Screened(mend(at.measurements), flattened, residuals, (*at.slips, slip),
+    return _Screened(split(at.measurements), flattened, residuals, (*at.slips, slip),
                      (*at.notes, text)), True
 
 

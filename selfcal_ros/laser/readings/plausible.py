@@ -34,7 +34,8 @@ def check_reading(value_m: float, nominal_m: float, where: str) -> None:
         named.
     """
     if not math.isfinite(value_m):
-        raise InputError(where, "not a finite number", "measure the block again or mend the cell")
+        raise InputError(where, "not a finite number",
+                         "measure the block again or correct the cell")
     ratio = value_m / nominal_m
     shown = f"{value_m * MM_PER_M:.6g} where {nominal_m * MM_PER_M:.6g} mm is nominal"
     if _is_near(ratio):
@@ -57,7 +58,8 @@ def check_linear(value_m: float, step_m: float, where: str) -> None:
         If it is not finite or larger than `LINEAR_SHARE` of the step.
     """
     if not math.isfinite(value_m):
-        raise InputError(where, "not a finite number", "measure the block again or mend the cell")
+        raise InputError(where, "not a finite number",
+                         "measure the block again or correct the cell")
     if abs(value_m) > LINEAR_SHARE * step_m:
         if _is_near((value_m + step_m) / step_m) or not _is_near(value_m / step_m):
             hint = "it looks like micrometres; give millimetres"

@@ -78,7 +78,7 @@ def read_table(path: str | os.PathLike, columns: Columns) -> tuple[StepDiagonal,
     for line, row in rows[1:]:
         if len(row) != len(header):
             raise InputError(f"{path}:{line}", f"{len(row)} cells where the header has "
-                             f"{len(header)}", "mend the line")
+                             f"{len(header)}", "correct the line")
         named = dict(zip(header, row, strict=True))
         block = _block(named[BLOCK], f"{path}:{line}: {BLOCK}")
         cells.setdefault(block, []).append(_values(named, columns, f"{path}:{line}"))

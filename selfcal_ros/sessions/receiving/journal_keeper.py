@@ -180,4 +180,4 @@ def bad_input(bad: Counter) -> InputError | None:
         return None
     line = "; ".join(f"{count} messages on {topic}" for (topic, _), count in bad.items())
     bad.clear()
-    return InputError(line, "cannot be decoded", "mend their publisher")
+    return InputError(line, "cannot be decoded", "correct their publisher")

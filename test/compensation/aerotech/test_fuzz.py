@@ -32,7 +32,7 @@ def survive(data, *, write=True):
     """Read, check, evaluate and write `data`; return whether it was good."""
     cal = parse_cal(data, "f.cal")
     lines = data.count(b"\n") + data.count(b"\r") + 1
-    assert all(0 <= f.line <= lines and f.what and f.mend and "\n" not in f.text("f.cal")
+    assert all(0 <= f.line <= lines and f.what and f.remedy and "\n" not in f.text("f.cal")
                for f in cal.findings)
     if cal.of(Severity.ERROR):
         return False

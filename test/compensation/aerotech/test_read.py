@@ -37,7 +37,7 @@ def only_tolerated(text, *want):
     cal = read(text)
     assert said(cal, Severity.ERROR) == []
     assert said(cal, Severity.TOLERATED) == list(want)
-    assert all(f.mend for f in cal.findings)
+    assert all(f.remedy for f in cal.findings)
     return cal.tables
 
 
@@ -223,7 +223,7 @@ def test_broken_files_name_line_reason_and_mend(text, line, what):
     cal = read(text)
     first = cal.of(Severity.ERROR)[0]
     assert (first.line, first.what) == (line, what)
-    assert first.mend
+    assert first.remedy
 
 
 def test_utf16_is_read_on_for_its_other_errors():

@@ -9,7 +9,7 @@ from selfcal_ros.compensation.aerotech.rules import Gi4
 
 def findings(text, severity=Severity.ERROR, **options):
     found = parse_cal(text.encode(), "f.cal", **options).of(severity)
-    assert all(f.mend for f in found)
+    assert all(f.remedy for f in found)
     return [(f.line, f.what) for f in found]
 
 
@@ -36,7 +36,7 @@ def test_axes_count_from_one_to_32(axis, good):
 
 def test_an_axis_of_zero_gets_the_hint():
     cal = parse_cal(one_d(0).encode(), "f")
-    assert cal.findings[0].mend == "indices in calibration files count from 1"
+    assert cal.findings[0].remedy == "indices in calibration files count from 1"
 
 
 def test_a_file_holds_100_tables_and_8_for_an_axis():

@@ -105,7 +105,7 @@ def test_what_cannot_be_decoded_is_counted_by_topic_and_the_rest_is_used(events,
     assert desk.receive(events).read() == expected
     assert desk.refused == {f"decoding: 1 messages on {COMMAND_TOPIC}; 2 messages on "
                             f"{ENCODER_TOPIC}; 1 messages on {DETECTION_TOPIC}: cannot be "
-                            "decoded; mend their publisher": 1}
+                            "decoded; correct their publisher": 1}
 
 
 def test_a_command_that_cannot_be_used_is_refused_and_the_others_are_used(events, expected):
