@@ -14,7 +14,6 @@ import os
 import resource
 import subprocess
 import sys
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,7 +21,9 @@ ROOT = Path(__file__).parents[2]
 sys.path.insert(0, str(ROOT))
 
 import ingest  # noqa: E402
+import with_terms  # noqa: E402
 from rivals import RIVALS, Rival, installed  # noqa: E402
+from timing import median_time  # noqa: E402
 
 from selfcal_ros.errors import InputError  # noqa: E402
 from selfcal_ros.files import write_json  # noqa: E402
@@ -30,12 +31,12 @@ from selfcal_ros.files import write_json  # noqa: E402
 SIZES = (11, 21, 51, 101, 201, 401, 1001)
 OURS = {"solve": "selfcal", "re-solve": "selfcal (factored plan)",
         "map only": "selfcal (factored plan, map only)", "uncertainty": "selfcal (uncertainty map)",
-        "missing": "selfcal (3 % of the marks missing)"}
-MAX_RE_SOLVE, MAX_UNCERTAINTY = 201, 401
+        "missing": "selfcal (3 % of the marks missing)",
+        "five views": "selfcal (defaults but causes)", "terms": "selfcal (all terms)"}
+MAX_SIZE = {"re-solve": 201, "map only": 201, "uncertainty": 401, "five views": 101, "terms": 101}
 MISSING = 0.03
 TIME_LIMIT_S = 60.0
 MEMORY_LIMIT_MB = 8000
-MIN_SECONDS, MAX_REPEATS = 0.5, 30
 
 
 def readings(size: int, missing: float = 0.0):
@@ -70,17 +71,6 @@ def error_of(field, truth) -> float:
     left = np.where(known, left, 0.0)
     left = gauge.remove(left, gauge.parts(left))[known]
     return float(max(abs(left.real).max(), abs(left.imag).max()))
-
-
-def median_time(run, once: bool) -> tuple[float, object]:
-    """Return the median wall time of `run` and its last result; at least one run."""
-    times, start = [], time.perf_counter()
-    while True:
-        began = time.perf_counter()
-        result = run()
-        times.append(time.perf_counter() - began)
-        if once or len(times) == MAX_REPEATS or time.perf_counter() - start > MIN_SECONDS:
-            return sorted(times)[len(times) // 2], result
 
 
 def ours(benchmark: str, data) -> tuple:
@@ -119,6 +109,11 @@ def ours(benchmark: str, data) -> tuple:
 def worker(benchmark: str, method: str, size: int) -> dict:
     """Measure one method in this process."""
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY_LIMIT_MB * 2**20,) * 2)
+    if benchmark in ("five views", "terms"):
+        seconds, error = with_terms.solved(size, benchmark == "terms")
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+        return {"benchmark": benchmark, "method": method, "n": size, "seconds": seconds,
+                "peak_mb": round(peak, 1), "max_error": error}
     truth, data = readings(size, MISSING if benchmark == "missing" else 0.0)
     if method in OURS.values():
         seconds, field = ours(benchmark, data)
@@ -155,11 +150,8 @@ def jobs(sizes: list[int], methods: list[str]):
         for benchmark, method in OURS.items():
             if "selfcal" not in methods:
                 continue
-            if benchmark in ("re-solve", "map only") and size > MAX_RE_SOLVE:
-                continue
-            if benchmark == "uncertainty" and size > MAX_UNCERTAINTY:
-                continue
-            yield benchmark, method, size
+            if size <= MAX_SIZE.get(benchmark, size):
+                yield benchmark, method, size
         for method in RIVALS:
             if method in methods:
                 yield "solve", method, size

@@ -18,21 +18,22 @@ def bench(tmp_path, *args):
 
 
 def test_every_method_is_measured_and_exact(tmp_path):
-    done, rows = bench(tmp_path, "--sizes", "5", "--ingest", "0", "--detections", "0")
+    done, rows = bench(tmp_path, "--sizes", "7", "--ingest", "0", "--detections", "0")
     assert done.returncode == 0, done.stderr
     methods = {row["method"] for row in rows}
     assert {"selfcal", "numpy.linalg.lstsq", "scipy lsmr", "scipy splu", "gtsam",
             "pyceres"} <= methods
     assert {row["benchmark"] for row in rows} == {"solve", "re-solve", "map only", "uncertainty",
-                                                "missing"}
+                                                "missing", "five views", "terms"}
     for row in rows:
-        assert row.keys() >= KEYS and row["n"] == 5
+        assert row.keys() >= KEYS and row["n"] == 7
         assert row["method"] in done.stdout
         if row["seconds"] is None:
             assert row["note"] == "not installed" and row["method"] in ("gtsam", "pyceres")
         else:
             assert row["seconds"] > 0 and row["peak_mb"] > 10
-            assert row["max_error"] < (1e-9 if row["method"] == "pyceres" else 1e-12)
+            noisy = row["benchmark"] in ("five views", "terms")
+            assert noisy or row["max_error"] < (1e-9 if row["method"] == "pyceres" else 1e-12)
 
 
 def test_unknown_methods_are_refused(tmp_path):

@@ -7,7 +7,7 @@ what the terms make of the readings, are taken off with the last solution until 
 Every step solves the same factored equations (Gauss-Newton).
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,12 +16,17 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.datum.covariance import TermSpread
 from selfcal_ros.estimation.joint.fit import JointFit, fit
 from selfcal_ros.estimation.joint.problem import ROUNDING, Problem, grid_dof, sigma_of
-from selfcal_ros.estimation.terms.columns import TermColumns, term_columns
+from selfcal_ros.estimation.terms.columns import TermColumns, made_anew, term_columns
 from selfcal_ros.estimation.terms.equations import TermEquations
 from selfcal_ros.estimation.terms.ground import without_noise
-from selfcal_ros.estimation.terms.projection import ReducedColumns, project, reduce_columns
+from selfcal_ros.estimation.terms.projection import (
+    ReducedColumns,
+    project,
+    reduce_anew,
+    reduce_columns,
+)
 from selfcal_ros.estimation.terms.solution import Sums, next_coefficients, noise_left, score
-from selfcal_ros.model.terms import TermName
+from selfcal_ros.model.terms import ModelTerm, TermName
 
 MAX_STEPS = 100
 
@@ -40,7 +45,7 @@ LINEAR = 1e-3
 anew."""
 
 OFFSET_STEPS = 10
-"""Steps in which the offsets that a microscope saw are freed from noise anew; then they stand."""
+"""Most steps in which the offsets that a microscope saw are freed from noise anew."""
 
 SHRINKS = 0.5
 """Ratio of two steps above which they no longer shrink."""
@@ -129,13 +134,6 @@ def fit_model(problem: Problem,
                      "check the readings for misalignments of more than a few degrees")
 
 
-def columns_of(problem: Problem, found: JointFit,
-               of_terms: Sequence[np.ndarray | float] = ()) -> TermColumns:
-    """Return the columns of the problem's terms, offsets freed from the noise of `found`."""
-    ground = without_noise(problem.ground, found.residuals, of_terms)
-    return term_columns(ground, problem.terms, problem.drift_degree)
-
-
 def equations_of(problem: Problem, found: JointFit, columns: TermColumns,
                  reduced: ReducedColumns | None = None) -> TermEquations:
     """Return the equations of columns beside the estimate `found`."""
@@ -145,8 +143,7 @@ def equations_of(problem: Problem, found: JointFit, columns: TermColumns,
     known = [sigma for sigma in (found.xy.declared, found.xy.repeats, found.xy.residuals)
              if np.isfinite(sigma)]
     return TermEquations(problem.system, columns,
-                         project(problem.system, columns.grid, reduced, inverse),
-                         min(known, default=0.0))
+                         project(problem.system, reduced, inverse), min(known, default=0.0))
 
 
 class _State:
@@ -154,27 +151,47 @@ class _State:
 
     def __init__(self, problem: Problem, found: JointFit) -> None:
         self.problem, self.found, self.steps = problem, found, 0
+        self.offset_steps = OFFSET_STEPS
         self.equations: TermEquations | None = None
         self.reduced: ReducedColumns | None = None
-        self.of_offsets = any(term.name is TermName.MICROSCOPE for term in problem.terms)
+        self.microscope = next((term for term in problem.terms
+                                if term.name is TermName.MICROSCOPE), None)
         if problem.terms:
-            self._linearise()
+            ground = without_noise(problem.ground, found.residuals)
+            columns = term_columns(ground, problem.terms, problem.drift_degree)
+            self._linearise(columns, reduce_columns(problem.system.grid, columns.grid))
         equations = self.equations
         self.coefficients = np.zeros(equations.n if equations else 0)
         self.sums = self._sums()
         self.y = problem.grid.y
 
-    def _linearise(self) -> None:
+    def _linearise(self, columns: TermColumns, reduced: ReducedColumns) -> None:
         """Set up the equations of the terms about the present solution."""
-        self.weights = self.found.inverse
-        if self.equations is None or self.of_offsets:
-            known = (self.equations.columns.at_visits(self.coefficients)
-                     if self.equations is not None else ())
-            columns = columns_of(self.problem, self.found, known)
-            self.reduced = reduce_columns(self.problem.system.grid, columns.grid)
-        else:
-            columns = self.equations.columns
-        self.equations = equations_of(self.problem, self.found, columns, self.reduced)
+        self.weights, self.reduced = self.found.inverse, reduced
+        self.equations = equations_of(self.problem, self.found, columns, reduced)
+
+    def _refresh(self, equations: TermEquations, reduced: ReducedColumns) -> None:
+        """Set up what has changed of the equations: the offsets' columns, or weights."""
+        columns = equations.columns
+        if self.microscope is not None and 0 < self.steps <= self.offset_steps:
+            columns = self._freed_of_noise(self.microscope, columns)
+            reduced = reduce_anew(self.problem.system.grid, columns.grid, reduced,
+                                  columns.rows([TermName.MICROSCOPE]))
+        elif not self._stale():
+            return
+        self._linearise(columns, reduced)
+
+    def _freed_of_noise(self, microscope: ModelTerm, before: TermColumns) -> TermColumns:
+        """Return the columns with offsets that are freed anew from the noise of the residuals."""
+        ground = without_noise(self.problem.ground, self.found.residuals,
+                               before.at_visits(self.coefficients))
+        columns = made_anew(ground, microscope, before)
+        rows = columns.rows([microscope.name])
+        effect = np.tensordot(self.coefficients[rows], columns.grid[rows] - before.grid[rows],
+                              axes=1)
+        if np.abs(effect).max() <= RESOLUTION * np.abs(self.found.parameters).max():
+            self.offset_steps = self.steps
+        return columns
 
     def _stale(self) -> bool:
         """Return whether the angular readings now weigh otherwise than in the equations."""
@@ -189,9 +206,8 @@ class _State:
         readings may where the misalignments take it up.
         """
         parameters, y = self.found.parameters, self.y
-        if self.equations is not None and (self._stale() or (
-                self.of_offsets and self.steps <= OFFSET_STEPS)):
-            self._linearise()
+        if self.equations is not None and self.reduced is not None:
+            self._refresh(self.equations, self.reduced)
         self.steps += 1
         if self.equations is not None:
             self._solve_terms(self.equations)

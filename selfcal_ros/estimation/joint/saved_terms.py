@@ -35,6 +35,9 @@ FREE = ""
 DIGITS = 7
 """Digits of a factor that are kept."""
 
+LEAST = 1e-12
+"""Entry of a factor below which nothing is kept, in units of the noise."""
+
 
 def saved_terms(cover: FieldCovariance, columns: TermColumns, sense: Sense) -> dict[str, Any]:
     """Return the factors for `CalibrationResult.extra`; empty without terms, or for large fields.
@@ -61,11 +64,20 @@ def saved_terms(cover: FieldCovariance, columns: TermColumns, sense: Sense) -> d
     for name, root in _roots(cover.terms.covariance, columns):
         left, size, _ = np.linalg.svd(both @ root, full_matrices=False)
         kept = size > NEGLIGIBLE
-        factors += (left[:, kept] * size[kept]).T.reshape(-1, 2, *shape).tolist()
+        factors += list((left[:, kept] * size[kept]).T.reshape(-1, 2, *shape))
         names += [name] * int(kept.sum())
-    return {KEY: {"terms": names, "factors": [
-        [[[float(f"{value:.{DIGITS}g}") for value in row] for row in axis] for axis in factor]
-        for factor in factors]}}
+    return {KEY: {"terms": names, "factors": rounded(np.array(factors)).tolist()}}
+
+
+def rounded(values: np.ndarray) -> np.ndarray:
+    """Return values rounded to `DIGITS` digits, none smaller than `LEAST`.
+
+    As quotients by a power of ten that is exact, so that they print with no more digits.
+    """
+    size = np.abs(values)
+    digits = DIGITS - 1 - np.floor(np.log10(np.maximum(size, LEAST)))
+    power = 10.0 ** np.maximum(digits, 0.0)
+    return np.where(size < LEAST, 0.0, np.round(values * power) / power)
 
 
 def _roots(covariance: np.ndarray, columns: TermColumns) -> list[tuple[str, np.ndarray]]:

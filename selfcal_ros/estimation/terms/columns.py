@@ -133,6 +133,25 @@ def term_columns(ground: Ground, terms: Iterable[ModelTerm], degree: int) -> Ter
     return _stacked(ground, made)
 
 
+def made_anew(ground: Ground, term: ModelTerm, before: TermColumns) -> TermColumns:
+    """Return columns of which those of one shared term of the visits are of another ground.
+
+    Parameters
+    ----------
+    ground : Ground
+        With the same readings as before, but other offsets or signs of approach.
+    term : ModelTerm
+        The term, one that all views share: its columns are made anew.
+    before : TermColumns
+        Columns of all terms.
+    """
+    at = np.flatnonzero(before.rows([term.name]))
+    grid, seen = before.grid.copy(), list(before.seen)
+    for row, (_, block, values) in zip(at, _visit_columns(ground, term, 0), strict=True):
+        grid[row], seen[row] = block, values
+    return TermColumns(before.columns, grid, _within_anew(ground, seen, before.within, at), seen)
+
+
 def columns_from(ground: Ground, columns: Iterable[Column],
                  shapes: Iterable[np.ndarray]) -> TermColumns:
     """Return columns of one view each, given by their values at its visits (V,), plate frame."""
@@ -246,18 +265,35 @@ def _plate_shapes(ground: Ground, name: TermName) -> list[tuple[str, np.ndarray]
 
 
 def _within(ground: Ground, seen: list[list[np.ndarray | None]]) -> WithinMarks:
-    p, n_marks = len(seen), ground.z.size
-    gram, right, total, dof = np.zeros((p, p)), np.zeros(p), 0.0, 0
+    total, dof, n = 0.0, 0, len(seen)
+    for visits in ground.visits:
+        if visits is not None:
+            rest = visits.about_means(visits.y[None], ground.z.size)[0]
+            total += float(visits.weight @ abs(rest) ** 2)
+            dof += 2 * (len(visits.mark) - len(np.unique(visits.mark)))
+    nothing = WithinMarks(np.zeros((n, n)), np.zeros(n), total, dof)
+    return _within_anew(ground, seen, nothing, np.arange(n))
+
+
+def _within_anew(ground: Ground, seen: list[list[np.ndarray | None]], before: WithinMarks,
+                 changed: np.ndarray) -> WithinMarks:
+    """Return what the means hide, the products of the columns `changed` set up anew."""
+    gram, right = before.gram.copy(), before.right.copy()
+    gram[changed], gram[:, changed], right[changed] = 0.0, 0.0, 0.0
     for view, visits in enumerate(ground.visits):
-        if visits is None:
+        mine = [k for k in changed if seen[k][view] is not None]
+        if visits is None or not mine:
             continue
-        rest = visits.about_means(visits.y[None], n_marks)[0]
-        total += float(visits.weight @ abs(rest) ** 2)
-        dof += 2 * (len(visits.mark) - len(np.unique(visits.mark)))
-        here = [k for k in range(p) if seen[k][view] is not None]
-        if here:
-            moved = visits.about_means(np.array([seen[k][view] for k in here]), n_marks)
-            weighted = np.conj(moved) * visits.weight
-            gram[np.ix_(here, here)] += (weighted @ moved.T).real
-            right[here] += (weighted @ rest).real
-    return WithinMarks(gram, right, total, dof)
+        here = [k for k in range(len(seen)) if seen[k][view] is not None]
+        # about the means of their marks: then those of the others drop out
+        moved = visits.about_means(np.array([seen[k][view] for k in mine]), ground.z.size)
+        weighted = np.conj(moved) * visits.weight
+        gram[np.ix_(mine, here)] += (weighted @ np.array([seen[k][view] for k in here]).T).real
+        right[mine] += (weighted @ visits.y).real
+    gram[:, changed] = gram[changed].T
+    gram[np.ix_(changed, changed)] = _symmetric(gram[np.ix_(changed, changed)])
+    return WithinMarks(gram, right, before.total, before.dof)
+
+
+def _symmetric(square: np.ndarray) -> np.ndarray:
+    return (square + square.T) / 2

@@ -63,8 +63,8 @@ class TermEquations:
 
         Against it is judged what is told: what is left may be nothing but rounding.
         """
-        grid = np.einsum("pvij,pvij,vij->p", np.conj(self.columns.grid), self.columns.grid,
-                         self.system.grid.weight, optimize=True).real
+        columns = self.columns.grid.reshape(self.n, -1)
+        grid = (columns.real**2 + columns.imag**2) @ self.system.grid.weight.ravel()
         return np.sqrt(np.maximum(grid + np.diag(self.columns.within.gram),
                                   np.finfo(float).tiny))
 

@@ -118,8 +118,7 @@ def planned_equations(system: NormalEquations, ground: Ground, terms: Iterable[M
     n = 3 * system.grid.n_views
     inverse = np.zeros((system.size, system.size))
     inverse[:n, :n] = system.grid_inverse
-    return TermEquations(system, columns, project(system, columns.grid, reduced, inverse),
-                         assumed.sigma_m)
+    return TermEquations(system, columns, project(system, reduced, inverse), assumed.sigma_m)
 
 
 def with_terms(every: TermEquations, terms: Iterable[ModelTerm]) -> TermEquations:

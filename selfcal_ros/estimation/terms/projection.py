@@ -6,6 +6,8 @@ column c has the map F = G(c) and the residuals r = (1 - P) c. With these the te
 partitioned regression (Frisch and Waugh):
     (r'W c + within + sigma^2/size^2) b = c'W e + within,
     G = G(y) - F b,     cov G = S + F cov(b) F'
+With the marks, then the sites (matrix M, right-hand side s), then the misalignments (right-hand
+side d, covariance C) eliminated, r'W c = c'W (c - mean) - s' M^-1 s - d' C d.
 """
 
 from dataclasses import dataclass
@@ -26,13 +28,16 @@ class ReducedColumns:
     Attributes
     ----------
     free : complex array (sites, p)
-        M^-1 b of every column.
+        M^-1 s of every column.
     right : float array (3 views, p)
         Right-hand side of the misalignments.
+    gram : float array (p, p)
+        Weighted inner products of what marks and sites leave of the columns.
     """
 
     free: np.ndarray
     right: np.ndarray
+    gram: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,19 +61,46 @@ class ProjectedColumns:
 
 def reduce_columns(grid: GridSystem, columns: np.ndarray) -> ReducedColumns:
     """Return columns (p, views, nx, ny) with the sites eliminated."""
-    free = np.zeros((grid.n_sites, len(columns)), dtype=complex)
-    right = np.zeros((3 * grid.n_views, len(columns)))
-    for part in _chunks(columns):
-        weighted = grid.weight * _centred(grid, columns[part])
-        sites = np.stack([grid.views.scatter(one).ravel() for one in weighted], axis=1)
+    n = len(columns)
+    empty = ReducedColumns(np.zeros((grid.n_sites, n), dtype=complex),
+                           np.zeros((3 * grid.n_views, n)), np.zeros((n, n)))
+    return reduce_anew(grid, columns, empty, np.ones(n, dtype=bool))
+
+
+def reduce_anew(grid: GridSystem, columns: np.ndarray, before: ReducedColumns,
+                rows: np.ndarray) -> ReducedColumns:
+    """Return columns with the sites eliminated, of which only `rows` have changed.
+
+    Parameters
+    ----------
+    grid : GridSystem
+        The measured plan.
+    columns : complex array (p, views, nx, ny)
+        The columns in the plate frame.
+    before : ReducedColumns
+        Of the columns before.
+    rows : bool array (p,)
+        Which ones are to be set up anew.
+    """
+    free, right, gram = before.free.copy(), before.right.copy(), before.gram.copy()
+    changed = np.flatnonzero(rows)
+    sites = np.empty((grid.n_sites, len(changed)), dtype=complex)
+    for part in _chunks(columns, len(changed)):
+        at = changed[part]
+        weighted = grid.weight * _centred(grid, columns[at])
+        for place, one in zip(range(part.start, part.stop), weighted, strict=True):
+            sites[:, place] = grid.views.scatter(one).ravel()
         sums = np.einsum("kij,pvij->vkp", np.conj(grid.shapes), weighted, optimize=True)
-        free[:, part] = grid.factor.solve(sites)
+        free[:, at] = grid.factor.solve(sites[:, part])
         both = np.stack([sums[:, 0].real, sums[:, 1].real, sums[:, 1].imag], axis=1)
-        right[:, part] = both.reshape(3 * grid.n_views, -1) - grid.coupled(free[:, part])
-    return ReducedColumns(free, right)
+        right[:, at] = both.reshape(3 * grid.n_views, -1) - grid.coupled(free[:, at])
+        gram[:, at] = inner_products(columns, weighted)
+    gram[:, changed] -= inner_products(free.T, sites.T)
+    gram[changed] = gram[:, changed].T
+    return ReducedColumns(free, right, (gram + gram.T) / 2)
 
 
-def project(system: NormalEquations, columns: np.ndarray, reduced: ReducedColumns,
+def project(system: NormalEquations, reduced: ReducedColumns,
             inverse: np.ndarray) -> ProjectedColumns:
     """Return what the joint estimate makes of the columns.
 
@@ -76,33 +108,23 @@ def project(system: NormalEquations, columns: np.ndarray, reduced: ReducedColumn
     ----------
     system : NormalEquations
         The measured plan.
-    columns : complex array (p, views, nx, ny)
-        The columns in the plate frame.
     reduced : ReducedColumns
-        Their sites eliminated.
+        The columns with their sites eliminated.
     inverse : float array (size, size)
         Covariance of the misalignments for unit noise of one grid reading.
     """
     grid, n = system.grid, 3 * system.grid.n_views
     parameters = inverse[:, :n] @ reduced.right
     fields = reduced.free - grid.response @ parameters[:n]
-    gram = np.zeros((len(columns), len(columns)))
-    for part in _chunks(columns):
-        residuals = residuals_of_columns(grid, columns[part], fields[:, part],
-                                         parameters[:n, part])
-        weighted = (grid.weight * residuals).reshape(residuals.shape[0], -1)
-        gram[:, part] = (np.conj(columns.reshape(len(columns), -1)) @ weighted.T).real
+    gram = reduced.gram - reduced.right.T @ parameters[:n]
     return ProjectedColumns(fields, parameters, (gram + gram.T) / 2)
 
 
-def residuals_of_columns(grid: GridSystem, columns: np.ndarray, fields: np.ndarray,
-                         parameters: np.ndarray) -> np.ndarray:
-    """Return the grid residuals (p, views, nx, ny) of columns with the maps (sites, p)."""
-    out = np.empty(columns.shape, dtype=complex)
-    shape = grid.views.shape
-    for row, column, field, values in zip(out, columns, fields.T, parameters.T, strict=True):
-        row[...] = grid.plate(column, field.reshape(shape), values)[1]
-    return out
+def inner_products(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Return the real part of the inner products of complex rows (p, ...) and (k, ...), (p, k)."""
+    pairs = [np.ascontiguousarray(rows).reshape(len(rows), -1).view(float)
+             for rows in (first, second)]
+    return pairs[0] @ pairs[1].T
 
 
 def _centred(grid: GridSystem, columns: np.ndarray) -> np.ndarray:
@@ -110,6 +132,6 @@ def _centred(grid: GridSystem, columns: np.ndarray) -> np.ndarray:
     return columns - mean[:, None]
 
 
-def _chunks(columns: np.ndarray) -> list[slice]:
+def _chunks(columns: np.ndarray, number: int) -> list[slice]:
     step = max(1, CHUNK_READINGS // max(columns[0].size if len(columns) else 1, 1))
-    return [slice(i, i + step) for i in range(0, len(columns), step)]
+    return [slice(i, min(i + step, number)) for i in range(0, number, step)]

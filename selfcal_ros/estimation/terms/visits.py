@@ -6,6 +6,7 @@ of one mark leave about their mean tells terms that differ between them, and the
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -47,13 +48,16 @@ class ViewVisits:
 
     def means(self, values: np.ndarray, n_marks: int) -> np.ndarray:
         """Return the weighted mean of complex values (k, V) at each mark, (k, marks)."""
-        total = np.bincount(self.mark, self.weight, n_marks)
-        relative = self.weight / total[self.mark]
         out = np.zeros((len(values), n_marks), dtype=complex)
         for row, value in zip(out, values, strict=True):
-            row.real = np.bincount(self.mark, relative * value.real, n_marks)
-            row.imag = np.bincount(self.mark, relative * value.imag, n_marks)
+            row.real = np.bincount(self.mark, self._relative * value.real, n_marks)
+            row.imag = np.bincount(self.mark, self._relative * value.imag, n_marks)
         return out
+
+    @cached_property
+    def _relative(self) -> np.ndarray:
+        """Weights that add up to 1 over the visits of each mark, (V,)."""
+        return self.weight / np.bincount(self.mark, self.weight)[self.mark]
 
     def about_means(self, values: np.ndarray, n_marks: int) -> np.ndarray:
         """Return complex values (k, V) less the mean of their mark."""
