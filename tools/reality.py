@@ -12,15 +12,18 @@ from functools import partial
 from selfcal_ros.files import write_text
 from selfcal_ros.simulation.reality import Case, Summary, cases, run_case, summarise
 
-HEADER = ("| what the machine does | map error, nm, largest (median) | in U | θ error / u | "
-          "not qualified | wrong and qualified | first cause |\n|---|---|---|---|---|---|---|")
+HEADER = ("| what the machine does | map error, nm, largest (median) | in U | XY error / u | "
+          "θ error / u | not qualified | wrong and qualified | first cause |\n"
+          "|---|---|---|---|---|---|---|---|")
 
 
 def row(found: Summary) -> str:
     causes = ", ".join(f"{name} ({count})" for name, count in found.causes) or "–"
+    refused = f" ({found.refused} refused)" if found.refused else ""
     return (f"| {found.case.name.replace('um', 'µm').replace(' deg', '°')} "
-            f"| {found.error_m * 1e9:.1f} | {100 * found.within:.1f} % | {found.z_theta:.2f} "
-            f"| {found.told} of {found.runs} | {found.wrong} | {causes} |")
+            f"| {found.error_m * 1e9:.1f} | {100 * found.within:.1f} % | {found.z_xy:.3f} "
+            f"| {found.z_theta:.3f} | {found.told} of {found.runs}{refused} | {found.wrong} "
+            f"| {causes} |")
 
 
 def once(numbers: tuple[int, int]) -> tuple[int, object]:

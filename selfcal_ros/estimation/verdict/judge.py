@@ -11,10 +11,12 @@ from dataclasses import replace
 import numpy as np
 from scipy.stats import f as f_distribution
 
+from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.blas_threads import one_thread
 from selfcal_ros.estimation.datum.angular import MISCLOSURE_LEVEL
 from selfcal_ros.estimation.joint.model_fit import ModelFit
 from selfcal_ros.estimation.joint.noise import NoiseEstimate, pooled
+from selfcal_ros.estimation.joint.solve import solve_joint
 from selfcal_ros.estimation.joint.solved import Solved
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.verdict.cause_text import cause_of, noise_cause
@@ -23,7 +25,7 @@ from selfcal_ros.estimation.verdict.provenance import provenance_of
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.verdict import Cause, Verdict
-from selfcal_ros.units import ARCSEC_PER_RAD, UM_PER_M
+from selfcal_ros.units import ARCSEC_PER_RAD, RAD_PER_MRAD, UM_PER_M
 
 ALWAYS_SITES = 41 * 41
 """Field up to which terms are looked for in any case; beyond, where another test fails."""
@@ -33,6 +35,9 @@ MAX_SITES = 201 * 201
 
 NOISY = 1.5
 """Ratio of the noise of a view to that of the others from which it matters."""
+
+MUCH_MORE = 1.1
+"""Ratio of what a linear model leaves to what finite rotations leave from which it is named."""
 
 MATTERS = 0.1
 """Effect of a cause on the map, in standard uncertainties (rms), below which it is of no account
@@ -52,8 +57,10 @@ def judged(solved: Solved, measurements: Measurements, options: Options) -> Cali
     options : Options
         How it was calibrated.
     """
-    reasons = [*_noise_reasons(solved), *_axes_reasons(solved)]
-    causes = _causes(solved, measurements, options, failed=bool(reasons))
+    reasons = _noise_reasons(solved)
+    checked = checked_by(solved, measurements, options, failed=bool(reasons))
+    reasons = [*_rotation_reasons(solved, checked), *reasons, *_axes_reasons(checked)]
+    causes = _causes(checked, measurements, options, failed=bool(reasons))
     reasons += [f"the readings show {_what(cause)}" for cause in causes]
     verdict = Verdict(not reasons, _sentence(solved, reasons, causes), tuple(reasons),
                       tuple(causes))
@@ -63,6 +70,36 @@ def judged(solved: Solved, measurements: Measurements, options: Options) -> Cali
         reference=None if reference is None else {
             "kind": str(reference.kind), "relative_error": reference.relative_error,
             "u_relative": reference.u_relative, "certificate": reference.certificate})
+
+
+def checked_by(solved: Solved, measurements: Measurements, options: Options, *,
+               failed: bool) -> Solved:
+    """Return the solution that is looked through for causes: joint, with finite rotations.
+
+    Hu's law has no residuals of the whole, and a linear model takes rotations for something else.
+    `solved` itself where it is that, where nobody asked, or where it cannot be had.
+    """
+    known = solved.model is not None and solved.model.problem.rigid
+    nx, ny = measurements.artifact.shape
+    wanted = failed or nx * ny <= ALWAYS_SITES
+    if known or options.causes is False or not wanted:
+        return solved
+    try:
+        return solve_joint(measurements, replace(options, method="joint",
+                                                 misalignment_model="rigid"))
+    except InputError:
+        return solved
+
+
+def _rotation_reasons(solved: Solved, checked: Solved) -> list[str]:
+    """Return whether finite rotations explain what a linear model leaves."""
+    if checked is solved or not solved.xy.contradicted or not (
+            solved.xy.residuals > MUCH_MORE * checked.xy.residuals):
+        return []
+    largest = max(abs(view.phi) for view in checked.result.views) / RAD_PER_MRAD
+    return [f"the model is linear, but the plate was turned by up to {largest:.2f} mrad: solve "
+            "jointly with finite rotations, the default, which leaves "
+            f"{checked.xy.residuals * UM_PER_M:.3g} µm"]
 
 
 def _what(cause: Cause) -> str:

@@ -1,0 +1,71 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A linear model, Hu's law included, gets the tests of the default one."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from selfcal_ros.estimation.api import calibrate
+from selfcal_ros.estimation.options import Options
+from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.simulation.machine import Spread, random_truth
+from selfcal_ros.simulation.settings import CellSettings
+from selfcal_ros.simulation.truth import hu_plan, simulate_measurements
+
+SETTINGS = CellSettings(sigma_xy_m=20e-9, sigma_theta_rad=2e-5, servo_sigma_m=0.0,
+                        servo_sigma_rad=0.0)
+FLAT = Spread(encoder="independent", rotation="finite", phi_rad=1e-7)
+LINEAR = [Options(method="law"), Options(misalignment_model="linear")]
+NAMES = ["law", "linear"]
+
+
+def judged(options, spread=FLAT, **how):
+    plan, rng = hu_plan(Artifact(7, 0.01, 24), 5), np.random.default_rng(3)
+    truth = random_truth(plan.artifact, 4, rng, spread)
+    readings = simulate_measurements(truth, plan, rng, settings=replace(SETTINGS, **how),
+                                     visits=True)
+    return truth, calibrate(readings, options)
+
+
+@pytest.mark.parametrize("options", LINEAR, ids=NAMES)
+def test_a_linear_plate_is_qualified(options):
+    verdict = judged(options)[1].verdict
+    assert verdict.qualified and not verdict.causes
+    assert verdict.sentence.startswith("Qualified")
+
+
+@pytest.mark.parametrize("options", LINEAR, ids=NAMES)
+def test_a_plate_that_really_turns_is_told_with_its_largest_turn(options):
+    truth, found = judged(options, replace(FLAT, phi_rad=5e-3))
+    # the rotation that all views share is the theta of the stage's datum, and small
+    largest = np.abs(truth.phi_rad).max() * 1e3
+    assert not found.verdict.qualified and not found.verdict.causes
+    head, _, tail = found.verdict.reasons[0].partition(" mrad")
+    assert head.startswith("the model is linear, but the plate was turned by up to ")
+    assert float(head.rpartition(" ")[2]) == pytest.approx(largest, abs=0.02)
+    assert "solve jointly with finite rotations" in tail
+    assert found.verdict.sentence == f"Not qualified: {found.verdict.reasons[0]}"
+
+
+@pytest.mark.parametrize("options", LINEAR, ids=NAMES)
+def test_a_turned_microscope_is_named(options):
+    found = judged(options, replace(FLAT, microscope_rotation_rad=2e-3), stop_sigma_m=20e-6)[1]
+    assert [cause.name for cause in found.verdict.causes] == ["microscope"]
+    assert found.verdict.causes[0].size == pytest.approx(2e-3, abs=4 * found.verdict.causes[0].u)
+    assert not any("linear" in reason for reason in found.verdict.reasons)
+
+
+@pytest.mark.parametrize("options", LINEAR, ids=NAMES)
+def test_nothing_is_looked_for_where_nobody_asks(options):
+    found = judged(replace(options, causes=False), replace(FLAT, phi_rad=5e-3))
+    assert not found[1].verdict.qualified and len(found[1].verdict.reasons) == 1
+
+
+@pytest.mark.parametrize("options", LINEAR, ids=NAMES)
+def test_axes_that_the_stage_does_not_have_are_not_qualified(options):
+    own = judged(replace(options, datum_theta="xy_axes"))[1].verdict
+    assert not own.qualified
+    assert any("does not satisfy the axis conditions" in reason for reason in own.reasons)
+    kept = judged(replace(options, datum_theta="xy_axes"), replace(FLAT, encoder="xy_axes"))[1]
+    assert kept.verdict.qualified
