@@ -74,27 +74,28 @@ def judged(solved: Solved, measurements: Measurements, options: Options) -> Cali
 
 def checked_by(solved: Solved, measurements: Measurements, options: Options, *,
                failed: bool) -> Solved:
-    """Return the solution that is looked through for causes: joint, with finite rotations.
+    """Return the solution that is looked through for causes: joint, and rigid if that fits better.
 
     Hu's law has no residuals of the whole, and a linear model takes rotations for something else.
-    `solved` itself where it is that, where nobody asked, or where it cannot be had.
+    `solved` itself where nobody asked, or where no other can be had.
     """
-    known = solved.model is not None and solved.model.problem.rigid
     nx, ny = measurements.artifact.shape
-    wanted = failed or nx * ny <= ALWAYS_SITES
-    if known or options.causes is False or not wanted:
+    wanted = failed or (solved.model is None and nx * ny <= ALWAYS_SITES)
+    if options.causes is False or not wanted or options.misalignment_model != "linear":
         return solved
     try:
-        return solve_joint(measurements, replace(options, method="joint",
-                                                 misalignment_model="rigid"))
+        linear = solved if solved.model is not None else solve_joint(
+            measurements, replace(options, method="joint", misalignment_model="linear"))
+        rigid = linear if not failed else solve_joint(
+            measurements, replace(options, method="joint", misalignment_model="rigid"))
     except InputError:
         return solved
+    return rigid if MUCH_MORE * rigid.xy.residuals < linear.xy.residuals else linear
 
 
 def _rotation_reasons(solved: Solved, checked: Solved) -> list[str]:
     """Return whether finite rotations explain what a linear model leaves."""
-    if checked is solved or not solved.xy.contradicted or not (
-            solved.xy.residuals > MUCH_MORE * checked.xy.residuals):
+    if checked is solved or checked.model is None or not checked.model.problem.rigid:
         return []
     largest = max(abs(view.phi) for view in checked.result.views) / RAD_PER_MRAD
     return [f"the model is linear, but the plate was turned by up to {largest:.2f} mrad: solve "
