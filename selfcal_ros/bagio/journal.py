@@ -197,7 +197,8 @@ class Journal:
                 raise failed
 
     def _append(self, waiting: list[tuple[str, bytes, int]]) -> None:
-        records, times = [], {topic: [] for topic in {item[0] for item in waiting}}
+        records: list[bytes] = []
+        times: dict[str, list[int]] = {topic: [] for topic in {item[0] for item in waiting}}
         for topic, data, log_time_ns in waiting:
             records.append(message_record(self._channels[topic], self._sequence[topic],
                                           log_time_ns, data))

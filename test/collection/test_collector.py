@@ -351,6 +351,12 @@ def test_the_digest_tells_readings_apart():
     index = cell.grid(0)
     cell.spoil(index, offset_x=cell.detections[index].offset_x + 1e-17)
     assert digest(cell.events) != before
+    zeros = [scene(), scene()]
+    for zero, sign in zip(zeros, (0.0, -0.0), strict=True):
+        for field in ("offset_x", "offset_y", "sigma", "score"):
+            zero.spoil(index, **{field: sign})
+        zero.spoil(zero.angular(0), offset_theta=sign)
+    assert len({digest(zero.events) for zero in zeros}) == 1
     outside = replace(cell.detections[0], stamp_ns=0)
     assert digest([*scene().events, outside]) != before
 

@@ -125,6 +125,11 @@ def test_commands_that_cannot_be_used(changes, message):
     assert str(caught.value).startswith(message)
 
 
+def test_a_command_may_be_stamped_at_the_beginning_of_time():
+    first = Command(0, Phase.PLACE, "p", 3, View("a"), Artifact(5, 0.01))
+    assert to_model.command(through_cdr("ViewCommand", from_model.command(first, "f"))) == first
+
+
 @pytest.mark.parametrize("text", ["spiral", "\x1b[31m", "raster@stage"])
 def test_an_order_that_is_not_known_does_not_cost_the_command(text):
     event = Command(STAMP_NS, Phase.MEASURE, "p", 3, View("a", repeats=2), Artifact(5, 0.01))

@@ -71,6 +71,15 @@ def test_a_run_is_named_by_the_stamp_of_its_first_command(measuring):
     assert measuring.hands.of("command")[-1]["run_id"] == str(START_NS + 2 * 10**9)
 
 
+def test_each_command_starts_the_coverage_of_its_view_anew(measuring):
+    assert measuring.session.diagnosis().values["coverage"] == "0.000"
+    measuring.status(done=10)
+    assert measuring.session.diagnosis().values["coverage"] == "0.400"
+    measuring.session.act(measuring.session.machine.redo)
+    assert (measuring.session.coverage, measuring.session.diagnosis().values["coverage"]) == (
+        0.0, "0.000")
+
+
 def test_stamps_grow_where_the_clock_steps_back(measuring):
     measuring.hands.pass_time(-5)
     measuring.session.act(measuring.session.machine.redo)

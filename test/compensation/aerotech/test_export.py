@@ -218,6 +218,9 @@ def test_unknown_sites_and_lines_are_refused_or_filled():
     around = [emap.gy[2, 3], emap.gy[4, 3], emap.gy[3, 2], filled.gy[3, 4]]
     assert filled.gy[3, 3] == pytest.approx(np.mean(around))
     np.testing.assert_array_equal(filled.gx[emap.valid], emap.gx[emap.valid])
+    pair, _ = fill_unknown(random_map(ARTIFACT, 2, unknown=[(0, 0), (0, 1), (6, 6)]))
+    assert pair.gx[0, 0] == pytest.approx((pair.gx[0, 1] + pair.gx[1, 0]) / 2)
+    assert pair.gx[0, 1] == pytest.approx((pair.gx[0, 0] + pair.gx[0, 2] + pair.gx[1, 1]) / 3)
     table = table_xy(filled, MachineFrame())
     found = verify_tables(emap, [table], MachineFrame())
     assert found.between is None and found.sites.largest("after") < 1e-10

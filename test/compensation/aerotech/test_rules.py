@@ -168,3 +168,6 @@ def test_2d_home_outside_loses_its_zero_bias():
     assert findings(text, Severity.WARNING) == [
         (1, "the home position of the row axis lies outside of the table, which covers 1 to 11: "
             "no zero bias")]
+    longer = two_d(more="POSUNIT=PRIMARY CORUNIT=PRIMARY OFFSETROW=-1 OFFSETCOL=-1", rows=3)
+    assert [text.split("table, ")[1] for _, text in findings(longer, Severity.WARNING)] == [
+        "which covers 1 to 21: no zero bias", "which covers 1 to 11: no zero bias"]

@@ -18,6 +18,8 @@ from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.joint import pcg
 from selfcal_ros.estimation.joint.map_only import MapSolver
 from selfcal_ros.estimation.normal import cache, equations
+from selfcal_ros.estimation.normal.grid import GridSystem
+from selfcal_ros.estimation.normal.planned import planned_system
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.quality.outliers import robust_calibrate
 from selfcal_ros.model.artifact import Artifact
@@ -32,6 +34,16 @@ def measured(plan, seed=1, **how):
     rng = np.random.default_rng(seed)
     truth = random_truth(plan.artifact, len(plan.views), rng)
     return truth, simulate_measurements(truth, plan, rng, **how)
+
+
+def test_a_full_plate_needs_no_correction_for_missing_marks_and_a_site_that_lost_some_does():
+    views = plan_of("0,90,tx", Artifact(7, 0.01)).views
+    full = planned_system(Artifact(7, 0.01), views).grid
+    assert np.abs(pcg.missing_mark_correction(full)).max() < 1e-15
+    weight = full.weight.copy()
+    weight[0, 2, 3] = 0.0  # in view 0 mark and site have one place
+    found = pcg.missing_mark_correction(GridSystem(full.views.poses, weight))
+    assert found[2, 3] == found.max() > 0.1 and found.min() >= 0
 
 
 @pytest.fixture
@@ -147,6 +159,8 @@ def test_the_core_of_a_large_field_tells_its_rank_alone(as_large):
 SCRIPT = """
 import hashlib, numpy as np
 from selfcal_ros.estimation.normal import cache, equations
+from selfcal_ros.estimation.normal.grid import GridSystem
+from selfcal_ros.estimation.normal.planned import planned_system
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact

@@ -89,6 +89,8 @@ HOSTILE = {
     "empty": ("", NoDataError, "the table is empty"),
     "header only": (HEAD + "\n", NoDataError, "the table has a header only"),
     "missing block": (f"{HEAD}\n1,{GOOD}\n3,{GOOD}\n", InputError, "block 2 is missing"),
+    "missing block from zero": (f"{HEAD}\n0,{GOOD}\n2,{GOOD}\n", InputError,
+                                "block 1 is missing; measure every block from 0 to 2"),
     "first block missing": (f"{HEAD}\n2,{GOOD}\n", InputError, "block 1 is missing"),
     "nan": (HEAD + "\n1,nan,7,7,7,0,0\n", InputError, "d.csv:2: rx_pp: 'nan' is not a finite"),
     "inf": (HEAD + "\n1,7,inf,7,7,0,0\n", InputError, "d.csv:2: ry_pp: 'inf' is not a finite"),
