@@ -5,6 +5,8 @@ A message is one line that names the place, what is wrong, and how to correct it
 The same codes are the ``error_code`` of services and actions.
 """
 
+from collections.abc import Iterable
+from difflib import get_close_matches
 from enum import IntEnum
 from typing import Any
 
@@ -68,6 +70,20 @@ class NoDataError(InputError):
     """Raised when the input is well formed but holds nothing to calibrate from."""
 
     exit_code = ExitCode.NO_DATA
+
+
+def did_you_mean(word: str, known: Iterable[str]) -> str:
+    """Return ``did you mean 'x'?`` with the names most like `word`, at most two; "" if none is."""
+    names = {str(name).lower(): str(name) for name in known}
+    found = get_close_matches(word.lower(), names, n=2, cutoff=0.7)
+    return f"did you mean {' or '.join(repr(names[name]) for name in found)}?" if found else ""
+
+
+def known_are(word: str, known: Iterable[str]) -> str:
+    """Return the remedy for a name that is not known: what is like it, then all that are."""
+    names = [str(name) for name in known]
+    hint = did_you_mean(word, names)
+    return f"{hint} known are {', '.join(names)}".strip()
 
 
 def first_line(error: BaseException) -> str:

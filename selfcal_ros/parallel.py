@@ -28,6 +28,14 @@ LOCAL = "local"
 _PR_SET_PDEATHSIG = 1
 
 
+Progress = Callable[[int, int], None]
+"""Called with how many items are done, and of how many."""
+
+
+def silent(done: int, total: int) -> None:
+    """Show no progress."""
+
+
 @dataclass(frozen=True)
 class Outcome:
     """What came of an item: its place in the order of the items, and a value or an error."""
@@ -85,7 +93,7 @@ def outcomes(function: Callable[[Any], Any], items: Sequence[Any], *,
 
 
 def mapped(function: Callable[[Any], Any], items: Sequence[Any], *, workers: int = 1,
-           progress: Callable[[int, int], None] = lambda done, total: None) -> list[Any]:
+           progress: Progress = silent) -> list[Any]:
     """Return `function` of each item, in their order; the first error met is raised.
 
     `progress` is called with how many are done, and of how many.
@@ -97,6 +105,19 @@ def mapped(function: Callable[[Any], Any], items: Sequence[Any], *, workers: int
         found[outcome.index] = outcome.value
         progress(done, len(items))
     return found
+
+
+def mapped_in_parts(function: Callable[[list[Any]], list[Any]], items: Sequence[Any], *,
+                    workers: int = 1, size: int = 20,
+                    progress: Progress = silent) -> list[Any]:
+    """Return what `function` makes of lists of items, joined in their order.
+
+    For items too small to be worth a way to a worker and back, one by one.
+    """
+    parts = [list(items[start:start + size]) for start in range(0, len(items), size)]
+    found = mapped(function, parts, workers=workers,
+                   progress=lambda done, _: progress(min(done * size, len(items)), len(items)))
+    return [value for part in found for value in part]
 
 
 def _tried(function: Callable[[Any], Any], items: Sequence[Any], index: int) -> Outcome:

@@ -11,7 +11,7 @@ import pytest
 from threadpoolctl import threadpool_info
 
 from selfcal_ros.errors import InputError
-from selfcal_ros.parallel import WorkerDied, check_workers, cores, mapped, outcomes
+from selfcal_ros.parallel import WorkerDied, check_workers, cores, mapped, mapped_in_parts, outcomes
 
 
 @pytest.mark.parametrize("workers", [1, 2])
@@ -20,6 +20,14 @@ def test_values_come_back_in_their_places(workers):
     assert mapped(math.factorial, numbers, workers=workers,
                   progress=lambda *at: seen.append(at)) == [math.factorial(n) for n in numbers]
     assert seen == [(n, 20) for n in range(1, 21)]
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_parts_are_joined_in_their_order(workers):
+    seen = []
+    assert mapped_in_parts(sorted, [3, 1, 5, 4, 2], workers=workers, size=2,
+                           progress=lambda *at: seen.append(at)) == [1, 3, 4, 5, 2]
+    assert seen == [(2, 5), (4, 5), (5, 5)]
 
 
 @pytest.mark.parametrize("workers", [1, 2])

@@ -6,11 +6,11 @@ reality.py [--runs N] [--workers N] [--only TEXT] [-o TABLE.md]
 
 import argparse
 import sys
-from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 
 from selfcal_ros.files import write_text
-from selfcal_ros.simulation.reality import Case, Summary, cases, run_case, summarise
+from selfcal_ros.parallel import check_workers, outcomes
+from selfcal_ros.simulation.reality import Case, Run, Summary, cases, run_case, summarise
 
 HEADER = ("| what the machine does | map error, nm, largest (median) | in U | XY error / u | "
           "θ error / u | not qualified | wrong and qualified | first cause |\n"
@@ -26,30 +26,34 @@ def row(found: Summary) -> str:
             f"| {causes} |")
 
 
-def once(numbers: tuple[int, int]) -> tuple[int, object]:
+def once(numbers: tuple[int, int]) -> Run:
     index, seed = numbers
-    return index, run_case(cases()[index], 10_000 * index + seed)
+    return run_case(cases()[index], 10_000 * index + seed)
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--runs", type=int, default=40, help="runs of each case (default: 40)")
-    parser.add_argument("--workers", type=int, default=2, help="processes (default: 2)")
+    parser.add_argument("--workers", type=int, help="processes (default: one a core)")
     parser.add_argument("--only", default="", help="only cases whose name holds this text")
     parser.add_argument("-o", "--output", help="write the table to this file")
     args = parser.parse_args()
     every: list[Case] = cases()
     chosen = [i for i, case in enumerate(every) if args.only in case.name]
     jobs = [(index, seed) for index in chosen for seed in range(args.runs)]
-    runs: dict[int, list] = {index: [] for index in chosen}
-    lines, write = [HEADER], partial(print, flush=True)
+    runs: dict[int, dict[int, Run]] = {index: {} for index in chosen}
+    waiting, lines, write = list(chosen), [HEADER], partial(print, flush=True)
     write(HEADER)
-    with ProcessPoolExecutor(args.workers) as pool:
-        for index, run in pool.map(once, jobs, chunksize=5):
-            runs[index].append(run)
-            if len(runs[index]) == args.runs:
-                lines.append(row(summarise(every[index], runs[index])))
-                write(lines[-1])
+    for outcome in outcomes(once, jobs, workers=check_workers(args.workers)):
+        if outcome.error is not None:
+            raise outcome.error
+        index = jobs[outcome.index][0]
+        runs[index][jobs[outcome.index][1]] = outcome.value
+        while waiting and len(runs[waiting[0]]) == args.runs:
+            done = waiting.pop(0)
+            found = [runs[done][seed] for seed in range(args.runs)]
+            lines.append(row(summarise(every[done], found)))
+            write(lines[-1])
     notes = [f"- {every[i].name}: {every[i].hidden}." for i in chosen if every[i].hidden]
     lines += ["", "Not told, or not always, by the readings:", "", *notes] if notes else []
     write("\n".join(lines[-len(notes) - 3:] if notes else []))

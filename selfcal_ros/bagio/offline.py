@@ -8,11 +8,11 @@ from typing import Any, NamedTuple
 
 from selfcal_ros.bagio.reader import BagReader
 from selfcal_ros.collection.collector import Collector, ViewProgress
-from selfcal_ros.errors import InputError, NoDataError
+from selfcal_ros.errors import InputError, NoDataError, did_you_mean
 from selfcal_ros.files import add_file
 from selfcal_ros.messages import to_model
 from selfcal_ros.messages.input_columns import EncoderBlock
-from selfcal_ros.messages.topics import COMMAND_TOPIC, DETECTION_TOPIC, ENCODER_TOPIC
+from selfcal_ros.messages.topics import COMMAND_TOPIC, DETECTION_TOPIC, ENCODER_TOPIC, INPUT_TOPICS
 from selfcal_ros.model.readings import Measurements
 
 MAX_SAID = 3
@@ -78,7 +78,8 @@ def collect_bag(path: str | Path, values: dict[str, Any], *, namespace: str | No
                         ("encoder", ENCODER_TOPIC)):
         if not received[kind]:
             raise NoDataError(str(path), f"no message on {topic}{tail}",
-                              "record this topic too, see the README")
+                              f"{topics_like(topic, reader.topics)}record this topic too, see "
+                              "the README")
     measurements, views = collector.collect()
     findings = [(f"view '{views[index].view.name}': " if index is not None else "") + str(finding)
                 for index, finding in collector.findings(measurements, views).items()]
@@ -89,6 +90,20 @@ def collect_bag(path: str | Path, values: dict[str, Any], *, namespace: str | No
                           f"reading (rejected: {reasons}){tail}",
                           findings[0] if findings else "correct the cause that is named first")
     return BagSession(measurements, views, reader.lost, findings)
+
+
+def topics_like(topic: str, topics: dict[str, str]) -> str:
+    """Return which of a bag's topics (name -> type) were probably meant, by type, then by name.
+
+    The text ends so that another remedy can follow; it is empty if there is no such topic.
+    """
+    others = {name: kind for name, kind in topics.items()
+              if not any(f"/{name}".endswith(f"/{role}") for role in INPUT_TOPICS)}
+    same = sorted(name for name, kind in others.items() if kind == INPUT_TOPICS[topic])
+    if same:
+        return f"is it {' or '.join(same[:MAX_SAID])}? then remap it to {topic}, or "
+    hint = did_you_mean(f"/{topic}", others)
+    return f"{hint} then remap it, or " if hint else ""
 
 
 def feeder(collector: Collector, complaints: list[str]) -> dict[str, Callable[[Any], None]]:

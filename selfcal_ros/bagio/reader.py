@@ -41,12 +41,15 @@ class BagReader:
         What could not be read, one line each, after reading.
     cells : set of str
         Namespaces of the input topics that were met, without slashes.
+    topics : dict of str
+        All topics of the bag and their types, after reading.
     """
 
     path: Path
     namespace: str | None = None
     lost: list[str] = field(default_factory=list)
     cells: set[str] = field(default_factory=set)
+    topics: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Find the MCAP files, refuse what is no bag."""
@@ -180,6 +183,9 @@ class BagReader:
                     if decoder is not None:
                         parts.append((decoder, np.flatnonzero(block.fronts["channel"] == number)))
                 yield block, parts
+            for channel in stream.channels.values():
+                schema = stream.schemas.get(channel.schema_id)
+                self.topics[channel.topic] = schema.name if schema else ""
 
     def _say(self, bad: Counter) -> None:
         self.lost += [f"{count} messages on {role} could not be decoded{why}"

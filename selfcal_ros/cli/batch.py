@@ -2,13 +2,13 @@
 """``selfcal batch``: hundreds of bags on all cores, one table, what changes over time."""
 
 import argparse
-import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from selfcal_ros.cli.solve import add_options, parameters
+from selfcal_ros.cli.terminal.output import add_json, say
 from selfcal_ros.errors import ExitCode, InputError, SelfcalError, first_line, printable
 
 if TYPE_CHECKING:
@@ -32,8 +32,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
                      help="work in a dask.distributed cluster: its scheduler's address, which sees "
                      "the same files, or 'local' (default) for one made for this run")
     parser.add_argument("--redo", action="store_true", help="solve all of the bags anew")
-    parser.add_argument("--json", action="store_true",
-                        help="print the content of batch.json instead of a summary")
+    add_json(parser, "the content of batch.json instead of a summary")
     add_options(parser)
 
 
@@ -67,8 +66,8 @@ def run(args: argparse.Namespace) -> int:
         write_text(folder / "table.csv", csv_text(records))
         write_text(folder / "index.html", page_html(records, found, lines))
         write_json(folder / "batch.json", content)
-    print(json.dumps(content, indent=1) if args.json else "\n".join(
-        [*map(printable, lines), f"written: {folder / 'table.csv'}, index.html, batch.json"]))
+    say(args, "\n".join([*map(printable, lines), f"written: {folder / 'table.csv'}, index.html, "
+                         "batch.json"]), content)
     return exit_code(records)
 
 

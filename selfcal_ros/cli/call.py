@@ -4,6 +4,7 @@
 import argparse
 import contextlib
 
+from selfcal_ros.cli.terminal.output import add_json, say
 from selfcal_ros.errors import ExitCode
 
 HELP = "ask the sequencer of a running cell: start, confirm, redo, skip or abort"
@@ -16,6 +17,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
                         "plate lies as asked; redo: measure the view again; skip: go on without "
                         "it; abort: give the plan up")
     parser.add_argument("--namespace", metavar="NS", default="", help="namespace of the cell")
+    add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -28,6 +30,7 @@ def run(args: argparse.Namespace) -> int:
         monitor.ask(args.request)
         for message in monitor.messages():
             if "answer" in message:
-                print(message["answer"])
+                say(args, message["answer"], {"request": args.request, "answer": message["answer"],
+                                              "success": bool(message["success"])})
                 return int(ExitCode.DONE if message["success"] else ExitCode.BAD_INPUT)
     return int(ExitCode.INTERNAL)

@@ -15,6 +15,7 @@ import sys
 from types import ModuleType
 
 from selfcal_ros import __version__, cli
+from selfcal_ros.cli.terminal.parser import Parser
 from selfcal_ros.errors import ExitCode, SelfcalError
 
 
@@ -30,10 +31,10 @@ def verbs() -> dict[str, ModuleType]:
 
 def build_parser() -> argparse.ArgumentParser:
     """Return the parser with one sub-parser a verb."""
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog="selfcal", description="Self-calibration of XY-theta stages.",
         epilog="exit codes: 0 done, 2 bad usage or input, 3 the measured plan does not identify "
-               "the stage, 4 no usable data, 1 our own fault")
+               "the stage, 4 no usable data, 5 not qualified, 1 our own fault")
     parser.add_argument("--version", action="version", version=f"selfcal {__version__}")
     group = parser.add_subparsers(dest="verb", metavar="VERB", required=True)
     for name, module in verbs().items():

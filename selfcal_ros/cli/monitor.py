@@ -3,9 +3,12 @@
 
 import argparse
 import contextlib
+import json
 import sys
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any
+
+from selfcal_ros.cli.terminal.output import add_json
 
 if TYPE_CHECKING:
     from selfcal_ros.cli.watching import Eyes
@@ -16,6 +19,7 @@ HELP = "watch a running cell on one screen, and drive its sequencer by keys"
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the verb."""
     parser.add_argument("--namespace", metavar="NS", default="", help="namespace of the cell")
+    add_json(parser, "one JSON object a line: pictures as they change, answers to requests")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -24,16 +28,17 @@ def run(args: argparse.Namespace) -> int:
     from selfcal_ros.cli.watching import eyes
 
     with ended_by_signals(), eyes(args.namespace) as monitor:
-        return watch(monitor, [], lambda: None)
+        return watch(monitor, [], lambda: None, as_json=args.json)
 
 
-def watch(monitor: "Eyes", log: list[str], step: Callable[[], None]) -> int:
+def watch(monitor: "Eyes", log: list[str], step: Callable[[], None], *,
+          as_json: bool = False) -> int:
     """Draw what the monitor sends and pass keys on; call `step` several times a second.
 
     Without a terminal every change of state is a line on stdout instead, and requests are read
-    as words from stdin.
+    as words from stdin. `as_json` prints what the monitor sends as JSON, one object a line.
     """
-    show = _lines if not sys.stdout.isatty() else _live
+    show = _json_lines if as_json else _live if sys.stdout.isatty() else _lines
     with _keys() as pressed, show(log) as draw:
         while True:
             step()
@@ -91,6 +96,20 @@ def _lines(log: list[str]) -> Iterator[Callable[[Any], None]]:
             if said.get(key) != line:
                 said[key] = line
                 print(printable(f"{key}: {line}"), flush=True)
+    yield draw
+
+
+@contextlib.contextmanager
+def _json_lines(log: list[str]) -> Iterator[Callable[[Any], None]]:
+    """Print each picture that differs from the one before, and each line of the log."""
+    newest: list[Any] = [None]
+
+    def draw(picture: Any) -> None:
+        while log:
+            print(json.dumps({"log": log.pop(0)}), flush=True)
+        if picture is not None and picture != newest[0]:
+            newest[0] = picture
+            print(json.dumps({"picture": picture}), flush=True)
     yield draw
 
 

@@ -14,7 +14,7 @@ from selfcal_ros.cli.plan_terms import (
     terms_text,
 )
 from selfcal_ros.cli.terminal.progress import late_progress
-from selfcal_ros.units import NM_PER_M
+from selfcal_ros.units import NM_PER_M, UM_PER_M
 
 HELP = "check a plan of views before it is measured, or suggest views"
 
@@ -73,6 +73,10 @@ def _check(args: argparse.Namespace, plan) -> int:
         seen, joint, checks = _judge(plan, model, assumed, sizes, (seen, alone))
     if args.json:
         found = _check_json(plan, seen, alone, maps=args.map)
+        if alone is not None and args.sigma is not None:
+            unit = _averaged_m(plan, assumed) * UM_PER_M
+            found["predicted"] |= {"rms_u_xy_um": alone.rms_xy * unit,
+                                   "max_u_xy_um": alone.max_xy * unit}
         if alone is not None:
             found["predicted"] |= {
                 "rms_gain_xy_with_terms": joint and joint.rms_xy,
@@ -80,6 +84,8 @@ def _check(args: argparse.Namespace, plan) -> int:
         print(json.dumps(found | {"terms": terms_json(checks)}, indent=1))
     else:
         lines = _check_text(plan, seen, alone)
+        if alone is not None and args.sigma is not None:
+            lines.append(_in_um(alone, plan, assumed))
         if model and joint is not None:
             lines += [f"  XY with {', '.join(map(str, model))}: rms {joint.rms_xy:.4f}   "
                       f"largest {joint.max_xy:.4f}"]
@@ -148,6 +154,18 @@ def _check_text(plan, seen, predicted) -> list[str]:
         lines.append(f"  theta  rms {predicted.rms_theta:.4f}")
     lines += [f"  ({predicted.note})"] if predicted.note else []
     return lines
+
+
+def _averaged_m(plan, assumed) -> float:
+    """Return the noise of an averaged reading of the plan, m."""
+    return assumed.sigma_m / min(view.repeats for view in plan.views) ** 0.5
+
+
+def _in_um(predicted, plan, assumed) -> str:
+    unit = _averaged_m(plan, assumed) * UM_PER_M
+    return (f"  XY     rms {predicted.rms_xy * unit:.4f} um   largest "
+            f"{predicted.max_xy * unit:.4f} um (k=1) for {assumed.sigma_m * UM_PER_M:.4g} um "
+            "noise of one reading")
 
 
 def _map_text(predicted) -> list[str]:
@@ -220,8 +238,7 @@ def _against(args: argparse.Namespace, plan):
 
 def _unit_nm(plan, against) -> float | None:
     """Return the noise of an averaged reading in nm where a plan is judged against terms."""
-    repeats = min(view.repeats for view in plan.views)
-    return None if against is None else against.assumed.sigma_m * NM_PER_M / repeats**0.5
+    return None if against is None else _averaged_m(plan, against.assumed) * NM_PER_M
 
 
 def _show_ranked(args: argparse.Namespace, plan, now: tuple, ranked: list) -> None:

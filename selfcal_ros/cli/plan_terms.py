@@ -22,8 +22,9 @@ def add_term_options(parser: argparse.ArgumentParser) -> None:
                         help="degree of the polynomial by which a view drifts (default 3)")
     parser.add_argument("--order", metavar="ORDER", default="",
                         help="visiting order of all views, instead of the plan's")
-    parser.add_argument("--sigma", metavar="LENGTH", default=SIGMA,
-                        help="noise of one reading, m or with a unit as in 20nm (default 20 nm)")
+    parser.add_argument("--sigma", metavar="LENGTH",
+                        help="noise of one reading, m or with a unit as in 20nm (default 20 nm); "
+                        "given, uncertainties are shown in um")
     parser.add_argument("--stop-error", metavar="LENGTH", default=STOP_ERROR,
                         help="how far off a mark the stage stops, standard deviation of an axis, "
                         "m or with a unit (default 10 um)")
@@ -66,8 +67,8 @@ def assumed_of(args: argparse.Namespace):
         raise InputError("--drift-degree", f"{degree} is no degree of a drift",
                          f"give 1 to {MAX_DRIFT_DEGREE}")
     order = str(parse_order(args.order, "--order")) if args.order else ""
-    return Assumed(length_m(args.sigma, "--sigma"), length_m(args.stop_error, "--stop-error"),
-                   degree, order)
+    return Assumed(length_m(args.sigma or SIGMA, "--sigma"),
+                   length_m(args.stop_error, "--stop-error"), degree, order)
 
 
 def sizes_of(args: argparse.Namespace) -> dict:

@@ -9,6 +9,7 @@ import tempfile
 from pathlib import Path
 
 from selfcal_ros.cli.processes import domain, ended_by_signals, need_ros, process
+from selfcal_ros.cli.terminal.output import add_json, aside, file_of, on_stdout, put
 
 HELP = "play a bag into the live nodes and take the map from them"
 NODES = ("measurement_collector", "pose_sequencer", "solver")
@@ -22,7 +23,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
     speed.add_argument("--fast", action="store_true", help="as fast as the nodes keep up")
     parser.add_argument("--shuffle", type=int, default=-1, metavar="SEED",
                         help="deliver the messages in shuffled order")
-    parser.add_argument("-o", "--output", metavar="RESULT.json", help="where to write the result")
+    parser.add_argument("-o", "--output", metavar="RESULT.json", help="where to write the result; "
+                        "- is stdout, and all else goes to stderr")
+    add_json(parser, "RESULT.json, and the summary on stderr")
     parser.add_argument("--params", metavar="NODES.yaml", help="ROS parameter file for the nodes")
     parser.add_argument("--namespace", metavar="NAME", help="namespace of the cell's topics, "
                         "for bags that hold several cells; / is the root")
@@ -40,7 +43,7 @@ def run(args: argparse.Namespace) -> int:
     need_ros(", or use `selfcal solve`")
     if not args.fast and not args.rate > 0:
         raise InputError("--rate", f"{args.rate:g} is not a speed", "give a number above 0")
-    check_outputs([args.bag, args.params], [args.output])
+    check_outputs([args.bag, args.params], [file_of(args)])
     source = bag_input(args.bag)
     with (ended_by_signals(), tempfile.TemporaryDirectory() as folder,
           domain() as environment):
@@ -49,10 +52,13 @@ def run(args: argparse.Namespace) -> int:
         if code or not saved.exists():
             return code or 1
         result = with_input(result_from_dict(read_json(saved), str(saved)), source, lost)
-    if args.output:
-        write_json(args.output, result_to_dict(result))
+    data = result_to_dict(result)
+    if file_of(args):
+        write_json(args.output, data)
+    if on_stdout(args):
+        put(data)
     if not args.quiet:
-        show(result, args.bag, args.output)
+        show(result, args.bag, file_of(args), aside(args))
     return exit_code(result)
 
 

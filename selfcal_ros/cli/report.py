@@ -5,6 +5,8 @@ import argparse
 import sys
 from pathlib import Path
 
+from selfcal_ros.cli.terminal.output import add_json, say
+
 HELP = "write a calibration report: one self-contained HTML file"
 
 
@@ -16,6 +18,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--plot", metavar="MAP.png", help="also write the map as a picture")
     parser.add_argument("--truth", metavar="TRUTH.json",
                         help="known truth to compare with: gx, gy in m, g_theta in rad")
+    add_json(parser)
     parser.add_argument("--text", action="store_true", help="also print the summary")
 
 
@@ -34,11 +37,11 @@ def run(args: argparse.Namespace) -> int:
     if args.plot:
         save_map_plot(result, args.plot, truth=truth)
     save_report(result, output, truth=truth)
-    if args.text:
-        print(summary_text(result, truth=truth, ascii_only=not can_print_symbols(sys.stdout)))
-    for written in (output, args.plot):
-        if written:
-            print(f"written: {written}")
+    written = [str(name) for name in (output, args.plot) if name]
+    text = [summary_text(result, truth=truth, ascii_only=not can_print_symbols(sys.stdout))
+            ] if args.text else []
+    say(args, "\n".join([*text, *(f"written: {name}" for name in written)]),
+        {"written": written, "summary": text[0] if text else None})
     return 0
 
 

@@ -2,9 +2,20 @@
 """``selfcal reproduce``: the published simulations, run again and set beside the paper."""
 
 import argparse
+import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+from selfcal_ros.cli.terminal.output import add_json, say
+from selfcal_ros.cli.terminal.progress import late_progress
+
+if TYPE_CHECKING:
+    from selfcal_ros.parallel import Progress
 
 HELP = "run the published simulations of Hu or Qiao, side by side with their figures"
+
+MANY = 1000
+"""Draws from which on processes are worth their start."""
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -14,6 +25,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
                         help="draws of noise (default 200)")
     parser.add_argument("--seed", type=int, default=1, metavar="S",
                         help="seed of all random numbers (default 1)")
+    parser.add_argument("--workers", type=int, metavar="N",
+                        help="processes; the numbers do not depend on it (default: 1, from "
+                        f"{MANY} draws on one a core)")
+    add_json(parser, "the numbers")
     parser.add_argument("--out", metavar="DIR", help="folder for the plots and the text")
 
 
@@ -21,6 +36,7 @@ def run(args: argparse.Namespace) -> int:
     """Run, print, and save what was asked for."""
     from selfcal_ros.errors import ExitCode, InputError
     from selfcal_ros.files import write_text
+    from selfcal_ros.parallel import check_workers
 
     if args.draws < 1:
         raise InputError("--draws", f"{args.draws} is not positive", "give 1 or more")
@@ -29,12 +45,14 @@ def run(args: argparse.Namespace) -> int:
     folder = Path(args.out) if args.out else None
     if folder is not None:
         _make(folder)
-    text, save = _hu(args) if args.paper == "hu" else _qiao(args)
-    print(text)
+    workers = check_workers(args.workers if args.workers or args.draws >= MANY else 1)
+    with late_progress("solving draws") as progress:
+        text, save, numbers = (_hu if args.paper == "hu" else _qiao)(args, workers, progress)
+    say(args, text, {"paper": args.paper, "draws": args.draws, "seed": args.seed, **numbers})
     if folder is not None:
         write_text(folder / f"{args.paper}.txt", text + "\n")
         for path in save(folder):
-            print(f"wrote {path}")
+            print(f"wrote {path}", file=sys.stderr if args.json else sys.stdout)
     return int(ExitCode.DONE)
 
 
@@ -48,27 +66,37 @@ def _make(folder: Path) -> None:
                          "name a folder that you may write") from error
 
 
-def _hu(args: argparse.Namespace) -> tuple:
+def _hu(args: argparse.Namespace, workers: int, progress: "Progress") -> tuple:
     from selfcal_ros.simulation.reproduce.hu import hu_text, reproduce_hu
 
-    found = reproduce_hu(args.draws, args.seed)
+    found = reproduce_hu(args.draws, args.seed, workers=workers, progress=progress)
 
     def save(folder: Path) -> list[Path]:
         from selfcal_ros.reporting.reproduce_plots import save_hu_plots
 
         return save_hu_plots(found, folder)
 
-    return hu_text(found), save
+    tables = [{"name": run.published.name, "sigma_um": run.published.sigma_um,
+               "sigma_deg": run.published.sigma_deg, "published": run.published.table,
+               "law_first": run.law.first.tolist(), "law_std": run.law.std.tolist(),
+               "joint_std": run.joint.std.tolist(), "bound": run.bound} for run in found.runs]
+    return hu_text(found), save, {"noise_free_um": found.noise_free_um,
+                                  "noise_free_deg": found.noise_free_deg, "tables": tables}
 
 
-def _qiao(args: argparse.Namespace) -> tuple:
-    from selfcal_ros.simulation.reproduce.qiao import qiao_text, reproduce_qiao
+def _qiao(args: argparse.Namespace, workers: int, progress: "Progress") -> tuple:
+    from selfcal_ros.simulation.reproduce.qiao import SIZES, qiao_text, reproduce_qiao
 
-    found = reproduce_qiao(args.draws, args.seed)
+    found = reproduce_qiao(args.draws, args.seed, workers=workers, progress=progress)
 
     def save(folder: Path) -> list[Path]:
         from selfcal_ros.reporting.reproduce_plots import save_qiao_plots
 
         return save_qiao_plots(found, folder)
 
-    return qiao_text(found), save
+    programs = [{"views": program.views, "rms_um": program.rms_um,
+                 "deficiency": program.deficiency} for program in found.programs]
+    return qiao_text(found), save, {
+        "sizes": SIZES, "ranks": found.ranks.tolist(), "unknowns": found.unknowns.tolist(),
+        "programs": programs, "rms_um": found.rms_um.tolist(),
+        "rms_uniform_um": found.rms_uniform_um.tolist(), "bound_um": found.bound_um}

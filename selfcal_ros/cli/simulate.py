@@ -3,6 +3,8 @@
 
 import argparse
 
+from selfcal_ros.cli.terminal.output import add_json, say
+
 HELP = "write a bag of a simulated cell, with its known truth"
 
 
@@ -11,6 +13,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("sim", metavar="SIM.yaml", help="what to simulate (docs/simulate.md)")
     parser.add_argument("-o", "--output", metavar="BAG", required=True,
                         help="bag folder to make; truth.json is written into it")
+    add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -22,5 +25,7 @@ def run(args: argparse.Namespace) -> int:
     simulation = read_simulation(args.sim)
     with progress_bar("simulating") as bar:
         counts = write_simulation(simulation, args.output, progress=bar)
-    print(f"{args.output}: " + ", ".join(f"{count} x {topic}" for topic, count in counts.items()))
+    say(args, f"{args.output}: " + ", ".join(
+        f"{count} x {topic}" for topic, count in counts.items()),
+        {"bag": args.output, "messages": dict(counts)})
     return 0

@@ -5,6 +5,7 @@ import argparse
 import sys
 from typing import Any
 
+from selfcal_ros.cli.terminal.output import add_json, aside, file_of, on_stdout, put
 from selfcal_ros.errors import InputError
 
 HELP = "calibrate from a bag: MCAP file or rosbag2 folder"
@@ -13,7 +14,9 @@ HELP = "calibrate from a bag: MCAP file or rosbag2 folder"
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the verb."""
     parser.add_argument("bag", metavar="BAG", help="MCAP file or rosbag2 folder")
-    parser.add_argument("-o", "--output", metavar="RESULT.json", help="where to write the result")
+    parser.add_argument("-o", "--output", metavar="RESULT.json", help="where to write the result; "
+                        "- is stdout, and all else goes to stderr")
+    add_json(parser, "RESULT.json, and the summary on stderr")
     add_options(parser)
     parser.add_argument("--validate", action="store_true",
                         help="hold out tenths of the readings and whole views, and predict them")
@@ -102,7 +105,7 @@ def run(args: argparse.Namespace) -> int:
     from selfcal_ros.collection.reasons import advice
     from selfcal_ros.errors import NotIdentifiableError
     from selfcal_ros.estimation.api import calibrate
-    from selfcal_ros.files import check_outputs, write_json
+    from selfcal_ros.files import check_outputs
     from selfcal_ros.model.result import (
         created_now,
         result_to_dict,
@@ -110,7 +113,7 @@ def run(args: argparse.Namespace) -> int:
         with_input,
     )
 
-    check_outputs([args.bag, args.params], [args.output])
+    check_outputs([args.bag, args.params], [file_of(args)])
     collector_values, solver_values = parameters(args)
     with progress_bar("reading") as bar:
         measurements, _, lost, findings = collect_bag(
@@ -126,21 +129,30 @@ def run(args: argparse.Namespace) -> int:
         else:
             result = calibrate(measurements, options)
     except NotIdentifiableError as error:
-        if args.output and error.observability is not None:
+        if (args.output or args.json) and error.observability is not None:
             result = unidentified_result(measurements, error.observability)
-            write_json(args.output, result_to_dict(with_input(result, bag_input(args.bag), lost)))
+            _write(args, result_to_dict(with_input(result, bag_input(args.bag), lost)))
         if findings:  # what the plan lacks is told by readings that are not there
             raise NotIdentifiableError(f"{args.bag}: {findings[0]}; correct this first (as it is: "
                                        f"{error})", error.observability) from error
         raise
     result, lines = _extended(args, measurements, options, result)
     result = created_now(with_input(result, bag_input(args.bag), lost))
-    if args.output:
-        write_json(args.output, result_to_dict(result))
+    _write(args, result_to_dict(result))
     if not args.quiet:
-        show(result, args.bag, args.output)
-        print("\n".join(lines), end="\n" * bool(lines))
+        show(result, args.bag, file_of(args), aside(args))
+        print("\n".join(lines), end="\n" * bool(lines), file=aside(args))
     return exit_code(result)
+
+
+def _write(args: argparse.Namespace, data: dict[str, Any]) -> None:
+    """Write a result where it is wanted: to a file, to stdout, or both."""
+    from selfcal_ros.files import write_json
+
+    if file_of(args):
+        write_json(args.output, data)
+    if on_stdout(args):
+        put(data)
 
 
 def _extended(args: argparse.Namespace, measurements: Any, options: Any,

@@ -2,7 +2,6 @@
 """``selfcal step-diagonal``: straightness and squareness from a laser step-diagonal measurement."""
 
 import argparse
-import json
 import math
 import sys
 from typing import TYPE_CHECKING
@@ -14,6 +13,7 @@ from selfcal_ros.cli.step_diagonal_bag import (
     joints_of,
     measurement_from_bag,
 )
+from selfcal_ros.cli.terminal.output import add_json, put, say
 from selfcal_ros.errors import ExitCode, InputError
 
 if TYPE_CHECKING:
@@ -65,6 +65,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add_bag_options(parser)
     parser.add_argument("-o", "--output", metavar="OUT.json",
                         help="write the result here; otherwise it is printed")
+    add_json(parser, "the result also where it is written")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -100,9 +101,10 @@ def run(args: argparse.Namespace) -> int:
         _write_cal(args, found)
     if args.output:
         write_json(args.output, result)
+    if args.output and not args.json:
         print(summary(result))
     else:
-        print(json.dumps(result, indent=1, allow_nan=False))
+        put(result)
     return ExitCode.DONE
 
 
@@ -160,9 +162,10 @@ def _sensitivity(args: argparse.Namespace) -> int:
     if args.plot:
         from selfcal_ros.reporting.laser_plots import plot_sensitivity
         plot_sensitivity(rows, sweep(machine, rng), args.plot)
+    table = {"machine": "case study, 6 blocks of 10 mm x 10 mm", "rows": rows}
     if args.output:
-        write_json(args.output, {"machine": "case study, 6 blocks of 10 mm x 10 mm", "rows": rows})
-    print(sensitivity_text(rows))
+        write_json(args.output, table)
+    say(args, sensitivity_text(rows), table)
     return ExitCode.DONE
 
 
@@ -186,8 +189,8 @@ def _simulate(args: argparse.Namespace) -> int:
         write_json(args.truth, truth_of(simulation.machine))
     if args.output:
         write_text(args.output, text)
-    else:
-        print(text, end="")
+    if args.json or not args.output:
+        say(args, text.removesuffix("\n"), {"csv": text, "file": args.output})
     return ExitCode.DONE
 
 

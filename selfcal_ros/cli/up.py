@@ -6,6 +6,8 @@ import contextlib
 import os
 from pathlib import Path
 
+from selfcal_ros.cli.terminal.output import add_json
+
 HELP = "bring up the nodes of a cell, supervise them, and run a calibration on one screen"
 
 
@@ -17,6 +19,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--bag", metavar="FOLDER", help="record the session to this new folder")
     parser.add_argument("--results", metavar="FOLDER", default=".",
                         help="folder for the maps that are saved (default: the working directory)")
+    add_json(parser, "one JSON object a line: pictures as they change, answers to requests")
     parser.add_argument("--compensate", action="store_true",
                         help="publish corrected joint states as well")
     parser.add_argument("--simulate", action="store_true",
@@ -44,7 +47,7 @@ def run(args: argparse.Namespace) -> int:
     with ended_by_signals(), contextlib.ExitStack() as stack:
         supervisor = stack.enter_context(Supervisor(commands(args), dict(os.environ)))
         monitor = stack.enter_context(eyes(args.namespace))
-        return watch(monitor, supervisor.log, supervisor.step)
+        return watch(monitor, supervisor.log, supervisor.step, as_json=args.json)
 
 
 def commands(args: argparse.Namespace) -> dict[str, list[str]]:

@@ -8,7 +8,7 @@ the same table, and the documentation is printed from it. An unknown name is an 
 from dataclasses import dataclass
 from typing import Any
 
-from selfcal_ros.errors import InputError
+from selfcal_ros.errors import InputError, known_are
 from selfcal_ros.estimation.options import Options, ReferenceKind, ReferenceLength
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.readings import Measurements, Sense
@@ -280,7 +280,7 @@ def parameter_values(node: str, overrides: dict[str, Any], where: str) -> dict[s
             continue
         if name not in table:
             raise InputError(f"{where}: {name}", f"{node} has no such parameter",
-                             "known are " + ", ".join(table))
+                             known_are(name, table))
         values[name] = table[name].check(value, where)
     return values
 
@@ -296,7 +296,7 @@ def overrides_in(data: object, node: str, where: str) -> dict[str, Any]:
         last = name.rsplit("/", 1)[-1]
         if last not in ("**", "*") and last not in NODE_PARAMETERS:
             raise InputError(f"{where}: {name}", "no node of this package",
-                             "known are " + ", ".join(NODE_PARAMETERS))
+                             known_are(last, NODE_PARAMETERS))
         if last == node or last in ("**", "*"):
             flat = dict(_flatten(section, ""))
             if last != node:  # a wild-card section may hold parameters of other nodes

@@ -4,7 +4,7 @@
 from dataclasses import dataclass
 from enum import StrEnum
 
-from selfcal_ros.errors import InputError
+from selfcal_ros.errors import InputError, known_are
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.terms import DRIFT_DEGREE, ModelTerm
 
@@ -110,9 +110,9 @@ class Options:
         for name, known in (("method", METHODS), ("misalignment_model", MISALIGNMENT_MODELS)):
             if getattr(self, name) not in known:
                 raise InputError(name, f"'{getattr(self, name)}' is unknown",
-                                 "known are " + ", ".join(known))
+                                 known_are(str(getattr(self, name)), known))
         try:
             object.__setattr__(self, "datum_theta", ThetaDatum(self.datum_theta))
         except ValueError as error:
             raise InputError("datum_theta", f"'{self.datum_theta}' is unknown",
-                             "known are " + ", ".join(ThetaDatum)) from error
+                             known_are(str(self.datum_theta), ThetaDatum)) from error

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import StrEnum
 
-from selfcal_ros.errors import InputError
+from selfcal_ros.errors import InputError, known_are
 
 MAX_DRIFT_DEGREE = 9
 """Largest degree of the polynomial by which a view may drift."""
@@ -67,7 +67,7 @@ class ModelTerm:
         """Take a name that is given as plain text, too."""
         if self.name not in list(TermName):
             raise InputError("ModelTerm", f"the term '{self.name}' is unknown",
-                             "known are " + ", ".join(TermName))
+                             known_are(self.name, TermName))
         object.__setattr__(self, "name", TermName(self.name))
 
     @property
@@ -101,8 +101,7 @@ def parse_terms(texts: Iterable[str], where: str) -> tuple[ModelTerm, ...]:
             continue
         name, colon, size = text.partition(":")
         if name not in list(TermName):
-            raise InputError(where, f"the term '{name}' is unknown",
-                             "known are " + ", ".join(TermName))
+            raise InputError(where, f"the term '{name}' is unknown", known_are(name, TermName))
         term = ModelTerm(TermName(name), _size(size, f"{where}: {name}") if colon else math.inf)
         if term.name in found:
             raise InputError(where, f"the term '{name}' is given twice", "remove one")

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from selfcal_ros.errors import InputError
+from selfcal_ros.errors import InputError, known_are
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.orders import parse_order
 from selfcal_ros.model.terms import parse_terms
@@ -256,7 +256,7 @@ def _fields(data: object, where: str, required: dict, optional: dict | None = No
     for key in data:
         if key not in required and key not in optional:
             raise InputError(f"{where}: {key}", "unknown key",
-                             "known are " + ", ".join([*required, *optional]))
+                             known_are(str(key), [*required, *optional]))
     out = {key: default for key, (_, default) in optional.items()}
     for key in required:
         if key not in data:

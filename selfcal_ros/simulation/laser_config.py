@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from selfcal_ros.errors import InputError
+from selfcal_ros.errors import InputError, known_are
 from selfcal_ros.laser.data import DIAGONALS, MAX_BLOCKS, Closure, StepDiagonalResult
 from selfcal_ros.laser.profiles import ReferenceLine, name_of
 from selfcal_ros.laser.result_json import geometry
@@ -153,7 +153,7 @@ def _mapping(data: object, where: str, known: tuple[str, ...]) -> dict[str, Any]
                          "see config/step_diagonal for an example")
     for key in data:
         if key not in known:
-            raise InputError(f"{where}: {key}", "unknown key", "known are " + ", ".join(known))
+            raise InputError(f"{where}: {key}", "unknown key", known_are(str(key), known))
     return data
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from selfcal_ros.collection.parameters import Parameter
-from selfcal_ros.errors import InputError
+from selfcal_ros.errors import InputError, known_are
 from selfcal_ros.files import read_yaml
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.view import Plan, plan_from_dict
@@ -158,7 +158,7 @@ def _mapping(data: Any, where: str, known: tuple[str, ...]) -> dict:
         raise InputError(where, "not a mapping", "see docs/simulate.md")
     for key in data:
         if key not in known:
-            raise InputError(f"{where}: {key}", "unknown key", "known are " + ", ".join(known))
+            raise InputError(f"{where}: {key}", "unknown key", known_are(str(key), known))
     return data
 
 

@@ -6,7 +6,7 @@ import json
 import math
 from typing import TYPE_CHECKING, Any
 
-from selfcal_ros.cli.aerotech.options import numbers, pairs
+from selfcal_ros.cli.aerotech.options import in_unit, numbers, pairs
 from selfcal_ros.errors import ExitCode, InputError
 
 if TYPE_CHECKING:
@@ -30,7 +30,10 @@ def add_to(group: argparse._SubParsersAction) -> None:
                                              "in primary units by axis")
     evaluate.add_argument("file", metavar="FILE.cal")
     add = evaluate.add_argument
-    add("--position", action="append", metavar="AXIS=P", help="position, primary units")
+    add("--position", action="append", metavar="AXIS=P", help="position: primary units, or a "
+        "length as in 1=10.5mm")
+    add("--unit", choices=("m", "mm", "um"), help="primary unit of the linear axes, for positions "
+        "with a unit (default: as the comments of FILE.cal say, else mm)")
     add("--counts-per-unit", action="append", metavar="AXIS=C",
         help="encoder counts per primary unit")
     add("--counts-per-secondary", action="append", metavar="AXIS=C",
@@ -42,6 +45,7 @@ def add_to(group: argparse._SubParsersAction) -> None:
         help="home offset now, primary units, if it has changed")
     add("--absolute-feedback-offset", action="append", metavar="AXIS=C",
         help="absolute feedback offset now, counts, if it has changed")
+    add("--json", action="store_true", help="print JSON: as it is printed anyhow")
     evaluate.set_defaults(run_sub_verb=_evaluate)
 
 
@@ -88,11 +92,15 @@ def _described(table: "Table1D | Table2D") -> dict:
 def _evaluate(args: argparse.Namespace) -> int:
     from selfcal_ros.compensation.aerotech.evaluate import CalEvaluator
     from selfcal_ros.compensation.aerotech.read import load_cal
+    from selfcal_ros.compensation.machine import frame_from_comments
 
-    positions = numbers(args.position, "--position")
+    cal = load_cal(args.file)
+    frame = frame_from_comments(cal.comments)
+    unit = args.unit or (frame.unit if frame else "mm")
+    positions = numbers(in_unit(args.position, unit), "--position")
     if not positions:
         raise InputError("--position", "no position is given", "write --position 1=10.5")
-    corrections = CalEvaluator(load_cal(args.file).tables, _setup(args)).corrections(positions)
+    corrections = CalEvaluator(cal.tables, _setup(args)).corrections(positions)
     print(json.dumps({str(axis): float(value) for axis, value in corrections.items()}))
     return int(ExitCode.DONE)
 

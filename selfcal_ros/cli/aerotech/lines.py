@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from selfcal_ros.cli.aerotech.options import add_frame, frame_of, read_result
+from selfcal_ros.cli.terminal.output import add_json, say
 from selfcal_ros.errors import ExitCode, InputError
 from selfcal_ros.units import M_PER_UM, UM_PER_M
 
@@ -36,7 +37,6 @@ def add_to(group: argparse._SubParsersAction) -> None:
     square.add_argument("--home", choices=tuple(_HOMES),
                         help="home position of the reference axis (default: show all; with -o: "
                              "must be said)")
-    square.add_argument("--json", action="store_true", help="print as JSON, primary units and um")
     _common(square, _orthogonality)
     for name, what in (("accuracy", "an axis from its own position"),
                        ("straightness", "the other axis from the position of an axis")):
@@ -55,6 +55,7 @@ def _common(parser: argparse.ArgumentParser, run: object) -> None:
     parser.add_argument("-o", "--output", metavar="FILE.cal", help="write a calibration file")
     parser.add_argument("--force", action="store_true",
                         help="replace an existing file; the old one is kept with its date")
+    add_json(parser)
     add_frame(parser, theta=False)
     parser.set_defaults(run_sub_verb=run)
 
@@ -151,10 +152,12 @@ def _deliver(args: argparse.Namespace, line: "AxisCorrection", frame: "MachineFr
                 f"{args.sub_verb} of {axes[1]} along {axes[0]}, from {source}", frame.comment()]
     table = line_table(line, frame, along=axes[0], corrected=axes[1])
     text = cal_text([table], comments=comments, decimals=DECIMALS)
+    found = {"table": text, "corrects": axes[1], "along": axes[0], "file": None, "old_file": None}
     if not args.output:
-        print(text, end="")
+        say(args, text.removesuffix("\n"), found)
         return int(ExitCode.DONE)
     backup = write_cal(args.output, text, force=args.force)
-    print(f"{args.output}: {args.sub_verb} table for {axes[1]}"
-          + (f"; the old file is {backup}" if backup else ""))
+    say(args, f"{args.output}: {args.sub_verb} table for {axes[1]}"
+        + (f"; the old file is {backup}" if backup else ""),
+        found | {"file": args.output, "old_file": backup and str(backup)})
     return int(ExitCode.DONE)

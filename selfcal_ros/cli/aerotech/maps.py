@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from selfcal_ros.cli.aerotech.options import add_frame, frame_of, read_result
+from selfcal_ros.cli.terminal.output import add_json, say
 from selfcal_ros.errors import ExitCode, InputError, NotIdentifiableError
 from selfcal_ros.units import M_PER_UM, RAD_PER_ARCSEC
 
@@ -28,6 +29,7 @@ def add_to(group: argparse._SubParsersAction) -> None:
                         help="set unknown sites to the mean of their neighbours")
     export.add_argument("--force", action="store_true",
                         help="replace existing files; the old ones are kept with their date")
+    add_json(export)
     add_frame(export, theta=True)
     export.set_defaults(run_sub_verb=_export)
     verify = group.add_parser("verify", help="print the residual of a simulated controller before "
@@ -69,10 +71,13 @@ def _export(args: argparse.Namespace) -> int:
                                  decimals=export.theta_decimals(result.error_map))
     check_outputs([args.result], texts)
     refuse_existing(list(texts), force=args.force)
+    lines, files = [], []
     for path, text in texts.items():
         backup = write_cal(path, text, force=args.force)
-        print(f"{path}: {'1D table for theta' if path != args.output else '2D table for x and y'}"
-              + (f"; the old file is {backup}" if backup else ""))
+        kind = "1D table for theta" if path != args.output else "2D table for x and y"
+        lines.append(f"{path}: {kind}" + (f"; the old file is {backup}" if backup else ""))
+        files.append({"file": path, "kind": kind, "old_file": backup and str(backup)})
+    say(args, "\n".join(lines), {"files": files, "filled": filled})
     if filled:
         print(f"selfcal cal: {filled} unknown sites filled from their neighbours", file=sys.stderr)
     if frame.theta_axis is not None and frame.theta_counts_per_unit is None:

@@ -3,9 +3,12 @@
 
 import argparse
 import math
+import re
+from fractions import Fraction
 from typing import TYPE_CHECKING, Any
 
 from selfcal_ros.errors import InputError
+from selfcal_ros.units import M_PER
 
 if TYPE_CHECKING:
     from selfcal_ros.compensation.machine import MachineFrame
@@ -40,6 +43,22 @@ def numbers(texts: list[str] | None, option: str, *, positive: bool = False) -> 
             raise InputError(option, f"'{text}' is not a {'positive ' * positive}number",
                              f"write {option} {axis}=1000")
         found[axis] = value
+    return found
+
+
+def in_unit(texts: list[str] | None, unit: str) -> list[str]:
+    """Return options AXIS=LENGTH with the length as a number in `unit`; others as they are."""
+    found = []
+    for text in texts or []:
+        match = re.fullmatch(r"(\d+)=([-+]?[\d.]+(?:[eE][-+]?\d{1,3})?) ?(m|mm|um|µm|nm)", text)
+        if match is None:
+            found.append(text)
+            continue
+        factor = Fraction(str(M_PER[match[3].replace("µ", "u")])) / Fraction(str(M_PER[unit]))
+        try:
+            found.append(f"{match[1]}={float(Fraction(match[2]) * factor)!r}")
+        except (ValueError, OverflowError):
+            found.append(text)
     return found
 
 

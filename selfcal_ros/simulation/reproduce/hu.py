@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Hu's published simulation, run again with seeds, by his law and by joint least squares."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -13,8 +15,9 @@ from selfcal_ros.estimation.normal.planned import planned_system
 from selfcal_ros.estimation.observability.prediction import predict
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.model.error_map import ThetaDatum
+from selfcal_ros.model.error_map import ErrorMap, ThetaDatum
 from selfcal_ros.model.readings import Measurements, Sense
+from selfcal_ros.parallel import Progress, mapped_in_parts, silent
 from selfcal_ros.simulation.truth import (
     Spread,
     Truth,
@@ -96,23 +99,31 @@ class HuReproduction:
 
 
 @one_thread()
-def reproduce_hu(n_draws: int, seed: int) -> HuReproduction:
-    """Run Hu's simulation: one truth, `n_draws` draws of noise at each of his two levels."""
+def reproduce_hu(n_draws: int, seed: int, *, workers: int = 1,
+                 progress: Progress = silent) -> HuReproduction:
+    """Run Hu's simulation: one truth, `n_draws` draws of noise at each of his two levels.
+
+    The draws are solved by `workers` processes, with the same results for any number of them.
+    """
     rng = np.random.default_rng(seed)
     truth = random_truth(ARTIFACT, 4, rng, AS_PUBLISHED)
     exact = _law_errors(truth, [simulate_measurements(truth, hu_plan(ARTIFACT), rng)])
-    runs = tuple(_run(truth, table, rng, n_draws) for table in TABLES)
+    runs = tuple(_run(truth, table, rng, n_draws, partial(
+        mapped_in_parts, workers=workers,
+        progress=lambda done, total, at=at: progress(done + at * total, len(TABLES) * total)))
+        for at, table in enumerate(TABLES))
     return HuReproduction(truth, float(abs(exact.xy).max()), float(abs(exact.theta).max()), runs)
 
 
-def _run(truth: Truth, table: Published, rng: np.random.Generator, n_draws: int) -> HuRun:
+def _run(truth: Truth, table: Published, rng: np.random.Generator, n_draws: int,
+         spread: Callable) -> HuRun:
     plan = hu_plan(ARTIFACT)
     draws = [simulate_measurements(truth, plan, rng, sigma_m=table.sigma_um * M_PER_UM,
                                    sigma_theta_rad=np.deg2rad(table.sigma_deg))
              for _ in range(n_draws)]
     gain = predict(planned_system(ARTIFACT, plan.views), ARTIFACT, ThetaDatum.XY_AXES)
     bound = gain.rms_xy * table.sigma_um, gain.rms_theta * table.sigma_deg
-    return HuRun(table, _law_errors(truth, draws), _joint_errors(truth, draws), bound)
+    return HuRun(table, _law_errors(truth, draws), _joint_errors(truth, draws, spread), bound)
 
 
 def _law_errors(truth: Truth, draws: list[Measurements]) -> Errors:
@@ -124,13 +135,17 @@ def _law_errors(truth: Truth, draws: list[Measurements]) -> Errors:
     return Errors(xy * UM_PER_M, np.rad2deg(found.g_theta.T - truth.g_theta))
 
 
-def _joint_errors(truth: Truth, draws: list[Measurements]) -> Errors:
-    options = Options(datum_theta=ThetaDatum.XY_AXES, misalignment_model="linear",
-                      uncertainty=False)
-    maps = [calibrate(readings, options).error_map for readings in draws]
+def _joint_errors(truth: Truth, draws: list[Measurements], spread: Callable) -> Errors:
+    maps = spread(_joint_maps, draws)
     xy = np.array([[m.gx - truth.g[0], m.gy - truth.g[1]] for m in maps])
     theta = np.array([m.g_theta - truth.g_theta for m in maps])
     return Errors(xy * UM_PER_M, np.rad2deg(theta))
+
+
+def _joint_maps(draws: list[Measurements]) -> list[ErrorMap]:
+    options = Options(datum_theta=ThetaDatum.XY_AXES, misalignment_model="linear",
+                      uncertainty=False)
+    return [calibrate(readings, options).error_map for readings in draws]
 
 
 def hu_text(found: HuReproduction) -> str:

@@ -2,6 +2,7 @@
 """Qiao's published tables and simulations, run again with seeds."""
 
 from dataclasses import dataclass
+from functools import partial
 from math import pi
 
 import numpy as np
@@ -17,6 +18,7 @@ from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.readings import Measurements, ViewReadings
 from selfcal_ros.model.view import Plan, View
+from selfcal_ros.parallel import Progress, mapped_in_parts, silent
 from selfcal_ros.simulation.truth import (
     Spread,
     Truth,
@@ -128,18 +130,24 @@ def plan_of(views: tuple[str, ...], artifact: Artifact = ARTIFACT) -> Plan:
 
 
 @one_thread()
-def reproduce_qiao(n_draws: int, seed: int) -> QiaoReproduction:
-    """Compute all ranks, run both programs without noise and the noise run `n_draws` times."""
+def reproduce_qiao(n_draws: int, seed: int, *, workers: int = 1,
+                   progress: Progress = silent) -> QiaoReproduction:
+    """Compute all ranks, run both programs without noise and the noise run `n_draws` times.
+
+    The noise runs are solved by `workers` processes, with the same results for any number.
+    """
     seen = [[plan_observability(plan_of(row.views, Artifact(n, 0.01))) for n in SIZES]
             for row in ROWS]
     rng = np.random.default_rng(seed)
     truth = random_truth(ARTIFACT, 3, rng, SPREAD)
     first, second = (_program(truth, views) for views in PROGRAMS)
     plan = plan_of(PROGRAMS[0])
-    normal = [_errors_um(truth, simulate_measurements(truth, plan, rng, sigma_m=SIGMA_M))
-              for _ in range(n_draws)]
+    draws = [simulate_measurements(truth, plan, rng, sigma_m=SIGMA_M) for _ in range(n_draws)]
     exact = simulate_measurements(truth, plan, rng)
-    uniform = [_errors_um(truth, _with_uniform_noise(exact, rng)) for _ in range(n_draws)]
+    draws += [_with_uniform_noise(exact, rng) for _ in range(n_draws)]
+    errors = mapped_in_parts(partial(_all_errors_um, truth), draws, workers=workers,
+                             progress=progress)
+    normal, uniform = errors[:n_draws], errors[n_draws:]
     gain = predict(planned_system(ARTIFACT, plan.views), ARTIFACT, ThetaDatum.XY_AXES).rms_xy
     return QiaoReproduction(
         np.array([[s.rank for s in row] for row in seen]),
@@ -149,6 +157,10 @@ def reproduce_qiao(n_draws: int, seed: int) -> QiaoReproduction:
 
 def _rms(errors: list[np.ndarray]) -> np.ndarray:
     return np.sqrt(np.mean(np.array(errors) ** 2, axis=(2, 3)))
+
+
+def _all_errors_um(truth: Truth, draws: list[Measurements]) -> list[np.ndarray]:
+    return [_errors_um(truth, readings) for readings in draws]
 
 
 def _errors_um(truth: Truth, readings: Measurements) -> np.ndarray:

@@ -1,0 +1,81 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``selfcal table``: the maps of a result as a CSV table or as numpy arrays."""
+
+import argparse
+from typing import TYPE_CHECKING
+
+from selfcal_ros.cli.terminal.output import add_json, say
+
+if TYPE_CHECKING:
+    from selfcal_ros.model.result import CalibrationResult
+
+HELP = "write the maps of a result as a table: csv or npz"
+COLUMNS = ("m", "n", "x_m", "y_m", "gx_m", "gy_m", "u_gx_m", "u_gy_m",
+           "k", "angle_rad", "g_theta_rad", "u_g_theta_rad")
+KINDS = (".csv", ".npz")
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the verb."""
+    parser.add_argument("result", metavar="RESULT.json", help="result that `selfcal solve` wrote")
+    parser.add_argument("-o", "--output", metavar="FILE.csv|.npz", required=True,
+                        help="table to write: a line for each site, then one for each angular "
+                        "line (csv, SI units, empty = not known), or arrays (npz)")
+    add_json(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Read the result, write the table, say where it is."""
+    from pathlib import Path
+
+    from selfcal_ros.errors import ExitCode, InputError
+    from selfcal_ros.files import check_outputs, read_json, write_bytes
+    from selfcal_ros.model.result import result_from_dict
+
+    kind = Path(args.output).suffix.lower()
+    if kind not in KINDS:
+        raise InputError(args.output, "no kind of table by its ending",
+                         "name a file that ends in " + " or ".join(KINDS))
+    check_outputs([args.result], [args.output])
+    result = result_from_dict(read_json(args.result), args.result)
+    write_bytes(args.output, csv_bytes(result) if kind == ".csv" else npz_bytes(result))
+    say(args, f"written: {args.output}", {"written": args.output, "kind": kind.lstrip(".")})
+    return int(ExitCode.DONE)
+
+
+def csv_bytes(result: "CalibrationResult") -> bytes:
+    """Return the maps as CSV: nominal places of sites and lines, errors, standard uncertainties."""
+    import math
+
+    emap, plate = result.error_map, result.artifact
+    rows = [",".join(COLUMNS)]
+    pitch = plate.grid_pitch_m
+    for i, j in ((i, j) for i in range(plate.shape[0]) for j in range(plate.shape[1])):
+        m, n = i - plate.half[0], j - plate.half[1]
+        cells = [m, n, m * pitch, n * pitch, emap.gx[i, j], emap.gy[i, j], emap.u_gx[i, j],
+                 emap.u_gy[i, j]]
+        rows.append(",".join([*map(_cell, cells), "", "", "", ""]))
+    for k in range(plate.angular_count):
+        cells = [k, 2 * math.pi * k / plate.angular_count, emap.g_theta[k], emap.u_g_theta[k]]
+        rows.append("," * 8 + ",".join(map(_cell, cells)))
+    return ("\n".join(rows) + "\n").encode()
+
+
+def _cell(value: float) -> str:
+    return str(value) if isinstance(value, int) else "" if value != value else repr(float(value))
+
+
+def npz_bytes(result: "CalibrationResult") -> bytes:
+    """Return the maps as arrays by the names of RESULT.json, [i, j] = site m = i - h, n = j - h."""
+    import io
+
+    import numpy as np
+
+    emap, plate = result.error_map, result.artifact
+    out = io.BytesIO()
+    np.savez(out, gx=emap.gx, gy=emap.gy, u_gx=emap.u_gx, u_gy=emap.u_gy, g_theta=emap.g_theta,
+             u_g_theta=emap.u_g_theta, ax=result.artifact_map.ax, ay=result.artifact_map.ay,
+             a_theta=result.artifact_map.a_theta, grid_pitch=np.float64(plate.grid_pitch_m),
+             nonorthogonality=np.float64(emap.nonorthogonality),
+             scale_difference=np.float64(emap.scale_difference))
+    return out.getvalue()
