@@ -108,11 +108,17 @@ def reproduce_hu(n_draws: int, seed: int, *, workers: int = 1,
     rng = np.random.default_rng(seed)
     truth = random_truth(ARTIFACT, 4, rng, AS_PUBLISHED)
     exact = _law_errors(truth, [simulate_measurements(truth, hu_plan(ARTIFACT), rng)])
-    runs = tuple(_run(truth, table, rng, n_draws, partial(
-        mapped_in_parts, workers=workers,
-        progress=lambda done, total, at=at: progress(done + at * total, len(TABLES) * total)))
-        for at, table in enumerate(TABLES))
-    return HuReproduction(truth, float(abs(exact.xy).max()), float(abs(exact.theta).max()), runs)
+    runs = []
+    for number, table in enumerate(TABLES):
+        spread = partial(mapped_in_parts, workers=workers,
+                         progress=partial(_later, progress, number))
+        runs.append(_run(truth, table, rng, n_draws, spread))
+    return HuReproduction(truth, float(abs(exact.xy).max()), float(abs(exact.theta).max()),
+                          tuple(runs))
+
+
+def _later(progress: Progress, number: int, done: int, total: int) -> None:
+    progress(done + number * total, len(TABLES) * total)
 
 
 def _run(truth: Truth, table: Published, rng: np.random.Generator, n_draws: int,
