@@ -3,9 +3,9 @@
 SHELL := /bin/bash
 BIN := .venv/bin
 
-.PHONY: setup demo test test-oldest lint bench soak mutants reality clean help
+.PHONY: setup demo test test-oldest lint bench soak mutants reality pictures clean help
 help:
-	@echo "make setup | demo | test | test-oldest | lint | bench | soak | mutants | reality | clean"
+	@echo "make setup | demo | test | test-oldest | lint | bench | soak | mutants | reality | pictures | clean"
 setup:
 	@tools/setup.sh
 demo: setup
@@ -31,6 +31,8 @@ mutants: setup  # e.g. make mutants MUTANTS="--number 200 --only selfcal_ros/est
 	@$(BIN)/python tools/mutants.py $(MUTANTS)
 reality: setup  # minutes; e.g. make reality REALITY="--runs 10 --only drift"
 	@$(BIN)/python tools/reality.py $(REALITY)
+pictures: setup  # those of README and docs
+	@$(BIN)/python tools/pictures.py
 clean:
 	rm -rf .venv .venv-oldest build install log selfcal_ros.egg-info
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``selfcal report``: a result in, one HTML file (and a picture, and the summary) out."""
+"""``selfcal report``: a result in, one HTML or PDF file (and a picture, and the summary) out."""
 
 import argparse
 import sys
@@ -7,13 +7,13 @@ from pathlib import Path
 
 from selfcal_ros.cli.terminal.output import add_json, say
 
-HELP = "write a calibration report: one self-contained HTML file"
+HELP = "write a calibration report: one self-contained HTML or PDF file"
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the verb."""
     parser.add_argument("result", metavar="RESULT.json", help="result that `selfcal solve` wrote")
-    parser.add_argument("-o", "--output", metavar="REPORT.html",
+    parser.add_argument("-o", "--output", metavar="REPORT.html|.pdf",
                         help="where to write (default: beside the result, ending in .html)")
     parser.add_argument("--plot", metavar="MAP.png", help="also write the map as a picture")
     parser.add_argument("--truth", metavar="TRUTH.json",
@@ -26,17 +26,18 @@ def run(args: argparse.Namespace) -> int:
     """Read the result, write the report, say where it is."""
     from selfcal_ros.files import check_outputs, read_json
     from selfcal_ros.model.result import result_from_dict
-    from selfcal_ros.reporting.html import save_report
     from selfcal_ros.reporting.maps.plot import save_map_plot
     from selfcal_ros.reporting.summary.text import can_print_symbols, summary_text
+    from selfcal_ros.reporting.write import check_name, write_report
 
     output = Path(args.output) if args.output else Path(args.result).with_suffix(".html")
     check_outputs([args.result, args.truth], [output, args.plot])
+    check_name(output)
     result = result_from_dict(read_json(args.result), args.result)
     truth = _read_truth(args.truth) if args.truth else None
     if args.plot:
         save_map_plot(result, args.plot, truth=truth)
-    save_report(result, output, truth=truth)
+    write_report(result, output, truth=truth)
     written = [str(name) for name in (output, args.plot) if name]
     text = [summary_text(result, truth=truth, ascii_only=not can_print_symbols(sys.stdout))
             ] if args.text else []

@@ -22,6 +22,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
                         help="hold out tenths of the readings and whole views, and predict them")
     parser.add_argument("--budget", action="store_true",
                         help="print the uncertainty budget of the map (GUM)")
+    parser.add_argument("--report", metavar="REPORT.html|.pdf", help="also write the report, "
+                        "compared with the truth where the bag holds one")
     parser.add_argument("--quiet", action="store_true", help="print no summary")
 
 
@@ -99,6 +101,7 @@ def _reference(text: str | None) -> dict[str, Any]:
 def run(args: argparse.Namespace) -> int:
     """Collect, calibrate, print the summary and write the result."""
     from selfcal_ros.bagio.offline import bag_input, collect_bag
+    from selfcal_ros.bagio.simulated import read_truth
     from selfcal_ros.cli.terminal.print_result import exit_code, show
     from selfcal_ros.cli.terminal.progress import progress_bar
     from selfcal_ros.collection.parameters import solver_options
@@ -112,8 +115,11 @@ def run(args: argparse.Namespace) -> int:
         unidentified_result,
         with_input,
     )
+    from selfcal_ros.reporting.write import check_name, write_report
 
-    check_outputs([args.bag, args.params], [file_of(args)])
+    check_outputs([args.bag, args.params], [file_of(args), args.report])
+    if args.report:
+        check_name(args.report)
     collector_values, solver_values = parameters(args)
     with progress_bar("reading") as bar:
         measurements, _, lost, findings = collect_bag(
@@ -139,6 +145,8 @@ def run(args: argparse.Namespace) -> int:
     result, lines = _extended(args, measurements, options, result)
     result = created_now(with_input(result, bag_input(args.bag), lost))
     _write(args, result_to_dict(result))
+    if args.report:
+        write_report(result, args.report, truth=read_truth(args.bag))
     if not args.quiet:
         show(result, args.bag, file_of(args), aside(args))
         print("\n".join(lines), end="\n" * bool(lines), file=aside(args))

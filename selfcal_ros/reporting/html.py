@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The calibration report: one HTML file that needs nothing else."""
 
-import base64
 import os
+import re
 from collections.abc import Mapping
 from html import escape
 
@@ -10,20 +10,23 @@ import numpy as np
 
 from selfcal_ros.files import write_text
 from selfcal_ros.model.result import CalibrationResult
-from selfcal_ros.reporting.html_extras import (
-    convention_section,
-    extra_sections,
-    provenance_section,
-)
+from selfcal_ros.reporting.chapters import Chapter, Figure, chapters
 from selfcal_ros.reporting.html_style import CSS
-from selfcal_ros.reporting.maps.plot import error_map_svg, theta_svg, uncertainty_map_svg
-from selfcal_ros.reporting.summary.format import printable
+from selfcal_ros.reporting.sheet.svg import inline_svg
+from selfcal_ros.reporting.summary.format import numeric_columns, printable
 from selfcal_ros.reporting.summary.numbers import truth_arrays
-from selfcal_ros.reporting.summary.sections import Section, all_sections
+from selfcal_ros.reporting.summary.sections import Section
 from selfcal_ros.reporting.summary.text import state_sentence
 
-POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
+POLICY = "default-src 'none'; style-src 'unsafe-inline'"
 """Content security policy: a browser will not fetch anything, whatever a name contains."""
+
+WIDE = 40
+"""Characters from which a cell of words is given room."""
+
+SHORT = 24
+"""Characters up to which a cell of words is kept in one line."""
+
 _PAGE = """<!DOCTYPE html>
 <html lang="en">
 <head>
@@ -55,7 +58,7 @@ def save_report(result: CalibrationResult, path: str | os.PathLike, *,
 
 def report_html(result: CalibrationResult, *,
                 truth: Mapping[str, np.ndarray] | None = None) -> str:
-    """Return the report as one HTML document with embedded pictures and no outside resource.
+    """Return the report as one HTML document with inline figures and no outside resource.
 
     Parameters
     ----------
@@ -69,16 +72,10 @@ def report_html(result: CalibrationResult, *,
     InputError
         If `truth` does not fit the map.
     """
-    truth = truth_arrays(result.error_map, truth)
-    sections = all_sections(result, truth)
-    attention = [s for s in sections if s.title == "Attention"]
-    others = [s for s in sections if s.title != "Attention"]
-    found = result.observability.identifiable and not result.warnings
-    verdict = _text(state_sentence(result))
-    parts = [f'<p class="verdict{"" if found else " bad"}">{verdict}</p>',
-             *(_section(s, kind="attention") for s in attention), _pictures(result, truth),
-             *map(_section, others), *map(_section, extra_sections(result.extra)),
-             _section(convention_section(result)), _section(provenance_section(result))]
+    found = chapters(result, truth_arrays(result.error_map, truth))
+    good = result.verdict.qualified and result.observability.identifiable and not result.warnings
+    parts = [f'<p class="verdict{"" if good else " bad"}">{_text(state_sentence(result))}</p>',
+             _contents(found), *map(_chapter, found)]
     title = _text(f"Stage calibration: plan {result.plan_id}")
     return _PAGE.format(policy=POLICY, title=title, css=CSS, body="\n".join(parts))
 
@@ -87,37 +84,58 @@ def _text(value: object) -> str:
     return escape(printable(value))
 
 
-def _pictures(result: CalibrationResult, truth: Mapping[str, np.ndarray] | None) -> str:
-    figures = [("Error of the stage in X and Y: enlarged vectors over their length.",
-                error_map_svg(result, truth=truth))]
-    if result.artifact.angular_count:
-        figures.append(("Error of the stage in θ: distance from the dashed circle.",
-                        theta_svg(result, truth=truth)))
-    figures.append(("Standard uncertainty of the XY error at every site.",
-                    uncertainty_map_svg(result)))
-    images = "\n".join(
-        f'<figure><img alt="{escape(caption)}" src="data:image/svg+xml;base64,'
-        f'{base64.b64encode(svg).decode()}"><figcaption>{escape(caption)}</figcaption></figure>'
-        for caption, svg in figures)
-    return f'<section class="maps"><h2>Maps</h2><div class="figures">\n{images}\n</div></section>'
+def _anchor(title: str) -> str:
+    return re.sub(r"[^a-z]+", "-", title.lower()).strip("-")
 
 
-def _section(section: Section, kind: str = "") -> str:
+def _contents(found: list[Chapter]) -> str:
+    links = "".join(f'<a href="#{_anchor(c.title)}">{_text(c.title)}</a>' for c in found)
+    return f"<nav>{links}</nav>"
+
+
+def _chapter(chapter: Chapter) -> str:
+    figures = "\n".join(map(_figure, chapter.figures))
+    parts = [f"<h2>{_text(chapter.title)}</h2>",
+             f'<div class="figures">\n{figures}\n</div>' if figures else "",
+             *(_section(s, titled=len(chapter.sections) > 1 and s.title != chapter.title)
+               for s in chapter.sections)]
+    kind = ' class="attention"' if chapter.alert else ""
+    return f'<section id="{_anchor(chapter.title)}"{kind}>' + "\n".join(
+        part for part in parts if part) + "</section>"
+
+
+def _figure(figure: Figure) -> str:
+    return (f"<figure>{inline_svg(figure.drawing)}"
+            f"<figcaption>{_text(figure.caption)}</figcaption></figure>")
+
+
+def _section(section: Section, *, titled: bool) -> str:
     """Return a section with its facts, its table and its notes."""
-    parts = [f"<h2>{escape(section.title)}</h2>"]
+    parts = [f"<h3>{_text(section.title)}</h3>"] if titled and section.title else []
     if section.facts:
-        rows = "".join(f"<tr><th>{escape(label)}</th><td>{escape(value)}</td></tr>"
+        rows = "".join(f"<tr><th>{_text(label)}</th><td>{_text(value)}</td></tr>"
                        for label, value in section.facts)
-        parts.append('<div class="scroll"><table class="facts">'
-                     f"<tbody>{rows}</tbody></table></div>")
+        parts.append(f'<table class="facts"><tbody>{rows}</tbody></table>')
     if section.table:
-        head = "".join(f"<th>{escape(cell)}</th>" for cell in section.table[0])
-        rows = "".join("<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>"
-                       for row in section.table[1:])
-        parts.append(f'<div class="scroll"><table><thead><tr>{head}</tr></thead>'
-                     f"<tbody>{rows}</tbody></table></div>")
+        parts.append(_table(section.table))
     if section.notes:
-        items = "".join(f"<li>{escape(note)}</li>" for note in section.notes)
+        items = "".join(f"<li>{_text(note)}</li>" for note in section.notes)
         parts.append(f"<ul>{items}</ul>")
-    tag = f'<section class="{kind}">' if kind else "<section>"
-    return tag + "\n".join(parts) + "</section>"
+    return "\n".join(parts)
+
+
+def _table(table: tuple[tuple[str, ...], ...]) -> str:
+    """Return a table; columns of numbers are flush right, long words get room."""
+    kinds = []
+    for number, column in zip(numeric_columns(table), zip(*table, strict=True), strict=True):
+        longest = max(map(len, column))
+        kinds.append("n" if number else "w" if longest > WIDE else "s" if longest < SHORT else "t")
+    head = "".join(_cell("th", cell, kind) for cell, kind in zip(table[0], kinds, strict=True))
+    rows = "".join("<tr>" + "".join(_cell("td", cell, kind) for cell, kind in
+                                    zip(row, kinds, strict=True)) + "</tr>" for row in table[1:])
+    return (f'<div class="scroll"><table><thead><tr>{head}</tr></thead>'
+            f"<tbody>{rows}</tbody></table></div>")
+
+
+def _cell(tag: str, value: str, kind: str) -> str:
+    return f'<{tag} class="{kind}">{_text(value)}</{tag}>'

@@ -3,6 +3,7 @@ import copy
 import io
 import json
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,6 +17,8 @@ from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.result import result_from_dict, result_to_dict
 from selfcal_ros.reporting.summary.text import summary_text
 from selfcal_ros.simulation.truth import hu_plan, random_truth, simulate_measurements
+
+ROOT = Path(__file__).parents[2]
 
 
 def calibrated(rng, sigma_m=2e-8, sigma_rad=2e-5):
@@ -73,6 +76,8 @@ def test_summary_on_a_terminal_without_symbols(folder, monkeypatch):
      "a.html: would be written over; name another output file"),
     (["result.json", "-o", "a.html", "--plot", "a.pdf"],
      "a.pdf: the picture is a PNG; name a file that ends in .png"),
+    (["result.json", "-o", "a.txt"],
+     "a.txt: a report is HTML or PDF; end the name in .html or .pdf"),
     (["result.json", "-o", "a.html", "--plot", "none/a.png"],
      "none/a.png: cannot be written (No such file or directory); name a folder that exists and "
      "that you may write"),
@@ -124,3 +129,19 @@ def test_no_damage_to_a_result_file_ends_in_a_traceback(folder):
                 assert "\n" not in str(error)
                 outcomes["refused"] += 1
     assert min(outcomes.values()) > 50
+
+
+def test_solve_writes_the_report_of_its_result(tmp_path, capsys):
+    bag = str(ROOT / "bags/hu_noise")
+    assert main(["solve", bag, "--quiet", "-o", str(tmp_path / "r.json"),
+                 "--report", str(tmp_path / "r.html")]) == 0
+    assert main(["report", str(tmp_path / "r.json"), "-o", str(tmp_path / "again.html"),
+                 "--truth", f"{bag}/truth.json"]) == 0
+    html = (tmp_path / "r.html").read_text(encoding="utf-8")
+    assert html == (tmp_path / "again.html").read_text(encoding="utf-8")
+    assert "Against the known truth" in html and "Mean residuals over the time" in html
+    assert len(html) < 2_000_000
+    capsys.readouterr()
+    assert main(["solve", bag, "--report", str(tmp_path / "r.txt")]) == 2
+    assert capsys.readouterr().err.endswith(
+        "r.txt: a report is HTML or PDF; end the name in .html or .pdf\n")

@@ -1,5 +1,4 @@
 # SPDX-License-Identifier: Apache-2.0
-import base64
 import re
 from dataclasses import replace
 from html.parser import HTMLParser
@@ -9,10 +8,12 @@ import pytest
 
 from selfcal_ros import __version__
 from selfcal_ros.errors import InputError
+from selfcal_ros.estimation.joint.noise import coverage_factor
 from selfcal_ros.model.result import Observability, result_from_dict, result_to_dict
+from selfcal_ros.model.verdict import Cause, Verdict
+from selfcal_ros.reporting.extras import MAX_ROWS, convention_section, extra_sections
 from selfcal_ros.reporting.html import report_html, save_report
-from selfcal_ros.reporting.html_extras import MAX_ROWS, convention_section, extra_sections
-from test.support.results import known_result
+from test.support.results import known_result, with_residuals
 
 VOID = {"meta", "img", "br"}
 
@@ -50,15 +51,67 @@ def test_report_is_whole_and_needs_nothing_from_outside():
     result, truth = known_result(5, 24)
     html = report_html(result, truth=truth)
     page = parsed(html)
-    assert len(page.addresses) == 3
-    assert all(a.startswith("data:image/svg+xml;base64,") for a in page.addresses)
-    assert not {"script", "link", "iframe", "object"} & set(page.tags)
+    assert page.addresses and all(a.startswith("#") for a in page.addresses)
+    assert all(f'id="{a[1:]}"' in html for a in page.addresses)
+    assert page.tags.count("svg") == 5
+    assert not {"script", "link", "iframe", "object", "img"} & set(page.tags)
     assert "url(" not in html and "@import" not in html
     assert "default-src 'none'" in html
-    for address in page.addresses:
-        svg = base64.b64decode(address.partition(",")[2]).decode()
-        targets = re.findall(r'href="([^"]*)"', svg)
-        assert all(target.startswith(("#", "data:")) for target in targets)
+
+
+def test_every_colour_of_a_figure_is_defined_for_light_and_dark():
+    html = report_html(with_residuals(), truth=known_result(5, 24)[1])
+    used = set(re.findall(r'class="(?:[^"]* )?[fs]-(\w+)', html))
+    light, dark = re.findall(r":root \{ [^}]*\}", html)[:2]
+    assert len(used) > 20
+    for name in used:
+        assert f"--{name}: #" in light and f"--{name}: #" in dark
+        assert f"svg.figure .f-{name}{{fill:var(--{name})}}" in html
+    assert "@media screen and (prefers-color-scheme: dark)" in html
+
+
+def test_figures_follow_what_the_result_keeps():
+    bare, rich = (parsed(report_html(r)).text for r in (known_result(5, 24)[0], with_residuals()))
+    titles = ("Residuals of the grid readings by view", "Distribution of the grid residuals",
+              "Distribution of the angular residuals", "Mean residuals over the time",
+              "Rejected grid readings, where they happened")
+    for title in titles:
+        assert not any(title in text for text in bare)
+        assert any(title in text for text in rich)
+
+
+def test_both_kinds_of_uncertainty_are_told_with_what_each_is_for():
+    result, _ = known_result(5, 24)
+    page = parsed(report_html(result))
+    text = "|".join(page.text)
+    for where in ("x or y, at the nodes", "x or y, anywhere", "θ, at the lines", "θ, anywhere"):
+        assert text.count(where) == 1
+    assert "At the nodes: how well the map itself is known." in text
+    assert "Anywhere: with the error of interpolating" in text
+    # U of the nodes is k u, written out: 2.0009 * 0.9 * 0.02 um * 1.28 at the corner
+    u = result.error_map.u_gx.max() * 1e6
+    assert f"|{coverage_factor(2904) * u:.3f}" in text.replace(" ", "")
+
+
+def test_causes_come_as_a_table_with_one_unit_each():
+    result, _ = known_result(3, 0)
+    causes = (Cause("drift", "drift of 80 ± 3 nm along x: solve with --model drift", 8e-8, 3e-9,
+                    "m", 1e-9), Cause("noise", "view 'a' is 2 times as noisy: measure it again",
+                                      2.0, 0.1, "m/m", 2e-4))
+    verdict = Verdict(False, "Not qualified: most likely drift", ("grid readings: too much",),
+                      causes)
+    html = report_html(replace(result, verdict=verdict))
+    assert '<p class="verdict bad">Not qualified: most likely drift. Map as it is:' in html
+    cells = re.findall(r"<td[^>]*>([^<]*)</td>", html)
+    at = cells.index("drift of 80 ± 3 nm along x")
+    assert cells[at:at + 6] == ["drift of 80 ± 3 nm along x", "0.0800", "0.0030", "µm", "1e-09",
+                                "solve with --model drift"]
+    assert "failed: grid readings: too much" in html
+
+
+def test_the_report_of_a_large_field_stays_small():
+    result, _ = known_result(101, 360)
+    assert len(report_html(result).encode()) < 2_000_000
 
 
 def test_report_says_everything():
@@ -66,7 +119,8 @@ def test_report_says_everything():
     text = " ".join(parsed(report_html(result, truth=truth)).text)
     for expected in ("Stage calibration: plan hu", "Calibrated from 4 views", "shift_x",
                      "Non-orthogonality".lower(), "scale difference", "no encoder sample",
-                     "Against the known truth", "xy_axes: the angular errors at 0°", "ab" * 32,
+                     "Against the known truth", "zero_mean: the angular errors add up to zero",
+                     "ab" * 32,
                      f"selfcal_ros {__version__}", "joint least squares", "add +G to a command"):
         assert expected in text, expected
 
@@ -90,7 +144,7 @@ def test_a_deficient_plan_is_marked_and_comes_first():
     seen = Observability(1, 3, 2, False, ("scale difference",), ("add a view turned by 90 deg",))
     html = report_html(replace(result, observability=seen))
     assert '<p class="verdict bad">Not a calibration: 2 modes' in html
-    assert html.index("advice: add a view turned by 90 deg") < html.index("<h2>Maps</h2>")
+    assert html.index("advice: add a view turned by 90 deg") < html.index("<h2>Map</h2>")
     assert '<p class="verdict">Calibrated' in report_html(result)
     assert '<p class="verdict bad">' in report_html(replace(result, warnings=("torn bag",)))
 
@@ -101,20 +155,28 @@ def test_unknown_maps_and_plates_without_lines():
     emap = replace(result.error_map, gx=nothing, gy=nothing, u_gx=nothing, u_gy=nothing,
                    nonorthogonality=np.nan, scale_difference=np.nan)
     page = parsed(report_html(replace(result, error_map=emap, views=())))
-    assert len(page.addresses) == 2
+    assert page.tags.count("svg") == 3
     assert "not known" in " ".join(page.text)
     assert "θ datum" not in page.text
 
 
+def test_a_site_that_is_unknown_leaves_a_table_with_a_hole():
+    result, _ = known_result(5, 0)
+    gx = result.error_map.gx.copy()
+    gx[1, 2] = np.nan
+    html = report_html(replace(result, error_map=replace(result.error_map, gx=gx)))
+    assert "1 sites are unknown, and a table has no holes: selfcal cal export --fill" in html
+
+
 def test_budget_and_residuals_are_tabulated_with_units():
-    budget = [{"component": "reading noise", "u_xy_m": 1.7e-8, "dof": 220},
-              {"component": "reference", "u_xy_m": None, "active": True}]
+    budget = [{"component": "reading noise", "u_xy_m": 1.7e-8, "dof": 220.4},
+              {"component": "reference", "u_xy_m": 1.23e-6, "active": True}]
     sections = extra_sections({"left_over": {"largest_rad": 1e-6, "n": 968, "map": [[1.0]]},
                                "budget": budget})
     assert [s.title for s in sections] == ["Uncertainty budget (GUM)", "Left over"]
     assert sections[0].table == (("component", "u xy in µm", "dof", "active"),
-                                 ("reading noise", "0.0170", "220", "–"),
-                                 ("reference", "–", "–", "yes"))
+                                 ("reading noise", "0.017", "220", "–"),
+                                 ("reference", "1.230", "many", "yes"))
     assert sections[1].facts == (("largest in arcsec", "0.206"), ("n", "968"))
 
 

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Calibration results with known content for the tests of reports."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from selfcal_ros.estimation.datum.modes import first_order
@@ -48,3 +50,19 @@ def known_result(size: int = 11, lines: int = 24, *, seed: int = 1, size_y: int 
         noise_of(lines),
         {"no_encoder_sample": 3, "outlier": 12}, {"file": "bags/hu.mcap", "sha256": "ab" * 32})
     return result, {"gx": truth.g[0], "gy": truth.g[1], "g_theta": truth.g_theta}
+
+
+def with_residuals(size: int = 5, lines: int = 24, *, size_y: int = 0) -> CalibrationResult:
+    """Return a result that keeps residuals, their course, and places of rejection."""
+    result, _ = known_result(size, lines, size_y=size_y)
+    rng, shape = np.random.default_rng(2), result.artifact.shape
+    rows = [{"view": v.name, "dx": rng.normal(0, 1e-8, shape), "dy": rng.normal(0, 1e-8, shape),
+             "dtheta": rng.normal(0, 1e-6, lines),
+             "course": {"time_s": np.arange(20.0), "dx": rng.normal(0, 1e-8, 20),
+                        "dy": rng.normal(0, 1e-8, 20), "count": np.full(20, 9)}}
+            for v in result.views]
+    rejected = [{"view": result.views[0].name, "reason": ["low_score", "too_far_from_nominal"],
+                 "x": [0.01, -0.02], "y": [0.02, 0.0]}]
+    removed = {"removed": [{"view": result.views[1].name, "kind": "grid", "mark": "1, 0"}]}
+    return replace(result, extra={"residuals": {"views": rows}, "rejected_at": rejected,
+                                  "outliers": removed})

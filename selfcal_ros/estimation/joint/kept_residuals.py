@@ -5,10 +5,9 @@ from typing import Any
 
 import numpy as np
 
-from selfcal_ros.estimation.joint.fit import JointFit
-from selfcal_ros.estimation.joint.problem import Problem
+from selfcal_ros.estimation.joint.model_fit import ModelFit
 from selfcal_ros.estimation.lattice.maps import PHASES
-from selfcal_ros.model.readings import Measurements, ViewReadings
+from selfcal_ros.model.readings import GridVisits, Measurements
 from selfcal_ros.units import NS_PER_S
 
 KEY = "residuals"
@@ -17,26 +16,29 @@ KEY = "residuals"
 MAX_READINGS = 60_000
 """Grid readings up to which residuals are kept: a plate of 121 x 121 marks in four views."""
 
+MAX_PARTS = 60
+"""Parts of a view's time for which the mean residual is kept."""
+
 DECIMALS_M, DECIMALS_RAD, DECIMALS_S = 13, 12, 3
 """Decimals that are kept: 0.1 pm, 1 prad, 1 ms."""
 
 
-def kept_residuals(measurements: Measurements, problem: Problem, found: JointFit) -> dict[str, Any]:
+def kept_residuals(measurements: Measurements, model: ModelFit) -> dict[str, Any]:
     """Return the residuals of all readings for `CalibrationResult.extra`; empty for large fields.
 
-    Each view has `dx`, `dy` [i][j] (m, stage axes, mark m = i - h, n = j - h of the plate),
-    `time_s` [i][j] (mean instant of the readings of the mark, from the first reading of the run),
-    and `dtheta` [k] (rad, counter-clockwise); NaN where not read or not known.
+    Each view has `dx`, `dy` [i][j] (m, stage axes, mark m = i - h, n = j - h of the plate) and
+    `dtheta` [k] (rad, counter-clockwise), NaN where not read; and where the visits of its marks
+    are known, `course`: `time_s` (from the first visit of the run), mean `dx`, `dy` (m) and
+    `count` of the readings in each part of the view's time.
 
     Parameters
     ----------
     measurements : Measurements
         The readings.
-    problem : Problem
-        What was fitted.
-    found : JointFit
+    model : ModelFit
         The solution, with its residuals in the plate frame.
     """
+    problem, found = model.problem, model.found
     if problem.system.grid.n_readings > MAX_READINGS:
         return {}
     starts = [int(v.visits.stamp_ns.min()) for v in measurements.views
@@ -49,8 +51,8 @@ def kept_residuals(measurements: Measurements, problem: Problem, found: JointFit
             read = problem.grid.weight[row] > 0
             rest = np.where(read, found.residuals[row], np.nan) * PHASES[problem.grid.poses[row].q]
             entry |= {"dx": np.round(rest.real, DECIMALS_M), "dy": np.round(rest.imag, DECIMALS_M)}
-            if starts:
-                entry["time_s"] = _times(view, measurements.artifact.half, read.shape, min(starts))
+            if starts and view.visits is not None and len(view.visits.mark):
+                entry["course"] = _course(view.visits, _at_visits(model, row), min(starts))
         if index in problem.angular.index:
             row = problem.angular.index.index(index)
             rest = np.where(problem.angular.weight[row] > 0, found.residuals_theta[row], np.nan)
@@ -59,17 +61,29 @@ def kept_residuals(measurements: Measurements, problem: Problem, found: JointFit
     return {KEY: {"views": views}}
 
 
-def _times(view: ViewReadings, half: tuple[int, int], shape: tuple[int, ...],
-           start_ns: int) -> np.ndarray:
-    """Return the mean time of the visits of every mark, s, (nx, ny); NaN where not known."""
-    out = np.full(shape, np.nan)
-    visits = view.visits
-    if visits is None or not len(visits.mark):
-        return out
+def _at_visits(model: ModelFit, row: int) -> np.ndarray:
+    """Return the residual of every visit of a grid view, complex (V,), stage axes, m."""
+    problem = model.problem
+    visits = problem.ground.visits[row] if problem.ground else None
+    if visits is None:
+        return np.zeros(0, dtype=complex)
+    values = visits.y
+    if model.equations is not None:
+        values = values - model.equations.columns.at_visits(model.coefficients)[row]
+    rest = model.found.residuals[row].reshape(-1)
+    left = visits.about_means(values[None], rest.size)[0] + rest[visits.mark]
+    return left * PHASES[problem.grid.poses[row].q]
+
+
+def _course(visits: GridVisits, rest: np.ndarray, start_ns: int) -> dict[str, np.ndarray]:
+    """Return the mean residual in each part of the view's time."""
+    order = np.argsort(visits.stamp_ns, kind="stable")
+    parts = [part for part in np.array_split(order, MAX_PARTS) if len(part)]
+    count = np.array([visits.count[part].sum() for part in parts])
     since_s = (visits.stamp_ns - start_ns) / NS_PER_S
-    count = np.bincount(visits.mark, visits.count, len(view.m))
-    total = np.bincount(visits.mark, visits.count * since_s, len(view.m))
-    known = count > 0
-    out[view.m[known] + half[0], view.n[known] + half[1]] = np.round(
-        total[known] / count[known], DECIMALS_S)
-    return out
+    columns = {name: np.array([np.average(values[part], weights=visits.count[part])
+                               for part in parts])
+               for name, values in (("time_s", since_s), ("dx", rest.real), ("dy", rest.imag))}
+    return {"time_s": np.round(columns["time_s"], DECIMALS_S),
+            "dx": np.round(columns["dx"], DECIMALS_M), "dy": np.round(columns["dy"], DECIMALS_M),
+            "count": count}

@@ -96,7 +96,7 @@ def _solved(measurements: Measurements, options: Options, *, model: ModelFit,
         _views(measurements, problem, found), seen, noise_of(found.xy, found.theta),
         measurements.all_rejected(), warnings=warnings, method="joint",
         sense=str(measurements.sense),
-        extra={"solver": found.solver, **kept, **kept_residuals(measurements, problem, found)},
+        extra={"solver": found.solver, **kept, **kept_residuals(measurements, model)},
         run_id=measurements.run_id,
         model=ModelResult("rigid" if problem.rigid else "linear", term_results(model)))
     return Solved(result, found.xy, found.theta, model, axes)

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pictures of a calibration: error vectors, angular error and uncertainty, as PNG or SVG."""
+"""Picture of a calibration: error vectors and angular error, as PNG."""
 
 import io
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from textwrap import fill
 
@@ -19,7 +19,7 @@ from selfcal_ros.files import write_bytes
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.reporting.maps.style import RC, drawable
 from selfcal_ros.reporting.maps.theta import draw_theta
-from selfcal_ros.reporting.maps.xy import draw_error_map, draw_uncertainty_map
+from selfcal_ros.reporting.maps.xy import draw_error_map
 from selfcal_ros.reporting.summary.numbers import truth_arrays
 from selfcal_ros.reporting.summary.text import state_sentence
 
@@ -50,38 +50,8 @@ def save_map_plot(result: CalibrationResult, path: str | os.PathLike, *,
     truth = truth_arrays(result.error_map, truth)
     with rc_context(RC):
         figure = _whole_figure(result, truth)
-        data = _render(figure, "png")
+        data = _render(figure)
     write_bytes(path, data)
-
-
-def error_map_svg(result: CalibrationResult, *,
-                  truth: Mapping[str, np.ndarray] | None = None) -> bytes:
-    """Return the XY error vectors as SVG, over the truth where it is given."""
-    return _single(lambda figure: draw_error_map(figure.add_subplot(), result.error_map,
-                                                 truth=truth))
-
-
-def uncertainty_map_svg(result: CalibrationResult) -> bytes:
-    """Return the map of the XY standard uncertainty as SVG."""
-    return _single(lambda figure: draw_uncertainty_map(figure.add_subplot(), result.error_map))
-
-
-def theta_svg(result: CalibrationResult, *,
-              truth: Mapping[str, np.ndarray] | None = None) -> bytes:
-    """Return the polar angular error as SVG; the plate must have angular lines."""
-    def draw(figure: Figure) -> None:
-        axes = figure.add_subplot(projection="polar")
-        draw_theta(axes, result.error_map, truth=truth)
-        _legend(axes)
-    return _single(draw)
-
-
-def _single(draw: Callable[[Figure], object]) -> bytes:
-    with rc_context(RC):
-        figure = Figure(figsize=(7, 6.6), layout="constrained")
-        FigureCanvasAgg(figure)
-        draw(figure)
-        return _render(figure, "svg")
 
 
 def _whole_figure(result: CalibrationResult, truth: Mapping[str, np.ndarray] | None) -> Figure:
@@ -116,8 +86,7 @@ def _legend(axes: PolarAxes) -> None:
                 fontsize=9)
 
 
-def _render(figure: Figure, kind: str) -> bytes:
+def _render(figure: Figure) -> bytes:
     buffer = io.BytesIO()
-    metadata = {"Date": None} if kind == "svg" else {"Software": f"selfcal {__version__}"}
-    figure.savefig(buffer, format=kind, dpi=DPI, metadata=metadata)
+    figure.savefig(buffer, format="png", dpi=DPI, metadata={"Software": f"selfcal {__version__}"})
     return buffer.getvalue()

@@ -30,13 +30,6 @@ def error_colours() -> Colormap:
     return colours.with_extremes(bad=UNKNOWN_SITE)
 
 
-def uncertainty_colours() -> Colormap:
-    """Return white to purple, another hue than the error's; unknown sites grey."""
-    colours = LinearSegmentedColormap.from_list(
-        "uncertainty", ["#ffffff", "#e4dff0", "#c3b8de", "#9d8cc7", "#7761ab"])
-    return colours.with_extremes(bad=UNKNOWN_SITE)
-
-
 def drawable(text: object, limit: int = 300) -> str:
     """Return `text` as one line of characters that the font has, cut at `limit`."""
     glyphs = get_font(findfont(FontProperties(family="DejaVu Sans")))

@@ -22,7 +22,6 @@ from selfcal_ros.reporting.maps.style import (
     TRUTH,
     error_colours,
     round_down,
-    uncertainty_colours,
 )
 from selfcal_ros.reporting.summary.format import significant
 from selfcal_ros.units import MM_PER_M, UM_PER_M
@@ -114,23 +113,14 @@ def _reach(emap: ErrorMap, arrows: Arrows) -> tuple[float, float]:
     return reach[0], reach[1]
 
 
-def draw_uncertainty_map(axes: Axes, emap: ErrorMap) -> None:
-    """Draw the standard uncertainty of an error vector, sqrt(u_gx² + u_gy²), at every site."""
-    _draw_size(axes, emap.artifact, np.hypot(emap.u_gx, emap.u_gy), uncertainty_colours(),
-               label="√(u² of Gx + u² of Gy), k=1", from_zero=False)
-    axes.set_title("Standard uncertainty of the XY error")
-    _finish(axes, emap.artifact)
-
-
 def _draw_size(axes: Axes, artifact: Artifact, size_m: np.ndarray, colours: Colormap, *,
-               label: str, from_zero: bool = True) -> None:
+               label: str) -> None:
     half = [(h + 0.5) * artifact.grid_pitch_m * MM_PER_M for h in artifact.half]
     known = size_m[np.isfinite(size_m)] * UM_PER_M
     top = float(known.max()) if known.size and known.max() > 0 else 1.0
-    low = 0.0 if from_zero or not known.size else 0.8 * float(known.min())
     image = axes.imshow(np.ma.masked_invalid(size_m.T * UM_PER_M), origin="lower", cmap=colours,
-                        extent=(-half[0], half[0], -half[1], half[1]), vmin=low,
-                        vmax=max(top, low), interpolation="nearest", zorder=0)
+                        extent=(-half[0], half[0], -half[1], half[1]), vmin=0.0,
+                        vmax=top, interpolation="nearest", zorder=0)
     bar = axes.figure.colorbar(image, cax=axes.inset_axes((1.03, 0, 0.035, 1)))
     bar.set_label(f"{label} in µm")
     bar.outline.set_linewidth(0.5)

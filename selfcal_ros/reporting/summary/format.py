@@ -2,11 +2,13 @@
 """Numbers, names and tables as a person reads them: significant digits, alignment, ASCII."""
 
 import math
+import re
 import unicodedata
 from collections.abc import Sequence
 from typing import TextIO
 
 UNKNOWN = "–"
+_NUMBER = re.compile(r"[−+-]?\d[\d.]*(e[+-]?\d+)?|–|many")
 _ASCII = {"µ": "u", "θ": "theta", "φ": "phi", "°": " deg", "±": "+/-", "–": "-", "×": "x",
           "σ": "sigma", "²": "^2", "−": "-"}
 
@@ -68,9 +70,30 @@ def fixed_column(values: Sequence[float], digits: int = 3) -> list[str]:
     return [fixed(value, decimals) for value in values]
 
 
+def aligned_numbers(values: Sequence[float], digits: int = 3, *, more: int = 3) -> list[str]:
+    """Return the values of a column with equal decimals that also show the smallest of them.
+
+    The largest has `digits` significant digits, and up to `more` decimals are added until the
+    smallest has two; values beyond are in scientific form.
+    """
+    known = [abs(v) for v in values if math.isfinite(v) and v != 0]
+    if not known or max(known) >= 1e7 or max(known) < 1e-6:
+        return [significant(v, digits) for v in values]
+    wanted = 1 - math.floor(math.log10(min(known)))
+    base = decimals_for(values, digits)
+    decimals = min(max(base, wanted), base + more)
+    return [fixed(value, decimals) for value in values]
+
+
 def counted(number: int, noun: str) -> str:
     """Return ``1 view``, ``4 views``."""
     return f"{number} {noun}" + ("" if number == 1 else "s")
+
+
+def numeric_columns(table: Sequence[Sequence[str]]) -> list[bool]:
+    """Return which columns of a table with a header hold numbers, and nothing else, below it."""
+    return [all(_NUMBER.fullmatch(cell) for cell in column)
+            for column in zip(*table[1:], strict=True)]
 
 
 def aligned(rows: Sequence[Sequence[str]], *, left: int = 1, indent: str = "  ") -> list[str]:

@@ -11,13 +11,14 @@ from selfcal_ros.model.error_map import ErrorMap
 from selfcal_ros.model.result import CalibrationResult, Noise, ViewResult
 from selfcal_ros.reporting.summary.format import (
     UNKNOWN,
+    aligned_numbers,
     counted,
     fixed_column,
     printable,
     significant,
 )
 from selfcal_ros.reporting.summary.numbers import map_figures, truth_figures
-from selfcal_ros.units import ARCSEC_PER_RAD, MM_PER_M, UM_PER_M
+from selfcal_ros.units import ARCSEC_PER_RAD, MM_PER_M, RAD_PER_MRAD, UM_PER_M
 
 
 @dataclass(frozen=True)
@@ -103,12 +104,11 @@ def views_section(result: CalibrationResult) -> Section:
     """Return the table of views: nominal pose, misalignment, detections."""
     pitch, views = result.artifact.grid_pitch_m, result.views
     columns = [[printable(v.name) for v in views], [pose_text(v, pitch) for v in views],
-               fixed_column([v.phi * MM_PER_M for v in views]),
-               fixed_column([math.degrees(v.phi) for v in views]),
+               fixed_column([v.phi / RAD_PER_MRAD for v in views]),
                fixed_column([v.tx * UM_PER_M for v in views]),
                fixed_column([v.ty * UM_PER_M for v in views]),
                [str(v.used) for v in views], [str(v.rejected) for v in views]]
-    header = ("view", "pose (pitches)", "φ mrad", "φ °", "tx µm", "ty µm", "used", "rejected")
+    header = ("view", "pose (pitches)", "φ mrad", "tx µm", "ty µm", "used", "rejected")
     return Section("Views and their misalignment",
                    table=(header, *zip(*columns, strict=True)) if views else ())
 
@@ -140,7 +140,7 @@ def error_section(result: CalibrationResult) -> Section:
                              (result.noise.k_xy, result.noise.dof_xy)),
               ("non-orthogonality", _slope_text(emap, emap.nonorthogonality, "O", "µrad",
                                                 "axes out of square by 2|O|")),
-              ("scale difference", _slope_text(emap, emap.scale_difference, "R", "ppm",
+              ("scale difference", _slope_text(emap, emap.scale_difference, "R", "µm/m",
                                                "scales of X and Y differ by 2|R|"))]
     if emap.artifact.angular_count:
         facts += _theta_facts(result)
@@ -196,15 +196,19 @@ def noise_section(noise: Noise) -> Section:
             continue
         dofs = [getattr(noise, f"dof_{name}_{kind}") for kind in ("repeats", "residuals")]
         ratio = residuals / repeats if repeats > 0 else float("nan")
-        rows.append((f"{label} ({unit})", significant(used * scale),
-                     *(significant(v * scale) + (f" (dof {dof:.0f})" if dof else "")
-                       for v, dof in zip((repeats, residuals), dofs, strict=True)),
+        shown = aligned_numbers([value * scale for value in (used, repeats, residuals)])
+        rows.append((f"{label} ({unit})", *shown[:2], _dof(dofs[0]), shown[2], _dof(dofs[1]),
                      significant(ratio)))
-    header = ("one reading", "σ used", "repeats", "residuals", "residuals/repeats")
+    header = ("one reading", "σ used", "repeats", "dof", "residuals", "dof", "residuals/repeats")
     if not rows:
         return Section("Noise", notes=("not known: no mark was read twice and no detection "
                                        "declared its uncertainty",))
     return Section("Noise", table=(header, *rows))
+
+
+def _dof(dof: float) -> str:
+    """Return degrees of freedom as an integer; a dash where there are none."""
+    return f"{dof:.0f}" if dof else UNKNOWN
 
 
 def truth_section(emap: ErrorMap, truth: Mapping[str, np.ndarray]) -> Section:

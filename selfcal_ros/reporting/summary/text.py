@@ -11,6 +11,7 @@ from selfcal_ros.reporting.summary.format import (
     aligned,
     can_print_symbols,
     counted,
+    numeric_columns,
     printable,
     to_ascii,
 )
@@ -106,5 +107,7 @@ def _section_lines(section: Section, spell: Callable[[str], str]) -> list[str]:
     """Return facts, table and notes of a section as aligned lines; spelled before aligning."""
     facts = [(spell(label), spell(value)) for label, value in section.facts]
     table = [[spell(cell) for cell in row] for row in section.table]
-    return (aligned(facts, left=2) + aligned(table, left=2 if len(table and table[0]) > 5 else 1)
+    numeric = numeric_columns(section.table) if section.table else []
+    left = next((i for i, number in enumerate(numeric) if number), len(numeric))
+    return (aligned(facts, left=2) + aligned(table, left=max(left, 1))
             + [f"  {spell(note)}" for note in section.notes])

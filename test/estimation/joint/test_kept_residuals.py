@@ -1,4 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -60,18 +62,39 @@ def test_residuals_are_what_maps_and_misalignment_leave_of_the_readings(sense):
     assert seen > 100
 
 
-def test_times_are_those_of_the_visits():
+def test_a_course_follows_the_readings_of_each_visit():
+    """A jump of the plate half-way through a view is in the course of that view."""
     measurements = measured(visits=True)
-    kept = calibrate(measurements).extra["residuals"]["views"]
-    first = min(v.visits.stamp_ns.min() for v in measurements.views if len(v.m))
-    for view, entry in zip(measurements.views, kept, strict=True):
+    views = list(measurements.views)
+    visits = views[0].visits
+    late = visits.stamp_ns > np.median(visits.stamp_ns)
+    jumped = replace(visits, dx=visits.dx + np.where(late, 5e-7, 0))
+    means = np.bincount(visits.mark, visits.count * jumped.dx) / np.bincount(
+        visits.mark, visits.count)
+    views[0] = replace(views[0], dx=means, visits=jumped)
+    kept = calibrate(replace(measurements, views=tuple(views))).extra["residuals"]["views"]
+    course = kept[0]["course"]
+    early = course["time_s"] < np.median(course["time_s"])
+    assert course["dx"][~early].mean() - course["dx"][early].mean() == pytest.approx(5e-7, rel=0.1)
+    assert abs(course["dy"][~early].mean() - course["dy"][early].mean()) < 2e-8
+    assert course["count"].sum() == visits.count.sum()
+
+
+def test_the_course_of_marks_visited_once_is_that_of_their_residuals():
+    measurements = measured(visits=True)
+    for view, entry in zip(measurements.views, calibrate(measurements).extra["residuals"]["views"],
+                           strict=True):
         if not len(view.m):
+            assert "course" not in entry
             continue
-        for row, (m, n) in enumerate(zip(view.m, view.n, strict=True)):
-            own = view.visits.mark == row
-            expected = np.average(view.visits.stamp_ns[own] - first,
-                                  weights=view.visits.count[own]) / 1e9
-            assert entry["time_s"][m + 3, n + 3] == pytest.approx(expected, abs=6e-4)
+        course, count = entry["course"], view.visits.count
+        first = min(v.visits.stamp_ns.min() for v in measurements.views if len(v.m))
+        assert np.average(course["dx"], weights=course["count"]) == pytest.approx(
+            np.average(entry["dx"][np.isfinite(entry["dx"])]), abs=1e-12)
+        mean_s = np.average((view.visits.stamp_ns - first) / 1e9, weights=count)
+        assert np.average(course["time_s"], weights=course["count"]) == pytest.approx(
+            mean_s, abs=1e-3)
+        assert (np.diff(course["time_s"]) > 0).all()
 
 
 def test_residuals_survive_the_json_form_and_are_left_out_of_large_results(monkeypatch):

@@ -6,9 +6,15 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from selfcal_ros import __version__
+from selfcal_ros.estimation.quality.budget import MANY_DOF
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.result import SCHEMA, CalibrationResult
-from selfcal_ros.reporting.summary.format import UNKNOWN, printable, significant
+from selfcal_ros.reporting.summary.format import (
+    UNKNOWN,
+    aligned_numbers,
+    printable,
+    significant,
+)
 from selfcal_ros.reporting.summary.sections import Section
 from selfcal_ros.units import ARCSEC_PER_RAD, UM_PER_M
 
@@ -39,12 +45,23 @@ def extra_sections(extra: Mapping[str, Any]) -> list[Section]:
     """
     names = [*(n for n in TITLES if n in extra), *sorted(n for n in extra if n not in TITLES)]
     names = [name for name in names if name not in DRAWN]
-    sections = [_extra_section(name, extra[name]) for name in names]
+    found = [part for name in names for part in _parts(name, extra[name])]
+    sections = [_extra_section(*part) for part in found]
     return [section for section in sections if section is not None]
 
 
-def _extra_section(name: str, value: Any) -> Section | None:
+def _parts(name: str, value: Any) -> list[tuple[str, str, Any]]:
+    """Return (name, title, value); a table over several quantities becomes one of each."""
     title = TITLES.get(name, _words(name).capitalize())
+    if not _is_table(value) or not all(isinstance(row.get("quantity"), str) for row in value):
+        return [(name, title, value)]
+    quantities = dict.fromkeys(row["quantity"] for row in value)
+    return [(name, f"{title}: {quantity}", [
+        {key: item for key, item in row.items() if key != "quantity"} for row in value
+        if row["quantity"] == quantity]) for quantity in quantities]
+
+
+def _extra_section(name: str, title: str, value: Any) -> Section | None:
     if isinstance(value, Mapping):
         facts = tuple((_heading(key), _cell(key, item)) for key, item in value.items()
                       if _is_plain(item))
@@ -71,12 +88,24 @@ def _is_table(value: Any) -> bool:
 def _table(rows: Sequence[Mapping[str, Any]]) -> tuple[tuple, tuple]:
     """Return the rows with a header of all their plain keys, and a note if there are too many."""
     keys = [k for k in dict.fromkeys(key for row in rows for key in row)
-            if all(_is_plain(row.get(k)) for row in rows)]
+            if all(_is_plain(row.get(k)) for row in rows)
+            and any(row.get(k) not in (None, "") for row in rows)]
     shown = rows[:MAX_ROWS]
-    table = (tuple(_heading(key) for key in keys),
-             *(tuple(_cell(key, row.get(key)) for key in keys) for row in shown))
+    columns = [_column(key, [row.get(key) for row in shown]) for key in keys]
+    table = (tuple(_heading(key) for key in keys), *zip(*columns, strict=True))
     more = len(rows) - len(shown)
     return table, ((f"{more} more rows are in the result file",) if more else ())
+
+
+def _column(key: str, values: list[Any]) -> list[str]:
+    """Return the cells of a column: numbers with equal decimals, degrees of freedom as integers."""
+    if key == "dof":
+        return ["many" if v is None or v >= MANY_DOF else f"{v:.0f}" for v in values]
+    if not any(isinstance(v, float) for v in values) or any(isinstance(v, str) for v in values):
+        return [_cell(key, v) for v in values]
+    scale = _unit(key)[2]
+    numbers = [float("nan") if v is None or isinstance(v, bool) else v * scale for v in values]
+    return aligned_numbers(numbers)
 
 
 def _unit(key: str) -> tuple[str, str, float]:
@@ -116,10 +145,17 @@ def convention_section(result: CalibrationResult) -> Section:
     facts += [("sense", _SENSE.get(result.sense, printable(result.sense))),
               ("uncertainty", "u is the standard uncertainty (k=1), U = k u the expanded one, "
                               "k from Student's t for 95.45 % at the degrees of freedom of the "
-                              "noise; pictures show 2 u"),
+                              "noise"),
               ("misalignment", "φ is the turn of the plate about its centre, counter-clockwise, "
                                "tx and ty its offset, beyond the nominal pose of the view")]
     return Section("Conventions", tuple(facts))
+
+
+def _said(value: Any) -> str:
+    """Return a value in words; of a mapping its entries one after the other."""
+    if isinstance(value, Mapping):
+        return ", ".join(f"{printable(key)}: {printable(item)}" for key, item in value.items())
+    return printable(str(value))
 
 
 def provenance_section(result: CalibrationResult) -> Section:
@@ -131,7 +167,7 @@ def provenance_section(result: CalibrationResult) -> Section:
                                                              printable(result.method))),
               ("result schema", SCHEMA), ("software", f"selfcal_ros {__version__}")]
     made = result.provenance
-    facts += [(_words(key), printable(str(value))) for key, value in (
+    facts += [(_words(key), _said(value)) for key, value in (
         ("created", made.created), ("solved_by", made.version and f"selfcal_ros {made.version}"),
         ("run", result.run_id), *made.extra.items()) if value]
     if math.isfinite(made.duration_s):

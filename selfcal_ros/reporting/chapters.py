@@ -1,0 +1,198 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a report holds, chapter by chapter, before it becomes a page or a PDF."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from selfcal_ros.compensation.aerotech.verify import Verification
+from selfcal_ros.estimation.options import ReferenceLength
+from selfcal_ros.estimation.quality.budget import MANY_DOF, Budget, budgets
+from selfcal_ros.model.result import CalibrationResult
+from selfcal_ros.reporting.extras import convention_section, extra_sections, provenance_section
+from selfcal_ros.reporting.figures.angular import angular_map
+from selfcal_ros.reporting.figures.correction import before_and_after, tried
+from selfcal_ros.reporting.figures.distributions import courses, distributions, drift_found
+from selfcal_ros.reporting.figures.maps import component_maps, error_map, uncertainty_map
+from selfcal_ros.reporting.figures.rejected import rejected_map
+from selfcal_ros.reporting.figures.residuals import residual_maps, residuals_in
+from selfcal_ros.reporting.sheet.drawing import Drawing
+from selfcal_ros.reporting.summary import sections
+from selfcal_ros.reporting.summary.format import fixed_column, printable
+from selfcal_ros.reporting.summary.sections import Section
+from selfcal_ros.units import ARCSEC_PER_RAD, PPM_PER_ONE, RAD_PER_MRAD, UM_PER_M
+
+AT_NODES = ("At the nodes: how well the map itself is known. Take it to compare two calibrations, "
+            "and for positions that are nodes.")
+ANYWHERE = ("Anywhere: with the error of interpolating between the nodes, which the curvature of "
+            "the map tells. Take it for what a corrected machine does at any position; a finer "
+            "plate makes it smaller.")
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A drawing and what to read from it."""
+
+    drawing: Drawing
+    caption: str
+
+
+@dataclass(frozen=True)
+class Chapter:
+    """A part of a report: figures, then tables; `alert` marks what a person has to act on."""
+
+    title: str
+    figures: tuple[Figure, ...] = ()
+    sections: tuple[Section, ...] = ()
+    alert: bool = False
+
+
+def chapters(result: CalibrationResult,
+             truth: Mapping[str, np.ndarray] | None) -> list[Chapter]:
+    """Return the chapters of a report; those with nothing to say are left out.
+
+    Parameters
+    ----------
+    result : CalibrationResult
+        What was found.
+    truth : mapping, optional
+        ``gx``, ``gy`` (nx, ny) in m and ``g_theta`` (K,) in rad on the lattice of the map.
+    """
+    found = [
+        Chapter("Attention", sections=(sections.attention_section(result),), alert=True),
+        _causes(result), _maps(result, truth), _uncertainty(result), _correction(result),
+        _residuals(result), _rejected(result),
+        Chapter("Measurement", sections=(sections.measurement_section(result),
+                                         sections.views_section(result))),
+        Chapter("Details", sections=tuple(extra_sections(result.extra))),
+        Chapter("How to read the numbers", sections=(convention_section(result),
+                                                     provenance_section(result)))]
+    kept = [Chapter(c.title, c.figures, tuple(s for s in c.sections
+                                              if s.facts or s.table or s.notes), c.alert)
+            for c in found]
+    return [c for c in kept if c.figures or c.sections]
+
+
+def _figures(*pairs: tuple[Drawing | None, str]) -> tuple[Figure, ...]:
+    return tuple(Figure(drawing, caption) for drawing, caption in pairs if drawing is not None)
+
+
+def _causes(result: CalibrationResult) -> Chapter:
+    """Return why the verdict is what it is: failed tests, causes with sizes, terms."""
+    verdict = result.verdict
+    units = {"m": ("µm", UM_PER_M), "rad": ("mrad", 1 / RAD_PER_MRAD),
+             "m/m": ("µm/m", PPM_PER_ONE)}
+    rows = []
+    for cause in verdict.causes:
+        ratio = cause.name == "noise"
+        unit, scale = ("times", 1.0) if ratio else units.get(cause.unit, (cause.unit, 1.0))
+        what, _, remedy = printable(cause.text).partition(": ")
+        rows.append((cause.name.replace("_", " "), what, *fixed_column([cause.size * scale,
+                     cause.u * scale], 3), unit, f"{cause.p:.1g}", remedy))
+    header = ("cause", "what the readings show", "size", "u", "unit", "p", "remedy")
+    return Chapter("Verdict, drift and causes", _figures(
+        (drift_found(result), "What the term drift took off the readings: the plate against the "
+                              "microscope, within each view.")), (
+        Section("Verdict", (("verdict", printable(verdict.sentence)),) if verdict.sentence else (),
+                notes=tuple(f"failed: {printable(reason)}" for reason in verdict.reasons)),
+        Section("Likely causes, the most likely first", table=(header, *rows) if rows else ()),
+        sections.terms_section(result), sections.noise_section(result.noise)))
+
+
+def _maps(result: CalibrationResult, truth: Mapping[str, np.ndarray] | None) -> Chapter:
+    pairs: list[tuple[Drawing | None, str]] = [
+        (error_map(result, truth), "Each vector leads from where the stage is to where its "
+                                   "encoders say it is. A pointer shows the numbers of a site."),
+        (component_maps(result), "Gx and Gy beside their standard uncertainties, in the same "
+                                 "colours: what stands out of u is known.")]
+    if result.artifact.angular_count:
+        pairs.append((angular_map(result, truth), "Error of the angle at every line; on the "
+                                                  "dashed circle there is none."))
+    pairs.append((uncertainty_map(result), "Where the map is known best: U of x or of y, whichever "
+                                           "is larger. Edges and corners are seen by fewer views."))
+    tables = [sections.error_section(result)]
+    if truth is not None:
+        tables.append(sections.truth_section(result.error_map, truth))
+    return Chapter("Map", _figures(*pairs), tuple(tables))
+
+
+def _uncertainty(result: CalibrationResult) -> Chapter:
+    """Return both kinds of U, each with what it is for."""
+    emap = result.error_map
+    if not (np.isfinite(emap.u_gx) & np.isfinite(emap.u_gy)).any():
+        return Chapter("Uncertainty")
+    rows = []
+    for budget in budgets(result, _reference(result)):
+        unit, scale = ("µm", UM_PER_M) if budget.unit == "m" else ("arcsec", ARCSEC_PER_RAD)
+        numbers = [budget.u_rms, budget.u_max, budget.U_rms, budget.U_max]
+        rows.append((_where(budget), *fixed_column([value * scale for value in numbers]), unit,
+                     f"{budget.k:.2f}", _dof_text(budget.dof)))
+    header = ("known", "u rms", "u largest", "U rms", "U largest", "unit", "k", "dof")
+    return Chapter("Uncertainty", sections=(Section(
+        "Two kinds of U, for 95.45 %", table=(header, *rows), notes=(AT_NODES, ANYWHERE)),))
+
+
+def _where(budget: Budget) -> str:
+    quantity = budget.quantity
+    if quantity.startswith("XY"):
+        return "x or y, at the nodes" if "at the nodes" in quantity else "x or y, anywhere"
+    return "θ, at the lines" if "at the lines" in quantity else "θ, anywhere"
+
+
+def _dof_text(dof: float) -> str:
+    return f"{dof:.0f}" if dof < MANY_DOF else "many"
+
+
+def _reference(result: CalibrationResult) -> ReferenceLength | None:
+    """Return the reference length that a result names; None without one."""
+    told = result.reference
+    if not told:
+        return None
+    return ReferenceLength(told["kind"], float(told["relative_error"]), float(told["u_relative"]),
+                           str(told.get("certificate") or ""))
+
+
+def _correction(result: CalibrationResult) -> Chapter:
+    title = "Exported table: before and after"
+    if not result.error_map.valid.any():
+        return Chapter(title)
+    outcome = tried(result)
+    if outcome.found is None:
+        return Chapter(title, sections=(Section("", notes=(outcome.why_not,)),))
+    return Chapter(title, _figures(
+        (before_and_after(result, outcome.found), "A simulated controller that moves to the middle "
+         "of every cell, without and with the table of selfcal cal export. What remains is the "
+         "controller's linear interpolation.")), (_correction_table(outcome.found),))
+
+
+def _correction_table(found: Verification) -> Section:
+    rows = []
+    for residual in found.residuals:
+        where = {"sites": "at the nodes", "between": "between the nodes"}[residual.place]
+        numbers = [f(which) * UM_PER_M for f in (residual.rms, residual.largest)
+                   for which in ("before", "after")]
+        rows.append((where, *fixed_column(numbers, 4)))
+    header = ("error vector in µm", "rms before", "after", "largest before", "after")
+    return Section("What the table leaves", table=(header, *rows), notes=(
+        "The map counts as the truth here: to what remains belongs the U of the map itself.",))
+
+
+def _residuals(result: CalibrationResult) -> Chapter:
+    found = residuals_in(result)
+    pairs = (
+        (residual_maps(result, found), "What the fit leaves at each mark. Random directions are "
+         "noise; neighbours that point alike are something that the model does not hold."),
+        (distributions(found, "xy"), "Bars against the normal curve of the same rms, and the same "
+         "residuals against normal quantiles: dots beside the line at the ends are outliers."),
+        (distributions(found, "theta"), "The same of the angular lines."),
+        (courses(found, result.noise.sigma_xy), "Means over a sixtieth of the view's time each. A "
+         "course that leaves the band is a drift."))
+    return Chapter("Residuals", _figures(*pairs))
+
+
+def _rejected(result: CalibrationResult) -> Chapter:
+    return Chapter("Rejected readings", _figures(
+        (rejected_map(result), "Many at one place: dirt or damage on the plate or the stage. Many "
+         "in one row: a moment of the run. Detections without an encoder sample have no place.")),
+        (sections.rejected_section(result),))

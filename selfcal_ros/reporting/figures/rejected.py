@@ -1,0 +1,99 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Figure of the readings that were rejected, where they happened."""
+
+import math
+from collections import Counter
+
+import numpy as np
+
+from selfcal_ros.model.result import CalibrationResult, ViewResult
+from selfcal_ros.reporting.figures.fields import legend, text_width
+from selfcal_ros.reporting.figures.maps import WIDTH
+from selfcal_ros.reporting.figures.residuals import panels, places_mm
+from selfcal_ros.reporting.sheet.drawing import Drawing
+from selfcal_ros.reporting.sheet.palette import SERIES
+from selfcal_ros.reporting.summary.format import printable
+from selfcal_ros.units import MM_PER_M
+
+Place = tuple[str, str, float, float]
+"""View, reason, x and y in mm."""
+
+
+def rejected_in(result: CalibrationResult) -> list[Place]:
+    """Return the rejected readings of known place: detections, and marks that `--robust` removed.
+
+    What a file holds in another form is left out.
+    """
+    found: list[Place] = []
+    for row in _rows(result.extra.get("rejected_at")):
+        columns = [row.get(key) for key in ("reason", "x", "y")]
+        if not all(isinstance(column, list | tuple | np.ndarray) for column in columns):
+            continue
+        found += [(str(row.get("view")), str(reason), x * MM_PER_M, y * MM_PER_M)
+                  for reason, x, y in zip(*columns, strict=False) if _number(x) and _number(y)]
+    views = {view.name: view for view in result.views}
+    outliers = result.extra.get("outliers")
+    removed = outliers.get("removed") if isinstance(outliers, dict) else None
+    for row in _rows(removed):
+        view = views.get(str(row.get("view")))
+        if view is not None and row.get("kind") == "grid":
+            found += _marked(result, view, str(row.get("mark")))
+    return found
+
+
+def _rows(value: object) -> list[dict]:
+    return [row for row in value if isinstance(row, dict)] if isinstance(value, list) else []
+
+
+def _number(value: object) -> bool:
+    return isinstance(value, int | float) and math.isfinite(value)
+
+
+def _marked(result: CalibrationResult, view: ViewResult, mark: str) -> list[Place]:
+    numbers = mark.split(", ")
+    if len(numbers) != 2 or not all(part.lstrip("-").isdigit() for part in numbers):
+        return []
+    m, n = (np.array(int(part) * result.artifact.grid_pitch_m) for part in numbers)
+    x, y = places_mm(view, m, n)
+    return [(view.name, "outlier_among_views", float(x), float(y))]
+
+
+def rejected_map(result: CalibrationResult) -> Drawing | None:
+    """Return where readings were rejected, view by view, coloured by reason; None without any."""
+    found = rejected_in(result)
+    names = [view.name for view in result.views if any(view.name == row[0] for row in found)]
+    if not names:
+        return None
+    artifact = result.artifact
+    field = [(half + 0.5) * artifact.grid_pitch_m * MM_PER_M for half in artifact.half]
+    reach = [half + 1.2 * artifact.grid_pitch_m * MM_PER_M for half in field]
+    colours = {reason: f"c{i % SERIES}" for i, (reason, _) in enumerate(
+        Counter(row[1] for row in found).most_common())}
+    drawing = Drawing("rejected", "Where the stage stood at grid readings that were rejected, by "
+                      "view and reason.", WIDTH, 0)
+    drawing.label(0, 16, "Rejected grid readings, where they happened", size=13, bold=True)
+    for title, frame in panels(drawing, names, reach):
+        low, high = frame.at(-field[0], -field[1]), frame.at(*field)
+        drawing.box(low[0], high[1], high[0] - low[0], low[1] - high[1], fill="card")
+        for reason, colour in colours.items():
+            at = [(x, y) for view, why, x, y in found if (view, why) == (title, reason)]
+            inside = [(min(max(x, -reach[0]), reach[0]), min(max(y, -reach[1]), reach[1]))
+                      for x, y in at]
+            drawing.discs([frame.at(x, y) for x, y in inside], 3.0, fill=colour, opacity=0.8)
+        frame.axes(ticks=(4, 4))
+    _legend(drawing, {reason: (colour, sum(row[1] == reason for row in found))
+                      for reason, colour in colours.items()})
+    return drawing
+
+
+def _legend(drawing: Drawing, entries: dict[str, tuple[str, int]]) -> None:
+    """Write the reasons below, as many a row as fit."""
+    x, y = 46.0, drawing.height + 14
+    for reason, (colour, count) in entries.items():
+        words = f"{printable(reason).replace('_', ' ')} ({count})"
+        width = 26 + text_width(words, 12)
+        if x + width > WIDTH and x > 46:
+            x, y = 46.0, y + 18
+        legend(drawing, [(colour, words)], (x, y))
+        x += width
+    drawing.height = y + 10

@@ -1,0 +1,110 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Drawings as SVG: inline in a page whose style sheet has the colours, or as files of their own."""
+
+import math
+from collections.abc import Iterable
+from html import escape
+
+from selfcal_ros.reporting.sheet.drawing import Discs, Drawing, Item, Label, Path, Point, Spot
+from selfcal_ros.reporting.sheet.palette import classes_css, variables_css
+from selfcal_ros.reporting.summary.format import printable
+
+FONT = 'system-ui, "Segoe UI", "DejaVu Sans", sans-serif'
+FIGURE_CSS = (f"svg.figure {{ display: block; width: 100%; height: auto; font-family: {FONT}; }}\n"
+              "svg.figure path, svg.figure ellipse { fill: none; }\n"
+              "svg.figure .b { font-weight: 600; }\n"
+              "svg.figure .spot { fill: transparent; }\n"
+              "svg.figure .spot:hover { fill: var(--truth); fill-opacity: .35; }\n")
+
+
+def css() -> str:
+    """Return the rules that every figure needs, colours included."""
+    return variables_css() + FIGURE_CSS + classes_css()
+
+
+def inline_svg(drawing: Drawing) -> str:
+    """Return a drawing for a page that has the rules of `css`."""
+    return _svg(drawing, "")
+
+
+def svg_file(drawing: Drawing) -> str:
+    """Return a drawing as a file that follows the reader's setting of light or dark."""
+    style = "".join((variables_css("svg"), FIGURE_CSS, classes_css()))
+    sheet = _shape("path", _d([((0, 0), (drawing.width, 0), (drawing.width, drawing.height),
+                                (0, drawing.height))], closed=True), "f-paper")
+    return _svg(drawing, f"<style>{style}</style>{sheet}\n",
+                f' xmlns="http://www.w3.org/2000/svg" width="{_n(drawing.width)}" '
+                f'height="{_n(drawing.height)}"') + "\n"
+
+
+def _svg(drawing: Drawing, before: str, attributes: str = "") -> str:
+    body = "\n".join(map(_item, drawing.items))
+    return (f'<svg{attributes} class="figure" role="img" '
+            f'aria-label="{escape(printable(drawing.says))}" '
+            f'viewBox="0 0 {_n(drawing.width)} {_n(drawing.height)}">\n{before}{body}\n</svg>')
+
+
+def _item(item: Item) -> str:
+    if isinstance(item, Label):
+        return _label(item)
+    if isinstance(item, Spot):
+        return (f'<circle class="spot" cx="{_n(item.at[0])}" cy="{_n(item.at[1])}" '
+                f'r="{_n(item.radius)}"><title>{escape(printable(item.title))}</title></circle>')
+    look = " ".join(name for name in (item.fill and f"f-{item.fill}",
+                                      item.stroke and f"s-{item.stroke}") if name)
+    more = _look(item)
+    if isinstance(item, Discs):
+        return "".join(f'<ellipse class="{look}" cx="{_n(x)}" cy="{_n(y)}" rx="{_n(rx)}" '
+                       f'ry="{_n(ry)}"{more}/>'
+                       for (x, y), (rx, ry) in zip(item.centres, item.radii, strict=True))
+    return _shape("path", _d(item.lines, closed=bool(item.fill)), look, more, item.title)
+
+
+def _look(item: Path | Discs) -> str:
+    more = f' stroke-width="{_n(item.width)}"' if item.stroke and item.width != 1 else ""
+    if isinstance(item, Path) and item.dash:
+        more += f' stroke-dasharray="{" ".join(map(_n, item.dash))}"'
+    return more + (f' fill-opacity="{_n(item.opacity)}"' if item.opacity != 1 else "")
+
+
+def _shape(tag: str, d: str, look: str, more: str = "", title: str = "") -> str:
+    start = f'<{tag} class="{look}" d="{d}"{more}'
+    return f"{start}><title>{escape(printable(title))}</title></{tag}>" if title else start + "/>"
+
+
+def _d(lines: Iterable[tuple[Point, ...]], *, closed: bool) -> str:
+    """Return path data; a step along one axis takes its short form."""
+    parts = []
+    for line in lines:
+        x, y = _n(line[0][0]), _n(line[0][1])
+        parts.append(f"M{x} {y}")
+        for point in line[1:]:
+            new_x, new_y = _n(point[0]), _n(point[1])
+            if new_y == y and new_x != x:
+                parts.append(f"H{new_x}")
+            elif new_x == x and new_y != y:
+                parts.append(f"V{new_y}")
+            elif (new_x, new_y) != (x, y):
+                parts.append(f"L{new_x} {new_y}")
+            x, y = new_x, new_y
+        if closed:
+            parts.append("Z")
+    return "".join(parts)
+
+
+def _label(label: Label) -> str:
+    x, y = label.at
+    look = f"f-{label.colour}" + (" b" if label.bold else "")
+    anchor = "" if label.anchor == "start" else f' text-anchor="{label.anchor}"'
+    turned = f' transform="rotate(-90 {_n(x)} {_n(y)})"' if label.turned else ""
+    return (f'<text class="{look}" x="{_n(x)}" y="{_n(y)}" font-size="{_n(label.size)}"{anchor}'
+            f'{turned}>{escape(printable(label.text))}</text>')
+
+
+def _n(value: float) -> str:
+    """Return a number with at most one decimal; what is not finite is an error of the figure."""
+    if not math.isfinite(value):
+        raise ValueError(f"{value} in a drawing")
+    text = f"{value:.1f}".rstrip("0").rstrip(".") if abs(value) >= 2 else f"{value:.2f}".rstrip(
+        "0").rstrip(".")
+    return "0" if text in ("-0", "") else text

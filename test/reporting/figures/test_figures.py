@@ -1,0 +1,307 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Figures show what they say, where they say it, and nothing of them is cut off."""
+
+import math
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from selfcal_ros.model.verdict import ModelResult, TermEstimate, TermResult
+from selfcal_ros.reporting.chapters import chapters
+from selfcal_ros.reporting.figures.angular import CENTRE, ZERO, angular_map
+from selfcal_ros.reporting.figures.correction import tried
+from selfcal_ros.reporting.figures.distributions import courses, distributions, drift_found
+from selfcal_ros.reporting.figures.fields import levels, text_width
+from selfcal_ros.reporting.figures.maps import component_maps, error_map, uncertainty_map
+from selfcal_ros.reporting.figures.rejected import rejected_in, rejected_map
+from selfcal_ros.reporting.figures.residuals import residual_maps, residuals_in
+from selfcal_ros.reporting.sheet.drawing import Discs, Drawing, Label, Path, Spot
+from selfcal_ros.reporting.sheet.frame import Frame, round_step, round_ticks
+from selfcal_ros.reporting.sheet.palette import COLOURS
+from selfcal_ros.reporting.sheet.svg import inline_svg, svg_file
+from test.support.results import known_result, with_residuals
+
+
+def drawn(result, truth=None):
+    return [figure.drawing for chapter in chapters(result, truth) for figure in chapter.figures]
+
+
+def long_names(result):
+    """Return a result whose views have long names, and one that has a model with a drift."""
+    views = tuple(replace(v, name=f"{v.name} of the third repetition on Monday morning")
+                  for v in result.views)
+    rows = [{**row, "view": view.name} for row, view in
+            zip(result.extra["residuals"]["views"], views, strict=True)]
+    estimates = tuple(TermEstimate(v.name, f"{axis} P{n}", 1e-7 / n, 1e-9, "m")
+                      for v in views for axis in "xy" for n in (1, 2))
+    return replace(result, views=views, model=ModelResult("rigid", (
+        TermResult("drift", None, estimates),)),
+        extra={**result.extra, "residuals": {"views": rows}})
+
+
+RESULTS = {
+    "usual": lambda: with_residuals(11, 24),
+    "smallest": lambda: with_residuals(3, 4),
+    "wide": lambda: with_residuals(9, 8, size_y=5),
+    "large": lambda: known_result(51, 360)[0],
+    "long names": lambda: long_names(with_residuals()),
+    "huge errors": lambda: replace(known_result(5, 8)[0], error_map=replace(
+        known_result(5, 8)[0].error_map, gx=np.full((5, 5), 123.456))),
+}
+
+
+def extent(item):
+    """Return the smallest and largest x and y of an item; words by a cautious width."""
+    if isinstance(item, Path):
+        points = [point for line in item.lines for point in line]
+    elif isinstance(item, Discs):
+        points = [(x + a * rx, y + a * ry) for (x, y), (rx, ry) in
+                  zip(item.centres, item.radii, strict=True) for a in (-1, 1)]
+    elif isinstance(item, Spot):
+        return extent(Discs((item.at,), ((0.0, 0.0),)))
+    else:
+        x, y = item.at
+        width = text_width(item.text, item.size) * 0.9
+        start = {"start": 0.0, "middle": 0.5, "end": 1.0}[item.anchor] * width
+        if item.turned:
+            return x - item.size, x, y + start - width, y + start
+        return x - start, x - start + width, y - 0.8 * item.size, y + 0.25 * item.size
+    return (min(p[0] for p in points), max(p[0] for p in points),
+            min(p[1] for p in points), max(p[1] for p in points))
+
+
+@pytest.mark.parametrize("name", RESULTS)
+def test_nothing_lies_outside_of_a_figure(name):
+    figures = drawn(RESULTS[name]())
+    assert len(figures) >= 4
+    for drawing in figures:
+        for item in drawing.items:
+            left, right, top, bottom = extent(item)
+            assert left >= -0.5 and right <= drawing.width + 0.5, (drawing.name, item)
+            assert top >= -0.5 and bottom <= drawing.height + 0.5, (drawing.name, item)
+
+
+@pytest.mark.parametrize("name", RESULTS)
+def test_words_do_not_lie_on_each_other(name):
+    for drawing in drawn(RESULTS[name]()):
+        boxes = [(item.text, extent(item)) for item in drawing.items if isinstance(item, Label)]
+        for number, (text, (left, right, top, bottom)) in enumerate(boxes):
+            for other, (a, b, c, d) in boxes[number + 1:]:
+                across = min(right, b) - max(left, a)
+                down = min(bottom, d) - max(top, c)
+                assert across < 3 or down < 3, (drawing.name, text, other)
+
+
+def shafts(drawing, colour="ink", width=1.2):
+    """Return the vectors (start, end) drawn in a colour and width, map frame left out."""
+    return [line for item in drawing.items if isinstance(item, Path)
+            and (item.stroke, item.width) == (colour, width) for line in item.lines]
+
+
+def test_vectors_begin_at_their_sites_and_point_along_the_error():
+    result, _ = known_result(5, 0, size_y=3)
+    emap = result.error_map
+    drawing = error_map(result)
+    factor = float(next(re.search(r"enlarged ([\d,]+) ×", i.text)[1].replace(",", "")
+                        for i in drawing.items if isinstance(i, Label) and "enlarged" in i.text))
+    vectors = np.array(shafts(drawing))
+    assert vectors.shape == (15, 2, 2)
+    starts, ends = vectors[:, 0], vectors[:, 1]
+    # pixels of a pitch, from neighbouring sites: x to the right, y upwards
+    pitch = starts[3, 0] - starts[0, 0]
+    assert pitch > 0 and starts[1, 1] - starts[0, 1] == pytest.approx(-pitch)
+    scale = pitch / emap.artifact.grid_pitch_m * factor
+    np.testing.assert_allclose(ends[:, 0] - starts[:, 0], emap.gx.ravel() * scale, atol=1e-9)
+    np.testing.assert_allclose(ends[:, 1] - starts[:, 1], -emap.gy.ravel() * scale, atol=1e-9)
+
+
+def test_residuals_of_a_turned_view_stand_where_its_marks_lie():
+    """Mark (1, 0) of a plate turned by 90 degrees lies on the stage at (0, 1)."""
+    result = with_residuals(3, 0)
+    only = np.full((3, 3), np.nan)
+    only[2, 1] = 1e-8
+    rows = [{"view": v.name} for v in result.views]
+    rows[1] |= {"dx": only, "dy": np.where(np.isnan(only), np.nan, 0.0)}
+    turned = replace(result, extra={"residuals": {"views": rows}})
+    assert math.degrees(turned.views[1].rotation) == pytest.approx(90)
+    drawing = residual_maps(turned, residuals_in(turned))
+    box = next(i for i in drawing.items if isinstance(i, Path) and i.stroke == "soft"
+               and len(i.lines[0]) == 5).lines[0]
+    centre = np.mean(box[:4], axis=0)
+    (start, end), = shafts(drawing, width=0.9)
+    assert start[0] == pytest.approx(centre[0])
+    assert start[1] < centre[1] - 20
+    assert end[0] > start[0] + 5 and end[1] == pytest.approx(start[1])
+
+
+@pytest.mark.parametrize(("value", "step"), [(0.0, 0), (0.0999, 0), (0.1001, 1), (0.95, 9),
+                                             (1.0, 9), (7.0, 9), (np.nan, -1)])
+def test_steps_of_a_scale_from_zero(value, step):
+    assert levels(np.array([value]), ("e", 1.0)) == [step]
+
+
+@pytest.mark.parametrize(("value", "step"), [(-2.0, 0), (-1.0, 0), (-0.11, 4), (-0.09, 5),
+                                             (0.09, 5), (0.11, 6), (1.0, 10), (np.nan, -1)])
+def test_steps_of_a_scale_to_both_sides(value, step):
+    assert levels(np.array([value]), ("d", 1.0)) == [step]
+
+
+def test_components_and_uncertainties_share_one_scale():
+    result, _ = known_result(3, 0)
+    gx, gy = np.zeros((2, 3, 3))
+    gx[2, 0], gy[0, 2] = 1e-6, -1e-6
+    u = np.full((3, 3), 1.5e-7)
+    u[1, 1] = 1e-6
+    emap = replace(result.error_map, gx=gx, gy=gy, u_gx=u, u_gy=u)
+    drawing = component_maps(replace(result, error_map=emap))
+    fills = [i.fill for i in drawing.items if isinstance(i, Path) and i.fill.startswith("d")]
+    assert fills[:8] == ["d5", "d10", "d0", "d5", "d6", "d10", "d6", "d10"]
+    assert uncertainty_map(result).width == error_map(result).width
+
+
+def test_lines_lie_outside_the_circle_where_the_error_is_positive():
+    result, _ = known_result(3, 4)
+    emap = replace(result.error_map, g_theta=np.array([1e-5, -1e-5, 0.0, np.nan]),
+                   u_g_theta=np.zeros(4))
+    drawing = angular_map(replace(result, error_map=emap))
+    dots = next(i for i in drawing.items if isinstance(i, Discs) and i.radii[0][0] == 1.8).centres
+    away = [math.dist(CENTRE, dot) for dot in dots]
+    assert away[0] > ZERO + 50 and away[1] < ZERO - 50 and away[2] == pytest.approx(ZERO)
+    assert dots[0][0] > CENTRE[0] + ZERO and dots[1][1] < CENTRE[1] - 30
+    assert len(dots) == 3
+
+
+def test_histograms_hold_every_residual():
+    result = with_residuals(11, 24)
+    found = residuals_in(result)
+    for kind, values in (("xy", [v.xy_m for v in found]), ("theta", [v.theta_rad for v in found])):
+        drawing = distributions(found, kind)
+        said = [int(i.text.split()[0]) for i in drawing.items
+                if isinstance(i, Label) and "residuals, rms" in i.text]
+        assert said == [np.isfinite(v).sum() for v in values]
+        bars = [i for i in drawing.items if isinstance(i, Path) and i.fill == "band"]
+        for item, count in zip(bars, said, strict=True):
+            # heights in pixels add up to the number of residuals in units of the axis
+            heights = [line[0][1] - line[1][1] for line in item.lines]
+            per_one = min(heights) / round(min(heights) / (sum(heights) / count))
+            assert sum(heights) / per_one == pytest.approx(count, rel=1e-6)
+
+
+def test_a_drift_is_drawn_from_its_legendre_coefficients():
+    result = with_residuals()
+    estimates = (TermEstimate("identity", "x P1", 3e-7, 1e-9, "m"),
+                 TermEstimate("identity", "y P2", 2e-7, 1e-9, "m"))
+    drawing = drift_found(replace(result, model=ModelResult("rigid", (
+        TermResult("drift", None, estimates),))))
+    x, y = (next(i.lines[0] for i in drawing.items if isinstance(i, Path) and i.stroke == "c0"
+                 and i.dash == dash) for dash in ((), (5, 3)))
+    zero = next(i.lines[0][0][1] for i in drawing.items if isinstance(i, Path)
+                and i.stroke == "line")
+    up = np.array([zero - point[1] for point in x])
+    assert up[0] == pytest.approx(-up[-1]) and up[-1] > 0  # P1 goes from -1 to 1
+    bent = np.array([zero - point[1] for point in y])
+    assert bent[0] == pytest.approx(2 / 3 * up[-1])  # P2 is 1 at both ends
+    assert bent[30] == pytest.approx(-bent[0] / 2)  # and -1/2 in the middle
+    assert drift_found(result) is None
+
+
+def test_courses_need_times_and_show_a_rise_upwards():
+    result = with_residuals()
+    rows = [dict(row) for row in result.extra["residuals"]["views"]]
+    rows[0]["course"] = {"time_s": np.arange(5.0), "dx": np.arange(5) * 1e-8, "dy": np.zeros(5),
+                         "count": np.ones(5)}
+    for row in rows[1:]:
+        del row["course"]
+    found = residuals_in(replace(result, extra={"residuals": {"views": rows}}))
+    drawing = courses(found, 1e-8)
+    rise = next(i.lines[0] for i in drawing.items if isinstance(i, Path) and i.stroke == "c0")
+    assert len(rise) == 5 and rise[-1][1] < rise[0][1] - 20
+    assert courses(found[1:], 1e-8) is None
+
+
+def test_rejected_readings_stand_where_they_happened():
+    result = with_residuals(5, 0)
+    found = rejected_in(result)
+    assert found[:2] == [("identity", "low_score", 10.0, 20.0),
+                         ("identity", "too_far_from_nominal", -20.0, 0.0)]
+    view, reason, x, y = found[2]  # mark (1, 0) in the view that is turned by 90 degrees
+    assert (view, reason) == (result.views[1].name, "outlier_among_views")
+    assert (x, y) == pytest.approx((0.0, 10.0), abs=1e-9)
+    words = [i.text for i in rejected_map(result).items if isinstance(i, Label)]
+    assert "low score (1)" in words and "outlier among views (1)" in words
+
+
+def test_a_table_with_holes_or_absurd_errors_is_not_tried():
+    result, _ = known_result(5, 0)
+    far = replace(result.error_map, gx=np.full((5, 5), 6e-3))
+    assert tried(replace(result, error_map=far)) == (
+        None, "errors beyond half a pitch are none that a table corrects")
+    gx = result.error_map.gx.copy()
+    gx[0, 0] = np.nan
+    holed = tried(replace(result, error_map=replace(result.error_map, gx=gx)))
+    assert holed.why_not.startswith("1 sites are unknown")
+
+
+@pytest.mark.parametrize("extra", [
+    {}, {"residuals": 5}, {"residuals": {"views": []}}, {"residuals": {"views": "abc"}},
+    {"residuals": {"views": [1, 2, 3, 4]}, "rejected_at": [7]},
+    {"residuals": {"views": [{"dx": [[1]], "course": {"dx": "x"}}] * 4}, "rejected_at": [{}]},
+    {"rejected_at": [{"view": "identity", "reason": "abc", "x": [1], "y": ["b"]}]},
+    {"outliers": {"removed": [{"view": "identity", "kind": "grid", "mark": "1; 2"}]}}])
+def test_extras_of_another_form_are_left_out(extra):
+    result = replace(known_result(3, 0)[0], extra=extra)
+    found = residuals_in(result)
+    assert residual_maps(result, found) is None and courses(found, 1e-8) is None
+    assert distributions(found, "xy") is None and rejected_map(result) is None
+
+
+def test_the_table_leaves_nothing_at_the_nodes_and_the_curvature_between():
+    result, _ = known_result(5, 0)
+    x = result.artifact.x_m
+    pitch = result.artifact.grid_pitch_m
+    gx = 1e-6 * (x / pitch) ** 2
+    found = tried(replace(result, error_map=replace(
+        result.error_map, gx=gx, gy=np.zeros_like(gx)))).found
+    assert found.sites.largest("before") > 1e-6
+    assert found.sites.largest("after") < 1e-11
+    # a parabola of 1 um a squared pitch lies 1/4 um below its chords at the middle of a cell
+    shift = found.between.shift_after - found.sites.shift_after
+    assert shift == pytest.approx([0.25e-6, 0.0], rel=1e-3, abs=1e-12)
+
+
+def test_svg_of_a_figure_stands_alone_and_is_the_same_twice():
+    result, truth = known_result(5, 8)
+    drawing = error_map(result, truth)
+    text = svg_file(drawing)
+    assert text == svg_file(error_map(result, truth))
+    assert 'xmlns="http://www.w3.org/2000/svg"' in text and "prefers-color-scheme: dark" in text
+    assert "url(" not in text and "<script" not in text and "href" not in text
+    used = set(re.findall(r'class="(?:[^"]* )?[fs]-(\w+)', text))
+    assert used and used <= set(COLOURS)
+
+
+def test_words_in_a_figure_are_escaped():
+    drawing = Drawing("a", "<b>", 100, 100)
+    drawing.label(1, 20, "<script>\x1b")
+    assert "&lt;script&gt;?</text>" in inline_svg(drawing) and "&lt;b&gt;" in inline_svg(drawing)
+
+
+def test_numbers_that_are_none_are_no_part_of_a_drawing():
+    drawing = Drawing("a", "b", 100, 100)
+    drawing.line([(0, 0), (float("nan"), 1)])
+    with pytest.raises(ValueError, match=r"^nan in a drawing$"):
+        inline_svg(drawing)
+
+
+@pytest.mark.parametrize(("span", "count", "step"), [(10, 5, 2), (1, 5, 0.2), (0.7, 5, 0.2),
+                                                     (26, 5, 10), (0, 5, 1), (math.inf, 5, 1)])
+def test_round_steps(span, count, step):
+    assert round_step(span, count) == pytest.approx(step)
+
+
+def test_ticks_lie_within_their_range_and_y_grows_upwards():
+    assert round_ticks(-1.0, 1.0, 4) == pytest.approx([-1.0, -0.5, 0.0, 0.5, 1.0])
+    frame = Frame(Drawing("a", "b", 100, 100), (10, 20, 50, 60), (0, 1), (0, 2))
+    assert frame.at(0, 0) == (10, 80) and frame.at(1, 2) == (60, 20)

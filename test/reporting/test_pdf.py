@@ -1,0 +1,51 @@
+# SPDX-License-Identifier: Apache-2.0
+import re
+from dataclasses import replace
+
+import pytest
+
+from selfcal_ros.errors import InputError
+from selfcal_ros.reporting.chapters import Chapter
+from selfcal_ros.reporting.pdf import COLUMNS, _lines, report_pdf, save_pdf
+from selfcal_ros.reporting.summary.sections import Section
+from selfcal_ros.reporting.write import write_report
+from test.support.results import known_result, with_residuals
+
+
+def test_a_pdf_has_pages_and_is_the_same_bytes_for_the_same_result(tmp_path):
+    result = with_residuals()
+    data = report_pdf(result)
+    assert data.startswith(b"%PDF") and data.rstrip().endswith(b"%%EOF")
+    pages = len(re.findall(rb"/Type /Page\b(?!s)", data))
+    assert pages >= 4
+    assert len(re.findall(rb"/Type /Page\b(?!s)", report_pdf(known_result(5, 24)[0]))) < pages
+    save_pdf(result, tmp_path / "a.pdf")
+    assert (tmp_path / "a.pdf").read_bytes() == data
+    assert b"/CreationDate" not in data
+
+
+def test_no_line_is_wider_than_the_page_and_no_cell_is_lost():
+    words = [f"word{i}" for i in range(200)]
+    rows = tuple(tuple(words[40 * j + 4 * i] * 4 for i in range(9)) for j in range(3))
+    section = Section("title", (("label", " ".join(words)),), rows, (" ".join(words),))
+    lines = [line for line, _ in _lines(Chapter("c", sections=(section,)))]
+    assert max(map(len, lines)) <= COLUMNS
+    told = " ".join(lines)
+    assert all(told.count(f"{word} ") + told.count(f"{word}\n") >= 1 for word in words[:-1])
+    for row in rows:
+        assert all(cell in told for cell in row)
+
+
+def test_the_ending_of_the_name_says_the_form(tmp_path):
+    result = known_result(3, 0)[0]
+    for name, start in (("a.pdf", b"%PDF"), ("a.PDF", b"%PDF"), ("a.html", b"<!DOCTYPE")):
+        write_report(result, tmp_path / name)
+        assert (tmp_path / name).read_bytes().startswith(start)
+    with pytest.raises(InputError, match=r"a\.docx: a report is HTML or PDF; end the name in "
+                       r"\.html or \.pdf$"):
+        write_report(result, tmp_path / "a.docx")
+
+
+def test_names_of_the_user_are_drawn_as_they_are():
+    result = replace(known_result(3, 0)[0], plan_id=r"$\frac{ \n 長", warnings=("$x$ \x1b[2J",))
+    assert report_pdf(result).startswith(b"%PDF")
