@@ -64,7 +64,7 @@ def collect_bag(path: str | Path, values: dict[str, Any], *, namespace: str | No
     """
     reader = BagReader(Path(path), namespace)
     collector = Collector(values)
-    take = block_feeder(collector, reader.lost)
+    take = block_handlers(collector, reader.lost)
     for topic, item in reader.columns():
         take[topic](item)
         progress(sum(collector.received.values()))
@@ -106,7 +106,8 @@ def topics_like(topic: str, topics: dict[str, str]) -> str:
     return f"{hint} then remap it, or " if hint else ""
 
 
-def feeder(collector: Collector, complaints: list[str]) -> dict[str, Callable[[Any], None]]:
+def input_handlers(collector: Collector,
+                   complaints: list[str]) -> dict[str, Callable[[Any], None]]:
     """Return topic -> handler that converts a message and gives it to the collector.
 
     A command that cannot be used is not fatal: it is counted, and said in `complaints`.
@@ -123,7 +124,7 @@ def feeder(collector: Collector, complaints: list[str]) -> dict[str, Callable[[A
             COMMAND_TOPIC: take_command}
 
 
-def block_feeder(collector: Collector,
+def block_handlers(collector: Collector,
                  complaints: list[str]) -> dict[str, Callable[[Any], None]]:
     """Return topic -> handler that gives the collector what `BagReader.columns` yields of it."""
     def take_encoder(block: EncoderBlock) -> None:
@@ -131,7 +132,7 @@ def block_feeder(collector: Collector,
                                     block.velocities)
 
     return {ENCODER_TOPIC: take_encoder, DETECTION_TOPIC: collector.add_detection_block,
-            COMMAND_TOPIC: feeder(collector, complaints)[COMMAND_TOPIC]}
+            COMMAND_TOPIC: input_handlers(collector, complaints)[COMMAND_TOPIC]}
 
 
 def bag_input(path: str | Path) -> dict[str, str]:

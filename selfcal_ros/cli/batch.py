@@ -31,7 +31,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     how.add_argument("--dask", metavar="ADDRESS", nargs="?", const=LOCAL,
                      help="work in a dask.distributed cluster: its scheduler's address, which sees "
                      "the same files, or 'local' (default) for one made for this run")
-    parser.add_argument("--redo", action="store_true", help="solve all of the bags anew")
+    parser.add_argument("--redo", action="store_true", help="solve all of the bags again")
     add_json(parser, "the content of batch.json instead of a summary")
     add_options(parser)
 

@@ -95,7 +95,7 @@ COLLECTOR = (
     Parameter("ambiguity_ratio", 0.5, "a mark without id is ambiguous if its distance to the "
               "nearest nominal mark exceeds this part of that to the second nearest",
               "", 0.01, 1.0),
-    Parameter("max_rotation", 0.035, "largest misalignment in rotation to reckon with when marks "
+    Parameter("max_rotation", 0.035, "largest rotational misalignment to expect when marks "
               "have no ids; where lines alone are read it must be below 0.45 of a line",
               "rad", 0.0, 0.2),
     Parameter("max_stage_distance", 0.0, "largest distance of the indicated stage position from "
@@ -166,7 +166,7 @@ SEQUENCER = (
     Parameter("auto_confirm", False, "measure without waiting for confirm_view (robot loaders)"),
     Parameter("settle_time", 0.5, "time between PLACE and MEASURE when auto_confirm is set",
               "s", 0.0, 3600.0),
-    Parameter("view_timeout", 0.0, "give up waiting for a view's completion; 0 = wait for ever",
+    Parameter("view_timeout", 0.0, "give up waiting for a view's completion; 0 = wait forever",
               "s", 0.0, 1e6),
     Parameter("max_redos", 0, "times an incomplete view is redone after a time-out", "", 0, 100),
     Parameter("result_path", "", "where run_calibration has the solver save the map; empty = "
@@ -216,7 +216,7 @@ SIMULATOR = (
     Parameter("with_ids", True, "detections name their marks"),
     Parameter("truth_path", "", "JSON file for the known truth; empty = none"),
     Parameter("declare_sigma", False, "detections state their standard deviation"),
-    Parameter("servo_sigma", 2e-8, "how far the stage stands off where it stopped", **_LENGTH),
+    Parameter("servo_sigma", 2e-8, "scatter of the stage about where it stopped", **_LENGTH),
     Parameter("servo_sigma_theta", 1e-7, "the same of theta", **_ANGLE),
     Parameter("stop_sigma", 0.0, "how far from its target the stage stops", **_LENGTH),
     Parameter("stop_sigma_theta", 0.0, "the same of theta", **_ANGLE),

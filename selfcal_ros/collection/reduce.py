@@ -148,7 +148,7 @@ def _reduce_angular(artifact: Artifact, view: View, d: np.ndarray, exposures: Ex
                     rules: Rules, rejected: Counter, phi: float | None) -> dict:
     stage = exposures.at(d["stamp"])
     why = _first(stage.theta.reason, stage.x.moving, stage.y.moving)
-    # beyond half a turn an offset is no sight of the line, though it may wrap to a small one
+    # beyond half a turn an offset cannot be a valid observation, though it may wrap to a small one
     why[(why == None) & (np.abs(d["ot"]) > np.pi)] = Reason.TOO_FAR  # noqa: E711
     d, (theta,) = _keep(d, why, rejected, stage.theta.position)
     found = identify_angular(artifact, view, _reading(rules.sense, theta, d["ot"]), ids=d["k"],

@@ -137,7 +137,7 @@ def _advice(found: StepDiagonalResult) -> list[str]:
                    f"{lengths * UM_PER_M:.3g} um: laser off the machine's diagonal, or linear "
                    "errors of another state of the machine")
     if found.covariance is not None and not found.covariance.any():
-        out.append("all repeats are identical: the uncertainty of zero is not to be believed")
+        out.append("all repeats are identical: an uncertainty of zero cannot be right")
     return out
 
 

@@ -247,7 +247,7 @@ def result_from_dict(data: object, where: str) -> CalibrationResult:
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         reason = f"the key {error} is missing" if isinstance(error, KeyError) else str(error)
         raise InputError(where, f"damaged result ({reason})",
-                         "write it anew with `selfcal solve`") from error
+                         "write it again with `selfcal solve`") from error
 
 
 def _parse(data: dict) -> CalibrationResult:

@@ -77,7 +77,7 @@ class CompensatingSession:
             return f"{_source(message)} is not qualified"
         if summary is None or summary.run_id != message.run_id or (
                 to_model.stamp_ns(summary) != to_model.stamp_ns(message)):
-            return f"no selfcal/summary tells yet whether {_source(message)} is complete"
+            return f"no selfcal/summary says yet whether {_source(message)} is complete"
         if not summary.qualified:
             return f"{_source(message)} is not qualified: {summary.state}"
         if summary.views_done < summary.views_planned:

@@ -6,7 +6,7 @@ import yaml
 import zstandard
 from rosbags.rosbag2 import CompressionMode, Reader
 
-from selfcal_ros.bagio.offline import collect_bag, feeder
+from selfcal_ros.bagio.offline import collect_bag, input_handlers
 from selfcal_ros.bagio.reader import INPUT_TOPICS, BagReader
 from selfcal_ros.bagio.schemas import typestore
 from selfcal_ros.collection.collector import Collector
@@ -293,7 +293,7 @@ def played(path):
     messages = [(topic, typestore().deserialize_cdr(data, INPUT_TOPICS[topic]))
                 for topic, _, data in BagReader(path).cdr_messages()]
     collector = Collector(VALUES)
-    feed = feeder(collector, [])
+    feed = input_handlers(collector, [])
     for topic, message in messages:
         feed[topic](message)
     return result_to_dict(calibrate(collector.collect()[0], Options()))

@@ -118,7 +118,7 @@ def test_damaged_results_are_refused(path, value, message):
     with pytest.raises(InputError) as caught:
         result_from_dict(damaged(path, value), "f.json")
     assert str(caught.value) == (f"f.json: damaged result ({message}); "
-                                 "write it anew with `selfcal solve`")
+                                 "write it again with `selfcal solve`")
 
 
 @pytest.mark.parametrize("data", [None, [], {}, {"schema": "selfcal.result/2"}])

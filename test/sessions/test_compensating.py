@@ -69,9 +69,9 @@ def test_a_map_is_used_once_its_summary_says_that_it_is_complete(desk, order):
     ({"qualified": False}, {}, "plan demo, run 7 is not qualified"),
     ({}, {"qualified": False}, "plan demo, run 7 is not qualified: as it is"),
     ({}, {"views_done": 3}, "plan demo, run 7 is of 3 of 4 views"),
-    ({}, {"run_id": "6"}, "no selfcal/summary tells yet whether plan demo, run 7 is complete"),
+    ({}, {"run_id": "6"}, "no selfcal/summary says yet whether plan demo, run 7 is complete"),
     ({}, {"stamp_ns": START_NS + 1},
-     "no selfcal/summary tells yet whether plan demo, run 7 is complete")])
+     "no selfcal/summary says yet whether plan demo, run 7 is complete")])
 def test_a_map_that_must_not_be_used_leaves_the_former_one_in_use(
         desk, the_map, the_summary, why):
     desk.session.take_map(map_of(TWO, START_NS - 5))

@@ -29,7 +29,7 @@ from selfcal_ros.messages.cdr_columns import Payloads
 
 CHECKED = (Opcode.HEADER, Opcode.CHUNK, Opcode.MESSAGE_INDEX, Opcode.MESSAGE, Opcode.SCHEMA,
            Opcode.CHANNEL)
-"""Records whose length is not believed blindly: one that only skips may skip too far."""
+"""Records whose declared length is validated before they are skipped: it may be too large."""
 INDEX = struct.Struct("<HI")
 """Channel and bytes of the entries of a message index."""
 INDEX_ENTRY = 16
@@ -230,7 +230,7 @@ class McapStream:
 
     def _say_end(self, data_ended: bool) -> None:
         self.lost.append(
-            "the end of the file is damaged, behind the last message: no message is lost"
+            "the end of the file is damaged, after the last message: no message is lost"
             if data_ended else "the file ends without its footer, as when a recorder is killed: "
             "every message that was written is read")
 

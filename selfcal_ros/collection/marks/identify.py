@@ -5,7 +5,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from selfcal_ros.collection.marks.rigid import LARGEST_TURN_RAD, Fit, Known, Rigid, fit_motion
+from selfcal_ros.collection.marks.rigid import (
+    LARGEST_TURN_RAD,
+    MotionEstimate,
+    Rigid,
+    RigidFit,
+    fit_motion,
+)
 from selfcal_ros.collection.reasons import Reason
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.view import View
@@ -40,7 +46,7 @@ class IdentityRules:
 
 
 @dataclass(frozen=True)
-class Identified:
+class MarkAssignment:
     """Marks behind readings: indices, deviations (rows, n), and reasons where rejected.
 
     `residual` is the deviation without the view's own motion `rigid`; `phi_error_rad` says how
@@ -57,7 +63,7 @@ class Identified:
 
 def identify_grid(artifact: Artifact, view: View, reading_m: np.ndarray, *, ids: np.ndarray,
                   has_id: np.ndarray, rules: IdentityRules,
-                  stage_m: np.ndarray | None = None) -> Identified:
+                  stage_m: np.ndarray | None = None) -> MarkAssignment:
     """Identify grid marks and return their deviations from the nominal places of the view.
 
     A mark at whose site the stage does not stand is rejected, and tells nothing of the others.
@@ -82,7 +88,7 @@ def identify_grid(artifact: Artifact, view: View, reading_m: np.ndarray, *, ids:
     reasons = np.full(reading_m.shape[1], None, dtype=object)
     if not view.grid or pose.quarter_turns is None:
         reasons[:] = Reason.NOT_IN_VIEW
-        return Identified(ids, np.zeros(reading_m.shape), np.zeros(reading_m.shape), reasons,
+        return MarkAssignment(ids, np.zeros(reading_m.shape), np.zeros(reading_m.shape), reasons,
                           Rigid())
     half = np.array(artifact.half)[:, None]
     named_unknown = has_id & (np.abs(ids) > half).any(axis=0)
@@ -118,7 +124,7 @@ def identify_grid(artifact: Artifact, view: View, reading_m: np.ndarray, *, ids:
     reasons[unsure] = Reason.ROTATION
     reasons[(np.abs(site) > half).any(axis=0) & ~unsure] = Reason.NOT_IN_VIEW
     reasons[named_unknown] = Reason.UNKNOWN_MARK
-    return Identified(marks, deviation, residual, reasons, rigid, fit.phi_error_rad)
+    return MarkAssignment(marks, deviation, residual, reasons, rigid, fit.phi_error_rad)
 
 
 def _astray(pose, marks: np.ndarray, stage_m: np.ndarray | None, artifact: Artifact,
@@ -146,7 +152,7 @@ def _nearest(pose, centred: np.ndarray, pitch: float, half: np.ndarray,
 
 def _settle(pose, centred: np.ndarray, half: np.ndarray, ids: np.ndarray,
             kinds: tuple[np.ndarray, np.ndarray], pitch: float,
-            rules: IdentityRules) -> tuple[Known, Fit]:
+            rules: IdentityRules) -> tuple[MotionEstimate, RigidFit]:
     """Return what is known of the view's own motion: grown outwards from what is sure.
 
     Far from the centre a misalignment in rotation may exceed half a pitch. So marks without ids
@@ -172,18 +178,19 @@ def _settle(pose, centred: np.ndarray, half: np.ndarray, ids: np.ndarray,
     return (known, fit) if named.any() else _folded(known, fit, pitch)
 
 
-def _innermost(centred: np.ndarray, pitch: float, max_rotation_rad: float) -> Known:
+def _innermost(centred: np.ndarray, pitch: float, max_rotation_rad: float) -> MotionEstimate:
     """Return what marks about the innermost one tell: the offset there, up to whole pitches."""
     if not centred.shape[1]:
-        return Known(phi_error_rad=max_rotation_rad)
+        return MotionEstimate(phi_error_rad=max_rotation_rad)
     centre = centred[:, np.argmin(np.hypot(*centred))]
     near = np.hypot(*(centred - centre[:, None])) * max_rotation_rad <= SURE * pitch
     offset = [_middle(row * (2 * np.pi / pitch), 2 * np.pi) * pitch / (2 * np.pi)
               for row in centred[:, near]]
-    return Known(Rigid(0.0, *offset), (float(centre[0]), float(centre[1])), 0.0, max_rotation_rad)
+    return MotionEstimate(Rigid(0.0, *offset), (float(centre[0]), float(centre[1])), 0.0,
+                          max_rotation_rad)
 
 
-def _folded(known: Known, fit: Fit, pitch: float) -> tuple[Known, Fit]:
+def _folded(known: MotionEstimate, fit: RigidFit, pitch: float) -> tuple[MotionEstimate, RigidFit]:
     """Return the motion whose offset at the plate's centre is below half a pitch.
 
     Marks without ids tell it only up to whole pitches, and not at all where they lie so far out
@@ -204,7 +211,7 @@ def _about(pose, marks: np.ndarray, pitch: float) -> np.ndarray:
 
 def identify_angular(artifact: Artifact, view: View, reading_rad: np.ndarray, *, ids: np.ndarray,
                      has_id: np.ndarray, rules: IdentityRules, phi_rad: float | None,
-                     ) -> Identified:
+                     ) -> MarkAssignment:
     """Identify angular lines and return their deviations, wrapped to (-pi, pi].
 
     Parameters
@@ -227,7 +234,7 @@ def identify_angular(artifact: Artifact, view: View, reading_rad: np.ndarray, *,
     count = artifact.angular_count
     if not count or not view.angular:
         reasons[:] = Reason.NOT_IN_VIEW
-        return Identified(np.zeros(len(ids), int), np.zeros(len(ids)), np.zeros(len(ids)),
+        return MarkAssignment(np.zeros(len(ids), int), np.zeros(len(ids)), np.zeros(len(ids)),
                           reasons, Rigid())
     step = 2 * np.pi / count
     base = view.lattice_pose(artifact).s
@@ -246,7 +253,7 @@ def identify_angular(artifact: Artifact, view: View, reading_rad: np.ndarray, *,
     if not told and not _nearest_line_is_sure(phi_rad, step, rules.max_rotation_rad):
         reasons[~has_id] = Reason.ROTATION
     reasons[has_id & ~known] = Reason.UNKNOWN_MARK
-    return Identified(line, deviation, residual, reasons, Rigid(phi_rad))
+    return MarkAssignment(line, deviation, residual, reasons, Rigid(phi_rad))
 
 
 def _nearest_line_is_sure(phi_rad: float, step_rad: float, max_rotation_rad: float) -> bool:

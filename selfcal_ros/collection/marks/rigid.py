@@ -39,7 +39,7 @@ class Rigid:
 
 
 @dataclass(frozen=True)
-class Known:
+class MotionEstimate:
     """What is known of a view's motion, and how far its prediction may be wrong.
 
     Attributes
@@ -66,7 +66,7 @@ class Known:
 
 
 @dataclass(frozen=True)
-class Fit:
+class RigidFit:
     """A rigid motion fitted to marks.
 
     Attributes
@@ -97,7 +97,7 @@ class Fit:
         return FEW_MARKS_COVERAGE * float(np.sqrt(
             self.squares_m2 / (2 * self.marks - 3) / self.power_m2))
 
-    def known(self, pitch_m: float, max_rotation_rad: float) -> Known:
+    def known(self, pitch_m: float, max_rotation_rad: float) -> MotionEstimate:
         """Return what the fit tells together with what is known beforehand.
 
         Before any mark is read the rotation is 0 to within `max_rotation_rad`, and marks
@@ -113,8 +113,8 @@ class Fit:
             error = weight * found + (1 - weight) * max_rotation_rad
         rigid = _through(weight * self.rigid.phi_rad, self.centre_m,
                          self.rigid.at(np.array(self.centre_m)))
-        return Known(rigid, self.centre_m, float(scatter * np.sqrt(1 + 1 / max(self.marks, 1))),
-                     float(error))
+        return MotionEstimate(rigid, self.centre_m,
+                              float(scatter * np.sqrt(1 + 1 / max(self.marks, 1))), float(error))
 
 
 def _through(phi_rad: float, centre: tuple[float, float], deviation: np.ndarray) -> Rigid:
@@ -123,7 +123,7 @@ def _through(phi_rad: float, centre: tuple[float, float], deviation: np.ndarray)
     return Rigid(float(phi_rad), float(rest[0]), float(rest[1]))
 
 
-def fit_motion(p: np.ndarray, deviation: np.ndarray) -> Fit:
+def fit_motion(p: np.ndarray, deviation: np.ndarray) -> RigidFit:
     """Fit a rigid motion to deviations, without those that lie far off.
 
     Parameters
@@ -135,12 +135,12 @@ def fit_motion(p: np.ndarray, deviation: np.ndarray) -> Fit:
 
     Returns
     -------
-    Fit
+    RigidFit
         From the median start, five rounds of least squares over the deviations within three
         times the median distance. The turn is never beyond `LARGEST_TURN_RAD`.
     """
     if not p.shape[1]:
-        return Fit(Rigid(), (0.0, 0.0), 0, 0.0, 0.0)
+        return RigidFit(Rigid(), (0.0, 0.0), 0, 0.0, 0.0)
     middle = p.mean(axis=1)
     arm = p - middle[:, None]
     offset = np.median(deviation, axis=1)
@@ -163,7 +163,7 @@ def fit_motion(p: np.ndarray, deviation: np.ndarray) -> Fit:
     rest = deviation[:, keep] - rigid.at(p[:, keep])
     marks = len(np.unique(p[0, keep] + 1j * p[1, keep]))
     share = marks / keep.sum()  # repeats of a mark are no further marks
-    return Fit(rigid, (float(middle[0]), float(middle[1])), marks, float(power * share),
+    return RigidFit(rigid, (float(middle[0]), float(middle[1])), marks, float(power * share),
                float((rest**2).sum() * share))
 
 

@@ -177,7 +177,7 @@ class Series:
         """Return `Reason.MOVING` where this joint is known to move, else None, object array (Q,).
 
         For joints that a reading does not need: one that has no samples near, or whose samples
-        contradict each other, tells nothing; and what its own noise can do is no motion.
+        contradict each other, tells nothing; and displacements within noise are not motion.
         """
         _, reasons = self.query(stamps_ns)
         fast = reasons == Reason.MOVING

@@ -215,7 +215,7 @@ def _weights(kept: Any, field: np.ndarray, where: str) -> np.ndarray:
         weight = weight * field
     if weight.shape != field.shape or not (np.isfinite(weight).all() and (weight >= 0).all()):
         raise InputError(where, "no weights of this field",
-                         "write the result anew with `selfcal solve`")
+                         "write the result again with `selfcal solve`")
     return weight
 
 

@@ -28,7 +28,7 @@ FLOOR = 1e-13
 
 MAX_WEIGHT = 1e8
 """Largest weight of one kind of readings against the other, all together: beyond, the lighter one
-would be lost in the rounding of the heavier, and with it the rotations that it alone tells."""
+would be lost in the rounding of the heavier, and with it the rotations that only it determines."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -120,7 +120,7 @@ def factors_of(result: CalibrationResult) -> np.ndarray:
         good = False
     if not good:
         raise InputError(KEY, "no factors of this lattice",
-                         "write the result anew with `selfcal solve`")
+                         "write the result again with `selfcal solve`")
     return factors
 
 

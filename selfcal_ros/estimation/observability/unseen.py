@@ -122,7 +122,7 @@ def _shape_of(grid: GridSystem, label: np.ndarray, signs: np.ndarray, *,
     shifts = {(pose.a, pose.b) for pose in grid.views.poses}
     turns = sorted({(pose.q - grid.views.poses[0].q) % 4 for pose in grid.views.poses})
     if len(grid.views.poses) == 1:
-        return "every field", "every field: one view cannot tell the stage from the plate"
+        return "every field", "every field: one view cannot separate the stage from the plate"
     for axis, line in ((0, "rows"), (1, "columns")):
         first = np.take(label, [label.shape[axis] // 2], axis=axis)
         if (label == first).all():

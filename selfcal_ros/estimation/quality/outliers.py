@@ -46,7 +46,7 @@ MAX_REMOVED = 0.1
 """Largest part of the readings that is removed; beyond, the fault is not in single readings."""
 
 TIED = 1e-6
-"""Readings whose ratios differ by less contradict each other, no one knows which is wrong."""
+"""Readings whose ratios differ by less cannot be attributed: both are removed."""
 
 MAX_SLIPS = 3
 MAX_TERMS = 3

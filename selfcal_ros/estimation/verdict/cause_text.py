@@ -108,7 +108,7 @@ def _plate_shape(found: Explanation, names: tuple[str, ...],
                  _: float) -> tuple[str, float, float, str]:
     at, value, u = _likeliest(found, _units(found))
     column = found.columns[int(at)]
-    more = "" if found.whole else "; part of it cannot be told from the stage: give its size"
+    more = "" if found.whole else "; part of it cannot be separated from the stage: give its size"
     return (f"plate bent by {plus_minus(value, u, 1e9, 'nm')} at the middle of an edge in view "
             f"'{names[column.view]}' against view '{names[0]}': solve with --model "
             f"plate_shape:SIZE, or lay it down without strain{more}", value, u, "m")

@@ -124,7 +124,7 @@ def _noise_reasons(solved: Solved) -> list[str]:
         if noise.contradicted:
             out.append(_contradiction(noise, kind, factor, unit))
     if not np.isfinite(solved.xy.sigma):
-        out.append("grid readings: neither repeats nor residuals tell the noise, so that the "
+        out.append("grid readings: neither repeats nor residuals determine the noise, so that the "
                    "uncertainty is not known; read every mark twice")
     return out
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from selfcal_ros.bagio.journal import Journal, resume, start
-from selfcal_ros.bagio.offline import block_feeder
+from selfcal_ros.bagio.offline import block_handlers
 from selfcal_ros.bagio.reader import BagReader
 from selfcal_ros.collection.collector import Collector
 from selfcal_ros.errors import InputError
@@ -45,7 +45,7 @@ def take_up(files: list[Path], values: dict[str, Any]) -> TakenUp:
     """
     collector = Collector(values)
     lost: list[str] = []
-    feed = block_feeder(collector, lost)
+    feed = block_handlers(collector, lost)
     for file in files:
         reader = BagReader(file)
         for topic, item in reader.columns():
