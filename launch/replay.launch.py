@@ -21,11 +21,18 @@ def generate_launch_description() -> LaunchDescription:
         DeclareLaunchArgument("rate", default_value="1.0",
                               description="speed; 0 = as fast as the nodes keep up"),
         DeclareLaunchArgument("namespace", default_value="", description="namespace of the cell"),
+        DeclareLaunchArgument("params", default_value=str(share / "config/params/cell.yaml"),
+                              description="ROS parameter file for all nodes"),
+        DeclareLaunchArgument("plan", default_value=str(share / "config/plans/resistant.yaml"),
+                              description="PLAN.yaml of a run that follows the bag; the bag's own "
+                              "commands are followed as they are"),
         IncludeLaunchDescription(
             PythonLaunchDescriptionSource(str(share / "launch/calibrate.launch.py")),
-            launch_arguments={"namespace": LaunchConfiguration("namespace")}.items()),
+            launch_arguments={name: LaunchConfiguration(name)
+                              for name in ("params", "plan", "namespace")}.items()),
         Node(package="selfcal_ros", executable="bag_player", name="bag_player", output="screen",
              namespace=LaunchConfiguration("namespace"), on_exit=end_if_it_cannot_start,
-             parameters=[{"bag": LaunchConfiguration("bag"),
+             parameters=[LaunchConfiguration("params"), {
+                          "bag": LaunchConfiguration("bag"),
                           "rate": ParameterValue(LaunchConfiguration("rate"), value_type=float)}]),
     ])

@@ -50,7 +50,8 @@ class Course:
     before, after : float
         Medians on both sides of it.
     adjusted_p : float
-        The smaller of the two, as it counts among all tests of a batch (Benjamini, Hochberg).
+        That of what is named (else the smaller), as it counts among all tests of a series
+        (Benjamini, Hochberg).
     finding : Finding
         What is significant; of two the one that leaves less.
     """
@@ -148,7 +149,9 @@ def _judged(course: Course, adjusted: np.ndarray, days: np.ndarray,
     if adjusted.min() <= LEVEL:
         finding = _of_both(course, days, values) if adjusted.max() <= LEVEL else (
             Finding.TREND if adjusted[0] <= LEVEL else Finding.CHANGE)
-    return replace(course, adjusted_p=float(adjusted.min()), finding=finding)
+    counted = {Finding.TREND: adjusted[0], Finding.CHANGE: adjusted[1]}
+    return replace(course, adjusted_p=float(counted.get(finding, adjusted.min())),
+                   finding=finding)
 
 
 def _of_both(course: Course, days: np.ndarray, values: np.ndarray) -> Finding:

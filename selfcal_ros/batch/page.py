@@ -17,7 +17,8 @@ from selfcal_ros.reporting.html_style import CSS
 POLICY = "default-src 'none'; style-src 'unsafe-inline'"
 WIDTH, HEIGHT, LEFT, EDGE = 560, 150, 64, 14
 STYLE = """
-svg { width: 100%; height: auto; } svg text { fill: var(--soft); font-size: 11px; }
+figure { max-width: 36rem; } svg { width: 100%; height: auto; }
+svg text { fill: var(--soft); font-size: 11px; }
 .frame { stroke: var(--line); fill: none; } .value { fill: var(--good); }
 .value.bad { fill: var(--bad); } .course { stroke: var(--ink); fill: none; stroke-width: 1.5; }
 .change { stroke: var(--bad); stroke-dasharray: 4 3; }
@@ -53,7 +54,7 @@ def page_html(records: Sequence[Record], found: Sequence[Series], lines: Sequenc
             parts.append(f"<section><h2>{_text('Plan ' + series.plan_id)}: over time</h2>"
                          f'<div class="figures">{pictures}</div></section>')
     parts.append(f"<section><h2>Bags</h2>{_table(records)}</section>")
-    return _PAGE.format(policy=POLICY, title=f"{len(records)} bags, calibrated",
+    return _PAGE.format(policy=POLICY, title=f"Calibrations from {len(records)} bags",
                         css=CSS + STYLE, body="\n".join(parts))
 
 
@@ -89,19 +90,23 @@ def _figure(series: Series, name: str, course: Course) -> str:
     text, unit = described(name)
     values = np.array([record["quantities"].get(name) for record in series.records], dtype=float)
     known = np.isfinite(values)
-    low, high = float(values[known].min()), float(values[known].max())
+    ends = low, high = float(values[known].min()), float(values[known].max())
     margin = (high - low) * 0.08 or abs(high) * 0.01 or 1.0
     low, high = low - margin, high + margin
     span = float(series.days[-1]) or 1.0
+    bottom = HEIGHT - 2 * EDGE
 
     def place(day: float, value: float) -> tuple[float, float]:
         return (LEFT + (WIDTH - LEFT - EDGE) * day / span,
-                EDGE + (HEIGHT - 2 * EDGE) * (high - value) / (high - low))
+                EDGE + (bottom - EDGE) * (high - value) / (high - low))
 
     marks = [f'<rect class="frame" x="{LEFT}" y="{EDGE}" width="{WIDTH - LEFT - EDGE}" '
-             f'height="{HEIGHT - 2 * EDGE}"/>',
-             *(f'<text x="{LEFT - 6}" y="{y}" text-anchor="end">{value:.4g}</text>'
-               for value, y in ((high, EDGE + 8), (low, HEIGHT - EDGE)))]
+             f'height="{bottom - EDGE}"/>',
+             *(f'<text x="{LEFT - 6}" y="{place(0.0, value)[1] + 4:.1f}" text-anchor="end">'
+               f"{value:.4g}</text>" for value in sorted({ends[0], ends[1]})),
+             f'<text x="{LEFT}" y="{HEIGHT - 1}">{series.date(0)[:10]}</text>',
+             f'<text x="{WIDTH - EDGE}" y="{HEIGHT - 1}" text-anchor="end">'
+             f"{series.date(-1)[:10]}</text>"]
     for day, value, record in zip(series.days[known], values[known],
                                   np.array(series.records, dtype=object)[known], strict=True):
         x, y = place(day, value)
@@ -124,7 +129,7 @@ def _named(series: Series, course: Course, values: np.ndarray, place: Any) -> li
     if course.finding is Finding.CHANGE:
         middle = (days[course.change - 1] + days[course.change]) / 2
         x = place(middle, 0.0)[0]
-        return [_line("change", (x, EDGE), (x, HEIGHT - EDGE)),
+        return [_line("change", (x, EDGE), (x, HEIGHT - 2 * EDGE)),
                 _line("course", place(days[0], course.before), place(middle, course.before)),
                 _line("course", place(middle, course.after), place(days[-1], course.after))]
     return []

@@ -18,6 +18,9 @@ from selfcal_ros import __version__, cli
 from selfcal_ros.cli.terminal.parser import Parser
 from selfcal_ros.errors import ExitCode, SelfcalError
 
+COMPLETE = "_ARGCOMPLETE"
+"""Set in the environment by a shell that asks for completions."""
+
 
 def verbs() -> dict[str, ModuleType]:
     """Return name -> module of every verb."""
@@ -44,12 +47,22 @@ def build_parser() -> argparse.ArgumentParser:
     return parser
 
 
+def _complete(parser: argparse.ArgumentParser) -> None:
+    """Answer the shell, which asks for words to complete, and end; the README says how."""
+    import argcomplete
+
+    argcomplete.autocomplete(parser)
+
+
 def main(argv: list[str] | None = None) -> int:
     """Run one verb and return its exit code."""
     said = "selfcal"
     try:
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})  # blocked by `start`
-        args = build_parser().parse_args(argv)
+        parser = build_parser()
+        if COMPLETE in os.environ:
+            _complete(parser)
+        args = parser.parse_args(argv)
         said = f"selfcal {args.verb}"
         code = int(args.run(args))
         sys.stdout.flush()

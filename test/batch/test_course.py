@@ -85,6 +85,8 @@ def test_a_trend_is_a_trend_and_a_change_is_a_change(sign):
         Finding.TREND, Finding.CHANGE, Finding.NONE]
     slope, low, high = found["line"].slope_per_day
     assert low < sign * 0.02 < high and high - low < 0.02 and low <= slope <= high
+    assert found["line"].adjusted_p < 1e-6  # Mann and Kendall's, not that of 9,999 orders
+    assert 1e-4 <= found["step"].adjusted_p < 1e-3
     assert found["step"].change == 25
     assert found["step"].after - found["step"].before == pytest.approx(sign * 1.0, abs=0.1)
 

@@ -10,7 +10,7 @@ ROOT = Path(__file__).parents[2]
 FILES = sorted((ROOT / "launch").glob("*.launch.py"))
 ARGUMENTS = {
     "calibrate.launch.py": {"namespace", "params", "plan", "compensate"},
-    "replay.launch.py": {"bag", "rate", "namespace"},
+    "replay.launch.py": {"bag", "rate", "namespace", "params", "plan"},
     "simulated_cell.launch.py": {"namespace", "bag", "params", "plan"},
 }
 STARTED = {
