@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Collector, sequencer and solver of one cell: ros2 launch selfcal_ros calibrate.launch.py."""
 
+import os
 from pathlib import Path
 
 from ament_index_python.packages import get_package_share_directory
@@ -9,8 +10,11 @@ from launch.actions import DeclareLaunchArgument
 from launch.conditions import IfCondition
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
+from launch_ros.parameter_descriptions import ParameterValue
 
 from selfcal_ros.nodes.launching import end_if_it_cannot_start
+
+JOURNALS = str(Path(os.environ.get("ROS_HOME") or Path.home() / ".ros") / "selfcal_journals")
 
 
 def generate_launch_description() -> LaunchDescription:
@@ -30,7 +34,10 @@ def generate_launch_description() -> LaunchDescription:
                               description="PLAN.yaml with plate and views"),
         DeclareLaunchArgument("compensate", default_value="false",
                               description="publish corrected joint states as well"),
-        node("measurement_collector"),
+        DeclareLaunchArgument("journal", default_value=JOURNALS, description="folder for journals, "
+                              "from which a collector that died goes on; '' = none"),
+        node("measurement_collector", {"journal": ParameterValue(argument("journal"),
+                                                                 value_type=str)}),
         node("solver"),
         node("pose_sequencer", {"plan": argument("plan")}),
         node("compensator", condition=IfCondition(argument("compensate"))),

@@ -28,8 +28,9 @@ def generate_launch_description() -> LaunchDescription:
                               "commands are followed as they are"),
         IncludeLaunchDescription(
             PythonLaunchDescriptionSource(str(share / "launch/calibrate.launch.py")),
-            launch_arguments={name: LaunchConfiguration(name)
-                              for name in ("params", "plan", "namespace")}.items()),
+            launch_arguments={
+                **{name: LaunchConfiguration(name) for name in ("params", "plan", "namespace")},
+                "journal": ""}.items()),  # there is a bag already
         Node(package="selfcal_ros", executable="bag_player", name="bag_player", output="screen",
              namespace=LaunchConfiguration("namespace"), on_exit=end_if_it_cannot_start,
              parameters=[LaunchConfiguration("params"), {

@@ -200,8 +200,8 @@ class Journal:
         records: list[bytes] = []
         times: dict[str, list[int]] = {topic: [] for topic in {item[0] for item in waiting}}
         for topic, data, log_time_ns in waiting:
-            records.append(message_record(self._channels[topic], self._sequence[topic],
-                                          log_time_ns, data))
+            records.append(message_record(
+                self._channels[topic], self._sequence[topic], log_time_ns, data))
             self._sequence[topic] += 1
             times[topic].append(log_time_ns)
         try:

@@ -20,6 +20,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--results", metavar="FOLDER", default=".",
                         help="folder for the maps that are saved (default: the working directory)")
     add_json(parser, "one JSON object a line: pictures as they change, answers to requests")
+    parser.add_argument("--journal", metavar="FOLDER", help="folder for journals, from which a "
+                        "collector that died goes on (default: journals, in that of the results)")
     parser.add_argument("--compensate", action="store_true",
                         help="publish corrected joint states as well")
     parser.add_argument("--simulate", action="store_true",
@@ -61,7 +63,8 @@ def commands(args: argparse.Namespace) -> dict[str, list[str]]:
     def with_parameters(**values: str) -> list[str]:
         return common + [word for name, value in values.items()
                          for word in ("-p", f"{name}:={value}")]
-    nodes = {"measurement_collector": with_parameters(),
+    journal = args.journal or str(Path(args.results, "journals"))
+    nodes = {"measurement_collector": with_parameters(journal=str(Path(journal).resolve())),
              "solver": with_parameters(result_folder=str(Path(args.results).resolve())),
              "pose_sequencer": with_parameters(plan=str(Path(args.plan).resolve()))}
     if args.compensate:

@@ -61,10 +61,10 @@ class MeasurementCollector(PollingNode):
 
     def activate(self) -> None:
         """Listen to the cell and to the commands."""
-        self._detections = self.subscribe(
-            names.DETECTIONS, ByTheClock(self._reception.detection), raw=True)
+        self._detections = self.subscribe(names.DETECTIONS, ByTheClock(
+            names.DETECTIONS.name, self._reception.detection), raw=True)
         self.subscribe_with_age(names.COMMAND, self._reception.command, raw=True)
-        EncoderInput(self, ByTheClock(self._reception.encoder), raw=True)
+        EncoderInput(self, ByTheClock(names.ENCODER.name, self._reception.encoder), raw=True)
         self.every(TICK_S, self._on_timer)
         self.service(Trigger, "~/finish", lambda request: self._finish())
 

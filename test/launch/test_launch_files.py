@@ -9,7 +9,7 @@ import pytest
 ROOT = Path(__file__).parents[2]
 FILES = sorted((ROOT / "launch").glob("*.launch.py"))
 ARGUMENTS = {
-    "calibrate.launch.py": {"namespace", "params", "plan", "compensate"},
+    "calibrate.launch.py": {"namespace", "params", "plan", "compensate", "journal"},
     "replay.launch.py": {"bag", "rate", "namespace", "params", "plan"},
     "simulated_cell.launch.py": {"namespace", "bag", "params", "plan"},
 }

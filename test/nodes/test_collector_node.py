@@ -302,3 +302,43 @@ def test_the_health_names_the_stage(graph, given, told):
     graph.node(MeasurementCollector, **given)
     graph.until(lambda: heard, "the health")
     assert heard[-1].hardware_id == told
+
+
+def losses(graph) -> list:
+    """Return a list that fills with what the collector's health tells of lost samples."""
+    told: list = []
+    graph.hand.create_subscription(
+        DiagnosticStatus, "measurement_collector/health", lambda status: told.extend(
+            (int(value.value), status.level, status.message) for value in status.values
+            if value.key == "lost stage/joint_states"), names.HEALTH.qos)
+    return told
+
+
+def test_messages_that_were_overwritten_before_they_were_taken_are_counted(graph):
+    graph.node(MeasurementCollector)
+    told, depth = losses(graph), names.ENCODER.qos.depth
+    encoder = graph.publisher(names.ENCODER)
+    sample = names.ENCODER.type(name=["x"], position=[0.0])
+    encoder.publish(sample)
+    graph.until(lambda: graph.nodes[-1].session.collector.received["encoder"] == 1, "the first")
+    for _ in range(depth + 700):  # nobody spins meanwhile
+        encoder.publish(sample)
+    graph.until(lambda: told, "the loss")
+    lost, level, message = told[-1]
+    graph.until(lambda: graph.nodes[-1].session.collector.received["encoder"]
+                == 1 + depth + 700 - lost, "the others")
+    assert lost > 0
+    assert level == DiagnosticStatus.WARN
+    assert message.startswith(f"stage/joint_states: {lost} messages lost")
+
+
+def test_the_numbers_of_two_publishers_that_interleave_are_no_loss(graph):
+    node = graph.node(MeasurementCollector)
+    first = graph.publisher(names.ENCODER)
+    second = graph.hand.create_publisher(names.ENCODER.type, names.ENCODER.name, names.ENCODER.qos)
+    graph.until(lambda: second.get_subscription_count() == 1, "both")
+    sample = names.ENCODER.type(name=["x"], position=[0.0])
+    for number in range(12):
+        (second if number == 8 else first).publish(sample)
+        graph.until(lambda n=number: node.session.collector.received["encoder"] == n + 1, "it")
+    assert not node.losses.counts
