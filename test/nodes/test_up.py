@@ -109,8 +109,10 @@ def test_a_calibration_by_words_past_the_death_of_two_nodes(start, tmp_path):
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
 def test_a_killed_command_takes_its_nodes_along(start, tmp_path, number):
-    up = start("up", "--plan", plan_file(tmp_path, small_plan()))
+    up = start("up", "--plan", plan_file(tmp_path, small_plan()), "--journal",
+               str(tmp_path / "journals"))
     up.until("now: Press s to start the plan.")
+    assert len(list((tmp_path / "journals").glob("journal_*/*.mcap"))) == 1
     session = up.process.pid
     up.process.send_signal(number)
     assert up.process.wait(PATIENCE_S) == (143 if number == signal.SIGTERM else -9)
