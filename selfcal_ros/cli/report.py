@@ -34,7 +34,7 @@ def run(args: argparse.Namespace) -> int:
     check_outputs([args.result, args.truth], [output, args.plot])
     check_name(output)
     result = result_from_dict(read_json(args.result), args.result)
-    truth = _read_truth(args.truth) if args.truth else None
+    truth = read_truth(args.truth) if args.truth else None
     if args.plot:
         save_map_plot(result, args.plot, truth=truth)
     write_report(result, output, truth=truth)
@@ -46,7 +46,8 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _read_truth(path: str) -> dict:
+def read_truth(path: str) -> dict:
+    """Return the truth in a TRUTH.json; InputError says what is wrong with it."""
     from selfcal_ros.errors import InputError
     from selfcal_ros.files import read_json
 

@@ -192,7 +192,8 @@ def test_every_verb_takes_json_and_is_documented(name):
 
 RUNS = {
     "solve": "solve BAG -o s.json", "batch": "batch BAG -o batch", "diff": "diff S S",
-    "report": "report R", "table": "table R -o t.csv", "plan check": "plan check PLAN",
+    "report": "report R", "plot": "plot R -o t.svg", "table": "table R -o t.csv",
+    "plan check": "plan check PLAN",
     "plan suggest": "plan suggest PLAN", "simulate": "simulate SIM -o made",
     "reproduce": "reproduce qiao --draws 2", "cal export": "cal export R -o f.cal",
     "cal check": "cal check f.cal", "cal eval": "cal eval f.cal --position 1=1 --position 2=2",
@@ -212,9 +213,31 @@ def test_every_verb_prints_one_json_object(bag, tmp_path, capsys, monkeypatch):
     places = {"BAG": bag, "R": "r.json", "S": "s.json", "PLAN": bag.parent / "plan.yaml",
               "SIM": bag.parent / "simulation.yaml",
               "DATA": root / "config/step_diagonal/case_study.csv"}
-    assert set(RUNS) | NEEDS_NODES | {"plot"} >= set(LEAVES)
+    assert set(RUNS) | NEEDS_NODES == set(LEAVES)
     for name, line in RUNS.items():
         words = [str(places.get(word, word)) for word in line.split()]
         assert main([*words, "--json"]) in (0, 5), name
         found = json.loads(capsys.readouterr().out)
         assert isinstance(found, dict) and found, name
+
+
+@pytest.mark.parametrize(("kind", "begins"), [("png", b"\x89PNG"), ("svg", b"<?xml"),
+                                              ("pdf", b"%PDF")])
+def test_the_picture_of_a_result_is_what_its_ending_says_and_repeatable(tmp_path, capsys, kind,
+                                                                        begins):
+    write_json(tmp_path / "r.json", result_to_dict(known_result(5, 8)[0]))
+    data = []
+    for name in ("a", "b"):
+        path = tmp_path / f"{name}.{kind}"
+        assert main(["plot", str(tmp_path / "r.json"), "-o", str(path), "--json"]) == 0
+        assert json.loads(capsys.readouterr().out) == {"written": str(path), "kind": kind}
+        data.append(path.read_bytes())
+    assert data[0] == data[1] and data[0].startswith(begins) and len(data[0]) > 5000
+
+
+def test_a_picture_of_no_kind(tmp_path, capsys):
+    write_json(tmp_path / "r.json", result_to_dict(known_result(5, 8)[0]))
+    assert main(["plot", str(tmp_path / "r.json"), "-o", str(tmp_path / "a.gif")]) == 2
+    assert capsys.readouterr() == ("", (
+        f"selfcal plot: {tmp_path / 'a.gif'}: no kind of picture by its ending; name a file that "
+        "ends in .png, .svg or .pdf\n"))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Picture of a calibration: error vectors and angular error, as PNG."""
+"""Picture of a calibration: error vectors and angular error, as PNG, SVG or PDF."""
 
 import io
 import os
@@ -24,33 +24,40 @@ from selfcal_ros.reporting.summary.numbers import truth_arrays
 from selfcal_ros.reporting.summary.text import state_sentence
 
 DPI = 150
+KINDS: dict[str, dict[str, str | None]] = {
+    ".png": {"Software": f"selfcal {__version__}"},
+    ".svg": {"Creator": f"selfcal {__version__}", "Date": None},
+    ".pdf": {"Creator": f"selfcal {__version__}", "CreationDate": None}}
+"""Endings of pictures, and what is written into them: no date, so that they are repeatable."""
 
 
 def save_map_plot(result: CalibrationResult, path: str | os.PathLike, *,
                   truth: Mapping[str, np.ndarray] | None = None) -> None:
-    """Write a PNG with the XY error vectors and the polar angular error to `path`, atomically.
+    """Write a picture with the XY error vectors and the polar angular error to `path`, atomically.
 
     Parameters
     ----------
     result : CalibrationResult
         What was found; unknown sites and lines are left out.
     path : path-like
-        PNG file to write.
+        File to write; .png, .svg or .pdf.
     truth : mapping, optional
         ``gx``, ``gy`` (nx, ny) in m and ``g_theta`` (K,) in rad, drawn beneath.
 
     Raises
     ------
     InputError
-        If `truth` does not fit the map, the name does not end in .png, or the file cannot be
-        written.
+        If `truth` does not fit the map, the name does not end in one of `KINDS`, or the file
+        cannot be written.
     """
-    if Path(path).suffix.lower() != ".png":
-        raise InputError(str(path), "the picture is a PNG", "name a file that ends in .png")
+    kind = Path(path).suffix.lower()
+    if kind not in KINDS:
+        raise InputError(str(path), "no kind of picture by its ending",
+                         "name a file that ends in .png, .svg or .pdf")
     truth = truth_arrays(result.error_map, truth)
     with rc_context(RC):
         figure = _whole_figure(result, truth)
-        data = _render(figure)
+        data = _render(figure, kind)
     write_bytes(path, data)
 
 
@@ -86,7 +93,7 @@ def _legend(axes: PolarAxes) -> None:
                 fontsize=9)
 
 
-def _render(figure: Figure) -> bytes:
+def _render(figure: Figure, kind: str) -> bytes:
     buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=DPI, metadata={"Software": f"selfcal {__version__}"})
+    figure.savefig(buffer, format=kind.lstrip("."), dpi=DPI, metadata=KINDS[kind])
     return buffer.getvalue()

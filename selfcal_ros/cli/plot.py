@@ -1,0 +1,37 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``selfcal plot``: the maps of a result as one picture."""
+
+import argparse
+
+from selfcal_ros.cli.terminal.output import add_json, say
+
+HELP = "draw the maps of a result: png, svg or pdf"
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the verb."""
+    parser.add_argument("result", metavar="RESULT.json", help="result that `selfcal solve` wrote")
+    parser.add_argument("-o", "--output", metavar="FILE.png|.svg|.pdf", required=True,
+                        help="picture to write; its ending says which kind")
+    parser.add_argument("--truth", metavar="TRUTH.json",
+                        help="known truth to compare with: gx, gy in m, g_theta in rad")
+    add_json(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Read the result, draw, say where it is."""
+    from pathlib import Path
+
+    from selfcal_ros.cli.report import read_truth
+    from selfcal_ros.errors import ExitCode
+    from selfcal_ros.files import check_outputs, read_json
+    from selfcal_ros.model.result import result_from_dict
+    from selfcal_ros.reporting.maps.plot import save_map_plot
+
+    check_outputs([args.result, args.truth], [args.output])
+    result = result_from_dict(read_json(args.result), args.result)
+    truth = read_truth(args.truth) if args.truth else None
+    save_map_plot(result, args.output, truth=truth)
+    say(args, f"written: {args.output}",
+        {"written": args.output, "kind": Path(args.output).suffix.lower().lstrip(".")})
+    return int(ExitCode.DONE)
