@@ -225,11 +225,11 @@ class Compensator:
         """Apply `field` block by block to broadcast positions."""
         x, y = np.broadcast_arrays(*(np.asarray(p, dtype=float) for p in position))
         shape, x, y = x.shape, x.ravel(), y.ravel()
-        out = np.empty((2, x.size))
+        out_x, out_y = np.empty(x.size), np.empty(x.size)
         for start in range(0, x.size, block):
             part = slice(start, start + block)
-            out[0, part], out[1, part] = field(x[part], y[part])
-        return out[0].reshape(shape), out[1].reshape(shape)
+            out_x[part], out_y[part] = field(x[part], y[part])
+        return out_x.reshape(shape), out_y.reshape(shape)
 
     def _refuse_outside(self, x_m: ArrayLike, y_m: ArrayLike) -> None:
         if self.outside == "clamp":

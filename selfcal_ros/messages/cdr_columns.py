@@ -172,10 +172,8 @@ def _take(layout: Layout, index: np.ndarray, rows: np.ndarray,
     """Add the messages of a layout to `groups` and return the others."""
     table = rows.view(layout.dtype)
     good = layout.matches(table)
-    if good.all():
-        if len(index):
-            groups.append(Columns(index, layout, table))
-        return index[:0], rows[:0]
-    if good.any():
+    if len(index) and good.all():  # as they are, without a copy
+        groups.append(Columns(index, layout, table))
+    elif good.any():
         groups.append(Columns(index[good], layout, table[good]))
     return index[~good], rows[~good]

@@ -65,7 +65,7 @@ class Artifact:
     @property
     def half(self) -> tuple[int, int]:
         """Largest index along x and y: h = (N-1)/2."""
-        return (self.shape[0] - 1) // 2, (self.shape[1] - 1) // 2
+        return self.shape[0] // 2, self.shape[1] // 2  # both are odd
 
     @cached_property
     def m(self) -> np.ndarray:

@@ -209,3 +209,15 @@ def test_flat_keys_reach_their_fields():
     assert settings == CellSettings(Sense.PLATE_MOVES, stop_sigma_m=1e-5)
     spread = spread_of({"encoder": "xy_axes", "drift_cubic": 1e-7, "phi": 0.0, "stop_sigma": 1})
     assert spread == Spread(encoder="xy_axes", drift_cubic_m=1e-7, phi_rad=0.0)
+
+
+def test_a_simulated_cell_is_by_default_what_a_simulation_is_but_for_hus_noise():
+    cell, spread = CellSettings(), Spread()
+    fields = {key: getattr(cell, field) for key, (field, _) in (NOISE | CELL).items()}
+    fields |= {key: getattr(spread, field) for key, (field, _) in PHYSICS.items()}
+    fields |= {key: getattr(spread, TRUTH[key][0]) for key in ("encoder", "rotation")}
+    fields |= {"sigma_xy": 20e-9, "sigma_theta": np.radians(0.001)}
+    shared = {parameter.name: parameter.default for parameter in NODE_PARAMETERS["stage_simulator"]
+              if parameter.name in fields}
+    assert len(shared) > 25
+    assert shared == {key: fields[key] for key in shared}

@@ -108,7 +108,7 @@ class HuLaw:
         """
         step = np.stack([np.broadcast_to(self.y, (*self.artifact.shape, 1)),
                          np.broadcast_to(-self.x, (*self.artifact.shape, 1))])[:, :-1]
-        quarter = np.zeros((2 * self.x.shape[0] * self.x.shape[1], 1))
+        quarter = np.zeros((2 * self.x.size, 1))
         right = np.concatenate([quarter, *(_columns(np.diff(part, axis=axis))
                                            for part in step for axis in (0, 1))])
         rest = self.solve_xy(right, np.zeros((6, 1)))[1][:, 0]

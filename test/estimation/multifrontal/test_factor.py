@@ -4,6 +4,7 @@
 import numpy as np
 import pytest
 
+from selfcal_ros.estimation.multifrontal import dissection
 from selfcal_ros.estimation.normal.grid import GridSystem
 from selfcal_ros.model.view import LatticePose
 
@@ -46,8 +47,14 @@ def dense(grid):
 
 @pytest.mark.parametrize("shape", [(7, 7), (9, 5), (15, 11)])
 @pytest.mark.parametrize("poses", SETS)
-def test_solution_and_diagonal_of_the_inverse_are_those_of_the_dense_matrix(poses, shape):
+@pytest.mark.parametrize("leaf", [4, 12, dissection.LEAF])
+def test_solution_and_diagonal_of_the_inverse_are_those_of_the_dense_matrix(
+        poses, shape, leaf, monkeypatch):
+    """With small leaves there are fronts on many levels, as on large fields."""
+    monkeypatch.setattr(dissection, "LEAF", leaf)
     grid = grid_of(poses, shape, 3)
+    if (leaf, poses, shape) == (4, SETS[0], (15, 11)):
+        assert len(grid.factor.dissection.fronts) > 6
     inverse = np.linalg.inv(dense(grid))
     size = np.abs(inverse).max()
     np.testing.assert_allclose(grid.factor.inverse_diagonal(), np.real(np.diag(inverse)),
