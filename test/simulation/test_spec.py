@@ -93,8 +93,8 @@ def test_a_seed_gives_the_same_messages(tmp_path):
 @pytest.mark.parametrize(("data", "message"), [
     ("[1]", ": not a mapping; see docs/simulate.md"),
     ({}, ": the key 'plan' is missing; name a PLAN.yaml"),
-    ({"plan": PLAN, "sed": 1}, ": sed: unknown key; known are plan, truth, physics, noise, "
-     "cell, faults, seed, start_time, compression"),
+    ({"plan": PLAN, "sed": 1}, ": sed: unknown key; did you mean 'seed'? known are plan, truth, "
+     "physics, noise, cell, faults, seed, start_time, compression"),
     ({"plan": {**PLAN, "views": []}}, ": plan: the plan has no views; add at least one view"),
     ({"plan": True}, ": plan: not a mapping of keys to values; see config/plans for examples"),
     ({"plan": PLAN, "truth": 5}, ": truth: not a mapping; see docs/simulate.md"),
