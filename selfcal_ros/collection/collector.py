@@ -32,8 +32,9 @@ from selfcal_ros.model.view import View
 
 MOST_NAMES = 20
 """Names of foreign joints that are remembered."""
-SETTLE_EVERY = 100_000
-"""Messages after which exposures are looked up, whether or not anybody asks for readings."""
+SETTLE_EVERY, SPARE = 100_000, 8
+"""Samples, or as many times `SPARE` detections, after which exposures are looked up, whether or
+not anybody asks for readings: the samples beside them should still be in memory."""
 
 
 @dataclass(frozen=True)
@@ -203,7 +204,7 @@ class Collector:
         """Take many detections: a structured array of `reduce.DETECTION`."""
         self.received["detection"] += len(table)
         self._views.append(table)
-        self._grow(len(table))
+        self._grow(len(table) // SPARE)
 
     def _grow(self, count: int) -> None:
         """Look up exposures now and then, while the samples beside them are in memory."""

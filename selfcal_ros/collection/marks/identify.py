@@ -113,7 +113,7 @@ def identify_grid(artifact: Artifact, view: View, reading_m: np.ndarray, *, ids:
     about = (site - np.array(pose.shift)[:, None]) * pitch
     limit = min(rules.max_deviation_m, pitch / 4)
     number = marks[0] * (2 * artifact.half[1] + 1) + marks[1]
-    if len(np.unique(number[~far & ~ambiguous & ~unsure])) < 3:
+    if _at_most_two(number[~far & ~ambiguous & ~unsure]):
         limit = pitch / 4  # too few marks to know the view's own rotation and offset
     residual = deviation - rigid.at(about)
     far |= ~ambiguous & (np.hypot(*residual) > limit)
@@ -125,6 +125,11 @@ def identify_grid(artifact: Artifact, view: View, reading_m: np.ndarray, *, ids:
     reasons[(np.abs(site) > half).any(axis=0) & ~unsure] = Reason.NOT_IN_VIEW
     reasons[named_unknown] = Reason.UNKNOWN_MARK
     return MarkAssignment(marks, deviation, residual, reasons, rigid, fit.phi_error_rad)
+
+
+def _at_most_two(numbers: np.ndarray) -> bool:
+    """Return whether the numbers have no more than two different values."""
+    return not len(numbers) or bool(((numbers == numbers.min()) | (numbers == numbers.max())).all())
 
 
 def _astray(pose, marks: np.ndarray, stage_m: np.ndarray | None, artifact: Artifact,

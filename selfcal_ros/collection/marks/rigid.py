@@ -161,7 +161,8 @@ def fit_motion(p: np.ndarray, deviation: np.ndarray) -> RigidFit:
         cross = _cross(arm, deviation[:, keep] - mean[:, None]).sum()
         rigid = _through(_turn(cross / power) if power > 0 else 0.0, tuple(middle), mean)
     rest = deviation[:, keep] - rigid.at(p[:, keep])
-    marks = len(np.unique(p[0, keep] + 1j * p[1, keep]))
+    where = p[0, keep] + 1j * p[1, keep]
+    marks = len(np.unique(where[np.diff(where, prepend=np.nan) != 0]))
     share = marks / keep.sum()  # repeats of a mark are no further marks
     return RigidFit(rigid, (float(middle[0]), float(middle[1])), marks, float(power * share),
                float((rest**2).sum() * share))
