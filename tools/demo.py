@@ -6,6 +6,7 @@ from pathlib import Path
 
 from selfcal_ros.bagio.simulated import read_truth
 from selfcal_ros.cli.main import main as selfcal
+from selfcal_ros.cli.terminal.map_picture import map_picture
 from selfcal_ros.files import read_json
 from selfcal_ros.model.result import result_from_dict
 from selfcal_ros.reporting.maps.plot import save_map_plot
@@ -27,8 +28,10 @@ def main() -> int:
     save_map_plot(result, FOLDER / "map.png", truth=read_truth(BAG))
     selfcal(["report", str(output), "-o", str(FOLDER / "report.html"),
              "--truth", str(BAG / "truth.json")])
+    if sys.stdout.isatty():
+        print("\n".join(["", *map_picture(result.error_map), ""]))
     for name, what in (("result.json", "the result"), ("map.png", "picture of the map"),
-                       ("report.html", "report")):
+                       ("report.html", "report: open it")):
         print(f"{what:18} {(FOLDER / name).relative_to(ROOT)}")
     return 0
 
