@@ -1,0 +1,161 @@
+#!/usr/bin/env python3
+# SPDX-License-Identifier: Apache-2.0
+"""A complete machine cell for selfcal_ros in one file: replace `Machine` by your own drivers.
+
+The node tells where the encoders say the stage is, carries out view commands, and tells where its
+microscope saw each mark. It imports nothing of selfcal_ros but the messages. Run it with
+
+    .venv/bin/python examples/cell.py            # or: python3 examples/cell.py with ROS 2 sourced
+"""
+
+import math
+import random
+from collections.abc import Iterator
+
+import rclpy
+from rclpy.executors import ExternalShutdownException
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from selfcal_msgs.msg import MarkDetection, ViewCommand
+from sensor_msgs.msg import JointState
+
+Position = tuple[float, float, float]
+"""Indicated x, y (m) and theta (rad) in the stage frame."""
+
+
+class Machine:
+    """What you replace: a stage with wrong encoders, a plate with wrong marks, a microscope."""
+
+    def __init__(self, seed: int = 1) -> None:
+        self._random = random.Random(seed)
+        self.position: Position = (0.0, 0.0, 0.0)
+        self._plate: dict = {}
+        self._laid = (0.0, 0.0, 0.0)
+
+    def move_to(self, position: Position) -> None:
+        """Go to a commanded position and come to rest."""
+        self.position = position
+
+    def lay_plate(self) -> None:
+        """Lay the plate down anew: half a millirad and 20 um beside where it should be."""
+        self._laid = tuple(self._random.gauss(0, s) for s in (5e-4, 2e-5, 2e-5))
+
+    def error(self, x: float, y: float) -> tuple[float, float]:
+        """Return what the encoders say too much at (x, y), m: what the calibration shall find."""
+        return (3e-7 * math.sin(120 * x) * math.cos(80 * y), 2e-7 * math.cos(90 * x + 60 * y))
+
+    def angle_error(self, theta: float) -> float:
+        """Return what the rotary encoder says too much, rad."""
+        return 2e-5 * math.sin(theta)
+
+    def see_mark(self, m: int, n: int, view: ViewCommand) -> tuple[float, float]:
+        """Return mark centre less optical axis, stage axes, m: what the image processing gives."""
+        ax, ay = self._plate.setdefault((m, n), (self._random.gauss(0, 3e-7),
+                                                 self._random.gauss(0, 3e-7)))
+        phi, tx, ty = self._laid
+        turn = view.rotation + phi
+        x, y = m * view.grid_pitch + ax, n * view.grid_pitch + ay
+        mark_x = math.cos(turn) * x - math.sin(turn) * y + view.translation_x + tx
+        mark_y = math.sin(turn) * x + math.cos(turn) * y + view.translation_y + ty
+        gx, gy = self.error(*self.position[:2])
+        return (mark_x - (self.position[0] - gx) + self._random.gauss(0, 5e-9),
+                mark_y - (self.position[1] - gy) + self._random.gauss(0, 5e-9))
+
+    def see_line(self, k: int, view: ViewCommand) -> float:
+        """Return line direction less optical axis, rad, counter-clockwise."""
+        a = self._plate.setdefault(k, self._random.gauss(0, 2e-5))
+        line = 2 * math.pi * k / view.angular_count + a + view.rotation + self._laid[0]
+        offset = line - (self.position[2] - self.angle_error(self.position[2]))
+        return math.remainder(offset, 2 * math.pi) + self._random.gauss(0, 1e-7)
+
+
+def grid_sites(view: ViewCommand) -> Iterator[tuple[int, int, Position]]:
+    """Yield the marks (m, n) of a view with the stage position at which each is seen.
+
+    Mark (m, n) lies on the site R^q (m, n) + (a, b). A view includes the marks whose site is in
+    the field, -h <= i, j <= h: a plate that is shifted by one pitch has a row less.
+    """
+    h = (view.grid_size - 1) // 2
+    quarter = round(view.rotation / (math.pi / 2)) % 4
+    a, b = (round(t / view.grid_pitch) for t in (view.translation_x, view.translation_y))
+    for m in range(-h, h + 1):
+        for n in range(-h, h + 1):
+            i, j = ((m, n), (-n, m), (-m, -n), (n, -m))[quarter]
+            i, j = i + a, j + b
+            if max(abs(i), abs(j)) <= h:
+                yield m, n, (i * view.grid_pitch, j * view.grid_pitch, 0.0)
+
+
+class Cell(Node):
+    """Encoders, microscope and the hand that lays the plate, as a ROS node."""
+
+    def __init__(self, machine: Machine | None = None, **kwargs: object) -> None:
+        super().__init__("cell", **kwargs)
+        self.machine = machine or Machine()
+        self._encoder = self.create_publisher(JointState, "stage/joint_states", QoSProfile(
+            depth=1000, reliability=ReliabilityPolicy.RELIABLE))
+        self._marks = self.create_publisher(MarkDetection, "stage/mark_detections", QoSProfile(
+            depth=1000, reliability=ReliabilityPolicy.RELIABLE))
+        # Commands are latched. With a depth of 1 a cell that starts late hears the newest alone,
+        # not every command of the run: an old MEASURE would set it off.
+        self.create_subscription(ViewCommand, "selfcal/view_command", self._on_command, QoSProfile(
+            depth=1, reliability=ReliabilityPolicy.RELIABLE,
+            durability=DurabilityPolicy.TRANSIENT_LOCAL))
+        self._work: Iterator[None] = iter(())
+        self.create_timer(0.002, self._tick)
+
+    def _on_command(self, view: ViewCommand) -> None:
+        self._work = iter(())  # whatever was measured is given up
+        if view.phase == ViewCommand.PLACE:
+            self.machine.lay_plate()  # then confirm_view is called, here by auto_confirm
+        elif view.phase == ViewCommand.MEASURE:
+            self._work = self._measure(view)
+
+    def _tick(self) -> None:
+        """Take one step of the work and tell where the stage is: it rests between two ticks."""
+        next(self._work, None)
+        message = JointState(name=["x", "y", "theta"], position=list(self.machine.position))
+        message.header.stamp = self.get_clock().now().to_msg()
+        self._encoder.publish(message)
+
+    def _measure(self, view: ViewCommand) -> Iterator[None]:
+        """Visit every mark as often as asked: move, rest, expose, rest."""
+        for _ in range(view.repeats):
+            for m, n, position in grid_sites(view) if view.grid else ():
+                yield from self._settle(position)
+                x, y = self.machine.see_mark(m, n, view)
+                self._expose(MarkDetection(kind=MarkDetection.GRID, has_id=True, m=m, n=n,
+                                           offset_x=x, offset_y=y, score=1.0))
+                yield
+            for k in range(view.angular_count) if view.angular else ():
+                yield from self._settle((0.0, 0.0, view.rotation
+                                         + 2 * math.pi * k / view.angular_count))
+                self._expose(MarkDetection(kind=MarkDetection.ANGULAR, has_id=True, k=k,
+                                           offset_theta=self.machine.see_line(k, view), score=1.0))
+                yield
+
+    def _settle(self, position: Position) -> Iterator[None]:
+        """Move, then wait until two encoder samples have told that the stage rests."""
+        self.machine.move_to(position)
+        yield
+        yield
+
+    def _expose(self, seen: MarkDetection) -> None:
+        seen.header.stamp = self.get_clock().now().to_msg()  # the instant of exposure
+        seen.header.frame_id = "stage"
+        self._marks.publish(seen)
+
+
+def main() -> None:
+    """Run the cell until Ctrl-C."""
+    rclpy.init()
+    try:
+        rclpy.spin(Cell())
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    finally:
+        rclpy.try_shutdown()
+
+
+if __name__ == "__main__":
+    main()
