@@ -3,9 +3,9 @@
 SHELL := /bin/bash
 BIN := .venv/bin
 
-.PHONY: setup demo test test-oldest lint bench soak mutants reality pictures clean help
+.PHONY: setup demo test test-oldest lint bench soak mutants reality pictures reference clean help
 help:
-	@echo "make setup | demo | test | test-oldest | lint | bench | soak | mutants | reality | pictures | clean"
+	@echo "make setup | demo | test | test-oldest | lint | bench | soak | mutants | reality | pictures | reference | clean"
 setup:
 	@tools/setup.sh
 demo: setup
@@ -33,6 +33,8 @@ reality: setup  # minutes; e.g. make reality REALITY="--runs 10 --only drift"
 	@$(BIN)/python tools/reality.py $(REALITY)
 pictures: setup  # those of README and docs
 	@$(BIN)/python tools/pictures.py
+reference: setup  # docs/reference.md
+	@$(BIN)/python tools/reference.py
 clean:
 	rm -rf .venv .venv-oldest build install log selfcal_ros.egg-info
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,0 +1,103 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Every command of README and docs is understood, and those that need no cell are run."""
+
+import os
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+
+from selfcal_ros.cli.main import build_parser, main
+
+ROOT = Path(__file__).parents[2]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+COMMAND = re.compile(r"^ *(?:\.venv/bin/)?(selfcal [a-z][^\n`]*?)(?: *# ?(.*))?$", re.M)
+FILE = re.compile(r"```yaml\n# (\w+\.yaml)\n(.*?)```", re.S)
+ONLY_PARSED = {
+    "up": "needs a terminal", "monitor": "needs a cell", "call": "needs a cell",
+    "replay": "run by test/nodes/test_replay.py", "batch": "run by the tests of batch",
+    "reproduce": "takes minutes; run small by test/cli/test_reproduce_verb.py",
+    "plan suggest": "takes long; run small by test/cli/test_plan.py"}
+"""Verbs whose commands are parsed alone, and why."""
+PLACES = ("BAG", "/tmp/session", "$", "qiao_7.yaml", "measured.csv", "FILE.cal", "stage_theta.cal")
+"""Words that stand for something of the reader's."""
+
+
+def commands(text: str) -> list[tuple[str, int]]:
+    """Return the commands in the code of a page, each with the exit code that it says."""
+    code, kind = [], None  # the kind of the fence that we are in
+    for line in text.splitlines():
+        if line.startswith("```"):
+            kind = line[3:] if kind is None else None
+        elif kind in ("", "sh") or (kind is None and line.startswith("    ")):
+            code.append(line)
+    found = []
+    for command, comment in COMMAND.findall("\n".join(code)):
+        said = re.search(r"exit code (\d)", comment)
+        found.append((command.split(" |")[0].strip(), int(said[1]) if said else 0))
+    return found
+
+
+def parsed_alone(command: str) -> bool:
+    return any(command.startswith(f"selfcal {verb}") for verb in ONLY_PARSED) or any(
+        word in command for word in PLACES)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda path: path.name)
+def test_commands_are_understood(page):
+    for command, _ in commands(page.read_text()):
+        words = shlex.split(command)[1:]
+        if "$" not in command:
+            build_parser().parse_args(words)
+
+
+@pytest.fixture
+def desk(tmp_path, monkeypatch):
+    """Go to a folder with what the repository has at its root, and a result."""
+    for name in ("config", "bags"):
+        (tmp_path / name).symlink_to(ROOT / name)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda path: path.name)
+def test_commands_run(page, desk, capsys):
+    text = page.read_text()
+    for name, content in FILE.findall(text):
+        (desk / name).write_text(content)
+    run = [(command, code) for command, code in commands(text) if not parsed_alone(command)]
+    if any("RESULT.json" in command for command, _ in run):
+        assert main(["solve", "bags/hu_noise", "--quiet", "-o", "RESULT.json"]) == 0
+    for command, code in run:
+        words = shlex.split(command)
+        if "-o" in words:  # one of two ways to write the same file
+            (desk / words[words.index("-o") + 1]).unlink(missing_ok=True)
+        found = main(words[1:])
+        error = capsys.readouterr().err
+        assert found == code, f"{page.name}: {command}: {error}"
+
+
+def test_the_tutorial_is_run_from_its_beginning_to_its_end():
+    steps = [command for command, _ in commands((ROOT / "docs/tutorial.md").read_text())]
+    assert sum(not parsed_alone(command) for command in steps) == 9
+    assert {shlex.split(command)[1] for command in steps} == {
+        "plan", "simulate", "solve", "cal", "up"}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda path: path.name)
+def test_links_lead_to_files(page):
+    for address in re.findall(r"\]\(([^)#]+)(?:#[^)]*)?\)", page.read_text()):
+        if not address.startswith("http"):
+            assert os.path.exists(page.parent / address), f"{page.name}: {address}"
+
+
+def test_what_faq_quotes_is_what_the_code_says():
+    """Each quoted message occurs in the source, where values stand for its blanks."""
+    source = re.sub(r'"\s*\n?\s*f?"', "", "".join(
+        path.read_text() for path in sorted((ROOT / "selfcal_ros").rglob("*.py"))))
+    quoted = re.findall(r"^### `(.+)`$", (ROOT / "docs/faq.md").read_text(), re.M)
+    assert len(quoted) >= 12
+    for message in quoted:
+        for part in message.split(" … "):
+            assert part.strip("… ") in source, message

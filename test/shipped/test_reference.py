@@ -1,0 +1,52 @@
+# SPDX-License-Identifier: Apache-2.0
+"""docs/reference.md is what `make reference` writes, and papers of the project agree with it."""
+
+import importlib.util
+from pathlib import Path
+
+import pytest
+import yaml
+
+from selfcal_ros import __version__
+from selfcal_ros.collection.parameters import NODE_PARAMETERS
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture(scope="module")
+def tool():
+    found = importlib.util.spec_from_file_location("reference", ROOT / "tools/reference.py")
+    module = importlib.util.module_from_spec(found)
+    found.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(scope="module")
+def result(tool):
+    return tool.example()
+
+
+def test_the_reference_is_current(tool, result):
+    assert tool.PAGE.read_text() == tool.text(result), "run `make reference`"
+
+
+def test_every_parameter_and_field_is_in_the_reference(tool):
+    page = tool.PAGE.read_text()
+    for parameters in NODE_PARAMETERS.values():
+        assert all(f"| `{p.name}` |" in page for p in parameters)
+    for path in (ROOT / "msg_defs/msg").iterdir():
+        assert f"### {path.stem}\n" in page
+    assert "| `views[].rotation_deg` |" in page and "| `physics.microscope_rotation` | 0 |" in page
+
+
+def test_a_key_that_is_not_described_is_named(tool, result):
+    with pytest.raises(SystemExit, match=r"^RESULT\.json: \['novelty'\]$"):
+        tool.text(result | {"novelty": 1})
+    with pytest.raises(SystemExit, match=r"^PLAN\.yaml: b, c: described and not there"):
+        tool.described(["a", "b"], {"a": "words", "c": "words"}, "PLAN.yaml")
+
+
+def test_the_citation_is_of_this_version_and_names_no_person_as_author():
+    cited = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    assert cited["version"] == __version__ and cited["cff-version"] == "1.2.0"
+    assert cited["authors"] == [{"name": "the selfcal_ros contributors"}]

@@ -1,0 +1,200 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`make reference`: docs/reference.md from the code that reads and writes what it describes."""
+
+import re
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from selfcal_ros.collection.parameters import NODE_PARAMETERS, Parameter
+from selfcal_ros.errors import InputError
+from selfcal_ros.files import write_text
+from selfcal_ros.model.result import result_to_dict
+from selfcal_ros.model.view import plan_from_dict
+from selfcal_ros.simulation import spec
+from selfcal_ros.simulation.faults import Faults
+from selfcal_ros.simulation.machine import Spread
+from selfcal_ros.simulation.settings import CellSettings
+
+ROOT = Path(__file__).parents[1]
+PAGE = ROOT / "docs/reference.md"
+HEAD = """# Reference
+
+Keys of PLAN.yaml, SIM.yaml and RESULT.json, parameters of the nodes, messages. Written by
+`make reference` from the code; a test keeps it current. SI units; names of units stand where a
+number has one.
+"""
+PLAN = {
+    "plan_id": "name of the plan; one plan has one plate",
+    "artifact": "the plate", "views": "list of views, in their order",
+    "visit_order": "order of the marks in views that have none of their own "
+                   "(docs/identifiability.md); default: as the cell likes",
+    "model_terms": "list of TERM or TERM:SIZE that are estimated with the map; default: none",
+    "artifact.grid_size": "N, marks along x; odd, 3 to 4001",
+    "artifact.grid_pitch": "distance between neighbouring marks, m",
+    "artifact.angular_count": "K, angular lines; a multiple of 4, 0 without lines",
+    "artifact.grid_size_y": "marks along y where the plate is not square; default: N",
+    "views[].name": "name, each its own",
+    "views[].rotation_deg": "nominal turn, counter-clockwise, degrees; default 0",
+    "views[].translation_pitch": "[a, b], nominal shift along stage x and y in pitches; "
+                                 "default [0, 0]",
+    "views[].grid": "whether grid marks are measured; needs quarter turns; default true",
+    "views[].angular": "whether angular lines are measured; default: true if the plate has some",
+    "views[].repeats": "times that every mark is measured; default 1",
+    "views[].visit_order": "order of the grid marks in this view"}
+RESULT = {
+    "schema": "`selfcal.result/1`", "plan_id": "plan that was measured",
+    "method": "`joint` or `law`", "measurement_sense": "`microscope_moves` or `plate_moves`",
+    "artifact": "the plate, as in PLAN.yaml", "run_id": "stamp of the run's first command, ns",
+    "verdict": "`qualified`, `sentence`, `reasons`, and `causes` (each name, text, size, u, unit, "
+               "p), the most likely first",
+    "model": "`misalignment` (rigid, linear) and `terms`: name, size (null = free), estimates "
+             "(view, component, value, u, unit)",
+    "reference": "kind, relative_error, u_relative, certificate of a known length; null without",
+    "provenance": "created (ISO 8601, UTC), duration_s, version, first_exposure, last_exposure, "
+                  "visit_order of each view",
+    "dof": "degrees of freedom of the noise behind u: xy, theta",
+    "coverage_factor": "k for 95.45 %: xy, theta",
+    "views": "a list: name, rotation (rad), translation_x, translation_y (m), misalignment {phi "
+             "(rad), tx, ty (m)}, used, rejected, read {grid, angular} (weights of what was read)",
+    "error_map": "gx, gy, u_gx, u_gy: N×N lists in m, [i][j] = site m = i − h, n = j − h, null "
+                 "where not known; g_theta, u_g_theta: K numbers in rad; nonorthogonality, "
+                 "scale_difference, datum_theta",
+    "artifact_map": "ax, ay (m), a_theta (rad) of the plate, as error_map",
+    "observability": "rank, unknowns, deficiency, identifiable, modes, advice",
+    "noise": "sigma_* of one reading (m, rad): used, from repeats, from residuals, declared; "
+             "dof_*; k_*; p_* of the F-test",
+    "rejected": "reason -> number of detections", "warnings": "a list of sentences",
+    "input": "file and sha256 of the bag", "solver": "how the equations were solved",
+    "residuals": "views: view, dx, dy (m, [i][j] by mark, stage axes), dtheta (rad), course "
+                 "{time_s, dx, dy, count} over the view's time"}
+SOMETIMES = {
+    "rejected_at": "where grid detections were rejected: view, reason, x, y (m)",
+    "outliers": "`--robust`: rule, and what was removed", "slips": "`--robust`: slips of the plate",
+    "noisy_views": "`--robust`: views noisier than the others",
+    "validation": "`--validate`: what was held out, and how well it was predicted",
+    "budget": "`--budget`: components of the uncertainty, m and rad",
+    "covariance_terms": "what an exact comparison of results with terms needs"}
+
+
+def table(head: tuple[str, ...], rows: Iterator[tuple[str, ...]] | list) -> list[str]:
+    return ["| " + " | ".join(head) + " |", "|" + "---|" * len(head),
+            *("| " + " | ".join(cell.replace("|", "\\|") for cell in row) + " |" for row in rows)]
+
+
+def known_keys(data: dict, where: str = "p") -> list[str]:
+    """Return the keys that the reader of plans names when it meets another."""
+    try:
+        plan_from_dict(data, where)
+    except InputError as error:
+        return error.remedy.partition("known are ")[2].split(", ")
+    raise AssertionError("an unknown key was taken")
+
+
+def plan_keys() -> list[str]:
+    whole: dict[str, Any] = {"plan_id": "p", "artifact": {
+        "grid_size": 3, "grid_pitch": 0.01, "angular_count": 0}, "views": [{"name": "a"}]}
+    strange = {"?": 1}
+    return [*known_keys(whole | strange),
+            *(f"artifact.{key}" for key in known_keys(whole | {
+                "artifact": whole["artifact"] | strange})),
+            *(f"views[].{key}" for key in known_keys(whole | {"views": [{"name": "a"} | strange]}))]
+
+
+def described(keys: list[str], words: dict[str, str], what: str) -> list[tuple[str, str]]:
+    missing = sorted(set(keys) ^ set(words))
+    if missing:
+        raise SystemExit(f"{what}: {', '.join(missing)}: described and not there, or the reverse")
+    return [(f"`{key}`", words[key]) for key in keys]
+
+
+def sim_rows() -> Iterator[tuple[str, ...]]:
+    for p in spec.TOP:
+        yield f"`{p.name}`", value(p.default), bounds(vars(p)), p.unit
+    yield "`plan`", "", "a path beside the file, or a plan", ""
+    for name, section, default in (
+            ("truth", spec.TRUTH, Spread()), ("physics", spec.PHYSICS, Spread()),
+            ("noise", spec.NOISE, CellSettings()), ("cell", spec.CELL, CellSettings()),
+            ("faults", spec.FAULTS, Faults())):
+        for key, (field, limits) in section.items():
+            yield (f"`{name}.{key}`", value(getattr(default, field)), bounds(limits),
+                   str(limits.get("unit", "")))
+
+
+def value(item: Any) -> str:
+    if isinstance(item, bool):
+        return str(item).lower()
+    return f"{item:g}" if isinstance(item, float) else str(item) or "empty"
+
+
+def bounds(limits: dict[str, Any]) -> str:
+    if limits.get("choices"):
+        return ", ".join(map(str, limits["choices"]))
+    low, high = limits.get("low"), limits.get("high")
+    return "" if low is None or high is None else f"{low:g} to {high:g}"
+
+
+def parameter_row(p: Parameter) -> tuple[str, ...]:
+    return f"`{p.name}`", value(p.default), bounds(vars(p)), p.unit, p.description
+
+
+def message_lines(path: Path) -> list[str]:
+    """Return the table of a message, service or action; its parts are divided by a row."""
+    rows = []
+    for line in path.read_text().splitlines():
+        found = re.match(r"([a-z]\S*)\s+(\w+(?:=\S+)?)\s*(?:#\s*(.*))?$", line)
+        if found:
+            rows.append((f"`{found[2]}`", f"`{found[1]}`", found[3] or ""))
+        elif line == "---":
+            rows.append(("—", "", "what follows is the answer"))
+    return [f"### {path.stem}", "", *table(("field", "type", "meaning"), rows), ""]
+
+
+def text(result: dict[str, Any]) -> str:
+    """Return the page; `result` is the JSON form of a result."""
+    unknown = set(result) - set(RESULT)
+    if unknown or set(RESULT) - set(result):
+        raise SystemExit(f"RESULT.json: {sorted(unknown ^ (set(RESULT) - set(result)))}")
+    lines = [HEAD, "## PLAN.yaml", "",
+             *table(("key", "meaning"), described(plan_keys(), PLAN, "PLAN.yaml")), "",
+             "## SIM.yaml", "", "What the keys mean: docs/simulate.md.", "",
+             *table(("key", "default", "allowed", "unit"), sim_rows()), "",
+             "## RESULT.json", "", *table(("key", "meaning"), described(
+                 list(result), RESULT, "RESULT.json")), "",
+             "Only where they were asked for, or there is something to tell:", "",
+             *table(("key", "meaning"), [(f"`{k}`", v) for k, v in SOMETIMES.items()]), "",
+             "## Parameters", ""]
+    for node, parameters in NODE_PARAMETERS.items():
+        lines += [f"### {node}", "", *table(("parameter", "default", "allowed", "unit", "meaning"),
+                                            map(parameter_row, parameters)), ""]
+    lines += ["## Messages, services, action", ""]
+    for folder in ("msg", "srv", "action"):
+        for path in sorted((ROOT / "msg_defs" / folder).iterdir()):
+            lines += message_lines(path)
+    return "\n".join(lines).rstrip() + "\n"
+
+
+def example() -> dict[str, Any]:
+    """Return the RESULT.json of a small simulated measurement."""
+    import numpy as np
+
+    from selfcal_ros.estimation.api import calibrate
+    from selfcal_ros.model.artifact import Artifact
+    from selfcal_ros.simulation.truth import hu_plan, random_truth, simulate_measurements
+
+    rng = np.random.default_rng(1)
+    plan = hu_plan(Artifact(5, 0.01, 8), 2)
+    truth = random_truth(plan.artifact, len(plan.views), rng)
+    return result_to_dict(calibrate(simulate_measurements(truth, plan, rng, sigma_m=1e-8,
+                                                          sigma_theta_rad=1e-6)))
+
+
+def main() -> int:
+    write_text(PAGE, text(example()))
+    print(PAGE.relative_to(ROOT))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
