@@ -3,6 +3,7 @@
 
 import io
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import matplotlib
@@ -27,7 +28,7 @@ def save_hu_plots(found: HuReproduction, folder: Path) -> list[Path]:
     for run in found.runs:
         for name, columns in zip(run.published.figures, ((0, 1), (2,)), strict=True):
             path = folder / f"hu_{name.lower().replace(' ', '_')}.png"
-            paths.append(_save(path, lambda fig, r=run, n=name, c=columns: _series(fig, r, n, c)))
+            paths.append(_save(path, partial(_series, run=run, name=name, columns=columns)))
     return paths
 
 

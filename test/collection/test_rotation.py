@@ -13,7 +13,7 @@ from selfcal_ros.collection.marks.identify import (
     identify_angular,
     identify_grid,
 )
-from selfcal_ros.collection.marks.rigid import LARGEST_TURN_RAD, Rigid, fit_motion
+from selfcal_ros.collection.marks.rigid import LARGEST_TURN_RAD, MotionEstimate, Rigid, fit_motion
 from selfcal_ros.collection.messages import Kind
 from selfcal_ros.collection.reasons import Reason, advice
 from selfcal_ros.model.artifact import Artifact
@@ -264,3 +264,10 @@ def test_grid_marks_that_disagree_leave_fine_lines_unread():
     assert found.all_rejected()["rotation_not_known"] == 360
     few = [e for e in events if e not in grid[3:]]
     assert collect(few)[0].all_rejected() == {}
+
+
+def test_a_prediction_is_the_less_sure_the_further_it_lies_from_where_the_offset_is_known():
+    at = np.array([[0.3, 0.0], [0.4, 0.0]])
+    assert MotionEstimate(phi_error_rad=0.01).error_at(at) == pytest.approx([5e-3, 0.0])
+    known = MotionEstimate(Rigid(), (0.3, 0.0), 1e-6, 0.01)
+    assert known.error_at(at) == pytest.approx([1e-6 + 4e-3, 1e-6 + 3e-3])

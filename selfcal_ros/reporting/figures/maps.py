@@ -128,7 +128,7 @@ def _reach(emap: ErrorMap, truth: Mapping[str, np.ndarray] | None, factor: float
             continue
         for key, at, half in (("gx", artifact.m, artifact.half[0]),
                               ("gy", artifact.n, artifact.half[1])):
-            g = getattr(emap, key) if field is emap else np.asarray(truth[key])  # type: ignore[index]
+            g = getattr(emap, key) if isinstance(field, ErrorMap) else np.asarray(field[key])
             ends = np.abs(at + g * factor / artifact.grid_pitch_m)
             known = ends[np.isfinite(ends)]
             most = max(most, float(known.max()) - half if known.size else 0.0)
@@ -136,7 +136,7 @@ def _reach(emap: ErrorMap, truth: Mapping[str, np.ndarray] | None, factor: float
 
 
 def _finish(frame: Frame, title: str, scale: Scale) -> None:
-    frame.axes(**AXES)
+    frame.axes(x_label=AXES["x_label"], y_label=AXES["y_label"])
     left, top, width, height = frame.box
     frame.drawing.label(0, 16, title, size=13, bold=True)
     scale_bar(frame.drawing, scale, (left + width + 16, top, 14.0, height))
@@ -165,8 +165,8 @@ def _spots(frame: Frame, emap: ErrorMap) -> None:
         return
     radius = 0.45 * artifact.grid_pitch_m * MM_PER_M * frame.per_x
     for index in np.ndindex(artifact.shape):
-        x, y = artifact.x_m[index] * MM_PER_M, artifact.y_m[index] * MM_PER_M
-        g, u = ((_um(a[index]), _um(b[index])) for a, b in ((emap.gx, emap.gy),
+        x, y = (float(part[index]) * MM_PER_M for part in (artifact.x_m, artifact.y_m))
+        g, u = ((_um(float(a[index])), _um(float(b[index]))) for a, b in ((emap.gx, emap.gy),
                                                             (emap.u_gx, emap.u_gy)))
         frame.drawing.spot(*frame.at(x, y), radius,
                            f"x {x:.6g} mm, y {y:.6g} mm: Gx {g[0]} µm, Gy {g[1]} µm, "

@@ -6,11 +6,13 @@ import os
 from collections.abc import Mapping
 from pathlib import Path
 from textwrap import fill
+from typing import Any
 
 import numpy as np
 from matplotlib import rc_context
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.projections.polar import PolarAxes
 
 from selfcal_ros import __version__
@@ -63,15 +65,15 @@ def save_map_plot(result: CalibrationResult, path: str | os.PathLike, *,
 
 def _whole_figure(result: CalibrationResult, truth: Mapping[str, np.ndarray] | None) -> Figure:
     wide = result.artifact.angular_count > 0
-    figure = Figure(figsize=(14.4 if wide else 8, 7.8), layout="constrained")
+    figure = Figure(figsize=(14.4 if wide else 8, 7.8),
+                    layout=ConstrainedLayoutEngine(rect=(0, 0.04, 1, 0.86)))
     FigureCanvasAgg(figure)
     axes = figure.add_subplot(1, 2 if wide else 1, 1)
     draw_error_map(axes, result.error_map, truth=truth)
     if wide:
-        polar = figure.add_subplot(1, 2, 2, projection="polar")
+        polar: Any = figure.add_subplot(1, 2, 2, projection="polar")
         draw_theta(polar, result.error_map, truth=truth)
         _legend(polar)
-    figure.get_layout_engine().set(rect=(0, 0.04, 1, 0.86))
     figure.text(0.5, 0.985, fill(drawable(state_sentence(result)), 140 if wide else 78),
                 ha="center", va="top", fontsize=11.5, fontweight="bold", linespacing=1.35)
     figure.text(0.01, 0.01, _footer(result), ha="left", va="bottom", fontsize=8,

@@ -2,6 +2,7 @@
 """Colours, text and round numbers that the pictures share; readable in grey and colour-blind."""
 
 import math
+from typing import Any
 
 from matplotlib.colors import Colormap, LinearSegmentedColormap
 from matplotlib.font_manager import FontProperties, findfont, get_font
@@ -16,10 +17,11 @@ BAND_EDGE = "#0072b2"
 GRID = "#c4ccd4"
 UNKNOWN_SITE = "#e3e3e3"
 
-RC = {"font.family": "DejaVu Sans", "font.size": 10, "axes.titlesize": 11, "axes.edgecolor": INK,
-      "axes.labelcolor": INK, "text.color": INK, "xtick.color": INK, "ytick.color": INK,
-      "axes.linewidth": 0.8, "svg.hashsalt": "selfcal", "svg.fonttype": "path",
-      "text.parse_math": False, "savefig.facecolor": "white", "figure.facecolor": "white"}
+RC: dict[Any, Any] = {
+    "font.family": "DejaVu Sans", "font.size": 10, "axes.titlesize": 11, "axes.edgecolor": INK,
+    "axes.labelcolor": INK, "text.color": INK, "xtick.color": INK, "ytick.color": INK,
+    "axes.linewidth": 0.8, "svg.hashsalt": "selfcal", "svg.fonttype": "path",
+    "text.parse_math": False, "savefig.facecolor": "white", "figure.facecolor": "white"}
 """Settings of every picture; the fixed salt makes SVG files repeatable."""
 
 

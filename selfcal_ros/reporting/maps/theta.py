@@ -59,7 +59,8 @@ def _finish(axes: PolarAxes, values: np.ndarray) -> None:
     axes.set_rorigin(-2.2 * span)
     axes.plot(np.linspace(0, 2 * np.pi, 361), np.zeros(361), color=INK, linewidth=0.8,
               linestyle=(0, (4, 3)), zorder=1.5, label="no error")
-    ticks = MaxNLocator(4, symmetric=True, steps=[1, 2, 5, 10]).tick_values(-span, span)
+    ticks = np.asarray(MaxNLocator(4, symmetric=True, steps=[1, 2, 5, 10]).tick_values(
+        -span, span))
     ticks = ticks[np.abs(ticks) <= span]
     axes.set_yticks(ticks, [""] * len(ticks))
     for tick in ticks:

@@ -4,6 +4,7 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -35,7 +36,7 @@ class Arrows:
     """What is drawn of a field: sites (mm), vectors (m), and how much they are magnified."""
 
     step: int
-    sites: tuple[slice, slice]
+    sites: tuple[slice, ...]
     x_mm: np.ndarray
     y_mm: np.ndarray
     magnification: float
@@ -98,7 +99,7 @@ def draw_error_map(axes: Axes, emap: ErrorMap, *, truth: Mapping[str, np.ndarray
                 borderaxespad=0.3, handlelength=1.6, columnspacing=1.4)
 
 
-def _entry(label: str, **style: object) -> Line2D:
+def _entry(label: str, **style: Any) -> Line2D:
     return Line2D([], [], label=label, **style)
 
 
@@ -133,13 +134,14 @@ def _draw_lattice(axes: Axes, artifact: Artifact, arrows: Arrows) -> None:
     axes.hlines(arrows.y_mm[0], -hx, hx, color=GRID, linewidth=0.5, zorder=1)
 
 
-def _quiver(axes: Axes, arrows: Arrows, g_m: tuple[np.ndarray, np.ndarray], *, color: str,
+def _quiver(axes: Axes, arrows: Arrows, g_m: tuple[np.ndarray, ...], *, color: str,
             zorder: float, thicker: float = 1.0, head: bool = True) -> Quiver:
     gx, gy = (part[arrows.sites] * (MM_PER_M * arrows.magnification) for part in g_m)
     known = np.isfinite(gx) & np.isfinite(gy)
     width = 0.012 / math.sqrt(max(gx.shape)) * thicker
-    shape = ({"headwidth": 3.4, "headlength": 4.2, "headaxislength": 3.8} if head else
-             {"headwidth": 1, "headlength": 0, "headaxislength": 0})
+    shape: dict[str, Any] = (
+        {"headwidth": 3.4, "headlength": 4.2, "headaxislength": 3.8} if head else
+        {"headwidth": 1, "headlength": 0, "headaxislength": 0})
     return axes.quiver(arrows.x_mm[known], arrows.y_mm[known], gx[known], gy[known], angles="xy",
                        scale_units="xy", scale=1, units="width", width=width, minlength=0.3,
                        color=color, zorder=zorder, **shape)

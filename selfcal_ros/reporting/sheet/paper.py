@@ -7,7 +7,7 @@ from matplotlib.patches import PathPatch
 from matplotlib.path import Path as Outline
 
 from selfcal_ros.reporting.maps.style import drawable
-from selfcal_ros.reporting.sheet.drawing import Discs, Drawing, Label, Path
+from selfcal_ros.reporting.sheet.drawing import Discs, Drawing, Label, Path, Point
 from selfcal_ros.reporting.sheet.palette import COLOURS
 
 
@@ -40,7 +40,8 @@ def _light(name: str) -> str:
 
 
 def _path(item: Path, axes: Axes, points: float, order: int) -> None:
-    vertices, codes = [], []
+    vertices: list[Point] = []
+    codes: list = []
     for line in item.lines:
         vertices += line
         codes += [Outline.MOVETO, *[Outline.LINETO] * (len(line) - 1)]

@@ -146,7 +146,7 @@ def truth_figures(emap: ErrorMap, truth: Mapping[str, np.ndarray]) -> TruthFigur
     InputError
         If an array is missing or of another shape.
     """
-    artifact, true = emap.artifact, truth_arrays(emap, truth)
+    artifact, true = emap.artifact, truth_arrays(emap, truth) or {}
     difference = np.stack([emap.gx - true["gx"], emap.gy - true["gy"]])
     if np.isfinite(difference).all(axis=0).any():
         difference = remove_modes(difference, datum_modes(artifact, scale=True))
