@@ -3,9 +3,9 @@
 SHELL := /bin/bash
 BIN := .venv/bin
 
-.PHONY: setup demo test test-oldest lint bench soak mutants reality pictures reference clean help
+.PHONY: setup demo test test-oldest lint bench soak chaos mutants reality pictures reference clean help
 help:
-	@echo "make setup | demo | test | test-oldest | lint | bench | soak | mutants | reality | pictures | reference | clean"
+	@echo "make setup | demo | test | test-oldest | lint | bench | soak | chaos | mutants | reality | pictures | reference | clean"
 setup:
 	@tools/setup.sh
 demo: setup
@@ -27,6 +27,8 @@ bench: setup
 	@PYTHONPATH=build/rivals $(BIN)/python test/bench/run.py
 soak: setup  # e.g. make soak HOURS=8 SIZE=21
 	@$(BIN)/python tools/soak.py --hours $(or $(HOURS),1) --size $(or $(SIZE),21)
+chaos: setup  # minutes; e.g. make chaos ROUNDS=3 SEED=7
+	@$(BIN)/python tools/chaos.py $(if $(ROUNDS),--rounds $(ROUNDS)) $(if $(SEED),--seed $(SEED))
 mutants: setup  # e.g. make mutants MUTANTS="--number 200 --only selfcal_ros/estimation"
 	@$(BIN)/python tools/mutants.py $(MUTANTS)
 reality: setup  # minutes; e.g. make reality REALITY="--runs 10 --only drift"

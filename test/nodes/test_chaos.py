@@ -1,0 +1,45 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A round of `make chaos`, short, and that its judgement sees what is wrong."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from selfcal_ros.collection.messages import Detection
+from test.support.chaos import HARMLESS, one_round, story
+
+
+def test_nothing_is_lost_without_a_word_and_the_maps_are_the_right_ones(ros_environment, tmp_path):
+    lines, wrong = one_round(2, ros_environment, tmp_path, kills=1)
+    assert wrong == []
+    assert [line.partition(":")[0] for line in lines] == ["quiet_messages", "lost_messages"]
+    assert all(" used + " in line and "killed " in line for line in lines)
+
+
+class Result:
+    """A cell whose result is known."""
+
+    namespace, folder = "cell", None
+
+    def __init__(self):
+        self.found = {}
+
+    def saved(self):
+        return self.found
+
+
+def test_the_judgement_sees_a_detection_that_is_not_accounted_for_and_another_map():
+    cell = Result()
+    told = story(cell, HARMLESS, np.random.default_rng(1), kills=0)
+    sent = sum(isinstance(event, Detection) for event in told.arriving)
+    nothing = {name: [0.0] for name in ("gx", "gy", "u_gx", "u_gy", "g_theta", "u_g_theta")}
+    cell.found = {"views": [{"used": sent - 1}], "rejected": {"duplicate": 2},
+                  "error_map": nothing}
+    told.judge()
+    assert told.faults[0] == f"{sent} detections sent, {sent - 1} used and 2 rejected"
+    assert "gx is not that of these messages" in told.faults
+    assert "gx is not that of the undisturbed run" in told.faults
+    lost = replace(told, faults=[])
+    cell.found = "no map"
+    assert lost.judge() == "refused: no map"
+    assert lost.faults == ["no map: no map"]

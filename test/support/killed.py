@@ -1,0 +1,147 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A cell that goes on when its nodes are killed: node processes, and messages played into them."""
+
+import contextlib
+import subprocess
+import time
+from collections.abc import Sequence
+from functools import partial
+from operator import ge
+from pathlib import Path
+from typing import Any
+
+from rclpy.event_handler import PublisherEventCallbacks
+from selfcal_msgs.srv import SaveMap
+from std_srvs.srv import Trigger
+
+from selfcal_ros.cli.processes import process
+from selfcal_ros.collection.messages import Command, Detection, EncoderSample
+from selfcal_ros.files import read_json
+from selfcal_ros.nodes import names
+from selfcal_ros.simulation.cell import Event
+from test.support.ros import Graph
+from test.support.sessions import cdr_of
+
+ROLES = {EncoderSample: names.ENCODER, Detection: names.DETECTIONS, Command: names.COMMAND}
+KINDS = tuple(ROLES)
+"""In the order in which the collector tells its counts."""
+
+ATTEMPTS, IDLE_S = 5, 5.0
+
+
+class Cell:
+    """Plays a run into node processes; repeats what the collector had not told as received.
+
+    A cell whose detections nobody takes waits: it goes on when the collector is back.
+    """
+
+    def __init__(self, graph: Graph, environment: dict, folder: Path, namespace: str = "") -> None:
+        self.graph, self.environment, self.folder = graph, environment, folder
+        self.namespace, self.running = namespace, {}
+        self.processes = contextlib.ExitStack()
+        self.told = (0, 0, 0)
+        graph.hand.create_subscription(
+            names.RECEIVED.type, self.name("measurement_collector/received"), self._on_told,
+            names.RECEIVED.qos)
+        self.solved: list = []
+        graph.hand.create_subscription(
+            names.SOLVED.type, self.name("solver/solved"), self.solved.append, names.SOLVED.qos)
+        self.matched = dict.fromkeys(KINDS, 0)
+        self.publishers = {kind: graph.hand.create_publisher(
+            topic.type, self.name(topic.name), topic.qos,
+            event_callbacks=PublisherEventCallbacks(matched=partial(self._on_matched, kind)))
+            for kind, topic in ROLES.items()}
+
+    def name(self, name: str) -> str:
+        """Return a name of this cell as the hand of the graph sees it."""
+        return f"{self.namespace}/{name}" if self.namespace else name
+
+    def _on_matched(self, kind: type, info: Any) -> None:
+        self.matched[kind] = info.total_count
+
+    def _on_told(self, message: object) -> None:
+        self.told = tuple(message.data)
+
+    def start(self, node: str, **parameters: object) -> None:
+        arguments = [word for key, value in parameters.items()
+                     for word in ("-p", f"{key}:={value}")]
+        self.running[node] = self.processes.enter_context(process(
+            f"selfcal_ros.nodes.{node}", ["--ros-args", "-r", f"__ns:=/{self.namespace}",
+                                          *arguments], self.environment,
+            stderr=subprocess.PIPE, text=True))
+
+    def start_collector(self) -> None:
+        """Start it and wait until it knows what its journal holds."""
+        before, self.told = self.told, (-1, -1, -1)
+        heard = {kind: self.matched[kind] for kind in (EncoderSample, Detection)}
+        self.start("measurement_collector", journal=self.folder, status_period=0.1)
+        # a reader that was killed counts as a reader for a while: wait for a new one
+        self.graph.until(lambda: all(self.matched[kind] > count for kind, count in heard.items()),
+                         "the collector")
+        if sum(before):
+            self.graph.until(lambda: all(map(ge, self.told, before)),
+                             f"what the journal holds: told {before} before")
+
+    def kill(self, node: str) -> None:
+        running = self.running.pop(node)
+        running.kill()
+        running.communicate()
+
+    def send(self, events: Sequence[Event], *, first: int = 0) -> None:
+        """Publish events, those of which the collector has told nothing; commands are latched."""
+        number = dict.fromkeys(KINDS, 0)
+        for index, event in enumerate(events):
+            kind = type(event)
+            number[kind] += 1
+            new = index >= first if kind is Command else number[kind] > self.told[
+                KINDS.index(kind)]
+            if new:
+                self.publishers[kind].publish(cdr_of(event))
+
+    def until_told(self, events: Sequence[Event], but: int = 0) -> None:
+        """Wait until all samples and detections but some are told as received."""
+        counts = [sum(isinstance(event, kind) for event in events) - but for kind in KINDS[:2]]
+        self.graph.until(lambda: all(map(ge, self.told, counts)), "what was sent")
+
+    def deliver(self, events: Sequence[Event], *, first: int = 0) -> None:
+        """Send events and wait until all are told; once more those that a new node did not hear."""
+        counts = [sum(isinstance(event, kind) for event in events) for kind in KINDS]
+        for _ in range(ATTEMPTS):
+            self.send(events, first=first)
+            first, changed, before = len(events), time.monotonic(), self.told
+            while time.monotonic() < changed + IDLE_S and not self._all_told(counts):
+                self.graph.executor.spin_once(timeout_sec=0.02)
+                if self.told != before:
+                    before, changed = self.told, time.monotonic()
+            if self._all_told(counts):
+                return
+        raise AssertionError(f"{counts} messages sent, {self.told} told as received")
+
+    def _all_told(self, counts: Sequence[int]) -> bool:
+        return all(map(ge, self.told[:2], counts[:2]))
+
+    def saved(self) -> dict | str:
+        """Return the result that the solver saves, or why there is none."""
+        path = self.folder / "map.json"
+        finished = self._answer(Trigger, "measurement_collector/finish")
+        assert finished.success, finished.message
+        end = time.monotonic() + 4 * IDLE_S  # where the readings are refused it says nothing
+        while time.monotonic() < end and all(m.data != finished.message for m in self.solved):
+            self.graph.executor.spin_once(timeout_sec=0.02)
+        answer = self._answer(SaveMap, "solver/save_map", path=str(path))
+        return read_json(path) if answer.success else answer.message
+
+    def _answer(self, kind: type, name: str, **fields: object) -> Any:
+        """Call a service, again where a node that was killed seems to have taken the request."""
+        client = self.graph.hand.create_client(kind, self.name(name))
+        for _ in range(ATTEMPTS):
+            self.graph.until(client.service_is_ready, name)
+            future, end = client.call_async(kind.Request(**fields)), time.monotonic() + 2 * IDLE_S
+            while not future.done() and time.monotonic() < end:
+                self.graph.executor.spin_once(timeout_sec=0.02)
+            if future.done():
+                return future.result()
+        raise AssertionError(f"{name} does not answer")
+
+    def close(self) -> None:
+        self.processes.close()
