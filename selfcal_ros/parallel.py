@@ -7,6 +7,7 @@ item alone. Every worker has one BLAS thread, and ends with the process that sta
 
 import contextlib
 import ctypes
+import logging
 import multiprocessing
 import os
 import signal
@@ -207,14 +208,15 @@ def _with_dask(function: Callable[[Any], Any], items: Sequence[Any], workers: in
         try:
             if address == LOCAL:
                 address = stack.enter_context(LocalCluster(
-                    n_workers=workers, threads_per_worker=1, dashboard_address=None))
+                    n_workers=workers, threads_per_worker=1, dashboard_address=None,
+                    silence_logs=logging.CRITICAL))
             client = stack.enter_context(Client(address, set_as_default=False))
         except (OSError, ValueError, TimeoutError) as error:
             raise InputError("--dask", f"no scheduler answers at {address} ({error})",
                              f"start one, or write --dask {LOCAL}") from error
         futures = {client.submit(_in_dask, function, item, pure=False):
                    index for index, item in enumerate(items)}
-        for future in as_completed(futures):
+        for future in as_completed(futures, loop=client.loop):
             yield _told(futures[future], future)
 
 

@@ -5,6 +5,7 @@ import argparse
 import json
 import math
 
+from selfcal_ros.cli.terminal.progress import busy
 from selfcal_ros.units import ARCSEC_PER_RAD, PPM_PER_ONE, UM_PER_M
 
 HELP = "compare two results after taking out the datum difference"
@@ -34,7 +35,8 @@ def run(args: argparse.Namespace) -> int:
         print(json.dumps(_laser_json(rows), indent=1) if args.json else _laser_text(rows))
         return int(ExitCode.DONE)
     b = result_from_dict(second, args.b)
-    found = compare(a, b, keep_scale=args.keep_scale, names=(args.a, args.b))
+    with busy("comparing"):
+        found = compare(a, b, keep_scale=args.keep_scale, names=(args.a, args.b))
     print(json.dumps(_json(found), indent=1) if args.json else _text(found))
     datums = [result.error_map.datum_theta for result in (a, b)]
     if datums[0] != datums[1] and not args.json and found.theta is not None:

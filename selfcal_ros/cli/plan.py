@@ -13,7 +13,7 @@ from selfcal_ros.cli.plan_terms import (
     terms_json,
     terms_text,
 )
-from selfcal_ros.cli.terminal.progress import late_progress
+from selfcal_ros.cli.terminal.progress import busy, late_progress
 from selfcal_ros.units import NM_PER_M, UM_PER_M
 
 HELP = "check a plan of views before it is measured, or suggest views"
@@ -66,11 +66,12 @@ def _check(args: argparse.Namespace, plan) -> int:
 
     assumed, sizes, model = assumed_of(args), sizes_of(args), model_of(args, plan)
     plan = _repeated(plan, args.repeats)
-    seen = check_plan(plan).observability
     alone, joint, checks = None, None, ()
-    if seen.identifiable:
-        alone = predict_plan(plan, ThetaDatum(args.theta_datum))
-        seen, joint, checks = _judge(plan, model, assumed, sizes, (seen, alone))
+    with busy("judging the plan"):
+        seen = check_plan(plan).observability
+        if seen.identifiable:
+            alone = predict_plan(plan, ThetaDatum(args.theta_datum))
+            seen, joint, checks = _judge(plan, model, assumed, sizes, (seen, alone))
     if args.json:
         found = _check_json(plan, seen, alone, maps=args.map)
         if alone is not None and args.sigma is not None:

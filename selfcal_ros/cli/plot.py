@@ -4,6 +4,7 @@
 import argparse
 
 from selfcal_ros.cli.terminal.output import add_json, say
+from selfcal_ros.cli.terminal.progress import busy
 
 HELP = "draw the maps of a result: png, svg or pdf"
 
@@ -31,7 +32,8 @@ def run(args: argparse.Namespace) -> int:
     check_outputs([args.result, args.truth], [args.output])
     result = result_from_dict(read_json(args.result), args.result)
     truth = read_truth(args.truth) if args.truth else None
-    save_map_plot(result, args.output, truth=truth)
+    with busy("drawing"):
+        save_map_plot(result, args.output, truth=truth)
     say(args, f"written: {args.output}",
         {"written": args.output, "kind": Path(args.output).suffix.lower().lstrip(".")})
     return int(ExitCode.DONE)

@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 from selfcal_ros.cli.terminal.output import add_json, say
+from selfcal_ros.cli.terminal.progress import busy
 
 HELP = "write a calibration report: one self-contained HTML or PDF file"
 
@@ -35,9 +36,10 @@ def run(args: argparse.Namespace) -> int:
     check_name(output)
     result = result_from_dict(read_json(args.result), args.result)
     truth = read_truth(args.truth) if args.truth else None
-    if args.plot:
-        save_map_plot(result, args.plot, truth=truth)
-    write_report(result, output, truth=truth)
+    with busy("drawing"):
+        if args.plot:
+            save_map_plot(result, args.plot, truth=truth)
+        write_report(result, output, truth=truth)
     written = [str(name) for name in (output, args.plot) if name]
     text = [summary_text(result, truth=truth, ascii_only=not can_print_symbols(sys.stdout))
             ] if args.text else []

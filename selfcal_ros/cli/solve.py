@@ -103,7 +103,7 @@ def run(args: argparse.Namespace) -> int:
     from selfcal_ros.bagio.offline import bag_input, collect_bag
     from selfcal_ros.bagio.simulated import read_truth
     from selfcal_ros.cli.terminal.print_result import exit_code, show
-    from selfcal_ros.cli.terminal.progress import progress_bar
+    from selfcal_ros.cli.terminal.progress import busy, progress_bar
     from selfcal_ros.collection.parameters import solver_options
     from selfcal_ros.collection.reasons import advice
     from selfcal_ros.errors import NotIdentifiableError
@@ -129,11 +129,12 @@ def run(args: argparse.Namespace) -> int:
         print(f"selfcal solve: {args.bag}: {line}", file=sys.stderr)
     options = solver_options(solver_values, measurements)
     try:
-        if args.robust:
-            from selfcal_ros.estimation.quality.outliers import robust_calibrate
-            result = robust_calibrate(measurements, options)
-        else:
-            result = calibrate(measurements, options)
+        with busy("solving"):
+            if args.robust:
+                from selfcal_ros.estimation.quality.outliers import robust_calibrate
+                result = robust_calibrate(measurements, options)
+            else:
+                result = calibrate(measurements, options)
     except NotIdentifiableError as error:
         if (args.output or args.json) and error.observability is not None:
             result = unidentified_result(measurements, error.observability)
@@ -142,7 +143,8 @@ def run(args: argparse.Namespace) -> int:
             raise NotIdentifiableError(f"{args.bag}: {findings[0]}; correct this first (as it is: "
                                        f"{error})", error.observability) from error
         raise
-    result, lines = _extended(args, measurements, options, result)
+    with busy("validating"):
+        result, lines = _extended(args, measurements, options, result)
     result = created_now(with_input(result, bag_input(args.bag), lost))
     _write(args, result_to_dict(result))
     if args.report:

@@ -14,6 +14,7 @@ from selfcal_ros.cli.step_diagonal_bag import (
     measurement_from_bag,
 )
 from selfcal_ros.cli.terminal.output import add_json, put, say
+from selfcal_ros.cli.terminal.progress import busy
 from selfcal_ros.errors import ExitCode, InputError
 
 if TYPE_CHECKING:
@@ -87,7 +88,8 @@ def run(args: argparse.Namespace) -> int:
                          "give both, or --sensitivity or --simulate alone")
     data, warnings, source = _measurement(args)
     choice = Choice(Method(args.method), Form(args.form), args.allow_equal)
-    found = identify(data, choice)
+    with busy("identifying"):
+        found = identify(data, choice)
     if readings_are_equal(data):
         warnings = [*warnings, EQUAL_READINGS]
     result = outcome(found, data, line=ReferenceLine(args.line), warnings=warnings)
@@ -158,7 +160,8 @@ def _sensitivity(args: argparse.Namespace) -> int:
         raise InputError("arguments", "--sensitivity simulates and reads no data",
                          "leave DATA.csv out")
     machine, rng = case_study_machine(), np.random.default_rng(SEED)
-    rows = sensitivity(machine, rng)
+    with busy("simulating faults"):
+        rows = sensitivity(machine, rng)
     if args.plot:
         from selfcal_ros.reporting.laser_plots import plot_sensitivity
         plot_sensitivity(rows, sweep(machine, rng), args.plot)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from selfcal_ros.cli.aerotech.options import add_frame, frame_of, read_result
 from selfcal_ros.cli.terminal.output import add_json, say
+from selfcal_ros.cli.terminal.progress import busy
 from selfcal_ros.errors import ExitCode, InputError, NotIdentifiableError
 from selfcal_ros.units import M_PER_UM, RAD_PER_ARCSEC
 
@@ -97,7 +98,8 @@ def _verify(args: argparse.Namespace) -> int:
     if base is None and isinstance(cal.tables[0], Table2D):
         base = MachineFrame(cal.tables[0].column_axis, cal.tables[0].row_axis)
     frame = frame_of(args, base)
-    found = verify_tables(result.error_map, cal.tables, frame)
+    with busy("simulating the controller"):
+        found = verify_tables(result.error_map, cal.tables, frame)
     print(json.dumps(_numbers(found), indent=1) if args.json else _text(found))
     if args.plot:
         from selfcal_ros.reporting.cal_plots import plot_verification

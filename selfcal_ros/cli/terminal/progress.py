@@ -3,6 +3,7 @@
 
 import contextlib
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 
@@ -44,3 +45,36 @@ def late_progress(label: str, after_s: float = 2.0) -> Iterator[Callable[[int, i
                 draw(done, total)
 
         yield advance
+
+
+@contextlib.contextmanager
+def busy(label: str, after_s: float = 2.0) -> Iterator[None]:
+    """Show that the block is at work, and for how long, once `after_s` have passed.
+
+    For work that cannot tell how far it is; drawn by a thread on stderr if that is a terminal.
+    Nothing may be printed in the block.
+    """
+    if not sys.stderr.isatty():
+        yield
+        return
+    ended = threading.Event()
+    watcher = threading.Thread(target=_watch, args=(label, after_s, ended), daemon=True)
+    watcher.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        watcher.join()
+
+
+def _watch(label: str, after_s: float, ended: threading.Event) -> None:
+    """Draw from `after_s` on until `ended` is set."""
+    if ended.wait(after_s):
+        return
+    from rich.console import Console
+    from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+    with Progress(SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn(),
+                  console=Console(stderr=True), transient=True) as bar:
+        bar.add_task(label, total=None)
+        ended.wait()

@@ -1,0 +1,98 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`selfcal batch` on several cores beside one after the other: seconds, CPU seconds, ratio.
+
+bench_batch.py [--bags N] [--workers N] [--folder FOLDER] [-o FILE.json]
+
+Simulates N bags of Hu's plan (11 x 11 marks, 24 lines, 20 nm), solves them with --workers 1 and
+with N workers, each as a command of its own into an empty folder, and compares the results.
+"""
+
+import argparse
+import contextlib
+import ctypes
+import json
+import os
+import resource
+import shutil
+import subprocess
+import sys
+import time
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from selfcal_ros.bagio.simulated import write_simulation
+from selfcal_ros.errors import InputError
+from selfcal_ros.files import write_json, write_yaml
+from selfcal_ros.parallel import check_workers, mapped
+from selfcal_ros.simulation.spec import read_simulation
+
+ROOT = Path(__file__).parents[1]
+PR_SET_CHILD_SUBREAPER = 36
+"""Of prctl(2): processes whose parents have ended become ours, and their CPU time is counted."""
+
+
+def simulate(folder: Path, seed: int) -> None:
+    """Write one bag, unless it is there."""
+    bag = folder / f"{seed:03}"
+    if bag.exists():
+        return
+    sim = folder / f".{seed:03}.yaml"
+    write_yaml(sim, {"plan": str(ROOT / "config/plans/hu.yaml"), "seed": seed,
+                     "noise": {"sigma_xy": 2e-8, "sigma_theta": 1.7e-5}})
+    write_simulation(read_simulation(sim), bag)
+
+
+def timed(bags: Path, out: Path, workers: int) -> tuple[float, float]:
+    """Return wall and CPU seconds of a batch into an empty folder."""
+    shutil.rmtree(out, ignore_errors=True)
+    before, began = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
+    done = subprocess.run([sys.executable, "-m", "selfcal_ros", "batch", str(bags), "-o", str(out),
+                           "--workers", str(workers)], stdout=subprocess.DEVNULL, check=False)
+    wall = time.perf_counter() - began
+    with contextlib.suppress(ChildProcessError):  # workers whose parent has ended
+        while True:
+            os.wait()
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    if done.returncode not in (0, 5):
+        raise InputError("selfcal batch", f"ended with exit code {done.returncode}", "see above")
+    return wall, after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+
+
+def maps_of(out: Path) -> dict[str, np.ndarray]:
+    """Return the maps of a batch by the file name of their results."""
+    return {path.name: np.array(json.loads(path.read_text())["error_map"]["gx"])
+            for path in sorted((out / "results").iterdir())}
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--bags", type=int, default=100)
+    parser.add_argument("--workers", type=int, help="processes (default: one a core)")
+    parser.add_argument("--folder", default=str(ROOT / "build" / "bench_batch"))
+    parser.add_argument("-o", "--output", help="write the figures to this file")
+    args = parser.parse_args()
+    ctypes.CDLL(None).prctl(PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
+    folder, workers = Path(args.folder), check_workers(args.workers)
+    bags = folder / "bags"
+    bags.mkdir(parents=True, exist_ok=True)
+    mapped(partial(simulate, bags), list(range(args.bags)), workers=workers)
+    alone, alone_cpu = timed(bags, folder / "alone", 1)
+    together, together_cpu = timed(bags, folder / "together", workers)
+    one, other = maps_of(folder / "alone"), maps_of(folder / "together")
+    same = one.keys() == other.keys() and all(np.array_equal(one[k], other[k]) for k in one)
+    figures = {"bags": args.bags, "workers": workers, "seconds_alone": alone,
+               "seconds_together": together, "ratio": together / alone, "cpu_s_alone": alone_cpu,
+               "cpu_s_together": together_cpu, "same_maps": same}
+    print(f"{args.bags} bags, one after the other: {alone:.1f} s ({alone_cpu:.1f} s of CPU)")
+    print(f"{args.bags} bags, {workers} workers: {together:.1f} s ({together_cpu:.1f} s of CPU)")
+    print(f"ratio {together / alone:.2f}; CPU shared by {workers}: "
+          f"{together_cpu / workers / alone_cpu:.2f}; maps equal: {same}")
+    if args.output:
+        write_json(args.output, figures)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
