@@ -12,6 +12,7 @@ import numpy as np
 from selfcal_ros.bagio.simulated import event_fields, write_truth
 from selfcal_ros.collection.messages import Command, Detection, EncoderSample, Phase
 from selfcal_ros.messages import to_model
+from selfcal_ros.messages.sizes import check_simulated
 from selfcal_ros.model.view import Plan, View
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes.base import SelfcalNode
@@ -58,6 +59,7 @@ class StageSimulator(SelfcalNode):
             self._measure(command)
 
     def _measure(self, command: Command) -> None:
+        check_simulated(command)
         plan = self._plan_with(command)
         if self.truth is None or self.truth.artifact != plan.artifact:
             count = max(64, len(plan.views), command.views_planned)

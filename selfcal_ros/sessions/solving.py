@@ -10,6 +10,7 @@ from selfcal_ros.errors import InputError, NoDataError, NotIdentifiableError, Se
 from selfcal_ros.estimation.api import Options, calibrate
 from selfcal_ros.files import write_json
 from selfcal_ros.messages import from_model, to_model
+from selfcal_ros.messages.sizes import check_plate, check_view
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.result import (
     CalibrationResult,
@@ -116,9 +117,10 @@ class SolvingSession:
         Raises
         ------
         InputError
-            If the message contradicts itself.
+            If the message contradicts itself, or claims what cannot be.
         """
-        to_model.view_readings(message)
+        check_view(to_model.view_readings(message), to_model.artifact_of(message),
+                   int(message.view_index))
         run = Run(message.plan_id, message.run_id)
         if run != self._run:
             if self._messages and not supersedes(run, self._run):
@@ -140,8 +142,10 @@ class SolvingSession:
         if len(artifacts) > 1:
             raise InputError("selfcal/view_measurement", "views of different plates in one plan",
                              "measure one plate")
-        return Measurements(ordered[0].plan_id, artifacts.pop(),
-                            tuple(to_model.view_readings(message) for message in ordered),
+        artifact = artifacts.pop()
+        views = tuple(to_model.view_readings(message) for message in ordered)
+        check_plate(artifact, views)
+        return Measurements(ordered[0].plan_id, artifact, views,
                             to_model.sense_of(ordered[0]),
                             to_model.counts(newest, "session_reject"), self._run.run_id,
                             to_model.terms_of(newest))

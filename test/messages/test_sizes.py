@@ -1,0 +1,84 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Messages that claim what cannot be: refused with a reason, before anything is allocated."""
+
+import tracemalloc
+from dataclasses import replace
+
+import pytest
+
+from selfcal_ros.collection.messages import Command, Phase
+from selfcal_ros.errors import InputError
+from selfcal_ros.messages import from_model
+from selfcal_ros.messages.sizes import MAX_EXPOSURES, check_simulated
+from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.view import View
+from selfcal_ros.sessions.solving import SolvingSession
+from test.support.ports import Hands, message, values_of
+from test.support.sessions import collected, events_of, small_plan
+
+SMALL = Artifact(5, 0.01, 8)
+
+
+def first_view(**changes):
+    """Return the ViewMeasurement of a view with 25 marks and 8 lines, some fields changed."""
+    _, measurements, progress = collected(events_of(small_plan("0", repeats=1)))
+    return message("ViewMeasurement", from_model.view_measurement(
+        progress[0], measurements, 10, "stage") | changes)
+
+
+@pytest.fixture
+def session():
+    return SolvingSession(values_of("solver"), Hands().ports)
+
+
+@pytest.mark.parametrize(("changes", "reason"), [
+    ({"translation_x": 1e300}, "pitches are beyond every field; is it in mm?"),
+    ({"translation_y": float("nan")}, "nan is not a whole number of pitch steps"),
+    ({"rotation": float("inf")}, "inf is not an angle"),
+    ({"view_index": 2**31}, "a plan has at most 10000 views; mend the view_index"),
+    ({"grid_size": 3}, "m goes beyond -1 to 1; mend the publisher"),
+    ({"angular_count": 4}, "k goes beyond 0 to 3; mend the publisher"),
+    ({"grid_size": 2**31 + 1}, "is not an odd number from 3 to"),
+    ({"angular_count": 2**32 - 4}, "is not a multiple of 4")])
+def test_a_view_that_cannot_be_is_refused_and_forgotten(session, changes, reason):
+    with pytest.raises(InputError) as caught:
+        session.take_measurement(first_view(**changes))
+    assert reason in str(caught.value)
+    assert session.next_job() is None
+
+
+def test_a_plate_that_is_enormous_beside_what_was_read_is_not_solved(session):
+    session.take_measurement(first_view(grid_size=4001))
+    tracemalloc.start()
+    with pytest.raises(InputError, match="25 readings of a plate with 16008001 marks; mend "):
+        session.next_job()
+    assert tracemalloc.get_traced_memory()[1] < 1e6
+    tracemalloc.stop()
+
+
+def test_a_thousand_sites_for_each_mark_are_still_solved(session):
+    session.take_measurement(first_view(grid_size=161))  # 25921 sites, 26 * 1000 is the limit
+    assert session.next_job() is not None
+    session.take_measurement(first_view(grid_size=163))
+    with pytest.raises(InputError, match="25 readings of a plate with 26569 marks"):
+        session.next_job()
+
+
+@pytest.mark.parametrize(("view", "artifact", "reason"), [
+    (View("a"), Artifact(4001, 0.01), "16008001 exposures are beyond the 5000000 of a simulated"),
+    (View("a", repeats=2**32 - 1), SMALL, "4294967295 repeats; ask for 1 to 1000000"),
+    (View("a", repeats=200_001), SMALL, "5000025 exposures are beyond"),
+    (View("a", grid=False, angular=False), SMALL, "neither grid nor angular marks are wanted"),
+    (View("a", translation_m=(1e17, 0.0)), SMALL, "pitches are beyond every field")])
+def test_what_the_simulated_cell_cannot_hold_is_refused(view, artifact, reason):
+    command = Command(5, Phase.MEASURE, "p", 0, view, artifact, 1)
+    with pytest.raises(InputError) as caught:
+        check_simulated(command)
+    assert reason in str(caught.value)
+
+
+def test_the_limit_itself_is_simulated():
+    command = Command(5, Phase.MEASURE, "p", 0, View("a", repeats=MAX_EXPOSURES // 25), SMALL, 1)
+    check_simulated(command)
+    with pytest.raises(InputError, match="at most 10000 views"):
+        check_simulated(replace(command, view_index=2**31))
