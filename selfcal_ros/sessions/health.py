@@ -26,8 +26,8 @@ def merged(main: Diagnosis, others: Iterable[Diagnosis]) -> Diagnosis:
                      "; ".join(dict.fromkeys([*wrong, main.message])), values)
 
 
-class Refusals:
-    """Counts what callbacks could not use, by place, and says why without flooding the log.
+class Tally:
+    """Counts what goes wrong, by place; the newest line of each place is told for some time.
 
     Parameters
     ----------
@@ -37,10 +37,28 @@ class Refusals:
         Monotonic seconds.
     """
 
+    word = ""
+    """Stands before a place in the diagnostics."""
+
     def __init__(self, say: Callable[[Level, str], None], now_s: Callable[[], float]) -> None:
         self._say, self._now_s = say, now_s
         self.counts: Counter = Counter()
         self._last: dict[str, tuple[float, str]] = {}
+
+    def _is_recent(self, place: str) -> bool:
+        return place in self._last and self._now_s() - self._last[place][0] < MEMORY_S
+
+    def diagnosis(self) -> Diagnosis:
+        """Return WARN and the newest lines for some time after something went wrong."""
+        recent = [line for place, (_, line) in self._last.items() if self._is_recent(place)]
+        return Diagnosis(Level.WARN if recent else Level.OK, "; ".join(recent),
+                         {f"{self.word} {place}": n for place, n in sorted(self.counts.items())})
+
+
+class Refusals(Tally):
+    """What callbacks could not use, and why; said without flooding the log."""
+
+    word = "refused"
 
     def add(self, place: str, error: Exception) -> None:
         """Count an error of the callback at `place`; one not of this package shows its type."""
@@ -52,46 +70,19 @@ class Refusals:
         if count <= FIRST_LINES or str(count).rstrip("0") == "1":
             self._say(Level.ERROR, line + (f" (refused {count} times)" if count > 1 else ""))
 
-    def diagnosis(self) -> Diagnosis:
-        """Return WARN and the newest reasons for some time after a refusal."""
-        now = self._now_s()
-        recent = [line for when, line in self._last.values() if now - when < MEMORY_S]
-        return Diagnosis(Level.WARN if recent else Level.OK, "; ".join(recent),
-                         {f"refused {place}": n for place, n in sorted(self.counts.items())})
 
+class Losses(Tally):
+    """Messages that the middleware reports as lost."""
 
-class Losses:
-    """Counts messages that the middleware reports as lost, by topic, and says so.
-
-    Parameters
-    ----------
-    say : callable (level, line)
-        Writes to the log.
-    now_s : callable
-        Monotonic seconds.
-    """
-
-    def __init__(self, say: Callable[[Level, str], None], now_s: Callable[[], float]) -> None:
-        self._say, self._now_s = say, now_s
-        self.counts: Counter = Counter()
-        self._when: dict[str, float] = {}
+    word = "lost"
 
     def add(self, topic: str, number: int) -> None:
         """Count `number` messages of `topic` as lost."""
-        now = self._now_s()
-        if now - self._when.get(topic, -MEMORY_S) >= MEMORY_S:
+        if not self._is_recent(topic):
             self._say(Level.WARN, f"{topic}: {number} messages were lost on the way; the machine "
                       "or the network is too slow for them")
         self.counts[topic] += number
-        self._when[topic] = now
-
-    def diagnosis(self) -> Diagnosis:
-        """Return WARN with the numbers for some time after a loss."""
-        now = self._now_s()
-        recent = [topic for topic, when in self._when.items() if now - when < MEMORY_S]
-        line = "; ".join(f"{topic}: {self.counts[topic]} messages lost" for topic in recent)
-        return Diagnosis(Level.WARN if recent else Level.OK, line,
-                         {f"lost {topic}": n for topic, n in sorted(self.counts.items())})
+        self._last[topic] = (self._now_s(), f"{topic}: {self.counts[topic]} messages lost")
 
 
 class Presence:
