@@ -13,6 +13,8 @@ from selfcal_ros.reporting.summary.format import (
     UNKNOWN,
     aligned_numbers,
     counted,
+    decimals_for,
+    fixed,
     fixed_column,
     printable,
     significant,
@@ -59,8 +61,10 @@ def terms_section(result: CalibrationResult) -> Section:
         how = "free" if term.size is None else f"size {term.size:g}"
         for item in term.estimates:
             scale, unit = (UM_PER_M, "µm") if item.unit == "m" else (UM_PER_M, "µm/m")
+            value, u = item.value * scale, item.u * scale
+            decimals = decimals_for([u], 2)  # two figures of u, and the value to the same place
             rows.append((f"{term.name} ({how})", item.view or "all", item.component,
-                         f"{item.value * scale:.5g}", f"{item.u * scale:.2g}", unit))
+                         fixed(value, decimals), fixed(u, decimals), unit))
     if not rows:
         return Section("Terms of the model")
     header = ("term", "view", "component", "value", "u (k=1)", "unit")

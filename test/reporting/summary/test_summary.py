@@ -177,7 +177,7 @@ def test_terms_of_the_model_are_shown_with_their_uncertainties():
     assert line_with(text, "microscope").split() == [
         "microscope", "(free)", "all", "xy", "-2000", "30", "µm/m"]
     assert line_with(text, "drift").split() == [
-        "drift", "(size", "5e-08)", "rot90", "x", "P1", "0.04", "0.001", "µm"]
+        "drift", "(size", "5e-08)", "rot90", "x", "P1", "0.0400", "0.0010", "µm"]
 
 
 def test_few_degrees_of_freedom_widen_what_is_claimed():
