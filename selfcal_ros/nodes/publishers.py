@@ -2,6 +2,7 @@
 """Who else publishes: offers that do not match, and second publishers where one is right."""
 
 from collections.abc import Iterable, Mapping
+from typing import Any
 
 from rclpy.node import Node
 from rclpy.qos import (
@@ -47,5 +48,5 @@ def offered(topic: Topic) -> dict:
                        depth=topic.qos.depth)
 
 
-def _name(offer: object) -> str:
+def _name(offer: Any) -> str:
     return f"{offer.node_namespace.rstrip('/')}/{offer.node_name}"
