@@ -47,17 +47,24 @@ def simulate(folder: Path, seed: int) -> None:
 def timed(bags: Path, out: Path, workers: int) -> tuple[float, float]:
     """Return wall and CPU seconds of a batch into an empty folder."""
     shutil.rmtree(out, ignore_errors=True)
+    known = children()
     before, began = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
     done = subprocess.run([sys.executable, "-m", "selfcal_ros", "batch", str(bags), "-o", str(out),
                            "--workers", str(workers)], stdout=subprocess.DEVNULL, check=False)
     wall = time.perf_counter() - began
-    with contextlib.suppress(ChildProcessError):  # workers whose parent has ended
-        while True:
-            os.wait()
+    for child in children() - known:  # what started the workers: its parent has ended
+        with contextlib.suppress(ChildProcessError):
+            os.waitpid(child, 0)
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     if done.returncode not in (0, 5):
         raise InputError("selfcal batch", f"ended with exit code {done.returncode}", "see above")
     return wall, after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+
+
+def children() -> set[int]:
+    """Return the processes whose parent is this one."""
+    task = Path(f"/proc/self/task/{os.getpid()}/children")
+    return {int(pid) for pid in task.read_text().split()}
 
 
 def maps_of(out: Path) -> dict[str, np.ndarray]:
