@@ -6,12 +6,11 @@ item alone. Every worker has one BLAS thread, and ends with the process that sta
 """
 
 import contextlib
-import ctypes
 import logging
 import multiprocessing
 import os
 import signal
-import sys
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
@@ -26,7 +25,6 @@ AHEAD = 2
 """Items in the hands of the pool, a worker: enough that none waits for work."""
 LOCAL = "local"
 """Instead of a scheduler's address: a dask cluster in this machine, made for the run."""
-_PR_SET_PDEATHSIG = 1
 
 
 Progress = Callable[[int, int], None]
@@ -134,7 +132,7 @@ def _with_processes(function: Callable[[Any], Any], items: Sequence[Any],
     waiting = list(reversed(range(len(items))))
     while waiting:
         suspects: list[int] = []
-        with _pool(workers) as pool:
+        with _pool(workers, function) as pool:
             running: dict[Future, int] = {}
             while waiting or running:
                 while waiting and len(running) < AHEAD * workers and not suspects:
@@ -158,7 +156,7 @@ def _with_processes(function: Callable[[Any], Any], items: Sequence[Any],
 
 def _alone(function: Callable[[Any], Any], items: Sequence[Any], index: int) -> Outcome:
     """Return the outcome of an item in a process of its own."""
-    with _pool(1) as pool:
+    with _pool(1, function) as pool:
         future = pool.submit(function, items[index])
         wait([future])
         if isinstance(future.exception(), BrokenProcessPool):
@@ -173,10 +171,15 @@ def _told(index: int, future: Any) -> Outcome:
 
 
 @contextlib.contextmanager
-def _pool(workers: int) -> Iterator[ProcessPoolExecutor]:
-    """Yield a pool whose processes are gone when the block ends, however it ends."""
+def _pool(workers: int, function: Callable[[Any], Any]) -> Iterator[ProcessPoolExecutor]:
+    """Yield a pool whose processes are gone when the block ends, however it ends.
+
+    What `function` needs is imported once, where the workers are forked.
+    """
     method = "forkserver" if "forkserver" in multiprocessing.get_all_start_methods() else "spawn"
     context = multiprocessing.get_context(method)
+    module = getattr(getattr(function, "func", function), "__module__", None) or "builtins"
+    context.set_forkserver_preload(["__main__" if module == "__main__" else module])
     before = set(multiprocessing.active_children())
     pool = ProcessPoolExecutor(workers, mp_context=context, initializer=begin_worker)
     try:
@@ -191,9 +194,16 @@ def _pool(workers: int) -> Iterator[ProcessPoolExecutor]:
 def begin_worker() -> None:
     """Prepare a worker: one BLAS thread, Ctrl-C left to its parent, no life without that."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    if sys.platform.startswith("linux"):
-        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     threadpool_limits(limits=1, user_api="blas")
+
+
+def _end_with_parent() -> None:
+    """End this process at once when the one that wanted it has ended, however that came."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
 
 
 def _with_dask(function: Callable[[Any], Any], items: Sequence[Any], workers: int,

@@ -4,8 +4,11 @@
 import math
 import operator
 import os
+import subprocess
 import sys
+import time
 from functools import partial
+from pathlib import Path
 
 import pytest
 from threadpoolctl import threadpool_info
@@ -63,6 +66,21 @@ def test_a_consumer_that_stops_takes_the_workers_along():
     next(running)
     running.close()
     assert multiprocessing.active_children() == []
+
+
+def test_workers_end_with_a_process_that_is_killed():
+    code = ("import operator, os, sys\nfrom selfcal_ros.parallel import outcomes\n"
+            "found = outcomes(operator.call, [os.getpid] * 9, workers=2)\n"
+            "print(next(found).value, flush=True)\nsys.stdin.read()")
+    with subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE,
+                          stdout=subprocess.PIPE, text=True) as running:
+        worker = Path("/proc", running.stdout.readline().strip(), "stat")
+        assert worker.exists()
+        running.kill()
+    deadline = time.monotonic() + 60
+    while time.monotonic() < deadline and worker.exists() and ") Z" not in worker.read_text():
+        os.sched_yield()
+    assert not worker.exists() or ") Z" in worker.read_text()
 
 
 def test_numbers_of_workers():
