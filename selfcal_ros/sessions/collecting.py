@@ -41,6 +41,7 @@ class CollectingSession:
         self._dirty, self._next_status, self._rested = False, 0.0, 0.0
         self._needed, self._unseen = 0, 0  # readings of the open view, detections since its status
         self._encoder_ns = self._exposed_ns = 0  # newest stamps
+        self._since_ns = 0  # beginning of the open view
         self._costs: deque[float] = deque(maxlen=1000)
         self._published: dict[int, str] = {}
         self._run = ("", "")
@@ -74,7 +75,7 @@ class CollectingSession:
             return
         self.collector.add_detection_block(table)
         self._exposed_ns = max(self._exposed_ns, self._note_clock(table["stamp"], age_ns))
-        self._unseen += len(table)
+        self._unseen += int((table["stamp"] >= self._since_ns).sum())
         self._dirty = True
 
     def _note_clock(self, stamps_ns: np.ndarray, age_ns: int) -> int:
@@ -214,6 +215,7 @@ class CollectingSession:
                 (told.sigma_xy, told.sigma_theta), self._noise, strict=True))
             self._noise = xy, theta
         self._needed = progress[index].needed if index is not None else 0
+        self._since_ns = self.collector.timeline.intervals[-1].start_ns
         self._state = "between views" if index is None else (
             f"view '{progress[index].view.name}': {100 * progress[index].coverage:.0f} % of the "
             "marks read")
