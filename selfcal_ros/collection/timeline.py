@@ -52,7 +52,8 @@ class Timeline:
     last_stamp_ns : int
         Stamp of the last command.
     run_id : str
-        Run of the last MEASURE; views of other runs are not used. Empty before the first MEASURE.
+        Run of the last MEASURE; views of other runs are not used. Empty before the first MEASURE,
+        and while its first command may not have come.
     model_terms : tuple of str
         Terms that the plan wants estimated, as the last MEASURE tells them.
     """
@@ -124,8 +125,17 @@ def build_timeline(commands: Iterable[Command]) -> Timeline:
     planned = max([c.views_planned for c in mine] + [max(views) + 1])
     return Timeline(plan_id, artifact, dict(sorted(views.items())),
                     tuple(_intervals(ordered, runs, run_id)), planned,
-                    ordered[-1].phase in (Phase.DONE, Phase.ABORT), ordered[-1].stamp_ns, run_id,
-                    newest.model_terms)
+                    ordered[-1].phase in (Phase.DONE, Phase.ABORT), ordered[-1].stamp_ns,
+                    run_id if _begin_is_known(mine[0], runs) else "", newest.model_terms)
+
+
+def _begin_is_known(first: Command, runs: list[str | None]) -> bool:
+    """Return whether the first command of a run that is there is the first there was.
+
+    Commands that do not name their run may arrive in any order: an earlier one may still come.
+    """
+    return bool(first.run_id or (first.phase == Phase.PLACE and first.view_index == 0)
+                or len(set(runs) - {None}) > 1)
 
 
 def _runs(ordered: list[Command], plan_id: str) -> list[str | None]:

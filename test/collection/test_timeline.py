@@ -186,3 +186,19 @@ def test_the_order_of_arrival_changes_no_run(commands):
     timeline = build_timeline(commands)
     assert timeline.run_id == "60"
     assert timeline == build_timeline(sorted(commands, key=lambda c: c.stamp_ns))
+
+
+@pytest.mark.parametrize("heard", [slice(1, None), slice(2, None), slice(3, 4), slice(0, 2),
+                                   slice(0, None)])
+def test_a_run_is_named_by_its_first_command_and_not_before_that_can_have_come(heard):
+    """Commands arrive in any order: what is called an earlier run would be left aside for good."""
+    known = heard.start == 0
+    assert build_timeline(WHOLE[heard]).run_id == ("10" if known else "")
+    named = build_timeline(of_run(WHOLE[heard], "7"))
+    assert named.run_id == "7"
+
+
+def test_a_later_run_is_named_though_the_one_before_is_known_in_part_only():
+    again = [replace(c, stamp_ns=c.stamp_ns + 100) for c in WHOLE]
+    assert build_timeline([*WHOLE[2:], *again]).run_id == "110"
+    assert build_timeline([*WHOLE[2:], *again[1:]]).run_id == "120"
