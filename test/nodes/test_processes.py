@@ -128,7 +128,7 @@ def test_an_unknown_name_in_a_parameter_file_is_refused(group, tmp_path):
     code, _, err = ended(group.start("-m", "selfcal_ros.nodes.solver", "--ros-args",
                                      "--params-file", str(file)))
     assert code == 2
-    assert "theta_data: solver has no such parameter; known are" in err
+    assert "theta_data: solver has no such parameter; did you mean 'theta_datum'? known are" in err
 
 
 @pytest.mark.parametrize("words, problem", [

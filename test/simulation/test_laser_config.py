@@ -58,7 +58,7 @@ def test_the_truth_of_the_case_study():
 
 @pytest.mark.parametrize(("data", "message"), [
     ([], "s: not a mapping of keys to values"),
-    ({"sed": 1}, "s: sed: unknown key; known are seed, machine"),
+    ({"sed": 1}, "s: sed: unknown key; did you mean 'seed'? known are seed, machine"),
     ({"seed": -1}, "s: seed: -1 is not a whole number"),
     ({"machine": "other"}, "s: machine: not a mapping"),
     ({"machine": {}}, "steps_mm: None is not a list of 2 or 3 numbers"),
@@ -73,7 +73,7 @@ def test_the_truth_of_the_case_study():
     ({"machine": {"steps_mm": [1, 1], "stacked": 1}}, "1 is neither true nor false"),
     ({"machine": {"steps_mm": [1, 1], "ex_x": [0], "turns_urad": {"x": [1, 2]}}},
      "turns_urad: x: not 1 rotation vectors"),
-    ({"setups": {"ppp": {}}}, "setups: ppp: unknown key; known are pp, np"),
+    ({"setups": {"ppp": {}}}, "setups: ppp: unknown key; did you mean 'pp'? known are pp, np"),
     ({"setups": {"pp": {"laser_mrad": 1}}}, "laser_mrad: 1 is not a list of 1 numbers"),
     ({"setups": {"pp": {"to_machine": "no"}}}, "'no' is neither true nor false"),
     ({"noise": {"distance_nm": float("nan")}}, "distance_nm: nan is not a number from 0"),

@@ -27,7 +27,7 @@ from selfcal_ros.compensation.machine import (
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.model.error_map import ErrorMap
+from selfcal_ros.model.error_map import ErrorMap, ThetaDatum
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.simulation.truth import hu_plan, random_truth, simulate_measurements
 from test.support.maps import random_map, result_of
@@ -269,12 +269,13 @@ def test_tables_of_other_axes_are_refused_by_the_verification():
         verify_tables(emap, [table_xy(emap, MachineFrame(5, 6))], MachineFrame(1, 2))
 
 
-def test_provenance_says_bag_plan_date_and_uncertainty():
-    result = result_of(random_map(ARTIFACT, 1), sense="plate_moves")
+@pytest.mark.parametrize("datum", ThetaDatum)
+def test_provenance_says_bag_plan_date_and_uncertainty(datum):
+    result = result_of(replace(random_map(ARTIFACT, 1), datum_theta=datum), sense="plate_moves")
     when = datetime(2026, 1, 2, tzinfo=UTC)
     text = "\n".join(provenance(result, MachineFrame(), filled=2, now=when))
     for part in ("2026-01-02T00:00:00Z", "plan: demo", "plate_moves", "demo.mcap", "ab" * 32,
-                 "nm rms", "xy_axes", "2 sites were not measured", "machine: x-axis=1"):
+                 "nm rms", str(datum), "2 sites were not measured", "machine: x-axis=1"):
         assert part in text
     u = np.sqrt(np.mean(np.square([result.error_map.u_gx, result.error_map.u_gy]))) * 1e9
     assert f"(k=1): {u:.3g} nm rms" in text

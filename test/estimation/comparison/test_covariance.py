@@ -84,7 +84,7 @@ def test_covariance_of_a_saved_map_with_missing_marks_and_terms(sense, reference
 def test_weights_that_are_none_are_refused(read, message):
     result = calibrate(measured(PLAN, 1))
     views = (replace(result.views[0], read_grid=read), *result.views[1:])
-    with pytest.raises(InputError, match=f"view '0', read.grid: {message}; write the result anew"):
+    with pytest.raises(InputError, match=f"view '0', read.grid: {message}; write the result again"):
         xy_covariance(replace(result, views=views), result.error_map.valid)
 
 
