@@ -40,6 +40,10 @@ replaced() {  # the pins of tools/requirements.txt, those of $pins in place of t
     "$pins" tools/requirements.txt
 }
 
+compile() {  # what is no Python 3, as templates, is passed over
+  "$venv/bin/python" -m compileall -q -j 0 -x '/(tests?|templates?)/' "$@" || true
+}
+
 wheels=$(digest tools/requirements.txt "$pins" tools/mend_wheels.py)
 if ! fresh wheels "$wheels"; then
   : > "$log"
@@ -56,6 +60,8 @@ if ! fresh wheels "$wheels"; then
   step "installing the pinned wheels (about a minute)" "$venv/bin/python" -m pip install \
     --disable-pip-version-check --no-deps --no-compile --only-binary :all: --no-binary empy -r "$build/requirements.txt"
   step "mending the wheels' CMake paths" "$venv/bin/python" tools/mend_wheels.py
+  # here and on both cores: else every process that may not write bytecode compiles all it imports
+  step "compiling them" compile "$venv/lib"
   numpy=$("$venv/bin/python" -c 'import sysconfig; print(sysconfig.get_path("purelib"))')/numpy
   [ -d "$numpy/_core/include" ] || ln -s ../core/include "$numpy/_core/include"  # NumPy 1; the wheels name 2's
   rm -f "$venv/.stamp-messages"
@@ -80,5 +86,6 @@ if ! fresh package "$package"; then
   step "installing selfcal_ros" "$venv/bin/python" -m pip install --disable-pip-version-check \
     --no-deps --no-build-isolation --config-settings editable_mode=compat --editable .
   step "installing its share files" "$venv/bin/python" tools/install_share.py "$venv"
+  step "compiling it" compile selfcal_ros "$venv/lib/"python3.*/site-packages/*_msgs
   stamp package "$package"
 fi
