@@ -12,9 +12,8 @@ from selfcal_ros.batch.jobs import Record
 from selfcal_ros.batch.quantities import described
 from selfcal_ros.batch.table import Series, in_time
 from selfcal_ros.errors import printable
-from selfcal_ros.reporting.html_style import CSS
+from selfcal_ros.reporting.html_page import page
 
-POLICY = "default-src 'none'; style-src 'unsafe-inline'"
 WIDTH, HEIGHT, LEFT, EDGE = 560, 150, 64, 14
 STYLE = """
 figure { max-width: 36rem; } svg { width: 100%; height: auto; }
@@ -23,21 +22,6 @@ svg text { fill: var(--soft); font-size: 11px; }
 .value.bad { fill: var(--bad); } .course { stroke: var(--ink); fill: none; stroke-width: 1.5; }
 .change { stroke: var(--bad); stroke-dasharray: 4 3; }
 td.text { text-align: left; min-width: 14rem; } td.bad { color: var(--bad); }
-"""
-_PAGE = """<!DOCTYPE html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta http-equiv="Content-Security-Policy" content="{policy}">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<title>{title}</title>
-<style>{css}</style>
-</head>
-<body>
-<h1>{title}</h1>
-{body}
-</body>
-</html>
 """
 
 
@@ -54,8 +38,7 @@ def page_html(records: Sequence[Record], found: Sequence[Series], lines: Sequenc
             parts.append(f"<section><h2>{_text('Plan ' + series.plan_id)}: over time</h2>"
                          f'<div class="figures">{pictures}</div></section>')
     parts.append(f"<section><h2>Bags</h2>{_table(records)}</section>")
-    return _PAGE.format(policy=POLICY, title=f"Calibrations from {len(records)} bags",
-                        css=CSS + STYLE, body="\n".join(parts))
+    return page(f"Calibrations from {len(records)} bags", "\n".join(parts), style=STYLE)
 
 
 def _text(value: object) -> str:

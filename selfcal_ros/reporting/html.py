@@ -11,37 +11,18 @@ import numpy as np
 from selfcal_ros.files import write_text
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.reporting.chapters import Chapter, Figure, chapters
-from selfcal_ros.reporting.html_style import CSS
+from selfcal_ros.reporting.html_page import page
 from selfcal_ros.reporting.sheet.svg import inline_svg
 from selfcal_ros.reporting.summary.format import numeric_columns, printable
 from selfcal_ros.reporting.summary.numbers import truth_arrays
 from selfcal_ros.reporting.summary.sections import Section
 from selfcal_ros.reporting.summary.text import state_sentence
 
-POLICY = "default-src 'none'; style-src 'unsafe-inline'"
-"""Content security policy: a browser will not fetch anything, whatever a name contains."""
-
 WIDE = 40
 """Characters from which a cell of words is given room."""
 
 SHORT = 24
 """Characters up to which a cell of words is kept in one line."""
-
-_PAGE = """<!DOCTYPE html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta http-equiv="Content-Security-Policy" content="{policy}">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<title>{title}</title>
-<style>{css}</style>
-</head>
-<body>
-<h1>{title}</h1>
-{body}
-</body>
-</html>
-"""
 
 
 def save_report(result: CalibrationResult, path: str | os.PathLike, *,
@@ -77,7 +58,7 @@ def report_html(result: CalibrationResult, *,
     parts = [f'<p class="verdict{"" if good else " bad"}">{_text(state_sentence(result))}</p>',
              _contents(found), *map(_chapter, found)]
     title = _text(f"Stage calibration: plan {result.plan_id}")
-    return _PAGE.format(policy=POLICY, title=title, css=CSS, body="\n".join(parts))
+    return page(title, "\n".join(parts))
 
 
 def _text(value: object) -> str:
