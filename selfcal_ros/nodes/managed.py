@@ -103,6 +103,16 @@ class ManagedNode(NodeBase, LifecycleNode):
     def take_down(self) -> None:
         """Let go of what configuring made that is no entity of ROS."""
 
+    def destroy_node(self) -> None:
+        """Take everything down, the name in the graph included.
+
+        rclpy 7.1 leaves the state machine, which holds on to the node: until Python collects
+        its garbage, the name would stay in the graph, without any topic.
+        """
+        self._unmake("activate", "configure")
+        super().destroy_node()
+        self._state_machine.destroy_when_not_in_use()
+
     def _make(self, step: str, make: Callable[[], None]) -> TransitionCallbackReturn:
         self.problem, self._making = None, step
         try:

@@ -76,10 +76,6 @@ class MeasurementCollector(PollingNode):
             self._reception.close()
         self.session = self._reception = self._worker = self._detections = None
 
-    def close(self) -> None:
-        """Write what has come to the journal."""
-        self.take_down()
-
     def _publish(self, output: str, fields: dict[str, Any]) -> None:
         publisher = self._outputs[output]
         publisher.publish(fill(publisher.msg_type(), fields))

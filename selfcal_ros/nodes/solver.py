@@ -54,10 +54,6 @@ class Solver(ManagedNode):
             self._worker.shutdown(wait=False, cancel_futures=True)
         self.session = self._worker = self._running = None
 
-    def close(self) -> None:
-        """Let the worker end."""
-        self.take_down()
-
     def _publish(self, output: str, fields: dict[str, Any]) -> None:
         if output == "markers":
             self._markers.publish(map_markers(**fields, frame_id=self.frame_id))

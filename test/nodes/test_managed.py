@@ -124,6 +124,18 @@ def test_work_goes_on_under_a_simulated_time_that_stands_still(graph, tmp_path):
     graph.until(lambda: len(heard) == 2, "PLACE and MEASURE")
 
 
+@pytest.mark.parametrize("name", MANAGED)
+def test_a_destroyed_node_leaves_the_graph(graph, name):
+    node = graph.node(MANAGED[name])
+    graph.until(lambda: name in graph.hand.get_node_names(), "the node")
+    gc.disable()  # or it would go when circles of references are broken, some time later
+    try:
+        graph.remove(node)
+        graph.until(lambda: name not in graph.hand.get_node_names(), "its end")
+    finally:
+        gc.enable()
+
+
 def test_whatever_a_message_does_is_counted_and_told(graph):
     node = graph.node(Solver)
     publisher = graph.publisher(names.MEASUREMENT)

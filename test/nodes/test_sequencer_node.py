@@ -57,6 +57,13 @@ class Desk:
             "run_id": self.heard[-1].run_id if self.heard else ""}))
 
 
+def all_alive(graph: Graph, **values: str) -> None:
+    """Let the companions tell from now on that all are there."""
+    graph.health("measurement_collector", **{
+        "encoder_heard": "yes", "detections_matched": "yes"} | values)
+    graph.health("solver")
+
+
 @pytest.fixture
 def desk(graph, tmp_path):
     return Desk(graph, tmp_path)
@@ -161,14 +168,12 @@ def test_a_start_waits_for_who_is_missing_and_names_them(graph, tmp_path):
              "stage/mark_detections", {"encoder_heard": "no", "detections_matched": "no"}),
             ("waiting for a publisher of stage/mark_detections",
              {"encoder_heard": "yes", "detections_matched": "no"})):
-        def told(said=said, values=values):
-            graph.health("solver")
-            graph.health("measurement_collector", **values)
-            return any(s.message == said for m in heard for s in m.status)
-        graph.until(told, said)
+        graph.health("solver")
+        graph.health("measurement_collector", **values)
+        graph.until(lambda said=said: any(s.message == said for m in heard for s in m.status),
+                    said)
     assert desk.commands == []
-    graph.health("measurement_collector", encoder_heard="yes", detections_matched="yes")
-    graph.health("solver")
+    all_alive(graph)
     desk.expect((PLACE, 0))
 
 
@@ -176,8 +181,7 @@ def test_a_start_that_waits_can_be_given_up(graph, tmp_path):
     desk = Desk(graph, tmp_path, start_checks=True)
     assert desk.ask("start").message.startswith("waiting for ")
     assert desk.ask("abort").message == "idle: no longer waiting"
-    graph.health("measurement_collector", encoder_heard="yes", detections_matched="yes")
-    graph.health("solver")
+    all_alive(graph)
     graph.until(lambda: not desk.node.session.missing(), "all of them")
     assert not desk.ask("confirm_view").success
     assert desk.commands == []
@@ -187,18 +191,15 @@ def test_an_automatic_start_waits_too(graph, tmp_path):
     desk = Desk(graph, tmp_path, auto_start=True, start_checks=True)
     graph.until(lambda: desk.node.session.waiting, "the node")
     assert desk.node.session.machine.state is State.IDLE
-    graph.health("measurement_collector", encoder_heard="yes", detections_matched="yes")
-    graph.health("solver")
+    all_alive(graph)
     desk.expect((PLACE, 0))
 
 
 def test_a_restarted_sequencer_takes_up_the_run_in_its_view(graph, tmp_path):
     desk = Desk(graph, tmp_path, start_checks=True)
-    told = {"encoder_heard": "yes", "detections_matched": "yes", "plan_id": PLAN.plan_id,
-            "run_id": "17", "phase": "MEASURE", "view": "1", "view_name": PLAN.views[1].name,
-            "command_stamp": "1700"}
-    graph.health("measurement_collector", **told)
-    graph.health("solver")
+    told = {"plan_id": PLAN.plan_id, "run_id": "17", "phase": "MEASURE", "view": "1",
+            "view_name": PLAN.views[1].name, "command_stamp": "1700"}
+    all_alive(graph, **told)
     graph.until(lambda: not desk.node.session.missing(), "all of them")
     assert desk.ask("start").message == f"took up run 17 in view '{PLAN.views[1].name}', MEASURE"
     desk.expect((MEASURE, 1))

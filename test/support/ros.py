@@ -7,6 +7,7 @@ from typing import Any
 
 import rclpy
 from diagnostic_msgs.msg import KeyValue
+from rclpy.clock import Clock, ClockType
 from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -31,6 +32,7 @@ class Graph:
         self.hand = self.add(Node("hand", context=self.context))
         self._clients: dict[str, Any] = {}
         self._voices: dict[str, Any] = {}
+        self._alive: dict[str, dict[str, str]] = {}
 
     def add(self, node: Node) -> Node:
         self.executor.add_node(node)
@@ -47,7 +49,6 @@ class Graph:
     def remove(self, node: Node) -> None:
         self.executor.remove_node(node)
         self.nodes.remove(node)
-        getattr(node, "take_down", lambda: None)()
         node.destroy_node()
 
     def listen(self, topic: Topic) -> list:
@@ -64,12 +65,22 @@ class Graph:
         return publisher
 
     def health(self, node: str, **values: str) -> None:
-        """Tell once, as `node` does each second, that it is alive."""
-        topic = names.of_node(node, names.HEALTH)
+        """Tell from now on, as `node` does each second, that it is alive, and these values.
+
+        By a timer: what is told in a loop of waiting comes faster than it can be heard.
+        """
+        if not self._alive:
+            self.hand.create_timer(0.1, self._tell, clock=Clock(clock_type=ClockType.STEADY_TIME))
         if node not in self._voices:
+            topic = names.of_node(node, names.HEALTH)
             self._voices[node] = self.hand.create_publisher(topic.type, topic.name, topic.qos)
-        self._voices[node].publish(topic.type(level=b"\0", name=node, message="as told", values=[
-            KeyValue(key=key, value=value) for key, value in values.items()]))
+        self._alive[node] = values
+
+    def _tell(self) -> None:
+        for node, values in self._alive.items():
+            self._voices[node].publish(names.HEALTH.type(
+                level=b"\0", name=node, message="as told", values=[
+                    KeyValue(key=key, value=value) for key, value in values.items()]))
 
     def until(self, condition: Callable[[], Any], what: str) -> None:
         """Spin until `condition` holds; fail when patience ends."""
