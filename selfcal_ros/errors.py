@@ -91,6 +91,13 @@ def first_line(error: BaseException) -> str:
     return (str(error).splitlines() or [type(error).__name__])[0]
 
 
+def as_answer(error: Exception) -> tuple[ExitCode, str]:
+    """Return code and message of an answer that an error ends, whoever made the error."""
+    if isinstance(error, SelfcalError):
+        return error.exit_code, printable(str(error))
+    return ExitCode.INTERNAL, printable(f"{type(error).__name__}: {error}")
+
+
 def printable(text: str) -> str:
     r"""Return `text` as one line without anything that a terminal acts on.
 

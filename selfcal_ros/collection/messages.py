@@ -86,6 +86,18 @@ class Command:
             raise ValueError(f"{self.phase.name} names no view")
         return self.view
 
+    def plate(self) -> Artifact:
+        """Return the plate that a PLACE or MEASURE names.
+
+        Raises
+        ------
+        ValueError
+            For a command without one.
+        """
+        if self.artifact is None:
+            raise ValueError(f"{self.phase.name} names no plate")
+        return self.artifact
+
 
 def check_command(command: Command) -> None:
     """Raise InputError for a command that no cell can follow.

@@ -13,9 +13,10 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 
 from selfcal_ros.collection.parameters import BARE_Y, NODE_PARAMETERS, parameter_values
-from selfcal_ros.errors import ExitCode, SelfcalError, printable
+from selfcal_ros.errors import SelfcalError, as_answer, printable
+from selfcal_ros.nodes.callbacks import WithInfo
 from selfcal_ros.nodes.descriptors import descriptor
-from selfcal_ros.nodes.filling import status_of
+from selfcal_ros.nodes.filling import fill, status_of
 from selfcal_ros.nodes.names import HEALTH, Topic, private
 from selfcal_ros.nodes.publishers import mismatched, others_publishing
 from selfcal_ros.sessions.clocks import RosTime
@@ -23,8 +24,8 @@ from selfcal_ros.sessions.health import Losses, Refusals, merged
 from selfcal_ros.sessions.ports import Diagnosis, Level, Ports
 
 
-class NodeBase:
-    """Mixed into a node of rclpy: parameters from the package's one table, health once a second.
+class NodeBase(Node):
+    """A node of rclpy with parameters from the package's one table, and health once a second.
 
     Work and health follow a steady clock: a simulated or stepped ROS time does not stop them.
     """
@@ -61,14 +62,21 @@ class NodeBase:
         return self.own(self.create_publisher(topic.type, topic.name, topic.qos),
                         self.destroy_publisher)
 
+    def output(self, topic: Topic) -> Callable[[dict[str, Any]], None]:
+        """Return what publishes the fields of a message on `topic`."""
+        publisher = self.publisher(topic)
+        return lambda fields: publisher.publish(fill(topic.type(), fields))
+
     def subscribe(self, topic: Topic, callback: Callable[..., None], **kwargs: Any) -> Any:
         """Subscribe `callback` to `topic`; what it raises is counted and does not end the node."""
         name = self.resolve_topic_name(topic.name)
         guarded = callback if hasattr(callback, "__signature__") else self.guarded(
             callback, topic.name)
         self._heard_on[name] = topic
-        events = SubscriptionEventCallbacks(message_lost=lambda event: self.losses.add(
-            topic.name, event.total_count_change))
+
+        def lost(event: Any) -> None:
+            self.losses.add(topic.name, event.total_count_change)
+        events = SubscriptionEventCallbacks(message_lost=lost)
         return self.own(self.create_subscription(
             topic.type, topic.name, guarded, topic.qos, event_callbacks=events, **kwargs),
             self.destroy_subscription)
@@ -85,9 +93,7 @@ class NodeBase:
             # the events executor of rclpy 7.1 passes message and info as one pair
             message, info = received[0] if len(received) == 1 else received
             callback(message, info["source_timestamp"] < began_ns)
-        guarded = self.guarded(call, topic.name)
-        guarded.__signature__ = inspect.signature(lambda message, info: None)  # rclpy counts them
-        return self.subscribe(topic, guarded, **kwargs)
+        return self.subscribe(topic, WithInfo(self.guarded(call, topic.name)), **kwargs)
 
     def service(self, kind: type, name: str, answer: Callable[..., str]) -> Any:
         """Offer a service whose response is filled from `answer` (request), or from its error.
@@ -107,13 +113,12 @@ class NodeBase:
         return self.own(self.create_service(kind, name, call), self.destroy_service)
 
     def _answer_error(self, response: Any, error: Exception) -> None:
-        known = isinstance(error, SelfcalError)
+        code, response.message = as_answer(error)
         response.success = False
-        response.message = str(error) if known else f"{type(error).__name__}: {error}"
-        if not known:
+        if not isinstance(error, SelfcalError):
             self.refusals.add("service", error)
         if hasattr(response, "error_code"):
-            response.error_code = int(error.exit_code if known else ExitCode.INTERNAL)
+            response.error_code = int(code)
 
     def every(self, seconds: float, callback: Callable[[], None]) -> Any:
         """Call `callback` every so many seconds of a steady clock."""
@@ -173,7 +178,7 @@ class NodeBase:
         self._health.publish(status)
 
 
-class SelfcalNode(NodeBase, Node):
+class SelfcalNode(NodeBase):
     """A node that works from its construction on.
 
     Parameters

@@ -10,7 +10,7 @@ from selfcal_msgs.action import RunCalibration
 from selfcal_msgs.srv import SaveMap
 
 from selfcal_ros.collection.sequencer import State
-from selfcal_ros.errors import ExitCode, NoDataError, SelfcalError, printable
+from selfcal_ros.errors import ExitCode, NoDataError, as_answer
 from selfcal_ros.nodes.managed import ManagedNode
 from selfcal_ros.sessions.map_files import plan_file_name
 from selfcal_ros.sessions.ports import Level
@@ -67,6 +67,10 @@ class CalibrationAction:
         if self._ended is not None:
             _complete(self._ended)
 
+    def _on_saved(self, _: Future) -> None:
+        if self._saved is not None:
+            _complete(self._saved)
+
     async def _execute(self, goal: Any) -> Any:
         """Run the plan of a goal to its end and have the solver save the map."""
         result = RunCalibration.Result()
@@ -78,9 +82,8 @@ class CalibrationAction:
             await self._ended
             await self._conclude(goal, result)
         except Exception as error:
-            known = isinstance(error, SelfcalError)
-            result.error_code = int(error.exit_code if known else ExitCode.INTERNAL)
-            result.message = printable(str(error) if known else f"{type(error).__name__}: {error}")
+            code, result.message = as_answer(error)
+            result.error_code = int(code)
             goal.abort()
         finally:
             self._goal, self._ended = None, None
@@ -94,7 +97,7 @@ class CalibrationAction:
             goal.canceled() if goal.is_cancel_requested else goal.abort()
             return
         answer = await self._save(
-            self._node.values["result_path"] or plan_file_name(machine.plan.plan_id))
+            self._node.values["result_path"] or plan_file_name(machine.need_plan().plan_id))
         result.error_code, result.message = answer.error_code, answer.message
         result.map_path = answer.path
         goal.succeed() if answer.success else goal.abort()
@@ -106,7 +109,7 @@ class CalibrationAction:
         patience = self._node.values["save_timeout"]
         self._saved, self._save_until = Future(), time.monotonic() + patience
         answer = self._saver.call_async(SaveMap.Request(path=path))
-        answer.add_done_callback(lambda _: self._saved and _complete(self._saved))
+        answer.add_done_callback(self._on_saved)
         try:
             await self._saved
         finally:

@@ -5,7 +5,7 @@ import sys
 from typing import Any
 
 from selfcal_ros.nodes import names
-from selfcal_ros.nodes.managed import ManagedNode
+from selfcal_ros.nodes.managed import ManagedNode, WhileConfigured
 from selfcal_ros.nodes.running import run
 from selfcal_ros.sessions.compensating import CompensatingSession
 from selfcal_ros.sessions.ports import Diagnosis
@@ -14,8 +14,9 @@ from selfcal_ros.sessions.ports import Diagnosis
 class CompensatorNode(ManagedNode):
     """Publishes stage/corrected_joint_states: each sample with the stage's error taken off."""
 
+    session = WhileConfigured[CompensatingSession]()
+
     def __init__(self, **kwargs: Any) -> None:
-        self.session: CompensatingSession | None = None
         super().__init__("compensator", **kwargs)
 
     def configure(self) -> None:
@@ -29,10 +30,6 @@ class CompensatorNode(ManagedNode):
         self.subscribe(names.SUMMARY, self.session.take_summary)
         self.subscribe(names.ERROR_MAP, self.session.take_map)
         self.subscribe(names.ENCODER_BEST_EFFORT, self._on_sample)
-
-    def take_down(self) -> None:
-        """Forget the map."""
-        self.session = None
 
     def _on_sample(self, message: Any) -> None:
         corrected = self.session.correct(list(message.name), list(message.position))

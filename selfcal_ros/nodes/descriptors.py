@@ -12,10 +12,12 @@ def descriptor(parameter: Parameter) -> ParameterDescriptor:
     told = ParameterDescriptor(description=parameter.description + unit, read_only=True)
     if parameter.choices:
         told.additional_constraints = "one of " + ", ".join(parameter.choices)
-    if parameter.low is not None and isinstance(parameter.default, float):
+    low, high = parameter.low, parameter.high
+    if low is None or high is None:
+        return told
+    if isinstance(parameter.default, float):
         told.floating_point_range = [FloatingPointRange(
-            from_value=float(parameter.low), to_value=float(parameter.high))]
-    elif parameter.low is not None:
-        told.integer_range = [IntegerRange(from_value=int(parameter.low),
-                                                 to_value=int(parameter.high), step=1)]
+            from_value=float(low), to_value=float(high))]
+    else:
+        told.integer_range = [IntegerRange(from_value=int(low), to_value=int(high), step=1)]
     return told

@@ -3,6 +3,7 @@
 
 import traceback
 from collections.abc import Callable
+from concurrent.futures import Executor
 from functools import partial
 from typing import Any
 
@@ -12,6 +13,33 @@ from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackRet
 from selfcal_ros.errors import SelfcalError, first_line
 from selfcal_ros.nodes.base import NodeBase
 from selfcal_ros.sessions.ports import Diagnosis, Level
+
+
+class WhileConfigured[T]:
+    """An attribute of a managed node that exists from its configuring to its taking down.
+
+    Read at another time it raises SelfcalError: no code of a node has to ask if there is one.
+    """
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self._name = name
+
+    def __get__(self, node: "ManagedNode", owner: type) -> T:
+        """Return what `configure` or `activate` has set."""
+        try:
+            return node.held[self._name]
+        except KeyError:
+            raise SelfcalError(f"{node.get_name()}: there is no {self._name.strip('_')} while "
+                               f"{node.state}; configure the node first") from None
+
+    def __set__(self, node: "ManagedNode", value: T) -> None:
+        """Hold `value` until the node is taken down."""
+        node.held[self._name] = value
+
+
+def stop(worker: Executor) -> None:
+    """Let a worker go; what still runs in it is not waited for."""
+    worker.shutdown(wait=False, cancel_futures=True)
 
 
 class ManagedNode(NodeBase, LifecycleNode):
@@ -34,6 +62,7 @@ class ManagedNode(NodeBase, LifecycleNode):
         self.problem: Exception | None = None
         self._made: dict[str, list[Callable[[], Any]]] = {"configure": [], "activate": []}
         self._making = ""
+        self.held: dict[str, Any] = {}
         super().__init__(name, **kwargs)
         self.prepare(name)
         change = self._service_change_state
@@ -100,9 +129,6 @@ class ManagedNode(NodeBase, LifecycleNode):
         """Take down everything; the node can be configured anew."""
         return self._unmake("activate", "configure")
 
-    def take_down(self) -> None:
-        """Let go of what configuring made that is no entity of ROS."""
-
     def destroy_node(self) -> None:
         """Take everything down, the name in the graph included.
 
@@ -131,7 +157,7 @@ class ManagedNode(NodeBase, LifecycleNode):
             if "configure" in steps:
                 self._heard_on.clear()
                 self.alone_on.clear()
-                self.take_down()
+                self.held.clear()
         except Exception as error:
             return self._fail(f"take down {steps[0]}", error)
         return TransitionCallbackReturn.SUCCESS

@@ -6,12 +6,13 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+from rclpy.subscription import Subscription
 from std_srvs.srv import Trigger
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes.encoder_input import EncoderInput
-from selfcal_ros.nodes.filling import fill
+from selfcal_ros.nodes.managed import WhileConfigured, stop
 from selfcal_ros.nodes.polling import ByTheClock, PollingNode
 from selfcal_ros.nodes.publishers import offered
 from selfcal_ros.nodes.running import run
@@ -32,11 +33,11 @@ class MeasurementCollector(PollingNode):
     together, and gives them to the session.
     """
 
+    session = WhileConfigured[CollectingSession]()
+    _reception = WhileConfigured[Reception]()
+    _detections = WhileConfigured[Subscription]()
+
     def __init__(self, **kwargs: Any) -> None:
-        self.session: CollectingSession | None = None
-        self._reception: Reception | None = None
-        self._worker: ThreadPoolExecutor | None = None
-        self._detections: Any = None
         super().__init__("measurement_collector", **kwargs)
 
     def configure(self) -> None:
@@ -46,11 +47,13 @@ class MeasurementCollector(PollingNode):
         journal = JournalKeeper(self._journal_folder(), {
             topic.name: (self.resolve_topic_name(topic.name), offered(topic))
             for topic in names.INPUTS}, self.values, ports)
-        self._reception = Reception(self.session, journal, say=self.say, refuse=self.refusals.add)
-        self._worker = ThreadPoolExecutor(1, thread_name_prefix="journal")
-        self._reception.open(self._worker)
-        self._outputs = {"status": self.publisher(names.STATUS),
-                         "measurement": self.publisher(names.MEASUREMENT)}
+        self._reception = self.own(
+            Reception(self.session, journal, say=self.say, refuse=self.refusals.add),
+            Reception.close)
+        worker = self.own(ThreadPoolExecutor(1, thread_name_prefix="journal"), stop)
+        self._reception.open(worker)
+        self._outputs = {"status": self.output(names.STATUS),
+                         "measurement": self.output(names.MEASUREMENT)}
         self._received = self.publisher(names.private(names.RECEIVED))
         self.alone_on += [names.STATUS.name, names.ENCODER.name]
 
@@ -68,17 +71,8 @@ class MeasurementCollector(PollingNode):
         self.every(TICK_S, self._on_timer)
         self.service(Trigger, "~/finish", lambda request: self._finish())
 
-    def take_down(self) -> None:
-        """Forget what was collected, close the journal."""
-        if self._worker is not None:
-            self._worker.shutdown(wait=False, cancel_futures=True)
-        if self._reception is not None:
-            self._reception.close()
-        self.session = self._reception = self._worker = self._detections = None
-
     def _publish(self, output: str, fields: dict[str, Any]) -> None:
-        publisher = self._outputs[output]
-        publisher.publish(fill(publisher.msg_type(), fields))
+        self._outputs[output](fields)
 
     def _on_timer(self) -> None:
         self._drain()

@@ -12,8 +12,10 @@ import os
 import sys
 import threading
 import time
+from functools import partial
 from typing import Any
 
+from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.task import Future
@@ -47,8 +49,8 @@ class MonitorSession(Node):
             self.create_subscription(topic.type, topic.name, take, topic.qos)
         for node in WATCHED:
             topic = names.of_node(node, names.HEALTH)
-            self.create_subscription(topic.type, topic.name, lambda status, node=node:
-                                     self._watch.take_health(node, diagnosis_of(status)), topic.qos)
+            self.create_subscription(topic.type, topic.name, partial(self._on_health, node),
+                                     topic.qos)
         self._askers = {word: self.create_client(Trigger, f"pose_sequencer/{service}")
                         for word, service in REQUESTS.items()}
         self._words: list[str] = []
@@ -58,6 +60,9 @@ class MonitorSession(Node):
         self.create_timer(PERIOD_S, self._show, clock=steady)
         self.create_timer(0.05, self._serve, clock=steady)
         threading.Thread(target=self._listen, name="stdin", daemon=True).start()
+
+    def _on_health(self, node: str, status: DiagnosticStatus) -> None:
+        self._watch.take_health(node, diagnosis_of(status))
 
     def _listen(self) -> None:
         for line in sys.stdin:

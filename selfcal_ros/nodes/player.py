@@ -40,7 +40,8 @@ class Player:
         self._publishers = {topic.name: node.publisher(topic) for topic in names.INPUTS}
         self.sent = dict.fromkeys(KINDS.values(), 0)
         self.heard: dict[str, int] | None = None
-        self._at, self._began = 0, None
+        self._at = 0
+        self._began: float | None = None
         node.subscribe(names.of_node("measurement_collector", names.RECEIVED), self._on_received)
 
     @property
@@ -66,24 +67,23 @@ class Player:
     def step(self) -> None:
         """Publish what is due now."""
         now = time.monotonic()
-        if self._began is None:
-            self._began = now
+        self._began = began = now if self._began is None else self._began
         stop = now + 0.02
         while not self.done and time.monotonic() < stop:
             topic, stamp, data = self._next
-            if self.rate > 0 and (stamp - self._first_ns) * 1e-9 / self.rate > now - self._began:
+            if self.rate > 0 and (stamp - self._first_ns) * 1e-9 / self.rate > now - began:
                 return
-            if not self._room():
+            if not self._room(time.monotonic() - began):
                 return
             self._publishers[topic].publish(data)
             self.sent[KINDS[topic]] += 1
             self._at += 1
             self._next = next(self._messages, self._next)
 
-    def _room(self) -> bool:
-        """Return whether the subscribers keep up."""
+    def _room(self, played_s: float) -> bool:
+        """Return whether the subscribers keep up, `played_s` after the first message."""
         if self.heard is None:
-            return self._at < WINDOW + UNHEARD_RATE * (time.monotonic() - self._began) / 2
+            return self._at < WINDOW + UNHEARD_RATE * played_s / 2
         return self._at - sum(self.heard.values()) < WINDOW
 
     def _on_received(self, message: Any) -> None:

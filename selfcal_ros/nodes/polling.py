@@ -4,7 +4,6 @@
 import inspect
 import time
 from collections.abc import Callable, Iterator
-from typing import Any
 
 from rclpy.subscription import Subscription
 
@@ -40,11 +39,11 @@ class ByTheClock:
         """Take a message from an executor."""
         self.take(message, time.time_ns())
 
-    def empty(self, handle: Any, kind: type) -> int:
+    def empty(self, subscription: Subscription) -> int:
         """Take what waits, up to `MOST`; return how many numbers of publication were left out."""
         gap = 0
         for _ in range(MOST):
-            taken = handle.take_message(kind, True)
+            taken = subscription.handle.take_message(subscription.msg_type, True)
             if taken is None:
                 break
             data, info = taken
@@ -74,7 +73,7 @@ class PollingNode(ManagedNode):
             callback = item.callback
             if isinstance(callback, ByTheClock):
                 with item.handle:
-                    gap = callback.empty(item.handle, item.msg_type)
+                    gap = callback.empty(item)
                 if gap and item.get_publisher_count() == 1:  # of several, numbers interleave
                     callback.n_missing += gap
                     untold = callback.n_missing - self.losses.counts[callback.topic]

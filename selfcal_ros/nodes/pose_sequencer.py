@@ -8,8 +8,8 @@ from std_srvs.srv import Trigger
 
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes.calibration_action import CalibrationAction
-from selfcal_ros.nodes.filling import diagnosis_of, fill
-from selfcal_ros.nodes.managed import ManagedNode
+from selfcal_ros.nodes.filling import diagnosis_of
+from selfcal_ros.nodes.managed import ManagedNode, WhileConfigured
 from selfcal_ros.nodes.running import run
 from selfcal_ros.sessions.ports import Diagnosis
 from selfcal_ros.sessions.sequencing import SequencingSession
@@ -21,15 +21,16 @@ TICK_S = 0.05
 class PoseSequencer(ManagedNode):
     """Publishes PLACE and MEASURE for each view; services and an action drive it."""
 
+    session = WhileConfigured[SequencingSession]()
+    _action = WhileConfigured[CalibrationAction]()
+
     def __init__(self, **kwargs: Any) -> None:
-        self.session: SequencingSession | None = None
-        self._action: CalibrationAction | None = None
         super().__init__("pose_sequencer", **kwargs)
 
     def configure(self) -> None:
         """Make the session, with its plan, and the publisher of commands."""
-        self.session = SequencingSession(self.values, self.ports(self._publish))
-        self._command = self.publisher(names.COMMAND)
+        command = self.output(names.COMMAND)
+        self.session = SequencingSession(self.values, self.ports(lambda _, fields: command(fields)))
 
     def activate(self) -> None:
         """Listen to the companions, offer services and the action."""
@@ -49,13 +50,6 @@ class PoseSequencer(ManagedNode):
             self.service(Trigger, f"~/{name}", lambda request, act=act: act())
         self._action = CalibrationAction(self, session)
         self.every(TICK_S, self._on_timer)
-
-    def take_down(self) -> None:
-        """Forget the plan."""
-        self.session = self._action = None
-
-    def _publish(self, _: str, fields: dict[str, Any]) -> None:
-        self._command.publish(fill(names.COMMAND.type(), fields))
 
     def _on_timer(self) -> None:
         self.session.tick()

@@ -8,8 +8,7 @@ from typing import Any
 from selfcal_msgs.srv import LoadMap, SaveMap
 
 from selfcal_ros.nodes import names
-from selfcal_ros.nodes.filling import fill
-from selfcal_ros.nodes.managed import ManagedNode
+from selfcal_ros.nodes.managed import ManagedNode, WhileConfigured, stop
 from selfcal_ros.nodes.markers import map_markers
 from selfcal_ros.nodes.running import run
 from selfcal_ros.sessions.ports import Diagnosis
@@ -24,18 +23,20 @@ class Solver(ManagedNode):
     Solving runs in a thread beside the executor; what arrives meanwhile is solved next, together.
     """
 
+    session = WhileConfigured[SolvingSession]()
+    _worker = WhileConfigured[ThreadPoolExecutor]()
+    _running = WhileConfigured[Future[Outcome] | None]()
+
     def __init__(self, **kwargs: Any) -> None:
-        self.session: SolvingSession | None = None
-        self._worker: ThreadPoolExecutor | None = None
-        self._running: Future[Outcome] | None = None
         super().__init__("solver", **kwargs)
 
     def configure(self) -> None:
         """Make the session, the worker and the publishers."""
         self.session = SolvingSession(self.values, self.ports(self._publish))
-        self._worker = ThreadPoolExecutor(1, thread_name_prefix="solver")
-        self._outputs = {"map": self.publisher(names.ERROR_MAP),
-                         "summary": self.publisher(names.SUMMARY)}
+        self._worker = self.own(ThreadPoolExecutor(1, thread_name_prefix="solver"), stop)
+        self._running = None
+        self._outputs = {"map": self.output(names.ERROR_MAP),
+                         "summary": self.output(names.SUMMARY)}
         self._markers = self.publisher(names.MAP_MARKERS)
         self._solved = self.publisher(names.private(names.SOLVED))
         self.alone_on += [names.ERROR_MAP.name, names.MEASUREMENT.name]
@@ -48,18 +49,11 @@ class Solver(ManagedNode):
         self.service(LoadMap, "~/load_map", lambda request: self.session.load(request.path))
         self.service(SaveMap, "~/save_map", self._save)
 
-    def take_down(self) -> None:
-        """Forget the readings; what still runs in the worker is not waited for."""
-        if self._worker is not None:
-            self._worker.shutdown(wait=False, cancel_futures=True)
-        self.session = self._worker = self._running = None
-
     def _publish(self, output: str, fields: dict[str, Any]) -> None:
         if output == "markers":
             self._markers.publish(map_markers(**fields, frame_id=self.frame_id))
         else:
-            publisher = self._outputs[output]
-            publisher.publish(fill(publisher.msg_type(), fields))
+            self._outputs[output](fields)
 
     def _on_measurement(self, message: Any) -> None:
         self.session.take_measurement(message)
@@ -68,7 +62,7 @@ class Solver(ManagedNode):
 
     def _on_timer(self) -> None:
         if self._running is not None and self._running.done():
-            self._take()
+            self._take(self._running)
         if self._running is None:
             self._begin()
 
@@ -76,8 +70,9 @@ class Solver(ManagedNode):
         job = self.session.next_job()
         self._running = self._worker.submit(solve, job) if job is not None else None
 
-    def _take(self) -> None:
-        outcome, self._running = self._running.result(), None
+    def _take(self, running: Future[Outcome]) -> None:
+        """Take what was solved; wait for it if need be."""
+        outcome, self._running = running.result(), None
         try:
             self.session.take(outcome)
         finally:
@@ -87,7 +82,7 @@ class Solver(ManagedNode):
         """Save the map of the newest readings: what runs or waits is solved first."""
         while True:
             if self._running is not None:
-                self._take()
+                self._take(self._running)
             self._begin()
             if self._running is None:
                 break

@@ -79,8 +79,8 @@ class StageSimulator(SelfcalNode):
         known = self._plan.views if self._plan else ()
         count = max(len(known), command.view_index + 1)
         views = [known[i] if i < len(known) else View(f"view {i}") for i in range(count)]
-        views[command.view_index] = command.view
-        self._plan = Plan(command.plan_id, command.artifact, tuple(views))
+        views[command.view_index] = command.placed()
+        self._plan = Plan(command.plan_id, command.plate(), tuple(views))
         return self._plan
 
     def _on_timer(self) -> None:

@@ -158,9 +158,8 @@ def test_the_readings_of_a_view_are_sent_before_it_is_called_complete(graph, mon
     graph.until(lambda: received(node, counts), "all messages")
     node.session._published.clear()
     sent: list[str] = []
-    monkeypatch.setattr(node, "_outputs", {name: SimpleNamespace(
-        msg_type=names.STATUS.type if name == "status" else names.MEASUREMENT.type,
-        publish=lambda message, name=name: sent.append(f"{name} {message.view_index}"))
+    monkeypatch.setattr(node, "_outputs", {
+        name: lambda fields, name=name: sent.append(f"{name} {fields['view_index']}")
         for name in ("status", "measurement")})
     node.session.finish()
     assert sent == ["measurement 0", "status 0", "measurement 1", "status 1"]

@@ -11,7 +11,7 @@ from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from std_srvs.srv import Trigger
 
-from selfcal_ros.errors import InputError
+from selfcal_ros.errors import InputError, SelfcalError
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes.compensator import CompensatorNode
 from selfcal_ros.nodes.measurement_collector import MeasurementCollector
@@ -56,6 +56,27 @@ def test_ten_bring_ups_and_tear_downs_leave_nothing_behind(graph, name):
     gc.collect()
     assert [session() for session in sessions] == [None] * 10
     assert state(graph, name) == "unconfigured"
+
+
+@pytest.mark.parametrize("name", MANAGED)
+def test_there_is_no_session_but_from_configuring_to_taking_down(graph, name):
+    node = graph.node(MANAGED[name], autostart=False)
+
+    def refused():
+        with pytest.raises(SelfcalError) as info:
+            node.session.diagnosis()
+        assert type(info.value) is SelfcalError
+        return str(info.value)
+    line = f"{name}: there is no session while unconfigured; configure the node first"
+    assert refused() == line
+    assert change(graph, name, Transition.TRANSITION_CONFIGURE)
+    session = node.session
+    assert change(graph, name, Transition.TRANSITION_ACTIVATE)
+    assert node.session is session
+    assert change(graph, name, Transition.TRANSITION_DEACTIVATE)
+    assert node.session is session
+    assert change(graph, name, Transition.TRANSITION_CLEANUP)
+    assert refused() == line
 
 
 def test_an_active_node_works_as_one_that_starts_by_itself(graph, tmp_path):
