@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from selfcal_ros.bagio.reader import BagReader
+from selfcal_ros.collection.clock.steps import step_lines
 from selfcal_ros.collection.collector import Collector, ViewProgress
 from selfcal_ros.errors import InputError, NoDataError, did_you_mean
 from selfcal_ros.files import add_file
@@ -29,9 +30,10 @@ class BagSession(NamedTuple):
     views : dict
         view_index -> how far the view came.
     lost : list of str
-        What could not be read, one line each.
+        What could not be read, and clocks that stepped, one line each.
     findings : list of str
-        Why most detections of the bag, or of views, were rejected, one line each.
+        Clocks that stepped, and why most detections of the bag, or of views, were rejected, one
+        line each.
     """
 
     measurements: Measurements
@@ -62,7 +64,7 @@ def collect_bag(path: str | Path, values: dict[str, Any], *, namespace: str | No
     NoDataError
         If it has no commands or no detections, or no detection became a reading.
     """
-    reader = BagReader(Path(path), namespace)
+    reader = BagReader(Path(path), namespace, values["clock_limit"])
     collector = Collector(values)
     take = block_handlers(collector, reader.lost)
     for topic, item in reader.columns():
@@ -81,6 +83,7 @@ def collect_bag(path: str | Path, values: dict[str, Any], *, namespace: str | No
                               f"{topics_like(topic, reader.topics)}record this topic too, see "
                               "the README")
     measurements, views = collector.collect()
+    clock = step_lines(reader.steps, collector.timeline)
     findings = [(f"view '{views[index].view.name}': " if index is not None else "") + str(finding)
                 for index, finding in collector.findings(measurements, views).items()]
     if not any(view.used for view in measurements.views):
@@ -88,8 +91,8 @@ def collect_bag(path: str | Path, values: dict[str, Any], *, namespace: str | No
                             sorted(measurements.all_rejected().items(), key=lambda i: -i[1])[:4])
         raise NoDataError(str(path), f"none of {received['detection']} detections became a "
                           f"reading (rejected: {reasons}){tail}",
-                          findings[0] if findings else "correct the cause that is named first")
-    return BagSession(measurements, views, reader.lost, findings)
+                          [*clock, *findings, "correct the cause that is named first"][0])
+    return BagSession(measurements, views, [*reader.lost, *clock], [*clock, *findings])
 
 
 def topics_like(topic: str, topics: dict[str, str]) -> str:

@@ -14,13 +14,19 @@ from selfcal_ros.bagio.channels import ChannelDecoder, Input, Waiting
 from selfcal_ros.bagio.mcap.chunk import Block
 from selfcal_ros.bagio.mcap.stream import CONVERT, McapStream
 from selfcal_ros.bagio.schemas import other_field, shorter_stores, store_of_schema
+from selfcal_ros.collection.clock.steps import Step, StepWatch
+from selfcal_ros.collection.parameters import parameter_values
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import read_yaml
+from selfcal_ros.messages.input_columns import first_stamps_ns
 from selfcal_ros.messages.topics import COMMAND_TOPIC, DETECTION_TOPIC, ENCODER_TOPIC, INPUT_TOPICS
 
 LAST_FIELDS = {ENCODER_TOPIC: "position", DETECTION_TOPIC: "score", COMMAND_TOPIC: "angular_count"}
 """Last field that the contract asks for; what stands behind it may be missing."""
 SUFFIXES = (".mcap", ".mcap.zstd")
+CLOCK_LIMIT_S = parameter_values("measurement_collector", {}, "defaults")["clock_limit"]
+LOOKED_AT = 200
+"""Stamps of a topic in a chunk that are held against the times of logging."""
 
 
 @dataclass
@@ -34,11 +40,15 @@ class BagReader:
     namespace : str or None
         Namespace of the topics, for bags that hold several cells; empty = the root, None = the
         only one.
+    clock_limit_s : float
+        Steps of clocks that are larger are noted.
 
     Attributes
     ----------
     lost : list of str
         What could not be read, one line each, after reading.
+    steps : dict
+        Topic -> steps of the clock that stamps it, after reading (not by `stamped_messages`).
     cells : set of str
         Namespaces of the input topics that were met, without slashes.
     topics : dict of str
@@ -47,7 +57,9 @@ class BagReader:
 
     path: Path
     namespace: str | None = None
+    clock_limit_s: float = CLOCK_LIMIT_S
     lost: list[str] = field(default_factory=list)
+    steps: dict[str, list[Step]] = field(default_factory=dict)
     cells: set[str] = field(default_factory=set)
     topics: dict[str, str] = field(default_factory=dict)
 
@@ -171,6 +183,7 @@ class BagReader:
     def _blocks(self, bad: Counter,
                 ) -> Iterator[tuple[Block, list[tuple[ChannelDecoder, np.ndarray]]]]:
         """Yield each block with the indices of its messages on our topics, by channel."""
+        watches = {role: StepWatch(self.clock_limit_s) for role in (ENCODER_TOPIC, DETECTION_TOPIC)}
         for file in self.files:
             stream = self._stream(file)
             decoders: dict[int, ChannelDecoder | None] = {}
@@ -182,10 +195,19 @@ class BagReader:
                     decoder = decoders[number]
                     if decoder is not None:
                         parts.append((decoder, np.flatnonzero(block.fronts["channel"] == number)))
+                for decoder, index in parts:
+                    if decoder.role in watches:
+                        self._note_steps(watches[decoder.role], decoder.role, block[
+                            index[::max(1, len(index) // LOOKED_AT)]])
                 yield block, parts
             for channel in stream.channels.values():
                 schema = stream.schemas.get(channel.schema_id)
                 self.topics[channel.topic] = schema.name if schema else ""
+
+    def _note_steps(self, watch: StepWatch, role: str, block: Block) -> None:
+        stamps, there = first_stamps_ns(block.payloads)
+        found = watch.add(stamps, block.fronts["log_time"][there].astype(np.int64))
+        self.steps.setdefault(role, []).extend(found)
 
     def _say(self, bad: Counter) -> None:
         self.lost += [f"{count} messages on {role} could not be decoded{why}"

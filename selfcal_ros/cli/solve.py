@@ -125,7 +125,8 @@ def run(args: argparse.Namespace) -> int:
         measurements, _, lost, findings = collect_bag(
             args.bag, collector_values, namespace=args.namespace,
             progress=lambda count: bar(count, None))
-    for line in (*findings, *lost, *(() if findings else advice(measurements.all_rejected()))):
+    said = [*findings, *lost, *(() if findings else advice(measurements.all_rejected()))]
+    for line in dict.fromkeys(said):  # a clock that stepped is a finding, and noted in the result
         print(f"selfcal solve: {args.bag}: {line}", file=sys.stderr)
     options = solver_options(solver_values, measurements)
     try:

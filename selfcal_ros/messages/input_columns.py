@@ -21,6 +21,8 @@ MARK_DETECTION = (
     Field("n", "i4"), Field("k", "u4"), Field("offset_x", "f8"), Field("offset_y", "f8"),
     Field("offset_theta", "f8"), Field("sigma", "f8"), Field("score", "f4"))
 """Fields of selfcal_msgs/msg/MarkDetection."""
+STAMP_END = 12
+"""Bytes of the encapsulation, and of the stamp behind it."""
 _OFFSETS = {"ox": "offset_x", "oy": "offset_y", "ot": "offset_theta"}
 
 
@@ -78,6 +80,27 @@ def stamps_ns(group: Columns) -> np.ndarray:
     """Return the stamps in the headers of messages, integer ns."""
     seconds = group["header.stamp.sec"].astype(np.int64)
     return seconds * 1_000_000_000 + group["header.stamp.nanosec"]
+
+
+def first_stamps_ns(messages: Payloads) -> tuple[np.ndarray, np.ndarray]:
+    """Return the stamps of messages that begin with a header, and which are long enough for one.
+
+    Returns
+    -------
+    stamps_ns : int64 array (k,)
+        Stamps, ns.
+    there : bool array (n,)
+        Which of the messages have one.
+    """
+    there = messages.length >= STAMP_END
+    octets = np.frombuffer(messages.data, np.uint8)[
+        messages.start[there][:, None] + np.arange(STAMP_END)]
+    words = octets[:, 4:].copy()
+    little, big = (words.view(np.dtype([("sec", f"{order}i4"), ("nanosec", f"{order}u4")]))[:, 0]
+                   for order in "<>")
+    is_little = octets[:, 1] & 1 == 1
+    second = np.where(is_little, little["sec"], big["sec"]).astype(np.int64)
+    return second * 1_000_000_000 + np.where(is_little, little["nanosec"], big["nanosec"]), there
 
 
 def _encoder_block(group: Columns) -> EncoderBlock:

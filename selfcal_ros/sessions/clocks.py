@@ -4,6 +4,9 @@
 from collections import deque
 from collections.abc import Callable
 
+import numpy as np
+
+from selfcal_ros.collection.clock.steps import Step, StepWatch
 from selfcal_ros.sessions.ports import Diagnosis, Level
 
 LIVE_NS = 1_000_000_000
@@ -19,24 +22,45 @@ class ClockWatch:
     is the offset of the cell's clock, to within the transport. Nothing is said while recorded
     messages are played: the commands then have stamps of the past as well.
 
+    Steps are looked for by a steady clock: those of this machine's own clock are found as well.
+
     Parameters
     ----------
     limit_s : float
-        Largest offset that is no matter.
+        Largest offset, and largest step, that is no matter.
+
+    Attributes
+    ----------
+    steps : dict
+        Topic -> steps of the clock that stamps it, since the run began.
     """
 
     def __init__(self, limit_s: float) -> None:
-        self._limit_ns = round(limit_s * 1e9)
-        self._live = False
+        self._limit_s, self._limit_ns = limit_s, round(limit_s * 1e9)
+        self._live, self._live_run = False, ""
         self._bins: deque[tuple[float, int]] = deque()
+        self._watches: dict[str, StepWatch] = {}
+        self.steps: dict[str, list[Step]] = {}
 
-    def command(self, stamp_ns: int, now_ns: int, *, is_older: bool) -> None:
-        """Learn from a command whether the session is live; a latched one tells nothing."""
-        if not is_older:
-            self._live = abs(now_ns - stamp_ns) <= LIVE_NS
+    def command(self, stamp_ns: int, now_ns: int, *, is_older: bool, run_id: str = "") -> None:
+        """Learn from a command whether the session is live; a latched one tells nothing.
 
-    def data(self, stamp_ns: int, now_ns: int, now_s: float) -> None:
-        """Take the stamp and the reception of a message of the cell."""
+        A run that was live remains so: when a clock has stepped, its stamps look like recorded
+        ones.
+        """
+        if is_older:
+            return
+        known = bool(run_id) and run_id == self._live_run
+        self._live = known or abs(now_ns - stamp_ns) <= LIVE_NS
+        if self._live and run_id != self._live_run:
+            self._live_run, self._watches, self.steps = run_id, {}, {}
+
+    def data(self, topic: str, stamp_ns: int, now_ns: int, now_s: float) -> None:
+        """Take the stamp and the reception of a message of the cell, by both clocks."""
+        if self._live:
+            watch = self._watches.setdefault(topic, StepWatch(self._limit_s))
+            self.steps.setdefault(topic, []).extend(watch.add(
+                np.array([stamp_ns]), np.array([round(now_s * 1e9)])))
         offset = stamp_ns - now_ns
         if self._bins and now_s - self._bins[-1][0] < BIN_S:
             when, largest = self._bins[-1]

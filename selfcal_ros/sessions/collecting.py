@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from selfcal_ros.collection.clock.steps import step_lines
 from selfcal_ros.collection.collector import Collector, ViewProgress
 from selfcal_ros.collection.digest import readings_digest, session_digest
 from selfcal_ros.collection.messages import Command, Phase
@@ -15,6 +16,7 @@ from selfcal_ros.collection.reasons import advice
 from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.messages import from_model, to_model
 from selfcal_ros.messages.input_columns import EncoderBlock
+from selfcal_ros.messages.topics import DETECTION_TOPIC, ENCODER_TOPIC
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.sessions.clocks import ClockWatch
 from selfcal_ros.sessions.health import Rate, merged
@@ -48,6 +50,7 @@ class CollectingSession:
         self._advised: set[int] = set()
         self._warned: set[tuple[int | None, str]] = set()
         self._findings: list[str] = []
+        self._stepped: list[str] = []
         self._clock = ClockWatch(values["clock_limit"])
         self._encoder_rate = Rate(ports.now_s)
         self._encoder_s = float("-inf")
@@ -66,7 +69,8 @@ class CollectingSession:
         self.collector.add_encoder_block(block.stamps_ns, block.names, block.positions,
                                          block.velocities)
         self._encoder_rate.add(block.stamps_ns)
-        self._encoder_ns = max(self._encoder_ns, self._note_clock(block.stamps_ns, age_ns))
+        newest = self._note_clock(ENCODER_TOPIC, block.stamps_ns, age_ns)
+        self._encoder_ns = max(self._encoder_ns, newest)
         self._dirty = True
 
     def take_detections(self, table: np.ndarray, age_ns: int = 0) -> None:
@@ -74,14 +78,15 @@ class CollectingSession:
         if not len(table):
             return
         self.collector.add_detection_block(table)
-        self._exposed_ns = max(self._exposed_ns, self._note_clock(table["stamp"], age_ns))
+        newest = self._note_clock(DETECTION_TOPIC, table["stamp"], age_ns)
+        self._exposed_ns = max(self._exposed_ns, newest)
         self._unseen += int((table["stamp"] >= self._since_ns).sum())
         self._dirty = True
 
-    def _note_clock(self, stamps_ns: np.ndarray, age_ns: int) -> int:
+    def _note_clock(self, topic: str, stamps_ns: np.ndarray, age_ns: int) -> int:
         """Hold stamps against their reception; return the newest."""
         newest = int(stamps_ns.max())
-        self._clock.data(newest, self._ports.now_ns() - age_ns, self._ports.now_s())
+        self._clock.data(topic, newest, self._ports.now_ns() - age_ns, self._ports.now_s())
         return newest
 
     def adopt(self, collector: Collector, journal: str) -> None:
@@ -100,7 +105,8 @@ class CollectingSession:
             command = to_model.command(message)
             known = self.collector.knows(command)
             self.collector.add_command(command)
-            self._clock.command(command.stamp_ns, self._ports.now_ns(), is_older=is_older)
+            self._clock.command(command.stamp_ns, self._ports.now_ns(), is_older=is_older,
+                                run_id=command.run_id)
             if not known:
                 self._note_missed(command, is_older=is_older)
         except InputError:
@@ -203,11 +209,20 @@ class CollectingSession:
             self._ports.say(Level.WARN, f"view '{view.view.name}': {line}")
             self._advised.add(index)
 
+    def _tell_steps(self) -> None:
+        """Say once that a clock has stepped; the health says it to the end of the run."""
+        lines = step_lines(self._clock.steps, self.collector.timeline)
+        for line in lines:
+            if line not in self._stepped:
+                self._ports.say(Level.WARN, line)
+        self._stepped = lines
+
     def _describe(self, measurements: Measurements, progress: dict[int, ViewProgress]) -> None:
         """Keep for the diagnostics how far the view is and what was rejected so far."""
         self._rejected = Counter(measurements.rejected)
         for view in progress.values():
             self._rejected.update(view.readings.rejected)
+        self._tell_steps()
         index = self.collector.timeline.intervals[-1].view_index
         for number in sorted(progress):  # of the last view that tells it
             told = progress[number].readings
@@ -240,8 +255,9 @@ class CollectingSession:
             "detections_matched": "yes" if detections_matched else "no",
             **{f"rejected {reason}": n for reason, n in sorted(self._rejected.items())}})
         found = Diagnosis(Level.WARN if self._findings else Level.OK, "; ".join(self._findings))
+        stepped = Diagnosis(Level.WARN if self._stepped else Level.OK, "; ".join(self._stepped))
         return merged(main, [
-            found, self._clock.diagnosis(),
+            found, self._clock.diagnosis(), stepped,
             self._encoder(), self._repeatability()])
 
     def _cost(self) -> dict[str, str]:

@@ -22,6 +22,9 @@ from selfcal_ros.sessions.stalls import StallWatch, missing_marks
 PATIENCE_S = 3.0
 """Time without a sign of life after which a node is missing; it tells its health each second."""
 
+SET_BACK_S = 0.1
+"""How far the clock may be behind the newest command."""
+
 
 def load_plan(path: str) -> Plan:
     """Return the plan in a PLAN.yaml."""
@@ -54,7 +57,7 @@ class SequencingSession:
         self._measured: dict[tuple[str, str], dict[int, str]] = {}
         self._stall = StallWatch(values["stall_time"], ports.now_s)
         self._status: Any = None  # newest of the current view
-        self._stalled = ""
+        self._stalled = self._set_back = ""
         if self.waiting:
             self.machine.need_plan()
 
@@ -195,10 +198,22 @@ class SequencingSession:
         if (self.machine.state is State.PLACING and self._values["auto_confirm"]
                 and now >= self._confirm_at):
             self._send(self.machine.confirm())
+        self._tell_set_back()
         if self.machine.state is State.MEASURING:
             self._tell_stall()
             if self._values["view_timeout"] > 0 and now >= self._deadline:
                 self._time_out()
+
+    def _tell_set_back(self) -> None:
+        """Say once that the clock is behind the last command: what comes now counts before it."""
+        behind_s = (self._commanded_ns - self._ports.now_ns()) * 1e-9
+        if self.current is None or behind_s <= SET_BACK_S:
+            self._set_back = ""
+        elif not self._set_back:
+            self._set_back = (f"this machine's clock is {behind_s:.3g} s behind its own last "
+                              "command: it was set back, and what is detected until it has "
+                              "caught up counts in an earlier view; wait, then redo_view")
+            self._ports.say(Level.WARN, self._set_back)
 
     def _tell_stall(self) -> None:
         if not self._stall.stalled:
@@ -233,6 +248,8 @@ class SequencingSession:
             state, level = f"waiting for {', '.join(self.missing())}", Level.WARN
         elif self.machine.state is State.MEASURING and self._stalled:
             state, level = self._stalled, Level.WARN
+        if self._set_back:
+            state, level = f"{self._set_back}; {state}", Level.WARN
         plan, view = self.machine.plan, self.current
         return Diagnosis(level, state, {
             "state": self.machine.state.name, "plan_id": plan.plan_id if plan else "",

@@ -124,6 +124,38 @@ def test_a_clock_behind_is_told():
     assert "the cell's clock is 1 s behind this machine's" in desk.told().message
 
 
+@pytest.mark.parametrize("by_s, words", [(-1.0, "stepped back by 1 s in view '"),
+                                         (37.0, "stepped ahead by 37 s in view '")])
+def test_a_clock_that_steps_within_a_view_is_said_once_and_told_to_the_end_of_the_run(by_s, words):
+    desk, events = Desk(), events_of(small_plan("0, 90", repeats=4))
+    half = next(n for n, event in enumerate(events) if event.stamp_ns > events[0].stamp_ns + 10**9)
+    desk.feed(events[:half], run_id="1")
+    assert desk.told().level == Level.OK
+    desk.feed(events[half:], ahead_s=by_s, run_id="1")
+    desk.session.tick()
+    assert words in desk.told().message and desk.told().level == Level.WARN
+    last = next(event for event in reversed(events) if isinstance(event, EncoderSample))
+    desk.session.take_encoder(encoder_block(last))
+    desk.session.tick()
+    assert sum(words in line for line in desk.hands.lines(Level.WARN)) == 1
+    again = [replace(event, stamp_ns=event.stamp_ns + 100 * 10**9) for event in events]
+    desk.feed(again, run_id="2")
+    desk.session.tick()
+    assert words not in desk.told().message
+
+
+def test_a_clock_that_steps_with_this_machines_is_found_by_the_steady_clock(monkeypatch):
+    desk, events = Desk(), events_of(small_plan("0, 90", repeats=4))
+    half = len(events) // 2
+    desk.feed(events[:half], run_id="1")
+    monkeypatch.setattr(Hands, "now_ns", property(
+        lambda hands: START_NS + round((hands.seconds - 137.0) * 1e9)))
+    desk.feed([replace(event, stamp_ns=event.stamp_ns - 37 * 10**9) if isinstance(event, Command)
+               else event for event in events[half:]], ahead_s=-37.0, run_id="1")
+    desk.session.tick()
+    assert "stepped back by 37 s" in desk.told().message
+
+
 @pytest.mark.parametrize("late_s, checked", [(1.0, True), (1.01, False)])
 def test_recorded_messages_are_not_held_against_the_clock(late_s, checked):
     desk = Desk()

@@ -88,6 +88,19 @@ def test_stamps_grow_where_the_clock_steps_back(measuring):
     assert stamps == [START_NS, START_NS + 1, START_NS + 2]
 
 
+@pytest.mark.parametrize("back_s, said", [(0.099, 0), (0.2, 1), (37.0, 1)])
+def test_a_clock_that_was_set_back_is_told_until_it_has_caught_up(measuring, back_s, said):
+    measuring.hands.pass_time(-back_s)
+    measuring.session.tick()
+    measuring.session.tick()
+    words = f"this machine's clock is {back_s:.3g} s behind its own last command: it was set back"
+    assert [line[:len(words)] for line in measuring.hands.lines(Level.WARN)] == [words] * said
+    assert measuring.session.diagnosis().message.startswith(words) is bool(said)
+    measuring.hands.pass_time(back_s)
+    measuring.session.tick()
+    assert measuring.session.diagnosis().level == Level.OK
+
+
 @pytest.mark.parametrize("age_ns, moves", [(1, False), (0, True), (-1, True)])
 def test_a_status_counts_from_the_stamp_of_the_newest_command(measuring, age_ns, moves):
     measuring.status(complete=True, age_ns=age_ns)

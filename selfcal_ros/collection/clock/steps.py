@@ -1,0 +1,157 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Clocks that step in the midst of a run, seen where stamps and reception part.
+
+Readings follow stamps alone and never the order of arrival; what is found here changes no number.
+It names the clock where stamps are no longer those of one clock, which stamps alone cannot tell.
+"""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from selfcal_ros.collection.timeline import Timeline
+
+GROUP, BESIDE = 5, 3
+"""Messages that are looked at as one, and such groups on either side of a step."""
+REMEDY = ("let clocks slew, not step, while a run is measured (chrony, ptp4l: no step after the "
+          "start)")
+
+
+@dataclass(frozen=True)
+class Step:
+    """A clock that has stepped.
+
+    Attributes
+    ----------
+    before_ns : int
+        A stamp of before the step, at most a few messages old.
+    by_ns : int
+        How much later (+) or earlier (-) things are stamped since.
+    """
+
+    before_ns: int
+    by_ns: int
+
+
+class StepWatch:
+    """Finds the steps of the clock that stamps a stream of messages.
+
+    A step parts the stamps from the instants of reception at once and for good: what lies before
+    and behind it do not overlap. Late, bundled or lost messages do not look like that. Where the
+    clock of reception steps as well, only a step back can be told from a pause.
+
+    Parameters
+    ----------
+    limit_s : float
+        Smaller steps are no matter.
+    """
+
+    def __init__(self, limit_s: float) -> None:
+        self._limit_ns = round(limit_s * 1e9)
+        self._rest = np.zeros((2, 0), dtype=np.int64)  # less than a group
+        self._groups = np.zeros((6, 0), dtype=np.int64)
+        self._quiet = 0  # groups in which a step that has been told is still seen
+
+    def add(self, stamps_ns: np.ndarray, received_ns: np.ndarray) -> list[Step]:
+        """Take messages in the order of reception; return the steps that they show.
+
+        Parameters
+        ----------
+        stamps_ns, received_ns : int64 array (n,)
+            Stamps, and instants of reception.
+        """
+        both = np.concatenate([self._rest, np.stack([stamps_ns, received_ns])], axis=1)
+        whole = both.shape[1] // GROUP * GROUP
+        self._rest = both[:, whole:]
+        stamps, received = both[:, :whole].reshape(2, -1, GROUP)
+        offset = stamps - received
+        self._groups = np.concatenate([self._groups, np.stack([
+            column for values in (offset, stamps, received)
+            for column in (values.min(axis=1), values.max(axis=1))])], axis=1)
+        found = self._look()
+        self._groups = self._groups[:, -2 * BESIDE:]
+        return found
+
+    def _look(self) -> list[Step]:
+        """Return the steps within a group that has its neighbours on both sides."""
+        count = self._groups.shape[1] - 2 * BESIDE
+        if count <= 0:
+            return []
+        low = np.stack([self._groups[0::2, k:k + count + BESIDE + 1] for k in range(BESIDE)]).min(0)
+        high = np.stack([self._groups[1::2, k:k + count + BESIDE + 1]
+                         for k in range(BESIDE)]).max(0)
+        before = (low[:, :count], high[:, :count])
+        after = (low[:, BESIDE + 1:][:, :count], high[:, BESIDE + 1:][:, :count])
+        size = _parted(before, after, self._limit_ns)
+        out = []
+        for number in range(count):
+            if self._quiet:
+                self._quiet -= 1
+            elif size[number]:
+                # of the groups that see it, the one in the midst has the step within it
+                last = min(number + BESIDE, count)
+                best = number + int(np.abs(size[number:last]).argmax())
+                out.append(Step(int(before[1][1, best]), int(size[best])))
+                self._quiet = 2 * BESIDE
+        return out
+
+
+Span = tuple[np.ndarray, np.ndarray]
+"""Lowest and highest of offset, stamp and reception, each (3, n)."""
+
+
+def _parted(before: Span, after: Span, limit_ns: int) -> np.ndarray:
+    """Return by how much the clock has stepped between two spans of messages; 0 where it has not.
+
+    The middles of the spans are compared, and the step must exceed the scatter of both.
+    """
+    (low, high), (next_low, next_high) = before, after
+    scatter = np.maximum(high[0] - low[0], next_high[0] - next_low[0])
+    by = (next_low[0] + next_high[0]) // 2 - (low[0] + high[0]) // 2
+    stamps, received = next_low[1] - high[1], next_low[2] - high[2]
+    clear = np.abs(by) > np.maximum(limit_ns, 2 * scatter)
+    ahead = clear & (by > 0) & (stamps > limit_ns) & (stamps > received + limit_ns)
+    back = clear & (by < 0) & (next_low[1] < high[1] - limit_ns // 2)
+    # both clocks went back, in messages that otherwise come in their order
+    length = np.maximum(high[2] - low[2], next_high[2] - next_low[2])
+    together = (~clear) & (stamps < -limit_ns) & (received < -limit_ns) & (
+        np.minimum(-stamps, -received) > 2 * length)
+    return np.where(ahead | back, by, np.where(together, stamps, 0))
+
+
+def step_lines(steps: Mapping[str, Iterable[Step]], timeline: Timeline) -> list[str]:
+    """Return one line for each step: whose clock, by how much, where, and what it does.
+
+    Parameters
+    ----------
+    steps : dict
+        Topic -> its steps. Steps of two topics by the same amount are one.
+    timeline : Timeline
+        Commands of the session.
+    """
+    found = sorted(((step, topic) for topic, mine in steps.items() for step in mine),
+                   key=lambda item: (item[0].before_ns, item[1]))
+    lines = []
+    while found:
+        step, _ = found[0]
+        same = [item for item in found if _alike(item[0], step)]
+        found = [item for item in found if item not in same]
+        topics = " and ".join(sorted({topic for _, topic in same}))
+        lines.append(_line(topics, step, timeline))
+    return lines
+
+
+def _alike(one: Step, other: Step) -> bool:
+    return (abs(one.by_ns - other.by_ns) < 0.1 * abs(other.by_ns)
+            and abs(one.before_ns - other.before_ns) < abs(other.by_ns) + 10_000_000_000)
+
+
+def _line(topics: str, step: Step, timeline: Timeline) -> str:
+    index = int(timeline.assign(np.array([step.before_ns]))[0])
+    view = timeline.intervals[index].view_index if index >= 0 else None
+    where = "between views" if view is None else f"in view '{timeline.views[view].name}'"
+    way, wrong = ("back", "an earlier") if step.by_ns < 0 else ("ahead", "a later")
+    return (f"the clock that stamps {topics} stepped {way} by {abs(step.by_ns) * 1e-9:.3g} s "
+            f"{where}, at {step.before_ns * 1e-9:.3f} s: what was stamped since may be missing or "
+            f"counted in {wrong} view; {REMEDY}, and measure again from that view on")

@@ -1,0 +1,127 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A clock that steps is named with its amount and place; what only looks like it is not."""
+
+import numpy as np
+import pytest
+
+from selfcal_ros.collection.clock.steps import Step, StepWatch, step_lines
+from selfcal_ros.collection.messages import Command, Phase
+from selfcal_ros.collection.timeline import build_timeline
+from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.view import View
+
+MS, S = 1_000_000, 1_000_000_000
+TRUE = 1_700_000_000 * S + np.arange(3000) * 5 * MS
+"""Instants of a stream of 200 messages a second."""
+
+
+def found(stamps, received, limit_s=0.1, pieces=1):
+    watch = StepWatch(limit_s)
+    parts = zip(np.array_split(stamps, pieces), np.array_split(received, pieces), strict=True)
+    return [step for part in parts for step in watch.add(*part)]
+
+
+def stepped(at, by_ns):
+    stamps = TRUE.copy()
+    stamps[at:] += by_ns
+    return stamps
+
+
+@pytest.mark.parametrize("pieces", [1, 7, 1000, 3000])
+@pytest.mark.parametrize("by_ns", [-37 * S, -S, -200 * MS, 200 * MS, S, 37 * S])
+@pytest.mark.parametrize("at", [100, 1502, 2980])
+def test_a_step_is_found_with_its_amount_and_place(at, by_ns, pieces):
+    delay = np.random.default_rng(at).exponential(10 * MS, len(TRUE)).astype(int)
+    (step,) = found(stepped(at, by_ns), TRUE + delay, pieces=pieces)
+    assert abs(step.by_ns - by_ns) < 30 * MS
+    assert 0 < TRUE[at] - step.before_ns <= 11 * 5 * MS
+
+
+@pytest.mark.parametrize("by_ns, number", [(101 * MS, 1), (99 * MS, 0), (-101 * MS, 1),
+                                           (-99 * MS, 0)])
+def test_the_limit(by_ns, number):
+    assert len(found(stepped(1500, by_ns), TRUE)) == number
+
+
+def test_two_steps_are_two():
+    stamps = stepped(1000, S)
+    stamps[2000:] -= 3 * S
+    assert [step.by_ns for step in found(stamps, TRUE)] == [S, -3 * S]
+
+
+def test_where_the_clock_of_reception_steps_back_too_it_is_found_by_the_order():
+    stamps = stepped(1500, -2 * S)
+    (step,) = found(stamps, stamps + MS)
+    assert -2 * S <= step.by_ns < -1.9 * S
+    assert 0 < TRUE[1500] - step.before_ns <= 11 * 5 * MS
+
+
+def bundles():
+    """Messages that are delivered together, up to 2 s late."""
+    return TRUE, np.maximum(TRUE, TRUE[0] + ((TRUE - TRUE[0]) // (2 * S) + 1) * 2 * S)
+
+
+def hole():
+    """Two seconds of messages are lost."""
+    kept = np.r_[TRUE[:1000], TRUE[1400:]]
+    return kept, kept + MS
+
+
+def stall():
+    """Reception stalls for 3 s and then takes what waits at a tenth of the time."""
+    late = TRUE[1000] + 3 * S + np.arange(700) * MS // 2
+    return TRUE, np.maximum(TRUE, np.r_[TRUE[:1000], late, TRUE[1700:]])
+
+
+def transport():
+    """The way becomes longer by 1 s for good."""
+    return TRUE, TRUE + MS + np.where(np.arange(len(TRUE)) >= 1000, S, 0)
+
+
+def shuffled():
+    """A file in any order, logged at its stamps."""
+    order = np.random.default_rng(1).permutation(len(TRUE))
+    return TRUE[order], TRUE[order] + MS
+
+
+def mixed():
+    """Messages that arrive in any order."""
+    return np.random.default_rng(1).permutation(TRUE), TRUE
+
+
+def faster():
+    """A recording that is played at eight times its speed."""
+    return TRUE, TRUE[0] + (TRUE - TRUE[0]) // 8
+
+
+@pytest.mark.parametrize("case", [bundles, hole, stall, transport, shuffled, mixed, faster],
+                         ids=lambda case: case.__name__)
+def test_what_only_looks_like_a_step_is_none(case):
+    assert found(*case()) == []
+    assert found(*case(), pieces=500) == []
+
+
+def timeline():
+    plate, view = Artifact(5, 0.01, 8), View("identity")
+    return build_timeline([
+        Command(TRUE[0], Phase.PLACE, "plan", 0, view, plate),
+        Command(TRUE[1000], Phase.MEASURE, "plan", 0, view, plate),
+        Command(TRUE[2000], Phase.DONE, "plan", 1, None, None)])
+
+
+@pytest.mark.parametrize("at, by_ns, words", [
+    (1500, -S, "stepped back by 1 s in view 'identity', at 1700000007.500 s: what was stamped "
+     "since may be missing or counted in an earlier view; let clocks slew, not step,"),
+    (500, 37 * S, "stepped ahead by 37 s between views, at 1700000002.500 s: what was stamped "
+     "since may be missing or counted in a later view;")])
+def test_the_line_says_whose_clock_how_much_and_where(at, by_ns, words):
+    step = Step(int(TRUE[at]), by_ns)
+    (line,) = step_lines({"b": [step], "a": [Step(step.before_ns + MS, by_ns + MS)]}, timeline())
+    assert line.startswith(f"the clock that stamps a and b {words}")
+
+
+def test_steps_of_two_clocks_are_two_lines():
+    lines = step_lines({"a": [Step(int(TRUE[9]), S)], "b": [Step(int(TRUE[9]), -S)]}, timeline())
+    assert [line.split(" by ")[0] for line in lines] == [
+        "the clock that stamps a stepped ahead", "the clock that stamps b stepped back"]
+    assert step_lines({"a": []}, timeline()) == []
