@@ -3,9 +3,9 @@
 SHELL := /bin/bash
 BIN := .venv/bin
 
-.PHONY: setup demo test test-oldest lint bench soak chaos mutants reality pictures reference clean help
+.PHONY: setup demo test test-oldest lint ament-lint bench soak chaos mutants reality pictures reference clean help
 help:
-	@echo "make setup | demo | test | test-oldest | lint | bench | soak | chaos | mutants | reality | pictures | reference | clean"
+	@echo "make setup | demo | test | test-oldest | lint | ament-lint | bench | soak | chaos | mutants | reality | pictures | reference | clean"
 setup:
 	@tools/setup.sh
 demo: setup
@@ -13,6 +13,12 @@ demo: setup
 lint: setup
 	@$(BIN)/ruff check .
 	@$(BIN)/mypy
+ament-lint: setup  # what ament_flake8 and ament_pep257 check, with setup.cfg
+	@test build/linters/.complete -nt tools/linter-requirements.txt || { \
+		$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --upgrade \
+		--target build/linters -r tools/linter-requirements.txt && touch build/linters/.complete; }
+	@PYTHONPATH=build/linters $(BIN)/python -m flake8 --config setup.cfg selfcal_ros launch tools examples setup.py test
+	@echo "ament-lint: nothing found"
 test: lint
 	@$(BIN)/python -m pytest -n 2 --dist worksteal
 test-oldest:  # with the libraries of Ubuntu 24.04; e.g. make test-oldest TESTS=test/laser

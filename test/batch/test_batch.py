@@ -201,7 +201,7 @@ def test_plans_and_plates_are_not_mixed():
 
 
 def test_the_table_has_a_line_a_bag_in_the_order_of_time():
-    failed = {"bag": "/bags/bad, or \"worse\"", "exit_code": 2, "qualified": None, "message": "no"}
+    failed = {"bag": '/bags/bad, or "worse"', "exit_code": 2, "qualified": None, "message": "no"}
     rows = list(csv.DictReader(io.StringIO(csv_text([failed, *records()[::-1]]))))
     assert [row["bag"] for row in rows] == [f"/bags/{day:02}" for day in range(30)] + [
         failed["bag"]]

@@ -173,4 +173,3 @@ def drift_found(result: CalibrationResult) -> Drawing | None:
     drawing.label(46, y, "solid: along x, dashed: along y", size=12, colour="soft")
     drawing.height = y + 10
     return drawing
-

@@ -39,7 +39,8 @@ def map_frame(drawing: Drawing, artifact: Artifact, box: tuple[float, float, flo
 def thinned(artifact: Artifact, most: int) -> tuple[slice, slice]:
     """Return slices that leave at most `most` sites a side, the centre among them."""
     step = max(1, math.ceil(max(artifact.shape) / most))
-    return tuple(slice(half % step, None, step) for half in artifact.half)  # type: ignore[return-value]
+    half_x, half_y = artifact.half
+    return slice(half_x % step, None, step), slice(half_y % step, None, step)
 
 
 def cells(frame: Frame, artifact: Artifact, values_um: np.ndarray, scale: Scale) -> None:
