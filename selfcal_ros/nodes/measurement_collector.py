@@ -64,6 +64,8 @@ class MeasurementCollector(PollingNode):
 
     def activate(self) -> None:
         """Listen to the cell and to the commands."""
+        # undone last: what the subscriptions still held goes to the journal and to the session
+        self.own(None, lambda _: self.guarded(self._drain)())
         self._detections = self.subscribe(names.DETECTIONS, ByTheClock(
             names.DETECTIONS.name, self._reception.detection), raw=True)
         self.subscribe_with_age(names.COMMAND, self._reception.command, raw=True)

@@ -39,10 +39,10 @@ class ByTheClock:
         """Take a message from an executor."""
         self.take(message, time.time_ns())
 
-    def empty(self, subscription: Subscription) -> int:
-        """Take what waits, up to `MOST`; return how many numbers of publication were left out."""
+    def empty(self, subscription: Subscription, most: int) -> int:
+        """Take what waits, up to `most`; return how many numbers of publication were left out."""
         gap = 0
-        for _ in range(MOST):
+        for _ in range(most):
             taken = subscription.handle.take_message(subscription.msg_type, True)
             if taken is None:
                 break
@@ -65,17 +65,31 @@ class PollingNode(ManagedNode):
                 if not isinstance(item.callback, ByTheClock))
 
     def poll(self) -> None:
-        """Take what has come on the other subscriptions, and count what was lost on the way.
+        """Take what has come on the other subscriptions, and count what was lost on the way."""
+        for item in [*super().subscriptions]:
+            if isinstance(item.callback, ByTheClock):
+                self._empty(item, item.callback, MOST)
+
+    def destroy_subscription(self, subscription: Subscription) -> bool:
+        """Destroy a subscription; what waits on one that is polled is taken first.
+
+        Its publishers have it acknowledged: nobody would send it again.
+        """
+        callback = subscription.callback
+        if isinstance(callback, ByTheClock) and subscription in [*super().subscriptions]:
+            self.guarded(self._empty, callback.topic)(
+                subscription, callback, subscription.qos_profile.depth)
+        return super().destroy_subscription(subscription)
+
+    def _empty(self, item: Subscription, callback: ByTheClock, most: int) -> None:
+        """Take what waits on a subscription.
 
         The middleware tells nothing of messages that were overwritten before they were taken.
         """
-        for item in [*super().subscriptions]:
-            callback = item.callback
-            if isinstance(callback, ByTheClock):
-                with item.handle:
-                    gap = callback.empty(item)
-                if gap and item.get_publisher_count() == 1:  # of several, numbers interleave
-                    callback.n_missing += gap
-                    untold = callback.n_missing - self.losses.counts[callback.topic]
-                    if untold > 0:
-                        self.losses.add(callback.topic, untold)
+        with item.handle:
+            gap = callback.empty(item, most)
+        if gap and item.get_publisher_count() == 1:  # of several, numbers interleave
+            callback.n_missing += gap
+            untold = callback.n_missing - self.losses.counts[callback.topic]
+            if untold > 0:
+                self.losses.add(callback.topic, untold)

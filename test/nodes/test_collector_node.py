@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from rclpy.duration import Duration
 from rclpy.qos import ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 from selfcal_msgs.msg import MarkDetection, ViewCommand
 from std_srvs.srv import Trigger
 
+from selfcal_ros.bagio.reader import BagReader
 from selfcal_ros.collection.digest import readings_digest, session_digest
 from selfcal_ros.collection.messages import Command, Detection, Phase
 from selfcal_ros.messages import from_model, to_model
@@ -341,3 +343,35 @@ def test_the_numbers_of_two_publishers_that_interleave_are_no_loss(graph):
         (second if number == 8 else first).publish(sample)
         graph.until(lambda n=number: node.session.collector.received["encoder"] == n + 1, "it")
     assert not node.losses.counts
+
+
+@pytest.mark.parametrize("taken_down_by", [
+    "deactivate", "clean up", "destroy", "new subscriptions"])
+def test_what_was_acknowledged_is_used_and_written_when_the_node_is_taken_down(
+        graph, tmp_path, taken_down_by):
+    node = graph.node(MeasurementCollector, journal=str(tmp_path))
+    samples, marks = graph.publisher(names.ENCODER), graph.publisher(names.DETECTIONS)
+    session = node.session
+    graph.executor.remove_node(node)  # from here on nothing takes what comes
+    for number in range(30):
+        samples.publish(names.ENCODER.type(name=["x"], position=[0.0]))
+        marks.publish(MarkDetection(m=number))
+    for publisher in (samples, marks):
+        assert publisher.wait_for_all_acked(Duration(seconds=60))
+    if taken_down_by == "new subscriptions":
+        for item in [*node._subscriptions]:
+            node.destroy_subscription(item)
+        node._drain()
+    elif taken_down_by == "destroy":
+        graph.nodes.remove(node)
+        node.destroy_node()
+    else:
+        node.trigger_deactivate()
+        assert session.collector.received == {"encoder": 30, "detection": 30, "command": 0}
+        if taken_down_by == "clean up":
+            node.trigger_cleanup()
+    assert session.collector.received == {"encoder": 30, "detection": 30, "command": 0}
+    assert not node.refusals.counts
+    [path] = (path for path in tmp_path.iterdir() if path.is_dir())
+    written = [item for _, item in BagReader(path).columns()]
+    assert sum(map(len, written)) == 60
