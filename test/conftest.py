@@ -1,7 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Hypothesis for every test: the same examples in every run, and no clock on a shared machine."""
+"""For every test: the same examples in every run, no clock, one thread of linear algebra.
+
+Two workers with two threads each would wait for one another in matrices of a few hundred rows.
+The number is set before NumPy is loaded; processes that tests start inherit it.
+"""
+
+import os
 
 from hypothesis import settings
+
+for _libraries in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+    os.environ.setdefault(_libraries, "1")
 
 settings.register_profile("repeatable", deadline=None, derandomize=True)
 settings.load_profile("repeatable")

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A planned measurement with terms as one dense least squares: the slow way, for comparison."""
 
+from functools import cached_property
+
 import numpy as np
 from scipy.stats import f as central_f
 from scipy.stats import ncf
@@ -28,6 +30,7 @@ class Dense:
         self.rows, self.weight, self.about, self.times = [], [], [], []
         for v, visits in enumerate(self.visits):
             self._view(v, visits)
+        self._known = {}
         self.base = np.array(self.rows)
         self.root = np.sqrt(np.array(self.weight))
 
@@ -69,8 +72,17 @@ class Dense:
     def _indicated(self):
         return 1 if self.sense is Sense.MICROSCOPE_MOVES else -1
 
+    def _once(self, what, make):
+        """Return what was computed before under a key, or compute it."""
+        if what not in self._known:
+            self._known[what] = make()
+        return self._known[what]
+
     def columns(self, name, *, free):
         """Columns of a term at every row: what a unit of each coefficient does to a reading."""
+        return self._once((name, free), lambda: self._columns(name, free))
+
+    def _columns(self, name, free):
         out = []
         views = range(len(self.visits))
         if name is TermName.MICROSCOPE:
@@ -80,11 +92,11 @@ class Dense:
             out = [[self._indicated() * np.array(h) * came for *_, came in self.about]
                    for h in ((1, 0), (0, 1))]
         elif name is TermName.DRIFT:
+            of_view = np.array([about[0] for about in self.about])
             for v in views:
                 for degree in range(1, self.assumed.drift_degree + 1):
-                    legendre = np.polynomial.Legendre.basis(degree)
-                    out += [[np.array(d) * legendre(t) * (about[0] == v) for about, t in zip(
-                        self.about, self.times, strict=True)] for d in ((1, 0), (0, 1))]
+                    course = np.polynomial.Legendre.basis(degree)(np.array(self.times))
+                    out += [np.outer(course * (of_view == v), d) for d in ((1, 0), (0, 1))]
         else:
             shapes = ([lambda x, y: np.array([x, y]) * self.half]
                       if name is TermName.PLATE_SCALE else
@@ -104,7 +116,7 @@ class Dense:
         prior = np.diag(sizes)[sizes > 0]
         return np.vstack([whole, prior])
 
-    @property
+    @cached_property
     def datum(self):
         """Projection of a map on what remains without translation, rotation and scale."""
         hx, hy = self.plan.artifact.half
@@ -120,6 +132,9 @@ class Dense:
 
     def n_unseen(self, terms):
         """Independent maps that can be added without changing any reading."""
+        return self._once(("unseen", *terms), lambda: self._n_unseen(terms))
+
+    def _n_unseen(self, terms):
         design = self.design(terms)
         scaled = design / np.linalg.norm(design, axis=0)
         _, size, right = np.linalg.svd(scaled)
@@ -129,6 +144,9 @@ class Dense:
 
     def solver(self, terms):
         """Matrix that takes weighted readings to unknowns, and the design."""
+        return self._once(("solver", *terms), lambda: self._solver(terms))
+
+    def _solver(self, terms):
         design = self.design(terms)
         norm = np.linalg.norm(design, axis=0)
         return np.linalg.pinv(design / norm, rcond=1e-11) / norm[:, None], design

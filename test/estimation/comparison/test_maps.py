@@ -25,7 +25,7 @@ def calibrated(seed, truth=None, *, method="joint", sigma=SIGMA_M):
     truth = truth or random_truth(ARTIFACT, 4, np.random.default_rng(99))
     readings = simulate_measurements(truth, hu_plan(ARTIFACT), rng, sigma_m=sigma,
                                      sigma_theta_rad=SIGMA_RAD)
-    return calibrate(readings, Options(method=method))
+    return calibrate(readings, Options(method=method, causes=False))
 
 
 A, B = calibrated(1), calibrated(2)

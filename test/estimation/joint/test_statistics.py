@@ -75,7 +75,7 @@ def test_thousand_re_solves_agree_with_the_prediction(missing, sigma_theta):
     clean = replace(clean, views=tuple(
         replace(view, count=1 + (view.m + 2 * view.n) % 3) for view in clean.views))
     rng = np.random.default_rng(3)
-    quick = Options(uncertainty=False)
+    quick = Options(uncertainty=False, causes=False)
     exact = calibrate(clean).error_map
     predicted = calibrate(noisy(clean, rng, sigma, sigma_theta)).error_map
     draws = [calibrate(noisy(clean, rng, sigma, sigma_theta), quick).error_map
@@ -171,7 +171,8 @@ def test_a_reference_length_sets_the_scale_and_its_uncertainty(kind, sense):
     for _ in range(n):
         drawn = replace(reference, relative_error=reference.relative_error + rng.normal(0, 2e-6))
         draws.append(calibrate(noisy(clean, rng, sigma, 1.0),
-                               replace(linear, reference=drawn, uncertainty=False)).error_map)
+                               replace(linear, reference=drawn, uncertainty=False,
+                                       causes=False)).error_map)
     for name in ("gx", "gy"):
         spread = np.std([getattr(draw, name)[known] for draw in draws], axis=0)
         ratio = spread / getattr(predicted, "u_" + name)[known]

@@ -29,9 +29,14 @@ SMALL = plan_of("0, 90, tx", 5, repeats=4)
 
 
 @cache
+def dense_of(plan, assumed, sense):
+    return Dense(plan, assumed, sense)
+
+
+@cache
 def both(order, sense=Sense.MICROSCOPE_MOVES, degree=3):
     assumed = Assumed(SIGMA, 10e-6, degree, order)
-    return PlannedTerms(SMALL, (), assumed), Dense(SMALL, assumed, sense)
+    return PlannedTerms(SMALL, (), assumed), dense_of(SMALL, assumed, sense)
 
 
 @pytest.mark.parametrize("sense", Sense)
@@ -63,7 +68,7 @@ UNLIKE = replace(plan_of("0, 90, tx, -ty", 5, size_y=3), views=tuple(
 def test_models_as_the_dense_matrix_has_them(text, plan, order, sense):
     model = parse_terms([text], "test")
     assumed = Assumed(SIGMA, 10e-6, 2, order)
-    planned, dense = PlannedTerms(plan, model, assumed), Dense(plan, assumed, sense)
+    planned, dense = PlannedTerms(plan, model, assumed), dense_of(plan, assumed, sense)
     alone = predict_plan(plan, ThetaDatum.ZERO_MEAN)
     seen = planned.told(check_plan(plan).observability)
     free = [term for term in model if term.free]
