@@ -73,16 +73,17 @@ def grid_sites(view: ViewCommand) -> Iterator[tuple[int, int, Position]]:
     """Yield the marks (m, n) of a view with the stage position at which each is seen.
 
     Mark (m, n) lies on the site R^q (m, n) + (a, b). A view includes the marks whose site is in
-    the field, -h <= i, j <= h: a plate that is shifted by one pitch has a row less.
+    the field, which is as large as the plate: one that is shifted by one pitch has a row less.
     """
-    h = (view.grid_size - 1) // 2
+    hx = (view.grid_size - 1) // 2
+    hy = ((view.grid_size_y or view.grid_size) - 1) // 2  # 0: the plate is square
     quarter = round(view.rotation / (math.pi / 2)) % 4
     a, b = (round(t / view.grid_pitch) for t in (view.translation_x, view.translation_y))
-    for m in range(-h, h + 1):
-        for n in range(-h, h + 1):
+    for m in range(-hx, hx + 1):
+        for n in range(-hy, hy + 1):
             i, j = ((m, n), (-n, m), (-m, -n), (n, -m))[quarter]
             i, j = i + a, j + b
-            if max(abs(i), abs(j)) <= h:
+            if abs(i) <= hx and abs(j) <= hy:
                 yield m, n, (i * view.grid_pitch, j * view.grid_pitch, 0.0)
 
 
@@ -97,14 +98,20 @@ class Cell(Node):
         self._marks = self.create_publisher(MarkDetection, "stage/mark_detections", QoSProfile(
             depth=1000, reliability=ReliabilityPolicy.RELIABLE))
         # Commands are latched. With a depth of 1 a cell that starts late hears the newest alone,
-        # not every command of the run: an old MEASURE would set it off.
+        # not every command of the run: an old MEASURE would set it off. (A MEASURE that follows its
+        # PLACE at once would overtake it: the sequencer's settle_time is for that.)
         self.create_subscription(ViewCommand, "selfcal/view_command", self._on_command, QoSProfile(
             depth=1, reliability=ReliabilityPolicy.RELIABLE,
             durability=DurabilityPolicy.TRANSIENT_LOCAL))
         self._work: Iterator[None] = iter(())
+        self._heard: tuple[int, int, int] | None = None
         self.create_timer(0.002, self._tick)
 
     def _on_command(self, view: ViewCommand) -> None:
+        command = (view.phase, view.header.stamp.sec, view.header.stamp.nanosec)
+        if command == self._heard:
+            return  # a sequencer that was restarted latches its last command anew
+        self._heard = command
         self._work = iter(())  # whatever was measured is given up
         if view.phase == ViewCommand.PLACE:
             self.machine.lay_plate()  # then confirm_view is called, here by auto_confirm

@@ -39,6 +39,6 @@ def generate_launch_description() -> LaunchDescription:
         node("measurement_collector", {"journal": ParameterValue(argument("journal"),
                                                                  value_type=str)}),
         node("solver"),
-        node("pose_sequencer", {"plan": argument("plan")}),
+        node("pose_sequencer", {"plan": ParameterValue(argument("plan"), value_type=str)}),
         node("compensator", condition=IfCondition(argument("compensate"))),
     ])

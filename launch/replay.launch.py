@@ -34,6 +34,6 @@ def generate_launch_description() -> LaunchDescription:
         Node(package="selfcal_ros", executable="bag_player", name="bag_player", output="screen",
              namespace=LaunchConfiguration("namespace"), on_exit=end_if_it_cannot_start,
              parameters=[LaunchConfiguration("params"), {
-                          "bag": LaunchConfiguration("bag"),
+                          "bag": ParameterValue(LaunchConfiguration("bag"), value_type=str),
                           "rate": ParameterValue(LaunchConfiguration("rate"), value_type=float)}]),
     ])

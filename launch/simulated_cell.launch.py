@@ -4,6 +4,7 @@
 `ros2 bag record` beside it wants --qos-profile-overrides-path config/rosbag2/record_qos.yaml.
 """
 
+import os
 from pathlib import Path
 
 from ament_index_python.packages import get_package_share_directory
@@ -13,8 +14,13 @@ from launch.conditions import IfCondition
 from launch.launch_description_sources import PythonLaunchDescriptionSource
 from launch.substitutions import LaunchConfiguration, NotEqualsSubstitution
 from launch_ros.actions import Node
+from launch_ros.parameter_descriptions import ParameterValue
 
 from selfcal_ros.nodes.launching import end_if_it_cannot_start
+
+# apart from those of real runs: a simulated run that was left must never go on with real readings
+JOURNALS = str(Path(os.environ.get("ROS_HOME") or Path.home() / ".ros")
+               / "selfcal_journals_simulated")
 
 
 def generate_launch_description() -> LaunchDescription:
@@ -34,11 +40,14 @@ def generate_launch_description() -> LaunchDescription:
             "all nodes"),
         DeclareLaunchArgument("plan", default_value=str(share / "config/plans/resistant.yaml"),
                               description="PLAN.yaml with plate and views"),
-        node("bag_recorder", parameters=[{"bag": argument("bag")}],
+        DeclareLaunchArgument("journal", default_value=JOURNALS, description="folder for the "
+                              "journals of simulated runs; '' = none"),
+        node("bag_recorder", parameters=[{"bag": ParameterValue(argument("bag"),
+                                                                value_type=str)}],
              condition=IfCondition(NotEqualsSubstitution(argument("bag"), ""))),
         node("stage_simulator", parameters=[argument("params")]),
         IncludeLaunchDescription(
             PythonLaunchDescriptionSource(str(share / "launch/calibrate.launch.py")),
             launch_arguments={name: argument(name)
-                              for name in ("params", "plan", "namespace")}.items()),
+                              for name in ("params", "plan", "namespace", "journal")}.items()),
     ])

@@ -21,7 +21,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
                         help="folder for the maps that are saved (default: the working directory)")
     add_json(parser, "one JSON object a line: pictures as they change, answers to requests")
     parser.add_argument("--journal", metavar="FOLDER", help="folder for journals, from which a "
-                        "collector that died goes on (default: journals, in that of the results)")
+                        "collector that died goes on (default: journals in that of the results; "
+                        "with --simulate journals_simulated)")
     parser.add_argument("--compensate", action="store_true",
                         help="publish corrected joint states as well")
     parser.add_argument("--simulate", action="store_true",
@@ -63,7 +64,9 @@ def commands(args: argparse.Namespace) -> dict[str, list[str]]:
     def with_parameters(**values: str) -> list[str]:
         return common + [word for name, value in values.items()
                          for word in ("-p", f"{name}:={value}")]
-    journal = args.journal or str(Path(args.results, "journals"))
+    # apart: a simulated run that was left must never go on with real readings
+    folder = "journals_simulated" if args.simulate else "journals"
+    journal = args.journal or str(Path(args.results, folder))
     nodes = {"measurement_collector": with_parameters(journal=str(Path(journal).resolve())),
              "solver": with_parameters(result_folder=str(Path(args.results).resolve())),
              "pose_sequencer": with_parameters(plan=str(Path(args.plan).resolve()))}

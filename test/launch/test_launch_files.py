@@ -11,7 +11,7 @@ FILES = sorted((ROOT / "launch").glob("*.launch.py"))
 ARGUMENTS = {
     "calibrate.launch.py": {"namespace", "params", "plan", "compensate", "journal"},
     "replay.launch.py": {"bag", "rate", "namespace", "params", "plan"},
-    "simulated_cell.launch.py": {"namespace", "bag", "params", "plan"},
+    "simulated_cell.launch.py": {"namespace", "bag", "params", "plan", "journal"},
 }
 STARTED = {
     "calibrate.launch.py": {"measurement_collector", "solver", "pose_sequencer", "compensator"},
@@ -74,4 +74,28 @@ def test_shipped_files_that_are_defaults_exist(description):
         for entity in description(path).entities:
             if isinstance(entity, DeclareLaunchArgument) and entity.default_value:
                 value = perform_substitutions(LaunchContext(), entity.default_value)
+                if entity.name == "journal":  # made when it is needed, apart for what is simulated
+                    simulated = path.name == "simulated_cell.launch.py"
+                    assert value.endswith("_simulated") == simulated
+                    continue
                 assert not value.startswith("/") or Path(value).is_file(), value
+
+
+@pytest.mark.parametrize("name", ["bag", "plan"])
+def test_a_name_like_a_date_or_a_number_stays_text(description, name):
+    from launch import LaunchContext
+    from launch_ros.actions import Node
+    from launch_ros.utilities import evaluate_parameters
+
+    told = set()
+    for path in FILES:
+        context = LaunchContext()
+        context.launch_configurations.update({
+            argument: "" for arguments in ARGUMENTS.values() for argument in arguments}
+            | {name: "2026_01_05", "rate": "1.0"})
+        for entity in description(path).entities:
+            if isinstance(entity, Node):
+                rows = [row for row in entity._Node__parameters if isinstance(row, dict)]
+                for row in evaluate_parameters(context, rows):
+                    told |= {value for key, value in row.items() if key == name}
+    assert told == {"2026_01_05"}

@@ -23,12 +23,13 @@ PLAN = {"plan_id": "small", "artifact": {"grid_size": 5, "grid_pitch": 0.01, "an
 
 
 @pytest.fixture
-def run(monkeypatch):
+def run(monkeypatch, tmp_path):
     """Return a function that runs a module in a ROS domain of its own."""
     from selfcal_ros.cli.replay import domain
 
     monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     monkeypatch.delenv("ROS_DOMAIN_ID", raising=False)
+    monkeypatch.setenv("ROS_HOME", str(tmp_path / "ros_home"))
     with domain() as environment:
         def call(*words: str) -> subprocess.CompletedProcess:
             return subprocess.run([sys.executable, *words], check=False, capture_output=True,

@@ -5,7 +5,11 @@ import importlib.util
 from pathlib import Path
 
 import numpy as np
+import pytest
+from selfcal_msgs.msg import ViewCommand
 
+from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.view import View
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes.measurement_collector import MeasurementCollector
 from selfcal_ros.nodes.pose_sequencer import PoseSequencer
@@ -59,10 +63,43 @@ def test_the_example_is_calibrated_to_its_true_error(graph, tmp_path):
 
 
 def test_a_shifted_view_has_a_row_less():
-    from selfcal_msgs.msg import ViewCommand
-
     view = ViewCommand(grid_size=5, grid_pitch=0.01, translation_x=0.01, rotation=np.pi / 2)
     sites = list(example().grid_sites(view))
     assert len(sites) == 20
     assert all(n >= -1 for _, n, _ in sites)  # turned by 90 degrees, -n runs along x
     assert (2, 2, (-0.01, 0.02, 0.0)) in [(m, n, tuple(np.round(p, 12))) for m, n, p in sites]
+
+
+@pytest.mark.parametrize("view", [View("", 0.0), View("", np.pi), View("", 0.0, (0.0, -0.01)),
+                                  View("", np.pi, (0.01, 0.0))])
+def test_marks_of_a_rectangular_plate(view):
+    plate = Artifact(5, 0.01, 0, 7)
+    m, n = (index.ravel() for index in np.meshgrid(plate.m, plate.n, indexing="ij"))
+    i, j = view.lattice_pose(plate).site_of(m, n)
+    inside = (abs(i) <= 2) & (abs(j) <= 3)
+    wanted = {(int(a), int(b)): (c * 0.01, d * 0.01) for a, b, c, d in zip(
+        m[inside], n[inside], i[inside], j[inside], strict=True)}
+    command = ViewCommand(grid_size=5, grid_size_y=7, grid_pitch=0.01, rotation=view.rotation_rad,
+                          translation_x=view.translation_m[0], translation_y=view.translation_m[1])
+    found = {(m, n): p[:2] for m, n, p in example().grid_sites(command)}
+    assert found.keys() == wanted.keys()
+    assert all(found[mark] == pytest.approx(wanted[mark]) for mark in wanted)
+
+
+def test_a_command_latched_anew_is_not_carried_out_again(graph):
+    cell = example().Cell(context=graph.context)
+    graph.add(cell)
+    commands = graph.publisher(names.COMMAND)
+    message = ViewCommand(phase=ViewCommand.MEASURE, grid=True, grid_size=5, grid_pitch=0.01,
+                          repeats=1)
+    message.header.stamp.sec = 7
+    marks = graph.listen(names.DETECTIONS)
+    commands.publish(message)
+    graph.until(lambda: len(marks) > 3, "the first marks")
+    commands.publish(message)
+    graph.until(lambda: len(marks) == 25, "all marks")
+    assert [(mark.m, mark.n) for mark in marks] == [
+        (m, n) for m in range(-2, 3) for n in range(-2, 3)]
+    message.header.stamp.sec = 8  # another one is
+    commands.publish(message)
+    graph.until(lambda: len(marks) == 50, "all marks again")

@@ -14,6 +14,8 @@ from types import SimpleNamespace
 import pytest
 
 from selfcal_ros.cli import supervisor as supervising
+from selfcal_ros.cli import up as up_verb
+from selfcal_ros.cli.main import build_parser
 from selfcal_ros.cli.supervisor import MOST_RESTARTS, Supervisor
 from test.support.sessions import plan_file, small_plan
 
@@ -120,6 +122,16 @@ def test_a_killed_command_takes_its_nodes_along(start, tmp_path, number):
     while subprocess.run(["ps", "-o", "pid=", "-s", str(session)], capture_output=True,
                          check=False).stdout.split():
         assert time.monotonic() < deadline, "a node stays behind"
+
+
+@pytest.mark.parametrize(("words", "folder"), [
+    ([], "journals"), (["--simulate"], "journals_simulated"), (["--journal", "own"], "own"),
+    (["--simulate", "--journal", "own"], "own")])
+def test_a_simulated_run_keeps_its_journals_apart(tmp_path, monkeypatch, words, folder):
+    monkeypatch.chdir(tmp_path)
+    args = build_parser().parse_args(["up", "--plan", "p.yaml", *words])
+    given = up_verb.commands(args)["measurement_collector"]
+    assert given[-2:] == ["-p", f"journal:={tmp_path / folder}"]
 
 
 def test_a_request_without_a_cell_says_so(start):
