@@ -20,7 +20,8 @@ from selfcal_ros.messages.topics import INPUT_TOPICS
 from selfcal_ros.sessions.ports import Diagnosis, Level, Ports
 
 RETRY_S = 10.0
-"""Time after which a journal that could not be opened is tried again."""
+"""Time after which a journal that could not be opened is tried again, and without failure a failure
+is over."""
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS)
 """Errors that a disk may get over; others are those of the parameter."""
 
@@ -75,6 +76,7 @@ class JournalKeeper:
         self._lag_limit_s = values["journal_lag_limit"]
         self._journal: Journal | None = None
         self._unwritten = 0  # while there was no journal
+        self._n_taken = 0  # since the last flush
         self._problem, self._retry_s = "", 0.0
 
     @property
@@ -116,6 +118,7 @@ class JournalKeeper:
 
     def write(self, topic: str, data: bytes, received_ns: int) -> None:
         """Take one message as received."""
+        self._n_taken += 1
         if self._journal is not None:
             self._journal.write(self._topics[topic][0], data, received_ns)
         elif self._folder:
@@ -123,19 +126,28 @@ class JournalKeeper:
 
     def flush(self) -> None:
         """Hand what was taken to the system; a failure is said once, and when it is over."""
-        if self._journal is None:
-            if self._folder and self._ports.now_s() >= self._retry_s:
-                self._open()
-            return
-        lost = self._journal.n_lost
+        taken, self._n_taken = self._n_taken, 0
         try:
+            if self._journal is None:
+                self._try_again()
+                return
+            lost = self.lost
             self._journal.flush()
-        except InputError as error:
+            if taken and self.lost == lost:
+                self._is_written()
+        except InputError as error:  # whatever it is: what was taken is to be used
             self._fail(error)
-            return
-        if self._problem and self._journal.n_lost == lost:
+
+    def _try_again(self) -> None:
+        if self._folder and self._ports.now_s() >= self._retry_s:
+            self._retry_s = self._ports.now_s() + RETRY_S
+            self._open()
+
+    def _is_written(self) -> None:
+        """Say that a failure is over, once nothing has failed for some time."""
+        if self._problem and self._ports.now_s() >= self._retry_s:
             self._problem = ""
-            self._ports.say(Level.WARN, f"{self._journal.path}: the journal is written again; "
+            self._ports.say(Level.WARN, f"{self.path}: the journal is written again; "
                             f"{self.lost} messages are not in it")
 
     def _fail(self, error: InputError) -> None:
@@ -148,11 +160,11 @@ class JournalKeeper:
         """Give the journal its end."""
         if self._journal is not None:
             journal, self._journal = self._journal, None
-            self._unwritten += journal.n_lost
             try:
                 journal.close()
             except InputError as error:
                 self._fail(error)
+            self._unwritten += journal.n_lost
 
     def diagnosis(self) -> Diagnosis:
         """Return where the journal is, how far the disk lags, and what is not in it."""

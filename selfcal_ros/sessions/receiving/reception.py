@@ -77,7 +77,10 @@ class Reception:
         adopted, waiting, self._waiting = False, self._waiting, []
         for topic, data, received_ns, _ in waiting:
             self.journal.write(topic, data, received_ns)
-        self.journal.flush()
+        try:
+            self.journal.flush()
+        except Exception as error:  # what has come is used, whatever becomes of the journal
+            self._refuse("journal", error)
         if self._restoring is not None:
             self._held += waiting
             if not self._restoring.done():

@@ -15,6 +15,7 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.messages.topics import COMMAND_TOPIC, DETECTION_TOPIC, ENCODER_TOPIC, INPUT_TOPICS
 from selfcal_ros.sessions.collecting import CollectingSession
 from selfcal_ros.sessions.ports import Level
+from selfcal_ros.sessions.receiving import journal_keeper
 from selfcal_ros.sessions.receiving.journal_keeper import JournalKeeper
 from selfcal_ros.sessions.receiving.reception import Reception
 from test.support.bags import Foreign
@@ -225,6 +226,7 @@ def test_a_full_disk_is_said_counted_and_ends_nothing(tmp_path, events, expected
                             "device); make room or name another folder; 30 messages are not in "
                             "the journal")
     disk.full = False
+    desk.hands.pass_time(10)
     desk.receive(events[70:])
     assert desk.read() == expected
     assert desk.hands.lines(Level.WARN) == [
@@ -275,3 +277,59 @@ def test_without_a_folder_there_is_no_journal(events, expected):
     desk = Desk().receive(events)
     assert desk.read() == expected
     assert desk.reception.diagnosis().values == {}
+
+
+class Locked:
+    """A journal that cannot be taken up, for a reason that is not the disk's."""
+
+    def __init__(self, monkeypatch, reason):
+        self.asked = 0
+
+        def refused(folder):
+            self.asked += 1
+            raise reason
+        monkeypatch.setattr(journal_keeper, "resume", refused)
+
+
+@pytest.mark.parametrize(("reason", "in_health", "refused"), [
+    (InputError("journal_1", "another process writes this journal", "end it"),
+     "journal_1: another process writes this journal; end it; 90 messages are not in the journal",
+     {}),
+    (ZeroDivisionError("within"), "no room; 90 messages are not in the journal",
+     {"journal: within": 1})])
+def test_whatever_a_later_try_meets_what_has_come_is_used(
+        tmp_path, events, expected, monkeypatch, reason, in_health, refused):
+    disk = FullDisk(monkeypatch)
+    disk.full = True
+    desk = Desk(tmp_path)
+    desk.keeper._problem = "no room"
+    locked = Locked(monkeypatch, reason)
+    desk.hands.pass_time(10)
+    for start in range(0, 90, 10):
+        desk.receive(events[start:start + 10]).reception.drain()
+    assert sum(desk.session.collector.received.values()) == 90
+    assert locked.asked == 1  # not at every tick
+    assert desk.refused == refused
+    told = desk.reception.diagnosis()
+    assert (told.level, told.message) == (Level.WARN, in_health)
+    desk.receive(events[90:])
+    assert desk.read() == expected
+
+
+def test_a_full_disk_and_a_slow_encoder_do_not_fill_the_log(tmp_path, events, monkeypatch):
+    disk, desk = FullDisk(monkeypatch), Desk(tmp_path)
+    disk.full = True
+    for tick in range(1000):  # 40 s, a message at every second look
+        desk.receive(events[tick:tick + 1] if tick % 2 else []).reception.drain()
+        desk.hands.pass_time(0.04)
+    assert len(desk.hands.lines(Level.WARN)) == 1
+    assert desk.reception.diagnosis().values["journal_lost"] == 500
+    disk.full = False
+    desk.receive(events[:1]).reception.drain()
+    assert len(desk.hands.lines(Level.WARN)) == 1  # it may fail again
+    desk.hands.pass_time(10)
+    desk.reception.drain()
+    assert len(desk.hands.lines(Level.WARN)) == 1  # nothing was written
+    desk.receive(events[:1]).reception.drain()
+    assert desk.hands.lines(Level.WARN)[1:] == [
+        f"{desk.keeper.path}: the journal is written again; 500 messages are not in it"]
