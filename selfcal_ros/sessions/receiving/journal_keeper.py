@@ -77,7 +77,7 @@ class JournalKeeper:
         self._journal: Journal | None = None
         self._unwritten = 0  # while there was no journal
         self._n_taken = 0  # since the last flush
-        self._problem, self._retry_s = "", 0.0
+        self._problem, self._tried_s, self._failed_s = "", 0.0, 0.0
 
     @property
     def path(self) -> Path | None:
@@ -139,19 +139,19 @@ class JournalKeeper:
             self._fail(error)
 
     def _try_again(self) -> None:
-        if self._folder and self._ports.now_s() >= self._retry_s:
-            self._retry_s = self._ports.now_s() + RETRY_S
+        if self._folder and self._ports.now_s() >= self._tried_s + RETRY_S:
+            self._tried_s = self._ports.now_s()
             self._open()
 
     def _is_written(self) -> None:
         """Say that a failure is over, once nothing has failed for some time."""
-        if self._problem and self._ports.now_s() >= self._retry_s:
+        if self._problem and self._ports.now_s() >= self._failed_s + RETRY_S:
             self._problem = ""
             self._ports.say(Level.WARN, f"{self.path}: the journal is written again; "
                             f"{self.lost} messages are not in it")
 
     def _fail(self, error: InputError) -> None:
-        self._retry_s = self._ports.now_s() + RETRY_S
+        self._tried_s = self._failed_s = self._ports.now_s()
         if not self._problem:
             self._ports.say(Level.WARN, f"{error}; collecting goes on without")
         self._problem = str(error)
