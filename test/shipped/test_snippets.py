@@ -1,0 +1,85 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The Python of the docs runs; the targets of make in README and docs exist."""
+
+import re
+import shlex
+import subprocess
+
+import numpy as np
+import pytest
+
+from selfcal_ros.cli.main import main
+from test.support.pages import PAGES, ROOT, lines_of
+from test.support.sessions import collected, events_of, small_plan
+
+TOPIC = ("/stage/joint_states", "sensor_msgs/msg/JointState")
+
+
+def snippets(name: str) -> list[str]:
+    """Return the blocks of Python of a page."""
+    text = (ROOT / "docs" / name).read_text()
+    return re.findall(r"```python\n(.*?)```", text, re.S)
+
+
+@pytest.fixture
+def run(tmp_path, monkeypatch):
+    """Return a function that runs the one block of a page in an empty folder; gives its names."""
+    monkeypatch.chdir(tmp_path)
+
+    def call(page: str, **given: object) -> dict:
+        block, = snippets(page)
+        exec(compile(block, page, "exec"), given)
+        return given
+    return call
+
+
+def test_every_page_with_python_is_run_here():
+    assert {page.name for page in PAGES if "```python" in page.read_text()} == {
+        "bags.md", "cal.md", "estimation.md"}
+
+
+def test_estimation(run):
+    measurements = collected(events_of(small_plan("0, 90, 180, tx")))[1]
+    found = run("estimation.md", measurements=measurements)
+    assert np.isnan(found["result"].error_map.u_gx).all()  # the last line asks for the map only
+
+
+def test_cal(run, tmp_path):
+    assert main(["solve", str(ROOT / "bags/hu_noise"), "--quiet", "-o", "R.json"]) == 0
+    assert main(["cal", "export", "R.json", "--x-axis", "1", "--y-axis", "2",
+                 "-o", "stage.cal"]) == 0
+    x = np.array([0.0, 1.5, -2.0])
+    found = run("cal.md", x_positions=x, y_positions=x[::-1])
+    assert all(np.isfinite(values).all() and values.shape == x.shape
+               for values in found["corrections"].values())
+
+
+def test_bags(run, tmp_path):
+    given = {"folder": tmp_path / "journals", "now_ns": 1_700_000_000_000_000_000,
+             "qos": "", "data": b"\0\1\0\0", "receive_time_ns": 1_700_000_000_000_000_000}
+    first = run("bags.md", **given)["journal"]
+    second = run("bags.md", **given)["journal"]  # no command ended the plan: it is taken up
+    assert first.path == second.path
+    assert len(list(first.path.glob("*.mcap"))) == 2
+
+
+def targets() -> set[str]:
+    return set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.M))
+
+
+def test_make_has_the_targets_that_are_named():
+    named = lines_of("make")
+    assert len({line.split()[1] for line in named}) > 8
+    for line in named:
+        words = shlex.split(line)
+        assert words[1] in targets(), line
+        # what is said beside the target is a variable that the Makefile reads
+        for word in words[2:]:
+            assert re.search(rf"\$[({{](or \$\()?{word.split('=')[0]}\b",
+                             (ROOT / "Makefile").read_text()), line
+
+
+def test_make_help_names_every_target():
+    said = subprocess.run(["make", "-s", "help"], cwd=ROOT, capture_output=True, text=True,
+                          check=True).stdout
+    assert set(re.findall(r"[a-z-]+", said)) - {"make"} == targets() - {"help"}
