@@ -27,6 +27,7 @@ from selfcal_ros.bagio.journal_file import (
     finish_file,
     message_record,
     records,
+    scan_file,
 )
 from selfcal_ros.bagio.metadata import Metadata, Topic
 from selfcal_ros.bagio.schemas import store_of_schema, typestore
@@ -56,20 +57,50 @@ def resume(folder: str | os.PathLike) -> "Journal | None":
     InputError
         If another process writes this journal, or it cannot be read or written.
     """
-    bag = _newest(Path(folder))
+    with _said(Path(folder)):
+        bag = _newest(Path(folder))
     if bag is None:
         return None
     with _said(bag):
         lock = _locked(bag)
         try:
             metadata, commands = _taken_up(bag)
-            if not commands or commands[-1][1] not in OVER:
+            if not _is_over(commands):
                 return Journal(bag, lock, metadata)
         except BaseException:
             os.close(lock)
             raise
         os.close(lock)
     return None
+
+
+def unfinished(folder: str | os.PathLike) -> list[Path]:
+    """Return the files of the journal that `resume` would take up, in their order; [] = none.
+
+    Nothing is written: where there is no room, what the journal holds can be used all the same.
+
+    Parameters
+    ----------
+    folder : path
+        Where journals lie, each a bag folder; need not exist.
+
+    Raises
+    ------
+    InputError
+        If the journal cannot be read.
+    """
+    bag = Path(folder)
+    try:
+        found = _newest(bag)
+        if found is None:
+            return []
+        bag, files = found, sorted(found.glob("*.mcap"), key=_number)
+        commands = [command for file in files
+                    for command in _commands(scan_file(file, COMMAND_TOPIC), str(file))]
+    except OSError as error:
+        raise InputError(str(bag), f"the journal cannot be read ({error.strerror})",
+                         "correct that, then restart the collector") from error
+    return [] if _is_over(sorted(commands)) else files
 
 
 def start(folder: str | os.PathLike, now_ns: int) -> "Journal":
@@ -281,6 +312,11 @@ def _taken_up(bag: Path) -> tuple[Metadata, list[tuple[int, Phase]]]:
                 topic.count += content.counts.get(channel.id, 0)
         commands += _commands(content, str(file))
     return metadata, sorted(commands)
+
+
+def _is_over(commands: list[tuple[int, Phase]]) -> bool:
+    """Return whether the last of the commands, by stamp, ends a run."""
+    return bool(commands) and commands[-1][1] in OVER
 
 
 def _locked(path: Path) -> int:

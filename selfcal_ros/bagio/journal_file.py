@@ -171,6 +171,12 @@ def finish_file(path: Path, keep: str) -> Content:
     return content
 
 
+def scan_file(path: Path, keep: str) -> Content:
+    """Return what `finish_file` does, and write nothing."""
+    with path.open("rb") as file:
+        return _scan(file, path.name, keep)
+
+
 def _scan(file: BinaryIO, name: str, keep: str) -> Content:
     """Go through the records of a file up to the first that is not whole."""
     content = Content(FileEntry(name))

@@ -19,7 +19,7 @@ from rosbags.rosbag2 import Reader
 
 from selfcal_ros.bagio import journal, journal_file
 from selfcal_ros.bagio.build import build
-from selfcal_ros.bagio.journal import resume, start
+from selfcal_ros.bagio.journal import resume, start, unfinished
 from selfcal_ros.bagio.metadata import qos_profile
 from selfcal_ros.bagio.offline import collect_bag
 from selfcal_ros.bagio.reader import BagReader
@@ -225,6 +225,9 @@ def test_the_plan_that_is_running_is_taken_up(tmp_path, phases, goes_on, reverse
     commands = [command(phase, NOW + i) for i, phase in enumerate(phases)]
     with declared(start(tmp_path, NOW)) as writer:
         record(writer, commands[::-1] if reverse else commands)
+    before = {file: file.read_bytes() for file in writer.path.iterdir()}
+    assert unfinished(tmp_path) == (list(writer.path.glob("*.mcap")) if goes_on else [])
+    assert {file: file.read_bytes() for file in writer.path.iterdir()} == before
     again = resume(tmp_path)
     assert (again is not None) == goes_on
     n_files = len(list(writer.path.glob("*.mcap")))
@@ -235,8 +238,9 @@ def test_the_plan_that_is_running_is_taken_up(tmp_path, phases, goes_on, reverse
 
 
 def test_the_journal_written_last_counts(tmp_path):
-    assert resume(tmp_path / "nothing") is None
-    assert resume(tmp_path) is None
+    for look in (resume, unfinished):
+        assert not look(tmp_path / "nothing")
+        assert not look(tmp_path)
     (tmp_path / "a file").write_text("nothing")
     (tmp_path / "empty").mkdir()
     old, new = (declared(start(tmp_path, NOW)) for _ in range(2))

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from selfcal_ros.bagio.journal import Journal, resume, start
+from selfcal_ros.bagio.journal import Journal, resume, start, unfinished
 from selfcal_ros.bagio.offline import block_handlers
 from selfcal_ros.bagio.reader import BagReader
 from selfcal_ros.collection.collector import Collector
@@ -75,6 +75,7 @@ class JournalKeeper:
         self._folder, self._topics, self._ports = folder, topics, ports
         self._lag_limit_s = values["journal_lag_limit"]
         self._journal: Journal | None = None
+        self._goes_on: list[Path] = []  # files that were taken up and could not be gone on with
         self._unwritten = 0  # while there was no journal
         self._n_taken = 0  # since the last flush
         self._problem, self._tried_s, self._failed_s = "", 0.0, 0.0
@@ -97,24 +98,35 @@ class JournalKeeper:
         InputError
             If the folder cannot be used; not if the disk is full.
         """
-        return self._open() if self._folder else []
+        if not self._folder:
+            return []
+        try:
+            self._open(resume(self._folder))
+        except InputError as error:
+            if getattr(error.__cause__, "errno", None) not in NO_ROOM:
+                raise
+            self._fail(error)
+            self._goes_on = self._readable()
+        return self._journal.earlier if self._journal else self._goes_on
 
-    def _open(self) -> list[Path]:
+    def _readable(self) -> list[Path]:
+        """Return the files of the journal of the run that is not over, which needs no room."""
+        try:
+            return unfinished(self._folder)
+        except InputError as error:
+            self._ports.say(Level.WARN, f"{error}; the run is not taken up")
+            return []
+
+    def _open(self, journal: Journal | None) -> None:
+        """Go on with a journal, or begin one."""
+        journal = journal or start(self._folder, self._ports.now_ns())
         with ExitStack() as undo:
-            try:
-                journal = resume(self._folder) or start(self._folder, self._ports.now_ns())
-                undo.callback(_given_up, journal)
-                for topic, typename in INPUT_TOPICS.items():
-                    name, qos = self._topics[topic]
-                    journal.add_topic(name, typename, [qos])
-            except InputError as error:
-                if getattr(error.__cause__, "errno", None) not in NO_ROOM:
-                    raise
-                self._fail(error)
-                return []
+            undo.callback(_given_up, journal)
+            for topic, typename in INPUT_TOPICS.items():
+                name, qos = self._topics[topic]
+                journal.add_topic(name, typename, [qos])
             undo.pop_all()
         self._journal = journal
-        return journal.earlier
 
     def write(self, topic: str, data: bytes, received_ns: int) -> None:
         """Take one message as received."""
@@ -141,7 +153,8 @@ class JournalKeeper:
     def _try_again(self) -> None:
         if self._folder and self._ports.now_s() >= self._tried_s + RETRY_S:
             self._tried_s = self._ports.now_s()
-            self._open()
+            # into an older journal only what follows it: the session has what that one holds
+            self._open(resume(self._folder) if self._goes_on else None)
 
     def _is_written(self) -> None:
         """Say that a failure is over, once nothing has failed for some time."""

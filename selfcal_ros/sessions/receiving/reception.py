@@ -42,6 +42,7 @@ class Reception:
         self._waiting: list[tuple[str, bytes, int, bool]] = []
         self._held: list[tuple[str, bytes, int, bool]] = []
         self._restoring: Future[TakenUp] | None = None
+        self._source = ""  # the journal that is taken up
         self._bad: Counter = Counter()
         self._decoders = {topic: ChannelDecoder(topic, name, (typestore(),), self._bad, told=True)
                           for topic, name in INPUT_TOPICS.items()}
@@ -50,6 +51,7 @@ class Reception:
         """Open the journal; what it holds of a run that is not over is read by `worker`."""
         files = self.journal.open()
         if files:
+            self._source = str(files[0].parent)
             self._restoring = worker.submit(take_up, files, self.session.values)
 
     @property
@@ -99,9 +101,9 @@ class Reception:
         except Exception as error:  # a journal that cannot be read ends nothing
             self._refuse("journal", error)
             return
-        self.session.adopt(found.collector, str(self.journal.path))
+        self.session.adopt(found.collector, self._source)
         for line in found.lost:
-            self._say(Level.WARN, f"{self.journal.path}: {line}")
+            self._say(Level.WARN, f"{self._source}: {line}")
 
     def _feed(self, waiting: list[tuple[str, bytes, int, bool]]) -> None:
         for _, data, _, is_older in (item for item in waiting if item[0] == COMMAND_TOPIC):
@@ -130,7 +132,7 @@ class Reception:
         """Return what is to be said of the journal."""
         told = self.journal.diagnosis()
         if self.restoring:
-            return Diagnosis(Level.WARN, f"reading the journal {self.journal.path}", told.values)
+            return Diagnosis(Level.WARN, f"reading the journal {self._source}", told.values)
         return told
 
     def close(self) -> None:

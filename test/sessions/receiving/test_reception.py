@@ -1,14 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """Bytes on their way to the session: written first, decoded as a bag's, held back, refused."""
 
+import errno
 from collections import Counter
 from concurrent.futures import Future
 
 import pytest
 
-from selfcal_ros.bagio import journal_file
+from selfcal_ros.bagio import journal, journal_file
 from selfcal_ros.bagio.journal import resume
 from selfcal_ros.bagio.offline import collect_bag
+from selfcal_ros.bagio.reader import BagReader
 from selfcal_ros.collection.digest import readings_digest
 from selfcal_ros.collection.messages import Command, Detection, Phase
 from selfcal_ros.errors import InputError
@@ -299,6 +301,7 @@ class Locked:
      {"journal: within": 1})])
 def test_whatever_a_later_try_meets_what_has_come_is_used(
         tmp_path, events, expected, monkeypatch, reason, in_health, refused):
+    Desk(tmp_path).keeper.close()  # a journal to go on with
     disk = FullDisk(monkeypatch)
     disk.full = True
     desk = Desk(tmp_path)
@@ -333,3 +336,54 @@ def test_a_full_disk_and_a_slow_encoder_do_not_fill_the_log(tmp_path, events, mo
     desk.receive(events[:1]).reception.drain()
     assert desk.hands.lines(Level.WARN)[1:] == [
         f"{desk.keeper.path}: the journal is written again; 500 messages are not in it"]
+
+
+def test_a_journal_is_taken_up_on_a_full_disk_and_gone_on_with_when_there_is_room(
+        tmp_path, events, expected, monkeypatch):
+    first = Desk(tmp_path).receive(events[:200])
+    first.reception.drain()
+    first.keeper.close()
+    disk = FullDisk(monkeypatch)
+    disk.full = True
+    second = Desk(tmp_path)
+    assert second.keeper.path is None and second.reception.restoring
+    second.receive(events[200:260]).reception.drain()
+    assert sum(second.session.collector.received.values()) == 260
+    [line] = second.hands.lines(Level.OK)
+    assert line.startswith(f"took up {first_path(tmp_path)} with 200 messages, in view")
+    disk.full = False
+    second.hands.pass_time(10)
+    second.reception.drain()
+    assert (second.keeper.path, second.reception.restoring) == (first_path(tmp_path), False)
+    second.receive(events[260:])
+    assert second.read() == expected
+    assert second.reception.diagnosis().message == "60 messages are not in the journal"
+    second.reception.close()
+    assert sum(len(item) if hasattr(item, "__len__") else 1 for _, item in
+               BagReader(first_path(tmp_path)).columns()) == len(events) - 60
+
+
+def first_path(folder):
+    return min(path for path in folder.iterdir() if path.is_dir())
+
+
+def test_a_journal_that_could_not_be_read_is_not_written_to(tmp_path, events, monkeypatch):
+    first = Desk(tmp_path).receive(events[:50])
+    first.reception.drain()
+    first.keeper.close()
+    bad = OSError(errno.EIO, "Input/output error")
+    with monkeypatch.context() as patch:
+        patch.setattr(journal, "_newest", lambda folder: (_ for _ in ()).throw(bad))
+        second = Desk(tmp_path)
+        second.receive(events[50:60]).reception.drain()
+    assert second.hands.lines(Level.WARN) == [
+        f"{tmp_path}: the journal cannot be written (Input/output error); make room or name "
+        "another folder; collecting goes on without",
+        f"{tmp_path}: the journal cannot be read (Input/output error); correct that, then restart "
+        "the collector; the run is not taken up"]
+    second.hands.pass_time(10)
+    second.reception.drain()
+    second.receive(events[60:70]).reception.drain()
+    assert second.keeper.path not in (None, first.keeper.path)
+    assert sum(second.session.collector.received.values()) == 20
+    assert [len(list(path.glob("*.mcap"))) for path in sorted(tmp_path.iterdir())] == [1, 1]
