@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
+from multiprocessing import forkserver
 from typing import Any
 
 from threadpoolctl import threadpool_limits
@@ -61,6 +62,21 @@ def check_workers(number: int | None, option: str = "--workers") -> int:
     if not 1 <= number <= 1024:
         raise InputError(option, f"{number} is no number of workers", "give 1 to 1024")
     return number
+
+
+def begin(module: str, workers: int) -> None:
+    """Begin to import what workers will need, while this process imports what it needs itself.
+
+    Parameters
+    ----------
+    module : str
+        Full name of the module of the function that they will be given.
+    workers : int
+        With one there is nothing to begin: it is this process.
+    """
+    if workers > 1 and _method() == "forkserver":
+        multiprocessing.get_context("forkserver").set_forkserver_preload([module])
+        forkserver.ensure_running()
 
 
 def outcomes(function: Callable[[Any], Any], items: Sequence[Any], *,
@@ -170,14 +186,17 @@ def _told(index: int, future: Any) -> Outcome:
     return Outcome(index, error=error) if error is not None else Outcome(index, future.result())
 
 
+def _method() -> str:
+    return "forkserver" if "forkserver" in multiprocessing.get_all_start_methods() else "spawn"
+
+
 @contextlib.contextmanager
 def _pool(workers: int, function: Callable[[Any], Any]) -> Iterator[ProcessPoolExecutor]:
     """Yield a pool whose processes are gone when the block ends, however it ends.
 
     What `function` needs is imported once, where the workers are forked.
     """
-    method = "forkserver" if "forkserver" in multiprocessing.get_all_start_methods() else "spawn"
-    context = multiprocessing.get_context(method)
+    context = multiprocessing.get_context(_method())
     module = getattr(getattr(function, "func", function), "__module__", None) or "builtins"
     context.set_forkserver_preload(["__main__" if module == "__main__" else module])
     before = set(multiprocessing.active_children())

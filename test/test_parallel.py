@@ -91,6 +91,15 @@ def test_workers_end_with_a_process_that_is_killed():
     assert not is_alive(worker)
 
 
+@pytest.mark.parametrize(("workers", "known"), [(1, False), (2, True)])
+def test_what_is_begun_is_imported_where_workers_are_forked(workers, known):
+    code = ("from selfcal_ros.parallel import begin, mapped\n"
+            f"begin('colorsys', {workers})\n"
+            "print(mapped(eval, [\"'colorsys' in __import__('sys').modules\"] * 4, workers=2))")
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split("\n")[0] == str([known] * 4)
+
+
 def test_numbers_of_workers():
     assert check_workers(None) == cores() >= 1
     assert check_workers(3) == 3

@@ -38,6 +38,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Solve what is not done yet, write the table and the page, say what was found."""
+    from selfcal_ros.parallel import begin, check_workers
+
+    if not args.dask:  # first: workers and this process import side by side
+        begin("selfcal_ros.batch.jobs", check_workers(args.workers))
     from selfcal_ros.batch.bags import find_bags
     from selfcal_ros.batch.jobs import Settings
     from selfcal_ros.batch.page import page_html
