@@ -15,7 +15,7 @@ import yaml
 from selfcal_ros.bagio.offline import bag_input, collect_bag
 from selfcal_ros.bagio.simulated import TRUTH_FILE, write_simulation
 from selfcal_ros.cli.replay import domain, process
-from selfcal_ros.collection.parameters import parameter_values
+from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.errors import NotIdentifiableError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.files import write_text
@@ -56,8 +56,8 @@ def record(bag: Path) -> None:
 
 def entry(name: str, made: str) -> dict:
     """Return the manifest entry of a bag: digest, how it was made, what it must give."""
-    measurements, _, lost, _ = collect_bag(BAGS / name, parameter_values(
-        "measurement_collector", {}, "defaults"))
+    measurements, _, lost, _ = collect_bag(BAGS / name, CollectorSettings.checked(
+        {}, "defaults"))
     expected: dict = {"rejected": measurements.all_rejected(), "lost": lost}
     try:
         result = calibrate(measurements)

@@ -6,7 +6,8 @@ from pathlib import Path
 
 from selfcal_ros.bagio.offline import bag_input, collect_bag
 from selfcal_ros.bagio.simulated import read_truth
-from selfcal_ros.collection.parameters import parameter_values, solver_options
+from selfcal_ros.collection.settings.estimator import solver_options
+from selfcal_ros.collection.settings.nodes import CollectorSettings, SolverSettings
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.files import write_text
 from selfcal_ros.model.result import CalibrationResult, with_input
@@ -26,8 +27,8 @@ FIGURES = ("error-map", "residual-maps")
 def calibrated() -> CalibrationResult:
     """Return the calibration of the demo's bag."""
     measurements, _, lost, _ = collect_bag(
-        BAG, parameter_values("measurement_collector", {}, "pictures"))
-    options = solver_options(parameter_values("solver", {}, "pictures"), measurements)
+        BAG, CollectorSettings.checked({}, "pictures"))
+    options = solver_options(SolverSettings.checked({}, "pictures"), measurements)
     result = with_input(calibrate(measurements, options), bag_input(BAG), lost)
     return result
 

@@ -7,7 +7,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from selfcal_ros.collection.parameters import NODE_PARAMETERS, Parameter
+from selfcal_ros.collection.settings.nodes import NODE_PARAMETERS
+from selfcal_ros.collection.settings.parameter import Parameter
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import write_text
 from selfcal_ros.model.result import result_to_dict

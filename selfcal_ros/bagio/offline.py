@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 from selfcal_ros.bagio.reader import BagReader
 from selfcal_ros.collection.clock.steps import step_lines
 from selfcal_ros.collection.collector import Collector, ViewProgress
+from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.errors import InputError, NoDataError, did_you_mean
 from selfcal_ros.files import add_file
 from selfcal_ros.messages import to_model
@@ -42,7 +43,7 @@ class BagSession(NamedTuple):
     findings: list[str]
 
 
-def collect_bag(path: str | Path, values: dict[str, Any], *, namespace: str | None = None,
+def collect_bag(path: str | Path, settings: CollectorSettings, *, namespace: str | None = None,
                 progress: Callable[[int], None] = lambda count: None) -> BagSession:
     """Return the readings in a bag, how far each view came, and what is wrong with it.
 
@@ -50,7 +51,7 @@ def collect_bag(path: str | Path, values: dict[str, Any], *, namespace: str | No
     ----------
     path : path
         MCAP file or rosbag2 folder.
-    values : dict
+    settings : CollectorSettings
         Values of the measurement_collector's parameters.
     namespace : str or None
         Namespace of the cell's topics; empty = the root, None = the only one.
@@ -64,8 +65,8 @@ def collect_bag(path: str | Path, values: dict[str, Any], *, namespace: str | No
     NoDataError
         If it has no commands or no detections, or no detection became a reading.
     """
-    reader = BagReader(Path(path), namespace, values["clock_limit"])
-    collector = Collector(values)
+    reader = BagReader(Path(path), namespace, settings.clock_limit)
+    collector = Collector(settings)
     take = block_handlers(collector, reader.lost)
     for topic, item in reader.columns():
         take[topic](item)

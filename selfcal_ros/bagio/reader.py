@@ -15,7 +15,7 @@ from selfcal_ros.bagio.mcap.chunk import Block
 from selfcal_ros.bagio.mcap.stream import CONVERT, McapStream
 from selfcal_ros.bagio.schemas import other_field, shorter_stores, store_of_schema
 from selfcal_ros.collection.clock.steps import Step, StepWatch
-from selfcal_ros.collection.parameters import parameter_values
+from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import read_yaml
 from selfcal_ros.messages.input_columns import first_stamps_ns
@@ -24,7 +24,7 @@ from selfcal_ros.messages.topics import COMMAND_TOPIC, DETECTION_TOPIC, ENCODER_
 LAST_FIELDS = {ENCODER_TOPIC: "position", DETECTION_TOPIC: "score", COMMAND_TOPIC: "angular_count"}
 """Last field that the contract asks for; what stands behind it may be missing."""
 SUFFIXES = (".mcap", ".mcap.zstd")
-CLOCK_LIMIT_S = parameter_values("measurement_collector", {}, "defaults")["clock_limit"]
+CLOCK_LIMIT_S = CollectorSettings().clock_limit
 LOOKED_AT = 200
 """Stamps of a topic in a chunk that are held against the times of logging."""
 

@@ -16,7 +16,8 @@ from selfcal_ros import __version__
 from selfcal_ros.bagio.offline import bag_input, collect_bag
 from selfcal_ros.batch.bags import stat_of
 from selfcal_ros.batch.quantities import quantities
-from selfcal_ros.collection.parameters import solver_options
+from selfcal_ros.collection.settings.estimator import solver_options
+from selfcal_ros.collection.settings.nodes import CollectorSettings, SolverSettings
 from selfcal_ros.errors import ExitCode, InputError, NotIdentifiableError, SelfcalError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.quality.outliers import robust_calibrate
@@ -43,16 +44,16 @@ class Settings:
 
     Attributes
     ----------
-    collector, solver : dict
-        Values of the parameters of the collector and the solver.
+    collector, solver : CollectorSettings, SolverSettings
+        Those of the nodes.
     robust : bool
         Whether outliers are looked for.
     namespace : str or None
         Of the cell's topics, see `selfcal_ros.bagio.offline.collect_bag`.
     """
 
-    collector: dict[str, Any]
-    solver: dict[str, Any]
+    collector: CollectorSettings
+    solver: SolverSettings
     robust: bool = False
     namespace: str | None = None
 

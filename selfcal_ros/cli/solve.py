@@ -3,10 +3,13 @@
 
 import argparse
 import sys
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from selfcal_ros.cli.terminal.output import add_json, aside, file_of, on_stdout, put
 from selfcal_ros.errors import InputError
+
+if TYPE_CHECKING:
+    from selfcal_ros.collection.settings.nodes import CollectorSettings, SolverSettings
 
 HELP = "calibrate from a bag: MCAP file or rosbag2 folder"
 
@@ -61,29 +64,28 @@ def add_options(parser: argparse.ArgumentParser) -> None:
                         "(docs/identifiability.md)")
 
 
-def parameters(args: argparse.Namespace) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return the collector's and the solver's parameter values; options win over the file."""
-    from selfcal_ros.collection.parameters import overrides_in, parameter_values
+def parameters(args: argparse.Namespace) -> "tuple[CollectorSettings, SolverSettings]":
+    """Return the settings of the collector and of the solver; options win over the file."""
+    from selfcal_ros.collection.settings.nodes import CollectorSettings, Settings, SolverSettings
+    from selfcal_ros.collection.settings.ros_file import overrides_in
     from selfcal_ros.files import read_yaml
 
     data = read_yaml(args.params) if args.params else {}
     where = args.params or "options"
-    options = {"measurement_collector": {"measurement_sense": args.sense},
-               "solver": {"method": args.method, "theta_datum": args.theta_datum,
-                          "misalignment_model": args.misalignment,
-                          "uncertainty": args.uncertainty,
-                          "model_terms": args.model, "drift_degree": args.drift_degree,
-                          "reference_certificate": args.certificate,
-                          **_reference(args.reference)}}
-    values = []
-    for node, given in options.items():
-        overrides = overrides_in(data, node, where)
+
+    def settings[S: Settings](kind: type[S], **given: Any) -> S:
+        overrides = overrides_in(data, kind.NODE, where)
         overrides |= {name: value for name, value in given.items() if value is not None}
-        values.append(parameter_values(node, overrides, where))
-    if args.misalignment == "rigid" and values[1]["method"] == "law":
+        return kind.checked(overrides, where)
+    collector = settings(CollectorSettings, measurement_sense=args.sense)
+    solver = settings(SolverSettings, method=args.method, theta_datum=args.theta_datum,
+                      misalignment_model=args.misalignment, uncertainty=args.uncertainty,
+                      model_terms=args.model, drift_degree=args.drift_degree,
+                      reference_certificate=args.certificate, **_reference(args.reference))
+    if args.misalignment == "rigid" and solver.method == "law":
         raise InputError("--misalignment", "Hu's law is linear, not rigid",
                          "leave it out, or use --method joint")
-    return values[0], values[1]
+    return collector, solver
 
 
 def _reference(text: str | None) -> dict[str, Any]:
@@ -104,8 +106,8 @@ def run(args: argparse.Namespace) -> int:
     from selfcal_ros.bagio.simulated import read_truth
     from selfcal_ros.cli.terminal.print_result import exit_code, show
     from selfcal_ros.cli.terminal.progress import busy, progress_bar
-    from selfcal_ros.collection.parameters import solver_options
     from selfcal_ros.collection.reasons import advice
+    from selfcal_ros.collection.settings.estimator import solver_options
     from selfcal_ros.errors import NotIdentifiableError
     from selfcal_ros.estimation.api import calibrate
     from selfcal_ros.files import check_outputs
@@ -120,15 +122,15 @@ def run(args: argparse.Namespace) -> int:
     check_outputs([args.bag, args.params], [file_of(args), args.report])
     if args.report:
         check_name(args.report)
-    collector_values, solver_values = parameters(args)
+    collector, solver = parameters(args)
     with progress_bar("reading") as bar:
         measurements, _, lost, findings = collect_bag(
-            args.bag, collector_values, namespace=args.namespace,
+            args.bag, collector, namespace=args.namespace,
             progress=lambda count: bar(count, None))
     said = [*findings, *lost, *(() if findings else advice(measurements.all_rejected()))]
     for line in dict.fromkeys(said):  # a clock that stepped is a finding, and noted in the result
         print(f"selfcal solve: {args.bag}: {line}", file=sys.stderr)
-    options = solver_options(solver_values, measurements)
+    options = solver_options(solver, measurements)
     try:
         with busy("solving"):
             if args.robust:

@@ -9,7 +9,6 @@ import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -20,6 +19,7 @@ from selfcal_ros.collection.marks.identify import IdentityRules
 from selfcal_ros.collection.messages import Command, Detection, EncoderSample, check_command
 from selfcal_ros.collection.reasons import Reason
 from selfcal_ros.collection.reduce import DETECTION, Rules
+from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.collection.stage.encoder import JointTrack, TrackLimits
 from selfcal_ros.collection.stage.exposures import Exposures, Tracks
 from selfcal_ros.collection.stage.samples import Limits
@@ -86,8 +86,8 @@ class Collector:
 
     Parameters
     ----------
-    values : dict
-        Values of the measurement_collector's parameters (`parameters.parameter_values`).
+    settings : CollectorSettings
+        What measurement_collector is set to.
     store : Limits, optional
         How many encoder samples are kept in memory.
 
@@ -97,24 +97,24 @@ class Collector:
         If two joints have one name.
     """
 
-    def __init__(self, values: dict[str, Any], store: Limits | None = None) -> None:
-        gap_ns = round(values["max_encoder_gap"] * 1e9)
-        linear = TrackLimits(gap_ns, values["max_speed"], values["encoder_agreement"])
-        turn = TrackLimits(gap_ns, values["max_angular_speed"], values["encoder_agreement"], True)
-        self.sense = Sense(values["measurement_sense"])
-        self._joints = {values["joint_x"]: "x", values["joint_y"]: "y",
-                        values["joint_theta"]: "theta"}
+    def __init__(self, settings: CollectorSettings, store: Limits | None = None) -> None:
+        gap_ns = round(settings.max_encoder_gap * 1e9)
+        linear = TrackLimits(gap_ns, settings.max_speed, settings.encoder_agreement)
+        turn = TrackLimits(gap_ns, settings.max_angular_speed, settings.encoder_agreement, True)
+        self.sense = Sense(settings.measurement_sense)
+        self._joints = {settings.joint_x: "x", settings.joint_y: "y",
+                        settings.joint_theta: "theta"}
         if len(self._joints) < 3:
             raise InputError("measurement_collector: joint_x, joint_y, joint_theta",
                              "two of them are the same joint", "give each its own name")
         self.tracks = Tracks(JointTrack(linear, store), JointTrack(linear, store),
                              JointTrack(turn, store))
         self._rules = Rules(
-            self.sense, IdentityRules(values["max_deviation"], values["ambiguity_ratio"],
-                                      values["max_rotation"], values["max_stage_distance"]),
-            values["min_score"], values["outlier_limit"])
+            self.sense, IdentityRules(settings.max_deviation, settings.ambiguity_ratio,
+                                      settings.max_rotation, settings.max_stage_distance),
+            settings.min_score, settings.outlier_limit)
         self._exposures = Exposures(self.tracks,
-                                    approach_threshold_m=values["approach_threshold"])
+                                    approach_threshold_m=settings.approach_threshold)
         self._views = ViewCache(self._rules)
         self._single: list[tuple] = []  # detections that were added one by one
         self._unsettled = 0

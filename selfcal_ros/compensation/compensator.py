@@ -8,7 +8,7 @@ The error map holds G = indicated - true at the true position of the marks, henc
 """
 
 from collections.abc import Callable
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -31,6 +31,8 @@ MAX_SLOPE = 0.25
 GENTLE = 0.005
 """Slope between neighbours below which no spline through them comes near twice MAX_SLOPE."""
 
+Interpolation = Literal["bilinear", "bicubic"]
+Outside = Literal["clamp", "refuse"]
 _Field = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 
@@ -62,12 +64,12 @@ class Compensator:
     """
 
     def __init__(self, error_map: ErrorMap, *,
-                 method: Literal["bilinear", "bicubic"] = "bilinear",
-                 outside: Literal["clamp", "refuse"] = "clamp") -> None:
-        if method not in ("bilinear", "bicubic"):
+                 method: Interpolation = "bilinear",
+                 outside: Outside = "clamp") -> None:
+        if method not in get_args(Interpolation):
             raise InputError("compensator method", f"'{method}' is unknown",
                              "take bilinear or bicubic")
-        if outside not in ("clamp", "refuse"):
+        if outside not in get_args(Outside):
             raise InputError("compensator outside", f"'{outside}' is unknown",
                              "take clamp or refuse")
         self.error_map, self.method, self.outside = error_map, method, outside

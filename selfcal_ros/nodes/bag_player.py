@@ -7,6 +7,7 @@ from typing import Any
 
 from rclpy.task import Future
 
+from selfcal_ros.collection.settings.nodes import PlayerSettings
 from selfcal_ros.errors import ExitCode, InputError
 from selfcal_ros.nodes.base import SelfcalNode
 from selfcal_ros.nodes.player import Player
@@ -14,18 +15,18 @@ from selfcal_ros.nodes.running import run
 from selfcal_ros.sessions.ports import Diagnosis, Level
 
 
-class BagPlayer(SelfcalNode):
+class BagPlayer(SelfcalNode[PlayerSettings]):
     """Plays one bag, says what it sent, and ends."""
 
     def __init__(self, **kwargs: Any) -> None:
-        super().__init__("bag_player", **kwargs)
-        if not self.values["bag"]:
+        super().__init__(PlayerSettings, **kwargs)
+        if not self.settings.bag:
             raise InputError("bag_player", "no bag is named", "set the parameter 'bag'")
         self.finished = Future()
         self.exit_code = ExitCode.DONE
-        self.player = Player(self, self.values["bag"], rate=self.values["rate"],
-                             seed=self.values["seed"])
-        self._patience = time.monotonic() + self.values["wait_for_subscribers"]
+        self.player = Player(self, self.settings.bag, rate=self.settings.rate,
+                             seed=self.settings.seed)
+        self._patience = time.monotonic() + self.settings.wait_for_subscribers
         self._started = False
         self.every(0.002, self._step)
 

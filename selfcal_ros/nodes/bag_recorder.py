@@ -3,9 +3,11 @@
 
 import sys
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 from selfcal_ros.bagio.writer import BagWriter
+from selfcal_ros.collection.settings.nodes import RecorderSettings
 from selfcal_ros.errors import InputError
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes.base import SelfcalNode
@@ -15,15 +17,15 @@ from selfcal_ros.nodes.running import run
 from selfcal_ros.sessions.ports import Diagnosis, Level
 
 
-class BagRecorder(SelfcalNode):
+class BagRecorder(SelfcalNode[RecorderSettings]):
     """Records what arrives, as it arrives; what was recorded survives a crash."""
 
     def __init__(self, **kwargs: Any) -> None:
-        super().__init__("bag_recorder", **kwargs)
-        if not self.values["bag"]:
+        super().__init__(RecorderSettings, **kwargs)
+        if not self.settings.bag:
             raise InputError("bag_recorder", "no bag is named", "set the parameter 'bag'")
-        self._writer = BagWriter(self.values["bag"])
-        topics = [*names.INPUTS, *(names.RESULTS if self.values["all_topics"] else ())]
+        self._writer = BagWriter(Path(self.settings.bag))
+        topics = [*names.INPUTS, *(names.RESULTS if self.settings.all_topics else ())]
         for topic in topics:
             name = self.resolve_topic_name(topic.name)
             typename = f"{topic.type.__module__.split('.')[0]}/msg/{topic.type.__name__}"
@@ -68,7 +70,7 @@ class BagRecorder(SelfcalNode):
         """Finish the bag."""
         try:
             self._writer.close()
-            self.say(Level.OK, f"{self.values['bag']}: {self._writer.counts}")
+            self.say(Level.OK, f"{self.settings.bag}: {self._writer.counts}")
         except InputError as error:
             if not self._failed:
                 self._fail(error)

@@ -12,7 +12,7 @@ from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 
-from selfcal_ros.collection.parameters import BARE_Y, NODE_PARAMETERS, parameter_values
+from selfcal_ros.collection.settings.parameter import BARE_Y, Settings
 from selfcal_ros.errors import SelfcalError, as_answer, printable
 from selfcal_ros.nodes.callbacks import WithInfo
 from selfcal_ros.nodes.descriptors import descriptor
@@ -24,13 +24,13 @@ from selfcal_ros.sessions.health import Losses, Refusals, merged
 from selfcal_ros.sessions.ports import Diagnosis, Level, Ports
 
 
-class NodeBase(Node):
+class NodeBase[S: Settings](Node):
     """A node of rclpy with parameters from the package's one table, and health once a second.
 
     Work and health follow a steady clock: a simulated or stepped ROS time does not stop them.
     """
 
-    def prepare(self, name: str) -> None:
+    def prepare(self, kind: type[S]) -> None:
         """Check the parameters and begin to tell the health.
 
         Raises
@@ -39,14 +39,13 @@ class NodeBase(Node):
             For an unknown parameter name, a wrong type or a value out of bounds.
         """
         overrides = {key: value.value for key, value in self._parameter_overrides.items()}
-        self.values = parameter_values(name, overrides, f"parameters of {name}")
-        for parameter in NODE_PARAMETERS[name]:  # the checked value: 2 is a good 2.0 here
-            self.declare_parameter(parameter.name, self.values[parameter.name],
+        self.settings = kind.checked(overrides, f"parameters of {kind.NODE}")
+        for parameter in kind.parameters():  # the checked value: 2 is a good 2.0 here
+            self.declare_parameter(parameter.name, getattr(self.settings, parameter.name),
                                    descriptor(parameter), ignore_override=True)
         for key in (key for key, value in overrides.items() if value is True):
-            if self.values.get(key) == BARE_Y:
+            if getattr(self.settings, key, "") == BARE_Y:
                 self.say(Level.OK, f"{key}: true is a bare y as ROS reads it; taken as 'y'")
-        self.frame_id = self.values.get("frame_id", "stage")
         self.refusals = Refusals(self.say, time.monotonic)
         self.losses = Losses(self.say, time.monotonic)
         self._ros_time = RosTime(self.say)
@@ -170,7 +169,7 @@ class NodeBase(Node):
 
     def diagnose(self, diagnosis: Diagnosis) -> None:
         """Publish one diagnostic status of this node, for everybody and for its companions."""
-        stage = self.values["hardware_id"] or self.get_namespace().strip("/") or "stage"
+        stage = self.settings.hardware_id or self.get_namespace().strip("/") or "stage"
         status = status_of(diagnosis, self.get_fully_qualified_name().lstrip("/"), stage)
         array_message = DiagnosticArray(status=[status])
         array_message.header.stamp = self.get_clock().now().to_msg()
@@ -178,17 +177,17 @@ class NodeBase(Node):
         self._health.publish(status)
 
 
-class SelfcalNode(NodeBase):
+class SelfcalNode[S: Settings](NodeBase[S]):
     """A node that works from its construction on.
 
     Parameters
     ----------
-    name : str
-        Key of `NODE_PARAMETERS`; also the node's name.
+    kind : type
+        The node's settings.
     **kwargs
         For rclpy.node.Node, e.g. parameter_overrides.
     """
 
-    def __init__(self, name: str, **kwargs: Any) -> None:
-        super().__init__(name, **kwargs)
-        self.prepare(name)
+    def __init__(self, kind: type[S], **kwargs: Any) -> None:
+        super().__init__(kind.NODE, **kwargs)
+        self.prepare(kind)

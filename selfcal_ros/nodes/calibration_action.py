@@ -10,6 +10,7 @@ from selfcal_msgs.action import RunCalibration
 from selfcal_msgs.srv import SaveMap
 
 from selfcal_ros.collection.sequencer import State
+from selfcal_ros.collection.settings.nodes import SequencerSettings
 from selfcal_ros.errors import ExitCode, NoDataError, as_answer
 from selfcal_ros.nodes.managed import ManagedNode
 from selfcal_ros.sessions.map_files import plan_file_name
@@ -28,7 +29,7 @@ class CalibrationAction:
         What runs the plan.
     """
 
-    def __init__(self, node: ManagedNode, session: SequencingSession) -> None:
+    def __init__(self, node: ManagedNode[SequencerSettings], session: SequencingSession) -> None:
         self._node, self._session = node, session
         self._goal: Any = None
         self._ended: Future | None = None
@@ -97,7 +98,7 @@ class CalibrationAction:
             goal.canceled() if goal.is_cancel_requested else goal.abort()
             return
         answer = await self._save(
-            self._node.values["result_path"] or plan_file_name(machine.need_plan().plan_id))
+            self._node.settings.result_path or plan_file_name(machine.need_plan().plan_id))
         result.error_code, result.message = answer.error_code, answer.message
         result.map_path = answer.path
         goal.succeed() if answer.success else goal.abort()
@@ -106,7 +107,7 @@ class CalibrationAction:
         """Return the solver's answer; NoDataError if there is none in time."""
         if not self._saver.service_is_ready():
             raise NoDataError("run_calibration", "no solver is running", "start one, then save_map")
-        patience = self._node.values["save_timeout"]
+        patience = self._node.settings.save_timeout
         self._saved, self._save_until = Future(), time.monotonic() + patience
         answer = self._saver.call_async(SaveMap.Request(path=path))
         answer.add_done_callback(self._on_saved)

@@ -4,6 +4,7 @@
 import sys
 from typing import Any
 
+from selfcal_ros.collection.settings.nodes import CompensatorSettings
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes.managed import ManagedNode, WhileConfigured
 from selfcal_ros.nodes.running import run
@@ -11,17 +12,17 @@ from selfcal_ros.sessions.compensating import CompensatingSession
 from selfcal_ros.sessions.ports import Diagnosis
 
 
-class CompensatorNode(ManagedNode):
+class CompensatorNode(ManagedNode[CompensatorSettings]):
     """Publishes stage/corrected_joint_states: each sample with the stage's error taken off."""
 
     session = WhileConfigured[CompensatingSession]()
 
     def __init__(self, **kwargs: Any) -> None:
-        super().__init__("compensator", **kwargs)
+        super().__init__(CompensatorSettings, **kwargs)
 
     def configure(self) -> None:
         """Make the session, with the map of a file if one is named."""
-        self.session = CompensatingSession(self.values, self.ports(lambda *_: None))
+        self.session = CompensatingSession(self.settings, self.ports(lambda *_: None))
         self._corrected = self.publisher(names.CORRECTED)
         self.alone_on += [names.CORRECTED.name]
 

@@ -3,7 +3,7 @@
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 
-from selfcal_ros.collection.parameters import Parameter
+from selfcal_ros.collection.settings.parameter import Parameter
 
 
 def descriptor(parameter: Parameter) -> ParameterDescriptor:

@@ -10,6 +10,7 @@ from typing import Any
 from rclpy._rclpy_pybind11 import RCLError
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 
+from selfcal_ros.collection.settings.parameter import ManagedSettings
 from selfcal_ros.errors import SelfcalError, first_line
 from selfcal_ros.nodes.base import NodeBase
 from selfcal_ros.sessions.ports import Diagnosis, Level
@@ -42,7 +43,7 @@ def stop(worker: Executor) -> None:
     worker.shutdown(wait=False, cancel_futures=True)
 
 
-class ManagedNode(NodeBase, LifecycleNode):
+class ManagedNode[S: ManagedSettings](NodeBase[S], LifecycleNode):
     """A lifecycle node whose errors in transitions are told, and which leaves nothing behind.
 
     `configure` makes the session and what it publishes on, `activate` what it hears, answers and
@@ -52,19 +53,19 @@ class ManagedNode(NodeBase, LifecycleNode):
 
     Parameters
     ----------
-    name : str
-        Key of `NODE_PARAMETERS`; also the node's name.
+    kind : type
+        The node's settings.
     **kwargs
         For rclpy.node.Node, e.g. parameter_overrides.
     """
 
-    def __init__(self, name: str, **kwargs: Any) -> None:
+    def __init__(self, kind: type[S], **kwargs: Any) -> None:
         self.problem: Exception | None = None
         self._made: dict[str, list[Callable[[], Any]]] = {"configure": [], "activate": []}
         self._making = ""
         self.held: dict[str, Any] = {}
-        super().__init__(name, **kwargs)
-        self.prepare(name)
+        super().__init__(kind.NODE, **kwargs)
+        self.prepare(kind)
         change = self._service_change_state
         change.callback = partial(self._change_state, change.callback)
 
@@ -80,7 +81,7 @@ class ManagedNode(NodeBase, LifecycleNode):
 
     def autostart(self) -> None:
         """Configure and activate, if the parameter ``autostart`` says so; raise what fails."""
-        if self.values["autostart"]:
+        if self.settings.autostart:
             for step in (self.trigger_configure, self.trigger_activate):
                 step()
                 if self.problem is not None:

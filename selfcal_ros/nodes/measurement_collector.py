@@ -9,6 +9,7 @@ from typing import Any
 from rclpy.subscription import Subscription
 from std_srvs.srv import Trigger
 
+from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.errors import InputError
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes.encoder_input import EncoderInput
@@ -26,7 +27,7 @@ TICK_S = 0.04
 """Time between two looks at what has come: much longer would be seen in the latency of a map."""
 
 
-class MeasurementCollector(PollingNode):
+class MeasurementCollector(PollingNode[CollectorSettings]):
     """Feeds a `CollectingSession`; publishes ViewStatus and ViewMeasurement.
 
     A tick takes the messages that have come as bytes, writes them to the journal, decodes them
@@ -38,15 +39,15 @@ class MeasurementCollector(PollingNode):
     _detections = WhileConfigured[Subscription]()
 
     def __init__(self, **kwargs: Any) -> None:
-        super().__init__("measurement_collector", **kwargs)
+        super().__init__(CollectorSettings, **kwargs)
 
     def configure(self) -> None:
         """Make the session, the journal and the publishers."""
         ports = self.ports(self._publish)
-        self.session = CollectingSession(self.values, ports)
+        self.session = CollectingSession(self.settings, ports)
         journal = JournalKeeper(self._journal_folder(), {
             topic.name: (self.resolve_topic_name(topic.name), offered(topic))
-            for topic in names.INPUTS}, self.values, ports)
+            for topic in names.INPUTS}, self.settings, ports)
         self._reception = self.own(
             Reception(self.session, journal, say=self.say, refuse=self.refusals.add),
             Reception.close)
@@ -59,7 +60,7 @@ class MeasurementCollector(PollingNode):
 
     def _journal_folder(self) -> str:
         """Return the folder of this cell's journals: one of its own for each namespace."""
-        folder = self.values["journal"]
+        folder = self.settings.journal
         return folder and str(Path(folder, self.get_namespace().strip("/")))
 
     def activate(self) -> None:

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 
 from rclpy.subscription import Subscription
 
+from selfcal_ros.collection.settings.parameter import ManagedSettings
 from selfcal_ros.nodes.managed import ManagedNode
 
 MOST = 2000
@@ -55,7 +56,7 @@ class ByTheClock:
         return gap
 
 
-class PollingNode(ManagedNode):
+class PollingNode[S: ManagedSettings](ManagedNode[S]):
     """A managed node whose subscriptions with `ByTheClock` are left to `poll` by executors."""
 
     @property

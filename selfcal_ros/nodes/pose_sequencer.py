@@ -6,6 +6,7 @@ from typing import Any
 
 from std_srvs.srv import Trigger
 
+from selfcal_ros.collection.settings.nodes import SequencerSettings
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes.calibration_action import CalibrationAction
 from selfcal_ros.nodes.filling import diagnosis_of
@@ -18,19 +19,20 @@ COMPANIONS = ("measurement_collector", "solver")
 TICK_S = 0.05
 
 
-class PoseSequencer(ManagedNode):
+class PoseSequencer(ManagedNode[SequencerSettings]):
     """Publishes PLACE and MEASURE for each view; services and an action drive it."""
 
     session = WhileConfigured[SequencingSession]()
     _action = WhileConfigured[CalibrationAction]()
 
     def __init__(self, **kwargs: Any) -> None:
-        super().__init__("pose_sequencer", **kwargs)
+        super().__init__(SequencerSettings, **kwargs)
 
     def configure(self) -> None:
         """Make the session, with its plan, and the publisher of commands."""
         command = self.output(names.COMMAND)
-        self.session = SequencingSession(self.values, self.ports(lambda _, fields: command(fields)))
+        self.session = SequencingSession(
+            self.settings, self.ports(lambda _, fields: command(fields)))
 
     def activate(self) -> None:
         """Listen to the companions, offer services and the action."""

@@ -17,6 +17,7 @@ from rclpy.task import Future
 from selfcal_msgs.srv import SaveMap
 from std_srvs.srv import Trigger
 
+from selfcal_ros.collection.settings.nodes import PlayerSettings
 from selfcal_ros.errors import ExitCode, SelfcalError
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes.base import SelfcalNode
@@ -27,11 +28,11 @@ PATIENCE_S = 30.0
 """Longest wait for the nodes to appear, to receive what was sent, or to answer."""
 
 
-class ReplaySession(SelfcalNode):
+class ReplaySession(SelfcalNode[PlayerSettings]):
     """Waits for subscribers, plays, checks that nothing was lost, has the map saved."""
 
     def __init__(self, player: Callable[[SelfcalNode], Player], output: str) -> None:
-        super().__init__("bag_player", parameter_overrides=[])
+        super().__init__(PlayerSettings, parameter_overrides=[])
         self.finished, self.exit_code = Future(), ExitCode.INTERNAL
         self._output = output
         self.player = player(self)

@@ -7,6 +7,7 @@ from typing import Any
 
 from selfcal_msgs.srv import LoadMap, SaveMap
 
+from selfcal_ros.collection.settings.nodes import SolverSettings
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes.managed import ManagedNode, WhileConfigured, stop
 from selfcal_ros.nodes.markers import map_markers
@@ -17,7 +18,7 @@ from selfcal_ros.sessions.solving import Outcome, SolvingSession, solve
 TICK_S = 0.02
 
 
-class Solver(ManagedNode):
+class Solver(ManagedNode[SolverSettings]):
     """Solves whenever a view's readings arrive; publishes ErrorMap and CalibrationSummary.
 
     Solving runs in a thread beside the executor; what arrives meanwhile is solved next, together.
@@ -28,11 +29,11 @@ class Solver(ManagedNode):
     _running = WhileConfigured[Future[Outcome] | None]()
 
     def __init__(self, **kwargs: Any) -> None:
-        super().__init__("solver", **kwargs)
+        super().__init__(SolverSettings, **kwargs)
 
     def configure(self) -> None:
         """Make the session, the worker and the publishers."""
-        self.session = SolvingSession(self.values, self.ports(self._publish))
+        self.session = SolvingSession(self.settings, self.ports(self._publish))
         self._worker = self.own(ThreadPoolExecutor(1, thread_name_prefix="solver"), stop)
         self._running = None
         self._outputs = {"map": self.output(names.ERROR_MAP),
@@ -51,7 +52,7 @@ class Solver(ManagedNode):
 
     def _publish(self, output: str, fields: dict[str, Any]) -> None:
         if output == "markers":
-            self._markers.publish(map_markers(**fields, frame_id=self.frame_id))
+            self._markers.publish(map_markers(**fields, frame_id=self.settings.frame_id))
         else:
             self._outputs[output](fields)
 

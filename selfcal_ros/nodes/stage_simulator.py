@@ -11,6 +11,7 @@ import numpy as np
 
 from selfcal_ros.bagio.simulated import event_fields, write_truth
 from selfcal_ros.collection.messages import Command, Detection, EncoderSample, Phase
+from selfcal_ros.collection.settings.nodes import SimulatorSettings
 from selfcal_ros.messages import to_model
 from selfcal_ros.messages.sizes import check_simulated
 from selfcal_ros.model.view import Plan, View
@@ -29,15 +30,15 @@ LEAD_NS = 20_000_000
 of its view: nothing is stamped at a time that has passed."""
 
 
-class StageSimulator(SelfcalNode):
+class StageSimulator(SelfcalNode[SimulatorSettings]):
     """Publishes encoder samples at a set rate and detections while a view is measured."""
 
     def __init__(self, **kwargs: Any) -> None:
-        super().__init__("stage_simulator", **kwargs)
-        v = self.values
-        self._settings = settings_of(v | {"sense": v["measurement_sense"]})
-        self._rng = np.random.default_rng(v["seed"])
-        self._plan: Plan | None = load_plan(v["plan"]) if v["plan"] else None
+        super().__init__(SimulatorSettings, **kwargs)
+        given = self.settings
+        self._cell = settings_of(asdict(given) | {"sense": given.measurement_sense})
+        self._rng = np.random.default_rng(given.seed)
+        self._plan: Plan | None = load_plan(given.plan) if given.plan else None
         self.truth: Truth | None = None
         self._events: Iterator[Event] = iter(())
         self._next: Event | None = None
@@ -64,13 +65,13 @@ class StageSimulator(SelfcalNode):
         if self.truth is None or self.truth.artifact != plan.artifact:
             count = max(64, len(plan.views), command.views_planned)
             self.truth = random_truth(plan.artifact, count,
-                                      np.random.default_rng(self.values["seed"]),
-                                      spread_of(self.values))
-            if self.values["truth_path"]:
-                write_truth(Path(self.values["truth_path"]), self.truth, seed=self.values["seed"],
-                            cell=asdict(self._settings))
+                                      np.random.default_rng(self.settings.seed),
+                                      spread_of(asdict(self.settings)))
+            if self.settings.truth_path:
+                write_truth(Path(self.settings.truth_path), self.truth, seed=self.settings.seed,
+                            cell=asdict(self._cell))
         start_ns = max(command.stamp_ns, self.get_clock().now().nanoseconds) + LEAD_NS
-        self._events = view_events(self.truth, plan, command.view_index, settings=self._settings,
+        self._events = view_events(self.truth, plan, command.view_index, settings=self._cell,
                                    rng=self._rng, start_ns=start_ns)
         self._next = next(self._events, None)
 
@@ -93,13 +94,13 @@ class StageSimulator(SelfcalNode):
 
     def _idle(self, now_ns: int) -> None:
         """Keep the encoder alive between views, at a tenth of the rate, the stage at home."""
-        step = round(1e10 / self.values["encoder_rate"])
+        step = round(1e10 / self.settings.encoder_rate)
         if now_ns - self._idle_stamp >= step:
             self._idle_stamp = now_ns
             self._publish(EncoderSample(now_ns, JOINTS, (0.0, 0.0, 0.0)))
 
     def _publish(self, event: Event) -> None:
-        _, fields = event_fields(event, self.frame_id)
+        _, fields = event_fields(event, self.settings.frame_id)
         is_detection = isinstance(event, Detection)
         self._sent["detection_sent" if is_detection else "encoder_sent"] += 1
         if is_detection:

@@ -13,6 +13,7 @@ from selfcal_ros.collection.collector import Collector, ViewProgress
 from selfcal_ros.collection.digest import readings_digest, session_digest
 from selfcal_ros.collection.messages import Command, Phase
 from selfcal_ros.collection.reasons import advice
+from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.messages import from_model, to_model
 from selfcal_ros.messages.input_columns import EncoderBlock
@@ -31,15 +32,15 @@ class CollectingSession:
 
     Parameters
     ----------
-    values : dict
+    settings : CollectorSettings
         Values of the collector's parameters.
     ports : Ports
         Publishes ``status`` and ``measurement``.
     """
 
-    def __init__(self, values: dict[str, Any], ports: Ports) -> None:
-        self.values, self._ports = values, ports
-        self.collector = Collector(values)
+    def __init__(self, settings: CollectorSettings, ports: Ports) -> None:
+        self.settings, self._ports = settings, ports
+        self.collector = Collector(settings)
         self._dirty, self._next_status, self._rested = False, 0.0, 0.0
         self._needed, self._unseen = 0, 0  # readings of the open view, detections since its status
         self._encoder_ns = self._exposed_ns = 0  # newest stamps
@@ -51,7 +52,7 @@ class CollectingSession:
         self._warned: set[tuple[int | None, str]] = set()
         self._findings: list[str] = []
         self._stepped: list[str] = []
-        self._clock = ClockWatch(values["clock_limit"])
+        self._clock = ClockWatch(settings.clock_limit)
         self._encoder_rate = Rate(ports.now_s)
         self._encoder_s = float("-inf")
         self._noise: tuple[float, float] = (math.nan, math.nan)
@@ -151,7 +152,7 @@ class CollectingSession:
         spent = self._ports.now_s() - now
         self._costs.append(spent)
         self._rested = now + 5 * spent
-        self._next_status = now + max(self.values["status_period"], 5 * spent)
+        self._next_status = now + max(self.settings.status_period, 5 * spent)
 
     def _may_complete(self) -> bool:
         """Return whether enough has come to complete the view that is measured."""
@@ -165,7 +166,7 @@ class CollectingSession:
 
     def _publish(self, measurements: Measurements, progress: dict[int, ViewProgress], *,
                  final: bool) -> None:
-        timeline, frame_id = self.collector.timeline, self.values["frame_id"]
+        timeline, frame_id = self.collector.timeline, self.settings.frame_id
         if (timeline.plan_id, timeline.run_id) != self._run:
             self._run, self._published = (timeline.plan_id, timeline.run_id), {}
             self._advised, self._warned = set(), set()
@@ -280,7 +281,7 @@ class CollectingSession:
         """Return rate and largest gap of the encoder, WARN beyond the limits."""
         heard = self._ports.now_s() - self._encoder_s <= HEARD_S
         gap = self._encoder_rate.take_gap_ns() * 1e-9
-        rate, least = self._encoder_rate.per_second, self.values["encoder_rate_min"]
+        rate, least = self._encoder_rate.per_second, self.settings.encoder_rate_min
         values = {"encoder_heard": "yes" if heard else "no", "encoder_rate": f"{rate:.0f}",
                   "encoder_gap_s": f"{gap:.4f}"}
         last = self.collector.newest_command
@@ -288,7 +289,7 @@ class CollectingSession:
         problems = []
         if measuring and not heard:
             problems.append("the encoder is not heard")
-        elif measuring and gap > self.values["max_encoder_gap"]:
+        elif measuring and gap > self.settings.max_encoder_gap:
             problems.append(f"a gap of {gap:.3g} s between encoder samples: exposures in it are "
                             "rejected")
         elif measuring and rate < least:
@@ -298,9 +299,11 @@ class CollectingSession:
     def _repeatability(self) -> Diagnosis:
         """Return the repeatability of the newest view, WARN beyond the limits."""
         values, problems = {}, []
-        for value, name, scale, unit in ((self._noise[0], "repeatability_xy", 1e6, "um"),
-                                         (self._noise[1], "repeatability_theta", 1.0, "rad")):
-            limit = self.values[f"{name}_limit"]
+        for value, limit, name, scale, unit in (
+                (self._noise[0], self.settings.repeatability_xy_limit, "repeatability_xy", 1e6,
+                 "um"),
+                (self._noise[1], self.settings.repeatability_theta_limit, "repeatability_theta",
+                 1.0, "rad")):
             if math.isfinite(value):
                 values[f"{name}_{unit}"] = f"{value * scale:.4g}"
             if 0 < limit < value:

@@ -5,6 +5,7 @@ import math
 from pathlib import Path
 from typing import Any
 
+from selfcal_ros.collection.settings.nodes import CompensatorSettings
 from selfcal_ros.compensation.compensator import Compensator
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import read_json
@@ -24,26 +25,26 @@ class CompensatingSession:
 
     Parameters
     ----------
-    values : dict
+    settings : CompensatorSettings
         Values of the compensator's parameters.
     ports : Ports
         Log and clocks.
     """
 
-    def __init__(self, values: dict[str, Any], ports: Ports) -> None:
-        self._values, self._ports = values, ports
+    def __init__(self, settings: CompensatorSettings, ports: Ports) -> None:
+        self._settings, self._ports = settings, ports
         self.compensator: Compensator | None = None
         self.counts = {"corrected": 0, "without_map": 0, "refused": 0}
         self._map: Any = None  # newest message of each, until they are judged together
         self._summary: Any = None
         self._waits = ""
         self._used, self._since_s, self._map_ns = "", 0.0, 0
-        if values["map"]:
-            self._load_file(values["map"])
+        if settings.map:
+            self._load_file(settings.map)
 
     def _load_file(self, path: str) -> None:
         result = result_from_dict(read_json(path), path)
-        if self._values["require_qualified"] and not is_qualified(result):
+        if self._settings.require_qualified and not is_qualified(result):
             raise InputError(path, "the map is not qualified", "measure again, or set "
                              "require_qualified to false")
         self._use(result.error_map, f"{Path(path).resolve()}, plan {result.plan_id}", 0)
@@ -61,7 +62,7 @@ class CompensatingSession:
     def _judge(self) -> None:
         if self._map is None:
             return
-        waits = self._doubt() if self._values["require_qualified"] else ""
+        waits = self._doubt() if self._settings.require_qualified else ""
         if waits != self._waits and waits:
             self._ports.say(Level.OK, f"the newest map is not used: {waits}")
         self._waits = waits
@@ -86,8 +87,8 @@ class CompensatingSession:
         return ""
 
     def _use(self, error_map: ErrorMap, source: str, stamp_ns: int) -> None:
-        self.compensator = Compensator(error_map, method=self._values["interpolation"],
-                                       outside=self._values["outside"])
+        self.compensator = Compensator(error_map, method=self._settings.interpolation,
+                                       outside=self._settings.outside)
         self._used, self._since_s, self._map_ns = source, self._ports.now_s(), stamp_ns
         self._ports.say(Level.OK, f"correcting by the map of {source} from now on")
 
@@ -118,7 +119,8 @@ class CompensatingSession:
         if len(positions) != len(names):
             return None
         place = {name: index for index, name in enumerate(names)}
-        x, y, theta = (place.get(self._values[f"joint_{axis}"]) for axis in ("x", "y", "theta"))
+        joints = (self._settings.joint_x, self._settings.joint_y, self._settings.joint_theta)
+        x, y, theta = map(place.get, joints)
         corrected: dict[int, float] = {}
         if self.compensator is None:
             return None
@@ -141,7 +143,7 @@ class CompensatingSession:
         values = self.counts | {
             "map": self._used, "since_s": f"{self._ports.now_s() - self._since_s:.0f}",
             **({"map_age_s": f"{age:.0f}"} if math.isfinite(age) else {})}
-        if 0 < self._values["max_map_age"] < age:
+        if 0 < self._settings.max_map_age < age:
             return Diagnosis(Level.WARN, f"the map is {age:.0f} s old: calibrate again", values)
         return Diagnosis(Level.OK, f"correcting by the map of {self._used}{waits}", values)
 

@@ -11,6 +11,7 @@ import numpy as np
 from selfcal_ros.collection.collector import expected_marks
 from selfcal_ros.collection.messages import Command, Phase
 from selfcal_ros.collection.sequencer import ENDED, Sequencer, State
+from selfcal_ros.collection.settings.nodes import SequencerSettings
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import read_yaml
 from selfcal_ros.messages import from_model, to_model
@@ -36,18 +37,18 @@ class SequencingSession:
 
     Parameters
     ----------
-    values : dict
+    settings : SequencerSettings
         Values of the sequencer's parameters.
     ports : Ports
         Publishes ``command``.
     """
 
-    def __init__(self, values: dict[str, Any], ports: Ports) -> None:
-        self._values, self._ports = values, ports
-        path = values["plan"]
+    def __init__(self, settings: SequencerSettings, ports: Ports) -> None:
+        self._settings, self._ports = settings, ports
+        path = settings.plan
         self.machine = Sequencer(load_plan(path) if path else None)
         self.presence = Presence(ports.now_s, PATIENCE_S)
-        self.waiting = values["auto_start"]
+        self.waiting = settings.auto_start
         self.run_id, self.coverage = "", 0.0
         self.on_end: Callable[[], None] | None = None
         self._own: set[tuple] = set()
@@ -55,7 +56,7 @@ class SequencingSession:
         self._deadline, self._confirm_at, self._redos = 0.0, 0.0, 0
         self._commanded_ns = 0
         self._measured: dict[tuple[str, str], dict[int, str]] = {}
-        self._stall = StallWatch(values["stall_time"], ports.now_s)
+        self._stall = StallWatch(settings.stall_time, ports.now_s)
         self._status: Any = None  # newest of the current view
         self._stalled = self._set_back = ""
         if self.waiting:
@@ -78,7 +79,7 @@ class SequencingSession:
 
     def missing(self) -> list[str]:
         """Return who is needed for a run and is not there."""
-        if not self._values["start_checks"]:
+        if not self._settings.start_checks:
             return []
         collector = self.presence.of("measurement_collector")
         found = []
@@ -116,7 +117,7 @@ class SequencingSession:
         """Go on where the collector is in an unfinished run of this plan; "" if there is none."""
         collector = self.presence.of("measurement_collector")
         plan = self.machine.need_plan()
-        if not (self._values["resume"] and self._fresh and collector):
+        if not (self._settings.resume and self._fresh and collector):
             return ""
         told = collector.values
         index = int(told["view"]) if told.get("view", "").isdecimal() else len(plan.views)
@@ -195,13 +196,13 @@ class SequencingSession:
         now = self._ports.now_s()
         if self.waiting and not self.missing():
             self.begin()
-        if (self.machine.state is State.PLACING and self._values["auto_confirm"]
+        if (self.machine.state is State.PLACING and self._settings.auto_confirm
                 and now >= self._confirm_at):
             self._send(self.machine.confirm())
         self._tell_set_back()
         if self.machine.state is State.MEASURING:
             self._tell_stall()
-            if self._values["view_timeout"] > 0 and now >= self._deadline:
+            if self._settings.view_timeout > 0 and now >= self._deadline:
                 self._time_out()
 
     def _tell_set_back(self) -> None:
@@ -237,7 +238,7 @@ class SequencingSession:
 
     def _time_out(self) -> None:
         self._ports.say(Level.WARN, f"view {self._view_name} is not complete in time")
-        again = self._redos < self._values["max_redos"]
+        again = self._redos < self._settings.max_redos
         self._redos = self._redos + 1 if again else 0
         self._send(self.machine.redo() if again else self.machine.skip())
 
@@ -264,13 +265,13 @@ class SequencingSession:
             command = replace(command, stamp_ns=stamp, run_id=self.run_id)
             self._own.add(_key(command))
             self._commanded_ns, self._fresh = stamp, False
-            self._ports.publish("command", from_model.command(command, self._values["frame_id"]))
+            self._ports.publish("command", from_model.command(command, self._settings.frame_id))
             name = command.view.name if command.view else command.plan_id
             self._ports.say(Level.OK, f"{command.phase.name} {name}")
             self.coverage, self._status, self._stalled = 0.0, None, ""
             self._stall.restart()
-            self._confirm_at = self._ports.now_s() + self._values["settle_time"]
-            self._deadline = self._ports.now_s() + self._values["view_timeout"]
+            self._confirm_at = self._ports.now_s() + self._settings.settle_time
+            self._deadline = self._ports.now_s() + self._settings.view_timeout
         if self.machine.state in ENDED:
             self._end()
 

@@ -5,7 +5,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from selfcal_ros.collection.digest import readings_digest, session_digest
-from selfcal_ros.collection.parameters import solver_options
+from selfcal_ros.collection.settings.estimator import solver_options
+from selfcal_ros.collection.settings.nodes import SolverSettings
 from selfcal_ros.errors import InputError, NoDataError, NotIdentifiableError, SelfcalError
 from selfcal_ros.estimation.api import Options, calibrate
 from selfcal_ros.files import write_json
@@ -79,14 +80,14 @@ class SolvingSession:
 
     Parameters
     ----------
-    values : dict
+    settings : SolverSettings
         Values of the solver's parameters.
     ports : Ports
         Publishes ``map``, ``summary`` and ``markers`` (the map and its stamp in ns).
     """
 
-    def __init__(self, values: dict[str, Any], ports: Ports) -> None:
-        self._values, self._ports = values, ports
+    def __init__(self, settings: SolverSettings, ports: Ports) -> None:
+        self._settings, self._ports = settings, ports
         self._messages: dict[int, Any] = {}
         self._run = Run()
         self._planned: dict[Run, int] = {}
@@ -166,7 +167,7 @@ class SolvingSession:
             digest = session_digest({
                 index: readings_digest(readings, measurements.rejected) for index, readings
                 in zip(sorted(self._messages), measurements.views, strict=True)})
-            options = solver_options(self._values, measurements)
+            options = solver_options(self._settings, measurements)
         except SelfcalError as error:
             self.shown.problem, self.shown.digest = error, ""
             raise
@@ -184,18 +185,18 @@ class SolvingSession:
         self.shown = Shown(outcome.result, outcome.problem, job.run, len(job.measurements.views),
                            job.stamp_ns, job.digest)
         self._publish(outcome.result)
-        if self._values["save_path"] and outcome.problem is None:
+        if self._settings.save_path and outcome.problem is None:
             self._save_by_itself(outcome.result)
 
     def _save_by_itself(self, result: CalibrationResult) -> None:
         try:
-            write_json(self._values["save_path"],
+            write_json(self._settings.save_path,
                        result_to_dict(created_now(result)))
         except InputError as error:  # the map itself is good, and save_map may go elsewhere
             self._ports.say(Level.ERROR, f"save_path: {error}")
 
     def _publish(self, result: CalibrationResult) -> None:
-        shown, frame_id = self.shown, self._values["frame_id"]
+        shown, frame_id = self.shown, self._settings.frame_id
         run = shown.run
         verdict = {"qualified": is_qualified(result), "run_id": run.run_id}
         if shown.problem is None:
@@ -246,7 +247,7 @@ class SolvingSession:
             raise self.shown.problem
         if self.shown.result is None:
             raise NoDataError("solver", "there is no map yet", "measure the views of the plan")
-        target = result_file(path, self._values["result_folder"])
+        target = result_file(path, self._settings.result_folder)
         write_json(target, result_to_dict(created_now(self.shown.result)))
         return f"saved to {target}; readings {self.digest() or 'of a loaded map'}", str(target)
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from selfcal_ros.collection.parameters import Parameter
+from selfcal_ros.collection.settings.parameter import Parameter
 from selfcal_ros.errors import InputError, known_are
 from selfcal_ros.files import read_yaml
 from selfcal_ros.model.readings import Sense

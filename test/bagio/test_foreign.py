@@ -11,7 +11,7 @@ from selfcal_ros.bagio.reader import INPUT_TOPICS, BagReader
 from selfcal_ros.bagio.schemas import typestore
 from selfcal_ros.collection.collector import Collector
 from selfcal_ros.collection.messages import Command, Detection, EncoderSample
-from selfcal_ros.collection.parameters import parameter_values
+from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.options import Options
@@ -20,7 +20,7 @@ from test.support import bags
 from test.support.bags import COMPRESSIONS, NO_SUMMARY, Foreign
 from test.support.sessions import collected, events_of, small_plan
 
-VALUES = parameter_values("measurement_collector", {}, "test")
+VALUES = CollectorSettings.checked({}, "test")
 EXTRA = "float64 temperature\nstring operator\n"
 
 

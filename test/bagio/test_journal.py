@@ -26,7 +26,7 @@ from selfcal_ros.bagio.reader import BagReader
 from selfcal_ros.bagio.schemas import typestore
 from selfcal_ros.bagio.simulated import event_fields
 from selfcal_ros.collection.messages import Command, EncoderSample, Phase
-from selfcal_ros.collection.parameters import parameter_values
+from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.api import Options, calibrate
 from selfcal_ros.messages.topics import INPUT_TOPICS
@@ -34,7 +34,7 @@ from selfcal_ros.model.result import result_to_dict
 from test.support.bags import Foreign
 from test.support.sessions import events_of, small_plan
 
-VALUES = parameter_values("measurement_collector", {}, "test")
+VALUES = CollectorSettings.checked({}, "test")
 NOW = 1_700_000_000_000_000_000
 QOS = qos_profile(reliable=True, transient_local=False, depth=1000)
 

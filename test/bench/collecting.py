@@ -22,8 +22,8 @@ sys.path.insert(0, str(Path(__file__).parents[2]))
 from selfcal_ros.collection.collector import Collector
 from selfcal_ros.collection.digest import readings_digest
 from selfcal_ros.collection.messages import Command, EncoderSample, Kind, Phase
-from selfcal_ros.collection.parameters import parameter_values
 from selfcal_ros.collection.reduce import DETECTION
+from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.view import View
 
@@ -63,7 +63,7 @@ def detections(since_s: np.ndarray, period_s: float, rng: np.random.Generator) -
 def run(args: argparse.Namespace) -> dict[str, float]:
     """Feed the shift and return the figures."""
     rng = np.random.default_rng(1)
-    collector = Collector(parameter_values("measurement_collector", {}, "bench"))
+    collector = Collector(CollectorSettings.checked({}, "bench"))
     plate, total = Artifact(SIZE, PITCH_M), round(args.hours * 3600)
     per_view = total // args.views
     costs, cpus, busy, blocks = [], [], 0.0, round(1 / 0.1)

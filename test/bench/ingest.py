@@ -156,10 +156,10 @@ def worker(benchmark: str, method: str, bag: Path) -> dict:
 def in_parts(bag: Path, method: str) -> tuple[float, float | None]:
     """Return the seconds of reading or of solving, and the error of the map that comes out."""
     from selfcal_ros.bagio.offline import collect_bag
-    from selfcal_ros.collection.parameters import parameter_values
+    from selfcal_ros.collection.settings.nodes import CollectorSettings
     from selfcal_ros.estimation.api import Options, calibrate
 
-    values = parameter_values("measurement_collector", {}, "bench")
+    values = CollectorSettings.checked({}, "bench")
     reading, (measurements, _, lost, _) = timed(lambda: collect_bag(bag, values))
     assert not lost and not measurements.all_rejected()
     if method == READ:

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from selfcal_ros.collection.collector import Collector
 from selfcal_ros.collection.digest import readings_digest, session_digest
 from selfcal_ros.collection.messages import Command, Detection, EncoderSample
-from selfcal_ros.collection.parameters import parameter_values
 from selfcal_ros.collection.reduce import DETECTION
+from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.collection.stage.exposures import Exposures
 from selfcal_ros.collection.stage.samples import Limits
 from selfcal_ros.errors import NoDataError
@@ -38,7 +38,7 @@ WANTED = digest(EVENTS)
 
 
 def fresh(store=SMALL, **parameters):
-    return Collector(parameter_values("measurement_collector", parameters, "test"), store)
+    return Collector(CollectorSettings.checked(parameters, "test"), store)
 
 
 def add(collector, event):

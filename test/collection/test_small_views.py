@@ -8,8 +8,8 @@ import numpy as np
 from selfcal_ros.collection.collector import Collector
 from selfcal_ros.collection.marks.repeats import reduce_repeats
 from selfcal_ros.collection.messages import Command, EncoderSample, Phase
-from selfcal_ros.collection.parameters import parameter_values
 from selfcal_ros.collection.reasons import Reason
+from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.collection.timeline import build_timeline
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.view import View
@@ -50,7 +50,7 @@ def test_a_measure_in_another_pose_supersedes_what_was_read_in_the_first():
 
 
 def test_a_sample_with_two_nan_is_one_rejected_message():
-    collector = Collector(parameter_values("measurement_collector", {}, "test"))
+    collector = Collector(CollectorSettings.checked({}, "test"))
     collector.add_encoder(EncoderSample(1, ("x", "y"), (math.nan, math.nan)))
     view, artifact = View("v", 0.0, (0.0, 0.0)), Artifact(3, 0.01)
     collector.add_command(Command(0, Phase.MEASURE, "p", 0, view, artifact))

@@ -57,7 +57,7 @@ def test_it_states_its_arguments(description, path):
 def test_it_starts_executables_of_this_package(description, path):
     from launch_ros.actions import Node
 
-    from selfcal_ros.collection.parameters import NODE_PARAMETERS
+    from selfcal_ros.collection.settings.nodes import NODE_PARAMETERS
 
     nodes = [entity for entity in description(path).entities if isinstance(entity, Node)]
     assert {node.node_executable for node in nodes} == STARTED[path.name]

@@ -13,7 +13,7 @@ from selfcal_ros.messages.sizes import MAX_EXPOSURES, check_simulated
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.view import View
 from selfcal_ros.sessions.solving import SolvingSession
-from test.support.ports import Hands, message, values_of
+from test.support.ports import Hands, message, settings_of
 from test.support.sessions import collected, events_of, small_plan
 
 SMALL = Artifact(5, 0.01, 8)
@@ -28,7 +28,7 @@ def first_view(**changes):
 
 @pytest.fixture
 def session():
-    return SolvingSession(values_of("solver"), Hands().ports)
+    return SolvingSession(settings_of("solver"), Hands().ports)
 
 
 @pytest.mark.parametrize(("changes", "reason"), [

@@ -7,14 +7,14 @@ from std_srvs.srv import Trigger
 
 from selfcal_ros.bagio.offline import collect_bag
 from selfcal_ros.collection.messages import Command, Phase
-from selfcal_ros.collection.parameters import parameter_values
+from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.estimation.api import Options, calibrate
 from selfcal_ros.files import read_json
 from selfcal_ros.nodes import names
 from test.support.killed import Cell
 from test.support.sessions import collected, events_of, small_plan
 
-VALUES = parameter_values("measurement_collector", {}, "test")
+VALUES = CollectorSettings.checked({}, "test")
 
 
 @pytest.fixture

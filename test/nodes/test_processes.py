@@ -12,7 +12,7 @@ import pytest
 import yaml
 from diagnostic_msgs.msg import DiagnosticArray
 
-from selfcal_ros.collection.parameters import NODE_PARAMETERS
+from selfcal_ros.collection.settings.nodes import NODE_PARAMETERS
 from test.support.sessions import plan_file, small_bag, small_plan
 
 PATIENCE_S = 120.0

@@ -11,7 +11,7 @@ from mcap.reader import make_reader
 from selfcal_ros.bagio.offline import collect_bag
 from selfcal_ros.bagio.reader import BagReader
 from selfcal_ros.collection.digest import readings_digest
-from selfcal_ros.collection.parameters import parameter_values
+from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes.bag_player import BagPlayer
@@ -31,7 +31,7 @@ def content(bag: Path) -> Counter:
 
 
 def digests(bag: Path) -> list[str]:
-    measurements, _, _, _ = collect_bag(bag, parameter_values("measurement_collector", {}, "test"))
+    measurements, _, _, _ = collect_bag(bag, CollectorSettings.checked({}, "test"))
     return [readings_digest(view, {}) for view in measurements.views]
 
 

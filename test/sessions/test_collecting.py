@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 
 from selfcal_ros.collection.messages import Command, Detection
-from selfcal_ros.collection.parameters import parameter_values
+from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.sessions.collecting import CollectingSession
 from selfcal_ros.sessions.ports import Level, Ports
@@ -18,7 +18,7 @@ class Cell:
 
     def __init__(self, **parameters):
         self.published, self.said, self.now = [], [], 0.0
-        values = parameter_values("measurement_collector", parameters, "test")
+        values = CollectorSettings.checked(parameters, "test")
         self.session = CollectingSession(values, Ports(
             lambda output, fields: self.published.append((output, fields)),
             lambda level, line: self.said.append((level, line)), self._now, lambda: 0))

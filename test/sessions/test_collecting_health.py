@@ -11,7 +11,7 @@ from selfcal_ros.collection.messages import Command, Detection, EncoderSample
 from selfcal_ros.sessions.collecting import CollectingSession
 from selfcal_ros.sessions.ports import Level
 from test.support.collecting import detection_table, encoder_block
-from test.support.ports import START_NS, Hands, values_of
+from test.support.ports import START_NS, Hands, settings_of
 from test.support.sessions import events_of, small_plan
 
 
@@ -26,7 +26,7 @@ class Desk:
 
     def __init__(self, **parameters) -> None:
         self.hands = Hands()
-        self.session = CollectingSession(values_of("measurement_collector", **parameters),
+        self.session = CollectingSession(settings_of("measurement_collector", **parameters),
                                          self.hands.ports)
 
     def feed(self, events: list, *, ahead_s: float = 0.0, run_id: str = "") -> None:

@@ -13,7 +13,7 @@ from selfcal_ros.model.result import result_to_dict
 from selfcal_ros.sessions.compensating import CompensatingSession
 from selfcal_ros.sessions.ports import Level
 from test.support.maps import random_map, result_of
-from test.support.ports import START_NS, Hands, message, values_of
+from test.support.ports import START_NS, Hands, message, settings_of
 
 ONE, TWO = (random_map(Artifact(5, 0.01, 8), seed) for seed in (3, 4))
 NAMES = ["x", "y", "theta"]
@@ -37,7 +37,7 @@ def summary_of(stamp_ns: int = START_NS, **changes) -> object:
 class Desk:
     def __init__(self, **parameters) -> None:
         self.hands = Hands()
-        self.session = CompensatingSession(values_of("compensator", **parameters),
+        self.session = CompensatingSession(settings_of("compensator", **parameters),
                                            self.hands.ports)
 
     def x_at(self, x: float) -> float | None:

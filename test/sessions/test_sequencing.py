@@ -12,7 +12,7 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.messages import from_model
 from selfcal_ros.sessions.ports import Diagnosis, Level
 from selfcal_ros.sessions.sequencing import PATIENCE_S, SequencingSession
-from test.support.ports import START_NS, Hands, message, values_of
+from test.support.ports import START_NS, Hands, message, settings_of
 from test.support.sessions import plan_file, small_plan
 
 PLAN = small_plan()
@@ -25,7 +25,7 @@ class Desk:
 
     def __init__(self, folder, **parameters) -> None:
         self.hands = Hands()
-        self.session = SequencingSession(values_of("pose_sequencer", **(
+        self.session = SequencingSession(settings_of("pose_sequencer", **(
             {"plan": plan_file(folder, PLAN), "start_checks": False} | parameters)),
             self.hands.ports)
 

@@ -15,7 +15,7 @@ from selfcal_ros.sessions.map_files import plan_file_name, read_result, result_f
 from selfcal_ros.sessions.ports import Level
 from selfcal_ros.sessions.runs import Run, supersedes
 from selfcal_ros.sessions.solving import SolvingSession, solve
-from test.support.ports import Hands, message, values_of
+from test.support.ports import Hands, message, settings_of
 from test.support.sessions import collected, events_of, small_plan
 
 PLAN = small_plan()
@@ -36,7 +36,7 @@ def command(views: int, run_id: str = "", plan_id: str = PLAN.plan_id) -> object
 class Desk:
     def __init__(self, **parameters) -> None:
         self.hands = Hands()
-        self.session = SolvingSession(values_of("solver", **parameters), self.hands.ports)
+        self.session = SolvingSession(settings_of("solver", **parameters), self.hands.ports)
 
     def take(self, messages: list) -> None:
         for item in messages:

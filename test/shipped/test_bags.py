@@ -9,7 +9,7 @@ import yaml
 
 from selfcal_ros.bagio.offline import bag_input, collect_bag
 from selfcal_ros.bagio.simulated import read_truth
-from selfcal_ros.collection.parameters import parameter_values
+from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.errors import NotIdentifiableError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.reporting.summary.numbers import summary_numbers
@@ -19,7 +19,7 @@ MANIFEST = yaml.safe_load((BAGS / "manifest.yaml").read_text())
 
 
 def measured(name):
-    values = parameter_values("measurement_collector", {}, "defaults")
+    values = CollectorSettings.checked({}, "defaults")
     return collect_bag(BAGS / name, values)
 
 

@@ -9,7 +9,8 @@ import pytest
 
 from selfcal_ros import __version__
 from selfcal_ros.cli.main import verbs
-from selfcal_ros.collection.parameters import NODE_PARAMETERS, overrides_in, parameter_values
+from selfcal_ros.collection.settings.nodes import NODE_PARAMETERS, NODE_SETTINGS
+from selfcal_ros.collection.settings.ros_file import overrides_in
 from selfcal_ros.files import read_yaml
 from selfcal_ros.model.view import plan_from_dict
 from selfcal_ros.simulation.spec import read_simulation
@@ -37,7 +38,7 @@ def test_simulations_load(path):
 def test_parameter_files_name_only_what_exists(path):
     data = read_yaml(path)
     for node in NODE_PARAMETERS:
-        parameter_values(node, overrides_in(data, node, str(path)), str(path))
+        NODE_SETTINGS[node].checked(overrides_in(data, node, str(path)), str(path))
 
 
 def test_cell_parameters_are_the_defaults_they_say_they_are():

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from selfcal_ros.cli.main import main, verbs
-from selfcal_ros.collection.parameters import NODE_PARAMETERS
 from selfcal_ros.collection.reasons import Reason
+from selfcal_ros.collection.settings.nodes import NODE_PARAMETERS
 
 ROOT = Path(__file__).parents[2]
 BAGS = (ROOT / "docs/bags.md").read_text()

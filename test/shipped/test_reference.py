@@ -8,7 +8,7 @@ import pytest
 import yaml
 
 from selfcal_ros import __version__
-from selfcal_ros.collection.parameters import NODE_PARAMETERS
+from selfcal_ros.collection.settings.nodes import NODE_PARAMETERS
 
 ROOT = Path(__file__).parents[2]
 

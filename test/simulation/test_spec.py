@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import yaml
 
-from selfcal_ros.collection.parameters import NODE_PARAMETERS
+from selfcal_ros.collection.settings.nodes import NODE_PARAMETERS
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.simulation.machine import Spread

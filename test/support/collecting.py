@@ -10,8 +10,8 @@ import numpy as np
 from selfcal_ros.collection.collector import Collector, ViewProgress
 from selfcal_ros.collection.digest import readings_digest, session_digest
 from selfcal_ros.collection.messages import Command, Detection, EncoderSample, Kind
-from selfcal_ros.collection.parameters import parameter_values
 from selfcal_ros.collection.reduce import DETECTION
+from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.messages.input_columns import EncoderBlock
 from selfcal_ros.model.readings import Measurements, ViewReadings
 from selfcal_ros.model.view import Plan
@@ -63,7 +63,7 @@ def scene(text: str = "0", *, size: int = 5, count: int = 8, line: bool = False,
 
 def gathered(events: Iterable[Event], **parameters: Any) -> Collector:
     """Return a collector that has taken all events in their order."""
-    collector = Collector(parameter_values("measurement_collector", parameters, "test"))
+    collector = Collector(CollectorSettings.checked(parameters, "test"))
     for event in events:
         if isinstance(event, Command):
             collector.add_command(event)

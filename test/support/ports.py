@@ -4,7 +4,7 @@
 
 from selfcal_ros.bagio.build import build
 from selfcal_ros.bagio.schemas import typestore
-from selfcal_ros.collection.parameters import parameter_values
+from selfcal_ros.collection.settings.nodes import NODE_SETTINGS, Settings
 from selfcal_ros.sessions.ports import Level, Ports
 
 START_NS = 1_700_000_000_000_000_000
@@ -40,8 +40,8 @@ class Hands:
         return [line for at, line in self.said if at == level]
 
 
-def values_of(node: str, **overrides) -> dict:
-    return parameter_values(node, overrides, "test")
+def settings_of(node: str, **overrides) -> Settings:
+    return NODE_SETTINGS[node].checked(overrides, "test")
 
 
 def message(kind: str, fields: dict) -> object:

@@ -9,12 +9,12 @@ from collections import Counter
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from selfcal_ros.bagio.journal import Journal, resume, start, unfinished
 from selfcal_ros.bagio.offline import block_handlers
 from selfcal_ros.bagio.reader import BagReader
 from selfcal_ros.collection.collector import Collector
+from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.errors import InputError
 from selfcal_ros.messages.topics import INPUT_TOPICS
 from selfcal_ros.sessions.ports import Diagnosis, Level, Ports
@@ -34,17 +34,17 @@ class TakenUp:
     lost: tuple[str, ...]
 
 
-def take_up(files: list[Path], values: dict[str, Any]) -> TakenUp:
+def take_up(files: list[Path], settings: CollectorSettings) -> TakenUp:
     """Return a collector with what the files of a journal hold.
 
     Parameters
     ----------
     files : list of Path
         Its MCAP files.
-    values : dict
+    settings : CollectorSettings
         Values of the collector's parameters.
     """
-    collector = Collector(values)
+    collector = Collector(settings)
     lost: list[str] = []
     feed = block_handlers(collector, lost)
     for file in files:
@@ -64,16 +64,17 @@ class JournalKeeper:
         Where journals lie; empty = keep none.
     topics : dict
         Topic of the contract -> its name with the namespace, and the quality of service offered.
-    values : dict
+    settings : CollectorSettings
         Values of the collector's parameters.
     ports : Ports
         Log and clocks.
     """
 
-    def __init__(self, folder: str, topics: dict[str, tuple[str, dict]], values: dict[str, Any],
+    def __init__(self, folder: str, topics: dict[str, tuple[str, dict]],
+                 settings: CollectorSettings,
                  ports: Ports) -> None:
         self._folder, self._topics, self._ports = folder, topics, ports
-        self._lag_limit_s = values["journal_lag_limit"]
+        self._lag_limit_s = settings.journal_lag_limit
         self._journal: Journal | None = None
         self._goes_on: list[Path] = []  # files that were taken up and could not be gone on with
         self._unwritten = 0  # while there was no journal

@@ -52,7 +52,7 @@ class Reception:
         files = self.journal.open()
         if files:
             self._source = str(files[0].parent)
-            self._restoring = worker.submit(take_up, files, self.session.values)
+            self._restoring = worker.submit(take_up, files, self.session.settings)
 
     @property
     def restoring(self) -> bool:

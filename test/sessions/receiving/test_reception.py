@@ -21,7 +21,7 @@ from selfcal_ros.sessions.receiving import journal_keeper
 from selfcal_ros.sessions.receiving.journal_keeper import JournalKeeper
 from selfcal_ros.sessions.receiving.reception import Reception
 from test.support.bags import Foreign
-from test.support.ports import Hands, values_of
+from test.support.ports import Hands, settings_of
 from test.support.sessions import cdr_of, collected, events_of, small_plan
 
 QOS = {"reliability": "reliable"}
@@ -33,9 +33,9 @@ class Desk:
 
     def __init__(self, folder="", worker=None, **parameters):
         self.hands, self.refused = Hands(), Counter()
-        values = values_of("measurement_collector", journal=str(folder), **parameters)
-        self.session = CollectingSession(values, self.hands.ports)
-        self.keeper = JournalKeeper(values["journal"], TOPICS, values, self.hands.ports)
+        settings = settings_of("measurement_collector", journal=str(folder), **parameters)
+        self.session = CollectingSession(settings, self.hands.ports)
+        self.keeper = JournalKeeper(settings.journal, TOPICS, settings, self.hands.ports)
         self.reception = Reception(
             self.session, self.keeper, say=self.hands.ports.say,
             refuse=lambda place, error: self.refused.update([f"{place}: {error}"]))
@@ -136,7 +136,7 @@ def test_the_journal_is_a_bag_that_gives_what_the_session_gave(tmp_path, events,
     desk = Desk(tmp_path).receive(events)
     assert desk.read() == expected
     desk.reception.close()
-    values = values_of("measurement_collector")
+    values = settings_of("measurement_collector")
     offline = collect_bag(desk_path(tmp_path), values)
     bag = collect_bag(Foreign().write(tmp_path / "x.mcap", events), values)
     for session in (offline, bag):
@@ -186,7 +186,7 @@ def test_what_comes_while_the_journal_is_read_is_written_and_held_back(
     assert second.reception.diagnosis().level == Level.OK
     assert second.read() == expected
     second.reception.close()
-    offline = collect_bag(desk_path(tmp_path), values_of("measurement_collector"))
+    offline = collect_bag(desk_path(tmp_path), settings_of("measurement_collector"))
     assert sum(view.used for view in offline.measurements.views) == sum(
         view.used for view in second.session.collector.collect()[0].views)
 

@@ -6,12 +6,16 @@ import math
 import pytest
 import yaml
 
-from selfcal_ros.collection.parameters import (
+from selfcal_ros.collection.settings.estimator import solver_options
+from selfcal_ros.collection.settings.nodes import (
     NODE_PARAMETERS,
-    overrides_in,
-    parameter_values,
-    solver_options,
+    NODE_SETTINGS,
+    CollectorSettings,
+    PlayerSettings,
+    RecorderSettings,
+    SolverSettings,
 )
+from selfcal_ros.collection.settings.ros_file import overrides_in
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact
@@ -22,14 +26,14 @@ EVERY = [(node, p) for node, table in NODE_PARAMETERS.items() for p in table]
 
 
 def values_in(text, node="measurement_collector"):
-    return parameter_values(node, overrides_in(yaml.safe_load(text), node, "p.yaml"), "p.yaml")
+    return NODE_SETTINGS[node].checked(overrides_in(yaml.safe_load(text), node, "p.yaml"), "p.yaml")
 
 
 @pytest.mark.parametrize(("node", "parameter"), EVERY, ids=lambda v: getattr(v, "name", v))
 def test_every_default_is_in_bounds_and_said_in_words(node, parameter):
     assert parameter.check(parameter.default, "here") == parameter.default
     assert parameter.description
-    assert parameter_values(node, {}, "here")[parameter.name] == parameter.default
+    assert getattr(NODE_SETTINGS[node].checked({}, "here"), parameter.name) == parameter.default
 
 
 @pytest.mark.parametrize(("node", "parameter"),
@@ -42,7 +46,7 @@ def test_the_bounds_are_allowed_and_beyond_is_not(node, parameter):
         beyond = math.nextafter(bound, away) if kind is float else int(bound + math.copysign(
             1, away))
         with pytest.raises(InputError, match=f"^here: {parameter.name}: .* is outside "):
-            parameter_values(node, {parameter.name: beyond}, "here")
+            NODE_SETTINGS[node].checked({parameter.name: beyond}, "here")
 
 
 def test_names_are_unique_in_a_node():
@@ -63,29 +67,29 @@ def test_names_are_unique_in_a_node():
 ])
 def test_what_is_refused_and_how(name, value, message):
     with pytest.raises(InputError) as caught:
-        parameter_values("measurement_collector", {name: value}, "p.yaml")
+        CollectorSettings.checked({name: value}, "p.yaml")
     assert str(caught.value).startswith(f"p.yaml: {name}: {message}")
 
 
 def test_whole_numbers_are_floats_where_floats_are_wanted_but_not_the_other_way():
-    value = parameter_values("bag_player", {"rate": 2}, "here")["rate"]
+    value = PlayerSettings.checked({"rate": 2}, "here").rate
     assert (value, type(value)) == (2.0, float)
     for value in (1.0, True):
         with pytest.raises(InputError, match="is not of type int"):
-            parameter_values("bag_player", {"seed": value}, "here")
+            PlayerSettings.checked({"seed": value}, "here")
     with pytest.raises(InputError, match="is not of type bool"):
-        parameter_values("bag_recorder", {"all_topics": 1}, "here")
+        RecorderSettings.checked({"all_topics": 1}, "here")
 
 
 @pytest.mark.parametrize("node", ["measurement_collector", "compensator"])
 def test_a_bare_y_that_ros_has_read_as_true_is_the_joint_y(node):
-    assert parameter_values(node, {"joint_y": True}, "here")["joint_y"] == "y"
+    assert NODE_SETTINGS[node].checked({"joint_y": True}, "here").joint_y == "y"
 
 
 def test_parameters_that_ros_adds_itself_are_let_pass():
     overrides = {"use_sim_time": True, "start_type_description_service": False,
                  "qos_overrides./tf.publisher.depth": 5}
-    assert parameter_values("solver", overrides, "here") == parameter_values("solver", {}, "here")
+    assert SolverSettings.checked(overrides, "here") == SolverSettings.checked({}, "here")
 
 
 @pytest.mark.parametrize("section", [
@@ -93,26 +97,26 @@ def test_parameters_that_ros_adds_itself_are_let_pass():
     "/**/measurement_collector", "/cell/**", "/*"])
 def test_sections_that_mean_a_node(section):
     text = f"'{section}':\n  ros__parameters:\n    max_speed: 0.25\n"
-    assert values_in(text)["max_speed"] == 0.25
+    assert values_in(text).max_speed == 0.25
 
 
 def test_nested_namespaces_and_nested_names():
     text = "cell:\n  left:\n    measurement_collector:\n      ros__parameters: {max_speed: 0.5}\n"
-    assert values_in(text)["max_speed"] == 0.5
+    assert values_in(text).max_speed == 0.5
     dotted = {"solver": {"ros__parameters": {"a": {"b": {"c": 1}}, "d": 2}}}
     assert overrides_in(dotted, "solver", "f") == {"a.b.c": 1, "d": 2}
 
 
 def test_sections_of_other_nodes_do_not_reach():
     text = "solver: {ros__parameters: {method: law}}\nbag_player: {ros__parameters: {rate: 0.0}}"
-    assert values_in(text) == parameter_values("measurement_collector", {}, "f")
-    assert values_in(text, "solver")["method"] == "law"
+    assert values_in(text) == CollectorSettings.checked({}, "f")
+    assert values_in(text, "solver").method == "law"
 
 
 def test_a_wild_card_section_holds_parameters_of_many_nodes_but_no_unknown_ones():
     text = "/**: {ros__parameters: {method: law, max_speed: 0.1, frame_id: base}}"
-    assert values_in(text)["frame_id"] == "base"
-    assert values_in(text, "solver")["method"] == "law"
+    assert values_in(text).frame_id == "base"
+    assert values_in(text, "solver").method == "law"
     with pytest.raises(InputError, match=r"p.yaml: methd: solver has no such parameter"):
         values_in("/**: {ros__parameters: {methd: law}}", "solver")
 
@@ -129,23 +133,23 @@ def test_files_that_are_refused(text, message):
 
 
 def test_an_empty_section_sets_nothing():
-    assert values_in("solver: {ros__parameters: }", "solver")["method"] == "joint"
+    assert values_in("solver: {ros__parameters: }", "solver").method == "joint"
 
 
 def test_the_estimator_gets_what_the_solver_was_given():
-    values = parameter_values("solver", {"theta_datum": "xy_axes",
-                                         "misalignment_model": "linear"}, "here")
-    options = solver_options(values)
+    settings = SolverSettings.checked({"theta_datum": "xy_axes",
+                                       "misalignment_model": "linear"}, "here")
+    options = solver_options(settings)
     assert (options.method, options.datum_theta, options.misalignment_model) == (
         "joint", ThetaDatum.XY_AXES, "linear")
     assert options.uncertainty is None
 
 
 def test_without_being_told_plates_turn_and_the_encoder_owes_nothing_to_the_axes():
-    options = solver_options(parameter_values("solver", {}, "here"))
+    options = solver_options(SolverSettings.checked({}, "here"))
     assert options == Options()
     assert (options.datum_theta, options.misalignment_model) == (ThetaDatum.ZERO_MEAN, "rigid")
-    law = solver_options(parameter_values("solver", {"method": "law"}, "here"))
+    law = solver_options(SolverSettings.checked({"method": "law"}, "here"))
     assert (law.method, law.misalignment_model) == ("law", "linear")
 
 
@@ -159,8 +163,8 @@ def asked(*terms: str) -> Measurements:
     (["none"], ("drift:1e-08",), [], ""), ([" none "], (), [], ""),
     (["drift"], (), ["drift"], "options")])
 def test_given_terms_win_over_those_of_the_plan(given, planned, terms, origin):
-    values = parameter_values("solver", {"model_terms": given}, "here")
-    options = solver_options(values, asked(*planned))
+    settings = SolverSettings.checked({"model_terms": given}, "here")
+    options = solver_options(settings, asked(*planned))
     assert ([str(term) for term in options.terms], options.terms_from) == (terms, origin)
 
 
@@ -170,13 +174,13 @@ def test_given_terms_win_over_those_of_the_plan(given, planned, terms, origin):
     (["none,drift"], (), "model_terms: the term 'none' is unknown; known are microscope, "),
     ([""], ("drift:x",), "plan 'p': model_terms: drift: the size 'x' is not a positive number; ")])
 def test_terms_that_cannot_be(given, planned, message):
-    values = parameter_values("solver", {"model_terms": given}, "here")
+    settings = SolverSettings.checked({"model_terms": given}, "here")
     with pytest.raises(InputError) as caught:
-        solver_options(values, asked(*planned))
+        solver_options(settings, asked(*planned))
     assert str(caught.value).startswith(message)
 
 
 @pytest.mark.parametrize(("word", "wanted"), [("auto", None), ("always", True), ("never", False)])
 def test_the_uncertainty_map_is_wanted_in_words(word, wanted):
-    values = parameter_values("solver", {"uncertainty": word}, "here")
-    assert solver_options(values).uncertainty is wanted
+    settings = SolverSettings.checked({"uncertainty": word}, "here")
+    assert solver_options(settings).uncertainty is wanted

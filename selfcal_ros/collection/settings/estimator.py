@@ -1,0 +1,43 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the settings of the solver ask of the estimator."""
+
+from selfcal_ros.collection.settings.nodes import NO_TERMS, UNCERTAINTY, SolverSettings
+from selfcal_ros.estimation.options import Options, ReferenceKind, ReferenceLength
+from selfcal_ros.model.error_map import ThetaDatum
+from selfcal_ros.model.readings import Measurements
+from selfcal_ros.model.terms import ModelTerm, parse_terms
+
+
+def solver_options(settings: SolverSettings,
+                   measurements: Measurements | None = None) -> Options:
+    """Return the estimator's options in a solver's settings.
+
+    Where `model_terms` is not given the terms that the plan of the `measurements` asks for hold.
+
+    Raises
+    ------
+    InputError
+        For terms that cannot be.
+    """
+    kind = settings.reference_kind
+    reference = None if kind == "none" else ReferenceLength(
+        ReferenceKind(kind), settings.reference_error, settings.reference_u,
+        settings.reference_certificate)
+    terms, origin = _terms(settings.model_terms, measurements)
+    return Options(method=settings.method, datum_theta=ThetaDatum(settings.theta_datum),
+                   misalignment_model="" if settings.method == "law" else
+                   settings.misalignment_model, reference=reference,
+                   uncertainty=UNCERTAINTY[settings.uncertainty],
+                   terms=terms, terms_from=origin if terms else "",
+                   drift_degree=settings.drift_degree)
+
+
+def _terms(given: list[str],
+           measurements: Measurements | None) -> tuple[tuple[ModelTerm, ...], str]:
+    """Return the terms of the model, and where they come from: ``options`` or ``plan``."""
+    if [text.strip() for text in given] == [NO_TERMS]:
+        return (), ""
+    if any(text.strip() for text in given) or measurements is None:
+        return parse_terms(given, "model_terms"), "options"
+    where = f"plan '{measurements.plan_id}': model_terms"
+    return parse_terms(measurements.model_terms, where), "plan"

@@ -1,0 +1,278 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Every parameter of every node, declared once: type, default, unit, bounds and description.
+
+The nodes declare them from here, ``selfcal solve --params`` reads a ROS parameter file against
+the same classes, and the documentation is printed from them. An unknown name is an error.
+"""
+
+from dataclasses import dataclass
+from typing import Any, ClassVar, get_args
+
+from selfcal_ros.collection.settings.parameter import (
+    ManagedSettings,
+    Parameter,
+    Settings,
+    declared,
+)
+from selfcal_ros.compensation.compensator import Interpolation, Outside
+from selfcal_ros.estimation.options import ReferenceKind
+from selfcal_ros.model.error_map import ThetaDatum
+from selfcal_ros.model.readings import Sense
+from selfcal_ros.model.terms import DRIFT_DEGREE, MAX_DRIFT_DEGREE, TermName
+
+NO_TERMS = "none"
+"""The word for no terms, where the plan asks for some."""
+
+UNCERTAINTY = {"auto": None, "always": True, "never": False}
+"""Whether an uncertainty map is wanted, in words."""
+
+_LENGTH: dict[str, Any] = {"unit": "m", "low": 0.0, "high": 1e-3}
+_ANGLE: dict[str, Any] = {"unit": "rad", "low": 0.0, "high": 0.1}
+_RATIO: dict[str, Any] = {"unit": "m/m", "low": -0.1, "high": 0.1}
+_DRIFT = "motion of the plate at the last grid exposure of a view, standard deviation: "
+
+
+def _sense() -> Any:
+    return declared(
+        str(Sense.MICROSCOPE_MOVES), "who moves: the microscope over a resting plate, or the plate "
+        "under the microscope", choices=tuple(str(sense) for sense in Sense))
+
+
+def _frame() -> Any:
+    return declared("stage", "frame of published messages (REP-103)")
+
+
+def _plan() -> Any:
+    return declared("", "path of PLAN.yaml")
+
+
+@dataclass(frozen=True)
+class CollectorSettings(ManagedSettings):
+    """What measurement_collector does with samples and detections."""
+
+    NODE: ClassVar[str] = "measurement_collector"
+    measurement_sense: str = _sense()
+    frame_id: str = _frame()
+    joint_x: str = declared("x", "joint that indicates x")
+    joint_y: str = declared("y", "joint that indicates y")
+    joint_theta: str = declared("theta", "joint that indicates theta")
+    max_encoder_gap: float = declared(
+        0.1, "largest gap between the encoder samples around an exposure", "s", 1e-6, 10.0)
+    max_speed: float = declared(
+        5e-4, "largest speed at which the stage counts as at rest", "m/s", 0.0, 1.0)
+    max_angular_speed: float = declared(
+        5e-3, "largest turn rate at which the stage counts as at rest", "rad/s", 0.0, 10.0)
+    encoder_agreement: float = declared(
+        1e-9, "largest difference of two samples with one stamp", "m or rad", 0.0, 1e-3)
+    min_score: float = declared(
+        0.4, "smallest score of a usable detection (ignored if all are 0)", "", 0.0, 1.0)
+    max_deviation: float = declared(
+        5e-4, "largest distance of a mark from its nominal place once the view's own rotation and "
+        "offset are removed; never more than a quarter pitch", "m", 1e-9, 1.0)
+    ambiguity_ratio: float = declared(
+        0.5, "a mark without id is ambiguous if its distance to the nearest nominal mark exceeds "
+        "this part of that to the second nearest", "", 0.01, 1.0)
+    max_rotation: float = declared(
+        0.035, "largest rotational misalignment to expect when marks have no ids; where lines "
+        "alone are read it must be below 0.45 of a line", "rad", 0.0, 0.2)
+    max_stage_distance: float = declared(
+        0.0, "largest distance of the indicated stage position from the nominal site of the mark "
+        "seen; 0 = half a pitch, and max_rotation times the radius of the plate", "m", 0.0, 10.0)
+    outlier_limit: float = declared(
+        6.0, "distance from the median of a mark's repeats, in standard deviations of one reading, "
+        "beyond which a repeat is an outlier; 0 = keep all", "", 0.0, 1000.0)
+    approach_threshold: float = declared(
+        1e-6, "displacement of x or y before an exposure that counts as a motion and tells the "
+        "direction of approach", "m", 0.0, 1e-2)
+    status_period: float = declared(0.5, "time between two ViewStatus messages", "s", 0.02, 60.0)
+    clock_limit: float = declared(
+        0.1, "offset between the cell's clock and this machine's that is a warning; a view is not "
+        "called complete on stamps that far in the future", "s", 0.001, 3600.0)
+    encoder_rate_min: float = declared(
+        0.0, "encoder samples a second below which there is a warning while a view is measured; 0 "
+        "= none", "Hz", 0.0, 1e5)
+    repeatability_xy_limit: float = declared(
+        0.0, "repeatability of one grid reading above which there is a warning; 0 = none", "m", 0.0,
+        1e-3)
+    repeatability_theta_limit: float = declared(
+        0.0, "repeatability of one angular reading above which there is a warning; 0 = none", "rad",
+        0.0, 0.1)
+    journal: str = declared(
+        "", "folder for journals: what is received, written before it is used, and taken up again "
+        "after a crash; empty = none")
+    journal_lag_limit: float = declared(
+        5.0, "time by which the disk may lag behind the journal before there is a warning", "s",
+        0.1, 3600.0)
+
+
+@dataclass(frozen=True)
+class SolverSettings(ManagedSettings):
+    """How solver estimates, and where it writes."""
+
+    NODE: ClassVar[str] = "solver"
+    frame_id: str = _frame()
+    method: str = declared("joint", "estimator", choices=("joint", "law"))
+    theta_datum: str = declared(
+        str(ThetaDatum.ZERO_MEAN), "what fixes the constant of the angular map",
+        choices=tuple(str(datum) for datum in ThetaDatum))
+    misalignment_model: str = declared(
+        "rigid", "how the plate turns in the joint method: rigid, by a rotation, or linear, as "
+        "published; the law is always linear", choices=("linear", "rigid"))
+    uncertainty: str = declared(
+        "auto", "uncertainty map of the joint solution: auto = up to 201 x 201 sites; always = up "
+        "to 1001 x 1001, in minutes", choices=tuple(UNCERTAINTY))
+    reference_kind: str = declared(
+        "none", "what a known length was measured on: it sets the scale",
+        choices=("none", *map(str, ReferenceKind)))
+    reference_error: float = declared(
+        0.0, "relative error of that length: artifact (true - nominal) / nominal, stage axis "
+        "(indicated - true) / nominal", "m/m", -0.09, 0.09)
+    reference_u: float = declared(
+        0.0, "standard uncertainty of reference_error (k=1)", "m/m", 0.0, 0.09)
+    reference_certificate: str = declared(
+        "", "what states that length: number and issuer of a certificate")
+    model_terms: list[str] = declared(
+        [""], f"terms estimated with the map, each TERM or TERM:SIZE of {', '.join(TermName)}; the "
+        f"size is a standard deviation, SI; empty = those of the plan, {NO_TERMS} = none")
+    drift_degree: int = declared(
+        DRIFT_DEGREE, "degree of the polynomial of time by which views drift, where drift is a "
+        "term", "", 1, MAX_DRIFT_DEGREE)
+    save_path: str = declared("", "RESULT.json to write whenever the map changes; empty = none")
+    result_folder: str = declared(
+        "", "folder in which save_map may write, and from which relative paths count; empty = the "
+        "working directory")
+
+
+@dataclass(frozen=True)
+class SequencerSettings(ManagedSettings):
+    """How pose_sequencer leads through a plan."""
+
+    NODE: ClassVar[str] = "pose_sequencer"
+    plan: str = _plan()
+    frame_id: str = _frame()
+    auto_start: bool = declared(False, "start the plan without waiting for the start service")
+    start_checks: bool = declared(
+        True, "start only when collector, encoder, detections and solver are there; false = start "
+        "without")
+    resume: bool = declared(
+        True, "the first start takes up the unfinished run of the plan that the collector knows")
+    stall_time: float = declared(
+        5.0, "time without a detection after which a view is said to stall", "s", 0.1, 3600.0)
+    auto_confirm: bool = declared(False, "measure without waiting for confirm_view (robot loaders)")
+    settle_time: float = declared(
+        0.5, "time between PLACE and MEASURE when auto_confirm is set", "s", 0.0, 3600.0)
+    view_timeout: float = declared(
+        0.0, "give up waiting for a view's completion; 0 = wait forever", "s", 0.0, 1e6)
+    max_redos: int = declared(0, "times an incomplete view is redone after a time-out", "", 0, 100)
+    result_path: str = declared(
+        "", "where run_calibration has the solver save the map; empty = PLAN_ID.json in the "
+        "solver's result_folder")
+    save_timeout: float = declared(
+        60.0, "longest wait of run_calibration for the solver to save", "s", 0.1, 3600.0)
+
+
+@dataclass(frozen=True)
+class CompensatorSettings(ManagedSettings):
+    """Which map compensator uses, and how."""
+
+    NODE: ClassVar[str] = "compensator"
+    frame_id: str = _frame()
+    joint_x: str = declared("x", "joint that indicates x")
+    joint_y: str = declared("y", "joint that indicates y")
+    joint_theta: str = declared("theta", "joint that indicates theta")
+    interpolation: Interpolation = declared(
+        "bilinear", "between nodes", choices=get_args(Interpolation))
+    outside: Outside = declared("clamp", "outside the field", choices=get_args(Outside))
+    map: str = declared("", "RESULT.json to start with; empty = wait for selfcal/error_map")
+    require_qualified: bool = declared(
+        True, "use only maps that are qualified, of one run, and of all planned views; false = any "
+        "map")
+    max_map_age: float = declared(
+        0.0, "age of the map in use above which there is a warning; 0 = none", "s", 0.0, 1e9)
+
+
+@dataclass(frozen=True)
+class PlayerSettings(Settings):
+    """What bag_player plays."""
+
+    NODE: ClassVar[str] = "bag_player"
+    bag: str = declared("", "MCAP file or rosbag2 folder")
+    rate: float = declared(
+        1.0, "speed of the replay; 0 = as fast as the subscribers keep up", "", 0.0, 1000.0)
+    seed: int = declared(
+        -1, "shuffle the order of arrival with this seed; -1 = as recorded", "", -1, 2**31)
+    wait_for_subscribers: float = declared(
+        10.0, "longest wait for a subscriber of each topic", "s", 0.0, 3600.0)
+
+
+@dataclass(frozen=True)
+class RecorderSettings(Settings):
+    """What bag_recorder writes."""
+
+    NODE: ClassVar[str] = "bag_recorder"
+    bag: str = declared("", "folder to write")
+    all_topics: bool = declared(True, "record selfcal/* results beside the inputs")
+
+
+@dataclass(frozen=True)
+class SimulatorSettings(Settings):
+    """The cell of stage_simulator, by the keys of SIM.yaml (docs/simulate.md)."""
+
+    NODE: ClassVar[str] = "stage_simulator"
+    measurement_sense: str = _sense()
+    frame_id: str = _frame()
+    plan: str = _plan()
+    seed: int = declared(0, "seed of the truth and of the noise", "", 0, 2**31)
+    sigma_xy: float = declared(2e-8, "standard deviation of one grid reading", **_LENGTH)
+    sigma_theta: float = declared(
+        1.7453292519943296e-05, "standard deviation of one angular reading", **_ANGLE)
+    encoder_rate: float = declared(500.0, "encoder samples a second", "Hz", 1.0, 10000.0)
+    exposure_period: float = declared(0.01, "time between two exposures", "s", 0.001, 10.0)
+    with_ids: bool = declared(True, "detections name their marks")
+    truth_path: str = declared("", "JSON file for the known truth; empty = none")
+    declare_sigma: bool = declared(False, "detections state their standard deviation")
+    servo_sigma: float = declared(2e-8, "scatter of the stage about where it stopped", **_LENGTH)
+    servo_sigma_theta: float = declared(1e-7, "the same of theta", **_ANGLE)
+    stop_sigma: float = declared(0.0, "how far from its target the stage stops", **_LENGTH)
+    stop_sigma_theta: float = declared(0.0, "the same of theta", **_ANGLE)
+    follow_mark: bool = declared(
+        False, "the stage goes to the mark as it lies, not to its nominal place")
+    visit_order: str = declared(
+        "", "order of the marks where the command asks for none; empty = serpentine")
+    consecutive: bool = declared(False, "all repeats of a mark one after another, in one pass")
+    visit_xy: float = declared(0.0, "noise shared by the exposures of a visit", **_LENGTH)
+    flicker_xy: float = declared(0.0, "1/f noise of grid readings", **_LENGTH)
+    flicker_theta: float = declared(0.0, "1/f noise of angular readings", **_ANGLE)
+    resolution_xy: float = declared(0.0, "step of the offsets of marks", **_LENGTH)
+    resolution_theta: float = declared(0.0, "step of the offsets of lines", **_ANGLE)
+    microscope_scale: float = declared(0.0, "a true length over the seen one, less 1", **_RATIO)
+    microscope_stretch: float = declared(0.0, "the same for x more, for y less", **_RATIO)
+    microscope_rotation: float = declared(
+        0.0, "turn of the microscope against the stage", "rad", -0.1, 0.1)
+    microscope_shear: float = declared(0.0, "symmetric shear of the microscope", **_RATIO)
+    backlash_x: float = declared(
+        0.0, "indicated - true position of x after a motion towards plus", "m", -1e-3, 1e-3)
+    backlash_y: float = declared(0.0, "the same of y", "m", -1e-3, 1e-3)
+    plate_scale: float = declared(
+        0.0, "growth of the plate in each view after the first, standard deviation", "m/m", 0.0,
+        0.1)
+    plate_shape: float = declared(
+        0.0, "bending of the plate in each view after the first, at mid-edge, standard deviation",
+        **_LENGTH)
+    drift_linear: float = declared(0.0, _DRIFT + "with time", **_LENGTH)
+    drift_quadratic: float = declared(0.0, _DRIFT + "with its square", **_LENGTH)
+    drift_cubic: float = declared(0.0, _DRIFT + "with its cube", **_LENGTH)
+    drift_walk: float = declared(0.0, _DRIFT + "as a random walk", **_LENGTH)
+    encoder: str = declared(
+        "independent", "the rotary encoder's error: of its own, or as the slopes of the axes",
+        choices=("independent", "xy_axes"))
+    rotation: str = declared(
+        "finite", "how the plate turns: by a rotation, or as the papers write it",
+        choices=("finite", "linear"))
+
+
+NODE_SETTINGS: dict[str, type[Settings]] = {kind.NODE: kind for kind in (
+    CollectorSettings, SolverSettings, SequencerSettings, CompensatorSettings, PlayerSettings,
+    RecorderSettings, SimulatorSettings)}
+NODE_PARAMETERS: dict[str, tuple[Parameter, ...]] = {
+    node: kind.parameters() for node, kind in NODE_SETTINGS.items()}
