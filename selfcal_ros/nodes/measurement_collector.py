@@ -37,6 +37,7 @@ class MeasurementCollector(PollingNode[CollectorSettings]):
     session = WhileConfigured[CollectingSession]()
     _reception = WhileConfigured[Reception]()
     _detections = WhileConfigured[Subscription]()
+    _inputs = WhileConfigured[dict[str, ByTheClock]]()
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__(CollectorSettings, **kwargs)
@@ -56,6 +57,9 @@ class MeasurementCollector(PollingNode[CollectorSettings]):
         self._outputs = {"status": self.output(names.STATUS),
                          "measurement": self.output(names.MEASUREMENT)}
         self._received = self.publisher(names.private(names.RECEIVED))
+        self._inputs = {names.ENCODER.name: ByTheClock(names.ENCODER.name, self._reception.encoder),
+                        names.DETECTIONS.name: ByTheClock(names.DETECTIONS.name,
+                                                          self._reception.detection)}
         self.alone_on += [names.STATUS.name, names.ENCODER.name]
 
     def _journal_folder(self) -> str:
@@ -67,10 +71,10 @@ class MeasurementCollector(PollingNode[CollectorSettings]):
         """Listen to the cell and to the commands."""
         # undone last: what the subscriptions still held goes to the journal and to the session
         self.own(None, lambda _: self.guarded(self._drain)())
-        self._detections = self.subscribe(names.DETECTIONS, ByTheClock(
-            names.DETECTIONS.name, self._reception.detection), raw=True)
+        inputs = self._inputs
+        self._detections = self.subscribe(names.DETECTIONS, inputs[names.DETECTIONS.name], raw=True)
         self.subscribe_with_age(names.COMMAND, self._reception.command, raw=True)
-        EncoderInput(self, ByTheClock(names.ENCODER.name, self._reception.encoder), raw=True)
+        EncoderInput(self, inputs[names.ENCODER.name], raw=True)
         self.every(TICK_S, self._on_timer)
         self.service(Trigger, "~/finish", lambda request: self._finish())
 

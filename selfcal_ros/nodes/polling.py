@@ -4,6 +4,7 @@
 import inspect
 import time
 from collections.abc import Callable, Iterator
+from typing import NamedTuple
 
 from rclpy.subscription import Subscription
 
@@ -14,8 +15,18 @@ MOST = 2000
 """Messages of a subscription that are taken at once; the others wait for the next time."""
 
 
+class Missing(NamedTuple):
+    """Messages that did not come: lost on the way, or published while nobody listened."""
+
+    lost: int
+    unheard: int
+
+
 class ByTheClock:
     """Takes the bytes of messages and the instants of their reception, ns; marks a subscription.
+
+    It outlives its subscription: what was published between two of them is known by the numbers
+    that a publisher gives. Of several publishers the numbers interleave and tell nothing.
 
     Parameters
     ----------
@@ -23,37 +34,55 @@ class ByTheClock:
         Name under which losses are counted.
     take : callable (data, received_ns)
         Takes a message.
-
-    Attributes
-    ----------
-    n_missing : int
-        Messages that were published between two that came, by the numbers that publishers give.
     """
 
     __signature__ = inspect.signature(lambda message: None)
 
     def __init__(self, topic: str, take: Callable[[bytes, int], None]) -> None:
-        self.topic, self.take, self.n_missing = topic, take, 0
+        self.topic, self.take = topic, take
         self._last: int | None = None
+        self._before: int | None = None  # the last number of the subscription before this one
+        self._n_publishers = 0
 
     def __call__(self, message: bytes) -> None:
         """Take a message from an executor."""
         self.take(message, time.time_ns())
 
-    def empty(self, subscription: Subscription, most: int) -> int:
+    def empty(self, subscription: Subscription, most: int) -> Missing:
         """Take what waits, up to `most`; return how many numbers of publication were left out."""
-        gap = 0
+        numbers = []
         for _ in range(most):
             taken = subscription.handle.take_message(subscription.msg_type, True)
             if taken is None:
                 break
             data, info = taken
-            number = info["publication_sequence_number"]
-            if number is not None and self._last is not None and number > self._last:
-                gap += number - self._last - 1
-            self._last = number
+            numbers.append(info["publication_sequence_number"])
             self.take(data, info["received_timestamp"] or time.time_ns())
-        return gap
+        return self._missing(numbers, subscription.get_publisher_count(), len(numbers) < most)
+
+    def _missing(self, numbers: list[int | None], n_publishers: int, is_empty: bool) -> Missing:
+        """Return what the numbers leave out, if they are of one publisher.
+
+        That is so if there was one at this look and at the last: what a second one sent that is
+        gone has been taken by then, unless the queue was not emptied.
+        """
+        most = max(n_publishers, self._n_publishers)
+        self._n_publishers = n_publishers if is_empty else most
+        lost = unheard = 0
+        for number in (n for n in numbers if n is not None and most == 1):
+            if self._last is not None:
+                lost += max(number - self._last - 1, 0)
+            elif self._before is not None:
+                unheard = max(number - self._before - 1, 0)
+            self._last, self._before = number, None
+        if most > 1 or n_publishers == 0:
+            self._last = None
+        return Missing(lost, unheard)
+
+    def pause(self) -> None:
+        """Take note that its subscription ends."""
+        self._before = self._before if self._last is None else self._last
+        self._last, self._n_publishers = None, 0
 
 
 class PollingNode[S: ManagedSettings](ManagedNode[S]):
@@ -80,6 +109,7 @@ class PollingNode[S: ManagedSettings](ManagedNode[S]):
         if isinstance(callback, ByTheClock) and subscription in [*super().subscriptions]:
             self.guarded(self._empty, callback.topic)(
                 subscription, callback, subscription.qos_profile.depth)
+            callback.pause()
         return super().destroy_subscription(subscription)
 
     def _empty(self, item: Subscription, callback: ByTheClock, most: int) -> None:
@@ -88,9 +118,8 @@ class PollingNode[S: ManagedSettings](ManagedNode[S]):
         The middleware tells nothing of messages that were overwritten before they were taken.
         """
         with item.handle:
-            gap = callback.empty(item, most)
-        if gap and item.get_publisher_count() == 1:  # of several, numbers interleave
-            callback.n_missing += gap
-            untold = callback.n_missing - self.losses.counts[callback.topic]
-            if untold > 0:
-                self.losses.add(callback.topic, untold)
+            missing = callback.empty(item, most)
+        if missing.lost:
+            self.losses.add(callback.topic, missing.lost, told_by="numbers")
+        if missing.unheard:
+            self.losses.add_unheard(callback.topic, missing.unheard)

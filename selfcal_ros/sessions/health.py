@@ -72,17 +72,39 @@ class Refusals(Tally):
 
 
 class Losses(Tally):
-    """Messages that the middleware reports as lost."""
+    """Messages that were published and did not come.
+
+    The middleware's events and the numbers of publication tell of the same losses, the one before
+    the other or not at all: the larger sum of the two counts.
+    """
 
     word = "lost"
 
-    def add(self, topic: str, number: int) -> None:
-        """Count `number` messages of `topic` as lost."""
-        if not self._is_recent(topic):
-            self._say(Level.WARN, f"{topic}: {number} messages were lost on the way; the machine "
-                      "or the network is too slow for them")
-        self.counts[topic] += number
-        self._last[topic] = (self._now_s(), f"{topic}: {self.counts[topic]} messages lost")
+    def __init__(self, say: Callable[[Level, str], None], now_s: Callable[[], float]) -> None:
+        super().__init__(say, now_s)
+        self._told: dict[str, Counter] = {}
+
+    def add(self, topic: str, number: int, told_by: str = "events") -> None:
+        """Count `number` messages of `topic` as lost, unless the other source told of them."""
+        told = self._told.setdefault(topic, Counter())
+        told[told_by] += number
+        total = max(told.values())
+        new = total - self.counts[topic]
+        if new > 0:
+            self._tell(topic, total, f"{topic}: {new} messages were lost on the way; the machine "
+                       "or the network is too slow for them", f"{topic}: {total} messages lost")
+
+    def add_unheard(self, topic: str, number: int) -> None:
+        """Count messages that were published while this node had no subscription."""
+        line = f"{topic}: {number} messages were published while this node did not listen"
+        place = f"{topic}, not listening"
+        self._tell(place, self.counts[place] + number, line, line)
+
+    def _tell(self, place: str, total: int, said: str, line: str) -> None:
+        if not self._is_recent(place):
+            self._say(Level.WARN, said)
+        self.counts[place] = total
+        self._last[place] = (self._now_s(), line)
 
 
 class Presence:

@@ -375,3 +375,22 @@ def test_what_was_acknowledged_is_used_and_written_when_the_node_is_taken_down(
     [path] = (path for path in tmp_path.iterdir() if path.is_dir())
     written = [item for _, item in BagReader(path).columns()]
     assert sum(map(len, written)) == 60
+
+
+def test_losses_are_counted_over_the_life_of_the_node(graph):
+    node = graph.node(MeasurementCollector)
+    marks = graph.publisher(names.DETECTIONS)
+    marks.publish(MarkDetection())
+    graph.until(lambda: node.session.collector.received["detection"] == 1, "the first")
+    node.losses.add(names.DETECTIONS.name, 10)
+    node.trigger_deactivate()
+    graph.until(lambda: marks.get_subscription_count() == 0, "its end")
+    for _ in range(6):
+        marks.publish(MarkDetection())
+    node.trigger_activate()
+    graph.until(lambda: marks.get_subscription_count() == 1, "the collector again")
+    graph.until(lambda: node._detections.get_publisher_count() == 1, "its publisher")
+    marks.publish(MarkDetection())
+    graph.until(lambda: node.session.collector.received["detection"] == 2, "the second")
+    assert node.losses.counts == {names.DETECTIONS.name: 10,
+                                  f"{names.DETECTIONS.name}, not listening": 6}

@@ -47,6 +47,32 @@ def test_a_refusal_and_a_loss_are_warnings_for_a_while(hands, seconds, level):
     assert (losses.diagnosis().message == "topic: 7 messages lost") is (level == Level.WARN)
 
 
+@pytest.mark.parametrize("told", [
+    [(5, "events"), (5, "numbers")], [(5, "numbers"), (5, "events")],
+    [(2, "numbers"), (5, "events"), (3, "numbers")]])
+def test_what_two_sources_tell_of_one_loss_counts_once(hands, told):
+    losses = Losses(hands.ports.say, hands.ports.now_s)
+    for number, source in told:
+        losses.add("topic", number, told_by=source)
+    assert losses.counts == {"topic": 5}
+    assert losses.diagnosis().message == "topic: 5 messages lost"
+    losses.add("topic", 8, told_by="numbers")
+    losses.add("other", 1)
+    assert losses.counts == {"topic": 13, "other": 1}
+    assert [line.partition(" messages")[0] for line in hands.lines(Level.WARN)] == [
+        f"topic: {told[0][0]}", "other: 1"]
+
+
+def test_what_was_published_while_nobody_listened_is_told_apart(hands):
+    losses = Losses(hands.ports.say, hands.ports.now_s)
+    losses.add("topic", 2)
+    losses.add_unheard("topic", 7)
+    losses.add_unheard("topic", 4)
+    assert losses.diagnosis().values == {"lost topic": 2, "lost topic, not listening": 11}
+    assert hands.lines(Level.WARN)[1:] == [
+        "topic: 7 messages were published while this node did not listen"]
+
+
 @pytest.mark.parametrize("seconds, there", [(3.0, True), (3.1, False)])
 def test_presence(hands, seconds, there):
     presence = Presence(hands.ports.now_s, 3.0)
