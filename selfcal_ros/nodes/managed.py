@@ -98,6 +98,17 @@ class ManagedNode[S: ManagedSettings](NodeBase[S], LifecycleNode):
             self._made[self._making].append(partial(destroy, entity))
         return entity
 
+    def guarded(self, callback: Callable[..., Any], place: str = "") -> Callable[..., Any]:
+        """Return a guarded callback that does nothing once the step that made it is undone.
+
+        An executor may still call what was due when it was taken down.
+        """
+        inner, step = super().guarded(callback, place), self._making
+        if not step:
+            return inner
+        mine = self._made[step]
+        return lambda *args: inner(*args) if self._made[step] is mine else None
+
     def diagnosis(self) -> Diagnosis:
         """Return the state of the node where it is not active, else what the session says."""
         if self.state == "active":
@@ -155,6 +166,7 @@ class ManagedNode[S: ManagedSettings](NodeBase[S], LifecycleNode):
             for step in steps:
                 while self._made[step]:
                     self._made[step].pop()()
+                self._made[step] = []  # what it made is called no more
             if "configure" in steps:
                 self._heard_on.clear()
                 self.alone_on.clear()

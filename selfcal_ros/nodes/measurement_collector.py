@@ -77,6 +77,7 @@ class MeasurementCollector(PollingNode[CollectorSettings]):
         EncoderInput(self, inputs[names.ENCODER.name], raw=True)
         self.every(TICK_S, self._on_timer)
         self.service(Trigger, "~/finish", lambda request: self._finish())
+        self.own(self, MeasurementCollector._drain)  # undone first: what has come is taken
 
     def _publish(self, output: str, fields: dict[str, Any]) -> None:
         self._outputs[output](fields)

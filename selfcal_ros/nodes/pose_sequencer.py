@@ -2,6 +2,7 @@
 """pose_sequencer: leads through the views of a plan."""
 
 import sys
+from functools import partial
 from typing import Any
 
 from std_srvs.srv import Trigger
@@ -37,12 +38,12 @@ class PoseSequencer(ManagedNode[SequencerSettings]):
     def activate(self) -> None:
         """Listen to the companions, offer services and the action."""
         session = self.session
-        self.subscribe(names.COMMAND, session.take_command)
+        self.subscribe_with_age(names.COMMAND, self._on_command)
         self.subscribe(names.STATUS_AS_IT_COMES, session.take_status)
         self.subscribe(names.MEASUREMENT, session.take_measurement)
         for node in COMPANIONS:
-            self.subscribe(names.of_node(node, names.HEALTH), lambda status, node=node:
-                           session.presence.take(node, diagnosis_of(status)))
+            self.subscribe_with_age(names.of_node(node, names.HEALTH),
+                                    partial(self._on_health, node))
         machine = session.machine
         for name, act in (
                 ("start", session.begin), ("abort", session.give_up),
@@ -52,6 +53,16 @@ class PoseSequencer(ManagedNode[SequencerSettings]):
             self.service(Trigger, f"~/{name}", lambda request, act=act: act())
         self._action = CalibrationAction(self, session)
         self.every(TICK_S, self._on_timer)
+
+    def _on_command(self, message: Any, is_older: bool) -> None:
+        """Take a command, but not the last words of a sequencer that has been taken down."""
+        if not is_older or self.count_publishers(names.COMMAND.name) > 1:
+            self.session.take_command(message)
+
+    def _on_health(self, node: str, status: Any, is_older: bool) -> None:
+        """Take what a companion says of itself now: a run is taken up where the collector is."""
+        if not is_older:
+            self.session.presence.take(node, diagnosis_of(status))
 
     def _on_timer(self) -> None:
         self.session.tick()

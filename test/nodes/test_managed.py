@@ -9,8 +9,11 @@ import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
+from rclpy.duration import Duration
+from rclpy.lifecycle import TransitionCallbackReturn
 from std_srvs.srv import Trigger
 
+from selfcal_ros.bagio.reader import BagReader
 from selfcal_ros.errors import InputError, SelfcalError
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes.compensator import CompensatorNode
@@ -209,3 +212,29 @@ def test_diagnostics_come_once_a_second_whatever_is_received(graph):
     graph.until(lambda: node.session.collector.received["encoder"] >= 3000, "the samples")
     graph.until(lambda: len(told) > before, "a report")
     assert len(told) - before <= time.monotonic() - began + 2
+
+
+def test_what_was_due_when_a_node_was_deactivated_is_not_called(graph):
+    node, called = graph.node(MeasurementCollector), []
+    node._making = "activate"
+    due = node.guarded(called.append, "due")
+    node._making = ""
+    due(1)
+    assert node.trigger_deactivate() == TransitionCallbackReturn.SUCCESS
+    assert node.trigger_activate() == TransitionCallbackReturn.SUCCESS
+    due(2)  # of the time before
+    assert called == [1]
+    assert node.refusals.counts == {}
+
+
+def test_what_has_come_is_in_the_journal_when_a_collector_is_taken_down(graph, tmp_path):
+    node = graph.node(MeasurementCollector, journal=str(tmp_path))
+    detections = graph.publisher(names.DETECTIONS)
+    received = node.session.collector.received
+    for k in range(7):
+        detections.publish(names.DETECTIONS.type(k=k))
+    assert detections.wait_for_all_acked(Duration(seconds=30))
+    graph.remove(node)  # before it looked
+    assert received["detection"] == 7
+    (journal,) = tmp_path.glob("journal_*")
+    assert [topic for topic, _ in BagReader(journal).messages()] == [names.DETECTIONS.name] * 7
