@@ -103,6 +103,22 @@ def unfinished(folder: str | os.PathLike) -> list[Path]:
     return [] if _is_over(sorted(commands)) else files
 
 
+def written_ago_s(folder: str | os.PathLike) -> float | None:
+    """Return the time since the newest journal in `folder` was written, s; None without one.
+
+    Raises
+    ------
+    InputError
+        If the folder cannot be read.
+    """
+    with _said(Path(folder)):
+        bag = _newest(Path(folder))
+        if bag is None:
+            return None
+        written = max(file.stat().st_mtime for file in bag.glob("*.mcap"))
+    return max(time.time() - written, 0.0)
+
+
 def start(folder: str | os.PathLike, now_ns: int) -> "Journal":
     """Begin a new journal in `folder`, which is made if need be; its name tells the time.
 

@@ -103,6 +103,9 @@ class CollectorSettings(ManagedSettings):
     journal_lag_limit: float = declared(
         5.0, "time by which the disk may lag behind the journal before there is a warning", "s",
         0.1, 3600.0)
+    journal_max_age: float = declared(
+        86400.0, "time since the last message of a journal after which its run is not taken up "
+        "again", "s", 0.0, 1e8)
 
 
 @dataclass(frozen=True)

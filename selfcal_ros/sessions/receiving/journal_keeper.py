@@ -10,7 +10,7 @@ from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from selfcal_ros.bagio.journal import Journal, resume, start, unfinished
+from selfcal_ros.bagio.journal import Journal, resume, start, unfinished, written_ago_s
 from selfcal_ros.bagio.offline import block_handlers
 from selfcal_ros.bagio.reader import BagReader
 from selfcal_ros.collection.collector import Collector
@@ -71,10 +71,10 @@ class JournalKeeper:
     """
 
     def __init__(self, folder: str, topics: dict[str, tuple[str, dict]],
-                 settings: CollectorSettings,
-                 ports: Ports) -> None:
+                 settings: CollectorSettings, ports: Ports) -> None:
         self._folder, self._topics, self._ports = folder, topics, ports
         self._lag_limit_s = settings.journal_lag_limit
+        self._max_age_s = settings.journal_max_age
         self._journal: Journal | None = None
         self._goes_on: list[Path] = []  # files that were taken up and could not be gone on with
         self._unwritten = 0  # while there was no journal
@@ -101,14 +101,27 @@ class JournalKeeper:
         """
         if not self._folder:
             return []
+        is_old = False
         try:
-            self._open(resume(self._folder))
+            is_old = self._is_too_old()
+            self._open(None if is_old else resume(self._folder))
         except InputError as error:
             if getattr(error.__cause__, "errno", None) not in NO_ROOM:
                 raise
             self._fail(error)
-            self._goes_on = self._readable()
+            self._goes_on = [] if is_old else self._readable()
         return self._journal.earlier if self._journal else self._goes_on
+
+    def _is_too_old(self) -> bool:
+        """Tell if the newest journal was left so long ago that its run is not this one."""
+        age_s = written_ago_s(self._folder)
+        if age_s is None or age_s <= self._max_age_s:
+            return False
+        for file in self._readable()[:1]:
+            self._ports.say(Level.WARN, f"{file.parent}: its run was left {age_s / 3600:.0f} h ago "
+                            "and is not taken up; 'selfcal solve' reads it, a greater "
+                            "journal_max_age goes on with it")
+        return True
 
     def _readable(self) -> list[Path]:
         """Return the files of the journal of the run that is not over, which needs no room."""

@@ -2,6 +2,8 @@
 """Bytes on their way to the session: written first, decoded as a bag's, held back, refused."""
 
 import errno
+import os
+import time
 from collections import Counter
 from concurrent.futures import Future
 
@@ -167,6 +169,34 @@ def test_a_session_that_takes_up_a_journal_goes_on_as_if_nothing_had_been(
     assert second.session.diagnosis(detections_matched=True).values["phase"] == "DONE"
     [line] = [line for line in second.hands.lines(Level.OK) if line.startswith("took up")]
     assert f"with {cut} messages" in line
+
+
+@pytest.mark.parametrize(("hours", "limit_s", "goes_on"), [
+    (23, 86400.0, True), (25, 86400.0, False), (25, 1e6, True), (1, 60.0, False)])
+def test_a_run_that_was_left_long_ago_is_not_taken_up(tmp_path, events, hours, limit_s, goes_on):
+    first = Desk(tmp_path).receive(events[:200])
+    first.reception.drain()
+    first.keeper.close()
+    written = time.time() - 3600 * hours
+    for file in first_path(tmp_path).glob("*.mcap"):
+        os.utime(file, (written, written))
+    second = Desk(tmp_path, journal_max_age=limit_s)
+    assert second.reception.restoring == goes_on
+    second.reception.drain()
+    assert (sum(second.session.collector.received.values()) > 0) == goes_on
+    assert second.hands.lines(Level.WARN) == ([] if goes_on else [
+        f"{first_path(tmp_path)}: its run was left {hours} h ago and is not taken up; 'selfcal "
+        "solve' reads it, a greater journal_max_age goes on with it"])
+    assert (second.keeper.path == first_path(tmp_path)) == goes_on
+
+
+def test_of_a_run_that_is_over_nothing_is_said_however_old(tmp_path, events):
+    Desk(tmp_path).receive(events).reception.close()
+    for file in first_path(tmp_path).glob("*.mcap"):
+        os.utime(file, (1, 1))
+    second = Desk(tmp_path)
+    assert not second.reception.restoring
+    assert not second.hands.lines(Level.WARN)
 
 
 def test_what_comes_while_the_journal_is_read_is_written_and_held_back(
