@@ -142,14 +142,31 @@ def test_blocks_that_cannot_be_used_are_counted_as_single_messages_are(names, po
     assert len(collector.tracks.y) == len(single.tracks.y)
 
 
-def test_a_settled_exposure_is_not_looked_up_again(monkeypatch):
-    looked_up = []
+def looks(monkeypatch):
+    """Return a list that fills with the number of exposures of each look at the encoder."""
+    looked_up: list = []
     plain = Exposures._look_up
     monkeypatch.setattr(Exposures, "_look_up", lambda self, group: (
         looked_up.append(len(group)), plain(self, group)))
+    return looked_up
+
+
+def without_theta(events, after_ns):
+    """Return the events with no sample of theta after a stamp."""
+    return [replace(e, names=e.names[:2], positions=e.positions[:2]) if isinstance(
+        e, EncoderSample) and e.stamp_ns > after_ns else e for e in events]
+
+
+@pytest.mark.parametrize("theta", ["is told", "ends", "is not told"])
+def test_a_settled_exposure_is_not_looked_up_again(monkeypatch, theta):
+    looked_up = looks(monkeypatch)
     cell = scene("0, 90, 180", count=0, repeats=4)
+    events = sorted(cell.events, key=lambda e: e.stamp_ns)
+    if theta != "is told":
+        events = without_theta(events, events[300 if theta == "ends" else 0].stamp_ns)
+        assert events[-2].names == ("x", "y")
     collector, asked = fresh(), 0
-    for at, event in enumerate(sorted(cell.events, key=lambda e: e.stamp_ns)):
+    for at, event in enumerate(events):
         add(collector, event)
         if at > 400 and at % 50 == 0:
             collector.collect()
@@ -157,7 +174,22 @@ def test_a_settled_exposure_is_not_looked_up_again(monkeypatch):
     # 36 samples behind an exposure decide about it: those of the last 8 exposures, 10 to a status
     assert sum(looked_up) - len(cell.detections) <= 10 * asked
     assert asked > 20
-    assert digest_of(collector) == digest(cell.events)
+    assert digest_of(collector) == digest(events)
+
+
+def test_a_joint_that_is_told_late_is_looked_up_with_all_exposures(monkeypatch):
+    cell = scene("0, 90", count=8, repeats=1)
+    events = sorted(cell.events, key=lambda e: e.stamp_ns)
+    bare = without_theta(events, 0)
+    collector = fresh()
+    for event in bare:
+        add(collector, event)
+    before = collector.collect()[0].all_rejected()
+    assert before["no_encoder_sample_near"] == 2 * 8  # the lines need theta
+    for sample in (e for e in events if isinstance(e, EncoderSample)):
+        add(collector, EncoderSample(sample.stamp_ns, ("theta",), sample.positions[2:]))
+    assert "no_encoder_sample_near" not in collector.collect()[0].all_rejected()
+    assert digest_of(collector) == digest(events)
 
 
 def test_views_that_have_not_changed_keep_their_readings():

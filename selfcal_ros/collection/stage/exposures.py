@@ -26,8 +26,8 @@ MOST_SAMPLES = 300_000
 """Samples of a joint that are looked at together."""
 ROW = np.dtype([
     ("stamp", "i8"), ("position", "f8", 3), ("reason", "i1", 3), ("moving", "?", 3),
-    ("approach", "i1", 2), ("first", "i8"), ("last", "i8")])
-"""One instant: what is known of x, y, theta, and the stamps of samples between which it depends."""
+    ("approach", "i1", 2), ("first", "i8", 3), ("last", "i8", 3)])
+"""One instant: what is known of x, y, theta, and between which stamps samples of each decide it."""
 
 
 @dataclass(frozen=True)
@@ -129,12 +129,13 @@ class Exposures:
         """Return which instants may depend on samples that came since the last time."""
         rows = self._table.rows
         due = np.zeros(len(rows), dtype=bool)
-        for track in self._tracks:
+        for joint, track in enumerate(self._tracks):  # one without samples waits for its own
             new = track.store.new_stamps()
+            first, last = rows["first"][:, joint], rows["last"][:, joint]
             if len(new) and len(rows):
-                near = np.flatnonzero((rows["last"] >= new[0]) & (rows["first"] <= new[-1]))
-                due[near] |= (np.searchsorted(new, rows["first"][near], "left")
-                              < np.searchsorted(new, rows["last"][near], "right"))
+                near = np.flatnonzero((last >= new[0]) & (first <= new[-1]))
+                due[near] |= (np.searchsorted(new, first[near], "left")
+                              < np.searchsorted(new, last[near], "right"))
         return due
 
     def _insert(self, stamps_ns: np.ndarray, due: np.ndarray) -> np.ndarray:
@@ -187,7 +188,6 @@ class Exposures:
         start, end = self._window(group)
         index = np.arange(group[0], group[-1] + 1)
         rows, since = self._table.rows[index], self._since(index)
-        rows["first"], rows["last"] = EVER, NEVER
         for joint, track in enumerate(self._tracks):
             series = track.between(start, end)
             position, reason = series.query(rows["stamp"])
@@ -198,8 +198,7 @@ class Exposures:
             if linear:
                 rows["approach"][:, joint] = self._approach_of(series, index, position)
             first, last = series.decided_by(rows["stamp"], since if linear else None)
-            rows["first"] = np.minimum(rows["first"], first)
-            rows["last"] = np.maximum(rows["last"], last)
+            rows["first"][:, joint], rows["last"][:, joint] = first, last
         self._table.rows[index] = rows
 
     def _approach_of(self, series: Series, index: np.ndarray, position: np.ndarray) -> np.ndarray:
