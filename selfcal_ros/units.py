@@ -8,6 +8,7 @@ import math
 
 MM_PER_M, UM_PER_M, NM_PER_M = 1e3, 1e6, 1e9
 M_PER_MM, M_PER_UM, M_PER_NM = 1e-3, 1e-6, 1e-9
+MRAD_PER_RAD, URAD_PER_RAD = 1e3, 1e6
 RAD_PER_MRAD, RAD_PER_URAD = 1e-3, 1e-6
 ARCSEC_PER_RAD = math.degrees(1) * 3600
 RAD_PER_ARCSEC = math.radians(1 / 3600)

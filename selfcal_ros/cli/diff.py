@@ -6,7 +6,7 @@ import json
 import math
 
 from selfcal_ros.cli.terminal.progress import busy
-from selfcal_ros.units import ARCSEC_PER_RAD, PPM_PER_ONE, UM_PER_M
+from selfcal_ros.units import ARCSEC_PER_RAD, UM_PER_M, URAD_PER_RAD
 
 HELP = "compare two results after taking out the datum difference"
 
@@ -70,14 +70,14 @@ def _text(found) -> str:
     lines = ["B less A, datum difference taken out: translation "
              f"({tx * UM_PER_M:+.4g}, {ty * UM_PER_M:+.4g}) um, "
              f"rotation {found.rotation_rad * ARCSEC_PER_RAD:+.4g} arcsec, "
-             f"scale {found.scale * PPM_PER_ONE:+.4g} ppm"
+             f"scale {found.scale * UM_PER_M:+.4g} um/m"
              + ("" if math.isnan(found.theta_rad)
                 else f", theta {found.theta_rad * ARCSEC_PER_RAD:+.4g} arcsec"),
              f"XY     rms {found.rms_m * UM_PER_M:.5f} um per axis   "
              f"largest {found.max_m * UM_PER_M:.5f} um on an axis",
              *_test_text(found.xy),
-             f"       non-orthogonality {found.nonorthogonality * ARCSEC_PER_RAD:+.4g} arcsec, "
-             f"scale difference {found.scale_difference * PPM_PER_ONE:+.4g} ppm"]
+             f"       non-orthogonality {found.nonorthogonality * URAD_PER_RAD:+.4g} urad, "
+             f"scale difference {found.scale_difference * UM_PER_M:+.4g} um/m"]
     if not math.isnan(found.rms_theta_rad):
         lines += [f"theta  rms {found.rms_theta_rad * ARCSEC_PER_RAD:.4f} arcsec   "
                   f"largest {found.max_theta_rad * ARCSEC_PER_RAD:.4f} arcsec",

@@ -14,7 +14,7 @@ from selfcal_ros.cli.plan_terms import (
     terms_text,
 )
 from selfcal_ros.cli.terminal.progress import busy, late_progress
-from selfcal_ros.units import NM_PER_M, UM_PER_M
+from selfcal_ros.units import UM_PER_M
 
 HELP = "check a plan of views before it is measured, or suggest views"
 
@@ -199,7 +199,7 @@ def _suggest(args: argparse.Namespace, plan) -> int:
         else:
             now, ranked = rank_next(plan, criterion=args.criterion, datum=datum, against=against,
                                     progress=progress)
-    unit = _unit_nm(plan, against)
+    unit = _noise_m(plan, against)
     if args.views is not None:
         best = replace(best, plan_id=f"{plan.plan_id}_best{args.views}",
                        model_terms=plan.model_terms)
@@ -237,9 +237,9 @@ def _against(args: argparse.Namespace, plan):
     return Against(tuple(found[n] for n in TermName if n in found), assumed) if found else None
 
 
-def _unit_nm(plan, against) -> float | None:
-    """Return the noise of an averaged reading in nm where a plan is judged against terms."""
-    return None if against is None else _averaged_m(plan, against.assumed) * NM_PER_M
+def _noise_m(plan, against) -> float | None:
+    """Return the noise of an averaged reading, m, where a plan is judged against terms."""
+    return None if against is None else _averaged_m(plan, against.assumed)
 
 
 def _show_ranked(args: argparse.Namespace, plan, now: tuple, ranked: list) -> None:
@@ -273,25 +273,25 @@ def _show_best(args: argparse.Namespace, best, score: tuple, how: str) -> None:
     print(_score_text(*score))
 
 
-def _score_json(score, unit_nm: float | None) -> dict:
+def _score_json(score, noise_m: float | None) -> dict:
     def number(value: float) -> float | None:
         return value if math.isfinite(value) else None
 
     out = {"deficiency": score.deficiency, "rms_gain_xy": number(score.rms_xy),
            "max_gain_xy": number(score.max_xy), "rms_gain_theta": number(score.rms_theta)}
-    if unit_nm is not None:
-        out |= {"u_rms_m": number(score.rms_xy * unit_nm / NM_PER_M),
-                "u_max_m": number(score.max_xy * unit_nm / NM_PER_M)}
+    if noise_m is not None:
+        out |= {"u_rms_m": number(score.rms_xy * noise_m),
+                "u_max_m": number(score.max_xy * noise_m)}
     return out
 
 
-def _score_text(score, unit_nm: float | None) -> str:
+def _score_text(score, noise_m: float | None) -> str:
     if score.deficiency:
         return f"{score.deficiency} modes unseen"
     theta = f"  theta rms {score.rms_theta:.3f}" if score.rms_theta else ""
-    if unit_nm is not None:
-        return (f"u XY rms {score.rms_xy * unit_nm:.2f} nm  max {score.max_xy * unit_nm:.2f} nm"
-                f"{theta}")
+    if noise_m is not None:
+        unit = noise_m * UM_PER_M
+        return f"u XY rms {score.rms_xy * unit:.5f} um  max {score.max_xy * unit:.5f} um{theta}"
     return f"XY rms {score.rms_xy:.3f}  max {score.max_xy:.3f}{theta}"
 
 

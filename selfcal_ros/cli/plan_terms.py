@@ -6,7 +6,7 @@ import math
 import re
 
 from selfcal_ros.errors import InputError
-from selfcal_ros.units import M_PER, NM_PER_M, UM_PER_M
+from selfcal_ros.units import M_PER, MRAD_PER_RAD, UM_PER_M
 
 SIGMA = "20e-9"
 STOP_ERROR = "10e-6"
@@ -109,12 +109,12 @@ def terms_text(plan, checks, assumed) -> list[str]:
     """Return the checks of terms as a table, with what was assumed."""
     lines = ["terms: told from the stage or not; what a size that the model does not hold does to "
              "the map;", "how surely it would be noticed",
-             f"  {'term':<12}{'model':<7}{'told':<17}{'size':>12}  {'map rms':>9} {'largest':>10}"
+             f"  {'term':<12}{'model':<7}{'told':<17}{'size':>12}  {'map rms':>10} {'largest':>10}"
              f" {'noticed':>9}"]
     for c in checks:
         told = "yes" if c.told else f"no, {_modes(c.unseen_modes)}"
         lines.append(f"  {c.name:<12}{c.model or '-':<7}{told:<17}{size_text(c):>12}"
-                     f"  {c.effect_rms_m * NM_PER_M:6.2f} nm {c.effect_max_m * NM_PER_M:7.2f} nm"
+                     f"  {c.effect_rms_m * UM_PER_M:7.5f} um {c.effect_max_m * UM_PER_M:7.5f} um"
                      f" {100 * c.power:7.1f} %")
     return [*lines, *_assumptions(plan, assumed)]
 
@@ -128,10 +128,10 @@ def size_text(check) -> str:
     from selfcal_ros.model.terms import TermName
 
     if check.unit == "m":
-        return f"{check.size * NM_PER_M:.6g} nm"
+        return f"{check.size * UM_PER_M:.6g} um"
     if check.name is TermName.PLATE_SCALE:
         return f"{check.size * UM_PER_M:.6g} um/m"
-    return f"{check.size * 1e3:.6g} mrad"
+    return f"{check.size * MRAD_PER_RAD:.6g} mrad"
 
 
 def _assumptions(plan, assumed) -> list[str]:
@@ -143,8 +143,8 @@ def _assumptions(plan, assumed) -> list[str]:
               for view in views}
     cut = [view for view in views if view.repeats % orders[view.name].passes]
     lines = [f"  assumed: order {', '.join(sorted({str(o) for o in orders.values()}))}; drifts of "
-             f"degree {assumed.drift_degree}; {assumed.sigma_m * NM_PER_M:.6g} nm noise of a "
-             "reading;",
+             f"degree {assumed.drift_degree}; {assumed.sigma_m * UM_PER_M:.6g} um noise of "
+             "one reading;",
              f"  plates laid down to {math.degrees(MISALIGNMENT_RAD):g} deg and "
              f"{MISALIGNMENT_M * UM_PER_M:g} um, stops {assumed.stop_error_m * UM_PER_M:.6g} um "
              "off the marks, drawn with a fixed seed"]

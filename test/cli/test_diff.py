@@ -84,7 +84,7 @@ def test_different_theta_datums_are_said(files, tmp_path, capsys):
 
 def test_keep_scale(files, capsys):
     assert main(["diff", *files, "--keep-scale"]) == 0
-    assert "scale +0 ppm" in capsys.readouterr().out
+    assert "scale +0 um/m" in capsys.readouterr().out
 
 
 def test_another_lattice_is_bad_input(files, tmp_path, capsys):

@@ -19,7 +19,7 @@ from selfcal_ros.estimation.lattice.maps import PHASES
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.quality.leverage import Residuals, grid_residuals
 from selfcal_ros.model.readings import Measurements, ViewReadings
-from selfcal_ros.units import UM_PER_M
+from selfcal_ros.units import UM_PER_M, URAD_PER_RAD
 
 AMBIGUOUS = 16.0
 """Difference of chi2 below which two places explain the readings equally well."""
@@ -89,8 +89,8 @@ class Slip(SlipPlace):
 
     def text(self) -> str:
         """Return the slip in words."""
-        size = (f"({self.tx_m * UM_PER_M:.3g}, {self.ty_m * UM_PER_M:.3g}) um and "
-                f"{self.phi_rad * 1e6:.3g} urad")
+        size = (f"({self.tx_m * UM_PER_M:.3g}, {self.ty_m * UM_PER_M:.3g}) µm and "
+                f"{self.phi_rad * URAD_PER_RAD:.3g} µrad")
         if self.alternatives:
             return (f"view '{self.view}': the plate slipped by about {size}, {self.place} or "
                     + " or ".join(self.alternatives) + "; the readings do not tell which")

@@ -3,6 +3,7 @@
 
 import math
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import eval_legendre
@@ -11,9 +12,21 @@ from selfcal_ros.estimation.verdict.causes import Explanation
 from selfcal_ros.estimation.verdict.slip_columns import SLIP
 from selfcal_ros.model.terms import TermName
 from selfcal_ros.model.verdict import Cause
+from selfcal_ros.units import MRAD_PER_RAD, PPM_PER_ONE, UM_PER_M, URAD_PER_RAD
 
 TIMES = np.linspace(-1, 1, 101)
 """Instants of a view between which the range of a drift is sought."""
+
+
+class Unit(NamedTuple):
+    """How a person reads a quantity: how many of the unit are one in SI, and its name."""
+
+    per_si: float
+    name: str
+
+
+UM, RATIO = Unit(UM_PER_M, "µm"), Unit(PPM_PER_ONE, "µm/m")
+MRAD, PERCENT = Unit(MRAD_PER_RAD, "mrad"), Unit(100.0, "%")
 
 
 def cause_of(found: Explanation, names: tuple[str, ...], half_width_m: float) -> Cause:
@@ -38,13 +51,13 @@ def noise_cause(view: str, ratio: float, u: float, p: float) -> Cause:
                  "again, or look for what shook it", ratio, u, "m/m", p)
 
 
-def plus_minus(value: float, u: float, factor: float, unit: str) -> str:
+def plus_minus(value: float, u: float, unit: Unit) -> str:
     """Return ``value ± u unit`` with two figures of the uncertainty."""
-    value, u = value * factor, u * factor
+    value, u = value * unit.per_si, u * unit.per_si
     digits = 3
     if math.isfinite(u) and u > 0:
         digits = min(max(1 - math.floor(math.log10(u)), 0), 9)
-    return f"{value:.{digits}f} ± {u:.{digits}f} {unit}"
+    return f"{value:.{digits}f} ± {u:.{digits}f} {unit.name}"
 
 
 def _linear(found: Explanation, weights: np.ndarray) -> tuple[float, float]:
@@ -65,12 +78,12 @@ def _microscope(found: Explanation, *_: object) -> tuple[str, float, float, str]
     half = np.array([[1, 0, 0, 1], [0, -1, 1, 0], [1, 0, 0, -1], [0, 1, 1, 0]]) / 2
     name, value, u = _likeliest(found, list(zip(("scale", "turn", "scales", "shear"), half,
                                                 strict=True)))
-    said = {"turn": f"microscope turned by {plus_minus(value, u, 1e3, 'mrad')}",
-            "scale": f"scale of the microscope off by {plus_minus(value, u, 100, '%')}",
+    said = {"turn": f"microscope turned by {plus_minus(value, u, MRAD)}",
+            "scale": f"scale of the microscope off by {plus_minus(value, u, PERCENT)}",
             "scales": f"scales of the microscope along x and y differ by "
-                      f"{plus_minus(2 * value, 2 * u, 100, '%')}",
+                      f"{plus_minus(2 * value, 2 * u, PERCENT)}",
             "shear": f"axes of the microscope out of square by "
-                     f"{plus_minus(2 * value, 2 * u, 1e3, 'mrad')}"}[name]
+                     f"{plus_minus(2 * value, 2 * u, MRAD)}"}[name]
     return (f"{said}: solve with --model microscope, or align it", value, u,
             "rad" if name in ("turn", "shear") else "m/m")
 
@@ -87,7 +100,7 @@ def _drift(found: Explanation, names: tuple[str, ...], _: float) -> tuple[str, f
             ends = shape[:, int(path.argmax())] - shape[:, int(path.argmin())]
             options[f"along {axis} while view '{names[view]}' was measured"] = ends
     where, value, u = _likeliest(found, list(options.items()))
-    return (f"drift of {plus_minus(value, u, 1e9, 'nm')} {where}: solve with --model drift, or "
+    return (f"drift of {plus_minus(value, u, UM)} {where}: solve with --model drift, or "
             "visit the marks there and back", value, u, "m")
 
 
@@ -99,7 +112,7 @@ def _plate_scale(found: Explanation, names: tuple[str, ...],
                  _: float) -> tuple[str, float, float, str]:
     at, value, u = _likeliest(found, _units(found))
     view = names[found.columns[int(at)].view]
-    return (f"plate larger by {plus_minus(value, u, 1e6, 'µm/m')} in view '{view}' than in view "
+    return (f"plate larger by {plus_minus(value, u, RATIO)} in view '{view}' than in view "
             f"'{names[0]}': solve with --model plate_scale, or let it take the temperature",
             value, u, "m/m")
 
@@ -109,7 +122,7 @@ def _plate_shape(found: Explanation, names: tuple[str, ...],
     at, value, u = _likeliest(found, _units(found))
     column = found.columns[int(at)]
     more = "" if found.whole else "; part of it cannot be separated from the stage: give its size"
-    return (f"plate bent by {plus_minus(value, u, 1e9, 'nm')} at the middle of an edge in view "
+    return (f"plate bent by {plus_minus(value, u, UM)} at the middle of an edge in view "
             f"'{names[column.view]}' against view '{names[0]}': solve with --model "
             f"plate_shape:SIZE, or lay it down without strain{more}", value, u, "m")
 
@@ -117,7 +130,7 @@ def _plate_shape(found: Explanation, names: tuple[str, ...],
 def _approach(found: Explanation, *_: object) -> tuple[str, float, float, str]:
     at, value, u = _likeliest(found, _units(found))
     axis = found.columns[int(at)].component
-    return (f"indicated {axis} differs by ±({plus_minus(value, u, 1e9, 'nm')}) with the direction "
+    return (f"indicated {axis} differs by ±({plus_minus(value, u, UM)}) with the direction "
             "of approach: solve with --model approach, or arrive from one side", value, u, "m")
 
 
@@ -130,9 +143,9 @@ def _slip(found: Explanation, names: tuple[str, ...],
     toward[order["x"]], toward[order["y"]] = (x / size, y / size) if size else (1.0, 0.0)
     value, u = _linear(found, toward)
     view = names[found.columns[0].view]
-    return (f"the plate slipped by ({x * 1e9:.3g}, {y * 1e9:.3g}) nm and "
-            f"{phi / half_width_m * 1e6:.3g} µrad after about {found.part:.0%} of view '{view}': "
-            "measure the view again, or solve with --robust", value, u, "m")
+    return (f"the plate slipped by ({x * UM_PER_M:.3g}, {y * UM_PER_M:.3g}) µm and "
+            f"{phi / half_width_m * URAD_PER_RAD:.3g} µrad after about {found.part:.0%} of view "
+            f"'{view}': measure the view again, or solve with --robust", value, u, "m")
 
 
 _TEXTS: dict[str, Callable[..., tuple[str, float, float, str]]] = {

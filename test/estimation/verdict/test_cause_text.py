@@ -1,0 +1,69 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Sentence, size and uncertainty of each cause: lengths in µm, ratios in µm/m, turns in mrad."""
+
+import numpy as np
+import pytest
+
+from selfcal_ros.estimation.terms.columns import Column
+from selfcal_ros.estimation.verdict.cause_text import cause_of, noise_cause
+from selfcal_ros.estimation.verdict.causes import Explanation
+
+NAMES = ("0", "90", "+x")
+MICROSCOPE = ("xx", "xy", "yx", "yy")
+
+
+def explanation(name, components, values, u, **more):
+    """Return an explanation with equal, independent uncertainties; (view, component) each."""
+    columns = tuple(Column(name, view, component, np.inf) for view, component in components)
+    return Explanation(name, columns, np.array(values, dtype=float),
+                       u**2 * np.eye(len(values)), 1e-6, more.pop("whole", True), 0.0, **more)
+
+
+def microscope(*values):
+    return explanation("microscope", [(-1, part) for part in MICROSCOPE], values, 1e-5 * 2**0.5)
+
+
+@pytest.mark.parametrize(("found", "text", "size", "u", "unit"), [
+    # E = ((xx, xy), (yx, yy)); a turn by a is ((0, -a), (a, 0))
+    (microscope(0, -2e-3, 2e-3, 0), "microscope turned by 2.000 ± 0.010 mrad: solve with --model "
+     "microscope, or align it", 2e-3, 1e-5, "rad"),
+    (microscope(5e-3, 0, 0, 5e-3), "scale of the microscope off by 0.5000 ± 0.0010 %: solve with "
+     "--model microscope, or align it", 5e-3, 1e-5, "m/m"),
+    (microscope(1e-3, 0, 0, -1e-3), "scales of the microscope along x and y differ by 0.2000 ± "
+     "0.0020 %: solve with --model microscope, or align it", 1e-3, 1e-5, "m/m"),
+    (microscope(0, 1e-3, 1e-3, 0), "axes of the microscope out of square by 2.000 ± 0.020 mrad: "
+     "solve with --model microscope, or align it", 1e-3, 1e-5, "rad"),
+    # P1 runs from -1 to 1: the range is twice the coefficient
+    (explanation("drift", [(1, "x P1"), (1, "y P1"), (2, "x P1"), (2, "y P1")],
+                 [1e-9, 0, 0, 25.6e-9], 1e-9), "drift of 0.0512 ± 0.0020 µm along y while view "
+     "'+x' was measured: solve with --model drift, or visit the marks there and back",
+     51.2e-9, 2e-9, "m"),
+    (explanation("plate_scale", [(1, ""), (2, "")], [1e-7, -2e-6], 1e-7),
+     "plate larger by -2.00 ± 0.10 µm/m in view '+x' than in view '0': solve with --model "
+     "plate_scale, or let it take the temperature", -2e-6, 1e-7, "m/m"),
+    (explanation("plate_shape", [(1, "x x2"), (1, "y x2")], [3e-8, 0], 1.5e-9),
+     "plate bent by 0.0300 ± 0.0015 µm at the middle of an edge in view '90' against view '0': "
+     "solve with --model plate_shape:SIZE, or lay it down without strain", 3e-8, 1.5e-9, "m"),
+    (explanation("plate_shape", [(1, "x x2")], [3e-8], 1.5e-9, whole=False),
+     "plate bent by 0.0300 ± 0.0015 µm at the middle of an edge in view '90' against view '0': "
+     "solve with --model plate_shape:SIZE, or lay it down without strain; part of it cannot be "
+     "separated from the stage: give its size", 3e-8, 1.5e-9, "m"),
+    (explanation("approach", [(-1, "x"), (-1, "y")], [0, 2e-8], 1e-9),
+     "indicated y differs by ±(0.0200 ± 0.0010 µm) with the direction of approach: solve with "
+     "--model approach, or arrive from one side", 2e-8, 1e-9, "m"),
+    # 3 and 4 make 5; a rotation is in units of what it does at the half width, 0.05 m
+    (explanation("slip", [(1, "x"), (1, "y"), (1, "phi")], [3e-7, -4e-7, 5e-8], 1e-8, part=0.4),
+     "the plate slipped by (0.3, -0.4) µm and 1 µrad after about 40% of view '90': measure the "
+     "view again, or solve with --robust", 5e-7, 1e-8, "m")])
+def test_a_cause_in_words(found, text, size, u, unit):
+    cause = cause_of(found, NAMES, 0.05)
+    assert (cause.name, cause.text, cause.unit, cause.p) == (found.name, text, unit, 1e-6)
+    assert (cause.size, cause.u) == pytest.approx((size, u), rel=1e-12)
+
+
+def test_a_noisy_view_in_words():
+    cause = noise_cause("90", 3.1415, 0.2, 1e-4)
+    assert cause.text == ("view '90' is 3.14 times as noisy as the others: measure it again, or "
+                          "look for what shook it")
+    assert (cause.name, cause.size, cause.u, cause.unit, cause.p) == (
+        "noise", 3.1415, 0.2, "m/m", 1e-4)
