@@ -13,12 +13,13 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 
 from selfcal_ros.collection.settings.parameter import BARE_Y, Settings
-from selfcal_ros.errors import SelfcalError, as_answer, printable
+from selfcal_ros.errors import printable
 from selfcal_ros.nodes.callbacks import WithInfo
 from selfcal_ros.nodes.descriptors import descriptor
 from selfcal_ros.nodes.filling import fill, status_of
 from selfcal_ros.nodes.names import HEALTH, Topic, private
 from selfcal_ros.nodes.publishers import mismatched, others_publishing
+from selfcal_ros.nodes.services import Later, answered, answering_later
 from selfcal_ros.sessions.clocks import RosTime
 from selfcal_ros.sessions.health import Losses, Refusals, merged
 from selfcal_ros.sessions.ports import Diagnosis, Level, Ports
@@ -103,21 +104,24 @@ class NodeBase[S: Settings](Node):
         arguments = sum(parameter.default is parameter.empty for parameter in parameters)
 
         def call(request: Any, response: Any) -> Any:
-            try:
-                message = answer(*(request, response)[:arguments])
-                response.success, response.message = True, printable(message)
-            except Exception as error:
-                self._answer_error(response, error)
-            return response
+            return answered(response, lambda: answer(*(request, response)[:arguments]),
+                            self.refusals.add)
         return self.own(self.create_service(kind, name, call), self.destroy_service)
 
-    def _answer_error(self, response: Any, error: Exception) -> None:
-        code, response.message = as_answer(error)
-        response.success = False
-        if not isinstance(error, SelfcalError):
-            self.refusals.add("service", error)
-        if hasattr(response, "error_code"):
-            response.error_code = int(code)
+    def service_later(self, kind: type, name: str, answer: Callable[[Any, Any], str],
+                      when: Callable[[Callable[[], None]], None]) -> Any:
+        """Offer a service that answers as `service` does, but not before its time.
+
+        `when` takes what gives the answer, and calls it once, at once or later, in the thread of
+        the executor.
+        """
+        def call(request: Any, response: Any) -> Later:
+            later = Later()
+            when(lambda: later.give(answered(response, lambda: answer(request, response),
+                                             self.refusals.add)))
+            return later
+        return self.own(answering_later(self.create_service(kind, name, call)),
+                        self.destroy_service)
 
     def every(self, seconds: float, callback: Callable[[], None]) -> Any:
         """Call `callback` every so many seconds of a steady clock."""

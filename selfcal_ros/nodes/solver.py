@@ -2,6 +2,7 @@
 """solver: readings of the views in, calibrated error map out."""
 
 import sys
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
@@ -13,15 +14,18 @@ from selfcal_ros.nodes.managed import ManagedNode, WhileConfigured, stop
 from selfcal_ros.nodes.markers import map_markers
 from selfcal_ros.nodes.running import run
 from selfcal_ros.sessions.ports import Diagnosis
-from selfcal_ros.sessions.solving import Outcome, SolvingSession, solve
+from selfcal_ros.sessions.solving import Outcome, SolvingSession, solve, warm_up
 
-TICK_S = 0.02
+SWEEP_S = 0.5
+"""Time between two looks for what no event has brought forward, as a solution that was ready while
+the node was not active. A solution itself wakes the executor."""
 
 
 class Solver(ManagedNode[SolverSettings]):
     """Solves whenever a view's readings arrive; publishes ErrorMap and CalibrationSummary.
 
     Solving runs in a thread beside the executor; what arrives meanwhile is solved next, together.
+    What is asked of the newest readings waits for their solution, not the executor.
     """
 
     session = WhileConfigured[SolvingSession]()
@@ -29,6 +33,8 @@ class Solver(ManagedNode[SolverSettings]):
     _running = WhileConfigured[Future[Outcome] | None]()
 
     def __init__(self, **kwargs: Any) -> None:
+        self._begun = 0  # jobs, that which runs included
+        self._waiting: list[tuple[int, Callable[[], None]]] = []  # for a job, by its number
         super().__init__(SolverSettings, **kwargs)
 
     def configure(self) -> None:
@@ -36,6 +42,7 @@ class Solver(ManagedNode[SolverSettings]):
         self.session = SolvingSession(self.settings, self.ports(self._publish))
         self._worker = self.own(ThreadPoolExecutor(1, thread_name_prefix="solver"), stop)
         self._running = None
+        warm_up()
         self._outputs = {"map": self.output(names.ERROR_MAP),
                          "summary": self.output(names.SUMMARY)}
         self._markers = self.publisher(names.MAP_MARKERS)
@@ -45,10 +52,11 @@ class Solver(ManagedNode[SolverSettings]):
     def activate(self) -> None:
         """Listen to the collector and to the commands."""
         self.subscribe(names.MEASUREMENT, self._on_measurement)
-        self.subscribe(names.COMMAND, self.session.take_command)
-        self.every(TICK_S, self._on_timer)
+        self.subscribe(names.COMMAND, self._on_command)
+        self.every(SWEEP_S, self._advance)
         self.service(LoadMap, "~/load_map", lambda request: self.session.load(request.path))
-        self.service(SaveMap, "~/save_map", self._save)
+        self._waiting.clear()
+        self.service_later(SaveMap, "~/save_map", self._save, self._once_solved)
 
     def _publish(self, output: str, fields: dict[str, Any]) -> None:
         if output == "markers":
@@ -58,35 +66,61 @@ class Solver(ManagedNode[SolverSettings]):
 
     def _on_measurement(self, message: Any) -> None:
         self.session.take_measurement(message)
-        if self._running is None:
-            self._begin()
+        self._begin()
 
-    def _on_timer(self) -> None:
-        if self._running is not None and self._running.done():
-            self._take(self._running)
-        if self._running is None:
-            self._begin()
+    def _on_command(self, message: Any) -> None:
+        self.session.take_command(message)
+        self._begin()
 
     def _begin(self) -> None:
-        job = self.session.next_job()
-        self._running = self._worker.submit(solve, job) if job is not None else None
+        """Solve what is new; while the worker is busy, it waits."""
+        job = self.session.next_job() if self._running is None else None
+        if job is not None:
+            self._begun += 1
+            self._running = self._worker.submit(solve, job)
+            self._running.add_done_callback(self._wake)
+
+    def _wake(self, _: Future[Outcome]) -> None:
+        """Have the executor take a solution at once; called in the worker's thread."""
+        executor = self.executor
+        if executor is not None:
+            executor.create_task(self.guarded(self._advance))
+
+    def _advance(self) -> None:
+        """Take a solution that is ready, go on with what is new, and with what has waited."""
+        if self.state != "active":
+            return
+        try:
+            if self._running is not None and self._running.done():
+                self._take(self._running)
+        finally:
+            try:
+                self._begin()
+            finally:
+                self._go_on()
 
     def _take(self, running: Future[Outcome]) -> None:
-        """Take what was solved; wait for it if need be."""
+        """Take what was solved."""
         outcome, self._running = running.result(), None
         try:
             self.session.take(outcome)
         finally:
             self._solved.publish(names.SOLVED.type(data=self.session.digest()))
 
+    def _once_solved(self, then: Callable[[], None]) -> None:
+        """Call `then` once the readings that have come so far are solved."""
+        self._waiting.append((self._begun + self.session.stale, then))
+        self._advance()
+
+    def _go_on(self) -> None:
+        done = self._begun - (self._running is not None)
+        idle = self._running is None and not self.session.stale
+        due = [item for item in self._waiting if idle or item[0] <= done]
+        self._waiting = [item for item in self._waiting if item not in due]
+        for _, then in due:
+            then()
+
     def _save(self, request: Any, response: Any) -> str:
-        """Save the map of the newest readings: what runs or waits is solved first."""
-        while True:
-            if self._running is not None:
-                self._take(self._running)
-            self._begin()
-            if self._running is None:
-                break
         message, response.path = self.session.save(request.path)
         return message
 

@@ -4,6 +4,8 @@
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
+
 from selfcal_ros.collection.digest import readings_digest, session_digest
 from selfcal_ros.collection.settings.estimator import solver_options
 from selfcal_ros.collection.settings.nodes import SolverSettings
@@ -12,6 +14,7 @@ from selfcal_ros.estimation.api import Options, calibrate
 from selfcal_ros.files import write_json
 from selfcal_ros.messages import from_model, to_model
 from selfcal_ros.messages.sizes import check_plate, check_view
+from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.result import (
     CalibrationResult,
@@ -25,6 +28,7 @@ from selfcal_ros.sessions.map_files import read_result, result_file
 from selfcal_ros.sessions.ports import Diagnosis, Level, Ports
 from selfcal_ros.sessions.runs import Run, supersedes
 from selfcal_ros.sessions.verdicts import is_qualified
+from selfcal_ros.simulation.truth import hu_plan, random_truth, simulate_measurements
 
 ECHO_LENGTH = 128
 """Characters of a string that `ros2 topic echo` shows."""
@@ -58,6 +62,19 @@ def solve(job: Job) -> Outcome:
         return Outcome(job, unidentified_result(job.measurements, error.observability), error)
     except Exception as error:  # told by `take`, in the thread of the session
         return Outcome(job, None, error)
+
+
+def warm_up() -> None:
+    """Solve a small simulated plan, so that all that solving needs is loaded.
+
+    Otherwise the first solution of a session would wait for it. To be called before there are other
+    threads: threadpoolctl, when it first looks for libraries, waits for the interpreter while the
+    loader of libraries waits for it, and an import in another thread at that time is a deadlock.
+    """
+    plan = hu_plan(Artifact(5, 0.01, 8))
+    rng = np.random.default_rng(1)
+    calibrate(simulate_measurements(random_truth(plan.artifact, len(plan.views), rng), plan, rng,
+                                    sigma_m=2e-8, sigma_theta_rad=1e-6))
 
 
 @dataclass
@@ -99,6 +116,11 @@ class SolvingSession:
     def result(self) -> CalibrationResult | None:
         """The result that is published."""
         return self.shown.result
+
+    @property
+    def stale(self) -> bool:
+        """Whether something has come that no job was made of."""
+        return self._stale
 
     def take_command(self, message: Any) -> None:
         """Learn from a view command how many views are planned."""
@@ -202,8 +224,6 @@ class SolvingSession:
         if shown.problem is None:
             self._ports.publish("map", from_model.error_map(
                 result, shown.stamp_ns, frame_id) | verdict)
-            self._ports.publish("markers", {"error_map": result.error_map,
-                                            "stamp_ns": shown.stamp_ns})
         numbers = summary_numbers(result)
         seen = result.observability
         fields = {name: getattr(numbers, name) for name in (
@@ -216,6 +236,9 @@ class SolvingSession:
             "identifiable": seen.identifiable, "rank_deficiency": seen.deficiency, **fields,
             "advice": [*seen.advice, *result.warnings], "causes": [
                 cause.text for cause in result.verdict.causes], **verdict})
+        if shown.problem is None:  # last: pictures take their time
+            self._ports.publish("markers", {"error_map": result.error_map,
+                                            "stamp_ns": shown.stamp_ns})
 
     def _unfinished(self) -> bool:
         """Return whether the plan has views that are still to come."""

@@ -3,6 +3,7 @@
 
 import json
 import re
+import threading
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from selfcal_ros.messages import from_model, to_model
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.result import result_to_dict
 from selfcal_ros.nodes import names
+from selfcal_ros.nodes import solver as solver_module
 from selfcal_ros.nodes.filling import fill
 from selfcal_ros.nodes.solver import Solver
 from selfcal_ros.reporting.maps.markers import map_geometry
@@ -81,6 +83,93 @@ def test_the_state_is_a_sentence_that_topic_echo_shows_whole(solve):
     ("a" * 60 + ", b; " + "c" * 80, "a" * 60 + ", b."), ("a" * 200, "a" * 127 + ".")])
 def test_a_long_sentence_ends_with_a_clause(sentence, shown):
     assert short(sentence) == shown
+
+
+def test_a_solution_wakes_the_node_that_waits_for_it(solve, graph, monkeypatch):
+    monkeypatch.setattr(solver_module, "SWEEP_S", 3600.0)
+    maps, _, measurements = solve()
+    graph.until(lambda: maps, "a map")
+    same_map(maps[-1], calibrate(measurements).error_map)
+
+
+def test_what_solving_needs_is_loaded_before_there_is_another_thread(graph, monkeypatch):
+    before: list[str] = []
+    monkeypatch.setattr(solver_module, "warm_up", lambda: before.extend(
+        thread.name for thread in [threading.current_thread(), *threading.enumerate()]))
+    graph.node(Solver)
+    assert before[0] == "MainThread"
+    assert not [name for name in before if name.startswith("solver")]
+
+
+def test_a_solution_that_was_ready_while_the_node_was_not_active_is_taken_later(
+        graph, monkeypatch):
+    gate, plain = threading.Event(), solver_module.solve
+    monkeypatch.setattr(solver_module, "solve", lambda job: gate.wait(60) and plain(job))
+    node = graph.node(Solver)
+    summaries = graph.listen(names.SUMMARY)
+    graph.publisher(names.MEASUREMENT).publish(measured()[0][0])
+    graph.until(lambda: node._running is not None, "a job")
+    node.trigger_deactivate()
+    gate.set()
+    graph.until(node._running.done, "the solution")
+    assert node.session.shown.problem is None
+    node.trigger_activate()
+    graph.until(lambda: summaries, "the summary")
+
+
+def test_save_map_waits_for_the_readings_that_came_before_while_the_node_works_on(
+        graph, tmp_path, monkeypatch):
+    gate, jobs, plain = threading.Event(), [], solver_module.solve
+
+    def wait_and_solve(job):
+        jobs.append(job)
+        assert gate.wait(60)
+        return plain(job)
+    monkeypatch.setattr(solver_module, "solve", wait_and_solve)
+    node = graph.node(Solver, result_folder=str(tmp_path))
+    publisher, (messages, measurements) = graph.publisher(names.MEASUREMENT), measured()
+    publisher.publish(messages[0])
+    graph.until(lambda: jobs, "a first job")
+    for message in messages[1:]:
+        publisher.publish(message)
+    graph.until(lambda: len(node.session._messages) == len(messages), "all views")
+    client = graph.hand.create_client(SaveMap, "solver/save_map")
+    graph.until(client.service_is_ready, "save_map")
+    path = tmp_path / "map.json"
+    future = client.call_async(SaveMap.Request(path=str(path)))
+    graph.until(lambda: node._waiting, "the request")
+    refused = graph.call(LoadMap, "solver/load_map", path="")  # others are answered meanwhile
+    assert refused.message == "path: is empty; name a file"
+    assert not future.done()
+    assert not path.exists()
+    gate.set()
+    answer = graph.finish(future, "the answer")
+    assert (answer.success, answer.path) == (True, str(path))
+    assert [len(job.measurements.views) for job in jobs] == [1, len(messages)]
+    np.testing.assert_array_equal(
+        np.array(json.loads(path.read_text())["error_map"]["gx"], dtype=float),
+        calibrate(measurements).error_map.gx)
+
+
+def test_a_save_that_waited_is_told_what_the_readings_contradict(graph, tmp_path, monkeypatch):
+    gate, plain = threading.Event(), solver_module.solve
+    monkeypatch.setattr(solver_module, "solve", lambda job: gate.wait(60) and plain(job))
+    node = graph.node(Solver, result_folder=str(tmp_path))
+    publisher, (messages, _) = graph.publisher(names.MEASUREMENT), measured()
+    publisher.publish(messages[0])
+    graph.until(lambda: node._running is not None, "a job")
+    messages[1].grid_pitch *= 2
+    publisher.publish(messages[1])
+    graph.until(lambda: node.session.stale, "the other plate")
+    client = graph.hand.create_client(SaveMap, "solver/save_map")
+    graph.until(client.service_is_ready, "save_map")
+    future = client.call_async(SaveMap.Request(path=str(tmp_path / "no.json")))
+    graph.until(lambda: node._waiting, "the request")
+    gate.set()
+    answer = graph.finish(future, "the answer")
+    assert (answer.success, answer.error_code, answer.message) == (
+        False, 2, "selfcal/view_measurement: views of different plates in one plan; measure one "
+        "plate")
 
 
 def test_a_late_joiner_gets_map_and_summary(solve, graph):

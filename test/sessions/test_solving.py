@@ -71,6 +71,11 @@ def test_the_solver_estimates_the_terms_that_the_plan_asks_for(desk):
     assert "model_terms_from" not in without.session.result.provenance.extra
 
 
+def test_pictures_come_after_what_they_show(desk):
+    desk.take(views_of())
+    assert [name for name, _ in desk.hands.published] == ["map", "summary", "markers"]
+
+
 def test_terms_that_nobody_knows_are_told_and_the_solver_lives(desk):
     with pytest.raises(InputError) as caught:
         desk.take(views_of(model_terms=["creep"]))
