@@ -17,6 +17,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -32,12 +33,15 @@ from selfcal_ros.cli.processes import domain, process
 from selfcal_ros.collection.messages import Phase
 from selfcal_ros.files import read_json
 from selfcal_ros.messages import from_model
+from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.view import Plan
 from selfcal_ros.nodes import names
+from selfcal_ros.simulation.truth import hu_plan, random_truth, simulate_measurements
 
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT / "test" / "bench"))
 
-from ingest import simulated  # noqa: E402
+from ingest import PITCH_M  # noqa: E402
 from ingest_bags import FRONT, Recording, detection_rows, encoder_rows, recording  # noqa: E402
 
 FOLDER = ROOT / "build" / "soak"
@@ -48,9 +52,20 @@ TICKS = os.sysconf("SC_CLK_TCK")
 NODES = ("measurement_collector", "solver", "pose_sequencer")
 
 
+def five_views(size: int) -> Plan:
+    """Return Hu's grid views and two more: from the third on, each gives a map."""
+    plan = hu_plan(Artifact(size, PITCH_M))
+    first = plan.views[0]
+    return replace(plan, views=(*plan.views,
+                                replace(first, name="rot180", rotation_rad=np.pi),
+                                replace(first, name="shift_y", translation_m=(0.0, PITCH_M))))
+
+
 def shift(hours: float, size: int) -> Recording:
-    """Return a run of three views, a detection a second on average, with noise."""
-    plan, _, measurements, _ = simulated(size, 1)
+    """Return a run of five views, a detection a second on average, with noise."""
+    plan, rng = five_views(size), np.random.default_rng(size)
+    truth = random_truth(plan.artifact, len(plan.views), rng)
+    measurements = simulate_measurements(truth, plan, rng)
     marks = sum(len(view.m) for view in measurements.views)
     repeats = max(1, round(3600 * hours / marks))
     part = recording(plan, measurements, repeats=repeats, encoder_ns=ENCODER_NS,
@@ -103,10 +118,12 @@ class Cell:
         self.heard = (0, 0, 0)
         self.health: dict[str, str] = {}
         self.status_ms: list[float] = []
-        self.worst_ms, self.views_solved, self.warned = 0.0, 0, set()
+        self.worst_ms, self.warned = 0.0, set()
+        self.views_solved, self.has_map = 0, False
+        self.heard_s = self.map_s = 0.0  # of the newest summary and map
         for topic, take in ((names.of_node(NODES[0], names.RECEIVED), self._on_received),
                             (names.of_node(NODES[0], names.HEALTH), self._on_health),
-                            (names.SUMMARY, self._on_summary)):
+                            (names.SUMMARY, self._on_summary), (names.ERROR_MAP, self._on_map)):
             self.node.create_subscription(topic.type, topic.name, take, topic.qos)
 
     def _on_received(self, message: object) -> None:
@@ -121,7 +138,12 @@ class Cell:
             self.worst_ms = max(self.worst_ms, float(self.health["status_ms_max"]))
 
     def _on_summary(self, message: object) -> None:
-        self.views_solved = message.views_done
+        if message.views_done > self.views_solved:
+            self.heard_s = time.monotonic()
+        self.views_solved, self.has_map = message.views_done, message.identifiable
+
+    def _on_map(self, _: object) -> None:
+        self.map_s = time.monotonic()
 
     def until(self, condition: Callable[[], bool], what: str) -> None:
         """Spin until `condition` holds."""
@@ -200,8 +222,12 @@ def run_shift(cell: Cell, part: Recording, pid: int, realtime_s: float) -> dict[
     return {"share": share, "latencies": latencies, "seconds": time.monotonic() - began}
 
 
-def closing_view(cell: Cell, batch: list[tuple[str, bytes]], ends: set[int]) -> float:
-    """Publish the batch with the last reading of a view at leisure; return the time to its map."""
+def closing_view(cell: Cell, batch: list[tuple[str, bytes]], ends: set[int]) -> tuple[bool, float]:
+    """Publish the batch with the last reading of a view in real time.
+
+    Return whether it gave a map, and the time from that reading to the map, or to the summary that
+    says why there is none.
+    """
     cell.until(lambda: cell.under_way <= 0, "all but the last reading")
     views, began = cell.views_solved, None
     for item in batch:
@@ -212,7 +238,9 @@ def closing_view(cell: Cell, batch: list[tuple[str, bytes]], ends: set[int]) -> 
         while began is not None and time.monotonic() < end:
             cell.executor.spin_once(timeout_sec=max(end - time.monotonic(), 0))
     cell.until(lambda: cell.views_solved > views, "the solution")
-    return time.monotonic() - began
+    if cell.has_map:
+        cell.until(lambda: cell.map_s > began, "the map")
+    return cell.has_map, (cell.map_s if cell.has_map else cell.heard_s) - began
 
 
 def same_maps(live: Path, journal: Path) -> bool:
@@ -263,8 +291,9 @@ def soak(args: argparse.Namespace, environment: dict) -> int:
           f"max {cell.worst_ms:.1f} ms")
     print(f"collector's CPU {100 * found['share']:.1f} % of a core in real time at 1 kHz "
           f"({args.realtime:g} s), {1e6 * used / total:.1f} us a message at full speed")
-    print("latency         last reading to published solution, ms: "
-          + ", ".join(f"{1e3 * latency:.0f}" for latency in found["latencies"]))
+    for has_map, what in ((True, "map"), (False, "summary of views that give none")):
+        print(f"latency         last reading to published {what}, ms: " + ", ".join(
+            f"{1e3 * latency:.0f}" for told, latency in found["latencies"] if told is has_map))
     print(f"journal         {size:.2f} GB, lag {cell.health.get('journal_lag_s')} s, lost "
           f"{cell.health.get('journal_lost')}; its map is "
           + ("the live one, bit for bit" if equal else "ANOTHER than the live one"))

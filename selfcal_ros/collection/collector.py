@@ -20,7 +20,7 @@ from selfcal_ros.collection.messages import Command, Detection, EncoderSample, c
 from selfcal_ros.collection.reasons import Reason
 from selfcal_ros.collection.reduce import DETECTION, Rules
 from selfcal_ros.collection.settings.nodes import CollectorSettings
-from selfcal_ros.collection.stage.encoder import JointTrack, TrackLimits
+from selfcal_ros.collection.stage.encoder import NEVER, JointTrack, TrackLimits
 from selfcal_ros.collection.stage.exposures import Exposures, Tracks
 from selfcal_ros.collection.stage.samples import Limits
 from selfcal_ros.collection.timeline import Timeline, build_timeline
@@ -240,6 +240,11 @@ class Collector:
     def newest_command(self) -> Command | None:
         """The command with the latest stamp, of equal ones that which came last."""
         return max(reversed(self._commands), key=lambda c: c.stamp_ns, default=None)
+
+    @property
+    def encoder_until_ns(self) -> int:
+        """Stamp up to which samples of all joints that have any have come, as far as is known."""
+        return min((track.store.newest_ns for track in self.tracks if len(track)), default=NEVER)
 
     @property
     def storage_problem(self) -> str:

@@ -24,14 +24,16 @@ from selfcal_ros.sessions.receiving.journal_keeper import JournalKeeper
 from selfcal_ros.sessions.receiving.reception import Reception
 
 TICK_S = 0.04
-"""Time between two looks at what has come: much longer would be seen in the latency of a map."""
+"""Time between two looks at what has come."""
+SOON_S, SOON_TICKS = 0.002, 50
+"""The same while the last exposure of a view waits for the samples behind it, and how often."""
 
 
 class MeasurementCollector(PollingNode[CollectorSettings]):
     """Feeds a `CollectingSession`; publishes ViewStatus and ViewMeasurement.
 
     A tick takes the messages that have come as bytes, writes them to the journal, decodes them
-    together, and gives them to the session.
+    together, and gives them to the session. A detection that may complete a view makes one at once.
     """
 
     session = WhileConfigured[CollectingSession]()
@@ -40,6 +42,7 @@ class MeasurementCollector(PollingNode[CollectorSettings]):
     _inputs = WhileConfigured[dict[str, ByTheClock]]()
 
     def __init__(self, **kwargs: Any) -> None:
+        self._looks = 0  # since the last detection that may have completed a view
         super().__init__(CollectorSettings, **kwargs)
 
     def configure(self) -> None:
@@ -58,8 +61,8 @@ class MeasurementCollector(PollingNode[CollectorSettings]):
                          "measurement": self.output(names.MEASUREMENT)}
         self._received = self.publisher(names.private(names.RECEIVED))
         self._inputs = {names.ENCODER.name: ByTheClock(names.ENCODER.name, self._reception.encoder),
-                        names.DETECTIONS.name: ByTheClock(names.DETECTIONS.name,
-                                                          self._reception.detection)}
+                        names.DETECTIONS.name: ByTheClock(
+                            names.DETECTIONS.name, self._reception.detection, self._on_detection)}
         self.alone_on += [names.STATUS.name, names.ENCODER.name]
 
     def _journal_folder(self) -> str:
@@ -76,6 +79,8 @@ class MeasurementCollector(PollingNode[CollectorSettings]):
         self.subscribe_with_age(names.COMMAND, self._reception.command, raw=True)
         EncoderInput(self, inputs[names.ENCODER.name], raw=True)
         self.every(TICK_S, self._on_timer)
+        self._soon = self.every(SOON_S, self._on_soon)
+        self._soon.cancel()
         self.service(Trigger, "~/finish", lambda request: self._finish())
         self.own(self, MeasurementCollector._drain)  # undone first: what has come is taken
 
@@ -86,6 +91,18 @@ class MeasurementCollector(PollingNode[CollectorSettings]):
         self._drain()
         if not self._reception.restoring:
             self.session.tick()
+
+    def _on_detection(self) -> None:
+        """Look at once where a view may be complete, and then until it is, or was not."""
+        if self._reception.may_end:
+            self._looks = 0
+            self._soon.reset()
+
+    def _on_soon(self) -> None:
+        self._on_timer()
+        self._looks += 1
+        if self._looks >= SOON_TICKS or not self._reception.may_end:
+            self._soon.cancel()
 
     def _drain(self) -> None:
         """Take what has come and tell the counts, so that a player can keep pace."""

@@ -4,7 +4,7 @@
 import inspect
 import time
 from collections.abc import Callable, Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from rclpy.subscription import Subscription
 
@@ -34,31 +34,42 @@ class ByTheClock:
         Name under which losses are counted.
     take : callable (data, received_ns)
         Takes a message.
+    wake : callable, optional
+        Called when a message has come; without it executors leave the subscription alone.
     """
 
-    __signature__ = inspect.signature(lambda message: None)
+    __signature__ = inspect.signature(lambda message, info: None)  # rclpy counts them
 
-    def __init__(self, topic: str, take: Callable[[bytes, int], None]) -> None:
-        self.topic, self.take = topic, take
+    def __init__(self, topic: str, take: Callable[[bytes, int], None],
+                 wake: Callable[[], None] | None = None) -> None:
+        self.topic, self.take, self.wake = topic, take, wake
+        self._numbers: list[int | None] = []  # of what was taken since the last look for gaps
         self._last: int | None = None
         self._before: int | None = None  # the last number of the subscription before this one
         self._n_publishers = 0
 
-    def __call__(self, message: bytes) -> None:
+    def __call__(self, *received: Any) -> None:
         """Take a message from an executor."""
-        self.take(message, time.time_ns())
+        # the events executor of rclpy 7.1 passes message and info as one pair
+        self._take(*(received[0] if len(received) == 1 else received))
+        if self.wake is not None:
+            self.wake()
 
     def empty(self, subscription: Subscription, most: int) -> Missing:
         """Take what waits, up to `most`; return how many numbers of publication were left out."""
-        numbers = []
+        is_empty = False
         for _ in range(most):
             taken = subscription.handle.take_message(subscription.msg_type, True)
             if taken is None:
+                is_empty = True
                 break
-            data, info = taken
-            numbers.append(info["publication_sequence_number"])
-            self.take(data, info["received_timestamp"] or time.time_ns())
-        return self._missing(numbers, subscription.get_publisher_count(), len(numbers) < most)
+            self._take(*taken)
+        numbers, self._numbers = self._numbers, []
+        return self._missing(numbers, subscription.get_publisher_count(), is_empty)
+
+    def _take(self, data: bytes, info: dict[str, int]) -> None:
+        self._numbers.append(info["publication_sequence_number"])
+        self.take(data, info["received_timestamp"] or time.time_ns())
 
     def _missing(self, numbers: list[int | None], n_publishers: int, is_empty: bool) -> Missing:
         """Return what the numbers leave out, if they are of one publisher.
@@ -86,16 +97,19 @@ class ByTheClock:
 
 
 class PollingNode[S: ManagedSettings](ManagedNode[S]):
-    """A managed node whose subscriptions with `ByTheClock` are left to `poll` by executors."""
+    """A managed node whose subscriptions with `ByTheClock` are left to `poll` by executors.
+
+    Those that wake the node are looked after by both.
+    """
 
     @property
     def subscriptions(self) -> Iterator[Subscription]:
         """The subscriptions that an executor looks after."""
         return (item for item in super().subscriptions
-                if not isinstance(item.callback, ByTheClock))
+                if not isinstance(item.callback, ByTheClock) or item.callback.wake)
 
     def poll(self) -> None:
-        """Take what has come on the other subscriptions, and count what was lost on the way."""
+        """Take what has come on those subscriptions, and count what was lost on the way."""
         for item in [*super().subscriptions]:
             if isinstance(item.callback, ByTheClock):
                 self._empty(item, item.callback, MOST)

@@ -43,7 +43,7 @@ class CollectingSession:
         self.collector = Collector(settings)
         self._dirty, self._next_status, self._rested = False, 0.0, 0.0
         self._needed, self._unseen = 0, 0  # readings of the open view, detections since its status
-        self._encoder_ns = self._exposed_ns = 0  # newest stamps
+        self._exposed_ns = 0  # newest exposure
         self._since_ns = 0  # beginning of the open view
         self._costs: deque[float] = deque(maxlen=1000)
         self._published: dict[int, str] = {}
@@ -70,8 +70,7 @@ class CollectingSession:
         self.collector.add_encoder_block(block.stamps_ns, block.names, block.positions,
                                          block.velocities)
         self._encoder_rate.add(block.stamps_ns)
-        newest = self._note_clock(ENCODER_TOPIC, block.stamps_ns, age_ns)
-        self._encoder_ns = max(self._encoder_ns, newest)
+        self._note_clock(ENCODER_TOPIC, block.stamps_ns, age_ns)
         self._dirty = True
 
     def take_detections(self, table: np.ndarray, age_ns: int = 0) -> None:
@@ -133,8 +132,8 @@ class CollectingSession:
     def tick(self) -> None:
         """Publish how far the views are, if something has come and it is time for it."""
         now = self._ports.now_s()
-        if not self._dirty or not (now >= self._next_status or (
-                now >= self._rested and self._may_complete())):
+        early = now < self._next_status
+        if not self._dirty or (early and not (now >= self._rested and self._may_complete())):
             return
         self._dirty, self._unseen = False, 0
         try:
@@ -151,12 +150,17 @@ class CollectingSession:
         self._describe(measurements, progress)
         spent = self._ports.now_s() - now
         self._costs.append(spent)
-        self._rested = now + 5 * spent
+        if early and self._needed:  # in vain: some of what came was no reading
+            self._rested = now + 5 * spent
         self._next_status = now + max(self.settings.status_period, 5 * spent)
+
+    def expects_end(self, more: int = 0) -> bool:
+        """Return whether the detections that came and `more` may complete the view."""
+        return 0 < self._needed <= self._unseen + more
 
     def _may_complete(self) -> bool:
         """Return whether enough has come to complete the view that is measured."""
-        return 0 < self._needed <= self._unseen and self._encoder_ns > self._exposed_ns
+        return self.expects_end() and self.collector.encoder_until_ns > self._exposed_ns
 
     def finish(self) -> str:
         """Publish every view as it is and return the digest of all readings."""

@@ -18,7 +18,7 @@ from selfcal_ros.bagio.reader import BagReader
 from selfcal_ros.collection.digest import readings_digest, session_digest
 from selfcal_ros.collection.messages import Command, Detection, Phase
 from selfcal_ros.messages import from_model, to_model
-from selfcal_ros.nodes import names
+from selfcal_ros.nodes import measurement_collector, names
 from selfcal_ros.nodes.filling import fill
 from selfcal_ros.nodes.measurement_collector import MeasurementCollector
 from test.support.plans import plan_of
@@ -114,6 +114,23 @@ def test_the_status_counts_marks_and_rejections_while_the_view_is_open(graph):
         "duplicate": 1, "unknown_mark": 1}
     assert last.detections_used == 32
     assert not last.complete
+
+
+def test_the_last_detection_of_a_view_is_not_left_to_the_clock(graph, monkeypatch):
+    monkeypatch.setattr(measurement_collector, "TICK_S", 3600.0)
+    monkeypatch.setattr(measurement_collector, "SOON_TICKS", 10**9)
+    events = events_of(small_plan("0", repeats=1))
+    commands = [index for index, event in enumerate(events) if isinstance(event, Command)]
+    node = graph.node(MeasurementCollector, status_period=60.0)
+    measured, status = graph.listen(names.MEASUREMENT), graph.listen(names.STATUS)
+    publish_events(graph, [events[index] for index in commands[:2]])
+    graph.until(lambda: len(node._reception._waiting) == 2, "the commands")
+    node._on_timer()
+    publish_events(graph, [event for event in events[:commands[2]] if event.stamp_ns
+                           > events[commands[1]].stamp_ns])
+    graph.until(lambda: measured and status and status[-1].complete, "the view")
+    graph.until(lambda: node._soon.is_canceled(), "rest")
+    assert node._looks < 10**6
 
 
 def test_finish_without_a_command_says_what_is_missing(graph):
@@ -305,13 +322,13 @@ def test_the_health_names_the_stage(graph, given, told):
     assert heard[-1].hardware_id == told
 
 
-def losses(graph) -> list:
-    """Return a list that fills with what the collector's health tells of lost samples."""
+def losses(graph, topic: str = names.ENCODER.name) -> list:
+    """Return a list that fills with what the collector's health tells of lost messages."""
     told: list = []
     graph.hand.create_subscription(
         DiagnosticStatus, "measurement_collector/health", lambda status: told.extend(
             (int(value.value), status.level, status.message) for value in status.values
-            if value.key == "lost stage/joint_states"), names.HEALTH.qos)
+            if value.key == f"lost {topic}"), names.HEALTH.qos)
     return told
 
 
@@ -331,6 +348,20 @@ def test_messages_that_were_overwritten_before_they_were_taken_are_counted(graph
     assert lost > 0
     assert level == DiagnosticStatus.WARN
     assert message.startswith(f"stage/joint_states: {lost} messages lost")
+
+
+def test_detections_that_were_overwritten_are_counted_too(graph):
+    node = graph.node(MeasurementCollector)
+    told, depth = losses(graph, names.DETECTIONS.name), names.DETECTIONS.qos.depth
+    detections = graph.publisher(names.DETECTIONS)
+    detections.publish(MarkDetection())
+    graph.until(lambda: node.session.collector.received["detection"] == 1, "the first")
+    for _ in range(depth + 700):  # nobody spins meanwhile
+        detections.publish(MarkDetection())
+    graph.until(lambda: told, "the loss")
+    graph.until(lambda: node.session.collector.received["detection"]
+                == 1 + depth + 700 - told[-1][0], "the others")
+    assert told[-1][0] > 0
 
 
 def test_the_numbers_of_two_publishers_that_interleave_are_no_loss(graph):

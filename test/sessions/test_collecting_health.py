@@ -234,6 +234,59 @@ def test_a_view_is_told_complete_at_once_whatever_the_period(missing, told):
     assert len(desk.hands.of("measurement")) == told
 
 
+def closing(**parameters) -> tuple[Desk, list, list]:
+    """Return a desk that waits for the last mark of a view, that detection, and what is behind."""
+    desk, events = Desk(status_period=60.0, **parameters), first_view()
+    last = max(event.stamp_ns for event in events if isinstance(event, Detection))
+    desk.hands.costs = 0.01
+    desk.feed([event for event in events if event.stamp_ns < last])
+    desk.session.tick()  # because of the command, whatever the period
+    return (desk, [event for event in events if event.stamp_ns == last],
+            [event for event in events if event.stamp_ns > last])
+
+
+def test_a_complete_view_does_not_wait_because_the_last_status_was_dear():
+    desk, detection, behind = closing()
+    desk.feed([*detection, *behind])
+    desk.hands.seconds = desk.session._next_status - 59.999  # as good as now
+    desk.session.tick()
+    assert complete(desk)
+
+
+def test_early_looks_in_vain_take_a_sixth_of_the_time_at_most():
+    desk, [detection], behind = closing()
+    wrong = [replace(detection, k=77, stamp_ns=detection.stamp_ns + number) for number in range(3)]
+    desk.feed([*wrong[:1], *behind])
+    desk.session.tick()
+    began = desk.hands.seconds - desk.hands.costs
+    assert len(desk.hands.of("status")) == 2
+    for after_s, told in ((0.0499, 2), (0.0501, 3)):
+        desk.session.take_detections(detection_table(wrong.pop()))
+        desk.hands.seconds = began + after_s
+        desk.session.tick()
+        assert len(desk.hands.of("status")) == told
+
+
+def test_joints_that_tell_their_samples_apart_are_waited_for():
+    desk, detection, behind = closing()
+    block = encoder_block(behind[0])
+    assert block.names == ("x", "y", "theta")
+    desk.feed(detection)
+    for column, name in enumerate(block.names):
+        assert not complete(desk)
+        assert len(desk.hands.of("status")) == 1
+        desk.session.take_encoder(replace(block, names=(name,), velocities=None,
+                                          positions=block.positions[:, column:column + 1]))
+        desk.session.tick()
+    assert complete(desk)
+
+
+@pytest.mark.parametrize("more, expected", [(0, False), (1, True)])
+def test_detections_that_are_not_decoded_yet_are_reckoned_with(more, expected):
+    desk, _, _ = closing()
+    assert desk.session.expects_end(more) is expected
+
+
 def test_the_health_tells_what_a_status_costs():
     desk = Desk(status_period=0.02)
     assert desk.told().values["status_ms"] == desk.told().values["status_ms_max"] == "0.0"

@@ -48,6 +48,8 @@ class SampleStore:
 
     Attributes
     ----------
+    newest_ns : int
+        Largest stamp of the samples that came in blocks.
     problem : str
         Why blocks stay in memory that should not; empty while the file can be written.
     """
@@ -62,7 +64,7 @@ class SampleStore:
         self._count, self._end = 0, 0
         self._file: io.FileIO | None = None
         self._read: tuple[_Block, Samples] | None = None  # the block read last
-        self.problem = ""
+        self.newest_ns, self.problem = int(np.iinfo(np.int64).min), ""
 
     def __len__(self) -> int:
         """Return the number of samples."""
@@ -97,6 +99,7 @@ class SampleStore:
             t = stamps[part]
             self._rising &= bool(t[0] >= self._last_ns and (t[1:] >= t[:-1]).all())
             self._last_ns = max(self._last_ns, int(t[-1]))
+            self.newest_ns = max(self.newest_ns, int(t.max()))
             self._parts.append((t, positions[part], speeds[part]))
             self._unseen.append(t)
             self._filled += len(t)

@@ -40,6 +40,7 @@ class Reception:
                  refuse: Callable[[str, Exception], None]) -> None:
         self.session, self.journal, self._say, self._refuse = session, journal, say, refuse
         self._waiting: list[tuple[str, bytes, int, bool]] = []
+        self._n_detections = 0  # that wait
         self._held: list[tuple[str, bytes, int, bool]] = []
         self._restoring: Future[TakenUp] | None = None
         self._source = ""  # the journal that is taken up
@@ -59,6 +60,11 @@ class Reception:
         """Whether a journal is still being read."""
         return self._restoring is not None
 
+    @property
+    def may_end(self) -> bool:
+        """Whether what has come, what waits included, may complete the view that is measured."""
+        return not self.restoring and self.session.expects_end(self._n_detections)
+
     def encoder(self, data: bytes, received_ns: int) -> None:
         """Take a sensor_msgs/JointState as received."""
         self._waiting.append((ENCODER_TOPIC, data, received_ns, False))
@@ -66,6 +72,7 @@ class Reception:
     def detection(self, data: bytes, received_ns: int) -> None:
         """Take a selfcal_msgs/MarkDetection as received."""
         self._waiting.append((DETECTION_TOPIC, data, received_ns, False))
+        self._n_detections += 1
 
     def command(self, data: bytes, is_older: bool) -> None:
         """Take a selfcal_msgs/ViewCommand as received; `is_older` than this node's listening."""
@@ -76,7 +83,7 @@ class Reception:
 
         While a journal is being taken up, what comes meanwhile is written and held back.
         """
-        adopted, waiting, self._waiting = False, self._waiting, []
+        adopted, waiting, self._waiting, self._n_detections = False, self._waiting, [], 0
         for topic, data, received_ns, _ in waiting:
             self.journal.write(topic, data, received_ns)
         try:
