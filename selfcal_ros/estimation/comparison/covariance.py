@@ -182,21 +182,30 @@ def _read_system(result: CalibrationResult) -> NormalEquations:
     artifact = result.artifact
     grid, lines = [], []
     for index, v in enumerate(result.views):
+        in_grid, of_grid = _is_read(v.read_grid), f"view '{v.name}', read.grid"
         pose = View(v.name, v.rotation, (v.translation_x, v.translation_y),
-                    bool(np.any(v.read_grid))).lattice_pose(artifact)
+                    in_grid).lattice_pose(artifact)
         field = np.ones(artifact.angular_count)
         weight = _weights(v.read_angular, field, f"view '{v.name}', read.angular")
         if weight.any():
             lines.append((index, pose.s, weight))
-        if np.any(v.read_grid):
+        if in_grid:
             field = GridSystem((pose,), np.zeros((1, *artifact.shape))).views.in_field[0]
-            grid.append((index, pose, _weights(v.read_grid, field, f"view '{v.name}', read.grid")))
+            grid.append((index, pose, _weights(v.read_grid, field, of_grid)))
     angular = np.array([weight for *_, weight in lines]).reshape(len(lines),
                                                                 artifact.angular_count)
     return NormalEquations(
         GridSystem(tuple(at for _, at, _ in grid), np.array([weight for *_, weight in grid])),
         AngularSystem(tuple(turn for _, turn, _ in lines), angular),
         tuple(index for index, *_ in grid), tuple(index for index, *_ in lines))
+
+
+def _is_read(kept: Any) -> bool:
+    """Tell if any weight is not zero; what is no number is, and is refused with the weights."""
+    try:
+        return bool(np.any(np.array(kept, dtype=float)))
+    except (TypeError, ValueError):
+        return True
 
 
 def _weights(kept: Any, field: np.ndarray, where: str) -> np.ndarray:
