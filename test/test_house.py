@@ -6,9 +6,8 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parents[1]
-PACKAGE = ROOT / "selfcal_ros"
-SOURCES = sorted(PACKAGE.rglob("*.py"))
+from test.support.sources import PACKAGE, SOURCES, source
+
 BASE = {"errors", "files", "units"}
 DOMAIN = {"model"} | BASE
 ESTIMATION = {"estimation", "compensation", "laser"}
@@ -36,10 +35,10 @@ ONLY_IN = {
 def imports(path: Path) -> set[str]:
     """Return the dotted names that a module imports, wherever in the file."""
     found = set()
-    for node in ast.walk(ast.parse(path.read_text())):
+    for node in (*source(path).imports, *source(path).late):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.ImportFrom):
+        else:
             assert node.level == 0, f"{path}: relative import"
             found.add(node.module)
             found |= {f"{node.module}.{alias.name}" for alias in node.names}
@@ -63,18 +62,16 @@ def test_imports_follow_the_layers(path):
 
 @pytest.mark.parametrize("path", SOURCES, ids=lambda p: str(p.relative_to(PACKAGE)))
 def test_files_and_functions_keep_their_room(path):
-    text = path.read_text()
+    text = source(path).text
     limit = 200 if layer_of(path) == "nodes" else 400
     assert len(text.splitlines()) <= limit
     assert text.startswith("# SPDX-License-Identifier: Apache-2.0\n")
-    for node in ast.walk(ast.parse(text)):
-        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
-            body = node.end_lineno - node.body[0].lineno
-            assert body <= 60, f"{path.name}:{node.lineno} {node.name} has {body} lines"
+    for line, name, body in source(path).functions:
+        assert body <= 60, f"{path.name}:{line} {name} has {body} lines"
 
 
 def test_no_stub_is_left():
     words = ("TO" + "DO", "FIX" + "ME", "NotImplemented" + "Error", "XX" + "X")
     for path in SOURCES:
         for word in words:
-            assert word not in path.read_text(), f"{path}: {word}"
+            assert word not in source(path).text, f"{path}: {word}"

@@ -2,13 +2,13 @@
 """The graph of imports: no circles, arrows downwards, imports in functions with a reason."""
 
 import ast
+from functools import cache
 from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parents[1]
-PACKAGE = ROOT / "selfcal_ros"
-SOURCES = sorted(PACKAGE.rglob("*.py"))
+from test.support.sources import PACKAGE, ROOT, SOURCES, source
+
 ESTIMATION = ("options", "blas_threads", "lattice", "multifrontal", "normal", "datum", "terms",
               "observability", "joint", "law", "verdict", "api", "quality", "comparison")
 """The parts of estimation/: each imports only those before it."""
@@ -31,17 +31,20 @@ NAMES = {dotted(path) for path in SOURCES}
 def imports(path: Path) -> set[str]:
     """Return the modules of this package that a module names in its imports, wherever."""
     found = set()
-    for node in ast.walk(ast.parse(path.read_text())):
+    for node in (*source(path).imports, *source(path).late):
         if isinstance(node, ast.ImportFrom):
             for alias in node.names:
                 inner = f"{node.module}.{alias.name}"
                 found.add(inner if inner in NAMES else node.module)
-        elif isinstance(node, ast.Import):
+        else:
             found |= {alias.name for alias in node.names}
     return found & NAMES
 
 
-GRAPH = {dotted(path): imports(path) - {dotted(path)} for path in SOURCES}
+@cache
+def graph() -> dict[str, set[str]]:
+    """Return the modules that each module imports."""
+    return {dotted(path): imports(path) - {dotted(path)} for path in SOURCES}
 
 
 def circle_in(graph: dict[str, set[str]]) -> list[str]:
@@ -71,18 +74,18 @@ def test_a_circle_would_be_found():
 
 
 def test_no_module_imports_itself_through_others():
-    assert circle_in(GRAPH) == []
+    assert circle_in(graph()) == []
 
 
 def part_of(module: str) -> str:
     return module.split(".")[2]
 
 
-@pytest.mark.parametrize("module", sorted(m for m in GRAPH if m.startswith(
+@pytest.mark.parametrize("module", sorted(m for m in NAMES if m.startswith(
     "selfcal_ros.estimation.")))
 def test_the_parts_of_estimation_import_only_those_before_them(module):
     place = ESTIMATION.index(part_of(module))
-    for other in GRAPH[module]:
+    for other in graph()[module]:
         if other.startswith("selfcal_ros.estimation."):
             assert ESTIMATION.index(part_of(other)) <= place, f"{module} -> {other}"
 
@@ -101,9 +104,7 @@ def test_imports_in_functions_state_their_reason(path):
     """Verbs import late, so that ``selfcal --help`` does not load numpy: cli/ need not say so."""
     if path.relative_to(PACKAGE).parts[0] == "cli":
         return
-    text = path.read_text()
-    lines, tree = text.splitlines(), ast.parse(text)
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Import | ast.ImportFrom) and node not in tree.body:
-            line = lines[node.lineno - 1]
-            assert "  # " in line, f"{dotted(path)}:{node.lineno}: say why it is not at the top"
+    lines = source(path).text.splitlines()
+    for node in source(path).late:
+        line = lines[node.lineno - 1]
+        assert "  # " in line, f"{dotted(path)}:{node.lineno}: say why it is not at the top"
