@@ -4,7 +4,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import norm
+from scipy.special import ndtr
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.blas_threads import one_thread
@@ -226,6 +226,6 @@ def compare_with_laser(result: CalibrationResult, laser: dict,
         u_laser = parts.get(f"u_{name}")
         u = float(np.hypot(u_of_map, np.nan if u_laser is None else u_laser))
         gap = abs(float(parts[name]) - value)
-        p = 2 * float(norm.sf(gap / u)) if u > 0 else float("nan")
+        p = 2 * float(ndtr(-gap / u)) if u > 0 else float("nan")
         out.append(LaserDifference(name, value, float(parts[name]), u, p))
     return out

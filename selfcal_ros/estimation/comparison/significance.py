@@ -13,9 +13,7 @@ significant if either probability is below LEVEL / 2 (Bonferroni).
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2
-from scipy.stats import f as f_distribution
-from scipy.stats import t as student
+from scipy.special import chdtrc, fdtrc, stdtr, stdtrit
 
 LEVEL = 0.05
 """Probability that maps of one stage differ significantly, both tests together."""
@@ -108,8 +106,8 @@ def significance(values: np.ndarray, covariances: list[tuple[np.ndarray, bool]],
         square, dof, root = _mahalanobis(z, total[np.ix_(good, good)] / np.outer(scale, scale))
     else:
         square, dof, root = float(z @ z), float(max(len(z) - q.shape[1], 1)), None
-    p = float(f_distribution.sf(square / dof, dof, noise_dof) if noise_dof <= MANY_DOF
-              else chi2.sf(square, dof))
+    p = float(fdtrc(dof, noise_dof, square / dof) if noise_dof <= MANY_DOF
+              else chdtrc(dof, square))
     largest = float(abs(z).max())
     p_z, limit = _of_largest(largest, len(z), root, noise_dof)
     return Significance(square / dof, dof, p, correlated, largest, limit, p_z, noise_dof,
@@ -132,8 +130,8 @@ def _of_largest(largest: float, n: int, root: np.ndarray | None,
     in the far tail, where the bound is close.
     """
     dof = min(noise_dof, MANY_DOF)
-    bound = min(float(2 * n * student.sf(largest, dof)), 1.0)
-    limit = float(student.isf(LEVEL / 4 / n, dof))
+    bound = min(float(2 * n * stdtr(dof, -largest)), 1.0)
+    limit = -float(stdtrit(dof, LEVEL / 4 / n))
     if root is None:
         return bound, limit
     rng = np.random.default_rng(0)

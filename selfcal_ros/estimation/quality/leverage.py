@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import nnls
-from scipy.stats import f as f_distribution
+from scipy.special import fdtrc
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.joint.fit import JointFit, fit
@@ -103,7 +103,7 @@ class Residuals:
         if not np.isfinite(rest) or dof <= columns:
             return float("nan")
         noise = max(rest / (dof - columns), ROUNDING**2)
-        return float(f_distribution.sf(squares[at] / columns / noise, columns, dof - columns))
+        return float(fdtrc(columns, dof - columns, squares[at] / columns / noise))
 
 
 def _scaled(squares: np.ndarray, weight: np.ndarray, redundancy: np.ndarray) -> np.ndarray:

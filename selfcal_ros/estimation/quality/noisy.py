@@ -2,7 +2,7 @@
 """Views that are noisier than the others: by their own repeats, and by their residuals."""
 
 import numpy as np
-from scipy.stats import f as f_distribution
+from scipy.special import fdtrc
 
 from selfcal_ros.estimation.joint.noise import pooled
 from selfcal_ros.estimation.quality.leverage import ROUNDING, Residuals, view_noise
@@ -41,7 +41,7 @@ def by_repeats(measurements: Measurements) -> dict[str, float]:
         others, rest = pooled((s, d) for i, (_, s, d) in enumerate(views) if i != index)
         if not rest or not others > ROUNDING:
             continue
-        p = float(f_distribution.sf((sigma / others) ** 2, dof, rest)) * len(views)
+        p = float(fdtrc(dof, rest, (sigma / others) ** 2)) * len(views)
         if p < LEVEL and sigma > NOISY_REPEATS * others:
             out[name] = float(sigma / others)
     return out

@@ -14,7 +14,7 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri, gammaincinv
 
 from selfcal_ros.errors import InputError, NotIdentifiableError
 from selfcal_ros.estimation.api import calibrate
@@ -222,7 +222,10 @@ def _split(at: _Screened, slip: Slip, linear: Options) -> tuple[_Screened, bool]
 def robust_sigma(squares: np.ndarray, dof: int) -> float:
     """Return the noise whose chi^2 has the median of the standardised squares; NaN if none."""
     known = squares[np.isfinite(squares)]
-    return float(np.sqrt(np.median(known) / chi2.median(dof))) if len(known) else float("nan")
+    if not len(known):
+        return float("nan")
+    median = 2 * gammaincinv(dof / 2, 0.5)  # of chi^2
+    return float(np.sqrt(np.median(known) / median))
 
 
 def _reject(measurements: Measurements, options: Options, residuals: Residuals
@@ -259,7 +262,7 @@ def _worst(residuals: Residuals, measurements: Measurements) -> dict[Key, Remove
     taken: dict[tuple[str, int], float] = {}
     # in the order of ratios rounded, so that ties have the order of the readings
     order = np.argsort(-np.round(ratio.ravel(), 6), kind="stable")
-    floor = max(chi2.isf(_level(residuals), 2), NEAR_LARGEST * float(ratio.max()))
+    floor = max(chdtri(2, _level(residuals)), NEAR_LARGEST * float(ratio.max()))
     for at in order[:int((ratio > floor).sum())]:
         v, i, j = np.unravel_index(at, ratio.shape)
         nodes = (("mark", int(i * ratio.shape[2] + j)),
@@ -284,7 +287,7 @@ def _worst_theta(residuals: Residuals, measurements: Measurements) -> dict[Key, 
         return {}
     ratio = _ratio(squares, robust_sigma(squares, 1))
     v, k = np.unravel_index(int(np.argmax(ratio)), ratio.shape)
-    if ratio[v, k] <= chi2.isf(_level(residuals), 1):
+    if ratio[v, k] <= chdtri(1, _level(residuals)):
         return {}
     index = residuals.problem.angular.index[v]
     return {(index, "angular", (int(k),)): Removed(

@@ -9,7 +9,7 @@ and variance, and with these a scaled chi^2 (Satterthwaite), or F, as the noise 
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import f as f_distribution
+from scipy.special import fdtri
 
 from selfcal_ros.estimation.joint.model_fit import ModelFit, equations_of
 from selfcal_ros.estimation.lattice.maps import LatticeViews
@@ -41,7 +41,7 @@ class PredictionLimit:
     def ratio(self, noise_dof: float) -> float:
         """Return the ratio of error to noise that is exceeded with the probability LEVEL."""
         dof = min(noise_dof, 1e9)
-        return float(np.sqrt(self.mean * f_distribution.isf(LEVEL, self.dof, dof)))
+        return float(np.sqrt(self.mean * fdtri(self.dof, dof, 1 - LEVEL)))
 
 
 def prediction_limit(model: ModelFit, held: HeldReadings, known: np.ndarray,

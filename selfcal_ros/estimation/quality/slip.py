@@ -9,7 +9,7 @@ squares that it explains, from the projection of its three columns on the residu
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from selfcal_ros.errors import NotIdentifiableError
 from selfcal_ros.estimation.joint.fit import JointFit, fit
@@ -122,7 +122,7 @@ def find_slip(residuals: Residuals, sigma_m: float, measurements: Measurements,
         for axis in (0, 1):
             for place in _places(grid.read[v], axis):
                 gain = _explained(residuals, clipped, v, axis, place)
-                if gain is not None and gain / sigma_m**2 >= chi2.isf(SLIP_LEVEL, 3):
+                if gain is not None and gain / sigma_m**2 >= chdtri(3, SLIP_LEVEL):
                     found.append(SlipPlace(measurements.views[i].view.name, i, "mn"[axis],
                                            int(place) - grid.views.half[axis],
                                            gain / sigma_m**2))
@@ -150,7 +150,7 @@ def _best(found: list[SlipPlace], measurements: Measurements, options: Options) 
     slip, squares, size = fits[order[0]]
     # the loss counts residuals, which are smaller than the noise by the part that the fit follows
     dof_part = 1 - _followed(measurements, slip, options)
-    near = losses[order[0]] + AMBIGUOUS * float(np.median(squares)) / chi2.median(2) / dof_part
+    near = losses[order[0]] + AMBIGUOUS * float(np.median(squares)) / chdtri(2, 0.5) / dof_part
     others = tuple(f"before {fits[i][0].axis} = {fits[i][0].first}" + (
         "" if fits[i][0].view == slip.view else f" in view '{fits[i][0].view}'")
         for i in order[1:] if losses[i] < near)

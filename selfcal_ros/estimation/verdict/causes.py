@@ -11,7 +11,7 @@ given: the readings do not tell which it is.
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import f as f_distribution
+from scipy.special import fdtrc
 
 from selfcal_ros.estimation.joint.model_fit import ModelFit, equations_of, squares
 from selfcal_ros.estimation.terms.columns import Column, TermColumns, joined, term_columns
@@ -238,7 +238,7 @@ def _test(pool: Pool, taken: np.ndarray, group: Group) -> tuple[float, float] | 
     variance, dof = pool.left(taken | group.rows)
     if more <= 0 or dof <= 0 or not variance > FLOOR_M**2:
         return None
-    p = float(f_distribution.sf(gained / more / variance, more, dof))
+    p = float(fdtrc(more, dof, gained / more / variance))
     # all readings together, so that explanations compare: by what each leaves of the same squares
     whole, n = pool.everything
     rest = max(whole - after, FLOOR_M**2)

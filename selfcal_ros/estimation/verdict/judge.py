@@ -9,7 +9,7 @@ conditions where they are the datum. Of 397 clean simulated measurements two wer
 from dataclasses import replace
 
 import numpy as np
-from scipy.stats import f as f_distribution
+from scipy.special import fdtrc
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.blas_threads import one_thread
@@ -189,7 +189,7 @@ def _noisy_views(measurements: Measurements, model: ModelFit) -> list[Cause]:
         if not rest or not others > 0:
             continue
         ratio = sigma / others
-        p = float(f_distribution.sf(ratio**2, dof, rest)) * len(views)
+        p = float(fdtrc(dof, rest, ratio**2)) * len(views)
         if p < LEVEL and ratio > NOISY:
             out.append(noise_cause(name, ratio, ratio * np.sqrt((1 / dof + 1 / rest) / 2), p))
     return sorted(out, key=lambda cause: cause.p)
