@@ -6,7 +6,6 @@ import operator
 import os
 import subprocess
 import sys
-import time
 from functools import partial
 from pathlib import Path
 
@@ -15,6 +14,7 @@ from threadpoolctl import threadpool_info
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.parallel import WorkerDied, check_workers, cores, mapped, mapped_in_parts, outcomes
+from test.support.waiting import wait_until
 
 
 @pytest.mark.parametrize("workers", [1, 2])
@@ -85,10 +85,7 @@ def test_workers_end_with_a_process_that_is_killed():
         worker = Path("/proc", running.stdout.readline().strip(), "stat")
         assert is_alive(worker)
         running.kill()
-    deadline = time.monotonic() + 60
-    while time.monotonic() < deadline and is_alive(worker):
-        os.sched_yield()
-    assert not is_alive(worker)
+    wait_until(lambda: not is_alive(worker), "the end of the worker")
 
 
 @pytest.mark.parametrize(("workers", "known"), [(1, False), (2, True)])

@@ -5,7 +5,6 @@ import csv
 import html.parser
 import io
 import json
-import os
 import shutil
 import signal
 import subprocess
@@ -25,6 +24,7 @@ from selfcal_ros.cli.main import main
 from selfcal_ros.errors import InputError, NoDataError
 from test.support.bags import Foreign
 from test.support.sessions import events_of, small_plan
+from test.support.waiting import wait_until
 
 
 @pytest.fixture(scope="module")
@@ -122,8 +122,8 @@ def test_killed_in_the_middle_it_does_only_the_rest(tmp_path):
     command = [sys.executable, "-m", "selfcal_ros", "batch", str(bags), "-o", str(out),
                "--workers", "2"]
     with subprocess.Popen(command, stdout=subprocess.DEVNULL) as running:
-        while running.poll() is None and len(list((out / RECORDS).glob("*.json"))) < 3:
-            os.sched_yield()
+        wait_until(lambda: running.poll() is not None
+                   or len(list((out / RECORDS).glob("*.json"))) >= 3, "three records")
         running.send_signal(signal.SIGKILL)
     assert running.returncode == -signal.SIGKILL
     assert subprocess.run(command, capture_output=True, check=False).returncode == 0

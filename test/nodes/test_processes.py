@@ -14,8 +14,8 @@ from diagnostic_msgs.msg import DiagnosticArray
 
 from selfcal_ros.collection.settings.nodes import NODE_PARAMETERS
 from test.support.sessions import plan_file, small_bag, small_plan
+from test.support.waiting import PATIENCE_S, wait_until
 
-PATIENCE_S = 120.0
 SELFCAL = "import sys; from selfcal_ros.cli.main import main; sys.exit(main())"
 
 
@@ -63,9 +63,7 @@ def alive(session: int) -> bool:
 
 def ended(process: subprocess.Popen) -> tuple[int, str, str]:
     out, err = process.communicate(timeout=PATIENCE_S)
-    deadline = time.monotonic() + PATIENCE_S
-    while alive(process.pid):
-        assert time.monotonic() < deadline, "a child stays behind"
+    wait_until(lambda: not alive(process.pid), "the end of its children")
     return process.returncode, out, err
 
 

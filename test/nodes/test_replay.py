@@ -25,8 +25,8 @@ def solved(tmp_path_factory):
     return bag, undated((folder / "solved.json").read_text())
 
 
-@pytest.mark.parametrize("options", [["--fast"], ["--rate", "20"], ["--rate", "50"],
-                                     ["--fast", "--shuffle", "3"]], ids=" ".join)
+@pytest.mark.parametrize("options", [["--fast"], ["--rate", "50"], ["--fast", "--shuffle", "3"]],
+                         ids=" ".join)
 def test_replay_gives_the_result_of_solve_bit_for_bit(ros_environment, solved, tmp_path, options):
     bag, expected = solved
     output = tmp_path / "replayed.json"
@@ -34,14 +34,15 @@ def test_replay_gives_the_result_of_solve_bit_for_bit(ros_environment, solved, t
     assert undated(output.read_text()) == expected
 
 
-@pytest.mark.parametrize("cell", ["/", "cell2"])
-def test_one_of_two_cells_is_played(ros_environment, tmp_path, capfd, cell):
+@pytest.mark.parametrize(("cell", "without"), [("/", False), ("cell2", True)])
+def test_one_of_two_cells_is_played(ros_environment, tmp_path, capfd, cell, without):
     for name, plan in (("", "0, 90, tx"), ("/cell2", "0, 90, ty")):
         Foreign(namespace=name).write(tmp_path / "bag" / f"x{name.strip('/')}.mcap",
                                       events_of(small_plan(plan, repeats=1)))
     bag, replayed, solved = (str(tmp_path / name) for name in ("bag", "replayed", "solved"))
-    assert selfcal(["replay", bag, "--fast", "--quiet"]) == 2
-    assert "choose one with --namespace" in capfd.readouterr().err
+    if without:
+        assert selfcal(["replay", bag, "--fast", "--quiet"]) == 2
+        assert "choose one with --namespace" in capfd.readouterr().err
     for verb, output in ((["replay", "--fast"], replayed), (["solve"], solved)):
         assert selfcal([*verb, bag, "--namespace", cell, "--quiet", "-o", output]) == 0
     replayed, solved = ((tmp_path / name).read_text() for name in ("replayed", "solved"))

@@ -18,8 +18,8 @@ from selfcal_ros.cli import up as up_verb
 from selfcal_ros.cli.main import build_parser
 from selfcal_ros.cli.supervisor import MOST_RESTARTS, Supervisor
 from test.support.sessions import plan_file, small_plan
+from test.support.waiting import PATIENCE_S, wait_until
 
-PATIENCE_S = 120.0
 SELFCAL = "import sys; from selfcal_ros.cli.main import main; sys.exit(main())"
 
 
@@ -114,14 +114,14 @@ def test_a_killed_command_takes_its_nodes_along(start, tmp_path, number):
     up = start("up", "--plan", plan_file(tmp_path, small_plan()), "--journal",
                str(tmp_path / "journals"))
     up.until("now: Press s to start the plan.")
-    assert len(list((tmp_path / "journals").glob("journal_*/*.mcap"))) == 1
+    # the collector may come up after the sequencer, who has said so
+    wait_until(lambda: len(list((tmp_path / "journals").glob("journal_*/*.mcap"))) == 1,
+               "the collector's journal")
     session = up.process.pid
     up.process.send_signal(number)
     assert up.process.wait(PATIENCE_S) == (143 if number == signal.SIGTERM else -9)
-    deadline = time.monotonic() + PATIENCE_S
-    while subprocess.run(["ps", "-o", "pid=", "-s", str(session)], capture_output=True,
-                         check=False).stdout.split():
-        assert time.monotonic() < deadline, "a node stays behind"
+    wait_until(lambda: not subprocess.run(["ps", "-o", "pid=", "-s", str(session)], check=False,
+                                          capture_output=True).stdout.split(), "all nodes to end")
 
 
 @pytest.mark.parametrize(("words", "folder"), [
