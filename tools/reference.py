@@ -51,7 +51,8 @@ RESULT = {
     "verdict": "`qualified`, `sentence`, `reasons`, and `causes` (each name, text, size, u, unit, "
                "p), the most likely first",
     "model": "`misalignment` (rigid, linear) and `terms`: name, size (null = free), estimates "
-             "(view, component, value, u, unit)",
+             "(view, component, value, u, unit), "
+             "size_used (where the readings contradict the size)",
     "reference": "kind, relative_error, u_relative, certificate of a known length; null without",
     "provenance": "created (ISO 8601, UTC), duration_s, version, first_exposure, last_exposure, "
                   "visit_order of each view",

@@ -71,11 +71,16 @@ class TermEstimate:
 
 @dataclass(frozen=True)
 class TermResult:
-    """A term of the model with what was found: `size` is None where it was free."""
+    """A term of the model with what was found.
+
+    `size` is as it was given, None where the term was free; `size_used` the larger one of the
+    solution where the readings contradict that, else None.
+    """
 
     name: str
     size: float | None
     estimates: tuple[TermEstimate, ...] = ()
+    size_used: float | None = None
 
 
 @dataclass(frozen=True)

@@ -37,7 +37,8 @@ def model_to_dict(model: ModelResult) -> dict[str, Any]:
     """Return the JSON form of the model behind a map."""
     return {"misalignment": model.misalignment, "terms": [
         {"name": term.name, "size": term.size,
-         "estimates": [vars(estimate) for estimate in term.estimates]} for term in model.terms]}
+         "estimates": [vars(estimate) for estimate in term.estimates],
+         "size_used": term.size_used} for term in model.terms]}
 
 
 def model_from_dict(data: dict | None) -> ModelResult:
@@ -48,7 +49,9 @@ def model_from_dict(data: dict | None) -> ModelResult:
         TermResult(_text(term["name"]), None if term["size"] is None else _number(term["size"]),
                    tuple(TermEstimate(_text(e["view"]), _text(e["component"]), _number(e["value"]),
                                       _number(e["u"]), _text(e["unit"]))
-                         for e in term["estimates"])) for term in data["terms"]))
+                         for e in term["estimates"]),
+                   None if term.get("size_used") is None else _number(term["size_used"]))
+        for term in data["terms"]))
 
 
 def provenance_to_dict(provenance: Provenance) -> dict[str, Any]:

@@ -212,6 +212,13 @@ def grown(truth: Truth, rng: np.random.Generator) -> Truth:
     return replace(truth, plate_scale=scale)
 
 
+def scaled(size: float) -> Callable[[Truth, np.random.Generator], Truth]:
+    """Return a change: the plate is larger by its own amount in each view."""
+    def change(truth: Truth, rng: np.random.Generator) -> Truth:
+        return replace(truth, plate_scale=rng.normal(0, size, len(truth.phi_rad)))
+    return change
+
+
 def bent(size_m: float) -> Callable[[Truth, np.random.Generator], Truth]:
     """Return a change: the plate is bent as (x^2 - y^2, -2xy) by its own amount in each view."""
     def change(truth: Truth, rng: np.random.Generator) -> Truth:
@@ -256,6 +263,12 @@ def _with_terms() -> list[Case]:
     everything = replace(
         _MICROSCOPE, backlash_x_m=20e-9, backlash_y_m=20e-9, plate_scale=1e-6,
         drift_linear_m=100e-9, drift_quadratic_m=50e-9)
+    too_small = [case(f"size {factor} times too small: {name}", f"{term}:{size / factor:.3g}",
+                      change=change)
+                 for name, term, size, change in (
+                     ("plate scale 1 um/m in each view", "plate_scale", 1e-6, scaled(1e-6)),
+                     ("plate bent by 30 nm in each view", "plate_shape", 30e-9, bent(30e-9)))
+                 for factor in (3, 10)]
     return [case("microscope turned by 2 mrad, stop errors 20 um", "microscope",
                  spread=_MICROSCOPE, settings=stops),
             case("microscope scale 0.5 %, stop errors 20 um", "microscope", spread=_SCALE,
@@ -266,4 +279,5 @@ def _with_terms() -> list[Case]:
             case("plate bent in each view, 10 nm", "plate_shape:10e-9", change=bent(10e-9)),
             case("backlash 20 nm", "approach", spread=back),
             case("all of them", "microscope,drift,plate_scale,approach", spread=everything,
-                 settings=stops)]
+                 settings=stops),
+            *too_small]

@@ -25,6 +25,7 @@ from selfcal_ros.estimation.terms.projection import (
     reduce_anew,
     reduce_columns,
 )
+from selfcal_ros.estimation.terms.sizes import SizeTest, size_tests
 from selfcal_ros.estimation.terms.solution import Sums, next_coefficients, noise_left, score
 from selfcal_ros.model.terms import ModelTerm, TermName
 
@@ -71,6 +72,9 @@ class ModelFit:
         Deviations as the last linear step took them.
     reduced : ReducedColumns or None
         The terms' columns with the sites eliminated.
+    sizes : tuple of SizeTest
+        The test of every size. In place of one that the readings contradict the fit, and with it
+        every uncertainty, has the largest that they allow.
     """
 
     problem: Problem
@@ -80,6 +84,7 @@ class ModelFit:
     sums: Sums
     y: np.ndarray
     reduced: ReducedColumns | None = None
+    sizes: tuple[SizeTest, ...] = ()
 
     @property
     def covariance(self) -> np.ndarray:
@@ -102,6 +107,9 @@ def fit_model(problem: Problem,
               check: Callable[[TermEquations], None] = lambda equations: None) -> ModelFit:
     """Return the joint least-squares solution of the whole model.
 
+    A term's size that the readings rule out would bend the map with nothing to show it: the fit is
+    repeated with the largest size that they allow.
+
     Parameters
     ----------
     problem : Problem
@@ -114,6 +122,29 @@ def fit_model(problem: Problem,
     InputError
         If the rotations do not settle, or a term needs what the readings do not tell.
     """
+    model = _settled(problem, check)
+    sizes = _size_tests(model)
+    allowed = {test.name: test.allowed for test in sizes if test.contradicted}
+    if not allowed:
+        return replace(model, sizes=sizes)
+    terms = tuple(replace(term, size=allowed.get(term.name, term.size)) for term in problem.terms)
+    return replace(_settled(replace(problem, terms=terms), check), sizes=sizes)
+
+
+def _size_tests(model: ModelFit) -> tuple[SizeTest, ...]:
+    """Return the tests of all sizes; none without a noise to test them by."""
+    equations = model.equations
+    if equations is None or equations.free.all():
+        return ()
+    left = score(equations, model.found.residuals, squares(model.problem, model.found),
+                 coefficients=model.coefficients)
+    right = left.total + equations.information @ model.coefficients
+    noise = model.found.xy
+    return size_tests(equations, right, model.problem.terms, (noise.sigma, noise.dof))
+
+
+def _settled(problem: Problem, check: Callable[[TermEquations], None]) -> ModelFit:
+    """Return the solution for the sizes as they are; see `fit_model`."""
     found = fit(problem, problem.grid.y)
     state = _State(problem, found)
     if state.equations is not None:

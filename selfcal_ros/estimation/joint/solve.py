@@ -135,6 +135,7 @@ def term_results(model: ModelFit) -> tuple[TermResult, ...]:
     columns, covariance = model.equations.columns.columns, model.covariance
     told = np.abs(model.equations.untold(model.equations.free)).max(axis=1, initial=0.0) < 1e-6
     names = (*model.problem.ground.names, "")  # -1: shared by all views
+    given = {test.name: test.given for test in model.sizes if test.contradicted}
     out = []
     for term in model.problem.terms:
         estimates = tuple(
@@ -143,7 +144,9 @@ def term_results(model: ModelFit) -> tuple[TermResult, ...]:
                          float(np.sqrt(max(covariance[i, i], 0.0)) * model.found.xy.sigma)
                          if told[i] else float("nan"), c.unit)
             for i, c in enumerate(columns) if c.term == term.name)
-        out.append(TermResult(str(term.name), None if term.free else term.size, estimates))
+        size = None if term.free else term.size
+        out.append(TermResult(str(term.name), given.get(term.name, size), estimates,
+                              size if term.name in given else None))
     return tuple(out)
 
 

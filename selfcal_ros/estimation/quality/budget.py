@@ -150,11 +150,13 @@ def _term_part(result: CalibrationResult, name: str, variance: np.ndarray,
     """
     term = next(term for term in result.model.terms if term.name == name)
     u = np.array([estimate.u for estimate in term.estimates])
-    size = term.size or np.inf
+    size = term.size_used or term.size or np.inf
     left = float(np.sqrt(np.mean(u[np.isfinite(u)] ** 2))) / size
     told = left < TOLD
     known = variance[:, result.error_map.valid]
-    note = (f"known to {size:.3g} beforehand; the readings leave {left:.0%} of it")
+    how = (f"given as {term.size:.3g}, which the readings contradict; they allow {size:.3g} and "
+           if term.size_used else f"known to {size:.3g} beforehand; the readings ")
+    note = f"{how}leave {left:.0%} of it"
     return Component(f"term {name}", "A" if told else "B", float(np.sqrt(known.mean())),
                      float(np.sqrt(known.max())), dof if told else np.inf, note)
 

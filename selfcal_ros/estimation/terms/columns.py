@@ -12,7 +12,7 @@ width and s the signs of approach (reality of machines; docs/method.md, terms of
 """
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.special import eval_legendre
@@ -101,6 +101,12 @@ class TermColumns:
         """Return which columns belong to the terms `names`, bool (p,)."""
         wanted = set(names)
         return np.array([column.term in wanted for column in self.columns], dtype=bool)
+
+    def with_size(self, name: str, size: float) -> "TermColumns":
+        """Return the same columns with another size of the term `name`."""
+        return replace(self, columns=tuple(
+            replace(column, size=size) if column.term == name else column
+            for column in self.columns))
 
 
 Parts = list[tuple[str, Callable[[ViewVisits], np.ndarray]]]

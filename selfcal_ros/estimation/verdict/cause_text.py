@@ -2,16 +2,17 @@
 """Explanations as causes: their largest component with its uncertainty, and what to do about it."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
 import numpy as np
 from scipy.special import eval_legendre
 
+from selfcal_ros.estimation.terms.sizes import SizeTest
 from selfcal_ros.estimation.verdict.causes import Explanation
 from selfcal_ros.estimation.verdict.slip_columns import SLIP
 from selfcal_ros.model.terms import TermName
-from selfcal_ros.model.verdict import Cause
+from selfcal_ros.model.verdict import Cause, TermEstimate
 from selfcal_ros.units import MRAD_PER_RAD, PPM_PER_ONE, UM_PER_M, URAD_PER_RAD
 
 TIMES = np.linspace(-1, 1, 101)
@@ -43,6 +44,30 @@ def cause_of(found: Explanation, names: tuple[str, ...], half_width_m: float) ->
     """
     text, size, u, unit = _TEXTS[found.name](found, names, half_width_m)
     return Cause(found.name, text, size, u, unit, found.p)
+
+
+def size_cause(test: SizeTest, estimates: Iterable[TermEstimate]) -> Cause:
+    """Return the size of a term that the readings contradict as a cause.
+
+    Parameters
+    ----------
+    test : SizeTest
+        That failed.
+    estimates : iterable of TermEstimate
+        The term's coefficients without that size.
+    """
+    largest = max(estimates, key=lambda e: abs(e.value))
+    unit = _OF_SIZES.get(test.name, UM)
+    ratio = abs(largest.value) / test.given
+    times = f"{ratio:.3g}" if ratio < 1e3 else f"{ratio:.0f}"
+    text = (f"{test.name} up to {abs(largest.value) * unit.per_si:.3g} {unit.name}, "
+            f"{times} times the size given: give a larger size, as "
+            f"in --model {test.name}:{test.shown:.1e}, or leave it free")
+    return Cause(str(test.name), text, abs(largest.value), largest.u, largest.unit, test.p)
+
+
+_OF_SIZES = {TermName.MICROSCOPE: MRAD, TermName.PLATE_SCALE: RATIO}
+"""Unit in which a person reads the coefficients of a term; µm for the others."""
 
 
 def noise_cause(view: str, ratio: float, u: float, p: float) -> Cause:

@@ -59,6 +59,8 @@ def terms_section(result: CalibrationResult) -> Section:
     rows = []
     for term in result.model.terms:
         how = "free" if term.size is None else f"size {term.size:g}"
+        if term.size_used is not None:
+            how += f", contradicted: {term.size_used:.2g} used"
         for item in term.estimates:
             scale, unit = (UM_PER_M, "µm") if item.unit == "m" else (UM_PER_M, "µm/m")
             value, u = item.value * scale, item.u * scale

@@ -180,7 +180,8 @@ def test_the_matrix_of_a_microscope_is_found_within_its_uncertainty():
 
 
 def test_a_drift_that_looks_like_the_stage_is_refused_and_a_size_widens_u():
-    _, readings = measured(plan_of(order="raster", repeats=1), sigma_m=20e-9)
+    still = Spread(encoder="independent", rotation="finite")
+    _, readings = measured(plan_of(order="raster", repeats=1), still, sigma_m=20e-9)
     with pytest.raises(NotIdentifiableError) as caught:
         calibrate(readings, Options(terms=parse_terms(["drift"], ""), drift_degree=1))
     assert str(caught.value).startswith("the readings do not tell drift from the stage (2 modes "

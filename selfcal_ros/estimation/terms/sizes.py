@@ -1,0 +1,162 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Whether the readings agree with the sizes of terms that were given as known beforehand.
+
+The coefficients of a term, as they would be without their size, have b ~ N(0, C + size^2 1), with
+C their covariance (method eq. 7.9). Where that is contradicted, the readings show a size of their
+own: that at which b' (C + size^2 1)^-1 b is as large as its rank (Paule and Mandel 1982), and at
+most that at which it is as small as chance would rarely make it.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.special import chdtri, fdtrc
+
+from selfcal_ros.estimation.terms.equations import TermEquations
+from selfcal_ros.model.terms import ModelTerm, TermName
+
+SIZE_LEVEL = 5e-4
+"""Level of the test of each size."""
+
+BISECTIONS = 60
+"""Steps, on a logarithmic scale, in which a size is found to rounding."""
+
+TAIL = (1 - 0.9545) / 2
+"""Probability with which a statistic as small contradicts a size as too large."""
+
+MANY_DOF = 1e9
+"""Degrees of freedom that stand for infinitely many."""
+
+
+@dataclass(frozen=True)
+class SizeTest:
+    """The size of a term against what the readings tell of its coefficients.
+
+    Attributes
+    ----------
+    name : TermName
+        The term.
+    given : float
+        Its size, SI unit of the term.
+    shown, allowed : float
+        The size that the readings show, and the largest that they allow (of two limits with a
+        coverage of 95.45 %); that given where they do not contradict it.
+    statistic : float
+        b' (C + size^2 1)^-1 b; `rank` on average.
+    rank : int
+        Combinations of the coefficients that the readings tell.
+    p : float
+        Probability of as much or more if the size is right.
+    """
+
+    name: TermName
+    given: float
+    shown: float
+    allowed: float
+    statistic: float
+    rank: int
+    p: float
+
+    @property
+    def contradicted(self) -> bool:
+        """Whether the readings rule the size out as too small."""
+        return self.p < SIZE_LEVEL
+
+
+def size_test(equations: TermEquations, right: np.ndarray, term: ModelTerm,
+              noise: tuple[float, float]) -> SizeTest:
+    """Return the test of one size, the other terms held by theirs or free.
+
+    Parameters
+    ----------
+    equations : TermEquations
+        The columns of all terms.
+    right : float array (p,)
+        Inner products c' W y of all columns with the readings, no coefficient taken off.
+    term : ModelTerm
+        With a size.
+    noise : tuple of float
+        Noise of one grid reading, m, and its degrees of freedom.
+    """
+    sigma, dof = noise
+    values, variance, of_size = _told(equations, right, equations.rows([term.name]), sigma)
+    rank = len(values)
+
+    def statistic(size: float) -> float:
+        return float(values @ np.linalg.solve(np.diag(variance) + size**2 * of_size, values))
+
+    if not rank:
+        return SizeTest(term.name, term.size, term.size, term.size, 0.0, 0, 1.0)
+    found = statistic(term.size)
+    p = float(fdtrc(rank, min(dof, MANY_DOF), found / rank))
+    test = SizeTest(term.name, term.size, term.size, term.size, found, rank, p)
+    if not test.contradicted:
+        return test
+    # b'b / (size^2 the smallest eigenvalue) is not below it
+    beyond = np.sqrt(values @ values / np.linalg.eigvalsh(of_size)[0])
+
+    def size_at(level: float) -> float:
+        low, high = term.size, float(beyond / np.sqrt(level))
+        for _ in range(BISECTIONS):
+            middle = float(np.sqrt(low * high))
+            low, high = (middle, high) if statistic(middle) > level else (low, middle)
+        return high
+
+    least = float(chdtri(rank, 1 - TAIL))
+    return replace(test, shown=size_at(rank), allowed=size_at(least))
+
+
+def _told(equations: TermEquations, right: np.ndarray, rows: np.ndarray, sigma_m: float
+          ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return what the readings tell of coefficients that count as free.
+
+    Their told combinations, scaled by the columns' norms, (r,), the variances of these by the
+    noise, (r,), and their covariance for coefficients of unit variance, (r, r).
+    """
+    rest = ~rows
+    prior = np.where(rest & ~equations.free, sigma_m / equations.columns.size, 0.0)
+    norm = np.hypot(equations.norm, prior)
+    scaled = equations.information / np.outer(norm, norm) + np.diag((prior / norm) ** 2)
+    hidden = equations.untold(equations.free & rest)[rest]
+    held = np.linalg.pinv(scaled[np.ix_(rest, rest)] + hidden @ hidden.T, hermitian=True,
+                          rcond=1e-14) - hidden @ hidden.T
+    couple, scores = scaled[np.ix_(rows, rest)] @ held, right / norm
+    told_by = scaled[np.ix_(rows, rows)] - couple @ scaled[np.ix_(rest, rows)]
+    size, vectors = np.linalg.eigh((told_by + told_by.T) / 2)
+    told = size > equations.limit(rows)
+    vectors, size = vectors[:, told], size[told]
+    values = vectors.T @ (scores[rows] - couple @ scores[rest]) / size
+    turned = vectors * norm[rows][:, None]
+    return values, sigma_m**2 / size, turned.T @ turned
+
+
+def size_tests(equations: TermEquations, right: np.ndarray, terms: Sequence[ModelTerm],
+               noise: tuple[float, float]) -> tuple[SizeTest, ...]:
+    """Return the tests of all sizes, those that the readings contradict first, the worst first.
+
+    Each is judged beside those before it with the sizes that the readings allow, so that one term
+    does not make others appear too small.
+
+    Parameters
+    ----------
+    equations, right, noise
+        As in `size_test`.
+    terms : sequence of ModelTerm
+        All terms.
+    """
+    found: list[SizeTest] = []
+    left = [term for term in terms if not term.free]
+    if not np.isfinite(noise[0]):
+        return ()
+    while left:
+        tests = [size_test(equations, right, term, noise) for term in left]
+        failed = [test for test in tests if test.contradicted]
+        if not failed:
+            return (*found, *tests)
+        worst = max(failed, key=lambda test: test.statistic - test.rank)
+        found.append(worst)
+        left = [term for term in left if term.name != worst.name]
+        equations = replace(equations, columns=equations.columns.with_size(
+            worst.name, worst.allowed))
+    return tuple(found)

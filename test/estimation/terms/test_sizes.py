@@ -1,0 +1,156 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A size that the readings contradict is told, and does not bend the map in silence."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from selfcal_ros.estimation.api import calibrate
+from selfcal_ros.estimation.joint.model_fit import fit_model
+from selfcal_ros.estimation.joint.solve import prepare
+from selfcal_ros.estimation.options import Options
+from selfcal_ros.estimation.quality.budget import budgets
+from selfcal_ros.model.result import result_from_dict, result_to_dict
+from selfcal_ros.model.terms import parse_terms
+from selfcal_ros.simulation.machine import Spread, random_truth
+from selfcal_ros.simulation.truth import simulate_measurements
+from test.estimation.terms.test_terms import dense, plan_of, settings
+
+CLEAN = Spread(encoder="independent", rotation="finite", phi_rad=1e-4)
+SIZES = {"microscope": 1e-3, "drift": 50e-9, "plate_scale": 1e-6, "plate_shape": 30e-9,
+         "approach": 20e-9}
+
+
+def of_sizes(truth, rng, sizes):
+    """Return a truth whose terms are drawn from their sizes, every view's own."""
+    views = len(truth.phi_rad)
+    of = {name: sizes.get(name, 0.0) for name in SIZES}
+    p1, p2, p3 = np.moveaxis(rng.normal(0, of["drift"], (views, 2, 3)), 2, 0)
+    # Legendre polynomials of 2 tau - 1, less what is constant
+    drift = np.stack([2 * p1 - 6 * p2 + 12 * p3, 6 * p2 - 30 * p3, 20 * p3], axis=2)
+    return replace(
+        truth, drift_m=drift, plate_scale=rng.normal(0, of["plate_scale"], views),
+        plate_shape_m=rng.normal(0, of["plate_shape"], (views, 2, 3)) * [1, 2, 1],
+        backlash_m=rng.normal(0, of["approach"], 2),
+        microscope=rng.normal(0, of["microscope"], (2, 2)))
+
+
+def measured(seed, sizes, *, sigma_m=20e-9, phi_rad=1e-4):
+    rng, plan = np.random.default_rng(seed), plan_of(5, 2)
+    truth = random_truth(plan.artifact, len(plan.views), rng, replace(CLEAN, phi_rad=phi_rad))
+    truth = of_sizes(truth, rng, sizes)
+    return truth, simulate_measurements(truth, plan, rng, settings=settings(sigma_m), visits=True)
+
+
+def options(*terms, **more):
+    return Options(terms=parse_terms(terms, ""), **more)
+
+
+def fitted(readings, wanted):
+    return fit_model(prepare(readings, wanted)[0])
+
+
+def test_sizes_that_are_right_are_contradicted_at_the_rate_of_the_level():
+    p = []
+    for seed in range(16):
+        _, readings = measured(seed, SIZES)
+        sizes = fitted(readings, options(*(f"{n}:{s}" for n, s in SIZES.items()))).sizes
+        assert {test.name for test in sizes} == set(SIZES)
+        assert [test.rank for test in sorted(sizes, key=lambda t: t.name)] == [2, 30, 4, 4, 23]
+        p += [test.p for test in sizes]
+    p = np.array(p)
+    assert p.min() > 5e-4
+    # 8 of 80 expected at 10 %, 40 at 50 %: four and a half standard deviations
+    assert 1 <= (p < 0.1).sum() <= 20
+    assert 20 <= (p < 0.5).sum() <= 60
+
+
+@pytest.mark.parametrize("name", SIZES)
+@pytest.mark.parametrize("factor", [10, 100])
+def test_a_size_that_is_too_small_is_told_and_the_one_shown_is_right(name, factor):
+    sizes = {name: 4 * SIZES[name]}
+    _, readings = measured(3, sizes)
+    (test,) = fitted(readings, options(f"{name}:{sizes[name] / factor}")).sizes
+    assert test.contradicted
+    # of two to thirty coefficients
+    assert sizes[name] / 3 < test.shown < 3 * sizes[name]
+    assert test.given == pytest.approx(sizes[name] / factor)
+    assert test.shown < test.allowed
+
+
+def test_the_statistic_is_what_the_size_adds_to_the_sum_of_squares():
+    _, readings = measured(5, SIZES, phi_rad=1e-6)
+    wanted = options("plate_scale:4e-7", "plate_shape:3e-8", "approach:2e-8", "drift",
+                     misalignment_model="linear")
+    model = fitted(readings, wanted)
+    rows, values, weights = dense(readings, model)
+    columns = model.equations.columns.columns
+    base, sigma = rows.shape[1] - len(columns), model.found.xy.sigma
+    tests = {test.name: test for test in model.sizes}
+    assert not any(test.contradicted for test in model.sizes)
+
+    def squares(without=""):
+        held = [(k, c.size) for k, c in enumerate(columns)
+                if np.isfinite(c.size) and c.term != without]
+        prior = np.zeros((len(held), rows.shape[1]))
+        for row, (k, size) in enumerate(held):
+            prior[row, base + k] = 1 / size
+        left = np.vstack([rows * (weights / sigma)[:, None], prior])
+        right = np.concatenate([values * weights / sigma, np.zeros(len(held))])
+        norm = np.linalg.norm(left, axis=0)
+        found = np.linalg.lstsq(left / norm, right, rcond=1e-10)[0]
+        return float(((left / norm) @ found - right) @ ((left / norm) @ found - right))
+
+    for name in ("plate_scale", "plate_shape", "approach"):
+        assert tests[name].statistic == pytest.approx(squares() - squares(name), rel=1e-5), name
+
+
+@pytest.mark.parametrize(("term", "unit"), [
+    ("plate_scale:1e-8", "µm/m"), ("plate_shape:1e-9", "µm"), ("drift:1e-9", "µm"),
+    ("microscope:1e-6", "mrad"), ("approach:1e-10", "µm")])
+def test_a_calibration_with_a_contradicted_size_is_not_qualified_and_its_u_is_honest(term, unit):
+    name, _, given = term.partition(":")
+    truth, readings = measured(4, {name: 5 * SIZES[name]})
+    result = calibrate(readings, options(term))
+    verdict, cause = result.verdict, result.verdict.causes[0]
+    assert not verdict.qualified
+    assert cause.name == name and cause.p < 5e-4
+    assert cause.text.startswith(f"{name} up to ")
+    assert f" {unit}, " in cause.text
+    assert "times the size given: give a larger size, as in --model " in cause.text
+    assert verdict.reasons[0].startswith(f"the readings show {name} up to ")
+    assert verdict.sentence.startswith(f"Not qualified: most likely {name} up to ")
+    estimates = result.model.terms[0].estimates
+    assert cause.size == max(abs(e.value) for e in estimates) > 100 * float(given)
+    error = np.stack([result.error_map.gx, result.error_map.gy]) - truth.g
+    u = np.stack([result.error_map.u_gx, result.error_map.u_gy])
+    assert np.sqrt(np.mean((error / u) ** 2)) < 1.5
+
+
+def test_a_size_that_is_too_small_is_kept_beside_the_one_that_was_used():
+    _, readings = measured(4, {"plate_scale": 5e-6})
+    result = calibrate(readings, options("plate_scale:1e-8"))
+    (term,) = result.model.terms
+    assert term.size == 1e-8 and 1e-6 < term.size_used < 1e-4
+    back = result_from_dict(result_to_dict(result), "r.json")
+    assert back.model == result.model
+    line = next(c for c in budgets(result)[0].components if c.label == "term plate_scale")
+    assert line.note.startswith("given as 1e-08, which the readings contradict; they allow ")
+    right = calibrate(readings, options("plate_scale:5e-6"))
+    assert right.model.terms[0].size_used is None
+    assert right.verdict.qualified
+
+
+def test_one_wrong_size_does_not_make_another_appear_wrong():
+    _, readings = measured(6, {**SIZES, "plate_scale": 1e-4, "plate_shape": 10e-9})
+    wanted = options("plate_scale:1e-8", "plate_shape:1e-8", "approach:2e-8")
+    sizes = fitted(readings, wanted).sizes
+    assert [(t.name, t.contradicted) for t in sizes] == [
+        ("plate_scale", True), ("plate_shape", False), ("approach", False)]
+
+
+def test_readings_without_noise_contradict_a_size_as_well():
+    _, readings = measured(7, {"plate_scale": 1e-6}, sigma_m=0.0)
+    (test,) = fitted(readings, options("plate_scale:1e-8")).sizes
+    assert test.contradicted and 3e-7 < test.shown < 3e-6
