@@ -60,8 +60,10 @@ def test_every_replaced_pin_is_one_of_the_environment():
 
 @pytest.mark.parametrize("library", TOO_NEW)
 def test_no_name_is_newer_than_the_floor(library):
+    words = re.compile(rf"\b(?:{'|'.join(TOO_NEW[library])})\b")
     for path in CODE:
-        for node in ast.walk(ast.parse(path.read_text())):
+        text = path.read_text()
+        for node in ast.walk(ast.parse(text)) if words.search(text) else ():
             used = ({node.attr} if isinstance(node, ast.Attribute) else
                     {alias.name for alias in node.names} if isinstance(node, ast.ImportFrom)
                     else set())

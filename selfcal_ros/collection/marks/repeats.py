@@ -14,6 +14,7 @@ of a sensor which resolves no finer, and a few steps are no outlier.
 """
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -170,6 +171,7 @@ def _sensor_step(groups: list[np.ndarray], values: np.ndarray, floor: float) -> 
     return float(spread.min()) if whole.sum() >= max(3, 0.75 * len(steps)) else 0.0
 
 
+@lru_cache(64)
 def _pairs(count: int) -> tuple[np.ndarray, np.ndarray]:
     """Return pairs of `count` repeats: all, or of many repeats each with 16 others, evenly."""
     if count <= ALL_PAIRS:
