@@ -175,34 +175,46 @@ class BagReader:
         return McapStream(file, lost=self.lost, wanted=lambda topic: bool(_roles(topic)))
 
     def _all(self) -> Iterator[tuple[McapStream, Channel, Message]]:
+        for stream, block in self._streams():
+            for message in block.messages():
+                yield stream, stream.channels[message.channel_id], message
+
+    def _streams(self) -> Iterator[tuple[McapStream, Block]]:
+        """Yield the blocks of all files; one that cannot be read costs itself if another can."""
+        refused: list[InputError] = []
         for file in self.files:
             stream = self._stream(file)
-            for channel, message in stream.messages():
-                yield stream, channel, message
+            try:
+                for block in stream.blocks():
+                    yield stream, block
+            except InputError as error:
+                refused.append(error)
+                self.lost.append(f"the file {file.name} was not read: {error.what}")
+            for channel in stream.channels.values():
+                schema = stream.schemas.get(channel.schema_id)
+                self.topics[channel.topic] = schema.name if schema else ""
+        if len(refused) == len(self.files):
+            raise refused[0]
 
     def _blocks(self, bad: Counter,
                 ) -> Iterator[tuple[Block, list[tuple[ChannelDecoder, np.ndarray]]]]:
         """Yield each block with the indices of its messages on our topics, by channel."""
         watches = {role: StepWatch(self.clock_limit_s) for role in (ENCODER_TOPIC, DETECTION_TOPIC)}
-        for file in self.files:
-            stream = self._stream(file)
-            decoders: dict[int, ChannelDecoder | None] = {}
-            for block in stream.blocks():
-                parts = []
-                for number in block.channels():
-                    if number not in decoders:
-                        decoders[number] = self._decoder(stream, stream.channels[number], bad)
-                    decoder = decoders[number]
-                    if decoder is not None:
-                        parts.append((decoder, np.flatnonzero(block.fronts["channel"] == number)))
-                for decoder, index in parts:
-                    if decoder.role in watches:
-                        self._note_steps(watches[decoder.role], decoder.role, block[
-                            index[::max(1, len(index) // LOOKED_AT)]])
-                yield block, parts
-            for channel in stream.channels.values():
-                schema = stream.schemas.get(channel.schema_id)
-                self.topics[channel.topic] = schema.name if schema else ""
+        decoders: dict[tuple[Path, int], ChannelDecoder | None] = {}
+        for stream, block in self._streams():
+            parts = []
+            for number in block.channels():
+                key = (stream.path, number)
+                if key not in decoders:
+                    decoders[key] = self._decoder(stream, stream.channels[number], bad)
+                decoder = decoders[key]
+                if decoder is not None:
+                    parts.append((decoder, np.flatnonzero(block.fronts["channel"] == number)))
+            for decoder, index in parts:
+                if decoder.role in watches:
+                    self._note_steps(watches[decoder.role], decoder.role, block[
+                        index[::max(1, len(index) // LOOKED_AT)]])
+            yield block, parts
 
     def _note_steps(self, watch: StepWatch, role: str, block: Block) -> None:
         stamps, there = first_stamps_ns(block.payloads)

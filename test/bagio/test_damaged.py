@@ -168,3 +168,22 @@ def test_what_is_no_bag_is_refused(tmp_path):
         file.write_bytes(content)
         with pytest.raises(InputError, match=message):
             read(file)
+
+
+@pytest.mark.parametrize("how", ["messages", "columns", "cdr_messages"])
+@pytest.mark.parametrize("place", [0, 1])
+def test_a_file_of_a_bag_that_is_no_mcap_file_costs_itself(tmp_path, how, place):
+    (tmp_path / f"b_{place}.mcap").write_bytes(bytes(5000))
+    (tmp_path / f"b_{1 - place}.mcap").write_bytes(DATA)
+    reader, whole = BagReader(tmp_path), BagReader(SOURCE)
+    assert [topic for topic, *_ in getattr(reader, how)()] == [
+        topic for topic, *_ in getattr(whole, how)()]
+    assert reader.lost == [f"the file b_{place}.mcap was not read: not an MCAP file"]
+    assert reader.topics == whole.topics
+
+
+def test_a_bag_none_of_whose_files_is_an_mcap_file_is_refused(tmp_path):
+    for number, content in enumerate((bytes(100), b"")):
+        (tmp_path / f"b_{number}.mcap").write_bytes(content)
+    with pytest.raises(InputError, match=r"b_0\.mcap: not an MCAP file; give an \.mcap file"):
+        read(tmp_path)

@@ -35,7 +35,7 @@ class TakenUp:
 
 
 def take_up(files: list[Path], settings: CollectorSettings) -> TakenUp:
-    """Return a collector with what the files of a journal hold.
+    """Return a collector with what the files of a journal hold; a file that cannot be read is lost.
 
     Parameters
     ----------
@@ -43,15 +43,27 @@ def take_up(files: list[Path], settings: CollectorSettings) -> TakenUp:
         Its MCAP files.
     settings : CollectorSettings
         Values of the collector's parameters.
+
+    Raises
+    ------
+    InputError
+        If none of them can be read.
     """
     collector = Collector(settings)
     lost: list[str] = []
+    refused: list[InputError] = []
     feed = block_handlers(collector, lost)
     for file in files:
-        reader = BagReader(file)
-        for topic, item in reader.columns():
-            feed[topic](item)
-        lost += reader.lost
+        try:
+            reader = BagReader(file)
+            for topic, item in reader.columns():
+                feed[topic](item)
+            lost += reader.lost
+        except InputError as error:
+            refused.append(error)
+            lost.append(f"the file {file.name} was not read: {error.what}")
+    if len(refused) == len(files):
+        raise refused[0]
     return TakenUp(collector, tuple(lost))
 
 

@@ -66,7 +66,10 @@ class AtOnce:
 
     def submit(self, work, *arguments):
         future = Future()
-        future.set_result(work(*arguments))
+        try:
+            future.set_result(work(*arguments))
+        except InputError as error:
+            future.set_exception(error)
         return future
 
 
@@ -417,3 +420,40 @@ def test_a_journal_that_could_not_be_read_is_not_written_to(tmp_path, events, mo
     assert second.keeper.path not in (None, first.keeper.path)
     assert sum(second.session.collector.received.values()) == 20
     assert [len(list(path.glob("*.mcap"))) for path in sorted(tmp_path.iterdir())] == [1, 1]
+
+
+def two_files(folder, events, spoil):
+    """Leave a journal of two files, one of which is spoiled at its head; return its folder."""
+    for part in (events[:50], events[50:120]):
+        desk = Desk(folder).receive(part)
+        desk.reception.drain()
+        desk.keeper.close()
+    path = first_path(folder)
+    file = sorted(path.glob("*.mcap"))[spoil]
+    file.write_bytes(bytes(len(file.read_bytes())))  # as a power cut leaves it
+    return path, file
+
+
+@pytest.mark.parametrize(("spoil", "n_read"), [(0, 70), (1, 50)])
+def test_a_file_of_a_journal_that_cannot_be_read_costs_itself(
+        tmp_path, events, monkeypatch, spoil, n_read):
+    path, file = two_files(tmp_path, events, spoil)
+    desk = Desk(tmp_path)
+    desk.receive(events[120:130]).reception.drain()
+    assert sum(desk.session.collector.received.values()) == n_read + 10
+    assert not desk.refused
+    assert desk.hands.lines(Level.WARN) == [
+        f"{path}: the file {file.name} was not read: not an MCAP file"]
+    desk.keeper.close()
+    assert [len(list(path.glob("*.mcap")))] == [3]
+
+
+def test_a_journal_none_of_whose_files_can_be_read_is_refused(tmp_path, events):
+    path, file = two_files(tmp_path, events, 0)
+    for other in path.glob("*.mcap"):
+        other.write_bytes(bytes(100))
+    desk = Desk(tmp_path)
+    desk.receive(events[120:130]).reception.drain()
+    assert sum(desk.session.collector.received.values()) == 10
+    assert desk.refused == {f"journal: {file}: not an MCAP file; give an .mcap file or a rosbag2 "
+                            "folder": 1}
