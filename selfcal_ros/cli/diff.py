@@ -1,12 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
 """``selfcal diff``: two calibrations, or a calibration and a laser measurement, compared."""
 
+from __future__ import annotations
+
 import argparse
 import json
 import math
+from typing import TYPE_CHECKING, Any
 
 from selfcal_ros.cli.terminal.progress import busy
 from selfcal_ros.units import ARCSEC_PER_RAD, UM_PER_M, URAD_PER_RAD
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from selfcal_ros.estimation.comparison.maps import LaserDifference, MapDifference
+    from selfcal_ros.estimation.comparison.significance import Significance
 
 HELP = "compare two results after taking out the datum difference"
 
@@ -45,7 +54,7 @@ def run(args: argparse.Namespace) -> int:
     return int(ExitCode.DONE)
 
 
-def _json(found) -> dict:
+def _json(found: MapDifference) -> dict[str, Any]:
     from dataclasses import asdict
 
     from selfcal_ros.model.result import plain
@@ -65,7 +74,7 @@ def _json(found) -> dict:
         "dx": found.dx, "dy": found.dy, "d_theta": found.d_theta})
 
 
-def _text(found) -> str:
+def _text(found: MapDifference) -> str:
     tx, ty = found.translation_m
     lines = ["B less A, datum difference taken out: translation "
              f"({tx * UM_PER_M:+.4g}, {ty * UM_PER_M:+.4g}) um, "
@@ -85,7 +94,7 @@ def _text(found) -> str:
     return "\n".join([*lines, _verdict_text(found)])
 
 
-def _test_text(test) -> list[str]:
+def _test_text(test: Significance | None) -> list[str]:
     """Return both tests of a difference, one line each."""
     if test is None:
         return ["       no uncertainties to test against"]
@@ -96,7 +105,7 @@ def _test_text(test) -> list[str]:
             f"p = {test.p_z:.2g}"]
 
 
-def _verdict_text(found) -> str:
+def _verdict_text(found: MapDifference) -> str:
     tests = {"XY": found.xy, "theta": found.theta}
     if found.significant is None:
         return "verdict: none, as there are no uncertainties to test against"
@@ -106,7 +115,7 @@ def _verdict_text(found) -> str:
     return "verdict: not significant, the maps agree within their uncertainties"
 
 
-def _laser_json(rows) -> dict:
+def _laser_json(rows: Sequence[LaserDifference]) -> dict[str, Any]:
     from selfcal_ros.model.result import plain
 
     return plain({row.name: {"map": row.of_map, "laser": row.of_laser,
@@ -114,7 +123,7 @@ def _laser_json(rows) -> dict:
                   for row in rows})
 
 
-def _laser_text(rows) -> str:
+def _laser_text(rows: Sequence[LaserDifference]) -> str:
     lines = ["first-order parts, map and laser:"]
     for row in rows:
         test = "" if math.isnan(row.u) else f"  u {row.u * ARCSEC_PER_RAD:.4g}, p = {row.p:.2g}"

@@ -1,9 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """``selfcal plan``: judge a plan before anything moves, and suggest views."""
 
+from __future__ import annotations
+
 import argparse
 import json
 import math
+from typing import TYPE_CHECKING, Any
 
 from selfcal_ros.cli.plan_terms import (
     add_term_options,
@@ -15,6 +18,18 @@ from selfcal_ros.cli.plan_terms import (
 )
 from selfcal_ros.cli.terminal.progress import busy, late_progress
 from selfcal_ros.units import UM_PER_M
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from selfcal_ros.estimation.observability.prediction import Prediction
+    from selfcal_ros.estimation.observability.resistance import TermCheck
+    from selfcal_ros.estimation.observability.suggest import Against, Score, Suggestion
+    from selfcal_ros.estimation.terms.planned import Assumed
+    from selfcal_ros.model.artifact import Artifact
+    from selfcal_ros.model.result import Observability
+    from selfcal_ros.model.terms import ModelTerm, TermName
+    from selfcal_ros.model.view import Plan, View
 
 HELP = "check a plan of views before it is measured, or suggest views"
 
@@ -59,14 +74,16 @@ def run(args: argparse.Namespace) -> int:
     return _check(args, plan) if args.plan_verb == "check" else _suggest(args, plan)
 
 
-def _check(args: argparse.Namespace, plan) -> int:
+def _check(args: argparse.Namespace, plan: Plan) -> int:
     from selfcal_ros.errors import ExitCode
     from selfcal_ros.estimation.observability.plan_check import check_plan, predict_plan
     from selfcal_ros.model.error_map import ThetaDatum
 
     assumed, sizes, model = assumed_of(args), sizes_of(args), model_of(args, plan)
     plan = _repeated(plan, args.repeats)
-    alone, joint, checks = None, None, ()
+    alone: Prediction | None = None
+    joint: Prediction | None = None
+    checks: Sequence[TermCheck] = ()
     with busy("judging the plan"):
         seen = check_plan(plan).observability
         if seen.identifiable:
@@ -91,12 +108,12 @@ def _check(args: argparse.Namespace, plan) -> int:
             lines += [f"  XY with {', '.join(map(str, model))}: rms {joint.rms_xy:.4f}   "
                       f"largest {joint.max_xy:.4f}"]
         lines += terms_text(plan, checks, assumed) if checks else []
-        lines += _map_text(alone) if args.map and seen.identifiable else []
+        lines += _map_text(alone) if args.map and alone and seen.identifiable else []
         print("\n".join(lines))
     return int(ExitCode.DONE if seen.identifiable else ExitCode.NOT_IDENTIFIABLE)
 
 
-def _repeated(plan, repeats: int | None):
+def _repeated(plan: Plan, repeats: int | None) -> Plan:
     from dataclasses import replace
 
     from selfcal_ros.errors import InputError
@@ -108,7 +125,9 @@ def _repeated(plan, repeats: int | None):
     return replace(plan, views=tuple(replace(view, repeats=repeats) for view in plan.views))
 
 
-def _judge(plan, model, assumed, sizes: dict, without: tuple) -> tuple:
+def _judge(plan: Plan, model: tuple[ModelTerm, ...], assumed: Assumed,
+           sizes: dict[TermName, float], without: tuple[Observability, Prediction],
+           ) -> tuple[Observability, Prediction | None, Sequence[TermCheck]]:
     """Return what the plan tells with its terms, the prediction with them, and their checks.
 
     `without`: observability and prediction without terms.
@@ -122,7 +141,8 @@ def _judge(plan, model, assumed, sizes: dict, without: tuple) -> tuple:
     return seen, joint, check_terms(terms, sizes, LEVEL)
 
 
-def _check_json(plan, seen, predicted, *, maps: bool) -> dict:
+def _check_json(plan: Plan, seen: Observability, predicted: Prediction | None, *,
+                maps: bool) -> dict[str, Any]:
     from selfcal_ros.model.result import plain
 
     out = {"plan_id": plan.plan_id, "rank": seen.rank, "unknowns": seen.unknowns,
@@ -138,12 +158,12 @@ def _check_json(plan, seen, predicted, *, maps: bool) -> dict:
     return out
 
 
-def _check_text(plan, seen, predicted) -> list[str]:
+def _check_text(plan: Plan, seen: Observability, predicted: Prediction | None) -> list[str]:
     artifact = plan.artifact
     lines = [f"plan {plan.plan_id}: {len(plan.views)} views of {artifact.shape[0]} x "
              f"{artifact.shape[1]} marks, {artifact.angular_count} angular lines",
              f"rank {seen.rank} of {seen.unknowns} unknowns, {seen.deficiency} unseen modes"]
-    if not seen.identifiable:
+    if predicted is None or not seen.identifiable:
         lines += ["the plan does not identify the stage; unseen are:"]
         lines += [f"  - {text}" for text in seen.modes]
         lines += ["it would, if you"] + [f"  - {text}" for text in seen.advice]
@@ -157,25 +177,25 @@ def _check_text(plan, seen, predicted) -> list[str]:
     return lines
 
 
-def _averaged_m(plan, assumed) -> float:
+def _averaged_m(plan: Plan, assumed: Assumed) -> float:
     """Return the noise of an averaged reading of the plan, m."""
     return assumed.sigma_m / min(view.repeats for view in plan.views) ** 0.5
 
 
-def _in_um(predicted, plan, assumed) -> str:
+def _in_um(predicted: Prediction, plan: Plan, assumed: Assumed) -> str:
     unit = _averaged_m(plan, assumed) * UM_PER_M
     return (f"  XY     rms {predicted.rms_xy * unit:.4f} um   largest "
             f"{predicted.max_xy * unit:.4f} um (k=1) for {assumed.sigma_m * UM_PER_M:.4g} um "
             "noise of one reading")
 
 
-def _map_text(predicted) -> list[str]:
+def _map_text(predicted: Prediction) -> list[str]:
     both = (predicted.ux**2 + predicted.uy**2) ** 0.5
     return ["sqrt(u_gx^2 + u_gy^2), one line for each y from the top, x to the right:",
             *(" ".join(f"{value:5.2f}" for value in row) for row in both.T[::-1])]
 
 
-def _suggest(args: argparse.Namespace, plan) -> int:
+def _suggest(args: argparse.Namespace, plan: Plan) -> int:
     from dataclasses import replace
 
     from selfcal_ros.errors import ExitCode, InputError
@@ -213,7 +233,7 @@ def _suggest(args: argparse.Namespace, plan) -> int:
     return int(ExitCode.DONE)
 
 
-def _in_order(plan, order: str):
+def _in_order(plan: Plan, order: str) -> Plan:
     """Return the plan with all grid marks visited in `order`, unless it is empty."""
     from dataclasses import replace
 
@@ -226,7 +246,7 @@ def _in_order(plan, order: str):
                                      for view in plan.views))
 
 
-def _against(args: argparse.Namespace, plan):
+def _against(args: argparse.Namespace, plan: Plan) -> Against | None:
     """Return the terms that count in the uncertainty: the plan's own and those of --against."""
     from selfcal_ros.estimation.observability.suggest import Against
     from selfcal_ros.model.terms import ModelTerm, TermName, parse_terms
@@ -237,13 +257,14 @@ def _against(args: argparse.Namespace, plan):
     return Against(tuple(found[n] for n in TermName if n in found), assumed) if found else None
 
 
-def _noise_m(plan, against) -> float | None:
+def _noise_m(plan: Plan, against: Against | None) -> float | None:
     """Return the noise of an averaged reading, m, where a plan is judged against terms."""
     return None if against is None else _averaged_m(plan, against.assumed)
 
 
-def _show_ranked(args: argparse.Namespace, plan, now: tuple, ranked: list) -> None:
-    """Print the next steps; `now`: score of the plan and the unit of an uncertainty, nm."""
+def _show_ranked(args: argparse.Namespace, plan: Plan, now: tuple[Score, float | None],
+                 ranked: Sequence[Suggestion]) -> None:
+    """Print the next steps; `now`: score of the plan and the noise of an averaged reading, m."""
     unit = now[1]
     if args.json:
         print(json.dumps({
@@ -259,7 +280,8 @@ def _show_ranked(args: argparse.Namespace, plan, now: tuple, ranked: list) -> No
         print(f"  {_score_text(item.score, unit)}   {item.text}")
 
 
-def _show_best(args: argparse.Namespace, best, score: tuple, how: str) -> None:
+def _show_best(args: argparse.Namespace, best: Plan, score: tuple[Score, float | None],
+               how: str) -> None:
     views = [view_to_dict(view, best.artifact) for view in best.views]
     if args.json:
         print(json.dumps({"plan_id": best.plan_id, "criterion": args.criterion, "views": views,
@@ -273,7 +295,7 @@ def _show_best(args: argparse.Namespace, best, score: tuple, how: str) -> None:
     print(_score_text(*score))
 
 
-def _score_json(score, noise_m: float | None) -> dict:
+def _score_json(score: Score, noise_m: float | None) -> dict[str, Any]:
     def number(value: float) -> float | None:
         return value if math.isfinite(value) else None
 
@@ -285,7 +307,7 @@ def _score_json(score, noise_m: float | None) -> dict:
     return out
 
 
-def _score_text(score, noise_m: float | None) -> str:
+def _score_text(score: Score, noise_m: float | None) -> str:
     if score.deficiency:
         return f"{score.deficiency} modes unseen"
     theta = f"  theta rms {score.rms_theta:.3f}" if score.rms_theta else ""
@@ -295,7 +317,7 @@ def _score_text(score, noise_m: float | None) -> str:
     return f"XY rms {score.rms_xy:.3f}  max {score.max_xy:.3f}{theta}"
 
 
-def view_to_dict(view, artifact) -> dict:
+def view_to_dict(view: View, artifact: Artifact) -> dict[str, Any]:
     """Return a view in the form of a PLAN.yaml."""
     a, b = view.lattice_pose(artifact).shift
     order = {"visit_order": view.visit_order} if view.visit_order else {}
@@ -304,7 +326,7 @@ def view_to_dict(view, artifact) -> dict:
             "repeats": view.repeats, **order}
 
 
-def _write_plan(path: str, plan) -> None:
+def _write_plan(path: str, plan: Plan) -> None:
     from selfcal_ros.files import write_yaml
 
     artifact = plan.artifact

@@ -1,12 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
 """``selfcal plan``: its options about the terms of the model, and what it prints of them."""
 
+from __future__ import annotations
+
 import argparse
 import math
 import re
+from typing import TYPE_CHECKING, Any
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.units import M_PER, MRAD_PER_RAD, UM_PER_M
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from selfcal_ros.estimation.observability.resistance import TermCheck
+    from selfcal_ros.estimation.terms.planned import Assumed
+    from selfcal_ros.model.terms import ModelTerm, TermName
+    from selfcal_ros.model.view import Plan
 
 SIGMA = "20e-9"
 STOP_ERROR = "10e-6"
@@ -50,7 +61,7 @@ def length_m(text: str, option: str) -> float:
     return value
 
 
-def assumed_of(args: argparse.Namespace):
+def assumed_of(args: argparse.Namespace) -> Assumed:
     """Return what the options say about the measurement to come.
 
     Raises
@@ -71,7 +82,7 @@ def assumed_of(args: argparse.Namespace):
                    length_m(args.stop_error, "--stop-error"), degree, order)
 
 
-def sizes_of(args: argparse.Namespace) -> dict:
+def sizes_of(args: argparse.Namespace) -> dict[TermName, float]:
     """Return the sizes that ``--against`` gives, by term.
 
     Raises
@@ -89,7 +100,7 @@ def sizes_of(args: argparse.Namespace) -> dict:
     return {term.name: term.size for term in terms}
 
 
-def model_of(args: argparse.Namespace, plan) -> tuple:
+def model_of(args: argparse.Namespace, plan: Plan) -> tuple[ModelTerm, ...]:
     """Return the terms of the model: the plan's, and those of ``--model`` in their place."""
     from selfcal_ros.model.terms import TermName, parse_terms
 
@@ -98,14 +109,14 @@ def model_of(args: argparse.Namespace, plan) -> tuple:
     return tuple(found[name] for name in TermName if name in found)
 
 
-def terms_json(checks) -> list[dict]:
+def terms_json(checks: Iterable[TermCheck]) -> list[dict[str, Any]]:
     """Return the checks of terms in the form of the contract."""
     return [{"name": str(c.name), "told": c.told, "unseen_modes": c.unseen_modes,
              "model": c.model, "size": c.size, "unit": c.unit, "effect_rms_m": c.effect_rms_m,
              "effect_max_m": c.effect_max_m, "power": c.power} for c in checks]
 
 
-def terms_text(plan, checks, assumed) -> list[str]:
+def terms_text(plan: Plan, checks: Iterable[TermCheck], assumed: Assumed) -> list[str]:
     """Return the checks of terms as a table, with what was assumed."""
     lines = ["terms: told from the stage or not; what a size that the model does not hold does to "
              "the map;", "how surely it would be noticed",
@@ -123,7 +134,7 @@ def _modes(number: int) -> str:
     return f"{number} unseen"
 
 
-def size_text(check) -> str:
+def size_text(check: TermCheck) -> str:
     """Return the size of a term in a person's unit."""
     from selfcal_ros.model.terms import TermName
 
@@ -134,7 +145,7 @@ def size_text(check) -> str:
     return f"{check.size * MRAD_PER_RAD:.6g} mrad"
 
 
-def _assumptions(plan, assumed) -> list[str]:
+def _assumptions(plan: Plan, assumed: Assumed) -> list[str]:
     from selfcal_ros.estimation.terms.planned import MISALIGNMENT_M, MISALIGNMENT_RAD
     from selfcal_ros.model.orders import DEFAULT_ORDER, parse_order
 

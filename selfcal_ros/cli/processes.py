@@ -10,8 +10,9 @@ import signal
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 from selfcal_ros.errors import InputError
 
@@ -29,7 +30,7 @@ def need_ros(alternative: str) -> None:
 
 
 @contextlib.contextmanager
-def process(module: str, arguments: list[str], environment: dict, **kwargs,
+def process(module: str, arguments: list[str], environment: dict, **kwargs: Any,
             ) -> Iterator[subprocess.Popen]:
     """Run a module as a process that is stopped, at worst killed, at the end of the block.
 
@@ -49,7 +50,7 @@ def process(module: str, arguments: list[str], environment: dict, **kwargs,
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _die_with_parent(parent: int):
+def _die_with_parent(parent: int) -> Callable[[], None] | None:
     """Return what a child does before it becomes the node: ask for SIGTERM when `parent` dies."""
     if not sys.platform.startswith("linux"):
         return None

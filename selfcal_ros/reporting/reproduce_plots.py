@@ -11,6 +11,7 @@ import matplotlib
 matplotlib.use("Agg")
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from selfcal_ros.files import write_bytes
@@ -88,7 +89,7 @@ def _programs(figure: Figure, found: QiaoReproduction) -> None:
     figure.suptitle("Qiao, Figure 3: truth (red) and least-squares answer (blue), times 5000")
 
 
-def _arrows(axes, program: Program) -> None:
+def _arrows(axes: Axes, program: Program) -> None:
     size = program.truth_um.shape[1]
     at = (np.arange(size) - size // 2) * 10.0
     x, y = np.meshgrid(at, at, indexing="ij")

@@ -8,6 +8,7 @@ import numpy as np
 from selfcal_ros.model.readings import GridVisits, Sense, ViewReadings
 from selfcal_ros.model.view import View
 from selfcal_ros.simulation.exposures import (
+    AngularExposures,
     GridExposures,
     angular_exposures,
     grid_exposures,
@@ -52,7 +53,7 @@ def _lost(rng: np.random.Generator, missing: float, shape: tuple[int, ...] | int
     return rng.random(shape) < missing if missing else np.zeros(shape, dtype=bool)
 
 
-def _read(sense: Sense, found) -> np.ndarray:
+def _read(sense: Sense, found: GridExposures | AngularExposures) -> np.ndarray:
     """Return where marks lie by what encoder and microscope say."""
     if sense is Sense.PLATE_MOVES:
         return found.offset - found.position

@@ -14,7 +14,7 @@ from selfcal_ros.collection.marks.rigid import (
 )
 from selfcal_ros.collection.reasons import Reason
 from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.model.view import View
+from selfcal_ros.model.view import LatticePose, View
 
 TOO_FAR_FROM_ANY = 0.75
 """Distance to the nearest mark, in pitches, beyond which a detection is of no mark at all."""
@@ -132,7 +132,7 @@ def _at_most_two(numbers: np.ndarray) -> bool:
     return not len(numbers) or bool(((numbers == numbers.min()) | (numbers == numbers.max())).all())
 
 
-def _astray(pose, marks: np.ndarray, stage_m: np.ndarray | None, artifact: Artifact,
+def _astray(pose: LatticePose, marks: np.ndarray, stage_m: np.ndarray | None, artifact: Artifact,
             rules: IdentityRules) -> np.ndarray:
     """Return for which marks (2, n) the stage stood further from their sites than it may."""
     if stage_m is None:
@@ -142,7 +142,7 @@ def _astray(pose, marks: np.ndarray, stage_m: np.ndarray | None, artifact: Artif
     return np.hypot(*away) > rules.stage_limit_m(artifact)
 
 
-def _nearest(pose, centred: np.ndarray, pitch: float, half: np.ndarray,
+def _nearest(pose: LatticePose, centred: np.ndarray, pitch: float, half: np.ndarray,
              ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return nearest mark (2, n), distance ratio to the second nearest, and distance in m."""
     step = centred / pitch
@@ -155,7 +155,7 @@ def _nearest(pose, centred: np.ndarray, pitch: float, half: np.ndarray,
     return mark.astype(np.int64), first / np.maximum(second, 1e-12), first * pitch
 
 
-def _settle(pose, centred: np.ndarray, half: np.ndarray, ids: np.ndarray,
+def _settle(pose: LatticePose, centred: np.ndarray, half: np.ndarray, ids: np.ndarray,
             kinds: tuple[np.ndarray, np.ndarray], pitch: float,
             rules: IdentityRules) -> tuple[MotionEstimate, RigidFit]:
     """Return what is known of the view's own motion: grown outwards from what is sure.
@@ -209,7 +209,7 @@ def _folded(known: MotionEstimate, fit: RigidFit, pitch: float) -> tuple[MotionE
     return replace(known, rigid=moved[0]), replace(fit, rigid=moved[1])
 
 
-def _about(pose, marks: np.ndarray, pitch: float) -> np.ndarray:
+def _about(pose: LatticePose, marks: np.ndarray, pitch: float) -> np.ndarray:
     site = np.stack(pose.site_of(marks[0], marks[1]))
     return (site - np.array(pose.shift)[:, None]) * pitch
 

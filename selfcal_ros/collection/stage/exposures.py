@@ -5,6 +5,7 @@ Each instant of exposure is looked up once the samples beside it have come, and 
 sample or an exposure comes that could change what was found: late ones cost, new ones do not.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -38,7 +39,7 @@ class Tracks:
     y: JointTrack
     theta: JointTrack
 
-    def __iter__(self):
+    def __iter__(self) -> Iterator[JointTrack]:
         """Yield the joints in their order."""
         return iter((self.x, self.y, self.theta))
 

@@ -5,6 +5,7 @@ Every array carries a last axis of columns, so that the same code solves the rea
 and propagates the noise of each reading (one column a reading).
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -180,7 +181,8 @@ def _rows_theta(count: int, datum: ThetaDatum, axis_lines: np.ndarray,
     return rows, one[axis_lines].toarray()
 
 
-def _bordered(rows: sparse.csr_array, ties: np.ndarray):
+def _bordered(rows: sparse.csr_array, ties: np.ndarray,
+              ) -> Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
     """Return a solver of the least squares of `rows` and the few dense rows `ties` together.
 
     The dense rows border the sparse normal matrix, so that it stays sparse. The solver takes the

@@ -5,6 +5,7 @@ Model (method eq. 2.3): V(k) = Gtheta((k + s) mod K) + Atheta(k) + phi + noise.
 """
 
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from scipy.linalg import lapack
@@ -93,7 +94,7 @@ class AngularSystem:
         return np.concatenate([np.flatnonzero(parts.of_site < 0), parts.first_sites])
 
     @cached_property
-    def _factor(self):
+    def _factor(self) -> Any:
         if self.n_lines <= DENSE_LINES:
             return lapack.dpotrf(self.matrix.toarray(), lower=1)[0]
         return splu(self.matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0,

@@ -1,14 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """The normal equations of a plan before anything is measured: every mark in the field is read."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from selfcal_ros.estimation.normal.angular import AngularSystem
 from selfcal_ros.estimation.normal.equations import NormalEquations
 from selfcal_ros.estimation.normal.grid import GridSystem
+from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.view import View
 
 
-def planned_system(artifact, views, *, rank_only: bool = False) -> NormalEquations:
+def planned_system(artifact: Artifact, views: Sequence[View], *,
+                   rank_only: bool = False) -> NormalEquations:
     """Return the system of views as planned: every mark that lies in the field, unit repeats.
 
     Parameters

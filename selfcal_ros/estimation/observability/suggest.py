@@ -315,7 +315,8 @@ def _search(searched: _Searched, free: int) -> tuple[dict[tuple[int, ...], tuple
             "greedy choice, then exchange of single views")
 
 
-def _exchange(key, n_pool: int, free: int) -> dict[tuple[int, ...], tuple[float, ...]]:
+def _exchange(key: Callable[[tuple[int, ...]], tuple[float, ...]], n_pool: int, free: int,
+              ) -> dict[tuple[int, ...], tuple[float, ...]]:
     """Search by greedy choice and exchange; return every plan tried with its key."""
     tried: dict[tuple[int, ...], tuple[float, ...]] = {}
 
