@@ -56,8 +56,9 @@ RESULT = {
     "reference": "kind, relative_error, u_relative, certificate of a known length; null without",
     "provenance": "created (ISO 8601, UTC), duration_s, version, first_exposure, last_exposure, "
                   "visit_order of each view",
-    "dof": "degrees of freedom of the noise behind u: xy, theta",
-    "coverage_factor": "k for 95.45 %: xy, theta",
+    "dof": "degrees of freedom of the map's uncertainty at its nodes, Welch-Satterthwaite: xy, "
+           "theta",
+    "coverage_factor": "k for 95.45 % at those degrees of freedom: xy, theta",
     "views": "a list: name, rotation (rad), translation_x, translation_y (m), misalignment {phi "
              "(rad), tx, ty (m)}, used, rejected, read {grid, angular} (weights of what was read)",
     "error_map": "gx, gy, u_gx, u_gy: N×N lists in m, [i][j] = site m = i − h, n = j − h, null "

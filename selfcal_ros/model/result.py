@@ -90,8 +90,10 @@ class Noise:
     `sigma_xy`, `sigma_theta` are the values behind the uncertainties; `*_repeats` come from the
     scatter of repeats, `*_residuals` from the residuals of the fit, `*_declared` from the
     detections; `dof_*` are their degrees of freedom, `dof_xy`, `dof_theta` those of the values
-    used (NaN: not known; infinite: declared), and `k_*` the coverage factors for 95.45 %. `p_*` is
-    the probability that residuals contradict repeats, or the declaration, as they do by chance.
+    used (NaN: not known; infinite: declared). `dof_map_*` are those of the map's uncertainty at its
+    nodes, which holds more than noise (Welch-Satterthwaite), and `k_*` the coverage factors for
+    95.45 % that belong to them. `p_*` is the probability that residuals contradict repeats, or the
+    declaration, as they do by chance.
     """
 
     sigma_xy: float
@@ -112,6 +114,16 @@ class Noise:
     k_theta: float = 2.0
     p_xy: float = float("nan")
     p_theta: float = float("nan")
+    dof_map_xy: float = float("nan")
+    dof_map_theta: float = float("nan")
+
+    def dof_of(self, kind: str) -> float:
+        """Return the degrees of freedom of the map's uncertainty, ``xy`` or ``theta``.
+
+        Older results name those of the noise alone.
+        """
+        found = float(getattr(self, f"dof_map_{kind}"))
+        return found if found > 0 else float(getattr(self, f"dof_{kind}"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,7 +199,7 @@ def result_to_dict(result: CalibrationResult) -> dict[str, Any]:
         "model": plain(model_to_dict(result.model)),
         "reference": result.reference,
         "provenance": plain(provenance_to_dict(result.provenance)),
-        "dof": plain({kind: getattr(result.noise, f"dof_{kind}") for kind in ("xy", "theta")}),
+        "dof": plain({kind: result.noise.dof_of(kind) for kind in ("xy", "theta")}),
         "coverage_factor": plain({kind: getattr(result.noise, f"k_{kind}")
                                   for kind in ("xy", "theta")}),
         "views": [{"name": v.name, "rotation": v.rotation, "translation_x": v.translation_x,

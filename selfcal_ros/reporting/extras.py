@@ -145,7 +145,7 @@ def convention_section(result: CalibrationResult) -> Section:
     facts += [("sense", _SENSE.get(result.sense, printable(result.sense))),
               ("uncertainty", "u is the standard uncertainty (k=1), U = k u the expanded one, "
                               "k from Student's t for 95.45 % at the degrees of freedom of the "
-                              "noise"),
+                              "uncertainty"),
               ("misalignment", "φ is the turn of the plate about its centre, counter-clockwise, "
                                "tx and ty its offset, beyond the nominal pose of the view")]
     return Section("Conventions", tuple(facts))

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Uncertainty budget of a calibrated map as the GUM asks for it: labelled components, k, U."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -9,13 +9,11 @@ import numpy as np
 from selfcal_ros.estimation.joint.noise import F_LEVEL, coverage_factor
 from selfcal_ros.estimation.joint.saved_terms import variance_of_terms
 from selfcal_ros.estimation.options import ReferenceLength
+from selfcal_ros.estimation.verdict.coverage import TOLD, part_left, with_coverage
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.result import CalibrationResult, Noise
 from selfcal_ros.model.statistics import rms
 from selfcal_ros.units import ARCSEC_PER_RAD, UM_PER_M
-
-TOLD = 0.5
-"""Part of a term's size that readings leave, below which it is they that tell the term."""
 
 MANY_DOF = 1e5
 """Degrees of freedom above which a number of them says nothing more."""
@@ -102,15 +100,26 @@ def budgets(result: CalibrationResult, reference: ReferenceLength | None = None)
     parts = [_noise_part(np.sqrt(np.maximum(power, 0.0)), noise, "xy"),
              *(_term_part(result, name, variance, dof) for name, variance in of_terms.items()),
              _reference_part(artifact, reference)]
-    out = [_combine("XY, one coordinate at the nodes of the map", "m", parts),
+    nodes = _map_dof(result, reference)
+    out = [_combine("XY, one coordinate at the nodes of the map", "m", parts, nodes),
            _combine("XY, one coordinate anywhere in the field, map interpolated between its nodes",
-                    "m", [*parts, _interpolation_xy(result)])]
+                    "m", parts, nodes, _interpolation_xy(result))]
     if np.isfinite(emap.u_g_theta).any():
         part = _noise_part(emap.u_g_theta, noise, "theta")
-        out += [_combine("theta at the lines of the map", "rad", [part]),
-                _combine("theta at any angle, map interpolated between its lines", "rad",
-                         [part, _interpolation_theta(result)])]
+        lines = _dof(noise, "theta")
+        out += [_combine("theta at the lines of the map", "rad", [part], lines),
+                _combine("theta at any angle, map interpolated between its lines", "rad", [part],
+                         lines, _interpolation_theta(result))]
     return out
+
+
+def _map_dof(result: CalibrationResult, reference: ReferenceLength | None) -> float:
+    """Return the degrees of freedom of the XY map's uncertainty; older results do not name them."""
+    named = result.noise.dof_map_xy
+    if not named > 0:
+        noise = replace(result.noise, dof_xy=_dof(result.noise, "xy"))
+        named = with_coverage(replace(result, noise=noise), reference).noise.dof_map_xy
+    return named
 
 
 def _dof(noise: Noise, kind: str) -> float:
@@ -149,9 +158,7 @@ def _term_part(result: CalibrationResult, name: str, variance: np.ndarray,
     Of type A if the readings tell the term, of type B if its size does.
     """
     term = next(term for term in result.model.terms if term.name == name)
-    u = np.array([estimate.u for estimate in term.estimates])
-    size = term.size_used or term.size or np.inf
-    left = float(np.sqrt(np.mean(u[np.isfinite(u)] ** 2))) / size
+    size, left = term.size_used or term.size or np.inf, part_left(term)
     told = left < TOLD
     known = variance[:, result.error_map.valid]
     how = (f"given as {term.size:.3g}, which the readings contradict; they allow {size:.3g} and "
@@ -210,13 +217,18 @@ def _curvature(field: np.ndarray, u: np.ndarray, axis: int) -> tuple[float, floa
     return float(known.mean()), float(max(known.max(), 0.0))
 
 
-def _combine(quantity: str, unit: str, parts: list[Component]) -> Budget:
+def _combine(quantity: str, unit: str, parts: list[Component], dof: float,
+             between: Component | None = None) -> Budget:
+    """Return a budget: that of the map, with `dof` degrees of freedom, and what is between."""
+    if between is not None:
+        at_nodes = sum(part.u_rms**2 for part in parts)
+        parts = [*parts, between]
+        if at_nodes > 0:
+            dof = dof * (1 + between.u_rms**2 / at_nodes) ** 2
     u_rms, u_max = (float(np.sqrt(sum(getattr(p, name) ** 2 for p in parts)))
                     for name in ("u_rms", "u_max"))
-    spread = sum(part.u_rms**4 / part.dof for part in parts)
-    dof = u_rms**4 / spread if spread > 0 else np.inf
-    k = coverage_factor(float(dof))
-    return Budget(quantity, unit, tuple(parts), u_rms, u_max, float(dof), k)
+    return Budget(quantity, unit, tuple(parts), u_rms, u_max, float(dof),
+                  coverage_factor(float(dof)))
 
 
 def budget_json(found: list[Budget]) -> list[dict[str, Any]]:

@@ -22,6 +22,7 @@ from selfcal_ros.estimation.joint.solved import Solved
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.verdict.cause_text import cause_of, noise_cause, size_cause
 from selfcal_ros.estimation.verdict.causes import LEVEL, Explanation, find_explanations
+from selfcal_ros.estimation.verdict.coverage import with_coverage
 from selfcal_ros.estimation.verdict.provenance import provenance_of
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.result import CalibrationResult
@@ -67,8 +68,9 @@ def judged(solved: Solved, measurements: Measurements, options: Options) -> Cali
     verdict = Verdict(not reasons, _sentence(solved, reasons, causes), tuple(reasons),
                       tuple(causes))
     reference = options.reference
+    result = with_coverage(solved.result, reference)
     return replace(
-        solved.result, verdict=verdict, provenance=provenance_of(measurements, options),
+        result, verdict=verdict, provenance=provenance_of(measurements, options),
         reference=None if reference is None else {
             "kind": str(reference.kind), "relative_error": reference.relative_error,
             "u_relative": reference.u_relative, "certificate": reference.certificate})

@@ -143,7 +143,7 @@ def error_section(result: CalibrationResult) -> Section:
     if figures.n_known < figures.n_sites:
         facts.append(("sites known", f"{figures.n_known} of {figures.n_sites}"))
     facts += [*_spread_facts("uncertainty", um, (figures.rms_u_m, figures.max_u_m),
-                             (result.noise.k_xy, result.noise.dof_xy)),
+                             (result.noise.k_xy, result.noise.dof_of("xy"))),
               ("non-orthogonality", _slope_text(emap, emap.nonorthogonality, "O", "µrad",
                                                 "axes out of square by 2|O|")),
               ("scale difference", _slope_text(emap, emap.scale_difference, "R", "µm/m",
@@ -173,7 +173,7 @@ def _theta_facts(result: CalibrationResult) -> list[tuple[str, str]]:
         facts.append(("lines known", f"{figures.n_lines_known} of {figures.n_lines}"))
     return [*facts, *_spread_facts("θ uncertainty", arcsec, (figures.rms_u_theta_rad,
                                                              figures.max_u_theta_rad),
-                                   (result.noise.k_theta, result.noise.dof_theta)),
+                                   (result.noise.k_theta, result.noise.dof_of("theta"))),
             ("θ datum", str(emap.datum_theta))]
 
 
