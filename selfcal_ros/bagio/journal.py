@@ -188,8 +188,12 @@ class Journal:
         self._syncer = threading.Thread(target=self._sync_on, name="journal", daemon=True)
         self._syncer.start()
 
-    def add_topic(self, topic: str, typename: str, qos: Sequence[dict] = ()) -> None:
+    def add_topic(self, topic: str, typename: str, qos: Sequence[dict] = (),
+                  heard_on: str = "") -> None:
         """Declare a topic, with its namespace, before its first message; again does nothing.
+
+        A topic of the contract is found by its name: one that was remapped is declared with its
+        own name all the same, and as `heard_on` the other one.
 
         Raises
         ------
@@ -201,7 +205,8 @@ class Journal:
         if typename not in typestore().fielddefs:
             raise InputError(f"topic {topic}", f"no definition of {typename}",
                              "record only topics of known types")
-        known = self._metadata.topics.setdefault(topic, Topic(typename, list(qos)))
+        known = self._metadata.topics.setdefault(
+            topic, Topic(typename, list(qos), heard_on=heard_on))
         self._declare(topic, known)
 
     def _declare(self, topic: str, known: Topic) -> None:
@@ -210,8 +215,7 @@ class Journal:
         schema = Schema(id=number, name=known.type, encoding="ros2msg", data=text.encode())
         channel = Channel(
             id=number, topic=topic, message_encoding="cdr", schema_id=number,
-            metadata={"offered_qos_profiles": yaml.safe_dump(known.qos, sort_keys=False)
-                      if known.qos else "", "topic_type_hash": store.hash_rihs01(known.type)})
+            metadata=known.channel_metadata())
         self.flush()
         with _said(self.path):
             self._file.append(records(schema, channel))
@@ -324,7 +328,8 @@ def _taken_up(bag: Path) -> tuple[Metadata, list[tuple[int, Phase]]]:
             schema = content.schemas.get(channel.schema_id)
             if schema is not None:
                 qos = yaml.safe_load(channel.metadata.get("offered_qos_profiles", "")) or []
-                topic = metadata.topics.setdefault(channel.topic, Topic(schema.name, qos))
+                topic = metadata.topics.setdefault(channel.topic, Topic(
+                    schema.name, qos, heard_on=channel.metadata.get("heard_on", "")))
                 topic.count += content.counts.get(channel.id, 0)
         commands += _commands(content, str(file))
     return metadata, sorted(commands)

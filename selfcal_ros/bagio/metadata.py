@@ -24,11 +24,21 @@ def qos_profile(*, reliable: bool, transient_local: bool, depth: int) -> dict:
 
 @dataclass
 class Topic:
-    """One topic of a bag: its type, the QoS offered, and how many messages it has."""
+    """One topic of a bag: its type, the QoS offered, and how many messages it has.
+
+    `heard_on` is the name that it was remapped to; empty = its own.
+    """
 
     type: str
     qos: list[dict]
     count: int = 0
+    heard_on: str = ""
+
+    def channel_metadata(self) -> dict[str, str]:
+        """Return the metadata of its channel as rosbag2 writes it, and where it was heard."""
+        about = {"offered_qos_profiles": yaml.safe_dump(self.qos, sort_keys=False)
+                 if self.qos else "", "topic_type_hash": typestore().hash_rihs01(self.type)}
+        return about | ({"heard_on": self.heard_on} if self.heard_on else {})
 
 
 @dataclass

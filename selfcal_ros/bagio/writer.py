@@ -12,7 +12,6 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-import yaml
 from mcap.writer import CompressionType, Writer
 
 from selfcal_ros.bagio.build import build
@@ -75,8 +74,17 @@ class BagWriter:
             raise InputError(str(self.path), f"cannot be written ({error.strerror})",
                              "make room or name another folder") from error
 
-    def add_topic(self, topic: str, typename: str, qos: list[dict]) -> None:
+    def add_topic(self, topic: str, typename: str, qos: list[dict], heard_on: str = "") -> None:
         """Declare a topic of a type known here, before its first message.
+
+        Parameters
+        ----------
+        topic, typename : str
+            Its name in the bag and its type.
+        qos : list of dict
+            What is offered.
+        heard_on : str, optional
+            Its name in the graph, where that is another one.
 
         Raises
         ------
@@ -91,11 +99,9 @@ class BagWriter:
             text = store.generate_msgdef(typename, ros_version=2)[0]
             self._schemas[typename] = self._mcap.register_schema(typename, "ros2msg",
                                                                  text.encode())
-        profile = yaml.safe_dump(qos, sort_keys=False) if qos else ""
+        self._metadata.topics[topic] = declared = Topic(typename, qos, heard_on=heard_on)
         self._channels[topic] = self._mcap.register_channel(
-            topic, "cdr", self._schemas[typename],
-            {"offered_qos_profiles": profile, "topic_type_hash": store.hash_rihs01(typename)})
-        self._metadata.topics[topic] = Topic(typename, qos)
+            topic, "cdr", self._schemas[typename], declared.channel_metadata())
 
     def write(self, topic: str, fields: Fields, log_time_ns: int) -> None:
         """Write one message given by its fields."""

@@ -27,13 +27,12 @@ class BagRecorder(SelfcalNode[RecorderSettings]):
         self._writer = BagWriter(Path(self.settings.bag))
         topics = [*names.INPUTS, *(names.RESULTS if self.settings.all_topics else ())]
         for topic in topics:
-            name = self.resolve_topic_name(topic.name)
+            name, heard = self.kept_names(topic)
             typename = f"{topic.type.__module__.split('.')[0]}/msg/{topic.type.__name__}"
-            self._writer.add_topic(name, typename, [offered(topic)])
+            self._writer.add_topic(name, typename, [offered(topic)], heard)
             if topic is not names.ENCODER:
                 self.subscribe(topic, partial(self._record, name), raw=True)
-        encoder = self.resolve_topic_name(names.ENCODER.name)
-        EncoderInput(self, partial(self._record, encoder), raw=True)
+        EncoderInput(self, partial(self._record, self.kept_names(names.ENCODER)[0]), raw=True)
         self._failed, self._unrecorded = "", 0
         self.every(1.0, self._flush)
 

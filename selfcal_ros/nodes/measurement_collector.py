@@ -20,7 +20,7 @@ from selfcal_ros.nodes.running import run
 from selfcal_ros.sessions.collecting import CollectingSession
 from selfcal_ros.sessions.health import merged
 from selfcal_ros.sessions.ports import Diagnosis
-from selfcal_ros.sessions.receiving.journal_keeper import JournalKeeper
+from selfcal_ros.sessions.receiving.journal_keeper import JournalKeeper, KeptTopic
 from selfcal_ros.sessions.receiving.reception import Reception
 
 TICK_S = 0.04
@@ -50,8 +50,7 @@ class MeasurementCollector(PollingNode[CollectorSettings]):
         ports = self.ports(self._publish)
         self.session = CollectingSession(self.settings, ports)
         journal = JournalKeeper(self._journal_folder(), {
-            topic.name: (self.resolve_topic_name(topic.name), offered(topic))
-            for topic in names.INPUTS}, self.settings, ports)
+            topic.name: self._kept(topic) for topic in names.INPUTS}, self.settings, ports)
         self._reception = self.own(
             Reception(self.session, journal, say=self.say, refuse=self.refusals.add),
             Reception.close)
@@ -64,6 +63,10 @@ class MeasurementCollector(PollingNode[CollectorSettings]):
                         names.DETECTIONS.name: ByTheClock(
                             names.DETECTIONS.name, self._reception.detection, self._on_detection)}
         self.alone_on += [names.STATUS.name, names.ENCODER.name]
+
+    def _kept(self, topic: names.Topic) -> KeptTopic:
+        own, heard = self.kept_names(topic)
+        return KeptTopic(own, offered(topic), heard)
 
     def _journal_folder(self) -> str:
         """Return the folder of this cell's journals: one of its own for each namespace."""

@@ -2,12 +2,14 @@
 """measurement_collector: the QoS it takes the encoder with, status, finish, readings sent on."""
 
 from dataclasses import replace
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from mcap.reader import make_reader
 from rclpy.duration import Duration
 from rclpy.qos import ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
@@ -425,3 +427,21 @@ def test_losses_are_counted_over_the_life_of_the_node(graph):
     graph.until(lambda: node.session.collector.received["detection"] == 2, "the second")
     assert node.losses.counts == {names.DETECTIONS.name: 10,
                                   f"{names.DETECTIONS.name}, not listening": 6}
+
+
+def test_a_remapped_topic_is_in_the_journal_under_the_name_of_the_contract(graph, tmp_path):
+    remapped = partial(MeasurementCollector, namespace="cell", cli_args=[
+        "--ros-args", "-r", "stage/joint_states:=/robot/joint_states"])
+    node = graph.node(remapped, journal=str(tmp_path))
+    encoder = graph.publisher(replace(names.ENCODER, name="/robot/joint_states"))
+    encoder.publish(names.ENCODER.type(name=["x"], position=[0.0]))
+    graph.until(lambda: node.session.collector.received["encoder"] == 1, "the sample")
+    graph.remove(node)
+    [file] = (tmp_path / "cell").glob("journal_*/*.mcap")
+    with file.open("rb") as stream:
+        heard = {channel.topic: channel.metadata.get("heard_on") for channel in
+                 make_reader(stream).get_summary().channels.values()}
+    assert heard == {"/cell/stage/joint_states": "/robot/joint_states",
+                     "/cell/stage/mark_detections": None, "/cell/selfcal/view_command": None}
+    again = graph.node(remapped, journal=str(tmp_path))
+    graph.until(lambda: again.session.collector.received["encoder"] == 1, "the journal")

@@ -2,6 +2,8 @@
 """bag_player and bag_recorder: what one plays the other writes, all of it."""
 
 from collections import Counter
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -156,3 +158,18 @@ def test_a_bag_without_our_topics_is_refused(graph, tmp_path):
     recorder.close()
     with pytest.raises(NoDataError, match="no message on the topics of the contract"):
         graph.node(BagPlayer, bag=str(tmp_path / "bag"))
+
+
+def test_a_remapped_topic_is_recorded_under_the_name_of_the_contract(graph, tmp_path):
+    recorder = graph.node(partial(BagRecorder, cli_args=[
+        "--ros-args", "-r", "stage/mark_detections:=/robot/marks"]), bag=str(tmp_path / "bag"))
+    marks = graph.publisher(replace(names.DETECTIONS, name="/robot/marks"))
+    marks.publish(names.DETECTIONS.type(m=3))
+    graph.until(lambda: sum(recorder._writer.counts.values()) == 1, "the detection")
+    recorder.close()
+    [(topic, message)] = BagReader(tmp_path / "bag").messages()
+    assert (topic, message.m) == (names.DETECTIONS.name, 3)
+    with (tmp_path / "bag" / "bag_0.mcap").open("rb") as stream:
+        assert {channel.metadata["heard_on"] for channel in make_reader(
+            stream).get_summary().channels.values() if "heard_on" in channel.metadata} == {
+            "/robot/marks"}

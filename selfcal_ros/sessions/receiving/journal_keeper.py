@@ -9,6 +9,7 @@ from collections import Counter
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from selfcal_ros.bagio.journal import Journal, resume, start, unfinished, written_ago_s
 from selfcal_ros.bagio.offline import block_handlers
@@ -67,6 +68,17 @@ def take_up(files: list[Path], settings: CollectorSettings) -> TakenUp:
     return TakenUp(collector, tuple(lost))
 
 
+class KeptTopic(NamedTuple):
+    """A topic of the contract in a journal: its name with the namespace, the QoS offered.
+
+    `heard_on` is its name in the graph, where it is remapped.
+    """
+
+    name: str
+    qos: dict
+    heard_on: str = ""
+
+
 class JournalKeeper:
     """Keeps a journal in a folder; a `Journal` may come, fail and come back.
 
@@ -75,14 +87,14 @@ class JournalKeeper:
     folder : str
         Where journals lie; empty = keep none.
     topics : dict
-        Topic of the contract -> its name with the namespace, and the quality of service offered.
+        Topic of the contract -> what is kept of it.
     settings : CollectorSettings
         Values of the collector's parameters.
     ports : Ports
         Log and clocks.
     """
 
-    def __init__(self, folder: str, topics: dict[str, tuple[str, dict]],
+    def __init__(self, folder: str, topics: dict[str, KeptTopic],
                  settings: CollectorSettings, ports: Ports) -> None:
         self._folder, self._topics, self._ports = folder, topics, ports
         self._lag_limit_s = settings.journal_lag_limit
@@ -149,8 +161,8 @@ class JournalKeeper:
         with ExitStack() as undo:
             undo.callback(_given_up, journal)
             for topic, typename in INPUT_TOPICS.items():
-                name, qos = self._topics[topic]
-                journal.add_topic(name, typename, [qos])
+                kept = self._topics[topic]
+                journal.add_topic(kept.name, typename, [kept.qos], kept.heard_on)
             undo.pop_all()
         self._journal = journal
 
@@ -158,7 +170,7 @@ class JournalKeeper:
         """Take one message as received."""
         self._n_taken += 1
         if self._journal is not None:
-            self._journal.write(self._topics[topic][0], data, received_ns)
+            self._journal.write(self._topics[topic].name, data, received_ns)
         elif self._folder:
             self._unwritten += 1
 

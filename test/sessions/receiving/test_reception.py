@@ -20,14 +20,14 @@ from selfcal_ros.messages.topics import COMMAND_TOPIC, DETECTION_TOPIC, ENCODER_
 from selfcal_ros.sessions.collecting import CollectingSession
 from selfcal_ros.sessions.ports import Level
 from selfcal_ros.sessions.receiving import journal_keeper
-from selfcal_ros.sessions.receiving.journal_keeper import JournalKeeper
+from selfcal_ros.sessions.receiving.journal_keeper import JournalKeeper, KeptTopic
 from selfcal_ros.sessions.receiving.reception import Reception
 from test.support.bags import Foreign
 from test.support.ports import Hands, settings_of
 from test.support.sessions import cdr_of, collected, events_of, small_plan
 
 QOS = {"reliability": "reliable"}
-TOPICS = {topic: (f"/cell/{topic}", QOS) for topic in INPUT_TOPICS}
+TOPICS = {topic: KeptTopic(f"/cell/{topic}", QOS) for topic in INPUT_TOPICS}
 
 
 class Desk:
