@@ -14,9 +14,9 @@ seen; a test that fails without any change does not count.
 import argparse
 import ast
 import contextlib
+import hashlib
 import importlib
 import os
-import random
 import resource
 import shutil
 import signal
@@ -24,9 +24,11 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cache
+from operator import itemgetter
 from pathlib import Path
 
 import pytest
@@ -159,15 +161,29 @@ def _code(tree: ast.AST) -> Iterator[ast.AST]:
 
 def sample(number: int, seed: int, only: list[str], *, root: Path = ROOT) -> list[Mutant]:
     """Return a seeded sample, as many from a long module as its length asks for."""
-    found: list[Mutant] = []
+    found: list[tuple[str, Mutant]] = []
     package = root / PACKAGE.name
     for path in sorted(package.rglob("*.py")):
         name = str(path.relative_to(root))
         inner = path.relative_to(package).parts[0]
         if (any(name.startswith(part.rstrip("/")) for part in only) if only
                 else inner not in LEFT_OUT):
-            found += mutants_of(name, path.read_text())
-    return random.Random(seed).sample(found, min(number, len(found)))
+            found += _in_lot(seed, name, path.read_text())
+    return [mutant for _, mutant in sorted(found, key=itemgetter(0))[:number]]
+
+
+def _in_lot(seed: int, name: str, text: str) -> list[tuple[str, Mutant]]:
+    """Return the mutants of a file, each with its lot.
+
+    It is drawn from the line itself: what is changed elsewhere leaves the sample as it was.
+    """
+    lines, met, out = text.splitlines(), Counter(), []
+    for mutant in mutants_of(name, text):
+        what = (seed, name, lines[mutant.line - 1].strip(), mutant.new)
+        met[what] += 1
+        lot = hashlib.sha256(repr((*what, met[what])).encode()).hexdigest()
+        out.append((lot, mutant))
+    return out
 
 
 def _imported(path: Path, known: set[str]) -> set[str]:

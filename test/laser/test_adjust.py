@@ -32,6 +32,18 @@ def test_model_derivatives_are_those_of_the_model(steps):
 
 
 @pytest.mark.parametrize("steps", [(0.01, 0.006), (0.01, 0.008, 0.006)])
+def test_beams_tilt_square_to_their_diagonals(steps):
+    """Diagonal, level side and the third: a right-handed frame of unit vectors."""
+    geometry = Geometry(measurement(steps))
+    assert len(geometry.sideways) == 2 ** (len(steps) - 1)
+    for signs, sides in zip(geometry.signs, geometry.sideways, strict=True):
+        frame = np.vstack([signs * np.array(steps) / np.linalg.norm(steps), sides])
+        np.testing.assert_allclose(frame @ frame.T, np.eye(len(steps)), atol=1e-15)
+        assert np.linalg.det(frame) == pytest.approx(1)
+        assert len(steps) == 2 or frame[1, 2] == 0
+
+
+@pytest.mark.parametrize("steps", [(0.01, 0.006), (0.01, 0.008, 0.006)])
 @pytest.mark.parametrize("pick", [None, ["pp"]])
 def test_solution_derivatives_are_those_of_the_solution(steps, pick):
     data = measurement(steps)

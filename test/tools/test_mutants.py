@@ -55,6 +55,25 @@ def test_a_sample_is_the_same_for_the_same_seed():
     assert not inner & {"cli", "reporting"} and {"estimation", "laser"} <= inner
 
 
+def test_what_changes_elsewhere_leaves_the_sample_as_it_was(tmp_path):
+    folder = tmp_path / "selfcal_ros" / "model"
+    folder.mkdir(parents=True)
+
+    def lines(number):
+        return [(m.path, (tmp_path / m.path).read_text().splitlines()[m.line - 1], m.new)
+                for m in mutants.sample(number, 0, [], root=tmp_path)]
+
+    (folder / "a.py").write_text("".join(f"x = {i} * a + {i}\nx = {i} * a + {i}\n"
+                                         for i in range(2, 30)))
+    before = lines(10**6)
+    (folder / "a.py").write_text("y = 1\nz = -3 < y\n" + (folder / "a.py").read_text())
+    (folder / "b.py").write_text("b = 3 + 4\n")
+    after = lines(10**6)
+    old = [one for one in after if one[1].startswith("x")]
+    assert old == before and len(before) == 2 * 4 * 28 and len(after) > len(before)
+    assert lines(20) == after[:20] != sorted(after)[:20]
+
+
 def test_the_tests_that_mirror_a_module_run_first_and_each_runs_once():
     groups = mutants.tests_for("selfcal_ros/estimation/joint/noise.py")
     assert groups[0] == ["test/estimation/joint/test_noise.py"]
