@@ -54,7 +54,8 @@ def test_the_example_is_calibrated_to_its_true_error(graph, tmp_path):
     # no view tells a translation, a rotation and a magnification of the field
     columns = np.array([np.r_[x * 0 + 1, y * 0], np.r_[x * 0, y * 0 + 1], np.r_[-y, x],
                         np.r_[x, y]]).T
-    rest = difference.ravel() - columns @ np.linalg.lstsq(columns, difference.ravel())[0]
+    rest = difference.ravel() - columns @ np.linalg.lstsq(
+        columns, difference.ravel(), rcond=None)[0]
     assert np.abs(true).max() > 1e-7
     assert np.abs(rest).max() < 2e-8
     k = np.arange(8) * np.pi / 4
