@@ -17,9 +17,6 @@ MODULES_OF_A_FOLDER = 12
 ONE_MODULE_EACH = {"cli": "one module a verb", "nodes": "one module a node"}
 """Folders that may hold more modules, and why."""
 
-LONGER = {"selfcal_ros/simulation": 13}
-"""Folders that hold more today: these numbers may only become smaller."""
-
 
 def dotted(path: Path) -> str:
     return ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
@@ -94,9 +91,8 @@ def test_the_parts_of_estimation_import_only_those_before_them(module):
                          ids=lambda p: str(p.relative_to(ROOT)))
 def test_a_folder_holds_few_modules(folder):
     modules = [path for path in folder.glob("*.py") if path.name != "__init__.py"]
-    limit = LONGER.get(str(folder.relative_to(ROOT)), MODULES_OF_A_FOLDER)
     if folder.name not in ONE_MODULE_EACH:
-        assert len(modules) <= limit, f"{len(modules)} modules: make sub-packages"
+        assert len(modules) <= MODULES_OF_A_FOLDER, f"{len(modules)} modules: make sub-packages"
 
 
 @pytest.mark.parametrize("path", SOURCES, ids=dotted)

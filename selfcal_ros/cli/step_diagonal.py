@@ -153,8 +153,8 @@ def _sensitivity(args: argparse.Namespace) -> int:
     import numpy as np
 
     from selfcal_ros.files import write_json
-    from selfcal_ros.simulation.laser import case_study_machine
-    from selfcal_ros.simulation.laser_sensitivity import sensitivity, sensitivity_text, sweep
+    from selfcal_ros.simulation.laser.measure import case_study_machine
+    from selfcal_ros.simulation.laser.sensitivity import sensitivity, sensitivity_text, sweep
 
     if args.data is not None:
         raise InputError("arguments", "--sensitivity simulates and reads no data",
@@ -176,8 +176,8 @@ def _simulate(args: argparse.Namespace) -> int:
     """Write the readings of a simulated measurement as a table."""
     from selfcal_ros.files import read_yaml, write_json, write_text
     from selfcal_ros.laser.readings.table import table_text
-    from selfcal_ros.simulation.laser import simulate_step_diagonal
-    from selfcal_ros.simulation.laser_config import simulation_from_dict, truth_of
+    from selfcal_ros.simulation.laser.config import simulation_from_dict, truth_of
+    from selfcal_ros.simulation.laser.measure import simulate_step_diagonal
 
     if args.data is not None:
         raise InputError("arguments", "--simulate makes data and reads none",

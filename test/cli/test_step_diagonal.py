@@ -7,7 +7,7 @@ import pytest
 
 from selfcal_ros.cli.main import main
 from selfcal_ros.laser.readings.table import write_table
-from selfcal_ros.simulation.laser import (
+from selfcal_ros.simulation.laser.measure import (
     LaserNoise,
     Measurement,
     SetUp,
@@ -165,10 +165,10 @@ def test_the_profiles_are_drawn(tmp_path, capsys):
 
 
 def test_the_sensitivity_table(tmp_path, capsys, monkeypatch):
-    from selfcal_ros.simulation import laser_sensitivity
+    from selfcal_ros.simulation.laser import sensitivity
 
-    monkeypatch.setattr(laser_sensitivity, "NOISE_DRAWS", 2)
-    monkeypatch.setattr(laser_sensitivity, "SWEEP", (1e-4, 1e-3))
+    monkeypatch.setattr(sensitivity, "NOISE_DRAWS", 2)
+    monkeypatch.setattr(sensitivity, "SWEEP", (1e-4, 1e-3))
     out, picture = tmp_path / "s.json", tmp_path / "s.svg"
     code, text, _ = run(capsys, "--sensitivity", "-o", out, "--plot", picture)
     rows = json.loads(out.read_text())["rows"]
@@ -211,7 +211,7 @@ def test_the_corrections_are_written_as_tables(tmp_path, capsys):
 
 
 def recorded_bag(path, **options):
-    from selfcal_ros.simulation.laser import case_study_machine
+    from selfcal_ros.simulation.laser.measure import case_study_machine
     from test.support.laser import recorded
     from test.support.laser_bags import write_laser_bag
 

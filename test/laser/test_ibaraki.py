@@ -10,7 +10,7 @@ from selfcal_ros.laser.ibaraki import identify_ibaraki
 from selfcal_ros.laser.profiles import squareness, straightness
 from selfcal_ros.laser.published_equations import Erratum
 from selfcal_ros.laser.wang import identify_wang
-from selfcal_ros.simulation.laser import (
+from selfcal_ros.simulation.laser.measure import (
     LaserNoise,
     Measurement,
     SetUp,

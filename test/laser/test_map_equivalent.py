@@ -15,7 +15,7 @@ from selfcal_ros.laser.map_equivalent import (
 from selfcal_ros.laser.profiles import squareness, squareness_rad, u_slope
 from selfcal_ros.laser.wang import identify_wang
 from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.simulation.laser import (
+from selfcal_ros.simulation.laser.measure import (
     LaserNoise,
     Measurement,
     StepMachine,

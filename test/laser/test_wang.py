@@ -10,7 +10,7 @@ from selfcal_ros.laser.identify import Choice, identify
 from selfcal_ros.laser.profiles import squareness
 from selfcal_ros.laser.published_equations import Erratum
 from selfcal_ros.laser.wang import identify_wang, jacobian, readings_are_equal
-from selfcal_ros.simulation.laser import (
+from selfcal_ros.simulation.laser.measure import (
     Measurement,
     SetUp,
     random_machine,

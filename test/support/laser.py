@@ -5,7 +5,7 @@ import numpy as np
 
 from selfcal_ros.laser.data import DIAGONALS, StepDiagonal, signs_of, step_vectors
 from selfcal_ros.laser.readings.zigzag import Series
-from selfcal_ros.simulation.laser import SetUp, trace
+from selfcal_ros.simulation.laser.measure import SetUp, trace
 
 MM = 1e-3
 

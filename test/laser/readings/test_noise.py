@@ -12,7 +12,7 @@ from selfcal_ros.laser.readings.noise import (
     reading_noise,
     time_order,
 )
-from selfcal_ros.simulation.laser import (
+from selfcal_ros.simulation.laser.measure import (
     LaserNoise,
     Measurement,
     case_study_machine,

@@ -11,7 +11,7 @@ from selfcal_ros.laser.readings.table import (
     table_text,
     write_table,
 )
-from selfcal_ros.simulation.laser import (
+from selfcal_ros.simulation.laser.measure import (
     LaserNoise,
     Measurement,
     random_machine,

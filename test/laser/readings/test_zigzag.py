@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.laser.ibaraki import identify_ibaraki
 from selfcal_ros.laser.readings.zigzag import CutRule, Series, cut_zigzag, find_rests
-from selfcal_ros.simulation.laser import (
+from selfcal_ros.simulation.laser.measure import (
     Measurement,
     SetUp,
     case_study_machine,

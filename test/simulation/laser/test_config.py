@@ -6,9 +6,9 @@ import pytest
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import read_yaml
-from selfcal_ros.simulation.laser_config import simulation_from_dict, truth_of
+from selfcal_ros.simulation.laser.config import simulation_from_dict, truth_of
 
-CONFIG = Path(__file__).parents[2] / "config" / "step_diagonal"
+CONFIG = Path(__file__).parents[3] / "config" / "step_diagonal"
 
 
 @pytest.mark.parametrize("path", sorted(CONFIG.glob("*.yaml")), ids=lambda path: path.name)

@@ -3,8 +3,8 @@ import numpy as np
 import pytest
 
 from selfcal_ros.laser.data import Method
-from selfcal_ros.simulation.laser import case_study_machine
-from selfcal_ros.simulation.laser_sensitivity import (
+from selfcal_ros.simulation.laser.measure import case_study_machine
+from selfcal_ros.simulation.laser.sensitivity import (
     FAULTS,
     effect_of,
     sensitivity_text,

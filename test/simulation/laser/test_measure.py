@@ -4,7 +4,7 @@ import pytest
 
 from selfcal_ros.laser.data import DIAGONALS
 from selfcal_ros.laser.ibaraki import identify_ibaraki
-from selfcal_ros.simulation.laser import (
+from selfcal_ros.simulation.laser.measure import (
     LaserNoise,
     Measurement,
     SetUp,

@@ -11,7 +11,7 @@ from selfcal_ros.errors import InputError, known_are
 from selfcal_ros.laser.data import DIAGONALS, MAX_BLOCKS, Closure, StepDiagonalResult
 from selfcal_ros.laser.profiles import ReferenceLine, name_of
 from selfcal_ros.laser.result_json import geometry
-from selfcal_ros.simulation.laser import (
+from selfcal_ros.simulation.laser.measure import (
     LaserNoise,
     Measurement,
     SetUp,

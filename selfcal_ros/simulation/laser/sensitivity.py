@@ -9,7 +9,7 @@ import numpy as np
 from selfcal_ros.laser.data import DIAGONALS, Closure, Method, StepDiagonal, StepDiagonalResult
 from selfcal_ros.laser.identify import Choice, identify
 from selfcal_ros.laser.profiles import squareness, straightness
-from selfcal_ros.simulation.laser import (
+from selfcal_ros.simulation.laser.measure import (
     LaserNoise,
     Measurement,
     SetUp,
