@@ -12,7 +12,7 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes.base import SelfcalNode
 from selfcal_ros.nodes.encoder_input import EncoderInput
-from selfcal_ros.nodes.publishers import offered
+from selfcal_ros.nodes.publishers import kept_names, offered
 from selfcal_ros.nodes.running import run
 from selfcal_ros.sessions.ports import Diagnosis, Level
 
@@ -27,12 +27,12 @@ class BagRecorder(SelfcalNode[RecorderSettings]):
         self._writer = BagWriter(Path(self.settings.bag))
         topics = [*names.INPUTS, *(names.RESULTS if self.settings.all_topics else ())]
         for topic in topics:
-            name, heard = self.kept_names(topic)
+            name, heard = kept_names(self, topic)
             typename = f"{topic.type.__module__.split('.')[0]}/msg/{topic.type.__name__}"
             self._writer.add_topic(name, typename, [offered(topic)], heard)
             if topic is not names.ENCODER:
                 self.subscribe(topic, partial(self._record, name), raw=True)
-        EncoderInput(self, partial(self._record, self.kept_names(names.ENCODER)[0]), raw=True)
+        EncoderInput(self, partial(self._record, kept_names(self, names.ENCODER)[0]), raw=True)
         self._failed, self._unrecorded = "", 0
         self.every(1.0, self._flush)
 

@@ -62,15 +62,6 @@ class NodeBase[S: Settings](Node):
         return self.own(self.create_publisher(topic.type, topic.name, topic.qos),
                         self.destroy_publisher)
 
-    def kept_names(self, topic: Topic) -> tuple[str, str]:
-        """Return under which name a bag keeps `topic`, and where it is heard if it is remapped.
-
-        Who reads a bag knows the names of the contract, behind a namespace.
-        """
-        own, heard = f"{self.get_namespace().rstrip('/')}/{topic.name}", self.resolve_topic_name(
-            topic.name)
-        return own, heard if heard != own else ""
-
     def output(self, topic: Topic) -> Callable[[dict[str, Any]], None]:
         """Return what publishes the fields of a message on `topic`."""
         publisher = self.publisher(topic)

@@ -15,7 +15,7 @@ from selfcal_ros.nodes import names
 from selfcal_ros.nodes.encoder_input import EncoderInput
 from selfcal_ros.nodes.managed import WhileConfigured, stop
 from selfcal_ros.nodes.polling import ByTheClock, PollingNode
-from selfcal_ros.nodes.publishers import offered
+from selfcal_ros.nodes.publishers import kept_names, offered
 from selfcal_ros.nodes.running import run
 from selfcal_ros.sessions.collecting import CollectingSession
 from selfcal_ros.sessions.health import merged
@@ -65,7 +65,7 @@ class MeasurementCollector(PollingNode[CollectorSettings]):
         self.alone_on += [names.STATUS.name, names.ENCODER.name]
 
     def _kept(self, topic: names.Topic) -> KeptTopic:
-        own, heard = self.kept_names(topic)
+        own, heard = kept_names(self, topic)
         return KeptTopic(own, offered(topic), heard)
 
     def _journal_folder(self) -> str:

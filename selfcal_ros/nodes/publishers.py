@@ -41,6 +41,16 @@ def others_publishing(node: Node, topics: Iterable[str]) -> Diagnosis:
     return Diagnosis(Level.WARN if found else Level.OK, "; ".join(found))
 
 
+def kept_names(node: Node, topic: Topic) -> tuple[str, str]:
+    """Return under which name a bag keeps `topic`, and where it is heard if it is remapped.
+
+    Who reads a bag knows the names of the contract, behind a namespace.
+    """
+    own, heard = f"{node.get_namespace().rstrip('/')}/{topic.name}", node.resolve_topic_name(
+        topic.name)
+    return own, heard if heard != own else ""
+
+
 def offered(topic: Topic) -> dict:
     """Return the quality of service of a topic as rosbag2 writes it down."""
     return qos_profile(reliable=topic.qos.reliability == ReliabilityPolicy.RELIABLE,
