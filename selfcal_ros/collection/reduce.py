@@ -63,7 +63,7 @@ def clean(detections: np.ndarray, rules: Rules, *, scored: bool,
     finite = np.all([np.isfinite(d[f]) for f in ("ox", "oy", "ot", "sigma", "score")], axis=0)
     finite &= d["sigma"] >= 0
     rejected[Reason.NOT_FINITE] = int((~finite).sum())
-    d = d[finite]
+    d = d if finite.all() else d[finite]
     unique = _canonical(d)
     rejected[Reason.DUPLICATE] += len(d) - len(unique)
     if scored:
@@ -179,6 +179,8 @@ def _keep(d: np.ndarray, reasons: np.ndarray, rejected: Counter, *values: np.nda
           ) -> tuple[np.ndarray, list[np.ndarray]]:
     """Return detections and values without the rejected ones, whose reasons are counted."""
     good = reasons == None  # noqa: E711
+    if good.all():
+        return d, [*values]
     rejected.update(str(reason) for reason in reasons[~good])
     return d[good], [value[good] for value in values]
 

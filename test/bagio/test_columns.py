@@ -256,7 +256,10 @@ def test_a_chunk_gives_what_the_library_gives(seed):
             parts += [message(int(rng.integers(3)), rng.bytes(size), int(rng.integers(2**62)))
                       for _ in range(rng.integers(1, (3, 90, 400)[choice]))]
         elif choice == 3:
-            parts += [message(i % 3, rng.bytes(size + i % 3)) for i in range(60)]
+            period = int(rng.integers(2, 90))
+            sizes = rng.integers(0, 40, period) if choice == 3 else np.arange(3)
+            parts += [message(i % 3, rng.bytes(int(sizes[i % len(sizes)])))
+                      for i in range(int(rng.integers(60, 700)))]
         else:
             parts.append((CHANNEL, SCHEMA, record(0x99, rng.bytes(size + 1)))[rng.integers(3)])
     data = b"".join(parts)
@@ -288,6 +291,30 @@ def test_runs_are_taken_at_once(monkeypatch):
         "size": 9, "unpack_from": staticmethod(lambda d, at: singles.append(at) or unpack(d, at))}))
     [block] = chunk_items(FakeChunk(data))
     assert len(block) == 5000 and len(singles) < 10
+
+
+@pytest.mark.parametrize("pattern", [(20, 40), (20, 40, 40, 40, 40, 40, 40, 40, 20), tuple(
+    range(1, 65))])
+def test_lengths_that_come_again_are_taken_at_once(monkeypatch, pattern):
+    lengths = [pattern[i % len(pattern)] for i in range(6000)]
+    lengths[3000] += 1  # one visit is another: the rest is found again
+    data = b"".join(message(1, bytes([i % 251]) * length) for i, length in enumerate(lengths))
+    looked = []
+    unpack = mcap_chunk.HEAD.unpack_from
+    monkeypatch.setattr(mcap_chunk, "HEAD", type("Head", (), {
+        "size": 9, "unpack_from": staticmethod(lambda d, at: looked.append(at) or unpack(d, at))}))
+    [block] = chunk_items(FakeChunk(data))
+    assert block.payloads.length.tolist() == lengths
+    assert [data[0] for data in block.payloads] == [i % 251 for i in range(6000)]
+    assert len(looked) < 1000
+
+
+@pytest.mark.parametrize("sizes, period", [
+    ([7, 7, 7], [7]), ([7, 7, 8], []), ([1, 2, 1, 2], [1, 2]), ([1, 2, 1, 2, 1], [2, 1]),
+    ([1, 2, 1], []), ([1, 1, 2, 1, 1, 2], [1, 1, 2]), (list(range(64)) * 2, list(range(64))),
+    (list(range(65)) * 2, [])])
+def test_a_period_is_one_that_came_twice(sizes, period):
+    assert mcap_chunk._period(np.array(sizes)).tolist() == period
 
 
 @pytest.mark.parametrize("compression", COMPRESSIONS)

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The messages of a chunk, or of a stretch of a file without chunks, found all at once.
 
-Records tell their lengths, so that each must be passed to find the next. Where several messages
-in a row are of one length, as those of an encoder are, the next ones are looked for at that
-distance by numpy.
+Records tell their lengths, so that each must be passed to find the next. Where lengths come again
+and again, those of an encoder's samples or of the samples and detections of each visit, the next
+messages are looked for at these distances by numpy.
 """
 
 import zlib
@@ -29,7 +29,9 @@ FRONT_TYPE = np.dtype({
 HEAD_TYPE = np.dtype({"names": ["opcode", "length"], "formats": ["u1", "<u8"],
                       "offsets": [0, 1], "itemsize": HEAD.size})
 PATIENCE, MAX_PATIENCE = 3, 1024
-"""Messages of one length in a row after which more are looked for; grows where there are none."""
+"""Messages after which lengths that come again are looked for; grows where there are none."""
+MAX_PERIOD = 64
+"""Messages after which lengths may come again, to be found."""
 FIRST_LOOK = 64
 STRETCH = 1 << 20
 """Bytes of a file without chunks in which messages are found at once."""
@@ -128,32 +130,36 @@ class _Places:
 
     def find(self, at: int) -> int:
         """Pass the messages from `at` on; return where something else begins."""
-        data, size = self.data, len(self.data)
-        previous, alike, patience = -1, 0, PATIENCE
+        data, size, single = self.data, len(self.data), self.single
+        waited, patience = 0, PATIENCE
         while at + FRONT <= size:
             opcode, length = HEAD.unpack_from(data, at)
             end = at + HEAD.size + length
             if opcode != Opcode.MESSAGE or length < MESSAGE_FRONT or end > size:
                 break
-            self.single.append(at)
+            single.append(at)
             at = end
-            alike = alike + 1 if length == previous else 0
-            previous = length
-            if alike >= patience:
-                found = self._run(at, length)
+            waited += 1
+            if waited >= patience:
+                sizes = _period(np.diff([*single[-waited:], at]))
+                found = self._run(at, sizes) if len(sizes) else 0
                 patience = PATIENCE if found >= FIRST_LOOK else min(2 * patience, MAX_PATIENCE)
-                at, alike = at + found * (HEAD.size + length), 0
+                at, waited = at + found // max(len(sizes), 1) * int(sizes.sum()), 0
         return at
 
-    def _run(self, at: int, length: int) -> int:
-        """Take the messages of one length in a row from `at` on; return how many there are."""
-        stride = HEAD.size + length
+    def _run(self, at: int, sizes: np.ndarray) -> int:
+        """Take messages whose sizes come again and again from `at` on; return how many."""
+        stride, offsets = int(sizes.sum()), np.cumsum(sizes) - sizes
         possible = (len(self.data) - at) // stride
-        found, look = 0, FIRST_LOOK
+        found, look = 0, max(FIRST_LOOK // len(sizes), 1)
         while found < possible:
             count = min(look, possible - found)
-            heads = np.ndarray((count,), HEAD_TYPE, self.data, at + found * stride, (stride,))
-            good = (heads["opcode"] == Opcode.MESSAGE) & (heads["length"] == length)
+            good = np.ones(count, dtype=bool)
+            for offset, size in zip(offsets.tolist(), sizes.tolist(), strict=True):
+                heads = np.ndarray((count,), HEAD_TYPE, self.data, at + found * stride + offset,
+                                   (stride,))
+                good &= (heads["opcode"] == Opcode.MESSAGE) & (heads["length"]
+                                                               == size - HEAD.size)
             step = count if good.all() else int(good.argmin())
             found += step
             if step < count:
@@ -161,9 +167,18 @@ class _Places:
             look *= 4
         if found:
             self.parts.append(np.array(self.single, dtype=np.int64))
-            self.parts.append(at + stride * np.arange(found, dtype=np.int64))
+            starts = at + stride * np.arange(found, dtype=np.int64)
+            self.parts.append((starts[:, None] + offsets).ravel())
             self.single.clear()
-        return found
+        return found * len(sizes)
+
+
+def _period(sizes: np.ndarray) -> np.ndarray:
+    """Return the sizes that come again in all of `sizes`, at least twice; empty if none do."""
+    for period in range(1, min(len(sizes) // 2, MAX_PERIOD) + 1):
+        if (sizes[period:] == sizes[:-period]).all():
+            return sizes[-period:]
+    return sizes[:0]
 
 
 def chunk_items(chunk: Chunk) -> list[Block | Schema | Channel]:

@@ -173,13 +173,15 @@ class Series:
         reasons[outside] = Reason.NO_ENCODER
         return np.where(outside, np.nan, p[before] + step * weight), reasons
 
-    def moving(self, stamps_ns: np.ndarray) -> np.ndarray:
+    def moving(self, stamps_ns: np.ndarray, reasons: np.ndarray | None = None) -> np.ndarray:
         """Return `Reason.MOVING` where this joint is known to move, else None, object array (Q,).
 
-        For joints that a reading does not need: one that has no samples near, or whose samples
-        contradict each other, tells nothing; and displacements within noise are not motion.
+        `reasons` are those of `query`, if they are known. For joints that a reading does not need:
+        one that has no samples near, or whose samples contradict each other, tells nothing; and
+        displacements within noise are not motion.
         """
-        _, reasons = self.query(stamps_ns)
+        if reasons is None:
+            _, reasons = self.query(stamps_ns)
         fast = reasons == Reason.MOVING
         if fast.any():
             t, p, v = self.t, self.p, self.v
@@ -220,12 +222,16 @@ class Series:
         if not len(self) or not len(stamps_ns):
             return np.zeros_like(out)
         t, p = self.t, self.p
-        limit = np.fmax(threshold, BEYOND_NOISE * np.sqrt(2) * self._noise_near(stamps_ns))
         owner = np.searchsorted(stamps_ns, t, "left")  # the first exposure at or after a sample
         sample = np.flatnonzero(owner < len(stamps_ns))
         owner = owner[sample]
-        away = p[sample] - positions[owner]
-        moved = (np.abs(away) > limit[owner]) & (stamps_ns[owner] - t[sample] <= LOOK_BACK_NS)
+        away = np.abs(p[sample] - positions[owner])
+        moved = (away > threshold) & (stamps_ns[owner] - t[sample] <= LOOK_BACK_NS)
+        limit = np.full(len(stamps_ns), threshold)
+        doubtful = np.unique(owner[moved])  # the noise is looked at where it can matter
+        limit[doubtful] = np.fmax(threshold, BEYOND_NOISE * np.sqrt(2) * self._noise_near(
+            stamps_ns[doubtful]))
+        moved &= away > limit[owner]
         last = np.full(len(stamps_ns), -1)
         last[owner[moved]] = sample[moved]  # of samples with one owner the last stays
         broken = np.diff(t, prepend=t[0]) > self.limits.max_gap_ns

@@ -20,6 +20,7 @@ from selfcal_ros.collection.stage.encoder import (
     filled,
 )
 from selfcal_ros.collection.stage.growing import GrowingTable
+from selfcal_ros.collection.stage.samples import NO_STAMPS
 
 REASONS = np.array([None, Reason.NO_ENCODER, Reason.MOVING, Reason.CONTRADICTION], dtype=object)
 """Reasons that the encoder gives, by the code that is kept of them."""
@@ -124,7 +125,7 @@ class Exposures:
             self._look_up(group)
         changed = np.zeros(len(due), dtype=bool)
         changed[due] = _differ(before, self._table.rows[due])
-        return self._fill(changed)
+        return self._fill(due, changed)
 
     def _due_to_samples(self) -> np.ndarray:
         """Return which instants may depend on samples that came since the last time."""
@@ -194,7 +195,8 @@ class Exposures:
             position, reason = series.query(rows["stamp"])
             rows["position"][:, joint] = position
             rows["reason"][:, joint] = _codes(reason)
-            rows["moving"][:, joint] = series.moving(rows["stamp"]) == Reason.MOVING
+            rows["moving"][:, joint] = series.moving(
+                rows["stamp"], reason) == Reason.MOVING
             linear = joint < 2
             if linear:
                 rows["approach"][:, joint] = self._approach_of(series, index, position)
@@ -211,14 +213,19 @@ class Exposures:
         return series.approach(both, np.concatenate([[np.nan], position]),
                                threshold=self._threshold_m)[1:]
 
-    def _fill(self, changed: np.ndarray) -> np.ndarray:
+    def _fill(self, due: np.ndarray, changed: np.ndarray) -> np.ndarray:
         """Work out the directions of approach; return the stamps of what has changed."""
-        found = np.stack([filled(column) for column in self._table.rows["approach"].T])
-        old = self._approach
-        changed |= ((found != old) & (old != NEW)).any(axis=0)
+        if not due.any():
+            return NO_STAMPS
+        start = int(due.argmax())  # what is before the first that was looked up stays as it is
+        old = self._approach[:, start:]
+        column = self._table.rows["approach"][start:].T
+        before = self._approach[:, start - 1:start] if start else np.zeros((2, 1), dtype=np.int8)
+        found = np.stack([filled(row)[1:] for row in np.concatenate([before, column], axis=1)])
+        changed = changed[start:] | ((found != old) & (old != NEW)).any(axis=0)
         changed &= (old != NEW).all(axis=0)
-        self._approach = found
-        return self._table.rows["stamp"][changed]
+        self._approach[:, start:] = found
+        return self._table.rows["stamp"][start:][changed]
 
 
 NEW = 9
@@ -227,8 +234,9 @@ NEW = 9
 
 def _codes(reasons: np.ndarray) -> np.ndarray:
     out = np.zeros(len(reasons), dtype=np.int8)
+    told = np.flatnonzero(reasons != None)  # noqa: E711
     for code, reason in enumerate(REASONS[1:], 1):
-        out[reasons == reason] = code
+        out[told[reasons[told] == reason]] = code
     return out
 
 
