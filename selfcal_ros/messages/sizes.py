@@ -22,14 +22,15 @@ def check_view(readings: ViewReadings, artifact: Artifact, view_index: int) -> N
     """Raise InputError for readings of a view that cannot be, or of marks that are not there."""
     where = f"{MEASUREMENT_TOPIC} of '{readings.view.name}'"
     if not 0 <= view_index <= MAX_VIEWS:
-        raise InputError(where, f"a plan has at most {MAX_VIEWS} views", "mend the view_index")
+        raise InputError(where, f"a plan has at most {MAX_VIEWS} views", "correct the view_index")
     readings.view.lattice_pose(artifact)
     for name, index, least, most in (
             ("m", readings.m, -artifact.half[0], artifact.half[0]),
             ("n", readings.n, -artifact.half[1], artifact.half[1]),
             ("k", readings.k, 0, artifact.angular_count - 1)):
         if len(index) and not least <= np.min(index) <= np.max(index) <= most:
-            raise InputError(where, f"{name} goes beyond {least} to {most}", "mend the publisher")
+            raise InputError(where, f"{name} goes beyond {least} to {most}",
+                             "correct the publisher")
 
 
 def check_plate(artifact: Artifact, views: Iterable[ViewReadings]) -> None:
@@ -37,7 +38,7 @@ def check_plate(artifact: Artifact, views: Iterable[ViewReadings]) -> None:
     marks, sites = sum(len(view.m) for view in views), math.prod(artifact.shape)
     if sites > SITES_A_MARK * (1 + marks):
         raise InputError(MEASUREMENT_TOPIC, f"{marks} readings of a plate with {sites} marks",
-                         "mend grid_size, or measure more of it")
+                         "correct grid_size, or measure more of it")
 
 
 def check_simulated(command: Command) -> None:

@@ -35,9 +35,9 @@ def session():
     ({"translation_x": 1e300}, "pitches are beyond every field; is it in mm?"),
     ({"translation_y": float("nan")}, "nan is not a whole number of pitch steps"),
     ({"rotation": float("inf")}, "inf is not an angle"),
-    ({"view_index": 2**31}, "a plan has at most 10000 views; mend the view_index"),
-    ({"grid_size": 3}, "m goes beyond -1 to 1; mend the publisher"),
-    ({"angular_count": 4}, "k goes beyond 0 to 3; mend the publisher"),
+    ({"view_index": 2**31}, "a plan has at most 10000 views; correct the view_index"),
+    ({"grid_size": 3}, "m goes beyond -1 to 1; correct the publisher"),
+    ({"angular_count": 4}, "k goes beyond 0 to 3; correct the publisher"),
     ({"grid_size": 2**31 + 1}, "is not an odd number from 3 to"),
     ({"angular_count": 2**32 - 4}, "is not a multiple of 4")])
 def test_a_view_that_cannot_be_is_refused_and_forgotten(session, changes, reason):
@@ -50,7 +50,7 @@ def test_a_view_that_cannot_be_is_refused_and_forgotten(session, changes, reason
 def test_a_plate_that_is_enormous_beside_what_was_read_is_not_solved(session):
     session.take_measurement(first_view(grid_size=4001))
     tracemalloc.start()
-    with pytest.raises(InputError, match="25 readings of a plate with 16008001 marks; mend "):
+    with pytest.raises(InputError, match="25 readings of a plate with 16008001 marks; correct "):
         session.next_job()
     assert tracemalloc.get_traced_memory()[1] < 1e6
     tracemalloc.stop()

@@ -71,8 +71,8 @@ def _at_visits(model: ModelFit, row: int) -> np.ndarray:
     if model.equations is not None:
         values = values - model.equations.columns.at_visits(model.coefficients)[row]
     rest = model.found.residuals[row].reshape(-1)
-    left = visits.about_means(values[None], rest.size)[0] + rest[visits.mark]
-    return left * PHASES[problem.grid.poses[row].q]
+    residual = visits.about_means(values[None], rest.size)[0] + rest[visits.mark]
+    return residual * PHASES[problem.grid.poses[row].q]
 
 
 def _course(visits: GridVisits, rest: np.ndarray, start_ns: int) -> dict[str, np.ndarray]:

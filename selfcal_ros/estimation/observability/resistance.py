@@ -186,8 +186,8 @@ class PlannedTerms:
         rng = np.random.default_rng(SEED)
         ratio = (size / self.assumed.sigma_m) ** 2
         explained = rng.chisquare(1, (DRAWS, rank)) @ (1 + ratio * values)
-        left = rng.chisquare(dof, DRAWS) / dof
-        return float(np.mean(explained / rank / left > fdtri(rank, dof, 1 - level)))
+        noise = rng.chisquare(dof, DRAWS) / dof
+        return float(np.mean(explained / rank / noise > fdtri(rank, dof, 1 - level)))
 
     def _information(self, name: TermName, beside: TermEquations) -> tuple[np.ndarray, int]:
         """Return the eigenvalues of the information on a term beside others, and its rank."""

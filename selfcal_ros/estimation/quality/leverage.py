@@ -72,10 +72,11 @@ class Residuals:
 
         What the sum of squares loses without the reading. NaN where it cannot be checked.
         """
-        left, skew = self.found.residuals, abs(self.skew)
+        residual, skew = self.found.residuals, abs(self.skew)
         good = self.redundancy - skew > CHECKED
         both = np.where(good, self.redundancy**2 - skew**2, 1.0)
-        form = self.redundancy * abs(left) ** 2 + np.real(np.conj(self.skew) * left**2)
+        form = (self.redundancy * abs(residual) ** 2
+                + np.real(np.conj(self.skew) * residual**2))
         return np.where(good, form / both * self.problem.grid.weight, np.nan)
 
     @property
@@ -90,16 +91,16 @@ class Residuals:
         F-test of what the reading adds to the sum of squares against what is left without it.
         """
         if kind == "grid":
-            system, squares, weight, left, columns = (
+            system, squares, weight, residual, columns = (
                 self.problem.system, self.squares, self.problem.grid.weight,
                 abs(self.found.residuals), 2)
             dof = 2 * system.grid.n_readings - system.rank_grid
         else:
-            system, squares, weight, left, columns = (
+            system, squares, weight, residual, columns = (
                 self.problem.system, self.squares_theta, self.problem.angular.weight,
                 self.found.residuals_theta, 1)
             dof = system.angular.n_readings - system.rank_angular
-        rest = float((weight * left**2).sum()) - float(squares[at])
+        rest = float((weight * residual**2).sum()) - float(squares[at])
         if not np.isfinite(rest) or dof <= columns:
             return float("nan")
         noise = max(rest / (dof - columns), ROUNDING**2)
@@ -112,7 +113,7 @@ def _scaled(squares: np.ndarray, weight: np.ndarray, redundancy: np.ndarray) -> 
 
 
 def residuals_of(measurements: Measurements, options: Options) -> Residuals:
-    """JointFit the readings and return their residuals with redundancies.
+    """Fit the readings jointly and return their residuals with redundancies.
 
     Raises
     ------

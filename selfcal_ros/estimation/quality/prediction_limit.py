@@ -109,8 +109,9 @@ def _fitted(model: ModelFit, noise: np.ndarray, rng: np.random.Generator
     columns = now.columns.grid.reshape(now.n, -1)
     right = np.zeros((now.n, len(noise)))
     for draw, one in enumerate(noise):
-        left = grid.plate(one, fields[:, draw].reshape(grid.views.shape), parameters[:, draw])[1]
-        right[:, draw] = (np.conj(columns) @ (grid.weight * left).ravel()).real
+        field = fields[:, draw].reshape(grid.views.shape)
+        residual = grid.plate(one, field, parameters[:, draw])[1]
+        right[:, draw] = (np.conj(columns) @ (grid.weight * residual).ravel()).real
     values, vectors = np.linalg.eigh(now.columns.within.gram)
     within = vectors * np.sqrt(np.maximum(values, 0.0))
     right += within @ rng.standard_normal((now.n, len(noise)))

@@ -108,7 +108,7 @@ class Pool:
         inverse, rank = self.inverse(rows)
         return float(self.right.total @ inverse @ self.right.total), rank
 
-    def left(self, rows: np.ndarray) -> tuple[float, float]:
+    def noise_beside(self, rows: np.ndarray) -> tuple[float, float]:
         """Return the variance of one reading that is left beside `rows`, m^2, and its dof.
 
         Visits of one mark agree better than marks do where a cause is not held: the larger counts.
@@ -235,7 +235,7 @@ def _test(pool: Pool, taken: np.ndarray, group: Group) -> tuple[float, float] | 
     before, rank_before = pool.explained(taken)
     after, rank = pool.explained(taken | group.rows)
     gained, more = max(after - before, 0.0), rank - rank_before
-    variance, dof = pool.left(taken | group.rows)
+    variance, dof = pool.noise_beside(taken | group.rows)
     if more <= 0 or dof <= 0 or not variance > FLOOR_M**2:
         return None
     p = float(fdtrc(more, dof, gained / more / variance))
@@ -249,7 +249,7 @@ def _test(pool: Pool, taken: np.ndarray, group: Group) -> tuple[float, float] | 
 def _explanation(pool: Pool, taken: np.ndarray, group: Group, p: float) -> Explanation:
     rows = taken | group.rows
     inverse, _ = pool.inverse(rows)
-    variance, _ = pool.left(rows)
+    variance, _ = pool.noise_beside(rows)
     values = inverse @ pool.right.total
     system = pool.equations.system
     moved = pool.equations.maps[:, group.rows] @ values[group.rows]
