@@ -7,7 +7,9 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
+from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import ViewReadings
+from selfcal_ros.model.view import View
 
 _ARRAYS = (("m", "i8"), ("n", "i8"), ("dx", "f8"), ("dy", "f8"), ("count", "i8"), ("u", "f8"),
            ("k", "i8"), ("dtheta", "f8"), ("count_theta", "i8"), ("u_theta", "f8"))
@@ -38,6 +40,14 @@ def _digest(readings: ViewReadings) -> str:
     digest.update(repr((view, readings.sigma_xy, readings.sigma_theta, readings.dof_xy,
                         readings.dof_theta, readings.used, readings.rejected)).encode())
     return digest.hexdigest()
+
+
+def placing_digest(artifact: Artifact, view: View) -> str:
+    """Return a short digest of a plate and of how a view lays and reads it, names left out."""
+    numbers = (*artifact.shape, artifact.grid_pitch_m, artifact.angular_count, view.rotation_rad,
+               *view.translation_m, view.grid, view.angular, view.repeats)
+    text = ",".join(float(number).hex() for number in numbers)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 def session_digest(digests: dict[int, str]) -> str:

@@ -10,7 +10,7 @@ import numpy as np
 
 from selfcal_ros.collection.clock.steps import step_lines
 from selfcal_ros.collection.collector import Collector, ViewProgress
-from selfcal_ros.collection.digest import readings_digest, session_digest
+from selfcal_ros.collection.digest import placing_digest, readings_digest, session_digest
 from selfcal_ros.collection.messages import Command, Phase
 from selfcal_ros.collection.reasons import advice
 from selfcal_ros.collection.settings.nodes import CollectorSettings
@@ -141,11 +141,12 @@ class CollectingSession:
         except NoDataError:
             self._rejected = Counter(self.collector.unusable)
             return
-        except InputError as error:  # holds until this node is restarted: say it once
+        except InputError as error:  # holds for this run: say it once
             if self._problem != str(error):
                 self._problem = str(error)
-                self._ports.say(Level.ERROR, f"{error}; then restart this node")
+                self._ports.say(Level.ERROR, f"{error}; then start a new run")
             return
+        self._problem = ""
         self._publish(measurements, progress, final=False)
         self._describe(measurements, progress)
         spent = self._ports.now_s() - now
@@ -279,7 +280,8 @@ class CollectingSession:
         return {"plan_id": command.plan_id, "run_id": command.run_id,
                 "phase": command.phase.name, "view": command.view_index,
                 "view_name": command.view.name if command.view else "",
-                "command_stamp": command.stamp_ns}
+                "command_stamp": command.stamp_ns,
+                "placing": placing_digest(command.plate(), command.view) if command.view else ""}
 
     def _encoder(self) -> Diagnosis:
         """Return rate and largest gap of the encoder, WARN beyond the limits."""

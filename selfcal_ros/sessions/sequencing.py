@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from selfcal_ros.collection.collector import expected_marks
+from selfcal_ros.collection.digest import placing_digest
 from selfcal_ros.collection.messages import Command, Phase
 from selfcal_ros.collection.sequencer import ENDED, Sequencer, State
 from selfcal_ros.collection.settings.nodes import SequencerSettings
@@ -126,6 +127,8 @@ class SequencingSession:
                 or phase not in ("PLACE", "MEASURE") or index >= len(plan.views)
                 or told.get("view_name") != plan.views[index].name):
             return ""
+        if told.get("placing") not in (None, placing_digest(plan.artifact, plan.views[index])):
+            return ""  # the plan has been edited: what was read is of another one
         self.run_id = told["run_id"]
         command = self.machine.resume(index, Phase[phase])
         self._send([command], stamp_ns=int(told["command_stamp"]))  # as it was: it is latched anew

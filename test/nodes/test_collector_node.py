@@ -232,7 +232,7 @@ def test_another_plate_under_the_same_plan_is_said_once_and_in_the_diagnostics(
         graph.until(lambda n=expected: received["detection"] == n, "the detections")
     assert len(said) == 1
     assert line in said[0]
-    assert said[0].endswith("; then restart this node")
+    assert said[0].endswith("; then start a new run")
 
 
 def test_diagnostics_count_rejections_before_any_view_and_beat_without_messages(graph):

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 
-from selfcal_ros.collection.messages import Command, Detection
+from selfcal_ros.collection.messages import Command, Detection, Phase
 from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.sessions.collecting import CollectingSession
@@ -96,3 +96,24 @@ def test_a_second_run_is_published_anew(run_id):
     assert first[0]["run_id"] != second[0]["run_id"] == (run_id or str(
         events.commands[0].stamp_ns + 10**12))
     assert second[0]["session_reject_reasons"] == ["other_run"]
+
+
+def test_a_run_with_two_plates_is_an_error_until_the_next_run():
+    cell, events = Cell(), scene("0, 90", count=0)
+    first = events.commands[0]
+    other = replace(first, artifact=replace(first.artifact, grid_size=7), view_index=1,
+                    stamp_ns=first.stamp_ns + 5, phase=Phase.MEASURE)
+    run = [replace(event, run_id="1") if isinstance(event, Command) else event
+           for event in events.events]
+    cell.feed([*run, replace(other, run_id="1")])
+    [(level, line)] = cell.said
+    assert (level, line.partition("use one")[2]) == (
+        Level.ERROR, " plate in one plan; then start a new run")
+    told = cell.session.diagnosis(detections_matched=True)
+    assert told.level == Level.WARN and "describes another plate" in told.message
+    later = events.commands[-1].stamp_ns + 10**9
+    cell.feed([replace(first, stamp_ns=later, run_id=str(later), phase=Phase.MEASURE,
+                       artifact=replace(first.artifact, grid_size=7))])
+    assert len(cell.said) == 1
+    told = cell.session.diagnosis(detections_matched=True)
+    assert "another plate" not in told.message

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The session of the sequencer, on both sides of every time and every guard."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,6 +11,7 @@ from selfcal_ros.collection.messages import Command, Phase
 from selfcal_ros.collection.sequencer import State
 from selfcal_ros.errors import InputError
 from selfcal_ros.messages import from_model
+from selfcal_ros.sessions.collecting import CollectingSession
 from selfcal_ros.sessions.ports import Diagnosis, Level
 from selfcal_ros.sessions.sequencing import PATIENCE_S, SequencingSession
 from test.support.ports import START_NS, Hands, message, settings_of
@@ -199,6 +201,25 @@ def test_a_run_is_taken_up_if_the_collector_tells_an_unfinished_one(
     assert desk.commands == [command]
     resumed = command[1] == 1
     assert desk.session.run_id == ("17" if resumed else str(START_NS))
+
+
+@pytest.mark.parametrize(("plate", "view", "goes_on"), [
+    ({}, {}, True), ({}, {"visit_order": "x_back_y@plate"}, True), ({"grid_size": 7}, {}, False),
+    ({"grid_pitch_m": 0.011}, {}, False), ({"angular_count": 12}, {}, False),
+    ({}, {"rotation_rad": np.pi}, False), ({}, {"translation_m": (0.0, 0.01)}, False),
+    ({}, {"repeats": 3}, False), ({}, {"grid": False}, False), ({}, {"angular": False}, False)])
+def test_a_plan_that_was_edited_begins_a_new_run(tmp_path, plate, view, goes_on):
+    collector = CollectingSession(settings_of("measurement_collector"), Hands().ports)
+    collector.take_command(message("ViewCommand", from_model.command(Command(
+        START_NS, MEASURE, PLAN.plan_id, 1, replace(PLAN.views[1], **view),
+        replace(PLAN.artifact, **plate), len(PLAN.views), run_id="17"), "stage")), False)
+    told = collector.diagnosis(detections_matched=True).values
+    desk = Desk(tmp_path, start_checks=True)
+    desk.hear("measurement_collector", **{key: str(told[key]) for key in told} | READY)
+    desk.hear("solver")
+    desk.session.begin()
+    assert desk.commands == [(MEASURE, 1) if goes_on else (PLACE, 0)]
+    assert desk.session.run_id == ("17" if goes_on else str(START_NS))
 
 
 def test_only_a_sequencer_that_has_done_nothing_yet_takes_up_a_run(tmp_path):
