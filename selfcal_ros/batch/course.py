@@ -45,8 +45,9 @@ class Course:
         Theil and Sen's slope, and the limits between which it lies with 95 %.
     p_trend, p_change : float
         Probability of as much, or more, if nothing goes on.
-    change : int
-        Number of the first value after the most likely change.
+    last_before, change : int
+        Numbers of the last known value before the most likely change, and of the first after it;
+        both 0 where there is none.
     before, after : float
         Medians on both sides of it.
     adjusted_p : float
@@ -65,6 +66,7 @@ class Course:
     after: float
     adjusted_p: float = 1.0
     finding: Finding = Finding.NONE
+    last_before: int = 0
 
 
 def course_of(days: np.ndarray, values: np.ndarray, rng: np.random.Generator, *,
@@ -131,7 +133,10 @@ def courses(days: np.ndarray, table: Mapping[str, np.ndarray], *, seed: int = SE
         known = np.isfinite(values)
         if known.sum() >= FEWEST:
             course = course_of(days[known], values[known], rng, orders=orders)
-            found[name] = replace(course, change=int(np.flatnonzero(known)[course.change]))
+            if course.change:
+                last, first = np.flatnonzero(known)[course.change - 1:course.change + 1]
+                course = replace(course, last_before=int(last), change=int(first))
+            found[name] = course
     adjusted = _adjusted([p for course in found.values()
                           for p in (course.p_trend, course.p_change)])
     return {name: _judged(course, pair, days, table[name]) for (name, course), pair in

@@ -16,6 +16,7 @@ from selfcal_ros import __version__
 from selfcal_ros.bagio.offline import bag_input, collect_bag
 from selfcal_ros.batch.bags import stat_of
 from selfcal_ros.batch.quantities import quantities
+from selfcal_ros.collection.marks.places import with_places
 from selfcal_ros.collection.settings.estimator import solver_options
 from selfcal_ros.collection.settings.nodes import CollectorSettings, SolverSettings
 from selfcal_ros.errors import ExitCode, InputError, NotIdentifiableError, SelfcalError
@@ -67,11 +68,12 @@ class Settings:
 
 @dataclass(frozen=True)
 class Job:
-    """A bag to be solved into the folder of a batch."""
+    """A bag to be solved into the folder of a batch; `redo`: also where it was solved before."""
 
     bag: Path
     folder: Path
     settings: Settings
+    redo: bool = False
 
 
 Record = dict[str, Any]
@@ -79,7 +81,7 @@ Record = dict[str, Any]
 
 
 def run_job(job: Job) -> Record:
-    """Return the record of a bag: the one that is there, or that of a new solution.
+    """Return the record of a bag: the one that is there if it may be, or that of a new solution.
 
     A bag that cannot be used has a record too, with the exit code and the line of `selfcal
     solve`. Only where its content cannot even be read nothing is kept.
@@ -98,7 +100,7 @@ def run_job(job: Job) -> Record:
         return record | _without_result(error)
     key = hashlib.sha256(f"{source['sha256']} {record['settings']}".encode()).hexdigest()[:24]
     path = job.folder / RECORDS / f"{key}.json"
-    kept = read_record(path)
+    kept = None if job.redo else read_record(path)
     if kept is not None and is_whole(job.folder, kept):
         if not Path(kept["bag"]).exists():  # it was moved here
             write_json(path, kept | record)
@@ -127,7 +129,7 @@ def solved(job: Job, source: dict[str, str],
         robust_calibrate if settings.robust else calibrate)
     problem = None
     try:
-        result = solve(session.measurements, options)
+        result = with_places(solve(session.measurements, options), session.measurements.views)
     except NotIdentifiableError as error:
         if not isinstance(error.observability, Observability):
             raise

@@ -110,7 +110,7 @@ def _named(series: Series, course: Course, values: np.ndarray, place: Any) -> li
         ends = [place(day, offset + slope * day) for day in (days[0], days[-1])]
         return [_line("course", *ends)]
     if course.finding is Finding.CHANGE:
-        middle = (days[course.change - 1] + days[course.change]) / 2
+        middle = (days[course.last_before] + days[course.change]) / 2
         x = place(middle, 0.0)[0]
         return [_line("change", (x, EDGE), (x, HEIGHT - 2 * EDGE)),
                 _line("course", place(days[0], course.before), place(middle, course.before)),

@@ -49,18 +49,22 @@ def opened(folder: Path) -> Iterator[None]:
         yield
 
 
-def done_and_to_do(folder: Path, bags: Sequence[Path], settings: Settings,
+def kept_records(folder: Path, settings: Settings) -> list[Record]:
+    """Return the records of these settings that are in the folder."""
+    digest = settings.digest()
+    found = (read_record(path) for path in sorted((folder / RECORDS).glob("*.json")))
+    return [record for record in found if record is not None and record["settings"] == digest
+            and is_whole(folder, record)]
+
+
+def done_and_to_do(kept: Sequence[Record], bags: Sequence[Path],
                    ) -> tuple[dict[int, Record], list[int]]:
     """Return the records of bags that are done, by their place in `bags`, and the others' places.
 
-    A bag is done if it has a record of these settings and its files are as they were. The largest
-    of the others come first, so that no core ends long after the others.
+    A bag is done if it has a record and its files are as they were. The largest of the others come
+    first, so that no core ends long after the others.
     """
-    digest, known = settings.digest(), {}
-    for path in sorted((folder / RECORDS).glob("*.json")):
-        record = read_record(path)
-        if record is not None and record["settings"] == digest and is_whole(folder, record):
-            known[record["bag"]] = record
+    known = {record["bag"]: record for record in kept}
     done, sizes = {}, {}
     for index, bag in enumerate(bags):
         files = stat_of(bag)
@@ -72,13 +76,7 @@ def done_and_to_do(folder: Path, bags: Sequence[Path], settings: Settings,
     return done, sorted(sizes, key=lambda index: -sizes[index])
 
 
-def forget(folder: Path, records: Sequence[Record]) -> None:
-    """Remove records, so that their bags are solved anew."""
-    for record in records:
-        (folder / RECORDS / f"{record['key']}.json").unlink(missing_ok=True)
-
-
 def jobs_of(folder: Path, bags: Sequence[Path], settings: Settings,
-            places: Sequence[int]) -> list[Job]:
+            places: Sequence[int], *, redo: bool) -> list[Job]:
     """Return the jobs of the bags at `places`."""
-    return [Job(bags[index], folder, settings) for index in places]
+    return [Job(bags[index], folder, settings, redo) for index in places]

@@ -56,7 +56,7 @@ class Series:
             slope, low, high = course.slope_per_day
             return (f"{text}: trend of {slope:+.3g} {unit} a day (95 %: {low:+.3g} to "
                     f"{high:+.3g}), {p}")
-        return (f"{text}: changed between {self.date(course.change - 1)} and "
+        return (f"{text}: changed between {self.date(course.last_before)} and "
                 f"{self.date(course.change)} by {course.after - course.before:+.3g} {unit} "
                 f"(from {course.before:.4g} to {course.after:.4g}), {p}")
 
@@ -128,7 +128,7 @@ def batch_json(records: Sequence[Record], found: Sequence[Series], done_before: 
 
 def _course_json(series: Series, course: Course) -> dict:
     changed = [series.records[i]["first_exposure"] for i in
-               (course.change - 1, course.change)] if course.change else None
+               (course.last_before, course.change)] if course.change else None
     return {"n": course.n, "finding": str(course.finding), "adjusted_p": course.adjusted_p,
             "p_trend": course.p_trend, "slope_per_day": list(course.slope_per_day),
             "p_change": course.p_change, "change_between": changed,

@@ -45,7 +45,7 @@ def run(args: argparse.Namespace) -> int:
     from selfcal_ros.batch.bags import find_bags
     from selfcal_ros.batch.jobs import Settings
     from selfcal_ros.batch.page import page_html
-    from selfcal_ros.batch.store import done_and_to_do, forget, opened
+    from selfcal_ros.batch.store import done_and_to_do, kept_records, opened
     from selfcal_ros.batch.table import batch_json, csv_text, series_of, summary_lines
     from selfcal_ros.files import write_json, write_text
 
@@ -55,15 +55,14 @@ def run(args: argparse.Namespace) -> int:
     settings = Settings(*parameters(args), args.robust, args.namespace)
     bags, folder = find_bags(args.bags), Path(args.output)
     with opened(folder):
-        done, places = done_and_to_do(folder, bags, settings)
-        if args.redo:
-            forget(folder, list(done.values()))
-            done, places = done_and_to_do(folder, bags, settings)
+        kept = [] if args.redo else kept_records(folder, settings)
+        done, places = done_and_to_do(kept, bags)
         for record in (done[index] for index in sorted(done)):
             _say(record)
-        before = len(done)
         done |= _worked(args, bags, settings, places)
         records = [done[index] for index in sorted(done)]
+        keys = {record.get("key") for record in kept}  # copies and moved bags have one as well
+        before = sum("key" in record and record["key"] in keys for record in records)
         found = series_of(records)
         lines = summary_lines(records, found, before)
         content = batch_json(records, found, before)
@@ -85,7 +84,7 @@ def _worked(args: argparse.Namespace, bags: Sequence[Path], settings: "Settings"
 
     found: dict[int, Record] = {}
     workers = check_workers(args.workers)
-    jobs = jobs_of(Path(args.output).resolve(), bags, settings, places)
+    jobs = jobs_of(Path(args.output).resolve(), bags, settings, places, redo=args.redo)
     with late_progress("solving bags") as progress:
         for outcome in outcomes(run_job, jobs, workers=workers, dask=args.dask or ""):
             place = places[outcome.index]

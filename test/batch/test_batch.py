@@ -14,12 +14,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from selfcal_ros.batch import jobs
 from selfcal_ros.batch.bags import find_bags
 from selfcal_ros.batch.jobs import RECORDS, RESULTS
 from selfcal_ros.batch.page import page_html
 from selfcal_ros.batch.quantities import described
 from selfcal_ros.batch.store import opened
-from selfcal_ros.batch.table import csv_text, series_of, summary_lines
+from selfcal_ros.batch.table import batch_json, csv_text, series_of, summary_lines
 from selfcal_ros.cli.main import main
 from selfcal_ros.errors import InputError, NoDataError
 from test.support.bags import Foreign
@@ -91,7 +92,7 @@ def test_only_what_is_new_is_done(shelf, tmp_path, capsys):
     assert batch(mine, "-o", out, "--workers", 1, "--json") == 0
     told = json.loads(capsys.readouterr().out)
     assert told == content(out)
-    assert (told["bags"], told["done_before"]) == (3, 1)
+    assert (told["bags"], told["done_before"]) == (3, 2)
     second = stamps(out)
     assert len(second) == 3 and first.items() <= second.items()
     assert sorted(r["bag"] for r in told["records"]) == [
@@ -111,7 +112,26 @@ def test_a_copy_of_a_bag_counts_once_over_time(shelf, tmp_path):
     assert batch(shelf / "a.mcap", tmp_path / "again.mcap", "-o", tmp_path / "out") == 0
     told = content(tmp_path / "out")
     assert (told["bags"], len(told["series"][0]["bags"])) == (2, 1)
+    assert told["done_before"] == 0
     assert len(list((tmp_path / "out" / RECORDS).iterdir())) == 1
+    again = tmp_path / "again.mcap", shelf / "a.mcap", "-o", tmp_path / "out"
+    assert batch(*again) == 0
+    assert content(tmp_path / "out")["done_before"] == 2
+
+
+def test_redo_solves_a_bag_again_that_is_known_by_its_content_alone(shelf, tmp_path, monkeypatch):
+    names = [tmp_path / name for name in ("one.mcap", "two.mcap")]
+    for name in names:
+        shutil.copy(shelf / "a.mcap", name)
+    assert batch(*names, "-o", tmp_path / "out", "--workers", 1) == 0
+    solved = []
+    monkeypatch.setattr(jobs, "solved", lambda job, source, right=jobs.solved: (
+        solved.append(job.bag.name), right(job, source))[1])
+    assert batch(*names, "-o", tmp_path / "out", "--workers", 1) == 0
+    assert not solved
+    assert batch(*names, "-o", tmp_path / "out", "--workers", 1, "--redo") == 0
+    assert sorted(solved) == ["one.mcap", "two.mcap"]
+    assert content(tmp_path / "out")["done_before"] == 0
 
 
 def test_killed_in_the_middle_it_does_only_the_rest(tmp_path):
@@ -179,6 +199,25 @@ def records(number: int = 30, change: int = 18, **more) -> list[dict]:
              "first_exposure": f"2026-03-{day + 1:02}T12:00:00.000+00:00",
              "quantities": {"nonorthogonality_arcsec": value, "sigma_xy_nm": None}, **more}
             for day, value in enumerate(values)]
+
+
+def test_a_change_is_named_between_bags_in_which_the_quantity_is_known():
+    gap = records()
+    for record in gap[14:18]:
+        record["quantities"]["nonorthogonality_arcsec"] = None
+    series, = series_of(gap)
+    line, = series.sentences()
+    assert line.startswith("nonorthogonality: changed between 2026-03-14 12:00 and 2026-03-19 ")
+    found = batch_json(gap, [series], 0)["series"][0]["courses"]["nonorthogonality_arcsec"]
+    assert [day[:10] for day in found["change_between"]] == ["2026-03-14", "2026-03-19"]
+    # the dashed line: half way from day 13 to day 18 of 29
+    place = 64 + (560 - 64 - 14) * 15.5 / 29
+    assert f'class="change" x1="{place:.1f}"' in page_html(gap, [series], ["30 bags"])
+    steady = [record | {"quantities": {"x_um": 1.0 if day > 4 else None}}
+              for day, record in enumerate(records())]
+    series, = series_of(steady)
+    (course,) = batch_json(steady, [series], 0)["series"][0]["courses"].values()
+    assert course["finding"] == "none" and course["change_between"] is None
 
 
 def test_a_change_is_named_with_its_date_whatever_the_order_of_the_bags():

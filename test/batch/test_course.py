@@ -102,6 +102,12 @@ def test_values_that_are_not_known_are_passed_over():
     values[20:] += 1
     values[3:6] = np.nan
     assert courses(days, {"x": values})["x"].change == 20
+    values[12:20] = np.nan  # nobody knows when it changed between
+    course = courses(days, {"x": values})["x"]
+    assert (course.finding, course.last_before, course.change) == (Finding.CHANGE, 11, 20)
+    steady = np.where(np.arange(40) < 5, np.nan, 1.0)
+    nothing = courses(days, {"x": steady})["x"]
+    assert (nothing.finding, nothing.last_before, nothing.change) == (Finding.NONE, 0, 0)
     few = np.where(np.arange(40) < FEWEST - 1, values, np.nan)
     few[3:6] = 0.1
     assert courses(days, {"x": few}) == {}

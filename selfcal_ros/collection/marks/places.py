@@ -2,11 +2,13 @@
 """Where the stage stood when grid detections were rejected: a hint at dirt, or at a bad region."""
 
 from collections.abc import Iterable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from selfcal_ros.model.readings import RejectedPlaces, ViewReadings
+from selfcal_ros.model.result import CalibrationResult
 
 
 class PlaceList:
@@ -30,6 +32,12 @@ class PlaceList:
             chosen = np.linspace(0, len(reason) - 1, RejectedPlaces.MOST).round().astype(int)
             reason, at = reason[chosen], at[:, chosen]
         return RejectedPlaces(tuple(map(str, reason)), *at)
+
+
+def with_places(result: CalibrationResult, views: Iterable[ViewReadings]) -> CalibrationResult:
+    """Return the result with the places of rejected detections, where there are any."""
+    places = places_json(views)
+    return replace(result, extra={**result.extra, "rejected_at": places}) if places else result
 
 
 def places_json(views: Iterable[ViewReadings]) -> list[dict[str, Any]]:
