@@ -82,6 +82,9 @@ def parameters(args: argparse.Namespace) -> "tuple[CollectorSettings, SolverSett
                       misalignment_model=args.misalignment, uncertainty=args.uncertainty,
                       model_terms=args.model, drift_degree=args.drift_degree,
                       reference_certificate=args.certificate, **_reference(args.reference))
+    if args.certificate is not None and solver.reference_kind == "none":
+        raise InputError("--certificate", "it belongs to a reference length, and none is given",
+                         "name the length with --reference KIND:ERROR:U")
     if args.misalignment == "rigid" and solver.method == "law":
         raise InputError("--misalignment", "Hu's law is linear, not rigid",
                          "leave it out, or use --method joint")
@@ -173,11 +176,10 @@ def _extended(args: argparse.Namespace, measurements: Any, options: Any,
     """Return the result with places, and validation and budget as wanted, and what to print."""
     from dataclasses import replace
 
-    from selfcal_ros.collection.marks.places import places_json
+    from selfcal_ros.collection.marks.places import with_places
 
     lines: list[str] = []
-    if places := places_json(measurements.views):
-        result = replace(result, extra={**result.extra, "rejected_at": places})
+    result = with_places(result, measurements.views)
     if args.validate:
         from selfcal_ros.estimation.quality.outliers import clean
         from selfcal_ros.estimation.quality.validation import (
@@ -193,6 +195,9 @@ def _extended(args: argparse.Namespace, measurements: Any, options: Any,
     if args.budget:
         from selfcal_ros.estimation.quality.budget import budget_json, budget_text, budgets
 
+        if not result.has_uncertainty:
+            return result, [*lines, "", "no budget: the uncertainty map was not computed "
+                            "(--uncertainty always)"]
         rows = budgets(result, options.reference)
         result = replace(result, extra={**result.extra, "budget": budget_json(rows)})
         lines += ["", *budget_text(rows)]

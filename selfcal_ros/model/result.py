@@ -23,6 +23,8 @@ from selfcal_ros.model.verdict_json import (
 )
 
 SCHEMA = "selfcal.result/1"
+REFERENCES = ("artifact", "stage_x", "stage_y")
+"""Kinds of a reference length."""
 
 
 @dataclass(frozen=True)
@@ -153,6 +155,37 @@ class CalibrationResult:
         """The plate."""
         return self.error_map.artifact
 
+    @property
+    def has_uncertainty(self) -> bool:
+        """Whether the uncertainty of the XY map was computed."""
+        emap = self.error_map
+        return bool((np.isfinite(emap.u_gx) & np.isfinite(emap.u_gy)).any())
+
+
+def _reference(raw: Any) -> dict[str, Any] | None:
+    """Return the reference length of a result as it is; ValueError if it is none."""
+    if raw is None:
+        return None
+    told = _of(dict, raw)
+    if told["kind"] not in REFERENCES:
+        raise ValueError(f"the reference {told['kind']!r} is unknown")
+    error, u = _number(told["relative_error"]), _number(told["u_relative"])
+    if not (abs(error) < 0.1 and 0 <= u < 0.1):
+        raise ValueError(f"reference: {error!r} with u {u!r} is not a relative error")
+    _of(str, told.get("certificate") or "")
+    return told
+
+
+def _budget(rows: Any) -> None:
+    """Raise ValueError if these are no rows of a budget."""
+    for row in _of(list, rows):
+        for key, value in _of(dict, row).items():
+            if key == "dof" or str(key).startswith("u_"):
+                _number(value)
+            else:
+                _of(str, value)
+        _of(str, row["quantity"])
+
 
 def with_input(result: CalibrationResult, source: dict[str, str],
                lost: list[str]) -> CalibrationResult:
@@ -267,6 +300,7 @@ def _parse(data: dict) -> CalibrationResult:
     artifact = Artifact(raw["grid_size"], float(raw["grid_pitch"]), raw["angular_count"],
                         raw.get("grid_size_y", 0))
     emap, amap = data["error_map"], data["artifact_map"]
+    _budget(data.get("budget", []))
     shapes: dict[str, tuple[int, ...]] = dict.fromkeys(_MAP_ARRAYS[:4], artifact.shape)
     shapes |= dict.fromkeys(_MAP_ARRAYS[4:], (artifact.angular_count,))
     error_map = ErrorMap(
@@ -293,7 +327,7 @@ def _parse(data: dict) -> CalibrationResult:
         _of(str, data.get("measurement_sense", "microscope_moves")),
         {key: value for key, value in data.items() if key not in _KNOWN},
         verdict_from_dict(data.get("verdict"), identifiable=seen["identifiable"]),
-        model_from_dict(data.get("model")), data.get("reference"),
+        model_from_dict(data.get("model")), _reference(data.get("reference")),
         provenance_from_dict(data.get("provenance")), _of(str, data.get("run_id", "")))
 
 

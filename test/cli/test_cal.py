@@ -197,6 +197,40 @@ def test_check_strict_refuses_what_is_tolerated(run, tmp_path):
     one_line(err, "f.cal:1: a token in mixed case")
 
 
+def test_eval_refuses_a_length_of_an_axis_that_turns(run):
+    assert run("export", "r.json", "-o", "f.cal", "--theta-axis", "3", "--theta-output",
+               "t.cal", "--counts-per-unit", "3=1000")[0] == 0
+    counts = "--counts-per-unit", "3=1000"
+    assert run("eval", "t.cal", "--position", "3=10", *counts)[0] == 0
+    for text in (without_comments, str):  # told by where the table rolls over, or by its comments
+        code, out, err = run("eval", text("t.cal"), "--position", "3=10mm", *counts)
+        assert (code, out) == (2, "")
+        one_line(err, "'3=10mm' is a length, and axis 3 turns; write 3=10.5, in its primary unit")
+    assert run("export", "r.json", "-o", "g.cal", "--theta-axis", "3")[0] == 0
+    code, _, err = run("eval", "g_theta.cal", "--position", "3=10mm")
+    assert code == 2
+    one_line(err, "'3=10mm' is a length, and axis 3 turns")
+    assert run("eval", "f.cal", "--position", "1=10mm", "--position", "2=1")[0] == 0
+
+
+def without_comments(path):
+    """Return the name of a copy of a calibration file without its comments."""
+    with open(path) as file:
+        kept = [line for line in file if not line.startswith(";")]
+    with open("bare.cal", "w") as file:
+        file.writelines(kept)
+    return "bare.cal"
+
+
+def test_a_table_of_a_map_without_uncertainty_says_so(run):
+    nan = np.full(MAP.gx.shape, np.nan)
+    write_json("n.json", result_to_dict(result_of(replace(MAP, u_gx=nan, u_gy=nan))))
+    assert run("export", "n.json", "-o", "n.cal")[0] == 0
+    comments = load_cal("n.cal").comments
+    assert any(line.strip() == "uncertainty: not computed" for line in comments)
+    assert not any("nan" in line for line in comments)
+
+
 def test_check_gi4(run, tmp_path):
     (tmp_path / "g.cal").write_text(":GALVO2D 2 1 1 2 1024 1024 65\n"
                                     + ("0 " * 130 + "\n") * 65 + ":END\n")

@@ -131,6 +131,38 @@ def test_no_damage_to_a_result_file_ends_in_a_traceback(folder):
     assert min(outcomes.values()) > 50
 
 
+REFERENCE = {"kind": "artifact", "relative_error": 1e-6, "u_relative": 1e-7, "certificate": "C 1"}
+ROW = {"quantity": "XY", "component": "combined", "type": "", "u_rms_m": 1e-9, "u_max_m": 2e-9,
+       "u_rms_rad": None, "u_max_rad": None, "dof": 12.0, "note": ""}
+
+
+@pytest.mark.parametrize(("key", "value", "said"), [
+    ("reference", REFERENCE | {"kind": "moon"}, "the reference 'moon' is unknown"),
+    ("reference", REFERENCE | {"relative_error": "x"}, "'x' is not a number"),
+    ("reference", REFERENCE | {"u_relative": None}, "with u nan is not a relative error"),
+    ("reference", REFERENCE | {"u_relative": -1.0}, "with u -1.0 is not a relative error"),
+    ("reference", REFERENCE | {"certificate": 3}, "3 is not of type str"),
+    ("reference", {}, "the key 'kind' is missing"),
+    ("reference", [], "[] is not of type dict"),
+    ("budget", [{}], "the key 'quantity' is missing"),
+    ("budget", [ROW | {"quantity": 3}], "3 is not of type str"),
+    ("budget", [ROW | {"dof": "many"}], "'many' is not a number"),
+    ("budget", [ROW | {"u_rms_m": [1]}], "[1] is not a number"),
+    ("budget", [3], "3 is not of type dict"), ("budget", "x", "'x' is not of type list")])
+def test_an_unusable_reference_or_budget_is_one_line(folder, monkeypatch, capsys, key, value, said):
+    monkeypatch.chdir(folder)
+    whole = json.loads(Path("result.json").read_text())
+    for name, good in (("reference", REFERENCE), ("budget", [ROW])):
+        Path("good.json").write_text(json.dumps(whole | {name: good}))
+        assert main(["report", "good.json"]) == 0
+    Path("bad.json").write_text(json.dumps(whole | {key: value}))
+    capsys.readouterr()
+    assert main(["report", "bad.json"]) == 2
+    err = capsys.readouterr().err
+    assert err.startswith("selfcal report: bad.json: damaged result (") and err.count("\n") == 1
+    assert said in err
+
+
 def test_solve_writes_the_report_of_its_result(tmp_path, capsys):
     bag = str(ROOT / "bags/hu_noise")
     assert main(["solve", bag, "--quiet", "-o", str(tmp_path / "r.json"),

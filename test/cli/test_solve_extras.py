@@ -30,6 +30,14 @@ def test_validation_and_budget_are_printed_and_written(solved):
     assert labels[-2:] == ["combined", "expanded"]
 
 
+def test_without_an_uncertainty_map_the_budget_is_one_line(solved):
+    code, result, printed = solved("hu_noise", "--uncertainty", "never", "--budget")
+    assert code == 0 and "budget" not in result
+    assert printed.out.splitlines()[-1] == (
+        "no budget: the uncertainty map was not computed (--uncertainty always)")
+    assert "reading noise" not in printed.out and printed.err == ""
+
+
 def test_robust_lists_what_it_removed(solved):
     code, result, _ = solved("hu_noise", "--robust", "--quiet")
     assert code == 0

@@ -42,6 +42,13 @@ def test_a_reference_length_adds_its_scale_and_its_uncertainty(tmp_path, kind):
     assert fixed["u_gx"][0, 5] == pytest.approx(0.05 * 1e-7, rel=0.05)
 
 
+def test_a_certificate_of_nothing_is_refused(capsys):
+    assert main(["solve", BAG, "--certificate", "PTB 123"]) == 2
+    assert capsys.readouterr().err == (
+        "selfcal solve: --certificate: it belongs to a reference length, and none is given; "
+        "name the length with --reference KIND:ERROR:U\n")
+
+
 @pytest.mark.parametrize("text", ["artifact", "artifact:x:1", "moon:1e-6:1e-7", "artifact:1:0"])
 def test_a_bad_reference_is_one_line(capsys, text):
     assert main(["solve", BAG, "--reference", text]) == 2

@@ -97,7 +97,11 @@ def _evaluate(args: argparse.Namespace) -> int:
     cal = load_cal(args.file)
     frame = frame_from_comments(cal.comments)
     unit = args.unit or (frame.unit if frame else "mm")
-    positions = numbers(in_unit(args.position, unit), "--position")
+    rotary = {axis for table in cal.tables if getattr(table, "rollover", None)
+              for axis in table.inputs}
+    if frame is not None and frame.theta_axis is not None:
+        rotary.add(frame.theta_axis)
+    positions = numbers(in_unit(args.position, unit, rotary=rotary), "--position")
     if not positions:
         raise InputError("--position", "no position is given", "write --position 1=10.5")
     corrections = CalEvaluator(cal.tables, _setup(args)).corrections(positions)

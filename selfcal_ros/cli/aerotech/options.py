@@ -4,6 +4,7 @@
 import argparse
 import math
 import re
+from collections.abc import Container
 from fractions import Fraction
 from typing import TYPE_CHECKING, Any
 
@@ -46,14 +47,23 @@ def numbers(texts: list[str] | None, option: str, *, positive: bool = False) -> 
     return found
 
 
-def in_unit(texts: list[str] | None, unit: str) -> list[str]:
-    """Return options AXIS=LENGTH with the length as a number in `unit`; others as they are."""
+def in_unit(texts: list[str] | None, unit: str, *, rotary: Container[int] = ()) -> list[str]:
+    """Return options AXIS=LENGTH with the length as a number in `unit`; others as they are.
+
+    Raises
+    ------
+    InputError
+        For a length of an axis in `rotary`.
+    """
     found = []
     for text in texts or []:
         match = re.fullmatch(r"(\d+)=([-+]?[\d.]+(?:[eE][-+]?\d{1,3})?) ?(m|mm|um|µm|nm)", text)
         if match is None:
             found.append(text)
             continue
+        if int(match[1]) in rotary:
+            raise InputError("--position", f"'{text}' is a length, and axis {match[1]} turns",
+                             f"write {match[1]}=10.5, in its primary unit (deg)")
         factor = Fraction(str(M_PER[match[3].replace("µ", "u")])) / Fraction(str(M_PER[unit]))
         try:
             found.append(f"{match[1]}={float(Fraction(match[2]) * factor)!r}")

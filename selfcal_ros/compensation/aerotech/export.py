@@ -18,6 +18,7 @@ from selfcal_ros.compensation.machine import MachineFrame
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.error_map import ErrorMap
 from selfcal_ros.model.result import CalibrationResult
+from selfcal_ros.model.statistics import rms
 from selfcal_ros.units import M_PER_UM, NM_PER_M, RAD_PER_ARCSEC
 
 DECIMALS = 5
@@ -163,15 +164,12 @@ def provenance(result: CalibrationResult, frame: MachineFrame, *, filled: int = 
         Date of the export, UTC.
     """
     emap, source = result.error_map, result.input
-    u_nm = np.sqrt(np.nanmean(np.square([emap.u_gx, emap.u_gy]))) * NM_PER_M \
-        if np.isfinite(emap.u_gx).any() else float("nan")
     lines = [
         f"written by selfcal {__version__} on {(now or datetime.now(UTC)):%Y-%m-%dT%H:%M:%SZ}",
         f"plan: {result.plan_id}; sense: {result.sense}; method: {result.method}",
         f"bag: {source.get('file', 'unknown')}; sha256: {source.get('sha256', 'unknown')}",
         *_verdict_lines(result),
-        f"standard uncertainty of the corrections (k=1): {u_nm:.3g} nm rms; U: k = "
-        f"{result.noise.k_xy:.3g} for 95.45 %",
+        _uncertainty_line(result),
         f"model: {result.model.misalignment} misalignments" + "".join(
             f", {term.name}" + ("" if term.size is None else f":{term.size:g}")
             for term in result.model.terms),
@@ -183,6 +181,14 @@ def provenance(result: CalibrationResult, frame: MachineFrame, *, filled: int = 
     if filled:
         lines.append(f"{filled} sites were not measured: mean of their neighbours")
     return lines
+
+
+def _uncertainty_line(result: CalibrationResult) -> str:
+    if not result.has_uncertainty:
+        return "uncertainty: not computed"
+    u = np.stack([result.error_map.u_gx, result.error_map.u_gy])
+    return (f"standard uncertainty of the corrections (k=1): {rms(u) * NM_PER_M:.3g} nm rms; U: "
+            f"k = {result.noise.k_xy:.3g} for 95.45 %")
 
 
 def _verdict_lines(result: CalibrationResult) -> list[str]:
