@@ -80,6 +80,7 @@ def _lines(log: list[str]) -> Iterator[Callable[[Any], None]]:
     from selfcal_ros.errors import printable
 
     said: dict[str, str] = {}
+    there: set[str] = set()
 
     def draw(picture: Any) -> None:
         while log:
@@ -90,8 +91,14 @@ def _lines(log: list[str]) -> Iterator[Callable[[Any], None]]:
         if picture["summary"]:
             now["map"] = picture["summary"]["state"]
         for node, told in picture["health"].items():
-            if told is not None and told["level"]:
-                now[node] = told["message"]
+            if told is None and node in there:
+                now[node] = "gone: no sign of life"
+            elif told is not None:
+                there.add(node)
+                if told["level"]:
+                    now[node] = told["message"]
+                elif node in said:
+                    now[node] = "well again"
         for key, line in now.items():
             if said.get(key) != line:
                 said[key] = line

@@ -37,24 +37,32 @@ def what_now(picture: dict[str, Any]) -> str:
     told = picture["health"].get("pose_sequencer")
     if told is None:
         return "pose_sequencer is not there: start it, or wait for it."
-    state, values = told["values"].get("state", ""), told["values"]
     command = picture["command"] or {}
+    state = _state(told["values"], command)
     if told["message"].startswith("waiting for ") and state in ("IDLE", "DONE", "ABORTED"):
         return f"Nothing: {printable(told['message'])}."
+    look = f"Look: {printable(told['message'])}." if told["level"] else ""
     if state == "PLACING":
         x, y = command.get("translation_mm") or (None, None)
         turn = command.get("rotation_deg")
         pose = "" if None in (x, y, turn) else f" turned by {turn:g} deg, at x {x:g} mm, y {y:g} mm"
-        return (f"Place the plate for view '{printable(values.get('view_name', ''))}'"
-                f"{pose}; then press c.")
+        name = command.get("view_name") or told["values"].get("view_name", "")
+        return f"Place the plate for view '{printable(name)}'{pose}; then press c. {look}".rstrip()
     if state == "MEASURING":
-        if told["level"]:
-            return f"Look: {printable(told['message'])}."
-        return "Nothing: the view is being measured."
+        return look or "Nothing: the view is being measured."
     return {"IDLE": "Press s to start the plan.", "DONE": "Done. s starts another run.",
             "ABORTED": "Aborted. s starts a new run.",
             "FOLLOWING": "Nothing: somebody else commands; a ends that.",
             }.get(state, printable(told["message"]))
+
+
+def _state(values: dict[str, str], command: dict[str, Any]) -> str:
+    """Return the sequencer's state; its newest command tells it earlier than its health."""
+    state = values.get("state", "")
+    if state not in ("PLACING", "MEASURING") or command.get("plan_id") != values.get("plan_id"):
+        return state
+    return {"PLACE": "PLACING", "MEASURE": "MEASURING", "DONE": "DONE",
+            "ABORT": "ABORTED"}.get(command.get("phase", ""), state)
 
 
 def _task(picture: dict[str, Any]) -> Panel:

@@ -75,7 +75,8 @@ class NodeBase[S: Settings](Node):
         self._heard_on[name] = topic
 
         def lost(event: Any) -> None:
-            self.losses.add(topic.name, event.total_count_change)
+            if topic.qos.depth > 1:  # else only the newest is wanted: the others are no loss
+                self.losses.add(topic.name, event.total_count_change)
         events = SubscriptionEventCallbacks(message_lost=lost)
         return self.own(self.create_subscription(
             topic.type, topic.name, guarded, topic.qos, event_callbacks=events, **kwargs),

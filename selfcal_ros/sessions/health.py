@@ -131,6 +131,10 @@ class Presence:
         when, diagnosis = self._heard.get(node, (float("-inf"), None))
         return diagnosis if self._now_s() - when <= self._patience_s else None
 
+    def silent(self) -> list[str]:
+        """Return the nodes that have told something, but not lately, by name."""
+        return sorted(node for node in self._heard if self.of(node) is None)
+
 
 class Rate:
     """Rate and longest gap of a stream over the last seconds.

@@ -59,7 +59,7 @@ class SequencingSession:
         self._measured: dict[tuple[str, str], dict[int, str]] = {}
         self._stall = StallWatch(settings.stall_time, ports.now_s)
         self._status: Any = None  # newest of the current view
-        self._stalled = self._set_back = ""
+        self._stalled = self._set_back = self._silent = ""
         if self.waiting:
             self.machine.need_plan()
 
@@ -203,6 +203,7 @@ class SequencingSession:
                 and now >= self._confirm_at):
             self._send(self.machine.confirm())
         self._tell_set_back()
+        self._tell_silent()
         if self.machine.state is State.MEASURING:
             self._tell_stall()
             if self._settings.view_timeout > 0 and now >= self._deadline:
@@ -218,6 +219,15 @@ class SequencingSession:
                               "command: it was set back, and what is detected until it has "
                               "caught up counts in an earlier view; wait, then redo_view")
             self._ports.say(Level.WARN, self._set_back)
+
+    def _tell_silent(self) -> None:
+        """Say once that a companion gives no sign of life while a plan runs."""
+        nodes = " and ".join(self.presence.silent()) if self.current is not None else ""
+        line = nodes and (f"no sign of life of {nodes} for {PATIENCE_S:g} s: it hangs or has "
+                          "ended; wait for it, or start it again: nothing measured is lost")
+        if line and line != self._silent:
+            self._ports.say(Level.WARN, line)
+        self._silent = line
 
     def _tell_stall(self) -> None:
         if not self._stall.stalled:
@@ -252,8 +262,8 @@ class SequencingSession:
             state, level = f"waiting for {', '.join(self.missing())}", Level.WARN
         elif self.machine.state is State.MEASURING and self._stalled:
             state, level = self._stalled, Level.WARN
-        if self._set_back:
-            state, level = f"{self._set_back}; {state}", Level.WARN
+        for line in filter(None, (self._silent, self._set_back)):
+            state, level = f"{line}; {state}", Level.WARN
         plan, view = self.machine.plan, self.current
         return Diagnosis(level, state, {
             "state": self.machine.state.name, "plan_id": plan.plan_id if plan else "",

@@ -34,12 +34,26 @@ def shown(picture: dict, log: tuple = ()) -> str:
                                          "10 mm, y -20 mm; then press c."),
     (told("MEASURING"), "Nothing: the view is being measured."),
     (told("MEASURING", "view 'rot90' stalls", 1), "Look: view 'rot90' stalls."),
+    (told("PLACING", "no sign of life of solver", 1),
+     "Place the plate for view 'rot90' turned by 90 deg, at x 10 mm, y -20 mm; then press c. "
+     "Look: no sign of life of solver."),
     (told("DONE"), "Done. s starts another run."),
     (told("ABORTED"), "Aborted. s starts a new run."),
     (told("FOLLOWING"), "Nothing: somebody else commands; a ends that.")])
 def test_what_a_person_has_to_do(sequencer, sentence):
     assert what_now(EMPTY | {"health": {"pose_sequencer": sequencer},
                              "command": COMMAND}) == sentence
+
+
+@pytest.mark.parametrize("phase, sentence", [
+    ("PLACE", "Place the plate for view 'rot90' turned by 90 deg, at x 10 mm, y -20 mm; then press "
+              "c."),
+    ("MEASURE", "Nothing: the view is being measured."), ("DONE", "Done. s starts another run."),
+    ("ABORT", "Aborted. s starts a new run.")])
+@pytest.mark.parametrize("state", ["PLACING", "MEASURING"])
+def test_the_newest_command_is_earlier_than_the_health(state, phase, sentence):
+    health = {"pose_sequencer": told(state, plan_id="hu", view_name="identity")}
+    assert what_now(EMPTY | {"health": health, "command": COMMAND | {"phase": phase}}) == sentence
 
 
 def test_an_empty_cell_is_shown_as_such():

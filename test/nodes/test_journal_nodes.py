@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Nodes that are killed at any moment: the run goes on, and the map is the undisturbed one."""
 
+import signal
+
 import numpy as np
 import pytest
 from std_srvs.srv import Trigger
@@ -81,6 +83,17 @@ def test_a_solver_killed_after_a_view_gets_all_readings_again(cell, run):
     solved = cell.graph.listen(names.of_node("solver", names.SOLVED))
     answer = cell.graph.call(Trigger, "measurement_collector/finish")
     cell.graph.until(lambda: answer.message in {message.data for message in solved}, "the map")
+    same(cell.saved()["error_map"], undisturbed(run))
+
+
+def test_a_solver_that_hangs_for_a_while_solves_then_what_it_missed(cell, run):
+    cell.start("solver", result_folder=cell.folder)
+    cell.start_collector()
+    half = len(run) // 2
+    cell.deliver(run[:half])
+    cell.running["solver"].send_signal(signal.SIGSTOP)
+    cell.deliver(run, first=half)
+    cell.running["solver"].send_signal(signal.SIGCONT)
     same(cell.saved()["error_map"], undisturbed(run))
 
 

@@ -109,6 +109,35 @@ def test_a_calibration_by_words_past_the_death_of_two_nodes(start, tmp_path):
         pid_of(up.process.pid, "solver")
 
 
+LINES_FIRST = """
+plan_id: lines_first
+artifact: {grid_size: 5, grid_pitch: 0.01, angular_count: 8}
+views:
+  - {name: line, rotation_deg: 45, grid: false, repeats: 2}
+  - {name: identity, repeats: 2}
+  - {name: rot90, rotation_deg: 90, repeats: 2}
+  - {name: shift, translation_pitch: [1, 0], repeats: 2}
+"""
+
+
+def test_a_good_run_says_no_error(start, tmp_path):
+    (tmp_path / "plan.yaml").write_text(LINES_FIRST)
+    up = start("up", "--plan", str(tmp_path / "plan.yaml"), "--simulate", "--compensate",
+               "--results", str(tmp_path), "--bag", str(tmp_path / "bag"))
+    up.until("now: Press s to start the plan.")
+    up.write("start")
+    for view in ("line", "identity", "rot90", "shift"):
+        up.until(f"PLACE {view}")
+        up.write("confirm")
+    up.until("map: Calibrated from 4 views: ")
+    up.write("quit")
+    assert up.process.wait(PATIENCE_S) == 0
+    said = "\n".join(up.lines) + up.process.stderr.read()
+    assert "PLACE line" in said  # the log is there
+    for word in ("ERROR", "FATAL", "Traceback", "Error:", "stalls", "lost"):
+        assert word not in said
+
+
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
 def test_a_killed_command_takes_its_nodes_along(start, tmp_path, number):
     up = start("up", "--plan", plan_file(tmp_path, small_plan()), "--journal",

@@ -294,3 +294,22 @@ def test_a_foreign_command_ends_waiting_and_its_own_plan(desk, measuring):
 def test_its_own_command_is_not_foreign(measuring):
     measuring.session.take_command(message("ViewCommand", measuring.hands.of("command")[0]))
     assert measuring.session.machine.state is State.MEASURING
+
+
+@pytest.mark.parametrize("seconds, said", [(PATIENCE_S, 0), (PATIENCE_S + 0.1, 1)])
+def test_a_companion_that_falls_silent_within_a_run_is_named_until_it_is_back(
+        measuring, seconds, said):
+    measuring.hear("solver")
+    measuring.hands.pass_time(seconds)
+    for _ in range(2):
+        measuring.session.tick()
+    line = "no sign of life of solver for 3 s: it hangs or has ended"
+    assert [text.startswith(line) for text in measuring.hands.lines(Level.WARN)] == [True] * said
+    assert measuring.session.diagnosis().message.startswith(line) is bool(said)
+    measuring.hear("solver")
+    measuring.session.tick()
+    assert measuring.session.diagnosis().level == Level.OK
+    measuring.session.give_up()
+    measuring.hands.pass_time(60)
+    measuring.session.tick()
+    assert len(measuring.hands.lines(Level.WARN)) == said  # no run, nobody is waited for
