@@ -202,13 +202,22 @@ class SolvingSession:
         if job.run != self._run:
             return
         if outcome.result is None:
-            self.shown.problem, self.shown.digest = outcome.problem, ""
-            raise outcome.problem or ValueError("neither a result nor a problem")
+            self._take_none(outcome)
+            return
         self.shown = Shown(outcome.result, outcome.problem, job.run, len(job.measurements.views),
                            job.stamp_ns, job.digest)
         self._publish(outcome.result)
         if self._settings.save_path and outcome.problem is None:
             self._save_by_itself(outcome.result)
+
+    def _take_none(self, outcome: Outcome) -> None:
+        """Show why readings gave no result; raise it unless views that are to come may mend it."""
+        job = outcome.job
+        self.shown = Shown(None, outcome.problem, job.run, len(job.measurements.views),
+                           job.stamp_ns, "")
+        if not self._unfinished():
+            raise outcome.problem or ValueError("neither a result nor a problem")
+        self._ports.say(Level.OK, self._state())
 
     def _save_by_itself(self, result: CalibrationResult) -> None:
         try:
@@ -242,7 +251,7 @@ class SolvingSession:
 
     def _unfinished(self) -> bool:
         """Return whether the plan has views that are still to come."""
-        return (isinstance(self.shown.problem, NotIdentifiableError)
+        return (isinstance(self.shown.problem, NotIdentifiableError | NoDataError)
                 and self.shown.views_done < self._planned_views(self.shown.run))
 
     def _state(self) -> str:

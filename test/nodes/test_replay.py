@@ -27,11 +27,15 @@ def solved(tmp_path_factory):
 
 @pytest.mark.parametrize("options", [["--fast"], ["--rate", "50"], ["--fast", "--shuffle", "3"]],
                          ids=" ".join)
-def test_replay_gives_the_result_of_solve_bit_for_bit(ros_environment, solved, tmp_path, options):
+def test_replay_gives_the_result_of_solve_bit_for_bit(
+        ros_environment, solved, tmp_path, options, capfd):
     bag, expected = solved
     output = tmp_path / "replayed.json"
     assert selfcal(["replay", str(bag), *options, "--quiet", "-o", str(output)]) in (0, 5)
     assert undated(output.read_text()) == expected
+    said = capfd.readouterr()
+    assert "ERROR" not in said.out + said.err
+    assert "Traceback" not in said.out + said.err
 
 
 @pytest.mark.parametrize(("cell", "without"), [("/", False), ("cell2", True)])

@@ -156,6 +156,23 @@ def test_a_deficient_plan_is_a_warning_once_all_its_views_are_measured(desk, pla
         desk.session.save("x.json")
 
 
+def test_a_view_of_lines_alone_is_no_error_while_others_are_to_come(desk):
+    lines = views_of()[3:]
+    assert [len(view.m) for view in lines] == [0]
+    desk.session.take_command(command(4))
+    desk.take(lines)
+    assert desk.hands.said == [
+        (Level.OK, "1 of 4 views measured, not yet enough to identify the stage.")]
+    assert desk.session.diagnosis().level == Level.OK
+    with pytest.raises(NoDataError, match="no grid mark was read"):
+        desk.session.save("x.json")
+    alone = Desk()
+    alone.session.take_command(command(1))
+    with pytest.raises(NoDataError, match="no grid mark was read"):
+        alone.take(lines)
+    assert alone.session.diagnosis().level == Level.WARN
+
+
 def test_more_planned_views_are_told_and_fewer_change_nothing(desk):
     desk.take(views_of())
     for views, solved in ((4, True), (4, False), (3, False), (5, True)):
