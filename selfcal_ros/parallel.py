@@ -60,7 +60,7 @@ def check_workers(number: int | None, option: str = "--workers") -> int:
     if number is None:
         return cores()
     if not 1 <= number <= 1024:
-        raise InputError(option, f"{number} is no number of workers", "give 1 to 1024")
+        raise InputError(option, f"{number} is not a number of workers", "give 1 to 1024")
     return number
 
 

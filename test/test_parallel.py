@@ -103,7 +103,8 @@ def test_numbers_of_workers():
     for number in (0, -1, 1025):
         with pytest.raises(InputError) as caught:
             check_workers(number)
-        assert str(caught.value) == f"--workers: {number} is no number of workers; give 1 to 1024"
+        assert str(caught.value) == (
+            f"--workers: {number} is not a number of workers; give 1 to 1024")
 
 
 def test_without_dask_it_is_said_how_to_get_it(monkeypatch):

@@ -149,7 +149,7 @@ def _keys() -> Iterator[Callable[[], list[str]]]:
 
 
 def _words() -> Callable[[], list[str]]:
-    """Return a function that returns the lines of stdin since the last call; its end is no end."""
+    """Return a function that gives the lines of stdin since the last call, also after its end."""
     import queue
     import threading
 

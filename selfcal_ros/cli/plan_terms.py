@@ -75,7 +75,7 @@ def assumed_of(args: argparse.Namespace) -> Assumed:
 
     degree = DRIFT_DEGREE if args.drift_degree is None else args.drift_degree
     if not 1 <= degree <= MAX_DRIFT_DEGREE:
-        raise InputError("--drift-degree", f"{degree} is no degree of a drift",
+        raise InputError("--drift-degree", f"{degree} is not a degree of a drift",
                          f"give 1 to {MAX_DRIFT_DEGREE}")
     order = str(parse_order(args.order, "--order")) if args.order else ""
     return Assumed(length_m(args.sigma or SIGMA, "--sigma"),

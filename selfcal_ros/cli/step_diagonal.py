@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 HELP = "identify linear, straightness and squareness errors from a laser step-diagonal measurement"
 SHORTEST_MM = 1e-6
-"""Steps below 1 nm are no steps of a machine."""
+"""Steps below 1 nm are not steps of a machine."""
 SEED = 1
 """Of the noise in the table of sensitivities."""
 

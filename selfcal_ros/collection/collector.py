@@ -253,7 +253,7 @@ class Collector:
 
     @property
     def unusable(self) -> dict[str, int]:
-        """Messages that are no usable encoder sample or command, by reason."""
+        """Messages that are not usable as encoder samples or commands, by reason."""
         return {str(reason): count for reason, count in sorted(self._rejected_input.items())}
 
     @property

@@ -68,7 +68,7 @@ REMEDY = {
     Reason.OUTLIER: "repeats of a mark contradict each other; check that each id is of one mark, "
                     "or raise outlier_limit",
 }
-"""What to do when most detections are rejected for a reason; reasons not here are no fault."""
+"""What to do when most detections are rejected for a reason; reasons not listed are not faults."""
 
 
 def advice(rejected: Mapping[str, int]) -> list[str]:

@@ -50,7 +50,7 @@ class MachineFrame:
     theta_counts_per_unit: float | None = None
 
     def __post_init__(self) -> None:
-        """Refuse an unknown unit, axes that are not distinct, and values that are no numbers."""
+        """Refuse an unknown unit, axes that are not distinct, and values that are not numbers."""
         if self.unit not in UNITS_M:
             raise InputError("unit", f"'{self.unit}' is not a primary unit", "take m, mm or um")
         axes = [a for a in (self.x_axis, self.y_axis, self.theta_axis) if a is not None]

@@ -77,7 +77,7 @@ class StepDiagonal:
     linear_m: np.ndarray | None = None
 
     def __post_init__(self) -> None:
-        """Refuse steps that are no lengths and arrays that do not belong together."""
+        """Refuse steps that are not lengths and arrays that do not belong together."""
         for axis, step in zip(AXES, self.steps_m, strict=False):
             if not (np.isfinite(step) and step > 0):
                 raise InputError(f"step {axis}", f"{step * MM_PER_M:g} mm is not a length",

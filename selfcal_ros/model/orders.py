@@ -46,6 +46,6 @@ def parse_order(text: str, where: str = "visit_order") -> VisitOrder:
     """
     name = text.removesuffix(PLATE_SUFFIX)
     if name not in ORDERS:
-        raise InputError(where, f"'{text}' is no visiting order",
+        raise InputError(where, f"'{text}' is not a visiting order",
                          f"use one of {', '.join(ORDERS)}, if need be with {PLATE_SUFFIX}")
     return VisitOrder(name, name != text)

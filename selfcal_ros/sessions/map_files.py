@@ -64,5 +64,5 @@ def read_result(path: str) -> CalibrationResult:
         raise InputError(path, f"cannot be read ({error.strerror})", "name a readable file") \
             from error
     except ValueError as error:  # a NUL in the name
-        raise InputError(path, f"is no file name ({error})", "name a RESULT.json") from error
+        raise InputError(path, f"is not a file name ({error})", "name a RESULT.json") from error
     return result_from_dict(read_json(path), path)

@@ -134,7 +134,7 @@ def test_orders_that_are_not_known(text):
     with pytest.raises(InputError) as caught:
         parse_order(text, "here")
     assert str(caught.value) == (
-        f"here: '{text}' is no visiting order; use one of raster, serpentine, there_and_back, "
+        f"here: '{text}' is not a visiting order; use one of raster, serpentine, there_and_back, "
         "x_then_y, x_back_y_back, random, if need be with @plate")
 
 

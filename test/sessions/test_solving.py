@@ -250,7 +250,7 @@ def test_only_regular_files_are_loaded(tmp_path):
                           ("/dev/zero", "is not a regular file; name a RESULT.json"),
                           (tmp_path, "is not a regular file; name a RESULT.json"),
                           (tmp_path / "no", "no such file; check the path"),
-                          ("a\0b", "no such file|is no file name|embedded null")):
+                          ("a\0b", "no such file|is not a file name|embedded null")):
         with pytest.raises(InputError, match=problem):
             read_result(str(path))
 

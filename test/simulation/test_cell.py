@@ -139,5 +139,5 @@ def test_a_view_that_asks_for_an_order_gets_it_and_others_that_of_the_cell():
 
 
 def test_an_order_that_is_not_known_is_refused():
-    with pytest.raises(InputError, match=r"^simulated cell: visit_order: 'spiral' is no visiting "):
+    with pytest.raises(InputError, match=r"^simulated cell: visit_order: 'spiral' is not a "):
         CellSettings(visit_order="spiral")

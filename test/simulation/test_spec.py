@@ -103,7 +103,7 @@ def test_a_seed_gives_the_same_messages(tmp_path):
      "are sigma_xy, sigma_theta, visit_xy, flicker_xy, flicker_theta, resolution_xy, "
      "resolution_theta"),
     ({"plan": PLAN, "cell": {"visit_order": "spiral"}}, ": simulated cell: visit_order: 'spiral' "
-     "is no visiting order; use one of raster, serpentine, there_and_back, x_then_y, "
+     "is not a visiting order; use one of raster, serpentine, there_and_back, x_then_y, "
      "x_back_y_back, random, if need be with @plate"),
     ({"plan": PLAN, "cell": {"encoder_rate": 100}}, ": simulated cell: 100 Hz gives fewer than 2.5 "
      "encoder samples in a dwell of 0.006 s; raise encoder_rate or exposure_period"),

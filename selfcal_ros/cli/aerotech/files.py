@@ -113,7 +113,7 @@ def _setup(args: argparse.Namespace) -> "MachineSetup":
     from selfcal_ros.compensation.aerotech.evaluate import AxisSetup, MachineSetup
 
     if args.temperature is not None and not math.isfinite(args.temperature):
-        raise InputError("--temperature", f"{args.temperature} is no temperature", "give degC")
+        raise InputError("--temperature", f"{args.temperature} is not a temperature", "give degC")
     directions = pairs(args.home_direction, "--home-direction")
     for axis, word in directions.items():
         if word not in ("CW", "CCW"):

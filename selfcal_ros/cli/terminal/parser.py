@@ -28,7 +28,7 @@ class Parser(argparse.ArgumentParser):
         return found
 
     def refuse(self, left: Sequence[str]) -> NoReturn:
-        """End with a line on the first argument that nobody takes."""
+        """End with a line on the first argument that is not recognised."""
         word = next((word for word in left if word.startswith("-")), left[0])
         name = word.partition("=")[0]
         if not word.startswith("-"):

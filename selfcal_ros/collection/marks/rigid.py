@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 LARGEST_TURN_RAD = 0.2
-"""A plate that is turned by more than this was put in wrongly: that is no misalignment."""
+"""A plate turned by more than this was laid down the wrong way; it is not a misalignment."""
 EXPECTED_SCATTER = 0.03
 """Distance of a mark from the rigid motion to reckon with while few marks tell it, in pitches."""
 EXPECTED_WEIGHT = 4

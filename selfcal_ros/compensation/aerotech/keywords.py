@@ -12,7 +12,7 @@ from typing import Any
 from selfcal_ros.compensation.aerotech.model import Kind, Unit, UnitWord
 
 LIMIT = 1e15
-"""Numbers beyond this are no lengths, angles or counts of a machine."""
+"""Numbers beyond this are not lengths, angles or counts of a machine."""
 SMALLEST = 1e-15
 """The same for distances and divisors that must not be zero."""
 OLD_UNITS = {"METRIC": "PRIMARY"}

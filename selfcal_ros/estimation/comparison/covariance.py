@@ -201,7 +201,7 @@ def _read_system(result: CalibrationResult) -> NormalEquations:
 
 
 def _is_read(kept: Any) -> bool:
-    """Tell if any weight is not zero; what is no number is, and is refused with the weights."""
+    """Tell if any weight is not zero; NaN counts, and is refused with the weights."""
     try:
         return bool(np.any(np.array(kept, dtype=float)))
     except (TypeError, ValueError):

@@ -308,7 +308,7 @@ def _level(residuals: Residuals) -> float:
 
 def _taken_back(measurements: Measurements, options: Options, gone: dict[Key, Removed],
                 residuals: Residuals) -> tuple[dict[Key, Removed], Residuals]:
-    """Take back, one by one, what is no outlier in the company of the good readings.
+    """Restore, one by one, what is not an outlier among the good readings.
 
     Readings that went together because each was the other's only check come back together.
     """

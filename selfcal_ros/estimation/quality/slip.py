@@ -37,7 +37,7 @@ MAX_PLACES = 20
 """Places tested along each axis of a view."""
 
 CLIP = 4.0
-"""Residuals count at most as this many standard deviations, so that one outlier is no slip."""
+"""Residuals count at most as this many standard deviations: one outlier is not a slip."""
 
 
 @dataclass(frozen=True)

@@ -33,7 +33,7 @@ def provenance_of(measurements: Measurements, options: Options) -> Provenance:
 
 
 def _iso(stamp_ns: int) -> str:
-    """Return a stamp as ISO 8601 in UTC; as it is where it is no date."""
+    """Return a stamp as ISO 8601 in UTC; unchanged where it is not a date."""
     try:
         return datetime.fromtimestamp(stamp_ns / 1e9, UTC).isoformat(timespec="milliseconds")
     except (OverflowError, ValueError, OSError):

@@ -50,7 +50,7 @@ def check_reading(value_m: float, nominal_m: float, where: str) -> None:
 
 
 def check_linear(value_m: float, step_m: float, where: str) -> None:
-    """Refuse a linear error that is no small part of its step.
+    """Refuse a linear error that is not small beside its step.
 
     Raises
     ------
