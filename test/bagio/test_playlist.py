@@ -48,6 +48,7 @@ def test_a_seed_shuffles_the_messages_but_not_the_times(tmp_path, events, shuffl
     found, plain = list(Playlist(path, seed=3)), by_time(path)
     assert found == list(Playlist(path, seed=3)) != plain
     assert found != list(Playlist(path, seed=4))
+    assert list(Playlist(path, seed=0)) not in (plain, found), "0 is a seed, too"
     assert [stamp for _, stamp, _ in found] == [stamp for _, stamp, _ in plain]
     assert sorted((t, d) for t, _, d in found) == sorted((t, d) for t, _, d in plain)
 

@@ -68,6 +68,13 @@ def test_a_bad_grid_detection_is_counted_under_its_reason(fault):
     assert_only_this_is_lost(spoilt, mark, reason)
 
 
+@pytest.mark.parametrize(("score", "rejected"), [(0.5, {}), (0.49, {"low_score": 1})])
+def test_a_score_at_the_limit_is_enough(score, rejected):
+    marked = scene()
+    marked.spoil(marked.grid(7), score=score)
+    assert collect(marked.events, min_score=0.5)[0].all_rejected() == rejected
+
+
 @pytest.mark.parametrize("fault", ["low score", "m off the plate", "one pitch off"])
 @pytest.mark.parametrize("sense", ["microscope_moves", "plate_moves"])
 def test_the_place_of_a_rejected_grid_detection_is_where_the_stage_stood(fault, sense):
