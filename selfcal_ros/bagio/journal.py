@@ -163,14 +163,14 @@ class Journal:
 
     Attributes
     ----------
-    n_lost : int
-        Messages that could not be written.
     earlier : list of Path
         Files that were there already, in their order.
     """
 
     def __init__(self, path: Path, lock: int, metadata: Metadata) -> None:
-        self.path, self.n_lost = path, 0
+        self.path = path
+        self._n_unwritten = self._n_unsynced = 0
+        self._n_appended = self._n_synced = 0
         self.earlier = [path / file.name for file in metadata.files]
         self._lock, self._metadata = lock, metadata
         self._channels: dict[str, int] = {}
@@ -242,6 +242,7 @@ class Journal:
         with _said(self.path):
             if waiting:
                 self._append(waiting)
+                self._n_appended += len(waiting)
                 self._unsynced_s = self._unsynced_s or time.monotonic()
             failed, self._failed = self._failed, None
             if failed is not None:
@@ -258,7 +259,7 @@ class Journal:
         try:
             self._file.append(b"".join(records))
         except OSError:
-            self.n_lost += len(waiting)
+            self._n_unwritten += len(waiting)
             raise
         for topic, logged in times.items():
             self._file.content.add(self._channels[topic], logged)
@@ -268,12 +269,20 @@ class Journal:
         """Synchronise with the disk, in a thread of its own: it may take its time."""
         while not self._stop.wait(SYNC_PERIOD_S):
             if self._unsynced_s is not None:
-                self._syncing_s, self._unsynced_s = self._unsynced_s, None
+                since, n_appended = self._unsynced_s, self._n_appended
+                self._syncing_s, self._unsynced_s = since, None
                 try:
                     self._file.sync()
-                except OSError as error:
-                    self._failed = error
+                except OSError as error:  # the system may have dropped it: a later sync tells not
+                    self._failed, self._unsynced_s = error, since
+                    self._n_unsynced += n_appended - self._n_synced
+                self._n_synced = n_appended
                 self._syncing_s = None
+
+    @property
+    def n_lost(self) -> int:
+        """Messages that could not be written, or that the disk failed to take."""
+        return self._n_unwritten + self._n_unsynced
 
     @property
     def lag_s(self) -> float:

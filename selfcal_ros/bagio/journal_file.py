@@ -9,6 +9,7 @@ whose writer was killed.
 import os
 import struct
 import zlib
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import BinaryIO
@@ -111,6 +112,7 @@ class JournalFile:
 
     def __init__(self, path: Path) -> None:
         self.content = Content(FileEntry(path.name), end=0)
+        self._torn = False  # whether something stands behind the last whole record
         part = path.with_suffix(".part")  # so that no file of a journal is ever empty
         self._fd = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_APPEND
                            | os.O_CLOEXEC, 0o666)
@@ -125,15 +127,26 @@ class JournalFile:
         sync_folder(path.parent)
 
     def append(self, data: bytes) -> None:
-        """Hand whole records to the system; after an OSError the file is as it was before."""
+        """Hand whole records to the system; after an OSError the file is as it was before.
+
+        Where what was begun cannot be taken back, nothing is appended until it can be.
+        """
+        self._take_back()
         rest = memoryview(data)
         try:
             while rest:
                 rest = rest[os.write(self._fd, rest):]
         except OSError:
-            os.ftruncate(self._fd, self.content.end)
+            self._torn = True
+            with suppress(OSError):
+                self._take_back()
             raise
         self.content.end += len(data)
+
+    def _take_back(self) -> None:
+        if self._torn:
+            os.ftruncate(self._fd, self.content.end)
+            self._torn = False
 
     def sync(self) -> None:
         """Wait until what was appended is on the disk."""

@@ -306,6 +306,9 @@ def test_the_disk_has_it_soon_and_its_failure_is_said(tmp_path, monkeypatch):
     writer = declared(start(tmp_path, NOW))
     record(writer, samples(1))
     assert synced.wait(60)
+    deadline = time.monotonic() + 60
+    while writer._n_synced < 1 and time.monotonic() < deadline:
+        pass
     failed.set()
     synced.clear()
     record(writer, samples(1, 1))
@@ -314,7 +317,10 @@ def test_the_disk_has_it_soon_and_its_failure_is_said(tmp_path, monkeypatch):
         deadline = time.monotonic() + 60
         while time.monotonic() < deadline:
             writer.flush()
+    assert writer.n_lost == 1  # the first one had been synchronised
+    synced.clear()
     failed.clear()
+    assert synced.wait(60)  # without a further message
     writer.close()
     assert stamps(writer.path) == ([0, 1], [])
 
@@ -350,3 +356,34 @@ def test_a_message_longer_than_a_stretch_is_passed(tmp_path):
     with resume(tmp_path):
         assert information(writer.path)["message_count"] == 3
     assert stamps(writer.path) == ([0, 1, 2], [])
+
+
+def test_nothing_follows_a_torn_record_that_cannot_be_taken_back(tmp_path, monkeypatch):
+    writer = declared(start(tmp_path, NOW))
+    record(writer, samples(3))
+    plain, room, stuck = os.write, [40], [True]
+
+    def full(fd, data):
+        if not room[0]:
+            raise OSError(errno.EIO, "Input/output error")
+        data, room[0] = data[:room[0]], room[0] - min(len(data), room[0])
+        return plain(fd, data)
+
+    def truncate(fd, size):
+        if stuck[0]:
+            raise OSError(errno.EROFS, "Read-only file system")
+        monkeypatch.undo()
+        os.ftruncate(fd, size)
+
+    monkeypatch.setattr(journal_file.os, "write", full)
+    monkeypatch.setattr(journal_file.os, "ftruncate", truncate)
+    with pytest.raises(InputError, match=r"cannot be written \(Input/output error\)"):
+        record(writer, samples(2, 100))
+    room[0] = 10**6
+    with pytest.raises(InputError, match=r"cannot be written \(Read-only file system\)"):
+        record(writer, samples(2, 200))
+    assert writer.n_lost == 4
+    stuck[0] = False
+    record(writer, samples(2, 3))
+    writer.close()
+    assert stamps(writer.path) == (list(range(5)), [])
