@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """One way to run a node as a process, and to stop it."""
 
+import gc
 import re
 import sys
 from collections.abc import Callable
@@ -42,6 +43,12 @@ def _init(argv: list[str] | None) -> None:
         raise InputError("arguments after --ros-args", what, "correct them") from error
 
 
+def _keep_what_is_loaded() -> None:
+    """Leave what is there out of later collections: going through it stops a node for 50 ms."""
+    gc.collect()
+    gc.freeze()
+
+
 def run(make_node: Callable[[], Node], argv: list[str] | None = None) -> int:
     """Run one node as a process; SIGINT and SIGTERM end it cleanly. Return the exit code.
 
@@ -58,6 +65,7 @@ def run(make_node: Callable[[], Node], argv: list[str] | None = None) -> int:
         finished = getattr(node, "finished", None)
         if finished is not None:
             finished.add_done_callback(lambda _: stop.set_result(None))
+        _keep_what_is_loaded()
         spin(node, stop)
         code = int(getattr(node, "exit_code", ExitCode.DONE))
     except SelfcalError as error:
