@@ -139,6 +139,8 @@ class Presence:
 class Rate:
     """Rate and longest gap of a stream over the last seconds.
 
+    A gap lies behind the newest stamp of these seconds: one stamp of the future hides none later.
+
     Parameters
     ----------
     now_s : callable
@@ -149,28 +151,29 @@ class Rate:
 
     def __init__(self, now_s: Callable[[], float]) -> None:
         self._now_s = now_s
-        self._bins: deque[tuple[float, int]] = deque()
-        self._last_ns = 0
+        self._bins: deque[tuple[float, int, int]] = deque()  # begin, messages, newest stamp
         self.longest_gap_ns = 0
 
     def add(self, stamps_ns: np.ndarray) -> None:
         """Take messages by their stamps, int64 array (n,) in the order of arrival, n > 0."""
-        now, count = self._now_s(), len(stamps_ns)
-        if self._bins and now - self._bins[-1][0] < 0.1:
-            self._bins[-1] = (self._bins[-1][0], self._bins[-1][1] + count)
-        else:
-            self._bins.append((now, count))
-        newest = np.maximum.accumulate(np.append(self._last_ns or stamps_ns[0], stamps_ns))
+        now, count, latest_ns = self._now_s(), len(stamps_ns), int(stamps_ns.max())
+        while len(self._bins) > 1 and now - self._bins[0][0] > self.WINDOW_S:
+            self._bins.popleft()
+        before_ns = max((newest for _, _, newest in self._bins), default=stamps_ns[0])
+        newest = np.maximum.accumulate(np.append(before_ns, stamps_ns))
         self.longest_gap_ns = max(self.longest_gap_ns, int(np.diff(newest).max()))
-        self._last_ns = int(newest[-1])
+        if self._bins and now - self._bins[-1][0] < 0.1:
+            began, before, known_ns = self._bins.pop()
+            self._bins.append((began, before + count, max(known_ns, latest_ns)))
+        else:
+            self._bins.append((now, count, latest_ns))
 
     @property
     def per_second(self) -> float:
         """Messages a second by reception."""
         now = self._now_s()
-        while self._bins and now - self._bins[0][0] > self.WINDOW_S:
-            self._bins.popleft()
-        return sum(count for _, count in self._bins) / self.WINDOW_S
+        return sum(count for began, count, _ in self._bins
+                   if now - began <= self.WINDOW_S) / self.WINDOW_S
 
     def take_gap_ns(self) -> int:
         """Return the longest gap between stamps since the last call."""

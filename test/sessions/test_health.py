@@ -95,6 +95,18 @@ def test_the_rate_is_of_the_last_seconds_and_the_gap_since_it_was_asked(hands):
     assert rate.per_second == 0
 
 
+@pytest.mark.parametrize("ahead_ns", [37_000_000_000, 10**18])
+def test_a_stamp_of_the_future_does_not_hide_later_gaps(hands, ahead_ns):
+    rate = Rate(hands.ports.now_s)
+    for index in range(300):
+        hands.pass_time(0.01)
+        rate.add(np.array([10_000_000 * index + ahead_ns * (index == 50)]))
+    rate.take_gap_ns()
+    hands.pass_time(9.0)
+    rate.add(np.array([10_000_000 * 299 + 9_000_000_000]))
+    assert rate.take_gap_ns() == 9_000_000_000
+
+
 @pytest.mark.parametrize("stamps, gap", [
     ([5], 0), ([5, 9, 20], 11), ([20, 5, 9], 0), ([5, 20, 9, 26], 15), ([9, 5, 12], 3)])
 def test_a_gap_lies_between_a_stamp_and_the_newest_before(hands, stamps, gap):
