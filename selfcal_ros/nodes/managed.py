@@ -62,7 +62,7 @@ class ManagedNode[S: ManagedSettings](NodeBase[S], LifecycleNode):
     def __init__(self, kind: type[S], **kwargs: Any) -> None:
         self.problem: Exception | None = None
         self._made: dict[str, list[Callable[[], Any]]] = {"configure": [], "activate": []}
-        self._making = ""
+        self._making, self._is_gone = "", False
         self.held: dict[str, Any] = {}
         super().__init__(kind.NODE, **kwargs)
         self.prepare(kind)
@@ -89,8 +89,8 @@ class ManagedNode[S: ManagedSettings](NodeBase[S], LifecycleNode):
 
     @property
     def state(self) -> str:
-        """Label of the lifecycle state."""
-        return self._state_machine.current_state[1]
+        """Label of the lifecycle state; ``finalized`` once the node is destroyed."""
+        return "finalized" if self._is_gone else self._state_machine.current_state[1]
 
     def own(self, entity: Any, destroy: Callable[[Any], Any]) -> Any:
         """Return `entity`, to be destroyed when the step that makes it is undone."""
@@ -149,6 +149,7 @@ class ManagedNode[S: ManagedSettings](NodeBase[S], LifecycleNode):
         """
         self._unmake("activate", "configure")
         super().destroy_node()
+        self._is_gone = True  # a state machine that is asked after its end ends the process
         self._state_machine.destroy_when_not_in_use()
 
     def _make(self, step: str, make: Callable[[], None]) -> TransitionCallbackReturn:

@@ -85,7 +85,6 @@ class MeasurementCollector(PollingNode[CollectorSettings]):
         self._soon = self.every(SOON_S, self._on_soon)
         self._soon.cancel()
         self.service(Trigger, "~/finish", lambda request: self._finish())
-        self.own(self, MeasurementCollector._drain)  # undone first: what has come is taken
 
     def _publish(self, output: str, fields: dict[str, Any]) -> None:
         self._outputs[output](fields)

@@ -156,6 +156,7 @@ def test_a_destroyed_node_leaves_the_graph(graph, name):
     try:
         graph.remove(node)
         graph.until(lambda: name not in graph.hand.get_node_names(), "its end")
+        assert node.state == "finalized"  # what still refers to it may ask
     finally:
         gc.enable()
 
