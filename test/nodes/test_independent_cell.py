@@ -143,7 +143,8 @@ def test_a_node_that_is_restarted_within_a_view(graph, tmp_path, kind, view):
     site.until_held()
     site.restart(kind)
     if kind is PoseSequencer:
-        graph.until(lambda: "took up run" in site.ask("start").message, "the run")
+        site.ask("start")  # takes up the run, at once or as soon as it has heard all of them
+        graph.until(lambda: site.nodes[PoseSequencer].session.run_id, "the run")
     elif kind is MeasurementCollector:
         graph.until(lambda: site.cell.marks.get_subscription_count() == 1
                     and site.cell.encoder.get_subscription_count() == 1, "the new collector")
