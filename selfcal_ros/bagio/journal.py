@@ -58,7 +58,7 @@ def resume(folder: str | os.PathLike) -> "Journal | None":
         If another process writes this journal, or it cannot be read or written.
     """
     with _said(Path(folder)):
-        bag = _newest(Path(folder))
+        bag = _newest(Path(folder))[1]
     if bag is None:
         return None
     with _said(bag):
@@ -91,7 +91,7 @@ def unfinished(folder: str | os.PathLike) -> list[Path]:
     """
     bag = Path(folder)
     try:
-        found = _newest(bag)
+        found = _newest(bag)[1]
         if found is None:
             return []
         bag, files = found, sorted(found.glob("*.mcap"), key=_number)
@@ -112,11 +112,8 @@ def written_ago_s(folder: str | os.PathLike) -> float | None:
         If the folder cannot be read.
     """
     with _said(Path(folder)):
-        bag = _newest(Path(folder))
-        if bag is None:
-            return None
-        written = max(file.stat().st_mtime for file in bag.glob("*.mcap"))
-    return max(time.time() - written, 0.0)
+        written_ns = _newest(Path(folder))[0]
+    return max(time.time_ns() - written_ns, 0) * 1e-9 if written_ns else None
 
 
 def start(folder: str | os.PathLike, now_ns: int) -> "Journal":
@@ -361,15 +358,15 @@ def _locked(path: Path) -> int:
     return lock
 
 
-def _newest(folder: Path) -> Path | None:
-    """Return the bag folder in `folder` whose file was written last."""
+def _newest(folder: Path) -> tuple[int, Path | None]:
+    """Return when a file of a bag folder in `folder` was written last, ns, and that bag folder."""
     found: list[tuple[int, Path]] = []
     with suppress(FileNotFoundError, NotADirectoryError):
         for bag in folder.iterdir():
             with suppress(NotADirectoryError):
                 found += [(file.stat().st_mtime_ns, bag) for file in bag.iterdir()
                           if file.suffix == ".mcap"]
-    return max(found, default=(0, None))[1]
+    return max(found, default=(0, None))
 
 
 def _number(file: Path) -> tuple[int, str]:
