@@ -3,6 +3,9 @@
 
 import numpy as np
 
+MANY_DOF = 1e9
+"""Degrees of freedom that stand for infinitely many, where the tail of F or t takes no infinity."""
+
 
 def rms(values: np.ndarray) -> float:
     """Return the root mean square of the finite values; NaN if there are none."""

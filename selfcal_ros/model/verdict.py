@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Whether a result can be relied on, why not, and what was estimated beside the map."""
 
+import math
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -81,6 +82,11 @@ class TermResult:
     size: float | None
     estimates: tuple[TermEstimate, ...] = ()
     size_used: float | None = None
+
+    @property
+    def solved_with(self) -> float:
+        """The size of the solution; infinite where the term was free."""
+        return self.size_used or self.size or math.inf
 
 
 @dataclass(frozen=True)

@@ -15,11 +15,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import chdtrc, fdtrc, stdtr, stdtrit
 
+from selfcal_ros.model.statistics import MANY_DOF
+
 LEVEL = 0.05
 """Probability that maps of one stage differ significantly, both tests together."""
-
-MANY_DOF = 1e9
-"""Degrees of freedom from which a noise counts as known."""
 
 DRAWS = 2000
 """Draws of the largest |z|: fifty of them lie above its limit."""

@@ -7,6 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import fdtrc, stdtrit
 
+from selfcal_ros.model.statistics import MANY_DOF
+
 MIN_REPEAT_DOF = 30
 """Degrees of freedom from which the scatter of repeats is trusted; below, residuals are."""
 
@@ -72,7 +74,7 @@ class NoiseEstimate:
 
 def coverage_factor(dof: float, probability: float = COVERAGE) -> float:
     """Return k such that value +- k u covers the truth with `probability` (Student's t)."""
-    return float(stdtrit(min(dof, 1e9), (1 + probability) / 2))
+    return float(stdtrit(min(dof, MANY_DOF), (1 + probability) / 2))
 
 
 def pooled(parts: Iterable[tuple[float, int]]) -> tuple[float, int]:
@@ -122,5 +124,5 @@ def _same_noise(base: tuple[float, float], residuals: tuple[float, float], floor
     if not (base[1] > 0 and residuals[1] > 0) or not max(base[0], residuals[0]) > floor:
         return float("nan")
     ratio = np.square(min(residuals[0] / max(base[0], np.finfo(float).tiny), 1e100))
-    upper = float(fdtrc(residuals[1], min(base[1], 1e9), ratio))
+    upper = float(fdtrc(residuals[1], min(base[1], MANY_DOF), ratio))
     return 2 * min(upper, 1 - upper)

@@ -158,7 +158,7 @@ def _term_part(result: CalibrationResult, name: str, variance: np.ndarray,
     Of type A if the readings tell the term, of type B if its size does.
     """
     term = next(term for term in result.model.terms if term.name == name)
-    size, left = term.size_used or term.size or np.inf, part_left(term)
+    size, left = term.solved_with, part_left(term)
     told = left < TOLD
     known = variance[:, result.error_map.valid]
     how = (f"given as {term.size:.3g}, which the readings contradict; they allow {size:.3g} and "

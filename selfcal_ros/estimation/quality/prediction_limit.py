@@ -15,6 +15,7 @@ from selfcal_ros.estimation.joint.model_fit import ModelFit, equations_of
 from selfcal_ros.estimation.lattice.maps import LatticeViews
 from selfcal_ros.estimation.quality.held_terms import HeldReadings
 from selfcal_ros.estimation.terms.projection import reduce_columns
+from selfcal_ros.model.statistics import MANY_DOF
 
 LEVEL = 1e-3
 """Probability that a good set of readings exceeds its limit."""
@@ -40,7 +41,7 @@ class PredictionLimit:
 
     def ratio(self, noise_dof: float) -> float:
         """Return the ratio of error to noise that is exceeded with the probability LEVEL."""
-        dof = min(noise_dof, 1e9)
+        dof = min(noise_dof, MANY_DOF)
         return float(np.sqrt(self.mean * fdtri(self.dof, dof, 1 - LEVEL)))
 
 

@@ -14,6 +14,7 @@ import numpy as np
 from scipy.special import chdtri, fdtrc
 
 from selfcal_ros.estimation.terms.equations import TermEquations
+from selfcal_ros.model.statistics import MANY_DOF
 from selfcal_ros.model.terms import ModelTerm, TermName
 
 SIZE_LEVEL = 5e-4
@@ -24,9 +25,6 @@ BISECTIONS = 60
 
 TAIL = (1 - 0.9545) / 2
 """Probability with which a statistic as small contradicts a size as too large."""
-
-MANY_DOF = 1e9
-"""Degrees of freedom that stand for infinitely many."""
 
 
 @dataclass(frozen=True)

@@ -23,8 +23,7 @@ TOLD = 0.5
 def part_left(term: TermResult) -> float:
     """Return the part of a term's size that the readings leave: rms u over the size."""
     u = np.array([estimate.u for estimate in term.estimates])
-    size = term.size_used or term.size or np.inf
-    return float(np.sqrt(np.mean(u[np.isfinite(u)] ** 2))) / size
+    return float(np.sqrt(np.mean(u[np.isfinite(u)] ** 2))) / term.solved_with
 
 
 def known_beforehand(result: CalibrationResult, reference: ReferenceLength | None) -> np.ndarray:
