@@ -4,14 +4,12 @@
 import os
 import re
 import shlex
-from pathlib import Path
 
 import pytest
 
 from selfcal_ros.cli.main import build_parser, main
+from test.support.pages import PAGES, ROOT, code_lines
 
-ROOT = Path(__file__).parents[2]
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 COMMAND = re.compile(r"^ *(?:\.venv/bin/)?(selfcal [a-z][^\n`]*?)(?: *# ?(.*))?$", re.M)
 FILE = re.compile(r"```yaml\n# (\w+\.yaml)\n(.*?)```", re.S)
 ONLY_PARSED = {
@@ -26,14 +24,8 @@ PLACES = ("BAG", "/tmp/session", "$", "qiao_7.yaml", "measured.csv", "FILE.cal",
 
 def commands(text: str) -> list[tuple[str, int]]:
     """Return the commands in the code of a page, each with the exit code that it says."""
-    code, kind = [], None  # the kind of the fence that we are in
-    for line in text.splitlines():
-        if line.startswith("```"):
-            kind = line[3:] if kind is None else None
-        elif kind in ("", "sh") or (kind is None and line.startswith("    ")):
-            code.append(line)
     found = []
-    for command, comment in COMMAND.findall("\n".join(code)):
+    for command, comment in COMMAND.findall("\n".join(code_lines(text))):
         said = re.search(r"exit code (\d)", comment)
         found.append((command.split(" |")[0].strip(), int(said[1]) if said else 0))
     return found
