@@ -3,6 +3,7 @@
 
 import ast
 import importlib.util
+import shutil
 from pathlib import Path
 
 import pytest
@@ -106,6 +107,7 @@ def small_tree(tmp_path, monkeypatch, test):
     monkeypatch.setattr(mutants, "tests_for", lambda path, near: [["test/test_half.py"]])
     folder = tmp_path / "tree"
     (folder / "test").mkdir(parents=True)
+    shutil.copy2(ROOT / "pyproject.toml", folder)  # also turns off plugins of an installed ROS
     (folder / "half.py").write_text(HALF)
     (folder / "test/test_half.py").write_text(test)
     return mutants.Tree(folder)
