@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from selfcal_ros.collection.settings.nodes import NODE_PARAMETERS
 from test.support.sources import PACKAGE, ROOT, SOURCES, source
 
 ESTIMATION = ("options", "blas_threads", "lattice", "multifrontal", "normal", "datum", "terms",
@@ -25,10 +26,13 @@ def dotted(path: Path) -> str:
 NAMES = {dotted(path) for path in SOURCES}
 
 
-def imports(path: Path) -> set[str]:
-    """Return the modules of this package that a module names in its imports, wherever."""
+def imports(path: Path, *, late: bool = True) -> set[str]:
+    """Return the modules of this package that a module names in its imports.
+
+    Those inside of functions are left out unless `late`.
+    """
     found = set()
-    for node in (*source(path).imports, *source(path).late):
+    for node in (*source(path).imports, *(source(path).late if late else ())):
         if isinstance(node, ast.ImportFrom):
             for alias in node.names:
                 inner = f"{node.module}.{alias.name}"
@@ -104,3 +108,29 @@ def test_imports_in_functions_state_their_reason(path):
     for node in source(path).late:
         line = lines[node.lineno - 1]
         assert "  # " in line, f"{dotted(path)}:{node.lineno}: say why it is not at the top"
+
+
+WITH_SCIPY = {"solver", "compensator"}
+"""The nodes that compute with it: half a second and 30 MB at each start of a process."""
+
+
+def loaded(path: Path) -> set[Path]:
+    """Return the modules of this package that are loaded with a module, itself included."""
+    files = {dotted(source): source for source in SOURCES}
+    found, waiting = set(), [path]
+    while waiting:
+        found.add(path := waiting.pop())
+        waiting += {files[name] for name in imports(path, late=False)} - found
+    return found
+
+
+def names_scipy(path: Path) -> bool:
+    return any((node.module if isinstance(node, ast.ImportFrom) else node.names[0].name)
+               .partition(".")[0] == "scipy" for node in source(path).imports)
+
+
+@pytest.mark.parametrize("node", NODE_PARAMETERS)
+def test_only_nodes_that_compute_with_scipy_load_it(node):
+    with_scipy = [dotted(path) for path in loaded(PACKAGE / "nodes" / f"{node}.py")
+                  if names_scipy(path)]
+    assert bool(with_scipy) == (node in WITH_SCIPY), with_scipy

@@ -8,7 +8,7 @@ The error map holds G = indicated - true at the true position of the marks, henc
 """
 
 from collections.abc import Callable
-from typing import Literal, get_args
+from typing import get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -22,6 +22,7 @@ from selfcal_ros.compensation.cells import (
     bicubic_cells,
     bilinear_cells,
 )
+from selfcal_ros.compensation.options import Interpolation, Outside
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.error_map import ErrorMap
 
@@ -31,8 +32,6 @@ MAX_SLOPE = 0.25
 GENTLE = 0.005
 """Slope between neighbours below which no spline through them comes near twice MAX_SLOPE."""
 
-Interpolation = Literal["bilinear", "bicubic"]
-Outside = Literal["clamp", "refuse"]
 _Field = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 

@@ -14,7 +14,7 @@ from selfcal_ros.collection.settings.parameter import (
     Settings,
     declared,
 )
-from selfcal_ros.compensation.compensator import Interpolation, Outside
+from selfcal_ros.compensation.options import Interpolation, Outside
 from selfcal_ros.estimation.options import ReferenceKind
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.readings import Sense
