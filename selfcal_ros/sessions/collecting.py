@@ -42,9 +42,9 @@ class CollectingSession:
         self.settings, self._ports = settings, ports
         self.collector = Collector(settings)
         self._dirty, self._next_status, self._rested = False, 0.0, 0.0
-        self._needed, self._unseen = 0, 0  # readings of the open view, detections since its status
-        self._exposed_ns = 0  # newest exposure
-        self._since_ns = 0  # beginning of the open view
+        self._needed = 0  # readings without which the open view is not complete
+        self._unseen: list[np.ndarray] = []  # its detections since the last status, by their stamps
+        self._since_ns = 0  # its beginning
         self._costs: deque[float] = deque(maxlen=1000)
         self._published: dict[int, str] = {}
         self._run = ("", "")
@@ -78,16 +78,14 @@ class CollectingSession:
         if not len(table):
             return
         self.collector.add_detection_block(table)
-        newest = self._note_clock(DETECTION_TOPIC, table["stamp"], age_ns)
-        self._exposed_ns = max(self._exposed_ns, newest)
-        self._unseen += int((table["stamp"] >= self._since_ns).sum())
+        self._note_clock(DETECTION_TOPIC, table["stamp"], age_ns)
+        self._unseen.append(table["stamp"][table["stamp"] >= self._since_ns])
         self._dirty = True
 
-    def _note_clock(self, topic: str, stamps_ns: np.ndarray, age_ns: int) -> int:
-        """Hold stamps against their reception; return the newest."""
-        newest = int(stamps_ns.max())
-        self._clock.data(topic, newest, self._ports.now_ns() - age_ns, self._ports.now_s())
-        return newest
+    def _note_clock(self, topic: str, stamps_ns: np.ndarray, age_ns: int) -> None:
+        """Hold stamps against their reception."""
+        self._clock.data(topic, int(stamps_ns.max()), self._ports.now_ns() - age_ns,
+                         self._ports.now_s())
 
     def adopt(self, collector: Collector, journal: str) -> None:
         """Go on with a collector that has taken what a journal holds of the run."""
@@ -135,7 +133,7 @@ class CollectingSession:
         early = now < self._next_status
         if not self._dirty or (early and not (now >= self._rested and self._may_complete())):
             return
-        self._dirty, self._unseen = False, 0
+        self._dirty, self._unseen = False, []
         try:
             measurements, progress = self.collector.collect()
         except NoDataError:
@@ -157,11 +155,16 @@ class CollectingSession:
 
     def expects_end(self, more: int = 0) -> bool:
         """Return whether the detections that came and `more` may complete the view."""
-        return 0 < self._needed <= self._unseen + more
+        return 0 < self._needed <= sum(map(len, self._unseen)) + more
 
     def _may_complete(self) -> bool:
-        """Return whether enough has come to complete the view that is measured."""
-        return self.expects_end() and self.collector.encoder_until_ns > self._exposed_ns
+        """Return whether enough has come, samples behind it included, to complete the view.
+
+        A detection whose stamp lies in the future waits for its samples; it holds up no other.
+        """
+        until_ns = self.collector.encoder_until_ns
+        return self.expects_end() and self._needed <= sum(
+            int((stamps < until_ns).sum()) for stamps in self._unseen)
 
     def finish(self) -> str:
         """Publish every view as it is and return the digest of all readings."""

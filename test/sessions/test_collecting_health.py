@@ -281,6 +281,25 @@ def test_joints_that_tell_their_samples_apart_are_waited_for():
     assert complete(desk)
 
 
+@pytest.mark.parametrize("is_early", [True, False])
+def test_a_detection_stamped_in_the_future_holds_up_no_other(is_early):
+    desk, detection, behind = closing()
+    [last] = detection
+    stray = replace(last, stamp_ns=last.stamp_ns + 3600 * 10**9)
+    desk.session.take_detections(detection_table(stray))
+    if is_early:  # a status has told of it
+        desk.hands.pass_time(61.0)
+        desk.session.tick()
+    before = len(desk.hands.of("status"))
+    desk.feed(detection)
+    desk.session.tick()
+    assert len(desk.hands.of("status")) == before
+    desk.feed(behind)
+    desk.session.tick()
+    assert len(desk.hands.of("status")) == before + 1
+    assert len(desk.hands.of("measurement")) == 1
+
+
 @pytest.mark.parametrize("more, expected", [(0, False), (1, True)])
 def test_detections_that_are_not_decoded_yet_are_reckoned_with(more, expected):
     desk, _, _ = closing()
