@@ -123,15 +123,15 @@ class Cell:
     def saved(self) -> dict | str:
         """Return the result that the solver saves, or why there is none."""
         path = self.folder / "map.json"
-        finished = self._answer(Trigger, "measurement_collector/finish")
+        finished = self.answer(Trigger, "measurement_collector/finish")
         assert finished.success, finished.message
         end = time.monotonic() + 4 * IDLE_S  # where the readings are refused it says nothing
         while time.monotonic() < end and all(m.data != finished.message for m in self.solved):
             self.graph.executor.spin_once(timeout_sec=0.02)
-        answer = self._answer(SaveMap, "solver/save_map", path=str(path))
+        answer = self.answer(SaveMap, "solver/save_map", path=str(path))
         return read_json(path) if answer.success else answer.message
 
-    def _answer(self, kind: type, name: str, **fields: object) -> Any:
+    def answer(self, kind: type, name: str, **fields: object) -> Any:
         """Call a service, again where a node that was killed seems to have taken the request."""
         client = self.graph.hand.create_client(kind, self.name(name))
         for _ in range(ATTEMPTS):
