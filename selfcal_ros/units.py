@@ -8,12 +8,16 @@ import math
 
 MM_PER_M, UM_PER_M, NM_PER_M = 1e3, 1e6, 1e9
 M_PER_MM, M_PER_UM, M_PER_NM = 1e-3, 1e-6, 1e-9
+UM_PER_MM = 1e3
 MRAD_PER_RAD, URAD_PER_RAD = 1e3, 1e6
 RAD_PER_MRAD, RAD_PER_URAD = 1e-3, 1e-6
-ARCSEC_PER_RAD = math.degrees(1) * 3600
+ARCSEC_PER_DEG = 3600.0
+ARCSEC_PER_RAD = math.degrees(1) * ARCSEC_PER_DEG
 RAD_PER_ARCSEC = math.radians(1 / 3600)
-PPM_PER_ONE = 1e6
+PPM_PER_ONE, ONE_PER_PPM = 1e6, 1e-6
 NS_PER_S = 1_000_000_000
+S_PER_NS, MS_PER_S, S_PER_H = 1e-9, 1e3, 3600.0
+BYTES_PER_MB = 1e6
 
 M_PER = {"m": 1.0, "mm": M_PER_MM, "um": M_PER_UM, "nm": M_PER_NM}
 """Length of each unit by the name that options and files use."""

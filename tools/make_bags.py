@@ -21,6 +21,7 @@ from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.files import write_text
 from selfcal_ros.reporting.summary.numbers import summary_numbers
 from selfcal_ros.simulation.spec import read_simulation
+from selfcal_ros.units import PPM_PER_ONE, URAD_PER_RAD
 
 ROOT = Path(__file__).parents[1]
 BAGS = ROOT / "bags"
@@ -61,10 +62,10 @@ def entry(name: str, made: str) -> dict:
     expected: dict = {"rejected": measurements.all_rejected(), "lost": lost}
     try:
         result = calibrate(measurements)
-        numbers = summary_numbers(result)
+        numbers, emap = summary_numbers(result), result.error_map
         expected |= {"identifiable": True, "max_error_um": round(numbers.max_error_um, 4),
-                     "nonorthogonality_urad": round(result.error_map.nonorthogonality * 1e6, 4),
-                     "scale_difference_ppm": round(result.error_map.scale_difference * 1e6, 4)}
+                     "nonorthogonality_urad": round(emap.nonorthogonality * URAD_PER_RAD, 4),
+                     "scale_difference_ppm": round(emap.scale_difference * PPM_PER_ONE, 4)}
     except NotIdentifiableError as error:
         expected |= {"identifiable": False, "deficiency": error.observability.deficiency}
     return {"sha256": bag_input(BAGS / name)["sha256"], "made": made, "truth": f"{name}/truth.json",

@@ -11,6 +11,7 @@ from functools import partial
 from selfcal_ros.files import write_text
 from selfcal_ros.parallel import check_workers, outcomes
 from selfcal_ros.simulation.reality import Case, Run, Summary, cases, run_case, summarise
+from selfcal_ros.units import NM_PER_M
 
 HEADER = ("| what the machine does | map error, nm, largest (median) | in U | XY error / u | "
           "θ error / u | not qualified | wrong and qualified | first cause |\n"
@@ -21,7 +22,7 @@ def row(found: Summary) -> str:
     causes = ", ".join(f"{name} ({count})" for name, count in found.causes) or "–"
     refused = f" ({found.refused} refused)" if found.refused else ""
     return (f"| {found.case.name.replace('um', 'µm').replace(' deg', '°')} "
-            f"| {found.error_m * 1e9:.1f} | {100 * found.within:.1f} % | {found.z_xy:.3f} "
+            f"| {found.error_m * NM_PER_M:.1f} | {100 * found.within:.1f} % | {found.z_xy:.3f} "
             f"| {found.z_theta:.3f} | {found.told} of {found.runs}{refused} | {found.wrong} "
             f"| {causes} |")
 

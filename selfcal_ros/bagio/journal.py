@@ -35,6 +35,7 @@ from selfcal_ros.collection.messages import Phase
 from selfcal_ros.errors import InputError, SelfcalError
 from selfcal_ros.messages.to_model import stamp_ns
 from selfcal_ros.messages.topics import COMMAND_TOPIC
+from selfcal_ros.units import S_PER_NS
 
 SYNC_PERIOD_S = 0.5
 """Time between two synchronisations with the disk, where there is something to synchronise."""
@@ -113,7 +114,7 @@ def written_ago_s(folder: str | os.PathLike) -> float | None:
     """
     with _said(Path(folder)):
         written_ns = _newest(Path(folder))[0]
-    return max(time.time_ns() - written_ns, 0) * 1e-9 if written_ns else None
+    return max(time.time_ns() - written_ns, 0) * S_PER_NS if written_ns else None
 
 
 def start(folder: str | os.PathLike, now_ns: int) -> "Journal":

@@ -16,6 +16,7 @@ from selfcal_ros.cli.step_diagonal_bag import (
 from selfcal_ros.cli.terminal.output import add_json, put, say
 from selfcal_ros.cli.terminal.progress import busy
 from selfcal_ros.errors import ExitCode, InputError
+from selfcal_ros.units import M_PER_MM
 
 if TYPE_CHECKING:
     from selfcal_ros.laser.data import StepDiagonalResult
@@ -219,7 +220,7 @@ def _steps(args: argparse.Namespace, dim: int) -> tuple[float, ...]:
         if not SHORTEST_MM <= step < math.inf:
             raise InputError(f"--step-{axis}", f"{step:g} mm is not a length",
                              "give the nominal step in mm, greater than 0")
-    return tuple(getattr(args, f"step_{axis}") * 1e-3 for axis in "xyz"[:dim])
+    return tuple(getattr(args, f"step_{axis}") * M_PER_MM for axis in "xyz"[:dim])
 
 
 def _diagonals(args: argparse.Namespace, dim: int) -> tuple[str, ...]:

@@ -29,6 +29,7 @@ from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Measurements, Sense, ViewReadings
 from selfcal_ros.model.view import View
+from selfcal_ros.units import NS_PER_S
 
 MOST_NAMES = 20
 """Names of foreign joints that are remembered."""
@@ -98,7 +99,7 @@ class Collector:
     """
 
     def __init__(self, settings: CollectorSettings, store: Limits | None = None) -> None:
-        gap_ns = round(settings.max_encoder_gap * 1e9)
+        gap_ns = round(settings.max_encoder_gap * NS_PER_S)
         linear = TrackLimits(gap_ns, settings.max_speed, settings.encoder_agreement)
         turn = TrackLimits(gap_ns, settings.max_angular_speed, settings.encoder_agreement, True)
         self.sense = Sense(settings.measurement_sense)
@@ -307,7 +308,7 @@ class Collector:
             {axis: name for name, axis in self._joints.items()},
             {axis: len(track) > 0 for axis, track in tracks.items()}, tuple(self._foreign),
             (min(s[0] for s in spans), max(s[1] for s in spans)) if spans else None,
-            self.tracks.x.usual_step_s(), self.tracks.x.limits.max_gap_ns / 1e9)
+            self.tracks.x.usual_step_s(), self.tracks.x.limits.max_gap_ns / NS_PER_S)
 
 
 def view_progress(timeline: Timeline, index: int, readings: ViewReadings) -> ViewProgress:

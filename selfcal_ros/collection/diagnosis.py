@@ -13,6 +13,7 @@ import numpy as np
 
 from selfcal_ros.collection.reasons import REMEDY, Reason
 from selfcal_ros.model.readings import Sense
+from selfcal_ros.units import NS_PER_S
 
 MOST = 0.5
 """Part of the detections beyond which one reason of rejection is a matter of its own."""
@@ -128,7 +129,7 @@ def _clock(e: Evidence) -> str | None:
     (first, last), (begin, end) = e.detections_ns, e.encoder_ns
     if first <= end and last >= begin:
         return None
-    offset = (last - end) / 1e9
+    offset = (last - end) / NS_PER_S
     return (f"the detections are stamped about {_seconds(offset)} "
             f"{'after' if offset > 0 else 'before'} the encoder samples; let both be stamped by "
             "one clock")
@@ -147,7 +148,7 @@ def _command_clock(e: Evidence) -> str | None:
     (first, last), (begin, end) = e.detections_ns, e.commands_ns
     if first <= end and last >= begin:
         return None
-    offset = (first - begin if last < begin else last - end) / 1e9
+    offset = (first - begin if last < begin else last - end) / NS_PER_S
     return (f"all detections are stamped {'before the first' if offset < 0 else 'after the last'} "
             f"view command, about {_seconds(offset)} off; let the cell and the sequencer have one "
             "clock")

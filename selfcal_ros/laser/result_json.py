@@ -23,7 +23,7 @@ from selfcal_ros.laser.profiles import (
 )
 from selfcal_ros.laser.readings.noise import linear_noise, reading_noise
 from selfcal_ros.model.result import plain
-from selfcal_ros.units import M_PER_MM, UM_PER_M
+from selfcal_ros.units import M_PER_MM, UM_PER_M, UM_PER_MM
 
 SCHEMA = "selfcal.step_diagonal/1"
 CONVENTION = {
@@ -143,9 +143,10 @@ def _advice(found: StepDiagonalResult) -> list[str]:
 
 def summary(result: dict[str, Any]) -> str:
     """Return what a person wants to read first, in micrometres."""
-    def shown(key: str) -> str:
-        u = result.get(f"u_{key}")
-        return f"{result[key] * 1e3:+.4f} um" + ("" if u is None else f" (u = {u * 1e3:.4f})")
+    def in_um(value_mm: float, u_mm: float | None) -> str:
+        u = "" if u_mm is None else f" (u = {u_mm * UM_PER_MM:.4f})"
+        return f"{value_mm * UM_PER_MM:+.4f} um{u}"
+
 
     names = [key for key in result if key.startswith(("squareness", "straightness"))
              and not key.endswith("_rad")]
@@ -154,9 +155,8 @@ def summary(result: dict[str, Any]) -> str:
                                                      "straightness_y")]
     lines = [f"{result['method']} formulation, {result['n_blocks']} blocks, "
              f"{len(result['diagonals'])} diagonals, {result['n_repeats']} repeat(s)"]
-    lines += [f"  {key:22s} {shown(key)}" for key in names]
+    lines += [f"  {key:22s} {in_um(result[key], result.get(f'u_{key}'))}" for key in names]
     lengths, u = result["closure"]["lengths"], result["closure"]["u_lengths"]
     if lengths is not None:
-        lines.append(f"  {'closure of lengths':22s} {lengths * 1e3:+.4f} um"
-                     + ("" if u is None else f" (u = {u * 1e3:.4f})"))
+        lines.append(f"  {'closure of lengths':22s} {in_um(lengths, u)}")
     return "\n".join(lines)

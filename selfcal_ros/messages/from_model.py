@@ -13,6 +13,7 @@ from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import GridVisits, Measurements
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.view import View
+from selfcal_ros.units import NS_PER_S
 
 Fields = dict[str, Any]
 
@@ -23,7 +24,7 @@ VISIT_COLUMNS = ("mark", "dx", "dy", "count", "u", "offset_x", "offset_y", "appr
 
 def header(stamp_ns: int, frame_id: str) -> Fields:
     """Return the fields of a std_msgs/Header."""
-    sec, nanosec = divmod(stamp_ns, 1_000_000_000)
+    sec, nanosec = divmod(stamp_ns, NS_PER_S)
     return {"stamp": {"sec": sec, "nanosec": nanosec}, "frame_id": frame_id}
 
 

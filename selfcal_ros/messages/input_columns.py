@@ -9,6 +9,7 @@ import numpy as np
 from selfcal_ros.collection.reduce import DETECTION
 from selfcal_ros.messages.cdr_columns import ColumnDecoder, Columns, Payloads
 from selfcal_ros.messages.cdr_layout import SEQUENCE, TEXT, Field
+from selfcal_ros.units import NS_PER_S
 
 TIME = (Field("sec", "i4"), Field("nanosec", "u4"))
 HEADER = (Field("stamp", TIME), Field("frame_id", TEXT))
@@ -79,7 +80,7 @@ class DetectionColumns:
 def stamps_ns(group: Columns) -> np.ndarray:
     """Return the stamps in the headers of messages, integer ns."""
     seconds = group["header.stamp.sec"].astype(np.int64)
-    return seconds * 1_000_000_000 + group["header.stamp.nanosec"]
+    return seconds * NS_PER_S + group["header.stamp.nanosec"]
 
 
 def first_stamps_ns(messages: Payloads) -> tuple[np.ndarray, np.ndarray]:
@@ -100,7 +101,7 @@ def first_stamps_ns(messages: Payloads) -> tuple[np.ndarray, np.ndarray]:
                    for order in "<>")
     is_little = octets[:, 1] & 1 == 1
     second = np.where(is_little, little["sec"], big["sec"]).astype(np.int64)
-    return second * 1_000_000_000 + np.where(is_little, little["nanosec"], big["nanosec"]), there
+    return second * NS_PER_S + np.where(is_little, little["nanosec"], big["nanosec"]), there
 
 
 def _encoder_block(group: Columns) -> EncoderBlock:

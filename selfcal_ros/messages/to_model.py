@@ -14,12 +14,13 @@ from selfcal_ros.model.error_map import ErrorMap, ThetaDatum
 from selfcal_ros.model.orders import parse_order
 from selfcal_ros.model.readings import GridVisits, Sense, ViewReadings
 from selfcal_ros.model.view import View
+from selfcal_ros.units import NS_PER_S
 
 
 def stamp_ns(message: Any) -> int:
     """Return the stamp in the header of a message, integer ns."""
     stamp = message.header.stamp
-    return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
+    return int(stamp.sec) * NS_PER_S + int(stamp.nanosec)
 
 
 def encoder_sample(message: Any) -> EncoderSample:

@@ -12,6 +12,7 @@ from selfcal_ros.errors import NoDataError
 from selfcal_ros.messages.topics import COMMAND_TOPIC, DETECTION_TOPIC, ENCODER_TOPIC
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes.base import SelfcalNode
+from selfcal_ros.units import S_PER_NS
 
 KINDS = {ENCODER_TOPIC: "encoder", DETECTION_TOPIC: "detection", COMMAND_TOPIC: "command"}
 WINDOW = 1500
@@ -71,7 +72,7 @@ class Player:
         stop = now + 0.02
         while not self.done and time.monotonic() < stop:
             topic, stamp, data = self._next
-            if self.rate > 0 and (stamp - self._first_ns) * 1e-9 / self.rate > now - began:
+            if self.rate > 0 and (stamp - self._first_ns) * S_PER_NS / self.rate > now - began:
                 return
             if not self._room(time.monotonic() - began):
                 return

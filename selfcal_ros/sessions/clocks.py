@@ -8,8 +8,9 @@ import numpy as np
 
 from selfcal_ros.collection.clock.steps import Step, StepWatch
 from selfcal_ros.sessions.ports import Diagnosis, Level
+from selfcal_ros.units import NS_PER_S, S_PER_NS
 
-LIVE_NS = 1_000_000_000
+LIVE_NS = NS_PER_S
 """A command received later than this after its stamp is recorded or latched, not live."""
 WINDOW_S = 2.0
 BIN_S = 0.1
@@ -36,7 +37,7 @@ class ClockWatch:
     """
 
     def __init__(self, limit_s: float) -> None:
-        self._limit_s, self._limit_ns = limit_s, round(limit_s * 1e9)
+        self._limit_s, self._limit_ns = limit_s, round(limit_s * NS_PER_S)
         self._live, self._live_run = False, ""
         self._bins: deque[tuple[float, int]] = deque()
         self._watches: dict[str, StepWatch] = {}
@@ -60,7 +61,7 @@ class ClockWatch:
         if self._live:
             watch = self._watches.setdefault(topic, StepWatch(self._limit_s))
             self.steps.setdefault(topic, []).extend(watch.add(
-                np.array([stamp_ns]), np.array([round(now_s * 1e9)])))
+                np.array([stamp_ns]), np.array([round(now_s * NS_PER_S)])))
         offset = stamp_ns - now_ns
         if self._bins and now_s - self._bins[-1][0] < BIN_S:
             when, largest = self._bins[-1]
@@ -85,12 +86,12 @@ class ClockWatch:
         offset = self.offset_ns
         if offset is None:
             return Diagnosis(Level.OK, "")
-        values = {"clock_offset_s": f"{offset * 1e-9:.3f}"}
+        values = {"clock_offset_s": f"{offset * S_PER_NS:.3f}"}
         if abs(offset) <= self._limit_ns:
             return Diagnosis(Level.OK, "", values)
         side = "ahead of" if offset > 0 else "behind"
-        return Diagnosis(Level.WARN, f"the cell's clock is {abs(offset) * 1e-9:.3g} s {side} this "
-                         "machine's: detections fall into wrong views; synchronise the clocks "
+        return Diagnosis(Level.WARN, f"the cell's clock is {abs(offset) * S_PER_NS:.3g} s {side} "
+                         "this machine's: detections fall into wrong views; synchronise the clocks "
                          "(PTP, NTP)", values)
 
 
@@ -127,5 +128,5 @@ class RosTime:
             return Level.WARN, self.NOTHING
         if state == "moves":
             return Level.OK, "stamps follow /clock (use_sim_time); work and health do not"
-        return Level.OK, (f"/clock stands at {self._last_ns * 1e-9:.3f} s; work and health go on, "
-                          "stamps do not")
+        return Level.OK, (f"/clock stands at {self._last_ns * S_PER_NS:.3f} s; work and health go "
+                          "on, stamps do not")

@@ -22,6 +22,7 @@ from selfcal_ros.model.readings import Measurements
 from selfcal_ros.sessions.clocks import ClockWatch
 from selfcal_ros.sessions.health import Rate, merged
 from selfcal_ros.sessions.ports import Diagnosis, Level, Ports
+from selfcal_ros.units import MS_PER_S, S_PER_NS, UM_PER_M
 
 HEARD_S = 1.0
 """Time without an encoder sample after which the encoder is not heard."""
@@ -66,7 +67,7 @@ class CollectingSession:
         """Take encoder samples, the newest of which was received `age_ns` ago."""
         if not len(block):
             return
-        self._encoder_s = self._ports.now_s() - age_ns * 1e-9
+        self._encoder_s = self._ports.now_s() - age_ns * S_PER_NS
         self.collector.add_encoder_block(block.stamps_ns, block.names, block.positions,
                                          block.velocities)
         self._encoder_rate.add(block.stamps_ns)
@@ -271,7 +272,7 @@ class CollectingSession:
 
     def _cost(self) -> dict[str, str]:
         """Return what the last statuses cost."""
-        costs = [1e3 * cost for cost in self._costs] or [0.0]
+        costs = [MS_PER_S * cost for cost in self._costs] or [0.0]
         return {"status_ms": f"{statistics.median(costs):.1f}",
                 "status_ms_max": f"{max(costs):.1f}"}
 
@@ -289,7 +290,7 @@ class CollectingSession:
     def _encoder(self) -> Diagnosis:
         """Return rate and largest gap of the encoder, WARN beyond the limits."""
         heard = self._ports.now_s() - self._encoder_s <= HEARD_S
-        gap = self._encoder_rate.take_gap_ns() * 1e-9
+        gap = self._encoder_rate.take_gap_ns() * S_PER_NS
         rate, least = self._encoder_rate.per_second, self.settings.encoder_rate_min
         values = {"encoder_heard": "yes" if heard else "no", "encoder_rate": f"{rate:.0f}",
                   "encoder_gap_s": f"{gap:.4f}"}
@@ -309,8 +310,8 @@ class CollectingSession:
         """Return the repeatability of the newest view, WARN beyond the limits."""
         values, problems = {}, []
         for value, limit, name, scale, unit in (
-                (self._noise[0], self.settings.repeatability_xy_limit, "repeatability_xy", 1e6,
-                 "um"),
+                (self._noise[0], self.settings.repeatability_xy_limit, "repeatability_xy",
+                 UM_PER_M, "um"),
                 (self._noise[1], self.settings.repeatability_theta_limit, "repeatability_theta",
                  1.0, "rad")):
             if math.isfinite(value):

@@ -14,6 +14,7 @@ from selfcal_ros.model.error_map import ErrorMap
 from selfcal_ros.model.result import result_from_dict
 from selfcal_ros.sessions.ports import Diagnosis, Level, Ports
 from selfcal_ros.sessions.verdicts import is_qualified
+from selfcal_ros.units import S_PER_NS
 
 
 class CompensatingSession:
@@ -139,7 +140,7 @@ class CompensatingSession:
         waits = f"; not used: {self._waits}" if self._waits else ""
         if self.compensator is None:
             return Diagnosis(Level.WARN, f"no error map yet{waits}", self.counts)
-        age = (self._ports.now_ns() - self._map_ns) * 1e-9 if self._map_ns else math.nan
+        age = (self._ports.now_ns() - self._map_ns) * S_PER_NS if self._map_ns else math.nan
         values = self.counts | {
             "map": self._used, "since_s": f"{self._ports.now_s() - self._since_s:.0f}",
             **({"map_age_s": f"{age:.0f}"} if math.isfinite(age) else {})}

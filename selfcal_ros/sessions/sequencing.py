@@ -20,6 +20,7 @@ from selfcal_ros.model.view import Plan, View, plan_from_dict
 from selfcal_ros.sessions.health import Presence
 from selfcal_ros.sessions.ports import Diagnosis, Level, Ports
 from selfcal_ros.sessions.stalls import StallWatch, missing_marks
+from selfcal_ros.units import S_PER_NS
 
 PATIENCE_S = 3.0
 """Time without a sign of life after which a node is missing; it tells its health each second."""
@@ -211,7 +212,7 @@ class SequencingSession:
 
     def _tell_set_back(self) -> None:
         """Say once that the clock is behind the last command: what comes now counts before it."""
-        behind_s = (self._commanded_ns - self._ports.now_ns()) * 1e-9
+        behind_s = (self._commanded_ns - self._ports.now_ns()) * S_PER_NS
         if self.current is None or behind_s <= SET_BACK_S:
             self._set_back = ""
         elif not self._set_back:

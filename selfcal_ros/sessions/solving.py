@@ -211,7 +211,7 @@ class SolvingSession:
             self._save_by_itself(outcome.result)
 
     def _take_none(self, outcome: Outcome) -> None:
-        """Show why readings gave no result; raise it unless views that are to come may mend it."""
+        """Show why readings gave no result; raise it unless views to come may change that."""
         job = outcome.job
         self.shown = Shown(None, outcome.problem, job.run, len(job.measurements.views),
                            job.stamp_ns, "")

@@ -10,6 +10,7 @@ from selfcal_ros.collection.messages import Phase
 from selfcal_ros.messages import to_model
 from selfcal_ros.sessions.health import Presence
 from selfcal_ros.sessions.ports import Diagnosis, Ports
+from selfcal_ros.units import ARCSEC_PER_RAD, MM_PER_M, UM_PER_M
 
 PATIENCE_S = 3.0
 NODES = ("measurement_collector", "pose_sequencer", "solver")
@@ -79,8 +80,8 @@ class Watch:
             "view_index": command.view_index, "view_name": command.view_name,
             "views_planned": command.views_planned,
             "rotation_deg": _finite(math.degrees(command.rotation)),
-            "translation_mm": [_finite(command.translation_x * 1e3),
-                               _finite(command.translation_y * 1e3)]}
+            "translation_mm": [_finite(command.translation_x * MM_PER_M),
+                               _finite(command.translation_y * MM_PER_M)]}
 
     def _view(self) -> dict[str, Any] | None:
         status = self._status
@@ -93,8 +94,8 @@ class Watch:
             "used": status.detections_used,
             "rejected": dict(zip(status.reject_reasons, map(int, status.reject_counts),
                                  strict=False)),
-            "repeatability_um": _finite(status.sigma_xy * 1e6),
-            "repeatability_arcsec": _finite(math.degrees(status.sigma_theta) * 3600),
+            "repeatability_um": _finite(status.sigma_xy * UM_PER_M),
+            "repeatability_arcsec": _finite(status.sigma_theta * ARCSEC_PER_RAD),
             "missing_lines": [int(k) for k in status.missing_k], "plate": self._plate()}
 
     def _plate(self) -> list[str]:
@@ -143,7 +144,7 @@ class Watch:
             error_map = to_model.error_map(message)
         except Exception:  # the solver's own health tells of it
             return None
-        size = np.hypot(error_map.gx, error_map.gy) * 1e6
+        size = np.hypot(error_map.gx, error_map.gy) * UM_PER_M
         step = max(1, math.ceil(max(size.shape) / MOST_SITES))
         return {"run_id": message.run_id, "qualified": bool(message.qualified), "um": [
             [_finite(value) for value in row] for row in size[::step, ::step].T[::-1].tolist()]}

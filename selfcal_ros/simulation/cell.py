@@ -14,6 +14,7 @@ from selfcal_ros.model.view import Plan, View
 from selfcal_ros.simulation.exposures import angular_exposures, grid_exposures, lead_in
 from selfcal_ros.simulation.machine import Truth
 from selfcal_ros.simulation.settings import CellSettings
+from selfcal_ros.units import NS_PER_S
 
 __all__ = ["JOINTS", "CellSettings", "Event", "plan_events", "view_events"]
 
@@ -30,7 +31,7 @@ def view_events(truth: Truth, plan: Plan, index: int, *, settings: CellSettings,
     the stage rests, and comes to the first grid mark from minus.
     """
     stops, offsets, marks = _exposures(truth, index, plan.views[index], settings, rng)
-    period_ns, step_ns = settings.period_ns, round(1e9 / settings.encoder_rate_hz)
+    period_ns, step_ns = settings.period_ns, round(NS_PER_S / settings.encoder_rate_hz)
     end_ns = start_ns + period_ns * len(stops)
     exposed = 0
     for stamp in range(start_ns, end_ns + 1, step_ns):

@@ -10,6 +10,7 @@ import numpy as np
 from selfcal_ros.collection.messages import Detection, EncoderSample, Kind
 from selfcal_ros.errors import InputError
 from selfcal_ros.simulation.cell import Event
+from selfcal_ros.units import M_PER_UM, NS_PER_S, RAD_PER_MRAD
 
 PARTS = ("lost", "outliers", "low_score", "not_finite", "unknown_mark", "duplicated")
 """Faults that meet a part of the detections, one at most each; in the order of the draw."""
@@ -75,14 +76,14 @@ def apply_faults(events: Sequence[Event], faults: Faults, rng: np.random.Generat
     first, last = events[0].stamp_ns, events[-1].stamp_ns
     gap = first + (last - first) // 3
     step_at = first + (last - first) // 2
-    step = round(faults.clock_step_s * 1e9)
+    step = round(faults.clock_step_s * NS_PER_S)
     out: list[tuple[int, Event]] = []
     for event in events:
         arrival = event.stamp_ns
         if faults.delay_s:
-            arrival += round(rng.exponential(faults.delay_s / 5) * 1e9)
+            arrival += round(rng.exponential(faults.delay_s / 5) * NS_PER_S)
         if isinstance(event, EncoderSample) and gap <= event.stamp_ns < gap + round(
-                faults.encoder_gap_s * 1e9):
+                faults.encoder_gap_s * NS_PER_S):
             ledger["encoder_samples_lost"] += 1
             continue
         if step and event.stamp_ns >= step_at:
@@ -121,6 +122,6 @@ def _one_fault(event: Detection, name: str, rng: np.random.Generator) -> list[Ev
     size, angle = rng.uniform(1, 20), rng.uniform(0, 2 * np.pi)
     if event.kind == Kind.ANGULAR:
         return [replace(event, offset_theta=event.offset_theta
-                        + np.sign(np.cos(angle)) * size * 1e-3)]
-    return [replace(event, offset_x=event.offset_x + size * 1e-6 * np.cos(angle),
-                    offset_y=event.offset_y + size * 1e-6 * np.sin(angle))]
+                        + np.sign(np.cos(angle)) * size * RAD_PER_MRAD)]
+    return [replace(event, offset_x=event.offset_x + size * M_PER_UM * np.cos(angle),
+                    offset_y=event.offset_y + size * M_PER_UM * np.sin(angle))]

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.orders import parse_order
 from selfcal_ros.model.readings import Sense
+from selfcal_ros.units import NS_PER_S
 
 DWELL = 0.6
 """Part of an exposure period in which the stage rests."""
@@ -82,7 +83,7 @@ class CellSettings:
     @property
     def period_ns(self) -> int:
         """Time from one exposure to the next, ns."""
-        return round(self.exposure_period_s * 1e9)
+        return round(self.exposure_period_s * NS_PER_S)
 
     @property
     def dwell_ns(self) -> int:

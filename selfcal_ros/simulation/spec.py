@@ -17,6 +17,7 @@ from selfcal_ros.simulation.cell import Event, plan_events
 from selfcal_ros.simulation.faults import PARTS, Faults, apply_faults
 from selfcal_ros.simulation.machine import ENCODERS, ROTATIONS, Spread, Truth, random_truth
 from selfcal_ros.simulation.settings import CellSettings
+from selfcal_ros.units import NS_PER_S
 
 Bounds = dict[str, Any]
 """Unit, limits and choices of a key, as `Parameter` takes them."""
@@ -127,7 +128,7 @@ def read_simulation(path: str | Path) -> Simulation:
         raise InputError(f"{where}: {error.where}", error.what, error.remedy) from error
     return Simulation(_plan(data["plan"], Path(path)), top["seed"],
                       Spread(**read["truth"], **read["physics"]), settings, faults,
-                      round(top["start_time"] * 1e9), top["compression"])
+                      round(top["start_time"] * NS_PER_S), top["compression"])
 
 
 def settings_of(values: Mapping[str, Any]) -> CellSettings:

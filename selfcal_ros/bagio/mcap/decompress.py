@@ -18,6 +18,7 @@ import lz4.frame
 import zstandard
 
 from selfcal_ros.errors import InputError, first_line
+from selfcal_ros.units import BYTES_PER_MB
 
 FREE = 64 << 20
 """Bytes that are always allowed."""
@@ -61,8 +62,9 @@ def check_size(size: int, compressed: int, declared: int | None = None) -> None:
 def refuse_beyond(limit: int, size: int) -> None:
     """Raise TooLargeError if `size` bytes are more than `limit`."""
     if size > limit:
-        raise TooLargeError(f"it would decompress to {size / 1e6:,.0f} MB, more than the "
-                            f"{limit / 1e6:,.0f} MB that its size, the file and the memory allow")
+        raise TooLargeError(f"it would decompress to {size / BYTES_PER_MB:,.0f} MB, more than "
+                            f"the {limit / BYTES_PER_MB:,.0f} MB that its size, the file and the "
+                            "memory allow")
 
 
 def zstd_chunk(data: bytes, declared: int) -> bytes:

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from selfcal_ros.collection.timeline import Timeline
+from selfcal_ros.units import NS_PER_S, S_PER_NS
 
 GROUP, BESIDE = 5, 3
 """Messages that are looked at as one, and such groups on either side of a step."""
@@ -48,7 +49,7 @@ class StepWatch:
     """
 
     def __init__(self, limit_s: float) -> None:
-        self._limit_ns = round(limit_s * 1e9)
+        self._limit_ns = round(limit_s * NS_PER_S)
         self._rest = np.zeros((2, 0), dtype=np.int64)  # less than a group
         self._groups = np.zeros((6, 0), dtype=np.int64)
         self._quiet = 0  # groups in which a step that has been told is still seen
@@ -152,6 +153,6 @@ def _line(topics: str, step: Step, timeline: Timeline) -> str:
     view = timeline.intervals[index].view_index if index >= 0 else None
     where = "between views" if view is None else f"in view '{timeline.views[view].name}'"
     way, wrong = ("back", "an earlier") if step.by_ns < 0 else ("ahead", "a later")
-    return (f"the clock that stamps {topics} stepped {way} by {abs(step.by_ns) * 1e-9:.3g} s "
-            f"{where}, at {step.before_ns * 1e-9:.3f} s: what was stamped since may be missing or "
-            f"counted in {wrong} view; {REMEDY}, and measure again from that view on")
+    return (f"the clock that stamps {topics} stepped {way} by {abs(step.by_ns) * S_PER_NS:.3g} s "
+            f"{where}, at {step.before_ns * S_PER_NS:.3f} s: what was stamped since may be missing "
+            f"or counted in {wrong} view; {REMEDY}, and measure again from that view on")

@@ -12,6 +12,7 @@ import numpy as np
 
 from selfcal_ros.collection.reasons import Reason, reason_where
 from selfcal_ros.collection.stage.samples import Limits, Samples, SampleStore
+from selfcal_ros.units import NS_PER_S
 
 BEYOND_NOISE = 6.0
 """Standard deviations by which two samples must differ to show that a joint has moved."""
@@ -65,7 +66,7 @@ class JointTrack:
         if span is None:
             return float("nan")
         t = np.unique(self.store.near(span[1], span[1], 1000)[0])
-        return float(np.median(np.diff(t)) / 1e9) if len(t) > 1 else float("nan")
+        return float(np.median(np.diff(t)) / NS_PER_S) if len(t) > 1 else float("nan")
 
     def query(self, stamps_ns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return `Series.query` of all samples."""
@@ -196,7 +197,7 @@ class Series:
             told = np.where(np.isfinite(v[before]) & np.isfinite(v[after]),
                             np.fmax(v[before], v[after]), 0.0)
             told = np.where(told > BEYOND_NOISE * speed_noise, told, 0.0)
-            told *= (t[right] - t[left]) / 1e9
+            told *= (t[right] - t[left]) / NS_PER_S
             fast &= np.fmax(way, told) > BEYOND_NOISE * np.sqrt(2) * noise
         return reason_where(fast, Reason.MOVING)
 
@@ -300,7 +301,7 @@ class Series:
         t, p, v = self.t, self.p, self.v
         dt = np.diff(t)
         step = self._difference(np.diff(p))
-        speed = np.abs(step) / np.where(dt > 0, dt, 1) * 1e9
+        speed = np.abs(step) / np.where(dt > 0, dt, 1) * NS_PER_S
         fast = np.concatenate([[False], speed > self.limits.max_speed, [False]])
         move = np.concatenate([[0.0], step, [0.0]])  # move[i]: from sample i-1 to sample i
         near = np.concatenate([[False], dt <= self.limits.max_gap_ns, [False]])

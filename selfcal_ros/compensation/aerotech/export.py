@@ -19,7 +19,7 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.model.error_map import ErrorMap
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.statistics import rms
-from selfcal_ros.units import M_PER_UM, NM_PER_M, RAD_PER_ARCSEC
+from selfcal_ros.units import ARCSEC_PER_DEG, M_PER_UM, NM_PER_M, RAD_PER_ARCSEC
 
 DECIMALS = 5
 """Digits of a correction in um: rounding stays below 0.005 nm."""
@@ -96,8 +96,8 @@ def table_theta(error_map: ErrorMap, frame: MachineFrame) -> Table1D:
     sign, first = frame.sign_theta, float(lines[0]) * 360 / count
     return Table1D(
         frame.theta_axis, tidy(sign * 360 / count),
-        np.round(sign * np.rad2deg(g[lines % count]) * 3600, theta_decimals(error_map)),
-        pos_unit=PRIMARY, cor_unit=Unit(UnitWord.PRIMARY, 3600.0),
+        np.round(sign * np.rad2deg(g[lines % count]) * ARCSEC_PER_DEG, theta_decimals(error_map)),
+        pos_unit=PRIMARY, cor_unit=Unit(UnitWord.PRIMARY, ARCSEC_PER_DEG),
         offset=tidy(sign * (np.rad2deg(frame.home_theta_rad) - first)),
         rollover=tidy(360 * counts) if counts else None)
 

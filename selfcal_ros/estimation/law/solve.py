@@ -31,7 +31,7 @@ N_DRAWS = 400
 """Unit-noise draws behind the uncertainties of a larger plate: 3.5 % standard error each."""
 
 _JOINT = "solve with --method joint"
-_MEND = "measure Hu's four views in full, or solve with --method joint"
+_REMEDY = "measure Hu's four views in full, or solve with --method joint"
 _NAMES = ("0 deg with grid and lines", "90 deg with grid and lines", "one line, lines only",
           "one pitch along +X with grid and lines")
 
@@ -137,11 +137,11 @@ def hu_views(measurements: Measurements) -> list[ViewReadings]:
             index = 2
         if index is None or index in found:
             raise InputError(f"method law: view '{view.view.name}'", "is not one of Hu's four "
-                             "views, each once", _MEND)
+                             "views, each once", _REMEDY)
         found[index] = view
     for index, name in enumerate(_NAMES):
         if index not in found:
-            raise InputError("method law", f"Hu's view {index} ({name}) is missing", _MEND)
+            raise InputError("method law", f"Hu's view {index} ({name}) is missing", _REMEDY)
         _require_complete(found[index], index, artifact)
     return [found[index] for index in range(4)]
 
@@ -153,7 +153,7 @@ def _require_complete(view: ViewReadings, index: int, artifact: Artifact) -> Non
                              ("angular lines", len(view.k), lines)):
         if have != want:
             raise InputError(f"method law: view '{view.view.name}'",
-                             f"{have} of {want} {what} were read", _MEND)
+                             f"{have} of {want} {what} were read", _REMEDY)
 
 
 def hu_readings(artifact: Artifact, views: list[ViewReadings]) -> HuReadings:

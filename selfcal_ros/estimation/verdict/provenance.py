@@ -8,6 +8,7 @@ from selfcal_ros import __version__
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.verdict import Provenance
+from selfcal_ros.units import NS_PER_S
 
 
 def provenance_of(measurements: Measurements, options: Options) -> Provenance:
@@ -28,13 +29,13 @@ def provenance_of(measurements: Measurements, options: Options) -> Provenance:
     duration = float("nan")
     if stamps:
         extra |= {"first_exposure": _iso(min(stamps)), "last_exposure": _iso(max(stamps))}
-        duration = (max(stamps) - min(stamps)) / 1e9
+        duration = (max(stamps) - min(stamps)) / NS_PER_S
     return Provenance("", duration, __version__, extra)
 
 
 def _iso(stamp_ns: int) -> str:
     """Return a stamp as ISO 8601 in UTC; unchanged where it is not a date."""
     try:
-        return datetime.fromtimestamp(stamp_ns / 1e9, UTC).isoformat(timespec="milliseconds")
+        return datetime.fromtimestamp(stamp_ns / NS_PER_S, UTC).isoformat(timespec="milliseconds")
     except (OverflowError, ValueError, OSError):
         return f"{stamp_ns} ns"

@@ -18,6 +18,7 @@ import numpy as np
 from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.laser.data import AXES, DIAGONALS, MAX_BLOCKS, StepDiagonal
 from selfcal_ros.laser.readings.plausible import check_reading
+from selfcal_ros.units import NS_PER_S
 
 OUTLIER = 10.0
 """Laser samples of a rest farther than this from its median are left out, in median distances: for
@@ -192,7 +193,7 @@ def find_rests(series: Series, rule: CutRule) -> list[Rest]:
     while start < len(stamps):
         end = _end_of_rest(positions, (start, end), rule.rest_tolerance_m)
         first, last = stamps[start], stamps[end - 1]
-        if last - first >= rule.min_rest_s * 1e9:
+        if last - first >= rule.min_rest_s * NS_PER_S:
             laser = _mean_laser(series, (first, last), rule)
             if laser is not None:
                 rests.append(Rest(positions[start:end].mean(axis=0), laser[0], int(first),
@@ -227,7 +228,7 @@ def _mean_laser(series: Series, between_ns: tuple[int, int],
     A single sample beside the others (a beam that was cut, a digit that was lost) would move the
     mean by far more than the noise of the laser. None without samples.
     """
-    settle_ns = round(rule.settle_s * 1e9)
+    settle_ns = round(rule.settle_s * NS_PER_S)
     inside = slice(np.searchsorted(series.laser_ns, between_ns[0] + settle_ns),
                    np.searchsorted(series.laser_ns, between_ns[1] - settle_ns, side="right"))
     distances = series.laser_m[inside]

@@ -19,6 +19,7 @@ from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.errors import InputError
 from selfcal_ros.messages.topics import INPUT_TOPICS
 from selfcal_ros.sessions.ports import Diagnosis, Level, Ports
+from selfcal_ros.units import S_PER_H
 
 RETRY_S = 10.0
 """Time after which a journal that could not be opened is tried again, and without failure a failure
@@ -142,8 +143,8 @@ class JournalKeeper:
         if age_s is None or age_s <= self._max_age_s:
             return False
         for file in self._readable()[:1]:
-            self._ports.say(Level.WARN, f"{file.parent}: its run was left {age_s / 3600:.0f} h ago "
-                            "and is not taken up; 'selfcal solve' reads it, a greater "
+            self._ports.say(Level.WARN, f"{file.parent}: its run was left {age_s / S_PER_H:.0f} h "
+                            "ago and is not taken up; 'selfcal solve' reads it, a greater "
                             "journal_max_age goes on with it")
         return True
 

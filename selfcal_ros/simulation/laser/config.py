@@ -19,7 +19,7 @@ from selfcal_ros.simulation.laser.measure import (
     case_study_machine,
     random_machine,
 )
-from selfcal_ros.units import M_PER_MM, M_PER_NM, M_PER_UM, RAD_PER_MRAD, RAD_PER_URAD
+from selfcal_ros.units import M_PER_MM, M_PER_NM, M_PER_UM, ONE_PER_PPM, RAD_PER_MRAD, RAD_PER_URAD
 
 MAX_REPEATS = 1000
 LARGEST = 1e9
@@ -143,7 +143,7 @@ def _setup(raw: object, where: str, dim: int) -> SetUp:
                          "give one")
     abbe_mm = _numbers(raw.get("abbe_mm", [0, 0, 0]), f"{where}: abbe_mm", (3,))
     x, y, z = np.array(abbe_mm) * M_PER_MM
-    scale = _number(raw.get("scale_ppm", 0.0), f"{where}: scale_ppm") * 1e-6
+    scale = _number(raw.get("scale_ppm", 0.0), f"{where}: scale_ppm") * ONE_PER_PPM
     return SetUp(laser_rad, mirror_rad, to_machine, (x, y, z), scale)
 
 

@@ -16,6 +16,7 @@ from selfcal_ros.simulation.laser.measure import (
     StepMachine,
     simulate_step_diagonal,
 )
+from selfcal_ros.units import UM_PER_M
 
 PP, NP = DIAGONALS[2]
 NOISE_DRAWS = 30
@@ -178,7 +179,7 @@ def sensitivity_text(rows: list[dict]) -> str:
              head + " ".join(["", *(f"{name:>12s}" for name in names * 2)])]
     for row in rows:
         size = f"{row['size']:g} {row['unit']}" if row["unit"] else "-"
-        values = [row[str(method)][column] * 1e6 for method in Method for column in columns]
+        values = [row[str(method)][column] * UM_PER_M for method in Method for column in columns]
         lines.append(f"{row['fault']:{width}s} {size:>14s} "
                      + " ".join(f"{value:12.4f}" for value in values))
     return "\n".join(lines)
