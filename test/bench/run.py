@@ -30,10 +30,9 @@ from selfcal_ros.files import write_json  # noqa: E402
 
 SIZES = (11, 21, 51, 101, 201, 401, 1001)
 OURS = {"solve": "selfcal", "re-solve": "selfcal (factored plan)",
-        "map only": "selfcal (factored plan, map only)", "uncertainty": "selfcal (uncertainty map)",
-        "missing": "selfcal (3 % of the marks missing)",
+        "uncertainty": "selfcal (uncertainty map)", "missing": "selfcal (3 % of the marks missing)",
         "five views": "selfcal (defaults but causes)", "terms": "selfcal (all terms)"}
-MAX_SIZE = {"re-solve": 201, "map only": 201, "uncertainty": 401, "five views": 101, "terms": 101}
+MAX_SIZE = {"re-solve": 201, "uncertainty": 401, "five views": 101, "terms": 101}
 MISSING = 0.03
 TIME_LIMIT_S = 60.0
 MEMORY_LIMIT_MB = 8000
@@ -78,7 +77,6 @@ def ours(benchmark: str, data) -> tuple:
     import numpy as np
 
     from selfcal_ros.estimation.api import calibrate
-    from selfcal_ros.estimation.joint.map_only import MapSolver
     from selfcal_ros.estimation.normal.cache import clear_cache
     from selfcal_ros.estimation.options import Options
 
@@ -95,10 +93,6 @@ def ours(benchmark: str, data) -> tuple:
     elif benchmark == "re-solve":
         calibrate(data, quick)
         seconds, found = median_time(lambda: calibrate(data, quick).error_map, once=False)
-    elif benchmark == "map only":
-        solver = MapSolver(data)
-        seconds, field = median_time(lambda: solver.solve(data), once=False)
-        return seconds, field
     else:
         calibrate(data, quick)
         seconds, found = median_time(
