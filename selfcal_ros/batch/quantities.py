@@ -5,7 +5,7 @@ import math
 
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.reporting.summary.numbers import summary_numbers
-from selfcal_ros.units import ARCSEC_PER_RAD, NM_PER_M, PPM_PER_ONE
+from selfcal_ros.units import ARCSEC_PER_RAD, PPM_PER_ONE, UM_PER_M
 
 PER = "_per_"
 """Stands for the stroke of a unit in a name."""
@@ -27,7 +27,7 @@ def quantities(result: CalibrationResult) -> dict[str, float | None]:
         "rms_uncertainty_um": numbers.rms_uncertainty_um,
         "max_theta_error_arcsec": numbers.max_theta_error_arcsec,
         "rms_theta_uncertainty_arcsec": numbers.rms_theta_uncertainty_arcsec,
-        "sigma_xy_nm": noise.sigma_xy * NM_PER_M,
+        "sigma_xy_um": noise.sigma_xy * UM_PER_M,
         "sigma_theta_arcsec": noise.sigma_theta * ARCSEC_PER_RAD,
         "rejected_percent": 100 * rejected / (used + rejected) if used + rejected else math.nan}
     for term in result.model.terms:

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from selfcal_ros.compensation.aerotech.verify import Residual, Verification
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import write_bytes
-from selfcal_ros.units import MM_PER_M, NM_PER_M, RAD_PER_ARCSEC
+from selfcal_ros.units import MM_PER_M, RAD_PER_ARCSEC, UM_PER_M
 
 FORMATS = ("png", "svg", "pdf")
 MAX_ARROWS = 41
@@ -53,19 +53,19 @@ def plot_verification(found: Verification, path: str | os.PathLike) -> None:
 
 def _arrows(ax: Axes, residual: Residual, which: str) -> None:
     x, y = residual.position * MM_PER_M
-    u, v = getattr(residual, which) * NM_PER_M
+    u, v = getattr(residual, which) * UM_PER_M
     sides = [len(np.unique(side)) for side in (x, y)]
     step = max(1, -(-max(sides) // MAX_ARROWS))
     take = np.ones(len(x), dtype=bool)
     for side in (x, y):
         take &= np.unique(side, return_inverse=True)[1].ravel() % step == 0
-    scale = max(residual.largest(which) * NM_PER_M, np.finfo(float).tiny)
+    scale = max(residual.largest(which) * UM_PER_M, np.finfo(float).tiny)
     room = (np.ptp(x) + np.ptp(y)) / max(sum(sides) - 2, 1) * step
     quiver = ax.quiver(x[take], y[take], u[take], v[take], np.hypot(u, v)[take], angles="xy",
                        scale_units="xy", scale=scale / (1.2 * room), cmap="viridis", width=0.004)
-    ax.figure.colorbar(quiver, ax=ax, label="length / nm")
-    ax.set(title=f"{which} {_TITLES[residual.place]}\nrms {residual.rms(which) * NM_PER_M:.3g} nm, "
-                 f"max {residual.largest(which) * NM_PER_M:.3g} nm",
+    ax.figure.colorbar(quiver, ax=ax, label="length / µm")
+    ax.set(title=f"{which} {_TITLES[residual.place]}\nrms {residual.rms(which) * UM_PER_M:.3g} µm, "
+                 f"max {residual.largest(which) * UM_PER_M:.3g} µm",
            xlabel="x / mm", ylabel="y / mm", aspect="equal")
     ax.margins(0.1)
 

@@ -197,7 +197,7 @@ def records(number: int = 30, change: int = 18, **more) -> list[dict]:
     return [{"bag": f"/bags/{day:02}", "exit_code": 0, "qualified": True, "message": "Qualified",
              "plan_id": "p", "plate": [5, 5, 0.01, 8], "sha256": str(day), "run_id": "",
              "first_exposure": f"2026-03-{day + 1:02}T12:00:00.000+00:00",
-             "quantities": {"nonorthogonality_arcsec": value, "sigma_xy_nm": None}, **more}
+             "quantities": {"nonorthogonality_arcsec": value, "sigma_xy_um": None}, **more}
             for day, value in enumerate(values)]
 
 
@@ -244,7 +244,7 @@ def test_the_table_has_a_line_a_bag_in_the_order_of_time():
     rows = list(csv.DictReader(io.StringIO(csv_text([failed, *records()[::-1]]))))
     assert [row["bag"] for row in rows] == [f"/bags/{day:02}" for day in range(30)] + [
         failed["bag"]]
-    assert (rows[0]["qualified"], rows[0]["sigma_xy_nm"], rows[30]["qualified"]) == ("true", "", "")
+    assert (rows[0]["qualified"], rows[0]["sigma_xy_um"], rows[30]["qualified"]) == ("true", "", "")
     assert float(rows[0]["nonorthogonality_arcsec"]) == pytest.approx(
         records()[0]["quantities"]["nonorthogonality_arcsec"], rel=1e-15)
 

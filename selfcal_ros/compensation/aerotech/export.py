@@ -19,7 +19,7 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.model.error_map import ErrorMap
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.statistics import rms
-from selfcal_ros.units import ARCSEC_PER_DEG, M_PER_UM, NM_PER_M, RAD_PER_ARCSEC
+from selfcal_ros.units import ARCSEC_PER_DEG, M_PER_UM, RAD_PER_ARCSEC, UM_PER_M
 
 DECIMALS = 5
 """Digits of a correction in um: rounding stays below 0.005 nm."""
@@ -187,7 +187,7 @@ def _uncertainty_line(result: CalibrationResult) -> str:
     if not result.has_uncertainty:
         return "uncertainty: not computed"
     u = np.stack([result.error_map.u_gx, result.error_map.u_gy])
-    return (f"standard uncertainty of the corrections (k=1): {rms(u) * NM_PER_M:.3g} nm rms; U: "
+    return (f"standard uncertainty of the corrections (k=1): {rms(u) * UM_PER_M:.3g} um rms; U: "
             f"k = {result.noise.k_xy:.3g} for 95.45 %")
 
 

@@ -275,10 +275,10 @@ def test_provenance_says_bag_plan_date_and_uncertainty(datum):
     when = datetime(2026, 1, 2, tzinfo=UTC)
     text = "\n".join(provenance(result, MachineFrame(), filled=2, now=when))
     for part in ("2026-01-02T00:00:00Z", "plan: demo", "plate_moves", "demo.mcap", "ab" * 32,
-                 "nm rms", str(datum), "2 sites were not measured", "machine: x-axis=1"):
+                 "um rms", str(datum), "2 sites were not measured", "machine: x-axis=1"):
         assert part in text
-    u = np.sqrt(np.mean(np.square([result.error_map.u_gx, result.error_map.u_gy]))) * 1e9
-    assert f"(k=1): {u:.3g} nm rms" in text
+    u = np.sqrt(np.mean(np.square([result.error_map.u_gx, result.error_map.u_gy]))) * 1e6
+    assert f"(k=1): {u:.3g} um rms" in text
 
 
 def test_the_residual_is_true_minus_commanded():
