@@ -11,6 +11,7 @@ import numpy as np
 from scipy.special import chdtrc
 
 from selfcal_ros.errors import InputError
+from selfcal_ros.estimation.datum.modes import slope_rows
 from selfcal_ros.estimation.normal.equations import NormalEquations
 from selfcal_ros.estimation.normal.memo import Memo
 from selfcal_ros.model.error_map import ThetaDatum
@@ -52,31 +53,6 @@ class Conditions:
 
 
 _of_system: Memo[tuple[ThetaDatum, Sense, float], Conditions] = Memo()
-
-
-def slope_rows(z_m: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Return the slopes of `datum.axis_slopes` as rows over the sites, complex (4, nx, ny).
-
-    A row of zeros stands for a half axis with fewer than two known sites.
-
-    Parameters
-    ----------
-    z_m : complex array (nx, ny)
-        Site positions, m.
-    known : bool array (nx, ny)
-        Sites that count.
-    """
-    hx, hy = (size // 2 for size in z_m.shape)
-    out = np.zeros((4, *z_m.shape), dtype=complex)
-    halves = ((np.s_[hx + 1:, hy], 1j), (np.s_[hx, hy + 1:], -1), (np.s_[:hx, hy], 1j),
-              (np.s_[hx, :hy], -1))
-    for row, (part, unit) in zip(out, halves, strict=True):
-        good = known[part]
-        if good.sum() >= 2:
-            at = (z_m[part].real + z_m[part].imag) * good
-            centred = (at - at.sum() / good.sum()) * good
-            row[part] = unit * centred / (centred @ centred)
-    return out
 
 
 def conditions_for(system: NormalEquations, datum: ThetaDatum, sense: Sense,

@@ -58,6 +58,31 @@ def _slope(values: np.ndarray, positions: np.ndarray) -> float:
     return float(centred @ values[known] / (centred @ centred))
 
 
+def slope_rows(z_m: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Return the slopes of `datum.axis_slopes` as rows over the sites, complex (4, nx, ny).
+
+    A row of zeros stands for a half axis with fewer than two known sites.
+
+    Parameters
+    ----------
+    z_m : complex array (nx, ny)
+        Site positions, m.
+    known : bool array (nx, ny)
+        Sites that count.
+    """
+    hx, hy = (size // 2 for size in z_m.shape)
+    out = np.zeros((4, *z_m.shape), dtype=complex)
+    halves = ((np.s_[hx + 1:, hy], 1j), (np.s_[hx, hy + 1:], -1), (np.s_[:hx, hy], 1j),
+              (np.s_[hx, :hy], -1))
+    for row, (part, unit) in zip(out, halves, strict=True):
+        good = known[part]
+        if good.sum() >= 2:
+            at = (z_m[part].real + z_m[part].imag) * good
+            centred = (at - at.sum() / good.sum()) * good
+            row[part] = unit * centred / (centred @ centred)
+    return out
+
+
 def first_order(artifact: Artifact, gx_m: np.ndarray, gy_m: np.ndarray) -> tuple[float, float]:
     """Return non-orthogonality O and scale difference R of a map (Hu eq. 6).
 
