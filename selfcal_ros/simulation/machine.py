@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from selfcal_ros.estimation.datum.modes import axis_slopes, datum_modes, remove_modes
+from selfcal_ros.estimation.datum.modes import datum_modes, half_axis_slopes, remove_modes
 from selfcal_ros.model.artifact import Artifact
 
 WALK_STEPS = 256
@@ -171,7 +171,7 @@ def _encoder(artifact: Artifact, g: np.ndarray, drawn: np.ndarray, encoder: str)
         return drawn
     if encoder == "independent":
         return drawn - drawn.mean()
-    slopes = axis_slopes(artifact, *g)  # a half axis of one site has none
+    slopes = half_axis_slopes(artifact, g)  # a half axis of one site has none
     quarter = drawn[:: artifact.angular_count // 4]
     quarter[:] = np.where(np.isfinite(slopes), slopes, quarter)
     return drawn

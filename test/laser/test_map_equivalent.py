@@ -5,7 +5,6 @@ import pytest
 from selfcal_ros.compensation.aerotech.evaluate import CalEvaluator
 from selfcal_ros.compensation.machine import MachineFrame
 from selfcal_ros.errors import InputError
-from selfcal_ros.estimation.datum.modes import first_order
 from selfcal_ros.laser.ibaraki import identify_ibaraki
 from selfcal_ros.laser.map_equivalent import (
     axis_corrections,
@@ -23,6 +22,7 @@ from selfcal_ros.simulation.laser.measure import (
     random_machine,
     simulate_step_diagonal,
 )
+from test.support.maps import first_order
 
 
 def measured(machine, noise=None):

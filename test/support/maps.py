@@ -3,6 +3,7 @@
 
 import numpy as np
 
+from selfcal_ros.estimation.datum.modes import datum_modes
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ErrorMap
 from selfcal_ros.model.result import ArtifactMap, CalibrationResult, Noise, Observability
@@ -29,3 +30,20 @@ def result_of(error_map: ErrorMap, *, sense: str = "microscope_moves") -> Calibr
         "demo", error_map, ArtifactMap(np.zeros(shape), np.zeros(shape), np.zeros(count)), (),
         Observability(1, 1, 0, True), Noise(1e-9, 1e-7),
         input={"file": "demo.mcap", "sha256": "ab" * 32}, sense=sense)
+
+
+def first_order(artifact, gx_m, gy_m):
+    """Return non-orthogonality O and scale difference R of a map (Hu eq. 6).
+
+    Gx = O y + R x + Fx, Gy = O x - R y + Fy, with F free of first-order parts: the
+    least-squares coefficients over the known sites.
+    """
+    x, y = artifact.x_m, artifact.y_m
+    shear = np.array([[(y, x), (x, -y)]])[0]
+    modes = np.concatenate([datum_modes(artifact, scale=True), shear])
+    known = np.isfinite(gx_m) & np.isfinite(gy_m)
+    basis = modes[:, :, known].reshape(len(modes), -1).T
+    norms = np.linalg.norm(basis, axis=0)
+    values = np.concatenate([gx_m[known], gy_m[known]])
+    fit = np.linalg.lstsq(basis / norms, values, rcond=None)[0] / norms
+    return float(fit[4]), float(fit[5])

@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from selfcal_ros.estimation.datum.modes import first_order
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ErrorMap
 from selfcal_ros.model.result import (
@@ -16,6 +15,7 @@ from selfcal_ros.model.result import (
     ViewResult,
 )
 from selfcal_ros.simulation.truth import hu_plan, random_truth
+from test.support.maps import first_order
 
 SIGMA_M, SIGMA_RAD = 0.02e-6, np.deg2rad(0.001)
 

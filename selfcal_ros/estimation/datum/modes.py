@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The datum: what no view can tell, and the first-order parts of a map (method eqs. 3.1-3.4)."""
+"""The datum: what no view can tell, and the slopes of the half axes (method eqs. 3.1-3.3, 3.7)."""
 
 import numpy as np
 
@@ -37,29 +37,35 @@ def remove_modes(field_m: np.ndarray, modes: np.ndarray) -> np.ndarray:
     return out
 
 
-def axis_slopes(artifact: Artifact, gx_m: np.ndarray, gy_m: np.ndarray) -> np.ndarray:
-    """Return the slopes of the XY error along the four half axes, rad (Hu eq. 27).
+def half_axis_slopes(artifact: Artifact, g_m: np.ndarray) -> np.ndarray:
+    """Return the slopes of the XY error along the half axes +X, +Y, -X, -Y, rad (Hu eq. 27).
 
     They are the angular errors at lines 0, K/4, K/2, 3K/4: ordinary least squares with
-    intercept; +Gy on x along +-X, -Gx on y along +-Y. NaN where fewer than two sites are known.
+    intercept; +Gy on x along +-X, -Gx on y along +-Y. NaN where a half axis has but one site.
+
+    Parameters
+    ----------
+    artifact : Artifact
+        Lattice of the map.
+    g_m : float array (2, nx, ny, ...)
+        XY error, m; further axes are kept.
     """
     hx, hy = artifact.half
-    pitch = artifact.grid_pitch_m
-    along = ((gy_m[hx + 1:, hy], np.arange(1, hx + 1)), (-gx_m[hx, hy + 1:], np.arange(1, hy + 1)),
-             (gy_m[:hx, hy], np.arange(-hx, 0)), (-gx_m[hx, :hy], np.arange(-hy, 0)))
-    return np.array([_slope(values, steps * pitch) for values, steps in along])
+    along = (g_m[1, hx + 1:, hy], -g_m[0, hx, hy + 1:], g_m[1, :hx, hy], -g_m[0, hx, :hy])
+    return np.stack([_slope(line, artifact.grid_pitch_m) for line in along])
 
 
-def _slope(values: np.ndarray, positions: np.ndarray) -> float:
-    known = np.isfinite(values)
-    if known.sum() < 2:
-        return float("nan")
-    centred = positions[known] - positions[known].mean()
-    return float(centred @ values[known] / (centred @ centred))
+def _slope(values: np.ndarray, pitch_m: float) -> np.ndarray:
+    """Return the slope of equidistant values (n, ...) along their first axis."""
+    n = len(values)
+    if n < 2:
+        return np.full(values.shape[1:], np.nan)
+    steps = (np.arange(1, n + 1) - (n + 1) / 2) * pitch_m
+    return np.tensordot(steps / (steps @ steps), values, axes=1)
 
 
 def slope_rows(z_m: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Return the slopes of `datum.axis_slopes` as rows over the sites, complex (4, nx, ny).
+    """Return the slopes of `half_axis_slopes` as rows over the sites, complex (4, nx, ny).
 
     A row of zeros stands for a half axis with fewer than two known sites.
 
@@ -81,20 +87,3 @@ def slope_rows(z_m: np.ndarray, known: np.ndarray) -> np.ndarray:
             centred = (at - at.sum() / good.sum()) * good
             row[part] = unit * centred / (centred @ centred)
     return out
-
-
-def first_order(artifact: Artifact, gx_m: np.ndarray, gy_m: np.ndarray) -> tuple[float, float]:
-    """Return non-orthogonality O and scale difference R of a map (Hu eq. 6).
-
-    Gx = O y + R x + Fx, Gy = O x - R y + Fy, with F free of first-order parts: the
-    least-squares coefficients over the known sites.
-    """
-    x, y = artifact.x_m, artifact.y_m
-    shear = np.array([[(y, x), (x, -y)]])[0]
-    modes = np.concatenate([datum_modes(artifact, scale=True), shear])
-    known = np.isfinite(gx_m) & np.isfinite(gy_m)
-    basis = modes[:, :, known].reshape(len(modes), -1).T
-    norms = np.linalg.norm(basis, axis=0)
-    values = np.concatenate([gx_m[known], gy_m[known]])
-    fit = np.linalg.lstsq(basis / norms, values, rcond=None)[0] / norms
-    return float(fit[4]), float(fit[5])

@@ -12,6 +12,7 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
+from selfcal_ros.estimation.datum.modes import half_axis_slopes
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ThetaDatum
 
@@ -122,15 +123,6 @@ class HuLaw:
             return self.solve_theta(right, np.zeros((1, right.shape[1])))
         slopes = self.axis_sign * half_axis_slopes(self.artifact, g)
         return self.solve_theta(right, slopes)
-
-
-def half_axis_slopes(artifact: Artifact, g: np.ndarray) -> np.ndarray:
-    """Return the slopes of g (2, N, N, C) along +X, +Y, -X, -Y, (4, C), rad (eq. 27)."""
-    h = artifact.half[0]
-    steps = (np.arange(1, h + 1) - (h + 1) / 2) * artifact.grid_pitch_m
-    weights = steps / (steps @ steps)
-    along = (g[1, h + 1:, h], -g[0, h, h + 1:], g[1, :h, h], -g[0, h, :h])
-    return np.stack([np.tensordot(weights, line, axes=1) for line in along])
 
 
 def _columns(part: np.ndarray) -> np.ndarray:

@@ -18,9 +18,8 @@ from selfcal_ros.compensation.aerotech.verify import verify_tables
 from selfcal_ros.compensation.compensator import Compensator
 from selfcal_ros.compensation.machine import MachineFrame, SimulatedController
 from selfcal_ros.errors import InputError
-from selfcal_ros.estimation.datum.modes import first_order
 from selfcal_ros.model.artifact import Artifact
-from test.support.maps import random_map
+from test.support.maps import first_order, random_map
 
 ARTIFACT = Artifact(7, 0.01)
 FRAMES = [MachineFrame(1, 2), MachineFrame(2, 1, unit="um", home_x_m=-0.03, home_y_m=0.01,

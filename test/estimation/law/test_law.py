@@ -8,8 +8,6 @@ import pytest
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.estimation.datum.modes import axis_slopes
-from selfcal_ros.estimation.law.equations import half_axis_slopes
 from selfcal_ros.estimation.law.solve import hu_readings, hu_views, law_for
 from selfcal_ros.estimation.options import Options, ReferenceKind, ReferenceLength
 from selfcal_ros.model.artifact import Artifact
@@ -62,13 +60,6 @@ def test_first_order_parts_are_reported():
     d = (x**2 + y**2).sum()
     assert emap.nonorthogonality == pytest.approx((emap.gx * y + emap.gy * x).sum() / d, rel=1e-9)
     assert emap.scale_difference == pytest.approx((emap.gx * x - emap.gy * y).sum() / d, rel=1e-9)
-
-
-def test_half_axis_slopes_are_those_of_the_datum():
-    artifact = Artifact(9, 0.005, 8)
-    g = np.random.default_rng(5).normal(size=(2, 9, 9))
-    assert np.allclose(half_axis_slopes(artifact, g[..., None])[:, 0], axis_slopes(artifact, *g),
-                       rtol=1e-12)
 
 
 def published_draws(n_draws):
