@@ -9,7 +9,7 @@ import io
 import re
 import struct
 import zlib
-from collections.abc import Buffer, Collection, Iterator
+from collections.abc import Collection, Iterator
 from mmap import mmap
 
 import lz4.frame
@@ -61,10 +61,13 @@ def parsed(opcode: int, body: bytes) -> tuple[McapRecord | None, int]:
     return None, len(body)
 
 
-def chunk_length(data: Buffer, at: int) -> int:
-    """Return the length of the chunk whose content begins at `at`, from the lengths inside it."""
-    name_length = struct.unpack_from("<I", data, at + 28)[0]
-    inside = struct.unpack_from("<Q", data, at + 32 + name_length)[0]
+def chunk_length(data: bytes | mmap, at: int) -> int:
+    """Return the length of the chunk whose content begins at `at`, from the lengths inside it.
+
+    More than there is where `data` ends before them.
+    """
+    name_length = int.from_bytes(data[at + 28:at + 32], "little")
+    inside = int.from_bytes(data[at + 32 + name_length:at + 40 + name_length], "little")
     return CHUNK_FRONT - HEAD.size + name_length + inside
 
 
@@ -107,8 +110,7 @@ def next_record(data: mmap, start: int, channels: Collection[int] | None) -> int
         if end > len(data) or length < MESSAGE_FRONT:
             continue
         if opcode == Opcode.CHUNK:
-            fits = length >= CHUNK_FRONT - HEAD.size and length == chunk_length(
-                data, at + HEAD.size)
+            fits = length == chunk_length(data, at + HEAD.size)
         else:
             fits = (struct.unpack_from("<H", data, at + HEAD.size)[0] in (channels or ())
                     and (end == len(data) or data[end] in (Opcode.MESSAGE, Opcode.DATA_END)))
@@ -126,9 +128,7 @@ def front_of_chunk(data: bytes) -> Iterator[McapRecord]:
         return
     size, crc, name_length = struct.unpack_from("<QII", data, 25)
     begin = CHUNK_FRONT + name_length
-    if len(data) < begin:
-        return
-    inside = struct.unpack_from("<Q", data, begin - 8)[0]
+    inside = int.from_bytes(data[begin - 8:begin], "little")
     name = data[41:41 + name_length].decode(errors="replace")
     body = _decompressed_front(name, data[begin:begin + inside], size)
     if crc and len(body) >= size and zlib.crc32(body[:size]) != crc:
