@@ -46,6 +46,17 @@ def test_the_probability_is_that_of_pettitts_statistic_in_all_orders(values):
     assert found == pytest.approx(exact, abs=0.008)
 
 
+@pytest.mark.parametrize("n", [FEWEST - 1, FEWEST])
+def test_a_course_needs_eight_values(n):
+    days, values = np.arange(n) * 2.0, np.arange(n) * 3.0 + 5.0
+    course = course_of(days, values, rng(), orders=99)
+    assert FEWEST == 8
+    slopes = (1.5, 1.5, 1.5) if n == 8 else (0.0, 0.0, 0.0)
+    assert (course.n, course.slope_per_day) == (n, pytest.approx(slopes))
+    # 2 of 8! orders are as steep as a series that rises all the time
+    assert course.p_trend == pytest.approx(2 / 40320 if n == 8 else 1.0)
+
+
 def test_a_step_near_the_end_is_placed_where_it_is():
     values = rng(8).normal(0, 0.1, 30)
     values[26:] += 1

@@ -119,6 +119,18 @@ def test_the_noise_is_that_of_all_samples_whenever_it_is_asked_for():
     assert joint.moving(np.array([17 * MS])).tolist() == [None]
 
 
+@pytest.mark.parametrize("n", range(2, 8))
+def test_three_samples_tell_noise_from_motion_and_two_do_not(n):
+    """Samples come unevenly; the limit is 1 unit per s, the first two are 5 per s apart."""
+    stamps_ms = np.array([0, 2, 5, 6, 9, 11, 12])[:n]
+    shaken = np.array([0.0, 10, 13, 20, 30, 33, 40])[:n] * 1e-3
+    for positions, moves in ((shaken, n == 2), (5e-3 * stamps_ms, True)):
+        joint = JointTrack(LIMITS)
+        for at, position in zip(stamps_ms.tolist(), positions.tolist(), strict=True):
+            joint.add(at * MS, position, math.nan)
+        assert joint.moving(np.array([MS])).tolist() == [Reason.MOVING if moves else None]
+
+
 def steps(rng, motion, *, sigma, speeds=False):
     """Return a track of 400 samples, 2 ms apart: noise on a motion in units per s."""
     joint, position = JointTrack(LIMITS), 0.0

@@ -36,6 +36,16 @@ def test_rows_are_inserted_as_into_a_list_and_nothing_is_lost():
         assert table.rows.tolist() == want and len(table) == len(want)
 
 
+def test_room_is_taken_ahead_but_never_more_than_twice_what_is_held():
+    table, rooms = GrowingTable(PAIR), set()
+    for at in range(5000):
+        table.append(rows_of(at, 1))
+        room = len(table.rows.base)
+        rooms.add(room)
+        assert len(table) <= room <= max(2 * len(table), 64)
+    assert len(rooms) < 10  # a copy of all rows at each doubling, not at each row
+
+
 def test_rows_may_be_changed_in_place():
     table = GrowingTable(PAIR)
     table.append(rows_of(0, 3))

@@ -13,6 +13,7 @@ from selfcal_ros.collection.marks.identify import (
     wrap,
 )
 from selfcal_ros.collection.marks.rigid import Rigid, fit_motion
+from selfcal_ros.collection.reasons import Reason
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.view import View
@@ -79,6 +80,25 @@ def test_named_and_unnamed_marks_go_together():
                           rules=RULES)
     np.testing.assert_array_equal(found.index, marks)
     assert (found.reasons == None).all()  # noqa: E711
+
+
+@pytest.mark.parametrize(("beyond", "reason"), [
+    (0.20, None), (0.30, Reason.TOO_FAR), (0.40, Reason.AMBIGUOUS), (0.74, Reason.AMBIGUOUS),
+    (0.76, Reason.TOO_FAR), (1.40, Reason.TOO_FAR), (3.00, Reason.TOO_FAR)])
+@pytest.mark.parametrize("axis", [0, 1])
+def test_what_stands_beside_the_plate_is_of_no_mark_from_three_quarters_of_a_pitch(axis, beyond,
+                                                                                    reason):
+    """All other marks are named: the view's own motion is known. 0.3 is beyond a quarter pitch."""
+    artifact, pitch = Artifact(7, 0.01, 8, 5), 0.01
+    read = np.stack([artifact.m.ravel(), artifact.n.ravel()]) * pitch
+    marks = np.rint(read / pitch).astype(int)
+    edge = int(np.flatnonzero((marks[axis] == artifact.half[axis]) & (marks[1 - axis] == -1))[0])
+    has_id = np.arange(marks.shape[1]) != edge
+    read[axis, edge] += beyond * pitch
+    found = identify_grid(artifact, View("v"), read, ids=marks, has_id=has_id,
+                          rules=IdentityRules(5e-3, 0.5, 0.035))
+    assert found.reasons[edge] == reason
+    assert (found.reasons[has_id] == None).all()  # noqa: E711
 
 
 def test_an_empty_view_and_a_single_mark():

@@ -5,6 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from selfcal_ros.errors import InputError, NotIdentifiableError
+from selfcal_ros.laser.closure import check_lengths
 from selfcal_ros.laser.data import DIAGONALS, Form, StepDiagonal
 from selfcal_ros.laser.ibaraki import identify_ibaraki
 from selfcal_ros.laser.profiles import squareness, straightness
@@ -240,6 +241,31 @@ def test_linear_errors_in_micrometres_are_found_out_by_the_diagonals():
     wrong = StepDiagonal(data.steps_m, data.diagonals, data.samples_m, data.linear_m * 1000)
     with pytest.raises(InputError, match="the linear errors look like micrometres; give ex_x"):
         identify_ibaraki(wrong)
+
+
+@pytest.mark.parametrize(("misfit", "micrometres"), [
+    (-0.11, False), (-0.09, True), (0.0, True), (0.09, True), (0.11, False)])
+def test_linear_errors_count_as_micrometres_where_a_tenth_of_the_misfit_is_left(misfit,
+                                                                                micrometres):
+    """Block 2 of 3, steps 30 and 40 mm: linear errors of 1 % in mm, of 10 ppm in micrometres.
+
+    A diagonal of 50 mm times d is off by d / 1.01 - 1 of them, and by d / 1.00001 - 1 of a
+    thousandth; d is such that the second is `misfit` times the first.
+    """
+    d = (1 - misfit) / (1 / 1.00001 - misfit / 1.01)
+    steps = np.array([0.03, 0.04])
+    readings = np.repeat((steps**2 / 0.05)[:, None], 3, axis=1)  # along the diagonal, in X and Y
+    readings[:, 1] *= d
+    linear = np.zeros((2, 3))
+    linear[:, 1] = 0.01 * steps
+    data = StepDiagonal(tuple(steps), DIAGONALS[2], np.stack([readings] * 2)[None], linear[None])
+    with pytest.raises(InputError) as raised:
+        check_lengths(data)
+    expected = (f"block 2: diagonals and linear errors disagree by {(d / 1.01 - 1) * 50:.4g} mm"
+                + ("; the linear errors look like micrometres; give ex_x, ey_y in mm"
+                   if micrometres else
+                   "; check the steps, the units, and that both are of one machine"))
+    assert str(raised.value) == expected
 
 
 def test_paper_forms_are_planar():

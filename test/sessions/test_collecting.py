@@ -7,10 +7,12 @@ import pytest
 
 from selfcal_ros.collection.messages import Command, Detection, Phase
 from selfcal_ros.collection.settings.nodes import CollectorSettings
+from selfcal_ros.messages import from_model
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.sessions.collecting import CollectingSession
 from selfcal_ros.sessions.ports import Level, Ports
 from test.support.collecting import scene
+from test.support.ports import message
 
 
 class Cell:
@@ -79,6 +81,31 @@ def test_status_names_the_run_and_what_is_missing():
     status = Cell().feed(events.events).of("status")[-1]
     assert (status["missing_m"], status["missing_n"]) == ([lost.m], [lost.n])
     assert (status["run_id"], status["complete"]) == ("77", False)
+
+
+@pytest.mark.parametrize(("heard", "missed"), [
+    ([(0, Phase.MEASURE, True)], ["0"]),
+    ([(0, Phase.MEASURE, False)], []),
+    ([(0, Phase.PLACE, True), (0, Phase.MEASURE, True)], ["0"]),
+    ([(0, Phase.PLACE, False), (0, Phase.MEASURE, False)], []),
+    ([(0, Phase.MEASURE, True), (0, Phase.PLACE, False)], ["0"]),  # the redo has not begun
+    ([(0, Phase.MEASURE, True), (0, Phase.PLACE, False), (0, Phase.MEASURE, False)], []),
+    ([(0, Phase.MEASURE, True), (1, Phase.PLACE, False), (1, Phase.MEASURE, False)], ["0"]),
+    ([(0, Phase.MEASURE, True), (0, Phase.MEASURE, False)], ["0"])])
+def test_a_view_that_began_before_the_node_is_missed_until_it_is_measured_again(heard, missed):
+    """Commands: view, phase, and whether it was published before this node listened."""
+    events, cell = scene("0, 90", count=0), Cell()
+    for number, (view, phase, is_older) in enumerate(heard):
+        like = next(c for c in events.commands if (c.view_index, c.phase) == (view, phase))
+        cell.session.take_command(message("ViewCommand", from_model.command(
+            replace(like, stamp_ns=events.commands[0].stamp_ns + number), "stage")), is_older)
+    assert list(cell.session.missed.values()) == missed
+    late = heard[-1][2] or (Phase.MEASURE, True) in [item[1:] for item in heard]
+    assert [line for _, line in cell.said] == ([
+        "view '0' began before this node: what was detected until now is missing here; "
+        "redo_view measures it again"] if late else [])
+    state = cell.session.diagnosis(detections_matched=True).message
+    assert state.endswith("began before this node: 0") == bool(missed)
 
 
 @pytest.mark.parametrize("run_id", ["", "b"])

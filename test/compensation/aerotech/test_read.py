@@ -258,5 +258,10 @@ def test_files_are_read_from_disk_and_errors_refused(tmp_path):
         load_cal(path)
     assert str(caught.value) == (f"{path}:3: OFFSET: 'y' is not a number; write a plain decimal "
                                  "number (1 more errors)")
+    path.write_text(STRICT_1D.replace("OFFSET=10", "OFFSET=y"))
+    with pytest.raises(InputError) as caught:
+        load_cal(path)
+    assert str(caught.value) == (f"{path}:3: OFFSET: 'y' is not a number; write a plain decimal "
+                                 "number")
     with pytest.raises(InputError, match="no such file"):
         read_cal(tmp_path / "none.cal")

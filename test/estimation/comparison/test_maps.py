@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.stats import binom
+from scipy.stats import binom, norm
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.api import calibrate
@@ -155,6 +155,18 @@ def test_laser_squareness_against_the_map():
     assert [row.name for row in compare_with_laser(A, laser, "out.json")] == ["nonorthogonality"]
     with pytest.raises(InputError, match="no error_map_equivalent"):
         compare_with_laser(A, {"squareness": 0.1}, "out.json")
+
+
+def test_without_any_uncertainty_no_difference_has_a_probability():
+    exact = replace(A, noise=replace(A.noise, sigma_xy=0.0))
+    for of_laser in (0.0, 2e-9):
+        laser = {"error_map_equivalent": {"nonorthogonality": 3e-9,
+                                          "u_nonorthogonality": of_laser}}
+        row, = compare_with_laser(exact, laser, "out.json")
+        gap = abs(3e-9 - A.error_map.nonorthogonality)
+        assert row.u == of_laser
+        assert row.p == (pytest.approx(2 * norm.sf(gap / 2e-9)) if of_laser else
+                         pytest.approx(np.nan, nan_ok=True))
 
 
 def test_uncertainty_of_squareness_is_that_of_recalibrations():

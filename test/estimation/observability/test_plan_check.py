@@ -91,6 +91,14 @@ def test_an_arbitrary_field_is_seen_by_hus_plan_and_not_by_one_view():
                          field[0] + 1j * field[1]) is unseen
 
 
+def test_no_error_is_unseen_and_the_least_one_is_not():
+    plan, field = plan_of("0, 90, tx"), np.zeros((5, 5), dtype=complex)
+    system = planned_system(plan.artifact, plan.views)
+    assert is_unseen(system, field)
+    field[1, 3] = 1e-9
+    assert not is_unseen(system, field)
+
+
 def names(views, **kwargs):
     plan = plan_of(views, **kwargs)
     return [mode.name for mode in unseen_modes(planned_system(plan.artifact, plan.views))]

@@ -1,0 +1,62 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Degrees of freedom of all residuals together, against the rank of one dense matrix."""
+
+from math import pi
+
+import numpy as np
+import pytest
+
+from selfcal_ros.estimation.joint.model_fit import fit_model, squares
+from selfcal_ros.estimation.joint.solve import prepare
+from selfcal_ros.estimation.options import Options
+from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.view import Plan, View
+from selfcal_ros.simulation.truth import random_truth, simulate_measurements
+
+PITCH, LINES = 0.01, 8
+ARTIFACT = Artifact(5, PITCH, LINES)
+
+
+def plan_with(shared: int, alone: int) -> Plan:
+    """Return grid views of which `shared` have lines too, and views of nothing but lines."""
+    poses = [(0, 0, 0), (1, 0, 0), (0, 1, 0), (3, 0, -2)]
+    grids = [View(str(i), q * pi / 2, (a * PITCH, b * PITCH), True, i < shared)
+             for i, (q, a, b) in enumerate(poses)]
+    return Plan("p", ARTIFACT, (*grids, *(View(f"line{s}", s * 2 * pi / LINES, (0.0, 0.0), False,
+                                               True) for s in range(1, alone + 1))))
+
+
+def dense_dof(plan: Plan) -> int:
+    """Return readings less the rank of their equations, every unknown a column."""
+    sites, rows = 25, []
+    views, lines = 4 * sites, 4 * sites + 3 * len(plan.views)
+    for v, view in enumerate(plan.views):
+        q = round(view.rotation_rad / (pi / 2)) if view.grid else 0
+        turn = np.linalg.matrix_power(np.array([[0, -1], [1, 0]]), q)
+        shift = np.round(np.array(view.translation_m) / PITCH).astype(int)
+        marks = [(m, n) for m in range(-2, 3) for n in range(-2, 3)] if view.grid else []
+        for m, n in marks:
+            site = turn @ [m, n] + shift
+            if np.abs(site).max() > 2:
+                continue
+            row = np.zeros((2, lines + 2 * LINES))
+            row[:, 2 * (5 * (site[0] + 2) + site[1] + 2):][:, :2] = np.eye(2)
+            row[:, 2 * sites + 2 * (5 * (m + 2) + n + 2):][:, :2] = turn
+            x, y = turn @ [m, n]
+            row[:, views + 3 * v:][:, :3] = [[-y, 1, 0], [x, 0, 1]]
+            rows += list(row)
+        for k in range(LINES if view.angular else 0):
+            row = np.zeros(lines + 2 * LINES)
+            row[lines + (k + round(view.rotation_rad / (2 * pi / LINES))) % LINES] = 1
+            row[lines + LINES + k] = row[views + 3 * v] = 1
+            rows.append(row)
+    return len(rows) - int(np.linalg.matrix_rank(np.array(rows)))
+
+
+@pytest.mark.parametrize(("shared", "alone"), [(0, 0), (0, 2), (1, 1), (1, 2), (2, 1), (4, 2)])
+def test_degrees_of_freedom_count_rotations_that_marks_and_lines_share_once(shared, alone):
+    plan, rng = plan_with(shared, alone), np.random.default_rng(6)
+    readings = simulate_measurements(random_truth(ARTIFACT, len(plan.views), rng), plan, rng,
+                                     sigma_m=2e-8, sigma_theta_rad=2e-6)
+    model = fit_model(prepare(readings, Options())[0])
+    assert squares(model.problem, model.found)[1] == dense_dof(plan)
