@@ -10,6 +10,9 @@ from difflib import get_close_matches
 from enum import IntEnum
 from typing import Any
 
+SHOWN = (3000, 1000)
+"""Characters of the beginning and of the end of a text that is longer."""
+
 
 class ExitCode(IntEnum):
     """Exit codes of ``selfcal`` and error codes of services and actions."""
@@ -102,7 +105,10 @@ def printable(text: str) -> str:
     r"""Return `text` as one line without anything that a terminal acts on.
 
     Names in bags, plans and messages are other people's: an escape sequence, a line break or a
-    change of the direction of writing in them is shown as ``\x1b``, ``\n``, ``\u202e``.
+    change of the direction of writing in them is shown as ``\x1b``, ``\n``, ``\u202e``. Of what
+    is too long for a line there are beginning, length and end.
     """
+    if len(text) > sum(SHOWN):
+        text = f"{text[:SHOWN[0]]} ... ({len(text)} characters) ... {text[-SHOWN[1]:]}"
     return "".join(c if c.isprintable() else c.encode("unicode_escape", "surrogatepass").decode()
                    for c in text)

@@ -47,8 +47,8 @@ def watch(monitor: "Eyes", log: list[str], step: Callable[[], None], *,
                 return 1
             if "picture" in message:
                 draw(message["picture"])
-            elif "answer" in message:
-                log.append(message["answer"])
+            elif "answer" in message or "said" in message:
+                log.append(message.get("answer") or message["said"])
                 draw(None)
             for word in pressed():
                 if word == "quit":

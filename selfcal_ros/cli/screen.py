@@ -68,7 +68,7 @@ def _state(values: dict[str, str], command: dict[str, Any]) -> str:
 def _task(picture: dict[str, Any]) -> Panel:
     command, told = picture["command"], picture["health"].get("pose_sequencer")
     values = told["values"] if told else {}
-    views = int(values.get("views") or 0) or (command or {}).get("views_planned", 0)
+    views = _whole(values.get("views")) or (command or {}).get("views_planned", 0)
     name = (command or {}).get("view_name") or "-"
     index = (command or {}).get("view_index", 0)
     of = f"view {index + 1} of {views}: {printable(name)}" if command and views else "no view yet"
@@ -76,6 +76,12 @@ def _task(picture: dict[str, Any]) -> Panel:
     plan = printable(values.get("plan_id") or (command or {}).get("plan_id") or "-")
     return Panel(Group(Text(of, style="bold"), Text(f"plan {plan}, run {run}", style="dim"),
                        Text(what_now(picture), style="bold cyan")), title="now", box=box.ROUNDED)
+
+
+def _whole(text: Any) -> int:
+    """Return the whole number that a node has told, 0 if it is none."""
+    text = str(text)
+    return int(text) if text.isascii() and text.isdecimal() and len(text) < 10 else 0
 
 
 def _coverage(picture: dict[str, Any]) -> Panel:

@@ -10,10 +10,12 @@ from selfcal_ros.collection.messages import MAX_VIEWS, Command, check_command
 from selfcal_ros.errors import InputError
 from selfcal_ros.messages.topics import MEASUREMENT_TOPIC
 from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.model.readings import ViewReadings
+from selfcal_ros.model.readings import GridVisits, ViewReadings
 
 SITES_A_MARK = 1000
 """Sites of the plate for each mark that was read, above which a plate cannot be calibrated."""
+LARGEST = 1e3
+"""Deviation or uncertainty, m or rad, beyond which nobody has measured anything."""
 MAX_EXPOSURES = 5_000_000
 """Exposures of one view that the simulated cell holds: 240 MB."""
 
@@ -31,6 +33,22 @@ def check_view(readings: ViewReadings, artifact: Artifact, view_index: int) -> N
         if len(index) and not least <= np.min(index) <= np.max(index) <= most:
             raise InputError(where, f"{name} goes beyond {least} to {most}",
                              "correct the publisher")
+    _check_values(where, readings, ("dx", "dy", "dtheta"), ("u", "u_theta", "sigma_xy",
+                                                            "sigma_theta"))
+    if readings.visits is not None:
+        _check_values(f"{where}, visits", readings.visits, ("dx", "dy", "offset_x", "offset_y"),
+                      ("u", "sigma_m"))
+        if np.min(readings.visits.count) < 1:
+            raise InputError(f"{where}, visits", "a count below 1", "correct the publisher")
+
+
+def _check_values(where: str, table: ViewReadings | GridVisits, told: Iterable[str],
+                  perhaps: Iterable[str]) -> None:
+    """Raise InputError for values that are enormous, or NaN where they have to be told."""
+    for name in (*told, *perhaps):
+        size = np.abs(getattr(table, name))
+        if np.any(size > LARGEST) or (name in told and np.isnan(size).any()):
+            raise InputError(where, f"{name} is no number up to {LARGEST:g}", "give m and rad")
 
 
 def check_plate(artifact: Artifact, views: Iterable[ViewReadings]) -> None:

@@ -4,7 +4,8 @@
 Run as a process: ``python -m selfcal_ros.nodes.monitor_session NAMESPACE``. It writes a line of
 JSON to stdout when something has changed, ``{"picture": ...}``, and takes requests from stdin, one
 word a line: start, confirm, redo, skip, abort. Each is answered by a line
-``{"answer": TEXT, "success": true|false}``. It ends when stdin does.
+``{"answer": TEXT, "success": true|false}``. What it hears and cannot use it says in a line
+``{"said": TEXT}``. It ends when stdin does.
 """
 
 import json
@@ -12,6 +13,7 @@ import os
 import sys
 import threading
 import time
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -21,10 +23,12 @@ from rclpy.node import Node
 from rclpy.task import Future
 from std_srvs.srv import Trigger
 
+from selfcal_ros.errors import printable
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes.filling import diagnosis_of
 from selfcal_ros.nodes.running import run
-from selfcal_ros.sessions.ports import Ports
+from selfcal_ros.sessions.health import Refusals
+from selfcal_ros.sessions.ports import Level, Ports
 from selfcal_ros.sessions.watching import Watch
 
 REQUESTS = {"start": "start", "confirm": "confirm_view", "redo": "redo_view",
@@ -41,25 +45,39 @@ class MonitorSession(Node):
     def __init__(self, namespace: str, **kwargs: Any) -> None:
         super().__init__(f"monitor_{os.getpid()}", namespace=namespace, **kwargs)
         self.finished = Future()
-        self._watch = Watch(Ports(lambda *_: None, lambda *_: None, time.monotonic, time.time_ns))
+        self.refusals = Refusals(self._say, time.monotonic)
+        self._watch = Watch(Ports(lambda *_: None, self._say, time.monotonic, time.time_ns))
         for topic, take in ((names.COMMAND, self._watch.take_command),
                             (names.STATUS, self._watch.take_status),
                             (names.SUMMARY, self._watch.take_summary),
                             (names.ERROR_MAP, self._watch.take_map)):
-            self.create_subscription(topic.type, topic.name, take, topic.qos)
+            self._hear(topic, take)
         for node in WATCHED:
-            topic = names.of_node(node, names.HEALTH)
-            self.create_subscription(topic.type, topic.name, partial(self._on_health, node),
-                                     topic.qos)
+            self._hear(names.of_node(node, names.HEALTH), partial(self._on_health, node))
         self._askers = {word: self.create_client(Trigger, f"pose_sequencer/{service}")
                         for word, service in REQUESTS.items()}
         self._words: list[str] = []
         self._asked: list[tuple[str, float, Any]] = []
         self._shown = ""
         steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self.create_timer(PERIOD_S, self._show, clock=steady)
-        self.create_timer(0.05, self._serve, clock=steady)
+        self.create_timer(PERIOD_S, self._guarded(self._show, "the picture"), clock=steady)
+        self.create_timer(0.05, self._guarded(self._serve, "requests"), clock=steady)
         threading.Thread(target=self._listen, name="stdin", daemon=True).start()
+
+    def _hear(self, topic: names.Topic, take: Callable[[Any], None]) -> None:
+        self.create_subscription(topic.type, topic.name, self._guarded(take, topic.name), topic.qos)
+
+    def _guarded(self, callback: Callable[..., None], place: str) -> Callable[..., None]:
+        """Return `callback` with whatever it raises counted and said instead of raised."""
+        def call(*args: Any) -> None:
+            try:
+                callback(*args)
+            except Exception as error:  # nothing that is heard may end the screen
+                self.refusals.add(place, error)
+        return call
+
+    def _say(self, level: Level, line: str) -> None:
+        self._write(json.dumps({"said": printable(line)}))
 
     def _on_health(self, node: str, status: DiagnosticStatus) -> None:
         self._watch.take_health(node, diagnosis_of(status))

@@ -16,6 +16,9 @@ from selfcal_ros.sessions.ports import Diagnosis, Level, Ports
 from selfcal_ros.sessions.verdicts import is_qualified
 from selfcal_ros.units import S_PER_NS
 
+FARTHEST = 1e12
+"""Position, m or rad, beyond which a sample is none of a stage."""
+
 
 class CompensatingSession:
     """Corrects samples by the newest map that may be used; counts what it cannot correct.
@@ -122,6 +125,8 @@ class CompensatingSession:
         place = {name: index for index, name in enumerate(names)}
         joints = (self._settings.joint_x, self._settings.joint_y, self._settings.joint_theta)
         x, y, theta = map(place.get, joints)
+        if any(index is not None and abs(positions[index]) > FARTHEST for index in (x, y, theta)):
+            return None
         corrected: dict[int, float] = {}
         if self.compensator is None:
             return None

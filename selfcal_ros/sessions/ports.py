@@ -6,6 +6,9 @@ from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Any
 
+DIGITS = 20
+"""Of a whole number that does not fit an int64 any more."""
+
 
 class Level(IntEnum):
     """Levels of diagnostic_msgs/DiagnosticStatus, and of log lines."""
@@ -22,6 +25,12 @@ class Diagnosis:
     level: Level
     message: str
     values: dict[str, Any] = field(default_factory=dict)
+
+    def number(self, key: str) -> int | None:
+        """Return a value that is a whole number from 0 on and fits an int64; else None."""
+        text = str(self.values.get(key, ""))
+        is_whole = text.isascii() and text.isdecimal() and len(text) < DIGITS
+        return int(text) if is_whole else None
 
 
 @dataclass(frozen=True)

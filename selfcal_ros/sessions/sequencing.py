@@ -25,6 +25,9 @@ from selfcal_ros.units import S_PER_NS
 PATIENCE_S = 3.0
 """Time without a sign of life after which a node is missing; it tells its health each second."""
 
+LATEST_NS = (1 << 31) * 1_000_000_000 - 1
+"""The latest stamp that a message can have."""
+
 SET_BACK_S = 0.1
 """How far the clock may be behind the newest command."""
 
@@ -121,18 +124,18 @@ class SequencingSession:
         plan = self.machine.need_plan()
         if not (self._settings.resume and self._fresh and collector):
             return ""
-        told = collector.values
-        index = int(told["view"]) if told.get("view", "").isdecimal() else len(plan.views)
-        phase = told.get("phase", "")
+        told, phase = collector.values, collector.values.get("phase", "")
+        index, stamp_ns = collector.number("view"), collector.number("command_stamp")
         if (told.get("plan_id") != plan.plan_id or not told.get("run_id")
-                or phase not in ("PLACE", "MEASURE") or index >= len(plan.views)
-                or told.get("view_name") != plan.views[index].name):
+                or phase not in ("PLACE", "MEASURE") or index is None or index >= len(plan.views)
+                or told.get("view_name") != plan.views[index].name
+                or stamp_ns is None or stamp_ns > LATEST_NS):
             return ""
         if told.get("placing") not in (None, placing_digest(plan.artifact, plan.views[index])):
             return ""  # the plan has been edited: what was read is of another one
         self.run_id = told["run_id"]
         command = self.machine.resume(index, Phase[phase])
-        self._send([command], stamp_ns=int(told["command_stamp"]))  # as it was: it is latched anew
+        self._send([command], stamp_ns=stamp_ns)  # as it was: it is latched anew
         known = self._measured.get((plan.plan_id, self.run_id), {})
         names = ", ".join(known[number] for number in sorted(known))
         return (f"took up run {self.run_id} in view '{plan.views[index].name}', {phase}"

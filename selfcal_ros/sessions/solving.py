@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from selfcal_ros.collection.digest import readings_digest, session_digest
+from selfcal_ros.collection.messages import MAX_VIEWS
 from selfcal_ros.collection.settings.estimator import solver_options
 from selfcal_ros.collection.settings.nodes import SolverSettings
 from selfcal_ros.errors import InputError, NoDataError, NotIdentifiableError, SelfcalError
@@ -14,6 +15,7 @@ from selfcal_ros.estimation.api import Options, calibrate
 from selfcal_ros.files import write_json
 from selfcal_ros.messages import from_model, to_model
 from selfcal_ros.messages.sizes import check_plate, check_view
+from selfcal_ros.messages.topics import COMMAND_TOPIC
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.result import (
@@ -123,7 +125,16 @@ class SolvingSession:
         return self._stale
 
     def take_command(self, message: Any) -> None:
-        """Learn from a view command how many views are planned."""
+        """Learn from a view command how many views are planned.
+
+        Raises
+        ------
+        InputError
+            If it names more views than a plan can have.
+        """
+        if message.views_planned > MAX_VIEWS:
+            raise InputError(COMMAND_TOPIC, f"a plan has at most {MAX_VIEWS} views, not "
+                             f"{message.views_planned}", "correct views_planned")
         run = Run(message.plan_id, message.run_id)
         known = self._planned.get(run, 0)
         self._planned[run] = max(known, message.views_planned)

@@ -2,11 +2,15 @@
 """What a person who watches a cell wants to see, gathered from its topics as plain values."""
 
 import math
+from collections.abc import Iterable
+from itertools import islice
 from typing import Any
 
 import numpy as np
 
 from selfcal_ros.collection.messages import Phase
+from selfcal_ros.collection.plate_picture import plate_picture
+from selfcal_ros.errors import printable
 from selfcal_ros.messages import to_model
 from selfcal_ros.sessions.health import Presence
 from selfcal_ros.sessions.ports import Diagnosis, Ports
@@ -16,7 +20,9 @@ PATIENCE_S = 3.0
 NODES = ("measurement_collector", "pose_sequencer", "solver")
 """Nodes that a calibration needs; others are shown when they tell something."""
 MOST_SITES = 41
-"""Sites a side of the pictures; a larger plate is shown by every second, third, ... mark."""
+"""Signs a side of the pictures; of a larger plate one stands for 2 x 2, 3 x 3, ... marks."""
+MOST_ENTRIES = 200
+"""Entries of a list that are shown: as many as a ViewStatus may name missing marks."""
 
 
 class Watch:
@@ -69,15 +75,17 @@ class Watch:
 
     def _health(self, node: str) -> dict[str, Any] | None:
         told = self._presence.of(node)
-        return None if told is None else {"level": int(told.level), "message": told.message,
-                                          "values": told.values}
+        return None if told is None else {
+            "level": int(told.level), "message": printable(told.message), "values": {
+                printable(key): printable(value) for key, value
+                in islice(told.values.items(), MOST_ENTRIES)}}
 
     def _commanded(self) -> dict[str, Any] | None:
         command = self._command
         return command and {
             "phase": Phase(command.phase).name if command.phase in list(Phase) else "?",
-            "plan_id": command.plan_id, "run_id": command.run_id,
-            "view_index": command.view_index, "view_name": command.view_name,
+            "plan_id": printable(command.plan_id), "run_id": printable(command.run_id),
+            "view_index": command.view_index, "view_name": printable(command.view_name),
             "views_planned": command.views_planned,
             "rotation_deg": _finite(math.degrees(command.rotation)),
             "translation_mm": [_finite(command.translation_x * MM_PER_M),
@@ -87,56 +95,47 @@ class Watch:
         status = self._status
         if status is None:
             return None
+        plate, step = self._plate()
         return {
-            "view_name": status.view_name, "complete": bool(status.complete),
+            "view_name": printable(status.view_name), "complete": bool(status.complete),
             "grid": [status.grid_done, status.grid_expected],
             "angular": [status.angular_done, status.angular_expected],
             "used": status.detections_used,
-            "rejected": dict(zip(status.reject_reasons, map(int, status.reject_counts),
+            "rejected": dict(zip(_lines(status.reject_reasons), map(int, status.reject_counts),
                                  strict=False)),
             "repeatability_um": _finite(status.sigma_xy * UM_PER_M),
             "repeatability_arcsec": _finite(status.sigma_theta * ARCSEC_PER_RAD),
-            "missing_lines": [int(k) for k in status.missing_k], "plate": self._plate()}
+            "missing_lines": [int(k) for k in status.missing_k[:MOST_ENTRIES]],
+            "plate": plate, "plate_step": step}
 
-    def _plate(self) -> list[str]:
-        """Return the plate as lines of characters, top line first; empty if it is not known.
-
-        ``o`` a mark that is read, ``.`` one that is missing, blank: not in this view.
-        """
+    def _plate(self) -> tuple[list[str], int]:
+        """Return the plate as `plate_picture` does; empty where the command tells none."""
         command, status = self._command, self._status
         try:
             artifact = to_model.artifact_of(command)
-            pose = to_model.view_of(command, repeats=1, grid=True,
-                                    angular=False).lattice_pose(artifact)
+            view = to_model.view_of(command, repeats=1, grid=bool(command.grid), angular=False)
+            missing = list(zip(map(int, status.missing_m[:MOST_ENTRIES]),
+                               map(int, status.missing_n[:MOST_ENTRIES]), strict=False))
+            return plate_picture(artifact, view, missing,
+                                 status.grid_expected - status.grid_done, MOST_SITES)
         except Exception:  # a picture is no place for the faults of a command
-            return []
-        if not command.grid or pose.quarter_turns is None:
-            return []
-        shape, half = artifact.shape, artifact.half
-        step = max(1, math.ceil(max(shape) / MOST_SITES))
-        m, n = np.meshgrid(np.arange(-half[0], half[0] + 1, step),
-                           np.arange(-half[1], half[1] + 1, step), indexing="ij")
-        i, j = pose.site_of(m, n)
-        inside = (abs(i) <= half[0]) & (abs(j) <= half[1])
-        missing = set(zip(map(int, status.missing_m), map(int, status.missing_n), strict=False))
-        if not missing and status.grid_done < status.grid_expected:
-            return []  # the collector does not tell which
-        return ["".join(" " if not inside[a, b] else
-                        "." if (int(m[a, b]), int(n[a, b])) in missing else "o"
-                        for a in range(m.shape[0])) for b in reversed(range(m.shape[1]))]
+            return [], 1
 
     def _summed(self) -> dict[str, Any] | None:
         summary = self._summary
         return summary and {
-            "state": summary.state, "views": [summary.views_done, summary.views_planned],
+            "state": printable(summary.state), "views": [summary.views_done, summary.views_planned],
             "identifiable": bool(summary.identifiable), "qualified": bool(summary.qualified),
             "max_error_um": _finite(summary.max_error_um),
             "rms_uncertainty_um": _finite(summary.rms_uncertainty_um),
-            "advice": list(summary.advice), "causes": list(summary.causes),
-            "run_id": summary.run_id}
+            "advice": _lines(summary.advice), "causes": _lines(summary.causes),
+            "run_id": printable(summary.run_id)}
 
     def _mapped(self) -> dict[str, Any] | None:
-        """Return |G| in um by site, rows from the top, sites thinned out; None where unknown."""
+        """Return |G| in um by site, rows from the top; None where unknown.
+
+        Of a larger map each number is the largest of its sites, None where one of them is unknown.
+        """
         message = self._map
         if message is None:
             return None
@@ -144,10 +143,18 @@ class Watch:
             error_map = to_model.error_map(message)
         except Exception:  # the solver's own health tells of it
             return None
-        size = np.hypot(error_map.gx, error_map.gy) * UM_PER_M
+        with np.errstate(over="ignore"):
+            size = np.hypot(error_map.gx, error_map.gy) * UM_PER_M
         step = max(1, math.ceil(max(size.shape) / MOST_SITES))
-        return {"run_id": message.run_id, "qualified": bool(message.qualified), "um": [
-            [_finite(value) for value in row] for row in size[::step, ::step].T[::-1].tolist()]}
+        for axis in (0, 1):
+            size = np.maximum.reduceat(size, np.arange(0, size.shape[axis], step), axis=axis)
+        return {"run_id": printable(message.run_id), "qualified": bool(message.qualified),
+                "step": step, "um": [
+                    [_finite(value) for value in row] for row in size.T[::-1].tolist()]}
+
+
+def _lines(texts: Iterable[str]) -> list[str]:
+    return [printable(text) for text in islice(texts, MOST_ENTRIES)]
 
 
 def _finite(value: float) -> float | None:

@@ -87,3 +87,12 @@ def test_coverage_rejections_map_verdict_and_health_are_shown():
     assert text.index("12  duplicate") < text.index("3  stage_moving")
     assert "\x1b[2J" not in text
     assert "escape \\x1b[2J" in text
+
+
+@pytest.mark.parametrize("views, sentence", [
+    ("4", "view 2 of 4: rot90"), ("-1", "view 2 of 3: rot90"), ("9" * 5000, "view 2 of 3: rot90"),
+    ("\u00b2", "view 2 of 3: rot90")])
+def test_a_number_of_views_that_is_none_is_not_shown(views, sentence):
+    picture = EMPTY | {"health": {"pose_sequencer": told("MEASURING", views=views)},
+                       "command": COMMAND | {"views_planned": 3}}
+    assert sentence in shown(picture)

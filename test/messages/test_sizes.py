@@ -39,12 +39,26 @@ def session():
     ({"grid_size": 3}, "m goes beyond -1 to 1; correct the publisher"),
     ({"angular_count": 4}, "k goes beyond 0 to 3; correct the publisher"),
     ({"grid_size": 2**31 + 1}, "is not an odd number from 3 to"),
-    ({"angular_count": 2**32 - 4}, "is not a multiple of 4")])
+    ({"angular_count": 2**32 - 4}, "is not a multiple of 4"),
+    ({"dx": [1000.1] * 25}, "'0': dx is no number up to 1000; give m and rad"),
+    ({"dy": [float("nan")] * 25}, "'0': dy is no number up to 1000"),
+    ({"dtheta": [float("-inf")] * 8}, "'0': dtheta is no number up to 1000"),
+    ({"u": [1e300] * 25}, "'0': u is no number up to 1000"),
+    ({"sigma_theta": -1e4}, "'0': sigma_theta is no number up to 1000"),
+    ({"visit_offset_y": [float("nan")] * 25}, "'0', visits: offset_y is no number up to 1000"),
+    ({"visit_count": [0] * 25}, "'0', visits: a count below 1; correct the publisher")])
 def test_a_view_that_cannot_be_is_refused_and_forgotten(session, changes, reason):
     with pytest.raises(InputError) as caught:
         session.take_measurement(first_view(**changes))
     assert reason in str(caught.value)
     assert session.next_job() is None
+
+
+def test_uncertainties_that_are_not_known_are_no_reason_to_refuse(session):
+    nothing = float("nan")
+    session.take_measurement(first_view(sigma_xy=nothing, sigma_theta=nothing, u=[nothing] * 25,
+                                        dx=[1000.0] * 25, sigma_visit=nothing))
+    assert session.next_job() is not None
 
 
 def test_a_plate_that_is_enormous_beside_what_was_read_is_not_solved(session):

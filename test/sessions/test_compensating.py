@@ -131,3 +131,15 @@ def test_a_malformed_map_leaves_the_former_one(desk):
     with pytest.raises(InputError, match="gx has 3 values, the plate 25"):
         desk.session.take_map(map_of(gx=np.zeros(3)))
     assert desk.x_at(0.0) is not None
+
+
+@pytest.mark.parametrize("position, refused", [
+    (1e12, False), (-1.1e12, True), (1.7e308, True), (float("inf"), True), (float("nan"), True)])
+@pytest.mark.parametrize("joint", [0, 1, 2])
+def test_a_position_that_no_stage_has_is_refused(desk, joint, position, refused):
+    desk.session.take_map(map_of())
+    desk.session.take_summary(summary_of())
+    sample = [0.0, 0.0, 0.0]
+    sample[joint] = position
+    assert (desk.session.correct(NAMES, sample) is None) is refused
+    assert desk.session.counts["refused"] == refused

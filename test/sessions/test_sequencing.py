@@ -190,6 +190,12 @@ TOLD = READY | {"plan_id": PLAN.plan_id, "run_id": "17", "phase": "MEASURE", "vi
     (TOLD | {"phase": "ABORT"}, {}, (PLACE, 0)),
     (TOLD | {"view": "4"}, {}, (PLACE, 0)),
     (TOLD | {"view": "-1"}, {}, (PLACE, 0)),
+    (TOLD | {"view": "\u0661"}, {}, (PLACE, 0)),
+    (TOLD | {"view": "9" * 5000}, {}, (PLACE, 0)),
+    (TOLD | {"command_stamp": str(2**31 * 10**9 - 1)}, {}, (MEASURE, 1)),
+    (TOLD | {"command_stamp": str(2**31 * 10**9)}, {}, (PLACE, 0)),
+    (TOLD | {"command_stamp": ""}, {}, (PLACE, 0)),
+    (TOLD | {"command_stamp": "1e9"}, {}, (PLACE, 0)),
     (TOLD | {"view_name": "other"}, {}, (PLACE, 0)),
     (READY, {}, (PLACE, 0))])
 def test_a_run_is_taken_up_if_the_collector_tells_an_unfinished_one(

@@ -13,6 +13,7 @@ from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.sessions.ports import Diagnosis, Level
 from selfcal_ros.sessions.watching import Watch
 from test.support.maps import random_map, result_of
+from test.support.plans import plan_of
 from test.support.ports import Hands, message
 from test.support.sessions import small_plan
 
@@ -88,6 +89,41 @@ def test_a_node_is_gone_after_a_while(watch, hands, seconds, there):
         {"level": 1, "message": "no map", "values": {"a": "1"}} if there else None)
 
 
+def test_a_large_plate_shows_the_worst_of_the_marks_behind_a_sign(watch):
+    plan = plan_of("0", 101)
+    watch.take_command(message("ViewCommand", from_model.command(Command(
+        5, Phase.MEASURE, plan.plan_id, 0, plan.views[0], plan.artifact, 1, "17"), "stage")))
+    watch.take_status(status(0, [(-50, -50), (0, 1), (50, 50)], plan_id=plan.plan_id,
+                             grid_expected=101**2, grid_done=101**2 - 3))
+    view = watch.picture()["view"]
+    assert view["plate_step"] == 3
+    rows = view["plate"]
+    assert {len(row) for row in rows} == {34} == {len(rows)}
+    missing = {(x, y) for y, row in enumerate(reversed(rows)) for x, sign in enumerate(row)
+               if sign == "."}
+    assert missing == {(0, 0), ((0 + 50) // 3, (1 + 50) // 3), (33, 33)}
+
+
+def test_marks_behind_the_last_that_is_named_are_not_known(watch):
+    watch.take_command(command(0))
+    watch.take_status(status(0, [(-2, -2), (-1, 0)], grid_done=25 - 9))
+    assert watch.picture()["view"]["plate"] == ["o????", "o????", "o.???", "oo???", ".o???"]
+
+
+def test_long_texts_and_lists_are_cut(watch):
+    watch.take_command(command(0))
+    watch.take_status(status(0, [], view_name="x" * 10**6, missing_k=[1] * 10**6,
+                             reject_reasons=[str(n) for n in range(1000)],
+                             reject_counts=[1] * 1000))
+    watch.take_health("solver", Diagnosis(Level.WARN, "y" * 10**6, {
+        str(n): "z" * 10**6 for n in range(300)}))
+    picture = watch.picture()
+    view, health = picture["view"], picture["health"]["solver"]
+    assert view["view_name"] == f"{'x' * 3000} ... (1000000 characters) ... {'x' * 1000}"
+    assert len(view["rejected"]) == len(view["missing_lines"]) == len(health["values"]) == 200
+    assert max(map(len, [health["message"], *health["values"].values()])) < 4100
+
+
 def test_the_map_is_thinned_out_and_stands_upright(watch):
     error_map = random_map(Artifact(5, 0.01, 8), 3, unknown=[(0, 4)])
     watch.take_map(message("ErrorMap", from_model.error_map(result_of(error_map), 1, "stage")))
@@ -96,4 +132,8 @@ def test_the_map_is_thinned_out_and_stands_upright(watch):
     assert um[-1][0] == pytest.approx(1e6 * np.hypot(error_map.gx[0, 0], error_map.gy[0, 0]))
     big = random_map(Artifact(101, 0.01, 8), 3)
     watch.take_map(message("ErrorMap", from_model.error_map(result_of(big), 1, "stage")))
-    assert len(watch.picture()["map"]["um"]) == 34
+    found = watch.picture()["map"]
+    size = 1e6 * np.hypot(big.gx, big.gy)
+    assert (len(found["um"]), found["step"]) == (34, 3)
+    assert found["um"][0][0] == pytest.approx(size[:3, 99:].max())  # the largest of its sites
+    assert found["um"][-1][1] == pytest.approx(size[3:6, :3].max())

@@ -1,0 +1,193 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Every node among publishers that send each field at its worst, and torn bytes: it goes on."""
+
+import io
+import json
+from collections import Counter
+from dataclasses import replace
+from itertools import batched
+
+import numpy as np
+import pytest
+from diagnostic_msgs.msg import KeyValue
+from std_srvs.srv import Trigger
+
+from selfcal_ros.collection.messages import Command, Detection, EncoderSample
+from selfcal_ros.errors import InputError, SelfcalError
+from selfcal_ros.estimation.api import calibrate
+from selfcal_ros.messages import from_model
+from selfcal_ros.nodes import monitor_session, names
+from selfcal_ros.nodes.bag_recorder import BagRecorder
+from selfcal_ros.nodes.compensator import CompensatorNode
+from selfcal_ros.nodes.filling import fill
+from selfcal_ros.nodes.measurement_collector import MeasurementCollector
+from selfcal_ros.nodes.pose_sequencer import PoseSequencer
+from selfcal_ros.nodes.solver import Solver
+from selfcal_ros.sessions.health import Refusals
+from selfcal_ros.sessions.solving import SolvingSession, solve
+from test.support.hostile import torn, worst
+from test.support.maps import random_map, result_of
+from test.support.plans import plan_of
+from test.support.ports import Hands, settings_of
+from test.support.sessions import cdr_of, collected, events_of, plan_file, small_plan
+
+PLAN = small_plan("0, 90, tx", repeats=1)
+TEXT_FIELDS = ("stamp.sec", "nanosec", "_id", "view_name", "reasons", "_terms", "_counts",
+               "missing_m", "stamp", "approach_x", "approach_y")
+HEARD_BY = {EncoderSample: (names.ENCODER, 3), Detection: (names.DETECTIONS, 2),
+            Command: (names.COMMAND, 5)}
+"""How many of the nodes hear what a cell says."""
+LATER_NS = 10_000_000_000_000_000
+"""How much later the good run is than the hostile one."""
+AT_ONCE = 20
+"""Messages that are sent before they are waited for; less than the smallest queue."""
+
+
+@pytest.fixture(scope="module")
+def good():
+    """Return (topic, fields of a message as it should be) for the topics that nodes hear."""
+    events = events_of(PLAN)
+    collector, measurements, progress = collected(events)
+    view, stamp = progress[1], collector.timeline.last_stamp_ns
+
+    def event(kind):
+        return next(e for e in events if isinstance(e, kind))
+    return [
+        (names.ENCODER, from_model.joint_state(event(EncoderSample), "stage")),
+        (names.DETECTIONS, from_model.detection(event(Detection), "stage")),
+        (names.COMMAND, from_model.command(
+            next(e for e in events if isinstance(e, Command) and e.phase == 1), "stage")),
+        (names.STATUS, from_model.view_status(view, PLAN.plan_id, stamp, "stage")),
+        (names.MEASUREMENT, from_model.view_measurement(view, measurements, stamp, "stage")),
+        (names.ERROR_MAP, from_model.error_map(
+            result_of(random_map(PLAN.artifact, 3)), stamp, "stage")),
+        (names.SUMMARY, {"header": from_model.header(stamp, "stage"), "qualified": True,
+                        "state": "Calibrated.", "views_done": 3, "views_planned": 3,
+                        "advice": ["none"], "causes": ["none"]})]
+
+
+@pytest.fixture
+def refused(monkeypatch):
+    """Return a list that fills with (place, error) of all that the nodes of this process refuse."""
+    found, add = [], Refusals.add
+
+    def note(self, place, error):
+        found.append((place, error))
+        add(self, place, error)
+    monkeypatch.setattr(Refusals, "add", note)
+    return found
+
+
+@pytest.fixture
+def cell(graph, refused, tmp_path, monkeypatch):
+    """Yield all nodes of a cell, each with every topic that it may hear."""
+    monkeypatch.setattr(monitor_session.sys, "stdin", io.StringIO())
+    nodes = [
+        graph.node(MeasurementCollector, journal=str(tmp_path / "journals"), status_period=0.02),
+        graph.node(PoseSequencer, plan=plan_file(tmp_path, PLAN)),
+        graph.node(Solver, result_folder=str(tmp_path)),
+        graph.node(CompensatorNode, require_qualified=False),
+        graph.node(BagRecorder, bag=str(tmp_path / "bag"), all_topics=True)]
+    graph.add(monitor_session.MonitorSession("", context=graph.context))
+    play(graph, events_of(PLAN))  # what is spoilt below belongs to this run
+    graph.until(lambda: nodes[2].session.result is not None, "a map")
+    yield nodes
+    nodes[-1].close()
+
+
+def play(graph, events) -> None:
+    """Publish the messages of a run, once all nodes that are to hear them do."""
+    voices = {kind: graph.publisher(topic, readers=readers)
+              for kind, (topic, readers) in HEARD_BY.items()}
+    for event in events:
+        voices[type(event)].publish(cdr_of(event))
+
+
+def send(graph, topic, messages) -> None:
+    """Publish messages, or the bytes of some, and wait until they have arrived."""
+    heard: list = []
+    ear = graph.hand.create_subscription(topic.type, topic.name, heard.append, topic.qos, raw=True)
+    voice, sent = graph.publisher(topic, readers=2), 0
+    for group in batched(messages, min(AT_ONCE, topic.qos.depth)):
+        for one in group:
+            voice.publish(one)
+        sent += len(group)
+        graph.until(lambda n=sent: len(heard) >= n, f"{sent} messages on {topic.name}")
+    graph.hand.destroy_subscription(ear)
+    graph.hand.destroy_publisher(voice)
+
+
+def everybody_is_well(graph, cell, refused, capsys) -> None:
+    """Check that each node tells its health anew, and that a good run gives its map."""
+    solver = cell[2]
+    assert [node.state for node in cell[:4]] == ["active"] * 4
+    assert [(place, error) for place, error in refused if not isinstance(error, SelfcalError)] == []
+    told = {node: graph.listen(names.of_node(node.get_name(), names.HEALTH)) for node in cell}
+    graph.until(lambda: all(len(heard) > 1 for heard in told.values()), "the health of all")
+    graph.call(Trigger, "pose_sequencer/abort")  # it followed the commands of others
+    events = [replace(event, stamp_ns=event.stamp_ns + LATER_NS) for event in events_of(PLAN)]
+    play(graph, events)
+    expected = calibrate(collected(events)[1]).error_map.gx
+    graph.until(lambda: solver.session.result is not None and np.array_equal(
+        solver.session.result.error_map.gx, expected), "the map of a good run")
+    capsys.readouterr()
+    said: list = []
+
+    def shown() -> bool:
+        said.extend(map(json.loads, capsys.readouterr().out.splitlines()))
+        return any(line["picture"]["map"] for line in said if "picture" in line)
+    graph.until(shown, "the picture of the map")
+
+
+def hostile_to(topic, fields):
+    """Yield messages of a topic with one field at its worst.
+
+    A command of the end of time is left out: it would be the newest for ever, as it says.
+    """
+    for _, message in worst(fill(topic.type(), fields)):
+        if topic is not names.COMMAND or message.header.stamp.sec < 2**31 - 1:
+            yield message
+
+
+def test_each_field_at_its_worst_ends_nothing(graph, cell, refused, good, capfd):
+    for topic, fields in good:
+        send(graph, topic, hostile_to(topic, fields))
+    for node in ("measurement_collector", "solver", "pose_sequencer"):
+        told = names.of_node(node, names.HEALTH)
+        health = names.HEALTH.type(level=b"\1", name=node, message="as told", values=[
+            KeyValue(key=key, value="1") for key in ("view", "command_stamp", "views", "run_id")])
+        send(graph, told, (message for _, message in worst(health)))
+    everybody_is_well(graph, cell, refused, capfd)
+    places = {place for place, _ in refused}
+    assert {names.COMMAND.name, names.MEASUREMENT.name, names.ERROR_MAP.name} <= places
+
+
+def test_torn_bytes_end_nothing(graph, cell, refused, good, capfd):
+    for seed, (topic, fields) in enumerate(good):
+        send(graph, topic, torn(fill(topic.type(), fields), seed))
+    everybody_is_well(graph, cell, refused, capfd)
+    assert "decoding" in {place for place, _ in refused}
+
+
+def test_numbers_of_readings_at_their_worst_are_solved_or_refused_in_one_line():
+    plan = plan_of("0, 90, tx", 3, count=4)
+    _, measurements, progress = collected(events_of(plan))
+    views = [fill(names.MEASUREMENT.type(), from_model.view_measurement(
+        view, measurements, 5, "stage")) for view in progress.values()]
+    answers = Counter()
+    for name, spoilt in worst(views[1]):
+        if name.endswith(TEXT_FIELDS):
+            continue
+        session = SolvingSession(settings_of("solver"), Hands().ports)
+        for view in views:
+            session.take_measurement(view)
+        try:
+            session.take_measurement(spoilt)
+            session.take(solve(session.next_job()))
+            answers["solved"] += 1
+        except InputError as error:
+            answers[error.what.partition(" ")[0]] += 1
+    assert answers["solved"] > 50
+    enormous_or_none = 5  # of FLOATS
+    assert answers["dtheta"] == enormous_or_none
+    assert answers["dx"] == answers["dy"] == 2 * enormous_or_none  # of means and of visits
