@@ -63,9 +63,9 @@ def prediction_limit(model: ModelFit, held: HeldReadings, known: np.ndarray,
     grid = model.problem.system.grid
     n = int(np.clip(READINGS_DRAWN // grid.weight.size, MIN_DRAWS, DRAWS))
     rng = np.random.default_rng(0)
-    noise = _noise(rng, (n, *grid.weight.shape), grid.weight)
+    noise = noise_of(rng, (n, *grid.weight.shape), grid.weight)
     fields, parameters, coefficients = _fitted(model, noise, rng)
-    own = _noise(rng, (n, *weight.shape), weight)
+    own = noise_of(rng, (n, *weight.shape), weight)
     views = LatticeViews(grid.views.shape, held.grid.poses)
     squares = np.zeros(n)
     for draw in range(n):
@@ -88,7 +88,8 @@ def prediction_limit(model: ModelFit, held: HeldReadings, known: np.ndarray,
     return PredictionLimit(mean, 2 * mean**2 / float(squares.var(ddof=1)))
 
 
-def _noise(rng: np.random.Generator, shape: tuple[int, ...], weight: np.ndarray) -> np.ndarray:
+def noise_of(rng: np.random.Generator, shape: tuple[int, ...], weight: np.ndarray) -> np.ndarray:
+    """Return noise of variance 1 / weight on each axis, complex `shape`; none where weight is 0."""
     root = np.sqrt(np.where(weight > 0, weight, 1.0))
     both = rng.standard_normal((2, *shape)) / root * (weight > 0)
     return both[0] + 1j * both[1]

@@ -112,14 +112,15 @@ class Pool:
         """Return the variance of one reading that is left beside `rows`, m^2, and its dof.
 
         Visits of one mark agree better than marks do where a cause is not held: the larger counts.
+        NaN and 0 where the rows take all degrees of freedom.
         """
         sums, gram = self.right.sums, self.equations.projected.gram
         inverse, rank = self.inverse(rows)
         values = inverse @ self.right.total
         between = sums.between - 2 * values @ self.right.between + values @ gram @ values
         dof = sums.dof_between - float(np.sum(inverse * gram))
-        if sums.dof_within >= 1:
-            both = sums.dof - rank
+        both = sums.dof - rank
+        if sums.dof_within >= 1 and both > 0:
             total = (sums.total - float(values @ self.right.total)) / both
             if dof <= 0 or between / dof <= total:
                 return max(total, 0.0), both
@@ -236,7 +237,7 @@ def _test(pool: Pool, taken: np.ndarray, group: Group) -> tuple[float, float] | 
     after, rank = pool.explained(taken | group.rows)
     gained, more = max(after - before, 0.0), rank - rank_before
     variance, dof = pool.noise_beside(taken | group.rows)
-    if more <= 0 or dof <= 0 or not variance > FLOOR_M**2:
+    if more <= 0 or not variance > FLOOR_M**2:  # NaN where nothing is left to test against
         return None
     p = float(fdtrc(more, dof, gained / more / variance))
     # all readings together, so that explanations compare: by what each leaves of the same squares

@@ -166,9 +166,7 @@ def _causes(solved: Solved, measurements: Measurements, options: Options, *,
     model = solved.model
     if model is None or not model.problem.direct or not np.isfinite(solved.xy.sigma):
         return []
-    sites = model.problem.system.grid.n_sites
-    if options.causes is False or sites > MAX_SITES or not (
-            failed or sites <= ALWAYS_SITES or options.causes):
+    if not are_looked_for(model.problem.system.grid.n_sites, options, failed=failed):
         return []
     found = [item for item in find_explanations(model, slips=False)
              if failed or _counts(item, solved)]
@@ -177,6 +175,23 @@ def _causes(solved: Solved, measurements: Measurements, options: Options, *,
     causes = [cause_of(item, model.problem.ground.names, model.problem.half_width_m)
               for item in found]
     return causes or _noisy_views(measurements, model)
+
+
+def are_looked_for(sites: int, options: Options, *, failed: bool) -> bool:
+    """Return whether causes are looked for in a field of so many sites, unasked only in small ones.
+
+    Parameters
+    ----------
+    sites : int
+        Sites of the field.
+    options : Options
+        Whether somebody asked.
+    failed : bool
+        Whether another test failed.
+    """
+    if options.causes is False or sites > MAX_SITES:
+        return False
+    return failed or sites <= ALWAYS_SITES or bool(options.causes)
 
 
 def _counts(found: Explanation, solved: Solved) -> bool:

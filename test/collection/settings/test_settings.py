@@ -2,6 +2,7 @@
 """Parameters: declared once; unknown names, wrong types and values out of bounds are refused."""
 
 import math
+from pathlib import Path
 
 import pytest
 import yaml
@@ -47,6 +48,30 @@ def test_the_bounds_are_allowed_and_beyond_is_not(node, parameter):
             1, away))
         with pytest.raises(InputError, match=f"^here: {parameter.name}: .* is outside "):
             NODE_SETTINGS[node].checked({parameter.name: beyond}, "here")
+
+
+def documented(node):
+    """Return name, default, bounds and unit of each parameter as docs/reference.md has them."""
+    page = (Path(__file__).parents[3] / "docs" / "reference.md").read_text()
+    _, _, section = page.partition("## Parameters")[2].partition(f"### {node}\n")
+    for line in section.partition("\n### ")[0].splitlines():
+        if line.startswith("| `"):
+            name, default, allowed, unit, _ = line.strip("| ").split(" | ", 4)
+            yield name.strip("`"), default, allowed, unit
+
+
+@pytest.mark.parametrize("node", NODE_PARAMETERS)
+def test_numbers_are_those_of_the_documents(node):
+    table = {name: row for name, *row in documented(node)}
+    assert list(table) == [parameter.name for parameter in NODE_PARAMETERS[node]]
+    for parameter in NODE_PARAMETERS[node]:
+        if type(parameter.default) not in (int, float):
+            continue
+        default, allowed, unit = table[parameter.name]
+        assert unit.strip() == parameter.unit
+        assert float(default) == pytest.approx(parameter.default, rel=1e-5)
+        bounds = tuple(map(float, allowed.split(" to "))) if allowed.strip() else (None, None)
+        assert bounds == pytest.approx((parameter.low, parameter.high), rel=1e-5)
 
 
 def test_names_are_unique_in_a_node():

@@ -12,7 +12,7 @@ from selfcal_ros.estimation.normal.planned import planned_system
 from selfcal_ros.estimation.observability import resistance
 from selfcal_ros.estimation.observability.plan_check import check_plan, predict_plan
 from selfcal_ros.estimation.observability.resistance import PlannedTerms, check_terms
-from selfcal_ros.estimation.terms.planned import Assumed, planned_ground
+from selfcal_ros.estimation.terms.planned import Assumed, planned_equations, planned_ground
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.orders import ORDERS
 from selfcal_ros.model.readings import Sense
@@ -59,6 +59,19 @@ UNLIKE = replace(plan_of("0, 90, tx, -ty", 5, size_y=3), views=tuple(
     replace(view, repeats=repeats) for view, repeats in zip(
         plan_of("0, 90, tx, -ty", 5).views, (2, 4, 3, 2), strict=True)))
 """A plate of 5 x 3 marks, and views of unlike repeats."""
+
+
+@pytest.mark.parametrize("name", TermName)
+@pytest.mark.parametrize("size", ["", ":1e-7"], ids=["free", "sized"])
+def test_columns_are_as_long_as_those_of_all_visits(name, size):
+    """Means of marks and visits about them hold together what every visit has."""
+    assumed = Assumed(SIGMA, 10e-6, 2, "serpentine@plate")
+    system = planned_system(UNLIKE.artifact, UNLIKE.views)
+    ground = planned_ground(UNLIKE.artifact, UNLIKE.views, system, assumed)
+    found = planned_equations(system, ground, parse_terms([name + size], "test"), assumed)
+    dense = dense_of(UNLIKE, assumed, Sense.MICROSCOPE_MOVES)
+    columns = dense.root[:, None] * dense.columns(name, free=not size)
+    assert found.norm == pytest.approx(np.linalg.norm(columns, axis=0), rel=1e-9)
 
 
 @pytest.mark.parametrize("sense", Sense)

@@ -1,0 +1,54 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From which probability and which size of a field on the verdict changes its mind."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from selfcal_ros.estimation.joint.solve import solve_joint
+from selfcal_ros.estimation.law.solve import solve_law
+from selfcal_ros.estimation.options import Options
+from selfcal_ros.estimation.verdict.judge import are_looked_for, judged
+from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.simulation.truth import hu_plan, random_truth, simulate_measurements
+
+ARCSEC_RAD = np.pi / 648_000
+
+
+@pytest.fixture(scope="module")
+def readings():
+    plan, rng = hu_plan(Artifact(5, 0.01, 8), repeats=2), np.random.default_rng(2)
+    return simulate_measurements(random_truth(plan.artifact, 4, rng), plan, rng, sigma_m=2e-8,
+                                 sigma_theta_rad=2e-6, linear=True)
+
+
+@pytest.mark.parametrize(("p", "holds"), [(0.04, False), (0.0499, False), (0.05, True),
+                                          (0.06, True), (0.9, True)])
+def test_the_axis_conditions_are_tested_at_5_percent(readings, p, holds):
+    options = Options(misalignment_model="linear", causes=False)
+    solved = replace(solve_joint(readings, options), axes=(p, 3 * ARCSEC_RAD))
+    verdict = judged(solved, readings, options).verdict
+    assert verdict.qualified == holds
+    assert verdict.reasons == (() if holds else (
+        "theta: the stage does not satisfy the axis conditions of the datum xy_axes (misclosure "
+        f"3 arcsec, p = {p:.2g}); use zero_mean",))
+
+
+def test_axis_conditions_that_nobody_asked_for_hold(readings):
+    assert solve_law(readings, Options(method="law")).axes == (1.0, 0.0)
+    linear = Options(misalignment_model="linear")
+    assert solve_joint(readings, linear).axes == (1.0, 0.0)
+
+
+@pytest.mark.parametrize(("side", "asked", "failed", "wanted"), [
+    (41, None, False, True), (43, None, False, False), (43, None, True, True),
+    (43, True, False, True), (201, True, False, True), (201, None, True, True),
+    (203, True, True, False), (41, False, True, False), (1, False, False, False)])
+def test_causes_are_looked_for_unasked_up_to_41_and_at_all_up_to_201_marks_a_side(
+        side, asked, failed, wanted):
+    assert are_looked_for(side**2, Options(causes=asked), failed=failed) is wanted
+    if side > 1:  # and no other number of sites lies between
+        beyond = are_looked_for(side**2 + 1, Options(causes=asked), failed=failed)
+        assert beyond is (wanted and (side, asked, failed) not in (
+            (41, None, False), (201, True, False), (201, None, True)))

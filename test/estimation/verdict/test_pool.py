@@ -1,0 +1,59 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is left beside columns: by hand, for columns that are at right angles to each other."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from selfcal_ros.estimation.terms.solution import Score, Sums
+from selfcal_ros.estimation.verdict.causes import Pool
+
+LENGTHS = np.array([2.0, 0.5, 4.0])
+"""Of three columns that all marks' means tell alone, in weighted readings."""
+FOUND = np.array([6.0, -8.0, 0.0])
+"""What each takes off the readings, times its length: squares of 6, 8 and 0."""
+
+
+def pool(sums: Sums) -> Pool:
+    """Return the columns, with `sums` of squares left before any of them is held."""
+    gram = np.diag(LENGTHS**2)
+    equations = SimpleNamespace(information=gram, norm=LENGTHS, limit=lambda rows: 1e-9,
+                                projected=SimpleNamespace(gram=gram))
+    return Pool(equations, Score(FOUND * LENGTHS, np.zeros(3), sums))
+
+
+def rows(*numbers: int) -> np.ndarray:
+    return np.isin(np.arange(3), numbers)
+
+
+@pytest.mark.parametrize(("taken", "squares"), [((), 0), ((0,), 36), ((1,), 64), ((0, 1), 100),
+                                                ((0, 1, 2), 100)])
+def test_columns_explain_the_squares_of_their_parts(taken, squares):
+    assert pool(Sums(164.0, 10, 0.0, 0)).explained(rows(*taken)) == (
+        pytest.approx(squares), len(taken))
+
+
+@pytest.mark.parametrize(("dof", "taken", "left", "dof_left"), [
+    (10, (), 164, 10), (10, (0,), 128, 9), (10, (0, 1), 64, 8), (10, (0, 1, 2), 64, 7),
+    (3, (0, 1), 64, 1), (4, (0, 1, 2), 64, 1)])
+def test_the_noise_beside_columns_has_a_degree_of_freedom_less_for_each(dof, taken, left,
+                                                                        dof_left):
+    variance, found = pool(Sums(164.0, dof, float("nan"), 0)).noise_beside(rows(*taken))
+    assert (variance, found) == (pytest.approx(left / dof_left), pytest.approx(dof_left))
+
+
+@pytest.mark.parametrize(("dof", "dof_within", "taken"), [
+    (2, 0, (0, 1)), (3, 0, (0, 1, 2)), (1, 0, (1,)), (1, 1, (0, 1)), (2, 1, (0, 1, 2))])
+def test_where_columns_take_all_degrees_of_freedom_no_noise_is_left(dof, dof_within, taken):
+    variance, found = pool(Sums(164.0, dof, 5.0, dof_within)).noise_beside(rows(*taken))
+    assert np.isnan(variance) and found == 0
+
+
+@pytest.mark.parametrize(("within", "dof_within", "variance", "dof"), [
+    (9.0, 90, 8.0, 8), (2000.0, 90, (64 + 2000) / 98, 98), (30.0, 1, (64 + 30) / 9, 9)])
+def test_the_larger_of_the_noises_of_marks_and_of_all_visits_counts(within, dof_within, variance,
+                                                                     dof):
+    """Marks alone: 64 / 8; all visits have the squares within the marks in addition."""
+    found = pool(Sums(164.0, 10, within, dof_within)).noise_beside(rows(0, 1))
+    assert found == (pytest.approx(variance), pytest.approx(dof))
