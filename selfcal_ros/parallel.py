@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
-from multiprocessing import forkserver
+from multiprocessing import forkserver, resource_tracker
 from typing import Any
 
 from threadpoolctl import threadpool_limits
@@ -76,7 +76,20 @@ def begin(module: str, workers: int) -> None:
     """
     if workers > 1 and _method() == "forkserver":
         multiprocessing.get_context("forkserver").set_forkserver_preload([module])
+        _start_server()
+
+
+def _start_server() -> None:
+    """Start the process that forks workers, with Ctrl-C blocked in it and in them.
+
+    Ctrl-C reaches all processes of a terminal, also while they import; it is for the parent.
+    """
+    resource_tracker.ensure_running()  # which lets the signal through
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
         forkserver.ensure_running()
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def outcomes(function: Callable[[Any], Any], items: Sequence[Any], *,
@@ -199,6 +212,8 @@ def _pool(workers: int, function: Callable[[Any], Any]) -> Iterator[ProcessPoolE
     context = multiprocessing.get_context(_method())
     module = getattr(getattr(function, "func", function), "__module__", None) or "builtins"
     context.set_forkserver_preload(["__main__" if module == "__main__" else module])
+    if _method() == "forkserver":
+        _start_server()
     before = set(multiprocessing.active_children())
     pool = ProcessPoolExecutor(workers, mp_context=context, initializer=begin_worker)
     try:

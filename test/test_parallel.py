@@ -120,3 +120,27 @@ def test_dask_gives_the_same(monkeypatch):
     found = {o.index: o for o in outcomes(math.sqrt, [4.0, -1.0, 9.0], workers=2, dask="local")}
     assert (found[0].value, found[2].value) == (2.0, 3.0)
     assert isinstance(found[1].error, ValueError)
+
+
+INTERRUPTED = """
+import signal
+signal.raise_signal(signal.SIGINT)
+
+def is_blocked(_):
+    return signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, [])
+"""
+WITH_WORKERS = """
+import signal
+from selfcal_ros import parallel
+parallel.begin("interrupted", 2)
+signal.signal(signal.SIGINT, signal.SIG_IGN)  # this process imports it too
+import interrupted
+print(parallel.mapped(interrupted.is_blocked, [1, 2], workers=2))
+"""
+
+
+def test_an_interrupt_while_workers_import_is_left_to_their_parent(tmp_path):
+    (tmp_path / "interrupted.py").write_text(INTERRUPTED)
+    done = subprocess.run([sys.executable, "-c", WITH_WORKERS], capture_output=True, text=True,
+                          check=False, env=os.environ | {"PYTHONPATH": str(tmp_path)})
+    assert (done.returncode, done.stdout, done.stderr) == (0, "[True, True]\n", "")

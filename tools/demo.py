@@ -1,15 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """`make demo`: replay a recorded bag through the live nodes and show the map that they find."""
 
+import signal
 import sys
 from pathlib import Path
-
-from selfcal_ros.bagio.simulated import read_truth
-from selfcal_ros.cli.main import main as selfcal
-from selfcal_ros.cli.terminal.map_picture import map_picture
-from selfcal_ros.files import read_json
-from selfcal_ros.model.result import result_from_dict
-from selfcal_ros.reporting.maps.plot import save_map_plot
 
 ROOT = Path(__file__).parents[1]
 BAG = ROOT / "bags" / "hu_noise"
@@ -17,6 +11,23 @@ FOLDER = ROOT / "build" / "demo"
 
 
 def main() -> int:
+    """Run the demo; Ctrl-C is one line at any time."""
+    try:
+        return demo()
+    except KeyboardInterrupt:
+        print("demo: interrupted", file=sys.stderr)
+        return 128 + signal.SIGINT
+
+
+def demo() -> int:
+    """Replay, plot, report; what takes long to import is imported here, where Ctrl-C is caught."""
+    from selfcal_ros.bagio.simulated import read_truth
+    from selfcal_ros.cli.main import main as selfcal
+    from selfcal_ros.cli.terminal.map_picture import map_picture
+    from selfcal_ros.files import read_json
+    from selfcal_ros.model.result import result_from_dict
+    from selfcal_ros.reporting.maps.plot import save_map_plot
+
     FOLDER.mkdir(parents=True, exist_ok=True)
     output = (FOLDER / "result.json").relative_to(Path.cwd(), walk_up=True)
     print(f"Replaying {BAG.relative_to(ROOT)} over DDS through measurement_collector, "
@@ -26,8 +37,10 @@ def main() -> int:
         return code
     result = result_from_dict(read_json(output), str(output))
     save_map_plot(result, FOLDER / "map.png", truth=read_truth(BAG))
-    selfcal(["report", str(output), "-o", str(FOLDER / "report.html"),
-             "--truth", str(BAG / "truth.json")])
+    code = selfcal(["report", str(output), "-o", str(FOLDER / "report.html"),
+                    "--truth", str(BAG / "truth.json")])
+    if code:
+        return code
     if sys.stdout.isatty():
         print("\n".join(["", *map_picture(result.error_map), ""]))
     for name, what in (("result.json", "the result"), ("map.png", "picture of the map"),

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
 import yaml
@@ -220,3 +221,17 @@ def test_a_replay_interrupted_while_its_nodes_are_imported_is_one_line(group, tm
     argv = ["selfcal", "replay", str(small_bag(tmp_path)), "--rate", "0.001"]
     code, out, err = ended(group.start("-c", INTERRUPTED_REPLAY.format(argv=argv)))
     assert (code, out, err) == (128 + signal.SIGINT, "", "selfcal replay: interrupted\n")
+
+
+INTERRUPTED_DEMO = INTERRUPT_WHILE_IMPORTING.partition("from selfcal_ros")[0] + """
+import runpy
+runpy.run_path({demo!r}, run_name="__main__")
+"""
+
+
+@pytest.mark.parametrize("module, who", [
+    ("selfcal_ros.bagio.simulated", "demo"), ("selfcal_ros.cli.processes", "selfcal")])
+def test_a_demo_that_is_interrupted_is_one_line(group, module, who):
+    code, _, err = ended(group.start("-c", INTERRUPTED_DEMO.format(
+        module=module, demo=str(Path(__file__).parents[2] / "tools/demo.py"))))
+    assert (code, err) == (128 + signal.SIGINT, f"{who}: interrupted\n")
