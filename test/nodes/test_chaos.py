@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from selfcal_ros.collection.messages import Detection
-from test.support.chaos import HARMLESS, one_round, story
+from test.support.chaos import HARMLESS, full_disk, one_round, story
 
 
 def test_nothing_is_lost_without_a_word_and_the_maps_are_the_right_ones(ros_environment, tmp_path):
@@ -14,6 +14,13 @@ def test_nothing_is_lost_without_a_word_and_the_maps_are_the_right_ones(ros_envi
     assert wrong == []
     assert [line.partition(":")[0] for line in lines] == ["quiet_messages", "lost_messages"]
     assert all(" used + " in line and "killed " in line for line in lines)
+
+
+def test_a_disk_that_is_full_for_a_while_costs_its_part_of_the_journal_alone(
+        ros_environment, tmp_path):
+    line, wrong = full_disk(3, ros_environment, tmp_path)
+    assert wrong == []
+    assert " used + " in line
 
 
 class Result:

@@ -5,20 +5,23 @@ In one cell messages only overtake each other and come twice; in the other some 
 as well and the clock steps. Collectors and solvers are killed (SIGKILL) at random moments and
 started again. Every detection that was sent must be used, or rejected by reason; the map must be
 the one of the same messages in a quiet process and, in the first cell, that of the undisturbed
-run, bit for bit.
+run, bit for bit. The disk of a third cell is full for a while.
 """
 
 import contextlib
+import resource
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
+from selfcal_ros.bagio.reader import BagReader
 from selfcal_ros.collection.collector import ViewProgress
 from selfcal_ros.collection.messages import Detection
 from selfcal_ros.errors import NotIdentifiableError
 from selfcal_ros.estimation.api import calibrate
+from selfcal_ros.nodes import names
 from selfcal_ros.simulation.cell import Event
 from selfcal_ros.simulation.faults import Faults, apply_faults
 from test.support.killed import Cell
@@ -151,3 +154,41 @@ def one_round(seed: int, environment: dict, folder: Path, *, kills: int = 3,
         lines = [f"{one.cell.namespace}: {one.judge()}" for one in stories]
         wrong = [f"{one.cell.namespace}: {text}" for one in stories for text in one.faults]
     return lines, wrong
+
+
+def full_disk(seed: int, environment: dict, folder: Path) -> tuple[str, list[str]]:
+    """Measure in a cell whose disk is full for a third of the run; return a line, what was wrong.
+
+    Each detection is used or rejected all the same, and each message is in the journal, or told by
+    the health as not in it. The disk is a limit to the size of the collector's files.
+    """
+    rng = np.random.default_rng(seed)
+    graph = Graph(int(environment["ROS_DOMAIN_ID"]))
+    cell = Cell(graph, environment, folder, "full_disk")
+    try:
+        one = story(cell, HARMLESS, rng, 0)
+        told: list = []
+        topic = names.of_node(cell.name("measurement_collector"), names.HEALTH)
+        graph.hand.create_subscription(topic.type, topic.name, told.append, topic.qos)
+        one.start()
+        one.play_to(rng.uniform(0.2, 0.4))
+        [file] = folder.glob("full_disk/journal_*/*.mcap")
+        cell.limit_files("measurement_collector", file.stat().st_size + int(rng.integers(3000)))
+        one.play_to(rng.uniform(0.6, 0.8))
+        cell.limit_files("measurement_collector", resource.RLIM_INFINITY)
+        one.play_to(1.0)
+        line = one.judge()
+        told.clear()
+        graph.until(lambda: told, "the health")
+        lost = int({item.key: item.value for item in told[-1].values}["journal_lost"])
+        cell.end("measurement_collector")
+        kept = sum(len(item) if hasattr(item, "__len__") else 1
+                   for _, item in BagReader(file.parent).columns())
+        received = sum(cell.told)
+        if kept + lost != received or not 0 < lost < received / 2:
+            one.faults.append(f"{received} messages received, {kept} in the journal and {lost} "
+                              "told as not in it")
+        return f"{line}; {kept} of {received} messages in the journal", one.faults
+    finally:
+        cell.close()
+        graph.close()

@@ -2,6 +2,7 @@
 """A cell that goes on when its nodes are killed: node processes, and messages played into them."""
 
 import contextlib
+import resource
 import subprocess
 import time
 from collections.abc import Sequence
@@ -86,6 +87,17 @@ class Cell:
         running = self.running.pop(node)
         running.kill()
         running.communicate()
+
+    def end(self, node: str) -> None:
+        """End a node as a launcher does, and wait for it."""
+        running = self.running.pop(node)
+        running.terminate()
+        running.communicate()
+
+    def limit_files(self, node: str, size: int) -> None:
+        """Let the files of a node grow no larger than `size` bytes, as if the disk were full."""
+        resource.prlimit(self.running[node].pid, resource.RLIMIT_FSIZE,
+                         (size, resource.RLIM_INFINITY))
 
     def send(self, events: Sequence[Event], *, first: int = 0) -> None:
         """Publish events, those of which the collector has told nothing; commands are latched."""
