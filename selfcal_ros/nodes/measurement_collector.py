@@ -23,8 +23,10 @@ from selfcal_ros.sessions.ports import Diagnosis
 from selfcal_ros.sessions.receiving.journal_keeper import JournalKeeper, KeptTopic
 from selfcal_ros.sessions.receiving.reception import Reception
 
-TICK_S = 0.04
+TICK_S = 0.1
 """Time between two looks at what has come."""
+BUSY_S, MANY = 0.02, 200
+"""The same while so many messages, or more, are there at a look: who plays a bag waits for it."""
 SOON_S, SOON_TICKS = 0.002, 50
 """The same while the last exposure of a view waits for the samples behind it, and how often."""
 
@@ -82,15 +84,17 @@ class MeasurementCollector(PollingNode[CollectorSettings]):
         self.subscribe_with_age(names.COMMAND, self._reception.command, raw=True)
         EncoderInput(self, inputs[names.ENCODER.name], raw=True)
         self.every(TICK_S, self._on_timer)
+        self._busy = self.every(BUSY_S, self._on_timer)
         self._soon = self.every(SOON_S, self._on_soon)
-        self._soon.cancel()
+        for timer in (self._busy, self._soon):
+            timer.cancel()
         self.service(Trigger, "~/finish", lambda request: self._finish())
 
     def _publish(self, output: str, fields: dict[str, Any]) -> None:
         self._outputs[output](fields)
 
     def _on_timer(self) -> None:
-        self._drain()
+        (self._busy.reset if self._drain() >= MANY else self._busy.cancel)()
         if not self._reception.restoring:
             self.session.tick()
 
@@ -106,12 +110,14 @@ class MeasurementCollector(PollingNode[CollectorSettings]):
         if self._looks >= SOON_TICKS or not self._reception.may_end:
             self._soon.cancel()
 
-    def _drain(self) -> None:
-        """Take what has come and tell the counts, so that a player can keep pace."""
+    def _drain(self) -> int:
+        """Take what has come and tell the counts, so that a player can keep pace; count it."""
         self.poll()
+        count = self._reception.n_waiting
         if self._reception.drain():
             self._received.publish(names.RECEIVED.type(
                 data=list(self.session.collector.received.values())))
+        return count
 
     def _finish(self) -> str:
         self._drain()

@@ -65,6 +65,11 @@ class Reception:
         """Whether what has come, what waits included, may complete the view that is measured."""
         return not self.restoring and self.session.expects_end(self._n_detections)
 
+    @property
+    def n_waiting(self) -> int:
+        """Messages that have come since the last `drain`."""
+        return len(self._waiting)
+
     def encoder(self, data: bytes, received_ns: int) -> None:
         """Take a sensor_msgs/JointState as received."""
         self._waiting.append((ENCODER_TOPIC, data, received_ns, False))
