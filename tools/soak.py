@@ -48,6 +48,8 @@ FOLDER = ROOT / "build" / "soak"
 ENCODER_NS, SIGMA_M = 1_000_000, 2e-8
 WINDOW, BATCH = 1500, 100
 PATIENCE_S = 300.0
+STAND_BACK = 5
+"""Priority below that of the nodes: no cell takes their processors, this one would."""
 TICKS = os.sysconf("SC_CLK_TCK")
 NODES = ("measurement_collector", "solver", "pose_sequencer")
 
@@ -119,7 +121,7 @@ class Cell:
         self.heard = (0, 0, 0)
         self.health: dict[str, str] = {}
         self.status_ms: list[float] = []
-        self.worst_ms, self.warned = 0.0, set()
+        self.worst_ms, self.worst_cpu_ms, self.warned = 0.0, 0.0, set()
         self.views_solved, self.has_map = 0, False
         self.heard_s = self.map_s = 0.0  # of the newest summary and map
         for topic, take in ((names.of_node(NODES[0], names.RECEIVED), self._on_received),
@@ -137,6 +139,7 @@ class Cell:
         if float(self.health.get("status_ms", 0)) > 0:
             self.status_ms.append(float(self.health["status_ms"]))
             self.worst_ms = max(self.worst_ms, float(self.health["status_ms_max"]))
+            self.worst_cpu_ms = max(self.worst_cpu_ms, float(self.health["status_cpu_ms_max"]))
 
     def _on_summary(self, message: object) -> None:
         if message.views_done > self.views_solved:
@@ -277,6 +280,7 @@ def soak(args: argparse.Namespace, environment: dict) -> int:
             ["--ros-args", "--log-level", "error",
              *(word for p in more.get(node, []) for word in ("-p", p))],
             environment)) for node in NODES}
+        os.nice(STAND_BACK)  # the nodes have been started: they are before the cell
         cell, pid = Cell(), running["measurement_collector"].pid
         for kind, readers in (("encoder", 1), ("detection", 1), ("command", 3)):
             cell.until(lambda kind=kind, readers=readers: cell.publishers[
@@ -299,7 +303,7 @@ def soak(args: argparse.Namespace, environment: dict) -> int:
     print(f"speed           {total / found['seconds'] / 1e3:.1f} k messages/s, lost {lost}")
     print("memory          " + ", ".join(f"{node} {mb:.0f} MB" for node, mb in memory.items()))
     print(f"status          median {statistics.median(cell.status_ms):.1f} ms, "
-          f"max {cell.worst_ms:.1f} ms")
+          f"max {cell.worst_ms:.1f} ms, {cell.worst_cpu_ms:.1f} ms of CPU")
     print(f"collector's CPU {100 * found['share']:.1f} % of a core in real time at 1 kHz "
           f"({args.realtime:g} s), {1e6 * used / total:.1f} us a message at full speed")
     for has_map, what in ((True, "map"), (False, "summary of views that give none")):

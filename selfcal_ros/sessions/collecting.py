@@ -46,7 +46,7 @@ class CollectingSession:
         self._needed = 0  # readings without which the open view is not complete
         self._unseen: list[np.ndarray] = []  # its detections since the last status, by their stamps
         self._since_ns = 0  # its beginning
-        self._costs: deque[float] = deque(maxlen=1000)
+        self._costs: deque[tuple[float, float]] = deque(maxlen=1000)  # time, and CPU time
         self._published: dict[int, str] = {}
         self._run = ("", "")
         self._advised: set[int] = set()
@@ -130,7 +130,7 @@ class CollectingSession:
 
     def tick(self) -> None:
         """Publish how far the views are, if something has come and it is time for it."""
-        now = self._ports.now_s()
+        now, worked = self._ports.now_s(), self._ports.cpu_s()
         early = now < self._next_status
         if not self._dirty or (early and not (now >= self._rested and self._may_complete())):
             return
@@ -149,7 +149,7 @@ class CollectingSession:
         self._publish(measurements, progress, final=False)
         self._describe(measurements, progress)
         spent = self._ports.now_s() - now
-        self._costs.append(spent)
+        self._costs.append((spent, self._ports.cpu_s() - worked))
         if early and self._needed:  # in vain: some of what came was no reading
             self._rested = now + 5 * spent
         self._next_status = now + max(self.settings.status_period, 5 * spent)
@@ -271,10 +271,11 @@ class CollectingSession:
             self._encoder(), self._repeatability()])
 
     def _cost(self) -> dict[str, str]:
-        """Return what the last statuses cost."""
-        costs = [MS_PER_S * cost for cost in self._costs] or [0.0]
-        return {"status_ms": f"{statistics.median(costs):.1f}",
-                "status_ms_max": f"{max(costs):.1f}"}
+        """Return what the last statuses cost, waiting for a processor included, or without."""
+        costs, worked = zip(*(self._costs or [(0.0, 0.0)]), strict=True)
+        return {"status_ms": f"{MS_PER_S * statistics.median(costs):.1f}",
+                "status_ms_max": f"{MS_PER_S * max(costs):.1f}",
+                "status_cpu_ms_max": f"{MS_PER_S * max(worked):.1f}"}
 
     def _newest(self) -> dict[str, Any]:
         """Return where the run is: what a sequencer that was restarted takes up."""

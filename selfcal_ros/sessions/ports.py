@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a session needs of the node around it, and what it says of itself."""
 
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import IntEnum
@@ -47,9 +48,12 @@ class Ports:
         Monotonic seconds, for time-outs.
     now_ns : callable
         The clock that stamps messages, integer ns.
+    cpu_s : callable
+        Seconds that a processor has worked for this thread.
     """
 
     publish: Callable[[str, dict[str, Any]], None]
     say: Callable[[Level, str], None]
     now_s: Callable[[], float]
     now_ns: Callable[[], int]
+    cpu_s: Callable[[], float] = time.thread_time

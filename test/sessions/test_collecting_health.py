@@ -308,13 +308,13 @@ def test_detections_that_are_not_decoded_yet_are_reckoned_with(more, expected):
 
 def test_the_health_tells_what_a_status_costs():
     desk = Desk(status_period=0.02)
-    assert desk.told().values["status_ms"] == desk.told().values["status_ms_max"] == "0.0"
+    names = ("status_ms", "status_ms_max", "status_cpu_ms_max")
+    assert [desk.told().values[name] for name in names] == ["0.0"] * 3
     desk.feed(first_view())
     for spent in (0.001, 0.007, 0.002):
-        desk.hands.costs = spent
+        desk.hands.costs, desk.hands.works = spent, spent / 2
         desk.hands.pass_time(1)
         desk.session.take_detections(detection_table(next(
             event for event in first_view() if isinstance(event, Detection))))
         desk.session.tick()
-    assert desk.told().values["status_ms"] == "2.0"
-    assert desk.told().values["status_ms_max"] == "7.0"
+    assert [desk.told().values[name] for name in names] == ["2.0", "7.0", "3.5"]

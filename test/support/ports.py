@@ -15,16 +15,18 @@ class Hands:
 
     def __init__(self) -> None:
         self.seconds, self.costs = 100.0, 0.0
+        self.worked, self.works = 0.0, 0.0
         self.published: list[tuple[str, dict]] = []
         self.said: list[tuple[Level, str]] = []
         self.ports = Ports(self._publish,
                            lambda level, line: self.said.append((level, line)),
-                           lambda: self.seconds, lambda: self.now_ns)
+                           lambda: self.seconds, lambda: self.now_ns, lambda: self.worked)
 
     def _publish(self, output: str, fields: dict) -> None:
-        """Take what is published; a status takes the time `costs`."""
+        """Take what is published; a status takes the time `costs`, and the CPU time `works`."""
         self.published.append((output, fields))
         self.seconds += self.costs if output == "status" else 0.0
+        self.worked += self.works if output == "status" else 0.0
 
     @property
     def now_ns(self) -> int:
