@@ -16,6 +16,7 @@ from selfcal_ros.reporting.figures.views import views_drawing
 from selfcal_ros.reporting.sheet.drawing import Drawing
 from selfcal_ros.reporting.sheet.svg import svg_file
 from selfcal_ros.reporting.summary.numbers import truth_arrays
+from selfcal_ros.reporting.words.result import worded
 
 ROOT = Path(__file__).parents[1]
 FOLDER = ROOT / "docs" / "pictures"
@@ -29,7 +30,7 @@ def calibrated() -> CalibrationResult:
     measurements, _, lost, _ = collect_bag(
         BAG, CollectorSettings.checked({}, "pictures"))
     options = solver_options(SolverSettings.checked({}, "pictures"), measurements)
-    result = with_input(calibrate(measurements, options), bag_input(BAG), lost)
+    result = with_input(worded(calibrate(measurements, options)), bag_input(BAG), lost)
     return result
 
 

@@ -184,13 +184,14 @@ def example() -> dict[str, Any]:
 
     from selfcal_ros.estimation.api import calibrate
     from selfcal_ros.model.artifact import Artifact
+    from selfcal_ros.reporting.words.result import worded
     from selfcal_ros.simulation.truth import hu_plan, random_truth, simulate_measurements
 
     rng = np.random.default_rng(1)
     plan = hu_plan(Artifact(5, 0.01, 8), 2)
     truth = random_truth(plan.artifact, len(plan.views), rng)
-    return result_to_dict(calibrate(simulate_measurements(truth, plan, rng, sigma_m=1e-8,
-                                                          sigma_theta_rad=1e-6)))
+    readings = simulate_measurements(truth, plan, rng, sigma_m=1e-8, sigma_theta_rad=1e-6)
+    return result_to_dict(worded(calibrate(readings)))
 
 
 def main() -> int:

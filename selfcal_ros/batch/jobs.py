@@ -32,6 +32,7 @@ from selfcal_ros.model.result import (
     unidentified_result,
     with_input,
 )
+from selfcal_ros.reporting.words.result import worded
 
 SCHEMA = "selfcal.batch/1"
 RECORDS, RESULTS = "records", "results"
@@ -129,7 +130,8 @@ def solved(job: Job, source: dict[str, str],
         robust_calibrate if settings.robust else calibrate)
     problem = None
     try:
-        result = with_places(solve(session.measurements, options), session.measurements.views)
+        result = worded(with_places(solve(session.measurements, options),
+                                    session.measurements.views))
     except NotIdentifiableError as error:
         if not isinstance(error.observability, Observability):
             raise

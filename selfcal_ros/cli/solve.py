@@ -120,6 +120,7 @@ def run(args: argparse.Namespace) -> int:
         unidentified_result,
         with_input,
     )
+    from selfcal_ros.reporting.words.result import worded
     from selfcal_ros.reporting.write import check_name, write_report
 
     check_outputs([args.bag, args.params], [file_of(args), args.report])
@@ -151,7 +152,7 @@ def run(args: argparse.Namespace) -> int:
         raise
     with busy("validating"):
         result, lines = _extended(args, measurements, options, result)
-    result = created_now(with_input(result, bag_input(args.bag), lost))
+    result = created_now(with_input(worded(result), bag_input(args.bag), lost))
     _write(args, result_to_dict(result))
     if args.report:
         write_report(result, args.report, truth=read_truth(args.bag))

@@ -12,7 +12,7 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ErrorMap, ThetaDatum
 from selfcal_ros.model.readings import Measurements
-from selfcal_ros.model.verdict import ModelResult, Provenance, Verdict
+from selfcal_ros.model.verdict import Finding, ModelResult, Provenance, Verdict
 from selfcal_ros.model.verdict_json import (
     model_from_dict,
     model_to_dict,
@@ -130,7 +130,11 @@ class Noise:
 
 @dataclass(frozen=True, eq=False)
 class CalibrationResult:
-    """Everything that one calibration found."""
+    """Everything that one calibration found.
+
+    `findings` is what estimation has to tell beside the verdict, as data, until
+    `selfcal_ros.reporting.words.result.worded` makes `warnings` of it.
+    """
 
     plan_id: str
     error_map: ErrorMap
@@ -149,6 +153,7 @@ class CalibrationResult:
     reference: dict[str, Any] | None = None
     provenance: Provenance = Provenance()
     run_id: str = ""
+    findings: tuple[Finding, ...] = ()
 
     @property
     def artifact(self) -> Artifact:
@@ -217,7 +222,15 @@ def unidentified_result(measurements: Measurements,
 
 
 def result_to_dict(result: CalibrationResult) -> dict[str, Any]:
-    """Return the JSON form of a result; NaN becomes null."""
+    """Return the JSON form of a result; NaN becomes null.
+
+    Raises
+    ------
+    ValueError
+        If it is not worded: give it to `selfcal_ros.reporting.words.result.worded` first.
+    """
+    if result.findings:
+        raise ValueError(f"{len(result.findings)} findings of the result are not worded")
     emap, amap, artifact = result.error_map, result.artifact_map, result.artifact
     return {
         "schema": SCHEMA,

@@ -7,7 +7,15 @@ from typing import Any
 
 
 @dataclass(frozen=True)
-class Cause:
+class Finding:
+    """Something that is to be told to a person: each kind has its data as fields, SI units.
+
+    `selfcal_ros.reporting.words` makes a sentence of it.
+    """
+
+
+@dataclass(frozen=True)
+class Cause(Finding):
     """Something that the readings show and the model does not hold.
 
     Attributes
@@ -16,13 +24,15 @@ class Cause:
         A `selfcal_ros.model.terms.TermName`, ``slip`` (of a plate within a view) or ``noise`` (of
         a view).
     text : str
-        What, with size, uncertainty and what to do, for a person.
+        What, with size, uncertainty and what to do, for a person; empty before it is worded.
     size, u : float
         Its largest component and standard uncertainty, in `unit`.
     unit : str
         ``m``, ``rad`` or ``m/m`` (also for a ratio of noises).
     p : float
         Probability that readings without it show as much.
+    what : Finding, optional
+        Where and of what kind; None of a cause that has its text.
     """
 
     name: str
@@ -31,6 +41,7 @@ class Cause:
     u: float
     unit: str
     p: float
+    what: Finding | None = None
 
 
 @dataclass(frozen=True)
@@ -42,17 +53,20 @@ class Verdict:
     qualified : bool
         The stage is identified and no test contradicts the model.
     sentence : str
-        The verdict in one sentence.
+        The verdict in one sentence; empty before it is worded.
     reasons : tuple of str
         The tests that failed, in words.
     causes : tuple of Cause
         What explains it, the most likely first.
+    findings : tuple of Finding
+        The tests that failed and the causes as data, until they are worded.
     """
 
     qualified: bool
     sentence: str = ""
     reasons: tuple[str, ...] = ()
     causes: tuple[Cause, ...] = ()
+    findings: tuple[Finding, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -16,9 +16,19 @@ NAN = float("nan")
 
 
 def verdict_to_dict(verdict: Verdict) -> dict[str, Any]:
-    """Return the JSON form of a verdict."""
+    """Return the JSON form of a verdict, which is worded.
+
+    Raises
+    ------
+    ValueError
+        If it is not: give the result to `selfcal_ros.reporting.words.result.worded` first.
+    """
+    if verdict.findings:
+        raise ValueError(f"{len(verdict.findings)} findings of the verdict are not worded")
     return {"qualified": verdict.qualified, "sentence": verdict.sentence,
-            "reasons": list(verdict.reasons), "causes": [vars(c) for c in verdict.causes]}
+            "reasons": list(verdict.reasons), "causes": [
+                {"name": c.name, "text": c.text, "size": c.size, "u": c.u, "unit": c.unit,
+                 "p": c.p} for c in verdict.causes]}
 
 
 def verdict_from_dict(data: dict | None, *, identifiable: bool) -> Verdict:

@@ -26,6 +26,7 @@ from selfcal_ros.model.result import (
 )
 from selfcal_ros.reporting.summary.numbers import summary_numbers
 from selfcal_ros.reporting.summary.text import state_sentence
+from selfcal_ros.reporting.words.result import worded
 from selfcal_ros.sessions.map_files import read_result, result_file
 from selfcal_ros.sessions.ports import Diagnosis, Level, Ports
 from selfcal_ros.sessions.runs import Run, supersedes
@@ -59,7 +60,7 @@ class Outcome:
 def solve(job: Job) -> Outcome:
     """Solve a job; needs nothing but the job, so that it can run anywhere."""
     try:
-        return Outcome(job, calibrate(job.measurements, job.options), None)
+        return Outcome(job, worded(calibrate(job.measurements, job.options)), None)
     except NotIdentifiableError as error:
         return Outcome(job, unidentified_result(job.measurements, error.observability), error)
     except Exception as error:  # told by `take`, in the thread of the session

@@ -20,6 +20,7 @@ from selfcal_ros.nodes import solver as solver_module
 from selfcal_ros.nodes.filling import fill
 from selfcal_ros.nodes.solver import Solver
 from selfcal_ros.reporting.maps.markers import map_geometry
+from selfcal_ros.reporting.words.result import worded
 from selfcal_ros.sessions.solving import short
 from test.support.maps import random_map, result_of
 from test.support.sessions import collected, events_of, small_plan
@@ -185,7 +186,7 @@ def test_save_map_writes_the_result_of_the_readings(solve, graph, tmp_path):
     answer = graph.call(SaveMap, "solver/save_map", path=str(path))
     assert (answer.success, answer.error_code) == (True, 0)
     assert answer.message.startswith(f"saved to {path}")
-    expected = json.loads(json.dumps(result_to_dict(calibrate(measurements))))
+    expected = json.loads(json.dumps(result_to_dict(worded(calibrate(measurements)))))
     saved = json.loads(path.read_text())
     assert saved["provenance"].pop("created")
     expected["provenance"].pop("created")

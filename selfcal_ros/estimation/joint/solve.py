@@ -10,6 +10,7 @@ from selfcal_ros.estimation.blas_threads import one_thread
 from selfcal_ros.estimation.datum.angular import conditions_for, misclosure_test
 from selfcal_ros.estimation.datum.covariance import FieldCovariance, angular_variance
 from selfcal_ros.estimation.datum.scale import scale_datum
+from selfcal_ros.estimation.findings import NoUncertainty
 from selfcal_ros.estimation.joint.fit import JointFit
 from selfcal_ros.estimation.joint.kept_residuals import kept_residuals
 from selfcal_ros.estimation.joint.model_fit import ModelFit, fit_model
@@ -86,15 +87,14 @@ def _solved(measurements: Measurements, options: Options, *, model: ModelFit,
             seen: Observability) -> Solved:
     problem, found = model.problem, model.found
     error_map, closure, kept = _error_map(measurements, options, model=model)
-    warnings = () if problem.direct or options.uncertainty is not None else (
-        "no uncertainty map, because of the size of the field: ask for it (--uncertainty always)",)
+    findings = () if problem.direct or options.uncertainty is not None else (NoUncertainty(),)
     axes = (1.0, 0.0)
     if problem.conditions.datum is ThetaDatum.XY_AXES and closure is not None:
         axes = misclosure_test(found.misclosure, closure)
     result = CalibrationResult(
         measurements.plan_id, error_map, _artifact_map(problem, found),
         _views(measurements, problem, found), seen, noise_of(found.xy, found.theta),
-        measurements.all_rejected(), warnings=warnings, method="joint",
+        measurements.all_rejected(), findings=findings, method="joint",
         sense=str(measurements.sense),
         extra={"solver": found.solver, **kept, **kept_residuals(measurements, model)},
         run_id=measurements.run_id,

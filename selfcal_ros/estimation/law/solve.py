@@ -7,6 +7,7 @@ import numpy as np
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.blas_threads import one_thread
+from selfcal_ros.estimation.findings import DrawnUncertainty
 from selfcal_ros.estimation.joint.noise import NoiseEstimate, noise_estimate, pooled
 from selfcal_ros.estimation.joint.problem import FLOOR
 from selfcal_ros.estimation.joint.solved import Solved, noise_of
@@ -22,6 +23,7 @@ from selfcal_ros.model.result import (
     Observability,
     ViewResult,
 )
+from selfcal_ros.model.verdict import Finding
 from selfcal_ros.model.view import View
 
 EXACT_SIZE = 21
@@ -79,7 +81,7 @@ def solve_law(measurements: Measurements, options: Options) -> Solved:
         tuple(_view_result(view, order.index(i), found)
               for i, view in enumerate(measurements.views)),
         Observability(4 * sites + 9, 4 * sites + 9, 0, True), noise,
-        measurements.all_rejected(), warnings=_warnings(artifact), method="law",
+        measurements.all_rejected(), findings=_findings(artifact), method="law",
         sense=str(measurements.sense), run_id=measurements.run_id)
     return Solved(result, xy, theta)
 
@@ -309,7 +311,5 @@ def _view_result(view: ViewReadings, index: int, found: HuSolution) -> ViewResul
                       used=view.used, rejected=sum(view.rejected.values()))
 
 
-def _warnings(artifact: Artifact) -> tuple[str, ...]:
-    if artifact.grid_size <= EXACT_SIZE:
-        return ()
-    return (f"uncertainties of the law from {N_DRAWS} draws of unit noise: 3.5 % standard error",)
+def _findings(artifact: Artifact) -> tuple[Finding, ...]:
+    return () if artifact.grid_size <= EXACT_SIZE else (DrawnUncertainty(N_DRAWS),)

@@ -19,6 +19,16 @@ from scipy.special import chdtri, gammaincinv
 from selfcal_ros.errors import InputError, NotIdentifiableError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.blas_threads import one_thread
+from selfcal_ros.estimation.findings import (
+    NoisyView,
+    OutliersGivenUp,
+    OutliersKept,
+    OutliersRemoved,
+    Removed,
+    SlipsGivenUp,
+    TakenForSlip,
+    TooManyOutliers,
+)
 from selfcal_ros.estimation.joint.model_fit import fit_model
 from selfcal_ros.estimation.joint.solve import prepare
 from selfcal_ros.estimation.lattice.maps import PHASES
@@ -33,6 +43,7 @@ from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.terms import ModelTerm, TermName
+from selfcal_ros.model.verdict import Finding
 
 LEVEL = 0.01
 """Probability that a measurement without outliers loses a reading."""
@@ -53,34 +64,6 @@ MAX_TERMS = 3
 """Terms that are taken off the readings, one after the other, before outliers are looked for."""
 
 
-@dataclass(frozen=True)
-class Removed:
-    """A reading that was removed.
-
-    Attributes
-    ----------
-    view : str
-        Name of the view.
-    kind : str
-        ``grid`` or ``angular``.
-    mark : tuple of int
-        (m, n), or (k,).
-    standardised : float
-        Residual over its standard deviation when it was removed.
-    leverage : float
-        Part of the reading that the fit followed.
-    residual : float
-        Length of the residual, m, or its size, rad.
-    """
-
-    view: str
-    kind: str
-    mark: tuple[int, ...]
-    standardised: float
-    leverage: float
-    residual: float
-
-
 @dataclass(frozen=True, eq=False)
 class OutlierScreening:
     """A measurement without its outliers, and what was found."""
@@ -90,7 +73,7 @@ class OutlierScreening:
     slips: tuple[Slip, ...]
     noisy: tuple[tuple[str, float], ...]
     unchecked: int
-    warnings: tuple[str, ...]
+    findings: tuple[Finding, ...]
 
 
 def robust_calibrate(measurements: Measurements,
@@ -107,7 +90,7 @@ def robust_calibrate(measurements: Measurements,
     Returns
     -------
     CalibrationResult
-        `warnings` says in words what was found, ``extra["outliers"]`` lists with view and mark
+        `findings` tells what was found, ``extra["outliers"]`` lists with view and mark
         what was removed, ``extra["slips"]`` and ``extra["noisy_views"]`` the bad views;
         `rejected` counts the removed detections under ``outlier_among_views``.
 
@@ -124,7 +107,7 @@ def robust_calibrate(measurements: Measurements,
                          "solve with --method joint")
     cleaned = clean(measurements, options)
     result = calibrate(cleaned.measurements, options)
-    return replace(result, warnings=(*result.warnings, *cleaned.warnings),
+    return replace(result, findings=(*result.findings, *cleaned.findings),
                    extra={**result.extra, **_listed(cleaned)})
 
 
@@ -154,10 +137,10 @@ def clean(measurements: Measurements, options: Options) -> OutlierScreening:
     gone, residuals, stopped = _reject(screened.flattened, linear, screened.residuals)
     removed = tuple(sorted(gone.values(), key=lambda item: (item.kind, item.view, item.mark)))
     noisy = noisy_views(residuals, screened.measurements)
-    warnings = [*screened.notes, *_warnings(removed, noisy, stopped)]
+    findings = [*screened.notes, *_findings(removed, noisy, stopped)]
     unchecked = int((np.isnan(residuals.squares) & (residuals.problem.grid.weight > 0)).sum())
     return OutlierScreening(without(screened.measurements, gone, mark=True), removed,
-                            screened.slips, noisy, unchecked, tuple(warnings))
+                            screened.slips, noisy, unchecked, tuple(findings))
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,7 +151,7 @@ class _Screened:
     flattened: Measurements
     residuals: Residuals
     slips: tuple[Slip, ...] = ()
-    notes: tuple[str, ...] = ()
+    notes: tuple[Finding, ...] = ()
 
 
 def _without_slips(measurements: Measurements, options: Options, linear: Options) -> _Screened:
@@ -188,23 +171,18 @@ def _without_slips(measurements: Measurements, options: Options, linear: Options
             if not done:
                 return at
             continue
-        at = replace(at, notes=(*at.notes, f"view '{slip.view}' looks as if the plate slipped, but "
-                                f"the readings show {cause.text.partition(': ')[0]}, which explains"
-                                " them better: no view was split"))
+        at = replace(at, notes=(*at.notes, TakenForSlip(slip.view, cause)))
         options = replace(options, terms=(*options.terms, ModelTerm(TermName(cause.name))))
         try:
             flattened = _flattened(at.measurements, options)
         except (NotIdentifiableError, InputError):
             return at
         at = replace(at, flattened=flattened, residuals=residuals_of(flattened, linear))
-    return replace(at, notes=(*at.notes, f"gave up on slips after {len(at.slips)}: more of them "
-                              "seem to be in the readings; measure again"))
+    return replace(at, notes=(*at.notes, SlipsGivenUp(len(at.slips))))
 
 
 def _split(at: _Screened, slip: Slip, linear: Options) -> tuple[_Screened, bool]:
     """Return the readings split at a slip, or without its view, and whether that could be done."""
-    text = slip.text()
-
     def split(readings: Measurements) -> Measurements:
         return left_out(readings, slip.index) if slip.alternatives else split_view(readings, slip)
 
@@ -212,11 +190,10 @@ def _split(at: _Screened, slip: Slip, linear: Options) -> tuple[_Screened, bool]
     try:
         residuals = residuals_of(flattened, linear)
     except NotIdentifiableError:
-        text += "; the map is spoiled by it: measure the view again"
-        return replace(at, slips=(*at.slips, slip), notes=(*at.notes, text)), False
-    text += "; the view is left out" if slip.alternatives else ""
+        return replace(at, slips=(*at.slips, slip),
+                       notes=(*at.notes, slip.found(spoils=True))), False
     return _Screened(split(at.measurements), flattened, residuals, (*at.slips, slip),
-                     (*at.notes, text)), True
+                     (*at.notes, slip.found(spoils=False))), True
 
 
 def robust_sigma(squares: np.ndarray, dof: int) -> float:
@@ -229,7 +206,7 @@ def robust_sigma(squares: np.ndarray, dof: int) -> float:
 
 
 def _reject(measurements: Measurements, options: Options, residuals: Residuals
-            ) -> tuple[dict[Key, Removed], Residuals, str]:
+            ) -> tuple[dict[Key, Removed], Residuals, Finding | None]:
     """Remove outliers round by round; return them, the last residuals, why it stopped early."""
     gone: dict[Key, Removed] = {}
     n_readings = sum(len(view.m) + len(view.k) for view in measurements.views)
@@ -238,19 +215,15 @@ def _reject(measurements: Measurements, options: Options, residuals: Residuals
         if not found:
             break
         if len(gone) + len(found) > MAX_REMOVED * n_readings:
-            return {}, residuals_of(measurements, options), (
-                f"more than {MAX_REMOVED:.0%} of the readings contradict the others: none was "
-                "removed; look for a wrong plan or a faulty view")
+            return {}, residuals_of(measurements, options), TooManyOutliers(MAX_REMOVED)
         try:
             residuals = residuals_of(without(measurements, gone | found), options)
         except NotIdentifiableError:
-            return gone, residuals, "removing more outliers would leave the stage undetermined"
+            return gone, residuals, OutliersKept()
         gone |= found
     else:
-        return (*_taken_back(measurements, options, gone, residuals),
-                f"gave up on outliers after {MAX_ROUNDS} rounds: more of them seem to be in the "
-                "readings; look for a wrong plan or a faulty view")
-    return (*_taken_back(measurements, options, gone, residuals), "")
+        return (*_taken_back(measurements, options, gone, residuals), OutliersGivenUp(MAX_ROUNDS))
+    return (*_taken_back(measurements, options, gone, residuals), None)
 
 
 def _worst(residuals: Residuals, measurements: Measurements) -> dict[Key, Removed]:
@@ -339,16 +312,10 @@ def _agrees(residuals: Residuals, key: Key) -> bool:
     return residuals.p_outlier(kind, at) >= _level(residuals)
 
 
-def _warnings(removed: tuple[Removed, ...], noisy: tuple[tuple[str, float], ...],
-              stopped: str) -> list[str]:
-    out = []
-    if removed:
-        names = [f"'{item.view}' {item.kind} {item.mark if len(item.mark) > 1 else item.mark[0]} "
-                 f"({item.standardised:.1f} sigma)" for item in removed[:5]]
-        more = f" and {len(removed) - 5} more" if len(removed) > 5 else ""
-        out.append(f"removed {len(removed)} outliers: " + ", ".join(names) + more)
-    out += [f"view '{name}' is {ratio:.1f} times as noisy as the others: measure it again"
-            for name, ratio in noisy]
+def _findings(removed: tuple[Removed, ...], noisy: tuple[tuple[str, float], ...],
+              stopped: Finding | None) -> list[Finding]:
+    out: list[Finding] = [OutliersRemoved(removed)] if removed else []
+    out += [NoisyView(name, ratio) for name, ratio in noisy]
     return out + ([stopped] if stopped else [])
 
 
@@ -361,6 +328,6 @@ def _flattened(measurements: Measurements, options: Options) -> Measurements:
     views, (hx, hy) = list(measurements.views), measurements.artifact.half
     for row, index in enumerate(problem.grid.index):
         view = views[index]
-        left = model.y[row][view.m + hx, view.n + hy] * PHASES[problem.grid.poses[row].q]
-        views[index] = replace(view, dx=left.real, dy=left.imag, visits=None)
+        linear = model.y[row][view.m + hx, view.n + hy] * PHASES[problem.grid.poses[row].q]
+        views[index] = replace(view, dx=linear.real, dy=linear.imag, visits=None)
     return replace(measurements, views=tuple(views))

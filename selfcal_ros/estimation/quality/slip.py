@@ -12,6 +12,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from selfcal_ros.errors import NotIdentifiableError
+from selfcal_ros.estimation.findings import SlipFound
 from selfcal_ros.estimation.joint.fit import JointFit, fit
 from selfcal_ros.estimation.joint.problem import Problem
 from selfcal_ros.estimation.joint.solve import prepare
@@ -19,7 +20,6 @@ from selfcal_ros.estimation.lattice.maps import PHASES
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.quality.leverage import Residuals, grid_residuals
 from selfcal_ros.model.readings import Measurements, ViewReadings
-from selfcal_ros.units import UM_PER_M, URAD_PER_RAD
 
 AMBIGUOUS = 16.0
 """Difference of chi2 below which two places explain the readings equally well."""
@@ -87,15 +87,10 @@ class Slip(SlipPlace):
     phi_rad: float
     alternatives: tuple[str, ...] = ()
 
-    def text(self) -> str:
-        """Return the slip in words."""
-        size = (f"({self.tx_m * UM_PER_M:.3g}, {self.ty_m * UM_PER_M:.3g}) µm and "
-                f"{self.phi_rad * URAD_PER_RAD:.3g} µrad")
-        if self.alternatives:
-            return (f"view '{self.view}': the plate slipped by about {size}, {self.place} or "
-                    + " or ".join(self.alternatives) + "; the readings do not tell which")
-        return (f"view '{self.view}': the plate slipped {self.place} by {size}; treated as two "
-                "placements")
+    def found(self, *, spoils: bool) -> SlipFound:
+        """Return what is told of the slip; `spoils`: its view had to stay as it was."""
+        return SlipFound(self.view, (self.place, *self.alternatives), self.tx_m, self.ty_m,
+                         self.phi_rad, spoils)
 
 
 def find_slip(residuals: Residuals, sigma_m: float, measurements: Measurements,

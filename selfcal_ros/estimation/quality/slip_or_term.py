@@ -16,7 +16,7 @@ from selfcal_ros.estimation.quality.slip import MAX_PLACES, Slip
 from selfcal_ros.estimation.terms.columns import Column, TermColumns, WithinMarks
 from selfcal_ros.estimation.terms.ground import Ground
 from selfcal_ros.estimation.terms.identifiable import require_terms_told
-from selfcal_ros.estimation.verdict.cause_text import cause_of
+from selfcal_ros.estimation.verdict.cause_sizes import cause_of
 from selfcal_ros.estimation.verdict.causes import PlacedSlip, find_explanations
 from selfcal_ros.estimation.verdict.slip_columns import SLIP
 from selfcal_ros.model.readings import Measurements

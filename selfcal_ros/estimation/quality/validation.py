@@ -14,6 +14,7 @@ import numpy as np
 from selfcal_ros.errors import InputError, NoDataError, NotIdentifiableError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.blas_threads import one_thread
+from selfcal_ros.estimation.findings import PredictionFailed
 from selfcal_ros.estimation.joint.model_fit import ModelFit
 from selfcal_ros.estimation.joint.solve import solve_joint
 from selfcal_ros.estimation.joint.solved import Solved
@@ -303,17 +304,15 @@ def _misalignment(residual: np.ndarray, marks: np.ndarray) -> tuple[float, float
 
 
 def with_validation(result: CalibrationResult, found: list[HeldOut]) -> CalibrationResult:
-    """Return a result with its validation; a prediction beyond its limit disqualifies it."""
-    reasons = tuple(
-        f"{item.name} is predicted with {item.ratio:.2f} times the noise, beyond the limit of "
-        f"{item.limit:.2f}" for item in found if item.exceeds)
+    """Return a result, not worded, with its validation; a prediction that failed disqualifies."""
+    failed = tuple(PredictionFailed(item.name, item.ratio, item.limit)
+                   for item in found if item.exceeds)
     result = replace(result, extra={**result.extra, "validation": validation_json(found)})
-    if not reasons:
+    if not failed:
         return result
     verdict = result.verdict
-    sentence = f"Not qualified: {reasons[0]}" if verdict.qualified else verdict.sentence
-    return replace(result, verdict=replace(verdict, qualified=False, sentence=sentence,
-                                           reasons=(*verdict.reasons, *reasons)))
+    return replace(result, verdict=replace(verdict, qualified=False,
+                                           findings=(*verdict.findings, *failed)))
 
 
 def validation_json(found: list[HeldOut]) -> list[dict[str, Any]]:

@@ -15,19 +15,25 @@ from scipy.special import fdtrc
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.blas_threads import one_thread
 from selfcal_ros.estimation.datum.angular import MISCLOSURE_LEVEL
+from selfcal_ros.estimation.findings import (
+    AxesNotMet,
+    FiniteRotation,
+    NoiseContradicted,
+    NoiseUnknown,
+)
 from selfcal_ros.estimation.joint.model_fit import ModelFit
-from selfcal_ros.estimation.joint.noise import NoiseEstimate, pooled
+from selfcal_ros.estimation.joint.noise import pooled
 from selfcal_ros.estimation.joint.solve import solve_joint
 from selfcal_ros.estimation.joint.solved import Solved
 from selfcal_ros.estimation.options import Options
-from selfcal_ros.estimation.verdict.cause_text import cause_of, noise_cause, size_cause
+from selfcal_ros.estimation.verdict.cause_sizes import cause_of, noise_cause, size_cause
 from selfcal_ros.estimation.verdict.causes import LEVEL, Explanation, find_explanations
 from selfcal_ros.estimation.verdict.coverage import with_coverage
 from selfcal_ros.estimation.verdict.provenance import provenance_of
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.result import CalibrationResult
-from selfcal_ros.model.verdict import Cause, Verdict
-from selfcal_ros.units import ARCSEC_PER_RAD, RAD_PER_MRAD, UM_PER_M
+from selfcal_ros.model.statistics import rms
+from selfcal_ros.model.verdict import Cause, Finding, Verdict
 
 ALWAYS_SITES = 41 * 41
 """Field up to which terms are looked for in any case; beyond, where another test fails."""
@@ -48,7 +54,7 @@ where the readings tell all of it."""
 
 @one_thread()
 def judged(solved: Solved, measurements: Measurements, options: Options) -> CalibrationResult:
-    """Return the result with its verdict.
+    """Return the result with its verdict, not worded.
 
     Parameters
     ----------
@@ -59,14 +65,12 @@ def judged(solved: Solved, measurements: Measurements, options: Options) -> Cali
     options : Options
         How it was calibrated.
     """
-    reasons = _noise_reasons(solved)
-    checked = checked_by(solved, measurements, options, failed=bool(reasons))
-    reasons = [*_rotation_reasons(solved, checked), *reasons, *_axes_reasons(checked)]
+    noises = _noise_findings(solved)
+    checked = checked_by(solved, measurements, options, failed=bool(noises))
+    failed = [*_rotation_findings(solved, checked), *noises, *_axes_findings(checked)]
     sizes = _sizes(solved)
-    causes = [*sizes, *_causes(checked, measurements, options, failed=bool(reasons or sizes))]
-    reasons += [f"the readings show {_what(cause)}" for cause in causes]
-    verdict = Verdict(not reasons, _sentence(solved, reasons, causes), tuple(reasons),
-                      tuple(causes))
+    causes = (*sizes, *_causes(checked, measurements, options, failed=bool(failed or sizes)))
+    verdict = Verdict(not (failed or causes), causes=causes, findings=(*failed, *causes))
     reference = options.reference
     result = with_coverage(solved.result, reference)
     return replace(
@@ -106,58 +110,24 @@ def checked_by(solved: Solved, measurements: Measurements, options: Options, *,
     return rigid if MUCH_MORE * rigid.xy.residuals < linear.xy.residuals else linear
 
 
-def _rotation_reasons(solved: Solved, checked: Solved) -> list[str]:
+def _rotation_findings(solved: Solved, checked: Solved) -> list[Finding]:
     """Return whether finite rotations explain what a linear model leaves."""
     if checked is solved or checked.model is None or not checked.model.problem.rigid:
         return []
-    largest = max(abs(view.phi) for view in checked.result.views) / RAD_PER_MRAD
-    return [f"the model is linear, but the plate was turned by up to {largest:.2f} mrad: solve "
-            "jointly with finite rotations, the default, which leaves "
-            f"{checked.xy.residuals * UM_PER_M:.3g} µm"]
+    return [FiniteRotation(max(abs(view.phi) for view in checked.result.views),
+                           checked.xy.residuals)]
 
 
-def _what(cause: Cause) -> str:
-    return cause.text.partition(": ")[0]
+def _noise_findings(solved: Solved) -> list[Finding]:
+    out: list[Finding] = [
+        NoiseContradicted(kind, noise.residuals, noise.stated, bool(np.isfinite(noise.declared)))
+        for noise, kind in ((solved.xy, "grid"), (solved.theta, "angular")) if noise.contradicted]
+    return out if np.isfinite(solved.xy.sigma) else [*out, NoiseUnknown()]
 
 
-def _sentence(solved: Solved, reasons: list[str], causes: list[Cause]) -> str:
-    if not reasons:
-        tested = np.isfinite(solved.xy.p) or np.isfinite(solved.theta.p)
-        return ("Qualified: residuals and the noise of readings agree" if tested else
-                "Qualified: residuals show the noise; there are no repeats to compare it with")
-    if causes:
-        return f"Not qualified: most likely {causes[0].text}"
-    return f"Not qualified: {reasons[0]}"
-
-
-def _noise_reasons(solved: Solved) -> list[str]:
-    out = []
-    for noise, kind, factor, unit in ((solved.xy, "grid", UM_PER_M, "µm"),
-                                      (solved.theta, "angular", ARCSEC_PER_RAD, "arcsec")):
-        if noise.contradicted:
-            out.append(_contradiction(noise, kind, factor, unit))
-    if not np.isfinite(solved.xy.sigma):
-        out.append("grid readings: neither repeats nor residuals determine the noise, so that the "
-                   "uncertainty is not known; read every mark twice")
-    return out
-
-
-def _contradiction(noise: NoiseEstimate, kind: str, factor: float, unit: str) -> str:
-    name = "the detections' own sigma" if np.isfinite(noise.declared) else "repeats"
-    larger = noise.residuals > noise.stated
-    return (f"{kind} readings: residuals show a noise of {noise.residuals * factor:.3g} {unit}, "
-            f"{name} {noise.stated * factor:.3g} {unit}; " + (
-                "something beside random noise is in the readings" if larger else
-                "repeats share what single readings do not (drift between passes), or the stated "
-                "noise is too large"))
-
-
-def _axes_reasons(solved: Solved) -> list[str]:
+def _axes_findings(solved: Solved) -> list[Finding]:
     p, size_rad = solved.axes
-    if p >= MISCLOSURE_LEVEL:
-        return []
-    return [f"theta: the stage does not satisfy the axis conditions of the datum xy_axes "
-            f"(misclosure {size_rad * ARCSEC_PER_RAD:.3g} arcsec, p = {p:.2g}); use zero_mean"]
+    return [] if p >= MISCLOSURE_LEVEL else [AxesNotMet(size_rad, p)]
 
 
 def _causes(solved: Solved, measurements: Measurements, options: Options, *,
@@ -202,7 +172,7 @@ def _counts(found: Explanation, solved: Solved) -> bool:
     u = np.concatenate([emap.u_gx[emap.valid], emap.u_gy[emap.valid]])
     if not np.isfinite(u).any():
         return True
-    return found.effect_m > MATTERS * float(np.sqrt(np.nanmean(u**2)))
+    return found.effect_m > MATTERS * rms(u)
 
 
 def _noisy_views(measurements: Measurements, model: ModelFit) -> list[Cause]:

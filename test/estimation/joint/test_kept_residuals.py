@@ -10,6 +10,7 @@ from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.result import result_from_dict, result_to_dict
+from selfcal_ros.reporting.words.result import worded
 from selfcal_ros.simulation.truth import hu_plan, random_truth, simulate_measurements
 
 
@@ -100,7 +101,7 @@ def test_the_course_of_marks_visited_once_is_that_of_their_residuals():
 def test_residuals_survive_the_json_form_and_are_left_out_of_large_results(monkeypatch):
     measurements = measured()
     result = calibrate(measurements)
-    data = result_to_dict(result)
+    data = result_to_dict(worded(result))
     again = result_from_dict(data, "r.json").extra["residuals"]["views"]
     own = result.extra["residuals"]["views"]
     assert [e["view"] for e in again] == [e["view"] for e in own]

@@ -49,7 +49,7 @@ def test_hu_simulation_comes_back_exactly(size, pitch, lines, sense):
         if view.name != "line":
             assert (view.tx, view.ty) == pytest.approx(tuple(truth.t_m[index]), abs=EXACT)
     assert np.isnan(found.views[2].tx)
-    assert found.observability.identifiable and found.warnings == ()
+    assert found.observability.identifiable and found.findings == ()
     assert np.nanmax(found.error_map.u_gx) < EXACT
 
 

@@ -15,6 +15,7 @@ from selfcal_ros.estimation.options import Options, ReferenceKind, ReferenceLeng
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.readings import Sense
+from selfcal_ros.reporting.words.result import worded
 from selfcal_ros.simulation.truth import Spread, hu_plan, random_truth, simulate_measurements
 from test.support.lattice_plans import in_datum, plan_of
 
@@ -215,13 +216,13 @@ class TestNoise:
         low, high = chi2.ppf([1e-4, 1 - 1e-4], noise.dof_theta_residuals) \
             / noise.dof_theta_residuals
         assert low < (noise.sigma_theta_residuals / 1e-6) ** 2 < high
-        assert calibrate(readings).warnings == ()
+        assert calibrate(readings).findings == ()
 
     def test_residuals_that_exceed_repeats_are_told(self):
         _, readings = measured(self.plan, sigma_m=1e-8, sigma_theta_rad=1e-6)
         calm = replace(readings, views=tuple(
             replace(view, sigma_xy=view.sigma_xy / 3) for view in readings.views))
-        found = calibrate(calm)
+        found = worded(calibrate(calm))
         text = " ".join(found.verdict.reasons)
         assert "grid readings: residuals show a noise of" in text
         assert "something beside random noise" in text
@@ -234,7 +235,7 @@ class TestNoise:
         _, readings = measured(self.plan, sigma_m=1e-8, sigma_theta_rad=1e-6)
         wild = replace(readings, views=tuple(
             replace(view, sigma_xy=view.sigma_xy * 2) for view in readings.views))
-        found = calibrate(wild)
+        found = worded(calibrate(wild))
         assert "the stated noise is too large" in found.verdict.reasons[0]
         assert found.noise.sigma_xy == found.noise.sigma_xy_repeats
 
@@ -272,7 +273,7 @@ def test_an_encoder_that_does_not_follow_the_axes_is_told_and_bends_nothing():
     g_theta[6] += 1e-4
     readings = simulate_measurements(replace(truth, g_theta=g_theta), plan, rng, sigma_m=1e-9,
                                      sigma_theta_rad=1e-6)
-    axes = calibrate(readings, Options(datum_theta="xy_axes"))
+    axes = worded(calibrate(readings, Options(datum_theta="xy_axes")))
     free = calibrate(readings, Options(datum_theta="zero_mean"))
     assert not axes.verdict.qualified and len(axes.verdict.reasons) == 1
     reason = axes.verdict.reasons[0]

@@ -8,6 +8,7 @@ import pytest
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.api import calibrate
+from selfcal_ros.estimation.findings import DrawnUncertainty
 from selfcal_ros.estimation.law.solve import hu_readings, hu_views, law_for
 from selfcal_ros.estimation.options import Options, ReferenceKind, ReferenceLength
 from selfcal_ros.model.artifact import Artifact
@@ -119,7 +120,7 @@ def test_exact_and_drawn_propagation_agree(monkeypatch):
         ratio = getattr(drawn.error_map, name) / getattr(exact.error_map, name)
         assert abs(np.sqrt((ratio**2).mean()) - 1) < 0.1
     assert drawn.noise.sigma_xy == pytest.approx(exact.noise.sigma_xy, rel=0.02)
-    assert drawn.warnings and not exact.warnings
+    assert drawn.findings == (DrawnUncertainty(400),) and exact.findings == ()
 
 
 def test_noise_of_one_reading_from_what_is_left_over():

@@ -26,6 +26,7 @@ from selfcal_ros.model.readings import GridVisits, Sense, ViewReadings
 from selfcal_ros.model.result import plain, result_from_dict, result_to_dict
 from selfcal_ros.model.terms import ModelTerm, TermName
 from selfcal_ros.model.view import View
+from selfcal_ros.reporting.words.result import worded
 from selfcal_ros.simulation.truth import hu_plan, random_truth, simulate_measurements
 from test.support.lattice_plans import plan_of
 
@@ -174,7 +175,7 @@ def test_a_turned_microscope_is_no_slip():
     assert result.extra["slips"] == []
     assert [v.name for v in result.views] == [v.view.name for v in readings.views]
     assert not result.verdict.qualified and result.verdict.causes[0].name == "microscope"
-    assert "no view was split" in " ".join(result.warnings)
+    assert "no view was split" in " ".join(worded(result).warnings)
     with_term = replace(LINEAR, terms=(ModelTerm(TermName.MICROSCOPE),))
     bad = with_errors(turned, 1, dx={(-4, 2): 1e-6})
     bad = replace(bad, views=tuple(
@@ -205,14 +206,14 @@ def test_giving_up_is_said(monkeypatch):
     monkeypatch.setattr("selfcal_ros.estimation.quality.outliers.MAX_ROUNDS", 1)
     _, readings = measured(3)
     bad = with_errors(readings, 1, dx={(-4, 2): 1e-6, (0, 0): 3e-6, (3, -3): 5e-7})
-    text = " ".join(robust_calibrate(bad, ZERO_MEAN).warnings)
+    text = " ".join(worded(robust_calibrate(bad, ZERO_MEAN)).warnings)
     assert "gave up on outliers after 1 rounds: more of them seem to be in the readings" in text
     monkeypatch.setattr("selfcal_ros.estimation.quality.outliers.MAX_SLIPS", 0)
     _, readings = measured(4, more=True)
     moved = slipped(readings, 3, "m", 2, (2e-7, -1e-7, 0.0))
     result = robust_calibrate(moved, ZERO_MEAN)
     assert "gave up on slips after 0: more of them seem to be in the readings" in " ".join(
-        result.warnings)
+        worded(result).warnings)
     assert result.extra["slips"] == []
 
 
@@ -243,7 +244,7 @@ def test_planted_outliers_are_removed_and_nothing_else(sense):
     assert row["standardised"] > 10 and 0 < row["leverage"] < 1
     # the fit follows the outlier by its leverage: the residual is the rest of it
     assert row["residual_m"] == pytest.approx((1 - row["leverage"]) * 1e-6, abs=1e-7)
-    assert "removed 4 outliers: 'identity' angular 5" in result.warnings[-1]
+    assert "removed 4 outliers: 'identity' angular 5" in worded(result).warnings[-1]
 
 
 def test_readings_that_only_check_each_other_both_go():
@@ -257,7 +258,7 @@ def test_readings_that_only_check_each_other_both_go():
 def test_removed_readings_survive_the_file(tmp_path):
     _, readings = measured(3)
     result = robust_calibrate(with_errors(readings, 1, dx={(0, 0): 1e-6}), ZERO_MEAN)
-    again = result_from_dict(plain(result_to_dict(result)), "r")
+    again = result_from_dict(plain(result_to_dict(worded(result))), "r")
     assert again.extra["outliers"] == plain(result.extra["outliers"])
 
 
@@ -277,7 +278,8 @@ def test_a_slipped_view_is_named_sized_and_split(index, axis, first, change):
     assert not removed(result)
     assert error_rms(result, truth) < 1.3 * error_rms(calibrate(readings, ZERO_MEAN), truth)
     name = view.view.name
-    assert f"view '{name}': the plate slipped before {axis} = {first}" in result.warnings[-1]
+    said = worded(result).warnings[-1]
+    assert f"view '{name}': the plate slipped before {axis} = {first}" in said
     assert [v.name for v in result.views if v.name.startswith(name)] == [
         name, f"{name} after slip", f"{name} lines"]
 
@@ -290,7 +292,7 @@ def test_a_slip_whose_place_three_views_do_not_tell_is_reported_not_mended():
     places = {f"before {slip['axis']} = {slip['first']}", *slip["alternatives"].split("; ")}
     assert "before m = 2" in places and len(places) >= 2
     assert "do not tell which; the map is spoiled by it: measure the view again" in " ".join(
-        result.warnings)
+        worded(result).warnings)
     assert [v.name for v in result.views] == [v.view.name for v in readings.views]
 
 
@@ -323,7 +325,7 @@ def test_a_noisy_view_is_named(index):
     result = robust_calibrate(replace(readings, views=views), ZERO_MEAN)
     (named,) = result.extra["noisy_views"]
     assert named["view"] == view.view.name and 3 < named["ratio"] <= 20
-    assert "times as noisy as the others: measure it again" in result.warnings[-1]
+    assert "times as noisy as the others: measure it again" in worded(result).warnings[-1]
 
 
 def test_too_many_contradictions_remove_nothing():
@@ -334,7 +336,7 @@ def test_too_many_contradictions_remove_nothing():
            for m, n in zip(view.m[::2], view.n[::2], strict=True)}
     result = robust_calibrate(with_errors(readings, 1, dx=bad), ZERO_MEAN)
     assert not removed(result)
-    text = " ".join(result.warnings)
+    text = " ".join(worded(result).warnings)
     assert "none was removed" in text or "rot90" in text
 
 
@@ -386,7 +388,8 @@ def test_a_view_whose_slip_cannot_be_placed_is_left_out_if_it_can_be_spared(monk
     monkeypatch.setattr("selfcal_ros.estimation.quality.slip.AMBIGUOUS", 1e9)
     truth, readings = measured(4, more=True)
     result = robust_calibrate(slipped(readings, 3, "m", 2, (2e-7, -1e-7, 0.0)), ZERO_MEAN)
-    assert "the readings do not tell which; the view is left out" in " ".join(result.warnings)
+    said = " ".join(worded(result).warnings)
+    assert "the readings do not tell which; the view is left out" in said
     view = result.views[3]
     lost = len(readings.views[3].m) + len(readings.views[3].k)
     assert view.name == "shift_x" and view.used == 0 and view.rejected == lost

@@ -21,6 +21,7 @@ from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.terms import ModelTerm, TermName
 from selfcal_ros.model.view import View
+from selfcal_ros.reporting.words.result import worded
 from selfcal_ros.simulation.truth import hu_plan, random_truth, simulate_measurements
 from test.support.lattice_plans import plan_of
 
@@ -130,7 +131,7 @@ def test_a_spoiled_view_exceeds_its_limit_and_disqualifies_the_result():
     found = validate(wrong, LINEAR, folds=1)
     bad = next(item for item in found if item.name == "view 'ty'")
     assert bad.exceeds and ", EXCEEDS the limit of " in "\n".join(validation_text(found))
-    judged = with_validation(result, [bad])
+    judged = worded(with_validation(result, [bad]))
     assert not judged.verdict.qualified
     assert judged.verdict.reasons == (
         f"view 'ty' is predicted with {bad.ratio:.2f} times the noise, beyond the limit of "

@@ -13,6 +13,7 @@ from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.quality.budget import budgets
 from selfcal_ros.model.result import result_from_dict, result_to_dict
 from selfcal_ros.model.terms import parse_terms
+from selfcal_ros.reporting.words.result import worded
 from selfcal_ros.simulation.machine import Spread, random_truth
 from selfcal_ros.simulation.truth import simulate_measurements
 from test.estimation.terms.test_terms import dense, plan_of, settings
@@ -112,7 +113,7 @@ def test_the_statistic_is_what_the_size_adds_to_the_sum_of_squares():
 def test_a_calibration_with_a_contradicted_size_is_not_qualified_and_its_u_is_honest(term, unit):
     name, _, given = term.partition(":")
     truth, readings = measured(4, {name: 5 * SIZES[name]})
-    result = calibrate(readings, options(term))
+    result = worded(calibrate(readings, options(term)))
     verdict, cause = result.verdict, result.verdict.causes[0]
     assert not verdict.qualified
     assert cause.name == name and cause.p < 5e-4
@@ -133,7 +134,7 @@ def test_a_size_that_is_too_small_is_kept_beside_the_one_that_was_used():
     result = calibrate(readings, options("plate_scale:1e-8"))
     (term,) = result.model.terms
     assert term.size == 1e-8 and 1e-6 < term.size_used < 1e-4
-    back = result_from_dict(result_to_dict(result), "r.json")
+    back = result_from_dict(result_to_dict(worded(result)), "r.json")
     assert back.model == result.model
     line = next(c for c in budgets(result)[0].components if c.label == "term plate_scale")
     assert line.note.startswith("given as 1e-08, which the readings contradict; they allow ")

@@ -10,6 +10,7 @@ from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.view import Plan, View
+from selfcal_ros.reporting.words.result import worded
 from selfcal_ros.simulation.machine import Spread, random_truth
 from selfcal_ros.simulation.settings import CellSettings
 from selfcal_ros.simulation.truth import simulate_measurements
@@ -36,7 +37,7 @@ def judged(spread=CLEAN, *, change=lambda truth: truth, plan=None, seed=1, spoil
     truth = change(random_truth(plan.artifact, len(plan.views), rng, spread))
     readings = simulate_measurements(truth, plan, rng, settings=replace(SETTINGS, **how),
                                      visits=True)
-    return calibrate(spoil(readings), OPTIONS)
+    return worded(calibrate(spoil(readings), OPTIONS))
 
 
 def with_views(name, index, value, shape):

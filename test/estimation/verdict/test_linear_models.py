@@ -9,6 +9,7 @@ import pytest
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.reporting.words.result import worded
 from selfcal_ros.simulation.machine import Spread, random_truth
 from selfcal_ros.simulation.settings import CellSettings
 from selfcal_ros.simulation.truth import hu_plan, simulate_measurements
@@ -25,7 +26,7 @@ def judged(options, spread=FLAT, **how):
     truth = random_truth(plan.artifact, 4, rng, spread)
     readings = simulate_measurements(truth, plan, rng, settings=replace(SETTINGS, **how),
                                      visits=True)
-    return truth, calibrate(readings, options)
+    return truth, worded(calibrate(readings, options))
 
 
 @pytest.mark.parametrize("options", LINEAR, ids=NAMES)

@@ -5,8 +5,9 @@ import numpy as np
 import pytest
 
 from selfcal_ros.estimation.terms.columns import Column
-from selfcal_ros.estimation.verdict.cause_text import cause_of, noise_cause
+from selfcal_ros.estimation.verdict.cause_sizes import cause_of, noise_cause
 from selfcal_ros.estimation.verdict.causes import Explanation
+from selfcal_ros.reporting.words.causes import cause_text
 
 NAMES = ("0", "90", "+x")
 MICROSCOPE = ("xx", "xy", "yx", "yy")
@@ -57,13 +58,13 @@ def microscope(*values):
      "view again, or solve with --robust", 5e-7, 1e-8, "m")])
 def test_a_cause_in_words(found, text, size, u, unit):
     cause = cause_of(found, NAMES, 0.05)
-    assert (cause.name, cause.text, cause.unit, cause.p) == (found.name, text, unit, 1e-6)
+    assert (cause.name, cause_text(cause), cause.unit, cause.p) == (found.name, text, unit, 1e-6)
     assert (cause.size, cause.u) == pytest.approx((size, u), rel=1e-12)
 
 
 def test_a_noisy_view_in_words():
     cause = noise_cause("90", 3.1415, 0.2, 1e-4)
-    assert cause.text == ("view '90' is 3.14 times as noisy as the others: measure it again, or "
-                          "look for what shook it")
+    assert cause_text(cause) == ("view '90' is 3.14 times as noisy as the others: measure it "
+                                 "again, or look for what shook it")
     assert (cause.name, cause.size, cause.u, cause.unit, cause.p) == (
         "noise", 3.1415, 0.2, "m/m", 1e-4)

@@ -1,0 +1,99 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The verdict in words: a sentence, and a reason for each test that failed."""
+
+from dataclasses import replace
+from functools import singledispatch
+
+import numpy as np
+
+from selfcal_ros.estimation.findings import (
+    AxesNotMet,
+    FiniteRotation,
+    NoiseContradicted,
+    NoiseUnknown,
+    PredictionFailed,
+)
+from selfcal_ros.model.result import Noise
+from selfcal_ros.model.verdict import Cause, Finding, Verdict
+from selfcal_ros.reporting.words.causes import cause_text, what_it_is
+from selfcal_ros.units import ARCSEC_PER_RAD, RAD_PER_MRAD, UM_PER_M
+
+
+def worded_verdict(verdict: Verdict, noise: Noise) -> Verdict:
+    """Return a verdict with its sentence, reasons and the texts of its causes.
+
+    One that has a sentence stays as it is, but for findings that came later.
+
+    Parameters
+    ----------
+    verdict : Verdict
+        As estimation gives it, or as a file tells it.
+    noise : Noise
+        Of the same result: whether there was something to compare residuals with.
+    """
+    if verdict.sentence and not verdict.findings:
+        return verdict
+    reasons = (*verdict.reasons, *(reason(finding) for finding in verdict.findings))
+    causes = tuple(replace(cause, text=cause_text(cause), what=None) for cause in verdict.causes)
+    return Verdict(verdict.qualified, _sentence(verdict.qualified, reasons, causes, noise),
+                   reasons, causes)
+
+
+def _sentence(qualified: bool, reasons: tuple[str, ...], causes: tuple[Cause, ...],
+              noise: Noise) -> str:
+    if qualified:
+        tested = np.isfinite(noise.p_xy) or np.isfinite(noise.p_theta)
+        return ("Qualified: residuals and the noise of readings agree" if tested else
+                "Qualified: residuals show the noise; there are no repeats to compare it with")
+    if causes:
+        return f"Not qualified: most likely {causes[0].text}"
+    return f"Not qualified: {reasons[0]}"
+
+
+@singledispatch
+def reason(finding: Finding) -> str:
+    """Return why a result is not qualified, in words."""
+    raise TypeError(f"no words for {type(finding).__name__}")
+
+
+@reason.register
+def _(cause: Cause) -> str:
+    return f"the readings show {what_it_is(cause)}"
+
+
+@reason.register
+def _(found: FiniteRotation) -> str:
+    return (f"the model is linear, but the plate was turned by up to "
+            f"{found.largest_rad / RAD_PER_MRAD:.2f} mrad: solve jointly with finite rotations, "
+            f"the default, which leaves {found.residuals_m * UM_PER_M:.3g} µm")
+
+
+@reason.register
+def _(found: NoiseContradicted) -> str:
+    factor, unit = (UM_PER_M, "µm") if found.kind == "grid" else (ARCSEC_PER_RAD, "arcsec")
+    name = "the detections' own sigma" if found.declared else "repeats"
+    return (f"{found.kind} readings: residuals show a noise of {found.residuals * factor:.3g} "
+            f"{unit}, {name} {found.stated * factor:.3g} {unit}; " + (
+                "something beside random noise is in the readings"
+                if found.residuals > found.stated else
+                "repeats share what single readings do not (drift between passes), or the stated "
+                "noise is too large"))
+
+
+@reason.register
+def _(_: NoiseUnknown) -> str:
+    return ("grid readings: neither repeats nor residuals determine the noise, so that the "
+            "uncertainty is not known; read every mark twice")
+
+
+@reason.register
+def _(found: AxesNotMet) -> str:
+    return (f"theta: the stage does not satisfy the axis conditions of the datum xy_axes "
+            f"(misclosure {found.misclosure_rad * ARCSEC_PER_RAD:.3g} arcsec, p = {found.p:.2g}); "
+            "use zero_mean")
+
+
+@reason.register
+def _(found: PredictionFailed) -> str:
+    return (f"{found.what} is predicted with {found.ratio:.2f} times the noise, beyond the limit "
+            f"of {found.limit:.2f}")
