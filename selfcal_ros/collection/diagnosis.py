@@ -199,7 +199,7 @@ def _said(scale: float, *, swapped: bool, signs: tuple[int, int], sense: Sense) 
         what.append("the stage is indicated at minus the marks' sites")
         remedy.append(f"the sense is the other one: measurement_sense {other} (--sense {other})")
     elif signs != (1, 1):
-        axis = "x" if signs[0] < 0 else "y"
+        axis = "x" if signs == (-1, 1) else "y"
         what.append(f"{axis} is indicated with the wrong sign")
         remedy.append(f"turn the sign of {axis}")
     return f"{' and '.join(what)}; {', and '.join(remedy)}"

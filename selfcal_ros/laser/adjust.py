@@ -157,7 +157,8 @@ def adjust(data: StepDiagonal) -> Adjusted:
 def _solver(matrix: np.ndarray, data: StepDiagonal) -> np.ndarray:
     """Return the pseudo-inverse of a matrix of full column rank."""
     scale = np.linalg.norm(matrix, axis=0)
-    u, s, vt = np.linalg.svd(matrix / np.where(scale > 0, scale, 1.0), full_matrices=False)
+    scaled = matrix / np.maximum(scale, np.finfo(float).tiny)
+    u, s, vt = np.linalg.svd(scaled, full_matrices=False)
     if matrix.shape[0] < matrix.shape[1] or s[-1] < 1e-9 * s[0]:
         raise NotIdentifiableError(
             f"diagonals {', '.join(data.diagonals)}: they do not determine the errors of "

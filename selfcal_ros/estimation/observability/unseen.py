@@ -157,10 +157,9 @@ def _period(label: np.ndarray) -> tuple[int, int] | None:
 
 
 def _smallest(grid: GridSystem, label: np.ndarray) -> str:
-    sizes = np.bincount(label[label >= 0])
-    which = int(np.argmin(np.where(sizes > 0, sizes, sizes.max() + 1)))
+    numbers, sizes = np.unique(label[label >= 0], return_counts=True)
     hx, hy = grid.views.half
-    at = np.argwhere(label == which)
+    at = np.argwhere(label == numbers[np.argmin(sizes)])
     text = ", ".join(f"({i - hx}, {j - hy})" for i, j in at[:4])
     return text + (", ..." if len(at) > 4 else "")
 

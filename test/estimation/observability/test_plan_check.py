@@ -104,6 +104,15 @@ def names(views, **kwargs):
     return [mode.name for mode in unseen_modes(planned_system(plan.artifact, plan.views))]
 
 
+def test_groups_that_no_reading_joins_are_counted_and_the_smallest_is_named():
+    """Every second site of a row of 5 hangs together: three with the ends, two between them."""
+    plan = plan_of("0, tx2", 5, size_y=3)
+    family = next(mode for mode in unseen_modes(planned_system(plan.artifact, plan.views))
+                  if mode.name == "separate groups of sites")
+    assert family.text == ("6 groups of sites that no reading joins to the others: each may move "
+                           "by itself, the smallest is (-1, -1), (1, -1)")
+
+
 def test_shifts_along_both_axes_leave_exactly_nonorthogonality_and_scale_difference():
     for size in (3, 5, 11):
         assert names("0, tx, ty", size=size) == ["non-orthogonality", "scale difference"]

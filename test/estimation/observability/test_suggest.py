@@ -22,6 +22,7 @@ from selfcal_ros.estimation.observability.suggest import (
     best_plan,
     rank_next,
     score_plan,
+    unused_name,
 )
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.terms.planned import Assumed
@@ -29,6 +30,7 @@ from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.orders import ORDERS
 from selfcal_ros.model.terms import parse_terms
+from selfcal_ros.model.view import View
 from selfcal_ros.simulation.truth import hu_plan, random_truth, simulate_measurements
 from test.support.dense_terms import Dense
 from test.support.plans import plan_of
@@ -179,6 +181,13 @@ def test_gain_is_the_scatter_of_recalibrations():
             calibrate(simulate_measurements(truth, plan, rng, sigma_m=1e-8), Options()).error_map
             for _ in range(250))]) / 1e-8
     assert np.sqrt((errors**2).mean()) == pytest.approx(found.rms_xy, rel=0.035)
+
+
+@pytest.mark.parametrize(("taken", "name"), [
+    ([], "90"), (["0"], "90"), (["90"], "90_2"), (["90", "90_3"], "90_2"),
+    (["90_2", "90"], "90_3"), (["90", "90_2", "90_3", "90_4"], "90_5")])
+def test_a_name_that_is_taken_gets_the_next_free_number(taken, name):
+    assert unused_name("90", [View(one) for one in taken]) == name
 
 
 BENT = parse_terms(["plate_shape:30e-9"], "")
