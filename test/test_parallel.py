@@ -42,6 +42,27 @@ def test_an_error_is_the_outcome_of_its_item_alone(workers):
         mapped(math.sqrt, [4.0, -1.0], workers=workers)
 
 
+class Asked(list):
+    """Items that note which of them were asked for."""
+
+    def __init__(self, items):
+        super().__init__(items)
+        self.order = []
+
+    def __getitem__(self, index):
+        self.order.append(index)
+        return super().__getitem__(index)
+
+
+def test_no_more_items_are_taken_than_workers_need_to_go_on():
+    """Two for each: one that it works on, one that waits for it; the others are left alone."""
+    items = Asked(range(12))
+    for given, _ in enumerate(outcomes(math.factorial, items, workers=2)):
+        assert len(items.order) <= given + 4
+        assert given or len(items.order) == 4
+    assert items.order == list(range(12))
+
+
 def test_a_worker_that_dies_costs_its_own_item():
     jobs = [partial(int, n) for n in range(6)]
     jobs[2] = partial(os._exit, 9)

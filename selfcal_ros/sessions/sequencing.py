@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The session of pose_sequencer: runs, who is missing, time-outs, redos, other sequencers."""
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from operator import ge
@@ -58,7 +59,7 @@ class SequencingSession:
         self.on_end: Callable[[], None] | None = None
         self._own: set[tuple] = set()
         self._fresh = True  # has neither sent nor followed a command
-        self._deadline, self._confirm_at, self._redos = 0.0, 0.0, 0
+        self._deadline, self._confirm_at, self._redos = math.inf, math.inf, 0
         self._commanded_ns = 0
         self._measured: dict[tuple[str, str], dict[int, str]] = {}
         self._stall = StallWatch(settings.stall_time, ports.now_s)

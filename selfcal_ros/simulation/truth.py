@@ -31,11 +31,11 @@ def grid_deviation(truth: Truth, index: int, view: View, *,
     """
     artifact = truth.artifact
     place, site = physics.mark_places(truth, index, view, physics.all_marks(artifact))
-    half = (np.array(artifact.half)[:, None] + 0.5) * artifact.grid_pitch_m
-    inside = (np.abs(site) < half).all(axis=0)
+    node = np.rint(site / artifact.grid_pitch_m).astype(int)
+    inside = (np.abs(node) <= np.array(artifact.half)[:, None]).all(axis=0)
     sign = -1 if sense is Sense.PLATE_MOVES else 1
     # what the stage is off by at the site, as `physics.stage_error` has it at a node
-    i, j = np.rint(sign * site / artifact.grid_pitch_m).astype(int)
+    i, j = sign * node
     out = np.full_like(site, np.nan)
     hx, hy = artifact.half
     out[:, inside] = (place - site)[:, inside] + sign * truth.g[:, i[inside] + hx, j[inside] + hy]

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """SIM.yaml: what it may say, what it must say, and that a seed gives the same messages."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import yaml
@@ -8,10 +10,12 @@ import yaml
 from selfcal_ros.collection.settings.nodes import NODE_PARAMETERS
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.readings import Sense
+from selfcal_ros.simulation.faults import Faults
 from selfcal_ros.simulation.machine import Spread
 from selfcal_ros.simulation.settings import CellSettings
 from selfcal_ros.simulation.spec import (
     CELL,
+    FAULTS,
     NOISE,
     PHYSICS,
     TRUTH,
@@ -221,3 +225,19 @@ def test_a_simulated_cell_is_by_default_what_a_simulation_is_but_for_hus_noise()
               if parameter.name in fields}
     assert len(shared) > 25
     assert shared == {key: fields[key] for key in shared}
+
+
+@pytest.mark.parametrize(("name", "keys", "defaults"), [
+    ("truth", TRUTH, Spread()), ("physics", PHYSICS, Spread()), ("noise", NOISE, CellSettings()),
+    ("cell", CELL, CellSettings()), ("faults", FAULTS, Faults())])
+def test_numbers_are_those_of_the_documents(name, keys, defaults):
+    page = (Path(__file__).parents[2] / "docs" / "reference.md").read_text()
+    rows = [line[2:].split(" | ") for line in page.splitlines()
+            if line.startswith(f"| `{name}.")]
+    assert [row[0] for row in rows] == [f"`{name}.{key}`" for key in keys]
+    for (field, limits), (_, default, allowed, *_) in zip(keys.values(), rows, strict=True):
+        value = getattr(defaults, field)
+        if type(value) in (int, float):
+            assert float(default) == pytest.approx(value, rel=1e-5)
+            low, high = map(float, allowed.split(" to "))
+            assert (low, high) == (limits["low"], limits["high"])

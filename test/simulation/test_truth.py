@@ -1,11 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """The truth satisfies Hu's datum to rounding; its deviations follow the written-out equations."""
 
+from datetime import UTC, datetime
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Sense
+from selfcal_ros.simulation.settings import CellSettings
 from selfcal_ros.simulation.truth import (
     Spread,
     angular_deviation,
@@ -130,3 +134,24 @@ def test_plates_without_lines_have_three_views_of_hu():
 def test_half_axes_of_one_site_leave_the_lines_as_drawn():
     truth = truth_of(Artifact(3, 0.01, 8), 1)
     assert np.isfinite(truth.g_theta).all()
+
+
+def test_simulated_visits_begin_on_a_day_of_2023_with_a_minute_between_views():
+    plan, rng = plan_of("0, 90, tx", 3, repeats=2), np.random.default_rng(1)
+    truth = random_truth(plan.artifact, 3, rng)
+    settings = CellSettings(exposure_period_s=0.02)
+    readings = simulate_measurements(truth, plan, rng, settings=settings, visits=True)
+    stamps = [view.visits.stamp_ns for view in readings.views]
+    begin = datetime(2023, 11, 14, 22, 13, 20, tzinfo=UTC).timestamp()
+    assert min(stamps[0]) / 1e9 == pytest.approx(begin, abs=1)
+    for before, after in pairwise(stamps):
+        assert 60 < (min(after) - max(before)) / 1e9 < 62
+
+
+@pytest.mark.parametrize(("how", "known"), [
+    ({}, False), ({"visits": True}, True), ({"settings": CellSettings()}, True)])
+def test_visits_are_known_where_they_are_wanted_or_the_cell_is_told(how, known):
+    plan, rng = plan_of("0, 90", 3), np.random.default_rng(1)
+    readings = simulate_measurements(random_truth(plan.artifact, 2, rng, AS_PUBLISHED), plan, rng,
+                                     **how)
+    assert [view.visits is not None for view in readings.views] == [known] * 2

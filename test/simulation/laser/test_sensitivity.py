@@ -8,6 +8,7 @@ from selfcal_ros.simulation.laser.sensitivity import (
     FAULTS,
     effect_of,
     sensitivity_text,
+    sweep,
 )
 
 NM = 1e-9
@@ -72,3 +73,18 @@ def test_the_table_has_a_line_for_every_row():
              "new": values}] * 2
     lines = sensitivity_text(rows).splitlines()
     assert len(lines) == 4 and lines[2].split()[2:] == ["0.001", "rad", *["1.0000"] * 8]
+
+
+def test_the_sweep_is_over_the_angles_of_laser_and_mirror(monkeypatch):
+    monkeypatch.setattr("selfcal_ros.simulation.laser.sensitivity.SWEEP", (1e-4, 1e-3))
+    rows = sweep(case_study_machine(), np.random.default_rng(0))
+    assert [row["fault"] for row in rows] == [
+        "mirror off, pp", "mirror off, pp and np alike", "laser off, pp",
+        "laser off, pp and np alike", "laser and mirror off, pp",
+        "laser and mirror off, pp and np alike"]
+    for row in rows:
+        assert row["size"] == [1e-4, 1e-3]
+        for place, size in enumerate(row["size"]):
+            expected = effects(row["fault"], size)
+            assert [row[str(method)][place] for method in Method] == [
+                pytest.approx(vars(one)) for one in expected]
