@@ -7,7 +7,7 @@ import lz4.frame
 import pytest
 import zstandard
 
-from selfcal_ros.bagio.mcap.salvage import front_of_chunk, next_record
+from selfcal_ros.bagio.mcap.salvage import declarations, front_of_chunk, next_record
 
 DATA_END = b"\x0f" + struct.pack("<QI", 4, 0) + b"\x0b"
 """The end of the data section, and the opcode of what stands behind it."""
@@ -65,3 +65,12 @@ def test_a_chunk_cut_anywhere_gives_a_front_part_of_its_records(name, packed):
     if not name:  # a message is read as soon as its last byte is there
         ends = [len(whole) - len(inside) + end for end in (31, 65, 107, 178)]
         assert counts == [sum(size >= end for end in ends) for size in range(len(whole) + 1)]
+
+
+def test_a_file_too_short_for_a_summary_declares_nothing():
+    schema = b"\x03" + struct.pack("<QH", 14, 1) + struct.pack("<I", 0) * 3
+    assert len(b"?" + schema) < 28
+    assert list(declarations(b"?" + schema)) == []
+    footer = struct.pack("<QQI", 5, 0, 0) + b"?" * 8
+    found, = declarations(b"magic" + schema + footer)
+    assert (found.id, found.name) == (1, "")

@@ -290,7 +290,7 @@ def _taken_back(measurements: Measurements, options: Options, gone: dict[Key, Re
             continue
         mates = {k for k in gone if k[1] == key[1] and abs(
             gone[k].standardised - gone[key].standardised) <= TIED * gone[key].standardised}
-        for back in ({key}, mates)[:1 + (len(mates) > 1)]:
+        for back in dict.fromkeys((frozenset([key]), frozenset(mates))):
             rest = {k: v for k, v in gone.items() if k not in back}
             again = residuals_of(without(measurements, rest), options)
             if all(_agrees(again, one) for one in back):
