@@ -12,6 +12,7 @@ from selfcal_ros.laser.readings.noise import (
     reading_covariance,
     reading_noise,
 )
+from selfcal_ros.model.statistics import rms
 from selfcal_ros.units import MM_PER_M
 
 LENGTH_TOLERANCE = 1e-3
@@ -49,11 +50,11 @@ def length_closure(data: StepDiagonal) -> tuple[float, float | None] | None:
         return None
     diagonals = data.readings_m.sum(axis=(1, 2))
     sides = data.linear_mean_m.sum(axis=1) + data.n_blocks * np.array(data.steps_m)
-    rms, side = float(np.sqrt(np.mean(diagonals**2))), float(np.linalg.norm(sides))
-    by_readings = np.repeat(diagonals / (len(diagonals) * rms), data.dim * data.n_blocks)
+    mean, side = rms(diagonals), float(np.linalg.norm(sides))
+    by_readings = np.repeat(diagonals / (len(diagonals) * mean), data.dim * data.n_blocks)
     by_linear = -np.repeat(sides / side, data.n_blocks)
     variance = propagated(data, by_readings[None], by_linear[None])
-    return rms - side, None if variance is None else float(np.sqrt(variance[0, 0]))
+    return mean - side, None if variance is None else float(np.sqrt(variance[0, 0]))
 
 
 def between_diagonals(data: StepDiagonal,

@@ -16,6 +16,7 @@ from selfcal_ros.laser.closure import (
 from selfcal_ros.laser.data import Closure, Form, Method, StepDiagonal, StepDiagonalResult
 from selfcal_ros.laser.published_equations import Erratum, solve_diagonal
 from selfcal_ros.laser.wang import jacobian
+from selfcal_ros.model.statistics import rms
 
 
 @one_thread()
@@ -49,7 +50,7 @@ def identify_ibaraki(data: StepDiagonal, *, form: Form = Form.EXACT,
               for name, tilt in zip(data.diagonals, found.tilt, strict=True)}
     between, u_between, residual = None, None, None
     if len(data.diagonals) > 1:
-        residual = float(np.sqrt(np.mean(found.residuals_m**2)))
+        residual = rms(found.residuals_m)
         if data.dim == 2:
             alone = [adjust(data.pick([name])) for name in data.diagonals]
             between, u_between = between_diagonals(data, alone)

@@ -22,6 +22,7 @@ from selfcal_ros.laser.data import (
 )
 from selfcal_ros.laser.published_equations import Erratum
 from selfcal_ros.laser.readings.noise import reading_covariance, reading_noise
+from selfcal_ros.model.statistics import rms
 
 EQUAL_RELATIVE = 1e-12
 """Readings closer than this are the same number."""
@@ -113,7 +114,7 @@ def _residual(data: StepDiagonal, readings_m: np.ndarray) -> float | None:
     directions = data.signs[:, :, None] * laser_directions(data)[:, None, :]
     misfit = [readings_m[:, j] - directions[:, j] @ np.linalg.lstsq(
         directions[:, j], readings_m[:, j], rcond=None)[0] for j in range(data.dim)]
-    return float(np.sqrt(np.mean(np.square(misfit))))
+    return rms(np.array(misfit))
 
 
 def jacobian(function: Callable[[np.ndarray], np.ndarray], x: np.ndarray,

@@ -19,6 +19,7 @@ from selfcal_ros.estimation.datum.modes import datum_modes, remove_modes
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.result import CalibrationResult
+from selfcal_ros.model.statistics import rms
 from selfcal_ros.model.terms import parse_terms
 from selfcal_ros.model.view import Plan, View
 from selfcal_ros.simulation.machine import Spread, Truth, random_truth
@@ -144,8 +145,7 @@ def compared(result: CalibrationResult, truth: Truth) -> Run:
     z = theta / emap.u_g_theta
     known = np.isfinite(error)
     return Run(float(np.nanmax(np.abs(error))), float(inside[known].mean()),
-               float(np.sqrt(np.nanmean((error / u_xy) ** 2))),
-               float(np.sqrt(np.nanmean(z**2))), result.verdict.qualified,
+               rms(error / u_xy), rms(z), result.verdict.qualified,
                tuple(cause.name for cause in result.verdict.causes))
 
 
@@ -157,8 +157,8 @@ def summarise(case: Case, found: list[Run | None]) -> Summary:
     return Summary(
         case, len(found), float(np.median([run.error_m for run in runs])),
         float(np.mean([run.within for run in runs])),
-        float(np.sqrt(np.mean([run.z_xy**2 for run in runs]))),
-        float(np.sqrt(np.mean([run.z_theta**2 for run in runs]))), refused,
+        rms(np.array([run.z_xy for run in runs])),
+        rms(np.array([run.z_theta for run in runs])), refused,
         refused + sum(not run.qualified for run in runs),
         sum(run.qualified and run.within < WRONG for run in runs), tuple(causes.most_common(3)))
 

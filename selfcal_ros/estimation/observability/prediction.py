@@ -11,6 +11,7 @@ from selfcal_ros.estimation.normal.equations import NormalEquations
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.readings import Sense
+from selfcal_ros.model.statistics import rms
 
 MAX_SITES = 151 * 151
 """Largest field whose uncertainty map is predicted in full."""
@@ -44,7 +45,7 @@ class Prediction:
     @property
     def rms_xy(self) -> float:
         """Root mean square over all sites and both axes."""
-        return float(np.sqrt(np.nanmean(np.stack([self.ux, self.uy]) ** 2)))
+        return rms(np.stack([self.ux, self.uy]))
 
     @property
     def max_xy(self) -> float:
@@ -54,8 +55,7 @@ class Prediction:
     @property
     def rms_theta(self) -> float:
         """Root mean square over the lines; NaN if no line is measured."""
-        known = self.u_theta[np.isfinite(self.u_theta)]
-        return float(np.sqrt(np.mean(known**2))) if len(known) else float("nan")
+        return rms(self.u_theta)
 
 
 def predict(system: NormalEquations, artifact: Artifact, datum: ThetaDatum, *,

@@ -31,6 +31,7 @@ from selfcal_ros.estimation.terms.planned import (
     with_terms,
 )
 from selfcal_ros.model.result import Observability
+from selfcal_ros.model.statistics import rms
 from selfcal_ros.model.terms import UNITS, ModelTerm, TermName
 from selfcal_ros.model.view import Plan
 
@@ -172,7 +173,7 @@ class PlannedTerms:
         known = every.system.known_sites.ravel()
         spread = size * np.sqrt(np.stack([(fields.real**2).sum(axis=1),
                                           (fields.imag**2).sum(axis=1)])[:, known])
-        return float(np.sqrt((spread**2).mean())), float(spread.max())
+        return rms(spread), float(spread.max())
 
     def _power(self, name: TermName, size: float, level: float) -> float:
         every, others = self.every, self._others(name)

@@ -14,6 +14,7 @@ from selfcal_ros.estimation.joint.noise import coverage_factor
 from selfcal_ros.estimation.joint.saved_terms import variance_of_terms
 from selfcal_ros.estimation.options import ReferenceLength
 from selfcal_ros.model.result import CalibrationResult
+from selfcal_ros.model.statistics import rms
 from selfcal_ros.model.verdict import TermResult
 
 TOLD = 0.5
@@ -22,8 +23,7 @@ TOLD = 0.5
 
 def part_left(term: TermResult) -> float:
     """Return the part of a term's size that the readings leave: rms u over the size."""
-    u = np.array([estimate.u for estimate in term.estimates])
-    return float(np.sqrt(np.mean(u[np.isfinite(u)] ** 2))) / term.solved_with
+    return rms(np.array([estimate.u for estimate in term.estimates])) / term.solved_with
 
 
 def known_beforehand(result: CalibrationResult, reference: ReferenceLength | None) -> np.ndarray:

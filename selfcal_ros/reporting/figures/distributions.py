@@ -8,6 +8,7 @@ import numpy as np
 from scipy.stats import norm
 
 from selfcal_ros.model.result import CalibrationResult
+from selfcal_ros.model.statistics import rms
 from selfcal_ros.reporting.figures.fields import legend
 from selfcal_ros.reporting.figures.maps import WIDTH
 from selfcal_ros.reporting.figures.residuals import ViewResiduals, shortened
@@ -49,40 +50,40 @@ def distributions(found: Sequence[ViewResiduals], kind: str) -> Drawing | None:
     end = 1.05 * span_of(np.concatenate([values for _, values in rows]).tolist())
     for number, (name, values) in enumerate(rows):
         top = 50.0 + 148 * number
-        rms = float(np.sqrt(np.mean(values**2)))
+        size = rms(values)
         drawing.label(46, top - 7, shortened(name, 24), size=12, bold=True)
-        drawing.label(472, top - 7, f"{len(values)} residuals, rms {significant(rms)} {unit}",
+        drawing.label(472, top - 7, f"{len(values)} residuals, rms {significant(size)} {unit}",
                       size=11, anchor="end", colour="soft")
-        _histogram(drawing, values, rms, (46, top, 190, 96), end)
-        _normal_plot(drawing, values, rms, (290, top, 182, 96), end)
+        _histogram(drawing, values, size, (46, top, 190, 96), end)
+        _normal_plot(drawing, values, size, (290, top, 182, 96), end)
     return drawing
 
 
-def _histogram(drawing: Drawing, values: np.ndarray, rms: float,
+def _histogram(drawing: Drawing, values: np.ndarray, size: float,
                box: tuple[float, float, float, float], end: float) -> None:
     counts, edges = np.histogram(values, BINS, (-end, end))
     width = 2 * end / BINS
-    peak = len(values) * width * norm.pdf(0) / rms if rms > 0 else 0.0
+    peak = len(values) * width * norm.pdf(0) / size if size > 0 else 0.0
     top = 1.1 * max(float(counts.max()), min(peak, 3 * float(counts.max())), 1.0)
     frame = Frame(drawing, box, (-end, end), (0.0, top))
     drawing.shapes([(frame.at(low, 0), frame.at(low, count), frame.at(high, count),
                      frame.at(high, 0)) for low, high, count in
                     zip(edges[:-1], edges[1:], counts, strict=True) if count],
                    fill="band", stroke="paper")
-    if rms > 0:
+    if size > 0:
         along = np.linspace(-end, end, 101)
-        curve = len(values) * width * norm.pdf(along, scale=rms)
+        curve = len(values) * width * norm.pdf(along, scale=size)
         drawing.line([frame.at(x, min(y, top)) for x, y in zip(along, curve, strict=True)],
                      width=1.3)
     frame.axes(ticks=(5, 3))
 
 
-def _normal_plot(drawing: Drawing, values: np.ndarray, rms: float,
+def _normal_plot(drawing: Drawing, values: np.ndarray, size: float,
                  box: tuple[float, float, float, float], end: float) -> None:
     quantiles = norm.ppf((np.arange(len(values)) + 0.5) / len(values))
     reach = max(3.2, float(np.abs(quantiles).max()) * 1.05)
     frame = Frame(drawing, box, (-reach, reach), (-end, end))
-    drawing.line([frame.at(q, min(max(q * rms, -end), end)) for q in
+    drawing.line([frame.at(q, min(max(q * size, -end), end)) for q in
                   np.linspace(-reach, reach, 41)], stroke="truth", width=1.2)
     chosen = _some(len(values))
     drawing.discs([frame.at(quantiles[i], values[i]) for i in chosen], 1.5, fill="ink")

@@ -17,6 +17,7 @@ from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.readings import Measurements, ViewReadings
+from selfcal_ros.model.statistics import rms
 from selfcal_ros.model.view import Plan, View
 from selfcal_ros.parallel import Progress, mapped_in_parts, silent
 from selfcal_ros.simulation.truth import (
@@ -105,7 +106,7 @@ class Program:
     @property
     def rms_um(self) -> float:
         """Root mean square of the answer's error, um."""
-        return float(np.sqrt(np.mean((self.found_um - self.truth_um) ** 2)))
+        return rms(self.found_um - self.truth_um)
 
 
 @dataclass(frozen=True, eq=False)
@@ -254,7 +255,7 @@ def qiao_text(found: QiaoReproduction) -> str:
 
 def _noise_text(found: QiaoReproduction) -> list[str]:
     n, (x, y) = len(found.rms_um), found.rms_um[0]
-    both, uniform = (float(np.sqrt(np.mean(r**2))) for r in (found.rms_um, found.rms_uniform_um))
+    both, uniform = (rms(r) for r in (found.rms_um, found.rms_uniform_um))
     return [f"Figure 4: noise of standard deviation 0.1 um, program 1, {n} draws",
             f"  rms error of one draw: x {x:.4f} um, y {y:.4f} um; published "
             f"{PUBLISHED_RMS_UM[0]} and {PUBLISHED_RMS_UM[1]} um",
