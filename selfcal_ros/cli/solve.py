@@ -185,16 +185,17 @@ def _extended(args: argparse.Namespace, measurements: Any, options: Any,
         from selfcal_ros.estimation.quality.outliers import clean
         from selfcal_ros.estimation.quality.validation import (
             validate,
-            validation_text,
             with_validation,
         )
+        from selfcal_ros.reporting.words.validation import validation_text
 
         used = clean(measurements, options).measurements if args.robust else measurements
         found = validate(used, options)
         result = with_validation(result, found)
         lines += ["", "held-out readings:", *(f"  {line}" for line in validation_text(found))]
     if args.budget:
-        from selfcal_ros.estimation.quality.budget import budget_json, budget_text, budgets
+        from selfcal_ros.estimation.quality.budget import budgets
+        from selfcal_ros.reporting.words.budget import budget_json, budget_text
 
         if not result.has_uncertainty:
             return result, [*lines, "", "no budget: the uncertainty map was not computed "

@@ -8,7 +8,7 @@ import numpy as np
 
 from selfcal_ros.compensation.aerotech.verify import Verification
 from selfcal_ros.estimation.options import ReferenceLength
-from selfcal_ros.estimation.quality.budget import MANY_DOF, Budget, budgets
+from selfcal_ros.estimation.quality.budget import Budget, budgets
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.reporting.extras import convention_section, extra_sections, provenance_section
 from selfcal_ros.reporting.figures.angular import angular_map
@@ -21,6 +21,7 @@ from selfcal_ros.reporting.sheet.drawing import Drawing
 from selfcal_ros.reporting.summary import sections
 from selfcal_ros.reporting.summary.format import fixed_column, printable
 from selfcal_ros.reporting.summary.sections import Section
+from selfcal_ros.reporting.words.budget import dof_text
 from selfcal_ros.units import ARCSEC_PER_RAD, PPM_PER_ONE, RAD_PER_MRAD, UM_PER_M
 
 AT_NODES = ("At the nodes: how well the map itself is known. Take it to compare two calibrations, "
@@ -127,21 +128,16 @@ def _uncertainty(result: CalibrationResult) -> Chapter:
         unit, scale = ("µm", UM_PER_M) if budget.unit == "m" else ("arcsec", ARCSEC_PER_RAD)
         numbers = [budget.u_rms, budget.u_max, budget.U_rms, budget.U_max]
         rows.append((_where(budget), *fixed_column([value * scale for value in numbers]), unit,
-                     f"{budget.k:.2f}", _dof_text(budget.dof)))
+                     f"{budget.k:.2f}", dof_text(budget.dof)))
     header = ("known", "u rms", "u largest", "U rms", "U largest", "unit", "k", "dof")
     return Chapter("Uncertainty", sections=(Section(
         "Two kinds of U, for 95.45 %", table=(header, *rows), notes=(AT_NODES, ANYWHERE)),))
 
 
 def _where(budget: Budget) -> str:
-    quantity = budget.quantity
-    if quantity.startswith("XY"):
-        return "x or y, at the nodes" if "at the nodes" in quantity else "x or y, anywhere"
-    return "θ, at the lines" if "at the lines" in quantity else "θ, anywhere"
-
-
-def _dof_text(dof: float) -> str:
-    return f"{dof:.0f}" if dof < MANY_DOF else "many"
+    if budget.quantity == "xy":
+        return "x or y, anywhere" if budget.anywhere else "x or y, at the nodes"
+    return "θ, anywhere" if budget.anywhere else "θ, at the lines"
 
 
 def _reference(result: CalibrationResult) -> ReferenceLength | None:

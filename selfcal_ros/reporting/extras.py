@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from selfcal_ros import __version__
-from selfcal_ros.estimation.quality.budget import MANY_DOF
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.result import SCHEMA, CalibrationResult
 from selfcal_ros.reporting.summary.format import (
@@ -16,6 +15,7 @@ from selfcal_ros.reporting.summary.format import (
     significant,
 )
 from selfcal_ros.reporting.summary.sections import Section
+from selfcal_ros.reporting.words.budget import COUNTED_DOF
 from selfcal_ros.units import ARCSEC_PER_RAD, UM_PER_M
 
 MAX_ROWS = 200
@@ -100,7 +100,7 @@ def _table(rows: Sequence[Mapping[str, Any]]) -> tuple[tuple, tuple]:
 def _column(key: str, values: list[Any]) -> list[str]:
     """Return the cells of a column: numbers with equal decimals, degrees of freedom as integers."""
     if key == "dof":
-        return ["many" if v is None or v >= MANY_DOF else f"{v:.0f}" for v in values]
+        return ["many" if v is None or v >= COUNTED_DOF else f"{v:.0f}" for v in values]
     if not any(isinstance(v, float) for v in values) or any(isinstance(v, str) for v in values):
         return [_cell(key, v) for v in values]
     scale = _unit(key)[2]

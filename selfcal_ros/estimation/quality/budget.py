@@ -2,7 +2,7 @@
 """Uncertainty budget of a calibrated map as the GUM asks for it: labelled components, k, U."""
 
 from dataclasses import dataclass, replace
-from typing import Any
+from enum import Enum
 
 import numpy as np
 
@@ -13,13 +13,52 @@ from selfcal_ros.estimation.verdict.coverage import TOLD, part_left, with_covera
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.result import CalibrationResult, Noise
 from selfcal_ros.model.statistics import rms
-from selfcal_ros.units import ARCSEC_PER_RAD, UM_PER_M
-
-MANY_DOF = 1e5
-"""Degrees of freedom above which a number of them says nothing more."""
+from selfcal_ros.model.verdict import Finding
 
 CELL_MEAN = 8 / 15
 """Mean square of the parabola 4 s (1 - s) over a cell: rms of an interpolation error."""
+
+
+class Source(Enum):
+    """What the noise behind a map is told by."""
+
+    RESIDUALS = "residuals"
+    REPEATS = "repeats"
+    DECLARED = "declared"
+
+
+@dataclass(frozen=True)
+class FromReadings(Finding):
+    """Noise of readings by its source; None: there is none. `contradicted`: by another source."""
+
+    source: Source | None
+    contradicted: bool = False
+
+
+@dataclass(frozen=True)
+class FromTerm(Finding):
+    """A term that was known to `given` beforehand, of which the readings leave a part.
+
+    `allowed` is the size that was used instead where the readings contradict it, else None.
+    """
+
+    given: float
+    allowed: float | None
+    part_left: float
+
+
+@dataclass(frozen=True)
+class FromReference(Finding):
+    """The relative uncertainty and kind of a reference length; None: no length sets the scale."""
+
+    reference: ReferenceLength | None
+
+
+@dataclass(frozen=True)
+class FromCurvature(Finding):
+    """Interpolation between ``sites`` or ``lines``, by the curvature of the map."""
+
+    between: str
 
 
 @dataclass(frozen=True)
@@ -36,7 +75,7 @@ class Component:
         Standard uncertainty, rms over the field and at its worst site, m or rad.
     dof : float
         Degrees of freedom; infinite if known.
-    note : str
+    how : Finding
         How it was found.
     """
 
@@ -45,25 +84,31 @@ class Component:
     u_rms: float
     u_max: float
     dof: float
-    note: str
+    how: Finding
 
 
 @dataclass(frozen=True)
 class Budget:
     """Components of one quantity and what they add up to.
 
-    `unit` is ``m`` or ``rad``; `u_rms`, `u_max` the combined standard uncertainty; `dof` the
-    effective degrees of freedom (Welch-Satterthwaite, GUM G.4); `k` the coverage factor for
-    95.45 %; `U_rms`, `U_max` the expanded uncertainty.
+    `quantity` is ``xy`` (one coordinate) or ``theta``, `anywhere` whether the map is interpolated
+    between its nodes or lines; `unit` is ``m`` or ``rad``; `u_rms`, `u_max` the combined standard
+    uncertainty; `dof` the effective degrees of freedom (Welch-Satterthwaite, GUM G.4); `k` the
+    coverage factor for 95.45 %; `U_rms`, `U_max` the expanded uncertainty.
     """
 
     quantity: str
-    unit: str
+    anywhere: bool
     components: tuple[Component, ...]
     u_rms: float
     u_max: float
     dof: float
     k: float
+
+    @property
+    def unit(self) -> str:
+        """Unit of the uncertainties."""
+        return "m" if self.quantity == "xy" else "rad"
 
     @property
     def U_rms(self) -> float:
@@ -101,15 +146,13 @@ def budgets(result: CalibrationResult, reference: ReferenceLength | None = None)
              *(_term_part(result, name, variance, dof) for name, variance in of_terms.items()),
              _reference_part(artifact, reference)]
     nodes = _map_dof(result, reference)
-    out = [_combine("XY, one coordinate at the nodes of the map", "m", parts, nodes),
-           _combine("XY, one coordinate anywhere in the field, map interpolated between its nodes",
-                    "m", parts, nodes, _interpolation_xy(result))]
+    out = [_combine("xy", parts, nodes),
+           _combine("xy", parts, nodes, _interpolation_xy(result))]
     if np.isfinite(emap.u_g_theta).any():
         part = _noise_part(emap.u_g_theta, noise, "theta")
         lines = _dof(noise, "theta")
-        out += [_combine("theta at the lines of the map", "rad", [part], lines),
-                _combine("theta at any angle, map interpolated between its lines", "rad", [part],
-                         lines, _interpolation_theta(result))]
+        out += [_combine("theta", [part], lines),
+                _combine("theta", [part], lines, _interpolation_theta(result))]
     return out
 
 
@@ -137,18 +180,12 @@ def _noise_part(u: np.ndarray, noise: Noise, kind: str) -> Component:
     sigma, repeats, residuals, p = (getattr(noise, name) for name in (
         f"sigma_{kind}", f"sigma_{kind}_repeats", f"sigma_{kind}_residuals", f"p_{kind}"))
     if not (np.isfinite(sigma) and sigma > 0):
-        return Component("reading noise", "A", 0.0, 0.0, np.inf, "no noise was found")
+        return Component("reading noise", "A", 0.0, 0.0, np.inf, FromReadings(None))
     dof = _dof(noise, kind)
-    if sigma == residuals:
-        source = "residuals of the fit"
-    elif sigma == repeats:
-        source = "scatter of repeats"
-    else:
-        source = "declared by the detections"
-    if p < F_LEVEL:
-        source += ", the larger of two that contradict each other (see the verdict)"
+    source = (Source.RESIDUALS if sigma == residuals else
+              Source.REPEATS if sigma == repeats else Source.DECLARED)
     return Component("reading noise", "A" if np.isfinite(dof) else "B", rms(u),
-                     float(np.nanmax(u)), dof, source)
+                     float(np.nanmax(u)), dof, FromReadings(source, p < F_LEVEL))
 
 
 def _term_part(result: CalibrationResult, name: str, variance: np.ndarray,
@@ -158,25 +195,21 @@ def _term_part(result: CalibrationResult, name: str, variance: np.ndarray,
     Of type A if the readings tell the term, of type B if its size does.
     """
     term = next(term for term in result.model.terms if term.name == name)
-    size, left = term.solved_with, part_left(term)
-    told = left < TOLD
+    part = part_left(term)
+    told = part < TOLD
     known = variance[:, result.error_map.valid]
-    how = (f"given as {term.size:.3g}, which the readings contradict; they allow {size:.3g} and "
-           if term.size_used else f"known to {size:.3g} beforehand; the readings ")
-    note = f"{how}leave {left:.0%} of it"
+    how = FromTerm(term.size or term.solved_with, term.size_used, part)
     return Component(f"term {name}", "A" if told else "B", float(np.sqrt(known.mean())),
-                     float(np.sqrt(known.max())), dof if told else np.inf, note)
+                     float(np.sqrt(known.max())), dof if told else np.inf, how)
 
 
 def _reference_part(artifact: Artifact, reference: ReferenceLength | None) -> Component:
     if reference is None:
-        return Component("reference length", "B", 0.0, 0.0, np.inf,
-                         "none: the scale is a convention, and not part of the map")
+        return Component("reference length", "B", 0.0, 0.0, np.inf, FromReference(None))
     coordinates = np.stack([artifact.x_m, artifact.y_m])
     return Component("reference length", "B", reference.u_relative * rms(coordinates),
                      reference.u_relative * float(abs(coordinates).max()), np.inf,
-                     f"relative {reference.u_relative:.3g} of the distance from the centre, "
-                     f"by {reference.kind.value}")
+                     FromReference(reference))
 
 
 def _interpolation_xy(result: CalibrationResult) -> Component:
@@ -194,7 +227,7 @@ def _interpolation_xy(result: CalibrationResult) -> Component:
     middle = np.sqrt(max(sum(value for value, _ in squares) / 2, 0.0)) / 4
     worst = np.sqrt(max(largest for _, largest in squares)) / 4
     return Component("interpolation", "B", float(np.sqrt(CELL_MEAN) * middle), float(worst), np.inf,
-                     "curvature of the map; assumes that it is smooth between sites")
+                     FromCurvature("sites"))
 
 
 def _interpolation_theta(result: CalibrationResult) -> Component:
@@ -203,7 +236,7 @@ def _interpolation_theta(result: CalibrationResult) -> Component:
     square, largest = _curvature(ring, ring_u, 0)
     return Component("interpolation", "B", float(np.sqrt(CELL_MEAN * max(square, 0.0)) / 4),
                      float(np.sqrt(largest) / 4), np.inf,
-                     "curvature of the map; assumes that it is smooth between lines")
+                     FromCurvature("lines"))
 
 
 def _curvature(field: np.ndarray, u: np.ndarray, axis: int) -> tuple[float, float]:
@@ -217,7 +250,7 @@ def _curvature(field: np.ndarray, u: np.ndarray, axis: int) -> tuple[float, floa
     return float(known.mean()), float(max(known.max(), 0.0))
 
 
-def _combine(quantity: str, unit: str, parts: list[Component], dof: float,
+def _combine(quantity: str, parts: list[Component], dof: float,
              between: Component | None = None) -> Budget:
     """Return a budget: that of the map, with `dof` degrees of freedom, and what is between."""
     if between is not None:
@@ -227,46 +260,5 @@ def _combine(quantity: str, unit: str, parts: list[Component], dof: float,
             dof = dof * (1 + between.u_rms**2 / at_nodes) ** 2
     u_rms, u_max = (float(np.sqrt(sum(getattr(p, name) ** 2 for p in parts)))
                     for name in ("u_rms", "u_max"))
-    return Budget(quantity, unit, tuple(parts), u_rms, u_max, float(dof),
+    return Budget(quantity, between is not None, tuple(parts), u_rms, u_max, float(dof),
                   coverage_factor(float(dof)))
-
-
-def budget_json(found: list[Budget]) -> list[dict[str, Any]]:
-    """Return the budgets for ``extra["budget"]`` of a result: a row a component, SI units."""
-    rows = []
-    for budget in found:
-        unit = budget.unit
-        lines = [(p.label, p.kind, p.u_rms, p.u_max, p.dof, p.note) for p in budget.components]
-        lines += [("combined", "", budget.u_rms, budget.u_max, budget.dof, ""),
-                  ("expanded", "", budget.U_rms, budget.U_max, budget.dof,
-                   f"k = {budget.k:.3f}, 95.45 % coverage")]
-        for label, kind, u_rms, u_max, dof, note in lines:
-            row: dict[str, Any] = {"quantity": budget.quantity, "component": label, "type": kind}
-            for name in ("m", "rad"):
-                row |= {f"u_rms_{name}": u_rms if name == unit else None,
-                        f"u_max_{name}": u_max if name == unit else None}
-            rows.append(row | {"dof": dof, "note": note})
-    return rows
-
-
-def budget_text(found: list[Budget]) -> list[str]:
-    """Return the budgets as a table, um and arcsec."""
-    lines = []
-    for budget in found:
-        factor, unit = (UM_PER_M, "um") if budget.unit == "m" else (ARCSEC_PER_RAD, "arcsec")
-        lines += [f"uncertainty of {budget.quantity}, {unit}",
-                  f"  {'component':18}{'type':>5}{'u rms':>12}{'u max':>12}{'dof':>10}  from"]
-        for part in budget.components:
-            dof = _dof_text(part.dof)
-            lines.append(f"  {part.label:18}{part.kind:>5}{part.u_rms * factor:12.4g}"
-                         f"{part.u_max * factor:12.4g}{dof:>10}  {part.note}")
-        dof = _dof_text(budget.dof)
-        lines += [f"  {'combined':18}{'':5}{budget.u_rms * factor:12.4g}"
-                  f"{budget.u_max * factor:12.4g}{dof:>10}",
-                  f"  {f'expanded, k = {budget.k:.2f}':23}{budget.U_rms * factor:12.4g}"
-                  f"{budget.U_max * factor:12.4g}          95.45 % coverage"]
-    return lines
-
-
-def _dof_text(dof: float) -> str:
-    return f"{dof:.0f}" if dof < MANY_DOF else "many"

@@ -45,7 +45,6 @@ from selfcal_ros.model.readings import Measurements, Sense, ViewReadings
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.statistics import rms
 from selfcal_ros.model.view import Plan
-from selfcal_ros.units import ARCSEC_PER_RAD, UM_PER_M
 
 FRACTION = 0.1
 """Part of the readings that is held out at random."""
@@ -318,30 +317,3 @@ def with_validation(result: CalibrationResult, found: list[HeldOut]) -> Calibrat
 def validation_json(found: list[HeldOut]) -> list[dict[str, Any]]:
     """Return the validation for ``extra["validation"]`` of a result: SI units."""
     return [vars(item) | {"exceeds": item.exceeds} for item in found]
-
-
-def validation_text(found: list[HeldOut]) -> list[str]:
-    """Return one line a held-out set, um and arcsec."""
-    lines = []
-    for item in found:
-        if not item.n_grid and not item.n_angular:
-            lines.append(f"{item.name}: {item.note}")
-            continue
-        parts = []
-        if item.n_grid:
-            parts.append(f"{item.n_grid} marks predicted within {item.rms_m * UM_PER_M:.4g} um "
-                         f"rms, {item.max_m * UM_PER_M:.4g} um at most "
-                         f"({item.ratio:.2f} times the noise{_limit_text(item)})")
-        if item.n_angular:
-            parts.append(f"{item.n_angular} lines within "
-                         f"{item.rms_rad * ARCSEC_PER_RAD:.4g} arcsec rms")
-        lines.append(f"{item.name}: " + ", ".join(parts))
-    return lines
-
-
-def _limit_text(item: HeldOut) -> str:
-    if item.note:
-        return f"; {item.note}"
-    if not np.isfinite(item.limit):
-        return ""
-    return f", {'EXCEEDS' if item.exceeds else 'within'} the limit of {item.limit:.2f}"

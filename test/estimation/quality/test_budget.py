@@ -9,10 +9,11 @@ from scipy.stats import t as student
 
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.options import Options, ReferenceKind, ReferenceLength
-from selfcal_ros.estimation.quality.budget import budget_json, budget_text, budgets
+from selfcal_ros.estimation.quality.budget import FromReadings, Source, budgets
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.terms import ModelTerm, TermName
+from selfcal_ros.reporting.words.budget import budget_json, budget_text, how_text, quantity_text
 from selfcal_ros.simulation.truth import Spread, hu_plan, random_truth, simulate_measurements
 from test.support.lattice_plans import plan_of
 
@@ -41,7 +42,7 @@ def test_reading_noise_is_that_of_the_map():
     u = np.stack([result.error_map.u_gx, result.error_map.u_gy])
     assert part.u_rms == pytest.approx(np.sqrt((u**2).mean()))
     assert part.u_max == pytest.approx(u.max())
-    assert part.dof == result.noise.dof_xy_repeats and part.note == "scatter of repeats"
+    assert part.dof == result.noise.dof_xy_repeats and part.how == FromReadings(Source.REPEATS)
     assert parts_of(theta)["reading noise"].u_rms == pytest.approx(
         np.sqrt((result.error_map.u_g_theta**2).mean()))
 
@@ -53,27 +54,28 @@ def test_noise_beyond_the_repeats_is_in_the_noise_once():
     u = np.stack([result.error_map.u_gx, result.error_map.u_gy])
     assert part.u_rms == pytest.approx(np.sqrt((u**2).mean()))
     assert part.dof == result.noise.dof_xy_residuals
-    assert part.note == ("residuals of the fit, the larger of two that contradict each other (see "
-                         "the verdict)")
+    assert part.how == FromReadings(Source.RESIDUALS, True)
+    assert how_text(part.how) == ("residuals of the fit, the larger of two that contradict each "
+                                  "other (see the verdict)")
     # an error of 30 nm a mean beside 20 nm / sqrt(5)
     quiet = parts_of(budgets(calibrated())[0])["reading noise"]
     assert part.u_rms == pytest.approx(quiet.u_rms * np.hypot(3e-8 * np.sqrt(5), 2e-8) / 2e-8,
                                        rel=0.15)
-    assert quiet.note == "scatter of repeats"
+    assert quiet.how == FromReadings(Source.REPEATS)
 
 
 def test_without_repeats_the_residuals_speak():
     parts = parts_of(budgets(calibrated(1))[0])
-    assert parts["reading noise"].note == "residuals of the fit"
+    assert parts["reading noise"].how == FromReadings(Source.RESIDUALS)
 
 
 def test_nodes_and_field_are_told_apart():
     at_nodes, in_field, of_lines, at_any_angle = budgets(calibrated(g_m=1e-6))
-    assert at_nodes.quantity == "XY, one coordinate at the nodes of the map"
-    assert in_field.quantity == ("XY, one coordinate anywhere in the field, map interpolated "
+    assert quantity_text(at_nodes) == "XY, one coordinate at the nodes of the map"
+    assert quantity_text(in_field) == ("XY, one coordinate anywhere in the field, map interpolated "
                                  "between its nodes")
-    assert of_lines.quantity == "theta at the lines of the map"
-    assert at_any_angle.quantity == "theta at any angle, map interpolated between its lines"
+    assert quantity_text(of_lines) == "theta at the lines of the map"
+    assert quantity_text(at_any_angle) == "theta at any angle, map interpolated between its lines"
     assert "interpolation" not in parts_of(at_nodes) | parts_of(of_lines)
     assert parts_of(in_field)["interpolation"].u_rms > 5 * at_nodes.u_rms
     assert in_field.u_rms == pytest.approx(np.hypot(
@@ -99,7 +101,7 @@ def test_a_term_with_a_size_has_a_line_and_the_lines_add_up():
     noise = np.sqrt(np.mean(bare**2)) * result.noise.sigma_xy
     assert parts["reading noise"].u_rms == pytest.approx(noise, rel=1e-3)
     assert line.u_rms > 0.2 * noise
-    assert line.note.startswith("known to 1e-07 beforehand; the readings leave ")
+    assert how_text(line.how).startswith("known to 1e-07 beforehand; the readings leave ")
     loose = parts_of(budgets(calibrate(readings, replace(plain, terms=(
         ModelTerm(TermName.PLATE_SHAPE, 1e-9),))))[0])["term plate_shape"]
     assert (loose.kind, loose.dof) == ("B", np.inf) and loose.u_rms < line.u_rms
@@ -112,7 +114,7 @@ def test_reference_length_grows_with_the_distance_from_the_centre():
     part = parts_of(budgets(result, reference)[0])["reference length"]
     assert part.u_max == pytest.approx(1e-6 * 0.04)
     assert part.u_rms == pytest.approx(1e-6 * np.sqrt((ARTIFACT.x_m**2).mean()))
-    assert part.kind == "B" and "artifact" in part.note
+    assert part.kind == "B" and "artifact" in how_text(part.how)
 
 
 def test_the_reference_is_not_counted_twice():
@@ -170,7 +172,7 @@ def test_table_and_json():
 def test_a_map_without_noise_has_no_noise_component():
     result = calibrated()
     silent = replace(result, noise=replace(result.noise, sigma_xy=0.0))
-    assert parts_of(budgets(silent)[0])["reading noise"].note == "no noise was found"
+    assert parts_of(budgets(silent)[0])["reading noise"].how == FromReadings(None)
 
 
 def test_noise_that_the_detections_declare_is_told_as_such():
@@ -185,6 +187,6 @@ def test_noise_that_the_detections_declare_is_told_as_such():
         parts = parts_of(budgets(result)[0])
         noise = parts["reading noise"]
         assert (noise.kind, noise.dof) == ("B", np.inf)
-        assert noise.note.startswith("declared by the detections, the larger of two")
+        assert noise.how == FromReadings(Source.DECLARED, True)
         u = np.stack([result.error_map.u_gx, result.error_map.u_gy])
         assert noise.u_rms == pytest.approx(np.sqrt((u**2).mean()))

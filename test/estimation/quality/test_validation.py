@@ -14,7 +14,6 @@ from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.quality.validation import (
     validate,
     validation_json,
-    validation_text,
     with_validation,
 )
 from selfcal_ros.model.artifact import Artifact
@@ -22,6 +21,7 @@ from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.terms import ModelTerm, TermName
 from selfcal_ros.model.view import View
 from selfcal_ros.reporting.words.result import worded
+from selfcal_ros.reporting.words.validation import validation_text
 from selfcal_ros.simulation.truth import hu_plan, random_truth, simulate_measurements
 from test.support.lattice_plans import plan_of
 

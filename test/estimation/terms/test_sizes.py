@@ -13,6 +13,7 @@ from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.quality.budget import budgets
 from selfcal_ros.model.result import result_from_dict, result_to_dict
 from selfcal_ros.model.terms import parse_terms
+from selfcal_ros.reporting.words.budget import how_text
 from selfcal_ros.reporting.words.result import worded
 from selfcal_ros.simulation.machine import Spread, random_truth
 from selfcal_ros.simulation.truth import simulate_measurements
@@ -137,7 +138,8 @@ def test_a_size_that_is_too_small_is_kept_beside_the_one_that_was_used():
     back = result_from_dict(result_to_dict(worded(result)), "r.json")
     assert back.model == result.model
     line = next(c for c in budgets(result)[0].components if c.label == "term plate_scale")
-    assert line.note.startswith("given as 1e-08, which the readings contradict; they allow ")
+    said = how_text(line.how)
+    assert said.startswith("given as 1e-08, which the readings contradict; they allow ")
     right = calibrate(readings, options("plate_scale:5e-6"))
     assert right.model.terms[0].size_used is None
     assert right.verdict.qualified

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from selfcal_ros.estimation.findings import AxesNotMet
 from selfcal_ros.estimation.joint.solve import solve_joint
 from selfcal_ros.estimation.law.solve import solve_law
 from selfcal_ros.estimation.options import Options
@@ -30,9 +31,7 @@ def test_the_axis_conditions_are_tested_at_5_percent(readings, p, holds):
     solved = replace(solve_joint(readings, options), axes=(p, 3 * ARCSEC_RAD))
     verdict = judged(solved, readings, options).verdict
     assert verdict.qualified == holds
-    assert verdict.reasons == (() if holds else (
-        "theta: the stage does not satisfy the axis conditions of the datum xy_axes (misclosure "
-        f"3 arcsec, p = {p:.2g}); use zero_mean",))
+    assert verdict.findings == (() if holds else (AxesNotMet(3 * ARCSEC_RAD, p),))
 
 
 def test_axis_conditions_that_nobody_asked_for_hold(readings):
