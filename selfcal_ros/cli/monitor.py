@@ -45,11 +45,9 @@ def watch(monitor: "Eyes", log: list[str], step: Callable[[], None], *,
             message = monitor.next(0.1)
             if message is None:
                 return 1
-            if "picture" in message:
-                draw(message["picture"])
-            elif "answer" in message or "said" in message:
+            if "answer" in message or "said" in message:
                 log.append(message.get("answer") or message["said"])
-                draw(None)
+            draw(message.get("picture"))
             for word in pressed():
                 if word == "quit":
                     return 0
@@ -61,22 +59,28 @@ def _live(log: list[str]) -> Iterator[Callable[[Any], None]]:
     """Draw on the whole terminal, which is given back as it was."""
     from rich.console import Console
     from rich.live import Live
+    from rich.text import Text
 
     from selfcal_ros.cli.screen import screen
 
     newest: dict[str, Any] = {}
-    with Live(console=Console(), screen=True, auto_refresh=False) as live:
+    console = Console()
+    drawn: list[Any] = []  # size and log of what is on the screen
+    with Live(Text("Looking for the nodes ..."), console=console, screen=True,
+              auto_refresh=False) as live:
         def draw(picture: Any) -> None:
+            now = [console.size, list(log)]
             newest.update(picture or {})
-            if newest:
-                live.update(screen(newest, log), refresh=True)
+            if newest and (picture is not None or now != drawn):
+                drawn[:] = now
+                size = (console.width, console.height)
+                live.update(screen(newest, log, size), refresh=True)
         yield draw
 
 
 @contextlib.contextmanager
 def _lines(log: list[str]) -> Iterator[Callable[[Any], None]]:
     """Print a line where something a script may wait for has changed."""
-    from selfcal_ros.cli.screen import what_now
     from selfcal_ros.errors import printable
 
     said: dict[str, str] = {}
@@ -87,23 +91,31 @@ def _lines(log: list[str]) -> Iterator[Callable[[Any], None]]:
             print(printable(log.pop(0)), flush=True)
         if picture is None:
             return
-        now = {"now": what_now(picture)}
-        if picture["summary"]:
-            now["map"] = picture["summary"]["state"]
-        for node, told in picture["health"].items():
-            if told is None and node in there:
-                now[node] = "gone: no sign of life"
-            elif told is not None:
-                there.add(node)
-                if told["level"]:
-                    now[node] = told["message"]
-                elif node in said:
-                    now[node] = "well again"
-        for key, line in now.items():
+        for key, line in _state_lines(picture, there, set(said)):
             if said.get(key) != line:
                 said[key] = line
                 print(printable(f"{key}: {line}"), flush=True)
     yield draw
+
+
+def _state_lines(picture: Any, there: set[str], said: set[str]) -> Iterator[tuple[str, str]]:
+    """Yield what a script may wait for; `there` collects the nodes that have told anything."""
+    from selfcal_ros.cli.screen import saved_as, what_now
+
+    yield "now", what_now(picture)
+    if picture["summary"]:
+        yield "map", picture["summary"]["state"]
+    if saved_as(picture):
+        yield "saved", saved_as(picture)
+    for node, told in picture["health"].items():
+        if told is None and node in there:
+            yield node, "gone: no sign of life"
+        elif told is not None:
+            there.add(node)
+            if told["level"]:
+                yield node, told["message"]
+            elif node in said:
+                yield node, "well again"
 
 
 @contextlib.contextmanager

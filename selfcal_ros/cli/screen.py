@@ -1,35 +1,53 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One terminal screen of a calibration: drawn from the picture that the monitor process sends."""
+"""One terminal screen of a calibration: drawn from the picture that the monitor process sends.
 
+It fits whatever the size of the terminal: what there is no room for is told in words, and pictures
+of the plate and the map become coarser.
+"""
+
+import re
 from typing import Any
 
-from rich import box
-from rich.columns import Columns
 from rich.console import Group, RenderableType
-from rich.panel import Panel
-from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
+from selfcal_ros.cli.terminal.fitting import coarser, fitted, headed, last_fitted, wrapped
 from selfcal_ros.errors import printable
 
 KEYS = {"s": "start", "c": "confirm", "r": "redo", "k": "skip", "a": "abort"}
 SHADES = " .:-=+*#%@"
 LEVELS = {0: ("ok", "green"), 1: ("warn", "yellow"), 2: ("error", "red")}
-LINES = 6
-"""Last lines of the log that are shown."""
+LEAST = (60, 18)
+"""Columns and rows below which only what is to be done now is shown."""
+BETWEEN = 3
+"""Columns between the two halves of the screen."""
+PREFIX = re.compile(r"^\[(\w+)\] \[[\d.]+\] \[([^\]]+)\]: ")
+"""What a node writes before a line of its log."""
 
 
-def screen(picture: dict[str, Any], log: list[str]) -> RenderableType:
-    """Return the screen of a picture and the last lines of the log."""
-    left = Group(_task(picture), _coverage(picture), _rejected(picture))
-    right = Group(_outcome(picture), _map(picture))
-    table = Table.grid(expand=True, padding=(0, 1))
-    table.add_column(ratio=1)
-    table.add_column(ratio=1)
-    table.add_row(left, right)
-    keys = "  ".join(f"[{key}] {word}" for key, word in KEYS.items()) + "  [q] quit"
-    return Group(table, _health(picture), _lines(log), Text(keys, style="reverse"))
+def screen(picture: dict[str, Any], log: list[str],
+           size: tuple[int, int] = (80, 24)) -> RenderableType:
+    """Return the screen of a picture and the last lines of the log, for (columns, rows)."""
+    width, height = size
+    keys = Text("  ".join(f"[{key}] {word}" for key, word in KEYS.items()) + "  [q] quit",
+                style="reverse", no_wrap=True, overflow="ellipsis")
+    if width < LEAST[0] or height < LEAST[1]:
+        small = Text(f"Make this terminal larger: {LEAST[0]} x {LEAST[1]}.", style="yellow")
+        return Group(*fitted(wrapped([*_task(picture), small], width), max(height - 1, 0)), keys)
+    now = headed("now", fitted(wrapped(_task(picture), width), height // 4), width)
+    nodes = headed("nodes", fitted(wrapped(_health(picture), width), height // 8), width)
+    said = headed("log", last_fitted([_said(line) for line in log] or [Text("-")], width,
+                                     height // 8), width)
+    rows = height - len(now) - len(nodes) - len(said) - 1
+    left = (width - BETWEEN) // 2
+    halves = [_measured(picture, left, rows), _found(picture, width - BETWEEN - left, rows)]
+    table = Table.grid(padding=(0, BETWEEN, 0, 0), pad_edge=False)
+    for wide in (left, width - BETWEEN - left):
+        table.add_column(width=wide, no_wrap=True, overflow="ellipsis")
+    for row in range(rows):
+        table.add_row(*(half[row] if row < len(half) else "" for half in halves))
+    return Group(*now, table, *nodes, *said, keys)
 
 
 def what_now(picture: dict[str, Any]) -> str:
@@ -56,6 +74,12 @@ def what_now(picture: dict[str, Any]) -> str:
             }.get(state, printable(told["message"]))
 
 
+def saved_as(picture: dict[str, Any]) -> str:
+    """Return the file that the solver has written the map to, empty if none."""
+    told = picture["health"].get("solver")
+    return str(told["values"].get("saved", "")) if told else ""
+
+
 def _state(values: dict[str, str], command: dict[str, Any]) -> str:
     """Return the sequencer's state; its newest command tells it earlier than its health."""
     state = values.get("state", "")
@@ -65,97 +89,151 @@ def _state(values: dict[str, str], command: dict[str, Any]) -> str:
             "ABORT": "ABORTED"}.get(command.get("phase", ""), state)
 
 
-def _task(picture: dict[str, Any]) -> Panel:
+def _task(picture: dict[str, Any]) -> list[Text]:
+    """Return which view of which run it is, and what is to be done."""
     command, told = picture["command"], picture["health"].get("pose_sequencer")
     values = told["values"] if told else {}
     views = _whole(values.get("views")) or (command or {}).get("views_planned", 0)
-    name = (command or {}).get("view_name") or "-"
-    index = (command or {}).get("view_index", 0)
-    of = f"view {index + 1} of {views}: {printable(name)}" if command and views else "no view yet"
+    name, index = (command or {}).get("view_name", ""), (command or {}).get("view_index", 0)
+    of = "no view yet"
+    if command and views:
+        of = (f"view {index + 1} of {views}: {printable(name)}"
+              if command["phase"] in ("PLACE", "MEASURE")
+              else f"{min(index, views)} of {views} views are over")
     run = printable(values.get("run_id") or (command or {}).get("run_id") or "-")
     plan = printable(values.get("plan_id") or (command or {}).get("plan_id") or "-")
-    return Panel(Group(Text(of, style="bold"), Text(f"plan {plan}, run {run}", style="dim"),
-                       Text(what_now(picture), style="bold cyan")), title="now", box=box.ROUNDED)
+    return [Text.assemble((of, "bold"), (f"   plan {plan}, run {run}", "dim")),
+            Text(what_now(picture), style="bold cyan"),
+            *([Text(f"The map is saved as {printable(saved_as(picture))}")]
+              if saved_as(picture) else [])]
 
 
 def _whole(text: Any) -> int:
-    """Return the whole number that a node has told, 0 if it is none."""
+    """Return the whole number in what a node has told, 0 if it is none."""
     text = str(text)
     return int(text) if text.isascii() and text.isdecimal() and len(text) < 10 else 0
 
 
-def _coverage(picture: dict[str, Any]) -> Panel:
+def _measured(picture: dict[str, Any], width: int, rows: int) -> list[Text]:
+    """Return how far the view is and what was rejected."""
     view = picture["view"]
     if view is None:
-        return Panel(Text("nothing measured yet"), title="coverage", box=box.ROUNDED)
-    done = view["grid"][0] + view["angular"][0]
-    expected = max(1, view["grid"][1] + view["angular"][1])
-    parts: list[RenderableType] = [
-        ProgressBar(total=expected, completed=done, width=40),
-        Text(f"marks {view['grid'][0]} of {view['grid'][1]}, lines {view['angular'][0]} of "
-             f"{view['angular'][1]}" + (", complete" if view["complete"] else "")),
-        Text(f"repeatability {_number(view['repeatability_um'], 'um')}, "
-             f"{_number(view['repeatability_arcsec'], 'arcsec')}")]
-    parts += [Text(" ".join(row), style="green") for row in view["plate"]]
+        return headed("coverage", [Text("nothing measured yet")], width)
+    reasons = [Text(f"{count:6d}  {printable(reason)}") for reason, count in sorted(
+        view["rejected"].items(), key=lambda item: -item[1])] or [Text("none")]
+    rejected = headed(f"rejected by reason; {view['used']} used",
+                      fitted(wrapped(reasons, width), max(2, rows // 5)), width)
+    text = wrapped(_coverage(view, width), width)
+    room = rows - 1 - len(text) - len(rejected)
+    plate = _plate(view, width, room) if view["plate"] else []
+    return fitted([*headed(f"coverage of {printable(view['view_name'])}", [*text, *plate], width),
+                   *rejected], rows)
+
+
+def _coverage(view: dict[str, Any], width: int) -> list[Text]:
+    """Return the numbers of a view."""
+    (grid, all_grid), (lines, all_lines) = view["grid"], view["angular"]
+    share = min(1.0, (grid + lines) / max(1, all_grid + all_lines))
+    wide = width - 6
+    counts = [f"{what} {done} of {wanted}" for what, done, wanted in (
+        ("marks", grid, all_grid), ("lines", lines, all_lines)) if wanted]
+    texts = [Text.assemble(("█" * int(share * wide), "green"), "░" * (wide - int(share * wide)),
+                           f" {int(100 * share):3d} %"),
+             Text(", ".join([*counts, *["complete"] * view["complete"]]))]
+    noise = [_with_unit(view[f"repeatability_{unit}"], unit) for unit in ("um", "arcsec")]
+    if noise != ["-", "-"]:
+        texts.append(Text(f"repeatability {', '.join(noise)}"))
     if view["missing_lines"]:
-        lines = ", ".join(map(str, view["missing_lines"][:10]))
-        parts.append(Text(f"missing lines {lines}" + " ..." * (len(view["missing_lines"]) > 10)))
-    return Panel(Group(*parts), title=f"coverage of {printable(view['view_name'])}",
-                 box=box.ROUNDED)
+        missing = view["missing_lines"]
+        rest = f" and {len(missing) - 10} more" if len(missing) > 10 else ""
+        texts.append(Text(f"missing lines {', '.join(map(str, missing[:10]))}{rest}"))
+    return texts
 
 
-def _rejected(picture: dict[str, Any]) -> Panel:
-    view = picture["view"]
-    rejected = view["rejected"] if view else {}
-    text = "\n".join(f"{count:6d}  {printable(reason)}" for reason, count in sorted(
-        rejected.items(), key=lambda item: -item[1])) or "none"
-    used = f"{view['used']} used" if view else ""
-    return Panel(Text(text), title=f"rejected by reason; {used}", box=box.ROUNDED)
+def _plate(view: dict[str, Any], width: int, room: int) -> list[Text]:
+    """Return the plate as a picture: o is read, . is missing."""
+    cells, step = coarser(view["plate"], width, max(room - 1, 1), _worst_mark)
+    step *= view.get("plate_step", 1)
+    what = "a mark" if step == 1 else f"{step} x {step} marks"
+    unknown = ", ? not told" if any("?" in row for row in cells) else ""
+    return [Text(f"a sign: {what}; . missing{unknown}", style="dim"),
+            *(Text(" ".join(row), style="green") for row in cells)]
 
 
-def _outcome(picture: dict[str, Any]) -> Panel:
+def _worst_mark(cells: list[str]) -> str:
+    return next((sign for sign in ".?o" if sign in cells), " ")
+
+
+def _found(picture: dict[str, Any], width: int, rows: int) -> list[Text]:
+    """Return verdict and map."""
+    told = picture["map"]
+    um = told["um"] if told else []
+    room = min(len(um), max(4, rows // 2 - 1))
+    verdict = headed("map and verdict", fitted(wrapped(_verdict(picture), width),
+                                               rows - 2 - room), width)
+    return [*verdict, *(_map(um, width, rows - len(verdict), told) if um else [
+        Text("no map yet", style="dim")])]
+
+
+def _verdict(picture: dict[str, Any]) -> list[Text]:
+    """Return what the solver says, the most important first."""
     summary = picture["summary"]
     if summary is None:
-        return Panel(Text("no view has been solved yet"), title="map and verdict", box=box.ROUNDED)
-    verdict = Text("qualified", style="bold green") if summary["qualified"] else Text(
-        "not qualified" if summary["identifiable"] else "not identified yet", style="bold yellow")
-    parts: list[RenderableType] = [
-        verdict, Text(printable(summary["state"])),
-        Text(f"views {summary['views'][0]} of {summary['views'][1]}; largest error "
-             f"{_number(summary['max_error_um'], 'um')}, rms u "
-             f"{_number(summary['rms_uncertainty_um'], 'um')}")]
-    parts += [Text(f"- {printable(line)}", style="yellow")
-              for line in (*summary["causes"], *summary["advice"])[:4]]
-    return Panel(Group(*parts), title="map and verdict", box=box.ROUNDED)
+        return [Text("no view has been solved yet")]
+    word, colour = ("qualified", "bold green") if summary["qualified"] else (
+        "not qualified" if summary["identifiable"] else "not identified yet", "bold yellow")
+    done, planned = summary["views"]
+    run, now = summary["run_id"], (picture["command"] or {}).get("run_id", "")
+    earlier = "; an earlier run" if run and now and run != now else ""
+    texts = [Text.assemble((word, colour), f"; views {done} of {planned}{earlier}"),
+             Text(printable(summary["state"]))]
+    texts += [Text(f"- {printable(line)}", style="yellow")
+              for line in (*summary["causes"], *summary["advice"])]
+    if summary["max_error_um"] is None:
+        return texts
+    return [*texts, Text(f"largest error {_with_unit(summary['max_error_um'], 'um')}, rms u "
+                         f"{_with_unit(summary['rms_uncertainty_um'], 'um')}")]
 
 
-def _map(picture: dict[str, Any]) -> Panel:
-    told = picture["map"]
-    sizes = [value for row in told["um"] for value in row if value is not None] if told else []
-    if not sizes:
-        return Panel(Text("no map yet"), title="error |G|", box=box.ROUNDED)
-    most = max(sizes) or 1.0
-    rows = [" ".join("?" if value is None else
-                     SHADES[min(len(SHADES) - 1, int(value / most * len(SHADES)))]
-                     for value in row) for row in told["um"]]
-    return Panel(Text("\n".join(rows), style="magenta"),
-                 title=f"error |G|, '@' = {most:.3g} um", box=box.ROUNDED)
+def _map(um: list[list[float | None]], width: int, rows: int, told: dict[str, Any]) -> list[Text]:
+    """Return the size of the error at each site as a picture."""
+    cells, step = coarser(um, width, max(rows - 1, 1), _worst_error)
+    step *= told.get("step", 1)
+    most = max((value for row in cells for value in row if value is not None), default=0.0)
+    signs = [["?" if value is None else SHADES[min(9, int(value / (most or 1.0) * 10))]
+              for value in row] for row in cells]
+    title = f"error, '@' = {most:.3g} um" + (f", sign {step} x {step}" if step > 1 else "")
+    return headed(title, [Text(" ".join(row), style="magenta") for row in signs], width)
 
 
-def _health(picture: dict[str, Any]) -> Columns:
-    parts = []
+def _worst_error(cells: list[float | None]) -> float | None:
+    known = [value for value in cells if value is not None]
+    return max(known) if len(known) == len(cells) else None
+
+
+def _health(picture: dict[str, Any]) -> list[Text]:
+    """Return the nodes with something wrong, one a line, and those that are well."""
+    well, texts = [], []
     for node, told in picture["health"].items():
-        word, colour = ("gone", "red") if told is None else LEVELS.get(told["level"],
-                                                                       LEVELS[2])
-        message = "" if told is None or not told["level"] else f" {printable(told['message'])}"
-        parts.append(Text.assemble((f"{node}: ", "bold"), (word, colour), message))
-    return Columns(parts, padding=(0, 3))
+        if told is not None and not told["level"]:
+            well.append(node)
+            continue
+        word, colour = ("no sign of life", "red") if told is None else LEVELS.get(
+            told["level"], LEVELS[2])
+        message = "" if told is None else f" {printable(told['message'])}"
+        texts.append(Text.assemble((f"{node}: ", "bold"), (word, colour), message))
+    return [*texts, *([Text.assemble(("ok: ", "green"), ", ".join(well))] if well else [])]
 
 
-def _lines(log: list[str]) -> Panel:
-    return Panel(Text("\n".join(map(printable, log[-LINES:])) or "-", no_wrap=True,
-                      overflow="ellipsis"), title="log", box=box.ROUNDED)
+def _said(line: str) -> Text:
+    """Return a line of the log; of what a node says, without the time."""
+    told = PREFIX.match(line)
+    if told is None:
+        return Text(printable(line))
+    level = "" if told[1] == "INFO" else f"{told[1]} "
+    return Text(printable(f"{level}{told[2]}: {line[told.end():]}"),
+                style={"WARN": "yellow", "ERROR": "red", "FATAL": "red"}.get(told[1], ""))
 
 
-def _number(value: float | None, unit: str) -> str:
+def _with_unit(value: float | None, unit: str) -> str:
     return "-" if value is None else f"{value:.3g} {unit}"

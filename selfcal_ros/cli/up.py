@@ -18,7 +18,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--namespace", metavar="NS", default="", help="namespace of the cell")
     parser.add_argument("--bag", metavar="FOLDER", help="record the session to this new folder")
     parser.add_argument("--results", metavar="FOLDER", default=".",
-                        help="folder for the maps that are saved (default: the working directory)")
+                        help="folder for the map of each run, PLAN_RUN.json, and for those that "
+                        "save_map writes (default: the working directory)")
     add_json(parser, "one JSON object a line: pictures as they change, answers to requests")
     parser.add_argument("--journal", metavar="FOLDER", help="folder for journals, from which a "
                         "collector that died goes on (default: journals in that of the results; "
@@ -67,8 +68,12 @@ def commands(args: argparse.Namespace) -> dict[str, list[str]]:
     # apart: a simulated run that was left must never go on with real readings
     folder = "journals_simulated" if args.simulate else "journals"
     journal = args.journal or str(Path(args.results, folder))
+    of = "_simulated" if args.simulate else ""
+    # first, so that a parameter file may name another
+    saved = Path(args.results, f"{Path(args.plan).stem}{of}_{{run_id}}.json")
     nodes = {"measurement_collector": with_parameters(journal=str(Path(journal).resolve())),
-             "solver": with_parameters(result_folder=str(Path(args.results).resolve())),
+             "solver": ["--ros-args", "-p", f"save_path:={saved.resolve()}", *common[1:], "-p",
+                        f"result_folder:={Path(args.results).resolve()}"],
              "pose_sequencer": with_parameters(plan=str(Path(args.plan).resolve()))}
     if args.compensate:
         nodes["compensator"] = with_parameters()

@@ -40,8 +40,16 @@ def result_file(path: str, folder: str) -> Path:
 
 def plan_file_name(plan_id: str) -> str:
     """Return PLAN_ID.json; what is no letter, digit, dot, dash or underscore becomes ``_``."""
-    name = re.sub(r"[^\w.-]", "_", plan_id).lstrip(".")[:200]
-    return f"{name or 'plan'}.json"
+    return f"{_word(plan_id) or 'plan'}.json"
+
+
+def run_file(path: str, run_id: str) -> Path:
+    """Return the absolute path of the map of a run: ``{run_id}`` in `path` stands for the run."""
+    return Path(os.path.abspath(path.replace("{run_id}", _word(run_id) or "run")))
+
+
+def _word(text: str) -> str:
+    return re.sub(r"[^\w.-]", "_", text).lstrip(".")[:200]
 
 
 def read_result(path: str) -> CalibrationResult:

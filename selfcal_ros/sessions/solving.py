@@ -27,7 +27,7 @@ from selfcal_ros.model.result import (
 from selfcal_ros.reporting.summary.numbers import summary_numbers
 from selfcal_ros.reporting.summary.text import state_sentence
 from selfcal_ros.reporting.words.result import worded
-from selfcal_ros.sessions.map_files import read_result, result_file
+from selfcal_ros.sessions.map_files import read_result, result_file, run_file
 from selfcal_ros.sessions.ports import Diagnosis, Level, Ports
 from selfcal_ros.sessions.runs import Run, supersedes
 from selfcal_ros.sessions.verdicts import is_qualified
@@ -113,6 +113,7 @@ class SolvingSession:
         self._planned: dict[Run, int] = {}
         self._stale = False
         self._left_aside = 0
+        self._saved = ""  # absolute path of the map that is shown
         self.shown = Shown()
 
     @property
@@ -218,6 +219,7 @@ class SolvingSession:
             return
         self.shown = Shown(outcome.result, outcome.problem, job.run, len(job.measurements.views),
                            job.stamp_ns, job.digest)
+        self._saved = ""
         self._publish(outcome.result)
         if self._settings.save_path and outcome.problem is None:
             self._save_by_itself(outcome.result)
@@ -233,8 +235,9 @@ class SolvingSession:
 
     def _save_by_itself(self, result: CalibrationResult) -> None:
         try:
-            write_json(self._settings.save_path,
-                       result_to_dict(created_now(result)))
+            path = run_file(self._settings.save_path, self.shown.run.run_id)
+            write_json(path, result_to_dict(created_now(result)))
+            self._saved = str(path)
         except InputError as error:  # the map itself is good, and save_map may go elsewhere
             self._ports.say(Level.ERROR, f"save_path: {error}")
 
@@ -293,6 +296,7 @@ class SolvingSession:
             raise NoDataError("solver", "there is no map yet", "measure the views of the plan")
         target = result_file(path, self._settings.result_folder)
         write_json(target, result_to_dict(created_now(self.shown.result)))
+        self._saved = str(target)
         return f"saved to {target}; readings {self.digest() or 'of a loaded map'}", str(target)
 
     def load(self, path: str) -> str:
@@ -300,6 +304,7 @@ class SolvingSession:
         result = read_result(path)
         self.shown = Shown(result, run=Run(result.plan_id, result.run_id),
                            views_done=len(result.views))
+        self._saved = ""
         self._publish(result)
         return f"loaded {path}: plan {result.plan_id}"
 
@@ -313,7 +318,7 @@ class SolvingSession:
                          self._state() if known else "waiting for views",
                          {"views": len(self._messages), "readings": self.digest(),
                           "plan_id": self._run.plan_id, "run_id": self._run.run_id,
-                          "left_aside": self._left_aside})
+                          "left_aside": self._left_aside, "saved": self._saved})
 
 
 def short(sentence: str) -> str:

@@ -39,6 +39,7 @@ class Watch:
         self._seen: set[str] = set(NODES)
         self._command: Any = None
         self._status: Any = None
+        self._measured: Any = None  # the command that it belongs to
         self._summary: Any = None
         self._map: Any = None
 
@@ -57,7 +58,7 @@ class Watch:
         command = self._command
         if command is None or (message.plan_id, message.view_index) == (
                 command.plan_id, command.view_index):
-            self._status = message
+            self._status, self._measured = message, command
 
     def take_summary(self, message: Any) -> None:
         """Take where the calibration stands."""
@@ -92,9 +93,10 @@ class Watch:
                                _finite(command.translation_y * MM_PER_M)]}
 
     def _view(self) -> dict[str, Any] | None:
-        status = self._status
-        if status is None:
-            return None
+        status, command = self._status, self._command
+        if status is None or (status.run_id and command is not None and command.run_id
+                              and status.run_id != command.run_id):
+            return None  # nothing of this run is measured yet
         plate, step = self._plate()
         return {
             "view_name": printable(status.view_name), "complete": bool(status.complete),
@@ -110,7 +112,7 @@ class Watch:
 
     def _plate(self) -> tuple[list[str], int]:
         """Return the plate as `plate_picture` does; empty where the command tells none."""
-        command, status = self._command, self._status
+        command, status = self._measured, self._status
         try:
             artifact = to_model.artifact_of(command)
             view = to_model.view_of(command, repeats=1, grid=bool(command.grid), angular=False)

@@ -4,11 +4,13 @@
 import contextlib
 import os
 import queue
+import re
 import signal
 import subprocess
 import sys
 import threading
 import time
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -17,6 +19,7 @@ from selfcal_ros.cli import supervisor as supervising
 from selfcal_ros.cli import up as up_verb
 from selfcal_ros.cli.main import build_parser
 from selfcal_ros.cli.supervisor import MOST_RESTARTS, Supervisor
+from selfcal_ros.files import read_json
 from test.support.sessions import plan_file, small_plan
 from test.support.waiting import PATIENCE_S, wait_until
 
@@ -100,6 +103,10 @@ def test_a_calibration_by_words_past_the_death_of_two_nodes(start, tmp_path):
         up.write("confirm")
     up.until("now: Done. s starts another run.")
     up.until("map: Calibrated from 4 views: largest error ")
+    saved = Path(up.until("saved: ").removeprefix("saved: "))
+    assert saved.parent == tmp_path
+    assert re.fullmatch(r"plan_simulated_\d{19}\.json", saved.name)
+    assert read_json(saved)["verdict"]["qualified"]
     asked = start("call", "confirm")
     assert asked.process.wait(PATIENCE_S) == 2
     asked.until("confirm: pose_sequencer: confirm_view does not fit while done")
@@ -161,6 +168,15 @@ def test_a_simulated_run_keeps_its_journals_apart(tmp_path, monkeypatch, words, 
     args = build_parser().parse_args(["up", "--plan", "p.yaml", *words])
     given = up_verb.commands(args)["measurement_collector"]
     assert given[-2:] == ["-p", f"journal:={tmp_path / folder}"]
+
+
+def test_a_parameter_file_may_name_where_the_map_goes(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    args = build_parser().parse_args(["up", "--plan", "p.yaml", "--params", "cell.yaml"])
+    given = up_verb.commands(args)["solver"]
+    assert given[:3] == ["--ros-args", "-p", f"save_path:={tmp_path}/p_{{run_id}}.json"]
+    assert given[3:5] == ["--params-file", str(tmp_path / "cell.yaml")]  # the later one counts
+    assert given[-2:] == ["-p", f"result_folder:={tmp_path}"]
 
 
 def test_a_request_without_a_cell_says_so(start):

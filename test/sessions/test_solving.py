@@ -235,6 +235,21 @@ def test_a_plan_names_no_file_elsewhere(plan_id, name):
     assert plan_file_name(plan_id) == name
 
 
+@pytest.mark.parametrize("run_id, name", [
+    ("17", "map_17.json"), ("", "map_run.json"), ("../../x", "map__.._x.json")])
+def test_each_run_has_a_file_of_its_own_and_the_health_names_it(tmp_path, run_id, name):
+    desk = Desk(save_path=str(tmp_path / "map_{run_id}.json"), result_folder=str(tmp_path))
+    assert desk.session.diagnosis().values["saved"] == ""
+    desk.take(views_of(run_id=run_id))
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+    assert desk.session.diagnosis().values["saved"] == str(tmp_path / name)
+    assert json.loads((tmp_path / name).read_text())["plan_id"] == PLAN.plan_id
+    desk.session.save("other.json")
+    assert desk.session.diagnosis().values["saved"] == str(tmp_path / "other.json")
+    desk.session.load(str(tmp_path / name))
+    assert desk.session.diagnosis().values["saved"] == ""
+
+
 def test_a_map_that_cannot_be_saved_by_itself_is_still_published(tmp_path):
     desk = Desk(save_path=str(tmp_path / "no" / "map.json"), result_folder=str(tmp_path))
     desk.take(views_of())

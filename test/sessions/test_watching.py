@@ -43,7 +43,7 @@ def status(index: int, missing: list, **fields) -> object:
         "angular_expected": 8, "detections_used": 50, "reject_reasons": ["duplicate"],
         "reject_counts": [2], "sigma_xy": 2e-8, "sigma_theta": float("nan"),
         "missing_m": [m for m, _ in missing], "missing_n": [n for _, n in missing],
-        "missing_k": [3]} | fields))
+        "missing_k": [3], "run_id": ""} | fields))
 
 
 def test_before_anything_is_heard(watch):
@@ -79,6 +79,21 @@ def test_only_the_newest_command_and_its_view_count(watch):
     picture = watch.picture()
     assert picture["command"]["view_name"] == picture["view"]["view_name"] == PLAN.views[1].name
     assert picture["command"]["rotation_deg"] == pytest.approx(90)
+
+
+def test_the_plate_is_that_of_the_view_that_was_measured(watch):
+    shifted = [view.name for view in PLAN.views].index("tx")
+    watch.take_command(command(0))
+    watch.take_status(status(0, []))
+    watch.take_command(command(shifted, stamp_ns=9))  # the next view is placed
+    assert watch.picture()["view"]["plate"] == ["ooooo"] * 5
+
+
+@pytest.mark.parametrize("run_id, there", [("17", True), ("", True), ("16", False)])
+def test_what_was_measured_in_an_earlier_run_is_not_shown(watch, run_id, there):
+    watch.take_command(command(0))
+    watch.take_status(status(0, [], run_id=run_id))
+    assert (watch.picture()["view"] is not None) is there
 
 
 @pytest.mark.parametrize("seconds, there", [(3.0, True), (3.1, False)])

@@ -140,7 +140,8 @@ class SolverSettings(ManagedSettings):
     drift_degree: int = declared(
         DRIFT_DEGREE, "degree of the polynomial of time by which views drift, where drift is a "
         "term", "", 1, MAX_DRIFT_DEGREE)
-    save_path: str = declared("", "RESULT.json to write whenever the map changes; empty = none")
+    save_path: str = declared("", "RESULT.json to write whenever the map changes, {run_id} in it "
+                              "stands for the run; empty = none")
     result_folder: str = declared(
         "", "folder in which save_map may write, and from which relative paths count; empty = the "
         "working directory")
