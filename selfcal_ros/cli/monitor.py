@@ -3,7 +3,9 @@
 
 import argparse
 import contextlib
+import errno
 import json
+import os
 import sys
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any
@@ -39,19 +41,29 @@ def watch(monitor: "Eyes", log: list[str], step: Callable[[], None], *,
     as words from stdin. `as_json` prints what the monitor sends as JSON, one object a line.
     """
     show = _json_lines if as_json else _live if sys.stdout.isatty() else _lines
-    with _keys() as pressed, show(log) as draw:
-        while True:
-            step()
-            message = monitor.next(0.1)
-            if message is None:
-                return 1
-            if "answer" in message or "said" in message:
-                log.append(message.get("answer") or message["said"])
-            draw(message.get("picture"))
-            for word in pressed():
-                if word == "quit":
-                    return 0
-                monitor.ask(word)
+    try:
+        with _keys() as pressed, show(log) as draw:
+            return _watched(monitor, log, step, pressed, draw)
+    except OSError as error:
+        if error.errno == errno.EIO:  # the terminal is gone
+            return 0
+        raise
+
+
+def _watched(monitor: "Eyes", log: list[str], step: Callable[[], None],
+             pressed: Callable[[], list[str]], draw: Callable[[Any], None]) -> int:
+    while True:
+        step()
+        message = monitor.next(0.1)
+        if message is None:
+            return 1
+        if "answer" in message or "said" in message:
+            log.append(message.get("answer") or message["said"])
+        draw(message.get("picture"))
+        for word in pressed():
+            if word == "quit":
+                return 0
+            monitor.ask(word)
 
 
 @contextlib.contextmanager
@@ -152,12 +164,23 @@ def _keys() -> Iterator[Callable[[], list[str]]]:
         def pressed() -> list[str]:
             found = []
             while select.select([sys.stdin], [], [], 0)[0]:
-                key = sys.stdin.read(1)
-                found += ["quit"] if key in ("q", "") else [KEYS[key]] if key in KEYS else []
+                keys = _read_keys(sys.stdin.fileno())
+                found += [KEYS.get(key, "quit") for key in keys if key in KEYS or key == "q"]
+                if not keys:  # the terminal is gone
+                    return [*found, "quit"]
             return found
         yield pressed
     finally:
-        termios.tcsetattr(sys.stdin, termios.TCSADRAIN, before)
+        with contextlib.suppress(termios.error):  # gone
+            termios.tcsetattr(sys.stdin, termios.TCSADRAIN, before)
+
+
+def _read_keys(descriptor: int) -> str:
+    """Return what has been typed on a terminal, empty at its end; nothing is left in a buffer."""
+    try:
+        return os.read(descriptor, 1024).decode(errors="replace")
+    except OSError:  # hung up
+        return ""
 
 
 def _words() -> Callable[[], list[str]]:

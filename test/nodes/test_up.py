@@ -160,6 +160,22 @@ def test_a_killed_command_takes_its_nodes_along(start, tmp_path, number):
                                           capture_output=True).stdout.split(), "all nodes to end")
 
 
+def test_a_terminal_that_is_closed_takes_the_command_along(ros_environment):
+    keyboard, terminal = os.openpty()
+    process = subprocess.Popen(
+        [sys.executable, "-c", SELFCAL, "monitor"], env=ros_environment | {"TERM": "xterm"},
+        stdin=terminal, stdout=terminal, stderr=subprocess.PIPE, text=True, start_new_session=True)
+    os.close(terminal)
+    drawn = b""
+    while b"pose_sequencer is not there" not in drawn:
+        drawn += os.read(keyboard, 4096)
+    os.close(keyboard)
+    _, said = process.communicate(timeout=PATIENCE_S)
+    assert (process.returncode, said) == (0, "")
+    assert not subprocess.run(["ps", "-o", "pid=", "-s", str(process.pid)], check=False,
+                              capture_output=True).stdout.split()
+
+
 @pytest.mark.parametrize(("words", "folder"), [
     ([], "journals"), (["--simulate"], "journals_simulated"), (["--journal", "own"], "own"),
     (["--simulate", "--journal", "own"], "own")])
