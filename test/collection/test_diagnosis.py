@@ -28,6 +28,12 @@ def with_positions(cell, change):
     return cell.events
 
 
+def test_evidence_without_positions_holds_none():
+    nothing = Evidence({}, 0)
+    assert nothing.stage_m.shape == nothing.site_m.shape == (2, 0)
+    assert diagnose(nothing) is None
+
+
 def test_nothing_is_said_of_good_readings():
     assert findings(scene("0, 90", repeats=2).events) == {}
     assert findings(scene(with_ids=False).events) == {}

@@ -14,7 +14,8 @@ from selfcal_ros.collection.digest import readings_digest, session_digest
 from selfcal_ros.collection.messages import Command, Detection, EncoderSample
 from selfcal_ros.collection.reduce import DETECTION
 from selfcal_ros.collection.settings.nodes import CollectorSettings
-from selfcal_ros.collection.stage.exposures import Exposures
+from selfcal_ros.collection.stage.encoder import JointTrack, TrackLimits
+from selfcal_ros.collection.stage.exposures import Exposures, Tracks
 from selfcal_ros.collection.stage.samples import Limits
 from selfcal_ros.errors import NoDataError
 from selfcal_ros.simulation.faults import Faults, apply_faults
@@ -155,6 +156,21 @@ def without_theta(events, after_ns):
     """Return the events with no sample of theta after a stamp."""
     return [replace(e, names=e.names[:2], positions=e.positions[:2]) if isinstance(
         e, EncoderSample) and e.stamp_ns > after_ns else e for e in events]
+
+
+@pytest.mark.parametrize("at_once", [True, False])
+def test_a_motion_long_before_an_exposure_is_found_back_to_the_exposure_before(at_once):
+    """At 1 kHz x steps forward soon after the exposure at 1 s, y back; the next is at 4 s."""
+    limits, s = TrackLimits(100_000_000, 1.0, 1e-9), 1_000_000_000
+    tracks = Tracks(*(JointTrack(limits) for _ in range(3)))
+    for ms in range(6000):
+        for track, step in zip(tracks, (1e-3, -1e-3, 0.0), strict=True):
+            track.add(ms * 1_000_000, step * (ms > 1200), float("nan"))
+    exposures = Exposures(tracks, approach_threshold_m=1e-6)
+    stamps = np.array([1 * s, 4 * s, 5 * s])
+    for some in (stamps,) if at_once else (stamps[:1], stamps[1:2], stamps[2:]):
+        exposures.update(some)
+    assert exposures.at(stamps).approach.tolist() == [[0, 1, 1], [0, -1, -1]]
 
 
 @pytest.mark.parametrize("theta", ["is told", "ends", "is not told"])

@@ -93,6 +93,17 @@ def test_equal_readings_are_said_and_the_new_formulation_refuses_them():
         assert np.isfinite(identify(data, choice).errors_m).all()
 
 
+@pytest.mark.parametrize(("steps", "blocks", "spoil_m", "equal"), [
+    ((0.01, 0.01), 3, 0.0, True), ((0.01, 0.01), 2, 0.0, True), ((0.01, 0.01), 1, 0.0, False),
+    ((0.01, 0.011), 3, 0.0, False), ((0.01, 0.01), 3, 1e-8, False)])
+def test_readings_are_equal_where_all_axes_read_the_same_in_two_or_more_blocks(steps, blocks,
+                                                                              spoil_m, equal):
+    samples = np.full((1, 2, 2, blocks), 7.0711e-3)
+    samples[0, 1, 0, -1] += spoil_m
+    assert readings_are_equal(StepDiagonal(steps, DIAGONALS[2], samples,
+                                           np.zeros((1, 2, blocks)))) is equal
+
+
 def test_table_1_case_b_holds_in_many_blocks():
     given, estimated, _ = TABLE_1["b"]
     data = planar((0.01, 0.01), np.repeat(one_block(*given), 6, axis=1))

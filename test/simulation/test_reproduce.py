@@ -64,6 +64,14 @@ def test_seeds_decide(hu):
     assert not np.array_equal(other.truth.g, hu.truth.g)
 
 
+def test_progress_of_both_tables_counts_up_to_all_draws():
+    seen = []
+    reproduce_hu(2, seed=1, progress=lambda done, total: seen.append((done, total)))
+    assert {total for _, total in seen} == {4}
+    done = [number for number, _ in seen]
+    assert done == sorted(done) and done[-1] == 4 and 2 in done
+
+
 def test_hus_text_shows_tables_and_figures(hu):
     text = hu_text(hu)
     for word in ("Table 1", "Table 2", "Figure 6", "Figure 7", "Figure 8", "Figure 9", "0.0195",

@@ -104,7 +104,7 @@ class Series:
         if not (stamps[1:] > stamps[:-1]).all():
             order = np.lexsort((positions, stamps))
             stamps, positions, speeds = stamps[order], positions[order], speeds[order]
-        first = np.flatnonzero(np.diff(stamps, prepend=stamps[:1] - 1))
+        first = np.flatnonzero(np.diff(stamps, prepend=NEVER))
         # from the first of each stamp to all of it: on a circle the last may lie nearer
         beside = np.repeat(positions[first], np.diff(first, append=len(stamps)))
         spread = np.abs(self._difference(positions - beside))

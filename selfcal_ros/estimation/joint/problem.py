@@ -26,6 +26,9 @@ ROUNDING = 16 * np.finfo(float).eps
 FLOOR = 1e-13
 """Noise, m or rad, that is rounding and not tested."""
 
+NO_NOISE = float(np.sqrt(np.finfo(float).tiny))
+"""Noise that stands for none: its square is still a number."""
+
 MAX_WEIGHT = 1e8
 """Largest weight of one kind of readings against the other, all together: beyond, the lighter one
 would be lost in the rounding of the heavier, and with it the rotations that only it determines."""
@@ -160,7 +163,7 @@ def bounded_ratio(system: NormalEquations, sigma_xy: float, sigma_theta: float,
     """
     if not (np.isfinite(sigma_xy) and np.isfinite(sigma_theta)):
         return 1.0
-    sigma_xy, sigma_theta = max(sigma_xy, 1e-300), max(sigma_theta, 1e-300)
+    sigma_xy, sigma_theta = max(sigma_xy, NO_NOISE), max(sigma_theta, NO_NOISE)
     ratio = (sigma_xy / (sigma_theta * half_width_m)) ** 2  # method eq. 4.2
     equal = system.grid_scale / system.angular_scale
     return float(np.clip(ratio, equal / MAX_WEIGHT, equal * MAX_WEIGHT))

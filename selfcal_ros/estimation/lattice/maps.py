@@ -46,7 +46,7 @@ def _run(sign: int, shift: int, half_mark: int, half_site: int) -> tuple[slice, 
     ends = sorted((sign * (-half_site - shift), sign * (half_site - shift)))
     low, high = max(ends[0], -half_mark), min(ends[1], half_mark)
     if low > high:
-        return slice(0, 0), slice(0, 0)
+        return slice(0), slice(0)
     first, last = sign * low + shift + half_site, sign * high + shift + half_site
     stop = last + sign
     return (slice(low + half_mark, high + half_mark + 1),

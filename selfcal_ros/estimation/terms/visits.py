@@ -79,7 +79,7 @@ def _visits_of(view: ViewReadings, grid: GridData, row: int) -> ViewVisits | Non
     visits = view.visits
     if visits is None or not len(visits.mark):
         return None
-    hx, hy = ((size - 1) // 2 for size in grid.y.shape[1:])
+    hx, hy = (size // 2 for size in grid.y.shape[1:])
     flat = (view.m + hx) * grid.y.shape[2] + (view.n + hy)
     mark = flat[visits.mark]
     own = _own_weights(visits, mark, grid.y[row].size)

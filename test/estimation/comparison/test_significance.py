@@ -43,6 +43,22 @@ def test_what_the_datum_takes_out_does_not_count():
     assert found.largest_z == pytest.approx(2 / np.sqrt(2 / 3))
 
 
+@pytest.mark.parametrize("k", [1, 2, 5])
+def test_every_column_that_was_taken_out_costs_a_degree_of_freedom(k):
+    """Of 12 unequal correlated values; the distance is that of 12 - k independent contrasts."""
+    rng = np.random.default_rng(k)
+    root, removed = rng.normal(size=(12, 12)), rng.normal(size=(12, k))
+    contrasts = np.linalg.svd(removed)[0][:, k:].T
+    values = contrasts.T @ rng.normal(size=12 - k)
+    found = significance(values, [(root @ root.T, True), (np.zeros((12, 12)), True)], removed,
+                         KNOWN)
+    own = contrasts @ values
+    square = own @ np.linalg.solve(contrasts @ root @ root.T @ contrasts.T, own)
+    assert found.dof == 12 - k
+    assert found.chi2_ratio == pytest.approx(square / (12 - k), rel=1e-6)
+    assert found.p == pytest.approx(chi2.sf(square, 12 - k), rel=1e-6)
+
+
 def test_the_largest_of_independent_values_has_its_own_distribution():
     z, n = 3.0, 50
     values = np.zeros(n)

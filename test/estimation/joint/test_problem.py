@@ -41,6 +41,13 @@ def test_the_ratio_ends_where_the_lighter_kind_would_be_lost(problem):
     assert weight_ratio(problem[0], 1e-15, 1.0, y) == pytest.approx(equal / MAX_WEIGHT)
 
 
+def test_readings_without_any_noise_weigh_as_much_as_rounding_bears(problem):
+    system, y = problem[0].system, np.zeros_like(problem[0].grid.y)
+    equal = system.grid_scale / system.angular_scale
+    assert weight_ratio(problem[0], 1e-8, 0.0, y) == pytest.approx(equal * MAX_WEIGHT)
+    assert weight_ratio(problem[0], 0.0, 1e-6, y) == pytest.approx(equal / MAX_WEIGHT)
+
+
 def test_repeats_are_pooled_over_the_views_that_have_them(problem):
     (sigma, dof), (sigma_theta, dof_theta) = repeats_of(problem[1])
     grid = [v for v in problem[1].views if len(v.m)]

@@ -68,3 +68,20 @@ def test_a_line_on_a_plate_without_lines_is_refused():
     with pytest.raises(InputError, match="view 'a' angular readings: a line that the plate does "
                        "not have"):
         angular_data(Measurements("p", Artifact(5, 0.01), (view,)))
+
+
+@pytest.mark.parametrize("lines", [[0, 4], [-1, 2], [4], [-1]])
+def test_lines_that_the_plate_does_not_have_are_refused(lines):
+    nothing = np.zeros(len(lines))
+    view = ViewReadings(View("a", grid=False), k=np.array(lines), dtheta=nothing,
+                        count_theta=np.ones(len(lines), dtype=int))
+    with pytest.raises(InputError) as raised:
+        angular_data(measurements(view))
+    assert str(raised.value) == ("view 'a' angular readings: a line that the plate does not have; "
+                                 "lines are 0 to 3")
+
+
+def test_the_first_and_the_last_line_of_the_plate_are_read():
+    view = ViewReadings(View("a", grid=False), k=np.array([0, 3]), dtheta=np.array([1e-6, 2e-6]),
+                        count_theta=np.array([1, 1]))
+    assert angular_data(measurements(view)).y.tolist() == [[1e-6, 0, 0, 2e-6]]

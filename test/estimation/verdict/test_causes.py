@@ -7,8 +7,12 @@ import numpy as np
 import pytest
 
 from selfcal_ros.estimation.api import calibrate
+from selfcal_ros.estimation.joint.model_fit import fit_model
+from selfcal_ros.estimation.joint.solve import prepare
 from selfcal_ros.estimation.options import Options
+from selfcal_ros.estimation.verdict.causes import find_explanations
 from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.terms import parse_terms
 from selfcal_ros.model.view import Plan, View
 from selfcal_ros.reporting.words.result import worded
 from selfcal_ros.simulation.machine import Spread, random_truth
@@ -133,3 +137,17 @@ def test_causes_can_be_left_out():
     readings = simulate_measurements(truth, plan, rng, settings=SETTINGS, visits=True)
     assert calibrate(readings, replace(OPTIONS, causes=False)).verdict.causes == ()
     assert calibrate(readings, OPTIONS).verdict.causes[0].name == "approach"
+
+
+def test_the_effect_of_a_cause_is_what_holding_it_does_to_the_map():
+    plan, rng = plan_of(), np.random.default_rng(1)
+    truth = random_truth(plan.artifact, len(plan.views), rng,
+                         replace(CLEAN, microscope_rotation_rad=2e-3))
+    readings = simulate_measurements(truth, plan, rng, visits=True,
+                                     settings=replace(SETTINGS, stop_sigma_m=20e-6))
+    found = find_explanations(fit_model(prepare(readings, OPTIONS)[0]), slips=False)[0]
+    without, held = (calibrate(readings, replace(OPTIONS, causes=False, terms=terms)).error_map
+                     for terms in ((), parse_terms(["microscope"], "")))
+    moved = np.stack([held.gx - without.gx, held.gy - without.gy])
+    assert found.name == "microscope"
+    assert found.effect_m == pytest.approx(np.sqrt((moved**2).mean()), rel=0.02)
