@@ -11,11 +11,9 @@ import re
 import threading
 import time
 from collections import Counter
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Sequence
+from contextlib import AbstractContextManager, suppress
 from pathlib import Path
-from types import TracebackType
-from typing import Self
 
 import yaml
 from mcap.records import Channel, Schema
@@ -29,13 +27,13 @@ from selfcal_ros.bagio.journal_file import (
     records,
     scan_file,
 )
-from selfcal_ros.bagio.metadata import Metadata, Topic
-from selfcal_ros.bagio.schemas import store_of_schema, typestore
+from selfcal_ros.bagio.metadata import Closing, Metadata, Topic, writing
+from selfcal_ros.bagio.schemas import definition_of, store_of_schema
 from selfcal_ros.collection.messages import Phase
 from selfcal_ros.errors import InputError, SelfcalError
 from selfcal_ros.messages.to_model import stamp_ns
 from selfcal_ros.messages.topics import COMMAND_TOPIC
-from selfcal_ros.units import S_PER_NS
+from selfcal_ros.units import NS_PER_S, S_PER_NS
 
 SYNC_PERIOD_S = 0.5
 """Time between two synchronisations with the disk, where there is something to synchronise."""
@@ -125,7 +123,7 @@ def start(folder: str | os.PathLike, now_ns: int) -> "Journal":
     InputError
         If it cannot be made.
     """
-    name = time.strftime("journal_%Y%m%dT%H%M%SZ", time.gmtime(now_ns // 10**9))
+    name = time.strftime("journal_%Y%m%dT%H%M%SZ", time.gmtime(now_ns // NS_PER_S))
     for suffix in ("", *(f"_{number}" for number in range(2, 1000))):
         bag = Path(folder) / (name + suffix)
         try:
@@ -147,7 +145,7 @@ def start(folder: str | os.PathLike, now_ns: int) -> "Journal":
     raise InputError(str(folder), f"holds a thousand journals of {name}", "remove some")
 
 
-class Journal:
+class Journal(Closing):
     """Writes raw messages to a bag folder; made by `start` or `resume`, to be closed.
 
     Parameters
@@ -200,17 +198,14 @@ class Journal:
         """
         if topic in self._channels:
             return
-        if typename not in typestore().fielddefs:
-            raise InputError(f"topic {topic}", f"no definition of {typename}",
-                             "record only topics of known types")
+        definition_of(topic, typename)  # refuses a type that is not known
         known = self._metadata.topics.setdefault(
             topic, Topic(typename, list(qos), heard_on=heard_on))
         self._declare(topic, known)
 
     def _declare(self, topic: str, known: Topic) -> None:
-        store, number = typestore(), len(self._channels) + 1
-        text = store.generate_msgdef(known.type, ros_version=2)[0]
-        schema = Schema(id=number, name=known.type, encoding="ros2msg", data=text.encode())
+        number, definition = len(self._channels) + 1, definition_of(topic, known.type)
+        schema = Schema(id=number, name=known.type, encoding="ros2msg", data=definition.encode())
         channel = Channel(
             id=number, topic=topic, message_encoding="cdr", schema_id=number,
             metadata=known.channel_metadata())
@@ -304,24 +299,10 @@ class Journal:
                     os.close(self._lock)
             self._metadata.write(self.path)
 
-    def __enter__(self) -> Self:
-        """Return the journal."""
-        return self
 
-    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None,
-                 trace: TracebackType | None) -> None:
-        """Close the journal, also after an error."""
-        self.close()
-
-
-@contextmanager
-def _said(path: Path) -> Iterator[None]:
+def _said(path: Path) -> AbstractContextManager[None]:
     """Turn a full disk or a vanished folder into the package's own error."""
-    try:
-        yield
-    except OSError as error:
-        raise InputError(str(path), f"the journal cannot be written ({error.strerror})",
-                         "make room or name another folder") from error
+    return writing(path, "the journal cannot be written")
 
 
 def _taken_up(bag: Path) -> tuple[Metadata, list[tuple[int, Phase]]]:

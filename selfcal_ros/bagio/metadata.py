@@ -1,13 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""metadata.yaml of a bag folder, as rosbag2 (Jazzy) writes it."""
+"""A bag folder: its metadata.yaml, as rosbag2 (Jazzy) writes it, and what its writers share."""
 
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from types import TracebackType
+from typing import Any, Self
 
 import yaml
 
 from selfcal_ros.bagio.schemas import typestore
+from selfcal_ros.errors import InputError
 from selfcal_ros.files import write_text
 
 INFINITE = {"sec": 9223372036, "nsec": 854775807}
@@ -20,6 +25,33 @@ def qos_profile(*, reliable: bool, transient_local: bool, depth: int) -> dict:
             "durability": "transient_local" if transient_local else "volatile",
             "deadline": INFINITE, "lifespan": INFINITE, "liveliness": "automatic",
             "liveliness_lease_duration": INFINITE, "avoid_ros_namespace_conventions": False}
+
+
+@contextmanager
+def writing(path: Path, what: str = "cannot be written") -> Iterator[None]:
+    """Turn a full disk or a vanished folder into the package's own error."""
+    try:
+        yield
+    except OSError as error:
+        raise InputError(str(path), f"{what} ({error.strerror})",
+                         "make room or name another folder") from error
+
+
+class Closing(ABC):
+    """What is closed at the end of a ``with``, also after an error: what was measured is kept."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Finish what was written."""
+
+    def __enter__(self) -> Self:
+        """Return the writer."""
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None,
+                 trace: TracebackType | None) -> None:
+        """Close it."""
+        self.close()
 
 
 @dataclass

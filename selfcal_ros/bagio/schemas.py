@@ -35,6 +35,20 @@ def typestore() -> Typestore:
     return store
 
 
+def definition_of(topic: str, typename: str) -> str:
+    """Return the definition of a type known here, as a ros2msg schema.
+
+    Raises
+    ------
+    InputError
+        If the type of the topic is not known here.
+    """
+    if typename not in typestore().fielddefs:
+        raise InputError(f"topic {topic}", f"no definition of {typename}",
+                         "record only topics of known types")
+    return typestore().generate_msgdef(typename, ros_version=2)[0]
+
+
 def store_of_schema(name: str, encoding: str, text: str, where: str) -> Typestore:
     """Return a typestore that decodes messages as the bag's own schema describes them.
 

@@ -5,18 +5,21 @@ A crash keeps what was flushed: chunks go to the disk as they fill, at the lates
 `flush`, and metadata.yaml, which only sums up, is written last.
 """
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import TracebackType
-from typing import Self
 
 from mcap.writer import CompressionType, Writer
 
 from selfcal_ros.bagio.build import build
-from selfcal_ros.bagio.metadata import FileEntry, Metadata, Topic, qos_profile
-from selfcal_ros.bagio.schemas import typestore
+from selfcal_ros.bagio.metadata import (
+    Closing,
+    FileEntry,
+    Metadata,
+    Topic,
+    qos_profile,
+    writing,
+)
+from selfcal_ros.bagio.schemas import definition_of, typestore
 from selfcal_ros.errors import InputError
 from selfcal_ros.messages.from_model import Fields
 
@@ -25,7 +28,7 @@ CHUNK_SIZE = 256 * 1024
 
 
 @dataclass
-class BagWriter:
+class BagWriter(Closing):
     """Writes one bag folder; use as a context manager.
 
     Parameters
@@ -59,20 +62,11 @@ class BagWriter:
                              "name a folder that you may write") from error
         self._entry = FileEntry(f"{self.path.name}_0.mcap")
         self._metadata = Metadata(files=[self._entry])
-        with self._said():
+        with writing(self.path):
             self._file = (self.path / self._entry.name).open("wb")
             self._mcap = Writer(self._file, chunk_size=CHUNK_SIZE,
                                 compression=CompressionType[self.compression.upper()])
             self._mcap.start(profile="ros2", library="selfcal_ros")
-
-    @contextmanager
-    def _said(self) -> Iterator[None]:
-        """Turn a full disk or a vanished folder into the package's own error."""
-        try:
-            yield
-        except OSError as error:
-            raise InputError(str(self.path), f"cannot be written ({error.strerror})",
-                             "make room or name another folder") from error
 
     def add_topic(self, topic: str, typename: str, qos: list[dict], heard_on: str = "") -> None:
         """Declare a topic of a type known here, before its first message.
@@ -91,14 +85,10 @@ class BagWriter:
         InputError
             If the type is not known here.
         """
-        store = typestore()
-        if typename not in store.fielddefs:
-            raise InputError(f"topic {topic}", f"no definition of {typename}",
-                             "record only topics of known types")
+        definition = definition_of(topic, typename)
         if typename not in self._schemas:
-            text = store.generate_msgdef(typename, ros_version=2)[0]
             self._schemas[typename] = self._mcap.register_schema(typename, "ros2msg",
-                                                                 text.encode())
+                                                                 definition.encode())
         self._metadata.topics[topic] = declared = Topic(typename, qos, heard_on=heard_on)
         self._channels[topic] = self._mcap.register_channel(
             topic, "cdr", self._schemas[typename], declared.channel_metadata())
@@ -113,7 +103,7 @@ class BagWriter:
         """Write one message given by its CDR bytes."""
         self._metadata.topics[topic].count += 1
         self._entry.add(log_time_ns)
-        with self._said():
+        with writing(self.path):
             self._mcap.add_message(self._channels[topic], log_time_ns, data, log_time_ns)
 
     @property
@@ -123,22 +113,13 @@ class BagWriter:
 
     def flush(self) -> None:
         """Write everything so far to the disk."""
-        with self._said():
+        with writing(self.path):
             self._mcap.flush()
 
     def close(self) -> None:
         """Finish the file and write metadata.yaml."""
         if self._file.closed:
             return
-        with self._said(), self._file:
+        with writing(self.path), self._file:
             self._mcap.finish()
         self._metadata.write(self.path)
-
-    def __enter__(self) -> Self:
-        """Return the writer."""
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None,
-                 trace: TracebackType | None) -> None:
-        """Close the bag, also after an error: what was measured is kept."""
-        self.close()
