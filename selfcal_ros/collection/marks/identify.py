@@ -100,14 +100,14 @@ def identify_grid(artifact: Artifact, view: View, reading_m: np.ndarray, *, ids:
     free = ~has_id
     known, fit = _settle(pose, centred, half, marks, (named, free), pitch, rules)
     rigid = known.rigid if fit.marks < 3 else fit.rigid
-    nominal = known.rigid.undo(centred)
-    nearest, ratio, distance = _nearest(pose, nominal, pitch, half)
-    marks[:, free] = nearest[:, free]
-    far = free & (distance > TOO_FAR_FROM_ANY * pitch)
-    error = known.error_at(nominal)
-    unsure = free & (error > SURE * pitch) & (distance <= TOO_FAR_FROM_ANY * pitch + error)
-    ambiguous = free & ~far & (ratio > rules.ambiguity_ratio)
-    far &= ~unsure
+    far, unsure, ambiguous = (np.zeros(marks.shape[1], dtype=bool) for _ in range(3))
+    if free.any():
+        nominal = known.rigid.undo(centred[:, free])
+        marks[:, free], ratio, distance = _nearest(pose, nominal, pitch, half)
+        error, reach = known.error_at(nominal), TOO_FAR_FROM_ANY * pitch
+        unsure[free] = (error > SURE * pitch) & (distance <= reach + error)
+        ambiguous[free] = (distance <= reach) & (ratio > rules.ambiguity_ratio)
+        far[free] = (distance > reach) & ~unsure[free]
     site = np.stack(pose.site_of(marks[0], marks[1]))
     deviation = reading_m - site * pitch
     about = (site - np.array(pose.shift)[:, None]) * pitch

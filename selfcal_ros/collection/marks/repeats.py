@@ -187,8 +187,10 @@ def _pair_scale(groups: list[np.ndarray], values: np.ndarray,
     differences = []
     for group in groups:
         i, j = _pairs(group.shape[1])
-        norm = np.hypot(relative[group][:, i], relative[group][:, j])
-        differences.append((np.abs(values[:, group[:, i]] - values[:, group[:, j]]) / norm).ravel())
+        weights, repeats = relative[group], np.take(values, group, axis=1)
+        norm = np.hypot(np.take(weights, i, axis=1), np.take(weights, j, axis=1))
+        apart = np.take(repeats, i, axis=2) - np.take(repeats, j, axis=2)
+        differences.append((np.abs(apart) / norm).ravel())
     if not differences:
         return float("nan"), 0
     every = np.concatenate(differences)

@@ -96,7 +96,7 @@ class Exposures:
 
     def at(self, stamps_ns: np.ndarray) -> StageAt:
         """Return the stage at some of the instants, in the order that is asked for."""
-        index = np.searchsorted(self._table.rows["stamp"], stamps_ns)
+        index = _as_slice(np.searchsorted(self._table.rows["stamp"], stamps_ns))
         rows = self._table.rows[index]
         x, y, theta = (JointAt(rows["position"][:, j], REASONS[rows["reason"][:, j]],
                                reason_where(rows["moving"][:, j], Reason.MOVING))
@@ -120,11 +120,12 @@ class Exposures:
         if not (stamps_ns[1:] > stamps_ns[:-1]).all():
             stamps_ns = np.unique(stamps_ns)
         due = self._insert(stamps_ns, due)
-        before = self._table.rows[due].copy()
+        known = due & (self._approach != NEW).all(axis=0)
+        before = self._table.rows[known]
         for group in self._groups(np.flatnonzero(due)):
             self._look_up(group)
         changed = np.zeros(len(due), dtype=bool)
-        changed[due] = _differ(before, self._table.rows[due])
+        changed[known] = _differ(before, self._table.rows[known])
         return self._fill(due, changed)
 
     def _due_to_samples(self) -> np.ndarray:
@@ -154,6 +155,9 @@ class Exposures:
         rows["stamp"] = stamps_ns
         rows["first"], rows["last"] = NEVER, EVER
         self._table.insert(at, rows)
+        if not len(behind):  # as a rule, and faster
+            self._approach = np.append(self._approach, np.full((2, len(at)), NEW, np.int8), axis=1)
+            return np.append(due, np.ones(len(at), dtype=bool))
         self._approach = np.insert(self._approach, at, NEW, axis=1)
         return np.insert(due, at, True)
 
@@ -189,7 +193,7 @@ class Exposures:
         """Look up a group of instants, all that lie between its ends."""
         start, end = self._window(group)
         index = np.arange(group[0], group[-1] + 1)
-        rows, since = self._table.rows[index], self._since(index)
+        rows, since = self._table.rows[group[0]:group[-1] + 1], self._since(index)
         for joint, track in enumerate(self._tracks):
             series = track.between(start, end)
             position, reason = series.query(rows["stamp"])
@@ -202,7 +206,6 @@ class Exposures:
                 rows["approach"][:, joint] = self._approach_of(series, index, position)
             first, last = series.decided_by(rows["stamp"], since if linear else None)
             rows["first"][:, joint], rows["last"][:, joint] = first, last
-        self._table.rows[index] = rows
 
     def _approach_of(self, series: Series, index: np.ndarray, position: np.ndarray) -> np.ndarray:
         stamps, first = self._table.rows["stamp"], index[0]
@@ -230,6 +233,13 @@ class Exposures:
 
 NEW = 9
 """Direction of approach of an instant that has not been looked up yet."""
+
+
+def _as_slice(index: np.ndarray) -> np.ndarray | slice:
+    """Return an index of rows one behind the other as a slice, which copies nothing."""
+    if len(index) and (np.diff(index) == 1).all():
+        return slice(int(index[0]), int(index[-1]) + 1)
+    return index
 
 
 def _codes(reasons: np.ndarray) -> np.ndarray:
