@@ -24,6 +24,7 @@ def demo() -> int:
     from selfcal_ros.bagio.simulated import read_truth
     from selfcal_ros.cli.main import main as selfcal
     from selfcal_ros.cli.terminal.map_picture import map_picture
+    from selfcal_ros.cli.terminal.output import tell
     from selfcal_ros.files import read_json
     from selfcal_ros.model.result import result_from_dict
     from selfcal_ros.reporting.maps.plot import save_map_plot
@@ -42,7 +43,7 @@ def demo() -> int:
     if code:
         return code
     if sys.stdout.isatty():
-        print("\n".join(["", *map_picture(result.error_map), ""]))
+        tell("\n".join(["", *map_picture(result.error_map), ""]))
     for name, what in (("result.json", "the result"), ("map.png", "picture of the map"),
                        ("report.html", "report: open it")):
         print(f"{what:18} {(FOLDER / name).relative_to(ROOT)}")

@@ -4,10 +4,10 @@
 from __future__ import annotations
 
 import argparse
-import json
 import math
 from typing import TYPE_CHECKING, Any
 
+from selfcal_ros.cli.terminal.output import say
 from selfcal_ros.cli.terminal.progress import busy
 from selfcal_ros.units import ARCSEC_PER_RAD, UM_PER_M, URAD_PER_RAD
 
@@ -41,12 +41,12 @@ def run(args: argparse.Namespace) -> int:
     a = result_from_dict(first, args.a)
     if isinstance(second, dict) and "ex_x" in second:
         rows = compare_with_laser(a, second, args.b)
-        print(json.dumps(_laser_json(rows), indent=1) if args.json else _laser_text(rows))
+        say(args, _laser_text(rows), _laser_json(rows))
         return int(ExitCode.DONE)
     b = result_from_dict(second, args.b)
     with busy("comparing"):
         found = compare(a, b, keep_scale=args.keep_scale, names=(args.a, args.b))
-    print(json.dumps(_json(found), indent=1) if args.json else _text(found))
+    say(args, _text(found), _json(found))
     datums = [result.error_map.datum_theta for result in (a, b)]
     if datums[0] != datums[1] and not args.json and found.theta is not None:
         print(f"       theta datums differ: {datums[0]} and {datums[1]}; xy_axes also ties four "
@@ -77,21 +77,26 @@ def _json(found: MapDifference) -> dict[str, Any]:
 def _text(found: MapDifference) -> str:
     tx, ty = found.translation_m
     lines = ["B less A, datum difference taken out: translation "
-             f"({tx * UM_PER_M:+.4g}, {ty * UM_PER_M:+.4g}) um, "
-             f"rotation {found.rotation_rad * ARCSEC_PER_RAD:+.4g} arcsec, "
-             f"scale {found.scale * UM_PER_M:+.4g} um/m"
+             f"({_signed(tx * UM_PER_M)}, {_signed(ty * UM_PER_M)}) µm, "
+             f"rotation {_signed(found.rotation_rad * ARCSEC_PER_RAD)} arcsec, "
+             f"scale {_signed(found.scale * UM_PER_M)} µm/m"
              + ("" if math.isnan(found.theta_rad)
-                else f", theta {found.theta_rad * ARCSEC_PER_RAD:+.4g} arcsec"),
-             f"XY     rms {found.rms_m * UM_PER_M:.5f} um per axis   "
-             f"largest {found.max_m * UM_PER_M:.5f} um on an axis",
+                else f", theta {_signed(found.theta_rad * ARCSEC_PER_RAD)} arcsec"),
+             f"XY     rms {found.rms_m * UM_PER_M:.5f} µm per axis   "
+             f"largest {found.max_m * UM_PER_M:.5f} µm on an axis",
              *_test_text(found.xy),
-             f"       non-orthogonality {found.nonorthogonality * URAD_PER_RAD:+.4g} urad, "
-             f"scale difference {found.scale_difference * UM_PER_M:+.4g} um/m"]
+             f"       non-orthogonality {_signed(found.nonorthogonality * URAD_PER_RAD)} µrad, "
+             f"scale difference {_signed(found.scale_difference * UM_PER_M)} µm/m"]
     if not math.isnan(found.rms_theta_rad):
         lines += [f"theta  rms {found.rms_theta_rad * ARCSEC_PER_RAD:.4f} arcsec   "
                   f"largest {found.max_theta_rad * ARCSEC_PER_RAD:.4f} arcsec",
                   *_test_text(found.theta)]
     return "\n".join([*lines, _verdict_text(found)])
+
+
+def _signed(value: float) -> str:
+    """Return a number with its sign; what is only rounding error is zero."""
+    return f"{round(value, 6) + 0.0:+.4g}"
 
 
 def _test_text(test: Significance | None) -> list[str]:

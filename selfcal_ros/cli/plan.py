@@ -16,6 +16,7 @@ from selfcal_ros.cli.plan_terms import (
     terms_json,
     terms_text,
 )
+from selfcal_ros.cli.terminal.output import tell
 from selfcal_ros.cli.terminal.progress import busy, late_progress
 from selfcal_ros.units import UM_PER_M
 
@@ -109,7 +110,7 @@ def _check(args: argparse.Namespace, plan: Plan) -> int:
                       f"largest {joint.max_xy:.4f}"]
         lines += terms_text(plan, checks, assumed) if checks else []
         lines += _map_text(alone) if args.map and alone and seen.identifiable else []
-        print("\n".join(lines))
+        tell("\n".join(lines))
     return int(ExitCode.DONE if seen.identifiable else ExitCode.NOT_IDENTIFIABLE)
 
 
@@ -184,8 +185,8 @@ def _averaged_m(plan: Plan, assumed: Assumed) -> float:
 
 def _in_um(predicted: Prediction, plan: Plan, assumed: Assumed) -> str:
     unit = _averaged_m(plan, assumed) * UM_PER_M
-    return (f"  XY     rms {predicted.rms_xy * unit:.4f} um   largest "
-            f"{predicted.max_xy * unit:.4f} um (k=1) for {assumed.sigma_m * UM_PER_M:.4g} um "
+    return (f"  XY     rms {predicted.rms_xy * unit:.4f} µm   largest "
+            f"{predicted.max_xy * unit:.4f} µm (k=1) for {assumed.sigma_m * UM_PER_M:.4g} µm "
             "noise of one reading")
 
 
@@ -274,10 +275,10 @@ def _show_ranked(args: argparse.Namespace, plan: Plan, now: tuple[Score, float |
                              "repeat_of": item.repeat_of, "visit_order": item.order or None,
                              **_score_json(item.score, unit)} for item in ranked]}, indent=1))
         return
-    print(f"plan {plan.plan_id}: {_score_text(*now)}")
+    tell(f"plan {plan.plan_id}: {_score_text(*now)}")
     print(f"next steps, the best first by {args.criterion} XY uncertainty:")
     for item in ranked:
-        print(f"  {_score_text(item.score, unit)}   {item.text}")
+        tell(f"  {_score_text(item.score, unit)}   {item.text}")
 
 
 def _show_best(args: argparse.Namespace, best: Plan, score: tuple[Score, float | None],
@@ -292,7 +293,7 @@ def _show_best(args: argparse.Namespace, best: Plan, score: tuple[Score, float |
         a, b = view["translation_pitch"]
         kind = "" if view["grid"] else ", lines only"
         print(f"  {view['name']}: turn {view['rotation_deg']:g} deg, shift [{a}, {b}]{kind}")
-    print(_score_text(*score))
+    tell(_score_text(*score))
 
 
 def _score_json(score: Score, noise_m: float | None) -> dict[str, Any]:
@@ -313,7 +314,7 @@ def _score_text(score: Score, noise_m: float | None) -> str:
     theta = f"  theta rms {score.rms_theta:.3f}" if score.rms_theta else ""
     if noise_m is not None:
         unit = noise_m * UM_PER_M
-        return f"u XY rms {score.rms_xy * unit:.5f} um  max {score.max_xy * unit:.5f} um{theta}"
+        return f"u XY rms {score.rms_xy * unit:.5f} µm  max {score.max_xy * unit:.5f} µm{theta}"
     return f"XY rms {score.rms_xy:.3f}  max {score.max_xy:.3f}{theta}"
 
 

@@ -125,7 +125,7 @@ def terms_text(plan: Plan, checks: Iterable[TermCheck], assumed: Assumed) -> lis
     for c in checks:
         told = "yes" if c.told else f"no, {_modes(c.unseen_modes)}"
         lines.append(f"  {c.name:<12}{c.model or '-':<7}{told:<17}{size_text(c):>12}"
-                     f"  {c.effect_rms_m * UM_PER_M:7.5f} um {c.effect_max_m * UM_PER_M:7.5f} um"
+                     f"  {c.effect_rms_m * UM_PER_M:7.5f} µm {c.effect_max_m * UM_PER_M:7.5f} µm"
                      f" {100 * c.power:7.1f} %")
     return [*lines, *_assumptions(plan, assumed)]
 
@@ -139,9 +139,9 @@ def size_text(check: TermCheck) -> str:
     from selfcal_ros.model.terms import TermName
 
     if check.unit == "m":
-        return f"{check.size * UM_PER_M:.6g} um"
+        return f"{check.size * UM_PER_M:.6g} µm"
     if check.name is TermName.PLATE_SCALE:
-        return f"{check.size * UM_PER_M:.6g} um/m"
+        return f"{check.size * UM_PER_M:.6g} µm/m"
     return f"{check.size * MRAD_PER_RAD:.6g} mrad"
 
 
@@ -154,10 +154,10 @@ def _assumptions(plan: Plan, assumed: Assumed) -> list[str]:
               for view in views}
     cut = [view for view in views if view.repeats % orders[view.name].passes]
     lines = [f"  assumed: order {', '.join(sorted({str(o) for o in orders.values()}))}; drifts of "
-             f"degree {assumed.drift_degree}; {assumed.sigma_m * UM_PER_M:.6g} um noise of "
+             f"degree {assumed.drift_degree}; {assumed.sigma_m * UM_PER_M:.6g} µm noise of "
              "one reading;",
              f"  plates laid down to {math.degrees(MISALIGNMENT_RAD):g} deg and "
-             f"{MISALIGNMENT_M * UM_PER_M:g} um, stops {assumed.stop_error_m * UM_PER_M:.6g} um "
+             f"{MISALIGNMENT_M * UM_PER_M:g} µm, stops {assumed.stop_error_m * UM_PER_M:.6g} µm "
              "off the marks, drawn with a fixed seed"]
     if cut:
         names = ", ".join(f"'{view.name}'" for view in cut)

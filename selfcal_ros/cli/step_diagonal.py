@@ -13,7 +13,7 @@ from selfcal_ros.cli.step_diagonal_bag import (
     joints_of,
     measurement_from_bag,
 )
-from selfcal_ros.cli.terminal.output import add_json, put, say
+from selfcal_ros.cli.terminal.output import add_json, put, say, tell
 from selfcal_ros.cli.terminal.progress import busy
 from selfcal_ros.errors import ExitCode, InputError
 from selfcal_ros.units import M_PER_MM
@@ -105,7 +105,7 @@ def run(args: argparse.Namespace) -> int:
     if args.output:
         write_json(args.output, result)
     if args.output and not args.json:
-        print(summary(result))
+        tell(summary(result))
     else:
         put(result)
     return ExitCode.DONE

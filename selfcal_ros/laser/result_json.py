@@ -145,7 +145,7 @@ def summary(result: dict[str, Any]) -> str:
     """Return what a person wants to read first, in micrometres."""
     def in_um(value_mm: float, u_mm: float | None) -> str:
         u = "" if u_mm is None else f" (u = {u_mm * UM_PER_MM:.4f})"
-        return f"{value_mm * UM_PER_MM:+.4f} um{u}"
+        return f"{value_mm * UM_PER_MM:+.4f} µm{u}"
 
 
     names = [key for key in result if key.startswith(("squareness", "straightness"))

@@ -58,7 +58,7 @@ def test_export_check_eval_verify(run):
     assert got["1"] == pytest.approx((MAP.gx[4, 0] - bias[0]) * 1e3, abs=1.1e-8)
     assert got["2"] == pytest.approx((MAP.gy[4, 0] - bias[1]) * 1e3, abs=1.1e-8)
     code, out, _ = run("verify", "r.json", "f.cal", "--plot", "f.png")
-    assert code == 0 and "49 sites, rms, um" in out and "36 cell centres" in out
+    assert code == 0 and "49 sites, rms, µm" in out and "36 cell centres" in out
     before, after = (float(word) for word in out.splitlines()[2].split()[-2:])
     assert after < 1e-4 < 0.1 < before
     with open("f.png", "rb") as file:
@@ -286,7 +286,7 @@ def test_eval_without_sense(run, tmp_path, args, message):
 def test_the_example_of_the_source(run):
     code, out, _ = run("orthogonality", "--measured", "5um", "--over", "200mm", "--travel", "900mm")
     rows = [line.split() for line in out.splitlines() if line.startswith("  ")]
-    assert code == 0 and "-22.5 um" in out
+    assert code == 0 and "-22.5 µm" in out
     assert [row for row in rows if row[0] != "position"] == [
         ["0", "0"], ["900", "-22.5"], ["-450", "0"], ["450", "-22.5"], ["-450", "11.25"],
         ["450", "-11.25"]]

@@ -112,7 +112,7 @@ def test_a_plan_is_judged_in_um_where_the_noise_is_given(capsys, tmp_path):
             {"name": "a", "repeats": 4}, {"name": "b", "rotation_deg": 90, "repeats": 4},
             {"name": "c", "translation_pitch": [1, 0], "repeats": 4}]}))
     assert main(["plan", "check", str(plan)]) == 0
-    assert " um" not in capsys.readouterr().out.partition("terms:")[0]
+    assert " µm" not in capsys.readouterr().out.partition("terms:")[0]
     for sigma in ("20nm", "0.02um", "20e-9", "2e-5 mm"):
         assert main(["plan", "check", str(plan), "--sigma", sigma, "--json"]) == 0
         found = json.loads(capsys.readouterr().out)["predicted"]
@@ -120,8 +120,8 @@ def test_a_plan_is_judged_in_um_where_the_noise_is_given(capsys, tmp_path):
         assert found["rms_u_xy_um"] == pytest.approx(0.01 * found["rms_gain_xy"], rel=1e-12)
         assert found["max_u_xy_um"] == pytest.approx(0.01 * found["max_gain_xy"], rel=1e-12)
     assert main(["plan", "check", str(plan), "--sigma", "20nm"]) == 0
-    assert (f"  XY     rms {found['rms_u_xy_um']:.4f} um   largest {found['max_u_xy_um']:.4f} um "
-            "(k=1) for 0.02 um noise of one reading") in capsys.readouterr().out
+    assert (f"  XY     rms {found['rms_u_xy_um']:.4f} µm   largest {found['max_u_xy_um']:.4f} µm "
+            "(k=1) for 0.02 µm noise of one reading") in capsys.readouterr().out
 
 
 def test_a_position_with_its_unit(tmp_path, capsys, monkeypatch):

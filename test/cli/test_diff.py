@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """``selfcal diff``: files in, figures out, exit codes."""
 
+import io
 import json
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -39,7 +41,7 @@ def test_two_results_as_text_and_as_json(files, capsys):
     assert "translation (+1, " in text and "not significant" in text and "theta  rms" in text
     assert main(["diff", *files, "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
-    assert f"XY     rms {found['rms_um']:.5f} um per axis   largest {found['max_um']:.5f} um on" \
+    assert f"XY     rms {found['rms_um']:.5f} µm per axis   largest {found['max_um']:.5f} µm on" \
         in text
     both = np.abs([found["dx"], found["dy"]]) * 1e6
     assert found["max_um"] == pytest.approx(both.max())
@@ -84,7 +86,7 @@ def test_different_theta_datums_are_said(files, tmp_path, capsys):
 
 def test_keep_scale(files, capsys):
     assert main(["diff", *files, "--keep-scale"]) == 0
-    assert "scale +0 um/m" in capsys.readouterr().out
+    assert "scale +0 µm/m" in capsys.readouterr().out
 
 
 def test_another_lattice_is_bad_input(files, tmp_path, capsys):
@@ -119,3 +121,19 @@ def test_files_that_are_no_results(files, tmp_path, capsys):
     assert "not a result of schema" in capsys.readouterr().err
     assert main(["diff", str(tmp_path / "none.json"), files[0]]) == 2
     assert "no such file" in capsys.readouterr().err
+
+
+def test_symbols_are_spelled_out_where_stdout_cannot_take_them(files, monkeypatch):
+    stream = io.TextIOWrapper(io.BytesIO(), encoding="ascii")
+    monkeypatch.setattr(sys, "stdout", stream)
+    assert main(["diff", *files]) == 0
+    stream.flush()
+    text = stream.buffer.getvalue().decode()
+    assert " um per axis" in text and " urad, scale difference " in text
+
+
+def test_rounding_errors_are_zero(files, capsys):
+    assert main(["diff", files[0], files[0]]) == 0
+    assert capsys.readouterr().out.splitlines()[0].startswith(
+        "B less A, datum difference taken out: translation (+0, +0) µm, rotation +0 arcsec, "
+        "scale +0 µm/m")

@@ -19,7 +19,7 @@ def test_shades_stand_where_the_errors_are_with_y_upwards():
         gx[2, 0], gx[0, 2], gx[1, 1] = 2e-6, -1e-6, np.nan
     lines = picture(3, fill)
     assert lines[:3] == ["  +    ", "    ?  ", "      @"]
-    assert lines[3].startswith("  length of the error: from ' ' = 0 to '@' = 2 um;")
+    assert lines[3].startswith("  length of the error: from ' ' = 0 to '@' = 2 µm;")
 
 
 def test_large_and_unknown_fields_are_small_pictures():

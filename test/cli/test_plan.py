@@ -90,7 +90,7 @@ def test_free_terms_that_a_plan_does_not_tell_are_refused(capsys, tmp_path):
     text = capsys.readouterr().out
     assert "  XY with drift: rms 0.8905   largest 1.2154\n" in text
     assert "  drift       free   yes" in text
-    assert ("assumed: order there_and_back; drifts of degree 1; 0.02 um noise of one reading;"
+    assert ("assumed: order there_and_back; drifts of degree 1; 0.02 µm noise of one reading;"
             in text)
     assert main(["plan", "check", shipped("qiao"), *asked, "--drift-degree", "2"]) == 3
     text = capsys.readouterr().out
@@ -163,7 +163,7 @@ def test_suggest_against_terms(capsys, tmp_path):
     asked = ["plan", "suggest", shipped("qiao"), "--against", "drift:500e-9", "--order", "raster"]
     assert main([*asked, "--top", "1", "-o", str(out)]) == 0
     text = capsys.readouterr().out
-    assert text.startswith("plan qiao: u XY rms ") and " um  max " in text.splitlines()[0]
+    assert text.startswith("plan qiao: u XY rms ") and " µm  max " in text.splitlines()[0]
     assert "visit the marks in the order x_back_y_back, 4 repeats for 1" in text
     plan = plan_from_dict(read_yaml(out), "next")
     assert {(v.visit_order, v.repeats) for v in plan.views} == {("x_back_y_back", 4)}

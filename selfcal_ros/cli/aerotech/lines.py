@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from selfcal_ros.cli.aerotech.options import add_frame, frame_of, read_result
-from selfcal_ros.cli.terminal.output import add_json, say
+from selfcal_ros.cli.terminal.output import add_json, say, tell
 from selfcal_ros.errors import ExitCode, InputError
 from selfcal_ros.units import M_PER_UM, UM_PER_M
 
@@ -95,10 +95,10 @@ def _orthogonality(args: argparse.Namespace) -> int:
     if args.json:
         print(json.dumps({"unit": args.unit, "correction_unit": "um", "tables": tables}, indent=1))
         return int(ExitCode.DONE)
-    print(f"correction of {other} over the full travel of {args.along}: "
-          f"{-measured_m / over_m * travel_m * UM_PER_M:.9g} um")
+    tell(f"correction of {other} over the full travel of {args.along}: "
+         f"{-measured_m / over_m * travel_m * UM_PER_M:.9g} µm")
     for home, rows in tables.items():
-        print(f"{_HOMES[home]} (--home {home})\n  position {args.unit:<5} correction um")
+        tell(f"{_HOMES[home]} (--home {home})\n  position {args.unit:<5} correction µm")
         print("\n".join(f"  {position:<14.9g} {correction:.9g}" for position, correction in rows))
     return int(ExitCode.DONE)
 

@@ -2,7 +2,6 @@
 """``selfcal cal export`` and ``selfcal cal verify``: between error maps and tables."""
 
 import argparse
-import json
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -100,7 +99,7 @@ def _verify(args: argparse.Namespace) -> int:
     frame = frame_of(args, base)
     with busy("simulating the controller"):
         found = verify_tables(result.error_map, cal.tables, frame)
-    print(json.dumps(_numbers(found), indent=1) if args.json else _text(found))
+    say(args, _text(found), _numbers(found))
     if args.plot:
         from selfcal_ros.reporting.cal_plots import plot_verification
         plot_verification(found, args.plot)
@@ -111,18 +110,20 @@ def _verify(args: argparse.Namespace) -> int:
 
 
 def _numbers(found: "Verification") -> dict:
-    return {r.place: {"points": r.position.shape[1],
+    from selfcal_ros.model.result import plain
+
+    return plain({r.place: {"points": r.position.shape[1],
                       "before": {"rms": r.rms("before"), "max": r.largest("before")},
                       "after": {"rms": r.rms("after"), "max": r.largest("after")},
-                      "shift_after": r.shift_after.tolist()} for r in found.residuals}
+                      "shift_after": r.shift_after} for r in found.residuals})
 
 
 def _text(found: "Verification") -> str:
-    """Return the residuals as a small table: um, and arcsec for angular lines."""
+    """Return the residuals as a small table: µm, and arcsec for angular lines."""
     lines = ["residual true - commanded, without its constant shift         before          after"]
     names = {"sites": "sites", "between": "cell centres (cubic stage)", "lines": "angular lines"}
     for r in found.residuals:
-        unit, scale = ("arcsec", RAD_PER_ARCSEC) if r.place == "lines" else ("um", M_PER_UM)
+        unit, scale = ("arcsec", RAD_PER_ARCSEC) if r.place == "lines" else ("µm", M_PER_UM)
         for what, value in (("rms", r.rms), ("max", r.largest)):
             name = f"{r.position.shape[1]} {names[r.place]}, {what}, {unit}"
             lines.append(f"{name:<48}{value('before') / scale:>16.6f}"

@@ -24,5 +24,5 @@ def map_picture(emap: ErrorMap) -> list[str]:
     rows = [" ".join(SHADES[k] if good else "?" for k, good in zip(levels, goods, strict=True))
             for levels, goods in zip(level.T[::-1].tolist(), known.T[::-1].tolist(), strict=True)]
     return [f"  {row}" for row in rows] + [
-        f"  length of the error: from ' ' = 0 to '{SHADES[-1]}' = {most:.3g} um; x to the right, "
+        f"  length of the error: from ' ' = 0 to '{SHADES[-1]}' = {most:.3g} µm; x to the right, "
         "y upwards"]

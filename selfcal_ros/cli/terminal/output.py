@@ -20,7 +20,14 @@ def say(args: argparse.Namespace, text: str, data: dict[str, Any]) -> None:
     if args.json:
         put(data)
     else:
-        print(text)
+        tell(text)
+
+
+def tell(text: str) -> None:
+    """Print text for a person; where stdout cannot take µ, ° and the like, spelled out."""
+    from selfcal_ros.reporting.summary.format import can_print_symbols, to_ascii
+
+    print(text if can_print_symbols(sys.stdout) else to_ascii(text))
 
 
 def put(data: Any) -> None:
