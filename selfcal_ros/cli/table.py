@@ -4,7 +4,7 @@
 import argparse
 from typing import TYPE_CHECKING
 
-from selfcal_ros.cli.terminal.output import add_json, say
+from selfcal_ros.cli.terminal.output import STDOUT, add_json, file_of, say
 
 if TYPE_CHECKING:
     from selfcal_ros.model.result import CalibrationResult
@@ -20,24 +20,29 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("result", metavar="RESULT.json", help="result that `selfcal solve` wrote")
     parser.add_argument("-o", "--output", metavar="FILE.csv|.npz", required=True,
                         help="table to write: a line for each site, then one for each angular "
-                        "line (csv, SI units, empty = not known), or arrays (npz)")
+                        "line (csv, SI units, empty = not known), or arrays (npz); "
+                        "- = csv to stdout")
     add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Read the result, write the table, say where it is."""
+    """Read the result, write the table to a file and say so, or to stdout."""
     from pathlib import Path
 
     from selfcal_ros.errors import ExitCode, InputError
     from selfcal_ros.files import check_outputs, read_json, write_bytes
     from selfcal_ros.model.result import result_from_dict
 
-    kind = Path(args.output).suffix.lower()
+    kind = ".csv" if args.output == STDOUT else Path(args.output).suffix.lower()
     if kind not in KINDS:
         raise InputError(args.output, "no kind of table by its ending",
-                         "name a file that ends in " + " or ".join(KINDS))
-    check_outputs([args.result], [args.output])
+                         "name a file that ends in " + " or ".join(KINDS) + ", or - for stdout")
+    check_outputs([args.result], [file_of(args)])
     result = result_from_dict(read_json(args.result), args.result)
+    if args.output == STDOUT:
+        text = csv_bytes(result).decode()
+        say(args, text.removesuffix("\n"), {"csv": text})
+        return int(ExitCode.DONE)
     write_bytes(args.output, csv_bytes(result) if kind == ".csv" else npz_bytes(result))
     say(args, f"written: {args.output}", {"written": args.output, "kind": kind.lstrip(".")})
     return int(ExitCode.DONE)
