@@ -104,9 +104,9 @@ def step_of(values: np.ndarray) -> int:
 
     Where Pettitt's statistic is largest is no good place: it is drawn to the middle.
     """
-    left = [np.abs(values[:t] - np.median(values[:t])).sum()
-            + np.abs(values[t:] - np.median(values[t:])).sum() for t in range(1, len(values))]
-    return int(np.argmin(left)) + 1
+    moduli = [np.abs(values[:t] - np.median(values[:t])).sum()
+              + np.abs(values[t:] - np.median(values[t:])).sum() for t in range(1, len(values))]
+    return int(np.argmin(moduli)) + 1
 
 
 def _imbalance(ranks: np.ndarray) -> np.ndarray:

@@ -44,8 +44,8 @@ def opened(folder: Path) -> Iterator[None]:
             raise InputError(str(folder), "another batch works in this folder",
                              "wait for its end or name another folder") from error
         for part in (folder / RECORDS, folder / RESULTS):
-            for left in part.glob(".selfcal.*"):  # of a batch that was killed as it wrote
-                left.unlink()
+            for stray in part.glob(".selfcal.*"):  # of a batch that was killed as it wrote
+                stray.unlink()
         yield
 
 

@@ -121,8 +121,8 @@ class ColumnDecoder:
         tries = FREE_TRIES + len(messages) // WORTH
         # the lengths that most messages have come first, so that what is odd costs them nothing
         for index in sorted(_by_length(messages.length), key=len, reverse=True):
-            tries, left = self._decode_length(messages, index, groups, tries)
-            rest.append(left)
+            tries, undecoded = self._decode_length(messages, index, groups, tries)
+            rest.append(undecoded)
         return groups, np.sort(np.concatenate(rest))
 
     def _decode_length(self, messages: Payloads, index: np.ndarray, groups: list[Columns],

@@ -124,7 +124,7 @@ def approach_signs(position: np.ndarray, threshold: float = 0.0) -> np.ndarray:
     position : float array (V,)
         Where the axis stops, visit by visit.
     threshold : float
-        Largest difference that is no motion, in the unit of the positions.
+        Largest difference that does not count as a motion, in the unit of the positions.
 
     Returns
     -------

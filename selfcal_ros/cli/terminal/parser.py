@@ -22,14 +22,14 @@ class Parser(argparse.ArgumentParser):
     def parse_args(self, args: Sequence[str] | None = None,  # type: ignore[override]
                    namespace: argparse.Namespace | None = None) -> argparse.Namespace:
         """Return the arguments; an option that is left over ends with a line that names it."""
-        found, left = self.parse_known_args(args, namespace)
-        if left:
-            found.leaf.refuse(left)
+        found, unknown = self.parse_known_args(args, namespace)
+        if unknown:
+            found.leaf.refuse(unknown)
         return found
 
-    def refuse(self, left: Sequence[str]) -> NoReturn:
+    def refuse(self, unknown: Sequence[str]) -> NoReturn:
         """End with a line on the first argument that is not recognised."""
-        word = next((word for word in left if word.startswith("-")), left[0])
+        word = next((word for word in unknown if word.startswith("-")), unknown[0])
         name = word.partition("=")[0]
         if not word.startswith("-"):
             self.error(f"'{word}' is one argument too many")

@@ -26,7 +26,7 @@ from selfcal_ros.estimation.terms.projection import (
     reduce_columns,
 )
 from selfcal_ros.estimation.terms.sizes import SizeTest, size_tests
-from selfcal_ros.estimation.terms.solution import Sums, next_coefficients, noise_left, score
+from selfcal_ros.estimation.terms.solution import Sums, next_coefficients, residual_sums, score
 from selfcal_ros.model.terms import ModelTerm, TermName
 
 MAX_STEPS = 100
@@ -136,9 +136,9 @@ def _size_tests(model: ModelFit) -> tuple[SizeTest, ...]:
     equations = model.equations
     if equations is None or equations.free.all():
         return ()
-    left = score(equations, model.found.residuals, squares(model.problem, model.found),
-                 coefficients=model.coefficients)
-    right = left.total + equations.information @ model.coefficients
+    scored = score(equations, model.found.residuals, squares(model.problem, model.found),
+                   coefficients=model.coefficients)
+    right = scored.total + equations.information @ model.coefficients
     noise = model.found.xy
     return size_tests(equations, right, model.problem.terms, (noise.sigma, noise.dof))
 
@@ -264,8 +264,8 @@ class _State:
     def _solve_terms(self, equations: TermEquations) -> None:
         now = score(equations, self.found.residuals, squares(self.problem, self.found),
                     coefficients=self.coefficients)
-        left = noise_left(equations, now)
-        self.problem = with_noise(self.problem, left)
+        sums = residual_sums(equations, now)
+        self.problem = with_noise(self.problem, sums)
         sigma = self.found.xy.sigma if np.isfinite(self.found.xy.sigma) else 0.0
         self.coefficients = next_coefficients(equations, now, self.coefficients, sigma)
 
@@ -295,7 +295,7 @@ class _State:
         if self.equations is not None:
             now = score(self.equations, self.found.residuals, squares(self.problem, self.found),
                         coefficients=self.coefficients)
-            return noise_left(self.equations, now)
+            return residual_sums(self.equations, now)
         return Sums(*squares(self.problem, self.found), float("nan"), 0)
 
 
@@ -317,10 +317,10 @@ def squares(problem: Problem, found: JointFit) -> tuple[float, float]:
     return total, dof
 
 
-def with_noise(problem: Problem, left: Sums) -> Problem:
+def with_noise(problem: Problem, sums: Sums) -> Problem:
     """Return the problem with the noise that terms leave, of residuals and of visits."""
     repeats = problem.repeats_xy
-    if left.dof_within >= 1:
-        repeats = sigma_of(left.within, left.dof_within)
-    return replace(problem, residuals_xy=sigma_of(left.between, left.dof_between),
+    if sums.dof_within >= 1:
+        repeats = sigma_of(sums.within, sums.dof_within)
+    return replace(problem, residuals_xy=sigma_of(sums.between, sums.dof_between),
                    repeats_xy=repeats)

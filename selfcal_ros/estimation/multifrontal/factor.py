@@ -99,8 +99,8 @@ class Factor:
             own = inverse @ real[front.start:front.stop]
             real[front.start:front.stop] = own
             if len(below):
-                left = (below @ own).view(complex).reshape(-1, *lanes.shape[1:])
-                lanes[front.boundary] = lanes.take(front.boundary, axis=0) - left
+                update = (below @ own).view(complex).reshape(-1, *lanes.shape[1:])
+                lanes[front.boundary] = lanes.take(front.boundary, axis=0) - update
 
     def _backward(self, work: np.ndarray) -> None:
         real, lanes = work.view(float), _lanes(work)

@@ -9,7 +9,7 @@ import numpy as np
 from selfcal_ros.estimation.joint.noise import F_LEVEL, coverage_factor
 from selfcal_ros.estimation.joint.saved_terms import variance_of_terms
 from selfcal_ros.estimation.options import ReferenceLength
-from selfcal_ros.estimation.verdict.coverage import TOLD, part_left, with_coverage
+from selfcal_ros.estimation.verdict.coverage import TOLD, remaining_part, with_coverage
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.result import CalibrationResult, Noise
 from selfcal_ros.model.statistics import rms
@@ -44,7 +44,7 @@ class FromTerm(Finding):
 
     given: float
     allowed: float | None
-    part_left: float
+    remaining_part: float
 
 
 @dataclass(frozen=True)
@@ -195,7 +195,7 @@ def _term_part(result: CalibrationResult, name: str, variance: np.ndarray,
     Of type A if the readings tell the term, of type B if its size does.
     """
     term = next(term for term in result.model.terms if term.name == name)
-    part = part_left(term)
+    part = remaining_part(term)
     told = part < TOLD
     known = variance[:, result.error_map.valid]
     how = FromTerm(term.size or term.solved_with, term.size_used, part)

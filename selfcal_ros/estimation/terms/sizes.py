@@ -144,17 +144,17 @@ def size_tests(equations: TermEquations, right: np.ndarray, terms: Sequence[Mode
         All terms.
     """
     found: list[SizeTest] = []
-    left = [term for term in terms if not term.free]
+    sized = [term for term in terms if not term.free]
     if not np.isfinite(noise[0]):
         return ()
-    while left:
-        tests = [size_test(equations, right, term, noise) for term in left]
+    while sized:
+        tests = [size_test(equations, right, term, noise) for term in sized]
         failed = [test for test in tests if test.contradicted]
         if not failed:
             return (*found, *tests)
         worst = max(failed, key=lambda test: test.statistic - test.rank)
         found.append(worst)
-        left = [term for term in left if term.name != worst.name]
+        sized = [term for term in sized if term.name != worst.name]
         equations = replace(equations, columns=equations.columns.with_size(
             worst.name, worst.allowed))
     return tuple(found)

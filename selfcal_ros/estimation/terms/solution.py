@@ -79,7 +79,7 @@ def score(equations: TermEquations, residuals: np.ndarray, squares: tuple[float,
     return Score(between, within.right - within.gram @ taken, sums)
 
 
-def noise_left(equations: TermEquations, found: Score) -> Sums:
+def residual_sums(equations: TermEquations, found: Score) -> Sums:
     """Return what all the columns leave, were their coefficients free.
 
     The noise is taken from this fit: a size that is too small would leave part of its term in.

@@ -21,7 +21,7 @@ TOLD = 0.5
 """Part of a term's size that readings leave, below which it is they that tell the term."""
 
 
-def part_left(term: TermResult) -> float:
+def remaining_part(term: TermResult) -> float:
     """Return the part of a term's size that the readings leave: rms u over the size."""
     return rms(np.array([estimate.u for estimate in term.estimates])) / term.solved_with
 
@@ -34,7 +34,7 @@ def known_beforehand(result: CalibrationResult, reference: ReferenceLength | Non
         found += (reference.u_relative * np.stack([artifact.x_m, artifact.y_m])) ** 2
     terms = {term.name: term for term in result.model.terms}
     for name, variance in variance_of_terms(result).items():
-        if part_left(terms[name]) >= TOLD:
+        if remaining_part(terms[name]) >= TOLD:
             found += variance
     return found
 

@@ -51,7 +51,7 @@ def _(how: FromTerm) -> str:
     known = (f"known to {how.given:.3g} beforehand; the readings " if how.allowed is None else
              f"given as {how.given:.3g}, which the readings contradict; they allow "
              f"{how.allowed:.3g} and ")
-    return f"{known}leave {how.part_left:.0%} of it"
+    return f"{known}leave {how.remaining_part:.0%} of it"
 
 
 @how_text.register
