@@ -183,15 +183,13 @@ def _extended(args: argparse.Namespace, measurements: Any, options: Any,
     result = with_places(result, measurements.views)
     if args.validate:
         from selfcal_ros.estimation.quality.outliers import clean
-        from selfcal_ros.estimation.quality.validation import (
-            validate,
-            with_validation,
-        )
-        from selfcal_ros.reporting.words.validation import validation_text
+        from selfcal_ros.estimation.quality.validation import judged_by, validate
+        from selfcal_ros.reporting.words.validation import validation_json, validation_text
 
         used = clean(measurements, options).measurements if args.robust else measurements
         found = validate(used, options)
-        result = with_validation(result, found)
+        result = judged_by(result, found)
+        result = replace(result, extra={**result.extra, "validation": validation_json(found)})
         lines += ["", "held-out readings:", *(f"  {line}" for line in validation_text(found))]
     if args.budget:
         from selfcal_ros.estimation.quality.budget import budgets

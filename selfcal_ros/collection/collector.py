@@ -26,6 +26,7 @@ from selfcal_ros.collection.stage.samples import Limits
 from selfcal_ros.collection.timeline import Timeline, build_timeline
 from selfcal_ros.collection.view_cache import ViewCache
 from selfcal_ros.errors import InputError, NoDataError
+from selfcal_ros.messages.topics import COMMAND_TOPIC
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Measurements, Sense, ViewReadings
 from selfcal_ros.model.view import View
@@ -274,7 +275,7 @@ class Collector:
         """
         timeline = self.timeline
         if timeline.artifact is None:
-            raise NoDataError("selfcal/view_command", "no MEASURE command",
+            raise NoDataError(COMMAND_TOPIC, "no MEASURE command",
                               "readings cannot be assigned to views without one")
         self._settle()
         readings, loose = self._views.readings(timeline, self._exposures)

@@ -6,7 +6,9 @@
 
 from dataclasses import dataclass
 
+from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.verdict import Cause, Finding
+from selfcal_ros.model.view import View
 
 
 @dataclass(frozen=True)
@@ -118,6 +120,29 @@ class PredictionFailed(Finding):
     what: str
     ratio: float
     limit: float
+
+
+@dataclass(frozen=True)
+class RestNotIdentified(Finding):
+    """Readings cannot be held out: the rest does not identify the stage.
+
+    With the view `more` of a plate measured as well it would; None: no single view would do.
+    """
+
+    artifact: Artifact
+    more: View | None = None
+
+
+@dataclass(frozen=True)
+class NothingToPredict(Finding):
+    """No mark that was held out is known from the rest."""
+
+
+@dataclass(frozen=True)
+class OwnTermsUnknown(Finding):
+    """What a view held out has of its own, by terms, cannot be known: it is not judged."""
+
+    terms: tuple[str, ...]
 
 
 @dataclass(frozen=True)

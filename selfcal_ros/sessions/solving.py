@@ -15,7 +15,7 @@ from selfcal_ros.estimation.api import Options, calibrate
 from selfcal_ros.files import write_json
 from selfcal_ros.messages import from_model, to_model
 from selfcal_ros.messages.sizes import check_plate, check_view
-from selfcal_ros.messages.topics import COMMAND_TOPIC
+from selfcal_ros.messages.topics import COMMAND_TOPIC, MEASUREMENT_TOPIC
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.result import (
@@ -170,13 +170,13 @@ class SolvingSession:
     def measurements(self) -> Measurements:
         """Return the readings of all views of the run so far."""
         if not self._messages:
-            raise NoDataError("selfcal/view_measurement", "no view has been measured",
+            raise NoDataError(MEASUREMENT_TOPIC, "no view has been measured",
                               "start the collector and measure")
         ordered = [self._messages[index] for index in sorted(self._messages)]
         newest = max(ordered, key=lambda m: sum(m.session_reject_counts))
         artifacts = {to_model.artifact_of(message) for message in ordered}
         if len(artifacts) > 1:
-            raise InputError("selfcal/view_measurement", "views of different plates in one plan",
+            raise InputError(MEASUREMENT_TOPIC, "views of different plates in one plan",
                              "measure one plate")
         artifact = artifacts.pop()
         views = tuple(to_model.view_readings(message) for message in ordered)

@@ -103,7 +103,7 @@ def test_validation_predicts_by_the_model_that_was_fitted(sense):
     wanted = validate(readings, Options(misalignment_model="linear"), folds=1)
     bent = with_finite_rotations(readings, truth)
     for one, two in zip(validate(bent, folds=1), wanted, strict=True):
-        assert one.n_grid == two.n_grid and one.note == two.note
+        assert one.n_grid == two.n_grid and one.why == two.why
         if one.n_grid:
             # a held-out whole view is placed anew, so that only the noise turns a little
             assert one.rms_m == pytest.approx(two.rms_m, rel=0.03)
@@ -114,7 +114,7 @@ def test_validation_does_not_depend_on_the_order_of_readings():
     _, readings = measured(CASES["square"])
     wanted = validate(readings, folds=2)
     for one, two in zip(validate(permuted(readings), folds=2), wanted, strict=True):
-        assert (one.n_grid, one.n_angular, one.note) == (two.n_grid, two.n_angular, two.note)
+        assert (one.n_grid, one.n_angular, one.why) == (two.n_grid, two.n_angular, two.why)
         assert one.rms_m == pytest.approx(two.rms_m, nan_ok=True)
         assert one.rms_rad == pytest.approx(two.rms_rad, nan_ok=True)
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Hu's self-calibration law, for comparison with the joint solution (method, section 5)."""
+"""Hu's self-calibration law, for comparison with the joint solution (method eqs. 5.1-5.10)."""
 
 from dataclasses import dataclass
 

@@ -7,14 +7,18 @@ misalignments are fitted first, as no calibration can know them.
 """
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
 from selfcal_ros.errors import InputError, NoDataError, NotIdentifiableError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.blas_threads import one_thread
-from selfcal_ros.estimation.findings import PredictionFailed
+from selfcal_ros.estimation.findings import (
+    NothingToPredict,
+    OwnTermsUnknown,
+    PredictionFailed,
+    RestNotIdentified,
+)
 from selfcal_ros.estimation.joint.model_fit import ModelFit
 from selfcal_ros.estimation.joint.solve import solve_joint
 from selfcal_ros.estimation.joint.solved import Solved
@@ -25,7 +29,6 @@ from selfcal_ros.estimation.lattice.finite_rotation import (
 )
 from selfcal_ros.estimation.observability.plan_check import (
     candidate_views,
-    describe_view,
     smaller,
 )
 from selfcal_ros.estimation.observability.rank import plan_observability
@@ -44,6 +47,7 @@ from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.readings import Measurements, Sense, ViewReadings
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.statistics import rms
+from selfcal_ros.model.verdict import Finding
 from selfcal_ros.model.view import Plan
 
 FRACTION = 0.1
@@ -74,8 +78,8 @@ class HeldOut:
     ratio : float
         rms over the noise of one reading; the noise alone gives 1, the map's own uncertainty
         adds to it.
-    note : str
-        Why nothing could be predicted, or why it is not judged; empty otherwise.
+    why : Finding, optional
+        Why nothing could be predicted, or why it is not judged; None otherwise.
     limit : float
         What `ratio` exceeds in one of a thousand good sets; NaN if it is not judged.
     """
@@ -87,7 +91,7 @@ class HeldOut:
     max_m: float = float("nan")
     rms_rad: float = float("nan")
     ratio: float = float("nan")
-    note: str = ""
+    why: Finding | None = None
     limit: float = NOTHING
 
     @property
@@ -153,8 +157,7 @@ def _held_out(measurements: Measurements, options: Options,
     try:
         solved = solve_joint(kept, options)
     except (NotIdentifiableError, NoDataError):
-        return HeldOut(name, note="cannot be held out: the rest does not identify the stage"
-                       + _further_view(kept, held))
+        return HeldOut(name, why=_rest_not_identified(kept, held))
     model = solved.model
     if model is None:
         raise AssertionError("the joint solution always has its model")
@@ -178,35 +181,35 @@ def _held_out(measurements: Measurements, options: Options,
     both = both[:, np.isfinite(both).all(axis=0)]
     lines_off = lines_off[np.isfinite(lines_off)]
     if not both.size and not lines_off.size:
-        return HeldOut(name, note="nothing to predict: no held-out mark is known from the rest")
-    ratio, limit, note = _judged(solved, model, of, known=known_at, error=error_at)
+        return HeldOut(name, why=NothingToPredict())
+    ratio, limit, why = _judged(solved, model, of, known=known_at, error=error_at)
     return HeldOut(name, both.shape[1], len(lines_off), rms(both) if both.size else NOTHING,
                    float(abs(both).max()) if both.size else NOTHING,
-                   rms(lines_off) if lines_off.size else NOTHING, ratio, note, limit)
+                   rms(lines_off) if lines_off.size else NOTHING, ratio, why, limit)
 
 
 def _judged(solved: Solved, model: ModelFit, held: HeldReadings, *, known: np.ndarray,
-            error: np.ndarray) -> tuple[float, float, str]:
+            error: np.ndarray) -> tuple[float, float, Finding | None]:
     """Return error over noise, its limit, and why there is none."""
     noise = solved.result.noise
     if not known.any():
-        return NOTHING, NOTHING, ""
+        return NOTHING, NOTHING, None
     weight = held.grid.weight
     if np.isfinite(held.grid.sigma_declared) and np.isfinite(noise.sigma_xy_declared):
         # each is relative to what its own detections declare on average
         weight = weight * (noise.sigma_xy_declared / held.grid.sigma_declared) ** 2
     square = float((weight * abs(error) ** 2)[known].sum()) / (2 * int(known.sum()))
     ratio = float(np.sqrt(square)) / max(noise.sigma_xy, 1e-300)
-    own = [str(term.name) for term in model.problem.terms if term.name in OF_A_VIEW]
+    own = tuple(str(term.name) for term in model.problem.terms if term.name in OF_A_VIEW)
     if own and -1 in held.rows:
-        return ratio, NOTHING, f"its own {' and '.join(own)} cannot be known: not judged"
+        return ratio, NOTHING, OwnTermsUnknown(own)
     if not (noise.sigma_xy > ROUNDING and noise.dof_xy > 0 and model.problem.direct):
-        return ratio, NOTHING, ""
-    return ratio, prediction_limit(model, held, known, weight).ratio(noise.dof_xy), ""
+        return ratio, NOTHING, None
+    return ratio, prediction_limit(model, held, known, weight).ratio(noise.dof_xy), None
 
 
-def _further_view(kept: Measurements, held: Measurements) -> str:
-    """Return which view more would let a view be held out, in words."""
+def _rest_not_identified(kept: Measurements, held: Measurements) -> RestNotIdentified:
+    """Return which view more would let a view be held out."""
     views = tuple(replace(v.view, grid=bool(len(v.m)), angular=bool(len(v.k)))
                   for v in kept.views if len(v.m) or len(v.k))
     gone = {v.view.lattice_pose(held.artifact) for v in held.views if len(v.m) or len(v.k)}
@@ -216,8 +219,8 @@ def _further_view(kept: Measurements, held: Measurements) -> str:
     for more in candidate_views(plan.artifact, angular=any(view.angular for view in views)):
         if more.lattice_pose(plan.artifact) not in gone and plan_observability(
                 replace(plan, views=(*plan.views, more))).identifiable:
-            return f"; with {describe_view(more, plan.artifact)} measured as well it could be"
-    return "; no single further view would change that"
+            return RestNotIdentified(plan.artifact, more)
+    return RestNotIdentified(plan.artifact)
 
 
 def prediction_errors(measurements: Measurements, result: CalibrationResult, index: int,
@@ -302,18 +305,12 @@ def _misalignment(residual: np.ndarray, marks: np.ndarray) -> tuple[float, float
     return float(phi), float(tx), float(ty)
 
 
-def with_validation(result: CalibrationResult, found: list[HeldOut]) -> CalibrationResult:
-    """Return a result, not worded, with its validation; a prediction that failed disqualifies."""
+def judged_by(result: CalibrationResult, found: list[HeldOut]) -> CalibrationResult:
+    """Return a result, not worded, that predictions beyond their limits disqualify."""
     failed = tuple(PredictionFailed(item.name, item.ratio, item.limit)
                    for item in found if item.exceeds)
-    result = replace(result, extra={**result.extra, "validation": validation_json(found)})
     if not failed:
         return result
     verdict = result.verdict
     return replace(result, verdict=replace(verdict, qualified=False,
                                            findings=(*verdict.findings, *failed)))
-
-
-def validation_json(found: list[HeldOut]) -> list[dict[str, Any]]:
-    """Return the validation for ``extra["validation"]`` of a result: SI units."""
-    return [vars(item) | {"exceeds": item.exceeds} for item in found]

@@ -12,16 +12,15 @@ from selfcal_ros.errors import InputError, NotIdentifiableError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.quality.validation import (
+    judged_by,
     validate,
-    validation_json,
-    with_validation,
 )
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.terms import ModelTerm, TermName
 from selfcal_ros.model.view import View
 from selfcal_ros.reporting.words.result import worded
-from selfcal_ros.reporting.words.validation import validation_text
+from selfcal_ros.reporting.words.validation import validation_json, validation_text, why_text
 from selfcal_ros.simulation.truth import hu_plan, random_truth, simulate_measurements
 from test.support.lattice_plans import plan_of
 
@@ -76,7 +75,7 @@ def test_a_spoiled_view_is_predicted_badly():
 
 def test_views_that_are_needed_cannot_be_held_out():
     readings = measured(more=False)
-    notes = {item.name: item.note for item in validate(readings, folds=1)}
+    notes = {item.name: why_text(item.why) for item in validate(readings, folds=1)}
     assert notes["a random tenth (1)"] == ""
     for name in ("identity", "rot90", "line", "shift_x"):
         assert "does not identify the stage" in notes[f"view '{name}'"]
@@ -89,7 +88,7 @@ def test_views_that_are_needed_cannot_be_held_out():
     truth = random_truth(ARTIFACT, 5, rng)
     more = simulate_measurements(truth, plan, rng, sigma_m=SIGMA_M, sigma_theta_rad=SIGMA_RAD)
     held = {item.name: item for item in validate(more, folds=1)}
-    assert held["view 'shift_x'"].note == "" and held["view 'shift_x'"].n_grid > 0
+    assert held["view 'shift_x'"].why is None and held["view 'shift_x'"].n_grid > 0
 
 
 def drawn(seed, plan, **how):
@@ -125,19 +124,19 @@ def test_a_spoiled_view_exceeds_its_limit_and_disqualifies_the_result():
     assert not any(item.exceeds for item in right)
     assert "times the noise, within the limit of " in validation_text(right)[0]
     result = calibrate(readings, LINEAR)
-    assert with_validation(result, right).verdict == result.verdict
+    assert judged_by(result, right).verdict == result.verdict
     view = readings.views[4]
     wrong = replace(readings, views=(*readings.views[:4], replace(view, dx=view.dy, dy=view.dx)))
     found = validate(wrong, LINEAR, folds=1)
     bad = next(item for item in found if item.name == "view 'ty'")
     assert bad.exceeds and ", EXCEEDS the limit of " in "\n".join(validation_text(found))
-    judged = worded(with_validation(result, [bad]))
+    judged = worded(judged_by(result, [bad]))
     assert not judged.verdict.qualified
     assert judged.verdict.reasons == (
         f"view 'ty' is predicted with {bad.ratio:.2f} times the noise, beyond the limit of "
         f"{bad.limit:.2f}",)
     assert judged.verdict.sentence == f"Not qualified: {judged.verdict.reasons[0]}"
-    assert judged.extra["validation"][0]["exceeds"] is True
+    assert validation_json([bad])[0]["exceeds"] is True
 
 
 def test_terms_are_predicted_with_the_readings():
@@ -160,13 +159,13 @@ def test_terms_are_predicted_with_the_readings():
     tenths, whole = found[:2], found[2]
     for item in tenths:
         assert item.ratio < item.limit < 3
-    assert whole.note == "its own drift cannot be known: not judged"
+    assert why_text(whole.why) == "its own drift cannot be known: not judged"
     assert "its own drift cannot be known: not judged)" in validation_text(found)[2]
     for left_out in (terms[:1], terms[1:]):
         poor = validate(readings, replace(LINEAR, terms=left_out, drift_degree=1), folds=1)[0]
         assert poor.rms_m > 2 * tenths[0].rms_m
     shared = validate(readings, replace(LINEAR, terms=terms[:1]), folds=1)[1]
-    assert shared.note == "" and np.isfinite(shared.limit)
+    assert why_text(shared.why) == "" and np.isfinite(shared.limit)
 
 
 def test_seeds_and_folds():
