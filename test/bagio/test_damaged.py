@@ -162,6 +162,38 @@ def test_a_chunk_whose_checksum_fails_is_not_believed_in_part(tmp_path, events):
             list(make_reader(file, validate_crcs=True).iter_messages())
 
 
+def test_damage_behind_the_last_message_costs_none_and_is_said_as_such(tmp_path):
+    """The data section has its end; of what follows, up to the closing magic, a part is gone."""
+    file = tmp_path / "x.mcap"
+    end = max(at for opcode, at, _ in records(DATA) if opcode == Opcode.DATA_END)
+    for cut, line in ((end + 13 + 5, "the end of the file is damaged, after the last message: no "
+                       "message is lost"),
+                      (end, "the file ends without its footer, as when a recorder is killed: every "
+                       "message that was written is read")):
+        file.write_bytes(DATA[:cut])
+        assert read(file) == (TOTAL, [line])
+
+
+@pytest.mark.parametrize(("names", "message"), [
+    (["b_0.db3", "metadata.yaml"], "a bag with sqlite3 storage; convert it with `ros2 "
+     "bag convert -i BAG "),
+    (["notes.txt"], "no .mcap file in this folder; give an MCAP file or a rosbag2 folder with MCAP "
+     "storage"),
+    ([], "no .mcap file in this folder; give an MCAP file or a rosbag2 folder with MCAP storage")])
+def test_a_folder_without_mcap_files_is_refused(tmp_path, names, message):
+    for name in names:
+        (tmp_path / name).write_text("")
+    with pytest.raises(InputError) as raised:
+        read(tmp_path)
+    assert str(raised.value).startswith(f"{tmp_path}: {message}")
+
+
+def test_an_mcap_file_beside_one_of_sqlite_is_read(tmp_path):
+    (tmp_path / "old.db3").write_bytes(b"")
+    (tmp_path / "b_0.mcap").write_bytes(DATA)
+    assert read(tmp_path)[0] == TOTAL
+
+
 def test_what_is_no_bag_is_refused(tmp_path):
     for content, message in ((b"", "the file is empty"), (b"hello world", "not an MCAP file")):
         file = tmp_path / "x.mcap"

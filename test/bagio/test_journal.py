@@ -267,6 +267,30 @@ def test_a_journal_has_one_writer(tmp_path):
     resume(tmp_path).close()
 
 
+def test_the_lag_is_the_age_of_what_the_disk_does_not_have(tmp_path, monkeypatch):
+    now = [100.0]
+    monkeypatch.setattr(journal.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(journal, "SYNC_PERIOD_S", 3600.0)
+    with declared(start(tmp_path, NOW)) as writer:
+        assert writer.lag_s == 0.0
+        record(writer, samples(1))
+        now[0] = 107.5
+        record(writer, samples(1, 1))
+        assert writer.lag_s == 7.5
+        now[0] = 109.0
+        assert writer.lag_s == 9.0
+
+
+def test_a_journal_may_be_read_by_whom_the_system_lets_read(tmp_path):
+    mask = os.umask(0o027)
+    try:
+        with declared(start(tmp_path, NOW)) as writer:
+            [file] = writer.path.glob("*.mcap")
+            assert file.stat().st_mode & 0o7777 == 0o640
+    finally:
+        os.umask(mask)
+
+
 @pytest.mark.parametrize("n_written", [0, 11, 200])
 def test_a_full_disk_is_said_and_leaves_no_half_message(tmp_path, monkeypatch, n_written):
     writer = declared(start(tmp_path, NOW))

@@ -101,13 +101,19 @@ def test_another_stage_is_significantly_different():
     assert found.xy.p < 1e-12 and found.theta.p < 1e-12
 
 
-def test_unknown_sites_do_not_count():
-    gone = A.error_map.gx.copy()
-    gone[0, 0] = np.nan
-    holed = replace(A, error_map=replace(A.error_map, gx=gone, gy=np.where(
-        np.isnan(gone), np.nan, A.error_map.gy)))
+@pytest.mark.parametrize("coordinates", ["both", "gx", "gy"])
+def test_unknown_sites_do_not_count(coordinates):
+    """One that is known in one coordinate alone is not known."""
+    hole = np.zeros(ARTIFACT.shape)
+    hole[0, 0] = np.nan
+    holed = replace(A, error_map=replace(A.error_map, **{
+        name: getattr(A.error_map, name) + hole for name in ("gx", "gy")
+        if coordinates in (name, "both")}))
     found = compare(holed, B)
-    assert np.isnan(found.dx[0, 0]) and np.isnan(found.dx).sum() == 1
+    wholly = compare(replace(A, error_map=replace(
+        A.error_map, gx=A.error_map.gx + hole, gy=A.error_map.gy + hole)), B)
+    assert np.isnan(wholly.dx[0, 0]) and np.isnan(wholly.dx).sum() == 1
+    assert (found.rms_m, found.max_m) == pytest.approx((wholly.rms_m, wholly.max_m), rel=0.02)
     assert np.isfinite([found.rms_m, found.max_m, found.xy.p]).all()
 
 

@@ -26,3 +26,45 @@ def test_sites_of_marks(shape, q, shift):
     views = LatticeViews(shape, (LatticePose(q, shift, None),))
     assert views.site_index[0].tolist() == expected.tolist()
     assert views.in_field[0].tolist() == (expected >= 0).tolist()
+
+
+POSES = (LatticePose(1, (1, 0), None), LatticePose(0, (0, 0), None), LatticePose(3, (-2, 1), None),
+         LatticePose(2, (0, -1), None))
+HALF, SIDE = 2, 5
+
+
+def dense(pose):
+    """Return what takes a field at the sites to the marks of a view, i^-q, complex (25, 25)."""
+    out = np.zeros((SIDE**2, SIDE**2), dtype=complex)
+    for m in range(-HALF, HALF + 1):
+        for n in range(-HALF, HALF + 1):
+            i, j = TURNS[pose.q] @ [m, n] + pose.shift
+            if max(abs(i), abs(j)) <= HALF:
+                out[(m + HALF) * SIDE + n + HALF, (i + HALF) * SIDE + j + HALF] = (-1j)**pose.q
+    return out
+
+
+def test_fields_go_to_the_marks_and_back_as_dense_matrices_take_them():
+    rng = np.random.default_rng(1)
+    views, matrices = LatticeViews((SIDE, SIDE), POSES), [dense(pose) for pose in POSES]
+    field = rng.normal(size=(SIDE, SIDE, 2)) @ [1, 1j]
+    marks = rng.normal(size=(4, SIDE, SIDE, 2)) @ [1, 1j]
+    weight = rng.uniform(0.5, 2, (4, SIDE, SIDE))
+    gathered = [(matrix @ field.ravel()).reshape(SIDE, SIDE) for matrix in matrices]
+    back = [(matrix.conj().T @ one.ravel()).reshape(SIDE, SIDE)
+            for matrix, one in zip(matrices, marks, strict=True)]
+    assert views.gather(field) == pytest.approx(np.array(gathered))
+    assert views.gather_mean(field, weight) == pytest.approx((weight * gathered).sum(axis=0))
+    assert views.scatter(marks) == pytest.approx(np.sum(back, axis=0))
+    for index in range(4):
+        out = field.copy()
+        views.add_scattered(out, index, marks[index])
+        assert out == pytest.approx(field + back[index])
+    out = field.copy()
+    views.subtract_scattered(out, weight, marks[0])
+    assert out == pytest.approx(field - sum(
+        (matrix.conj().T @ (one * marks[0]).ravel()).reshape(SIDE, SIDE)
+        for matrix, one in zip(matrices, weight, strict=True)))
+    assert views.scatter_weight(weight) == pytest.approx(sum(
+        (abs(matrix).T @ one.ravel()).reshape(SIDE, SIDE)
+        for matrix, one in zip(matrices, weight, strict=True)))
