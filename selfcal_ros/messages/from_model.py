@@ -4,6 +4,7 @@
 `bagio.build` makes a rosbags message of them; nodes fill rclpy messages from the same dicts.
 """
 
+from collections.abc import Iterable
 from typing import Any
 
 from selfcal_ros.collection.collector import ViewProgress
@@ -82,8 +83,8 @@ def view_status(progress: ViewProgress, plan_id: str, stamp_ns: int, frame_id: s
 
 
 def view_measurement(progress: ViewProgress, measurements: Measurements, stamp_ns: int,
-                     frame_id: str) -> Fields:
-    """Return the fields of a selfcal_msgs/ViewMeasurement."""
+                     frame_id: str, notes: Iterable[str] = ()) -> Fields:
+    """Return the fields of a selfcal_msgs/ViewMeasurement; `notes` are lines on the session."""
     readings = progress.readings
     arrays = ("m", "n", "dx", "dy", "count", "k", "dtheta", "count_theta", "u", "u_theta")
     return {
@@ -98,7 +99,7 @@ def view_measurement(progress: ViewProgress, measurements: Measurements, stamp_n
         "measurement_sense": str(measurements.sense),
         **_rejected(measurements.rejected, "session_reject"),
         **_visits(readings.visits), "run_id": measurements.run_id,
-        "model_terms": list(measurements.model_terms)}
+        "model_terms": list(measurements.model_terms), "session_notes": list(notes)}
 
 
 def _visits(visits: GridVisits | None) -> Fields:

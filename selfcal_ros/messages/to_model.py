@@ -2,12 +2,13 @@
 """From messages to the model. Messages of rclpy and of rosbags have the same fields."""
 
 import math
+from itertools import islice
 from typing import Any
 
 import numpy as np
 
 from selfcal_ros.collection.messages import Command, Detection, EncoderSample, Phase
-from selfcal_ros.errors import InputError
+from selfcal_ros.errors import InputError, printable
 from selfcal_ros.messages.topics import COMMAND_TOPIC, ERROR_MAP_TOPIC, MEASUREMENT_TOPIC
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ErrorMap, ThetaDatum
@@ -15,6 +16,9 @@ from selfcal_ros.model.orders import parse_order
 from selfcal_ros.model.readings import GridVisits, Sense, ViewReadings
 from selfcal_ros.model.view import View
 from selfcal_ros.units import NS_PER_S
+
+MOST_NOTES = 20
+"""Lines on the session that are taken."""
 
 
 def stamp_ns(message: Any) -> int:
@@ -69,6 +73,11 @@ def command(message: Any) -> Command:
 def terms_of(message: Any) -> tuple[str, ...]:
     """Return the terms that a ViewCommand or ViewMeasurement wants estimated; none in old bags."""
     return tuple(map(str, getattr(message, "model_terms", ())))
+
+
+def notes_of(message: Any) -> tuple[str, ...]:
+    """Return the lines on the session in a ViewMeasurement, at most `MOST_NOTES`."""
+    return tuple(map(printable, islice(getattr(message, "session_notes", ()), MOST_NOTES)))
 
 
 def artifact_of(message: Any) -> Artifact:

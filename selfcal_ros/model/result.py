@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The result of a calibration and its JSON form, schema ``selfcal.result/1``."""
 
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime
 from numbers import Integral
@@ -195,7 +196,12 @@ def _budget(rows: Any) -> None:
 def with_input(result: CalibrationResult, source: dict[str, str],
                lost: list[str]) -> CalibrationResult:
     """Return `result` with the file it came from, and what was lost of it as warnings."""
-    return replace(result, input=source, warnings=(*result.warnings, *lost))
+    return replace(with_warnings(result, lost), input=source)
+
+
+def with_warnings(result: CalibrationResult, lines: Iterable[str]) -> CalibrationResult:
+    """Return `result` with further warnings."""
+    return replace(result, warnings=(*result.warnings, *lines))
 
 
 def created_now(result: CalibrationResult) -> CalibrationResult:

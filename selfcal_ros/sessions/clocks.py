@@ -2,7 +2,7 @@
 """Whose time it is: whether the cell's clock is this machine's, and what ROS time follows."""
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import numpy as np
 
@@ -55,6 +55,11 @@ class ClockWatch:
         self._live = known or abs(now_ns - stamp_ns) <= LIVE_NS
         if self._live and run_id != self._live_run:
             self._live_run, self._watches, self.steps = run_id, {}, {}
+
+    def adopt(self, run_id: str, steps: Mapping[str, list[Step]]) -> None:
+        """Go on with a run in which clocks have stepped before."""
+        self._live_run, self._watches = run_id, {}
+        self.steps = {topic: list(mine) for topic, mine in steps.items()}
 
     def data(self, topic: str, stamp_ns: int, now_ns: int, now_s: float) -> None:
         """Take the stamp and the reception of a message of the cell, by both clocks."""

@@ -4,11 +4,12 @@
 import math
 import statistics
 from collections import Counter, deque
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
-from selfcal_ros.collection.clock.steps import step_lines
+from selfcal_ros.collection.clock.steps import Step, step_lines
 from selfcal_ros.collection.collector import Collector, ViewProgress
 from selfcal_ros.collection.digest import placing_digest, readings_digest, session_digest
 from selfcal_ros.collection.messages import Command, Phase
@@ -53,6 +54,7 @@ class CollectingSession:
         self._warned: set[tuple[int | None, str]] = set()
         self._findings: list[str] = []
         self._stepped: list[str] = []
+        self._noted: list[str] = []  # what the readings of a view that were sent last say of clocks
         self._clock = ClockWatch(settings.clock_limit)
         self._encoder_rate = Rate(ports.now_s)
         self._encoder_s = float("-inf")
@@ -88,10 +90,23 @@ class CollectingSession:
         self._clock.data(topic, int(stamps_ns.max()), self._ports.now_ns() - age_ns,
                          self._ports.now_s())
 
-    def adopt(self, collector: Collector, journal: str) -> None:
-        """Go on with a collector that has taken what a journal holds of the run."""
+    def adopt(self, collector: Collector, journal: str,
+              steps: Mapping[str, list[Step]] | None = None) -> None:
+        """Go on with a collector that has taken what a journal holds of the run.
+
+        Parameters
+        ----------
+        collector : Collector
+            Has what the journal holds.
+        journal : str
+            Its name.
+        steps : dict, optional
+            Topic -> steps of clocks that the journal shows.
+        """
         self.collector, self._dirty, self._next_status = collector, True, 0.0
         last = collector.newest_command
+        if last is not None:
+            self._clock.adopt(last.run_id, steps or {})
         where = "between views" if last is None or last.phase != Phase.MEASURE else (
             f"in view '{last.placed().name}'; marks that were detected since and are missing have "
             "to be measured again, by the cell or with redo_view")
@@ -178,7 +193,8 @@ class CollectingSession:
         timeline, frame_id = self.collector.timeline, self.settings.frame_id
         if (timeline.plan_id, timeline.run_id) != self._run:
             self._run, self._published = (timeline.plan_id, timeline.run_id), {}
-            self._advised, self._warned = set(), set()
+            self._advised, self._warned, self._noted = set(), set(), []
+        self._tell_steps()
         self._warn(measurements, progress)
         for index, view in progress.items():
             stamp = from_model.session_stamp_ns(timeline, view)
@@ -187,10 +203,11 @@ class CollectingSession:
             closed = view.end_ns <= timeline.last_stamp_ns
             ready = final or closed or view.complete
             worth = view.readings.used or view.readings.rejected or index in self._published
-            if ready and worth and self._published.get(index) != key:
-                self._published[index] = key
+            is_new = self._published.get(index) != key or self._noted != self._stepped
+            if ready and worth and is_new:
+                self._published[index], self._noted = key, self._stepped
                 self._ports.publish("measurement", from_model.view_measurement(
-                    view, measurements, stamp, frame_id))
+                    view, measurements, stamp, frame_id, self._stepped))
             # after the readings: what is called complete can be solved
             if current or index == max(progress) or final:
                 fields = from_model.view_status(view, timeline.plan_id, stamp, frame_id,
@@ -232,7 +249,6 @@ class CollectingSession:
         self._rejected = Counter(measurements.rejected)
         for view in progress.values():
             self._rejected.update(view.readings.rejected)
-        self._tell_steps()
         index = self.collector.timeline.intervals[-1].view_index
         for number in sorted(progress):  # of the last view that tells it
             told = progress[number].readings

@@ -23,6 +23,7 @@ from selfcal_ros.model.result import (
     created_now,
     result_to_dict,
     unidentified_result,
+    with_warnings,
 )
 from selfcal_ros.reporting.summary.numbers import summary_numbers
 from selfcal_ros.reporting.summary.text import state_sentence
@@ -46,6 +47,7 @@ class Job:
     options: Options
     digest: str
     stamp_ns: int
+    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,9 +62,11 @@ class Outcome:
 def solve(job: Job) -> Outcome:
     """Solve a job; needs nothing but the job, so that it can run anywhere."""
     try:
-        return Outcome(job, worded(calibrate(job.measurements, job.options)), None)
+        result = worded(calibrate(job.measurements, job.options))
+        return Outcome(job, with_warnings(result, job.notes), None)
     except NotIdentifiableError as error:
-        return Outcome(job, unidentified_result(job.measurements, error.observability), error)
+        result = unidentified_result(job.measurements, error.observability)
+        return Outcome(job, with_warnings(result, job.notes), error)
     except Exception as error:  # told by `take`, in the thread of the session
         return Outcome(job, None, error)
 
@@ -109,6 +113,7 @@ class SolvingSession:
     def __init__(self, settings: SolverSettings, ports: Ports) -> None:
         self._settings, self._ports = settings, ports
         self._messages: dict[int, Any] = {}
+        self._notes: tuple[str, ...] = ()  # on the session, of the newest message
         self._run = Run()
         self._planned: dict[Run, int] = {}
         self._stale = False
@@ -165,6 +170,7 @@ class SolvingSession:
             self._run, self._messages = run, {}
         # one collector, delivered in order: its newest word on a view holds
         self._messages[message.view_index] = message
+        self._notes = to_model.notes_of(message)
         self._stale = True
 
     def measurements(self) -> Measurements:
@@ -207,7 +213,7 @@ class SolvingSession:
             self.shown.problem, self.shown.digest = error, ""
             raise
         stamp = max(to_model.stamp_ns(message) for message in self._messages.values())
-        return Job(self._run, measurements, options, digest, stamp)
+        return Job(self._run, measurements, options, digest, stamp, self._notes)
 
     def take(self, outcome: Outcome) -> None:
         """Publish what solving a job gave, unless another run has begun meanwhile."""

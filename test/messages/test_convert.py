@@ -222,7 +222,7 @@ def test_fields_of_a_view_measurement_by_name():
         "detections_used": 15, "reject_reasons": ["low_score"], "reject_counts": [16],
         "measurement_sense": "plate_moves", "session_reject_reasons": ["other"],
         "session_reject_counts": [17], "run_id": "77", "sigma_visit": 9e-9, "dof_visit": 6,
-        "model_terms": ["approach"]}
+        "model_terms": ["approach"], "session_notes": []}
 
 
 def test_fields_of_a_view_status_by_name():

@@ -1,17 +1,26 @@
 # SPDX-License-Identifier: Apache-2.0
 """The session of the collector: when it publishes what, and what it warns of."""
 
+import re
 from dataclasses import replace
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
+from selfcal_ros.bagio.offline import collect_bag
 from selfcal_ros.bagio.simulated import event_fields
+from selfcal_ros.bagio.writer import BagWriter
 from selfcal_ros.collection.messages import Command, Detection, EncoderSample
+from selfcal_ros.estimation.api import calibrate
+from selfcal_ros.messages.topics import INPUT_TOPICS
+from selfcal_ros.model.result import with_input
 from selfcal_ros.sessions.collecting import CollectingSession
 from selfcal_ros.sessions.ports import Level
+from selfcal_ros.sessions.receiving.journal_keeper import take_up
+from selfcal_ros.sessions.solving import SolvingSession, solve
 from test.support.collecting import detection_table, encoder_block
-from test.support.ports import START_NS, Hands, settings_of
+from test.support.ports import START_NS, Hands, message, settings_of
 from test.support.sessions import events_of, small_plan
 
 
@@ -142,6 +151,69 @@ def test_a_clock_that_steps_within_a_view_is_said_once_and_told_to_the_end_of_th
     desk.feed(again, run_id="2")
     desk.session.tick()
     assert words not in desk.told().message
+
+
+def solved_live(desk: Desk):
+    """Return the result of what the collector's session has published."""
+    session = SolvingSession(settings_of("solver"), Hands().ports)
+    for fields in desk.hands.of("measurement"):
+        session.take_measurement(message("ViewMeasurement", fields))
+    session.take(solve(session.next_job()))
+    return session.result
+
+
+def logged(folder, events: list):
+    """Write a bag of these events and the instants at which they were logged; return `folder`."""
+    with BagWriter(folder) as writer:
+        for topic, typename in INPUT_TOPICS.items():
+            writer.add_topic(f"/{topic}", typename, [])
+        for event, logged_ns in events:
+            topic, fields = event_fields(event, "stage")
+            writer.write(f"/{topic}", fields, logged_ns)
+    return folder
+
+
+def solved_offline(folder):
+    found = collect_bag(folder, settings_of("measurement_collector"))
+    return with_input(calibrate(found.measurements), {}, found.lost)
+
+
+@pytest.mark.parametrize("by_s", [0.15, -0.3])
+def test_a_clock_that_stepped_is_in_the_live_result_as_in_the_offline_one(tmp_path, by_s):
+    desk, events = Desk(), events_of(small_plan("0, 90, tx", repeats=6))
+    half = next(n for n, event in enumerate(events) if isinstance(event, Command)
+                and event.view_index == 1) + 400
+    later = [event if isinstance(event, Command) else replace(
+        event, stamp_ns=event.stamp_ns + round(by_s * 1e9)) for event in events[half:]]
+    desk.feed(events[:half])
+    desk.session.tick()
+    desk.feed(events[half:], ahead_s=by_s)
+    desk.session.tick()
+    desk.session.finish()
+    live = solved_live(desk)
+    bag = logged(tmp_path / "bag", [*zip(
+        [*events[:half], *later], [event.stamp_ns for event in events], strict=True)])
+    offline = solved_offline(bag)
+    lines = [[re.sub(r"at \d+\.\d{3} s", "at T", line) for line in result.warnings
+              if "clock" in line] for result in (live, offline)]
+    assert lines[0] == lines[1]
+    assert len(lines[0]) == 1
+    assert f"{'ahead' if by_s > 0 else 'back'} by {abs(by_s)} s in view '90', at T: " in lines[0][0]
+    assert [line for line in live.warnings if "clock" in line] == desk.session._stepped
+    np.testing.assert_array_equal(live.error_map.gx, offline.error_map.gx)
+    again = Desk()  # that takes up the journal
+    taken = take_up([*bag.glob("*.mcap")], again.session.settings)
+    again.session.adopt(taken.collector, "journal", taken.steps)
+    again.session.finish()
+    assert [line for line in offline.warnings if "clock" in line] == again.hands.of(
+        "measurement")[-1]["session_notes"]
+
+
+def test_no_step_no_note(tmp_path):
+    desk = Desk()
+    desk.feed(events_of(small_plan("0, 90, tx")))
+    desk.session.finish()
+    assert {len(fields["session_notes"]) for fields in desk.hands.of("measurement")} == {0}
 
 
 def test_a_clock_that_steps_with_this_machines_is_found_by_the_steady_clock(monkeypatch):

@@ -288,3 +288,13 @@ def test_a_map_tells_run_and_verdict(desk):
     assert (published["qualified"], published["run_id"]) == (True, "7")
     assert (summary["qualified"], summary["run_id"], summary["causes"]) == (True, "7", [])
     assert to_model.error_map(message("ErrorMap", published)).artifact == PLAN.artifact
+
+
+def test_what_is_noted_of_the_session_is_a_warning_of_the_result(desk):
+    first, *others = views_of()
+    first.session_notes = ["the clock stepped \x1b[2J"] + ["more"] * 30
+    desk.take([*others, first])
+    assert desk.session.result.warnings[-20:] == (r"the clock stepped \x1b[2J", *["more"] * 19)
+    first.session_notes = []
+    desk.take([first])  # the newest word counts
+    assert "more" not in desk.session.result.warnings

@@ -7,13 +7,14 @@ A journal that cannot be written ends nothing: what is not in it is counted and 
 import errno
 from collections import Counter
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
 from selfcal_ros.bagio.journal import Journal, resume, start, unfinished, written_ago_s
 from selfcal_ros.bagio.offline import block_handlers
 from selfcal_ros.bagio.reader import BagReader
+from selfcal_ros.collection.clock.steps import Step
 from selfcal_ros.collection.collector import Collector
 from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.errors import InputError
@@ -30,10 +31,14 @@ NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS)
 
 @dataclass(frozen=True)
 class TakenUp:
-    """What a journal that is taken up gave: a collector that has it, and what was lost of it."""
+    """What a journal that is taken up gave: a collector that has it, and what was lost of it.
+
+    `steps` are those of clocks, by topic.
+    """
 
     collector: Collector
     lost: tuple[str, ...]
+    steps: dict[str, list[Step]] = field(default_factory=dict)
 
 
 def take_up(files: list[Path], settings: CollectorSettings) -> TakenUp:
@@ -54,19 +59,22 @@ def take_up(files: list[Path], settings: CollectorSettings) -> TakenUp:
     collector = Collector(settings)
     lost: list[str] = []
     refused: list[InputError] = []
+    steps: dict[str, list[Step]] = {}
     feed = block_handlers(collector, lost)
     for file in files:
         try:
-            reader = BagReader(file)
+            reader = BagReader(file, clock_limit_s=settings.clock_limit)
             for topic, item in reader.columns():
                 feed[topic](item)
             lost += reader.lost
+            for topic, found in reader.steps.items():
+                steps.setdefault(topic, []).extend(found)
         except InputError as error:
             refused.append(error)
             lost.append(f"the file {file.name} was not read: {error.what}")
     if len(refused) == len(files):
         raise refused[0]
-    return TakenUp(collector, tuple(lost))
+    return TakenUp(collector, tuple(lost), steps)
 
 
 class KeptTopic(NamedTuple):

@@ -113,7 +113,7 @@ class Reception:
         except Exception as error:  # a journal that cannot be read ends nothing
             self._refuse("journal", error)
             return
-        self.session.adopt(found.collector, self._source)
+        self.session.adopt(found.collector, self._source, found.steps)
         for line in found.lost:
             self._say(Level.WARN, f"{self._source}: {line}")
 
