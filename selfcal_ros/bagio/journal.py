@@ -33,7 +33,7 @@ from selfcal_ros.collection.messages import Phase
 from selfcal_ros.errors import InputError, SelfcalError
 from selfcal_ros.messages.to_model import stamp_ns
 from selfcal_ros.messages.topics import COMMAND_TOPIC
-from selfcal_ros.units import NS_PER_S, S_PER_NS
+from selfcal_ros.units import NS_PER_S
 
 SYNC_PERIOD_S = 0.5
 """Time between two synchronisations with the disk, where there is something to synchronise."""
@@ -56,24 +56,49 @@ def resume(folder: str | os.PathLike) -> "Journal | None":
     InputError
         If another process writes this journal, or it cannot be read or written.
     """
-    with _said(Path(folder)):
-        bag = _newest(Path(folder))[1]
-    if bag is None:
+    found = claim(folder)
+    return found.resume() if found else None
+
+
+class Claim:
+    """The newest journal of a folder, locked: nobody else writes it. It is gone through once."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        with _said(path):
+            self._lock = _locked(path)
+
+    def resume(self) -> "Journal | None":
+        """Return the journal as `resume` does: all of it is read, a GB in some seconds."""
+        with _said(self.path):
+            try:
+                metadata, commands = _taken_up(self.path)
+                if not _is_over(commands):
+                    return Journal(self.path, self._lock, metadata)
+            except BaseException:
+                os.close(self._lock)
+                raise
+            os.close(self._lock)
         return None
-    with _said(bag):
-        lock = _locked(bag)
-        try:
-            metadata, commands = _taken_up(bag)
-            if not _is_over(commands):
-                return Journal(bag, lock, metadata)
-        except BaseException:
-            os.close(lock)
-            raise
-        os.close(lock)
-    return None
+
+    def close(self) -> None:
+        """Let go of a journal that is not resumed."""
+        os.close(self._lock)
 
 
-def unfinished(folder: str | os.PathLike) -> list[Path]:
+def claim(folder: str | os.PathLike) -> Claim | None:
+    """Return the newest journal in `folder` before it is gone through; None without one.
+
+    Raises
+    ------
+    InputError
+        If another process writes this journal, or the folder cannot be read.
+    """
+    found = newest(folder)
+    return Claim(found[0]) if found else None
+
+
+def unfinished(folder: str | os.PathLike, journal: Path | None = None) -> list[Path]:
     """Return the files of the journal that `resume` would take up, in their order; [] = none.
 
     Nothing is written: where there is no room, what the journal holds can be used all the same.
@@ -82,6 +107,8 @@ def unfinished(folder: str | os.PathLike) -> list[Path]:
     ----------
     folder : path
         Where journals lie, each a bag folder; need not exist.
+    journal : Path, optional
+        The one to look at; None = the newest.
 
     Raises
     ------
@@ -90,7 +117,7 @@ def unfinished(folder: str | os.PathLike) -> list[Path]:
     """
     bag = Path(folder)
     try:
-        found = _newest(bag)[1]
+        found = journal or _newest(bag)[1]
         if found is None:
             return []
         bag, files = found, sorted(found.glob("*.mcap"), key=_number)
@@ -102,8 +129,8 @@ def unfinished(folder: str | os.PathLike) -> list[Path]:
     return [] if _is_over(sorted(commands)) else files
 
 
-def written_ago_s(folder: str | os.PathLike) -> float | None:
-    """Return the time since the newest journal in `folder` was written, s; None without one.
+def newest(folder: str | os.PathLike) -> tuple[Path, float] | None:
+    """Return the journal in `folder` that was written last, and the time since, s.
 
     Raises
     ------
@@ -111,8 +138,8 @@ def written_ago_s(folder: str | os.PathLike) -> float | None:
         If the folder cannot be read.
     """
     with _said(Path(folder)):
-        written_ns = _newest(Path(folder))[0]
-    return max(time.time_ns() - written_ns, 0) * S_PER_NS if written_ns else None
+        written_ns, bag = _newest(Path(folder))
+    return (bag, max(time.time_ns() - written_ns, 0) * 1e-9) if bag else None
 
 
 def start(folder: str | os.PathLike, now_ns: int) -> "Journal":

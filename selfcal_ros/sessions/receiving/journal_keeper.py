@@ -6,12 +6,21 @@ A journal that cannot be written ends nothing: what is not in it is counted and 
 
 import errno
 from collections import Counter
+from concurrent.futures import CancelledError, Executor, Future
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
-from selfcal_ros.bagio.journal import Journal, resume, start, unfinished, written_ago_s
+from selfcal_ros.bagio.journal import (
+    Claim,
+    Journal,
+    claim,
+    newest,
+    resume,
+    start,
+    unfinished,
+)
 from selfcal_ros.bagio.offline import block_handlers
 from selfcal_ros.bagio.reader import BagReader
 from selfcal_ros.collection.clock.steps import Step
@@ -88,8 +97,57 @@ class KeptTopic(NamedTuple):
     heard_on: str = ""
 
 
+@dataclass(frozen=True)
+class Looked:
+    """What going through the newest journal gave.
+
+    Attributes
+    ----------
+    journal : Journal or None
+        The journal of the run that is not over, to be gone on with.
+    files : list of Path
+        Files of such a run: of the journal, or of one that cannot be written or is too old.
+    error : InputError or None
+        Why it cannot be written.
+    problem : InputError or None
+        Why it cannot be read either.
+    """
+
+    journal: Journal | None = None
+    files: list[Path] = field(default_factory=list)
+    error: InputError | None = None
+    problem: InputError | None = None
+
+
+def look_through(found: Claim | None, folder: str, left: Path | None = None) -> Looked:
+    """Go through the newest journal of `folder`, which takes its time.
+
+    Parameters
+    ----------
+    found : Claim or None
+        That journal, to go on with it where its run is not over; None only looks.
+    folder : str
+        Where journals lie.
+    left : Path, optional
+        The journal that is only looked at, where it is no longer the newest.
+    """
+    error = None
+    try:
+        journal = found.resume() if found else None
+        if found:
+            return Looked(journal, journal.earlier if journal else [])
+    except InputError as reason:
+        error = reason
+    try:
+        return Looked(None, unfinished(folder, left), error)
+    except InputError as problem:
+        return Looked(None, [], error, problem)
+
+
 class JournalKeeper:
     """Keeps a journal in a folder; a `Journal` may come, fail and come back.
+
+    Until the newest journal has been gone through, what is to be written is held.
 
     Parameters
     ----------
@@ -109,6 +167,11 @@ class JournalKeeper:
         self._lag_limit_s = settings.journal_lag_limit
         self._max_age_s = settings.journal_max_age
         self._journal: Journal | None = None
+        self._looking: Future[Looked] | None = None
+        self._claim: Claim | None = None
+        self.looked_at = ""  # what is gone through
+        self._left_ago_s: float | None = None  # of a run that is too old to be taken up
+        self._early: list[tuple[str, bytes, int]] = []  # came while the journal is gone through
         self._goes_on: list[Path] = []  # files that were taken up and could not be gone on with
         self._unwritten = 0  # while there was no journal
         self._n_taken = 0  # since the last flush
@@ -124,45 +187,79 @@ class JournalKeeper:
         """Messages that are not in the journal and should be."""
         return self._unwritten + (self._journal.n_lost if self._journal else 0)
 
-    def open(self) -> list[Path]:
-        """Take up the journal of the run that is not over, or begin one; return its older files.
+    def open(self, worker: Executor) -> None:
+        """Begin a journal, or have `worker` go through the one of a run that may not be over.
 
         Raises
         ------
         InputError
-            If the folder cannot be used; not if the disk is full.
+            If the folder cannot be used, or another process writes the journal; not if the disk
+            is full.
         """
         if not self._folder:
-            return []
-        is_old = False
+            return
+        self._claim, left = None, None
         try:
-            is_old = self._is_too_old()
-            self._open(None if is_old else resume(self._folder))
+            known = newest(self._folder)
+            if known is not None and known[1] > self._max_age_s:
+                left, self._left_ago_s = known
+            else:
+                self._claim = claim(self._folder)
+            if self._claim is None:
+                self._open(None)
+            if self._claim is None and left is None:
+                return
         except InputError as error:
             if getattr(error.__cause__, "errno", None) not in NO_ROOM:
                 raise
             self._fail(error)
-            self._goes_on = [] if is_old else self._readable()
-        return self._journal.earlier if self._journal else self._goes_on
+        self.looked_at = str(self._claim.path if self._claim else self._folder)
+        self._looking = worker.submit(look_through, self._claim, self._folder, left)
 
-    def _is_too_old(self) -> bool:
-        """Tell if the newest journal was left so long ago that its run is not this one."""
-        age_s = written_ago_s(self._folder)
-        if age_s is None or age_s <= self._max_age_s:
-            return False
-        for file in self._readable()[:1]:
-            self._ports.say(Level.WARN, f"{file.parent}: its run was left {age_s / S_PER_H:.0f} h "
-                            "ago and is not taken up; 'selfcal solve' reads it, a greater "
-                            "journal_max_age goes on with it")
-        return True
+    @property
+    def holds(self) -> bool:
+        """Whether what comes is held until it is known if a run is to be gone on with."""
+        return self._looking is not None and self._left_ago_s is None
 
-    def _readable(self) -> list[Path]:
-        """Return the files of the journal of the run that is not over, which needs no room."""
-        try:
-            return unfinished(self._folder)
-        except InputError as error:
-            self._ports.say(Level.WARN, f"{error}; the run is not taken up")
+    def earlier(self) -> list[Path]:
+        """Return once the files of the run that is not over, as soon as they are known; else []."""
+        if self._looking is None or not self._looking.done():
             return []
+        looking, self._looking = self._looking, None
+        try:
+            looked = looking.result()
+            return self._take_up(looked) if self._left_ago_s is None else self._tell_left(looked)
+        finally:
+            early, self._early = self._early, []
+            for item in early:
+                self.write(*item)
+
+    def _take_up(self, looked: Looked) -> list[Path]:
+        """Go on with what was found, or begin a journal; return the files of the run."""
+        self._tell_problem(looked)
+        try:
+            if looked.error is not None:
+                raise looked.error
+            if not self._problem:
+                self._open(looked.journal)
+        except InputError as error:
+            self._fail(error)
+        if self._journal is None:
+            self._goes_on = looked.files
+        return looked.files
+
+    def _tell_left(self, looked: Looked) -> list[Path]:
+        """Say that a run was left too long ago to be taken up; return none of its files."""
+        self._tell_problem(looked)
+        for file in looked.files[:1]:
+            self._ports.say(Level.WARN, f"{file.parent}: its run was left "
+                            f"{(self._left_ago_s or 0.0) / S_PER_H:.0f} h ago and is not taken up; "
+                            "'selfcal solve' reads it, a greater journal_max_age goes on with it")
+        return []
+
+    def _tell_problem(self, looked: Looked) -> None:
+        if looked.problem is not None:
+            self._ports.say(Level.WARN, f"{looked.problem}; the run is not taken up")
 
     def _open(self, journal: Journal | None) -> None:
         """Go on with a journal, or begin one."""
@@ -178,7 +275,9 @@ class JournalKeeper:
     def write(self, topic: str, data: bytes, received_ns: int) -> None:
         """Take one message as received."""
         self._n_taken += 1
-        if self._journal is not None:
+        if self.holds:
+            self._early.append((topic, data, received_ns))
+        elif self._journal is not None:
             self._journal.write(self._topics[topic].name, data, received_ns)
         elif self._folder:
             self._unwritten += 1
@@ -198,7 +297,8 @@ class JournalKeeper:
             self._fail(error)
 
     def _try_again(self) -> None:
-        if self._folder and self._ports.now_s() >= self._tried_s + RETRY_S:
+        if (self._folder and not self.holds
+                and self._ports.now_s() >= self._tried_s + RETRY_S):
             self._tried_s = self._ports.now_s()
             # into an older journal only what follows it: the session has what that one holds
             self._open(resume(self._folder) if self._goes_on else None)
@@ -217,7 +317,15 @@ class JournalKeeper:
         self._problem = str(error)
 
     def close(self) -> None:
-        """Give the journal its end."""
+        """Give the journal its end; one that is still gone through first gets what has come."""
+        if self._looking is not None:
+            try:
+                self._looking.result()
+                self.earlier()
+            except CancelledError:  # it was not begun
+                self._unwritten += len(self._early)
+                if self._claim is not None:
+                    self._claim.close()
         if self._journal is not None:
             journal, self._journal = self._journal, None
             try:

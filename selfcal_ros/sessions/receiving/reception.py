@@ -42,6 +42,7 @@ class Reception:
         self._waiting: list[tuple[str, bytes, int, bool]] = []
         self._n_detections = 0  # that wait
         self._held: list[tuple[str, bytes, int, bool]] = []
+        self._worker: Executor | None = None
         self._restoring: Future[TakenUp] | None = None
         self._source = ""  # the journal that is taken up
         self._bad: Counter = Counter()
@@ -50,15 +51,26 @@ class Reception:
 
     def open(self, worker: Executor) -> None:
         """Open the journal; what it holds of a run that is not over is read by `worker`."""
-        files = self.journal.open()
-        if files:
+        self._worker = worker
+        self.journal.open(worker)
+        self._source = self.journal.looked_at
+        self._advance()
+
+    def _advance(self) -> None:
+        """Have the run read that is not over, once it is known that there is one."""
+        try:
+            files = self.journal.earlier()
+        except Exception as error:  # what has come is used, whatever becomes of the journal
+            self._refuse("journal", error)
+            return
+        if files and self._worker is not None:
             self._source = str(files[0].parent)
-            self._restoring = worker.submit(take_up, files, self.session.settings)
+            self._restoring = self._worker.submit(take_up, files, self.session.settings)
 
     @property
     def restoring(self) -> bool:
         """Whether a journal is still being read."""
-        return self._restoring is not None
+        return self.journal.holds or self._restoring is not None
 
     @property
     def may_end(self) -> bool:
@@ -89,19 +101,21 @@ class Reception:
         While a journal is being taken up, what comes meanwhile is written and held back.
         """
         adopted, waiting, self._waiting, self._n_detections = False, self._waiting, [], 0
+        self._advance()
         for topic, data, received_ns, _ in waiting:
             self.journal.write(topic, data, received_ns)
         try:
             self.journal.flush()
         except Exception as error:  # what has come is used, whatever becomes of the journal
             self._refuse("journal", error)
-        if self._restoring is not None:
+        if self.restoring:
             self._held += waiting
-            if not self._restoring.done():
+            if self._restoring is None or not self._restoring.done():
                 return False
-            waiting, self._held = self._held, []
+            waiting = []
             self._adopt(self._restoring)
             adopted = True
+        waiting, self._held = [*self._held, *waiting], []
         self._feed(waiting)
         return adopted or bool(waiting)
 

@@ -209,12 +209,16 @@ def test_what_comes_while_the_journal_is_read_is_written_and_held_back(
     first.reception.drain()
     first.keeper.close()
     worker = Later()
-    second = Desk(tmp_path, worker).receive(events[cut:-3])
-    assert not second.reception.drain()
-    told = second.reception.diagnosis()
-    assert (told.level, told.message) == (Level.WARN, f"reading the journal {second.keeper.path}")
-    second.receive(events[-3:])
-    worker.finish()
+    second = Desk(tmp_path, worker).receive(events[cut:-6])
+    for path in (None, first.keeper.path or first_path(tmp_path)):  # gone through, then read
+        assert not second.reception.drain()
+        told = second.reception.diagnosis()
+        assert (told.level, told.message) == (
+            Level.WARN, f"reading the journal {first_path(tmp_path)}")
+        assert second.keeper.path == path
+        second.receive(events[-6:-3] if path is None else events[-3:])
+        assert not second.session.collector.received["encoder"]
+        worker.finish()
     assert second.reception.drain()
     assert second.reception.diagnosis().level == Level.OK
     assert second.read() == expected
@@ -224,13 +228,74 @@ def test_what_comes_while_the_journal_is_read_is_written_and_held_back(
         view.used for view in second.session.collector.collect()[0].views)
 
 
+def test_what_comes_while_a_journal_whose_run_is_over_is_gone_through_is_in_the_next_one(
+        tmp_path, events, expected):
+    Desk(tmp_path).receive(events).reception.close()
+    worker = Later()
+    second = Desk(tmp_path, worker).receive(events[:100])
+    assert not second.reception.drain()
+    worker.finish()
+    second.receive(events[100:])
+    assert second.read() == expected
+    path = second.keeper.path
+    second.reception.close()
+    assert path != first_path(tmp_path)
+    assert sum(len(item) if hasattr(item, "__len__") else 1
+               for _, item in BagReader(path).columns()) == len(events)
+
+
+def test_what_comes_while_a_run_that_was_left_is_looked_for_is_used_and_written(
+        tmp_path, events, expected):
+    first = Desk(tmp_path).receive(events[:200])
+    first.reception.drain()
+    first.keeper.close()
+    for file in first_path(tmp_path).glob("*.mcap"):
+        os.utime(file, (1, 1))
+    worker = Later()
+    second = Desk(tmp_path, worker).receive(events)
+    assert second.read() == expected
+    assert not second.hands.lines(Level.WARN)
+    worker.finish()
+    second.reception.drain()
+    [line] = second.hands.lines(Level.WARN)
+    assert line.startswith(f"{first_path(tmp_path)}: its run was left ")
+
+
+def test_a_collector_that_ends_while_a_journal_is_gone_through_writes_what_has_come(
+        tmp_path, events):
+    first = Desk(tmp_path).receive(events[:200])
+    first.reception.drain()
+    first.keeper.close()
+    worker = Later()
+    second = Desk(tmp_path, worker).receive(events[200:260])
+    second.reception.drain()
+    worker.finish()
+    second.receive(events[260:270]).reception.close()
+    assert sum(len(item) if hasattr(item, "__len__") else 1
+               for _, item in BagReader(first_path(tmp_path)).columns()) == 270
+
+
+def test_a_journal_that_was_not_gone_through_is_let_go(tmp_path, events):
+    first = Desk(tmp_path).receive(events[:200])
+    first.reception.drain()
+    first.keeper.close()
+    worker = Later()
+    second = Desk(tmp_path, worker).receive(events[200:260])
+    worker.future.cancel()
+    second.keeper.close()
+    assert Desk(tmp_path).reception.restoring  # nobody holds it
+
+
 def test_a_journal_that_cannot_be_read_is_refused_and_collecting_goes_on(
         tmp_path, events, expected):
     first = Desk(tmp_path).receive(events[:50])
     first.reception.drain()
     first.keeper.close()
     worker = Later()
-    second = Desk(tmp_path, worker).receive(events)
+    second = Desk(tmp_path, worker)
+    worker.finish()
+    second.reception.drain()
+    second.receive(events)
     worker.future.set_exception(InputError("journal", "is gone", "look for it"))
     assert second.read() == expected
     assert second.refused == {"journal: journal: is gone; look for it": 1}
