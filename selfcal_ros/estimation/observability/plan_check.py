@@ -182,7 +182,7 @@ def smaller(plan: Plan, size: int) -> Plan:
     large enough for the plan's own shifts.
     """
     reach = [max(map(abs, view.lattice_pose(plan.artifact).shift)) for view in plan.views]
-    room = 2 * max(reach) + 3
+    room = 2 * max(reach, default=0) + 3  # a plan that is to be found has no views yet
     part = min(1.0, max(size, room) / max(plan.artifact.shape))
     nx, ny = (max(2 * round((n * part - 1) / 2) + 1, min(n, max(room, NARROW)))
               for n in plan.artifact.shape)
