@@ -152,7 +152,7 @@ def _check_json(plan: Plan, seen: Observability, predicted: Prediction | None, *
     if predicted is not None:
         out["predicted"] = plain({
             "rms_gain_xy": predicted.rms_xy, "max_gain_xy": predicted.max_xy,
-            "rms_gain_theta": predicted.rms_theta, "note": predicted.note})
+            "rms_gain_theta": predicted.rms_theta, "note": field_note(predicted, plan)})
         if maps:
             out["predicted"] |= plain({"u_gx": predicted.ux, "u_gy": predicted.uy,
                                        "u_g_theta": predicted.u_theta})
@@ -174,8 +174,16 @@ def _check_text(plan: Plan, seen: Observability, predicted: Prediction | None) -
               f"  XY     rms {predicted.rms_xy:.4f}   largest {predicted.max_xy:.4f}"]
     if len(predicted.u_theta):
         lines.append(f"  theta  rms {predicted.rms_theta:.4f}")
-    lines += [f"  ({predicted.note})"] if predicted.note else []
-    return lines
+    note = field_note(predicted, plan)
+    return [*lines, *([f"  ({note})"] if note else [])]
+
+
+def field_note(predicted: Prediction, plan: Plan) -> str:
+    """Return that a prediction is not for the plan's own field; empty if it is."""
+    nx, ny = predicted.ux.shape
+    return "" if (nx, ny) == plan.artifact.shape else (
+        f"predicted for a field of {nx} x {ny} sites; XY is about 5 % larger for each doubling of "
+        "the field")
 
 
 def _averaged_m(plan: Plan, assumed: Assumed) -> float:

@@ -9,9 +9,12 @@ import pytest
 import yaml
 
 from selfcal_ros.cli.main import main
+from selfcal_ros.cli.plan import field_note
 from selfcal_ros.cli.plan_terms import length_m
 from selfcal_ros.cli.terminal import progress
+from selfcal_ros.estimation.observability.plan_check import predict_plan
 from selfcal_ros.files import read_yaml
+from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.view import plan_from_dict
 
 PLANS = sorted((Path(__file__).parents[2] / "config" / "plans").glob("*.yaml"))
@@ -245,3 +248,14 @@ def test_progress_shows_only_what_takes_long(monkeypatch):
         advance(3, 9)
         advance(4, None)
     assert drawn == ["plans", (3, 9), (4, None)]
+
+
+def test_a_large_field_is_said_to_be_predicted_on_a_smaller_one(monkeypatch):
+    plan = plan_from_dict(read_yaml(shipped("hu")), "p")
+    assert field_note(predict_plan(plan, ThetaDatum.ZERO_MEAN), plan) == ""
+    where = "selfcal_ros.estimation.observability.plan_check"
+    monkeypatch.setattr(f"{where}.MAX_SITES", 20)
+    monkeypatch.setattr(f"{where}.PROXY_SIZE", 5)
+    assert field_note(predict_plan(plan, ThetaDatum.ZERO_MEAN), plan) == (
+        "predicted for a field of 5 x 5 sites; XY is about 5 % larger for each doubling of the "
+        "field")

@@ -89,19 +89,16 @@ def with_unseen_modes(seen: Observability, system: NormalEquations, plan: Plan) 
 def predict_plan(plan: Plan, datum: ThetaDatum) -> Prediction:
     """Return the uncertainties that a plan promises if every mark is read.
 
-    Fields above MAX_SITES are predicted on a smaller field, and the note says so: the gain grows
-    slowly, as log N, so that it is too small then.
+    Fields above MAX_SITES are predicted on a smaller field, as the shape of what is returned
+    tells: the gain grows slowly, as log N, so that it is too small then.
     """
     artifact = plan.artifact
     if artifact.shape[0] * artifact.shape[1] <= MAX_SITES:
         return predict(planned_system(artifact, plan.views), artifact, datum,
                        repeats=unit_repeats(plan))
     small = smaller(plan, PROXY_SIZE)
-    found = predict(planned_system(small.artifact, small.views), small.artifact, datum,
-                    repeats=unit_repeats(plan))
-    nx, ny = small.artifact.shape
-    return replace(found, note=f"predicted for a field of {nx} x {ny} sites; XY is about 5 % "
-                               "larger for each doubling of the field")
+    return predict(planned_system(small.artifact, small.views), small.artifact, datum,
+                   repeats=unit_repeats(plan))
 
 
 def unit_repeats(plan: Plan) -> int:

@@ -29,18 +29,16 @@ class Prediction:
     Attributes
     ----------
     ux, uy : float array (nx, ny)
-        Of Gx and Gy, in units of the noise of a grid reading.
+        Of Gx and Gy, in units of the noise of a grid reading; their shape is that of the field
+        which it is for.
     u_theta : float array (K,)
         Of Gtheta, in units of the noise of an angular reading, misalignments of the grid
         views known; empty if no line is measured.
-    note : str
-        Where the prediction is not for the plan's own field.
     """
 
     ux: np.ndarray
     uy: np.ndarray
     u_theta: np.ndarray
-    note: str = ""
 
     @property
     def rms_xy(self) -> float:
