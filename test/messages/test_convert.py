@@ -317,3 +317,10 @@ def test_a_field_that_is_not_given_is_an_error():
             name: value for name, value in from_model.detection(
                 Detection(0, 0, True, 0, 0, 0, 0.0, 0.0, 0.0, 0.0, 0.0), "").items()
             if name != "score"})
+
+
+def test_a_command_without_a_view_names_no_plate_and_asks_for_nothing():
+    made = from_model.command(Command(STAMP_NS, Phase.DONE, "p", 3), "stage")
+    for name in ("grid_size", "grid_pitch", "angular_count", "grid_size_y", "repeats"):
+        assert made[name] == 0, name
+    assert (made["grid"], made["angular"], made["visit_order"]) == (False, False, "")

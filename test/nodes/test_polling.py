@@ -81,5 +81,14 @@ def test_what_was_published_between_two_subscriptions_is_told_apart(callback):
     assert missing(callback, queue, 14) == (0, 0)
 
 
+def test_what_a_publisher_left_behind_that_is_gone_is_not_held_against_what_was_heard(callback):
+    assert missing(callback, Queue(), 1, 2) == (0, 0)
+    callback.pause()
+    queue = Queue(0)
+    assert missing(callback, queue, 9) == (0, 0)
+    queue.n_publishers = 1
+    assert missing(callback, queue, 12, 15) == (2, 9)
+
+
 def test_a_middleware_without_numbers_tells_nothing(callback):
     assert missing(callback, Queue(), None, None) == (0, 0)

@@ -68,3 +68,15 @@ def test_a_deficient_bag_ends_with_code_3_and_says_why(ros_environment, tmp_path
 def test_a_rate_must_be_above_zero(options, problem, capsys):
     assert selfcal(["replay", "bag", *options]) == 2
     assert problem in capsys.readouterr().err
+
+
+def test_what_follows_the_five_arguments_of_a_session_is_for_ros(monkeypatch):
+    from selfcal_ros.nodes import replay_session
+
+    given = []
+    monkeypatch.setattr(replay_session, "run", lambda make, args: given.append(args) or 3)
+    for more in ([], ["--ros-args", "-p", "a:=1", "-p", "b:=2", "-p", "c:=3", "-p", "d:=4"]):
+        monkeypatch.setattr("sys.argv", ["session", "bag", "2.0", "-1", "r.json", "/cell", *more])
+        with pytest.raises(SystemExit) as ended:
+            replay_session.main()
+        assert ended.value.code == 3 and given.pop() == more

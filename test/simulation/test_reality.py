@@ -8,7 +8,7 @@ import pytest
 
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.simulation.machine import random_truth
-from selfcal_ros.simulation.reality import MODEL, compared, resistant
+from selfcal_ros.simulation.reality import MODEL, cases, compared, resistant
 from selfcal_ros.simulation.truth import simulate_measurements
 
 
@@ -40,3 +40,11 @@ def test_a_site_that_is_wrong_by_more_than_its_u_is_counted_and_sized():
         result.error_map, gx=gx, gy=truth.g[1].copy())), truth)
     assert wrong.error_m == pytest.approx(2e-7, rel=0.05)
     assert wrong.within == pytest.approx(1 - 1 / 242, abs=1e-9)
+
+
+def test_cases_have_the_stop_errors_that_their_names_say():
+    said = [(case.name, case.settings.stop_sigma_m) for case in cases()
+            if "stop errors" in case.name]
+    assert len(said) == 4
+    for name, stop_m in said:
+        assert stop_m == pytest.approx(float(name.split("stop errors ")[1].split(" um")[0]) * 1e-6)
