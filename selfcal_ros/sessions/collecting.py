@@ -305,12 +305,15 @@ class CollectingSession:
                 "placing": placing_digest(command.plate(), command.view) if command.view else ""}
 
     def _encoder(self) -> Diagnosis:
-        """Return rate and largest gap of the encoder, WARN beyond the limits."""
+        """Return rate, largest gap and jitter of the encoder, WARN beyond the limits."""
         heard = self._ports.now_s() - self._encoder_s <= HEARD_S
         gap = self._encoder_rate.take_gap_ns() * S_PER_NS
         rate, least = self._encoder_rate.per_second, self.settings.encoder_rate_min
         values = {"encoder_heard": "yes" if heard else "no", "encoder_rate": f"{rate:.0f}",
                   "encoder_gap_s": f"{gap:.4f}"}
+        jitter, limit = self._encoder_rate.take_jitter_s(), self.settings.encoder_jitter_limit
+        if math.isfinite(jitter):
+            values["encoder_jitter_s"] = f"{jitter:.6f}"
         last = self.collector.newest_command
         measuring = last is not None and last.phase == Phase.MEASURE
         problems = []
@@ -321,6 +324,9 @@ class CollectingSession:
                             "rejected")
         elif measuring and rate < least:
             problems.append(f"{rate:.0f} encoder samples a second, {least:g} are wanted")
+        elif measuring and 0 < limit < jitter:
+            problems.append(f"the intervals between encoder samples vary by {jitter:.3g} s, the "
+                            f"limit is {limit:g} s")
         return Diagnosis(Level.WARN if problems else Level.OK, "; ".join(problems), values)
 
     def _repeatability(self) -> Diagnosis:

@@ -8,11 +8,14 @@ import numpy as np
 
 from selfcal_ros.errors import SelfcalError, first_line, printable
 from selfcal_ros.sessions.ports import Diagnosis, Level
+from selfcal_ros.units import NS_PER_S
 
 FIRST_LINES = 5
 """Refusals of one kind that are logged line by line; then only the 10th, 100th, ..."""
 MEMORY_S = 10.0
 """Time for which a refusal or a loss keeps the state at WARN."""
+LEAST_STEPS, MOST_STEPS = 40, 20_000
+"""Intervals between stamps that tell a jitter, and that are kept to tell it."""
 
 
 def merged(main: Diagnosis, others: Iterable[Diagnosis]) -> Diagnosis:
@@ -137,7 +140,7 @@ class Presence:
 
 
 class Rate:
-    """Rate and longest gap of a stream over the last seconds.
+    """Rate, longest gap and jitter of a stream over the last seconds.
 
     A gap lies behind the newest stamp of these seconds: one stamp of the future hides none later.
 
@@ -153,6 +156,7 @@ class Rate:
         self._now_s = now_s
         self._bins: deque[tuple[float, int, int]] = deque()  # begin, messages, newest stamp
         self.longest_gap_ns = 0
+        self._steps: list[np.ndarray] = []  # between stamps, since the jitter was asked
 
     def add(self, stamps_ns: np.ndarray) -> None:
         """Take messages by their stamps, int64 array (n,) in the order of arrival, n > 0."""
@@ -161,7 +165,10 @@ class Rate:
             self._bins.popleft()
         before_ns = max((newest for _, _, newest in self._bins), default=stamps_ns[0])
         newest = np.maximum.accumulate(np.append(before_ns, stamps_ns))
-        self.longest_gap_ns = max(self.longest_gap_ns, int(np.diff(newest).max()))
+        steps = np.diff(newest)
+        self.longest_gap_ns = max(self.longest_gap_ns, int(steps.max()))
+        if sum(map(len, self._steps)) < MOST_STEPS:
+            self._steps.append(steps[steps > 0])
         if self._bins and now - self._bins[-1][0] < 0.1:
             began, before, known_ns = self._bins.pop()
             self._bins.append((began, before + count, max(known_ns, latest_ns)))
@@ -179,3 +186,14 @@ class Rate:
         """Return the longest gap between stamps since the last call."""
         gap, self.longest_gap_ns = self.longest_gap_ns, 0
         return gap
+
+    def take_jitter_s(self) -> float:
+        """Return half of the range that holds 95 % of the intervals since the last call, s.
+
+        A single gap is no jitter. NaN of fewer than `LEAST_STEPS` intervals.
+        """
+        steps, self._steps = np.concatenate([np.zeros(0), *self._steps]), []
+        if len(steps) < LEAST_STEPS:
+            return float("nan")
+        low, high = np.percentile(steps, [2.5, 97.5])
+        return float(high - low) / 2 / NS_PER_S

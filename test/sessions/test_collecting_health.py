@@ -390,3 +390,18 @@ def test_the_health_tells_what_a_status_costs():
             event for event in first_view() if isinstance(event, Detection))))
         desk.session.tick()
     assert [desk.told().values[name] for name in names] == ["2.0", "7.0", "3.5"]
+
+
+@pytest.mark.parametrize("limit, level", [(0.0, Level.OK), (0.00019, Level.WARN),
+                                          (0.00021, Level.OK)])
+def test_the_jitter_of_the_encoder_is_told_and_held_against_its_limit(limit, level):
+    desk = Desk(encoder_jitter_limit=limit)
+    events = first_view()
+    stamps = {id(event): number for number, event in enumerate(
+        event for event in events if isinstance(event, EncoderSample))}
+    desk.feed([replace(event, stamp_ns=event.stamp_ns + 200_000 * (stamps[id(event)] % 2))
+               if id(event) in stamps else event for event in events])
+    told = desk.told()
+    assert float(told.values["encoder_jitter_s"]) == pytest.approx(2e-4, rel=0.01)
+    assert told.level == level
+    assert ("vary by 0.0002 s, the limit is 0.00019 s" in told.message) is (level == Level.WARN)

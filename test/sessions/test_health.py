@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Health put together: levels, refusals and losses without a flood, presence, rates."""
 
+import math
+
 import numpy as np
 import pytest
 
@@ -119,3 +121,22 @@ def test_a_gap_lies_between_a_stamp_and_the_newest_before(hands, stamps, gap):
     together.add(np.array([30]))
     assert together.take_gap_ns() == 30 - max(stamps)
     assert together.per_second == (len(stamps) + 1) / Rate.WINDOW_S
+
+
+def test_the_jitter_is_that_of_most_intervals_since_it_was_asked(hands):
+    rate = Rate(hands.ports.now_s)
+    steps = np.tile([900_000, 1_000_000, 1_100_000], 40)
+    steps[50] = 10**9  # a gap is none
+    rate.add(np.cumsum(steps))
+    assert rate.take_jitter_s() == pytest.approx(1e-4)
+    assert math.isnan(rate.take_jitter_s())
+    rate.add(np.cumsum(steps)[-1] + 1_000_000 * np.arange(1, 41))
+    assert rate.take_jitter_s() == 0
+
+
+@pytest.mark.parametrize("number, is_told", [(39, False), (40, True)])
+def test_few_intervals_tell_no_jitter(hands, number, is_told):
+    rate = Rate(hands.ports.now_s)
+    for stamp in range(number + 1):
+        rate.add(np.array([stamp * 1000]))
+    assert math.isfinite(rate.take_jitter_s()) is is_told

@@ -91,6 +91,9 @@ class CollectorSettings(ManagedSettings):
     encoder_rate_min: float = declared(
         0.0, "encoder samples a second below which there is a warning while a view is measured; 0 "
         "= none", "Hz", 0.0, 1e5)
+    encoder_jitter_limit: float = declared(
+        0.0, "half of the range of 95 % of the intervals between encoder samples above which there "
+        "is a warning while a view is measured; 0 = none", "s", 0.0, 10.0)
     repeatability_xy_limit: float = declared(
         0.0, "repeatability of one grid reading above which there is a warning; 0 = none", "m", 0.0,
         1e-3)
