@@ -1,12 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """A simulation written as a bag, with its truth beside it."""
 
+import tempfile
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 
 from selfcal_ros.bagio.writer import BagWriter, qos_profile
 from selfcal_ros.collection.messages import Command, Detection
+from selfcal_ros.errors import InputError
 from selfcal_ros.files import read_json, write_json
 from selfcal_ros.messages import from_model
 from selfcal_ros.messages.topics import COMMAND_TOPIC, DETECTION_TOPIC, ENCODER_TOPIC, INPUT_TOPICS
@@ -26,9 +28,33 @@ TRUTH_FILE = "truth.json"
 def write_simulation(simulation: Simulation, path: str | Path, *,
                      progress: Callable[[int, int], None] = lambda done, total: None,
                      ) -> dict[str, int]:
-    """Simulate, write the bag folder `path` with `truth.json` in it, return messages by topic."""
+    """Simulate, write the bag folder `path` with `truth.json` in it, return messages by topic.
+
+    It is written beside and gets its name when it is whole.
+
+    Raises
+    ------
+    InputError
+        If the folder exists, or cannot be made or written.
+    """
+    target = Path(path)
+    if target.exists():
+        raise InputError(str(target), "exists already", "remove it or name another folder")
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=target.parent, prefix=f".{target.name}_") as beside:
+            counts = _write(simulation, Path(beside, target.name), progress)
+            Path(beside, target.name).rename(target)
+    except OSError as error:
+        raise InputError(str(target), f"cannot be made ({error.strerror})",
+                         "name a folder that you may write") from error
+    return counts
+
+
+def _write(simulation: Simulation, path: Path,
+           progress: Callable[[int, int], None]) -> dict[str, int]:
     truth, arrivals, ledger = simulation.run()
-    with BagWriter(Path(path), simulation.compression) as writer:
+    with BagWriter(path, simulation.compression) as writer:
         for topic, typename in INPUT_TOPICS.items():
             writer.add_topic(f"/{topic}", typename, [QOS[topic]])
         for number, (arrival_ns, event) in enumerate(arrivals):
@@ -36,7 +62,7 @@ def write_simulation(simulation: Simulation, path: str | Path, *,
             writer.write(f"/{topic}", fields, arrival_ns)
             if number % 1000 == 0:
                 progress(number, len(arrivals))
-        write_truth(Path(path) / TRUTH_FILE, truth, seed=simulation.seed, faults=ledger,
+        write_truth(path / TRUTH_FILE, truth, seed=simulation.seed, faults=ledger,
                     cell=asdict(simulation.settings))
         return writer.counts
 
