@@ -125,3 +125,16 @@ def test_damaged_results_are_refused(path, value, message):
 def test_other_json_is_no_result(data):
     with pytest.raises(InputError, match=r"^f: not a result of schema selfcal\.result/1; give a "):
         result_from_dict(data, "f")
+
+
+@pytest.mark.parametrize(("error", "u", "is_one"), [
+    (0.099, 0.0, True), (-0.099, 0.099, True), (0.1, 0.0, False), (-0.1, 0.0, False),
+    (0.15, 0.0, False), (0.0, 0.1, False), (0.0, 0.15, False), (0.0, -1e-9, False)])
+def test_a_reference_is_off_by_less_than_a_tenth(error, u, is_one):
+    data = result_to_dict(known_result()[0])
+    data["reference"] = {"kind": "stage_x", "relative_error": error, "u_relative": u}
+    if is_one:
+        assert result_from_dict(data, "r").reference == data["reference"]
+        return
+    with pytest.raises(InputError, match=f"reference: {error!r} with u {u!r} is not a relative"):
+        result_from_dict(data, "r")

@@ -11,7 +11,7 @@ import pytest
 from selfcal_ros.bagio.offline import collect_bag
 from selfcal_ros.bagio.simulated import event_fields
 from selfcal_ros.bagio.writer import BagWriter
-from selfcal_ros.collection.messages import Command, Detection, EncoderSample
+from selfcal_ros.collection.messages import Command, Detection, EncoderSample, Phase
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.messages.topics import INPUT_TOPICS
 from selfcal_ros.model.result import with_input
@@ -376,6 +376,16 @@ def test_a_detection_stamped_in_the_future_holds_up_no_other(is_early):
 def test_detections_that_are_not_decoded_yet_are_reckoned_with(more, expected):
     desk, _, _ = closing()
     assert desk.session.expects_end(more) is expected
+
+
+@pytest.mark.parametrize("after_ns, expected", [(-1, False), (0, True), (1, True)])
+def test_a_detection_counts_for_its_view_from_the_instant_of_its_command_on(after_ns, expected):
+    desk, [last], _ = closing()
+    begin = desk.session.collector.timeline.intervals[-1].start_ns
+    assert begin == next(event.stamp_ns for event in first_view() if isinstance(event, Command)
+                         and event.phase == Phase.MEASURE)
+    desk.session.take_detections(detection_table(replace(last, stamp_ns=begin + after_ns)))
+    assert desk.session.expects_end() is expected
 
 
 def test_the_health_tells_what_a_status_costs():

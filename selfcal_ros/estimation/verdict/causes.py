@@ -172,7 +172,7 @@ def find_explanations(model: ModelFit, *, slips: bool,
     taken[:len(model.coefficients)] = model.coefficients
     right = score(equations, model.found.residuals, squares(problem, model.found),
                   coefficients=taken)
-    return _select(Pool(equations, right), groups, columns.rows(own))
+    return select_explanations(Pool(equations, right), groups, columns.rows(own))
 
 
 def _groups(columns: TermColumns, name: TermName) -> list[Group]:
@@ -198,7 +198,7 @@ def _with_slips(ground: Ground, columns: TermColumns,
         for (view, part), rows in places.items()]
 
 
-def _select(pool: Pool, groups: list[Group], taken: np.ndarray) -> list[Explanation]:
+def select_explanations(pool: Pool, groups: list[Group], taken: np.ndarray) -> list[Explanation]:
     """Return the explanations, each judged beside `taken` and those before it."""
     found: list[Explanation] = []
     while groups and len(found) < MAX_CAUSES:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from selfcal_ros.estimation.terms.solution import Score, Sums
-from selfcal_ros.estimation.verdict.causes import Pool
+from selfcal_ros.estimation.verdict.causes import Group, Pool, select_explanations
 
 LENGTHS = np.array([2.0, 0.5, 4.0])
 """Of three columns that all marks' means tell alone, in weighted readings."""
@@ -57,3 +57,19 @@ def test_the_larger_of_the_noises_of_marks_and_of_all_visits_counts(within, dof_
     """Marks alone: 64 / 8; all visits have the squares within the marks in addition."""
     found = pool(Sums(164.0, 10, within, dof_within)).noise_beside(rows(0, 1))
     assert found == (pytest.approx(variance), pytest.approx(dof))
+
+
+def test_at_most_four_causes_are_named_the_likeliest_first():
+    """Six terms of one column each, at right angles; each takes more off than the one before."""
+    names = ["a", "b", "c", "d", "e", "f"]
+    equations = SimpleNamespace(
+        information=np.eye(6), norm=np.ones(6), limit=lambda rows: 1e-9, maps=np.zeros((4, 6)),
+        projected=SimpleNamespace(gram=np.eye(6)), system=SimpleNamespace(known_sites=np.ones(4)),
+        columns=SimpleNamespace(columns=tuple(names)))
+    parts = np.arange(1.0, 7.0) * 1e-6
+    many = Pool(equations, Score(parts, np.zeros(6), Sums(
+        float(parts @ parts) + 1e-14, 100, float("nan"), 0)))
+    groups = [Group(name, np.arange(6) == number) for number, name in enumerate(names)]
+    found = select_explanations(many, groups, np.zeros(6, dtype=bool))
+    assert [item.name for item in found] == ["f", "e", "d", "c"]
+    assert [float(item.values[0]) for item in found] == pytest.approx([6e-6, 5e-6, 4e-6, 3e-6])
