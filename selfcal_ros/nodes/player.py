@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Playing a bag onto the graph: at its own pace, or as fast as the subscribers keep up."""
 
+import math
 import time
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,8 @@ from selfcal_ros.units import S_PER_NS
 KINDS = {ENCODER_TOPIC: "encoder", DETECTION_TOPIC: "detection", COMMAND_TOPIC: "command"}
 WINDOW = 1500
 """Messages that may be under way to the collector; well below the depth of its queues."""
+BURST, SLICE_S = 100, 0.02
+"""Messages between two looks at the time and at how far the subscribers are; longest step."""
 UNHEARD_RATE = 4000
 """Messages a second while no collector tells how far it is."""
 
@@ -69,23 +72,30 @@ class Player:
         """Publish what is due now."""
         now = time.monotonic()
         self._began = began = now if self._began is None else self._began
-        stop = now + 0.02
-        while not self.done and time.monotonic() < stop:
+        played_ns = (now - began) * self.rate / S_PER_NS
+        due_ns = self._first_ns + played_ns if self.rate > 0 else math.inf
+        while not self.done and (instant := time.monotonic()) < now + SLICE_S:
+            count = min(self._room(instant - began), BURST)
+            if count <= 0 or not self._publish(count, due_ns):
+                return
+
+    def _publish(self, count: int, due_ns: float) -> bool:
+        """Publish up to so many messages that were logged by then; tell if more may be due."""
+        for _ in range(min(count, self.total - self._at)):
             topic, stamp, data = self._next
-            if self.rate > 0 and (stamp - self._first_ns) * S_PER_NS / self.rate > now - began:
-                return
-            if not self._room(time.monotonic() - began):
-                return
+            if stamp > due_ns:
+                return False
             self._publishers[topic].publish(data)
             self.sent[KINDS[topic]] += 1
             self._at += 1
             self._next = next(self._messages, self._next)
+        return True
 
-    def _room(self, played_s: float) -> bool:
-        """Return whether the subscribers keep up, `played_s` after the first message."""
+    def _room(self, played_s: float) -> int:
+        """Return how many messages the subscribers can take, `played_s` after the first one."""
         if self.heard is None:
-            return self._at < WINDOW + UNHEARD_RATE * played_s / 2
-        return self._at - sum(self.heard.values()) < WINDOW
+            return int(WINDOW + UNHEARD_RATE * played_s / 2) - self._at
+        return WINDOW - self._at + sum(self.heard.values())
 
     def _on_received(self, message: Any) -> None:
         if len(message.data) == len(self.sent):
