@@ -25,8 +25,9 @@ from selfcal_ros.sessions.receiving.reception import Reception
 
 TICK_S = 0.1
 """Time between two looks at what has come."""
-BUSY_S, MANY = 0.02, 200
-"""The same while so many messages, or more, are there at a look: who plays a bag waits for it."""
+BUSY_S, MANY, BUSY_LOOKS = 0.01, 200, 50
+"""The same for so many looks after one that found so many messages, or more: who plays a bag waits
+to be told that they have come."""
 SOON_S, SOON_TICKS = 0.002, 50
 """The same while the last exposure of a view waits for the samples behind it, and how often."""
 
@@ -44,6 +45,7 @@ class MeasurementCollector(PollingNode[CollectorSettings]):
     _inputs = WhileConfigured[dict[str, ByTheClock]]()
 
     def __init__(self, **kwargs: Any) -> None:
+        self._busy_looks = 0  # to come
         self._looks = 0  # since the last detection that may have completed a view
         super().__init__(CollectorSettings, **kwargs)
 
@@ -94,7 +96,8 @@ class MeasurementCollector(PollingNode[CollectorSettings]):
         self._outputs[output](fields)
 
     def _on_timer(self) -> None:
-        (self._busy.reset if self._drain() >= MANY else self._busy.cancel)()
+        self._busy_looks = BUSY_LOOKS if self._drain() >= MANY else self._busy_looks - 1
+        (self._busy.reset if self._busy_looks > 0 else self._busy.cancel)()
         if not self._reception.restoring:
             self.session.tick()
 
