@@ -147,7 +147,6 @@ def summary(result: dict[str, Any]) -> str:
         u = "" if u_mm is None else f" (u = {u_mm * UM_PER_MM:.4f})"
         return f"{value_mm * UM_PER_MM:+.4f} µm{u}"
 
-
     names = [key for key in result if key.startswith(("squareness", "straightness"))
              and not key.endswith("_rad")]
     if "squareness_xy" in names:
