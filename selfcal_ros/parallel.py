@@ -92,8 +92,8 @@ def _start_server() -> None:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def outcomes(function: Callable[[Any], Any], items: Sequence[Any], *,
-             workers: int = 1, dask: str = "") -> Iterator[Outcome]:
+def outcomes(function: Callable[[Any], Any], items: Sequence[Any], *, workers: int = 1,
+             dask: str = "", meanwhile: Callable[[], None] | None = None) -> Iterator[Outcome]:
     """Yield what `function` makes of each item, as it becomes ready.
 
     Parameters
@@ -106,6 +106,8 @@ def outcomes(function: Callable[[Any], Any], items: Sequence[Any], *,
         Processes; 1 = in this process, one after the other.
     dask : str
         Address of a dask scheduler, or `LOCAL`; empty = processes of the standard library.
+    meanwhile : callable, optional
+        Called once, when the processes have their first items: what this one has to load.
 
     Raises
     ------
@@ -117,7 +119,7 @@ def outcomes(function: Callable[[Any], Any], items: Sequence[Any], *,
     elif workers == 1 or len(items) < 2:
         yield from (_tried(function, items, index) for index in range(len(items)))
     else:
-        yield from _with_processes(function, items, min(workers, len(items)))
+        yield from _with_processes(function, items, min(workers, len(items)), meanwhile)
 
 
 def mapped(function: Callable[[Any], Any], items: Sequence[Any], *, workers: int = 1,
@@ -156,7 +158,7 @@ def _tried(function: Callable[[Any], Any], items: Sequence[Any], index: int) -> 
 
 
 def _with_processes(function: Callable[[Any], Any], items: Sequence[Any],
-                    workers: int) -> Iterator[Outcome]:
+                    workers: int, meanwhile: Callable[[], None] | None) -> Iterator[Outcome]:
     """Yield outcomes of a pool; where it breaks, each item in its hands is tried by itself."""
     waiting = list(reversed(range(len(items))))
     while waiting:
@@ -170,6 +172,9 @@ def _with_processes(function: Callable[[Any], Any], items: Sequence[Any],
                         running[pool.submit(function, items[index])] = index
                     except BrokenProcessPool:
                         suspects.append(index)
+                if meanwhile is not None:
+                    meanwhile()
+                    meanwhile = None
                 ready, _ = wait(running, return_when=FIRST_COMPLETED)
                 for future in ready:
                     index = running.pop(future)

@@ -165,3 +165,13 @@ def test_an_interrupt_while_workers_import_is_left_to_their_parent(tmp_path):
     done = subprocess.run([sys.executable, "-c", WITH_WORKERS], capture_output=True, text=True,
                           check=False, env=os.environ | {"PYTHONPATH": str(tmp_path)})
     assert (done.returncode, done.stdout, done.stderr) == (0, "[True, True]\n", "")
+
+
+@pytest.mark.parametrize("workers", [2, 1])
+def test_what_is_loaded_meanwhile_is_loaded_once_before_the_first_outcome(workers):
+    order = []
+    for outcome in outcomes(abs, [-1, -2, -3, -4, -5], workers=workers,
+                            meanwhile=lambda: order.append("loaded")):
+        order.append(outcome.value)
+    assert sorted(order[-5:]) == [1, 2, 3, 4, 5]
+    assert order[:-5] == (["loaded"] if workers == 2 else [])

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from selfcal_ros.batch.course import Course, Finding
-from selfcal_ros.batch.jobs import Record
 from selfcal_ros.batch.quantities import described
+from selfcal_ros.batch.records import Record
 from selfcal_ros.batch.table import Series, in_time
 from selfcal_ros.errors import printable
 from selfcal_ros.reporting.html_page import page

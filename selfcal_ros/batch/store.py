@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from selfcal_ros.batch.bags import stat_of
-from selfcal_ros.batch.jobs import (
+from selfcal_ros.batch.records import (
     RECORDS,
     RESULTS,
     Job,
@@ -80,3 +80,10 @@ def jobs_of(folder: Path, bags: Sequence[Path], settings: Settings,
             places: Sequence[int], *, redo: bool) -> list[Job]:
     """Return the jobs of the bags at `places`."""
     return [Job(bags[index], folder, settings, redo) for index in places]
+
+
+def work_on(job: Job) -> Record:
+    """Return what `selfcal_ros.batch.jobs.run_job` makes of a job."""
+    from selfcal_ros.batch.jobs import run_job  # heavy, and in a worker loaded already
+
+    return run_job(job)

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from selfcal_ros.batch.course import FEWEST, Course, Finding, courses
-from selfcal_ros.batch.jobs import SCHEMA, Record
 from selfcal_ros.batch.quantities import described
+from selfcal_ros.batch.records import SCHEMA, Record
 
 S_PER_DAY = 86400.0
 BASE = ("bag", "first_exposure", "exit_code", "qualified", "message", "plan_id", "run_id",

@@ -12,7 +12,7 @@ from selfcal_ros.cli.terminal.output import add_json, say
 from selfcal_ros.errors import ExitCode, InputError, SelfcalError, first_line, printable
 
 if TYPE_CHECKING:
-    from selfcal_ros.batch.jobs import Record, Settings
+    from selfcal_ros.batch.records import Record, Settings
 
 HELP = "calibrate from many bags on all cores: one table, trends and changes over time"
 LOCAL = "local"
@@ -40,13 +40,11 @@ def run(args: argparse.Namespace) -> int:
     """Solve what is not done yet, write the table and the page, say what was found."""
     from selfcal_ros.parallel import begin, check_workers
 
-    if not args.dask:  # first: workers and this process import side by side
+    if not args.dask:  # first: what the workers need is loaded beside this process
         begin("selfcal_ros.batch.jobs", check_workers(args.workers))
     from selfcal_ros.batch.bags import find_bags
-    from selfcal_ros.batch.jobs import Settings
-    from selfcal_ros.batch.page import page_html
+    from selfcal_ros.batch.records import Settings
     from selfcal_ros.batch.store import done_and_to_do, kept_records, opened
-    from selfcal_ros.batch.table import batch_json, csv_text, series_of, summary_lines
     from selfcal_ros.files import write_json, write_text
 
     if args.dask and args.dask != LOCAL and ":" not in args.dask:
@@ -60,6 +58,9 @@ def run(args: argparse.Namespace) -> int:
         for record in (done[index] for index in sorted(done)):
             _say(record)
         done |= _worked(args, bags, settings, places)
+        from selfcal_ros.batch.page import page_html
+        from selfcal_ros.batch.table import batch_json, csv_text, series_of, summary_lines
+
         records = [done[index] for index in sorted(done)]
         keys = {record.get("key") for record in kept}  # copies and moved bags have one as well
         before = sum("key" in record and record["key"] in keys for record in records)
@@ -77,8 +78,7 @@ def run(args: argparse.Namespace) -> int:
 def _worked(args: argparse.Namespace, bags: Sequence[Path], settings: "Settings",
             places: Sequence[int]) -> dict[int, "Record"]:
     """Return the records of the bags at `places`, and say each that gave no qualified result."""
-    from selfcal_ros.batch.jobs import run_job
-    from selfcal_ros.batch.store import jobs_of
+    from selfcal_ros.batch.store import jobs_of, work_on
     from selfcal_ros.cli.terminal.progress import late_progress
     from selfcal_ros.parallel import check_workers, outcomes
 
@@ -86,7 +86,8 @@ def _worked(args: argparse.Namespace, bags: Sequence[Path], settings: "Settings"
     workers = check_workers(args.workers)
     jobs = jobs_of(Path(args.output).resolve(), bags, settings, places, redo=args.redo)
     with late_progress("solving bags") as progress:
-        for outcome in outcomes(run_job, jobs, workers=workers, dask=args.dask or ""):
+        for outcome in outcomes(work_on, jobs, workers=workers, dask=args.dask or "",
+                                meanwhile=_load_table):
             place = places[outcome.index]
             if isinstance(outcome.error, SelfcalError):  # the folder cannot be written
                 raise outcome.error
@@ -94,6 +95,11 @@ def _worked(args: argparse.Namespace, bags: Sequence[Path], settings: "Settings"
             _say(found[place])
             progress(len(found), len(jobs))
     return found
+
+
+def _load_table() -> None:
+    """Load what makes the table: SciPy's statistics take as long as three bags."""
+    import selfcal_ros.batch.page  # noqa: F401
 
 
 def _failed(bag: Path, error: BaseException | None) -> dict[str, Any]:

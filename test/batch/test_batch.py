@@ -16,9 +16,9 @@ import pytest
 
 from selfcal_ros.batch import jobs
 from selfcal_ros.batch.bags import find_bags
-from selfcal_ros.batch.jobs import RECORDS, RESULTS
 from selfcal_ros.batch.page import page_html
 from selfcal_ros.batch.quantities import described
+from selfcal_ros.batch.records import RECORDS, RESULTS
 from selfcal_ros.batch.store import opened
 from selfcal_ros.batch.table import batch_json, csv_text, series_of, summary_lines
 from selfcal_ros.cli.main import main
