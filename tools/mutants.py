@@ -259,6 +259,7 @@ def _in_a_fork(run: Callable[[], int], cwd: Path) -> int | None:
     if child == 0:
         os.setsid()
         os.chdir(cwd)
+        os.environ.pop("PYTEST_ADDOPTS", None)  # of those who run this by pytest, as colcon does
         status = 1
         try:
             with open(os.devnull, "w") as nowhere:

@@ -124,6 +124,7 @@ RED = "\n\ndef test_red():\n    assert half(2) is None\n"
     (GOOD.format(3, 1.5) + RED, False), (GOOD.format(0, 0) + RED, True)])
 def test_a_change_survives_what_does_not_see_it_and_what_fails_anyway(
         tmp_path, monkeypatch, test, survives):
+    monkeypatch.setenv("PYTEST_ADDOPTS", "-n 2")  # colcon test gives its options that way
     tree = small_tree(tmp_path, monkeypatch, test)
     divided, = (m for m in mutants.mutants_of("half.py", HALF) if m.new == "*")
     assert tree.survives(divided) is survives
