@@ -9,7 +9,6 @@ import re
 from typing import Any
 
 from rich.console import Group, RenderableType
-from rich.table import Table
 from rich.text import Text
 
 from selfcal_ros.cli.terminal.fitting import coarser, fitted, headed, last_fitted, wrapped
@@ -41,13 +40,19 @@ def screen(picture: dict[str, Any], log: list[str],
                                      height // 8), width)
     rows = height - len(now) - len(nodes) - len(said) - 1
     left = (width - BETWEEN) // 2
-    halves = [_measured(picture, left, rows), _found(picture, width - BETWEEN - left, rows)]
-    table = Table.grid(padding=(0, BETWEEN, 0, 0), pad_edge=False)
-    for wide in (left, width - BETWEEN - left):
-        table.add_column(width=wide, no_wrap=True, overflow="ellipsis")
-    for row in range(rows):
-        table.add_row(*(half[row] if row < len(half) else "" for half in halves))
-    return Group(*now, table, *nodes, *said, keys)
+    halves = (_measured(picture, left, rows), _found(picture, width - BETWEEN - left, rows))
+    beside = [_beside(width, *(half[row] if row < len(half) else Text() for half in halves))
+              for row in range(rows)]
+    return Group(*now, *beside, *nodes, *said, keys)
+
+
+def _beside(width: int, left: Text, right: Text) -> Text:
+    """Return one row of both halves of the screen."""
+    first = (width - BETWEEN) // 2
+    left, right = left.copy(), right.copy()
+    left.truncate(first, overflow="ellipsis", pad=True)
+    right.truncate(width - BETWEEN - first, overflow="ellipsis")
+    return Text(no_wrap=True).append_text(left).append(" " * BETWEEN).append_text(right)
 
 
 def what_now(picture: dict[str, Any]) -> str:
