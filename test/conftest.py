@@ -8,7 +8,7 @@ The number is set before NumPy is loaded; processes that tests start inherit it.
 import gc
 import os
 
-from hypothesis import settings
+from hypothesis import given, settings, strategies
 
 for _libraries in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(_libraries, "1")
@@ -18,8 +18,17 @@ settings.load_profile("repeatable")
 gc.disable()  # nothing that is collected goes before the tests do
 
 
+@given(strategies.none())
+def first_example(nothing: None) -> None:
+    """Have Hypothesis ask once, before the freeze, what holds the generators of random numbers.
+
+    Older versions ask the garbage collector, which does not know what is frozen, and warn.
+    """
+
+
 def pytest_collection_finish():
     """Look for garbage again, but no more through modules and tests."""
+    first_example()
     gc.collect()
     gc.freeze()
     gc.enable()
