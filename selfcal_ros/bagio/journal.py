@@ -33,7 +33,7 @@ from selfcal_ros.collection.messages import Phase
 from selfcal_ros.errors import InputError, SelfcalError
 from selfcal_ros.messages.to_model import stamp_ns
 from selfcal_ros.messages.topics import COMMAND_TOPIC
-from selfcal_ros.units import NS_PER_S
+from selfcal_ros.units import NS_PER_S, S_PER_NS
 
 SYNC_PERIOD_S = 0.5
 """Time between two synchronisations with the disk, where there is something to synchronise."""
@@ -139,7 +139,7 @@ def newest(folder: str | os.PathLike) -> tuple[Path, float] | None:
     """
     with _said(Path(folder)):
         written_ns, bag = _newest(Path(folder))
-    return (bag, max(time.time_ns() - written_ns, 0) * 1e-9) if bag else None
+    return (bag, max(time.time_ns() - written_ns, 0) * S_PER_NS) if bag else None
 
 
 def start(folder: str | os.PathLike, now_ns: int) -> "Journal":

@@ -98,7 +98,7 @@ def _worked(args: argparse.Namespace, bags: Sequence[Path], settings: "Settings"
 
 
 def _load_table() -> None:
-    """Load what makes the table: SciPy's statistics take as long as three bags."""
+    """Load what makes the table: with SciPy's statistics it takes longer than a bag."""
     import selfcal_ros.batch.page  # noqa: F401
 
 

@@ -283,10 +283,10 @@ def _show_ranked(args: argparse.Namespace, plan: Plan, now: tuple[Score, float |
                              "repeat_of": item.repeat_of, "visit_order": item.order or None,
                              **_score_json(item.score, unit)} for item in ranked]}, indent=1))
         return
-    tell(f"plan {plan.plan_id}: {_score_text(*now)}")
-    print(f"next steps, the best first by {args.criterion} XY uncertainty:")
-    for item in ranked:
-        tell(f"  {_score_text(item.score, unit)}   {item.text}")
+    tell("\n".join([
+        f"plan {plan.plan_id}: {_score_text(*now)}",
+        f"next steps, the best first by {args.criterion} XY uncertainty:",
+        *(f"  {_score_text(item.score, unit)}   {item.text}" for item in ranked)]))
 
 
 def _show_best(args: argparse.Namespace, best: Plan, score: tuple[Score, float | None],
@@ -296,11 +296,11 @@ def _show_best(args: argparse.Namespace, best: Plan, score: tuple[Score, float |
         print(json.dumps({"plan_id": best.plan_id, "criterion": args.criterion, "views": views,
                           "how": how, **_score_json(*score)}, indent=1))
         return
-    print(f"best plan of {len(views)} views by {args.criterion} XY uncertainty ({how}):")
+    tell(f"best plan of {len(views)} views by {args.criterion} XY uncertainty ({how}):")
     for view in views:
         a, b = view["translation_pitch"]
         kind = "" if view["grid"] else ", lines only"
-        print(f"  {view['name']}: turn {view['rotation_deg']:g} deg, shift [{a}, {b}]{kind}")
+        tell(f"  {view['name']}: turn {view['rotation_deg']:g} deg, shift [{a}, {b}]{kind}")
     tell(_score_text(*score))
 
 

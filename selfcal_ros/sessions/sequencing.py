@@ -21,12 +21,12 @@ from selfcal_ros.model.view import Plan, View, plan_from_dict
 from selfcal_ros.sessions.health import Presence
 from selfcal_ros.sessions.ports import Diagnosis, Level, Ports
 from selfcal_ros.sessions.stalls import StallWatch, missing_marks
-from selfcal_ros.units import S_PER_NS
+from selfcal_ros.units import NS_PER_S, S_PER_NS
 
 PATIENCE_S = 3.0
 """Time without a sign of life after which a node is missing; it tells its health each second."""
 
-LATEST_NS = (1 << 31) * 1_000_000_000 - 1
+LATEST_NS = (1 << 31) * NS_PER_S - 1
 """The latest stamp that a message can have."""
 
 SET_BACK_S = 0.1

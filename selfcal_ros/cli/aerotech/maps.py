@@ -113,9 +113,9 @@ def _numbers(found: "Verification") -> dict:
     from selfcal_ros.model.result import plain
 
     return plain({r.place: {"points": r.position.shape[1],
-                      "before": {"rms": r.rms("before"), "max": r.largest("before")},
-                      "after": {"rms": r.rms("after"), "max": r.largest("after")},
-                      "shift_after": r.shift_after} for r in found.residuals})
+                            "before": {"rms": r.rms("before"), "max": r.largest("before")},
+                            "after": {"rms": r.rms("after"), "max": r.largest("after")},
+                            "shift_after": r.shift_after} for r in found.residuals})
 
 
 def _text(found: "Verification") -> str:
