@@ -14,7 +14,7 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes.encoder_input import EncoderInput
 from selfcal_ros.nodes.managed import WhileConfigured, stop
-from selfcal_ros.nodes.polling import ByTheClock, PollingNode
+from selfcal_ros.nodes.polling import ByTheClock, PollingNode, wake
 from selfcal_ros.nodes.publishers import kept_names, offered
 from selfcal_ros.nodes.running import run
 from selfcal_ros.sessions.collecting import CollectingSession
@@ -86,10 +86,8 @@ class MeasurementCollector(PollingNode[CollectorSettings]):
         self.subscribe_with_age(names.COMMAND, self._reception.command, raw=True)
         EncoderInput(self, inputs[names.ENCODER.name], raw=True)
         self.every(TICK_S, self._on_timer)
-        self._busy = self.every(BUSY_S, self._on_timer)
-        self._soon = self.every(SOON_S, self._on_soon)
-        for timer in (self._busy, self._soon):
-            timer.cancel()
+        self._busy = self.at_need(BUSY_S, self._on_timer)
+        self._soon = self.at_need(SOON_S, self._on_soon)
         self.service(Trigger, "~/finish", lambda request: self._finish())
 
     def _publish(self, output: str, fields: dict[str, Any]) -> None:
@@ -97,7 +95,10 @@ class MeasurementCollector(PollingNode[CollectorSettings]):
 
     def _on_timer(self) -> None:
         self._busy_looks = BUSY_LOOKS if self._drain() >= MANY else self._busy_looks - 1
-        (self._busy.reset if self._busy_looks > 0 else self._busy.cancel)()
+        if self._busy_looks > 0:
+            wake(self._busy)
+        else:
+            self._busy.cancel()
         if not self._reception.restoring:
             self.session.tick()
 
@@ -105,7 +106,7 @@ class MeasurementCollector(PollingNode[CollectorSettings]):
         """Look at once where a view may be complete, and then until it is, or was not."""
         if self._reception.may_end:
             self._looks = 0
-            self._soon.reset()
+            wake(self._soon)
 
     def _on_soon(self) -> None:
         self._on_timer()

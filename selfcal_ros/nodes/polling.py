@@ -6,13 +6,21 @@ import time
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
+from rclpy.clock import Clock, ClockType
 from rclpy.subscription import Subscription
+from rclpy.timer import Timer
 
 from selfcal_ros.collection.settings.parameter import ManagedSettings
 from selfcal_ros.nodes.managed import ManagedNode
 
 MOST = 2000
 """Messages of a subscription that are taken at once; the others wait for the next time."""
+
+
+def wake(timer: Timer) -> None:
+    """Let a timer run that stands; one that runs is left alone."""
+    if timer.is_canceled():
+        timer.reset()
 
 
 class Missing(NamedTuple):
@@ -101,6 +109,18 @@ class PollingNode[S: ManagedSettings](ManagedNode[S]):
 
     Those that wake the node are looked after by both.
     """
+
+    def at_need(self, seconds: float, callback: Callable[[], None]) -> Timer:
+        """Return a timer that stands until `wake`, on a clock of its own.
+
+        For each reset of a timer the events executor of rclpy 7.1 calls, once more, every timer of
+        the same clock that is due, and each call puts off the next by a period: twenty resets
+        beside the second's health would tell it twenty times, and then not for twenty seconds.
+        """
+        timer = self.create_timer(seconds, self.guarded(callback),
+                                  clock=Clock(clock_type=ClockType.STEADY_TIME))
+        timer.cancel()
+        return self.own(timer, self.destroy_timer)
 
     @property
     def subscriptions(self) -> Iterator[Subscription]:

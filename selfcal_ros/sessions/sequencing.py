@@ -229,7 +229,7 @@ class SequencingSession:
         """Say once that a companion gives no sign of life while a plan runs."""
         nodes = " and ".join(self.presence.silent()) if self.current is not None else ""
         line = nodes and (f"no sign of life of {nodes} for {PATIENCE_S:g} s: it hangs or has "
-                          "ended; wait for it, or start it again: nothing measured is lost")
+                          "ended; wait for it, or start it again: what was measured is kept")
         if line and line != self._silent:
             self._ports.say(Level.WARN, line)
         self._silent = line

@@ -23,6 +23,7 @@ from selfcal_ros.messages import from_model, to_model
 from selfcal_ros.nodes import measurement_collector, names
 from selfcal_ros.nodes.filling import fill
 from selfcal_ros.nodes.measurement_collector import MeasurementCollector
+from selfcal_ros.units import NS_PER_S
 from test.support.plans import plan_of
 from test.support.ros import publish_events
 from test.support.sessions import collected, events_of, small_plan
@@ -133,6 +134,21 @@ def test_the_last_detection_of_a_view_is_not_left_to_the_clock(graph, monkeypatc
     graph.until(lambda: measured and status and status[-1].complete, "the view")
     graph.until(lambda: node._soon.is_canceled(), "rest")
     assert node._looks < 10**6
+
+
+def test_timers_that_are_woken_neither_hasten_nor_put_off_the_health(graph):
+    node = graph.node(MeasurementCollector)
+    told = graph.listen(names.of_node("measurement_collector", names.HEALTH))
+    graph.until(lambda: told, "the health")
+    while not node._beat.is_ready():
+        pass
+    for _ in range(20):
+        node._soon.reset()
+        node._busy.reset()
+    before = len(told)
+    graph.until(lambda: len(told) > before, "the health")
+    graph.call(Trigger, FINISH)  # what was due before has been done
+    assert node._beat.time_until_next_call() <= NS_PER_S
 
 
 def test_finish_without_a_command_says_what_is_missing(graph):
