@@ -70,6 +70,7 @@ def shift(hours: float, size: int) -> Recording:
     measurements = simulate_measurements(truth, plan, rng)
     marks = sum(len(view.m) for view in measurements.views)
     repeats = max(1, round(3600 * hours / marks))
+    plan = replace(plan, views=tuple(replace(view, repeats=repeats) for view in plan.views))
     part = recording(plan, measurements, repeats=repeats, encoder_ns=ENCODER_NS,
                      visit_ns=max(round(3600e9 * hours / marks), 50_000_000))
     rng = np.random.default_rng(1)
@@ -244,7 +245,10 @@ def closing_view(cell: Cell, batch: list[tuple[str, bytes]], stream: Iterator,
 
     def solved() -> bool:
         return cell.views_solved > views and (not cell.has_map or cell.map_s > began)
+    end = time.monotonic() + PATIENCE_S
     while batch:
+        if time.monotonic() > end:
+            raise SystemExit("soak: waited in vain for the solution of a view")
         for kind in paced(cell, batch):
             if not began and kind == "detection" and cell.sent["detection"] in ends:
                 began = time.monotonic()
