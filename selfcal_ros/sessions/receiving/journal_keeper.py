@@ -183,6 +183,11 @@ class JournalKeeper:
         return self._journal.path if self._journal else None
 
     @property
+    def is_wanted(self) -> bool:
+        """Whether a journal is to be kept, be it that it cannot be written just now."""
+        return bool(self._folder)
+
+    @property
     def lost(self) -> int:
         """Messages that are not in the journal and should be."""
         return self._unwritten + (self._journal.n_lost if self._journal else 0)

@@ -13,11 +13,13 @@ from typing import Any
 
 from selfcal_ros.bagio.channels import ChannelDecoder
 from selfcal_ros.bagio.schemas import typestore
+from selfcal_ros.collection.messages import Phase
 from selfcal_ros.messages.cdr_columns import Payloads
 from selfcal_ros.messages.topics import COMMAND_TOPIC, DETECTION_TOPIC, ENCODER_TOPIC, INPUT_TOPICS
 from selfcal_ros.sessions.collecting import CollectingSession
 from selfcal_ros.sessions.ports import Diagnosis, Level
 from selfcal_ros.sessions.receiving.journal_keeper import JournalKeeper, TakenUp, bad_input, take_up
+from selfcal_ros.sessions.receiving.resting import Resting
 
 
 class Reception:
@@ -42,6 +44,7 @@ class Reception:
         self._waiting: list[tuple[str, bytes, int, bool]] = []
         self._n_detections = 0  # that wait
         self._held: list[tuple[str, bytes, int, bool]] = []
+        self._resting = Resting()
         self._worker: Executor | None = None
         self._restoring: Future[TakenUp] | None = None
         self._source = ""  # the journal that is taken up
@@ -91,9 +94,13 @@ class Reception:
         self._waiting.append((DETECTION_TOPIC, data, received_ns, False))
         self._n_detections += 1
 
-    def command(self, data: bytes, is_older: bool) -> None:
-        """Take a selfcal_msgs/ViewCommand as received; `is_older` than this node's listening."""
-        self._waiting.append((COMMAND_TOPIC, data, time.time_ns(), is_older))
+    def command(self, data: bytes, is_older: bool, received_ns: int | None = None) -> None:
+        """Take a selfcal_msgs/ViewCommand as received, now unless another instant is told.
+
+        `is_older`: published before this node listened.
+        """
+        when_ns = time.time_ns() if received_ns is None else received_ns
+        self._waiting.append((COMMAND_TOPIC, data, when_ns, is_older))
 
     def drain(self) -> bool:
         """Write what has come to the journal, then give it to the session; tell if it has anything.
@@ -102,8 +109,7 @@ class Reception:
         """
         adopted, waiting, self._waiting, self._n_detections = False, self._waiting, [], 0
         self._advance()
-        for topic, data, received_ns, _ in waiting:
-            self.journal.write(topic, data, received_ns)
+        self._write(waiting)
         try:
             self.journal.flush()
         except Exception as error:  # what has come is used, whatever becomes of the journal
@@ -118,6 +124,21 @@ class Reception:
         waiting, self._held = [*self._held, *waiting], []
         self._feed(waiting)
         return adopted or bool(waiting)
+
+    def _write(self, waiting: list[tuple[str, bytes, int, bool]]) -> None:
+        """Hand what has come to the journal; of an encoder at rest, a sample a second."""
+        if not self.journal.is_wanted:
+            return
+        newest = self.session.collector.newest_command
+        measuring = self.restoring or (newest is not None and newest.phase == Phase.MEASURE)
+        for topic, data, received_ns, _ in waiting:
+            is_sample = topic == ENCODER_TOPIC
+            samples = self._resting.sample(data, received_ns, measuring=measuring) if is_sample \
+                else self._resting.wake(received_ns)
+            for sample in samples:
+                self.journal.write(ENCODER_TOPIC, *sample)
+            if not is_sample:
+                self.journal.write(topic, data, received_ns)
 
     def _adopt(self, taken: Future[TakenUp]) -> None:
         """Go on from what the journal held."""
@@ -164,4 +185,6 @@ class Reception:
     def close(self) -> None:
         """Take what waits, and close the journal."""
         self.drain()
+        for sample in self._resting.end():
+            self.journal.write(ENCODER_TOPIC, *sample)
         self.journal.close()
