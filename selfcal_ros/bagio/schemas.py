@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Message definitions without ROS: the contract's own, and those that a bag brings along."""
 
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,9 @@ from selfcal_ros.errors import InputError, first_line
 from selfcal_ros.messages.cdr_layout import SEQUENCE, TEXT, Field
 
 OWN = "selfcal_msgs"
+
+KEPT = 64
+"""Schemas whose typestores are kept; a folder of foreign bags has a handful."""
 
 
 def _message_folder() -> Path:
@@ -74,15 +77,20 @@ def store_of_schema(name: str, encoding: str, text: str, where: str) -> Typestor
                              "record it with message definitions")
         return typestore()
     try:
-        types = (get_types_from_idl(text) if encoding == "ros2idl"
-                 else get_types_from_msg(text, name))
-        store = get_typestore(Stores.EMPTY)
-        for known in ("std_msgs/msg/Header", "builtin_interfaces/msg/Time"):
-            types.setdefault(known, typestore().fielddefs[known])
-        store.register(types)
+        return _store_of_text(name, encoding, text)
     except Exception as error:
         raise InputError(where, f"the definition of {name} cannot be read ({first_line(error)})",
                          "record the bag anew") from error
+
+
+@lru_cache(maxsize=KEPT)
+def _store_of_text(name: str, encoding: str, text: str) -> Typestore:
+    """Return a typestore of a schema; bags have the same ones, and rosbags writes code for each."""
+    types = get_types_from_idl(text) if encoding == "ros2idl" else get_types_from_msg(text, name)
+    store = get_typestore(Stores.EMPTY)
+    for known in ("std_msgs/msg/Header", "builtin_interfaces/msg/Time"):
+        types.setdefault(known, typestore().fielddefs[known])
+    store.register(types)
     return store
 
 

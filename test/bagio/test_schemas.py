@@ -4,7 +4,8 @@
 import pytest
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from selfcal_ros.bagio.schemas import same_layout, typestore
+from selfcal_ros.bagio.schemas import same_layout, store_of_schema, typestore
+from selfcal_ros.errors import InputError
 
 HEADER = "std_msgs/msg/Header"
 JOINTS = "sensor_msgs/msg/JointState"
@@ -33,3 +34,17 @@ def test_fields_and_their_order_decide_and_constants_do_not(joints, same):
 def test_fields_of_inner_types_count():
     older = "uint32 seq\nbuiltin_interfaces/Time stamp\nstring frame_id\n"
     assert same_layout(store_of(KNOWN, older), JOINTS) is False
+
+
+def test_a_schema_is_read_anew_where_any_of_it_differs_and_refused_wherever_it_stands():
+    text = "std_msgs/Header header\nfloat64 a\n"
+    store = store_of_schema("pkg/msg/T", "ros2msg", text, "bag 1")
+    assert store_of_schema("pkg/msg/T", "ros2msg", text, "bag 2") is store
+    for name, other in (("pkg/msg/T", text.replace("64", "32")), ("pkg/msg/U", text)):
+        found = store_of_schema(name, "ros2msg", other, "bag 1")
+        assert found.fielddefs[name][1][1][1][1][0] == ("float32" if "32" in other else "float64")
+        assert (name in store.fielddefs) == (name == "pkg/msg/T")
+    for where in ("bag 1", "bag 2"):
+        with pytest.raises(InputError, match=rf"^{where}: the definition of pkg/msg/T cannot be "
+                           r"read \(.+\); record the bag anew$"):
+            store_of_schema("pkg/msg/T", "ros2msg", "float64", where)
