@@ -3,9 +3,10 @@
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
-from scipy.stats import norm
+from scipy.special import ndtri
 
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.statistics import rms
@@ -63,7 +64,7 @@ def _histogram(drawing: Drawing, values: np.ndarray, size: float,
                box: tuple[float, float, float, float], end: float) -> None:
     counts, edges = np.histogram(values, BINS, (-end, end))
     width = 2 * end / BINS
-    peak = len(values) * width * norm.pdf(0) / size if size > 0 else 0.0
+    peak = len(values) * width * _normal_density(0.0) / size if size > 0 else 0.0
     top = 1.1 * max(float(counts.max()), min(peak, 3 * float(counts.max())), 1.0)
     frame = Frame(drawing, box, (-end, end), (0.0, top))
     drawing.shapes([(frame.at(low, 0), frame.at(low, count), frame.at(high, count),
@@ -72,15 +73,20 @@ def _histogram(drawing: Drawing, values: np.ndarray, size: float,
                    fill="band", stroke="paper")
     if size > 0:
         along = np.linspace(-end, end, 101)
-        curve = len(values) * width * norm.pdf(along, scale=size)
+        curve = len(values) * width * (_normal_density(along / size) / size)
         drawing.line([frame.at(x, min(y, top)) for x, y in zip(along, curve, strict=True)],
                      width=1.3)
     frame.axes(ticks=(5, 3))
 
 
+def _normal_density(x: Any) -> Any:
+    """Return the density of the standard normal distribution, of a number or an array."""
+    return np.exp(-x ** 2 / 2) / math.sqrt(2 * math.pi)
+
+
 def _normal_plot(drawing: Drawing, values: np.ndarray, size: float,
                  box: tuple[float, float, float, float], end: float) -> None:
-    quantiles = norm.ppf((np.arange(len(values)) + 0.5) / len(values))
+    quantiles = ndtri((np.arange(len(values)) + 0.5) / len(values))
     reach = max(3.2, float(np.abs(quantiles).max()) * 1.05)
     frame = Frame(drawing, box, (-reach, reach), (-end, end))
     drawing.line([frame.at(q, min(max(q * size, -end), end)) for q in
