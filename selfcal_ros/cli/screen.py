@@ -19,6 +19,7 @@ SHADES = " .:-=+*#%@"
 LEVELS = {0: ("ok", "green"), 1: ("warn", "yellow"), 2: ("error", "red")}
 LEAST = (60, 18)
 """Columns and rows below which only what is to be done now is shown."""
+SYMBOLS = {"um": "µm"}
 BETWEEN = 3
 """Columns between the two halves of the screen."""
 PREFIX = re.compile(r"^\[(\w+)\] \[[\d.]+\] \[([^\]]+)\]: ")
@@ -207,7 +208,7 @@ def _map(um: list[list[float | None]], width: int, rows: int, told: dict[str, An
     most = max((value for row in cells for value in row if value is not None), default=0.0)
     signs = [["?" if value is None else SHADES[min(9, int(value / (most or 1.0) * 10))]
               for value in row] for row in cells]
-    title = f"error, '@' = {most:.3g} um" + (f", sign {step} x {step}" if step > 1 else "")
+    title = f"error, '@' = {most:.3g} µm" + (f", sign {step} x {step}" if step > 1 else "")
     return headed(title, [Text(" ".join(row), style="magenta") for row in signs], width)
 
 
@@ -241,4 +242,4 @@ def _said(line: str) -> Text:
 
 
 def _with_unit(value: float | None, unit: str) -> str:
-    return "-" if value is None else f"{value:.3g} {unit}"
+    return "-" if value is None else f"{value:.3g} {SYMBOLS.get(unit, unit)}"

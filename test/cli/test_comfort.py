@@ -31,6 +31,9 @@ def bag(tmp_path_factory):
 
 @pytest.mark.parametrize(("words", "message"), [
     ("solv x", "selfcal: VERB 'solv' is unknown; did you mean 'solve'?; see selfcal --help"),
+    ("", "selfcal: VERB is missing: one of batch, cal, call, diff, monitor, plan, plot, replay, "
+     "report, reproduce, simulate, solve, step-diagonal, table, up; see selfcal --help"),
+    ("plan", "selfcal plan: check|suggest is missing; see selfcal plan --help"),
     ("solve", "selfcal solve: BAG is missing; see selfcal solve --help"),
     ("solve b --methd joint", "selfcal solve: the option --methd is unknown; did you mean "
      "'--method'?; see selfcal solve --help"),

@@ -81,9 +81,9 @@ def test_coverage_rejections_map_verdict_and_health_are_shown():
         "map": {"run_id": "17", "qualified": False, "um": [[0.0, 1.0], [None, 0.5]]}},
         ["first", "escape \x1b[2J"])
     for words in ("view 2 of 4: rot90", "plan hu, run 17", "marks 7 of 9, lines 3 of 8",
-                  "repeatability 0.0213 um, -", "o o .", "missing lines 0, 2, 4, 5, 7",
+                  "repeatability 0.0213 µm, -", "o o .", "missing lines 0, 2, 4, 5, 7",
                   "12  duplicate", "not qualified", "the plate slipped", "add a view",
-                  "'@' = 1 um", "solver: warn readings cannot be used", "first"):
+                  "'@' = 1 µm", "solver: warn readings cannot be used", "first"):
         assert words in text
     rows = [row for row in text.splitlines() if "? +" in row or "  @" in row]
     assert len(rows) == 2  # the known sites by size, the unknown one as a question mark
@@ -135,7 +135,7 @@ def test_all_of_a_good_view_is_on_the_screen(size):
     assert len(rows) == size[1]
     for words in ("view 2 of 4: rot90 plan hu, run 17", "Nothing: the view is being measured.",
                   "The map is saved as /results/hu_17.json", "marks 430 of 441, lines 3 of 8",
-                  "repeatability 0.0213 um, 0.5 arcsec", "missing lines 0, 2, 4, 5, 7",
+                  "repeatability 0.0213 µm, 0.5 arcsec", "missing lines 0, 2, 4, 5, 7",
                   "rejected by reason; 20 used", "3 stage_moving", "qualified; views 4 of 4",
                   "every", "ok: pose_sequencer, solver, measurement_collector",
                   "pose_sequencer: PLACE rot90", "confirm: measuring",

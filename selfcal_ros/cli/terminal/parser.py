@@ -41,7 +41,11 @@ class Parser(argparse.ArgumentParser):
         required = "the following arguments are required: "
         if message.startswith(required):
             names = message.removeprefix(required).replace("/--", " or --")
-            message = f"{names} {'are' if ', ' in names else 'is'} missing"
+            verbs = [verb for action in self._actions if str(action.metavar) == names
+                     and isinstance(action.choices, dict) for verb in action.choices
+                     if verb not in names]
+            message = f"{names} {'are' if ', ' in names else 'is'} missing" + (
+                f": one of {', '.join(verbs)}" if verbs else "")
         self.exit(int(ExitCode.BAD_INPUT),
                   printable(f"{self.prog}: {message}; see {self.prog} --help") + "\n")
 

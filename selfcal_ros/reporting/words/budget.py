@@ -88,10 +88,10 @@ def budget_json(found: list[Budget]) -> list[dict[str, Any]]:
 
 
 def budget_text(found: list[Budget]) -> list[str]:
-    """Return the budgets as a table, um and arcsec."""
+    """Return the budgets as a table, µm and arcsec."""
     lines = []
     for budget in found:
-        factor, unit = (UM_PER_M, "um") if budget.unit == "m" else (ARCSEC_PER_RAD, "arcsec")
+        factor, unit = (UM_PER_M, "µm") if budget.unit == "m" else (ARCSEC_PER_RAD, "arcsec")
         lines += [f"uncertainty of {quantity_text(budget)}, {unit}",
                   f"  {'component':18}{'type':>5}{'u rms':>12}{'u max':>12}{'dof':>10}  from"]
         for part in budget.components:

@@ -50,7 +50,7 @@ def validation_json(found: list[HeldOut]) -> list[dict[str, Any]]:
 
 
 def validation_text(found: list[HeldOut]) -> list[str]:
-    """Return one line a held-out set, um and arcsec."""
+    """Return one line a held-out set, µm and arcsec."""
     lines = []
     for item in found:
         if not item.n_grid and not item.n_angular:
@@ -58,8 +58,8 @@ def validation_text(found: list[HeldOut]) -> list[str]:
             continue
         parts = []
         if item.n_grid:
-            parts.append(f"{item.n_grid} marks predicted within {item.rms_m * UM_PER_M:.4g} um "
-                         f"rms, {item.max_m * UM_PER_M:.4g} um at most "
+            parts.append(f"{item.n_grid} marks predicted within {item.rms_m * UM_PER_M:.4g} µm "
+                         f"rms, {item.max_m * UM_PER_M:.4g} µm at most "
                          f"({item.ratio:.2f} times the noise{_limit_text(item)})")
         if item.n_angular:
             parts.append(f"{item.n_angular} lines within "
