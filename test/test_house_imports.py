@@ -110,8 +110,8 @@ def test_imports_in_functions_state_their_reason(path):
         assert "  # " in line, f"{dotted(path)}:{node.lineno}: say why it is not at the top"
 
 
-WITH_SCIPY = {"solver", "compensator"}
-"""The nodes that compute with it: half a second and 30 MB at each start of a process."""
+WITH_SCIPY = {"solver"}
+"""The nodes that always compute with it: half a second and 30 MB at each start of a process."""
 
 
 def loaded(path: Path) -> set[Path]:

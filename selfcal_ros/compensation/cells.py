@@ -7,9 +7,9 @@ gather of a row and a short Horner scheme; positions go through in blocks that s
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 
 BLOCK = 16384
 """Bilinear positions handled at once: their coefficients fill the second-level cache."""
@@ -20,6 +20,14 @@ REST = 4 * float(np.finfo(float).eps)
 """Step, in pitches, at which a fixed point has come to rest."""
 SNAP = 1e-9
 """Distance to a node, in pitches, below which a position counts as lying on it."""
+
+
+
+def cubic_spline(nodes: np.ndarray, values: np.ndarray, **kwargs: Any) -> Any:
+    """Return the scipy.interpolate.CubicSpline through `values` at `nodes`."""
+    from scipy.interpolate import CubicSpline  # most of a second, which bilinear does without
+
+    return CubicSpline(nodes, values, **kwargs)
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,8 +208,8 @@ def bicubic_cells(fields: np.ndarray) -> Cells:
     Not-a-knot ends; along a direction of three nodes that spline is a parabola.
     """
     nx, ny = fields.shape[1:]
-    along_x = CubicSpline(np.arange(nx), fields, axis=1).c[::-1]
-    both = CubicSpline(np.arange(ny), along_x, axis=3).c[::-1]
+    along_x = cubic_spline(np.arange(nx), fields, axis=1).c[::-1]
+    both = cubic_spline(np.arange(ny), along_x, axis=3).c[::-1]
     # Axes now: q, j, p, i, field.
     return _cells(both.transpose(4, 3, 1, 2, 0), 4, fields)
 

@@ -12,7 +12,6 @@ from typing import get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.interpolate import CubicSpline
 
 from selfcal_ros.compensation.cells import (
     MAX_ITERATIONS,
@@ -21,6 +20,7 @@ from selfcal_ros.compensation.cells import (
     Cells,
     bicubic_cells,
     bilinear_cells,
+    cubic_spline,
 )
 from selfcal_ros.compensation.options import Interpolation, Outside
 from selfcal_ros.errors import InputError
@@ -262,7 +262,7 @@ class _Circle:
         steps = np.abs(np.diff(self._closed))
         if np.any(steps > MAX_SLOPE * 2 * np.pi / max(self._count, 1)):
             raise _steep("angular lines")
-        self._spline = (CubicSpline(np.arange(self._count + 1), self._closed, bc_type="periodic")
+        self._spline = (cubic_spline(np.arange(self._count + 1), self._closed, bc_type="periodic")
                         if cubic and self._count else None)
 
     def at(self, angle_rad: np.ndarray) -> np.ndarray:
