@@ -8,7 +8,8 @@ from typing import Any, NamedTuple
 
 from selfcal_ros.bagio.reader import BagReader
 from selfcal_ros.collection.clock.steps import step_lines
-from selfcal_ros.collection.collector import Collector, ViewProgress
+from selfcal_ros.collection.collector import Collector
+from selfcal_ros.collection.expected import ViewProgress
 from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.errors import InputError, NoDataError, did_you_mean
 from selfcal_ros.files import add_file

@@ -8,13 +8,12 @@ What it gives is a function of the set of messages alone, so that live nodes, a 
 import math
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 from selfcal_ros.collection.diagnosis import Finding
 from selfcal_ros.collection.evidence import EncoderFacts, Seen
-from selfcal_ros.collection.expected import Missing, expected_marks, missing_marks
+from selfcal_ros.collection.expected import ViewProgress, expected_marks
 from selfcal_ros.collection.marks.identify import IdentityRules
 from selfcal_ros.collection.messages import Command, Detection, EncoderSample, check_command
 from selfcal_ros.collection.reasons import Reason
@@ -27,9 +26,7 @@ from selfcal_ros.collection.timeline import Timeline, build_timeline
 from selfcal_ros.collection.view_cache import ViewCache
 from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.messages.topics import COMMAND_TOPIC
-from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Measurements, Sense, ViewReadings
-from selfcal_ros.model.view import View
 from selfcal_ros.units import NS_PER_S
 
 MOST_NAMES = 20
@@ -37,47 +34,6 @@ MOST_NAMES = 20
 SETTLE_EVERY, SPARE = 100_000, 8
 """Samples, or as many times `SPARE` detections, after which exposures are looked up, whether or
 not anybody asks for readings: the samples beside them should still be in memory."""
-
-
-@dataclass(frozen=True)
-class ViewProgress:
-    """How far a view has come; the fields of selfcal_msgs/ViewStatus."""
-
-    view_index: int
-    view: View
-    grid_expected: int
-    grid_done: int
-    angular_expected: int
-    angular_done: int
-    readings: ViewReadings
-    end_ns: int
-    artifact: Artifact | None = None
-
-    @property
-    def missing(self) -> Missing:
-        """Marks that have not been read as often as the plan asks, at most 200 of each kind."""
-        if self.artifact is None:
-            return Missing()
-        return missing_marks(self.artifact, self.view, self.readings)
-
-    @property
-    def needed(self) -> int:
-        """Number of readings without which the view cannot be complete."""
-        told, repeats = self.readings, self.view.repeats
-        have = [int(np.minimum(count, repeats).sum()) for count in (told.count, told.count_theta)]
-        return repeats * (self.grid_expected + self.angular_expected) - sum(have)
-
-    @property
-    def complete(self) -> bool:
-        """Whether every expected mark has been read as often as the plan asks."""
-        return (self.grid_done >= self.grid_expected
-                and self.angular_done >= self.angular_expected)
-
-    @property
-    def coverage(self) -> float:
-        """Part of the expected marks that have been read as often as the plan asks, 0..1."""
-        expected = self.grid_expected + self.angular_expected
-        return (self.grid_done + self.angular_done) / expected if expected else 1.0
 
 
 class Collector:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which marks a view asks for, and which of them are still missing; room only for what is said."""
+"""Which marks a view asks for, which are missing, and how far a view has come."""
 
 from dataclasses import dataclass
 
@@ -62,3 +62,44 @@ def first_missing(done: np.ndarray, total: int) -> np.ndarray:
     """Return the first of the numbers 0..total-1 that are not in `done` (rising, each once)."""
     rank = np.arange(min(total - len(done), NAMED_AT_MOST))
     return rank + np.searchsorted(done - np.arange(len(done)), rank, "right")
+
+
+@dataclass(frozen=True)
+class ViewProgress:
+    """How far a view has come; the fields of selfcal_msgs/ViewStatus."""
+
+    view_index: int
+    view: View
+    grid_expected: int
+    grid_done: int
+    angular_expected: int
+    angular_done: int
+    readings: ViewReadings
+    end_ns: int
+    artifact: Artifact | None = None
+
+    @property
+    def missing(self) -> Missing:
+        """Marks that have not been read as often as the plan asks, at most 200 of each kind."""
+        if self.artifact is None:
+            return Missing()
+        return missing_marks(self.artifact, self.view, self.readings)
+
+    @property
+    def needed(self) -> int:
+        """Number of readings without which the view cannot be complete."""
+        told, repeats = self.readings, self.view.repeats
+        have = [int(np.minimum(count, repeats).sum()) for count in (told.count, told.count_theta)]
+        return repeats * (self.grid_expected + self.angular_expected) - sum(have)
+
+    @property
+    def complete(self) -> bool:
+        """Whether every expected mark has been read as often as the plan asks."""
+        return (self.grid_done >= self.grid_expected
+                and self.angular_done >= self.angular_expected)
+
+    @property
+    def coverage(self) -> float:
+        """Part of the expected marks that have been read as often as the plan asks, 0..1."""
+        expected = self.grid_expected + self.angular_expected
+        return (self.grid_done + self.angular_done) / expected if expected else 1.0

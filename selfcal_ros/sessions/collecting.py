@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 
 from selfcal_ros.collection.clock.steps import Step, step_lines
-from selfcal_ros.collection.collector import Collector, ViewProgress
+from selfcal_ros.collection.collector import Collector
 from selfcal_ros.collection.digest import placing_digest, readings_digest, session_digest
+from selfcal_ros.collection.expected import ViewProgress
 from selfcal_ros.collection.messages import Command, Phase
 from selfcal_ros.collection.reasons import advice
 from selfcal_ros.collection.settings.nodes import CollectorSettings

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from selfcal_ros.collection.collector import expected_marks
 from selfcal_ros.collection.digest import placing_digest
+from selfcal_ros.collection.expected import expected_marks
 from selfcal_ros.collection.messages import Command, Phase
 from selfcal_ros.collection.sequencer import ENDED, Sequencer, State
 from selfcal_ros.collection.settings.nodes import SequencerSettings

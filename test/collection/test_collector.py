@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from selfcal_ros.collection.collector import ViewProgress
+from selfcal_ros.collection.expected import ViewProgress
 from selfcal_ros.collection.messages import Command, Detection, EncoderSample, Phase
 from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.model.artifact import Artifact

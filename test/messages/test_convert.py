@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from selfcal_ros.bagio.build import build
 from selfcal_ros.bagio.schemas import typestore
-from selfcal_ros.collection.collector import ViewProgress
+from selfcal_ros.collection.expected import ViewProgress
 from selfcal_ros.collection.messages import Command, Detection, EncoderSample, Phase
 from selfcal_ros.collection.timeline import Timeline
 from selfcal_ros.errors import InputError

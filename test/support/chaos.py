@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from selfcal_ros.bagio.reader import BagReader
-from selfcal_ros.collection.collector import ViewProgress
+from selfcal_ros.collection.expected import ViewProgress
 from selfcal_ros.collection.messages import Detection
 from selfcal_ros.errors import NotIdentifiableError
 from selfcal_ros.estimation.api import calibrate

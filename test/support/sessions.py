@@ -9,7 +9,8 @@ import yaml
 from selfcal_ros.bagio.build import build
 from selfcal_ros.bagio.schemas import typestore
 from selfcal_ros.bagio.simulated import event_fields, write_simulation
-from selfcal_ros.collection.collector import Collector, ViewProgress
+from selfcal_ros.collection.collector import Collector
+from selfcal_ros.collection.expected import ViewProgress
 from selfcal_ros.messages.topics import INPUT_TOPICS
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.view import Plan
