@@ -15,17 +15,6 @@ from selfcal_ros.bagio.schemas import typestore
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import write_text
 
-INFINITE = {"sec": 9223372036, "nsec": 854775807}
-
-
-def qos_profile(*, reliable: bool, transient_local: bool, depth: int) -> dict:
-    """Return one offered QoS profile as rosbag2 (Jazzy) writes it."""
-    return {"history": "keep_last", "depth": depth,
-            "reliability": "reliable" if reliable else "best_effort",
-            "durability": "transient_local" if transient_local else "volatile",
-            "deadline": INFINITE, "lifespan": INFINITE, "liveliness": "automatic",
-            "liveliness_lease_duration": INFINITE, "avoid_ros_namespace_conventions": False}
-
 
 @contextmanager
 def writing(path: Path, what: str = "cannot be written") -> Iterator[None]:

@@ -6,11 +6,12 @@ from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 
-from selfcal_ros.bagio.writer import BagWriter, qos_profile
+from selfcal_ros.bagio.writer import BagWriter
 from selfcal_ros.collection.messages import Command, Detection
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import read_json, write_json
 from selfcal_ros.messages import from_model
+from selfcal_ros.messages.qos import qos_profile
 from selfcal_ros.messages.topics import COMMAND_TOPIC, DETECTION_TOPIC, ENCODER_TOPIC, INPUT_TOPICS
 from selfcal_ros.model.result import plain
 from selfcal_ros.simulation.cell import Event

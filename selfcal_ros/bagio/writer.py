@@ -16,14 +16,12 @@ from selfcal_ros.bagio.metadata import (
     FileEntry,
     Metadata,
     Topic,
-    qos_profile,
     writing,
 )
 from selfcal_ros.bagio.schemas import definition_of, typestore
 from selfcal_ros.errors import InputError
 from selfcal_ros.messages.from_model import Fields
 
-__all__ = ["BagWriter", "qos_profile"]
 CHUNK_SIZE = 256 * 1024
 
 

@@ -12,7 +12,7 @@ from rclpy.qos import (
     qos_check_compatible,
 )
 
-from selfcal_ros.bagio.metadata import qos_profile
+from selfcal_ros.messages.qos import qos_profile
 from selfcal_ros.nodes.names import Topic
 from selfcal_ros.sessions.ports import Diagnosis, Level
 

@@ -20,7 +20,6 @@ from rosbags.rosbag2 import Reader
 from selfcal_ros.bagio import journal, journal_file
 from selfcal_ros.bagio.build import build
 from selfcal_ros.bagio.journal import resume, start, unfinished
-from selfcal_ros.bagio.metadata import qos_profile
 from selfcal_ros.bagio.offline import collect_bag
 from selfcal_ros.bagio.reader import BagReader
 from selfcal_ros.bagio.schemas import typestore
@@ -29,6 +28,7 @@ from selfcal_ros.collection.messages import Command, EncoderSample, Phase
 from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.api import Options, calibrate
+from selfcal_ros.messages.qos import qos_profile
 from selfcal_ros.messages.topics import INPUT_TOPICS
 from selfcal_ros.model.result import result_to_dict
 from test.support.bags import Foreign

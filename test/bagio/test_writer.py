@@ -13,10 +13,11 @@ from rosbags.rosbag2 import Reader
 from selfcal_ros.bagio.reader import INPUT_TOPICS, BagReader
 from selfcal_ros.bagio.schemas import typestore
 from selfcal_ros.bagio.simulated import QOS, event_fields
-from selfcal_ros.bagio.writer import BagWriter, qos_profile
+from selfcal_ros.bagio.writer import BagWriter
 from selfcal_ros.collection.messages import Detection, EncoderSample
 from selfcal_ros.errors import InputError
 from selfcal_ros.messages import from_model
+from selfcal_ros.messages.qos import qos_profile
 from test.support.sessions import events_of, small_plan
 
 STRING_HASH = "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"

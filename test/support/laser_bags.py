@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Bags of a step-diagonal measurement."""
 
-from selfcal_ros.bagio.writer import BagWriter, qos_profile
+from selfcal_ros.bagio.writer import BagWriter
+from selfcal_ros.messages.qos import qos_profile
 
 EPOCH_NS = 1_700_000_000_000_000_000
 QOS = [qos_profile(reliable=True, transient_local=False, depth=10)]
