@@ -62,7 +62,7 @@ class JointFit:
     ratio: float = 0.0
 
 
-def fit(problem: Problem, y: np.ndarray) -> JointFit:
+def fit(problem: Problem, y: np.ndarray, theta: AngularPart | None = None) -> JointFit:
     """Return the joint least-squares solution.
 
     Each kind of readings is first fitted alone, for its noise; the two noises then weigh them
@@ -74,10 +74,12 @@ def fit(problem: Problem, y: np.ndarray) -> JointFit:
         The plan and its readings.
     y : complex array (views, nx, ny)
         Grid deviations in the plate frame, m.
+    theta : AngularPart, optional
+        `angular_part` of the problem, where several grid deviations are solved with it.
     """
     system, grid, angular = problem.system, problem.system.grid, problem.system.angular
     n, length = 3 * grid.n_views, problem.half_width_m
-    theta = _angular_part(problem)
+    theta = theta or angular_part(problem)
     raw = (_solve_direct if problem.direct else solve_iterated)(problem, y, theta)
     field, parameters = raw.field, raw.parameters
 
@@ -128,7 +130,8 @@ def _solve_direct(problem: Problem, y: np.ndarray, theta: AngularPart) -> FreeNe
     return FreeNetworkSolution(field, parameters, xy, inverse, {"method": "multifrontal"}, ratio)
 
 
-def _angular_part(problem: Problem) -> AngularPart:
+def angular_part(problem: Problem) -> AngularPart:
+    """Return the angular readings fitted alone: they do not depend on the grid's."""
     angular, y = problem.system.angular, problem.angular.y
     if not angular.n_views:
         nothing = noise_estimate((float("nan"), 0), (float("nan"), 0), float("nan"))

@@ -14,7 +14,7 @@ import numpy as np
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.datum.covariance import TermSpread
-from selfcal_ros.estimation.joint.fit import JointFit, fit
+from selfcal_ros.estimation.joint.fit import JointFit, angular_part, fit
 from selfcal_ros.estimation.joint.problem import ROUNDING, Problem, grid_dof, sigma_of
 from selfcal_ros.estimation.terms.columns import TermColumns, made_anew, term_columns
 from selfcal_ros.estimation.terms.equations import TermEquations
@@ -145,8 +145,7 @@ def _size_tests(model: ModelFit) -> tuple[SizeTest, ...]:
 
 def _settled(problem: Problem, check: Callable[[TermEquations], None]) -> ModelFit:
     """Return the solution for the sizes as they are; see `fit_model`."""
-    found = fit(problem, problem.grid.y)
-    state = _State(problem, found)
+    state = _State(problem)
     if state.equations is not None:
         check(state.equations)
     if not (problem.rigid or problem.terms):
@@ -180,15 +179,16 @@ def equations_of(problem: Problem, found: JointFit, columns: TermColumns,
 class _State:
     """Where the iteration stands."""
 
-    def __init__(self, problem: Problem, found: JointFit) -> None:
-        self.problem, self.found, self.steps = problem, found, 0
+    def __init__(self, problem: Problem) -> None:
+        self.problem, self.steps, self.theta = problem, 0, angular_part(problem)
+        self.found = fit(problem, problem.grid.y, self.theta)
         self.offset_steps = OFFSET_STEPS
         self.equations: TermEquations | None = None
         self.reduced: ReducedColumns | None = None
         self.microscope = next((term for term in problem.terms
                                 if term.name is TermName.MICROSCOPE), None)
         if problem.terms:
-            ground = without_noise(problem.ground, found.residuals)
+            ground = without_noise(problem.ground, self.found.residuals)
             columns = term_columns(ground, problem.terms, problem.drift_degree)
             self._linearise(columns, reduce_columns(problem.system.grid, columns.grid))
         equations = self.equations
@@ -244,7 +244,7 @@ class _State:
             self._solve_terms(self.equations)
         self.y = np.where(self.problem.system.grid.read,
                           self.problem.grid.y - self._excess() - self._of_terms(), 0.0)
-        self.found = fit(self.problem, self.y)
+        self.found = fit(self.problem, self.y, self.theta)
         return float(min(np.abs(self.found.parameters - parameters).max(),
                          np.abs(self.y - y).max()))
 
