@@ -2,6 +2,7 @@
 """Hu's self-calibration law, for comparison with the joint solution (method eqs. 5.1-5.10)."""
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -96,8 +97,9 @@ def _require_plain(options: Options) -> None:
                          _JOINT)
 
 
+@lru_cache(4)
 def law_for(artifact: Artifact, datum: ThetaDatum, sense: Sense) -> HuLaw:
-    """Return the law for a plate and a sense of measurement.
+    """Return the law for a plate and a sense of measurement, factorised once for each.
 
     With the plate on the stage the law solves for H(X) = -G(-X): the slopes of G along +X, +Y,
     -X, -Y are those of H along -X, -Y, +X, +Y, and Htheta(-k) = -Gtheta(k).

@@ -22,6 +22,7 @@ from selfcal_ros.estimation.joint.problem import Problem
 from selfcal_ros.estimation.joint.solve import prepare
 from selfcal_ros.estimation.lattice.maps import PHASES
 from selfcal_ros.estimation.normal.equations import NormalEquations
+from selfcal_ros.estimation.normal.memo import Memo
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.readings import Measurements
 
@@ -209,17 +210,7 @@ def view_noise(residuals: Residuals) -> np.ndarray:
     Twice the inverse of that mixing is the covariance of two variances that are 1.
     """
     system, grid = residuals.problem.system, residuals.problem.system.grid
-    rng = np.random.default_rng(0)
-    root = np.sqrt(np.where(grid.read, grid.weight, 1.0))
-    mixing = np.zeros((grid.n_views, grid.n_views))
-    for u in range(grid.n_views):
-        for _ in range(VIEW_DRAWS):
-            noise = np.zeros(grid.weight.shape, dtype=complex)
-            draw = rng.standard_normal((2, *root[u].shape)) / root[u] * grid.read[u]
-            noise[u] = draw[0] + 1j * draw[1]
-            rest = grid_residuals(system, noise)
-            mixing[:, u] += (abs(rest) ** 2 * grid.weight).sum(axis=(1, 2)) / VIEW_DRAWS
-    mixing = (mixing + mixing.T) / 2
+    mixing = _mixings.get(system, None, lambda: _mixing(system))
     sums = (abs(residuals.found.residuals) ** 2 * grid.weight).sum(axis=(1, 2))
     out = np.empty((grid.n_views, 3))
     for v in range(grid.n_views):
@@ -229,6 +220,24 @@ def view_noise(residuals: Residuals) -> np.ndarray:
         out[v, :2] = np.sqrt(nnls(normal, group.T @ sums)[0])
         out[v, 2] = normal[0, 0] - normal[0, 1] ** 2 / max(normal[1, 1], 1e-300)
     return out
+
+
+_mixings: Memo[None, np.ndarray] = Memo()
+
+
+def _mixing(system: NormalEquations) -> np.ndarray:
+    """Return what unit noise of each view leaves as sum of squares in each, (views, views)."""
+    grid, rng = system.grid, np.random.default_rng(0)
+    root = np.sqrt(np.where(grid.read, grid.weight, 1.0))
+    mixing = np.zeros((grid.n_views, grid.n_views))
+    for u in range(grid.n_views):
+        for _ in range(VIEW_DRAWS):
+            noise = np.zeros(grid.weight.shape, dtype=complex)
+            draw = rng.standard_normal((2, *root[u].shape)) / root[u] * grid.read[u]
+            noise[u] = draw[0] + 1j * draw[1]
+            rest = grid_residuals(system, noise)
+            mixing[:, u] += (abs(rest) ** 2 * grid.weight).sum(axis=(1, 2)) / VIEW_DRAWS
+    return (mixing + mixing.T) / 2
 
 
 def angular_redundancy(system: NormalEquations) -> np.ndarray:

@@ -67,6 +67,8 @@ def prediction_limit(model: ModelFit, held: HeldReadings, known: np.ndarray,
     fields, parameters, coefficients = _fitted(model, noise, rng)
     own = noise_of(rng, (n, *weight.shape), weight)
     views = LatticeViews(grid.views.shape, held.grid.poses)
+    placings = [None if fitted >= 0 else Placing(views.z, known[row])
+                for row, fitted in enumerate(held.rows)]
     squares = np.zeros(n)
     for draw in range(n):
         field = fields[:, draw].reshape(grid.views.shape)
@@ -79,10 +81,8 @@ def prediction_limit(model: ModelFit, held: HeldReadings, known: np.ndarray,
         error = own[draw] - views.gather(field) - plate
         if len(coefficients):
             error = error - np.tensordot(coefficients[:, draw], held.columns, axes=1)
-        for row, fitted in enumerate(held.rows):
-            here = known[row]
-            error[row] -= misaligned[fitted] if fitted >= 0 else placed(
-                error[row], views.z, here)
+        for row, (fitted, placing) in enumerate(zip(held.rows, placings, strict=True)):
+            error[row] -= misaligned[fitted] if placing is None else placing.of(error[row])
         squares[draw] = float((weight * abs(error) ** 2)[known].sum()) / (2 * known.sum())
     mean = float(squares.mean())
     return PredictionLimit(mean, 2 * mean**2 / float(squares.var(ddof=1)))
@@ -125,11 +125,25 @@ def _fitted(model: ModelFit, noise: np.ndarray, rng: np.random.Generator
             parameters - now.projected.parameters[:n] @ coefficients, coefficients)
 
 
-def placed(error: np.ndarray, z: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Return the misalignment (nx, ny) that fits the known errors of one view best, plate frame."""
-    columns = np.stack([1j * z, np.ones_like(z), np.full_like(z, 1j)])
-    at = columns[:, known]
-    rows = np.concatenate([at.real, at.imag], axis=1).T
-    values = np.concatenate([error[known].real, error[known].imag])
-    found = np.linalg.lstsq(rows, values, rcond=None)[0]
-    return np.tensordot(found, columns, axes=1)
+class Placing:
+    """The misalignment that fits the known errors of one view best, plate frame.
+
+    Parameters
+    ----------
+    z : complex array (nx, ny)
+        Places of the marks.
+    known : bool array (nx, ny)
+        Marks whose error is known.
+    """
+
+    def __init__(self, z: np.ndarray, known: np.ndarray) -> None:
+        self.known = known
+        self.columns = np.stack([1j * z, np.ones_like(z), np.full_like(z, 1j)])
+        at = self.columns[:, known]
+        self.rows = np.concatenate([at.real, at.imag], axis=1).T
+
+    def of(self, error: np.ndarray) -> np.ndarray:
+        """Return the misalignment at every mark, complex (nx, ny)."""
+        at = error[self.known]
+        found = np.linalg.lstsq(self.rows, np.concatenate([at.real, at.imag]), rcond=None)[0]
+        return np.tensordot(found, self.columns, axes=1)
