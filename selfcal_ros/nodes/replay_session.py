@@ -31,8 +31,9 @@ PATIENCE_S = 30.0
 class ReplaySession(SelfcalNode[PlayerSettings]):
     """Waits for subscribers, plays, checks that nothing was lost, has the map saved."""
 
-    def __init__(self, player: Callable[[SelfcalNode], Player], output: str) -> None:
-        super().__init__(PlayerSettings, parameter_overrides=[])
+    def __init__(self, player: Callable[[SelfcalNode], Player], output: str,
+                 **kwargs: Any) -> None:
+        super().__init__(PlayerSettings, parameter_overrides=[], **kwargs)
         self.finished, self.exit_code = Future(), ExitCode.INTERNAL
         self._output = output
         self.player = player(self)

@@ -2,10 +2,24 @@
 """`selfcal replay`: over DDS, at any pace and in any order, the map of `selfcal solve`."""
 
 import re
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
+from selfcal_ros.bagio.offline import bag_input
+from selfcal_ros.cli import replay as replay_verb
 from selfcal_ros.cli.main import main as selfcal
+from selfcal_ros.errors import InputError
+from selfcal_ros.files import read_json, write_json
+from selfcal_ros.model.result import result_from_dict, result_to_dict, with_input
+from selfcal_ros.nodes.measurement_collector import MeasurementCollector
+from selfcal_ros.nodes.player import Player
+from selfcal_ros.nodes.pose_sequencer import PoseSequencer
+from selfcal_ros.nodes.replay_session import ReplaySession
+from selfcal_ros.nodes.solver import Solver
 from test.support.bags import Foreign
 from test.support.sessions import events_of, small_bag, small_plan
 
@@ -25,32 +39,100 @@ def solved(tmp_path_factory):
     return bag, undated((folder / "solved.json").read_text())
 
 
-@pytest.mark.parametrize("options", [["--fast"], ["--rate", "50"], ["--fast", "--shuffle", "3"]],
-                         ids=" ".join)
-def test_replay_gives_the_result_of_solve_bit_for_bit(
-        ros_environment, solved, tmp_path, options, capfd):
+@pytest.fixture(scope="module")
+def two_cells(tmp_path_factory):
+    """Return a bag of two cells."""
+    bag = tmp_path_factory.mktemp("two_cells") / "bag"
+    for name, plan in (("", "0, 90, tx"), ("/cell2", "0, 90, ty")):
+        Foreign(namespace=name).write(bag / f"x{name.strip('/')}.mcap",
+                                      events_of(small_plan(plan, repeats=1)))
+    return bag
+
+
+def played(graph, bag, folder, *, rate=0.0, seed=-1, cell=None):
+    """Return a session that has played a bag into the nodes, all of them in this process."""
+    for node, parameters in ((MeasurementCollector, {}), (PoseSequencer, {}),
+                             (Solver, {"result_folder": str(folder)})):
+        graph.node(node, **parameters)
+    player = partial(Player, bag=str(bag), rate=rate, seed=seed, namespace=cell)
+    session = graph.add(ReplaySession(player, str(folder / "saved.json"), context=graph.context))
+    graph.until(session.finished.done, "the end of the session")
+    return session
+
+
+def result_text(session, bag, folder):
+    """Return the text of the result that the command would write."""
+    saved = folder / "saved.json"
+    result = with_input(result_from_dict(read_json(saved), str(saved)), bag_input(str(bag)),
+                        session.player.playlist.lost)
+    write_json(folder / "replayed.json", result_to_dict(result))
+    return undated((folder / "replayed.json").read_text())
+
+
+@pytest.mark.parametrize("options", [{}, {"rate": 50.0}, {"seed": 3}],
+                         ids=["fast", "at a rate", "shuffled"])
+def test_a_session_gives_the_result_of_solve_bit_for_bit(
+        graph, solved, tmp_path, options, capfd):
     bag, expected = solved
-    output = tmp_path / "replayed.json"
-    assert selfcal(["replay", str(bag), *options, "--quiet", "-o", str(output)]) in (0, 5)
-    assert undated(output.read_text()) == expected
+    session = played(graph, bag, tmp_path, **options)
+    assert session.exit_code == 0
+    assert result_text(session, bag, tmp_path) == expected
+    said = capfd.readouterr()
+    total = session.player.total
+    assert said.out.splitlines()[-1] == f"progress {total} {total}"
+    assert "ERROR" not in said.err
+    assert "Traceback" not in said.err
+
+
+@pytest.mark.parametrize("cell", ["/", "/cell2"])
+def test_one_of_two_cells_is_played(graph, two_cells, tmp_path, cell):
+    session = played(graph, two_cells, tmp_path, cell=cell)
+    assert selfcal(["solve", str(two_cells), "--namespace", cell, "--quiet", "-o",
+                    str(tmp_path / "solved.json")]) == 0
+    assert result_text(session, two_cells, tmp_path) == undated(
+        (tmp_path / "solved.json").read_text())
+
+
+def test_of_two_cells_one_must_be_named(graph, two_cells):
+    player = partial(Player, bag=str(two_cells), rate=0.0, seed=-1, namespace=None)
+    with pytest.raises(InputError, match="choose one with --namespace"):
+        ReplaySession(player, "saved.json", context=graph.context)
+
+
+def test_processes_give_the_result_of_solve_bit_for_bit(
+        ros_environment, two_cells, tmp_path, capfd):
+    bag, replayed, solved = (str(name) for name in (
+        two_cells, tmp_path / "replayed", tmp_path / "solved"))
+    for verb, output in ((["replay", "--rate", "50", "--shuffle", "3"], replayed),
+                         (["solve"], solved)):
+        assert selfcal([*verb, bag, "--namespace", "cell2", "--quiet", "-o", output]) == 0
+    replayed, solved = ((tmp_path / name).read_text() for name in ("replayed", "solved"))
+    assert undated(replayed) == undated(solved)
     said = capfd.readouterr()
     assert "ERROR" not in said.out + said.err
     assert "Traceback" not in said.out + said.err
 
 
-@pytest.mark.parametrize(("cell", "without"), [("/", False), ("cell2", True)])
-def test_one_of_two_cells_is_played(ros_environment, tmp_path, capfd, cell, without):
-    for name, plan in (("", "0, 90, tx"), ("/cell2", "0, 90, ty")):
-        Foreign(namespace=name).write(tmp_path / "bag" / f"x{name.strip('/')}.mcap",
-                                      events_of(small_plan(plan, repeats=1)))
-    bag, replayed, solved = (str(tmp_path / name) for name in ("bag", "replayed", "solved"))
-    if without:
-        assert selfcal(["replay", bag, "--fast", "--quiet"]) == 2
-        assert "choose one with --namespace" in capfd.readouterr().err
-    for verb, output in ((["replay", "--fast"], replayed), (["solve"], solved)):
-        assert selfcal([*verb, bag, "--namespace", cell, "--quiet", "-o", output]) == 0
-    replayed, solved = ((tmp_path / name).read_text() for name in ("replayed", "solved"))
-    assert undated(replayed) == undated(solved)
+@pytest.mark.parametrize(("options", "arguments"), [
+    ([], ["1.0", "-1", ""]), (["--fast"], ["0.0", "-1", ""]),
+    (["--rate", "50"], ["50.0", "-1", ""]), (["--shuffle", "3"], ["1.0", "3", ""]),
+    (["--namespace", "/"], ["1.0", "-1", "/"]),
+    (["--namespace", "cell2"], ["1.0", "-1", "/cell2"])], ids=" ".join)
+def test_what_a_session_is_told_and_that_its_code_is_that_of_the_command(
+        monkeypatch, solved, options, arguments):
+    started = {}
+
+    @contextmanager
+    def process(module, given, *_, **__):
+        started[module.removeprefix("selfcal_ros.nodes.")] = given
+        yield SimpleNamespace(stdout=["progress 3 4\n"], wait=lambda: 4)
+    monkeypatch.setattr(replay_verb, "process", process)
+    assert selfcal(["replay", str(solved[0]), *options]) == 4
+    assert list(started) == [*replay_verb.NODES, "replay_session"]
+    bag, *rest = started["replay_session"][:5]
+    saved = rest.pop(2)
+    assert (bag, rest) == (str(solved[0]), arguments)
+    assert f"result_folder:={Path(saved).parent}" in started["solver"]
 
 
 def test_a_deficient_bag_ends_with_code_3_and_says_why(ros_environment, tmp_path, capfd):
