@@ -14,7 +14,7 @@ from selfcal_ros.estimation.api import Options, calibrate
 from selfcal_ros.files import read_json
 from selfcal_ros.nodes import names
 from test.support.independent_cell import IndependentCell, largest_deviation
-from test.support.killed import Cell
+from test.support.killed import NODES, Cell
 from test.support.sessions import collected, events_of, plan_file, small_plan
 
 VALUES = CollectorSettings.checked({}, "test")
@@ -43,6 +43,7 @@ def run():
 
 
 def test_a_collector_killed_again_and_again_goes_on_in_it_and_the_map_is_the_same(cell, run):
+    cell.inside["solver"] = None
     cell.start("solver", result_folder=cell.folder)
     cell.start_collector()
     done, rng = 0, np.random.default_rng(4)
@@ -72,6 +73,7 @@ def test_a_collector_killed_again_and_again_goes_on_in_it_and_the_map_is_the_sam
 def test_a_solver_killed_after_a_view_gets_all_readings_again(cell, run):
     second = next(n for n, event in enumerate(run) if isinstance(event, Command)
                   and (event.phase, event.view_index) == (Phase.PLACE, 1))
+    cell.inside["measurement_collector"] = None
     cell.start("solver", result_folder=cell.folder)
     cell.start_collector()
     measured = cell.graph.listen(names.MEASUREMENT)
@@ -88,6 +90,7 @@ def test_a_solver_killed_after_a_view_gets_all_readings_again(cell, run):
 
 
 def test_a_solver_that_hangs_for_a_while_solves_then_what_it_missed(cell, run):
+    cell.inside["measurement_collector"] = None
     cell.start("solver", result_folder=cell.folder)
     cell.start_collector()
     half = len(run) // 2
@@ -104,44 +107,47 @@ def start_sequencer(cell, plan):
     cell.answer(Trigger, "pose_sequencer/start")
 
 
-@pytest.mark.parametrize("held_at", [(0, 1), (1, 20)], ids=["first", "second"])
-def test_a_sequencer_killed_within_a_view_takes_up_the_run_there(cell, held_at):
+def test_a_sequencer_killed_within_views_takes_up_the_run_there(cell):
     plan = small_plan("0, 90, tx", repeats=1)
     machine = cell.graph.add(IndependentCell(context=cell.graph.context))
-    machine.hold_at = held_at
+    machine.hold_at = (0, 1)
     commands, maps = cell.graph.listen(names.COMMAND), cell.graph.listen(names.ERROR_MAP)
+    cell.inside = dict.fromkeys(NODES)
     cell.start("solver", result_folder=cell.folder)
     cell.start_collector()
     start_sequencer(cell, plan)
-    cell.graph.until(lambda: machine.held, "the middle of the view")
-    cell.kill("pose_sequencer")
-    began = commands[-1]
-    commands.clear()
-    start_sequencer(cell, plan)
-    cell.graph.until(lambda: commands, "the command of the view in which it was")
-    assert commands[0] == began
-    machine.hold_at = None
+    for view, hold_at in ((0, (1, 20)), (1, None)):
+        cell.graph.until(lambda: machine.held, "the middle of the view")
+        cell.kill("pose_sequencer")
+        began = commands[-1]
+        assert (began.phase, began.view_index) == (Phase.MEASURE, view)
+        commands.clear()
+        start_sequencer(cell, plan)
+        cell.graph.until(lambda: commands, "the command of the view in which it was")
+        assert commands[0] == began
+        machine.hold_at = hold_at
     cell.graph.until(lambda: commands[-1].phase == Phase.DONE, "the end of the plan")
     measured = [command.view_index for command in commands if command.phase == Phase.MEASURE]
-    assert measured == list(range(held_at[0], len(plan.views)))
-    [run_id] = {command.run_id for command in commands}
+    assert measured == list(range(1, len(plan.views)))
+    assert {command.run_id for command in commands} == {began.run_id}
     saved = cell.saved()
-    cell.graph.until(lambda: maps[-1].run_id == run_id and maps[-1].identifiable, "the map")
+    cell.graph.until(lambda: maps[-1].run_id == began.run_id and maps[-1].identifiable, "the map")
     off_m, off_rad = largest_deviation(maps[-1])
     assert off_m < 2e-8 and off_rad < 1e-6
     [journal] = (path for path in cell.folder.iterdir() if path.name.startswith("journal_"))
-    cell.kill("measurement_collector")
+    cell.end("measurement_collector")
     offline = collect_bag(journal, VALUES)
-    assert (offline.measurements.run_id, offline.measurements.all_rejected()) == (run_id, {})
+    assert (offline.measurements.run_id, offline.measurements.all_rejected()) == (
+        began.run_id, {})
     same(saved["error_map"], calibrate(offline.measurements, Options()).error_map)
 
 
 def test_a_second_collector_on_one_journal_is_refused(cell):
+    cell.inside["measurement_collector"] = None
     cell.start_collector()
     cell.graph.until(lambda: any(cell.folder.glob("journal_*/metadata.yaml")), "the journal")
-    first = cell.running.pop("measurement_collector")
+    cell.inside.clear()
     cell.start("measurement_collector", journal=cell.folder)
     _, err = cell.running["measurement_collector"].communicate(timeout=120)
-    cell.running["measurement_collector"] = first
     [line] = [text for text in err.splitlines() if text.startswith("selfcal: ")]
     assert line.endswith("another process writes this journal; end it or name another folder")

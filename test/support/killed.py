@@ -19,6 +19,8 @@ from selfcal_ros.cli.processes import process
 from selfcal_ros.collection.messages import Command, Detection, EncoderSample
 from selfcal_ros.files import read_json
 from selfcal_ros.nodes import names
+from selfcal_ros.nodes.measurement_collector import MeasurementCollector
+from selfcal_ros.nodes.solver import Solver
 from selfcal_ros.simulation.cell import Event
 from test.support.ros import Graph
 from test.support.sessions import cdr_of
@@ -27,17 +29,22 @@ ROLES = {EncoderSample: names.ENCODER, Detection: names.DETECTIONS, Command: nam
 KINDS = tuple(ROLES)
 """In the order in which the collector tells its counts."""
 
+NODES = {"measurement_collector": MeasurementCollector, "solver": Solver}
+"""Those that may run in the process of the test."""
+
 ATTEMPTS, IDLE_S = 5, 5.0
 
 
 class Cell:
     """Plays a run into node processes; repeats what the collector had not told as received.
 
-    A cell whose detections nobody takes waits: it goes on when the collector is back.
+    A cell whose detections nobody takes waits: it goes on when the collector is back. Nodes named
+    in `inside`, which nobody kills, run in the process of the test.
     """
 
     def __init__(self, graph: Graph, environment: dict, folder: Path, namespace: str = "") -> None:
         self.graph, self.environment, self.folder = graph, environment, folder
+        self.inside: dict[str, Any] = {}
         self.namespace, self.running = namespace, {}
         self.processes = contextlib.ExitStack()
         self.told = (0, 0, 0)
@@ -64,6 +71,12 @@ class Cell:
         self.told = tuple(message.data)
 
     def start(self, node: str, **parameters: object) -> None:
+        if node in self.inside:
+            self.inside[node] = self.graph.node(
+                partial(NODES[node], namespace=self.namespace),
+                **{key: str(value) if isinstance(value, Path) else value
+                   for key, value in parameters.items()})
+            return
         arguments = [word for key, value in parameters.items()
                      for word in ("-p", f"{key}:={value}")]
         self.running[node] = self.processes.enter_context(process(
@@ -90,6 +103,9 @@ class Cell:
 
     def end(self, node: str) -> None:
         """End a node as a launcher does, and wait for it."""
+        if node in self.inside:
+            self.graph.remove(self.inside.pop(node))
+            return
         running = self.running.pop(node)
         running.terminate()
         running.communicate()
