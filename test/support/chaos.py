@@ -140,13 +140,18 @@ def cells(environment: dict, folder: Path) -> Iterator[list[Cell]]:
 
 
 def one_round(seed: int, environment: dict, folder: Path, *, kills: int = 3,
-              ) -> tuple[list[str], list[str]]:
-    """Run a round of two cells; return a line for each, and what was wrong."""
+              all_are_processes: bool = True) -> tuple[list[str], list[str]]:
+    """Run a round of two cells; return a line for each, and what was wrong.
+
+    Unless `all_are_processes`, nodes that are not killed run in this process.
+    """
     rng = np.random.default_rng(seed)
     with cells(environment, folder) as running:
         stories = [story(cell, faults, rng, kills)
                    for cell, faults in zip(running, CELLS.values(), strict=True)]
         for one in stories:
+            if not all_are_processes:
+                one.cell.inside = dict.fromkeys(set(NODES) - {node for _, node in one.kills})
             one.start()
         for share in np.linspace(0, 1, 9)[1:]:
             for one in stories:
@@ -156,7 +161,8 @@ def one_round(seed: int, environment: dict, folder: Path, *, kills: int = 3,
     return lines, wrong
 
 
-def full_disk(seed: int, environment: dict, folder: Path) -> tuple[str, list[str]]:
+def full_disk(seed: int, environment: dict, folder: Path, *, all_are_processes: bool = True,
+              ) -> tuple[str, list[str]]:
     """Measure in a cell whose disk is full for a third of the run; return a line, what was wrong.
 
     Each detection is used or rejected all the same, and each message is in the journal, or told by
@@ -165,6 +171,7 @@ def full_disk(seed: int, environment: dict, folder: Path) -> tuple[str, list[str
     rng = np.random.default_rng(seed)
     graph = Graph(int(environment["ROS_DOMAIN_ID"]))
     cell = Cell(graph, environment, folder, "full_disk")
+    cell.inside = {} if all_are_processes else {"solver": None}
     try:
         one = story(cell, HARMLESS, rng, 0)
         told: list = []
