@@ -13,6 +13,7 @@ import pytest
 import yaml
 from diagnostic_msgs.msg import DiagnosticArray
 
+from selfcal_ros.cli.replay import NODES
 from selfcal_ros.collection.settings.nodes import NODE_PARAMETERS
 from test.support.sessions import plan_file, small_bag, small_plan
 from test.support.waiting import PATIENCE_S, wait_until
@@ -68,8 +69,13 @@ def ended(process: subprocess.Popen) -> tuple[int, str, str]:
     return process.returncode, out, err
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_ends_every_node_cleanly(graph, group, tmp_path, number):
+SIGNALS = {"measurement_collector": signal.SIGINT, "pose_sequencer": signal.SIGTERM,
+           "solver": signal.SIGTERM, "compensator": signal.SIGINT, "bag_player": signal.SIGTERM,
+           "bag_recorder": signal.SIGTERM, "stage_simulator": signal.SIGINT}
+"""One for each node: all of them take both through the same lines; `selfcal up` sends SIGTERM."""
+
+
+def test_a_signal_ends_every_node_cleanly(graph, group, tmp_path):
     bag, recorded = small_bag(tmp_path), tmp_path / "recorded"
     needed = {"bag_player": {"bag": bag, "rate": 0.001}, "bag_recorder": {"bag": recorded},
               "pose_sequencer": {"plan": plan_file(tmp_path, small_plan())}}
@@ -79,8 +85,8 @@ def test_a_signal_ends_every_node_cleanly(graph, group, tmp_path, number):
     graph.until(lambda: set(NODE_PARAMETERS) <= set(graph.hand.get_node_names()), "all nodes")
     graph.until(lambda: {status.name for m in diagnostics for status in m.status}
                 >= set(NODE_PARAMETERS) - {"bag_player"}, "their diagnostics")
-    for process in processes.values():
-        process.send_signal(number)
+    for name, process in processes.items():
+        process.send_signal(SIGNALS[name])
     for name, process in processes.items():
         code, _, err = ended(process)
         assert code == 0, f"{name}: {err}"
@@ -91,8 +97,8 @@ def test_a_signal_ends_every_node_cleanly(graph, group, tmp_path, number):
 
 def test_a_signal_that_comes_again_and_again_changes_nothing(graph, group):
     """Ctrl-C reaches a node from the terminal and once more from `ros2 launch`."""
-    process = group.node("solver")
-    graph.until(lambda: "solver" in graph.hand.get_node_names(), "the node")
+    process = group.node("compensator")
+    graph.until(lambda: "compensator" in graph.hand.get_node_names(), "the node")
     deadline = time.monotonic() + PATIENCE_S
     while process.poll() is None:
         assert time.monotonic() < deadline
@@ -110,7 +116,8 @@ def test_a_player_ends_by_itself_when_the_bag_is_played(group, tmp_path):
 
 
 @pytest.mark.parametrize("node, parameters, line", [
-    ("solver", {"metod": "joint"}, "parameters of solver: metod: solver has no such parameter"),
+    ("compensator", {"metod": "joint"},
+     "parameters of compensator: metod: compensator has no such parameter"),
     ("pose_sequencer", {"plan": "/no/plan.yaml"}, "/no/plan.yaml: no such file"),
     ("bag_player", {"bag": "/no/bag"}, "/no/bag: no such file or folder")])
 def test_bad_input_is_one_line_and_code_2(group, node, parameters, line):
@@ -123,18 +130,19 @@ def test_bad_input_is_one_line_and_code_2(group, node, parameters, line):
 
 def test_an_unknown_name_in_a_parameter_file_is_refused(group, tmp_path):
     file = tmp_path / "params.yaml"
-    file.write_text(yaml.safe_dump({"solver": {"ros__parameters": {"theta_data": "zero_mean"}}}))
-    code, _, err = ended(group.start("-m", "selfcal_ros.nodes.solver", "--ros-args",
+    file.write_text(yaml.safe_dump({"compensator": {"ros__parameters": {"joint_tetha": "c"}}}))
+    code, _, err = ended(group.start("-m", "selfcal_ros.nodes.compensator", "--ros-args",
                                      "--params-file", str(file)))
     assert code == 2
-    assert "theta_data: solver has no such parameter; did you mean 'theta_datum'? known are" in err
+    assert ("joint_tetha: compensator has no such parameter; did you mean 'joint_theta'? known are"
+            in err)
 
 
 @pytest.mark.parametrize("words, problem", [
     (("--params-file", "/no/params.yaml"), "Couldn't parse params file"),
     (("--bogus",), "['--bogus']")])
 def test_arguments_that_ros_does_not_take_are_one_line_and_code_2(group, words, problem):
-    code, _, err = ended(group.start("-m", "selfcal_ros.nodes.solver", "--ros-args", *words))
+    code, _, err = ended(group.start("-m", "selfcal_ros.nodes.compensator", "--ros-args", *words))
     assert code == 2
     [said] = [text for text in err.splitlines() if text.startswith("selfcal: ")]
     assert said.startswith("selfcal: arguments after --ros-args: ")
@@ -143,11 +151,13 @@ def test_arguments_that_ros_does_not_take_are_one_line_and_code_2(group, words, 
     assert "Traceback" not in err
 
 
-@pytest.mark.parametrize("whole_group", [True, False], ids=["ctrl-c", "kill -INT"])
-def test_an_interrupted_replay_leaves_no_process(graph, group, tmp_path, whole_group):
+@pytest.mark.parametrize("whole_group, nodes", [(True, NODES[:1]), (False, NODES)],
+                         ids=["ctrl-c", "kill -INT"])
+def test_an_interrupted_replay_leaves_no_process(graph, group, tmp_path, whole_group, nodes):
     bag = small_bag(tmp_path)
-    replay = group.start("-c", SELFCAL, "replay", str(bag), "--rate", "0.001")
-    graph.until(lambda: {"bag_player", "solver"} <= set(graph.hand.get_node_names()), "the nodes")
+    some = f"from selfcal_ros.cli import replay; replay.NODES = {nodes}; "
+    replay = group.start("-c", some + SELFCAL, "replay", str(bag), "--rate", "0.001")
+    graph.until(lambda: {"bag_player", *nodes} <= set(graph.hand.get_node_names()), "the nodes")
     (os.killpg if whole_group else os.kill)(replay.pid, signal.SIGINT)
     code, _, err = ended(replay)
     assert code == 128 + signal.SIGINT
@@ -170,10 +180,12 @@ sys.exit(start.{command}())
 """
 
 
-@pytest.mark.parametrize("module", ["rclpy", "numpy", "selfcal_ros.estimation.api"])
-def test_a_signal_while_a_node_is_imported_ends_it_cleanly(group, module):
+@pytest.mark.parametrize("module, node", [
+    ("rclpy", "compensator"), ("numpy", "stage_simulator"),
+    ("selfcal_ros.estimation.api", "solver")])
+def test_a_signal_while_a_node_is_imported_ends_it_cleanly(group, module, node):
     code, out, err = ended(group.start("-c", INTERRUPT_WHILE_IMPORTING.format(
-        module=module, argv=["solver"], command="solver")))
+        module=module, argv=[node], command=node)))
     assert (code, out, err) == (0, "", "")
 
 
@@ -208,6 +220,7 @@ def play(*args, play=replay._play):
         os.kill(os.getpid(), signal.SIGINT)
 
 replay._play = play
+replay.NODES = replay.NODES[:1]
 sys.argv = {argv!r}
 sys.exit(start.selfcal())
 """
