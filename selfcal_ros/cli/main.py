@@ -32,8 +32,8 @@ def verbs() -> dict[str, ModuleType]:
     return modules
 
 
-def build_parser() -> argparse.ArgumentParser:
-    """Return the parser with one sub-parser a verb."""
+def build_parser(only: str | None = None) -> argparse.ArgumentParser:
+    """Return the parser with one sub-parser a verb; with the arguments of `only` alone if given."""
     parser = Parser(
         prog="selfcal", description="Self-calibration of XY-theta stages.",
         epilog="exit codes: 0 done, 2 bad usage or input, 3 the measured plan does not identify "
@@ -42,7 +42,8 @@ def build_parser() -> argparse.ArgumentParser:
     group = parser.add_subparsers(dest="verb", metavar="VERB", required=True)
     for name, module in verbs().items():
         sub = group.add_parser(name, help=module.HELP, description=module.HELP)
-        module.configure(sub)
+        if only in (None, name):
+            module.configure(sub)
         sub.set_defaults(run=module.run)
     return parser
 
@@ -59,9 +60,10 @@ def main(argv: list[str] | None = None) -> int:
     said = "selfcal"
     try:
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})  # blocked by `start`
-        parser = build_parser()
         if COMPLETE in os.environ:
-            _complete(parser)
+            _complete(build_parser())
+        words = sys.argv[1:] if argv is None else argv
+        parser = build_parser(next((word for word in words if not word.startswith("-")), ""))
         args = parser.parse_args(argv)
         said = f"selfcal {args.verb}"
         code = int(args.run(args))

@@ -27,7 +27,6 @@ def run(args: argparse.Namespace) -> int:
     """Read the result, write the report, say where it is."""
     from selfcal_ros.files import check_outputs, read_json
     from selfcal_ros.model.result import result_from_dict
-    from selfcal_ros.reporting.maps.plot import save_map_plot
     from selfcal_ros.reporting.summary.text import can_print_symbols, summary_text
     from selfcal_ros.reporting.write import check_name, write_report
 
@@ -38,6 +37,7 @@ def run(args: argparse.Namespace) -> int:
     truth = read_truth(args.truth) if args.truth else None
     with busy("drawing"):
         if args.plot:
+            from selfcal_ros.reporting.maps.plot import save_map_plot
             save_map_plot(result, args.plot, truth=truth)
         write_report(result, output, truth=truth)
     written = [str(name) for name in (output, args.plot) if name]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which form a report takes: the ending of its name says it."""
+"""Which form a report takes: the ending of its name says it. Only that form is loaded."""
 
 import os
 from collections.abc import Mapping
@@ -9,8 +9,6 @@ import numpy as np
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.result import CalibrationResult
-from selfcal_ros.reporting.html import save_report
-from selfcal_ros.reporting.pdf import save_pdf
 
 
 def write_report(result: CalibrationResult, path: str | os.PathLike, *,
@@ -24,7 +22,10 @@ def write_report(result: CalibrationResult, path: str | os.PathLike, *,
         cannot be written.
     """
     check_name(path)
-    save = save_pdf if Path(path).suffix.lower() == ".pdf" else save_report
+    if Path(path).suffix.lower() == ".pdf":
+        from selfcal_ros.reporting.pdf import save_pdf as save  # loads matplotlib
+    else:
+        from selfcal_ros.reporting.html import save_report as save  # loads every figure
     save(result, path, truth=truth)
 
 

@@ -201,6 +201,16 @@ def test_every_verb_takes_json_and_is_documented(name):
     assert f"`{name}`" in docs.read_text()
 
 
+@pytest.mark.parametrize("verb", ["solve", "plan", "cal", "step-diagonal"])
+def test_the_parser_of_one_verb_takes_what_that_of_all_does_and_lists_all_verbs(verb):
+    found = dict(leaves(build_parser(verb)))
+    own = {name: parser for name, parser in LEAVES.items() if name.split()[0] == verb}
+    assert own and {name: found[name].format_help() for name in own} == {
+        name: parser.format_help() for name, parser in own.items()}
+    assert build_parser(verb).format_help() == build_parser().format_help()
+    assert build_parser("").format_help() == build_parser().format_help()
+
+
 RUNS = {
     "solve": "solve BAG -o s.json", "batch": "batch BAG -o batch", "diff": "diff S S",
     "report": "report R", "plot": "plot R -o t.svg", "table": "table R -o t.csv",
