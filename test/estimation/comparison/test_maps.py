@@ -15,6 +15,7 @@ from selfcal_ros.estimation.comparison.maps import compare, compare_with_laser
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.simulation.truth import hu_plan, random_truth, simulate_measurements
+from test.support.recalibrations import responses, sizes_of
 
 ARTIFACT = Artifact(7, 0.01, 12)
 SIGMA_M, SIGMA_RAD = 2e-8, 2e-5
@@ -23,7 +24,7 @@ SIGMA_M, SIGMA_RAD = 2e-8, 2e-5
 def calibrated(seed, truth=None, *, method="joint", sigma=SIGMA_M):
     rng = np.random.default_rng(seed)
     truth = truth or random_truth(ARTIFACT, 4, np.random.default_rng(99))
-    readings = simulate_measurements(truth, hu_plan(ARTIFACT), rng, sigma_m=sigma,
+    readings = simulate_measurements(truth, hu_plan(truth.artifact), rng, sigma_m=sigma,
                                      sigma_theta_rad=SIGMA_RAD)
     return calibrate(readings, Options(method=method, causes=False))
 
@@ -82,7 +83,7 @@ def test_scale_is_kept_on_demand():
 
 
 def test_p_values_of_repeated_calibrations_are_uniform():
-    truth = random_truth(ARTIFACT, 4, np.random.default_rng(5))
+    truth = random_truth(Artifact(5, 0.01, 8), 4, np.random.default_rng(5))
     results = [calibrated(seed, truth) for seed in range(100, 220)]
     tests = [compare(a, b) for a, b in zip(results[::2], results[1::2], strict=True)]
     for kind in ("xy", "theta"):
@@ -175,10 +176,18 @@ def test_without_any_uncertainty_no_difference_has_a_probability():
                          pytest.approx(np.nan, nan_ok=True))
 
 
-def test_uncertainty_of_squareness_is_that_of_recalibrations():
+def test_uncertainty_of_squareness_is_that_of_every_reading_moved_in_turn():
     truth = random_truth(ARTIFACT, 4, np.random.default_rng(5))
-    found = [calibrated(seed, truth).error_map.nonorthogonality for seed in range(400, 600)]
+    readings = simulate_measurements(truth, hu_plan(ARTIFACT), np.random.default_rng(1),
+                                     linear=True)
+    readings = replace(readings, views=tuple(
+        replace(view, sigma_xy=SIGMA_M, dof_xy=1000, sigma_theta=SIGMA_RAD, dof_theta=1000)
+        for view in readings.views))
+    linear = Options(misalignment_model="linear", causes=False)
+    answers = responses(
+        lambda moved: np.array([calibrate(moved, replace(
+            linear, uncertainty=False)).error_map.nonorthogonality]),
+        readings, sizes_of(readings, SIGMA_M, SIGMA_RAD))
     laser = {"error_map_equivalent": {"nonorthogonality": 0.0, "u_nonorthogonality": 0.0}}
-    row = compare_with_laser(calibrated(1, truth), laser, "out.json")[0]
-    scale = SIGMA_M / calibrated(1, truth).noise.sigma_xy
-    assert row.u * scale == pytest.approx(np.std(found), rel=0.15)
+    row = compare_with_laser(calibrate(readings, linear), laser, "out.json")[0]
+    assert row.u == pytest.approx(np.sqrt((answers**2).sum()), rel=1e-4)

@@ -15,6 +15,7 @@ from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.simulation.truth import Spread, hu_plan, random_truth, simulate_measurements
+from test.support.recalibrations import responses, sizes_of
 
 SIGMA_M, SIGMA_RAD = 0.02e-6, np.deg2rad(0.001)
 LAW = Options(method="law", datum_theta="xy_axes")
@@ -89,20 +90,27 @@ def test_published_calibration_errors_lie_within_the_spread_of_200_draws():
     assert (np.abs(checked - mean) < 4 * spread / np.sqrt(20)).all()
 
 
-def test_uncertainty_agrees_with_the_scatter_of_repeated_calibrations():
-    g, theta = published_draws(1000)
-    artifact = Artifact(11, 0.01, 24)
-    truth = random_truth(artifact, 4, np.random.default_rng(3), AS_PUBLISHED)
-    readings = simulate_measurements(truth, hu_plan(artifact, 2), np.random.default_rng(3),
-                                     sigma_m=SIGMA_M * np.sqrt(2),
-                                     sigma_theta_rad=SIGMA_RAD * np.sqrt(2))
-    # one reading of sigma sqrt(2), each repeated twice: the mean has the sigma of the draws
-    emap = calibrate(_known_noise(readings, SIGMA_M * np.sqrt(2), SIGMA_RAD * np.sqrt(2)),
-                     LAW).error_map
-    for u, scatter in ((emap.u_gx, g[0]), (emap.u_gy, g[1]), (emap.u_g_theta, theta)):
-        found = scatter.std(axis=-1)
-        assert np.sqrt((u**2).mean()) == pytest.approx(np.sqrt((found**2).mean()), rel=0.03)
-        assert (np.abs(u / found - 1) < 0.12).all()
+@pytest.mark.parametrize("sense", Sense)
+def test_uncertainty_is_that_of_every_reading_moved_in_turn(sense):
+    """Each mean counts by its repeats, which differ from view to view."""
+    _, readings = measured(5, 8, sense=sense)
+    readings = _known_noise(replace(readings, views=tuple(
+        replace(view, count=np.full(len(view.m), 1 + i), count_theta=np.full(8, 4 - i))
+        for i, view in enumerate(readings.views))), SIGMA_M, SIGMA_RAD)
+    law = law_for(readings.artifact, ThetaDatum.XY_AXES, sense)
+
+    def solve(moved):
+        found = law.solve(hu_readings(moved.artifact, hu_views(moved)))
+        return np.concatenate([found.g.ravel(), found.g_theta[:, 0]])
+
+    answers = responses(solve, readings, sizes_of(readings, SIGMA_M, SIGMA_RAD))
+    spread = np.sqrt((answers**2).sum(axis=0))
+    u_g, u_theta = spread[:50].reshape(2, 5, 5), spread[50:]
+    if sense is Sense.PLATE_MOVES:  # the law solves for H(X) = -G(-X)
+        u_g, u_theta = u_g[:, ::-1, ::-1], u_theta[-np.arange(8)]
+    emap = calibrate(readings, LAW).error_map
+    np.testing.assert_allclose([emap.u_gx, emap.u_gy], u_g, rtol=1e-8)
+    np.testing.assert_allclose(emap.u_g_theta, u_theta, rtol=1e-8)
 
 
 def _known_noise(readings, sigma_m, sigma_rad):
