@@ -19,7 +19,7 @@ from selfcal_ros.estimation.quality.leverage import (
     residuals_of,
 )
 from selfcal_ros.estimation.quality.noisy import by_repeats
-from selfcal_ros.estimation.quality.outliers import LEVEL, clean, robust_calibrate
+from selfcal_ros.estimation.quality.outliers import clean, robust_calibrate
 from selfcal_ros.estimation.quality.thinning import REASON, subset, without
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import GridVisits, Sense, ViewReadings
@@ -98,17 +98,22 @@ def test_standardised_residuals_are_chi_square():
         assert np.mean(squares > -2 * np.log(level)) == pytest.approx(level, rel=0.35)
 
 
-def test_good_readings_stay():
-    """One run in a hundred loses a reading, marks and lines together; never is a slip seen."""
+def test_good_readings_stay(monkeypatch):
+    """At a level of 10 % at most one run in ten loses a reading, marks and lines together.
+
+    At ten times its level the test has its power in fewer runs: more than 14 of 60 happen once in
+    a thousand at a rate of 10 %, five times in six at 30 %. Never is a slip or a noisy view seen.
+    """
+    monkeypatch.setattr("selfcal_ros.estimation.quality.outliers.LEVEL", 0.1)
     plan, lost = hu_plan(Artifact(5, 0.01, 8)), 0
-    for seed in range(150):
+    for seed in range(60):
         rng = np.random.default_rng(seed)
         truth = random_truth(plan.artifact, 4, rng)
         found = clean(simulate_measurements(truth, plan, rng, sigma_m=SIGMA_M, linear=True,
                                             sigma_theta_rad=SIGMA_RAD), LINEAR)
         lost += bool(found.removed)
         assert not found.slips and not found.noisy
-    assert lost <= binom.ppf(0.999, 150, LEVEL)
+    assert lost <= binom.ppf(0.999, 60, 0.1)
 
 
 def dof_of(residuals):
