@@ -4,7 +4,9 @@
 bench_batch.py [--bags N] [--workers N] [--folder FOLDER] [-o FILE.json]
 
 Simulates N bags of Hu's plan (11 x 11 marks, 24 lines, 20 nm), solves them with --workers 1 and
-with N workers, each as a command of its own into an empty folder, and compares the results.
+with N workers, each as a command of its own into an empty folder, and compares the results. Before
+and after, one process and then N at once solve one bag over and over, with all loaded: what the
+cores themselves lose beside each other.
 """
 
 import argparse
@@ -61,6 +63,42 @@ def timed(bags: Path, out: Path, workers: int) -> tuple[float, float]:
     return wall, after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
 
 
+SOLVER = """
+import sys, time
+from selfcal_ros.bagio.offline import collect_bag
+from selfcal_ros.collection.settings.nodes import CollectorSettings
+from selfcal_ros.estimation.api import calibrate
+def solve():
+    calibrate(collect_bag(sys.argv[1], CollectorSettings.checked({}, "bench")).measurements)
+solve()
+print(flush=True)
+sys.stdin.readline()
+number, end = 0, time.perf_counter() + float(sys.argv[2])
+while time.perf_counter() < end:
+    solve()
+    number += 1
+print(number, flush=True)
+"""
+
+
+def solved_in(bag: Path, processes: int, seconds: float = 4.0) -> float:
+    """Return how often each of some processes at once solves a bag in `seconds`, on average."""
+    running = [subprocess.Popen([sys.executable, "-c", SOLVER, str(bag), str(seconds)], text=True,
+                                stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+               for _ in range(processes)]
+    for process in running:
+        process.stdout.readline()  # it has loaded all
+    for process in running:
+        process.stdin.write("\n")
+        process.stdin.flush()
+    return sum(int(process.communicate()[0]) for process in running) / processes
+
+
+def own_ratio(bag: Path, workers: int) -> float:
+    """Return the ratio that the cores allow: wall time of all together to one after the other."""
+    return solved_in(bag, 1) / solved_in(bag, workers) / workers
+
+
 def children() -> set[int]:
     """Return the processes whose parent is this one."""
     task = Path(f"/proc/self/task/{os.getpid()}/children")
@@ -85,17 +123,22 @@ def main() -> int:
     bags = folder / "bags"
     bags.mkdir(parents=True, exist_ok=True)
     mapped(partial(simulate, bags), list(range(args.bags)), workers=workers)
+    own = [own_ratio(bags / "000", workers)]
     alone, alone_cpu = timed(bags, folder / "alone", 1)
     together, together_cpu = timed(bags, folder / "together", workers)
+    own.append(own_ratio(bags / "000", workers))
     one, other = maps_of(folder / "alone"), maps_of(folder / "together")
     same = one.keys() == other.keys() and all(np.array_equal(one[k], other[k]) for k in one)
     figures = {"bags": args.bags, "workers": workers, "seconds_alone": alone,
                "seconds_together": together, "ratio": together / alone, "cpu_s_alone": alone_cpu,
-               "cpu_s_together": together_cpu, "same_maps": same}
+               "cpu_s_together": together_cpu, "own_ratio": own,
+               "same_maps": same}
     print(f"{args.bags} bags, one after the other: {alone:.1f} s ({alone_cpu:.1f} s of CPU)")
     print(f"{args.bags} bags, {workers} workers: {together:.1f} s ({together_cpu:.1f} s of CPU)")
     print(f"ratio {together / alone:.2f}; CPU shared by {workers}: "
           f"{together_cpu / workers / alone_cpu:.2f}; maps equal: {same}")
+    print(f"the cores by themselves, without starts and imports: {own[0]:.2f} before, "
+          f"{own[1]:.2f} after")
     if args.output:
         write_json(args.output, figures)
     return 0
