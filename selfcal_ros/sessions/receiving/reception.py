@@ -126,7 +126,7 @@ class Reception:
         return adopted or bool(waiting)
 
     def _write(self, waiting: list[tuple[str, bytes, int, bool]]) -> None:
-        """Hand what has come to the journal; of an encoder at rest, a sample a second."""
+        """Hand what has come to the journal; of an encoder at rest, little."""
         if not self.journal.is_wanted:
             return
         newest = self.session.collector.newest_command

@@ -1,18 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which encoder samples a journal keeps: all around what is measured, one a second at rest.
+"""Which encoder samples a journal keeps: all around what is measured, some a minute at rest.
 
 An encoder at 1 kHz writes 15 GB a day, whether anything is measured or not.
 """
 
 from collections import deque
 
+from selfcal_ros.collection.stage.encoder import LOOK_BACK_NS
 from selfcal_ros.units import NS_PER_S
 
-REACH_NS = 10 * NS_PER_S
-"""How long before and behind a command or a detection, by reception, every sample is kept: what
-lies around an exposure comes before the command or the detection that tells of it."""
-APART_NS = NS_PER_S
-"""Time between the samples that are kept at rest, which show the encoder's clock."""
+REACH_NS = LOOK_BACK_NS + 10 * NS_PER_S
+"""How long before and behind a command or a detection, by reception, every sample is kept: that far
+back from an exposure the direction of approach is looked for, and messages take their time."""
+APART_NS, BURST = 60 * NS_PER_S, 50
+"""Time between the samples that are kept at rest, and how many of them follow one another: they
+show that the encoder was there, how often it told its position, and steps of its clock."""
 
 Sample = tuple[bytes, int]
 """Bytes, and the instant of reception, ns."""
@@ -24,7 +26,8 @@ class Resting:
     def __init__(self) -> None:
         self._held: deque[Sample] = deque()
         self._until_ns: int | None = None  # all is kept up to here
-        self._kept_ns: int | None = None  # the newest that was kept at rest
+        self._burst_ns: int | None = None  # begin of the newest burst that was kept at rest
+        self._rest_of_burst = 0
 
     def wake(self, received_ns: int) -> list[Sample]:
         """Take note of a command or a detection; return what was held back, oldest first."""
@@ -44,7 +47,13 @@ class Resting:
         kept = []
         while abs(received_ns - self._held[0][1]) > REACH_NS:  # a clock may be set back
             oldest = self._held.popleft()
-            if self._kept_ns is None or abs(oldest[1] - self._kept_ns) >= APART_NS:
-                self._kept_ns = oldest[1]
+            if self._is_kept(oldest[1]):
                 kept.append(oldest)
         return kept
+
+    def _is_kept(self, received_ns: int) -> bool:
+        """Return whether a sample is kept that is too old to be of use."""
+        if self._burst_ns is None or abs(received_ns - self._burst_ns) >= APART_NS:
+            self._burst_ns, self._rest_of_burst = received_ns, BURST
+        self._rest_of_burst -= 1
+        return self._rest_of_burst >= 0
