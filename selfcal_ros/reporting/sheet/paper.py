@@ -51,7 +51,7 @@ def _path(item: Path, axes: Axes, points: float, order: int) -> None:
     dash = (0, tuple(part * points for part in item.dash)) if item.dash else "solid"
     fill, stroke = ((_light(name), part) if name else "none" for name, part in (
         (item.fill, item.opacity), (item.stroke, 1.0)))
-    axes.add_patch(PathPatch(Outline(vertices, codes), facecolor=fill, edgecolor=stroke,
+    axes.add_artist(PathPatch(Outline(vertices, codes), facecolor=fill, edgecolor=stroke,
                              linewidth=item.width * points if item.stroke else 0,
                              linestyle=dash, zorder=order, clip_on=False))
 
@@ -63,7 +63,8 @@ def _discs(item: Discs, axes: Axes, points: float, order: int) -> None:
     axes.add_collection(EllipseCollection(
         [2 * r for r in wide], [2 * r for r in high], [0.0] * len(wide), units="xy",
         offsets=item.centres, offset_transform=axes.transData, facecolor=fill, edgecolor=stroke,
-        linewidth=item.width * points if item.stroke else 0, zorder=order, clip_on=False))
+        linewidth=item.width * points if item.stroke else 0, zorder=order, clip_on=False),
+        autolim=False)
 
 
 def _label(item: Label, axes: Axes, points: float, order: int) -> None:
