@@ -16,6 +16,7 @@ ONLY_PARSED = {
     "up": "needs a terminal", "monitor": "needs a cell", "call": "needs a cell",
     "replay": "run by test/nodes/test_replay.py", "batch": "run by the tests of batch",
     "reproduce": "takes minutes; run small by test/cli/test_reproduce_verb.py",
+    "step-diagonal --sensitivity": "takes seconds; run small by test/cli/test_step_diagonal.py",
     "plan suggest": "takes long; run small by test/cli/test_plan.py"}
 """Verbs whose commands are parsed alone, and why."""
 PLACES = ("BAG", "/tmp/session", "$", "qiao_7.yaml", "measured.csv", "FILE.cal", "stage_theta.cal")
