@@ -186,10 +186,18 @@ def _in_lot(seed: int, name: str, text: str) -> list[tuple[str, Mutant]]:
     return out
 
 
+def _statements(tree: ast.AST) -> Iterator[ast.AST]:
+    """Yield every statement below a node, however deep; what they are made of is passed over."""
+    for name in ("body", "orelse", "finalbody", "handlers", "cases"):
+        for node in getattr(tree, name, ()):
+            yield node
+            yield from _statements(node)
+
+
 def _imported(path: Path, known: set[str]) -> set[str]:
     """Return the modules among `known` that a file names in its imports."""
     found = set()
-    for node in ast.walk(ast.parse(path.read_text())):
+    for node in _statements(ast.parse(path.read_text())):
         if isinstance(node, ast.ImportFrom) and node.module:
             names = {f"{node.module}.{alias.name}" for alias in node.names} | {node.module}
             found |= names & known
