@@ -22,7 +22,6 @@ SNAP = 1e-9
 """Distance to a node, in pitches, below which a position counts as lying on it."""
 
 
-
 def cubic_spline(nodes: np.ndarray, values: np.ndarray, **kwargs: Any) -> Any:
     """Return the scipy.interpolate.CubicSpline through `values` at `nodes`."""
     from scipy.interpolate import CubicSpline  # most of a second, which bilinear does without
