@@ -65,6 +65,8 @@ class StepWatch:
         both = np.concatenate([self._rest, np.stack([stamps_ns, received_ns])], axis=1)
         whole = both.shape[1] // GROUP * GROUP
         self._rest = both[:, whole:]
+        if not whole:
+            return []
         stamps, received = both[:, :whole].reshape(2, -1, GROUP)
         offset = stamps - received
         self._groups = np.concatenate([self._groups, np.stack([
