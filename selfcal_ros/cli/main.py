@@ -22,28 +22,32 @@ COMPLETE = "_ARGCOMPLETE"
 """Set in the environment by a shell that asks for completions."""
 
 
-def verbs() -> dict[str, ModuleType]:
-    """Return name -> module of every verb."""
+def verbs(only: str | None = None) -> dict[str, ModuleType]:
+    """Return name -> module of every verb, or of `only` alone; nothing if that is no verb."""
     modules = {}
     for info in pkgutil.iter_modules(cli.__path__):
-        module = importlib.import_module(f"{cli.__name__}.{info.name}")
-        if hasattr(module, "HELP"):
-            modules[info.name.replace("_", "-")] = module
+        name = info.name.replace("_", "-")
+        if only in (None, name):
+            module = importlib.import_module(f"{cli.__name__}.{info.name}")
+            if hasattr(module, "HELP"):
+                modules[name] = module
     return modules
 
 
 def build_parser(only: str | None = None) -> argparse.ArgumentParser:
-    """Return the parser with one sub-parser a verb; with the arguments of `only` alone if given."""
+    """Return the parser with one sub-parser a verb, or with that of `only` alone if it is a verb.
+
+    A command that begins with a verb needs no other.
+    """
     parser = Parser(
         prog="selfcal", description="Self-calibration of XY-theta stages.",
         epilog="exit codes: 0 done, 2 bad usage or input, 3 the measured plan does not identify "
                "the stage, 4 no usable data, 5 not qualified, 1 our own fault")
     parser.add_argument("--version", action="version", version=f"selfcal {__version__}")
     group = parser.add_subparsers(dest="verb", metavar="VERB", required=True)
-    for name, module in verbs().items():
+    for name, module in (verbs(only) or verbs()).items():
         sub = group.add_parser(name, help=module.HELP, description=module.HELP)
-        if only in (None, name):
-            module.configure(sub)
+        module.configure(sub)
         sub.set_defaults(run=module.run)
     return parser
 
@@ -63,7 +67,7 @@ def main(argv: list[str] | None = None) -> int:
         if COMPLETE in os.environ:
             _complete(build_parser())
         words = sys.argv[1:] if argv is None else argv
-        parser = build_parser(next((word for word in words if not word.startswith("-")), ""))
+        parser = build_parser(words[0] if words else None)
         args = parser.parse_args(argv)
         said = f"selfcal {args.verb}"
         code = int(args.run(args))
