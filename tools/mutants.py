@@ -206,6 +206,16 @@ def _imported(path: Path, known: set[str]) -> set[str]:
     return found
 
 
+def _statements(tree: ast.AST) -> Iterator[ast.stmt]:
+    """Yield all statements, the inner ones too; no expression holds an import."""
+    inner = [tree]
+    while inner:
+        node = inner.pop()
+        for name in ("body", "orelse", "finalbody", "handlers", "cases"):
+            inner += (part := getattr(node, name, ()))
+            yield from part
+
+
 def _dotted(path: Path) -> str:
     return ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
 

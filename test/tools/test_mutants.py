@@ -51,9 +51,23 @@ def test_a_sample_is_the_same_for_the_same_seed():
     one, same, other = (mutants.sample(20, seed, ["selfcal_ros/model"]) for seed in (1, 1, 2))
     assert one == same != other
     assert all(m.path.startswith("selfcal_ros/model/") for m in one)
-    assert len(mutants.sample(10**6, 0, ["selfcal_ros/cli"])) > 100  # where it is asked for
-    inner = {Path(m.path).parts[1] for m in mutants.sample(10**6, 0, [])}
-    assert not inner & {"cli", "reporting"} and {"estimation", "laser"} <= inner
+
+
+def test_text_and_plots_are_changed_only_where_it_is_asked_for(tmp_path):
+    names = ["cli/a.py", "reporting/figures/a.py", "estimation/a.py", "laser/a.py", "units.py",
+             "files.py"]
+    for name in names:
+        path = tmp_path / "selfcal_ros" / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text("x = 3 * a\n")
+
+    def sampled(*only):
+        return {m.path.removeprefix("selfcal_ros/")
+                for m in mutants.sample(100, 0, list(only), root=tmp_path)}
+    assert sampled() == {"estimation/a.py", "laser/a.py", "files.py"}
+    assert sampled("selfcal_ros/cli", "selfcal_ros/laser/") == {"cli/a.py", "laser/a.py"}
+    for module in mutants.LEFT_OUT:
+        assert (mutants.PACKAGE / module).exists()
 
 
 def test_what_changes_elsewhere_leaves_the_sample_as_it_was(tmp_path):
