@@ -2,6 +2,8 @@
 """`selfcal up`, `monitor`, `call`: a whole calibration, nodes that die, nothing left behind."""
 
 import contextlib
+import io
+import json
 import os
 import queue
 import re
@@ -20,6 +22,7 @@ from selfcal_ros.cli import up as up_verb
 from selfcal_ros.cli.main import build_parser
 from selfcal_ros.cli.supervisor import MOST_RESTARTS, Supervisor
 from selfcal_ros.files import read_json
+from selfcal_ros.nodes import monitor_session
 from test.support.sessions import plan_file, small_plan
 from test.support.waiting import PATIENCE_S, wait_until
 
@@ -195,11 +198,18 @@ def test_a_parameter_file_may_name_where_the_map_goes(tmp_path, monkeypatch):
     assert given[-2:] == ["-p", f"result_folder:={tmp_path}"]
 
 
-def test_a_request_without_a_cell_says_so(start):
-    asked = start("call", "start")
-    asked.until("start: pose_sequencer does not answer; is it running in this namespace and "
-                "ROS_DOMAIN_ID?")
-    assert asked.process.wait(PATIENCE_S) == 2
+def test_a_request_without_a_cell_says_so(graph, monkeypatch, capsys):
+    monkeypatch.setattr(monitor_session.sys, "stdin", io.StringIO("start\n"))
+    monkeypatch.setattr(monitor_session, "PATIENCE_S", 0.0)
+    graph.add(monitor_session.MonitorSession("", context=graph.context))
+    said: list = []
+
+    def answers() -> list[dict]:
+        said.extend(map(json.loads, capsys.readouterr().out.splitlines()))
+        return [line for line in said if "answer" in line]
+    graph.until(answers, "the answer")
+    assert answers() == [{"success": False, "answer": "start: pose_sequencer does not answer; is "
+                          "it running in this namespace and ROS_DOMAIN_ID?"}]
 
 
 @pytest.mark.parametrize("words, line", [
