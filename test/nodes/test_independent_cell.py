@@ -108,8 +108,8 @@ class Site:
 
 
 @pytest.mark.parametrize("cell", [
-    {}, {"ids": False}, {"plate_moves": True}, {"plate_moves": True, "ids": False},
-    {"joints": ("spindle", "theta", "y", "z", "x")}], ids=lambda cell: "-".join(cell) or "plain")
+    {}, {"plate_moves": True}, {"ids": False, "joints": ("spindle", "theta", "y", "z", "x")},
+    {"plate_moves": True, "ids": False}], ids=lambda cell: "-".join(cell) or "plain")
 def test_it_is_calibrated_to_its_true_error(graph, tmp_path, cell):
     site = Site(graph, tmp_path, **cell).begin()
     site.check()
@@ -136,8 +136,8 @@ def test_two_cells_side_by_side(graph, tmp_path):
     right.check(-2.0)
 
 
-@pytest.mark.parametrize("view", [0, 3])
-@pytest.mark.parametrize("kind", [MeasurementCollector, Solver, PoseSequencer])
+@pytest.mark.parametrize("kind, view", [
+    (MeasurementCollector, 0), (MeasurementCollector, 3), (Solver, 3), (PoseSequencer, 3)])
 def test_a_node_that_is_restarted_within_a_view(graph, tmp_path, kind, view):
     site = Site(graph, tmp_path).begin(hold_at=(view, 4))
     site.until_held()
