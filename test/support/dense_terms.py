@@ -137,7 +137,8 @@ class Dense:
     def _n_unseen(self, terms):
         design = self.design(terms)
         scaled = design / np.linalg.norm(design, axis=0)
-        _, size, right = np.linalg.svd(scaled)
+        # the triangle has the singular values and right vectors of the whole
+        _, size, right = np.linalg.svd(np.linalg.qr(scaled, mode="r"))
         null = right[(size > 1e-9 * size[0]).sum():].T / np.linalg.norm(design, axis=0)[:, None]
         maps = self.to_map(null / np.linalg.norm(null, axis=0))
         return int((np.linalg.svd(maps, compute_uv=False) > 1e-7).sum())
@@ -163,15 +164,18 @@ class Dense:
         spread = np.sqrt((moved**2).sum(axis=1))
         return np.sqrt((spread**2).mean()), spread.max()
 
+    @staticmethod
+    def _rank(design):
+        return np.linalg.matrix_rank(np.linalg.qr(design / np.linalg.norm(design, axis=0),
+                                                  mode="r"), tol=1e-9)
+
     def power(self, terms, name, size, level, draws=300):
         """Mean over drawn coefficients of the power of the noncentral F-test."""
         free = [ModelTerm(term.name) for term in terms]
-        _, before = self.solver(free)
+        solve, before = self.solver(free)
         column = self.root[:, None] * self.columns(name, free=False)
-        norm = np.linalg.norm(before, axis=0)
-        left = column - (before / norm) @ (
-            np.linalg.pinv(before / norm, rcond=1e-11) @ column)
-        rank_before = np.linalg.matrix_rank(before / norm, tol=1e-9)
+        left = column - before @ (solve @ column)
+        rank_before = self._once(("rank", *free), lambda: self._rank(before))
         rank = np.linalg.matrix_rank(left / np.linalg.norm(column, axis=0), tol=1e-5)
         dof = len(before) - rank_before - rank
         b = np.random.default_rng(5).normal(size=(draws, column.shape[1])) * size
