@@ -111,11 +111,14 @@ class Geometry:
         w, by_along, by_tilt = self._directions(vectors, tilt)
         n_k, dim, n = self.shape
         sign = self.signs
-        own = np.einsum("kj,jJ,iI,kc->kjiJIc", sign, np.eye(dim), np.eye(n), w, optimize=True)
-        common = np.einsum("kj,jie,kec,kJ->kjiJc", sign, vectors, by_along, sign, optimize=True)
-        by_errors = own + common[:, :, :, :, None, :]
-        by_tilts = np.einsum("kj,jie,kem,kK->kjiKm", sign, vectors, by_tilt, np.eye(n_k),
-                             optimize=True)
+        by_errors = np.einsum("kj,kJ,jikc->kjiJc", sign, sign, np.tensordot(
+            vectors, by_along, axes=(2, 1)))[:, :, :, :, None].repeat(n, axis=4)
+        j, i = np.ogrid[:dim, :n]
+        by_errors[:, j, i, j, i] += np.moveaxis(sign.T[:, None, :, None] * w, 2, 0)
+        by_tilts = np.zeros((n_k, dim, n, n_k, dim - 1))
+        k = np.arange(n_k)
+        moved = np.tensordot(vectors, by_tilt, axes=(2, 1))  # (j, i, k, m)
+        by_tilts[k, :, :, k] = sign[:, :, None, None] * np.moveaxis(moved, 2, 0)
         rows = n_k * dim * n
         return by_errors.reshape(rows, -1), by_tilts.reshape(rows, -1)
 
