@@ -265,7 +265,8 @@ def test_a_chunk_gives_what_the_library_gives(seed):
     data = b"".join(parts)
     expected = breakup_chunk(FakeChunk(data))
     assert flat(chunk_items(FakeChunk(data))) == expected
-    for cut in rng.integers(0, len(data), 5):
+    between = len(b"".join(parts[:len(parts) // 2]))
+    for cut in (*rng.integers(0, len(data), 2), between):
         outcomes = []
         for read in (lambda chunk: flat(chunk_items(chunk)), breakup_chunk):
             try:

@@ -91,12 +91,12 @@ def test_png_of_any_size(tmp_path, size, lines):
     assert list(tmp_path.iterdir()) == [tmp_path / "map.png"]
 
 
-def test_truth_changes_the_picture_and_the_same_input_gives_the_same_bytes(tmp_path):
+def test_truth_changes_the_picture(tmp_path):
+    """That the same input gives the same bytes is tested with the verb, for every form."""
     result, truth = known_result(3, 8)
-    for name, options in (("a", {}), ("b", {}), ("c", {"truth": truth})):
-        save_map_plot(result, tmp_path / f"{name}.png", **options)
-    a, b, c = ((tmp_path / f"{name}.png").read_bytes() for name in "abc")
-    assert a == b != c
+    save_map_plot(result, tmp_path / "a.png")
+    save_map_plot(result, tmp_path / "b.png", truth=truth)
+    assert (tmp_path / "a.png").read_bytes() != (tmp_path / "b.png").read_bytes()
 
 
 @pytest.mark.parametrize("value", [np.nan, 0.0, 1e-30, 1e300])
