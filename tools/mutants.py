@@ -186,14 +186,6 @@ def _in_lot(seed: int, name: str, text: str) -> list[tuple[str, Mutant]]:
     return out
 
 
-def _statements(tree: ast.AST) -> Iterator[ast.AST]:
-    """Yield every statement below a node, however deep; what they are made of is passed over."""
-    for name in ("body", "orelse", "finalbody", "handlers", "cases"):
-        for node in getattr(tree, name, ()):
-            yield node
-            yield from _statements(node)
-
-
 def _imported(path: Path, known: set[str]) -> set[str]:
     """Return the modules among `known` that a file names in its imports."""
     found = set()
