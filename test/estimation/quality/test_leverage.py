@@ -55,27 +55,29 @@ def dense(readings):
     return left, np.array(right), np.array(of_view)
 
 
-def two_variances(left, of_view, v, y):
-    """Return the variances of view `v` and of the others in readings `y` (rows, draws)."""
+def two_variances(left, of_view, v):
+    """Return the forms A (rows, rows) whose y' A y are the variances of view `v` and of others."""
     own = of_view == v
-    parts = [np.where(own, 1.0, 0.0), np.where(own, 0.0, 1.0)]
-    mixing = np.array([[np.trace(left * a @ left * b) for b in parts] for a in parts])
-    squares = (left @ y) ** 2
-    return np.linalg.solve(mixing, np.array([part @ squares for part in parts]))
+    parts = [left * np.where(own, 1.0, 0.0) @ left, left * np.where(own, 0.0, 1.0) @ left]
+    mixing = np.array([[np.trace(left * a @ left * b) for b in (own, ~own)] for a in (own, ~own)])
+    return np.tensordot(np.linalg.inv(mixing), np.array(parts), axes=1)
 
 
 def test_the_noise_of_a_view_and_its_degrees_of_freedom(monkeypatch):
-    """The degrees of freedom are those of a variance that scatters as the estimates do: 2/dof."""
+    """The degrees of freedom are those of a variance that scatters as the estimates do: 2/dof.
+
+    A form y' A y of unit noise has the variance 2 tr(A A).
+    """
     monkeypatch.setattr(leverage, "VIEW_DRAWS", 1000)
     readings = measured()
     found = view_noise(residuals_of(readings, LINEAR))
     left, y, of_view = dense(readings)
-    draws = np.random.default_rng(1).standard_normal((len(y), 20_000))
     for v in range(5):
-        scatter = two_variances(left, of_view, v, draws)[0].var()
+        forms = two_variances(left, of_view, v)
+        scatter = 2 * np.sum(forms[0] ** 2)
         assert found[v, 2] == pytest.approx(2 / scatter, rel=0.06)
         assert found[v, 2] < 16  # one more or less is not within 6 %
-        variances = two_variances(left, of_view, v, y[:, None])[:, 0]
+        variances = y @ forms @ y
         np.testing.assert_allclose(found[v, :2], np.sqrt(np.maximum(variances, 0)), rtol=0.05,
                                    atol=1e-9)
     assert found[3, 0] > 2 * found[3, 1]
