@@ -104,7 +104,7 @@ def test_a_solver_that_hangs_for_a_while_solves_then_what_it_missed(cell, run):
 def start_sequencer(cell, plan):
     cell.start("pose_sequencer", plan=plan_file(cell.folder, plan), auto_confirm=True,
                settle_time=0.0)
-    cell.answer(Trigger, "pose_sequencer/start")
+    cell.answer(Trigger, "pose_sequencer/start", again_s=2.0)  # a second start changes nothing
 
 
 def test_a_sequencer_killed_within_views_takes_up_the_run_there(cell):

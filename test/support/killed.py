@@ -159,12 +159,13 @@ class Cell:
         answer = self.answer(SaveMap, "solver/save_map", path=str(path))
         return read_json(path) if answer.success else answer.message
 
-    def answer(self, kind: type, name: str, **fields: object) -> Any:
+    def answer(self, kind: type, name: str, *, again_s: float = 2 * IDLE_S,
+               **fields: object) -> Any:
         """Call a service, again where a node that was killed seems to have taken the request."""
         client = self.graph.hand.create_client(kind, self.name(name))
-        for _ in range(ATTEMPTS):
+        for _ in range(round(ATTEMPTS * 2 * IDLE_S / again_s)):
             self.graph.until(client.service_is_ready, name)
-            future, end = client.call_async(kind.Request(**fields)), time.monotonic() + 2 * IDLE_S
+            future, end = client.call_async(kind.Request(**fields)), time.monotonic() + again_s
             while not future.done() and time.monotonic() < end:
                 self.graph.executor.spin_once(timeout_sec=0.02)
             if future.done():
