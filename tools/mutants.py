@@ -270,6 +270,8 @@ def _in_a_fork(run: Callable[[], int], cwd: Path) -> int | None:
         os.setsid()
         os.chdir(cwd)
         os.environ.pop("PYTEST_ADDOPTS", None)  # of those who run this by pytest, as colcon does
+        # bytecode of the same second and size as a change would be taken for that of the change
+        os.environ["PYTHONDONTWRITEBYTECODE"], sys.dont_write_bytecode = "1", True
         status = 1
         try:
             with open(os.devnull, "w") as nowhere:

@@ -4,6 +4,7 @@
 import ast
 import importlib.util
 import shutil
+import sys
 from pathlib import Path
 
 import pytest
@@ -139,9 +140,12 @@ RED = "\n\ndef test_red():\n    assert half(2) is None\n"
 def test_a_change_survives_what_does_not_see_it_and_what_fails_anyway(
         tmp_path, monkeypatch, test, survives):
     monkeypatch.setenv("PYTEST_ADDOPTS", "-n 2")  # colcon test gives its options that way
+    monkeypatch.setenv("PYTHONDONTWRITEBYTECODE", "")
+    monkeypatch.setattr(sys, "dont_write_bytecode", False)
     tree = small_tree(tmp_path, monkeypatch, test)
     divided, = (m for m in mutants.mutants_of("half.py", HALF) if m.new == "*")
     assert tree.survives(divided) is survives
     assert (tree.folder / "half.py").read_text() == HALF  # as before
+    assert not [*tree.folder.rglob("*.pyc")]  # it could be taken for that of the next change
     assert [name for name, sound in tree.sound.items() if not sound] == (
         ["test/test_half.py::test_red"] if "test_red" in test and survives else [])
