@@ -2,6 +2,7 @@
 """How SIGINT and SIGTERM end a node, once or again and again."""
 
 import ctypes
+import faulthandler
 import signal
 import socket
 import threading
@@ -10,6 +11,8 @@ import time
 from rclpy.task import Future
 
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+ENDS_S = 60.0
+"""Time after a stop signal at which a node that has not ended is ended; it says where it hung."""
 
 
 def complete_on_signal(stop: Future) -> None:
@@ -27,6 +30,7 @@ def complete_on_signal(stop: Future) -> None:
 
     def wait() -> None:
         reader.recv(1)
+        faulthandler.dump_traceback_later(ENDS_S, exit=True)  # a thread of C, whatever hangs
         stop.set_result(None)
         while True:  # the descriptor stays open, or later signals would find a broken pipe
             reader.recv(4096)

@@ -2,6 +2,8 @@
 """How a node runs as a process."""
 
 import gc
+import subprocess
+import sys
 from types import SimpleNamespace
 
 import pytest
@@ -32,3 +34,25 @@ def test_what_a_node_has_loaded_is_not_gone_through_while_it_works(monkeypatch, 
     assert running.run(make) == 0
     assert frozen[0] > 1000
     assert not any(found is made[0] for found in gc.get_objects())
+
+
+HANGING = """
+import os, signal, time
+from rclpy.task import Future
+from selfcal_ros.nodes import stopping
+stopping.ENDS_S = 0.5
+stopping.complete_on_signal(Future())
+def hang():
+    os.kill(os.getpid(), signal.SIGTERM)
+    while True:
+        time.sleep(0.01)
+hang()
+"""
+
+
+def test_a_node_that_hangs_when_it_is_to_end_is_ended_and_says_where():
+    done = subprocess.run([sys.executable, "-c", HANGING], capture_output=True, text=True,
+                          check=False)
+    assert done.returncode == 1
+    assert "Timeout" in done.stderr
+    assert " in hang" in done.stderr
