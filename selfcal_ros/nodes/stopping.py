@@ -30,8 +30,10 @@ def complete_on_signal(stop: Future) -> None:
 
     def wait() -> None:
         reader.recv(1)
-        faulthandler.dump_traceback_later(ENDS_S, exit=True)  # a thread of C, whatever hangs
-        stop.set_result(None)
+        try:  # a thread of C, whatever hangs
+            faulthandler.dump_traceback_later(ENDS_S, exit=True)
+        finally:  # also where there is no stderr to say it on
+            stop.set_result(None)
         while True:  # the descriptor stays open, or later signals would find a broken pipe
             reader.recv(4096)
 

@@ -52,8 +52,8 @@ def _path(item: Path, axes: Axes, points: float, order: int) -> None:
     fill, stroke = ((_light(name), part) if name else "none" for name, part in (
         (item.fill, item.opacity), (item.stroke, 1.0)))
     axes.add_artist(PathPatch(Outline(vertices, codes), facecolor=fill, edgecolor=stroke,
-                             linewidth=item.width * points if item.stroke else 0,
-                             linestyle=dash, zorder=order, clip_on=False))
+                              linewidth=item.width * points if item.stroke else 0,
+                              linestyle=dash, zorder=order, clip_on=False))
 
 
 def _discs(item: Discs, axes: Axes, points: float, order: int) -> None:

@@ -132,12 +132,13 @@ class Reception:
         newest = self.session.collector.newest_command
         measuring = self.restoring or (newest is not None and newest.phase == Phase.MEASURE)
         for topic, data, received_ns, _ in waiting:
-            is_sample = topic == ENCODER_TOPIC
-            samples = self._resting.sample(data, received_ns, measuring=measuring) if is_sample \
-                else self._resting.wake(received_ns)
-            for sample in samples:
+            if topic == ENCODER_TOPIC:
+                kept = self._resting.sample(data, received_ns, measuring=measuring)
+            else:
+                kept = self._resting.wake(received_ns)
+            for sample in kept:
                 self.journal.write(ENCODER_TOPIC, *sample)
-            if not is_sample:
+            if topic != ENCODER_TOPIC:
                 self.journal.write(topic, data, received_ns)
 
     def _adopt(self, taken: Future[TakenUp]) -> None:
