@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from selfcal_ros.collection.digest import readings_digest, session_digest
-from selfcal_ros.collection.messages import MAX_VIEWS
+from selfcal_ros.collection.messages import MAX_VIEWS, Phase
 from selfcal_ros.collection.settings.estimator import solver_options
 from selfcal_ros.collection.settings.nodes import SolverSettings
 from selfcal_ros.errors import InputError, NoDataError, NotIdentifiableError, SelfcalError
@@ -25,6 +25,7 @@ from selfcal_ros.model.result import (
     unidentified_result,
     with_warnings,
 )
+from selfcal_ros.reporting.summary.format import counted
 from selfcal_ros.reporting.summary.numbers import summary_numbers
 from selfcal_ros.reporting.summary.text import state_sentence
 from selfcal_ros.reporting.words.result import worded
@@ -116,6 +117,7 @@ class SolvingSession:
         self._notes: tuple[str, ...] = ()  # on the session, of the newest message
         self._run = Run()
         self._planned: dict[Run, int] = {}
+        self._ended: set[Run] = set()  # a DONE was heard, but no number of views
         self._stale = False
         self._left_aside = 0
         self._saved = ""  # absolute path of the map that is shown
@@ -145,8 +147,12 @@ class SolvingSession:
         run = Run(message.plan_id, message.run_id)
         known = self._planned.get(run, 0)
         self._planned[run] = max(known, message.views_planned)
-        if run in (self._run, Run(self._run.plan_id)) and message.views_planned > known:
-            self._stale = True  # the summary says how many views are planned
+        ends = (message.phase == Phase.DONE and not self._planned_views(run)
+                and run not in self._ended)
+        if ends:
+            self._ended.add(run)
+        if run in (self._run, Run(self._run.plan_id)) and (message.views_planned > known or ends):
+            self._stale = True  # the summary says how many views are planned, or still to come
 
     def _planned_views(self, run: Run) -> int:
         """Return the number of views planned; commands that tell no run count for all of a plan."""
@@ -271,15 +277,25 @@ class SolvingSession:
                                             "stamp_ns": shown.stamp_ns})
 
     def _unfinished(self) -> bool:
-        """Return whether the plan has views that are still to come."""
-        return (isinstance(self.shown.problem, NotIdentifiableError | NoDataError)
-                and self.shown.views_done < self._planned_views(self.shown.run))
+        """Return whether views to come may bring what is missing.
+
+        Where no command has told how many there are, lines without a single grid mark are taken
+        for a beginning until DONE: readings may arrive before any command.
+        """
+        run, problem = self.shown.run, self.shown.problem
+        planned = self._planned_views(run)
+        if planned == 0:
+            return (isinstance(problem, NoDataError)
+                    and not self._ended & {run, Run(run.plan_id)})
+        return (isinstance(problem, NotIdentifiableError | NoDataError)
+                and self.shown.views_done < planned)
 
     def _state(self) -> str:
         if self._unfinished():
-            planned = self._planned_views(self.shown.run)
-            return (f"{self.shown.views_done} of {planned} views measured, "
-                    "not yet enough to identify the stage.")
+            done, planned = self.shown.views_done, self._planned_views(self.shown.run)
+            views = f"{done} of {planned} views measured" if planned \
+                else f"{counted(done, 'view')} measured so far"
+            return f"{views}, not yet enough to identify the stage."
         if self.shown.problem is not None or self.shown.result is None:
             return str(self.shown.problem)
         return state_sentence(self.shown.result)

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from selfcal_ros.collection.messages import Phase
 from selfcal_ros.errors import InputError, NoDataError, NotIdentifiableError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.messages import from_model, to_model
@@ -29,8 +30,10 @@ def views_of(plan=PLAN, seed: int = 5, run_id: str = "", **changes) -> list:
         for index, view in progress.items()]
 
 
-def command(views: int, run_id: str = "", plan_id: str = PLAN.plan_id) -> object:
-    return type("Command", (), {"plan_id": plan_id, "run_id": run_id, "views_planned": views})
+def command(views: int, run_id: str = "", plan_id: str = PLAN.plan_id,
+            phase: Phase = Phase.MEASURE) -> object:
+    return type("Command", (), {"plan_id": plan_id, "run_id": run_id, "views_planned": views,
+                                "phase": phase})
 
 
 class Desk:
@@ -171,6 +174,34 @@ def test_a_view_of_lines_alone_is_no_error_while_others_are_to_come(desk):
     with pytest.raises(NoDataError, match="no grid mark was read"):
         alone.take(lines)
     assert alone.session.diagnosis().level == Level.WARN
+
+
+def test_lines_that_come_before_any_command_are_no_error(desk):
+    lines, grids = views_of(run_id="7")[3:], views_of(run_id="7")[:3]
+    desk.take(lines)
+    state = "1 view measured so far, not yet enough to identify the stage."
+    assert desk.hands.said == [(Level.OK, state)]
+    told = desk.session.diagnosis()
+    assert (told.level, told.message) == (Level.OK, state)
+    desk.session.take_command(command(4, run_id="7"))
+    desk.take(grids)
+    assert desk.session.shown.problem is None
+    desk.session.take_command(command(4, run_id="7", phase=Phase.DONE))
+    assert not desk.solve()
+    assert [level for level, _ in desk.hands.said] == [Level.OK]
+
+
+@pytest.mark.parametrize("run_id", ["", "7"])
+def test_done_without_a_number_of_views_says_that_lines_alone_were_read(desk, run_id):
+    desk.take(views_of(run_id="7")[3:])
+    desk.session.take_command(command(0, run_id="8", phase=Phase.DONE))
+    assert not desk.solve()
+    desk.session.take_command(command(0, run_id=run_id))
+    assert not desk.solve()
+    desk.session.take_command(command(0, run_id=run_id, phase=Phase.DONE))
+    with pytest.raises(NoDataError, match="no grid mark was read"):
+        desk.solve()
+    assert desk.session.diagnosis().level == Level.WARN
 
 
 def test_more_planned_views_are_told_and_fewer_change_nothing(desk):
