@@ -107,7 +107,8 @@ def outcomes(function: Callable[[Any], Any], items: Sequence[Any], *, workers: i
     dask : str
         Address of a dask scheduler, or `LOCAL`; empty = processes of the standard library.
     meanwhile : callable, optional
-        Called once, when the processes have their first items: what this one has to load.
+        Called once, in a thread of its own while other processes start and work: what this one
+        has to load. It has returned when the last outcome has come.
 
     Raises
     ------
@@ -119,7 +120,8 @@ def outcomes(function: Callable[[Any], Any], items: Sequence[Any], *, workers: i
     elif workers == 1 or len(items) < 2:
         yield from (_tried(function, items, index) for index in range(len(items)))
     else:
-        yield from _with_processes(function, items, min(workers, len(items)), meanwhile)
+        with _beside(meanwhile):
+            yield from _with_processes(function, items, min(workers, len(items)))
 
 
 def mapped(function: Callable[[Any], Any], items: Sequence[Any], *, workers: int = 1,
@@ -157,8 +159,25 @@ def _tried(function: Callable[[Any], Any], items: Sequence[Any], index: int) -> 
         return Outcome(index, error=error)
 
 
+@contextlib.contextmanager
+def _beside(function: Callable[[], None] | None) -> Iterator[None]:
+    """Run `function`, if there is one, in a thread while the block runs; both end together.
+
+    This process waits for the one that forks workers, which is still importing, and works later.
+    """
+    if function is None:
+        yield
+        return
+    thread = threading.Thread(target=function)
+    thread.start()
+    try:
+        yield
+    finally:
+        thread.join()
+
+
 def _with_processes(function: Callable[[Any], Any], items: Sequence[Any],
-                    workers: int, meanwhile: Callable[[], None] | None) -> Iterator[Outcome]:
+                    workers: int) -> Iterator[Outcome]:
     """Yield outcomes of a pool; where it breaks, each item in its hands is tried by itself."""
     waiting = list(reversed(range(len(items))))
     while waiting:
@@ -172,9 +191,6 @@ def _with_processes(function: Callable[[Any], Any], items: Sequence[Any],
                         running[pool.submit(function, items[index])] = index
                     except BrokenProcessPool:
                         suspects.append(index)
-                if meanwhile is not None:
-                    meanwhile()
-                    meanwhile = None
                 ready, _ = wait(running, return_when=FIRST_COMPLETED)
                 for future in ready:
                     index = running.pop(future)

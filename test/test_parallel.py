@@ -6,6 +6,7 @@ import operator
 import os
 import subprocess
 import sys
+import threading
 from functools import partial
 from pathlib import Path
 
@@ -167,11 +168,23 @@ def test_an_interrupt_while_workers_import_is_left_to_their_parent(tmp_path):
     assert (done.returncode, done.stdout, done.stderr) == (0, "[True, True]\n", "")
 
 
-@pytest.mark.parametrize("workers", [2, 1])
-def test_what_is_loaded_meanwhile_is_loaded_once_before_the_first_outcome(workers):
-    order = []
+@pytest.mark.parametrize(("workers", "told"), [(2, [True]), (1, [])])
+def test_what_is_loaded_meanwhile_is_loaded_once_beside_the_workers(workers, told):
+    first, loaded = threading.Event(), []
+    values = []
     for outcome in outcomes(abs, [-1, -2, -3, -4, -5], workers=workers,
-                            meanwhile=lambda: order.append("loaded")):
-        order.append(outcome.value)
-    assert sorted(order[-5:]) == [1, 2, 3, 4, 5]
-    assert order[:-5] == (["loaded"] if workers == 2 else [])
+                            meanwhile=lambda: loaded.append(first.wait(60.0))):
+        first.set()  # what is loaded has waited for this outcome, and the outcome not for it
+        values.append(outcome.value)
+    assert sorted(values) == [1, 2, 3, 4, 5]
+    assert loaded == told
+
+
+def test_a_consumer_that_stops_waits_for_what_is_loaded_meanwhile():
+    stopped, loaded = threading.Event(), []
+    running = outcomes(abs, [-1, -2, -3], workers=2,
+                       meanwhile=lambda: loaded.append(stopped.wait(60.0)))
+    next(running)
+    stopped.set()
+    running.close()
+    assert loaded == [True]

@@ -26,7 +26,6 @@ from selfcal_ros.collection.marks.places import with_places
 from selfcal_ros.collection.settings.estimator import solver_options
 from selfcal_ros.errors import ExitCode, NotIdentifiableError, SelfcalError
 from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.estimation.quality.outliers import robust_calibrate
 from selfcal_ros.files import write_json
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.result import (
@@ -85,8 +84,10 @@ def solved(job: Job, source: dict[str, str],
     settings = job.settings
     session = collect_bag(job.bag, settings.collector, namespace=settings.namespace)
     options = solver_options(settings.solver, session.measurements)
-    solve: Callable[[Measurements, Any], CalibrationResult] = (
-        robust_calibrate if settings.robust else calibrate)
+    solve: Callable[[Measurements, Any], CalibrationResult] = calibrate
+    if settings.robust:
+        from selfcal_ros.estimation.quality.outliers import robust_calibrate  # scipy.optimize
+        solve = robust_calibrate
     problem = None
     try:
         result = worded(with_places(solve(session.measurements, options),
