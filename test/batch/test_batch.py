@@ -79,6 +79,19 @@ def test_good_bags_are_solved_as_solve_does_and_bad_ones_are_passed(shelf, tmp_p
             ("few.mcap", 3), ("text.mcap", 2))}
 
 
+def test_robust_bags_are_solved_as_robust_solve_does(shelf, tmp_path):
+    out, alone = tmp_path / "out", tmp_path / "a.json"
+    bag = shelf / "a.mcap"
+    assert batch(bag, "-o", out, "--workers", 1, "--robust") == 0
+    assert main(["solve", str(bag), "--robust", "--quiet", "-o", str(alone)]) == 0
+    ours, theirs = (json.loads(path.read_text()) for path in
+                    (out / content(out)["records"][0]["result"], alone))
+    for result in (ours, theirs):
+        assert result["provenance"].pop("created")
+    assert ours == theirs
+    assert "outliers" in ours
+
+
 def test_only_what_is_new_is_done(shelf, tmp_path, capsys):
     mine, out = tmp_path / "mine", tmp_path / "out"
     mine.mkdir()
