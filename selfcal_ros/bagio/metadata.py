@@ -11,7 +11,7 @@ from typing import Any, Self
 
 import yaml
 
-from selfcal_ros.bagio.schemas import typestore
+from selfcal_ros.bagio.schemas import hash_of
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import write_text
 
@@ -58,7 +58,7 @@ class Topic:
     def channel_metadata(self) -> dict[str, str]:
         """Return the metadata of its channel as rosbag2 writes it, and where it was heard."""
         about = {"offered_qos_profiles": yaml.safe_dump(self.qos, sort_keys=False)
-                 if self.qos else "", "topic_type_hash": typestore().hash_rihs01(self.type)}
+                 if self.qos else "", "topic_type_hash": hash_of(self.type)}
         return about | ({"heard_on": self.heard_on} if self.heard_on else {})
 
 
@@ -105,7 +105,7 @@ class Metadata:
         topics = [{"topic_metadata": {
             "name": name, "type": topic.type, "serialization_format": "cdr",
             "offered_qos_profiles": topic.qos,
-            "type_description_hash": typestore().hash_rihs01(topic.type)},
+            "type_description_hash": hash_of(topic.type)},
             "message_count": topic.count} for name, topic in self.topics.items()]
         return {
             "version": 9, "storage_identifier": "mcap", "duration": about["duration"],

@@ -18,7 +18,7 @@ from selfcal_ros.bagio.metadata import (
     Topic,
     writing,
 )
-from selfcal_ros.bagio.schemas import definition_of, typestore
+from selfcal_ros.bagio.schemas import definition_of, store_with
 from selfcal_ros.errors import InputError
 from selfcal_ros.messages.from_model import Fields
 
@@ -94,8 +94,9 @@ class BagWriter(Closing):
     def write(self, topic: str, fields: Fields, log_time_ns: int) -> None:
         """Write one message given by its fields."""
         typename = self._metadata.topics[topic].type
-        message = build(typestore(), typename, fields)
-        self.write_raw(topic, bytes(typestore().serialize_cdr(message, typename)), log_time_ns)
+        store = store_with(typename)
+        message = build(store, typename, fields)
+        self.write_raw(topic, bytes(store.serialize_cdr(message, typename)), log_time_ns)
 
     def write_raw(self, topic: str, data: bytes, log_time_ns: int) -> None:
         """Write one message given by its CDR bytes."""

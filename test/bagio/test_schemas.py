@@ -4,7 +4,15 @@
 import pytest
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from selfcal_ros.bagio.schemas import same_layout, store_of_schema, typestore
+from selfcal_ros.bagio.schemas import (
+    COMMON,
+    definition_of,
+    hash_of,
+    same_layout,
+    shorter_stores,
+    store_of_schema,
+    typestore,
+)
 from selfcal_ros.errors import InputError
 
 HEADER = "std_msgs/msg/Header"
@@ -48,3 +56,32 @@ def test_a_schema_is_read_anew_where_any_of_it_differs_and_refused_wherever_it_s
         with pytest.raises(InputError, match=rf"^{where}: the definition of pkg/msg/T cannot be "
                            r"read \(.+\); record the bag anew$"):
             store_of_schema("pkg/msg/T", "ros2msg", "float64", where)
+
+
+@pytest.mark.parametrize("name", [*COMMON, "std_msgs/msg/Float64"])
+def test_common_types_are_those_of_jazzy(name):
+    """Those that are written out here, and one that is looked up among all of them."""
+    jazzy = get_typestore(Stores.ROS2_JAZZY)
+    assert definition_of("t", name) == jazzy.generate_msgdef(name, ros_version=2)[0]
+    assert hash_of(name) == jazzy.hash_rihs01(name)
+    found = store_of_schema(name, "", "", "bag")
+    assert found.fielddefs[name] == jazzy.fielddefs[name]
+    assert (found is typestore()) == (name in COMMON)
+
+
+def test_a_type_that_nobody_knows_is_refused():
+    with pytest.raises(InputError, match=r"^bag: the bag holds no definition of a/msg/B; record it "
+                       r"with message definitions$"):
+        store_of_schema("a/msg/B", "", "", "bag")
+    with pytest.raises(InputError, match=r"^topic t: no definition of a/msg/B; record only topics "
+                       r"of known types$"):
+        definition_of("t", "a/msg/B")
+
+
+def test_shorter_stores_hold_as_many_fields_as_their_publisher_knew():
+    name, last = "selfcal_msgs/msg/ViewCommand", "plan_id"
+    every = [field for field, _ in typestore().fielddefs[name][1]]
+    kept = [[field for field, _ in store.fielddefs[name][1]]
+            for store in shorter_stores(name, last)]
+    assert kept == [every[:count] for count in range(len(every) - 1, every.index(last), -1)]
+    assert kept

@@ -11,7 +11,7 @@ from mcap.stream_reader import StreamReader
 from rosbags.rosbag2 import Reader
 
 from selfcal_ros.bagio.reader import INPUT_TOPICS, BagReader
-from selfcal_ros.bagio.schemas import typestore
+from selfcal_ros.bagio.schemas import hash_of, typestore
 from selfcal_ros.bagio.simulated import QOS, event_fields
 from selfcal_ros.bagio.writer import BagWriter
 from selfcal_ros.collection.messages import Detection, EncoderSample
@@ -87,7 +87,7 @@ def test_schemas_and_channels_are_those_of_rosbag2(tmp_path, events):
         name = summary.schemas[channel.schema_id].name
         assert channel.message_encoding == "cdr"
         assert set(channel.metadata) == {"offered_qos_profiles", "topic_type_hash"}
-        assert channel.metadata["topic_type_hash"] == typestore().hash_rihs01(name)
+        assert channel.metadata["topic_type_hash"] == hash_of(name)
         profiles = yaml.safe_load(channel.metadata["offered_qos_profiles"] or "[]")
         assert profiles == ([QOS[channel.topic.strip("/")]] if channel.topic != "/notes" else [])
 
@@ -130,7 +130,7 @@ def test_metadata_is_what_rosbag2_writes_in_jazzy(tmp_path, events):
         assert set(about) == {"name", "type", "serialization_format", "offered_qos_profiles",
                               "type_description_hash"}
         assert about["serialization_format"] == "cdr"
-        assert about["type_description_hash"] == typestore().hash_rihs01(about["type"])
+        assert about["type_description_hash"] == hash_of(about["type"])
     types = {entry["topic_metadata"]["name"]: entry["topic_metadata"]["type"] for entry in topics}
     assert types == {f"/{t}": name for t, name in INPUT_TOPICS.items()} | {
         "/notes": "std_msgs/msg/String"}
