@@ -78,12 +78,20 @@ def _at_visits(model: ModelFit, row: int) -> np.ndarray:
 def _course(visits: GridVisits, rest: np.ndarray, start_ns: int) -> dict[str, np.ndarray]:
     """Return the mean residual in each part of the view's time."""
     order = np.argsort(visits.stamp_ns, kind="stable")
-    parts = [part for part in np.array_split(order, MAX_PARTS) if len(part)]
-    count = np.array([visits.count[part].sum() for part in parts])
+    starts = _starts(len(order))
+    counts = visits.count[order]
+    count = np.add.reduceat(counts, starts)
     since_s = (visits.stamp_ns - start_ns) / NS_PER_S
-    columns = {name: np.array([np.average(values[part], weights=visits.count[part])
-                               for part in parts])
+    columns = {name: np.add.reduceat(values[order] * counts, starts) / count
                for name, values in (("time_s", since_s), ("dx", rest.real), ("dy", rest.imag))}
     return {"time_s": np.round(columns["time_s"], DECIMALS_S),
             "dx": np.round(columns["dx"], DECIMALS_M), "dy": np.round(columns["dy"], DECIMALS_M),
             "count": count}
+
+
+def _starts(visits: int) -> np.ndarray:
+    """Return where each of `MAX_PARTS` parts, or of fewer visits as many, begins; never empty."""
+    parts = min(visits, MAX_PARTS)
+    size, longer = divmod(visits, parts)
+    number = np.arange(parts)
+    return number * size + np.minimum(number, longer)

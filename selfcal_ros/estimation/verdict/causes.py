@@ -79,22 +79,45 @@ class Group:
 
 
 @dataclass(frozen=True, eq=False)
+class Beside:
+    """What columns explain together.
+
+    Attributes
+    ----------
+    inverse : ndarray
+        Pseudo-inverse of their information, (p, p).
+    rank : int
+        Its rank.
+    values : ndarray
+        Their estimated coefficients, (p,).
+    explained : float
+        The sum of squares that they explain, m^2.
+    """
+
+    inverse: np.ndarray
+    rank: int
+    values: np.ndarray
+    explained: float
+
+
+@dataclass(frozen=True, eq=False)
 class Pool:
     """All candidate columns at once, and the residuals that they are to explain."""
 
     equations: TermEquations
     right: Score
 
-    def inverse(self, rows: np.ndarray) -> tuple[np.ndarray, int]:
-        """Return the pseudo-inverse of the information on `rows`, (p, p), and its rank."""
+    def beside(self, rows: np.ndarray) -> Beside:
+        """Return what the columns of `rows`, bool (p,), explain together."""
         norm = self.equations.norm[rows]
-        scaled = self.equations.information[np.ix_(rows, rows)] / np.outer(norm, norm)
-        values, vectors = np.linalg.eigh(scaled)
+        norms, place = np.outer(norm, norm), np.ix_(rows, rows)
+        values, vectors = np.linalg.eigh(self.equations.information[place] / norms)
         told = values > self.equations.limit(rows)
         part = (vectors[:, told] / values[told]) @ vectors[:, told].T
-        out = np.zeros((len(rows), len(rows)))
-        out[np.ix_(rows, rows)] = part / np.outer(norm, norm)
-        return out, int(told.sum())
+        inverse = np.zeros((len(rows), len(rows)))
+        inverse[place] = part / norms
+        return Beside(inverse, int(told.sum()), inverse @ self.right.total,
+                      float(self.right.total @ inverse @ self.right.total))
 
     @property
     def everything(self) -> tuple[float, float]:
@@ -103,23 +126,17 @@ class Pool:
         return (sums.total, sums.dof) if sums.dof_within >= 1 else (sums.between,
                                                                    sums.dof_between)
 
-    def explained(self, rows: np.ndarray) -> tuple[float, int]:
-        """Return the sum of squares that `rows` explain, m^2, and their rank."""
-        inverse, rank = self.inverse(rows)
-        return float(self.right.total @ inverse @ self.right.total), rank
-
-    def noise_beside(self, rows: np.ndarray) -> tuple[float, float]:
-        """Return the variance of one reading that is left beside `rows`, m^2, and its dof.
+    def noise(self, beside: Beside) -> tuple[float, float]:
+        """Return the variance of one reading that columns leave, m^2, and its dof.
 
         Visits of one mark agree better than marks do where a cause is not held: the larger counts.
-        NaN and 0 where the rows take all degrees of freedom.
+        NaN and 0 where the columns take all degrees of freedom.
         """
         sums, gram = self.right.sums, self.equations.projected.gram
-        inverse, rank = self.inverse(rows)
-        values = inverse @ self.right.total
+        values = beside.values
         between = sums.between - 2 * values @ self.right.between + values @ gram @ values
-        dof = sums.dof_between - float(np.sum(inverse * gram))
-        both = sums.dof - rank
+        dof = sums.dof_between - float(np.sum(beside.inverse * gram))
+        both = sums.dof - beside.rank
         if sums.dof_within >= 1 and both > 0:
             total = (sums.total - float(values @ self.right.total)) / both
             if dof <= 0 or between / dof <= total:
@@ -202,7 +219,8 @@ def select_explanations(pool: Pool, groups: list[Group], taken: np.ndarray) -> l
     """Return the explanations, each judged beside `taken` and those before it."""
     found: list[Explanation] = []
     while groups and len(found) < MAX_CAUSES:
-        tests = [(_test(pool, taken, group), group) for group in groups]
+        before = pool.beside(taken)
+        tests = [(_test(pool, taken, before, group), group) for group in groups]
         good = [(test, group) for test, group in tests if test is not None and test[0] < LEVEL]
         if not good:
             break
@@ -227,31 +245,35 @@ def _replaces(pool: Pool, taken: np.ndarray, group: Group, best: Group) -> bool:
     """Return whether a term explains the residuals so well that `best` adds nothing to it."""
     if SLIP in (group.name, best.name):
         return False
-    more = _test(pool, taken | group.rows, best)
+    both = taken | group.rows
+    more = _test(pool, both, pool.beside(both), best)
     return more is None or more[0] >= LEVEL
 
 
-def _test(pool: Pool, taken: np.ndarray, group: Group) -> tuple[float, float] | None:
-    """Return probability and evidence of a group beside `taken`; None if nothing tells it."""
-    before, rank_before = pool.explained(taken)
-    after, rank = pool.explained(taken | group.rows)
-    gained, more = max(after - before, 0.0), rank - rank_before
-    variance, dof = pool.noise_beside(taken | group.rows)
+def _test(pool: Pool, taken: np.ndarray, before: Beside,
+          group: Group) -> tuple[float, float] | None:
+    """Return probability and evidence of a group beside `taken`; None if nothing tells it.
+
+    `before`: what `taken` explains.
+    """
+    after = pool.beside(taken | group.rows)
+    gained, more = max(after.explained - before.explained, 0.0), after.rank - before.rank
+    variance, dof = pool.noise(after)
     if more <= 0 or not variance > FLOOR_M**2:  # NaN where nothing is left to test against
         return None
     p = float(fdtrc(more, dof, gained / more / variance))
     # all readings together, so that explanations compare: by what each leaves of the same squares
     whole, n = pool.everything
-    rest = max(whole - after, FLOOR_M**2)
+    rest = max(whole - after.explained, FLOOR_M**2)
     evidence = n * np.log1p(gained / rest) - more * np.log(n)
     return min(p * group.places, 1.0), float(evidence - 2 * np.log(group.places))
 
 
 def _explanation(pool: Pool, taken: np.ndarray, group: Group, p: float) -> Explanation:
     rows = taken | group.rows
-    inverse, _ = pool.inverse(rows)
-    variance, _ = pool.noise_beside(rows)
-    values = inverse @ pool.right.total
+    beside = pool.beside(rows)
+    variance, _ = pool.noise(beside)
+    values = beside.values
     system = pool.equations.system
     moved = pool.equations.maps[:, group.rows] @ values[group.rows]
     known = max(int(system.known_sites.sum()), 1)
@@ -259,5 +281,5 @@ def _explanation(pool: Pool, taken: np.ndarray, group: Group, p: float) -> Expla
     columns = tuple(column for column, here in zip(
         pool.equations.columns.columns, group.rows, strict=True) if here)
     return Explanation(group.name, columns, values[group.rows],
-                       variance * inverse[np.ix_(group.rows, group.rows)], p,
-                       pool.inverse(group.rows)[1] == int(group.rows.sum()), effect, group.part)
+                       variance * beside.inverse[np.ix_(group.rows, group.rows)], p,
+                       pool.beside(group.rows).rank == int(group.rows.sum()), effect, group.part)

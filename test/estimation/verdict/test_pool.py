@@ -27,11 +27,19 @@ def rows(*numbers: int) -> np.ndarray:
     return np.isin(np.arange(3), numbers)
 
 
+def noise(sums: Sums, taken: np.ndarray) -> tuple[float, float]:
+    """Return variance and degrees of freedom of what the columns `taken` leave."""
+    left = pool(sums)
+    return left.noise(left.beside(taken))
+
+
 @pytest.mark.parametrize(("taken", "squares"), [((), 0), ((0,), 36), ((1,), 64), ((0, 1), 100),
                                                 ((0, 1, 2), 100)])
 def test_columns_explain_the_squares_of_their_parts(taken, squares):
-    assert pool(Sums(164.0, 10, 0.0, 0)).explained(rows(*taken)) == (
-        pytest.approx(squares), len(taken))
+    found = pool(Sums(164.0, 10, 0.0, 0)).beside(rows(*taken))
+    assert (found.explained, found.rank) == (pytest.approx(squares), len(taken))
+    assert found.values == pytest.approx([3.0, -16.0, 0.0] * rows(*taken))
+    assert found.inverse == pytest.approx(np.diag(rows(*taken) / LENGTHS**2))
 
 
 @pytest.mark.parametrize(("dof", "taken", "left", "dof_left"), [
@@ -39,14 +47,14 @@ def test_columns_explain_the_squares_of_their_parts(taken, squares):
     (3, (0, 1), 64, 1), (4, (0, 1, 2), 64, 1)])
 def test_the_noise_beside_columns_has_a_degree_of_freedom_less_for_each(dof, taken, left,
                                                                         dof_left):
-    variance, found = pool(Sums(164.0, dof, float("nan"), 0)).noise_beside(rows(*taken))
+    variance, found = noise(Sums(164.0, dof, float("nan"), 0), rows(*taken))
     assert (variance, found) == (pytest.approx(left / dof_left), pytest.approx(dof_left))
 
 
 @pytest.mark.parametrize(("dof", "dof_within", "taken"), [
     (2, 0, (0, 1)), (3, 0, (0, 1, 2)), (1, 0, (1,)), (1, 1, (0, 1)), (2, 1, (0, 1, 2))])
 def test_where_columns_take_all_degrees_of_freedom_no_noise_is_left(dof, dof_within, taken):
-    variance, found = pool(Sums(164.0, dof, 5.0, dof_within)).noise_beside(rows(*taken))
+    variance, found = noise(Sums(164.0, dof, 5.0, dof_within), rows(*taken))
     assert np.isnan(variance) and found == 0
 
 
@@ -55,7 +63,7 @@ def test_where_columns_take_all_degrees_of_freedom_no_noise_is_left(dof, dof_wit
 def test_the_larger_of_the_noises_of_marks_and_of_all_visits_counts(within, dof_within, variance,
                                                                      dof):
     """Marks alone: 64 / 8; all visits have the squares within the marks in addition."""
-    found = pool(Sums(164.0, 10, within, dof_within)).noise_beside(rows(0, 1))
+    found = noise(Sums(164.0, 10, within, dof_within), rows(0, 1))
     assert found == (pytest.approx(variance), pytest.approx(dof))
 
 
