@@ -157,6 +157,7 @@ class Rate:
         self._bins: deque[tuple[float, int, int]] = deque()  # begin, messages, newest stamp
         self.longest_gap_ns = 0
         self._steps: list[np.ndarray] = []  # between stamps, since the jitter was asked
+        self._n_steps = 0
 
     def add(self, stamps_ns: np.ndarray) -> None:
         """Take messages by their stamps, int64 array (n,) in the order of arrival, n > 0."""
@@ -167,8 +168,9 @@ class Rate:
         newest = np.maximum.accumulate(np.append(before_ns, stamps_ns))
         steps = np.diff(newest)
         self.longest_gap_ns = max(self.longest_gap_ns, int(steps.max()))
-        if sum(map(len, self._steps)) < MOST_STEPS:
+        if self._n_steps < MOST_STEPS:
             self._steps.append(steps[steps > 0])
+            self._n_steps += len(self._steps[-1])
         if self._bins and now - self._bins[-1][0] < 0.1:
             began, before, known_ns = self._bins.pop()
             self._bins.append((began, before + count, max(known_ns, latest_ns)))
@@ -192,7 +194,8 @@ class Rate:
 
         A single gap is no jitter. NaN of fewer than `LEAST_STEPS` intervals.
         """
-        steps, self._steps = np.concatenate([np.zeros(0), *self._steps]), []
+        steps = np.concatenate([np.zeros(0), *self._steps])
+        self._steps, self._n_steps = [], 0
         if len(steps) < LEAST_STEPS:
             return float("nan")
         low, high = np.percentile(steps, [2.5, 97.5])
