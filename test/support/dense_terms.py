@@ -98,11 +98,13 @@ class Dense:
                     course = np.polynomial.Legendre.basis(degree)(np.array(self.times))
                     out += [np.outer(course * (of_view == v), d) for d in ((1, 0), (0, 1))]
         else:
-            shapes = ([lambda x, y: np.array([x, y]) * self.half]
-                      if name is TermName.PLATE_SCALE else
-                      [lambda x, y, d=d, q=q: np.array(d) * (x * x, 2 * x * y, y * y)[q]
-                       for d in ((1, 0), (0, 1)) for q in range(3)])
-            out = [[turn @ shape(*place) * (u == v) for u, place, turn, *_ in self.about]
+            of_view = np.array([about[0] for about in self.about])
+            x, y = np.array([place for _, place, *_ in self.about]).T
+            turns = np.array([turn for _, _, turn, *_ in self.about])
+            shapes = ([np.stack([x, y]) * self.half] if name is TermName.PLATE_SCALE else
+                      [np.outer(d, q) for d in ((1, 0), (0, 1))
+                       for q in (x * x, 2 * x * y, y * y)])
+            out = [np.einsum("rij,jr->ri", turns, shape) * (of_view == v)[:, None]
                    for v in views[int(free):] for shape in shapes]
         return np.array(out).reshape(len(out), -1).T
 
