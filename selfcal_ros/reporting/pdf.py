@@ -5,6 +5,7 @@ import io
 import os
 from collections.abc import Mapping
 from textwrap import wrap
+from typing import Any
 
 import numpy as np
 from matplotlib import rc_context
@@ -33,6 +34,9 @@ COLUMNS = 108
 
 FIGURE_WIDTH = 240.0
 """Width of a figure, of which two stand beside each other, points."""
+
+EMBEDDED: dict[Any, Any] = {"pdf.fonttype": 42}
+"""Fonts go into the file as TrueType: words can be found and copied."""
 
 Line = tuple[str, bool]
 """Words of a line, and whether they are a heading."""
@@ -64,7 +68,7 @@ def report_pdf(result: CalibrationResult, *,
     buffer = io.BytesIO()
     about = {"Title": title, "Creator": f"selfcal {__version__}", "CreationDate": None,
              "Producer": None}
-    with rc_context({**RC, "pdf.fonttype": 42}), PdfPages(buffer, metadata=about) as pages:
+    with rc_context({**RC, **EMBEDDED}), PdfPages(buffer, metadata=about) as pages:
         writer = _Writer(pages, title)
         writer.sentence(drawable(state_sentence(result), 600))
         for chapter in found:

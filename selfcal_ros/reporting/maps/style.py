@@ -2,6 +2,7 @@
 """Colours, text and round numbers that the pictures share; readable in grey and colour-blind."""
 
 import math
+from functools import cache
 from typing import Any
 
 from matplotlib.colors import Colormap, LinearSegmentedColormap
@@ -34,10 +35,16 @@ def error_colours() -> Colormap:
 
 def drawable(text: object, limit: int = 300) -> str:
     """Return `text` as one line of characters that the font has, cut at `limit`."""
-    glyphs = get_font(findfont(FontProperties(family="DejaVu Sans")))
-    line = "".join(c if c.isprintable() and glyphs.get_char_index(ord(c)) else "?"
-                   for c in str(text)[:limit + 1])
+    known = _characters()
+    line = "".join(c if c.isprintable() and c in known else "?" for c in str(text)[:limit + 1])
     return line if len(line) <= limit else line[:limit - 1] + "…"
+
+
+@cache
+def _characters() -> frozenset[str]:
+    """Return the characters that the font has."""
+    font = get_font(findfont(FontProperties(family="DejaVu Sans")))
+    return frozenset(chr(code) for code, glyph in font.get_charmap().items() if glyph)
 
 
 def round_down(value: float) -> float:
