@@ -140,6 +140,7 @@ RED = "\n\ndef test_red():\n    assert half(2) is None\n"
 def test_a_change_survives_what_does_not_see_it_and_what_fails_anyway(
         tmp_path, monkeypatch, test, survives):
     monkeypatch.setenv("PYTEST_ADDOPTS", "-n 2")  # colcon test gives its options that way
+    monkeypatch.setenv("PYTEST_DISABLE_PLUGIN_AUTOLOAD", "1")  # of no use here; 0.5 s a start
     monkeypatch.setenv("PYTHONDONTWRITEBYTECODE", "")
     monkeypatch.setattr(sys, "dont_write_bytecode", False)
     tree = small_tree(tmp_path, monkeypatch, test)
