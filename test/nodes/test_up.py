@@ -32,10 +32,11 @@ SELFCAL = "import sys; from selfcal_ros.cli.main import main; sys.exit(main())"
 class Screen:
     """A command of `selfcal` whose lines are read and whose words are written."""
 
-    def __init__(self, environment: dict, *words: str) -> None:
+    def __init__(self, environment: dict, *words: str, before: str = "") -> None:
         self.process = subprocess.Popen(
-            [sys.executable, "-c", SELFCAL, *words], env=environment, stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True)
+            [sys.executable, "-c", before + SELFCAL, *words], env=environment, text=True,
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+            start_new_session=True)
         self.lines: list[str] = []
         self._queue: queue.Queue = queue.Queue()
         threading.Thread(target=self._read, daemon=True).start()
@@ -69,18 +70,23 @@ class Screen:
 def start(ros_environment):
     screens = []
 
-    def run(*words: str) -> Screen:
-        screens.append(Screen(ros_environment, *words))
+    def run(*words: str, before: str = "") -> Screen:
+        screens.append(Screen(ros_environment, *words, before=before))
         return screens[-1]
     yield run
     for screen in screens:
         screen.close()
 
 
+def processes_of(session: int) -> list[str]:
+    """Return the processes of a session, each as its id and its arguments."""
+    return subprocess.run(["ps", "-o", "pid=,args=", "-s", str(session)], text=True,
+                          capture_output=True, check=False).stdout.splitlines()
+
+
 def pid_of(session: int, node: str) -> int:
     """Return the process of a session that runs a node."""
-    for line in subprocess.run(["ps", "-o", "pid=,args=", "-s", str(session)], text=True,
-                               capture_output=True, check=False).stdout.splitlines():
+    for line in processes_of(session):
         pid, _, command = line.strip().partition(" ")
         if f"selfcal_ros.nodes.{node}" in command:
             return int(pid)
@@ -130,7 +136,7 @@ views:
 """
 
 
-def test_a_good_run_says_no_error(start, tmp_path):
+def test_a_good_run_says_no_error_and_a_stop_signal_takes_its_nodes_along(start, tmp_path):
     (tmp_path / "plan.yaml").write_text(LINES_FIRST)
     up = start("up", "--plan", str(tmp_path / "plan.yaml"), "--simulate", "--compensate",
                "--results", str(tmp_path), "--bag", str(tmp_path / "bag"))
@@ -140,27 +146,32 @@ def test_a_good_run_says_no_error(start, tmp_path):
         up.until(f"PLACE {view}")
         up.write("confirm")
     up.until("map: Calibrated from 4 views: ")
-    up.write("quit")
-    assert up.process.wait(PATIENCE_S) == 0
+    up.process.send_signal(signal.SIGTERM)
+    assert up.process.wait(PATIENCE_S) == 128 + signal.SIGTERM
+    wait_until(lambda: not processes_of(up.process.pid), "all nodes to end")
     said = "\n".join(up.lines) + up.process.stderr.read()
     assert "PLACE line" in said  # the log is there
     for word in ("ERROR", "FATAL", "Traceback", "Error:", "stalls", "lost"):
         assert word not in said
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
-def test_a_killed_command_takes_its_nodes_along(start, tmp_path, number):
+ONE_NODE = """
+from selfcal_ros.cli import up
+up.commands = lambda args, commands=up.commands: {
+    "measurement_collector": commands(args)["measurement_collector"]}
+"""
+
+
+def test_a_killed_command_takes_its_nodes_along(start, tmp_path):
+    """Of a kill it knows nothing: each node, and the screen's eyes, end by themselves."""
     up = start("up", "--plan", plan_file(tmp_path, small_plan()), "--journal",
-               str(tmp_path / "journals"))
-    up.until("now: Press s to start the plan.")
-    # the collector may come up after the sequencer, who has said so
+               str(tmp_path / "journals"), before=ONE_NODE)
+    up.until("pose_sequencer is not there")
     wait_until(lambda: len(list((tmp_path / "journals").glob("journal_*/*.mcap"))) == 1,
                "the collector's journal")
-    session = up.process.pid
-    up.process.send_signal(number)
-    assert up.process.wait(PATIENCE_S) == (143 if number == signal.SIGTERM else -9)
-    wait_until(lambda: not subprocess.run(["ps", "-o", "pid=", "-s", str(session)], check=False,
-                                          capture_output=True).stdout.split(), "all nodes to end")
+    up.process.send_signal(signal.SIGKILL)
+    assert up.process.wait(PATIENCE_S) == -signal.SIGKILL
+    wait_until(lambda: not processes_of(up.process.pid), "all nodes to end")
 
 
 def test_a_terminal_that_is_closed_takes_the_command_along(ros_environment):
@@ -175,8 +186,7 @@ def test_a_terminal_that_is_closed_takes_the_command_along(ros_environment):
     os.close(keyboard)
     _, said = process.communicate(timeout=PATIENCE_S)
     assert (process.returncode, said) == (0, "")
-    assert not subprocess.run(["ps", "-o", "pid=", "-s", str(process.pid)], check=False,
-                              capture_output=True).stdout.split()
+    assert not processes_of(process.pid)
 
 
 @pytest.mark.parametrize(("words", "folder"), [
