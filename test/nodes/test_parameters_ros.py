@@ -25,12 +25,19 @@ NODES = {"measurement_collector": MeasurementCollector, "pose_sequencer": PoseSe
          "bag_recorder": BagRecorder, "stage_simulator": StageSimulator}
 
 
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    """Return a bag, and the plan file beside it."""
+    folder = tmp_path_factory.mktemp("files")
+    return {"bag": str(small_bag(folder)), "plan": plan_file(folder, small_plan())}
+
+
 @pytest.fixture
-def needed(tmp_path):
+def needed(files, tmp_path):
     """Return the parameters without which a node cannot run."""
-    return {"bag_player": {"bag": str(small_bag(tmp_path))},
+    return {"bag_player": {"bag": files["bag"]},
             "bag_recorder": {"bag": str(tmp_path / "recorded")},
-            "pose_sequencer": {"plan": plan_file(tmp_path, small_plan())}}
+            "pose_sequencer": {"plan": files["plan"]}}
 
 
 def test_the_table_covers_every_node():
