@@ -24,6 +24,8 @@ from selfcal_ros.sessions.clocks import RosTime
 from selfcal_ros.sessions.health import Losses, Refusals, merged
 from selfcal_ros.sessions.ports import Diagnosis, Level, Ports
 
+BEAT_S = 1.0  # from one telling of the health to the next
+
 
 class NodeBase[S: Settings](Node):
     """A node of rclpy with parameters from the package's one table, and health once a second.
@@ -55,7 +57,7 @@ class NodeBase[S: Settings](Node):
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._health = self.publisher(private(HEALTH))
-        self._beat = self.create_timer(1.0, self.guarded(self.report), clock=self._steady)
+        self._beat = self.create_timer(BEAT_S, self.guarded(self.report), clock=self._steady)
 
     def publisher(self, topic: Topic) -> Publisher:
         """Return a publisher of `topic`."""

@@ -49,3 +49,11 @@ def graph(ros_environment):
     graph = Graph(int(ros_environment["ROS_DOMAIN_ID"]))
     yield graph
     graph.close()
+
+
+@pytest.fixture
+def quick_beat(monkeypatch):
+    """Have nodes tell their health at once and often: for tests of what it says, not of when."""
+    from selfcal_ros.nodes import base
+
+    monkeypatch.setattr(base, "BEAT_S", 0.05)

@@ -90,6 +90,7 @@ def test_joints_are_found_by_name_and_others_pass_unchanged(graph, tmp_path):
     assert list(answer.position) == [7.0, y, x]
 
 
+@pytest.mark.usefixtures("quick_beat")
 def test_what_is_not_corrected_is_counted_and_not_published(graph, tmp_path):
     node = graph.node(CompensatorNode, map=map_file(tmp_path), outside="refuse")
     heard, said = graph.listen(names.CORRECTED), []
@@ -105,6 +106,7 @@ def test_what_is_not_corrected_is_counted_and_not_published(graph, tmp_path):
     assert node.get_name() == "compensator"
 
 
+@pytest.mark.usefixtures("quick_beat")
 def test_places_beside_unknown_sites_and_no_numbers_are_refused(graph):
     graph.node(CompensatorNode)
     latch_map(graph, random_map(Artifact(5, 0.01, 8), 3, unknown=[(2, 2)]))
@@ -122,6 +124,7 @@ def test_places_beside_unknown_sites_and_no_numbers_are_refused(graph):
                 "the counts")
 
 
+@pytest.mark.usefixtures("quick_beat")
 def test_without_a_map_the_state_is_a_warning(graph):
     graph.node(CompensatorNode)
     said: list = []

@@ -177,6 +177,7 @@ def test_whatever_a_message_does_is_counted_and_told(graph):
     assert "selfcal/view_command: cannot be used (OverflowError: int too large)" in told.message
 
 
+@pytest.mark.usefixtures("quick_beat")
 def test_a_publisher_that_cannot_be_heard_is_named(graph):
     node = graph.node(MeasurementCollector)
     deaf = names._qos(10, reliable=False)
@@ -189,6 +190,7 @@ def test_a_publisher_that_cannot_be_heard_is_named(graph):
     assert node.get_name() == "measurement_collector"
 
 
+@pytest.mark.usefixtures("quick_beat")
 def test_two_solvers_are_named(graph):
     first = graph.node(Solver)
     graph.hand.create_publisher(names.ERROR_MAP.type, names.ERROR_MAP.name, names.ERROR_MAP.qos)

@@ -15,7 +15,7 @@ from std_srvs.srv import Trigger
 from selfcal_ros.collection.messages import Command, Phase
 from selfcal_ros.collection.sequencer import State
 from selfcal_ros.messages import from_model, to_model
-from selfcal_ros.nodes import names
+from selfcal_ros.nodes import names, pose_sequencer
 from selfcal_ros.nodes.filling import fill
 from selfcal_ros.nodes.pose_sequencer import PoseSequencer
 from test.support.ros import Graph
@@ -154,6 +154,7 @@ def test_recorded_commands_win_over_its_own(desk):
     desk.graph.until(lambda: len(desk.heard) == 6, "a command of its own")
 
 
+@pytest.mark.usefixtures("quick_beat")
 def test_a_start_waits_for_who_is_missing_and_names_them(graph, tmp_path):
     desk = Desk(graph, tmp_path, start_checks=True)
     answer = desk.ask("start")
@@ -227,9 +228,10 @@ def test_following_is_a_warning_only_where_a_plan_is_given_up(desk, monkeypatch)
         said.clear()
 
 
-def test_an_incomplete_view_is_redone_and_then_skipped(graph, tmp_path):
+def test_an_incomplete_view_is_redone_and_then_skipped(graph, tmp_path, monkeypatch):
+    monkeypatch.setattr(pose_sequencer, "TICK_S", 0.005)
     desk = Desk(graph, tmp_path, auto_start=True, auto_confirm=True, settle_time=0.0,
-                view_timeout=0.1, max_redos=1)
+                view_timeout=0.02, max_redos=1)
     twice = [(phase, index) for index in range(len(PLAN.views))
              for phase in (PLACE, MEASURE, PLACE, MEASURE)]
     desk.expect(*twice, (DONE, len(PLAN.views)))

@@ -106,6 +106,7 @@ def test_a_solution_that_was_ready_while_the_node_was_not_active_is_taken_later(
         graph, monkeypatch):
     gate, plain = threading.Event(), solver_module.solve
     monkeypatch.setattr(solver_module, "solve", lambda job: gate.wait(60) and plain(job))
+    monkeypatch.setattr(solver_module, "SWEEP_S", 0.02)
     node = graph.node(Solver)
     summaries = graph.listen(names.SUMMARY)
     graph.publisher(names.MEASUREMENT).publish(measured()[0][0])
@@ -286,6 +287,7 @@ def command_of(plan_id: str, views_planned: int):
     return names.COMMAND.type(plan_id=plan_id, views_planned=views_planned)
 
 
+@pytest.mark.usefixtures("quick_beat")
 def test_the_plan_is_known_whichever_topic_is_heard_first(graph):
     graph.node(Solver)
     summaries, diagnostics = graph.listen(names.SUMMARY), []
@@ -307,6 +309,7 @@ def test_the_plan_is_known_whichever_topic_is_heard_first(graph):
                             for m in diagnostics for s in m.status), "no alarm")
 
 
+@pytest.mark.usefixtures("quick_beat")
 def test_views_of_two_plates_are_an_alarm(graph, tmp_path):
     graph.node(Solver)
     diagnostics: list = []
