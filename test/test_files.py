@@ -181,7 +181,7 @@ def test_faults_in_json(tmp_path, text, message):
     ("a: !!python/name:os.system ''", ":1:4: not YAML (could not determine a constructor"),
     ("a: \x01", ": not YAML; give a YAML text file"),
     ("a: 2001-13-40", ": not usable YAML (month must be in 1..12); correct the value"),
-    ("[" * 100_000, ": not usable YAML (maximum recursion depth")])
+    ("[" * 2_000, ": not usable YAML (maximum recursion depth")])
 def test_faults_in_yaml(tmp_path, text, message):
     with pytest.raises(InputError) as caught:
         yaml_of(tmp_path, text)
@@ -228,12 +228,14 @@ def test_the_loader_of_others_is_left_alone():
 
 
 WHOLE = st.integers(-2**63, 2**63 - 1)
-PLAIN = st.one_of(st.none(), st.booleans(), WHOLE, st.floats(allow_nan=False), st.text(),
-                  st.from_regex(r"\A[-+]?[0-9]*\.?[0-9]*[eE]?[-+]?[0-9]*\Z"))
+ANY = st.characters(exclude_categories=["Cs"])
+"""Said by a codec instead, as by default, Hypothesis first tries all characters for 2 s."""
+PLAIN = st.one_of(st.none(), st.booleans(), WHOLE, st.floats(allow_nan=False), st.text(ANY),
+                  st.from_regex(r"\A[-+]?[0-9]*\.?[0-9]*[eE]?[-+]?[0-9]*\Z", alphabet=ANY))
 
 
 @given(value=st.recursive(PLAIN, lambda inner: st.lists(inner, max_size=3) | st.dictionaries(
-    st.text(max_size=5), inner, max_size=3), max_leaves=8))
+    st.text(ANY, max_size=5), inner, max_size=3), max_leaves=8))
 def test_yaml_that_is_written_comes_back(tmp_path_factory, value):
     path = tmp_path_factory.mktemp("yaml") / "x.yaml"
     write_yaml(path, value)
