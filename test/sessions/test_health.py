@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from selfcal_ros.errors import InputError
-from selfcal_ros.sessions.health import Losses, Presence, Rate, Refusals, merged
+from selfcal_ros.sessions.health import MOST_STEPS, Losses, Presence, Rate, Refusals, merged
 from selfcal_ros.sessions.ports import Diagnosis, Level
 from test.support.ports import Hands
 
@@ -132,6 +132,16 @@ def test_the_jitter_is_that_of_most_intervals_since_it_was_asked(hands):
     assert math.isnan(rate.take_jitter_s())
     rate.add(np.cumsum(steps)[-1] + 1_000_000 * np.arange(1, 41))
     assert rate.take_jitter_s() == 0
+
+
+def test_intervals_beyond_a_number_are_not_kept_until_the_jitter_is_asked(hands):
+    rate = Rate(hands.ports.now_s)
+    rate.add(1_000_000 * np.arange(MOST_STEPS + 1))
+    rough = np.cumsum(np.tile([900_000, 1_100_000], 1000))  # a tenth of all
+    rate.add(MOST_STEPS * 1_000_000 + rough)
+    assert rate.take_jitter_s() == 0
+    rate.add((MOST_STEPS + 2000) * 1_000_000 + rough)
+    assert rate.take_jitter_s() == pytest.approx(1e-4)
 
 
 @pytest.mark.parametrize("number, is_told", [(39, False), (40, True)])
