@@ -110,12 +110,18 @@ class LatticeViews:
         return out
 
     def gather(self, field: np.ndarray) -> np.ndarray:
-        """Return i^-q G(X_v(m)), complex (views, nx, ny), 0 where the mark is off the field."""
-        out = np.zeros((len(self.poses), *self.shape), dtype=complex)
+        """Return i^-q G(X_v(m)), complex (..., views, nx, ny), 0 where the mark is off the field.
+
+        Parameters
+        ----------
+        field : complex array (..., nx, ny)
+            G, or many of them.
+        """
+        out = np.zeros((*field.shape[:-2], len(self.poses), *self.shape), dtype=complex)
         for index, (pose, win) in enumerate(zip(self.poses, self.windows, strict=True)):
-            sites = field[win.sites]
-            np.multiply(sites.T if win.transposed else sites, PHASES[-pose.q % 4],
-                        out=out[index][win.marks])
+            sites = field[(..., *win.sites)]
+            np.multiply(sites.swapaxes(-1, -2) if win.transposed else sites, PHASES[-pose.q % 4],
+                        out=out[(..., index, *win.marks)])
         return out
 
     def gather_mean(self, field: np.ndarray, relative_weight: np.ndarray) -> np.ndarray:

@@ -172,15 +172,16 @@ class GridSystem:
         return free, d - self.coupled(free)
 
     def misaligned(self, parameters: np.ndarray) -> np.ndarray:
-        """Return phi i z + tau at every mark, complex (views, nx, ny)."""
-        phi, re, im = parameters.reshape(self.n_views, 3).T
-        return (phi[:, None, None] * self.shapes[0] + (re + 1j * im)[:, None, None])
+        """Return phi i z + tau at every mark, complex (..., views, nx, ny), of (..., 3 views)."""
+        each = parameters.reshape(*parameters.shape[:-1], self.n_views, 3)
+        phi, tau = each[..., 0], each[..., 1] + 1j * each[..., 2]
+        return phi[..., None, None] * self.shapes[0] + tau[..., None, None]
 
     def plate(self, y: np.ndarray, field: np.ndarray, parameters: np.ndarray) -> tuple:
-        """Return A (nx, ny) and the residuals (views, nx, ny) for given G and misalignments."""
+        """Return A (..., nx, ny) and the residuals (..., views, nx, ny) for G and misalignments."""
         residual = y - self.views.gather(field) - self.misaligned(parameters)
-        a = np.einsum("vij,vij->ij", self.relative_weight, residual)
-        return a, np.where(self.read, residual - a, 0.0)
+        a = np.einsum("vij,...vij->...ij", self.relative_weight, residual)
+        return a, np.where(self.read, residual - a[..., None, :, :], 0.0)
 
 
 def _of_misalignments(sums: np.ndarray) -> np.ndarray:

@@ -28,6 +28,9 @@ READINGS_DRAWN = 2_000_000
 
 MIN_DRAWS = 16
 
+TOGETHER = 20_000
+"""Readings that are worked on at once: a few draws of a small field, one of a large one."""
+
 
 @dataclass(frozen=True)
 class PredictionLimit:
@@ -70,22 +73,29 @@ def prediction_limit(model: ModelFit, held: HeldReadings, known: np.ndarray,
     placings = [None if fitted >= 0 else Placing(views.z, known[row])
                 for row, fitted in enumerate(held.rows)]
     squares = np.zeros(n)
-    for draw in range(n):
-        field = fields[:, draw].reshape(grid.views.shape)
-        taken = noise[draw]
+    step = max(TOGETHER // grid.weight.size, 1)
+    for draws in (slice(first, first + step) for first in range(0, n, step)):
+        field = fields[:, draws].T.reshape(-1, *grid.views.shape)
+        taken = noise[draws]
         if model.equations is not None:
-            taken = taken - np.tensordot(coefficients[:, draw], model.equations.columns.grid,
-                                         axes=1)
-        plate = grid.plate(taken, field, parameters[:, draw])[0]
-        misaligned = grid.misaligned(parameters[:, draw])
-        error = own[draw] - views.gather(field) - plate
+            taken = taken - _of_terms(coefficients[:, draws], model.equations.columns.grid)
+        plate = grid.plate(taken, field, parameters[:, draws].T)[0]
+        misaligned = grid.misaligned(parameters[:, draws].T)
+        error = own[draws] - views.gather(field) - plate[:, None]
         if len(coefficients):
-            error = error - np.tensordot(coefficients[:, draw], held.columns, axes=1)
+            error = error - _of_terms(coefficients[:, draws], held.columns)
         for row, (fitted, placing) in enumerate(zip(held.rows, placings, strict=True)):
-            error[row] -= misaligned[fitted] if placing is None else placing.of(error[row])
-        squares[draw] = float((weight * abs(error) ** 2)[known].sum()) / (2 * known.sum())
+            error[:, row] -= (misaligned[:, fitted] if placing is None else
+                              np.array([placing.of(one) for one in error[:, row]]))
+        each = np.ascontiguousarray((weight * abs(error) ** 2)[:, known])
+        squares[draws] = each.sum(axis=1) / (2 * known.sum())
     mean = float(squares.mean())
     return PredictionLimit(mean, 2 * mean**2 / float(squares.var(ddof=1)))
+
+
+def _of_terms(coefficients: np.ndarray, columns: np.ndarray) -> np.ndarray:
+    """Return what coefficients (p, k) do to the readings, complex (k, views, nx, ny)."""
+    return np.array([np.tensordot(one, columns, axes=1) for one in coefficients.T])
 
 
 def noise_of(rng: np.random.Generator, shape: tuple[int, ...], weight: np.ndarray) -> np.ndarray:

@@ -146,7 +146,7 @@ def test_a_spoiled_view_exceeds_its_limit_and_disqualifies_the_result():
     assert validation_json([bad])[0]["exceeds"] is True
 
 
-def test_terms_are_predicted_with_the_readings():
+def test_terms_are_predicted_with_the_readings(few_draws):
     """A turned microscope and a drift: within the limit with the terms, beyond it without."""
     plan = replace(SMALL, artifact=Artifact(7, 0.01))
     readings, rng, views = drawn(5, plan, visits=True), np.random.default_rng(1), []
