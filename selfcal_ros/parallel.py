@@ -24,6 +24,9 @@ from selfcal_ros.errors import InputError
 
 AHEAD = 2
 """Items in the hands of the pool, a worker: enough that none waits for work."""
+BLAS_THREADS = "OPENBLAS_NUM_THREADS"
+"""Environment variable: threads that OpenBLAS starts as it is loaded."""
+FORKED = "selfcal_ros.forked"
 LOCAL = "local"
 """Instead of a scheduler's address: a dask cluster in this machine, made for the run."""
 
@@ -75,20 +78,27 @@ def begin(module: str, workers: int) -> None:
         With one there is nothing to begin: it is this process.
     """
     if workers > 1 and _method() == "forkserver":
-        multiprocessing.get_context("forkserver").set_forkserver_preload([module])
-        _start_server()
+        _start_server(module)
 
 
-def _start_server() -> None:
-    """Start the process that forks workers, with Ctrl-C blocked in it and in them.
+def _start_server(module: str) -> None:
+    """Start the process that forks workers, unless it runs: with Ctrl-C blocked in it and in them.
 
-    Ctrl-C reaches all processes of a terminal, also while they import; it is for the parent.
+    Ctrl-C reaches all processes of a terminal, also while they import; it is for the parent. BLAS
+    has one thread in all of them from the start: others would spin for 0.03 s in each library.
     """
+    multiprocessing.get_context("forkserver").set_forkserver_preload([module, __name__, FORKED])
     resource_tracker.ensure_running()  # which lets the signal through
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    threads = os.environ.get(BLAS_THREADS)
+    os.environ[BLAS_THREADS] = "1"
     try:
         forkserver.ensure_running()
     finally:
+        if threads is None:
+            del os.environ[BLAS_THREADS]
+        else:
+            os.environ[BLAS_THREADS] = threads
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
@@ -231,10 +241,9 @@ def _pool(workers: int, function: Callable[[Any], Any]) -> Iterator[ProcessPoolE
     What `function` needs is imported once, where the workers are forked.
     """
     context = multiprocessing.get_context(_method())
-    module = getattr(getattr(function, "func", function), "__module__", None) or "builtins"
-    context.set_forkserver_preload(["__main__" if module == "__main__" else module])
     if _method() == "forkserver":
-        _start_server()
+        _start_server(getattr(getattr(function, "func", function), "__module__", None)
+                      or "builtins")
     before = set(multiprocessing.active_children())
     pool = ProcessPoolExecutor(workers, mp_context=context, initializer=begin_worker)
     try:

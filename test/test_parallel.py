@@ -119,6 +119,30 @@ def test_what_is_begun_is_imported_where_workers_are_forked(workers, known):
     assert done.stdout.split("\n")[0] == str([known] * 4)
 
 
+LOADED = """
+import gc, os
+from selfcal_ros.parallel import begin, mapped
+os.environ.pop("OPENBLAS_NUM_THREADS", None)
+if OTHERS:
+    os.environ["OPENBLAS_NUM_THREADS"] = OTHERS
+begin("numpy", 2)
+assert os.environ.get("OPENBLAS_NUM_THREADS", "") == OTHERS
+tasks = mapped(os.listdir, ["/proc/self/task"] * 4, workers=2)
+print({len(found) for found in tasks})
+print(set(mapped(os.getenv, ["OPENBLAS_NUM_THREADS"] * 4, workers=2)))
+frozen = mapped(eval, ["__import__('gc').get_freeze_count()"] * 4, workers=2)
+print(min(frozen) > 10_000 > gc.get_freeze_count())
+"""
+
+
+@pytest.mark.parametrize("others", ["", "2"])
+def test_workers_start_without_threads_of_blas_and_leave_what_is_loaded_out_of_garbage(others):
+    """One thread works, one waits for the end of the parent; the parent itself is as it was."""
+    done = subprocess.run([sys.executable, "-c", f"OTHERS = {others!r}" + LOADED],
+                          capture_output=True, text=True, check=False)
+    assert (done.stderr, done.stdout.splitlines()) == ("", ["{2}", "{'1'}", "True"])
+
+
 def test_numbers_of_workers():
     assert check_workers(None) == cores() >= 1
     assert check_workers(3) == 3
