@@ -147,7 +147,8 @@ def _addresses(fronts: tuple[Front, ...], row: np.ndarray, column: np.ndarray, *
     start = np.array([one.start for one in fronts])[front]
     own = np.array([one.stop for one in fronts])[front] - start
     widths = np.array([len(one.boundary) for one in fronts])
-    keys = np.concatenate([number * size + one.boundary for number, one in enumerate(fronts)])
+    keys = np.concatenate([np.zeros(0, dtype=int), *(
+        number * size + one.boundary for number, one in enumerate(fronts))])
     before = np.cumsum(widths) - widths
     place = np.searchsorted(keys, front * size + row) - before[front]
     offset = np.array([one.offset for one in fronts])[front]
