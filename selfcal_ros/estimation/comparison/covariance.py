@@ -22,7 +22,7 @@ from selfcal_ros.estimation.normal.equations import NormalEquations
 from selfcal_ros.estimation.normal.grid import GridSystem
 from selfcal_ros.estimation.normal.planned import planned_system
 from selfcal_ros.estimation.observability.prediction import theta_matrix
-from selfcal_ros.estimation.observability.rank import full_observability
+from selfcal_ros.estimation.observability.rank import deficiency
 from selfcal_ros.estimation.options import ReferenceLength
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.result import CalibrationResult
@@ -172,9 +172,7 @@ def _system(result: CalibrationResult) -> NormalEquations | None:
     if not any(view.grid for view in views):
         return None
     system = planned_system(result.artifact, views)
-    if not full_observability(system, result.artifact, views).identifiable:
-        return None
-    return system
+    return None if deficiency(system) else system
 
 
 def _read_system(result: CalibrationResult) -> NormalEquations:

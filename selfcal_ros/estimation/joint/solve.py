@@ -22,11 +22,7 @@ from selfcal_ros.estimation.lattice.readings import angular_data, grid_data
 from selfcal_ros.estimation.normal.cache import system_for
 from selfcal_ros.estimation.normal.equations import MAX_DIRECT_SITES
 from selfcal_ros.estimation.observability.plan_check import with_unseen_modes
-from selfcal_ros.estimation.observability.rank import (
-    measured_observability,
-    plan_observability,
-    refusal,
-)
+from selfcal_ros.estimation.observability.rank import identifies, measured_observability, refusal
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.terms.ground import ground_of
 from selfcal_ros.estimation.terms.identifiable import require_terms_told
@@ -68,7 +64,7 @@ def prepare(measurements: Measurements, options: Options) -> tuple[Problem, Obse
     if not seen.identifiable:
         plan = Plan(measurements.plan_id, measurements.artifact,
                     tuple(v.view for v in measurements.views))
-        if not plan_observability(plan).identifiable:
+        if not identifies(plan.artifact, plan.views):
             seen = with_unseen_modes(seen, system, plan).observability
         raise NotIdentifiableError(refusal(seen), seen)
     half_width_m = measurements.artifact.grid_pitch_m * max(measurements.artifact.half)

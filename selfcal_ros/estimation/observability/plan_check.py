@@ -10,7 +10,7 @@ from selfcal_ros.estimation.blas_threads import one_thread
 from selfcal_ros.estimation.normal.equations import NormalEquations
 from selfcal_ros.estimation.normal.planned import planned_system
 from selfcal_ros.estimation.observability.prediction import MAX_SITES, Prediction, predict
-from selfcal_ros.estimation.observability.rank import full_observability
+from selfcal_ros.estimation.observability.rank import full_observability, identifies
 from selfcal_ros.estimation.observability.unseen import (
     UnseenMode,
     angular_families,
@@ -155,21 +155,14 @@ def find_cures(plan: Plan) -> Iterator[tuple[View, ...]]:
                 break
     for views in found:
         cure = next((more for more in (views, (*views, candidates[-1]))
-                     if more and _cured(plan, more)), None)
+                     if more and identifies(plan.artifact, (*plan.views, *more))), None)
         if cure:
             yield cure
 
 
 def _grid_seen(plan: Plan, views: tuple[View, ...]) -> bool:
-    every = tuple(replace(view, angular=False) for view in (*plan.views, *views) if view.grid)
-    return full_observability(planned_system(plan.artifact, every), plan.artifact,
-                              every).identifiable
-
-
-def _cured(plan: Plan, views: tuple[View, ...]) -> bool:
-    every = (*plan.views, *views)
-    return full_observability(planned_system(plan.artifact, every), plan.artifact,
-                              every).identifiable
+    return identifies(plan.artifact, [replace(view, angular=False)
+                                      for view in (*plan.views, *views) if view.grid])
 
 
 def smaller(plan: Plan, size: int) -> Plan:

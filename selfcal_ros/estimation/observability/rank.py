@@ -8,7 +8,7 @@ three rows a view, whose zeros and non-zeros lie ten orders of magnitude apart (
 """
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 from selfcal_ros.estimation.normal.equations import NormalEquations
 from selfcal_ros.estimation.normal.memo import Memo
@@ -33,6 +33,24 @@ def plan_observability(plan: Plan) -> Observability:
     return full_observability(system, plan.artifact, plan.views)
 
 
+def identifies(artifact: Artifact, views: Sequence[View]) -> bool:
+    """Return whether views would tell the whole map if every mark in the field were read.
+
+    That alone, for searches: no advice, and no matrix where a count of components says no already.
+    """
+    system = planned_system(artifact, views, rank_only=True)
+    parts = system.grid.components
+    if parts.balanced.any() or min(parts.of_site.min(), parts.of_mark.min()) < 0:
+        return False
+    return deficiency(system) == 0
+
+
+def deficiency(system: NormalEquations) -> int:
+    """Return how many numbers of the map, the plate and the misalignments no reading tells."""
+    rank = system.rank_grid + DATUM_ROWS
+    return 4 * system.grid.n_sites + 3 * system.grid.n_views - rank + angular_deficiency(system)
+
+
 def full_observability(system: NormalEquations, artifact: Artifact,
                        views: Iterable[View]) -> Observability:
     """Return rank and deficiency over all sites, marks and lines of the artifact.
@@ -47,11 +65,9 @@ def full_observability(system: NormalEquations, artifact: Artifact,
         The views behind the readings, for the advice.
     """
     unknowns = 4 * system.grid.n_sites + 3 * system.grid.n_views
-    rank = system.rank_grid + DATUM_ROWS
-    angular = angular_deficiency(system)
-    advice = advice_for(artifact, views) if unknowns > rank or angular else ()
-    deficiency = unknowns - rank + angular
-    return Observability(rank, unknowns, deficiency, deficiency == 0, advice=advice)
+    unseen = deficiency(system)
+    return Observability(system.rank_grid + DATUM_ROWS, unknowns, unseen, unseen == 0,
+                         advice=advice_for(artifact, views) if unseen else ())
 
 
 def angular_deficiency(system: NormalEquations) -> int:
@@ -98,8 +114,7 @@ def _measured_observability(system: NormalEquations, artifact: Artifact,
     full = full_observability(system, artifact, read)
     if full.identifiable:
         return full
-    as_planned = plan_observability(Plan("", artifact, read))
-    if not as_planned.identifiable:
+    if not identifies(artifact, read):
         return full
     sites, lines = system.known_sites, system.known_lines
     if sites.mean() < DETERMINED or (len(lines) and lines.mean() < DETERMINED):
@@ -144,9 +159,7 @@ def _tried(artifact: Artifact, views: tuple[View, ...]) -> tuple[str, ...]:
                               ("turned by 90 deg", math.pi / 2, (0.0, 0.0)),
                               ("that is neither turned nor shifted", 0.0, (0.0, 0.0))):
         more = View("", turn, shift, True, artifact.angular_count > 0)
-        system = planned_system(artifact, (*views, more), rank_only=True)
-        if (system.rank_grid + DATUM_ROWS == 4 * system.grid.n_sites + 3 * system.grid.n_views
-                and not angular_deficiency(system)):
+        if identifies(artifact, (*views, more)):
             return (f"add a view {name}",)
     return ("add views turned by 90 deg and shifted by one pitch along X and along Y",)
 

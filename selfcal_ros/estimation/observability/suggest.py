@@ -17,7 +17,7 @@ from selfcal_ros.estimation.observability.plan_check import (
     unit_repeats,
 )
 from selfcal_ros.estimation.observability.prediction import Prediction, predict
-from selfcal_ros.estimation.observability.rank import full_observability
+from selfcal_ros.estimation.observability.rank import deficiency
 from selfcal_ros.estimation.observability.resistance import with_part_of_terms
 from selfcal_ros.estimation.terms.planned import Assumed, planned_equations, planned_ground
 from selfcal_ros.model.artifact import Artifact
@@ -130,9 +130,9 @@ def score_plan(plan: Plan, datum: ThetaDatum = ThetaDatum.ZERO_MEAN, *,
     The part of the terms that it is judged `against` is in the XY uncertainty.
     """
     system = planned_system(plan.artifact, plan.views)
-    seen = full_observability(system, plan.artifact, plan.views)
-    if not seen.identifiable:
-        return Score(seen.deficiency, inf, inf, inf)
+    unseen = deficiency(system)
+    if unseen:
+        return Score(unseen, inf, inf, inf)
     repeats = repeats or unit_repeats(plan)
     found: Prediction = predict(system, plan.artifact, datum, repeats=repeats)
     if against is not None and against.terms:

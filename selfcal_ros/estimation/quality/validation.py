@@ -31,7 +31,7 @@ from selfcal_ros.estimation.observability.plan_check import (
     candidate_views,
     smaller,
 )
-from selfcal_ros.estimation.observability.rank import plan_observability
+from selfcal_ros.estimation.observability.rank import identifies
 from selfcal_ros.estimation.observability.suggest import FULL_SIZE, SEARCH_SIZE
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.quality.held_terms import (
@@ -217,8 +217,8 @@ def _rest_not_identified(kept: Measurements, held: Measurements) -> RestNotIdent
     if max(kept.artifact.shape) > FULL_SIZE and views:
         plan = smaller(plan, SEARCH_SIZE)
     for more in candidate_views(plan.artifact, angular=any(view.angular for view in views)):
-        if more.lattice_pose(plan.artifact) not in gone and plan_observability(
-                replace(plan, views=(*plan.views, more))).identifiable:
+        if more.lattice_pose(plan.artifact) not in gone and identifies(
+                plan.artifact, (*plan.views, more)):
             return RestNotIdentified(plan.artifact, more)
     return RestNotIdentified(plan.artifact)
 

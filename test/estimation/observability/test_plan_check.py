@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from selfcal_ros.errors import NotIdentifiableError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.normal.planned import planned_system
-from selfcal_ros.estimation.observability import plan_check
+from selfcal_ros.estimation.observability import plan_check, rank
 from selfcal_ros.estimation.observability.plan_check import (
     candidate_views,
     check_plan,
@@ -22,7 +22,7 @@ from selfcal_ros.estimation.observability.plan_check import (
     smaller,
     unseen_modes,
 )
-from selfcal_ros.estimation.observability.rank import plan_observability
+from selfcal_ros.estimation.observability.rank import identifies, plan_observability
 from selfcal_ros.estimation.observability.unseen import is_unseen
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.view import View
@@ -80,7 +80,25 @@ def test_rank_is_that_of_the_dense_matrix(names, shape):
     if shape[1]:
         names = [name for name in names if POSES[name][0] % 2 == 0] or ["0"]
     plan = plan_of(", ".join(names), shape[0], size_y=shape[1])
+    seen, dense = plan_observability(plan), dense_rank(plan)
+    assert seen.rank == dense
+    assert identifies(plan.artifact, plan.views) == (dense == seen.unknowns)
+
+
+@pytest.mark.parametrize("views", ["-tx, -ty, 90tx", "-tx, 90tx, tx2"])
+def test_few_sites_of_a_small_plate_leave_nothing_to_eliminate(views):
+    plan = plan_of(views, 3)
     assert plan_observability(plan).rank == dense_rank(plan)
+
+
+@pytest.mark.parametrize(("views", "asks"), [
+    ("0", False), ("-tx, -ty, 90tx", False), ("90tx, tx, ty", False), ("0, 90, tx", True)])
+def test_no_matrix_is_made_where_a_count_says_no(monkeypatch, views, asks):
+    """One view joins each mark to one site; then one mark is never read, then no corner visited."""
+    asked: list = []
+    monkeypatch.setattr(rank, "deficiency", lambda system: asked.append(system) or 0)
+    plan = plan_of(views)
+    assert (identifies(plan.artifact, plan.views), len(asked)) == (asks, asks)
 
 
 def test_an_arbitrary_field_is_seen_by_hus_plan_and_not_by_one_view():
