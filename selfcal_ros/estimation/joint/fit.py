@@ -6,7 +6,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from selfcal_ros.estimation.datum.scale import scale_of
-from selfcal_ros.estimation.joint.iterated import solve_iterated
 from selfcal_ros.estimation.joint.noise import NoiseEstimate, noise_estimate
 from selfcal_ros.estimation.joint.problem import (
     FLOOR,
@@ -80,7 +79,7 @@ def fit(problem: Problem, y: np.ndarray, theta: AngularPart | None = None) -> Jo
     system, grid, angular = problem.system, problem.system.grid, problem.system.angular
     n, length = 3 * grid.n_views, problem.half_width_m
     theta = theta or angular_part(problem)
-    raw = (_solve_direct if problem.direct else solve_iterated)(problem, y, theta)
+    raw = _solve_direct(problem, y, theta) if problem.direct else _iterated(problem, y, theta)
     field, parameters = raw.field, raw.parameters
 
     parts = system.gauge.parts(field)
@@ -108,6 +107,12 @@ def fit(problem: Problem, y: np.ndarray, theta: AngularPart | None = None) -> Jo
     a_theta, residuals_theta = angular.plate(problem.angular.y, g_theta, phi)
     return JointFit(field, plate, residuals, parameters, g_theta, a_theta, residuals_theta,
                     misclosure, xy, theta.noise, raw.inverse, raw.solver, raw.ratio)
+
+
+def _iterated(problem: Problem, y: np.ndarray, theta: AngularPart) -> FreeNetworkSolution:
+    from selfcal_ros.estimation.joint.iterated import solve_iterated  # scipy.fft, for large fields
+
+    return solve_iterated(problem, y, theta)
 
 
 def _solve_direct(problem: Problem, y: np.ndarray, theta: AngularPart) -> FreeNetworkSolution:
