@@ -211,6 +211,7 @@ def _suggest(args: argparse.Namespace, plan: Plan) -> int:
     from selfcal_ros.estimation.observability.suggest import best_plan, rank_next
     from selfcal_ros.files import check_outputs
     from selfcal_ros.model.error_map import ThetaDatum
+    from selfcal_ros.reporting.words.steps import search_text
 
     if args.top < 1:
         raise InputError("--top", f"{args.top} is not positive", "give 1 or more")
@@ -222,7 +223,7 @@ def _suggest(args: argparse.Namespace, plan: Plan) -> int:
         if args.views is not None:
             angular = any(view.angular for view in plan.views) and plan.artifact.angular_count > 0
             repeats = min(view.repeats for view in plan.views)
-            best, score, how = best_plan(
+            best, score, search = best_plan(
                 plan.artifact, args.views, angular=angular, criterion=args.criterion,
                 repeats=repeats, datum=datum, against=against, progress=progress)
         else:
@@ -233,7 +234,7 @@ def _suggest(args: argparse.Namespace, plan: Plan) -> int:
         best = replace(best, plan_id=f"{plan.plan_id}_best{args.views}",
                        model_terms=plan.model_terms)
         best = _in_order(best, next((v.visit_order for v in plan.views if v.grid), ""))
-        _show_best(args, best, (score, unit), how)
+        _show_best(args, best, (score, unit), search_text(search))
     else:
         best = replace(plan, views=ranked[0].views)
         _show_ranked(args, plan, (now, unit), ranked[:args.top])
@@ -274,11 +275,13 @@ def _noise_m(plan: Plan, against: Against | None) -> float | None:
 def _show_ranked(args: argparse.Namespace, plan: Plan, now: tuple[Score, float | None],
                  ranked: Sequence[Suggestion]) -> None:
     """Print the next steps; `now`: score of the plan and the noise of an averaged reading, m."""
+    from selfcal_ros.reporting.words.steps import step_text
+
     unit = now[1]
     if args.json:
         print(json.dumps({
             "plan_id": plan.plan_id, "criterion": args.criterion, "now": _score_json(*now),
-            "suggestions": [{"text": item.text,
+            "suggestions": [{"text": step_text(item, plan),
                              "view": item.view and view_to_dict(item.view, plan.artifact),
                              "repeat_of": item.repeat_of, "visit_order": item.order or None,
                              **_score_json(item.score, unit)} for item in ranked]}, indent=1))
@@ -286,7 +289,7 @@ def _show_ranked(args: argparse.Namespace, plan: Plan, now: tuple[Score, float |
     tell("\n".join([
         f"plan {plan.plan_id}: {_score_text(*now)}",
         f"next steps, the best first by {args.criterion} XY uncertainty:",
-        *(f"  {_score_text(item.score, unit)}   {item.text}" for item in ranked)]))
+        *(f"  {_score_text(item.score, unit)}   {step_text(item, plan)}" for item in ranked)]))
 
 
 def _show_best(args: argparse.Namespace, best: Plan, score: tuple[Score, float | None],

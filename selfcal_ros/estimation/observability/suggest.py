@@ -12,7 +12,6 @@ from selfcal_ros.estimation.normal.planned import planned_system
 from selfcal_ros.estimation.observability.equivalent import equivalent_key
 from selfcal_ros.estimation.observability.plan_check import (
     candidate_views,
-    describe_view,
     smaller,
     unit_repeats,
 )
@@ -87,13 +86,27 @@ class Against:
 
 
 @dataclass(frozen=True)
+class Search:
+    """How a plan was searched.
+
+    Attributes
+    ----------
+    n_plans : int or None
+        The number of plans if all were tried; None after greedy choice and exchange.
+    size : int or None
+        Sites a side of the smaller field on which they were compared; None for the plan's own.
+    """
+
+    n_plans: int | None
+    size: int | None = None
+
+
+@dataclass(frozen=True)
 class Suggestion:
     """A next step and the score that the plan then has.
 
     Attributes
     ----------
-    text : str
-        What to do.
     view : View or None
         The view to add, or the one to repeat; None for another visiting order.
     score : Score
@@ -106,7 +119,6 @@ class Suggestion:
         The visiting order, if another is suggested.
     """
 
-    text: str
     view: View | None
     score: Score
     views: tuple[View, ...]
@@ -179,14 +191,14 @@ def rank_next(plan: Plan, *, criterion: str = "rms", datum: ThetaDatum = ThetaDa
     if against is not None and against.of_order:
         steps += _other_orders(plan)
     out = []
-    for number, (text, view, views, more) in enumerate(steps):
-        out.append(Suggestion(text, view, score(views), views, **more))
+    for number, (view, views, more) in enumerate(steps):
+        out.append(Suggestion(view, score(views), views, **more))
         progress(number + 1, len(steps))
     out.sort(key=lambda item: item.score.key(criterion))
     return score(plan.views), out
 
 
-Step = tuple[str, View | None, tuple[View, ...], dict]
+Step = tuple[View | None, tuple[View, ...], dict]
 
 
 def _more_views(plan: Plan) -> list[Step]:
@@ -197,7 +209,7 @@ def _more_views(plan: Plan) -> list[Step]:
     for view in candidate_views(plan.artifact, angular=angular):
         named = replace(view, name=unused_name(view.name, plan.views), repeats=unit,
                         visit_order=order if view.grid else "")
-        out.append(("add " + describe_view(view, plan.artifact), named, (*plan.views, named), {}))
+        out.append((named, (*plan.views, named), {}))
     return out
 
 
@@ -206,8 +218,8 @@ def _more_repeats(plan: Plan) -> list[Step]:
     out: list[Step] = []
     for index, view in enumerate(plan.views):
         more = replace(view, repeats=view.repeats + unit)
-        out.append((f"measure view '{view.name}' {more.repeats} times, not {view.repeats}", more,
-                    (*plan.views[:index], more, *plan.views[index + 1:]), {"repeat_of": index}))
+        out.append((more, (*plan.views[:index], more, *plan.views[index + 1:]),
+                    {"repeat_of": index}))
     return out
 
 
@@ -216,14 +228,8 @@ def _other_orders(plan: Plan) -> list[Step]:
     out: list[Step] = []
     for order in ORDERS:
         views = tuple(_in_order(view, order) for view in plan.views)
-        if views == plan.views:
-            continue
-        pairs = zip(plan.views, views, strict=True)
-        more = sorted({(old.repeats, new.repeats) for old, new in pairs
-                       if old.repeats != new.repeats})
-        text = f"visit the marks in the order {order}"
-        text += "".join(f", {new} repeats for {old}" for old, new in more)
-        out.append((text, None, views, {"order": order}))
+        if views != plan.views:
+            out.append((None, views, {"order": order}))
     return out
 
 
@@ -238,8 +244,8 @@ def _in_order(view: View, order: str) -> View:
 def best_plan(artifact: Artifact, n_views: int, *, angular: bool, criterion: str = "rms",
               repeats: int = 1, datum: ThetaDatum = ThetaDatum.ZERO_MEAN,
               against: Against | None = None,
-              progress: Progress = no_progress) -> tuple[Plan, Score, str]:
-    """Return the best plan of `n_views` views among the candidates, its score, how it was found.
+              progress: Progress = no_progress) -> tuple[Plan, Score, Search]:
+    """Return the best plan of `n_views` views among the candidates, its score, and the search.
 
     The first view is the one without turn: turning all views together only renames the plate. With
     angular lines one view is the turn by one line. Up to EXHAUSTIVE plans are all tried, more are
@@ -262,7 +268,7 @@ def best_plan(artifact: Artifact, n_views: int, *, angular: bool, criterion: str
     searched = _Searched(small, pool, repeats, criterion, against, progress)
     tried, how = _search(searched, n_views - 1 - fixed)
     if small is not whole:
-        how += f" on a field of {SEARCH_SIZE} x {SEARCH_SIZE} sites"
+        how = replace(how, size=SEARCH_SIZE)
     judged = whole if max(artifact.shape) <= FULL_SIZE else small
 
     def with_lines(chosen: tuple[int, ...]) -> Plan:
@@ -304,15 +310,14 @@ class _Searched:
         return self._known[same]
 
 
-def _search(searched: _Searched, free: int) -> tuple[dict[tuple[int, ...], tuple], str]:
+def _search(searched: _Searched, free: int) -> tuple[dict[tuple[int, ...], tuple], Search]:
     """Return the plans that were tried with their keys, and how they were found."""
     n_pool = len(searched.pool)
     n_plans = comb(n_pool + free - 1, free)
     if n_plans <= (FEW if searched.one_by_one else EXHAUSTIVE):
         every = combinations_with_replacement(range(n_pool), free)
-        return {chosen: searched.key(chosen) for chosen in every}, f"all {n_plans} plans tried"
-    return (_exchange(searched.key, n_pool, free),
-            "greedy choice, then exchange of single views")
+        return {chosen: searched.key(chosen) for chosen in every}, Search(n_plans)
+    return _exchange(searched.key, n_pool, free), Search(None)
 
 
 def _exchange(key: Callable[[tuple[int, ...]], tuple[float, ...]], n_pool: int, free: int,
