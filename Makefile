@@ -20,8 +20,9 @@ ament-lint: setup  # what ament_flake8 and ament_pep257 check, with setup.cfg
 	@PYTHONPATH=build/linters $(BIN)/python -m flake8 --config setup.cfg selfcal_ros launch tools examples setup.py test
 	@echo "ament-lint: nothing found"
 # bytecode is kept: else each worker compiles all tests anew, and each process that they start the package
+# three workers on two cores: as a rule one waits for a message
 test: lint
-	@PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -n 2 --dist worksteal
+	@PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -n 3 --dist worksteal
 test-oldest:  # with the libraries of Ubuntu 24.04; e.g. make test-oldest TESTS=test/laser
 	@VENV=.venv-oldest PINS=tools/oldest.txt tools/setup.sh
 	@.venv-oldest/bin/python -m pytest -n 2 --dist worksteal $(TESTS)

@@ -17,6 +17,9 @@ settings.register_profile("repeatable", deadline=None, derandomize=True)
 settings.load_profile("repeatable")
 gc.disable()  # nothing that is collected goes before the tests do
 
+RARELY = (100_000, 50, 100)
+"""Objects and rounds between two looks for garbage: tests leave little in circles."""
+
 
 @given(strategies.none())
 def first_example(nothing: None) -> None:
@@ -31,4 +34,5 @@ def pytest_collection_finish():
     first_example()
     gc.collect()
     gc.freeze()
+    gc.set_threshold(*RARELY)
     gc.enable()

@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Every test here gets a ROS domain of its own on loopback; without ROS all of them are skipped."""
 
+import os
 from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
 
-HERE = Path(__file__).parent
+HERE = f"{Path(__file__).parent}{os.sep}"
 MISSING = [name for name in ("rclpy", "selfcal_msgs") if find_spec(name) is None]
 
 
@@ -23,7 +24,7 @@ def pytest_pycollect_makemodule(module_path, parent):
 
 def pytest_collection_modifyitems(items):
     for item in items:
-        if HERE in item.path.parents:
+        if str(item.path).startswith(HERE):
             item.add_marker("ros")
             # the parser that rclpy's type description service loads is older than Python 3.12
             item.add_marker(pytest.mark.filterwarnings("ignore:module 'sre_:DeprecationWarning"))
