@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What all nodes share: checked parameters, ports for the session, guarded callbacks, health."""
 
-import inspect
 import time
 from collections.abc import Callable
 from typing import Any
@@ -9,7 +8,6 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.clock import Clock, ClockType
 from rclpy.event_handler import SubscriptionEventCallbacks
-from rclpy.node import Node
 from rclpy.publisher import Publisher
 
 from selfcal_ros.collection.settings.parameter import BARE_Y, Settings
@@ -19,7 +17,7 @@ from selfcal_ros.nodes.descriptors import descriptor
 from selfcal_ros.nodes.filling import fill, status_of
 from selfcal_ros.nodes.names import HEALTH, Topic, private
 from selfcal_ros.nodes.publishers import mismatched, others_publishing
-from selfcal_ros.nodes.services import Later, answered, answering_later
+from selfcal_ros.nodes.services import Answering
 from selfcal_ros.sessions.clocks import RosTime
 from selfcal_ros.sessions.health import Losses, Refusals, merged
 from selfcal_ros.sessions.ports import Diagnosis, Level, Ports
@@ -27,7 +25,7 @@ from selfcal_ros.sessions.ports import Diagnosis, Level, Ports
 BEAT_S = 1.0  # from one telling of the health to the next
 
 
-class NodeBase[S: Settings](Node):
+class NodeBase[S: Settings](Answering):
     """A node of rclpy with parameters from the package's one table, and health once a second.
 
     Work and health follow a steady clock: a simulated or stepped ROS time does not stop them.
@@ -97,34 +95,6 @@ class NodeBase[S: Settings](Node):
             message, info = received[0] if len(received) == 1 else received
             callback(message, info["source_timestamp"] < began_ns)
         return self.subscribe(topic, WithInfo(self.guarded(call, topic.name)), **kwargs)
-
-    def service(self, kind: type, name: str, answer: Callable[..., str]) -> Any:
-        """Offer a service whose response is filled from `answer` (request), or from its error.
-
-        `answer` may take the response as well, for fields beside success and message.
-        """
-        parameters = inspect.signature(answer).parameters.values()
-        arguments = sum(parameter.default is parameter.empty for parameter in parameters)
-
-        def call(request: Any, response: Any) -> Any:
-            return answered(response, lambda: answer(*(request, response)[:arguments]),
-                            self.refusals.add)
-        return self.own(self.create_service(kind, name, call), self.destroy_service)
-
-    def service_later(self, kind: type, name: str, answer: Callable[[Any, Any], str],
-                      when: Callable[[Callable[[], None]], None]) -> Any:
-        """Offer a service that answers as `service` does, but not before its time.
-
-        `when` takes what gives the answer, and calls it once, at once or later, in the thread of
-        the executor.
-        """
-        def call(request: Any, response: Any) -> Later:
-            later = Later()
-            when(lambda: later.give(answered(response, lambda: answer(request, response),
-                                             self.refusals.add)))
-            return later
-        return self.own(answering_later(self.create_service(kind, name, call)),
-                        self.destroy_service)
 
     def every(self, seconds: float, callback: Callable[[], None]) -> Any:
         """Call `callback` every so many seconds of a steady clock."""

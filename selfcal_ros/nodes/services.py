@@ -1,10 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """How services answer: success or the error in the response, at once or once it is known."""
 
+import inspect
 from collections.abc import Callable
 from typing import Any
 
+from rclpy.node import Node
+
 from selfcal_ros.errors import SelfcalError, as_answer, printable
+from selfcal_ros.sessions.health import Refusals
 
 
 def answered(response: Any, answer: Callable[[], str],
@@ -63,3 +67,42 @@ def answering_later(service: Any) -> Any:
             send(response, header)
     service.send_response = send_response
     return service
+
+
+class Answering(Node):
+    """A node whose services answer with success and message, whatever happens.
+
+    What has these: `refusals`, which counts what is raised, and `own`, which notes how to take a
+    service down.
+    """
+
+    refusals: Refusals
+    own: Callable[[Any, Callable[[Any], Any]], Any]
+
+    def service(self, kind: type, name: str, answer: Callable[..., str]) -> Any:
+        """Offer a service whose response is filled from `answer` (request), or from its error.
+
+        `answer` may take the response as well, for fields beside success and message.
+        """
+        parameters = inspect.signature(answer).parameters.values()
+        arguments = sum(parameter.default is parameter.empty for parameter in parameters)
+
+        def call(request: Any, response: Any) -> Any:
+            return answered(response, lambda: answer(*(request, response)[:arguments]),
+                            self.refusals.add)
+        return self.own(self.create_service(kind, name, call), self.destroy_service)
+
+    def service_later(self, kind: type, name: str, answer: Callable[[Any, Any], str],
+                      when: Callable[[Callable[[], None]], None]) -> Any:
+        """Offer a service that answers as `service` does, but not before its time.
+
+        `when` takes what gives the answer, and calls it once, at once or later, in the thread of
+        the executor.
+        """
+        def call(request: Any, response: Any) -> Later:
+            later = Later()
+            when(lambda: later.give(answered(response, lambda: answer(request, response),
+                                             self.refusals.add)))
+            return later
+        return self.own(answering_later(self.create_service(kind, name, call)),
+                        self.destroy_service)
