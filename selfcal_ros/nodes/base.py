@@ -11,7 +11,7 @@ from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.publisher import Publisher
 
 from selfcal_ros.collection.settings.parameter import BARE_Y, Settings
-from selfcal_ros.errors import printable
+from selfcal_ros.errors import InputError, printable
 from selfcal_ros.nodes.callbacks import WithInfo
 from selfcal_ros.nodes.descriptors import descriptor
 from selfcal_ros.nodes.filling import fill, status_of
@@ -39,6 +39,22 @@ class NodeBase[S: Settings](Answering):
         InputError
             For an unknown parameter name, a wrong type or a value out of bounds.
         """
+        self.refusals = Refusals(self.say, time.monotonic)
+        self.losses = Losses(self.say, time.monotonic)
+        self._ros_time = RosTime(self.say)
+        self.alone_on: list[str] = []
+        self._heard_on: dict[str, Topic] = {}
+        try:
+            self._take_parameters(kind)
+        except InputError:
+            self.destroy_node()  # or its name stays in the graph until garbage is looked for
+            raise
+        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
+        self._health = self.publisher(private(HEALTH))
+        self._beat = self.create_timer(BEAT_S, self.guarded(self.report), clock=self._steady)
+
+    def _take_parameters(self, kind: type[S]) -> None:
         overrides = {key: value.value for key, value in self._parameter_overrides.items()}
         self.settings = kind.checked(overrides, f"parameters of {kind.NODE}")
         for parameter in kind.parameters():  # the checked value: 2 is a good 2.0 here
@@ -47,15 +63,6 @@ class NodeBase[S: Settings](Answering):
         for key in (key for key, value in overrides.items() if value is True):
             if getattr(self.settings, key, "") == BARE_Y:
                 self.say(Level.OK, f"{key}: true is a bare y as ROS reads it; taken as 'y'")
-        self.refusals = Refusals(self.say, time.monotonic)
-        self.losses = Losses(self.say, time.monotonic)
-        self._ros_time = RosTime(self.say)
-        self.alone_on: list[str] = []
-        self._heard_on: dict[str, Topic] = {}
-        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
-        self._health = self.publisher(private(HEALTH))
-        self._beat = self.create_timer(BEAT_S, self.guarded(self.report), clock=self._steady)
 
     def publisher(self, topic: Topic) -> Publisher:
         """Return a publisher of `topic`."""

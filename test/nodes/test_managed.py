@@ -16,6 +16,7 @@ from std_srvs.srv import Trigger
 from selfcal_ros.bagio.reader import BagReader
 from selfcal_ros.errors import InputError, SelfcalError
 from selfcal_ros.nodes import names
+from selfcal_ros.nodes.bag_player import BagPlayer
 from selfcal_ros.nodes.compensator import CompensatorNode
 from selfcal_ros.nodes.measurement_collector import MeasurementCollector
 from selfcal_ros.nodes.pose_sequencer import PoseSequencer
@@ -157,6 +158,19 @@ def test_a_destroyed_node_leaves_the_graph(graph, name):
         graph.remove(node)
         graph.until(lambda: name not in graph.hand.get_node_names(), "its end")
         assert node.state == "finalized"  # what still refers to it may ask
+    finally:
+        gc.enable()
+
+
+@pytest.mark.parametrize("name", [*MANAGED, "bag_player"])
+def test_a_node_that_cannot_be_made_leaves_the_graph(graph, name):
+    make = MANAGED.get(name, BagPlayer)
+    gc.disable()
+    try:
+        with pytest.raises(InputError, match="hardware_id: 7 is not of type str"):
+            graph.node(make, hardware_id=7)
+        graph.until(lambda: name not in graph.hand.get_node_names(), "its end")
+        assert graph.hand.get_node_names() == ["hand"]
     finally:
         gc.enable()
 
