@@ -25,7 +25,7 @@ test: lint
 	@PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -n 3 --dist worksteal
 test-oldest:  # with the libraries of Ubuntu 24.04; e.g. make test-oldest TESTS=test/laser
 	@VENV=.venv-oldest PINS=tools/oldest.txt tools/setup.sh
-	@.venv-oldest/bin/python -m pytest -n 2 --dist worksteal $(TESTS)
+	@.venv-oldest/bin/python -m pytest -n 3 --dist worksteal $(TESTS)
 bench: setup
 	@test build/rivals/.complete -nt tools/bench-requirements.txt || { mkdir -p build/rivals; \
 		grep -v '^#' tools/bench-requirements.txt | while read -r rival; do \
