@@ -98,6 +98,38 @@ def test_the_course_of_marks_visited_once_is_that_of_their_residuals():
         assert (np.diff(course["time_s"]) > 0).all()
 
 
+@pytest.mark.parametrize("parts", [1, 8, 60, 200])
+def test_each_part_of_a_course_is_a_mean_of_readings_in_the_order_of_time(monkeypatch, parts):
+    """Two visits a mark, in an order of their own, with unequal repeats: part by part."""
+    monkeypatch.setattr(kept_residuals, "MAX_PARTS", parts)
+    rng, measurements = np.random.default_rng(2), measured(visits=True)
+    views, about = [], []
+    for view in measurements.views[:2]:
+        visits = replace(view.visits, count=rng.integers(1, 6, len(view.visits.mark)),
+                         stamp_ns=rng.permutation(view.visits.stamp_ns))
+        count = np.bincount(visits.mark, visits.count)
+        dx, dy = (np.bincount(visits.mark, visits.count * values) / count
+                  for values in (visits.dx, visits.dy))
+        views.append(replace(view, count=count.astype(int), dx=dx, dy=dy, visits=visits))
+        about.append((visits.dx - dx[visits.mark], visits.dy - dy[visits.mark]))
+    views += measurements.views[2:]
+    kept = calibrate(replace(measurements, views=tuple(views))).extra["residuals"]["views"]
+    first = min(view.visits.stamp_ns.min() for view in views if len(view.m))
+    for view, (dx, dy), entry in zip(views[:2], about, kept[:2], strict=True):
+        visits, course = view.visits, entry["course"]
+        at = view.m[visits.mark] + 3, view.n[visits.mark] + 3
+        found = {"time_s": (visits.stamp_ns - first) / 1e9, "dx": entry["dx"][at] + dx,
+                 "dy": entry["dy"][at] + dy}
+        chosen = [part for part in np.array_split(np.argsort(visits.stamp_ns), parts) if len(part)]
+        assert len(chosen) == len(course["count"])
+        for number, part in enumerate(chosen):
+            assert course["count"][number] == visits.count[part].sum()
+            for name, values in found.items():
+                mean = (values[part] * visits.count[part]).sum() / visits.count[part].sum()
+                assert course[name][number] == pytest.approx(
+                    mean, abs=1e-3 if name == "time_s" else 2e-13)
+
+
 def test_residuals_survive_the_json_form_and_are_left_out_of_large_results(monkeypatch):
     measurements = measured()
     result = calibrate(measurements)
