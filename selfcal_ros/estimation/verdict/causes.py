@@ -84,16 +84,19 @@ class Beside:
 
     Attributes
     ----------
-    inverse : ndarray
-        Pseudo-inverse of their information, (p, p).
+    rows : bool array (p,)
+        Which columns they are.
+    inverse : float array (p, p)
+        Pseudo-inverse of their information.
     rank : int
         Its rank.
-    values : ndarray
-        Their estimated coefficients, (p,).
+    values : float array (p,)
+        Their estimated coefficients.
     explained : float
         The sum of squares that they explain, m^2.
     """
 
+    rows: np.ndarray
     inverse: np.ndarray
     rank: int
     values: np.ndarray
@@ -116,7 +119,7 @@ class Pool:
         part = (vectors[:, told] / values[told]) @ vectors[:, told].T
         inverse = np.zeros((len(rows), len(rows)))
         inverse[place] = part / norms
-        return Beside(inverse, int(told.sum()), inverse @ self.right.total,
+        return Beside(rows, inverse, int(told.sum()), inverse @ self.right.total,
                       float(self.right.total @ inverse @ self.right.total))
 
     @property
@@ -220,7 +223,7 @@ def select_explanations(pool: Pool, groups: list[Group], taken: np.ndarray) -> l
     found: list[Explanation] = []
     while groups and len(found) < MAX_CAUSES:
         before = pool.beside(taken)
-        tests = [(_test(pool, taken, before, group), group) for group in groups]
+        tests = [(_test(pool, before, group), group) for group in groups]
         good = [(test, group) for test, group in tests if test is not None and test[0] < LEVEL]
         if not good:
             break
@@ -245,18 +248,13 @@ def _replaces(pool: Pool, taken: np.ndarray, group: Group, best: Group) -> bool:
     """Return whether a term explains the residuals so well that `best` adds nothing to it."""
     if SLIP in (group.name, best.name):
         return False
-    both = taken | group.rows
-    more = _test(pool, both, pool.beside(both), best)
+    more = _test(pool, pool.beside(taken | group.rows), best)
     return more is None or more[0] >= LEVEL
 
 
-def _test(pool: Pool, taken: np.ndarray, before: Beside,
-          group: Group) -> tuple[float, float] | None:
-    """Return probability and evidence of a group beside `taken`; None if nothing tells it.
-
-    `before`: what `taken` explains.
-    """
-    after = pool.beside(taken | group.rows)
+def _test(pool: Pool, before: Beside, group: Group) -> tuple[float, float] | None:
+    """Return probability and evidence of a group beside others; None if nothing tells it."""
+    after = pool.beside(before.rows | group.rows)
     gained, more = max(after.explained - before.explained, 0.0), after.rank - before.rank
     variance, dof = pool.noise(after)
     if more <= 0 or not variance > FLOOR_M**2:  # NaN where nothing is left to test against
