@@ -10,9 +10,12 @@ import stat
 import tempfile
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, ClassVar
 
 import yaml
+from yaml.composer import Composer
+from yaml.constructor import SafeConstructor
+from yaml.resolver import Resolver
 
 from selfcal_ros.errors import InputError, first_line
 
@@ -22,8 +25,8 @@ WHOLE_LIMIT = 1 << 63
 """Whole numbers in files must fit into 64 bits: everything that is one here does."""
 
 
-class YamlLoader(yaml.SafeLoader):
-    """PyYAML's safe loader that reads floats as YAML 1.2 and rcl do: 5e-4, 1.0e3, -.5.
+class _Strict(Composer, SafeConstructor, Resolver):
+    """Makes values of YAML's events: floats are those of YAML 1.2 and rcl: 5e-4, 1.0e3, -.5.
 
     It refuses a key that is given twice, a whole number beyond 64 bits, and aliases that would
     grow to more than `MAX_YAML_NODES` values.
@@ -37,6 +40,15 @@ class YamlLoader(yaml.SafeLoader):
                                               f"{MAX_YAML_NODES} values", node.start_mark)
         return node
 
+    def construct_object(self, node: yaml.Node, deep: bool = False) -> Any:
+        """Return the value of a node whose text is one of its tag: `!!int ''` is none."""
+        try:
+            return super().construct_object(node, deep)
+        except (LookupError, AttributeError) as error:
+            raise yaml.constructor.ConstructorError(
+                None, None, f"no value of the type {node.tag.rpartition(':')[2]}",
+                node.start_mark) from error
+
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict:
         """Return the mapping of a node without a key that is given twice."""
         seen = set()
@@ -48,12 +60,36 @@ class YamlLoader(yaml.SafeLoader):
                 seen.add((key.tag, key.value))
         return super().construct_mapping(node, deep)
 
-    def construct_yaml_int(self, node: yaml.ScalarNode) -> int:
+    def whole_number(self, node: yaml.ScalarNode) -> int:
         """Return a whole number that fits into 64 bits."""
-        return _whole(super().construct_yaml_int(node) if len(node.value) < 70 else node.value)
+        return _whole(self.construct_yaml_int(node) if len(node.value) < 70 else node.value)
+
+    yaml_constructors: ClassVar = SafeConstructor.yaml_constructors | {
+        "tag:yaml.org,2002:int": whole_number}
 
 
-YamlLoader.add_constructor("tag:yaml.org,2002:int", YamlLoader.construct_yaml_int)
+class YamlLoader(_Strict, yaml.SafeLoader):
+    """Reads YAML by itself; its messages are those that a user gets."""
+
+
+LOADERS: list[type[yaml.SafeLoader] | type[yaml.CSafeLoader]] = [YamlLoader]
+"""The ways to read a document, all tried before it is refused; the last one says why."""
+
+if yaml.__with_libyaml__:
+    class FastYamlLoader(_Strict, yaml.CSafeLoader):
+        """Reads YAML by libyaml, which gives events; Python makes values of them.
+
+        Parameters
+        ----------
+        text : str
+            One document.
+        """
+
+        def __init__(self, text: str) -> None:
+            yaml.CSafeLoader.__init__(self, text)
+            Composer.__init__(self)
+
+    LOADERS.insert(0, FastYamlLoader)
 
 
 def _yaml_size(node: yaml.Node, known: dict[int, int]) -> int:
@@ -76,13 +112,13 @@ def _whole(value: int | str) -> int:
 
 
 class YamlDumper(yaml.SafeDumper):
-    """Writes what `YamlLoader` reads: a text that looks like such a float is quoted."""
+    """Writes what `read_yaml` reads: a text that looks like such a float is quoted."""
 
 
 FLOATS = re.compile(r"^[-+]?(?:(?:[0-9]+\.?[0-9]*|\.[0-9]+)[eE][-+]?[0-9]+|\.[0-9]+)$")
 """What YAML 1.1 takes for text, because a dot or the sign of the exponent is missing."""
 
-for _class in (YamlLoader, YamlDumper):
+for _class in (*LOADERS, YamlDumper):
     _class.add_implicit_resolver("tag:yaml.org,2002:float", FLOATS, list("-+.0123456789"))
 
 
@@ -246,7 +282,10 @@ def read_yaml(path: str | os.PathLike) -> Any:
     """
     text = read_text(path)
     try:
-        return yaml.load(text, YamlLoader)
+        for loader in LOADERS[:-1]:  # several times as fast
+            with contextlib.suppress(yaml.YAMLError):
+                return yaml.load(text, loader)
+        return yaml.load(text, LOADERS[-1])
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark
         place = f"{path}:{mark.line + 1}:{mark.column + 1}" if mark else str(path)

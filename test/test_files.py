@@ -36,7 +36,17 @@ def names(folder):
 def yaml_of(folder, text):
     path = folder / "x.yaml"
     path.write_text(text)
-    return read_yaml(path)
+    found = read_yaml(path)
+    for loader in files.LOADERS:  # each by itself
+        assert repr(yaml.load(text, loader)) == repr(found)
+    return found
+
+
+@pytest.fixture(params=["all ways", "without libyaml"])
+def loaders(request, monkeypatch):
+    """Read as where libyaml is, and as where it is not."""
+    if request.param == "without libyaml":
+        monkeypatch.setattr(files, "LOADERS", [files.YamlLoader])
 
 
 class Crash(Exception):
@@ -180,8 +190,12 @@ def test_faults_in_json(tmp_path, text, message):
     ("a: &x 1\nb: *y", ":2:4: not YAML (found undefined alias 'y')"),
     ("a: !!python/name:os.system ''", ":1:4: not YAML (could not determine a constructor"),
     ("a: \x01", ": not YAML; give a YAML text file"),
+    ("a: {b: 1,\n    c: !!int ''}", ":2:8: not YAML (no value of the type int); correct the line"),
+    ("!!bool perhaps", ":1:1: not YAML (no value of the type bool)"),
+    ("- !!timestamp x", ":1:3: not YAML (no value of the type timestamp)"),
     ("a: 2001-13-40", ": not usable YAML (month must be in 1..12); correct the value"),
     ("[" * 2_000, ": not usable YAML (maximum recursion depth")])
+@pytest.mark.usefixtures("loaders")
 def test_faults_in_yaml(tmp_path, text, message):
     with pytest.raises(InputError) as caught:
         yaml_of(tmp_path, text)
@@ -239,9 +253,10 @@ PLAIN = st.one_of(st.none(), st.booleans(), WHOLE, st.floats(allow_nan=False), s
 def test_yaml_that_is_written_comes_back(tmp_path_factory, value):
     path = tmp_path_factory.mktemp("yaml") / "x.yaml"
     write_yaml(path, value)
-    found = read_yaml(path)
-    assert found == value
-    assert repr(found) == repr(value)
+    for found in (read_yaml(path), *(yaml.load(path.read_text(), loader)
+                                     for loader in files.LOADERS)):
+        assert found == value
+        assert repr(found) == repr(value)
 
 
 def test_keys_are_written_in_their_order(tmp_path):
@@ -292,6 +307,7 @@ def test_what_json_writes_is_what_json_reads(tmp_path):
     ("\n".join(["a0: &a0 [0, 0]"] + [f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 10)}]"
                                      for i in range(1, 12)]),
      r"f\.yaml:1:1: not YAML \(its aliases stand for more than 1000000 values\)")])
+@pytest.mark.usefixtures("loaders")
 def test_yaml_that_means_harm_or_is_ambiguous_is_refused(tmp_path, text, problem):
     path = tmp_path / "f.yaml"
     path.write_text(text)
@@ -305,9 +321,7 @@ def test_yaml_that_means_harm_or_is_ambiguous_is_refused(tmp_path, text, problem
     ("a: 9223372036854775807", {"a": 2**63 - 1}), ("a: -9223372036854775808", {"a": -2**63}),
     ("a: 0x1F", {"a": 31}), ("1: a\n'1': b\n", {1: "a", "1": "b"})])
 def test_honest_yaml_is_read(tmp_path, text, value):
-    path = tmp_path / "f.yaml"
-    path.write_text(text)
-    assert files.read_yaml(path) == value
+    assert yaml_of(tmp_path, text) == value
 
 
 @pytest.mark.parametrize("digits", [20, 400, 5000])
