@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The result of a calibration and its JSON form, schema ``selfcal.result/1``."""
 
+import math
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime
@@ -282,16 +283,17 @@ _KNOWN = {"schema", "run_id", "verdict", "model", "reference", "provenance", "do
 
 def plain(value: Any) -> Any:
     """Return `value` as JSON types: arrays as lists, NaN and infinities as None."""
+    if isinstance(value, np.generic):  # first: a float64 is a float
+        return plain(value.item())
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
     if isinstance(value, dict):
         return {key: plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
         return [plain(item) for item in value]
     if isinstance(value, np.ndarray):
-        return plain(value.tolist())
-    if isinstance(value, np.generic):
-        return plain(value.item())
-    if isinstance(value, float):
-        return value if np.isfinite(value) else None
+        whole = value.dtype.kind in "fiub" and bool(np.isfinite(value).all())
+        return value.tolist() if whole else plain(value.tolist())
     return value
 
 
