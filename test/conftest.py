@@ -7,7 +7,9 @@ The number is set before NumPy is loaded; processes that tests start inherit it.
 
 import gc
 import os
+from pathlib import Path
 
+import pytest
 from hypothesis import given, settings, strategies
 
 for _libraries in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
@@ -27,6 +29,33 @@ def first_example(nothing: None) -> None:
 
     Older versions ask the garbage collector, which does not know what is frozen, and warn.
     """
+
+
+def pytest_collection(session):
+    """Let each of several workers begin with modules of its own.
+
+    All of them import all modules; in a fresh clone the one that comes first compiles a module, and
+    without this they come at once and each compiles it.
+    """
+    folders = [Path(arg) for arg in session.config.args if Path(arg).is_dir()]
+    if len(folders) < len(session.config.args) or not (turn := worker(session.config)):
+        return
+    modules = sorted(str(path) for folder in folders for path in folder.rglob("test_*.py"))
+    first = len(modules) * turn[0] // turn[1]
+    session.config.args[:] = modules[first:] + modules[:first]
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(config, items):
+    """Bring the tests of all workers into one order."""
+    if worker(config):
+        items.sort(key=lambda item: item.path)
+
+
+def worker(config: pytest.Config) -> tuple[int, int] | None:
+    """Tell which of how many workers of pytest-xdist this process is."""
+    told = getattr(config, "workerinput", None)
+    return told and (int(told["workerid"].removeprefix("gw")), told["workercount"])
 
 
 def pytest_collection_finish():
