@@ -17,7 +17,7 @@ from selfcal_ros.estimation.datum.scale import scale_datum
 from selfcal_ros.estimation.joint.problem import bounded_ratio
 from selfcal_ros.estimation.joint.saved_terms import KEY, MAX_SITES, factors_of
 from selfcal_ros.estimation.law.solve import law_covariance
-from selfcal_ros.estimation.normal.angular import AngularSystem
+from selfcal_ros.estimation.normal.cache import Marks, system_of
 from selfcal_ros.estimation.normal.equations import NormalEquations
 from selfcal_ros.estimation.normal.grid import GridSystem
 from selfcal_ros.estimation.normal.planned import planned_system
@@ -192,10 +192,10 @@ def _read_system(result: CalibrationResult) -> NormalEquations:
             grid.append((index, pose, _weights(v.read_grid, field, of_grid)))
     angular = np.array([weight for *_, weight in lines]).reshape(len(lines),
                                                                 artifact.angular_count)
-    return NormalEquations(
-        GridSystem(tuple(at for _, at, _ in grid), np.array([weight for *_, weight in grid])),
-        AngularSystem(tuple(turn for _, turn, _ in lines), angular),
-        tuple(index for index, *_ in grid), tuple(index for index, *_ in lines))
+    return system_of(
+        Marks(tuple(at for _, at, _ in grid), np.array([weight for *_, weight in grid]),
+              tuple(index for index, *_ in grid)),
+        Marks(tuple(turn for _, turn, _ in lines), angular, tuple(index for index, *_ in lines)))
 
 
 def _is_read(kept: Any) -> bool:

@@ -3,12 +3,16 @@
 
 import hashlib
 from collections import OrderedDict
+from dataclasses import dataclass
 from threading import Lock
+
+import numpy as np
 
 from selfcal_ros.estimation.lattice.readings import AngularData, GridData
 from selfcal_ros.estimation.normal.angular import AngularSystem
 from selfcal_ros.estimation.normal.equations import NormalEquations
 from selfcal_ros.estimation.normal.grid import GridSystem
+from selfcal_ros.model.view import LatticePose
 
 CACHED = 16
 CACHED_READINGS = 4_000_000
@@ -19,18 +23,43 @@ _cache: OrderedDict[tuple, NormalEquations] = OrderedDict()
 _lock = Lock()
 
 
+@dataclass(frozen=True, eq=False)
+class Marks[Pose]:
+    """Which marks of one kind were read, and how often.
+
+    Attributes
+    ----------
+    poses : tuple
+        Of the views in which they were: lattice poses for the grid, turns in lines.
+    weight : float array (views, ...)
+        Weights of the marks on the plate.
+    index : tuple of int
+        Position of the views in the measurement.
+    """
+
+    poses: tuple[Pose, ...]
+    weight: np.ndarray
+    index: tuple[int, ...]
+
+
 def system_for(grid: GridData, angular: AngularData) -> NormalEquations:
     """Return the system of a measured plan, from the cache if the same marks were read."""
+    return system_of(Marks(grid.poses, grid.weight, grid.index),
+                     Marks(angular.turns, angular.weight, angular.index))
+
+
+def system_of(grid: Marks[LatticePose], angular: Marks[int]) -> NormalEquations:
+    """Return the system of marks that were read, from the cache if it is known."""
     digest = hashlib.blake2b(grid.weight, digest_size=16)
     digest.update(angular.weight)
-    key = (grid.weight.shape, grid.poses, grid.index, angular.weight.shape, angular.turns,
+    key = (grid.weight.shape, grid.poses, grid.index, angular.weight.shape, angular.poses,
            angular.index, digest.digest())
     with _lock:
         if key in _cache:
             _cache.move_to_end(key)
             return _cache[key]
     system = NormalEquations(GridSystem(grid.poses, grid.weight),
-                             AngularSystem(angular.turns, angular.weight), grid.index,
+                             AngularSystem(angular.poses, angular.weight), grid.index,
                              angular.index)
     with _lock:
         _cache[key] = system

@@ -12,6 +12,8 @@ from scipy.stats import binom, norm
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.comparison.maps import compare, compare_with_laser
+from selfcal_ros.estimation.normal import cache
+from selfcal_ros.estimation.normal.equations import NormalEquations
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.simulation.truth import hu_plan, random_truth, simulate_measurements
@@ -62,6 +64,19 @@ def test_a_map_against_itself():
     found = compare(A, A)
     assert found.rms_m == found.max_m == found.rms_theta_rad == 0.0
     assert found.xy.chi2_ratio == 0.0 and found.xy.p == 1.0
+
+
+def test_maps_of_the_same_marks_share_their_equations_and_others_do_not(monkeypatch):
+    made = []
+    monkeypatch.setattr(cache, "NormalEquations",
+                        lambda *given: made.append(given) or NormalEquations(*given))
+    cache.clear_cache()
+    compare(A, B)
+    assert len(made) == 1
+    repeated = replace(B, views=tuple(replace(v, read_angular=2) for v in B.views))
+    other = compare(A, repeated)
+    assert len(made) == 2 and other.theta.p == pytest.approx(compare(A, B).theta.p)
+    assert other.xy.p != compare(A, B).xy.p  # lines that weigh more tell more of the rotations
 
 
 def test_known_difference_is_found_with_its_sign_and_size():
