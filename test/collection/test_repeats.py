@@ -44,6 +44,20 @@ def test_views_with_few_pairs_of_repeats_reject_no_more(marks):
     assert bad <= binom.ppf(0.999, total, 1e-5)
 
 
+@pytest.mark.parametrize("side", [1.0, -1.0])
+@pytest.mark.parametrize(("marks", "cut"), [  # limit / 0.6745 sqrt(2) (1 + 4/sqrt(2n) + 8/2n)
+    (6, 6 / 0.9538725524 * (1 + 4 / 12**0.5 + 8 / 12)),
+    (9, 6 / 0.9538725524 * (1 + 4 / 18**0.5 + 8 / 18)),
+    (100, 6 / 0.9538725524 * (1 + 4 / 200**0.5 + 8 / 200))])
+def test_where_an_outlier_begins_is_as_by_hand(marks, cut, side):
+    """Marks read at -1, 0 and 1: half of their pairs differ by no more than 1."""
+    key, values = np.repeat(np.arange(marks), 3), np.tile([-1.0, 0.0, 1.0], marks)
+    for off, expected in ((cut - 1e-6, []), (cut + 1e-6, [5])):
+        values[3:6] = [-side, 0.0, side * off]
+        found = reduce_repeats(key, values[None] * SIGMA, np.zeros(len(key)), limit=LIMIT)
+        assert np.flatnonzero(found.outlier).tolist() == expected
+
+
 @pytest.mark.parametrize("repeats", range(3, 8))
 @pytest.mark.parametrize("marks", [121, 441])
 def test_every_outlier_of_1_to_20_um_is_caught(repeats, marks):

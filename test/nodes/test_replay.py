@@ -8,6 +8,9 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from selfcal_msgs.srv import SaveMap
+from std_msgs.msg import String
+from std_srvs.srv import Trigger
 
 from selfcal_ros.bagio.offline import bag_input
 from selfcal_ros.cli import replay as replay_verb
@@ -15,6 +18,7 @@ from selfcal_ros.cli.main import main as selfcal
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import read_json, write_json
 from selfcal_ros.model.result import result_from_dict, result_to_dict, with_input
+from selfcal_ros.nodes import names
 from selfcal_ros.nodes.measurement_collector import MeasurementCollector
 from selfcal_ros.nodes.player import Player
 from selfcal_ros.nodes.pose_sequencer import PoseSequencer
@@ -143,6 +147,35 @@ def test_a_deficient_bag_ends_with_code_3_and_says_why(graph, tmp_path, capfd):
     assert selfcal(["solve", str(bag), "--quiet"]) == 3
     [same] = [text for text in capfd.readouterr().err.splitlines() if "selfcal solve: " in text]
     assert line.removeprefix("selfcal replay: ") == same.removeprefix("selfcal solve: ")
+
+
+def test_the_map_is_saved_once_the_solver_has_solved_what_the_collector_sent_last(graph):
+    told, saved, turns = [], [], []
+
+    def answer(_, response):
+        response.success, response.message = True, "of all views"
+        return response
+
+    def save(_, response):
+        saved.append(told[-1])
+        response.success = True
+        return response
+    graph.hand.create_service(Trigger, "measurement_collector/finish", answer)
+    graph.hand.create_service(SaveMap, "solver/save_map", save)
+    solver = graph.hand.create_publisher(String, "solver/solved", names.SOLVED.qos)
+
+    def tell(text):
+        told.append(text)
+        solver.publish(String(data=text))
+    tell("of three views")
+    player = SimpleNamespace(matched=list, step=lambda: None, played=1, total=1, done=True,
+                             sent={}, heard={}, playlist=SimpleNamespace(lost=[]))
+    session = graph.add(ReplaySession(lambda _: player, "map.json", context=graph.context))
+    graph.hand.create_timer(0.005, lambda: turns.append(session._digest))
+    graph.until(lambda: turns.count("of all views") > 20, "the session to wait for the solver")
+    tell("of all views")
+    graph.until(session.finished.done, "the end of the session")
+    assert (saved, session.exit_code) == (["of all views"], 0)
 
 
 @pytest.mark.parametrize("options, problem", [
