@@ -2,6 +2,7 @@
 """From the detections of one view to its readings: a pure function of their set."""
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,7 +17,8 @@ from selfcal_ros.collection.marks.repeats import reduce_repeats
 from selfcal_ros.collection.marks.visits import grid_visits
 from selfcal_ros.collection.messages import Kind
 from selfcal_ros.collection.reasons import Reason, reason_where
-from selfcal_ros.collection.stage.exposures import Exposures
+from selfcal_ros.collection.stage.encoder import GOOD, MOVING, REASONS
+from selfcal_ros.collection.stage.exposures import Exposures, JointAt
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Sense, ViewReadings
 from selfcal_ros.model.view import View
@@ -64,13 +66,13 @@ def clean(detections: np.ndarray, rules: Rules, *, scored: bool,
     for field in ("ox", "oy", "ot", "sigma", "score"):
         finite &= np.isfinite(d[field])
     rejected[Reason.NOT_FINITE] = int((~finite).sum())
-    d = d if finite.all() else d[finite]
+    d = _where(finite, d)
     unique = _canonical(d)
     rejected[Reason.DUPLICATE] += len(d) - len(unique)
     if scored:
         low = unique["score"] < rules.min_score
         rejected[Reason.LOW_SCORE] += int(low.sum())
-        unique = unique[~low]
+        unique = _where(~low, unique)
     return unique, +rejected
 
 
@@ -107,8 +109,8 @@ def reduce_view(artifact: Artifact, view: View, detections: np.ndarray, *,
     `exposures` hold the stage at the instants of at least these detections.
     """
     rejected: Counter = Counter()
-    grid = detections[detections["kind"] == Kind.GRID]
-    angular = detections[detections["kind"] == Kind.ANGULAR]
+    grid = _where(detections["kind"] == Kind.GRID, detections)
+    angular = _where(detections["kind"] == Kind.ANGULAR, detections)
     readings, phi = _reduce_grid(artifact, view, grid, exposures, rules, rejected)
     part = _reduce_angular(artifact, view, angular, exposures, rules, rejected, phi)
     used = int(readings["count"].sum() + part["count_theta"].sum())
@@ -119,7 +121,7 @@ def reduce_view(artifact: Artifact, view: View, detections: np.ndarray, *,
 def _reduce_grid(artifact: Artifact, view: View, d: np.ndarray, exposures: Exposures, rules: Rules,
                  rejected: Counter) -> tuple[dict, float | None]:
     stage = exposures.at(d["stamp"])
-    why, places = _first(stage.x.reason, stage.y.reason, stage.theta.moving), PlaceList()
+    why, places = _reasons((stage.x, stage.y), (stage.theta,)), PlaceList()
     places.add(why, stage.x.position, stage.y.position)
     d, (x, y, *approach) = _keep(d, why, rejected, stage.x.position, stage.y.position,
                                  *stage.approach)
@@ -151,7 +153,7 @@ def _reduce_grid(artifact: Artifact, view: View, d: np.ndarray, exposures: Expos
 def _reduce_angular(artifact: Artifact, view: View, d: np.ndarray, exposures: Exposures,
                     rules: Rules, rejected: Counter, phi: float | None) -> dict:
     stage = exposures.at(d["stamp"])
-    why = _first(stage.theta.reason, stage.x.moving, stage.y.moving)
+    why = _reasons((stage.theta,), (stage.x, stage.y))
     # beyond half a turn an offset cannot be a valid observation, though it may wrap to a small one
     why[(why == None) & (np.abs(d["ot"]) > np.pi)] = Reason.TOO_FAR  # noqa: E711
     d, (theta,) = _keep(d, why, rejected, stage.theta.position)
@@ -172,11 +174,22 @@ def _reading(sense: Sense, position: np.ndarray,
     return offset - position if sense is Sense.PLATE_MOVES else position + offset
 
 
-def _first(reasons: np.ndarray, *more: np.ndarray) -> np.ndarray:
-    """Return the first reason of each detection, None where there is none: each counts once."""
-    for other in more:
-        reasons = np.where(reasons == None, other, reasons)  # noqa: E711
-    return reasons
+def _reasons(needed: Sequence[JointAt], others: Sequence[JointAt]) -> np.ndarray:
+    """Return the first reason of each detection, None where there is none: each counts once.
+
+    Of the `needed` joints the position must be known, the others must not move.
+    """
+    codes = needed[0].code
+    for joint in needed[1:]:
+        codes = np.where(codes == GOOD, joint.code, codes)
+    for joint in others:
+        codes = np.where((codes == GOOD) & joint.moving, MOVING, codes)
+    return REASONS[codes]
+
+
+def _where(good: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """Return some of the rows; all of them as they are, without a copy."""
+    return rows if good.all() else rows[good]
 
 
 def _keep(d: np.ndarray, reasons: np.ndarray, rejected: Counter, *values: np.ndarray,

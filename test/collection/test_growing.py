@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from selfcal_ros.collection.stage.growing import GrowingTable
+from selfcal_ros.collection.stage.growing import GrowingColumns, GrowingTable
 
 PAIR = np.dtype([("a", np.int64), ("b", float)])
 
@@ -51,3 +51,14 @@ def test_rows_may_be_changed_in_place():
     table.append(rows_of(0, 3))
     table.rows["a"][1] = 7
     assert table.rows["a"].tolist() == [0, 7, 2]
+
+
+def test_columns_take_the_same_rows_each_with_its_own_value():
+    columns = GrowingColumns({"a": "i8", "b": "f8", "c": "?"})
+    columns.insert(np.zeros(3, dtype=int), {"a": 5, "b": 0.5})
+    columns["b"][:] = [1.0, 2.0, 3.0]
+    columns.insert(np.array([0, 2, 2, 3]), {"a": 7, "b": np.nan, "c": True})
+    assert columns["a"].tolist() == [7, 5, 5, 7, 7, 5, 7]
+    np.testing.assert_array_equal(columns["b"], [np.nan, 1, 2, np.nan, np.nan, 3, np.nan])
+    assert columns["c"].tolist() == [True, False, False, True, True, False, True]
+    assert [columns[name].dtype for name in "abc"] == [np.int64, np.float64, np.bool_]

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from selfcal_ros.collection.reasons import Reason, reason_where
+from selfcal_ros.collection.reasons import Reason
 from selfcal_ros.collection.stage.samples import Limits, Samples, SampleStore
 from selfcal_ros.units import NS_PER_S
 
@@ -24,6 +24,10 @@ for the noise, the other gives as many more."""
 LOOK_BACK_NS = 60_000_000_000
 """Time before an exposure in which a motion is looked for."""
 NEVER, EVER = np.iinfo(np.int64).min, np.iinfo(np.int64).max
+GOOD, NO_ENCODER, MOVING, CONTRADICTION = range(4)
+"""What the encoder says of an exposure, in codes: they take an eighth of the memory of reasons."""
+REASONS = np.array([None, Reason.NO_ENCODER, Reason.MOVING, Reason.CONTRADICTION], dtype=object)
+"""The reasons behind the codes; None where the position is good."""
 AS_BEFORE = 2
 """Direction of approach of an exposure before which there was no motion: that of the last one."""
 
@@ -69,12 +73,14 @@ class JointTrack:
         return float(np.median(np.diff(t)) / NS_PER_S) if len(t) > 1 else float("nan")
 
     def query(self, stamps_ns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return `Series.query` of all samples."""
-        return self._all().query(stamps_ns)
+        """Return `Series.query` of all samples, with reasons in place of their codes."""
+        positions, codes = self._all().query(stamps_ns)
+        return positions, REASONS[codes]
 
     def moving(self, stamps_ns: np.ndarray) -> np.ndarray:
-        """Return `Series.moving` of all samples."""
-        return self._all().moving(stamps_ns)
+        """Return `Reason.MOVING` where the joint is known to move, else None, by all samples."""
+        series = self._all()
+        return REASONS[np.where(series.moving(stamps_ns, series.query(stamps_ns)[1]), MOVING, GOOD)]
 
     def approach(self, stamps_ns: np.ndarray, positions: np.ndarray, *,
                  threshold: float) -> np.ndarray:
@@ -145,7 +151,7 @@ class Series:
         return np.remainder(a + np.pi, 2 * np.pi) - np.pi if self.limits.wraps else a
 
     def query(self, stamps_ns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the interpolated positions and the reason why each cannot be used.
+        """Return the interpolated positions and whether each can be used.
 
         Parameters
         ----------
@@ -156,34 +162,31 @@ class Series:
         -------
         positions : float array (Q,)
             m or rad; NaN where there is none.
-        reasons : object array (Q,)
-            None where the position is good, else a `Reason`.
+        codes : int8 array (Q,)
+            `GOOD`, or why not: `NO_ENCODER`, `MOVING`, `CONTRADICTION`.
         """
-        reasons = np.full(len(stamps_ns), None, dtype=object)
+        codes = np.zeros(len(stamps_ns), dtype=np.int8)
         if not len(self) or not len(stamps_ns):
-            reasons[:] = Reason.NO_ENCODER
-            return np.full(len(stamps_ns), np.nan), reasons
+            codes[:] = NO_ENCODER
+            return np.full(len(stamps_ns), np.nan), codes
         t, p = self.t, self.p
         before, after, exact, outside = self._around(stamps_ns)
         gap = t[after] - t[before]
         step = self._difference(p[after] - p[before])
         weight = (stamps_ns - t[before]) / np.where(gap > 0, gap, 1)
         moving, reversing = self._motion(before, after, exact)
-        reasons[moving] = Reason.MOVING
-        reasons[reversing | self._contradicted(stamps_ns, before, after)] = Reason.CONTRADICTION
-        reasons[outside] = Reason.NO_ENCODER
-        return np.where(outside, np.nan, p[before] + step * weight), reasons
+        codes[moving] = MOVING
+        codes[reversing | self._contradicted(stamps_ns, before, after)] = CONTRADICTION
+        codes[outside] = NO_ENCODER
+        return np.where(outside, np.nan, p[before] + step * weight), codes
 
-    def moving(self, stamps_ns: np.ndarray, reasons: np.ndarray | None = None) -> np.ndarray:
-        """Return `Reason.MOVING` where this joint is known to move, else None, object array (Q,).
+    def moving(self, stamps_ns: np.ndarray, codes: np.ndarray) -> np.ndarray:
+        """Return where this joint is known to move, bool array (Q,); `codes` are those of `query`.
 
-        `reasons` are those of `query`, if they are known. For joints that a reading does not need:
-        one that has no samples near, or whose samples contradict each other, tells nothing; and
-        displacements within noise are not motion.
+        For joints that a reading does not need: one that has no samples near, or whose samples
+        contradict each other, tells nothing; and displacements within noise are not motion.
         """
-        if reasons is None:
-            _, reasons = self.query(stamps_ns)
-        fast = reasons == Reason.MOVING
+        fast = codes == MOVING
         if fast.any():
             t, p, v = self.t, self.p, self.v
             before, after, exact, _ = self._around(stamps_ns)
@@ -199,7 +202,7 @@ class Series:
             told = np.where(told > BEYOND_NOISE * speed_noise, told, 0.0)
             told *= (t[right] - t[left]) / NS_PER_S
             fast &= np.fmax(way, told) > BEYOND_NOISE * np.sqrt(2) * noise
-        return reason_where(fast, Reason.MOVING)
+        return fast
 
     def approach(self, stamps_ns: np.ndarray, positions: np.ndarray, *, threshold: float,
                  ) -> np.ndarray:

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from selfcal_ros.collection.reasons import Reason, reason_where
 from selfcal_ros.collection.stage.encoder import (
     EVER,
     LOOK_BACK_NS,
@@ -19,17 +18,15 @@ from selfcal_ros.collection.stage.encoder import (
     Series,
     filled,
 )
-from selfcal_ros.collection.stage.growing import GrowingTable
+from selfcal_ros.collection.stage.growing import GrowingColumns, GrowingTable
 from selfcal_ros.collection.stage.samples import NO_STAMPS
 
-REASONS = np.array([None, Reason.NO_ENCODER, Reason.MOVING, Reason.CONTRADICTION], dtype=object)
-"""Reasons that the encoder gives, by the code that is kept of them."""
 MOST_SAMPLES = 300_000
 """Samples of a joint that are looked at together."""
-ROW = np.dtype([
-    ("stamp", "i8"), ("position", "f8", 3), ("reason", "i1", 3), ("moving", "?", 3),
-    ("approach", "i1", 2), ("first", "i8", 3), ("last", "i8", 3)])
-"""One instant: what is known of x, y, theta, and between which stamps samples of each decide it."""
+COLUMNS = {"position": "f8", "reason": "i1", "moving": "?", "first": "i8", "last": "i8"}
+"""What is known of a joint at each instant, and between which stamps its samples decide it."""
+APPROACH = {"motion": "i1", "approach": "i1"}
+"""The last motion of a linear joint as samples tell it, and the sign with `AS_BEFORE` filled in."""
 
 
 @dataclass(frozen=True)
@@ -53,14 +50,14 @@ class JointAt:
     ----------
     position : float array
         Indicated position, m or rad; NaN where there is none.
-    reason : object array
-        Why the position cannot be used; None where it can.
-    moving : object array
-        `Reason.MOVING` where the joint is known to move, for readings that do not need it.
+    code : int8 array
+        Why the position cannot be used, see `encoder.REASONS`.
+    moving : bool array
+        Where the joint is known to move, for readings that do not need it.
     """
 
     position: np.ndarray
-    reason: np.ndarray
+    code: np.ndarray
     moving: np.ndarray
 
 
@@ -87,21 +84,31 @@ class Exposures:
 
     def __init__(self, tracks: Tracks, *, approach_threshold_m: float) -> None:
         self._tracks, self._threshold_m = tracks, approach_threshold_m
-        self._table = GrowingTable(ROW)
-        self._approach = np.zeros((2, 0), dtype=np.int8)
+        self._stamps = GrowingTable(np.dtype(np.int64))
+        self._joints = [GrowingColumns(COLUMNS | (APPROACH if linear else {}))
+                        for linear in (True, True, False)]
 
     def __len__(self) -> int:
         """Return the number of instants."""
-        return len(self._table)
+        return len(self._stamps)
 
     def at(self, stamps_ns: np.ndarray) -> StageAt:
         """Return the stage at some of the instants, in the order that is asked for."""
-        index = _as_slice(np.searchsorted(self._table.rows["stamp"], stamps_ns))
-        rows = self._table.rows[index]
-        x, y, theta = (JointAt(rows["position"][:, j], REASONS[rows["reason"][:, j]],
-                               reason_where(rows["moving"][:, j], Reason.MOVING))
-                       for j in range(3))
-        return StageAt(x, y, theta, self._approach[:, index])
+        index = self._index(stamps_ns)
+        x, y, theta = (JointAt(joint["position"][index], joint["reason"][index],
+                               joint["moving"][index]) for joint in self._joints)
+        return StageAt(x, y, theta, np.stack([joint["approach"][index]
+                                              for joint in self._joints[:2]]))
+
+    def _index(self, stamps_ns: np.ndarray) -> np.ndarray | slice:
+        """Return where some of the instants stand; of neighbours as a slice, which copies none."""
+        known = self._stamps.rows
+        if len(stamps_ns):
+            first = int(np.searchsorted(known, stamps_ns[0]))
+            here = slice(first, first + len(stamps_ns))
+            if np.array_equal(known[here], stamps_ns):
+                return here
+        return np.searchsorted(known, stamps_ns)
 
     def update(self, stamps_ns: np.ndarray) -> np.ndarray:
         """Take further instants of exposure and what came of the encoder since the last time.
@@ -120,22 +127,21 @@ class Exposures:
         if not (stamps_ns[1:] > stamps_ns[:-1]).all():
             stamps_ns = np.unique(stamps_ns)
         due = self._insert(stamps_ns, due)
-        known = due & (self._approach != NEW).all(axis=0)
-        before = self._table.rows[known]
+        known = np.flatnonzero(due & (self._joints[0]["approach"] != NEW))
+        before = self._told(known)
         for group in self._groups(np.flatnonzero(due)):
             self._look_up(group)
         changed = np.zeros(len(due), dtype=bool)
-        changed[known] = _differ(before, self._table.rows[known])
+        changed[known] = _differ(before, self._told(known))
         return self._fill(due, changed)
 
     def _due_to_samples(self) -> np.ndarray:
         """Return which instants may depend on samples that came since the last time."""
-        rows = self._table.rows
-        due = np.zeros(len(rows), dtype=bool)
-        for joint, track in enumerate(self._tracks):  # one without samples waits for its own
-            new = track.store.new_stamps()
-            first, last = rows["first"][:, joint], rows["last"][:, joint]
-            if len(new) and len(rows):
+        due = np.zeros(len(self), dtype=bool)
+        for joint, track in zip(self._joints, self._tracks, strict=True):
+            new = track.store.new_stamps()  # one without samples waits for its own
+            first, last = joint["first"], joint["last"]
+            if len(new) and len(due):
                 near = np.flatnonzero((last >= new[0]) & (first <= new[-1]))
                 due[near] |= (np.searchsorted(new, first[near], "left")
                               < np.searchsorted(new, last[near], "right"))
@@ -143,7 +149,7 @@ class Exposures:
 
     def _insert(self, stamps_ns: np.ndarray, due: np.ndarray) -> np.ndarray:
         """Add the instants that are new; return `due` with them and with those behind them."""
-        known = self._table.rows["stamp"]
+        known = self._stamps.rows
         at = np.searchsorted(known, stamps_ns)
         fresh = np.ones(len(stamps_ns), dtype=bool)
         inside = at < len(known)
@@ -151,15 +157,17 @@ class Exposures:
         at, stamps_ns = at[fresh], stamps_ns[fresh]
         behind = at[at < len(known)]
         due[behind] = True  # the time since the exposure before is another one
-        rows = np.zeros(len(at), dtype=ROW)
-        rows["stamp"] = stamps_ns
-        rows["first"], rows["last"] = NEVER, EVER
-        self._table.insert(at, rows)
+        self._stamps.insert(at, stamps_ns)
+        for joint in self._joints:
+            joint.insert(at, {"first": NEVER, "last": EVER, "approach": NEW})
         if not len(behind):  # as a rule, and faster
-            self._approach = np.append(self._approach, np.full((2, len(at)), NEW, np.int8), axis=1)
             return np.append(due, np.ones(len(at), dtype=bool))
-        self._approach = np.insert(self._approach, at, NEW, axis=1)
         return np.insert(due, at, True)
+
+    def _told(self, index: np.ndarray) -> list[np.ndarray]:
+        """Return positions, reasons and motions of all joints at some of the instants."""
+        return [joint[name][index] for joint in self._joints
+                for name in ("position", "reason", "moving")]
 
     def _groups(self, due: np.ndarray) -> list[np.ndarray]:
         """Return the instants that are due in groups with few enough samples each, (n,) each.
@@ -181,34 +189,33 @@ class Exposures:
 
     def _since(self, index: np.ndarray) -> np.ndarray:
         """Return from when on a motion before each instant is looked for."""
-        stamps = self._table.rows["stamp"]
+        stamps = self._stamps.rows
         earliest = np.maximum(stamps[index], NEVER + LOOK_BACK_NS) - LOOK_BACK_NS
         before = np.where(index > 0, stamps[np.maximum(index - 1, 0)], NEVER)
         return np.maximum(before, earliest)
 
     def _window(self, group: np.ndarray) -> tuple[int, int]:
-        return int(self._since(group[:1])[0]), int(self._table.rows["stamp"][group[-1]])
+        return int(self._since(group[:1])[0]), int(self._stamps.rows[group[-1]])
 
     def _look_up(self, group: np.ndarray) -> None:
         """Look up a group of instants, all that lie between its ends."""
         start, end = self._window(group)
         index = np.arange(group[0], group[-1] + 1)
-        rows, since = self._table.rows[group[0]:group[-1] + 1], self._since(index)
-        for joint, track in enumerate(self._tracks):
+        here = slice(group[0], group[-1] + 1)
+        stamps, since = self._stamps.rows[here], self._since(index)
+        for number, (joint, track) in enumerate(zip(self._joints, self._tracks, strict=True)):
             series = track.between(start, end)
-            position, reason = series.query(rows["stamp"])
-            rows["position"][:, joint] = position
-            rows["reason"][:, joint] = _codes(reason)
-            rows["moving"][:, joint] = series.moving(
-                rows["stamp"], reason) == Reason.MOVING
-            linear = joint < 2
+            position, codes = series.query(stamps)
+            joint["position"][here], joint["reason"][here] = position, codes
+            joint["moving"][here] = series.moving(stamps, codes)
+            linear = number < N_LINEAR
             if linear:
-                rows["approach"][:, joint] = self._approach_of(series, index, position)
-            first, last = series.decided_by(rows["stamp"], since if linear else None)
-            rows["first"][:, joint], rows["last"][:, joint] = first, last
+                joint["motion"][here] = self._motions(series, index, position)
+            joint["first"][here], joint["last"][here] = series.decided_by(
+                stamps, since if linear else None)
 
-    def _approach_of(self, series: Series, index: np.ndarray, position: np.ndarray) -> np.ndarray:
-        stamps, first = self._table.rows["stamp"], index[0]
+    def _motions(self, series: Series, index: np.ndarray, position: np.ndarray) -> np.ndarray:
+        stamps, first = self._stamps.rows, index[0]
         if first == 0:
             return series.approach(stamps[index], position, threshold=self._threshold_m)
         # behind the exposure before, whose own samples may not all be here
@@ -221,37 +228,24 @@ class Exposures:
         if not due.any():
             return NO_STAMPS
         start = int(due.argmax())  # what is before the first that was looked up stays as it is
-        old = self._approach[:, start:]
-        column = self._table.rows["approach"][start:].T
-        before = self._approach[:, start - 1:start] if start else np.zeros((2, 1), dtype=np.int8)
-        found = np.stack([filled(row)[1:] for row in np.concatenate([before, column], axis=1)])
-        changed = changed[start:] | ((found != old) & (old != NEW)).any(axis=0)
-        changed &= (old != NEW).all(axis=0)
-        self._approach[:, start:] = found
-        return self._table.rows["stamp"][start:][changed]
+        changed, known = changed[start:], np.zeros(0, dtype=bool)
+        for joint in self._joints[:N_LINEAR]:
+            old = joint["approach"][start:]
+            before = joint["approach"][start - 1:start] if start else np.zeros(1, dtype=np.int8)
+            found = filled(np.concatenate([before, joint["motion"][start:]]))[1:]
+            known = old != NEW
+            changed |= found != old
+            joint["approach"][start:] = found
+        return self._stamps.rows[start:][changed & known]
 
 
 NEW = 9
 """Direction of approach of an instant that has not been looked up yet."""
+N_LINEAR = 2
+"""Joints whose direction of approach is known: the first ones."""
 
 
-def _as_slice(index: np.ndarray) -> np.ndarray | slice:
-    """Return an index of rows one behind the other as a slice, which copies nothing."""
-    if len(index) and (np.diff(index) == 1).all():
-        return slice(int(index[0]), int(index[-1]) + 1)
-    return index
-
-
-def _codes(reasons: np.ndarray) -> np.ndarray:
-    out = np.zeros(len(reasons), dtype=np.int8)
-    told = np.flatnonzero(reasons != None)  # noqa: E711
-    for code, reason in enumerate(REASONS[1:], 1):
-        out[told[reasons[told] == reason]] = code
-    return out
-
-
-def _differ(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return in which rows positions, reasons or motions are not the same."""
-    same = (a["position"] == b["position"]) | (np.isnan(a["position"]) & np.isnan(b["position"]))
-    same &= (a["reason"] == b["reason"]) & (a["moving"] == b["moving"])
-    return ~same.all(axis=1)
+def _differ(before: list[np.ndarray], after: list[np.ndarray]) -> np.ndarray:
+    """Return at which instants something else is told; NaN is equal to NaN."""
+    return np.array([(a != b) & ((a == a) | (b == b))
+                     for a, b in zip(before, after, strict=True)]).any(axis=0)

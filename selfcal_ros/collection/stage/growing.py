@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A table that grows at its end at no cost, and elsewhere at that of a copy."""
+"""Tables that grow at their end at no cost, and elsewhere at that of a copy."""
+
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -37,3 +39,25 @@ class GrowingTable:
             return
         self._room = np.insert(self.rows, at, rows)
         self._count = len(self._room)
+
+
+class GrowingColumns:
+    """Columns that grow together, each by itself in memory: to look at one costs no other.
+
+    Parameters
+    ----------
+    kinds : dict
+        Name -> numpy type of a column.
+    """
+
+    def __init__(self, kinds: Mapping[str, str]) -> None:
+        self._columns = {name: GrowingTable(np.dtype(kind)) for name, kind in kinds.items()}
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        """Return a column, as a view that may be written to; valid until rows are added."""
+        return self._columns[name].rows
+
+    def insert(self, at: np.ndarray, values: Mapping[str, float]) -> None:
+        """Add rows with the same values in front of the rows `at` (rising); unnamed ones are 0."""
+        for name, column in self._columns.items():
+            column.insert(at, np.full(len(at), values.get(name, 0), dtype=column.rows.dtype))
