@@ -83,14 +83,13 @@ class ViewCache:
         interval = timeline.assign(self.table["stamp"][start:])
         place = self._place.rows[start:]
         place["interval"], place["view"] = interval, view_of[interval]
-        touched = [np.unique(self.view_of[known:])]
+        touched = _different(self.view_of[known:])
         if old is not None:
             moved = old != self.view_of[:known]
-            touched += [np.unique(old[moved]), np.unique(self.view_of[:known][moved])]
+            touched |= _different(old[moved]) | _different(self.view_of[:known][moved])
         stamps = np.concatenate(self._changed)
-        touched.append(np.unique(view_of[timeline.assign(stamps)]))
         self._timeline, self._changed = timeline, [NO_STAMPS]
-        return set(np.concatenate(touched).tolist())
+        return touched | _different(view_of[timeline.assign(stamps)])
 
     def _loose(self, timeline: Timeline) -> Counter:
         """Return reason -> number of detections that belong to no view."""
@@ -103,7 +102,8 @@ class ViewCache:
         return +loose
 
     def _reduce(self, timeline: Timeline, index: int, exposures: Exposures) -> ViewReadings:
-        detections = self.table[self.view_of == index]
+        rows = np.flatnonzero(self.view_of == index)
+        detections = self.table[_as_slice(rows)]
         good, reasons = clean(detections, self._rules, scored=self._scored)
         readings = reduce_view(*timeline.planned_view(index), good,
                                exposures=exposures, rules=self._rules)
@@ -113,3 +113,15 @@ class ViewCache:
         total = Counter(readings.rejected)
         total.update({str(reason): count for reason, count in reasons.items()})
         return replace(readings, rejected=dict(sorted(total.items())))
+
+
+def _different(views: np.ndarray) -> set[int]:
+    """Return the different numbers of views, -1 among them."""
+    return set((np.flatnonzero(np.bincount(views + 1)) - 1).tolist())
+
+
+def _as_slice(rows: np.ndarray) -> np.ndarray | slice:
+    """Return rising indices of rows one behind the other as a slice, which copies nothing."""
+    if len(rows) and rows[-1] - rows[0] == len(rows) - 1:
+        return slice(int(rows[0]), int(rows[-1]) + 1)
+    return rows

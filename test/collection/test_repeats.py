@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import binom
 
+from selfcal_ros.collection.marks import repeats as repeats_module
 from selfcal_ros.collection.marks.repeats import reduce_repeats
 
 SIGMA = 2e-8
@@ -209,3 +210,20 @@ def test_a_thousand_repeats_do_not_cost_their_square():
     assert peak < 60e6  # all pairs of one mark alone would be 8 MB, of 25 marks 200 MB
     assert np.flatnonzero(means.outlier).tolist() == [12_345]
     assert means.sigma == pytest.approx(SIGMA, rel=0.02)
+
+
+@pytest.mark.parametrize("part", [1, 7, 64, 10**6])
+def test_outliers_are_found_in_every_part_of_the_marks(monkeypatch, part):
+    """Marks of two to six repeats in mixed order; first and last of each number have an outlier."""
+    monkeypatch.setattr(repeats_module, "PART", part)
+    rng, count = np.random.default_rng(8), np.repeat([2, 3, 4, 5, 6], 9)
+    key = rng.permutation(np.repeat(np.arange(len(count)), count))
+    values = rng.normal(0, SIGMA, (2, len(key)))
+    spoilt = np.zeros(len(key), dtype=bool)
+    for mark in np.flatnonzero((np.arange(len(count)) % 9 == 0) | (np.arange(len(count)) % 9 == 8)):
+        spoilt[np.flatnonzero(key == mark)[-1]] = True
+    values[:, spoilt] += 50 * SIGMA
+    found = reduce_repeats(key, values, np.zeros(len(key)), limit=LIMIT)
+    pairs = spoilt | ((count[key] == 2) & np.isin(key, key[spoilt]))  # of two both go
+    assert found.outlier.tolist() == pairs.tolist()
+    assert found.count.sum() == (~pairs).sum()

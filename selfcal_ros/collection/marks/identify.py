@@ -10,6 +10,7 @@ from selfcal_ros.collection.marks.rigid import (
     MotionEstimate,
     Rigid,
     RigidFit,
+    columns_where,
     fit_motion,
 )
 from selfcal_ros.collection.reasons import Reason
@@ -166,7 +167,7 @@ def _settle(pose: LatticePose, centred: np.ndarray, half: np.ndarray, ids: np.nd
     """
     named, free = kinds
     about = _about(pose, ids, pitch)
-    use, fit = named, fit_motion(about[:, named], (centred - about)[:, named])
+    use, fit = named, fit_motion(*columns_where(named, about, centred - about))
     known = (fit.known(pitch, rules.max_rotation_rad) if named.any() else
              _innermost(centred[:, free], pitch, rules.max_rotation_rad))
     while free.any():
@@ -178,7 +179,7 @@ def _settle(pose: LatticePose, centred: np.ndarray, half: np.ndarray, ids: np.nd
             break
         use, mark = wider, np.where(named, ids, nearest)
         about = _about(pose, mark, pitch)
-        fit = fit_motion(about[:, use], (centred - about)[:, use])
+        fit = fit_motion(*columns_where(use, about, centred - about))
         known = fit.known(pitch, rules.max_rotation_rad)
     return (known, fit) if named.any() else _folded(known, fit, pitch)
 

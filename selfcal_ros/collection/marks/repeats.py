@@ -13,6 +13,7 @@ Where most pairs agree to the bit and the others differ by whole steps of one si
 of a sensor which resolves no finer, and a few steps are no outlier.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -22,6 +23,9 @@ MIN_PAIRS = 12
 """Pairs of repeats below which a view is too small to tell outliers."""
 ALL_PAIRS = 33
 """Repeats of a mark up to which all their pairs are looked at; of more, 16 for each repeat."""
+PART = 32_768
+"""Numbers that are worked on together where marks do not depend on each other: they stay in the
+cache of a processor, and take no memory beside the readings."""
 STEPS = 3
 """Steps of a sensor by which repeats may differ that otherwise agree to the bit."""
 
@@ -141,10 +145,12 @@ def _outliers(key: np.ndarray, values: np.ndarray, relative: np.ndarray,
     if cut <= floor:
         floor = max(floor, (STEPS + 0.5) * _sensor_step(groups, values, floor))
     for group in groups:
-        away = np.abs(values[:, group] - np.median(values[:, group], axis=2, keepdims=True))
         share = np.sqrt(0.5) if group.shape[1] == 2 else 1.0  # of two, each is half-way off
-        bad = (away > np.maximum(cut * share * relative[group], floor)).any(axis=0)
-        out[group] = bad | (2 * (~bad).sum(axis=1, keepdims=True) < group.shape[1])
+        for part in _parts(group, group.shape[1]):
+            repeats = np.take(values, part, axis=1)
+            away = np.abs(repeats - np.median(repeats, axis=2, keepdims=True))
+            bad = (away > np.maximum(cut * share * relative[part], floor)).any(axis=0)
+            out[part] = bad | (2 * (~bad).sum(axis=1, keepdims=True) < group.shape[1])
     return out
 
 
@@ -154,6 +160,13 @@ def _groups(key: np.ndarray) -> list[np.ndarray]:
     start = np.flatnonzero(np.diff(key[order], prepend=key[order[:1]] - 1))
     count = np.diff(np.append(start, len(key)))
     return [order[start[count == r][:, None] + np.arange(r)] for r in np.unique(count) if r > 1]
+
+
+def _parts(group: np.ndarray, width: int) -> Iterator[np.ndarray]:
+    """Yield the marks of a group in parts, for work that makes `width` numbers of each mark."""
+    size = max(1, PART // width)
+    for start in range(0, len(group), size):
+        yield group[start:start + size]
 
 
 def _sensor_step(groups: list[np.ndarray], values: np.ndarray, floor: float) -> float:
@@ -184,15 +197,18 @@ def _pairs(count: int) -> tuple[np.ndarray, np.ndarray]:
 def _pair_scale(groups: list[np.ndarray], values: np.ndarray,
                 relative: np.ndarray) -> tuple[float, int]:
     """Return the robust standard deviation of one reading, and how many pairs told it."""
-    differences = []
+    if not groups:
+        return float("nan"), 0
+    every = np.empty(len(values) * sum(len(group) * len(_pairs(group.shape[1])[0])
+                                       for group in groups))
+    done = 0
     for group in groups:
         i, j = _pairs(group.shape[1])
-        weights, repeats = relative[group], np.take(values, group, axis=1)
-        norm = np.hypot(np.take(weights, i, axis=1), np.take(weights, j, axis=1))
-        apart = np.take(repeats, i, axis=2) - np.take(repeats, j, axis=2)
-        differences.append((np.abs(apart) / norm).ravel())
-    if not differences:
-        return float("nan"), 0
-    every = np.concatenate(differences)
+        for part in _parts(group, len(i)):
+            weights, repeats = relative[part], np.take(values, part, axis=1)
+            norm = np.hypot(np.take(weights, i, axis=1), np.take(weights, j, axis=1))
+            apart = np.take(repeats, i, axis=2) - np.take(repeats, j, axis=2)
+            every[done:done + apart.size] = (np.abs(apart) / norm).ravel()
+            done += apart.size
     independent = sum(len(group) * (group.shape[1] - 1) for group in groups) * len(values)
-    return float(np.median(every) / 0.6744897501960817), independent
+    return float(np.median(every, overwrite_input=True) / 0.6744897501960817), independent

@@ -155,23 +155,29 @@ def fit_motion(p: np.ndarray, deviation: np.ndarray) -> RigidFit:
         before, keep = keep, distance <= 3 * np.median(distance) + 1e-9
         if (keep == before).all():  # the same marks give the same motion again
             break
-        near, read = _columns(keep, p, deviation)
+        near, read = columns_where(keep, p, deviation)
         middle, mean = near.mean(axis=1), read.mean(axis=1)
         arm = near - middle[:, None]
         power = (arm**2).sum()
         cross = _cross(arm, read - mean[:, None]).sum()
         rigid = _through(_turn(cross / power) if power > 0 else 0.0, tuple(middle), mean)
-    near, read = _columns(keep, p, deviation)
+    near, read = columns_where(keep, p, deviation)
     rest = read - rigid.at(near)
-    where = near[0] + 1j * near[1]
-    marks = len(np.unique(where[np.diff(where, prepend=np.nan) != 0]))
+    other = (near[:, 1:] != near[:, :-1]).any(axis=0)  # than the one before
+    first = near[:, np.append(True, other)]
+    marks = len(np.unique(first[0] + 1j * first[1]))
     share = marks / keep.sum()  # repeats of a mark are no further marks
     return RigidFit(rigid, (float(middle[0]), float(middle[1])), marks, float(power * share),
                float((rest**2).sum() * share))
 
 
-def _columns(keep: np.ndarray, *tables: np.ndarray) -> list[np.ndarray]:
-    """Return some of the columns of tables (2, n); ten times as fast as by the mask itself."""
+def columns_where(keep: np.ndarray, *tables: np.ndarray) -> list[np.ndarray]:
+    """Return some of the columns of tables (2, n), as they are if it is all of them.
+
+    Ten times as fast as by the mask itself.
+    """
+    if keep.all():
+        return [*tables]
     index = np.flatnonzero(keep)
     return [np.take(table, index, axis=1) for table in tables]
 
