@@ -38,6 +38,22 @@ class Rules:
     outlier_limit: float
 
 
+def canonical(detections: np.ndarray) -> np.ndarray:
+    """Return the detections with one form for all that mean the same, structured array (n,).
+
+    What a kind does not use is 0, and so are ids that are not told; -0.0 and 0.0 are one number.
+    """
+    d = detections.copy()
+    grid, angular = d["kind"] == Kind.GRID, d["kind"] == Kind.ANGULAR
+    for field, used in (("ox", grid), ("oy", grid), ("ot", angular)):
+        d[field] = np.where(used, d[field] + 0.0, 0.0)
+    for field, used in (("m", grid), ("n", grid), ("k", angular)):
+        d[field] = np.where(used & d["has_id"], d[field], 0)
+    for field in ("sigma", "score"):
+        d[field] += 0.0
+    return d
+
+
 def clean(detections: np.ndarray, rules: Rules, *, scored: bool,
           ) -> tuple[np.ndarray, Counter]:
     """Return the usable detections in canonical order, each once, and the reasons of the rest.
@@ -45,7 +61,7 @@ def clean(detections: np.ndarray, rules: Rules, *, scored: bool,
     Parameters
     ----------
     detections : structured array of `DETECTION`
-        In any order.
+        In any order, as `canonical` returns them.
     rules : Rules
         Limits.
     scored : bool
@@ -54,14 +70,7 @@ def clean(detections: np.ndarray, rules: Rules, *, scored: bool,
     rejected: Counter = Counter()
     known = (detections["kind"] == Kind.GRID) | (detections["kind"] == Kind.ANGULAR)
     rejected[Reason.UNKNOWN_KIND] = int((~known).sum())
-    d = detections.copy() if known.all() else detections[known]
-    grid, angular = d["kind"] == Kind.GRID, d["kind"] == Kind.ANGULAR
-    for field, used in (("ox", grid), ("oy", grid), ("ot", angular)):
-        d[field] = np.where(used, d[field] + 0.0, 0.0)
-    for field, used in (("m", grid), ("n", grid), ("k", angular)):
-        d[field] = np.where(used & d["has_id"], d[field], 0)
-    for field in ("sigma", "score"):
-        d[field] += 0.0  # -0.0 and 0.0 are one number
+    d = _where(known, detections)
     finite = d["sigma"] >= 0
     for field in ("ox", "oy", "ot", "sigma", "score"):
         finite &= np.isfinite(d[field])

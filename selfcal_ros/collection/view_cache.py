@@ -7,14 +7,23 @@ from dataclasses import replace
 import numpy as np
 
 from selfcal_ros.collection.reasons import Reason
-from selfcal_ros.collection.reduce import DETECTION, Rules, clean, reduce_view, with_low_scores
+from selfcal_ros.collection.reduce import (
+    DETECTION,
+    Rules,
+    canonical,
+    clean,
+    reduce_view,
+    with_low_scores,
+)
 from selfcal_ros.collection.stage.exposures import Exposures
-from selfcal_ros.collection.stage.growing import GrowingTable
+from selfcal_ros.collection.stage.growing import GrowingColumns, GrowingTable
 from selfcal_ros.collection.timeline import Timeline
 from selfcal_ros.model.readings import ViewReadings
 
 NO_STAMPS = np.zeros(0, dtype=np.int64)
-PLACE = np.dtype([("interval", "i4"), ("view", "i4")])
+TOGETHER = 65_536
+"""Detections that are assigned to views together: what is made of them stays in the cache."""
+PLACE = {"interval": "i4", "view": "i4"}
 """Interval of the timeline and view of a detection; -1 = before the first, in no view."""
 
 
@@ -23,7 +32,7 @@ class ViewCache:
 
     def __init__(self, rules: Rules) -> None:
         self._rules = rules
-        self._table, self._place = GrowingTable(DETECTION), GrowingTable(PLACE)
+        self._table, self._place = GrowingTable(DETECTION), GrowingColumns(PLACE)
         self._looked_up = 0  # detections whose stamps were handed out
         self._scored = False
         self._timeline: Timeline | None = None
@@ -38,11 +47,11 @@ class ViewCache:
     @property
     def view_of(self) -> np.ndarray:
         """View of each detection, -1 for none; as of the last `readings`."""
-        return self._place.rows["view"]
+        return self._place["view"]
 
     def append(self, table: np.ndarray) -> None:
         """Take detections."""
-        self._table.append(table)
+        self._table.append(canonical(table))
         scored = bool((np.isfinite(table["score"]) & (table["score"] > 0)).any())
         if scored and not self._scored:  # low scores count from now on
             self._scored = True
@@ -72,17 +81,18 @@ class ViewCache:
 
     def _assign(self, timeline: Timeline) -> set[int]:
         """Find the view of each detection; return the views whose detections have changed."""
-        known = len(self._place)
+        known = len(self.view_of)
         old = self.view_of[:known].copy() if timeline is not self._timeline else None
         if self._timeline is None or timeline.artifact != self._timeline.artifact:
             self._readings = {}
         start = 0 if old is not None else known
-        self._place.append(np.zeros(len(self._table) - known, dtype=PLACE))
+        self._place.insert(np.full(len(self._table) - known, known), {})
         view_of = np.array([-1 if interval.view_index is None else interval.view_index
                             for interval in timeline.intervals] + [-1])
-        interval = timeline.assign(self.table["stamp"][start:])
-        place = self._place.rows[start:]
-        place["interval"], place["view"] = interval, view_of[interval]
+        for begin in range(start, len(self._table), TOGETHER):
+            here = slice(begin, begin + TOGETHER)
+            interval = timeline.assign(self.table["stamp"][here])
+            self._place["interval"][here], self._place["view"][here] = interval, view_of[interval]
         touched = _different(self.view_of[known:])
         if old is not None:
             moved = old != self.view_of[:known]
@@ -93,7 +103,7 @@ class ViewCache:
 
     def _loose(self, timeline: Timeline) -> Counter:
         """Return reason -> number of detections that belong to no view."""
-        counts = np.bincount(self._place.rows["interval"] + 1,
+        counts = np.bincount(self._place["interval"] + 1,
                              minlength=len(timeline.intervals) + 1).tolist()
         loose = Counter({str(Reason.OUTSIDE_VIEWS): counts[0]})
         for interval, count in zip(timeline.intervals, counts[1:], strict=True):

@@ -9,8 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from selfcal_ros.collection import view_cache
 from selfcal_ros.collection.collector import Collector
 from selfcal_ros.collection.digest import readings_digest, session_digest
+from selfcal_ros.collection.marks import identify, repeats
 from selfcal_ros.collection.messages import Command, Detection, EncoderSample
 from selfcal_ros.collection.reduce import DETECTION
 from selfcal_ros.collection.settings.nodes import CollectorSettings
@@ -74,6 +76,13 @@ def test_what_is_asked_on_the_way_changes_nothing(seed, spread, asked):
                 continue
             assert so_far == digest(late(seed, spread)[:at + 1])
     assert digest_of(collector) == WANTED
+
+
+@pytest.mark.parametrize("size", [1, 7, 100])
+def test_how_many_are_looked_at_together_changes_nothing(monkeypatch, size):
+    for module, name in ((view_cache, "TOGETHER"), (identify, "PART"), (repeats, "PART")):
+        monkeypatch.setattr(module, name, size)
+    assert digest(EVENTS) == digest(late(4, 10**6)) == WANTED
 
 
 def blocks(events, size):

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from selfcal_ros.collection.marks import identify
 from selfcal_ros.model.readings import Sense
 from test.support.collecting import collect, scene, table
 
@@ -33,6 +34,14 @@ def test_a_stage_that_stands_beside_the_mark(with_ids, shift, kept):
     found, _ = collect(cell.events)
     assert found.all_rejected() == ({} if kept else {REASON: 1})
     assert len(whole) - len(table(found.views[0])) == (not kept)
+
+
+@pytest.mark.parametrize("part", [1, 4, 7, 25])
+def test_a_stage_beside_any_of_many_marks_is_seen(monkeypatch, part):
+    monkeypatch.setattr(identify, "PART", part)
+    for index in (0, 3, 4, 24):
+        found, _ = collect(led_astray(scene(count=0), index, 2 * PITCH).events)
+        assert found.all_rejected() == {REASON: 1}
 
 
 def test_the_limit_is_a_parameter_and_grows_with_the_rotation_reckoned_with():

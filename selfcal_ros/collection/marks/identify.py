@@ -24,6 +24,8 @@ SURE = 0.25
 with an unknown offset of a quarter pitch it stays below half a pitch."""
 OFF_ANY_PLATE_M = 1e9
 """Coordinate beyond which a reading is not looked at more closely."""
+PART = 32_768
+"""Readings that are looked at together where they do not depend on each other."""
 HALF_A_LINE = 0.45
 """Largest rotation to reckon with, in lines, at which the nearest line is the one seen."""
 
@@ -138,9 +140,13 @@ def _astray(pose: LatticePose, marks: np.ndarray, stage_m: np.ndarray | None, ar
     """Return for which marks (2, n) the stage stood further from their sites than it may."""
     if stage_m is None:
         return np.zeros(marks.shape[1], dtype=bool)
-    site = np.stack(pose.site_of(marks[0], marks[1])) * artifact.grid_pitch_m
-    away = np.clip(stage_m - site, -OFF_ANY_PLATE_M, OFF_ANY_PLATE_M)
-    return np.hypot(*away) > rules.stage_limit_m(artifact)
+    astray = np.empty(marks.shape[1], dtype=bool)
+    for start in range(0, len(astray), PART):
+        here = slice(start, start + PART)
+        site = np.stack(pose.site_of(marks[0, here], marks[1, here])) * artifact.grid_pitch_m
+        away = np.clip(stage_m[:, here] - site, -OFF_ANY_PLATE_M, OFF_ANY_PLATE_M)
+        astray[here] = np.hypot(*away) > rules.stage_limit_m(artifact)
+    return astray
 
 
 def _nearest(pose: LatticePose, centred: np.ndarray, pitch: float, half: np.ndarray,

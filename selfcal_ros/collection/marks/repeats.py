@@ -91,7 +91,7 @@ def average(key: np.ndarray, values: np.ndarray, sigma: np.ndarray,
 
     `companions` (e, n) are averaged alike, and tell nothing of the repeatability.
     """
-    marks, inverse, count = np.unique(key, return_inverse=True, return_counts=True)
+    marks, inverse, count = _distinct(key)
     declared = np.bincount(inverse, sigma > 0, len(marks)) == count
     best = np.full(len(marks), np.inf)  # weights relative to a mark's best reading stay finite
     np.minimum.at(best, inverse, sigma)
@@ -105,6 +105,18 @@ def average(key: np.ndarray, values: np.ndarray, sigma: np.ndarray,
     u = np.where(declared, best / np.sqrt(total), np.nan) if declared.any() else np.zeros(0)
     more = mean[:0] if companions is None else _means(companions, weight, inverse, total)
     return Means(marks, mean, count, u, pooled, dof, np.zeros(len(key), dtype=bool), more)
+
+
+def _distinct(key: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the different keys, which of them each one is, and how often each is there.
+
+    As `numpy.unique`; repeats of a mark mostly follow each other, so that runs of them are sorted.
+    """
+    begin = np.flatnonzero(np.diff(key, prepend=key[:1] - 1))
+    length = np.diff(np.append(begin, len(key)))
+    marks, inverse = np.unique(key[begin], return_inverse=True)
+    count = np.bincount(inverse, length, len(marks)).astype(np.int64)
+    return marks, np.repeat(inverse, length), count
 
 
 def _means(values: np.ndarray, weight: np.ndarray, inverse: np.ndarray,

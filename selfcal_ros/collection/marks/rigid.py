@@ -141,14 +141,7 @@ def fit_motion(p: np.ndarray, deviation: np.ndarray) -> RigidFit:
     """
     if not p.shape[1]:
         return RigidFit(Rigid(), (0.0, 0.0), 0, 0.0, 0.0)
-    middle = p.mean(axis=1)
-    arm = p - middle[:, None]
-    offset = np.median(deviation, axis=1)
-    radius2 = (arm**2).sum(axis=0)
-    rim = (radius2 >= np.median(radius2)) & (radius2 > 0)
-    cross = _cross(arm, deviation - offset[:, None])
-    rigid = _through(_turn(np.median(cross[rim] / radius2[rim])) if rim.any() else 0.0,
-                     tuple(middle), offset)
+    rigid = _median_motion(p, deviation)
     keep = np.zeros(p.shape[1], dtype=bool)
     for _ in range(5):
         distance = np.hypot(*(deviation - rigid.at(p)))
@@ -156,19 +149,37 @@ def fit_motion(p: np.ndarray, deviation: np.ndarray) -> RigidFit:
         if (keep == before).all():  # the same marks give the same motion again
             break
         near, read = columns_where(keep, p, deviation)
-        middle, mean = near.mean(axis=1), read.mean(axis=1)
-        arm = near - middle[:, None]
-        power = (arm**2).sum()
-        cross = _cross(arm, read - mean[:, None]).sum()
-        rigid = _through(_turn(cross / power) if power > 0 else 0.0, tuple(middle), mean)
+        rigid, middle, power = _least_squares(near, read)
     near, read = columns_where(keep, p, deviation)
     rest = read - rigid.at(near)
     other = (near[:, 1:] != near[:, :-1]).any(axis=0)  # than the one before
     first = near[:, np.append(True, other)]
     marks = len(np.unique(first[0] + 1j * first[1]))
     share = marks / keep.sum()  # repeats of a mark are no further marks
-    return RigidFit(rigid, (float(middle[0]), float(middle[1])), marks, float(power * share),
-               float((rest**2).sum() * share))
+    return RigidFit(rigid, middle, marks, float(power * share), float((rest**2).sum() * share))
+
+
+def _median_motion(p: np.ndarray, deviation: np.ndarray) -> Rigid:
+    """Return the median offset, and the median turn of the marks in the outer half."""
+    middle = p.mean(axis=1)
+    arm = p - middle[:, None]
+    offset = np.median(deviation, axis=1)
+    radius2 = (arm**2).sum(axis=0)
+    rim = (radius2 >= np.median(radius2)) & (radius2 > 0)
+    cross = _cross(arm, deviation - offset[:, None])
+    phi_rad = _turn(np.median(cross[rim] / radius2[rim])) if rim.any() else 0.0
+    return _through(phi_rad, tuple(middle), offset)
+
+
+def _least_squares(p: np.ndarray, deviation: np.ndarray,
+                   ) -> tuple[Rigid, tuple[float, float], float]:
+    """Return the motion, the centre of the marks and the sum of squared distances from it."""
+    middle, mean = p.mean(axis=1), deviation.mean(axis=1)
+    arm = p - middle[:, None]
+    power = (arm**2).sum()
+    cross = _cross(arm, deviation - mean[:, None]).sum()
+    centre = float(middle[0]), float(middle[1])
+    return _through(_turn(cross / power) if power > 0 else 0.0, centre, mean), centre, float(power)
 
 
 def columns_where(keep: np.ndarray, *tables: np.ndarray) -> list[np.ndarray]:

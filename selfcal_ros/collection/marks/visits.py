@@ -37,7 +37,8 @@ def grid_visits(means: Means, key: np.ndarray, sigma: np.ndarray, *, stamps_ns: 
         return None
     number = np.cumsum(np.diff(key, prepend=key[:1]) != 0)[kept]
     key, stamps_ns = key[kept], stamps_ns[kept]
-    _, first, visit = np.unique(number, return_index=True, return_inverse=True)
+    begins = np.diff(number, prepend=-1) != 0
+    first, visit = np.flatnonzero(begins), np.cumsum(begins) - 1
     since = (stamps_ns - stamps_ns[first][visit]).astype(float)
     found = average(visit, deviation[:, kept], sigma[kept], np.vstack([offset[:, kept], since]))
     mark = np.searchsorted(means.key, key[first])
