@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """`selfcal batch` on several cores beside one after the other: seconds, CPU seconds, ratio.
 
-bench_batch.py [--bags N] [--workers N] [--rounds N] [--folder FOLDER] [-o FILE.json]
+bench_batch.py [--bags N] [--plan PLAN.yaml] [--workers N] [--rounds N] [--folder FOLDER]
+               [-o FILE.json]
 
-Simulates N bags of Hu's plan (11 x 11 marks, 24 lines, 20 nm), solves them with `selfcal batch
+Simulates N bags of a plan (Hu's, 11 x 11 marks, 24 lines; 20 nm), solves them with `selfcal batch
 --workers 1`, which is one process and one bag after the other, and with N workers, each as a
 command of its own into an empty folder, in turn; tells means over the rounds and compares the
 results. The modules are compiled, as where they are installed. Before and after, one process and
@@ -38,13 +39,13 @@ PR_SET_CHILD_SUBREAPER = 36
 """Of prctl(2): processes whose parents have ended become ours, and their CPU time is counted."""
 
 
-def simulate(folder: Path, seed: int) -> None:
+def simulate(folder: Path, plan: Path, seed: int) -> None:
     """Write one bag, unless it is there."""
     bag = folder / f"{seed:03}"
     if bag.exists():
         return
     sim = folder / f".{seed:03}.yaml"
-    write_yaml(sim, {"plan": str(ROOT / "config/plans/hu.yaml"), "seed": seed,
+    write_yaml(sim, {"plan": str(plan), "seed": seed,
                      "noise": {"sigma_xy": 2e-8, "sigma_theta": 1.7e-5}})
     write_simulation(read_simulation(sim), bag)
 
@@ -117,6 +118,7 @@ def maps_of(out: Path) -> dict[str, np.ndarray]:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--bags", type=int, default=100)
+    parser.add_argument("--plan", type=Path, default=ROOT / "config/plans/hu.yaml")
     parser.add_argument("--workers", type=int, help="processes (default: one a core)")
     parser.add_argument("--rounds", type=int, default=1, help="times that both ways are run")
     parser.add_argument("--folder", default=str(ROOT / "build" / "bench_batch"))
@@ -124,9 +126,9 @@ def main() -> int:
     args = parser.parse_args()
     ctypes.CDLL(None).prctl(PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
     folder, workers = Path(args.folder), check_workers(args.workers)
-    bags = folder / "bags"
+    bags = folder / args.plan.stem
     bags.mkdir(parents=True, exist_ok=True)
-    mapped(partial(simulate, bags), list(range(args.bags)), workers=workers)
+    mapped(partial(simulate, bags, args.plan.resolve()), list(range(args.bags)), workers=workers)
     own = [own_ratio(bags / "000", workers)]
     compileall.compile_dir(ROOT / "selfcal_ros", quiet=1)  # not all programs may write bytecode
     times = [(*timed(bags, folder / "alone", 1), *timed(bags, folder / "together", workers))
@@ -135,9 +137,9 @@ def main() -> int:
     own.append(own_ratio(bags / "000", workers))
     one, other = maps_of(folder / "alone"), maps_of(folder / "together")
     same = one.keys() == other.keys() and all(np.array_equal(one[k], other[k]) for k in one)
-    figures = {"bags": args.bags, "workers": workers, "rounds": times, "seconds_alone": alone,
-               "seconds_together": together, "ratio": together / alone, "cpu_s_alone": alone_cpu,
-               "cpu_s_together": together_cpu, "own_ratio": own,
+    figures = {"bags": args.bags, "plan": args.plan.stem, "workers": workers, "rounds": times,
+               "seconds_alone": alone, "seconds_together": together, "ratio": together / alone,
+               "cpu_s_alone": alone_cpu, "cpu_s_together": together_cpu, "own_ratio": own,
                "same_maps": same}
     print(f"{args.bags} bags, one after the other: {alone:.1f} s ({alone_cpu:.1f} s of CPU)")
     print(f"{args.bags} bags, {workers} workers: {together:.1f} s ({together_cpu:.1f} s of CPU)")
