@@ -233,6 +233,29 @@ def test_a_view_is_compared_by_its_own_repeats():
     assert named["view"] == "rot90" and named["ratio"] == pytest.approx(2.0)
 
 
+def test_a_reading_goes_where_it_adds_more_than_one_in_a_hundred_sets_of_good_ones():
+    """F-test of what it adds to the sum of squares of a fit, at 1 % over all readings checked."""
+    _, readings = measured(3, linear=True)
+    place = {("rot90", "grid", "2, -3")}
+
+    def squares(planted_m, *, without_it=False):
+        given = with_errors(readings, 1, dx={(2, -3): planted_m})
+        found = residuals_of(without(given, {(1, "grid", (2, -3))}) if without_it else given,
+                             LINEAR)
+        checked = np.isfinite(found.squares).sum() + np.isfinite(found.squares_theta).sum()
+        return float((abs(found.found.residuals) ** 2).sum()), found.found.xy.dof, checked
+
+    rest, dof, _ = squares(0.0, without_it=True)
+    limit = rest * (1 + 2 / dof * f_distribution.isf(0.01 / squares(0.0)[2], 2, dof))
+    at = np.array([0.0, 2e-7, 4e-7])  # what is planted goes into the sum as a parabola
+    a, b, c = np.polyfit(at, [squares(x)[0] for x in at], 2)
+    just = (-b + np.sqrt(b**2 - 4 * a * (c - limit))) / (2 * a)
+    assert squares(just)[0] == pytest.approx(limit, rel=1e-9)
+    for part, expected in ((0.98, set()), (1.02, place)):
+        bad = with_errors(readings, 1, dx={(2, -3): part * just})
+        assert removed(robust_calibrate(bad, LINEAR)) == expected
+
+
 @pytest.mark.parametrize("sense", list(Sense))
 def test_planted_outliers_are_removed_and_nothing_else(sense):
     truth, readings = measured(3, sense=sense)
