@@ -6,7 +6,7 @@ from dataclasses import fields, replace
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from selfcal_ros.bagio.build import build
@@ -168,6 +168,7 @@ def readings(draw):
         draw(FLOATS), draw(U32), draw(U32), draw(U32), draw(COUNTS))
 
 
+@settings(max_examples=40)
 @given(read=readings(), artifact=ARTIFACTS, rejected=COUNTS, sense=st.sampled_from(Sense))
 def test_view_measurements_come_back(read, artifact, rejected, sense):
     progress = ViewProgress(5, read.view, 0, 0, 0, 0, read, 0)

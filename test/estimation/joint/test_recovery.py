@@ -116,17 +116,13 @@ def test_missing_marks(missing, sense):
     assert np.isnan(found.error_map.u_gx[~known]).all()
 
 
-@given(st.randoms(use_true_random=False))
-@settings(max_examples=15, deadline=None)
-def test_order_of_readings_changes_no_bit(random):
-    _, readings = measured(hu_plan(Artifact(5, 0.01, 8)), sigma_m=1e-8, sigma_theta_rad=1e-7,
-                           missing=0.05)
+@pytest.mark.parametrize("seed", range(8))
+def test_order_of_readings_changes_no_bit(seed):
+    random, (_, readings) = np.random.default_rng(seed), measured(
+        hu_plan(Artifact(5, 0.01, 8)), sigma_m=1e-8, sigma_theta_rad=1e-7, missing=0.05)
     shuffled = []
     for view in readings.views:
-        marks, lines = list(range(len(view.m))), list(range(len(view.k)))
-        random.shuffle(marks)
-        random.shuffle(lines)
-        marks, lines = np.array(marks, dtype=int), np.array(lines, dtype=int)
+        marks, lines = (random.permutation(len(of)) for of in (view.m, view.k))
         fields = {name: getattr(view, name)[marks] for name in ("m", "n", "dx", "dy", "count")}
         fields |= {name: getattr(view, name)[lines] for name in ("k", "dtheta", "count_theta")}
         shuffled.append(replace(view, **fields))
@@ -141,7 +137,7 @@ def test_order_of_readings_changes_no_bit(random):
 
 
 @given(st.tuples(*[st.floats(-1e-4, 1e-4)] * 7), st.sampled_from(["0,90,tx", "0,90,180,ty"]))
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=12, deadline=None)
 def test_datum_shifts_change_nothing(shift, names):
     """A stage or a plate moved, turned or grown as a whole gives the same map.
 
