@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Plot of ``selfcal cal verify``: what a stage's error is before and after its tables."""
 
-import io
 import os
 from pathlib import Path
 
@@ -12,6 +11,7 @@ from matplotlib.figure import Figure
 from selfcal_ros.compensation.aerotech.verify import Residual, Verification
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import write_bytes
+from selfcal_ros.reporting.picture import picture
 from selfcal_ros.units import MM_PER_M, RAD_PER_ARCSEC, UM_PER_M
 
 FORMATS = ("png", "svg", "pdf")
@@ -46,9 +46,7 @@ def plot_verification(found: Verification, path: str | os.PathLike) -> None:
                 _arrows(ax, residual, which)
     figure.suptitle("Residual true − commanded of the simulated controller, "
                     "without its constant shift")
-    picture = io.BytesIO()
-    figure.savefig(picture, format=kind, dpi=120)
-    write_bytes(path, picture.getvalue())
+    write_bytes(path, picture(figure, kind, dpi=120))
 
 
 def _arrows(ax: Axes, residual: Residual, which: str) -> None:

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Plots of the step-diagonal measurement: profiles, and sensitivity to the set-up."""
 
-import io
 import os
 from pathlib import Path
 
@@ -13,6 +12,7 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.files import write_bytes
 from selfcal_ros.laser.data import AXES, StepDiagonalResult
 from selfcal_ros.laser.profiles import positions_m, profile_m, u_profile_m
+from selfcal_ros.reporting.picture import picture
 from selfcal_ros.units import MM_PER_M, UM_PER_M
 
 FORMATS = ("png", "svg", "pdf")
@@ -104,6 +104,4 @@ def _save(figure: Figure, path: str | os.PathLike) -> None:
     if suffix not in FORMATS:
         raise InputError(str(path), f"'{suffix}' is not a picture format",
                          "name a file that ends in ." + ", .".join(FORMATS))
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format=suffix, dpi=120)
-    write_bytes(path, buffer.getvalue())
+    write_bytes(path, picture(figure, suffix, dpi=120))

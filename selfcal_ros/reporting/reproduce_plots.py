@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Plots of the published simulations, as PNG."""
 
-import io
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -15,6 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from selfcal_ros.files import write_bytes
+from selfcal_ros.reporting.picture import picture
 from selfcal_ros.simulation.reproduce.hu import HuReproduction, HuRun
 from selfcal_ros.simulation.reproduce.qiao import Program, QiaoReproduction
 from selfcal_ros.units import MM_PER_M, UM_PER_M
@@ -42,9 +42,7 @@ def save_qiao_plots(found: QiaoReproduction, folder: Path) -> list[Path]:
 def _save(path: Path, draw: Callable[[Figure], None]) -> Path:
     figure = Figure(figsize=(9, 4.5), dpi=DPI, layout="constrained")
     draw(figure)
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", metadata={"Software": None})
-    write_bytes(path, buffer.getvalue())
+    write_bytes(path, picture(figure, "png", dpi=DPI, metadata={"Software": None}))
     return path
 
 

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Picture of a calibration: error vectors and angular error, as PNG, SVG or PDF."""
 
-import io
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -22,6 +21,7 @@ from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.reporting.maps.style import RC, drawable
 from selfcal_ros.reporting.maps.theta import draw_theta
 from selfcal_ros.reporting.maps.xy import draw_error_map
+from selfcal_ros.reporting.picture import picture
 from selfcal_ros.reporting.summary.numbers import truth_arrays
 from selfcal_ros.reporting.summary.text import state_sentence
 
@@ -59,7 +59,7 @@ def save_map_plot(result: CalibrationResult, path: str | os.PathLike, *,
     truth = truth_arrays(result.error_map, truth)
     with rc_context(RC):
         figure = _whole_figure(result, truth)
-        data = _render(figure, kind)
+        data = picture(figure, kind.lstrip("."), dpi=DPI, metadata=KINDS[kind])
     write_bytes(path, data)
 
 
@@ -93,9 +93,3 @@ def _footer(result: CalibrationResult) -> str:
 def _legend(axes: PolarAxes) -> None:
     axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.06), ncols=4, frameon=False,
                 fontsize=9)
-
-
-def _render(figure: Figure, kind: str) -> bytes:
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format=kind.lstrip("."), dpi=DPI, metadata=KINDS[kind])
-    return buffer.getvalue()
