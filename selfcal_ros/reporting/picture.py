@@ -37,6 +37,7 @@ def picture(figure: Figure, kind: str, *, dpi: float,
     if layout is not None:
         layout.execute(figure)
         figure.set_layout_engine("none")
+        figure.set_dpi(dpi)  # the layout of vector formats sets it to their points
     buffer = io.BytesIO()
     getattr(canvas, f"print_{kind}")(buffer, metadata=metadata)
     return buffer.getvalue()
