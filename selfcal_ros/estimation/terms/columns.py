@@ -13,6 +13,7 @@ width and s the signs of approach (reality of machines; docs/method.md, terms of
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import eval_legendre
@@ -112,6 +113,14 @@ class TermColumns:
 Parts = list[tuple[str, Callable[[ViewVisits], np.ndarray]]]
 
 
+class Made(NamedTuple):
+    """A column: means at the marks (nx, ny) by view, 0 in others; values as in `TermColumns`."""
+
+    column: Column
+    means: dict[int, np.ndarray]
+    seen: list[np.ndarray | None]
+
+
 def term_columns(ground: Ground, terms: Iterable[ModelTerm], degree: int) -> TermColumns:
     """Return the columns of `terms`.
 
@@ -129,7 +138,7 @@ def term_columns(ground: Ground, terms: Iterable[ModelTerm], degree: int) -> Ter
     InputError
         If a term needs to know the visits of a view, and they are not known.
     """
-    made: list[tuple[Column, np.ndarray, list]] = []
+    made: list[Made] = []
     for term in terms:
         if term.name in VISIT_TERMS:
             _require_visits(ground, term.name)
@@ -153,8 +162,9 @@ def made_anew(ground: Ground, term: ModelTerm, before: TermColumns) -> TermColum
     """
     at = np.flatnonzero(before.rows([term.name]))
     grid, seen = before.grid.copy(), list(before.seen)
-    for row, (_, block, values) in zip(at, _visit_columns(ground, term, 0), strict=True):
-        grid[row], seen[row] = block, values
+    for row, (_, means, values) in zip(at, _visit_columns(ground, term, 0), strict=True):
+        _fill(grid[row], means)
+        seen[row] = values
     return TermColumns(before.columns, grid, _within_anew(ground, seen, before.within, at), seen)
 
 
@@ -163,23 +173,27 @@ def columns_from(ground: Ground, columns: Iterable[Column],
     """Return columns of one view each, given by their values at its visits (V,), plate frame."""
     made = []
     for column, values in zip(columns, shapes, strict=True):
-        block = np.zeros(ground.weight.shape, dtype=complex)
         visits = ground.visits[column.view]
         if visits is None:
             raise ValueError(f"column of view {column.view}: its visits are not known")
-        block[column.view] = visits.means(values[None], ground.z.size).reshape(ground.z.shape)
+        means = visits.means(values[None], ground.z.size).reshape(ground.z.shape)
         seen: list[np.ndarray | None] = [None] * len(ground.names)
         seen[column.view] = values
-        made.append((column, block, seen))
+        made.append(Made(column, {column.view: means}, seen))
     return _stacked(ground, made)
 
 
-def _stacked(ground: Ground, made: list[tuple[Column, np.ndarray, list]]) -> TermColumns:
-    shape = (len(made), *ground.weight.shape)
-    grid = np.array([block for _, block, _ in made]).reshape(shape) if made else np.zeros(
-        shape, dtype=complex)
-    seen = [values for _, _, values in made]
-    return TermColumns(tuple(column for column, _, _ in made), grid, _within(ground, seen), seen)
+def _stacked(ground: Ground, made: list[Made]) -> TermColumns:
+    grid = np.zeros((len(made), *ground.weight.shape), dtype=complex)
+    for out, item in zip(grid, made, strict=True):
+        _fill(out, item.means)
+    seen = [item.seen for item in made]
+    return TermColumns(tuple(item.column for item in made), grid, _within(ground, seen), seen)
+
+
+def _fill(out: np.ndarray, means: dict[int, np.ndarray]) -> None:
+    for view, values in means.items():
+        out[view] = values
 
 
 def joined(ground: Ground, first: TermColumns, second: TermColumns) -> TermColumns:
@@ -198,7 +212,7 @@ def _require_visits(ground: Ground, name: TermName) -> None:
 
 
 def _visit_columns(ground: Ground, term: ModelTerm,
-                   degree: int) -> list[tuple[Column, np.ndarray, list]]:
+                   degree: int) -> list[Made]:
     if term.name is TermName.DRIFT:
         out = []
         for view in range(len(ground.names)):
@@ -230,21 +244,21 @@ def _approach_parts(ground: Ground) -> Parts:
 
 
 def _of_visits(ground: Ground, column: Column,
-               shape: Callable[[ViewVisits], np.ndarray]) -> tuple[Column, np.ndarray, list]:
+               shape: Callable[[ViewVisits], np.ndarray]) -> Made:
     """Return a column of the visits: its means at the marks, and its values at the visits."""
-    block = np.zeros(ground.weight.shape, dtype=complex)
+    means: dict[int, np.ndarray] = {}
     values: list[np.ndarray | None] = []
     for view, visits in enumerate(ground.visits):
         if visits is None or column.view not in (-1, view):
             values.append(None)
             continue
         at = shape(visits) * visits.phase
-        block[view] = visits.means(at[None], block[view].size)[0].reshape(block[view].shape)
+        means[view] = visits.means(at[None], ground.z.size)[0].reshape(ground.z.shape)
         values.append(at)
-    return column, block, values
+    return Made(column, means, values)
 
 
-def _plate_columns(ground: Ground, term: ModelTerm) -> list[tuple[Column, np.ndarray, list]]:
+def _plate_columns(ground: Ground, term: ModelTerm) -> list[Made]:
     """Return columns of plate scale or shape: the same at all visits of a mark.
 
     A size says how far views scatter about what they have in common, so that each view has its
@@ -254,10 +268,9 @@ def _plate_columns(ground: Ground, term: ModelTerm) -> list[tuple[Column, np.nda
     out = []
     for view in range(first, len(ground.names)):
         for text, shape in _plate_shapes(ground, term.name):
-            block = np.zeros(ground.weight.shape, dtype=complex)
-            block[view] = np.where(ground.weight[view] > 0, shape, 0)
-            out.append((Column(term.name, view, text, term.size), block,
-                        [None] * len(ground.names)))
+            means = {view: np.where(ground.weight[view] > 0, shape, 0)}
+            out.append(Made(Column(term.name, view, text, term.size), means,
+                            [None] * len(ground.names)))
     return out
 
 
@@ -273,7 +286,7 @@ def _plate_shapes(ground: Ground, name: TermName) -> list[tuple[str, np.ndarray]
 def _within(ground: Ground, seen: list[list[np.ndarray | None]]) -> WithinMarks:
     total, dof, n = 0.0, 0, len(seen)
     for visits in ground.visits:
-        if visits is not None:
+        if visits is not None and visits.repeated:
             rest = visits.about_means(visits.y[None], ground.z.size)[0]
             total += float(visits.weight @ abs(rest) ** 2)
             dof += 2 * (len(visits.mark) - len(np.unique(visits.mark)))
@@ -288,7 +301,7 @@ def _within_anew(ground: Ground, seen: list[list[np.ndarray | None]], before: Wi
     gram[changed], gram[:, changed], right[changed] = 0.0, 0.0, 0.0
     for view, visits in enumerate(ground.visits):
         mine = [k for k in changed if seen[k][view] is not None]
-        if visits is None or not mine:
+        if visits is None or not visits.repeated or not mine:
             continue
         here = [k for k in range(len(seen)) if seen[k][view] is not None]
         # about the means of their marks: then those of the others drop out

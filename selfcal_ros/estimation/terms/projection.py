@@ -87,7 +87,8 @@ def reduce_anew(grid: GridSystem, columns: np.ndarray, before: ReducedColumns,
     sites = np.empty((grid.n_sites, len(changed)), dtype=complex)
     for part in _chunks(columns, len(changed)):
         at = changed[part]
-        weighted = grid.weight * _centred(grid, columns[at])
+        weighted = _centred(grid, columns[at])
+        weighted *= grid.weight
         for place, one in zip(range(part.start, part.stop), weighted, strict=True):
             sites[:, place] = grid.views.scatter(one).ravel()
         sums = np.einsum("kij,pvij->vkp", np.conj(grid.shapes), weighted, optimize=True)
@@ -128,8 +129,9 @@ def inner_products(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 
 
 def _centred(grid: GridSystem, columns: np.ndarray) -> np.ndarray:
-    mean = np.einsum("vij,pvij->pij", grid.relative_weight, columns)
-    return columns - mean[:, None]
+    """Return columns less their weighted mean over the views, in their own memory."""
+    columns -= np.einsum("vij,pvij->pij", grid.relative_weight, columns)[:, None]
+    return columns
 
 
 def _chunks(columns: np.ndarray, number: int) -> list[slice]:

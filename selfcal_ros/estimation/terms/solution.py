@@ -73,7 +73,7 @@ def score(equations: TermEquations, residuals: np.ndarray, squares: tuple[float,
     within = columns.within
     taken = np.zeros(equations.n) if coefficients is None else coefficients
     weighted = (weight * residuals).reshape(-1)
-    between = (np.conj(columns.grid.reshape(len(taken), weighted.size)) @ weighted).real
+    between = (columns.grid.reshape(len(taken), weighted.size) @ np.conj(weighted)).real
     inner = within.total - 2 * taken @ within.right + taken @ within.gram @ taken
     sums = Sums(*squares, float(inner), within.dof)
     return Score(between, within.right - within.gram @ taken, sums)

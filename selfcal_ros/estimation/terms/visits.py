@@ -59,6 +59,11 @@ class ViewVisits:
         """Weights that add up to 1 over the visits of each mark, (V,)."""
         return self.weight / np.bincount(self.mark, self.weight)[self.mark]
 
+    @cached_property
+    def repeated(self) -> bool:
+        """Whether a mark was visited more than once; else its visit is its mean."""
+        return len(np.unique(self.mark)) < len(self.mark)
+
     def about_means(self, values: np.ndarray, n_marks: int) -> np.ndarray:
         """Return complex values (k, V) less the mean of their mark."""
         return values - self.means(values, n_marks)[:, self.mark]
