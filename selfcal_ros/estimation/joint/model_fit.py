@@ -37,9 +37,9 @@ RESOLUTION = 1e-12
 ROUGH_RESOLUTION = 1e-11
 """The same once steps no longer shrink."""
 
-OF_NOISE = 1e-6
+OF_NOISE = 1e-4
 """Change of a reading, against the standard uncertainty of a misalignment, that is none once steps
-no longer shrink: where weights lie far apart rounding moves it."""
+no longer shrink: rounding moves it where weights lie far apart, or a term is hardly told."""
 
 LINEAR = 1e-3
 """Relative change of the misalignments' covariance from which the terms' equations are set up
@@ -47,6 +47,9 @@ anew."""
 
 OFFSET_STEPS = 10
 """Most steps in which the offsets that a microscope saw are freed from noise anew."""
+
+FIXED = 1e-12
+"""Variance of a misalignment, against the largest, that is rounding: a datum fixes it."""
 
 SHRINKS = 0.5
 """Ratio of two steps above which they no longer shrink."""
@@ -160,6 +163,9 @@ def _settled(problem: Problem, check: Callable[[TermEquations], None]) -> ModelF
         if stuck and (change <= ROUGH_RESOLUTION * largest or state.within_noise(change)):
             return state.finished()
         before = change
+    if problem.terms:
+        raise InputError(f"model {', '.join(str(term.name) for term in problem.terms)}",
+                         "the estimate does not settle", "leave a term out, or give it a size")
     raise InputError("misalignment model 'rigid'", "the rotations do not settle",
                      "check the readings for misalignments of more than a few degrees")
 
@@ -251,7 +257,7 @@ class _State:
     def within_noise(self, change: float) -> bool:
         """Return whether a change of the misalignments is nothing against their uncertainty."""
         spread = np.diag(self.found.inverse)
-        spread = spread[spread > 0]
+        spread = spread[spread > FIXED * spread.max(initial=0.0)]
         sigma = self.found.xy.sigma
         return bool(len(spread) and np.isfinite(sigma)
                     and change <= OF_NOISE * sigma * np.sqrt(spread.min()))
