@@ -60,3 +60,13 @@ def quick_beat(monkeypatch):
     from selfcal_ros.nodes import base
 
     monkeypatch.setattr(base, "BEAT_S", 0.05)
+
+
+@pytest.fixture(scope="session")
+def forks():
+    """Yield what starts nodes as processes without importing them each time."""
+    from test.support.forked import Forks
+
+    forks = Forks()
+    yield forks
+    forks.close()

@@ -9,9 +9,9 @@ from selfcal_ros.collection.messages import Detection
 from test.support.chaos import HARMLESS, full_disk, one_round, story
 
 
-def test_nothing_is_lost_without_a_word_and_the_maps_are_the_right_ones(ros_environment, tmp_path):
-    lines, wrong = one_round(2, ros_environment, tmp_path, kills=1,
-                             all_are_processes=False)
+def test_nothing_is_lost_without_a_word_and_the_maps_are_the_right_ones(
+        ros_environment, tmp_path, forks):
+    lines, wrong = one_round(2, ros_environment, tmp_path, kills=1, forks=forks)
     assert wrong == []
     assert [line.partition(":")[0] for line in lines] == ["quiet_messages", "lost_messages"]
     assert all(" used + " in line for line in lines)
@@ -20,8 +20,8 @@ def test_nothing_is_lost_without_a_word_and_the_maps_are_the_right_ones(ros_envi
 
 
 def test_a_disk_that_is_full_for_a_while_costs_its_part_of_the_journal_alone(
-        ros_environment, tmp_path):
-    line, wrong = full_disk(3, ros_environment, tmp_path, all_are_processes=False)
+        ros_environment, tmp_path, forks):
+    line, wrong = full_disk(3, ros_environment, tmp_path, forks=forks)
     assert wrong == []
     assert " used + " in line
 

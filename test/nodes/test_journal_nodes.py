@@ -21,8 +21,8 @@ VALUES = CollectorSettings.checked({}, "test")
 
 
 @pytest.fixture
-def cell(graph, ros_environment, tmp_path):
-    cell = Cell(graph, ros_environment, tmp_path)
+def cell(graph, ros_environment, tmp_path, forks):
+    cell = Cell(graph, ros_environment, tmp_path, forks=forks)
     yield cell
     cell.close()
 

@@ -2,7 +2,6 @@
 """Each node as a process: it starts, a signal ends it with code 0, and nothing stays behind."""
 
 import contextlib
-import json
 import os
 import signal
 import subprocess
@@ -16,6 +15,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 
 from selfcal_ros.cli.replay import NODES
 from selfcal_ros.collection.settings.nodes import NODE_PARAMETERS
+from test.support.forked import Fork, Forks
 from test.support.sessions import plan_file, small_bag, small_plan
 from test.support.waiting import PATIENCE_S, wait_until
 
@@ -25,9 +25,9 @@ SELFCAL = "import sys; from selfcal_ros.cli.main import main; sys.exit(main())"
 class Group:
     """Processes in a session of their own, as a terminal or a launcher would have them."""
 
-    def __init__(self, environment: dict) -> None:
-        self.environment = environment
-        self.running: list[subprocess.Popen] = []
+    def __init__(self, environment: dict, forks: Forks) -> None:
+        self.environment, self.forks = environment, forks
+        self.running: list[subprocess.Popen | Fork] = []
 
     def start(self, *command: str) -> subprocess.Popen:
         process = subprocess.Popen([sys.executable, *command], env=self.environment,
@@ -36,10 +36,10 @@ class Group:
         self.running.append(process)
         return process
 
-    def node(self, name: str, **parameters: object) -> subprocess.Popen:
-        arguments = [word for key, value in parameters.items()
-                     for word in ("-p", f"{key}:={value}")]
-        return self.start("-m", f"selfcal_ros.nodes.{name}", "--ros-args", *arguments)
+    def node(self, name: str, *arguments: str) -> Fork:
+        process = self.forks.start(name, ["--ros-args", *arguments], self.environment)
+        self.running.append(process)
+        return process
 
     def close(self) -> None:
         for process in self.running:
@@ -49,8 +49,8 @@ class Group:
 
 
 @pytest.fixture
-def group(ros_environment):
-    group = Group(ros_environment)
+def group(ros_environment, forks):
+    group = Group(ros_environment, forks)
     yield group
     group.close()
 
@@ -64,7 +64,7 @@ def alive(session: int) -> bool:
     return True
 
 
-def ended(process: subprocess.Popen) -> tuple[int, str, str]:
+def ended(process: subprocess.Popen | Fork) -> tuple[int, str, str]:
     out, err = process.communicate(timeout=PATIENCE_S)
     wait_until(lambda: not alive(process.pid), "the end of its children")
     return process.returncode, out, err
@@ -78,11 +78,12 @@ SIGNALS = {"measurement_collector": signal.SIGINT, "pose_sequencer": signal.SIGT
 
 def test_a_signal_ends_every_node_cleanly(graph, group, tmp_path):
     bag, recorded = small_bag(tmp_path), tmp_path / "recorded"
-    needed = {"bag_player": {"bag": bag, "rate": 0.001}, "bag_recorder": {"bag": recorded},
-              "pose_sequencer": {"plan": plan_file(tmp_path, small_plan())}}
+    needed = {"bag_player": ["-p", f"bag:={bag}", "-p", "rate:=0.001"],
+              "bag_recorder": ["-p", f"bag:={recorded}"],
+              "pose_sequencer": ["-p", f"plan:={plan_file(tmp_path, small_plan())}"]}
     diagnostics: list = []
     graph.hand.create_subscription(DiagnosticArray, "/diagnostics", diagnostics.append, 100)
-    processes = {name: group.node(name, **needed.get(name, {})) for name in NODE_PARAMETERS}
+    processes = {name: group.node(name, *needed.get(name, [])) for name in NODE_PARAMETERS}
     graph.until(lambda: set(NODE_PARAMETERS) <= set(graph.hand.get_node_names()), "all nodes")
     graph.until(lambda: {status.name for m in diagnostics for status in m.status}
                 >= set(NODE_PARAMETERS) - {"bag_player"}, "their diagnostics")
@@ -110,30 +111,15 @@ def test_a_signal_that_comes_again_and_again_changes_nothing(graph, group):
 
 
 def test_a_player_ends_by_itself_when_the_bag_is_played(group, tmp_path):
-    code, _, err = ended(group.node("bag_player", bag=small_bag(tmp_path), rate=0.0,
-                                    wait_for_subscribers=0.0))
+    code, _, err = ended(group.start(
+        "-m", "selfcal_ros.nodes.bag_player", "--ros-args", "-p", f"bag:={small_bag(tmp_path)}",
+        "-p", "rate:=0.0", "-p", "wait_for_subscribers:=0.0"))
     assert code == 0
     assert "played" in err
 
 
-EACH_IN_A_PROCESS = """
-import importlib, json, os, sys
-starts = json.loads(sys.argv[1])
-mains = [importlib.import_module(f"selfcal_ros.nodes.{node}").main for node, _ in starts]
-codes = []
-for number, (main, (node, words)) in enumerate(zip(mains, starts, strict=True)):
-    if not (child := os.fork()):  # as a new interpreter would be when it has imported the node
-        os.dup2(os.open(f"{sys.argv[2]}/{number}", os.O_WRONLY | os.O_CREAT), 2)
-        sys.argv = [node, "--ros-args", *words]
-        main()
-    codes.append(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
-print(json.dumps(codes))
-"""
-
-
 def test_bad_input_is_one_line_and_code_2(group, tmp_path):
-    file, said = tmp_path / "params.yaml", tmp_path / "said"
-    said.mkdir()
+    file = tmp_path / "params.yaml"
     file.write_text(yaml.safe_dump({"compensator": {"ros__parameters": {"joint_tetha": "c"}}}))
     not_ros = "arguments after --ros-args: "
     cases = [
@@ -145,11 +131,10 @@ def test_bad_input_is_one_line_and_code_2(group, tmp_path):
          "parameter; did you mean 'joint_theta'? known are", ""),
         ("compensator", ["--params-file", "/no/p.yaml"], "Couldn't parse params file", not_ros),
         ("compensator", ["--bogus"], "['--bogus']", not_ros)]
-    out = ended(group.start("-c", EACH_IN_A_PROCESS, json.dumps([case[:2] for case in cases]),
-                            str(said)))[1]
-    assert json.loads(out) == [2] * len(cases)
-    for number, (_, _, problem, begin) in enumerate(cases):
-        err = (said / str(number)).read_text()
+    processes = [group.node(node, *words) for node, words, _, _ in cases]
+    for process, (_, _, problem, begin) in zip(processes, cases, strict=True):
+        code, _, err = ended(process)
+        assert code == 2
         [line] = [text for text in err.splitlines() if text.startswith("selfcal: ")]
         assert line.startswith(f"selfcal: {begin}")
         assert problem in line

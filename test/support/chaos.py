@@ -24,6 +24,7 @@ from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.nodes import names
 from selfcal_ros.simulation.cell import Event
 from selfcal_ros.simulation.faults import Faults, apply_faults
+from test.support.forked import Forks
 from test.support.killed import Cell
 from test.support.ros import Graph
 from test.support.sessions import collected, events_of, small_plan
@@ -125,13 +126,13 @@ def story(cell: Cell, faults: Faults, rng: np.random.Generator, kills: int) -> S
 
 
 @contextlib.contextmanager
-def cells(environment: dict, folder: Path) -> Iterator[list[Cell]]:
+def cells(environment: dict, folder: Path, forks: Forks | None) -> Iterator[list[Cell]]:
     """Yield two cells side by side; none of their nodes is left behind."""
     graph, out = Graph(int(environment["ROS_DOMAIN_ID"])), []
     try:
         for name in CELLS:
             (folder / name).mkdir()
-            out.append(Cell(graph, environment, folder / name, name))
+            out.append(Cell(graph, environment, folder / name, name, forks=forks))
         yield out
     finally:
         for cell in out:
@@ -140,17 +141,17 @@ def cells(environment: dict, folder: Path) -> Iterator[list[Cell]]:
 
 
 def one_round(seed: int, environment: dict, folder: Path, *, kills: int = 3,
-              all_are_processes: bool = True) -> tuple[list[str], list[str]]:
+              forks: Forks | None = None) -> tuple[list[str], list[str]]:
     """Run a round of two cells; return a line for each, and what was wrong.
 
-    Unless `all_are_processes`, nodes that are not killed run in this process.
+    With `forks`, nodes that are killed are forks, and those that are not run in this process.
     """
     rng = np.random.default_rng(seed)
-    with cells(environment, folder) as running:
+    with cells(environment, folder, forks) as running:
         stories = [story(cell, faults, rng, kills)
                    for cell, faults in zip(running, CELLS.values(), strict=True)]
         for one in stories:
-            if not all_are_processes:
+            if forks:
                 one.cell.inside = dict.fromkeys(set(NODES) - {node for _, node in one.kills})
             one.start()
         for share in np.linspace(0, 1, 9)[1:]:
@@ -161,7 +162,7 @@ def one_round(seed: int, environment: dict, folder: Path, *, kills: int = 3,
     return lines, wrong
 
 
-def full_disk(seed: int, environment: dict, folder: Path, *, all_are_processes: bool = True,
+def full_disk(seed: int, environment: dict, folder: Path, *, forks: Forks | None = None,
               ) -> tuple[str, list[str]]:
     """Measure in a cell whose disk is full for a third of the run; return a line, what was wrong.
 
@@ -170,8 +171,8 @@ def full_disk(seed: int, environment: dict, folder: Path, *, all_are_processes: 
     """
     rng = np.random.default_rng(seed)
     graph = Graph(int(environment["ROS_DOMAIN_ID"]))
-    cell = Cell(graph, environment, folder, "full_disk")
-    cell.inside = {} if all_are_processes else {"solver": None}
+    cell = Cell(graph, environment, folder, "full_disk", forks=forks)
+    cell.inside = {"solver": None} if forks else {}
     try:
         one = story(cell, HARMLESS, rng, 0)
         told: list = []

@@ -22,6 +22,7 @@ from selfcal_ros.nodes import names
 from selfcal_ros.nodes.measurement_collector import MeasurementCollector
 from selfcal_ros.nodes.solver import Solver
 from selfcal_ros.simulation.cell import Event
+from test.support.forked import Forks
 from test.support.ros import Graph
 from test.support.sessions import cdr_of
 
@@ -39,11 +40,13 @@ class Cell:
     """Plays a run into node processes; repeats what the collector had not told as received.
 
     A cell whose detections nobody takes waits: it goes on when the collector is back. Nodes named
-    in `inside`, which nobody kills, run in the process of the test.
+    in `inside`, which nobody kills, run in the process of the test; the others are forked, if there
+    are `forks`, or started as new interpreters.
     """
 
-    def __init__(self, graph: Graph, environment: dict, folder: Path, namespace: str = "") -> None:
-        self.graph, self.environment, self.folder = graph, environment, folder
+    def __init__(self, graph: Graph, environment: dict, folder: Path, namespace: str = "", *,
+                 forks: Forks | None = None) -> None:
+        self.graph, self.environment, self.folder, self.forks = graph, environment, folder, forks
         self.inside: dict[str, Any] = {}
         self.namespace, self.running = namespace, {}
         self.processes = contextlib.ExitStack()
@@ -77,12 +80,12 @@ class Cell:
                 **{key: str(value) if isinstance(value, Path) else value
                    for key, value in parameters.items()})
             return
-        arguments = [word for key, value in parameters.items()
-                     for word in ("-p", f"{key}:={value}")]
-        self.running[node] = self.processes.enter_context(process(
-            f"selfcal_ros.nodes.{node}", ["--ros-args", "-r", f"__ns:=/{self.namespace}",
-                                          *arguments], self.environment,
-            stderr=subprocess.PIPE, text=True))
+        arguments = ["--ros-args", "-r", f"__ns:=/{self.namespace}", *(
+            word for key, value in parameters.items() for word in ("-p", f"{key}:={value}"))]
+        self.running[node] = self.processes.enter_context(
+            self.forks.process(node, arguments, self.environment) if self.forks else process(
+                f"selfcal_ros.nodes.{node}", arguments, self.environment,
+                stderr=subprocess.PIPE, text=True))
 
     def start_collector(self) -> None:
         """Start it and wait until it knows what its journal holds."""
