@@ -5,6 +5,7 @@ A message is one line that names the place, what is wrong, and how to correct it
 The same codes are the ``error_code`` of services and actions.
 """
 
+import re
 from collections.abc import Iterable
 from difflib import get_close_matches
 from enum import IntEnum
@@ -76,9 +77,14 @@ class NoDataError(InputError):
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:
-    """Return ``did you mean 'x'?`` with the names most like `word`, at most two; "" if none is."""
+    """Return ``did you mean 'x'?`` with the names most like `word`, at most two; "" if none is.
+
+    The same words in another order are most like it.
+    """
     names = {str(name).lower(): str(name) for name in known}
-    found = get_close_matches(word.lower(), names, n=2, cutoff=0.7)
+    words = sorted(re.split("[-_/]+", word.lower()))
+    found = [name for name in names if sorted(re.split("[-_/]+", name)) == words][:2] or (
+        get_close_matches(word.lower(), names, n=2, cutoff=0.7))
     return f"did you mean {' or '.join(repr(names[name]) for name in found)}?" if found else ""
 
 

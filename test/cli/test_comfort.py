@@ -58,6 +58,8 @@ def test_a_fault_on_the_command_line_is_one_line(capsys, words, message):
 def test_names_like_one_another():
     assert did_you_mean("Viws", ["views", "plan_id"]) == "did you mean 'views'?"
     assert did_you_mean("nothing", ["views", "plan_id"]) == ""
+    assert did_you_mean("--Datum-theta", ["--theta", "--theta-datum"]) == (
+        "did you mean '--theta-datum'?")
     assert known_are("viws", ["views", "artifact"]) == (
         "did you mean 'views'? known are views, artifact")
     assert known_are("zzz", ["views", "artifact"]) == "known are views, artifact"
