@@ -1,11 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """Step-diagonal readings from the formula of the method, and tables with a fault."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from selfcal_ros.laser.data import DIAGONALS, StepDiagonal, signs_of, step_vectors
 from selfcal_ros.laser.readings.zigzag import Series
-from selfcal_ros.simulation.laser.measure import SetUp, trace
+from selfcal_ros.simulation.laser.measure import (
+    LaserNoise,
+    Measurement,
+    SetUp,
+    simulate_step_diagonal,
+    trace,
+)
 
 MM = 1e-3
 
@@ -39,6 +47,37 @@ def random_errors(n, rng, sigma_m=1e-7):
     errors = rng.normal(0, sigma_m, (2, n, 2))
     errors[0, 0, 1] = 0.0
     return errors
+
+
+def scatter_of(machine, values_of):
+    """Return a function from a `LaserNoise` to the standard deviations of values that are found.
+
+    `values_of` finds them from a measurement; they follow every mean reading moved in turn. A
+    reading is the difference of two distances, one after the other in time.
+    """
+    exact, size = simulate_step_diagonal(machine, Measurement(), np.random.default_rng(0)), 1e-8
+    base, answers = values_of(exact), {}
+    for name in ("samples_m", "linear_m"):
+        whole = getattr(exact, name)
+        moves = size * np.eye(whole.size).reshape(-1, *whole.shape)
+        answers[name] = np.array([(values_of(replace(exact, **{name: whole + move})) - base) / size
+                                  for move in moves])
+
+    def scatter(noise: LaserNoise):
+        n = machine.n_blocks
+        variance = np.zeros(len(base))
+        for k, name in enumerate(exact.diagonals):
+            order, _ = trace(machine, name, SetUp())
+            of_run = answers["samples_m"].reshape(-1, machine.dim * n, len(base))[k]
+            distances = np.diff(of_run[order], axis=0, prepend=0.0, append=0.0)
+            variance += noise.distance_m**2 * (distances**2).sum(axis=0)
+            variance += noise.reading_m**2 * (of_run**2).sum(axis=0)
+        for of_axis in answers["linear_m"].reshape(machine.dim, n, len(base)):
+            places = np.diff(of_axis, axis=0, prepend=0.0, append=0.0)
+            variance += noise.linear_m**2 * (places**2).sum(axis=0)
+        return np.sqrt(variance / noise.repeats)
+
+    return scatter
 
 
 def recorded(machine, setups, *, rng, noise_m=0.0, extra=None):
