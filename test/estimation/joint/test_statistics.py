@@ -83,7 +83,7 @@ def test_uncertainty_is_that_of_every_reading_moved_in_turn(missing, sigma_theta
     model of finite rotations, show that draws of noise are sums of these answers.
     """
     sigma, rng = 2e-8, np.random.default_rng(3)
-    plan = hu_plan(Artifact(7, 0.01, 12))
+    plan = hu_plan(Artifact(5, 0.01, 12))
     for options, exact, tolerance in ((LINEAR, True, 1e-6), (Options(), False, 0.03)):
         _, readings = measured(plan, seed=12, missing=missing, sense=Sense.PLATE_MOVES,
                                linear=exact)

@@ -99,21 +99,22 @@ def test_standardised_residuals_are_chi_square():
 
 
 def test_good_readings_stay(monkeypatch):
-    """At a level of 10 % at most one run in ten loses a reading, marks and lines together.
+    """At a level of 30 % at most so many runs lose a reading, marks and lines together.
 
-    At ten times its level the test has its power in fewer runs: more than 14 of 60 happen once in
-    a thousand at a rate of 10 %, five times in six at 30 %. Never is a slip or a noisy view seen.
+    At thirty times its level the test has its power in few runs: more than 17 of 30 happen once in
+    a thousand at a rate of 30 %, five times in six at 66 %, as of three such tests in one.
+    Never is a slip or a noisy view seen.
     """
-    monkeypatch.setattr("selfcal_ros.estimation.quality.outliers.LEVEL", 0.1)
+    monkeypatch.setattr("selfcal_ros.estimation.quality.outliers.LEVEL", 0.3)
     plan, lost = hu_plan(Artifact(5, 0.01, 8)), 0
-    for seed in range(60):
+    for seed in range(30):
         rng = np.random.default_rng(seed)
         truth = random_truth(plan.artifact, 4, rng)
         found = clean(simulate_measurements(truth, plan, rng, sigma_m=SIGMA_M, linear=True,
                                             sigma_theta_rad=SIGMA_RAD), LINEAR)
         lost += bool(found.removed)
         assert not found.slips and not found.noisy
-    assert lost <= binom.ppf(0.999, 60, 0.1)
+    assert lost <= binom.ppf(0.999, 30, 0.3)
 
 
 def dof_of(residuals):
