@@ -33,7 +33,7 @@ class JointFit:
     g_theta, a_theta : float array (K,)
         Angular maps, rad.
     residuals_theta : float array (views, K)
-        Angular residuals, rad.
+        Angular residuals, rad; axis conditions that the stage does not keep are not in them.
     misclosure : float array (conditions,)
         Slopes less Gtheta before the angular datum was applied, rad.
     xy, theta : NoiseEstimate
@@ -101,10 +101,11 @@ def fit(problem: Problem, y: np.ndarray, theta: AngularPart | None = None) -> Jo
     g_theta = theta.free - angular.response @ phi
     slopes = np.einsum("cij,ij->c", conditions.slopes.conj(), field).real
     misclosure = slopes - conditions.rows @ g_theta
+    a_theta, residuals_theta = angular.plate(problem.angular.y, g_theta, phi)
     g_theta = g_theta + conditions.gain @ misclosure
     phi = phi + conditions.phi_gain @ misclosure
     parameters[system.phi_at] = phi * length
-    a_theta, residuals_theta = angular.plate(problem.angular.y, g_theta, phi)
+    a_theta = angular.plate(problem.angular.y, g_theta, phi)[0]
     return JointFit(field, plate, residuals, parameters, g_theta, a_theta, residuals_theta,
                     misclosure, xy, theta.noise, raw.inverse, raw.solver, raw.ratio)
 

@@ -18,6 +18,7 @@ from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.terms import ModelTerm, TermName, parse_terms
 from selfcal_ros.model.view import Plan, View
+from selfcal_ros.reporting.words.result import worded
 from selfcal_ros.simulation.machine import Spread, random_truth
 from selfcal_ros.simulation.settings import CellSettings
 from selfcal_ros.simulation.truth import simulate_measurements
@@ -194,6 +195,22 @@ def test_a_drift_that_looks_like_the_stage_is_refused_and_a_size_widens_u():
                                              drift_degree=1))
         u[size] = float(np.sqrt(np.mean(result.error_map.u_gx**2)))
     assert u["1e-6"] > 4 * u["1e-9"]
+
+
+@pytest.mark.parametrize("terms", ["microscope", "drift", "plate_scale:1e-6", ""])
+def test_axes_that_the_stage_does_not_have_are_no_noise_of_the_readings(terms):
+    """The datum of theta shifts the angular map; whether the stage keeps it is another test."""
+    plan = plan_of(lines=8)
+    plan = replace(plan, views=(*plan.views, View("line", np.pi / 4, (0.0, 0.0), False, True)))
+    _, readings = measured(plan, Spread(encoder="independent", rotation="finite"),
+                           sigma_m=20e-9, sigma_theta_rad=2e-6)
+    found = [calibrate(readings, Options(terms=parse_terms([terms], ""), datum_theta=datum,
+                                         causes=False)) for datum in ("xy_axes", "zero_mean")]
+    assert [item.verdict.qualified for item in found] == [False, True]
+    assert all("axis conditions" in reason for reason in worded(found[0]).verdict.reasons)
+    for values in zip(*((item.error_map.gx, item.error_map.u_gx, item.noise.sigma_xy_residuals,
+                         item.noise.sigma_theta_residuals) for item in found), strict=True):
+        assert np.allclose(*values, rtol=1e-6, atol=1e-13)
 
 
 def test_terms_need_visits():
