@@ -116,5 +116,7 @@ def printable(text: str) -> str:
     """
     if len(text) > sum(SHOWN):
         text = f"{text[:SHOWN[0]]} ... ({len(text)} characters) ... {text[-SHOWN[1]:]}"
+    if text.isprintable():
+        return text
     return "".join(c if c.isprintable() else c.encode("unicode_escape", "surrogatepass").decode()
                    for c in text)

@@ -2,6 +2,7 @@
 """The session of solver: which readings are solved together, what is published and saved."""
 
 from dataclasses import dataclass, field
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -72,8 +73,9 @@ def solve(job: Job) -> Outcome:
         return Outcome(job, None, error)
 
 
+@cache
 def warm_up() -> None:
-    """Solve a small simulated plan, so that all that solving needs is loaded.
+    """Solve a small simulated plan, so that all that solving needs is loaded; once in a process.
 
     Otherwise the first solution of a session would wait for it. To be called before there are other
     threads: threadpoolctl, when it first looks for libraries, waits for the interpreter while the
