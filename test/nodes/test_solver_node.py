@@ -4,6 +4,7 @@
 import json
 import re
 import threading
+from functools import cache
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.messages import from_model, to_model
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.result import result_to_dict
+from selfcal_ros.model.view import Plan
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes import solver as solver_module
 from selfcal_ros.nodes.filling import fill
@@ -28,9 +30,15 @@ from test.support.sessions import collected, events_of, small_plan
 PLAN = small_plan()
 
 
-def measured(plan=PLAN, seed: int = 5) -> tuple:
+@cache
+def readings(plan: Plan, seed: int) -> tuple:
+    """Return the readings of a plan and how far each of its views is; nobody changes them."""
+    return collected(events_of(plan, seed))[1:]
+
+
+def measured(plan: Plan = PLAN, seed: int = 5) -> tuple:
     """Return ViewMeasurement messages of a plan, and the readings behind them."""
-    _, measurements, progress = collected(events_of(plan, seed))
+    measurements, progress = readings(plan, seed)
     return [fill(names.MEASUREMENT.type(), from_model.view_measurement(
         view, measurements, 10 + index, "stage")) for index, view in progress.items()], measurements
 
