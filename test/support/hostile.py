@@ -3,11 +3,10 @@
 
 import math
 from collections.abc import Iterator
-from copy import deepcopy
 from typing import Any
 
 import numpy as np
-from rclpy.serialization import serialize_message
+from rclpy.serialization import deserialize_message, serialize_message
 
 FLOATS = (math.nan, math.inf, -math.inf, -1.0, 0.0, 4.2e-3, 1e17, 1.7e308, 5e-324)
 TEXTS = ("", "no such", "../../outside", "/dev/zero", "\x1b[2J\x1b]0;title\x07", "\u202e\n\t\0",
@@ -21,9 +20,10 @@ LONG = 20_000
 
 def worst(message: Any) -> Iterator[tuple[str, Any]]:
     """Yield (what was done, message): copies of a message with one field at its worst."""
+    data = serialize_message(message)
     for path, values in _fields(message, ()):
         for value in values:
-            spoilt = deepcopy(message)
+            spoilt = deserialize_message(data, type(message))  # a tenth of a deepcopy
             _set(spoilt, path, value)
             yield ".".join(map(str, path)), spoilt
 
