@@ -16,12 +16,12 @@ PLAN = """
 plan_id: independent
 artifact: {grid_size: 5, grid_pitch: 0.01, angular_count: 8}
 views:
-  - {name: identity, repeats: 2}
-  - {name: rot90, rotation_deg: 90, repeats: 2}
-  - {name: one_line, rotation_deg: 45, grid: false, repeats: 2}
-  - {name: shift, translation_pitch: [1, 0], repeats: 2}
+  - {name: identity, repeats: REPEATS}
+  - {name: rot90, rotation_deg: 90, repeats: REPEATS}
+  - {name: one_line, rotation_deg: 45, grid: false, repeats: REPEATS}
+  - {name: shift, translation_pitch: [1, 0], repeats: REPEATS}
 """
-VIEWS, MARKS = 4, (66, 66, 16, 56)
+VIEWS, MARKS = 4, (33, 33, 8, 28)
 NEAR_M, NEAR_RAD = 2e-8, 1e-6
 """What the noise of the cell may do to a map; its errors are above 4e-7 m and 5e-5 rad."""
 
@@ -29,11 +29,12 @@ NEAR_M, NEAR_RAD = 2e-8, 1e-6
 class Site:
     """A cell and the nodes that calibrate it, in a namespace."""
 
-    def __init__(self, graph, folder, namespace="", **cell):
+    def __init__(self, graph, folder, namespace="", *, repeats=1, **cell):
         self.graph, self.folder, self.namespace = graph, folder, namespace
         self.nodes = {}
         folder.mkdir(exist_ok=True)
-        (folder / "plan.yaml").write_text(PLAN)
+        (folder / "plan.yaml").write_text(PLAN.replace("REPEATS", str(repeats)))
+        self.marks = [repeats * marks for marks in MARKS]
         self.maps, self.summaries, self.commands, self.statuses = (
             graph.listen(self.topic(topic)) for topic in (
                 names.ERROR_MAP, names.SUMMARY, names.COMMAND, names.STATUS))
@@ -79,7 +80,7 @@ class Site:
         """Wait until the cell waits and the collector has what was sent."""
         self.graph.until(lambda: self.cell.held, "the middle of a view")
         received = self.nodes[MeasurementCollector].session.collector.received
-        self.graph.until(lambda: received["detection"] == sum(MARKS[:self.cell.view])
+        self.graph.until(lambda: received["detection"] == sum(self.marks[:self.cell.view])
                          + self.cell.exposed, "what was sent")
 
     def release(self):
@@ -117,7 +118,7 @@ class Site:
     {"plate_moves": True}, {"ids": False, "joints": ("spindle", "theta", "y", "z", "x")},
     {"plate_moves": True, "ids": False}], ids="-".join)
 def test_it_is_calibrated_to_its_true_error(graph, tmp_path, cell):
-    site = Site(graph, tmp_path, **cell).begin()
+    site = Site(graph, tmp_path, repeats=2, **cell).begin()
     site.check()
     site.check_that_all_was_used()
 
