@@ -20,6 +20,7 @@ import pytest
 from selfcal_ros.cli import supervisor as supervising
 from selfcal_ros.cli import up as up_verb
 from selfcal_ros.cli.main import build_parser
+from selfcal_ros.cli.main import main as selfcal
 from selfcal_ros.cli.supervisor import MOST_RESTARTS, Supervisor
 from selfcal_ros.files import read_json
 from selfcal_ros.nodes import monitor_session
@@ -228,11 +229,12 @@ def test_a_request_without_a_cell_says_so(graph, monkeypatch, capsys):
                                           "another folder"),
     (["--plan", "PLAN", "--results", "/no"], "selfcal up: /no: is not a folder; name one that "
                                              "exists")])
-def test_bad_input_is_one_line_before_anything_is_started(start, tmp_path, words, line):
+def test_bad_input_is_one_line_before_anything_is_started(
+        tmp_path, monkeypatch, capsys, words, line):
+    monkeypatch.setattr(supervising, "process", None)  # nothing can be started
     plan = plan_file(tmp_path, small_plan())
-    up = start("up", *[plan if word == "PLAN" else word for word in words])
-    assert up.process.wait(PATIENCE_S) == 2
-    assert up.process.stderr.read() == f"{line}\n"
+    assert selfcal(["up", *[plan if word == "PLAN" else word for word in words]]) == 2
+    assert capsys.readouterr() == ("", f"{line}\n")
 
 
 class Child:
