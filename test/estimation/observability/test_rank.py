@@ -86,3 +86,11 @@ def test_too_many_missing_marks_are_refused():
     readings = simulate_measurements(random_truth(artifact, 3, rng), plan, rng, missing=0.7)
     with pytest.raises(NotIdentifiableError, match="read the missing marks: only"):
         calibrate(readings)
+
+
+@pytest.mark.parametrize(("lines", "more"), [
+    (1, ()), (-1, ()), (2, ("add an angular view turned by one line (45 deg)",)),
+    (4, ("add an angular view turned by one line (45 deg)",))])
+def test_a_turn_by_one_line_is_advised_where_none_tells_the_lines_apart(lines, more):
+    seen = plan_observability(plan_of("0,90", Artifact(5, 0.01, 8), lines=lines))
+    assert seen.advice == ("add a view shifted by one pitch along X", *more)

@@ -1,0 +1,45 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Columns of a slip: what moves, from which visit on, in which frame."""
+
+import numpy as np
+import pytest
+
+from selfcal_ros.estimation.lattice.readings import grid_data
+from selfcal_ros.estimation.terms.ground import ground_of
+from selfcal_ros.estimation.verdict.slip_columns import slip_columns
+from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.simulation.settings import CellSettings
+from selfcal_ros.simulation.truth import random_truth, simulate_measurements
+from test.support.lattice_plans import plan_of
+
+
+@pytest.fixture(scope="module")
+def ground():
+    """Return the ground of two views of 7 x 7 marks, the second turned by 90 deg."""
+    plan, rng = plan_of("0,90,tx", Artifact(7, 0.01)), np.random.default_rng(4)
+    readings = simulate_measurements(random_truth(plan.artifact, 3, rng), plan, rng,
+                                     settings=CellSettings(), visits=True)
+    return ground_of(readings, grid_data(readings), 0.03)
+
+
+@pytest.mark.parametrize("view", [0, 1])
+def test_twelve_instants_divide_the_visits_of_a_view_evenly(ground, view):
+    made, rows = slip_columns(ground)
+    parts = [part for number, part in rows if number == view]
+    assert parts == pytest.approx([k / 13 for k in range(1, 13)], abs=1e-15)
+    time, mark = ground.visits[view].time, ground.visits[view].mark
+    unit = (1, -1j)[view]  # a stage axis in the frame of a plate turned by 90 deg
+    for part in parts:
+        x, y, phi = (made.seen[at][view] for at in np.flatnonzero(rows[view, part]))
+        after = time >= np.sort(time)[round(49 * part)]
+        assert np.array_equal(x, unit * after) and np.array_equal(y, 1j * unit * after)
+        assert np.array_equal(phi, 1j * ground.z.ravel()[mark] * after)
+
+
+def test_each_column_moves_its_own_view_alone(ground):
+    made, rows = slip_columns(ground)
+    for (view, _), mine in rows.items():
+        assert [made.columns[at].component for at in np.flatnonzero(mine)] == ["x", "y", "phi"]
+        for at in np.flatnonzero(mine):
+            assert np.flatnonzero(np.abs(made.grid[at]).max(axis=(1, 2))).tolist() == [view]
+            assert made.columns[at].view == view
