@@ -88,8 +88,13 @@ class NormalEquations:
         out = np.zeros((self.size, self.size))
         n = 3 * self.grid.n_views
         out[:n, :n] = of_grid
-        out[np.ix_(self.phi_at, self.phi_at)] += ratio * self.angular.schur
+        out[self._phi_blocks] += ratio * self.angular.schur
         return out
+
+    @cached_property
+    def _phi_blocks(self) -> tuple[np.ndarray, ...]:
+        """Rows and columns of the rotations of the angular views."""
+        return np.ix_(self.phi_at, self.phi_at)
 
     @cached_property
     def grid_scale(self) -> float:
@@ -132,10 +137,15 @@ class NormalEquations:
 
     def inverse(self, ratio: float) -> np.ndarray:
         """Return the pseudo-inverse of `normal`: covariance of the misalignments, unit noise."""
-        null = self._null
-        held = self.grid_scale * (null @ null.T)
-        out = np.linalg.inv(self.normal(ratio) + held) - held / self.grid_scale**2
+        held, let_go = self._held
+        out = np.linalg.inv(self.normal(ratio) + held) - let_go
         return (out + out.T) / 2
+
+    @cached_property
+    def _held(self) -> tuple[np.ndarray, np.ndarray]:
+        """What makes the normal matrix regular, and what it adds to its inverse."""
+        held = self.grid_scale * (self._null @ self._null.T)
+        return held, held / self.grid_scale**2
 
     @cached_property
     def rank_grid(self) -> int:
