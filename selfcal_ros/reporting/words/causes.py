@@ -40,10 +40,10 @@ def _text(what: Finding, cause: Cause) -> str:
 @_text.register
 def _(what: MicroscopeCause, cause: Cause) -> str:
     value, u = cause.size, cause.u
-    if what.part == "scale" and value < -1:
-        return (f"offsets of the opposite sign (scale {plus_minus(value, u, PERCENT)}): the sense "
-                "is the other one (--sense, measurement_sense), or the axes of the microscope "
-                "point the other way")
+    if what.part == "scale" and abs(value) > 1:
+        return (f"offsets of another sign (scale {plus_minus(value, u, PERCENT)}): look whether "
+                "the sense is the other one (--sense, measurement_sense), or the axes of the "
+                "microscope point the other way")
     said = {"turn": f"microscope turned by {plus_minus(value, u, MRAD)}",
             "scale": f"scale of the microscope off by {plus_minus(value, u, PERCENT)}",
             "scales": f"scales of the microscope along x and y differ by "

@@ -30,9 +30,12 @@ def microscope(*values):
      "microscope, or align it", 2e-3, 1e-5, "rad"),
     (microscope(5e-3, 0, 0, 5e-3), "scale of the microscope off by 0.5000 ± 0.0010 %: solve with "
      "--model microscope, or align it", 5e-3, 1e-5, "m/m"),
-    (microscope(-2.01, 0, 0, -2.01), "offsets of the opposite sign (scale -201.0000 ± 0.0010 %): "
-     "the sense is the other one (--sense, measurement_sense), or the axes of the microscope point "
-     "the other way", -2.01, 1e-5, "m/m"),
+    (microscope(-2.01, 0, 0, -2.01), "offsets of another sign (scale -201.0000 ± 0.0010 %): look "
+     "whether the sense is the other one (--sense, measurement_sense), or the axes of the "
+     "microscope point the other way", -2.01, 1e-5, "m/m"),
+    (microscope(2.01, 0, 0, 2.01), "offsets of another sign (scale 201.0000 ± 0.0010 %): look "
+     "whether the sense is the other one (--sense, measurement_sense), or the axes of the "
+     "microscope point the other way", 2.01, 1e-5, "m/m"),
     (microscope(-0.99, 0, 0, -0.99), "scale of the microscope off by -99.0000 ± 0.0010 %: solve "
      "with --model microscope, or align it", -0.99, 1e-5, "m/m"),
     (microscope(1e-3, 0, 0, -1e-3), "scales of the microscope along x and y differ by 0.2000 ± "
