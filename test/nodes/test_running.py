@@ -13,9 +13,7 @@ from selfcal_ros.nodes import running
 
 @pytest.fixture
 def thawed():
-    """Give what a node has frozen back to the collector of garbage."""
-    gc.unfreeze()
-    yield
+    """Give what is frozen back to the collector of garbage; the node freezes it again."""
     gc.unfreeze()
 
 
