@@ -60,8 +60,7 @@ def worker(config: pytest.Config) -> tuple[int, int] | None:
 
 def pytest_collection_finish():
     """Look for garbage again, but no more through modules and tests."""
-    first_example()
-    gc.collect()
+    first_example()  # collects, or what collecting has left stays
     gc.freeze()
     gc.set_threshold(*RARELY)
     gc.enable()
