@@ -73,7 +73,8 @@ def test_a_course_follows_the_readings_of_each_visit():
     means = np.bincount(visits.mark, visits.count * jumped.dx) / np.bincount(
         visits.mark, visits.count)
     views[0] = replace(views[0], dx=means, visits=jumped)
-    kept = calibrate(replace(measurements, views=tuple(views))).extra["residuals"]["views"]
+    kept = calibrate(replace(measurements, views=tuple(views)),
+                     Options(causes=False)).extra["residuals"]["views"]
     course = kept[0]["course"]
     early = course["time_s"] < np.median(course["time_s"])
     assert course["dx"][~early].mean() - course["dx"][early].mean() == pytest.approx(5e-7, rel=0.1)
@@ -113,7 +114,8 @@ def test_each_part_of_a_course_is_a_mean_of_readings_in_the_order_of_time(monkey
         views.append(replace(view, count=count.astype(int), dx=dx, dy=dy, visits=visits))
         about.append((visits.dx - dx[visits.mark], visits.dy - dy[visits.mark]))
     views += measurements.views[2:]
-    kept = calibrate(replace(measurements, views=tuple(views))).extra["residuals"]["views"]
+    kept = calibrate(replace(measurements, views=tuple(views)),
+                     Options(causes=False)).extra["residuals"]["views"]
     first = min(view.visits.stamp_ns.min() for view in views if len(view.m))
     for view, (dx, dy), entry in zip(views[:2], about, kept[:2], strict=True):
         visits, course = view.visits, entry["course"]

@@ -156,7 +156,7 @@ def test_datum_shifts_change_nothing(shift, names):
     for model, limit in (("linear", EXACT), ("rigid", EXACT + 4e-4 * largest)):
         one, two = (calibrate(simulate_measurements(
             known, plan, np.random.default_rng(0), linear=model == "linear"),
-            Options(misalignment_model=model)).error_map for known in (truth, moved))
+            Options(misalignment_model=model, causes=False)).error_map for known in (truth, moved))
         assert np.abs(one.gx - two.gx).max() < limit
         assert np.abs(one.gy - two.gy).max() < limit
 
