@@ -127,36 +127,62 @@ def reduce_view(artifact: Artifact, view: View, detections: np.ndarray, *,
                    rejected=dict(sorted((str(r), c) for r, c in rejected.items())))
 
 
+@dataclass(frozen=True)
+class _GridMarks:
+    """Grid detections whose marks are known: arrays (n,) and (2, n) in their order.
+
+    `position` is where the stage stood, `approach` from where it had come; `phi_rad` is the view's
+    rotation if the marks tell it.
+    """
+
+    detections: np.ndarray
+    index: np.ndarray
+    deviation: np.ndarray
+    residual: np.ndarray
+    position: np.ndarray
+    approach: np.ndarray
+    phi_rad: float | None
+
+
+def _grid_marks(artifact: Artifact, view: View, d: np.ndarray, *, exposures: Exposures,
+                rules: Rules, rejected: Counter, places: PlaceList) -> _GridMarks:
+    """Find the marks of grid detections; what has none is counted, and where the stage stood."""
+    stage = exposures.at(d["stamp"])
+    position = np.stack([stage.x.position, stage.y.position])
+    why = _reasons((stage.x, stage.y), (stage.theta,))
+    places.add(why, *position)
+    d, (position, approach) = _keep(d, why, rejected, position, stage.approach)
+    found = identify_grid(
+        artifact, view, _reading(rules.sense, position, np.stack([d["ox"], d["oy"]])),
+        ids=np.stack([d["m"], d["n"]]), has_id=d["has_id"], rules=rules.identity,
+        stage_m=_reading(rules.sense, position, 0.0))
+    places.add(found.reasons, *position)
+    d, (index, deviation, residual, position, approach) = _keep(
+        d, found.reasons, rejected, found.index, found.deviation, found.residual, position,
+        approach)
+    told = found.phi_error_rad <= np.pi / 2 / max(artifact.angular_count, 1)  # a quarter line
+    return _GridMarks(d, index, deviation, residual, position, approach,
+                      found.rigid.phi_rad if told else None)
+
+
 def _reduce_grid(artifact: Artifact, view: View, d: np.ndarray, exposures: Exposures, rules: Rules,
                  rejected: Counter) -> tuple[dict, float | None]:
-    stage = exposures.at(d["stamp"])
-    why, places = _reasons((stage.x, stage.y), (stage.theta,)), PlaceList()
-    places.add(why, stage.x.position, stage.y.position)
-    d, (x, y, *approach) = _keep(d, why, rejected, stage.x.position, stage.y.position,
-                                 *stage.approach)
-    reading = _reading(rules.sense, np.stack([x, y]), np.stack([d["ox"], d["oy"]]))
-    found = identify_grid(artifact, view, reading, ids=np.stack([d["m"], d["n"]]),
-                          has_id=d["has_id"], rules=rules.identity,
-                          stage_m=_reading(rules.sense, np.stack([x, y]), 0.0))
-    places.add(found.reasons, x, y)
-    d, (m, n, vx, vy, rx, ry, x, y, *approach) = _keep(
-        d, found.reasons, rejected, *found.index, *found.deviation, *found.residual, x, y,
-        *approach)
-    hx, hy = artifact.half
-    key, deviation = (m + hx) * (2 * hy + 1) + n + hy, np.stack([vx, vy])
-    means = reduce_repeats(key, deviation, d["sigma"], limit=rules.outlier_limit,
+    places = PlaceList()
+    marks = _grid_marks(artifact, view, d, exposures=exposures, rules=rules, rejected=rejected,
+                        places=places)
+    d, (hx, hy) = marks.detections, artifact.half
+    key = (marks.index[0] + hx) * (2 * hy + 1) + marks.index[1] + hy
+    means = reduce_repeats(key, marks.deviation, d["sigma"], limit=rules.outlier_limit,
                            extent=2 * max(hx, hy) * artifact.grid_pitch_m,
-                           residual=np.stack([rx, ry]))
+                           residual=marks.residual)
     _count(rejected, Reason.OUTLIER, means.outlier)
-    places.add(reason_where(means.outlier, Reason.OUTLIER), x, y)
-    visits = grid_visits(means, key, d["sigma"], stamps_ns=d["stamp"], deviation=deviation,
-                         offset=np.stack([d["ox"], d["oy"]]), approach=np.stack(approach))
+    places.add(reason_where(means.outlier, Reason.OUTLIER), *marks.position)
+    visits = grid_visits(means, key, d["sigma"], stamps_ns=d["stamp"], deviation=marks.deviation,
+                         offset=np.stack([d["ox"], d["oy"]]), approach=marks.approach)
     mark = means.key.astype(np.int64)
-    told = found.phi_error_rad <= np.pi / 2 / max(artifact.angular_count, 1)  # a quarter line
-    phi = found.rigid.phi_rad if told else None
     return {"m": mark // (2 * hy + 1) - hx, "n": mark % (2 * hy + 1) - hy, "dx": means.mean[0],
             "dy": means.mean[1], "count": means.count, "u": means.u, "sigma_xy": means.sigma,
-            "dof_xy": means.dof, "visits": visits, "places": places.places()}, phi
+            "dof_xy": means.dof, "visits": visits, "places": places.places()}, marks.phi_rad
 
 
 def _reduce_angular(artifact: Artifact, view: View, d: np.ndarray, exposures: Exposures,
@@ -203,12 +229,12 @@ def _where(good: np.ndarray, rows: np.ndarray) -> np.ndarray:
 
 def _keep(d: np.ndarray, reasons: np.ndarray, rejected: Counter, *values: np.ndarray,
           ) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Return detections and values without the rejected ones, whose reasons are counted."""
+    """Return detections and values (n,) or (k, n) without the rejected ones, which are counted."""
     good = reasons == None  # noqa: E711
     if good.all():
         return d, [*values]
     rejected.update(str(reason) for reason in reasons[~good])
-    return d[good], [value[good] for value in values]
+    return d[good], [np.compress(good, value, axis=-1) for value in values]
 
 
 def _count(rejected: Counter, reason: Reason, mask: np.ndarray) -> None:
