@@ -14,6 +14,7 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from ingest_bags import Recording, recording, write_bag
@@ -53,6 +54,13 @@ def detection_part(n_detections: int) -> tuple[Recording, Truth]:
     repeats = max(1, round(n_detections / sum(len(view.m) for view in measurements.views)))
     return recording(plan, measurements, repeats=repeats, visit_ns=50_000_000,
                      encoder_ns=0), truth
+
+
+class Taken(NamedTuple):
+    """What something took: beside other programs only the processor time says how much it is."""
+
+    wall_s: float
+    cpu_s: float
 
 
 PARTS: dict[str, Callable[[int], tuple[Recording, Truth]]] = {
@@ -139,22 +147,23 @@ def worker(benchmark: str, method: str, bag: Path) -> dict:
     error, who = None, resource.RUSAGE_SELF
     if method == SOLVE:
         who, out = resource.RUSAGE_CHILDREN, bag.with_name(f"{bag.name}_result.json")
-        seconds, _ = timed(lambda: subprocess.run(
+        taken, _ = timed(lambda: subprocess.run(
             [sys.executable, "-m", "selfcal_ros", "solve", str(bag), "--quiet", "-o", str(out)],
             check=True))
         error = error_of(json.loads(out.read_text())["error_map"], bag)
     elif method in (READ, SOLVE_ONLY):
-        seconds, error = in_parts(bag, method)
+        taken, error = in_parts(bag, method)
     else:
-        seconds, count = timed(lambda: PEERS[method][1](bag))
+        taken, count = timed(lambda: PEERS[method][1](bag))
         if count != total:
             raise RuntimeError(f"{method} met {count} of {total} messages")
-    return {"benchmark": benchmark, "method": method, "n": total, "seconds": seconds,
-            "peak_mb": round(resource.getrusage(who).ru_maxrss / 1024, 1), "max_error": error}
+    return {"benchmark": benchmark, "method": method, "n": total, "seconds": taken.wall_s,
+            "peak_mb": round(resource.getrusage(who).ru_maxrss / 1024, 1), "max_error": error,
+            "cpu_seconds": taken.cpu_s}
 
 
-def in_parts(bag: Path, method: str) -> tuple[float, float | None]:
-    """Return the seconds of reading or of solving, and the error of the map that comes out."""
+def in_parts(bag: Path, method: str) -> tuple[Taken, float | None]:
+    """Return the time of reading or of solving, and the error of the map that comes out."""
     from selfcal_ros.bagio.offline import collect_bag
     from selfcal_ros.collection.settings.nodes import CollectorSettings
     from selfcal_ros.estimation.api import Options, calibrate
@@ -169,11 +178,17 @@ def in_parts(bag: Path, method: str) -> tuple[float, float | None]:
     return solving, error_of({"gx": result.error_map.gx, "gy": result.error_map.gy}, bag)
 
 
-def timed(run: Callable) -> tuple[float, object]:
-    """Return the wall time of `run` and what it gives."""
-    began = time.perf_counter()
+def timed(run: Callable) -> tuple[Taken, object]:
+    """Return the time that `run` takes and what it gives."""
+    began, cpu = time.perf_counter(), cpu_seconds()
     result = run()
-    return time.perf_counter() - began, result
+    return Taken(time.perf_counter() - began, cpu_seconds() - cpu), result
+
+
+def cpu_seconds() -> float:
+    """Return the processor time of this process and of those it waited for, kernel included."""
+    return sum(used.ru_utime + used.ru_stime for used in map(
+        resource.getrusage, (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)))
 
 
 def error_of(found: dict, bag: Path) -> float:

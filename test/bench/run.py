@@ -178,7 +178,8 @@ def show(row: dict) -> None:
         figures = f"{row['note']:>36}"
     else:
         error = "" if row["max_error"] is None else f"{row['max_error']:12.1e}"
-        figures = f"{row['seconds']:12.6f} {row['peak_mb']:10.0f} {error:>12}"
+        cpu = f"{row['cpu_seconds']:10.2f}" if "cpu_seconds" in row else ""
+        figures = f"{row['seconds']:12.6f} {row['peak_mb']:10.0f} {error:>12} {cpu}".rstrip()
     print(f"{row['benchmark']:<17} {row['method']:<36} {row['n']:>7} {figures}", flush=True)
 
 
@@ -207,7 +208,7 @@ def main() -> int:
         if method not in ("selfcal", *RIVALS):
             raise InputError("--methods", f"'{method}' is unknown", "see --help")
     print(f"{'benchmark':<17} {'method':<36} {'N':>7} {'seconds':>12} {'peak MB':>10} "
-          f"{'max error m':>12}")
+          f"{'max error m':>12} {'CPU s':>10}")
     rows, given_up = [], set()
     sizes = [int(size) for size in args.sizes.split(",") if size]
     for benchmark, method, size in jobs(sizes, methods):

@@ -81,5 +81,14 @@ def test_every_way_to_read_meets_every_message(bench):
             assert row["note"] == "not installed" and method in ("mcap-ros2-support", "pybag-sdk")
             continue
         assert row["seconds"] > 0 and row["peak_mb"] > 10 and row["n"] > 5000
+        assert row["cpu_seconds"] > 0 and f"{row['cpu_seconds']:.2f}" in out
         exact = method in ("selfcal solve", "selfcal (solving)")
         assert (row["max_error"] < 1e-12) if exact else row["max_error"] is None
+
+
+def test_processor_time_counts_what_the_process_and_its_children_do(monkeypatch):
+    monkeypatch.syspath_prepend(RUN.parent)
+    ingest = importlib.import_module("ingest")
+    work = "import time\nwhile time.process_time() < 0.05: pass"
+    taken, done = ingest.timed(lambda: subprocess.run([sys.executable, "-c", work], check=True))
+    assert done.returncode == 0 and taken.cpu_s >= 0.05
