@@ -221,7 +221,7 @@ RUNS = {
     "report": "report R", "plot": "plot R -o t.svg", "table": "table R -o t.csv",
     "plan check": "plan check PLAN",
     "plan suggest": "plan suggest PLAN", "simulate": "simulate SIM -o made",
-    "reproduce": "reproduce qiao --draws 2", "cal export": "cal export R -o f.cal",
+    "reproduce": "reproduce hu --draws 2", "cal export": "cal export R -o f.cal",
     "cal check": "cal check f.cal", "cal eval": "cal eval f.cal --position 1=1 --position 2=2",
     "cal verify": "cal verify R f.cal", "cal accuracy": "cal accuracy R",
     "cal straightness": "cal straightness R -o s.cal",

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """``selfcal reproduce``: prints, saves plots, refuses nonsense."""
 
+import json
+
 import pytest
 
 from selfcal_ros.cli.main import main
@@ -22,8 +24,12 @@ def test_text_and_plots_and_the_same_bytes_for_the_same_seed(paper, figures, wor
     assert all((out / name).read_bytes().startswith(PNG) for name in names)
     if paper == "qiao":  # same seed, same bytes
         again = tmp_path / "again"
-        assert main(["reproduce", paper, "--draws", "3", "--seed", "5", "--out", str(again)]) == 0
-        assert "wrote" in capsys.readouterr().out
+        assert main(["reproduce", paper, "--draws", "3", "--seed", "5", "--out", str(again),
+                     "--json"]) == 0
+        told = capsys.readouterr()
+        numbers = json.loads(told.out)
+        assert (numbers["paper"], numbers["draws"], numbers["seed"]) == ("qiao", 3, 5)
+        assert len(numbers) > 3 and told.err.count("wrote") == 2
         assert {path.name: path.read_bytes() for path in again.iterdir()} == {
             path.name: path.read_bytes() for path in out.iterdir()}
 
