@@ -26,10 +26,14 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Read the result, write the table to a file and say so, or to stdout."""
+    """Read the result, write the table to a file and say so, or to stdout.
+
+    A result that is not qualified ends with code 5 and the reason on stderr, as where it was made.
+    """
     from pathlib import Path
 
-    from selfcal_ros.errors import ExitCode, InputError
+    from selfcal_ros.cli.terminal.print_result import exit_code
+    from selfcal_ros.errors import InputError
     from selfcal_ros.files import check_outputs, read_json, write_bytes
     from selfcal_ros.model.result import result_from_dict
 
@@ -42,10 +46,10 @@ def run(args: argparse.Namespace) -> int:
     if args.output == STDOUT:
         text = csv_bytes(result).decode()
         say(args, text.removesuffix("\n"), {"csv": text})
-        return int(ExitCode.DONE)
+        return exit_code(result)
     write_bytes(args.output, csv_bytes(result) if kind == ".csv" else npz_bytes(result))
     say(args, f"written: {args.output}", {"written": args.output, "kind": kind.lstrip(".")})
-    return int(ExitCode.DONE)
+    return exit_code(result)
 
 
 def csv_bytes(result: "CalibrationResult") -> bytes:

@@ -11,6 +11,7 @@ from selfcal_ros.compensation.aerotech.read import load_cal
 from selfcal_ros.files import write_json
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.result import Observability, result_to_dict
+from selfcal_ros.model.verdict import Verdict
 from test.support.maps import random_map, result_of
 
 MAP = random_map(Artifact(7, 0.01, 24), 11)
@@ -162,6 +163,25 @@ def test_results_that_cannot_be_exported(run):
     code, _, err = run("export", "unseen.json", "-o", "g.cal")
     assert code == 3
     one_line(err, "does not identify the stage")
+    write_json("o.json", result_to_dict(result_of(replace(MAP, nonorthogonality=math.nan))))
+    code, _, err = run("orthogonality", "o.json", "--along", "x")
+    assert code == 2
+    one_line(err, "its non-orthogonality is not known")
+
+
+@pytest.mark.parametrize("verb", ["export", "orthogonality", "accuracy", "straightness"])
+def test_a_table_of_a_result_that_is_not_qualified_says_so_everywhere(run, verb):
+    why = "the plate slipped: measure it again"
+    doubted = Verdict(False, f"Not qualified: {why}", (why,))
+    write_json("r.json", result_to_dict(replace(result_of(MAP), verdict=doubted)))
+    along = [] if verb == "export" else ["--along", "x"]
+    code, out, err = run(verb, "r.json", *along, "-o", "f.cal")
+    assert (code, err) == (5, f"selfcal: Not qualified: {why}\n")
+    assert out.startswith("f.cal: ")
+    comments = load_cal("f.cal").comments
+    assert "verdict: NOT QUALIFIED, the readings contradict the model" in comments
+    assert f"because: {why}" in comments
+    assert run(verb, "r.json", *along, "-o", "f.cal")[0] == 2  # it is there
 
 
 @pytest.mark.parametrize(("args", "message"), [

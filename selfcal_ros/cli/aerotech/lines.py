@@ -14,6 +14,7 @@ from selfcal_ros.units import M_PER_UM, UM_PER_M
 if TYPE_CHECKING:
     from selfcal_ros.compensation.aerotech.lines import AxisCorrection
     from selfcal_ros.compensation.machine import MachineFrame
+    from selfcal_ros.model.result import CalibrationResult
 
 Axis = Literal["x", "y"]
 
@@ -71,8 +72,9 @@ def _orthogonality(args: argparse.Namespace) -> int:
         if any(measured) or args.home:
             raise InputError("arguments", "RESULT.json and a measured square exclude each other",
                              "give one of them; --home-x and --home-y place the home position")
-        line = cal_lines.map_orthogonality(read_result(args.source).error_map, args.along)
-        return _deliver(args, line, frame, (args.along, other))
+        result = read_result(args.source)
+        line = cal_lines.map_orthogonality(result.error_map, args.along)
+        return _deliver(args, line, frame, (args.along, other), result)
     if None in measured:
         raise InputError("arguments", "the measurement is not complete",
                          "give --measured, --over and --travel, or a RESULT.json")
@@ -115,16 +117,17 @@ def _line(args: argparse.Namespace, corrected: Axis) -> int:
     from selfcal_ros.compensation.aerotech import lines as cal_lines
     from selfcal_ros.files import read_text
 
-    frame = frame_of(args)
+    frame, result = frame_of(args), None
     if Path(args.source).suffix.lower() == ".csv":
         _refuse_frame(args, "measured errors, whose positions are the controller's own",
                       "leave it out")
         line = cal_lines.measured_line(read_text(args.source), args.source, frame.unit_m)
     else:
-        line = cal_lines.map_line(read_result(args.source).error_map, args.along, corrected)
+        result = read_result(args.source)
+        line = cal_lines.map_line(result.error_map, args.along, corrected)
     if corrected != args.along:
         line = cal_lines.without_slope(line)
-    return _deliver(args, line, frame, (args.along, corrected))
+    return _deliver(args, line, frame, (args.along, corrected), result)
 
 
 def _refuse_frame(args: argparse.Namespace, what: str, remedy: str) -> None:
@@ -138,26 +141,29 @@ def _refuse_frame(args: argparse.Namespace, what: str, remedy: str) -> None:
 
 
 def _deliver(args: argparse.Namespace, line: "AxisCorrection", frame: "MachineFrame",
-             axes: tuple[Axis, Axis]) -> int:
-    """Write the table of a line to its file, or print it."""
+             axes: tuple[Axis, Axis], result: "CalibrationResult | None" = None) -> int:
+    """Write the table of a line to its file, or print it; `result` is that of its map."""
     from datetime import UTC, datetime
 
     from selfcal_ros import __version__
-    from selfcal_ros.compensation.aerotech.export import DECIMALS
+    from selfcal_ros.cli.terminal.print_result import exit_code
+    from selfcal_ros.compensation.aerotech.export import DECIMALS, verdict_lines
     from selfcal_ros.compensation.aerotech.lines import line_table
     from selfcal_ros.compensation.aerotech.write import cal_text, write_cal
 
     source = args.source or f"{args.measured} over {args.over}, travel {args.travel}"
     comments = [f"written by selfcal {__version__} on {datetime.now(UTC):%Y-%m-%dT%H:%M:%SZ}",
-                f"{args.sub_verb} of {axes[1]} along {axes[0]}, from {source}", frame.comment()]
+                f"{args.sub_verb} of {axes[1]} along {axes[0]}, from {source}",
+                *([] if result is None else verdict_lines(result)), frame.comment()]
+    code = ExitCode.DONE if result is None else exit_code(result)
     table = line_table(line, frame, along=axes[0], corrected=axes[1])
     text = cal_text([table], comments=comments, decimals=DECIMALS)
     found = {"table": text, "corrects": axes[1], "along": axes[0], "file": None, "old_file": None}
     if not args.output:
         say(args, text.removesuffix("\n"), found)
-        return int(ExitCode.DONE)
+        return int(code)
     backup = write_cal(args.output, text, force=args.force)
     say(args, f"{args.output}: {args.sub_verb} table for {axes[1]}"
         + (f"; the old file is {backup}" if backup else ""),
         found | {"file": args.output, "old_file": backup and str(backup)})
-    return int(ExitCode.DONE)
+    return int(code)

@@ -45,6 +45,7 @@ def add_to(group: argparse._SubParsersAction) -> None:
 def _export(args: argparse.Namespace) -> int:
     from dataclasses import replace
 
+    from selfcal_ros.cli.terminal.print_result import exit_code
     from selfcal_ros.compensation.aerotech import export
     from selfcal_ros.compensation.aerotech.write import cal_text, refuse_existing, write_cal
     from selfcal_ros.files import check_outputs
@@ -83,7 +84,7 @@ def _export(args: argparse.Namespace) -> int:
     if frame.theta_axis is not None and frame.theta_counts_per_unit is None:
         print("selfcal cal: the theta table covers one turn to either side and does not roll over;"
               f" --counts-per-unit {frame.theta_axis}=COUNTS makes it roll over", file=sys.stderr)
-    return int(ExitCode.DONE)
+    return exit_code(result)
 
 
 def _verify(args: argparse.Namespace) -> int:

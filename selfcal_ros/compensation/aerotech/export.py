@@ -168,7 +168,7 @@ def provenance(result: CalibrationResult, frame: MachineFrame, *, filled: int = 
         f"written by selfcal {__version__} on {(now or datetime.now(UTC)):%Y-%m-%dT%H:%M:%SZ}",
         f"plan: {result.plan_id}; sense: {result.sense}; method: {result.method}",
         f"bag: {source.get('file', 'unknown')}; sha256: {source.get('sha256', 'unknown')}",
-        *_verdict_lines(result),
+        *verdict_lines(result),
         _uncertainty_line(result),
         f"model: {result.model.misalignment} misalignments" + "".join(
             f", {term.name}" + ("" if term.size is None else f":{term.size:g}")
@@ -191,7 +191,7 @@ def _uncertainty_line(result: CalibrationResult) -> str:
             f"k = {result.noise.k_xy:.3g} for 95.45 %")
 
 
-def _verdict_lines(result: CalibrationResult) -> list[str]:
+def verdict_lines(result: CalibrationResult) -> list[str]:
     """Return the verdict, and why it is none where it is none."""
     verdict, when = result.verdict, result.provenance.extra.get("last_exposure", "")
     lines = [f"measured until {when}"] if when else []

@@ -146,7 +146,15 @@ def map_orthogonality(error_map: ErrorMap, along: Literal["x", "y"]) -> AxisCorr
     """Return the two-point correction for the non-orthogonality O of an error map.
 
     Gx = O y and Gy = O x (Hu 6) are, but for a rotation, an error 2 O x of y alone.
+
+    Raises
+    ------
+    InputError
+        If O is not known.
     """
+    if not np.isfinite(error_map.nonorthogonality):
+        raise InputError("error map", "its non-orthogonality is not known",
+                         "measure views that identify the stage, see selfcal plan check")
     artifact = error_map.artifact
     half = artifact.half[0 if along == "x" else 1] * artifact.grid_pitch_m
     ends = np.array([-half, half])
