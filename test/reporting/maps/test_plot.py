@@ -91,7 +91,7 @@ def test_theta_is_drawn_in_arcsec_and_closes_the_circle():
     assert axes.get_rorigin() < axes.get_rmin() < radius.min()
 
 
-@pytest.mark.parametrize(("size", "lines"), [(3, 0), (11, 24), (5, 720)])
+@pytest.mark.parametrize(("size", "lines"), [(3, 0), (5, 720)])
 def test_png_of_any_size(tmp_path, size, lines):
     result, truth = known_result(size, lines)
     save_map_plot(result, tmp_path / "map.png", truth=truth)
@@ -100,12 +100,15 @@ def test_png_of_any_size(tmp_path, size, lines):
     assert list(tmp_path.iterdir()) == [tmp_path / "map.png"]
 
 
-def test_truth_changes_the_picture(tmp_path, coarse):
+def test_truth_is_in_the_picture(tmp_path, monkeypatch):
     """That the same input gives the same bytes is tested with the verb, for every form."""
-    result, truth = known_result(3, 0)
+    figures = []
+    monkeypatch.setattr(plot, "picture", lambda figure, *_, **__: figures.append(figure) or b"")
+    result, truth = known_result(3, 8)
     save_map_plot(result, tmp_path / "a.png")
     save_map_plot(result, tmp_path / "b.png", truth=truth)
-    assert (tmp_path / "a.png").read_bytes() != (tmp_path / "b.png").read_bytes()
+    counts = [(len(arrows_in(figure.axes[0])), len(figure.axes[1].lines)) for figure in figures]
+    assert counts[1] == (counts[0][0] + 1, counts[0][1] + 1)
 
 
 @pytest.mark.parametrize("value", [np.nan, 0.0, 1e-30, 1e300])
@@ -129,7 +132,8 @@ def test_text_of_the_user_is_drawn_as_it_is(tmp_path, coarse):
     assert drawable("x" * 400, 10) == "x" * 9 + "…"
 
 
-def test_unusable_truth_and_folder_are_refused_before_anything_is_written(tmp_path, coarse):
+def test_unusable_truth_and_folder_are_refused_before_anything_is_written(tmp_path, monkeypatch):
+    monkeypatch.setattr(plot, "picture", lambda *_, **__: b"drawn")
     result, truth = known_result(3, 0)
     with pytest.raises(InputError, match=r"^truth gx: has the shape \(5, 5\)"):
         save_map_plot(known_result(3)[0], tmp_path / "a.png", truth={**truth,
