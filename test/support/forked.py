@@ -22,6 +22,7 @@ import socket
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
+from functools import cached_property
 from typing import BinaryIO
 
 from selfcal_ros import sessions
@@ -98,11 +99,18 @@ class Forks:
     """Starts nodes as forks; those that are left end with it."""
 
     def __init__(self) -> None:
-        self._requests, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self._open = contextlib.ExitStack()
+
+    @cached_property
+    def _requests(self) -> socket.socket:
+        """What takes the requests of a process that is started with the first of them."""
+        requests, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         with theirs:
-            self._process = subprocess.Popen(
+            process = subprocess.Popen(
                 [sys.executable, "-W", BESIDE_THREADS, __file__, str(theirs.fileno())],
                 pass_fds=[theirs.fileno()], start_new_session=True)
+        self._open.callback(process.wait, 60)
+        return self._open.enter_context(requests)
 
     def start(self, node: str, arguments: Sequence[str], environment: dict) -> Fork:
         """Return the process of a node with these arguments."""
@@ -123,8 +131,7 @@ class Forks:
             stop(child)
 
     def close(self) -> None:
-        self._requests.close()
-        self._process.wait(60)
+        self._open.close()
 
 
 def _serve(requests: socket.socket) -> None:
