@@ -133,9 +133,12 @@ class TermEquations:
         matrix = self.information * np.outer(scale, scale)
         matrix[np.diag_indices(len(scale))] += np.where(self.free, 0.0, sigma_m**2)
         hold = self.untold(self.free)
-        # sized coefficients may be told far better than free ones, in these units
-        own = np.sqrt(np.maximum(np.diag(matrix), np.finfo(float).tiny))
+        # sized coefficients may be told far better than free ones, in these units; the diagonal of
+        # a free one that nothing tells is rounding
+        diagonal = np.maximum(np.diag(matrix), np.finfo(float).tiny)
+        own = np.sqrt(np.where(self.free & (diagonal <= UNTOLD), 1.0, diagonal))
         matrix = matrix / np.outer(own, own)
+        hold = np.linalg.qr(own[:, None] * hold)[0]
         found = np.linalg.pinv(matrix + hold @ hold.T, hermitian=True, rcond=1e-14)
         found = found - hold @ hold.T
         scale = scale / own

@@ -213,6 +213,26 @@ def test_axes_that_the_stage_does_not_have_are_no_noise_of_the_readings(terms):
         assert np.allclose(*values, rtol=1e-6, atol=1e-13)
 
 
+@pytest.mark.parametrize("one_sided", [("y",), ("x", "y")])
+def test_an_axis_that_arrives_from_one_side_alone_has_no_approach_and_keeps_its_map(one_sided):
+    """What it adds is the same everywhere: the views' own positions take it up."""
+    _, readings = measured(plan_of(), Spread(encoder="independent", rotation="finite"),
+                           sigma_m=20e-9)
+    always = {f"approach_{axis}": 1 for axis in one_sided}
+    readings = replace(readings, views=tuple(replace(view, visits=replace(view.visits, **{
+        name: np.full(len(view.visits.mark), sign, dtype=np.int8)
+        for name, sign in always.items()})) for view in readings.views))
+    plain, found = (calibrate(readings, Options(terms=parse_terms([terms], ""), causes=False))
+                    for terms in ("", "approach"))
+    (term,) = found.model.terms
+    told = {estimate.component: estimate for estimate in term.estimates}
+    for axis in "xy":
+        assert np.isfinite(told[axis].value) == (axis not in one_sided)
+    for name in ("gx", "gy", "u_gx"):
+        values = getattr(found.error_map, name), getattr(plain.error_map, name)
+        assert np.allclose(*values, rtol=0, atol=1e-13 if len(one_sided) == 2 else 5e-9)
+
+
 def test_terms_need_visits():
     _, readings = measured(plan_of())
     without = replace(readings, views=tuple(replace(v, visits=None) for v in readings.views))
