@@ -137,12 +137,12 @@ class TermEquations:
         # a free one that nothing tells is rounding
         diagonal = np.maximum(np.diag(matrix), np.finfo(float).tiny)
         own = np.sqrt(np.where(self.free & (diagonal <= UNTOLD), 1.0, diagonal))
-        matrix = matrix / np.outer(own, own)
-        hold = np.linalg.qr(own[:, None] * hold)[0]
-        found = np.linalg.pinv(matrix + hold @ hold.T, hermitian=True, rcond=1e-14)
-        found = found - hold @ hold.T
-        scale = scale / own
-        return found * np.outer(scale, scale)
+        null = np.linalg.qr(own[:, None] * hold)[0]
+        found = np.linalg.pinv(matrix / np.outer(own, own) + null @ null.T, hermitian=True,
+                               rcond=1e-14) - null @ null.T
+        found /= np.outer(own, own)
+        told = np.eye(self.n) - hold @ hold.T
+        return told @ found @ told * np.outer(scale, scale)
 
     def rank(self) -> int:
         """Return how many combinations of all coefficients the readings tell."""
