@@ -155,15 +155,14 @@ def _deliver(args: argparse.Namespace, line: "AxisCorrection", frame: "MachineFr
     comments = [f"written by selfcal {__version__} on {datetime.now(UTC):%Y-%m-%dT%H:%M:%SZ}",
                 f"{args.sub_verb} of {axes[1]} along {axes[0]}, from {source}",
                 *([] if result is None else verdict_lines(result)), frame.comment()]
-    code = ExitCode.DONE if result is None else exit_code(result)
     table = line_table(line, frame, along=axes[0], corrected=axes[1])
     text = cal_text([table], comments=comments, decimals=DECIMALS)
     found = {"table": text, "corrects": axes[1], "along": axes[0], "file": None, "old_file": None}
-    if not args.output:
+    if args.output:
+        backup = write_cal(args.output, text, force=args.force)
+        say(args, f"{args.output}: {args.sub_verb} table for {axes[1]}"
+            + (f"; the old file is {backup}" if backup else ""),
+            found | {"file": args.output, "old_file": backup and str(backup)})
+    else:
         say(args, text.removesuffix("\n"), found)
-        return int(code)
-    backup = write_cal(args.output, text, force=args.force)
-    say(args, f"{args.output}: {args.sub_verb} table for {axes[1]}"
-        + (f"; the old file is {backup}" if backup else ""),
-        found | {"file": args.output, "old_file": backup and str(backup)})
-    return int(code)
+    return int(ExitCode.DONE) if result is None else exit_code(result)
