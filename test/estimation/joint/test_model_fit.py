@@ -6,10 +6,13 @@ from math import pi
 import numpy as np
 import pytest
 
+from selfcal_ros.errors import InputError
+from selfcal_ros.estimation.joint import model_fit
 from selfcal_ros.estimation.joint.model_fit import fit_model, squares
 from selfcal_ros.estimation.joint.solve import prepare
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.terms import parse_terms
 from selfcal_ros.model.view import Plan, View
 from selfcal_ros.simulation.truth import random_truth, simulate_measurements
 
@@ -60,3 +63,18 @@ def test_degrees_of_freedom_count_rotations_that_marks_and_lines_share_once(shar
                                      sigma_m=2e-8, sigma_theta_rad=2e-6)
     model = fit_model(prepare(readings, Options())[0])
     assert squares(model.problem, model.found)[1] == dense_dof(plan)
+
+
+@pytest.mark.parametrize(("terms", "message"), [
+    ("", "misalignment model 'rigid': the rotations do not settle; check the readings for "
+     "misalignments of more than a few degrees"),
+    ("plate_scale,drift:1e-8", "model drift, plate_scale: the estimate does not settle; leave a "
+     "term out, or give it a size")])
+def test_what_does_not_settle_is_named(monkeypatch, terms, message):
+    monkeypatch.setattr(model_fit, "MAX_STEPS", 1)
+    plan, rng = plan_with(0, 0), np.random.default_rng(6)
+    readings = simulate_measurements(random_truth(ARTIFACT, len(plan.views), rng), plan, rng,
+                                     sigma_m=2e-8, visits=True)
+    with pytest.raises(InputError) as caught:
+        fit_model(prepare(readings, Options(terms=parse_terms([terms], "")))[0])
+    assert str(caught.value) == message
