@@ -26,7 +26,7 @@ from functools import cached_property
 from typing import BinaryIO
 
 from selfcal_ros import sessions
-from selfcal_ros.cli.processes import stop
+from selfcal_ros.cli.processes import PR_SET_PDEATHSIG, stop
 
 MESSAGES = ("diagnostic_msgs.msg", "geometry_msgs.msg", "rcl_interfaces.msg", "rcl_interfaces.srv",
             "lifecycle_msgs.msg", "rosidl_generator_py", "selfcal_msgs.msg", "selfcal_msgs.srv",
@@ -34,7 +34,6 @@ MESSAGES = ("diagnostic_msgs.msg", "geometry_msgs.msg", "rcl_interfaces.msg", "r
 
 BESIDE_THREADS = "error:This process:DeprecationWarning"
 """Python warns of a fork beside threads: no import may begin one."""
-PR_SET_PDEATHSIG = 1
 ROOM = 1 << 17
 """Bytes for the arguments and the environment of a node."""
 BYTES = 4
