@@ -70,6 +70,10 @@ class NotIdentifiableError(SelfcalError):
         super().__init__(message)
 
 
+class NotSettledError(InputError):
+    """Raised when an estimate does not settle on the readings that it was given."""
+
+
 class NoDataError(InputError):
     """Raised when the input is well formed but holds nothing to calibrate from."""
 

@@ -134,6 +134,11 @@ class RestNotIdentified(Finding):
 
 
 @dataclass(frozen=True)
+class RestNotSettled(Finding):
+    """Readings cannot be held out: the estimate does not settle on the rest."""
+
+
+@dataclass(frozen=True)
 class NothingToPredict(Finding):
     """No mark that was held out is known from the rest."""
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from selfcal_ros.errors import InputError
+from selfcal_ros.errors import NotSettledError
 from selfcal_ros.estimation.datum.covariance import TermSpread
 from selfcal_ros.estimation.joint.fit import JointFit, angular_part, fit
 from selfcal_ros.estimation.joint.problem import ROUNDING, Problem, grid_dof, sigma_of
@@ -122,7 +122,7 @@ def fit_model(problem: Problem,
 
     Raises
     ------
-    InputError
+    NotSettledError, InputError
         If the rotations do not settle, or a term needs what the readings do not tell.
     """
     model = _settled(problem, check)
@@ -164,10 +164,11 @@ def _settled(problem: Problem, check: Callable[[TermEquations], None]) -> ModelF
             return state.finished()
         before = change
     if problem.terms:
-        raise InputError(f"model {', '.join(str(term.name) for term in problem.terms)}",
-                         "the estimate does not settle", "leave a term out, or give it a size")
-    raise InputError("misalignment model 'rigid'", "the rotations do not settle",
-                     "check the readings for misalignments of more than a few degrees")
+        raise NotSettledError(f"model {', '.join(str(term.name) for term in problem.terms)}",
+                              "the estimate does not settle",
+                              "leave a term out, or give it a size")
+    raise NotSettledError("misalignment model 'rigid'", "the rotations do not settle",
+                          "check the readings for misalignments of more than a few degrees")
 
 
 def equations_of(problem: Problem, found: JointFit, columns: TermColumns,

@@ -10,7 +10,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from selfcal_ros.errors import InputError, NoDataError, NotIdentifiableError
+from selfcal_ros.errors import (
+    InputError,
+    NoDataError,
+    NotIdentifiableError,
+    NotSettledError,
+)
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.blas_threads import one_thread
 from selfcal_ros.estimation.findings import (
@@ -18,6 +23,7 @@ from selfcal_ros.estimation.findings import (
     OwnTermsUnknown,
     PredictionFailed,
     RestNotIdentified,
+    RestNotSettled,
 )
 from selfcal_ros.estimation.joint.model_fit import ModelFit
 from selfcal_ros.estimation.joint.solve import solve_joint
@@ -158,6 +164,8 @@ def _held_out(measurements: Measurements, options: Options,
         solved = solve_joint(kept, options)
     except (NotIdentifiableError, NoDataError):
         return HeldOut(name, why=_rest_not_identified(kept, held))
+    except NotSettledError:
+        return HeldOut(name, why=RestNotSettled())
     model = solved.model
     if model is None:
         raise AssertionError("the joint solution always has its model")

@@ -6,7 +6,12 @@ from typing import Any
 
 import numpy as np
 
-from selfcal_ros.estimation.findings import NothingToPredict, OwnTermsUnknown, RestNotIdentified
+from selfcal_ros.estimation.findings import (
+    NothingToPredict,
+    OwnTermsUnknown,
+    RestNotIdentified,
+    RestNotSettled,
+)
 from selfcal_ros.estimation.observability.plan_check import describe_view
 from selfcal_ros.estimation.quality.validation import HeldOut
 from selfcal_ros.model.verdict import Finding
@@ -29,6 +34,11 @@ def _(why: RestNotIdentified) -> str:
     more = ("no single further view would change that" if why.more is None else
             f"with {describe_view(why.more, why.artifact)} measured as well it could be")
     return f"cannot be held out: the rest does not identify the stage; {more}"
+
+
+@why_text.register
+def _(_: RestNotSettled) -> str:
+    return "cannot be held out: the estimate does not settle on the rest"
 
 
 @why_text.register

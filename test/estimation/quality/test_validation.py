@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
-from selfcal_ros.errors import InputError, NotIdentifiableError
+from selfcal_ros.errors import InputError, NotIdentifiableError, NotSettledError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.options import Options
-from selfcal_ros.estimation.quality import prediction_limit
+from selfcal_ros.estimation.quality import prediction_limit, validation
 from selfcal_ros.estimation.quality.validation import (
     judged_by,
     validate,
@@ -96,6 +96,23 @@ def test_views_that_are_needed_cannot_be_held_out(few_draws):
     more = simulate_measurements(truth, plan, rng, sigma_m=SIGMA_M, sigma_theta_rad=SIGMA_RAD)
     held = {item.name: item for item in validate(more, folds=1)}
     assert held["view 'shift_x'"].why is None and held["view 'shift_x'"].n_grid > 0
+
+
+def test_a_rest_that_does_not_settle_costs_its_own_line_alone(few_draws, monkeypatch):
+    """With few readings and a drift the rest may not settle where all readings do."""
+    readings, solve = measured(), validation.solve_joint
+
+    def without_first(kept, options):
+        if not len(kept.views[0].m):
+            raise NotSettledError("model drift", "the estimate does not settle", "leave it out")
+        return solve(kept, options)
+    monkeypatch.setattr(validation, "solve_joint", without_first)
+    found = validate(readings, folds=1)
+    line = "cannot be held out: the estimate does not settle on the rest"
+    assert validation_text(found)[1] == f"view 'identity': {line}"
+    assert validation_json(found)[1]["note"] == line and not found[1].exceeds
+    assert [item.name for item in found if item.n_grid] == [
+        "a random tenth (1)", "view 'rot90'", "view 'shift_x'", "view 'both'"]
 
 
 def drawn(seed, plan, **how):
