@@ -32,7 +32,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Compare and print."""
-    from selfcal_ros.errors import ExitCode
+    from selfcal_ros.errors import ExitCode, InputError
     from selfcal_ros.estimation.comparison.maps import compare, compare_with_laser
     from selfcal_ros.files import read_json
     from selfcal_ros.model.result import result_from_dict
@@ -40,10 +40,19 @@ def run(args: argparse.Namespace) -> int:
     first, second = read_json(args.a), read_json(args.b)
     a = result_from_dict(first, args.a)
     if isinstance(second, dict) and "ex_x" in second:
+        if args.keep_scale:
+            raise InputError("--keep-scale", f"of {args.b} squareness and scale difference are "
+                             "compared, no magnification", "leave it out")
         rows = compare_with_laser(a, second, args.b)
         say(args, _laser_text(rows), _laser_json(rows))
         return int(ExitCode.DONE)
     b = result_from_dict(second, args.b)
+    if args.keep_scale:
+        for name, result in ((args.a, a), (args.b, b)):
+            if result.reference is None:
+                raise InputError("--keep-scale", f"{name} has no reference length, so its "
+                                 "magnification is not known",
+                                 "leave it out, or solve with --reference")
     with busy("comparing"):
         found = compare(a, b, keep_scale=args.keep_scale, names=(args.a, args.b))
     say(args, _text(found), _json(found))

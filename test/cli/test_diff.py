@@ -84,8 +84,26 @@ def test_different_theta_datums_are_said(files, tmp_path, capsys):
     assert "datums differ" not in capsys.readouterr().out
 
 
-def test_keep_scale(files, capsys):
-    assert main(["diff", *files, "--keep-scale"]) == 0
+def test_keep_scale_is_for_maps_that_have_one(files, tmp_path, capsys):
+    """Scales of 50 µm/m apart: one is measured, the other a convention, which is no difference."""
+    for number, error in enumerate((0.0, 5e-5)):
+        data = read_json(files[number])
+        data["error_map"]["gx"] = (np.array(data["error_map"]["gx"])
+                                   + error * 0.01 * np.arange(-2, 3)[:, None]).tolist()
+        data["error_map"]["gy"] = (np.array(data["error_map"]["gy"])
+                                   + error * 0.01 * np.arange(-2, 3)).tolist()
+        if error:
+            data["reference"] = {"kind": "artifact", "relative_error": error, "u_relative": 1e-7}
+        write_json(files[number], data)
+    assert main(["diff", *files]) == 0
+    assert "scale +50 µm/m" in capsys.readouterr().out
+    for pair, bare in ((files, files[0]), (files[::-1], files[0])):
+        assert main(["diff", *pair, "--keep-scale"]) == 2
+        printed = capsys.readouterr()
+        assert printed.out == "" and printed.err == (
+            f"selfcal diff: --keep-scale: {bare} has no reference length, so its magnification is "
+            "not known; leave it out, or solve with --reference\n")
+    assert main(["diff", files[1], files[1], "--keep-scale"]) == 0
     assert "scale +0 µm/m" in capsys.readouterr().out
 
 
@@ -112,6 +130,10 @@ def test_result_against_the_laser(files, tmp_path, capsys):
     assert found["nonorthogonality"]["laser"] == 1e-6
     assert found["nonorthogonality"]["difference"] == pytest.approx(
         1e-6 - found["nonorthogonality"]["map"])
+    assert main(["diff", files[0], str(laser), "--keep-scale"]) == 2
+    assert capsys.readouterr().err == (
+        f"selfcal diff: --keep-scale: of {laser} squareness and scale difference are compared, no "
+        "magnification; leave it out\n")
 
 
 def test_files_that_are_no_results(files, tmp_path, capsys):
