@@ -32,6 +32,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Compare and print."""
+    from selfcal_ros.cli.terminal.print_result import say_unless_qualified
     from selfcal_ros.errors import ExitCode, InputError
     from selfcal_ros.estimation.comparison.maps import compare, compare_with_laser
     from selfcal_ros.files import read_json
@@ -45,6 +46,7 @@ def run(args: argparse.Namespace) -> int:
                              "compared, no magnification", "leave it out")
         rows = compare_with_laser(a, second, args.b)
         say(args, _laser_text(rows), _laser_json(rows))
+        say_unless_qualified(a, f"selfcal diff: {args.a}")
         return int(ExitCode.DONE)
     b = result_from_dict(second, args.b)
     if args.keep_scale:
@@ -60,6 +62,8 @@ def run(args: argparse.Namespace) -> int:
     if datums[0] != datums[1] and not args.json and found.theta is not None:
         print(f"       theta datums differ: {datums[0]} and {datums[1]}; xy_axes also ties four "
               "lines to the XY axes")
+    for name, result in ((args.a, a), (args.b, b)):
+        say_unless_qualified(result, f"selfcal diff: {name}")
     return int(ExitCode.DONE)
 
 

@@ -73,6 +73,22 @@ def test_maps_that_differ_and_maps_without_uncertainty_have_their_verdicts(files
         "verdict: none, as there are no uncertainties to test against")
 
 
+def test_a_result_that_is_not_qualified_is_named(files, tmp_path, capsys):
+    """Its uncertainties are enlarged, so that it agrees with much: that is told beside it."""
+    data = read_json(files[1])
+    data["verdict"] |= {"qualified": False, "sentence": "Not qualified: because"}
+    bad, laser = str(tmp_path / "bad.json"), str(tmp_path / "laser.json")
+    write_json(bad, data)
+    write_json(laser, {"ex_x": [], "error_map_equivalent": {
+        "nonorthogonality": 1e-6, "u_nonorthogonality": 1e-7, "scale_difference": None,
+        "u_scale_difference": None}})
+    for arguments in ((files[0], bad), (bad, files[0]), (bad, laser), (files[0], bad, "--json")):
+        assert main(["diff", *arguments]) == 0
+        assert capsys.readouterr().err == f"selfcal diff: {bad}: Not qualified: because\n"
+    assert main(["diff", *files]) == 0
+    assert capsys.readouterr().err == ""
+
+
 def test_different_theta_datums_are_said(files, tmp_path, capsys):
     data = read_json(files[1])
     data["error_map"]["datum_theta"] = "xy_axes"

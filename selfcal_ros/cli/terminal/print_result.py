@@ -26,10 +26,17 @@ def exit_code(result: "CalibrationResult") -> int:
     Why not is said in one line on stderr, whatever else is printed.
     """
     from selfcal_ros.errors import ExitCode
+
+    said = say_unless_qualified(result, "selfcal")
+    return int(ExitCode.NOT_QUALIFIED if said else ExitCode.DONE)
+
+
+def say_unless_qualified(result: "CalibrationResult", who: str) -> bool:
+    """Say on stderr why a result is not qualified, and return whether that was to be said."""
     from selfcal_ros.reporting.summary.format import can_print_symbols, printable, to_ascii
 
     if result.verdict.qualified:
-        return int(ExitCode.DONE)
-    line = printable(result.verdict.sentence)
-    print(f"selfcal: {line if can_print_symbols(sys.stderr) else to_ascii(line)}", file=sys.stderr)
-    return int(ExitCode.NOT_QUALIFIED)
+        return False
+    line = printable(f"{who}: {result.verdict.sentence}")
+    print(line if can_print_symbols(sys.stderr) else to_ascii(line), file=sys.stderr)
+    return True
