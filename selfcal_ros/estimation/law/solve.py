@@ -48,7 +48,7 @@ def solve_law(measurements: Measurements, options: Options) -> Solved:
     measurements : Measurements
         Readings; their repeats are averaged as they are, without weights, as published.
     options : Options
-        Only `datum_theta` matters here.
+        Only `datum_theta` matters here, and whether an uncertainty map is not wanted.
 
     Returns
     -------
@@ -69,6 +69,8 @@ def solve_law(measurements: Measurements, options: Options) -> Solved:
     xy, theta = _noise(found, spread, measurements.views)
     noise = noise_of(xy, theta)
     u_g, u_theta = spread.uncertainty(noise)
+    if options.uncertainty is False:
+        u_g, u_theta = np.full_like(u_g, np.nan), np.full_like(u_theta, np.nan)
     turn = _to_stage if measurements.sense is Sense.PLATE_MOVES else _as_is
     g, g_theta = turn(found.g[..., 0], found.g_theta[:, 0], -1)
     u_g, u_theta = turn(u_g, u_theta, 1)
@@ -82,7 +84,7 @@ def solve_law(measurements: Measurements, options: Options) -> Solved:
         tuple(_view_result(view, order.index(i), found)
               for i, view in enumerate(measurements.views)),
         Observability(4 * sites + 9, 4 * sites + 9, 0, True), noise,
-        measurements.all_rejected(), findings=_findings(artifact), method="law",
+        measurements.all_rejected(), findings=_findings(artifact, options), method="law",
         sense=str(measurements.sense), run_id=measurements.run_id)
     return Solved(result, xy, theta)
 
@@ -313,5 +315,7 @@ def _view_result(view: ViewReadings, index: int, found: HuSolution) -> ViewResul
                       used=view.used, rejected=sum(view.rejected.values()))
 
 
-def _findings(artifact: Artifact) -> tuple[Finding, ...]:
-    return () if artifact.grid_size <= EXACT_SIZE else (DrawnUncertainty(N_DRAWS),)
+def _findings(artifact: Artifact, options: Options) -> tuple[Finding, ...]:
+    if artifact.grid_size <= EXACT_SIZE or options.uncertainty is False:
+        return ()
+    return (DrawnUncertainty(N_DRAWS),)

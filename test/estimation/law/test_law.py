@@ -131,6 +131,21 @@ def test_exact_and_drawn_propagation_agree(monkeypatch):
     assert drawn.findings == (DrawnUncertainty(400),) and exact.findings == ()
 
 
+@pytest.mark.parametrize("exact_size", [21, 3])
+def test_an_uncertainty_map_that_is_not_wanted_is_not_there(monkeypatch, exact_size):
+    monkeypatch.setattr("selfcal_ros.estimation.law.solve.EXACT_SIZE", exact_size)
+    _, readings = measured(sigma_m=SIGMA_M, sigma_theta_rad=SIGMA_RAD)
+    wanted, plain = (calibrate(readings, replace(LAW, uncertainty=uncertainty)).error_map
+                     for uncertainty in (None, False))
+    for name in ("gx", "gy", "g_theta"):
+        assert np.array_equal(getattr(wanted, name), getattr(plain, name))
+    for name in ("u_gx", "u_gy", "u_g_theta"):
+        assert (getattr(wanted, name) > 0).all() and np.isnan(getattr(plain, name)).all()
+    found = calibrate(readings, replace(LAW, uncertainty=False))
+    assert not any(isinstance(finding, DrawnUncertainty) for finding in found.findings)
+    assert not found.has_uncertainty
+
+
 def test_noise_of_one_reading_from_what_is_left_over():
     ratios = []
     for seed in range(12):
