@@ -175,7 +175,7 @@ def equations_of(problem: Problem, found: JointFit, columns: TermColumns,
                  reduced: ReducedColumns | None = None) -> TermEquations:
     """Return the equations of columns beside the estimate `found`."""
     if reduced is None:
-        reduced = reduce_columns(problem.system.grid, columns.grid)
+        reduced = reduce_columns(problem.system.grid, columns.shapes)
     inverse = found.inverse if len(found.inverse) else problem.system.grid_inverse
     known = [sigma for sigma in (found.xy.declared, found.xy.repeats, found.xy.residuals)
              if np.isfinite(sigma)]
@@ -197,7 +197,7 @@ class _State:
         if problem.terms:
             ground = without_noise(problem.ground, self.found.residuals)
             columns = term_columns(ground, problem.terms, problem.drift_degree)
-            self._linearise(columns, reduce_columns(problem.system.grid, columns.grid))
+            self._linearise(columns, reduce_columns(problem.system.grid, columns.shapes))
         equations = self.equations
         self.coefficients = np.zeros(equations.n if equations else 0)
         self.sums = self._sums()
@@ -213,7 +213,7 @@ class _State:
         columns = equations.columns
         if self.microscope is not None and 0 < self.steps <= self.offset_steps:
             columns = self._freed_of_noise(self.microscope, columns)
-            reduced = reduce_anew(self.problem.system.grid, columns.grid, reduced,
+            reduced = reduce_anew(self.problem.system.grid, columns.shapes, reduced,
                                   columns.rows([TermName.MICROSCOPE]))
         elif not self._stale():
             return
@@ -225,8 +225,8 @@ class _State:
                                before.at_visits(self.coefficients))
         columns = made_anew(ground, microscope, before)
         rows = columns.rows([microscope.name])
-        effect = np.tensordot(self.coefficients[rows], columns.grid[rows] - before.grid[rows],
-                              axes=1)
+        effect = columns.shapes.combined(self.coefficients, rows) - before.shapes.combined(
+            self.coefficients, rows)
         if np.abs(effect).max() <= RESOLUTION * np.abs(self.found.parameters).max():
             self.offset_steps = self.steps
         return columns
@@ -279,7 +279,7 @@ class _State:
     def _of_terms(self) -> np.ndarray | float:
         if self.equations is None:
             return 0.0
-        return np.tensordot(self.coefficients, self.equations.columns.grid, axes=1)
+        return self.equations.columns.shapes.combined(self.coefficients)
 
     def _excess(self) -> np.ndarray | float:
         """Return what a finite rotation adds to the linear model, plate frame, m."""
@@ -296,7 +296,7 @@ class _State:
         if self.equations is None:
             return 0.0
         rows = self.equations.rows((TermName.PLATE_SCALE, TermName.PLATE_SHAPE))
-        return np.tensordot(self.coefficients[rows], self.equations.columns.grid[rows], axes=1)
+        return self.equations.columns.shapes.combined(self.coefficients, rows)
 
     def _sums(self) -> Sums:
         if self.equations is not None:

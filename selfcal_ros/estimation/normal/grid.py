@@ -123,7 +123,7 @@ class GridSystem:
 
     def coupled(self, fields: np.ndarray) -> np.ndarray:
         """Return what fields (sites, ...) ask of phi, Re, Im tau of the views, (3 views, ...)."""
-        return _of_misalignments((self.columns @ fields.conj()).conj())
+        return of_misalignments((self.columns @ fields.conj()).conj())
 
     @cached_property
     def block(self) -> np.ndarray:
@@ -163,7 +163,7 @@ class GridSystem:
         weighted = self.weight * self.centred(y)
         shapes = self.shapes.reshape(2, -1)
         sums = (shapes @ weighted.conj().reshape(self.n_views, -1).T).conj()
-        return self.views.scatter(weighted).ravel(), _of_misalignments(sums.T.ravel())
+        return self.views.scatter(weighted).ravel(), of_misalignments(sums.T.ravel())
 
     def reduced(self, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return M^-1 b and the right-hand side of the misalignments with sites eliminated."""
@@ -184,7 +184,7 @@ class GridSystem:
         return a, np.where(self.read, residual - a[..., None, :, :], 0.0)
 
 
-def _of_misalignments(sums: np.ndarray) -> np.ndarray:
+def of_misalignments(sums: np.ndarray) -> np.ndarray:
     """Return sums over phi and tau of each view (2 views, ...) as phi, Re tau, Im tau."""
     pairs = sums.reshape(-1, 2, *sums.shape[1:])
     parts = (pairs[:, 0].real, pairs[:, 1].real, pairs[:, 1].imag)

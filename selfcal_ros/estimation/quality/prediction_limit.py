@@ -15,6 +15,7 @@ from selfcal_ros.estimation.joint.model_fit import ModelFit, equations_of
 from selfcal_ros.estimation.lattice.maps import LatticeViews
 from selfcal_ros.estimation.quality.held_terms import HeldReadings
 from selfcal_ros.estimation.terms.projection import reduce_columns
+from selfcal_ros.estimation.terms.shapes import shapes_in_full
 from selfcal_ros.model.statistics import MANY_DOF
 
 LEVEL = 1e-3
@@ -112,7 +113,7 @@ def _fitted(model: ModelFit, noise: np.ndarray, rng: np.random.Generator
     grid, n = problem.system.grid, 3 * problem.system.grid.n_views
     found = model.found
     inverse = found.inverse if len(found.inverse) else problem.system.grid_inverse
-    reduced = reduce_columns(grid, noise)
+    reduced = reduce_columns(grid, shapes_in_full(noise))
     parameters = inverse[:n, :n] @ reduced.right
     fields = reduced.free - grid.response @ parameters
     if model.equations is None:

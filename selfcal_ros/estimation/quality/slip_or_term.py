@@ -16,6 +16,7 @@ from selfcal_ros.estimation.quality.slip import MAX_PLACES, Slip
 from selfcal_ros.estimation.terms.columns import Column, TermColumns, WithinMarks
 from selfcal_ros.estimation.terms.ground import Ground
 from selfcal_ros.estimation.terms.identifiable import require_terms_told
+from selfcal_ros.estimation.terms.shapes import shapes_of
 from selfcal_ros.estimation.verdict.cause_sizes import cause_of
 from selfcal_ros.estimation.verdict.causes import PlacedSlip, find_explanations
 from selfcal_ros.estimation.verdict.slip_columns import SLIP
@@ -61,9 +62,8 @@ def slip_at_line(ground: Ground, row: int, slip: Slip, phase: complex) -> TermCo
     axis = "mn".index(slip.axis)
     line = np.indices(ground.z.shape)[axis] - half[axis]
     after = (line >= slip.first) & (ground.weight[row] > 0)
-    block: np.ndarray = np.zeros((3, *ground.weight.shape), dtype=complex)
-    for column, shape in zip(block, (phase, 1j * phase, 1j * ground.z), strict=True):
-        column[row] = after * shape
+    shapes = shapes_of([{row: (after * shape).reshape(-1)} for shape in (phase, ground.z)],
+                       (0, 0, 1), (1, 1j, 1j), ground.weight)
     columns = tuple(Column(SLIP, row, part, np.inf) for part in ("x", "y", "phi"))
     nothing = WithinMarks(np.zeros((3, 3)), np.zeros(3), 0.0, 0)
-    return TermColumns(columns, block, nothing, [[None] * len(ground.names)] * 3)
+    return TermColumns(columns, shapes, nothing, [[None] * len(ground.names)] * 2)

@@ -11,17 +11,22 @@ width and s the signs of approach (reality of machines; docs/method.md, terms of
     approach     V has +-(h_x s_x + i h_y s_y)  2, shared; minus where the plate moves
 """
 
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
-from typing import NamedTuple
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.special import eval_legendre
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.terms.ground import Ground
+from selfcal_ros.estimation.terms.shapes import Shapes, shapes_of
 from selfcal_ros.estimation.terms.visits import ViewVisits
 from selfcal_ros.model.terms import UNITS, VISIT_TERMS, ModelTerm, TermName
+
+Seen = list[list[np.ndarray | None]]
+
+AXES: tuple[tuple[str, complex], ...] = (("x", 1), ("y", 1j))
+"""Along x and along y: what a column multiplies its shape by."""
 
 
 @dataclass(frozen=True)
@@ -69,19 +74,30 @@ class TermColumns:
     ----------
     columns : tuple of Column
         What each is, p of them.
-    grid : complex array (p, views, nx, ny)
+    shapes : Shapes
         Mean over the visits of every mark, plate frame; 0 where not read.
     within : WithinMarks
         What the means hide.
-    seen : list
-        Values of each column at the visits of each view, (V,), plate frame; None where they are
+    at : list
+        Values of each shape at the visits of each view, (V,), plate frame; None where they are
         those of the means.
     """
 
     columns: tuple[Column, ...]
-    grid: np.ndarray
+    shapes: Shapes
     within: WithinMarks
-    seen: list[list[np.ndarray | None]]
+    at: Seen
+
+    @property
+    def grid(self) -> np.ndarray:
+        """The columns at the marks in full, complex (p, views, nx, ny)."""
+        return self.shapes.grid
+
+    @property
+    def seen(self) -> Seen:
+        """Values of each column at the visits of each view, as `at` has them of the shapes."""
+        return [[None if one is None else unit * one for one in self.at[shape]]
+                for shape, unit in zip(self.shapes.of_column, self.shapes.unit, strict=True)]
 
     @property
     def size(self) -> np.ndarray:
@@ -93,9 +109,11 @@ class TermColumns:
 
         Up to what is the same at all visits of a mark.
         """
-        views = len(self.seen[0]) if self.seen else 0
-        return [sum((value * column[view] for value, column in zip(
-            coefficients, self.seen, strict=True) if column[view] is not None), start=0.0)
+        of_shape = np.zeros(len(self.at), dtype=complex)
+        np.add.at(of_shape, self.shapes.of_column, coefficients * self.shapes.unit)
+        views = len(self.at[0]) if self.at else 0
+        return [sum((value * shape[view] for value, shape in zip(
+            of_shape, self.at, strict=True) if shape[view] is not None), start=0.0)
             for view in range(views)]
 
     def rows(self, names: Iterable[str]) -> np.ndarray:
@@ -110,15 +128,32 @@ class TermColumns:
             for column in self.columns))
 
 
-Parts = list[tuple[str, Callable[[ViewVisits], np.ndarray]]]
+@dataclass
+class Made:
+    """Columns in the making: their shapes at the marks (marks,) by view, and at the visits."""
 
+    columns: list[Column] = field(default_factory=list)
+    of_column: list[int] = field(default_factory=list)
+    unit: list[complex] = field(default_factory=list)
+    means: list[dict[int, np.ndarray]] = field(default_factory=list)
+    at: Seen = field(default_factory=list)
 
-class Made(NamedTuple):
-    """A column: means at the marks (nx, ny) by view, 0 in others; values as in `TermColumns`."""
+    def add(self, means: dict[int, np.ndarray], at: list[np.ndarray | None]) -> int:
+        """Add a shape; return its number."""
+        self.means.append(means)
+        self.at.append(at)
+        return len(self.means) - 1
 
-    column: Column
-    means: dict[int, np.ndarray]
-    seen: list[np.ndarray | None]
+    def column(self, column: Column, shape: int, unit: complex) -> None:
+        """Add a column that is `unit`, 1 or i, times a shape."""
+        self.columns.append(column)
+        self.of_column.append(shape)
+        self.unit.append(unit)
+
+    def done(self, ground: Ground) -> TermColumns:
+        """Return the columns."""
+        shapes = shapes_of(self.means, self.of_column, self.unit, ground.weight)
+        return TermColumns(tuple(self.columns), shapes, _within(ground, self.at, shapes), self.at)
 
 
 def term_columns(ground: Ground, terms: Iterable[ModelTerm], degree: int) -> TermColumns:
@@ -138,14 +173,17 @@ def term_columns(ground: Ground, terms: Iterable[ModelTerm], degree: int) -> Ter
     InputError
         If a term needs to know the visits of a view, and they are not known.
     """
-    made: list[Made] = []
+    made = Made()
     for term in terms:
-        if term.name in VISIT_TERMS:
-            _require_visits(ground, term.name)
-            made += _visit_columns(ground, term, degree)
+        if term.name not in VISIT_TERMS:
+            _plate_columns(made, ground, term)
+            continue
+        _require_visits(ground, term.name)
+        if term.name is TermName.DRIFT:
+            _drift_columns(made, ground, term, degree)
         else:
-            made += _plate_columns(ground, term)
-    return _stacked(ground, made)
+            _shared_columns(made, ground, term)
+    return made.done(ground)
 
 
 def made_anew(ground: Ground, term: ModelTerm, before: TermColumns) -> TermColumns:
@@ -160,47 +198,54 @@ def made_anew(ground: Ground, term: ModelTerm, before: TermColumns) -> TermColum
     before : TermColumns
         Columns of all terms.
     """
-    at = np.flatnonzero(before.rows([term.name]))
-    grid, seen = before.grid.copy(), list(before.seen)
-    for row, (_, means, values) in zip(at, _visit_columns(ground, term, 0), strict=True):
-        _fill(grid[row], means)
-        seen[row] = values
-    return TermColumns(before.columns, grid, _within_anew(ground, seen, before.within, at), seen)
+    fresh = Made()
+    _shared_columns(fresh, ground, term)
+    changed = before.shapes.of_column[before.rows([term.name])]
+    # the shape of each new column takes the place of that of the same column before
+    own = dict(zip(fresh.of_column, changed.tolist(), strict=True))
+    at = list(before.at)
+    for shape, number in own.items():
+        at[number] = fresh.at[shape]
+    shapes = before.shapes.replaced(list(own.values()), [fresh.means[shape] for shape in own])
+    within = _within_anew(ground, at, shapes, before=before.within,
+                          changed=np.array(sorted(own.values()), dtype=int))
+    return TermColumns(before.columns, shapes, within, at)
 
 
 def columns_from(ground: Ground, columns: Iterable[Column],
-                 shapes: Iterable[np.ndarray]) -> TermColumns:
-    """Return columns of one view each, given by their values at its visits (V,), plate frame."""
-    made = []
-    for column, values in zip(columns, shapes, strict=True):
-        visits = ground.visits[column.view]
+                 shapes: Iterable[tuple[np.ndarray, Sequence[complex]]]) -> TermColumns:
+    """Return columns of one view each.
+
+    Parameters
+    ----------
+    ground : Ground
+        Plate, views, visits.
+    columns : iterable of Column
+        What each is.
+    shapes : iterable of tuple
+        Values at the visits of a view, (V,), plate frame, and the units, 1 or i, of the columns
+        that are made of them: as many columns in a row, of one view.
+    """
+    made, rest = Made(), iter(columns)
+    for values, units in shapes:
+        mine = [next(rest) for _ in units]
+        [view] = {column.view for column in mine}
+        visits = ground.visits[view]
         if visits is None:
-            raise ValueError(f"column of view {column.view}: its visits are not known")
-        means = visits.means(values[None], ground.z.size).reshape(ground.z.shape)
-        seen: list[np.ndarray | None] = [None] * len(ground.names)
-        seen[column.view] = values
-        made.append(Made(column, {column.view: means}, seen))
-    return _stacked(ground, made)
-
-
-def _stacked(ground: Ground, made: list[Made]) -> TermColumns:
-    grid = np.zeros((len(made), *ground.weight.shape), dtype=complex)
-    for out, item in zip(grid, made, strict=True):
-        _fill(out, item.means)
-    seen = [item.seen for item in made]
-    return TermColumns(tuple(item.column for item in made), grid, _within(ground, seen), seen)
-
-
-def _fill(out: np.ndarray, means: dict[int, np.ndarray]) -> None:
-    for view, values in means.items():
-        out[view] = values
+            raise ValueError(f"column of view {view}: its visits are not known")
+        at: list[np.ndarray | None] = [None] * len(ground.names)
+        at[view] = values
+        number = made.add({view: visits.means(values[None], ground.z.size)[0]}, at)
+        for column, unit in zip(mine, units, strict=True):
+            made.column(column, number, unit)
+    return made.done(ground)
 
 
 def joined(ground: Ground, first: TermColumns, second: TermColumns) -> TermColumns:
     """Return the columns of both."""
-    seen = [*first.seen, *second.seen]
-    return TermColumns((*first.columns, *second.columns),
-                       np.concatenate([first.grid, second.grid]), _within(ground, seen), seen)
+    at = [*first.at, *second.at]
+    shapes = first.shapes.with_others(second.shapes)
+    return TermColumns((*first.columns, *second.columns), shapes, _within(ground, at, shapes), at)
 
 
 def _require_visits(ground: Ground, name: TermName) -> None:
@@ -211,106 +256,108 @@ def _require_visits(ground: Ground, name: TermName) -> None:
                              "tell it", "solve from the bag, or leave the term out")
 
 
-def _visit_columns(ground: Ground, term: ModelTerm,
-                   degree: int) -> list[Made]:
-    if term.name is TermName.DRIFT:
-        out = []
-        for view in range(len(ground.names)):
-            for order in range(1, degree + 1):
-                parts = _drift_parts(order)
-                out += [_of_visits(ground, Column(term.name, view, text, term.size), shape)
-                        for text, shape in parts]
-        return out
-    parts = _microscope_parts() if term.name is TermName.MICROSCOPE else _approach_parts(ground)
-    return [_of_visits(ground, Column(term.name, -1, text, term.size), shape)
-            for text, shape in parts]
-
-
-def _drift_parts(order: int) -> Parts:
-    return [(f"x P{order}", lambda v: eval_legendre(order, v.time) + 0j),
-            (f"y P{order}", lambda v: 1j * eval_legendre(order, v.time))]
-
-
-def _microscope_parts() -> Parts:
-    # E o = (e_xx o_x + e_xy o_y) + i (e_yx o_x + e_yy o_y); a reading has o where it should
-    # have (1 + E) o
-    return [("xx", lambda v: -v.offset.real + 0j), ("xy", lambda v: -v.offset.imag + 0j),
-            ("yx", lambda v: -1j * v.offset.real), ("yy", lambda v: -1j * v.offset.imag)]
-
-
-def _approach_parts(ground: Ground) -> Parts:
-    return [("x", lambda v: ground.indicated * v.approach_x + 0j),
-            ("y", lambda v: 1j * ground.indicated * v.approach_y)]
-
-
-def _of_visits(ground: Ground, column: Column,
-               shape: Callable[[ViewVisits], np.ndarray]) -> Made:
-    """Return a column of the visits: its means at the marks, and its values at the visits."""
-    means: dict[int, np.ndarray] = {}
-    values: list[np.ndarray | None] = []
+def _drift_columns(made: Made, ground: Ground, term: ModelTerm, degree: int) -> None:
+    orders = np.arange(1, degree + 1)
     for view, visits in enumerate(ground.visits):
-        if visits is None or column.view not in (-1, view):
-            values.append(None)
+        if visits is None:
             continue
-        at = shape(visits) * visits.phase
-        means[view] = visits.means(at[None], ground.z.size)[0].reshape(ground.z.shape)
-        values.append(at)
-    return Made(column, means, values)
+        values = eval_legendre(orders[:, None], visits.time) * visits.phase
+        for order, mean, one in zip(orders, visits.means(values, ground.z.size), values,
+                                    strict=True):
+            at: list[np.ndarray | None] = [None] * len(ground.names)
+            at[view] = one
+            number = made.add({view: mean}, at)
+            for axis, unit in AXES:
+                made.column(Column(term.name, view, f"{axis} P{order}", term.size), number, unit)
 
 
-def _plate_columns(ground: Ground, term: ModelTerm) -> list[Made]:
-    """Return columns of plate scale or shape: the same at all visits of a mark.
+def _shared_columns(made: Made, ground: Ground, term: ModelTerm) -> None:
+    """Add the columns of a term of the visits whose coefficients all views share."""
+    of_axes = [None if visits is None else _of_axes(ground, term.name, visits) * visits.phase
+               for visits in ground.visits]
+    means = [None if visits is None or values is None else visits.means(values, ground.z.size)
+             for visits, values in zip(ground.visits, of_axes, strict=True)]
+    numbers = [made.add({view: both[axis] for view, both in enumerate(means) if both is not None},
+                        [None if both is None else both[axis] for both in of_axes])
+               for axis in range(2)]
+    for (name, unit), own in zip(AXES, numbers, strict=True):
+        if term.name is TermName.APPROACH:
+            made.column(Column(term.name, -1, name, term.size), own, unit)
+            continue
+        # E o = (e_xx o_x + e_xy o_y) + i (e_yx o_x + e_yy o_y); a reading has o where it should
+        # have (1 + E) o
+        for (other, _), number in zip(AXES, numbers, strict=True):
+            made.column(Column(term.name, -1, name + other, term.size), number, unit)
+
+
+def _of_axes(ground: Ground, name: TermName, visits: ViewVisits) -> np.ndarray:
+    """Return what the visits say of each axis, (2, V): offsets seen, or where it came from."""
+    if name is TermName.MICROSCOPE:
+        return -np.stack([visits.offset.real, visits.offset.imag])
+    return ground.indicated * np.stack([visits.approach_x, visits.approach_y])
+
+
+def _plate_columns(made: Made, ground: Ground, term: ModelTerm) -> None:
+    """Add the columns of plate scale or shape: the same at all visits of a mark.
 
     A size says how far views scatter about what they have in common, so that each view has its
     own; free ones are relative to the first view, as what all have in common is the plate's.
     """
-    first = 1 if term.free else 0
-    out = []
-    for view in range(first, len(ground.names)):
-        for text, shape in _plate_shapes(ground, term.name):
-            means = {view: np.where(ground.weight[view] > 0, shape, 0)}
-            out.append(Made(Column(term.name, view, text, term.size), means,
-                            [None] * len(ground.names)))
-    return out
+    forms, axes = _plate_forms(ground, term.name)
+    nothing: list[np.ndarray | None] = [None] * len(ground.names)
+    for view in range(1 if term.free else 0, len(ground.names)):
+        here = ground.weight[view].reshape(-1) > 0
+        numbers = [made.add({view: np.where(here, form, 0)}, nothing) for form in forms.values()]
+        for axis, unit in axes:
+            for text, number in zip(forms, numbers, strict=True):
+                made.column(Column(term.name, view, f"{axis}{text}", term.size), number, unit)
 
 
-def _plate_shapes(ground: Ground, name: TermName) -> list[tuple[str, np.ndarray]]:
+def _plate_forms(ground: Ground, name: TermName
+                 ) -> tuple[dict[str, np.ndarray], tuple[tuple[str, complex], ...]]:
+    """Return forms over the marks, (marks,), and along which axes each has a column."""
+    z = ground.z.reshape(-1)
     if name is TermName.PLATE_SCALE:
-        return [("scale", ground.z * ground.half_width_m)]
-    x, y = ground.z.real, ground.z.imag
+        return {"scale": z * ground.half_width_m}, (("", 1),)
+    x, y = z.real, z.imag
     # 2xy beside x^2 and y^2: a bending (x^2 - y^2, -2xy) then has coefficients of one size
-    return [(f"{axis} {text}", unit * form) for axis, unit in (("x", 1), ("y", 1j))
-            for text, form in (("xx", x * x), ("xy", 2 * x * y), ("yy", y * y))]
+    return ({"xx": x * x, "xy": 2 * x * y, "yy": y * y},
+            tuple((f"{axis} ", unit) for axis, unit in AXES))
 
 
-def _within(ground: Ground, seen: list[list[np.ndarray | None]]) -> WithinMarks:
-    total, dof, n = 0.0, 0, len(seen)
+def _within(ground: Ground, at: Seen, shapes: Shapes) -> WithinMarks:
+    total, dof, n = 0.0, 0, len(shapes.unit)
     for visits in ground.visits:
         if visits is not None and visits.repeated:
             rest = visits.about_means(visits.y[None], ground.z.size)[0]
             total += float(visits.weight @ abs(rest) ** 2)
             dof += 2 * (len(visits.mark) - len(np.unique(visits.mark)))
     nothing = WithinMarks(np.zeros((n, n)), np.zeros(n), total, dof)
-    return _within_anew(ground, seen, nothing, np.arange(n))
+    return _within_anew(ground, at, shapes, before=nothing, changed=np.arange(shapes.n))
 
 
-def _within_anew(ground: Ground, seen: list[list[np.ndarray | None]], before: WithinMarks,
+def _within_anew(ground: Ground, at: Seen, shapes: Shapes, *, before: WithinMarks,
                  changed: np.ndarray) -> WithinMarks:
-    """Return what the means hide, the products of the columns `changed` set up anew."""
-    gram, right = before.gram.copy(), before.right.copy()
-    gram[changed], gram[:, changed], right[changed] = 0.0, 0.0, 0.0
+    """Return what the means hide, the products of the shapes `changed` set up anew."""
+    inner: np.ndarray = np.zeros((shapes.n, shapes.n), dtype=complex)
+    against: np.ndarray = np.zeros(shapes.n, dtype=complex)
     for view, visits in enumerate(ground.visits):
-        mine = [k for k in changed if seen[k][view] is not None]
-        if visits is None or not visits.repeated or not mine:
+        if visits is None or not visits.repeated:
             continue
-        here = [k for k in range(len(seen)) if seen[k][view] is not None]
+        here = [k for k in range(shapes.n) if at[k][view] is not None]
+        mine = [k for k in changed if at[k][view] is not None]
+        if not mine:
+            continue
         # about the means of their marks: then those of the others drop out
-        moved = visits.about_means(np.array([seen[k][view] for k in mine]), ground.z.size)
+        moved = visits.about_means(np.array([at[k][view] for k in mine]), ground.z.size)
         weighted = np.conj(moved) * visits.weight
-        gram[np.ix_(mine, here)] += (weighted @ np.array([seen[k][view] for k in here]).T).real
-        right[mine] += (weighted @ visits.y).real
-    gram[:, changed] = gram[changed].T
-    gram[np.ix_(changed, changed)] = _symmetric(gram[np.ix_(changed, changed)])
+        inner[np.ix_(mine, here)] += weighted @ np.array([at[k][view] for k in here]).T
+        against[mine] += (weighted @ visits.y).conj()
+    gram, right = before.gram.copy(), before.right.copy()
+    own = np.isin(shapes.of_column, changed)
+    gram[own], right[own] = shapes.products(inner)[own], shapes.against(against)[own]
+    gram[:, own] = gram[own].T
+    gram[np.ix_(own, own)] = _symmetric(gram[np.ix_(own, own)])
     return WithinMarks(gram, right, before.total, before.dof)
 
 

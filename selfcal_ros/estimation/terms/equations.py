@@ -63,8 +63,7 @@ class TermEquations:
 
         Against it is judged what is told: what is left may be nothing but rounding.
         """
-        columns = self.columns.grid.reshape(self.n, self.system.grid.weight.size)
-        grid = (columns.real**2 + columns.imag**2) @ self.system.grid.weight.ravel()
+        grid = self.columns.shapes.squares(self.system.grid.weight)
         return np.sqrt(np.maximum(grid + np.diag(self.columns.within.gram),
                                   np.finfo(float).tiny))
 

@@ -114,7 +114,7 @@ def planned_equations(system: NormalEquations, ground: Ground, terms: Iterable[M
     Rotations are those that the grid tells, as in `predict`: lines add little to them.
     """
     columns = term_columns(ground, terms, assumed.drift_degree)
-    reduced = reduce_columns(system.grid, columns.grid)
+    reduced = reduce_columns(system.grid, columns.shapes)
     n = 3 * system.grid.n_views
     inverse = np.zeros((system.size, system.size))
     inverse[:n, :n] = system.grid_inverse
@@ -138,11 +138,10 @@ def with_terms(every: TermEquations, terms: Iterable[ModelTerm]) -> TermEquation
                     for column, here in zip(known.columns, rows, strict=True) if here)
     inner = known.within
     within = WithinMarks(inner.gram[np.ix_(rows, rows)], inner.right[rows], inner.total, inner.dof)
-    seen = [values for values, here in zip(known.seen, rows, strict=True) if here]
     part = every.projected
     return TermEquations(
-        every.system, TermColumns(columns, known.grid[rows], within, seen),
-        ProjectedColumns(part.fields[:, rows], part.parameters[:, rows],
+        every.system, TermColumns(columns, known.shapes.part(rows), within, known.at),
+        ProjectedColumns(lambda: part.fields[:, rows], part.parameters[:, rows],
                          part.gram[np.ix_(rows, rows)]), every.noise_m)
 
 

@@ -7,18 +7,19 @@ partitioned regression (Frisch and Waugh):
     (r'W c + within + sigma^2/size^2) b = c'W e + within,
     G = G(y) - F b,     cov G = S + F cov(b) F'
 With the marks, then the sites (matrix M, right-hand side s), then the misalignments (right-hand
-side d, covariance C) eliminated, r'W c = c'W (c - mean) - s' M^-1 s - d' C d.
+side d, covariance C) eliminated, r'W c = c'W c - mean' W mean - s' M^-1 s - d' C d. Up to the last
+all is linear over the complex numbers and done for the shapes of the columns.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from selfcal_ros.estimation.normal.equations import NormalEquations
-from selfcal_ros.estimation.normal.grid import GridSystem
-
-CHUNK_READINGS = 4_000_000
-"""Readings of columns that are worked on at a time: 64 MB."""
+from selfcal_ros.estimation.normal.grid import GridSystem, of_misalignments
+from selfcal_ros.estimation.terms.shapes import Shapes
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,17 +28,104 @@ class ReducedColumns:
 
     Attributes
     ----------
-    free : complex array (sites, p)
-        M^-1 s of every column.
-    right : float array (3 views, p)
-        Right-hand side of the misalignments.
-    gram : float array (p, p)
-        Weighted inner products of what marks and sites leave of the columns.
+    grid : GridSystem
+        The measured plan.
+    shapes : Shapes
+        The columns, p of them, of q shapes.
+    sites : complex array (sites, q)
+        Right-hand side s of every shape.
+    inner : complex array (q, q)
+        Weighted inner products of what marks and sites leave of the shapes.
+    asked : complex array (2 views, q)
+        What the shapes ask of rotation and offset of every view, sites eliminated.
     """
 
-    free: np.ndarray
-    right: np.ndarray
-    gram: np.ndarray
+    grid: GridSystem
+    shapes: Shapes
+    sites: np.ndarray
+    inner: np.ndarray
+    asked: np.ndarray
+
+    @cached_property
+    def free(self) -> np.ndarray:
+        """M^-1 s of every column, complex (sites, p)."""
+        return self.shapes.of_columns(self.grid.factor.solve(self.sites))
+
+    @cached_property
+    def right(self) -> np.ndarray:
+        """Right-hand side of the misalignments, (3 views, p)."""
+        return of_misalignments(self.shapes.of_columns(self.asked))
+
+    @cached_property
+    def gram(self) -> np.ndarray:
+        """Weighted inner products of what marks and sites leave of the columns, (p, p)."""
+        return self.shapes.products(self.inner)
+
+
+def reduce_columns(grid: GridSystem, shapes: Shapes) -> ReducedColumns:
+    """Return columns with the sites eliminated."""
+    sites, inner, asked = _marks_eliminated(grid, shapes)
+    inner -= grid.factor.products(sites)
+    return ReducedColumns(grid, shapes, sites, (inner + inner.conj().T) / 2,
+                          asked - _coupled(grid, sites))
+
+
+def reduce_anew(grid: GridSystem, shapes: Shapes, before: ReducedColumns,
+                rows: np.ndarray) -> ReducedColumns:
+    """Return columns with the sites eliminated, of which only `rows` have changed.
+
+    Parameters
+    ----------
+    grid : GridSystem
+        The measured plan.
+    shapes : Shapes
+        The columns.
+    before : ReducedColumns
+        Of the columns before.
+    rows : bool array (p,)
+        Which ones are to be set up anew, with all others of the same shapes.
+    """
+    changed = np.unique(shapes.of_column[rows])
+    sites, fresh, asked = _marks_eliminated(grid, shapes)
+    free = grid.factor.solve(np.ascontiguousarray(sites[:, changed]))
+    inner, asked_before = before.inner.copy(), before.asked.copy()
+    inner[changed] = fresh[changed] - free.conj().T @ sites
+    inner[:, changed] = inner[changed].conj().T
+    asked_before[:, changed] = asked[:, changed] - _coupled(grid, sites[:, changed])
+    return ReducedColumns(grid, shapes, sites, (inner + inner.conj().T) / 2, asked_before)
+
+
+def _marks_eliminated(grid: GridSystem, shapes: Shapes
+                      ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return s (sites, q), inner products (q, q) and what is asked of views (2 views, q)."""
+    n, marks = grid.n_views, grid.n_sites
+    weight, part = (array.reshape(n, marks) for array in (grid.weight, grid.relative_weight))
+    to_views = grid.shapes.reshape(2, marks).conj()
+    means: np.ndarray = np.zeros((shapes.n, marks), dtype=complex)
+    sites: np.ndarray = np.zeros((shapes.n, *shapes.lattice), dtype=complex)
+    inner: np.ndarray = np.zeros((shapes.n, shapes.n), dtype=complex)
+    asked: np.ndarray = np.zeros((n, 2, shapes.n), dtype=complex)
+    for v, (rows, values) in enumerate(zip(shapes.rows, shapes.values, strict=True)):
+        weighted = values * weight[v]
+        means[rows] += values * part[v]
+        inner[rows[:, None], rows] += values.conj() @ weighted.T
+        asked[v][:, rows] += to_views @ weighted.T
+        here = np.zeros((len(rows), *shapes.lattice), dtype=complex)
+        grid.views.add_scattered(here, v, weighted.reshape(here.shape))
+        sites[rows] += here
+    # less the mean of each mark, which all views share
+    inner -= (means * weight.sum(axis=0)).conj() @ means.T
+    asked -= (to_views * weight[:, None]) @ means.T
+    for v in range(n):
+        grid.views.add_scattered(sites, v, (means * -weight[v]).reshape(sites.shape))
+    return (np.ascontiguousarray(sites.reshape(shapes.n, marks).T), inner,
+            asked.reshape(2 * n, shapes.n))
+
+
+def _coupled(grid: GridSystem, sites: np.ndarray) -> np.ndarray:
+    """Return what M^-1 s asks of rotation and offset of every view, complex (2 views, k)."""
+    answers = grid.response.reshape(grid.n_sites, grid.n_views, 3)[:, :, :2]
+    return answers.reshape(grid.n_sites, -1).conj().T @ sites
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,59 +134,22 @@ class ProjectedColumns:
 
     Attributes
     ----------
-    fields : complex array (sites, p)
-        Map F.
+    make_fields : callable
+        Returns `fields`: few ask for them.
     parameters : float array (size, p)
         Misalignments, as in `NormalEquations`.
     gram : float array (p, p)
         Weighted inner products of columns and residuals, c' W r.
     """
 
-    fields: np.ndarray
+    make_fields: Callable[[], np.ndarray]
     parameters: np.ndarray
     gram: np.ndarray
 
-
-def reduce_columns(grid: GridSystem, columns: np.ndarray) -> ReducedColumns:
-    """Return columns (p, views, nx, ny) with the sites eliminated."""
-    n = len(columns)
-    empty = ReducedColumns(np.zeros((grid.n_sites, n), dtype=complex),
-                           np.zeros((3 * grid.n_views, n)), np.zeros((n, n)))
-    return reduce_anew(grid, columns, empty, np.ones(n, dtype=bool))
-
-
-def reduce_anew(grid: GridSystem, columns: np.ndarray, before: ReducedColumns,
-                rows: np.ndarray) -> ReducedColumns:
-    """Return columns with the sites eliminated, of which only `rows` have changed.
-
-    Parameters
-    ----------
-    grid : GridSystem
-        The measured plan.
-    columns : complex array (p, views, nx, ny)
-        The columns in the plate frame.
-    before : ReducedColumns
-        Of the columns before.
-    rows : bool array (p,)
-        Which ones are to be set up anew.
-    """
-    free, right, gram = before.free.copy(), before.right.copy(), before.gram.copy()
-    changed = np.flatnonzero(rows)
-    sites = np.empty((grid.n_sites, len(changed)), dtype=complex)
-    for part in _chunks(columns, len(changed)):
-        at = changed[part]
-        weighted = _centred(grid, columns[at])
-        weighted *= grid.weight
-        for place, one in zip(range(part.start, part.stop), weighted, strict=True):
-            sites[:, place] = grid.views.scatter(one).ravel()
-        sums = np.einsum("kij,pvij->vkp", np.conj(grid.shapes), weighted, optimize=True)
-        free[:, at] = grid.factor.solve(sites[:, part])
-        both = np.stack([sums[:, 0].real, sums[:, 1].real, sums[:, 1].imag], axis=1)
-        right[:, at] = both.reshape(3 * grid.n_views, -1) - grid.coupled(free[:, at])
-        gram[:, at] = inner_products(columns, weighted)
-    gram[:, changed] -= inner_products(free.T, sites.T)
-    gram[changed] = gram[:, changed].T
-    return ReducedColumns(free, right, (gram + gram.T) / 2)
+    @cached_property
+    def fields(self) -> np.ndarray:
+        """Map F, complex (sites, p)."""
+        return self.make_fields()
 
 
 def project(system: NormalEquations, reduced: ReducedColumns,
@@ -116,24 +167,6 @@ def project(system: NormalEquations, reduced: ReducedColumns,
     """
     grid, n = system.grid, 3 * system.grid.n_views
     parameters = inverse[:, :n] @ reduced.right
-    fields = reduced.free - grid.response @ parameters[:n]
     gram = reduced.gram - reduced.right.T @ parameters[:n]
-    return ProjectedColumns(fields, parameters, (gram + gram.T) / 2)
-
-
-def inner_products(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Return the real part of the inner products of complex rows (p, ...) and (k, ...), (p, k)."""
-    pairs = [np.ascontiguousarray(rows).reshape(len(rows), -1).view(float)
-             for rows in (first, second)]
-    return pairs[0] @ pairs[1].T
-
-
-def _centred(grid: GridSystem, columns: np.ndarray) -> np.ndarray:
-    """Return columns less their weighted mean over the views, in their own memory."""
-    columns -= np.einsum("vij,pvij->pij", grid.relative_weight, columns)[:, None]
-    return columns
-
-
-def _chunks(columns: np.ndarray, number: int) -> list[slice]:
-    step = max(1, CHUNK_READINGS // max(columns[0].size if len(columns) else 1, 1))
-    return [slice(i, min(i + step, number)) for i in range(0, number, step)]
+    return ProjectedColumns(
+        lambda: reduced.free - grid.response @ parameters[:n], parameters, (gram + gram.T) / 2)

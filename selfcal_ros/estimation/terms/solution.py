@@ -70,10 +70,10 @@ def score(equations: TermEquations, residuals: np.ndarray, squares: tuple[float,
         What has been taken off already.
     """
     columns, weight = equations.columns, equations.system.grid.weight
+    shapes = columns.shapes
     within = columns.within
     taken = np.zeros(equations.n) if coefficients is None else coefficients
-    weighted = (weight * residuals).reshape(-1)
-    between = (columns.grid.reshape(len(taken), weighted.size) @ np.conj(weighted)).real
+    between = shapes.against(shapes.sums(weight * residuals))
     inner = within.total - 2 * taken @ within.right + taken @ within.gram @ taken
     sums = Sums(*squares, float(inner), within.dof)
     return Score(between, within.right - within.gram @ taken, sums)

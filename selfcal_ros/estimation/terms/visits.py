@@ -49,6 +49,9 @@ class ViewVisits:
     def means(self, values: np.ndarray, n_marks: int) -> np.ndarray:
         """Return the weighted mean of complex values (k, V) at each mark, (k, marks)."""
         out = np.zeros((len(values), n_marks), dtype=complex)
+        if not self.repeated:
+            out[:, self.mark] = values
+            return out
         for row, value in zip(out, values, strict=True):
             row.real = np.bincount(self.mark, self._relative * value.real, n_marks)
             row.imag = np.bincount(self.mark, self._relative * value.imag, n_marks)
@@ -62,7 +65,7 @@ class ViewVisits:
     @cached_property
     def repeated(self) -> bool:
         """Whether a mark was visited more than once; else its visit is its mean."""
-        return len(np.unique(self.mark)) < len(self.mark)
+        return bool(len(self.mark)) and int(np.bincount(self.mark).max()) > 1
 
     def about_means(self, values: np.ndarray, n_marks: int) -> np.ndarray:
         """Return complex values (k, V) less the mean of their mark."""

@@ -20,7 +20,7 @@ def slip_columns(ground: Ground) -> tuple[TermColumns, dict[tuple[int, float], n
     whose visits are not known have none. An instant is a part of the view's visits, 0..1.
     """
     columns: list[Column] = []
-    shapes: list[np.ndarray] = []
+    shapes: list[tuple[np.ndarray, tuple[complex, ...]]] = []
     groups: dict[tuple[int, float], list[int]] = {}
     for view, visits in enumerate(ground.visits):
         if visits is None:
@@ -30,10 +30,9 @@ def slip_columns(ground: Ground) -> tuple[TermColumns, dict[tuple[int, float], n
             if not 3 <= after.sum() <= len(after) - 3:
                 continue
             at = ground.z.reshape(-1)[visits.mark]
-            for text, shape in (("x", visits.phase), ("y", 1j * visits.phase), ("phi", 1j * at)):
-                groups.setdefault((view, float(part)), []).append(len(columns))
-                columns.append(Column(SLIP, view, text, np.inf))
-                shapes.append(after * shape)
+            groups[view, float(part)] = list(range(len(columns), len(columns) + 3))
+            columns += [Column(SLIP, view, text, np.inf) for text in ("x", "y", "phi")]
+            shapes += [(after * visits.phase, (1, 1j)), (after * at, (1j,))]
     made = columns_from(ground, columns, shapes)
     rows = {key: np.isin(np.arange(len(columns)), at) for key, at in groups.items()}
     return made, rows

@@ -1,0 +1,155 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What columns are at the marks, kept as the complex shapes of which they are 1 or i times one.
+
+Most terms come in pairs, the same along x and along y, and most live in one view: a drift of
+degree 3 in five views has 30 columns of 5 x 441 numbers each, and 15 shapes of 441. All that the
+equations need is linear over the complex numbers until misalignments join, so it is worked out for
+the shapes; what is asked of the columns is read off:
+
+    Re(conj(u c) v d) = Re(conj(u) v <c, d>),     u, v in {1, i}
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+
+@dataclass(frozen=True, eq=False)
+class Shapes:
+    """Shapes at the means of the marks, and the columns made of them.
+
+    Attributes
+    ----------
+    n : int
+        Number of shapes, q.
+    lattice : tuple of int
+        Marks along x and y.
+    rows : tuple of int array
+        Which shapes each view has, (k,); all others are 0 in it.
+    values : tuple of complex array
+        Those shapes, (k, marks), plate frame; 0 where not read.
+    of_column : int array (p,)
+        The shape of each column.
+    unit : complex array (p,)
+        1 or i: the column is that times its shape.
+    """
+
+    n: int
+    lattice: tuple[int, int]
+    rows: tuple[np.ndarray, ...]
+    values: tuple[np.ndarray, ...]
+    of_column: np.ndarray
+    unit: np.ndarray
+
+    @cached_property
+    def grid(self) -> np.ndarray:
+        """The columns in full, complex (p, views, nx, ny)."""
+        out = np.zeros((len(self.unit), len(self.rows), *self.lattice), dtype=complex)
+        for view, (rows, values) in enumerate(zip(self.rows, self.values, strict=True)):
+            at = np.full(self.n, -1)
+            at[rows] = np.arange(len(rows))
+            here = np.flatnonzero(at[self.of_column] >= 0)
+            out[here, view] = (self.unit[here, None] * values[at[self.of_column[here]]]).reshape(
+                -1, *self.lattice)
+        return out
+
+    def of_columns(self, each: np.ndarray) -> np.ndarray:
+        """Return what is linear in the shapes, complex (..., q), for the columns, (..., p)."""
+        return each[..., self.of_column] * self.unit
+
+    def products(self, inner: np.ndarray) -> np.ndarray:
+        """Return real inner products of the columns, (p, p), from those of the shapes, (q, q)."""
+        pairs = inner[self.of_column[:, None], self.of_column]
+        return (pairs * (self.unit.conj()[:, None] * self.unit)).real
+
+    def against(self, inner: np.ndarray) -> np.ndarray:
+        """Return Re(conj(column) e), (p,), from the sums of conj(e) times the shapes, (q,)."""
+        return self.of_columns(inner).real
+
+    def sums(self, field: np.ndarray) -> np.ndarray:
+        """Return the sums of conj(field) times each shape, (q,); field (views, nx, ny)."""
+        out = np.zeros(self.n, dtype=complex)
+        for rows, values, one in zip(self.rows, self.values, field, strict=True):
+            out[rows] += values @ one.reshape(-1).conj()
+        return out
+
+    def squares(self, weight: np.ndarray) -> np.ndarray:
+        """Return the weighted sum of squares of each column, (p,); weight (views, nx, ny)."""
+        out = np.zeros(self.n)
+        for rows, values, one in zip(self.rows, self.values, weight, strict=True):
+            out[rows] += (values.real**2 + values.imag**2) @ one.reshape(-1)
+        return out[self.of_column]
+
+    def combined(self, coefficients: np.ndarray, only: np.ndarray | None = None) -> np.ndarray:
+        """Return the sum of coefficients (p,) times columns, complex (views, nx, ny).
+
+        `only`, bool (p,), says which columns count.
+        """
+        here = slice(None) if only is None else only
+        each: np.ndarray = np.zeros(self.n, dtype=complex)
+        np.add.at(each, self.of_column[here], (coefficients * self.unit)[here])
+        out = np.empty((len(self.rows), *self.lattice), dtype=complex)
+        for one, rows, values in zip(out, self.rows, self.values, strict=True):
+            one[...] = (each[rows] @ values).reshape(self.lattice)
+        return out
+
+    def part(self, columns: np.ndarray) -> "Shapes":
+        """Return some of the columns, bool (p,); the shapes are the same."""
+        return replace(self, of_column=self.of_column[columns], unit=self.unit[columns])
+
+    def with_others(self, other: "Shapes") -> "Shapes":
+        """Return these columns and those of another."""
+        return Shapes(
+            self.n + other.n, self.lattice,
+            tuple(np.concatenate([a, b + self.n]) for a, b in zip(
+                self.rows, other.rows, strict=True)),
+            tuple(np.concatenate(pair) for pair in zip(self.values, other.values, strict=True)),
+            np.concatenate([self.of_column, other.of_column + self.n]),
+            np.concatenate([self.unit, other.unit]))
+
+    def replaced(self, shapes: Sequence[int], means: Sequence[Mapping[int, np.ndarray]]
+                 ) -> "Shapes":
+        """Return the columns with other values of some shapes, in the views that they have."""
+        values = list(self.values)
+        for view, rows in enumerate(self.rows):
+            at = [(np.flatnonzero(rows == shape), mean[view])
+                  for shape, mean in zip(shapes, means, strict=True) if view in mean]
+            if at:
+                values[view] = values[view].copy()
+            for place, mine in at:
+                values[view][place] = mine
+        return replace(self, values=tuple(values))
+
+
+def shapes_of(means: Sequence[Mapping[int, np.ndarray]], of_column: Sequence[int],
+              unit: Sequence[complex], weight: np.ndarray) -> Shapes:
+    """Return shapes given by their values in the views that they have.
+
+    Parameters
+    ----------
+    means : sequence of dict
+        Values of each shape at the marks (marks,), by view.
+    of_column, unit : sequences (p,)
+        Shape of each column, and 1 or i.
+    weight : float array (views, nx, ny)
+        Of the readings; its shape is that of the lattice.
+    """
+    rows, values = [], []
+    for view in range(len(weight)):
+        here = [at for at, mean in enumerate(means) if view in mean]
+        rows.append(np.array(here, dtype=int))
+        values.append(np.array([means[at][view] for at in here], dtype=complex).reshape(
+            len(here), weight[0].size))
+    return Shapes(len(means), weight.shape[1:], tuple(rows), tuple(values),
+                  np.array(of_column, dtype=int), np.array(unit, dtype=complex))
+
+
+def shapes_in_full(columns: np.ndarray) -> Shapes:
+    """Return columns that are given in all views, complex (p, views, nx, ny)."""
+    p, views = columns.shape[:2]
+    every = np.arange(p)
+    return Shapes(p, columns.shape[2:], (every,) * views,
+                  tuple(columns[:, view].reshape(p, -1) for view in range(views)),
+                  every, np.ones(p, dtype=complex))
