@@ -87,12 +87,19 @@ class TermEquations:
 
     def limit(self, rows: np.ndarray) -> float:
         """Return the eigenvalue of the scaled equations of `rows` up to which nothing is told."""
-        seen = rows & self.rows([TermName.MICROSCOPE])
-        if not seen.any():
-            return UNTOLD
+        seen = self._norm_of_microscope[rows]
+        least = float(seen.min()) if len(seen) else np.inf
         # each column holds the noise of one coordinate of every mean
-        power = self.noise_m**2 * self.system.grid.n_readings
-        return max(UNTOLD, OVER_NOISE * power / float(self.norm[seen].min()) ** 2)
+        return max(UNTOLD, OVER_NOISE * self._power / least**2)
+
+    @cached_property
+    def _norm_of_microscope(self) -> np.ndarray:
+        """The norm of the microscope's columns, infinite for others, (p,)."""
+        return np.where(self.rows([TermName.MICROSCOPE]), self.norm, np.inf)
+
+    @cached_property
+    def _power(self) -> float:
+        return self.noise_m**2 * self.system.grid.n_readings
 
     @cached_property
     def maps(self) -> np.ndarray:

@@ -8,7 +8,9 @@ that one cause does not appear under many names. Terms that explain the same equ
 given: the readings do not tell which it is.
 """
 
+import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from scipy.special import fdtrc
@@ -85,22 +87,39 @@ class Beside:
     Attributes
     ----------
     rows : bool array (p,)
-        Which columns they are.
-    inverse : float array (p, p)
+        Which columns they are, k of p.
+    at : int array (k,)
+        The same as numbers.
+    own_inverse : float array (k, k)
         Pseudo-inverse of their information.
     rank : int
         Its rank.
-    values : float array (p,)
+    own_values : float array (k,)
         Their estimated coefficients.
     explained : float
         The sum of squares that they explain, m^2.
     """
 
     rows: np.ndarray
-    inverse: np.ndarray
+    at: np.ndarray
+    own_inverse: np.ndarray
     rank: int
-    values: np.ndarray
+    own_values: np.ndarray
     explained: float
+
+    @property
+    def inverse(self) -> np.ndarray:
+        """The pseudo-inverse among all columns, (p, p)."""
+        out = np.zeros((len(self.rows),) * 2)
+        out[self.at[:, None], self.at] = self.own_inverse
+        return out
+
+    @property
+    def values(self) -> np.ndarray:
+        """The estimates among all columns, (p,)."""
+        out = np.zeros(len(self.rows))
+        out[self.at] = self.own_values
+        return out
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,17 +131,27 @@ class Pool:
 
     def beside(self, rows: np.ndarray) -> Beside:
         """Return what the columns of `rows`, bool (p,), explain together."""
-        norm = self.equations.norm[rows]
-        norms, place = np.outer(norm, norm), np.ix_(rows, rows)
-        values, vectors = np.linalg.eigh(self.equations.information[place] / norms)
+        at = rows.nonzero()[0]
+        if not len(at):
+            return Beside(rows, at, np.zeros((0, 0)), 0, np.zeros(0), 0.0)
+        values, vectors = np.linalg.eigh(self._scaled[at[:, None], at])
         told = values > self.equations.limit(rows)
-        part = (vectors[:, told] / values[told]) @ vectors[:, told].T
-        inverse = np.zeros((len(rows), len(rows)))
-        inverse[place] = part / norms
-        return Beside(rows, inverse, int(told.sum()), inverse @ self.right.total,
-                      float(self.right.total @ inverse @ self.right.total))
+        vectors = vectors[:, told] / self.equations.norm[at, None]
+        inverse = (vectors / values[told]) @ vectors.T
+        right = self._total[at]
+        own = inverse @ right
+        return Beside(rows, at, inverse, vectors.shape[1], own, float(right @ own))
 
-    @property
+    @cached_property
+    def _scaled(self) -> np.ndarray:
+        """The information of columns of unit length, (p, p)."""
+        return self.equations.information / np.outer(self.equations.norm, self.equations.norm)
+
+    @cached_property
+    def _total(self) -> np.ndarray:
+        return self.right.total
+
+    @cached_property
     def everything(self) -> tuple[float, float]:
         """Squares of all residuals, m^2, and their degrees of freedom, without any column."""
         sums = self.right.sums
@@ -135,13 +164,13 @@ class Pool:
         Visits of one mark agree better than marks do where a cause is not held: the larger counts.
         NaN and 0 where the columns take all degrees of freedom.
         """
-        sums, gram = self.right.sums, self.equations.projected.gram
-        values = beside.values
-        between = sums.between - 2 * values @ self.right.between + values @ gram @ values
-        dof = sums.dof_between - float(np.sum(beside.inverse * gram))
+        sums, at, values = self.right.sums, beside.at, beside.own_values
+        gram = self.equations.projected.gram[at[:, None], at]
+        between = float(sums.between - 2 * values @ self.right.between[at] + values @ gram @ values)
+        dof = sums.dof_between - float(np.vdot(beside.own_inverse, gram))
         both = sums.dof - beside.rank
         if sums.dof_within >= 1 and both > 0:
-            total = (sums.total - float(values @ self.right.total)) / both
+            total = (sums.total - beside.explained) / both
             if dof <= 0 or between / dof <= total:
                 return max(total, 0.0), both
         return (max(between, 0.0) / dof, dof) if dof > 0 else (float("nan"), 0.0)
@@ -263,8 +292,8 @@ def _test(pool: Pool, before: Beside, group: Group) -> tuple[float, float] | Non
     # all readings together, so that explanations compare: by what each leaves of the same squares
     whole, n = pool.everything
     rest = max(whole - after.explained, FLOOR_M**2)
-    evidence = n * np.log1p(gained / rest) - more * np.log(n)
-    return min(p * group.places, 1.0), float(evidence - 2 * np.log(group.places))
+    evidence = n * math.log1p(gained / rest) - more * math.log(n)
+    return min(p * group.places, 1.0), evidence - 2 * math.log(group.places)
 
 
 def _explanation(pool: Pool, taken: np.ndarray, group: Group, p: float) -> Explanation:
