@@ -92,22 +92,26 @@ def _check(args: argparse.Namespace, plan: Plan) -> int:
             seen, joint, checks = _judge(plan, model, assumed, sizes, (seen, alone))
     if args.json:
         found = _check_json(plan, seen, alone, maps=args.map)
+        unit = _averaged_m(plan, assumed) * UM_PER_M
         if alone is not None and args.sigma is not None:
-            unit = _averaged_m(plan, assumed) * UM_PER_M
             found["predicted"] |= {"rms_u_xy_um": alone.rms_xy * unit,
                                    "max_u_xy_um": alone.max_xy * unit}
         if alone is not None:
             found["predicted"] |= {
                 "rms_gain_xy_with_terms": joint and joint.rms_xy,
                 "max_gain_xy_with_terms": joint and joint.max_xy}
+            if args.sigma is not None and joint is not None:
+                found["predicted"] |= {"rms_u_xy_um_with_terms": joint.rms_xy * unit,
+                                       "max_u_xy_um_with_terms": joint.max_xy * unit}
         print(json.dumps(found | {"terms": terms_json(checks)}, indent=1))
     else:
         lines = _check_text(plan, seen, alone)
         if alone is not None and args.sigma is not None:
-            lines.append(_in_um(alone, plan, assumed))
+            lines.append(_in_um("XY    ", alone, plan, assumed))
         if model and joint is not None:
-            lines += [f"  XY with {', '.join(map(str, model))}: rms {joint.rms_xy:.4f}   "
-                      f"largest {joint.max_xy:.4f}"]
+            what = f"XY with {', '.join(map(str, model))}:"
+            lines.append(f"  {what} rms {joint.rms_xy:.4f}   largest {joint.max_xy:.4f}")
+            lines += [_in_um(what, joint, plan, assumed)] if args.sigma is not None else []
         lines += terms_text(plan, checks, assumed) if checks else []
         lines += _map_text(alone) if args.map and alone and seen.identifiable else []
         tell("\n".join(lines))
@@ -191,9 +195,9 @@ def _averaged_m(plan: Plan, assumed: Assumed) -> float:
     return assumed.sigma_m / min(view.repeats for view in plan.views) ** 0.5
 
 
-def _in_um(predicted: Prediction, plan: Plan, assumed: Assumed) -> str:
+def _in_um(what: str, predicted: Prediction, plan: Plan, assumed: Assumed) -> str:
     unit = _averaged_m(plan, assumed) * UM_PER_M
-    return (f"  XY     rms {predicted.rms_xy * unit:.4f} µm   largest "
+    return (f"  {what} rms {predicted.rms_xy * unit:.4f} µm   largest "
             f"{predicted.max_xy * unit:.4f} µm (k=1) for {assumed.sigma_m * UM_PER_M:.4g} µm "
             "noise of one reading")
 
@@ -229,7 +233,8 @@ def _suggest(args: argparse.Namespace, plan: Plan) -> int:
         else:
             now, ranked = rank_next(plan, criterion=args.criterion, datum=datum, against=against,
                                     progress=progress)
-    unit = _noise_m(plan, against)
+    # without terms and without a noise that is given the figures are gains
+    unit = _averaged_m(plan, assumed_of(args)) if against or args.sigma is not None else None
     if args.views is not None:
         best = replace(best, plan_id=f"{plan.plan_id}_best{args.views}",
                        model_terms=plan.model_terms)
@@ -265,11 +270,6 @@ def _against(args: argparse.Namespace, plan: Plan) -> Against | None:
     found |= {name: ModelTerm(name, size) for name, size in sizes_of(args).items()}
     assumed = assumed_of(args)
     return Against(tuple(found[n] for n in TermName if n in found), assumed) if found else None
-
-
-def _noise_m(plan: Plan, against: Against | None) -> float | None:
-    """Return the noise of an averaged reading, m, where a plan is judged against terms."""
-    return None if against is None else _averaged_m(plan, against.assumed)
 
 
 def _show_ranked(args: argparse.Namespace, plan: Plan, now: tuple[Score, float | None],

@@ -128,6 +128,35 @@ def test_a_plan_is_judged_in_um_where_the_noise_is_given(capsys, tmp_path):
     assert main(["plan", "check", str(plan), "--sigma", "20nm"]) == 0
     assert (f"  XY     rms {found['rms_u_xy_um']:.4f} µm   largest {found['max_u_xy_um']:.4f} µm "
             "(k=1) for 0.02 µm noise of one reading") in capsys.readouterr().out
+    terms = [str(plan), "--model", "plate_scale:1e-6", "--sigma", "20nm"]
+    assert main(["plan", "check", *terms, "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)["predicted"]
+    for name in ("rms", "max"):
+        assert found[f"{name}_u_xy_um_with_terms"] == pytest.approx(
+            0.01 * found[f"{name}_gain_xy_with_terms"], rel=1e-12)
+    assert main(["plan", "check", *terms]) == 0
+    assert (f"  XY with plate_scale:1e-06: rms {found['rms_u_xy_um_with_terms']:.4f} µm   largest "
+            f"{found['max_u_xy_um_with_terms']:.4f} µm (k=1) for") in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("more", [[], ["--views", "4"]])
+def test_plans_are_ranked_in_um_where_the_noise_is_given(capsys, tmp_path, more):
+    plan = tmp_path / "plan.yaml"
+    plan.write_text(yaml.safe_dump({"plan_id": "p", "artifact": {
+        "grid_size": 3, "grid_pitch": 0.01, "angular_count": 0}, "views": [
+            {"name": "a", "repeats": 4}, {"name": "b", "rotation_deg": 90, "repeats": 4},
+            {"name": "c", "translation_pitch": [1, 0], "repeats": 4}]}))
+    asked = ["plan", "suggest", str(plan), *more]
+    assert main(asked) == 0
+    assert "µm" not in capsys.readouterr().out
+    assert main([*asked, "--sigma", "20nm", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    best = found if more else found["suggestions"][0]
+    # 20 nm, averaged over 4 repeats: 10 nm
+    assert best["u_rms_m"] == pytest.approx(1e-8 * best["rms_gain_xy"], rel=1e-12)
+    assert main([*asked, "--sigma", "20nm"]) == 0
+    assert (f"u XY rms {best['u_rms_m'] * 1e6:.5f} µm  max {best['u_max_m'] * 1e6:.5f} µm"
+            in capsys.readouterr().out)
 
 
 def test_a_position_with_its_unit(tmp_path, capsys, monkeypatch):
