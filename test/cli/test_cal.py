@@ -192,6 +192,9 @@ def test_a_table_of_a_result_that_is_not_qualified_says_so_everywhere(run, verb)
     (["--home-x", "nan"], "--home-x: nan is not a position"),
     (["--theta-axis", "3", "--counts-per-unit", "4=1000"], "axis 4 is not the theta axis; write"),
     (["--counts-per-unit", "3=1000"], "axis 3 is not the theta axis; name --theta-axis"),
+    (["--theta-output", "t.cal"], "--theta-output: no theta table is written; name --theta-axis"),
+    (["--home-theta", "0"], "--home-theta: there is no theta axis; name --theta-axis"),
+    (["--reverse-theta"], "--reverse-theta: there is no theta axis; name --theta-axis"),
     (["--theta-axis", "3", "--counts-per-unit", "3=0"], "'0' is not a positive number"),
     (["--theta-axis", "3", "--counts-per-unit", "1000"], "'1000' is not AXIS=VALUE")])
 def test_options_of_export_without_sense(run, args, message):
@@ -261,6 +264,9 @@ def test_check_gi4(run, tmp_path):
     assert code == 2
     one_line(err, "needs 16384, 1/64 of its range")
     assert run("check", "g.cal", "--gi4", "--scanner-bits", "99")[0] == 2
+    code, out, err = run("check", "g.cal", "--scanner-bits", "20")
+    assert code == 2 and not out
+    one_line(err, "--scanner-bits: they are those behind a GI4; add --gi4")
 
 
 @pytest.mark.parametrize(("args", "want"), [
@@ -373,6 +379,13 @@ def test_all_outputs_of_an_export_are_checked_first(run, tmp_path):
     code, _, err = run("export", "r.json", "-o", "r.json", "--force")
     assert code == 2
     one_line(err, "r.json: would be written over")
+    (tmp_path / "d.csv").write_text("position,error\n0,0\n10,1\n20,3\n")
+    for verb, source in (("orthogonality", "r.json"), ("accuracy", "r.json"),
+                         ("straightness", "d.csv")):
+        before = (tmp_path / source).read_bytes()
+        code, _, err = run(verb, source, "-o", source, "--force")
+        assert code == 2 and (tmp_path / source).read_bytes() == before
+        one_line(err, f"{source}: would be written over")
 
 
 def test_bad_paths_and_bad_plots(run, tmp_path):

@@ -13,6 +13,8 @@ if TYPE_CHECKING:
     from selfcal_ros.compensation.aerotech.evaluate import MachineSetup
     from selfcal_ros.compensation.aerotech.model import Table1D, Table2D
 
+SCANNER_BITS = 16
+
 
 def add_to(group: argparse._SubParsersAction) -> None:
     """Add the sub-verbs."""
@@ -20,8 +22,8 @@ def add_to(group: argparse._SubParsersAction) -> None:
     check.add_argument("file", metavar="FILE.cal")
     check.add_argument("--gi4", action="store_true",
                        help="check galvo tables against the restrictions of the GI4 too")
-    check.add_argument("--scanner-bits", type=int, default=16, metavar="N",
-                       help="bits of the scanner protocol behind --gi4 (default 16)")
+    check.add_argument("--scanner-bits", type=int, metavar="N",
+                       help=f"bits of the scanner protocol behind --gi4 (default {SCANNER_BITS})")
     check.add_argument("--strict", action="store_true",
                        help="refuse what is only tolerated or doubtful, too")
     check.add_argument("--json", action="store_true", help="print the findings as JSON")
@@ -54,9 +56,12 @@ def _check(args: argparse.Namespace) -> int:
     from selfcal_ros.compensation.aerotech.read import read_cal, refuse_errors
     from selfcal_ros.compensation.aerotech.rules import Gi4
 
-    if not 6 <= args.scanner_bits <= 48:
-        raise InputError("--scanner-bits", f"{args.scanner_bits} bits", "give 16, 18 or 20")
-    cal = read_cal(args.file, gi4=Gi4(args.scanner_bits) if args.gi4 else None)
+    if args.scanner_bits is not None and not args.gi4:
+        raise InputError("--scanner-bits", "they are those behind a GI4", "add --gi4")
+    bits = SCANNER_BITS if args.scanner_bits is None else args.scanner_bits
+    if not 6 <= bits <= 48:
+        raise InputError("--scanner-bits", f"{bits} bits", "give 16, 18 or 20")
+    cal = read_cal(args.file, gi4=Gi4(bits) if args.gi4 else None)
     counts = {severity: len(cal.of(severity)) for severity in Severity}
     if args.json:
         print(json.dumps({

@@ -150,6 +150,7 @@ def _deliver(args: argparse.Namespace, line: "AxisCorrection", frame: "MachineFr
     from selfcal_ros.compensation.aerotech.export import DECIMALS, verdict_lines
     from selfcal_ros.compensation.aerotech.lines import line_table
     from selfcal_ros.compensation.aerotech.write import cal_text, write_cal
+    from selfcal_ros.files import check_outputs
 
     source = args.source or f"{args.measured} over {args.over}, travel {args.travel}"
     comments = [f"written by selfcal {__version__} on {datetime.now(UTC):%Y-%m-%dT%H:%M:%SZ}",
@@ -159,6 +160,7 @@ def _deliver(args: argparse.Namespace, line: "AxisCorrection", frame: "MachineFr
     text = cal_text([table], comments=comments, decimals=DECIMALS)
     found = {"table": text, "corrects": axes[1], "along": axes[0], "file": None, "old_file": None}
     if args.output:
+        check_outputs([args.source], [args.output])
         backup = write_cal(args.output, text, force=args.force)
         say(args, f"{args.output}: {args.sub_verb} table for {axes[1]}"
             + (f"; the old file is {backup}" if backup else ""),

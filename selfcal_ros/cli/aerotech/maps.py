@@ -51,6 +51,8 @@ def _export(args: argparse.Namespace) -> int:
     from selfcal_ros.files import check_outputs
 
     result, frame = read_result(args.result), frame_of(args)
+    if args.theta_output and frame.theta_axis is None:
+        raise InputError("--theta-output", "no theta table is written", "name --theta-axis")
     if not result.observability.identifiable:
         raise NotIdentifiableError(f"{args.result}: the plan that was measured does not identify "
                                    "the stage; measure the views that are missing",

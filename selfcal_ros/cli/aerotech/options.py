@@ -124,6 +124,10 @@ def frame_of(args: argparse.Namespace, base: "MachineFrame | None" = None) -> "M
                              "indices in calibration files count from 1")
     counts = numbers(getattr(args, "counts_per_unit", None), "--counts-per-unit", positive=True)
     theta_axis = changes.get("theta_axis", base.theta_axis)
+    for name in ("home_theta_rad", "reverse_theta"):
+        if name in changes and theta_axis is None:
+            raise InputError(f"--{name.removesuffix('_rad').replace('_', '-')}",
+                             "there is no theta axis", "name --theta-axis")
     for axis, count in counts.items():
         if axis != theta_axis:
             raise InputError("--counts-per-unit", f"axis {axis} is not the theta axis",
