@@ -4,8 +4,6 @@
 from collections.abc import Mapping
 from enum import StrEnum
 
-import numpy as np
-
 
 class Reason(StrEnum):
     """Reasons of rejection; those of encoder samples start with ``encoder_sample``."""
@@ -75,10 +73,3 @@ def advice(rejected: Mapping[str, int]) -> list[str]:
     """Return one line for each reason in `rejected` that has an advice, with its count."""
     return [f"{rejected[reason]} detections rejected as {reason}: {text}"
             for reason, text in ADVICE.items() if rejected.get(reason)]
-
-
-def reason_where(bad: np.ndarray, reason: Reason) -> np.ndarray:
-    """Return `reason` where `bad`, else None, object array of the same shape."""
-    reasons = np.full(bad.shape, None, dtype=object)
-    reasons[bad] = reason
-    return reasons

@@ -16,7 +16,7 @@ from selfcal_ros.collection.marks.places import PlaceList
 from selfcal_ros.collection.marks.repeats import reduce_repeats
 from selfcal_ros.collection.marks.visits import grid_visits
 from selfcal_ros.collection.messages import Kind
-from selfcal_ros.collection.reasons import Reason, reason_where
+from selfcal_ros.collection.reasons import Reason
 from selfcal_ros.collection.stage.encoder import GOOD, MOVING, REASONS
 from selfcal_ros.collection.stage.exposures import Exposures, JointAt
 from selfcal_ros.model.artifact import Artifact
@@ -92,8 +92,8 @@ def with_low_scores(readings: ViewReadings, detections: np.ndarray, *, exposures
     if not len(low):
         return readings
     stage, places = exposures.at(low["stamp"]), PlaceList(readings.places)
-    places.add(np.full(len(low), Reason.LOW_SCORE, dtype=object), stage.x.position,
-               stage.y.position)
+    places.add(np.full(len(low), Reason.LOW_SCORE, dtype=object),
+               np.stack([stage.x.position, stage.y.position]))
     return replace(readings, places=places.places())
 
 
@@ -150,16 +150,14 @@ def _grid_marks(artifact: Artifact, view: View, d: np.ndarray, *, exposures: Exp
     stage = exposures.at(d["stamp"])
     position = np.stack([stage.x.position, stage.y.position])
     why = _reasons((stage.x, stage.y), (stage.theta,))
-    places.add(why, *position)
-    d, (position, approach) = _keep(d, why, rejected, position, stage.approach)
+    d, (position, approach) = _keep(d, why, rejected, position, stage.approach, places=places)
     found = identify_grid(
         artifact, view, _reading(rules.sense, position, np.stack([d["ox"], d["oy"]])),
         ids=np.stack([d["m"], d["n"]]), has_id=d["has_id"], rules=rules.identity,
         stage_m=_reading(rules.sense, position, 0.0))
-    places.add(found.reasons, *position)
-    d, (index, deviation, residual, position, approach) = _keep(
-        d, found.reasons, rejected, found.index, found.deviation, found.residual, position,
-        approach)
+    d, (position, index, deviation, residual, approach) = _keep(
+        d, found.reasons, rejected, position, found.index, found.deviation, found.residual,
+        approach, places=places)
     told = found.phi_error_rad <= np.pi / 2 / max(artifact.angular_count, 1)  # a quarter line
     return _GridMarks(d, index, deviation, residual, position, approach,
                       found.rigid.phi_rad if told else None)
@@ -176,7 +174,8 @@ def _reduce_grid(artifact: Artifact, view: View, d: np.ndarray, exposures: Expos
                            extent=2 * max(hx, hy) * artifact.grid_pitch_m,
                            residual=marks.residual)
     _count(rejected, Reason.OUTLIER, means.outlier)
-    places.add(reason_where(means.outlier, Reason.OUTLIER), *marks.position)
+    out = np.flatnonzero(means.outlier)
+    places.add(np.full(len(out), Reason.OUTLIER, dtype=object), marks.position[:, out])
     visits = grid_visits(means, key, d["sigma"], stamps_ns=d["stamp"], deviation=marks.deviation,
                          offset=np.stack([d["ox"], d["oy"]]), approach=marks.approach)
     mark = means.key.astype(np.int64)
@@ -228,12 +227,17 @@ def _where(good: np.ndarray, rows: np.ndarray) -> np.ndarray:
 
 
 def _keep(d: np.ndarray, reasons: np.ndarray, rejected: Counter, *values: np.ndarray,
-          ) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Return detections and values (n,) or (k, n) without the rejected ones, which are counted."""
+          places: PlaceList | None = None) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Return detections and values (n,) or (k, n) without the rejected ones, which are counted.
+
+    Where the stage stood at these, the first of the values, goes to `places`.
+    """
     good = reasons == None  # noqa: E711
     if good.all():
         return d, [*values]
     rejected.update(str(reason) for reason in reasons[~good])
+    if places is not None:
+        places.add(reasons[~good], values[0][:, ~good])
     return d[good], [np.compress(good, value, axis=-1) for value in values]
 
 

@@ -104,7 +104,7 @@ def test_a_place_that_the_encoder_does_not_tell_is_unknown_and_lines_have_none()
 def test_of_many_places_an_even_choice_is_kept():
     gathered = PlaceList()
     at = np.arange(2 * RejectedPlaces.MOST - 1.0)
-    gathered.add(np.full(len(at), Reason.TOO_FAR, dtype=object), at, -at)
+    gathered.add(np.full(len(at), Reason.TOO_FAR, dtype=object), np.stack([at, -at]))
     places = gathered.places()
     np.testing.assert_array_equal(places.x, at[::2])
     np.testing.assert_array_equal(places.y, -at[::2])

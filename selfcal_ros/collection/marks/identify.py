@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from selfcal_ros.collection.marks.medians import distances
 from selfcal_ros.collection.marks.rigid import (
     LARGEST_TURN_RAD,
     MotionEstimate,
@@ -119,8 +120,9 @@ def identify_grid(artifact: Artifact, view: View, reading_m: np.ndarray, *, ids:
     if _at_most_two(number[~far & ~ambiguous & ~unsure]):
         limit = pitch / 4  # too few marks to know the view's own rotation and offset
     residual = deviation - rigid.at(about)
-    far |= ~ambiguous & (np.hypot(*residual) > limit)
-    astray |= free & ~far & _astray(pose, marks, stage_m, artifact, rules)
+    far |= ~ambiguous & (distances(residual) > limit)
+    if free.any():  # their marks are known by now
+        astray |= free & ~far & _astray(pose, marks, stage_m, artifact, rules)
     reasons[far] = Reason.TOO_FAR
     reasons[astray] = Reason.NOT_AT_MARK
     reasons[ambiguous] = Reason.AMBIGUOUS
@@ -145,7 +147,7 @@ def _astray(pose: LatticePose, marks: np.ndarray, stage_m: np.ndarray | None, ar
         here = slice(start, start + PART)
         site = np.stack(pose.site_of(marks[0, here], marks[1, here])) * artifact.grid_pitch_m
         away = np.clip(stage_m[:, here] - site, -OFF_ANY_PLATE_M, OFF_ANY_PLATE_M)
-        astray[here] = np.hypot(*away) > rules.stage_limit_m(artifact)
+        astray[here] = distances(away) > rules.stage_limit_m(artifact)
     return astray
 
 
@@ -157,7 +159,7 @@ def _nearest(pose: LatticePose, centred: np.ndarray, pitch: float, half: np.ndar
     plate = np.stack(back.site_of(step[0], step[1]))
     mark = np.clip(np.rint(plate), -half, half)
     away = np.abs(plate - mark)
-    first = np.hypot(*away)
+    first = distances(away)
     second = np.minimum(np.hypot(1 - away[0], away[1]), np.hypot(away[0], 1 - away[1]))
     return mark.astype(np.int64), first / np.maximum(second, 1e-12), first * pitch
 

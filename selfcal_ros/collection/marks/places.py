@@ -19,11 +19,10 @@ class PlaceList:
         self._reason = [np.array(before.reason, dtype=object)]
         self._at = [np.stack([before.x, before.y])]
 
-    def add(self, reasons: np.ndarray, x: np.ndarray, y: np.ndarray) -> None:
-        """Take detections (D,) with their reasons, None where good, and positions in m."""
-        bad = reasons != None  # noqa: E711
-        self._reason.append(reasons[bad])
-        self._at.append(np.stack([x[bad], y[bad]]))
+    def add(self, reasons: np.ndarray, at_m: np.ndarray) -> None:
+        """Take rejected detections: their reasons (D,) and positions (2, D) in m."""
+        self._reason.append(reasons)
+        self._at.append(at_m)
 
     def places(self) -> RejectedPlaces:
         """Return the places; of more than `RejectedPlaces.MOST` an even choice."""

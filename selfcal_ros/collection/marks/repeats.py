@@ -19,6 +19,8 @@ from functools import lru_cache
 
 import numpy as np
 
+from selfcal_ros.collection.marks.medians import median, row_medians
+
 MIN_PAIRS = 12
 """Pairs of repeats below which a view is too small to tell outliers."""
 ALL_PAIRS = 33
@@ -145,7 +147,7 @@ def _outliers(key: np.ndarray, values: np.ndarray, relative: np.ndarray,
     limit, extent = limits
     scale, pairs = _pair_scale(groups, values, relative)
     if groups and pairs < MIN_PAIRS and residual is not None:
-        scale = float(np.median(np.abs(residual)) / 0.6744897501960817)
+        scale = median(np.abs(residual).ravel()) / 0.6744897501960817
         pairs = len(np.unique(key)) * len(residual)
     out = np.zeros(len(key), dtype=bool)
     if pairs < MIN_PAIRS:
@@ -160,7 +162,7 @@ def _outliers(key: np.ndarray, values: np.ndarray, relative: np.ndarray,
         share = np.sqrt(0.5) if group.shape[1] == 2 else 1.0  # of two, each is half-way off
         for part in _parts(group, group.shape[1]):
             repeats = np.take(values, part, axis=1)
-            away = np.abs(repeats - np.median(repeats, axis=2, keepdims=True))
+            away = np.abs(repeats - row_medians(repeats))
             bad = (away > np.maximum(cut * share * relative[part], floor)).any(axis=0)
             out[part] = bad | (2 * (~bad).sum(axis=1, keepdims=True) < group.shape[1])
     return out
@@ -213,14 +215,15 @@ def _pair_scale(groups: list[np.ndarray], values: np.ndarray,
         return float("nan"), 0
     every = np.empty(len(values) * sum(len(group) * len(_pairs(group.shape[1])[0])
                                        for group in groups))
-    done = 0
+    done, alike = 0, bool((relative == 1).all())  # as where no sigma is declared
     for group in groups:
         i, j = _pairs(group.shape[1])
         for part in _parts(group, len(i)):
             weights, repeats = relative[part], np.take(values, part, axis=1)
-            norm = np.hypot(np.take(weights, i, axis=1), np.take(weights, j, axis=1))
+            norm = np.sqrt(2) if alike else np.hypot(np.take(weights, i, axis=1),
+                                                     np.take(weights, j, axis=1))
             apart = np.take(repeats, i, axis=2) - np.take(repeats, j, axis=2)
             every[done:done + apart.size] = (np.abs(apart) / norm).ravel()
             done += apart.size
     independent = sum(len(group) * (group.shape[1] - 1) for group in groups) * len(values)
-    return float(np.median(every, overwrite_input=True) / 0.6744897501960817), independent
+    return median(every, overwrite=True) / 0.6744897501960817, independent

@@ -5,6 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from selfcal_ros.collection.marks.medians import distances, median
+
 LARGEST_TURN_RAD = 0.2
 """A plate turned by more than this was laid down the wrong way; it is not a misalignment."""
 EXPECTED_SCATTER = 0.03
@@ -144,8 +146,8 @@ def fit_motion(p: np.ndarray, deviation: np.ndarray) -> RigidFit:
     rigid = _median_motion(p, deviation)
     keep = np.zeros(p.shape[1], dtype=bool)
     for _ in range(5):
-        distance = np.hypot(*(deviation - rigid.at(p)))
-        before, keep = keep, distance <= 3 * np.median(distance) + 1e-9
+        distance = distances(deviation - rigid.at(p))
+        before, keep = keep, distance <= 3 * median(distance) + 1e-9
         if (keep == before).all():  # the same marks give the same motion again
             break
         near, read = columns_where(keep, p, deviation)
@@ -163,11 +165,11 @@ def _median_motion(p: np.ndarray, deviation: np.ndarray) -> Rigid:
     """Return the median offset, and the median turn of the marks in the outer half."""
     middle = p.mean(axis=1)
     arm = p - middle[:, None]
-    offset = np.median(deviation, axis=1)
+    offset = np.array([median(row) for row in deviation])
     radius2 = (arm**2).sum(axis=0)
-    rim = (radius2 >= np.median(radius2)) & (radius2 > 0)
+    rim = (radius2 >= median(radius2)) & (radius2 > 0)
     cross = _cross(arm, deviation - offset[:, None])
-    phi_rad = _turn(np.median(cross[rim] / radius2[rim])) if rim.any() else 0.0
+    phi_rad = _turn(median(cross[rim] / radius2[rim])) if rim.any() else 0.0
     return _through(phi_rad, tuple(middle), offset)
 
 
