@@ -6,6 +6,7 @@ side, on what contradicts itself within half a gap, and, for the direction of ap
 since the exposure before. So an exposure is settled once these have come.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -107,9 +108,12 @@ class Series:
     def __init__(self, limits: TrackLimits, samples: Samples) -> None:
         self.limits = limits
         stamps, positions, speeds = samples
-        if not (stamps[1:] > stamps[:-1]).all():
-            order = np.lexsort((positions, stamps))
-            stamps, positions, speeds = stamps[order], positions[order], speeds[order]
+        if (stamps[1:] > stamps[:-1]).all():  # as a rule: nothing to hold against each other
+            self.t, self.p, self.speed, self.v = stamps, positions, speeds, np.abs(speeds)
+            self.bad = np.zeros(len(stamps), dtype=bool)
+            return
+        order = np.lexsort((positions, stamps))
+        stamps, positions, speeds = stamps[order], positions[order], speeds[order]
         first = np.flatnonzero(np.diff(stamps, prepend=NEVER))
         # from the first of each stamp to all of it: on a circle the last may lie nearer
         beside = np.repeat(positions[first], np.diff(first, append=len(stamps)))
@@ -255,31 +259,38 @@ class Series:
         From each sample's distance to the line through its neighbours, whose variance is 1.5 times
         as large: motion at a steady speed adds nothing to it.
         """
-        if len(self) < 3:
-            return np.zeros(len(stamps_ns))
-        step, dt = self._difference(np.diff(self.p)), np.diff(self.t)
-        off = np.abs(step[:-1] * dt[1:] - step[1:] * dt[:-1]) / (dt[:-1] + dt[1:])
-        return self._median_near(off, stamps_ns) / np.sqrt(1.5)
+        def off(t: np.ndarray, p: np.ndarray) -> np.ndarray:
+            step, dt = self._difference(np.diff(p)), np.diff(t)
+            return np.abs(step[..., :-1] * dt[..., 1:] - step[..., 1:] * dt[..., :-1]) / (
+                dt[..., :-1] + dt[..., 1:])
+        return self._median_near(off, (self.t, self.p), stamps_ns) / np.sqrt(1.5)
 
     def _speed_noise_near(self, stamps_ns: np.ndarray) -> np.ndarray:
         """Return the standard deviation of one told speed beside each exposure, robustly, (Q,).
 
         From the second differences: a steady speed and a steady acceleration add nothing to it.
         """
+        def off(v: np.ndarray) -> np.ndarray:
+            return np.abs(np.diff(np.where(np.isfinite(v), v, 0.0), 2))
+        return self._median_near(off, (self.speed,), stamps_ns) / np.sqrt(6)
+
+    def _median_near(self, off: Callable[..., np.ndarray], columns: tuple[np.ndarray, ...],
+                     stamps_ns: np.ndarray) -> np.ndarray:
+        """Return the standard deviation about 0 of values near each exposure, most are noise.
+
+        `off` makes of columns (..., n) of samples the values (..., n - 2), which are not negative:
+        one for each sample but the first and the last.
+        """
         if len(self) < 3:
             return np.zeros(len(stamps_ns))
-        v = np.where(np.isfinite(self.speed), self.speed, 0.0)
-        return self._median_near(np.abs(np.diff(v, 2)), stamps_ns) / np.sqrt(6)
-
-    def _median_near(self, values: np.ndarray, stamps_ns: np.ndarray) -> np.ndarray:
-        """Return the standard deviation about 0 of the values near each exposure, most are noise.
-
-        `values` are not negative, one for each sample but the first and the last.
-        """
-        width = min(2 * NEAR, len(values))
-        start = np.searchsorted(self.t, stamps_ns, "left") - 1 - NEAR
-        near = np.lib.stride_tricks.sliding_window_view(values, width)
-        near = near[np.clip(start, 0, len(values) - width)]
+        width = min(2 * NEAR, len(self) - 2)
+        start = np.clip(np.searchsorted(self.t, stamps_ns, "left") - 1 - NEAR, 0,
+                        len(self) - 2 - width)
+        windows = np.lib.stride_tricks.sliding_window_view
+        if len(start) * width < len(self):  # as a rule: few exposures, far from each other
+            near = off(*(windows(column, width + 2)[start] for column in columns))
+        else:
+            near = windows(off(*columns), width)[start]
         return np.median(near, axis=1) / 0.6744897501960817
 
     def _around(self, stamps_ns: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -301,27 +312,36 @@ class Series:
     def _motion(self, before: np.ndarray, after: np.ndarray, exact: np.ndarray,
                 ) -> tuple[np.ndarray, np.ndarray]:
         """Return which exposures saw the stage moving, and which saw it jump to and fro."""
-        t, p, v = self.t, self.p, self.v
-        dt = np.diff(t)
-        step = self._difference(np.diff(p))
-        speed = np.abs(step) / np.where(dt > 0, dt, 1) * NS_PER_S
-        fast = np.concatenate([[False], speed > self.limits.max_speed, [False]])
-        move = np.concatenate([[0.0], step, [0.0]])  # move[i]: from sample i-1 to sample i
-        near = np.concatenate([[False], dt <= self.limits.max_gap_ns, [False]])
-        left, right = before, after + 1
-        # between two samples: their segment; at a sample: the calmer of the two beside it
-        calm = (near[left] & ~fast[left]) | (near[right] & ~fast[right])
-        both = ~calm & (near[left] | near[right])
-        moving = np.where(exact, both, fast[after])
+        v = self.v
+        move_left, fast_left, near_left = self._step_to(before)
+        middle, fast, _ = self._step_to(after)
+        move_right, fast_right, near_right = self._step_to(after + 1)
+        # between two samples: their step; at a sample: the calmer of the two beside it
+        calm = (near_left & ~fast_left) | (near_right & ~fast_right)
+        both = ~calm & (near_left | near_right)
+        moving = np.where(exact, both, fast)
         told = np.isfinite(v[before]) & np.isfinite(v[after])
         rate = np.fmax(v[before], v[after])
         moving = np.where(told & exact, rate > self.limits.max_speed, moving)
         moving |= told & (rate > self.limits.max_speed)
-        middle = move[after]
-        reversing = fast[after] & ~exact & (
-            (fast[left] & (move[left] * middle < 0)) | (fast[right] & (move[right] * middle < 0)))
-        reversing |= exact & fast[left] & fast[right] & (move[left] * move[right] < 0) & ~told
+        reversing = fast & ~exact & (
+            (fast_left & (move_left * middle < 0)) | (fast_right & (move_right * middle < 0)))
+        reversing |= exact & fast_left & fast_right & (move_left * move_right < 0) & ~told
         return moving, reversing
+
+    def _step_to(self, number: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the step from the sample before to each one, whether it is fast, whether near.
+
+        There is no step, 0 and neither, to the first sample and to the one behind the last.
+        """
+        inside = (number > 0) & (number < len(self.t))
+        to = np.clip(number, 0, len(self.t) - 1)
+        since = np.maximum(to - 1, 0)
+        dt = self.t[to] - self.t[since]
+        step = np.where(inside, self._difference(self.p[to] - self.p[since]), 0.0)
+        speed = np.abs(step) / np.where(dt > 0, dt, 1) * NS_PER_S
+        return step, inside & (speed > self.limits.max_speed), (
+            inside & (dt <= self.limits.max_gap_ns))
 
     def _contradicted(self, stamps_ns: np.ndarray, before: np.ndarray,
                       after: np.ndarray) -> np.ndarray:

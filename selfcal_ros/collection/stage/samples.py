@@ -60,6 +60,7 @@ class SampleStore:
         self._parts: list[Samples] = []  # of the block that is being filled
         self._filled, self._rising, self._last_ns = 0, True, np.iinfo(np.int64).min
         self._blocks: list[_Block] = []
+        self._firsts = self._lasts = self._counts = NO_STAMPS  # of the blocks
         self._unseen: list[np.ndarray] = []
         self._count, self._end = 0, 0
         self._file: io.FileIO | None = None
@@ -123,6 +124,8 @@ class SampleStore:
         told = bool(np.isfinite(speeds).any() or np.isinf(speeds).any())
         columns = (stamps, positions, speeds) if told else (stamps, positions)
         self._blocks.append(_Block(int(stamps[0]), int(stamps[-1]), len(stamps), told, columns))
+        self._firsts, self._lasts, self._counts = (np.append(known, new) for known, new in (
+            (self._firsts, stamps[0]), (self._lasts, stamps[-1]), (self._counts, len(stamps))))
         self._parts, self._filled, self._rising = [], 0, True
         self._last_ns = np.iinfo(np.int64).min
         held = [number for number, block in enumerate(self._blocks) if block.columns]
@@ -191,7 +194,11 @@ class SampleStore:
         self._flush()
         stamps = self._open()[0]
         inside = int(np.searchsorted(stamps, end_ns, "right") - np.searchsorted(stamps, start_ns))
-        return inside + sum(_share(block, start_ns, end_ns) for block in self._blocks)
+        return inside + int(self._counts[self._touched(start_ns, end_ns)].sum())
+
+    def _touched(self, start_ns: int, end_ns: int) -> np.ndarray:
+        """Return which blocks may have samples between two stamps."""
+        return (self._lasts >= start_ns) & (self._firsts <= end_ns)
 
     def near(self, start_ns: int, end_ns: int, beside: int) -> Samples:
         """Return the samples from `start_ns` to `end_ns`, and their neighbours, in any order.
@@ -200,23 +207,19 @@ class SampleStore:
         as many as exist.
         """
         self._flush()
-        blocks = [*self._blocks]
         open_samples = self._open()
         parts = [_cut(open_samples, start_ns, end_ns, beside)] if len(open_samples[0]) else []
-        rest = []
-        for block in blocks:
-            if block.last_ns >= start_ns and block.first_ns <= end_ns:
-                parts.append(_cut(self._samples(block), start_ns, end_ns, beside))
-            else:
-                rest.append(block)
-        before = sorted((b for b in rest if b.last_ns < start_ns), key=lambda b: -b.last_ns)
-        after = sorted((b for b in rest if b.last_ns >= start_ns), key=lambda b: b.first_ns)
-        for side, sign in ((before, -1), (after, 1)):
-            for block in side:
-                edge, known = (start_ns, -block.last_ns) if sign < 0 else (end_ns, block.first_ns)
-                if known > _nth(parts, edge, sign, beside):
+        touched = self._touched(start_ns, end_ns)
+        parts += [_cut(self._samples(self._blocks[number]), start_ns, end_ns, beside)
+                  for number in np.flatnonzero(touched)]
+        before = np.flatnonzero(self._lasts < start_ns)
+        after = np.flatnonzero(~touched & (self._lasts >= start_ns))
+        for side, sign, edge, known in ((before, -1, start_ns, -self._lasts[before]),
+                                        (after, 1, end_ns, self._firsts[after])):
+            for at in np.argsort(known, kind="stable"):
+                if known[at] > _nth(parts, edge, sign, beside):
                     break
-                parts.append(_cut(self._samples(block), start_ns, end_ns, beside))
+                parts.append(_cut(self._samples(self._blocks[side[at]]), start_ns, end_ns, beside))
         if not parts:
             return NO_STAMPS, np.zeros(0), np.zeros(0)
         return _joined(parts)
@@ -231,10 +234,6 @@ def _with_speeds(columns: tuple[np.ndarray, ...]) -> Samples:
     """Return samples from their columns; speeds that were not told are NaN."""
     stamps, positions, *speeds = columns
     return stamps, positions, speeds[0] if speeds else np.full(len(stamps), np.nan)
-
-
-def _share(block: _Block, start_ns: int, end_ns: int) -> int:
-    return block.count if block.last_ns >= start_ns and block.first_ns <= end_ns else 0
 
 
 def _nth(parts: list[Samples], edge: int, sign: int, n: int) -> float:
