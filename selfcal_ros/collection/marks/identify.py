@@ -99,7 +99,7 @@ def identify_grid(artifact: Artifact, view: View, reading_m: np.ndarray, *, ids:
     marks = np.where(has_id & ~named_unknown, ids, 0)
     reading_m = np.clip(reading_m, -OFF_ANY_PLATE_M, OFF_ANY_PLATE_M)  # squares stay finite
     centred = reading_m - np.array(pose.shift)[:, None] * pitch  # about the plate's centre
-    astray = has_id & _astray(pose, marks, stage_m, artifact, rules)
+    astray = _astray(pose, marks, stage_m, artifact, rules, among=has_id)
     named = has_id & ~named_unknown & ~astray
     free = ~has_id
     known, fit = _settle(pose, centred, half, marks, (named, free), pitch, rules)
@@ -121,8 +121,7 @@ def identify_grid(artifact: Artifact, view: View, reading_m: np.ndarray, *, ids:
         limit = pitch / 4  # too few marks to know the view's own rotation and offset
     residual = deviation - rigid.at(about)
     far |= ~ambiguous & (distances(residual) > limit)
-    if free.any():  # their marks are known by now
-        astray |= free & ~far & _astray(pose, marks, stage_m, artifact, rules)
+    astray |= _astray(pose, marks, stage_m, artifact, rules, among=free & ~far)
     reasons[far] = Reason.TOO_FAR
     reasons[astray] = Reason.NOT_AT_MARK
     reasons[ambiguous] = Reason.AMBIGUOUS
@@ -138,9 +137,9 @@ def _at_most_two(numbers: np.ndarray) -> bool:
 
 
 def _astray(pose: LatticePose, marks: np.ndarray, stage_m: np.ndarray | None, artifact: Artifact,
-            rules: IdentityRules) -> np.ndarray:
-    """Return for which marks (2, n) the stage stood further from their sites than it may."""
-    if stage_m is None:
+            rules: IdentityRules, *, among: np.ndarray) -> np.ndarray:
+    """Return which `among` marks (2, n) have the stage further from their sites than it may be."""
+    if stage_m is None or not among.any():
         return np.zeros(marks.shape[1], dtype=bool)
     astray = np.empty(marks.shape[1], dtype=bool)
     for start in range(0, len(astray), PART):
@@ -148,7 +147,7 @@ def _astray(pose: LatticePose, marks: np.ndarray, stage_m: np.ndarray | None, ar
         site = np.stack(pose.site_of(marks[0, here], marks[1, here])) * artifact.grid_pitch_m
         away = np.clip(stage_m[:, here] - site, -OFF_ANY_PLATE_M, OFF_ANY_PLATE_M)
         astray[here] = distances(away) > rules.stage_limit_m(artifact)
-    return astray
+    return astray & among
 
 
 def _nearest(pose: LatticePose, centred: np.ndarray, pitch: float, half: np.ndarray,
