@@ -237,7 +237,7 @@ class Collector:
         readings, loose = self._views.readings(timeline, self._exposures)
         loose.update({str(reason): count for reason, count in self._rejected_input.items()})
         stamps = [command.stamp_ns for command in self._commands]
-        self._seen = Seen(self._views.table, self._views.view_of, self._exposures, self._facts(),
+        self._seen = Seen(self._views.table, self._views.view_of, self._exposures, self._facts,
                           (min(stamps), max(stamps)), timeline.artifact, self._rules.identity,
                           self.sense)
         progress = {index: view_progress(timeline, index, found)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What is known of the detections of a session, gathered for its diagnosis."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -56,8 +56,8 @@ class Seen:
         View of each, -1 for none.
     exposures : Exposures
         The stage at their instants.
-    encoder : EncoderFacts
-        What came of the encoder.
+    encoder : callable
+        Returns what came of the encoder, `EncoderFacts`: asked only where something is amiss.
     commands_ns : tuple of int
         First and last stamp of the commands.
     artifact : Artifact
@@ -71,7 +71,7 @@ class Seen:
     table: np.ndarray
     view_of: np.ndarray
     exposures: Exposures
-    encoder: EncoderFacts
+    encoder: Callable[[], EncoderFacts]
     commands_ns: Span
     artifact: Artifact
     rules: IdentityRules
@@ -106,7 +106,7 @@ class Seen:
             return None
         here = np.isin(self.view_of, list(views))
         rows = np.flatnonzero(here if here.any() else np.ones(len(here), dtype=bool))
-        table, encoder = self.table[rows], self.encoder
+        table, encoder = self.table[rows], self.encoder()
         kinds = {"x": Kind.GRID, "y": Kind.GRID, "theta": Kind.ANGULAR}
         missing = tuple(encoder.names[axis] for axis, kind in kinds.items()
                         if not encoder.sampled[axis] and (table["kind"] == kind).any())

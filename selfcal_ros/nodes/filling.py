@@ -19,7 +19,9 @@ def fill(message: Any, fields: dict[str, Any]) -> Any:
         elif isinstance(value, np.ndarray):
             current = getattr(message, name)
             if isinstance(current, array.array):
-                value = array.array(current.typecode, value.tolist())
+                code = current.typecode
+                fits = np.can_cast(value.dtype, code)  # otherwise `array` looks at each number
+                value = array.array(code, value.astype(code).tobytes() if fits else value.tolist())
             setattr(message, name, value)
         else:
             setattr(message, name, value)
