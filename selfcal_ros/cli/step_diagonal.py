@@ -12,6 +12,7 @@ from selfcal_ros.cli.step_diagonal_bag import (
     is_bag,
     joints_of,
     measurement_from_bag,
+    refuse_for_table,
 )
 from selfcal_ros.cli.terminal.output import add_json, put, say, tell
 from selfcal_ros.cli.terminal.progress import busy
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     from selfcal_ros.laser.data import StepDiagonalResult
 
 HELP = "identify linear, straightness and squareness errors from a laser step-diagonal measurement"
+STEP_MM = 10.0
 SHORTEST_MM = 1e-6
 """Steps below 1 nm are not steps of a machine."""
 SEED = 1
@@ -41,8 +43,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
                         help="new formulation: exact geometry by least squares (default), the "
                              "paper's equations with the exact form of eq. 5, or as printed")
     for axis in "xyz":
-        parser.add_argument(f"--step-{axis}", type=float, default=10.0, metavar="MM",
-                            help=f"nominal step of {axis.upper()} in a block, mm (default 10)")
+        parser.add_argument(f"--step-{axis}", type=float, default=STEP_MM, metavar="MM",
+                            help=f"nominal step of {axis.upper()} in a block, mm (default "
+                                 f"{STEP_MM:g})")
     parser.add_argument("--line", default="lsq", choices=("lsq", "end"),
                         help="reference line: least squares (default) or through the end points")
     parser.add_argument("--diagonals", metavar="LIST",
@@ -116,6 +119,9 @@ def _check_outputs(args: argparse.Namespace) -> None:
     from selfcal_ros.compensation.aerotech.write import refuse_existing
     from selfcal_ros.files import check_outputs
 
+    if args.sensitivity and args.simulate:
+        raise InputError("--sensitivity", "it and --simulate exclude each other",
+                         "leave one of them out")
     measured = not (args.sensitivity or args.simulate)
     for option, path, there, remedy in (
             ("--truth", args.truth, args.simulate, "it belongs to --simulate"),
@@ -129,6 +135,17 @@ def _check_outputs(args: argparse.Namespace) -> None:
                   [args.output, args.plot, args.cal, args.truth, args.save_csv])
     if args.cal:
         refuse_existing([args.cal], force=args.force)
+    else:
+        _refuse_machine(args)
+
+
+def _refuse_machine(args: argparse.Namespace) -> None:
+    """Refuse options of a calibration file where none is written."""
+    for name, default in {"x_axis": 1, "y_axis": 2, "unit": "mm", "home_x": None, "home_y": None,
+                          "reverse_x": False, "reverse_y": False, "force": False}.items():
+        if getattr(args, name) != default:
+            raise InputError(f"--{name.replace('_', '-')}", "it belongs to a calibration file",
+                             "name one with --cal, or leave it out")
 
 
 def _write_cal(args: argparse.Namespace, found: "StepDiagonalResult") -> None:
@@ -208,6 +225,7 @@ def _measurement(args: argparse.Namespace) -> tuple:
         if args.diagonals is not None:
             data = data.pick(_diagonals(args, data.dim))
     else:
+        refuse_for_table(args)
         dim = dimension_of(args.data)
         columns = Columns(_steps(args, dim), _diagonals(args, dim), args.method == "new")
         data, warnings = read_table(args.data, columns)
@@ -215,6 +233,8 @@ def _measurement(args: argparse.Namespace) -> tuple:
 
 
 def _steps(args: argparse.Namespace, dim: int) -> tuple[float, ...]:
+    if dim < 3 and args.step_z != STEP_MM:
+        raise InputError("--step-z", "the measurement has no Z", "leave it out")
     for axis in "xyz"[:dim]:
         step = getattr(args, f"step_{axis}")
         if not SHORTEST_MM <= step < math.inf:

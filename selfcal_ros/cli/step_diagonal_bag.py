@@ -13,6 +13,12 @@ if TYPE_CHECKING:
     from selfcal_ros.laser.data import StepDiagonal
 
 
+JOINTS = "x,y"
+REST_TOLERANCE_UM = 2.0
+MIN_REST_S = 0.5
+SETTLE_S = 0.1
+
+
 def add_bag_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of a bag."""
     group = parser.add_argument_group(
@@ -29,15 +35,26 @@ def add_bag_options(parser: argparse.ArgumentParser) -> None:
                        help="-1 if the distance shrinks along the diagonals (default 1)")
     group.add_argument("--position-topic", metavar="TOPIC",
                        help="axis positions: JointState, PointStamped or PoseStamped, m")
-    group.add_argument("--joints", metavar="LIST", default="x,y",
+    group.add_argument("--joints", metavar="LIST", default=JOINTS,
                        help="joints of X, Y[, Z] (default x,y; three names mean 3D)")
-    group.add_argument("--rest-tolerance", type=float, default=2.0, metavar="UM",
+    group.add_argument("--rest-tolerance", type=float, default=REST_TOLERANCE_UM, metavar="UM",
                        help="wandering of an axis at rest, um (default 2)")
-    group.add_argument("--min-rest", type=float, default=0.5, metavar="S",
+    group.add_argument("--min-rest", type=float, default=MIN_REST_S, metavar="S",
                        help="shortest rest, s (default 0.5)")
-    group.add_argument("--settle", type=float, default=0.1, metavar="S",
+    group.add_argument("--settle", type=float, default=SETTLE_S, metavar="S",
                        help="left out at both ends of a rest, s (default 0.1)")
     group.add_argument("--save-csv", metavar="FILE", help="write the blocks as a CSV table")
+
+
+def refuse_for_table(args: argparse.Namespace) -> None:
+    """Refuse options of a bag where the readings come from a table, which they would not change."""
+    given = {"laser_topic": None, "laser_field": "", "laser_unit": "m", "laser_sign": 1,
+             "position_topic": None, "joints": JOINTS, "rest_tolerance": REST_TOLERANCE_UM,
+             "min_rest": MIN_REST_S, "settle": SETTLE_S}
+    for name, default in given.items():
+        if getattr(args, name) != default:
+            raise InputError(f"--{name.replace('_', '-')}", f"it is for a bag, and {args.data} is "
+                             "a table", "leave it out")
 
 
 def is_bag(path: str) -> bool:

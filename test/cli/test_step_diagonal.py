@@ -138,6 +138,26 @@ def test_outputs_are_refused_before_anything_is_written(tmp_path, monkeypatch, c
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
+@pytest.mark.parametrize("extra", [
+    ("--laser-topic", "/l"), ("--laser-field", "data"), ("--laser-unit", "mm"),
+    ("--laser-sign", "-1"), ("--position-topic", "/p"), ("--joints", "a,b"),
+    ("--rest-tolerance", "3"), ("--min-rest", "1"), ("--settle", "0.2"), ("--step-z", "5"),
+    ("--x-axis", "3"), ("--y-axis", "3"), ("--unit", "um"), ("--home-x", "0"), ("--home-y", "1"),
+    ("--reverse-x",), ("--reverse-y",), ("--force",)])
+def test_options_that_would_do_nothing_are_refused(capsys, extra):
+    """A sign or unit of the laser that is given and not used looks as if the result had it."""
+    code, out, err = run(capsys, EXAMPLE, "--method", "new", *extra)
+    assert (code, out) == (2, "") and err.count("\n") == 1
+    assert err.startswith(f"selfcal step-diagonal: {extra[0]}: ")
+    assert err.endswith("leave it out\n")
+
+
+def test_two_simulations_exclude_each_other(capsys):
+    code, out, err = run(capsys, "--sensitivity", "--simulate", CONFIG / "case_study.yaml")
+    assert (code, out, err) == (2, "", "selfcal step-diagonal: --sensitivity: it and --simulate "
+                                       "exclude each other; leave one of them out\n")
+
+
 def test_bad_tables_are_one_line_with_their_exit_code(tmp_path, capsys):
     table = tmp_path / "d.csv"
     for text, expected, message in (
