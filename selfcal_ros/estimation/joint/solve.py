@@ -157,17 +157,20 @@ def _error_map(measurements: Measurements, options: Options, *, model: ModelFit,
     u_x = u_y = np.full(system.grid.views.shape, np.nan)
     u_theta, closure = np.full(system.angular.n_lines, np.nan), None
     kept: dict[str, Any] = {}
-    if problem.direct and options.uncertainty is not False:
+    wanted = options.uncertainty is not False
+    tested = problem.conditions.datum is ThetaDatum.XY_AXES  # that the stage keeps its axes
+    if problem.direct and (wanted or tested):
         scale = (scale_datum(system, options.reference, length) if options.reference else None)
         cover = FieldCovariance(system, found.inverse, scale, found.xy.sigma, model.spread)
-        u_x, u_y = (np.sqrt(v) * found.xy.sigma for v in cover.diagonal())
-        if model.equations is not None:
+        if wanted:
+            u_x, u_y = (np.sqrt(v) * found.xy.sigma for v in cover.diagonal())
+        if wanted and model.equations is not None:
             kept = saved_terms(cover, model.equations.columns, measurements.sense)
-    if problem.direct and options.uncertainty is not False and system.angular.n_views:
-        variance, closure = angular_variance(
-            cover, problem.conditions, sigma=(found.xy.sigma, found.theta.sigma),
-            half_width_m=length)
-        u_theta = np.sqrt(variance)
+        if system.angular.n_views:
+            variance, closure = angular_variance(
+                cover, problem.conditions, sigma=(found.xy.sigma, found.theta.sigma),
+                half_width_m=length)
+            u_theta = np.sqrt(variance) if wanted else u_theta
     known = system.known_sites
     field = np.where(known, found.field, complex(np.nan, np.nan))
     g_theta = np.where(system.known_lines, found.g_theta, np.nan)

@@ -6,12 +6,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.findings import AxesNotMet
 from selfcal_ros.estimation.joint.solve import solve_joint
 from selfcal_ros.estimation.law.solve import solve_law
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.verdict.judge import are_looked_for, judged
 from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.error_map import ThetaDatum
+from selfcal_ros.model.terms import ModelTerm, TermName
 from selfcal_ros.simulation.truth import hu_plan, random_truth, simulate_measurements
 
 ARCSEC_RAD = np.pi / 648_000
@@ -38,6 +41,21 @@ def test_axis_conditions_that_nobody_asked_for_hold(readings):
     assert solve_law(readings, Options(method="law")).axes == (1.0, 0.0)
     linear = Options(misalignment_model="linear")
     assert solve_joint(readings, linear).axes == (1.0, 0.0)
+
+
+@pytest.mark.parametrize("terms", [(), (ModelTerm(TermName.PLATE_SCALE, 1e-9),)])
+def test_axes_that_the_stage_does_not_keep_are_found_without_an_uncertainty_map(readings, terms):
+    """The rotary encoder owes nothing to the axes: its map in their datum is wrong."""
+    options = Options(misalignment_model="linear", datum_theta=ThetaDatum.XY_AXES, terms=terms)
+    wanted, plain = (calibrate(readings, replace(options, uncertainty=uncertainty))
+                     for uncertainty in (None, False))
+    assert wanted.verdict.findings == plain.verdict.findings
+    (found,) = plain.verdict.findings
+    assert isinstance(found, AxesNotMet) and found.misclosure_rad > 30 * ARCSEC_RAD
+    assert not plain.verdict.qualified
+    for name in ("u_gx", "u_gy", "u_g_theta"):
+        assert np.isnan(getattr(plain.error_map, name)).all()
+    assert "covariance_terms" not in plain.extra
 
 
 @pytest.mark.parametrize(("side", "asked", "failed", "wanted"), [
