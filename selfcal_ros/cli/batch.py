@@ -52,6 +52,9 @@ def run(args: argparse.Namespace) -> int:
                          f"write HOST:PORT, or --dask {LOCAL} in front of a bag")
     settings = Settings(*parameters(args), args.robust, args.namespace)
     bags, folder = find_bags(args.bags), Path(args.output)
+    for bag in bags:
+        if folder.resolve().is_relative_to(bag.resolve()):
+            raise InputError(str(folder), f"it is in the bag {bag}", "name another folder")
     with opened(folder):
         kept = [] if args.redo else kept_records(folder, settings)
         done, places = done_and_to_do(kept, bags)

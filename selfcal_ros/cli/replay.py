@@ -12,6 +12,8 @@ from selfcal_ros.cli.processes import domain, ended_by_signals, need_ros, proces
 from selfcal_ros.cli.terminal.output import add_json, aside, file_of, on_stdout, put
 
 HELP = "play a bag into the live nodes and take the map from them"
+AS_RECORDED = -1
+LARGEST_SEED = 2**31
 NODES = ("measurement_collector", "pose_sequencer", "solver")
 
 
@@ -21,7 +23,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     speed = parser.add_mutually_exclusive_group()
     speed.add_argument("--rate", type=float, default=1.0, metavar="R", help="speed (default: 1)")
     speed.add_argument("--fast", action="store_true", help="as fast as the nodes keep up")
-    parser.add_argument("--shuffle", type=int, default=-1, metavar="SEED",
+    parser.add_argument("--shuffle", type=int, metavar="SEED",
                         help="deliver the messages in shuffled order")
     parser.add_argument("-o", "--output", metavar="RESULT.json", help="where to write the result; "
                         "- is stdout, and all else goes to stderr")
@@ -43,6 +45,9 @@ def run(args: argparse.Namespace) -> int:
     need_ros(", or use `selfcal solve`")
     if not args.fast and not args.rate > 0:
         raise InputError("--rate", f"{args.rate:g} is not a speed", "give a number above 0")
+    if args.shuffle is not None and not 0 <= args.shuffle <= LARGEST_SEED:
+        raise InputError("--shuffle", f"{args.shuffle} is not a seed",
+                         f"give a number from 0 to {LARGEST_SEED}")
     check_outputs([args.bag, args.params], [file_of(args)])
     source = bag_input(args.bag)
     with (ended_by_signals(), tempfile.TemporaryDirectory() as folder,
@@ -76,7 +81,8 @@ def _play(args: argparse.Namespace, saved: Path, environment: dict) -> tuple[int
                                         [*rest, *own.get(node, []), *quiet], environment))
         session = stack.enter_context(process(
             "selfcal_ros.nodes.replay_session",
-            [args.bag, str(rate), str(args.shuffle), str(saved), cell, *quiet], environment,
+            [args.bag, str(rate), str(AS_RECORDED if args.shuffle is None else args.shuffle),
+             str(saved), cell, *quiet], environment,
             stdout=subprocess.PIPE, text=True))
         bar = stack.enter_context(progress_bar("replaying"))
         lost = []

@@ -45,7 +45,7 @@ def run(args: argparse.Namespace) -> int:
     folder = Path(args.out) if args.out else None
     if folder is not None:
         _make(folder)
-    workers = check_workers(args.workers if args.workers or args.draws >= MANY else 1)
+    workers = check_workers(1 if args.workers is None and args.draws < MANY else args.workers)
     with late_progress("solving draws") as progress:
         text, save, numbers = (_hu if args.paper == "hu" else _qiao)(args, workers, progress)
     say(args, text, {"paper": args.paper, "draws": args.draws, "seed": args.seed, **numbers})

@@ -182,6 +182,15 @@ def test_options_that_cannot_be(shelf, tmp_path, capsys, options, message):
     assert capsys.readouterr().err == f"selfcal batch: {message}\n"
 
 
+def test_a_bag_is_no_folder_for_results(tmp_path, capsys):
+    bag = Path(__file__).parents[2] / "bags" / "hu_exact"
+    for folder in (bag, bag / "results"):
+        assert batch(bag, "-o", folder) == 2
+        assert capsys.readouterr().err == (
+            f"selfcal batch: {folder}: it is in the bag {bag}; name another folder\n")
+    assert {path.suffix for path in bag.iterdir()} == {".mcap", ".yaml", ".json"}
+
+
 def test_bags_are_found_at_any_depth_once(shelf, tmp_path):
     names = ["a.mcap", "b.mcap", "deep/c.mcap", "deep/deeper/d.mcap", "few.mcap", "text.mcap"]
     assert find_bags([str(shelf), str(shelf / "a.mcap")]) == [shelf / name for name in names]

@@ -37,6 +37,7 @@ def test_text_and_plots_and_the_same_bytes_for_the_same_seed(paper, figures, wor
 @pytest.mark.parametrize(("arguments", "message"), [
     (["--draws", "0"], "--draws: 0 is not positive; give 1 or more"),
     (["--seed", "-1"], "--seed: -1 is negative"),
+    (["--workers", "0", "--draws", "2"], "--workers: 0 is not a number of workers"),
     (["--out", "/proc/nothing"], "cannot be made"),
 ])
 def test_bad_arguments(arguments, message, capsys):

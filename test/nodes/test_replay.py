@@ -178,8 +178,10 @@ def test_the_map_is_saved_once_the_solver_has_solved_what_the_collector_sent_las
 
 
 @pytest.mark.parametrize("options, problem", [
-    (["--rate", "0"], "--rate: 0 is not a speed; give a number above 0")])
-def test_a_rate_must_be_above_zero(options, problem, capsys):
+    (["--rate", "0"], "--rate: 0 is not a speed; give a number above 0"),
+    (["--shuffle", "-1"], "--shuffle: -1 is not a seed; give a number from 0 to 2147483648"),
+    (["--shuffle", "2147483649"], "--shuffle: 2147483649 is not a seed; give a number from 0")])
+def test_speeds_and_seeds_that_are_none(options, problem, capsys):
     assert selfcal(["replay", "bag", *options]) == 2
     assert problem in capsys.readouterr().err
 
