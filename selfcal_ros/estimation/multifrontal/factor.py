@@ -140,12 +140,25 @@ class Factor:
         sites = folded.free[self.dissection.order]
         for number in range(len(fronts) - 1, -1, -1):
             front, own = fronts[number], fronts[number].stop - fronts[number].start
+            if not front.children:
+                out[sites[front.start:front.stop]] = self._diagonal(number, needed.pop(number))
+                continue
             z = self._selected(number, needed.pop(number))
             out[sites[front.start:front.stop]] = z[:own, :own].diagonal()
             for child in front.children:
                 places = front.places(fronts[child].boundary)
                 needed[child] = z[places[:, None], places]
         return out
+
+    def _diagonal(self, number: int, z22: np.ndarray) -> np.ndarray:
+        """Return the diagonal of `_selected`: no front asks for the rest of one without children.
+
+        Z11 = J' J + (Y J)' Z22 (Y J).
+        """
+        lower, below = self._blocks[number]
+        carried = below @ lower
+        return (np.einsum("ki,ki->i", lower, lower)
+                + np.einsum("ki,ki->i", carried, z22 @ carried))
 
     def _selected(self, number: int, z22: np.ndarray) -> np.ndarray:
         """Return the inverse over one front, given that over its boundary."""

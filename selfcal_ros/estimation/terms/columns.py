@@ -303,26 +303,26 @@ def _plate_columns(made: Made, ground: Ground, term: ModelTerm) -> None:
     A size says how far views scatter about what they have in common, so that each view has its
     own; free ones are relative to the first view, as what all have in common is the plate's.
     """
-    forms, axes = _plate_forms(ground, term.name)
+    texts, forms, axes = _plate_forms(ground, term.name)
     nothing: list[np.ndarray | None] = [None] * len(ground.names)
     for view in range(1 if term.free else 0, len(ground.names)):
         here = ground.weight[view].reshape(-1) > 0
-        numbers = [made.add({view: np.where(here, form, 0)}, nothing) for form in forms.values()]
+        numbers = [made.add({view: form}, nothing) for form in forms * here]
         for axis, unit in axes:
-            for text, number in zip(forms, numbers, strict=True):
-                made.column(Column(term.name, view, f"{axis}{text}", term.size), number, unit)
+            for text, number in zip(texts, numbers, strict=True):
+                made.column(Column(term.name, view, axis + text, term.size), number, unit)
 
 
 def _plate_forms(ground: Ground, name: TermName
-                 ) -> tuple[dict[str, np.ndarray], tuple[tuple[str, complex], ...]]:
-    """Return forms over the marks, (marks,), and along which axes each has a column."""
+                 ) -> tuple[tuple[str, ...], np.ndarray, Sequence[tuple[str, complex]]]:
+    """Return names and values of forms, (k, marks), and along which axes each has a column."""
     z = ground.z.reshape(-1)
     if name is TermName.PLATE_SCALE:
-        return {"scale": z * ground.half_width_m}, (("", 1),)
+        return ("scale",), z[None] * ground.half_width_m, [("", 1)]
     x, y = z.real, z.imag
     # 2xy beside x^2 and y^2: a bending (x^2 - y^2, -2xy) then has coefficients of one size
-    return ({"xx": x * x, "xy": 2 * x * y, "yy": y * y},
-            tuple((f"{axis} ", unit) for axis, unit in AXES))
+    return ("xx", "xy", "yy"), np.stack([x * x, 2 * x * y, y * y]), [
+        (f"{axis} ", unit) for axis, unit in AXES]
 
 
 def _within(ground: Ground, at: Seen, shapes: Shapes) -> WithinMarks:
@@ -339,6 +339,8 @@ def _within(ground: Ground, at: Seen, shapes: Shapes) -> WithinMarks:
 def _within_anew(ground: Ground, at: Seen, shapes: Shapes, *, before: WithinMarks,
                  changed: np.ndarray) -> WithinMarks:
     """Return what the means hide, the products of the shapes `changed` set up anew."""
+    if not any(visits is not None and visits.repeated for visits in ground.visits):
+        return before
     inner: np.ndarray = np.zeros((shapes.n, shapes.n), dtype=complex)
     against: np.ndarray = np.zeros(shapes.n, dtype=complex)
     for view, visits in enumerate(ground.visits):

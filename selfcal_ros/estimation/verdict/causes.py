@@ -228,11 +228,13 @@ def _groups(columns: TermColumns, name: TermName) -> list[Group]:
     """Return the columns of a term as a whole, and those of each view, steady drift apart."""
     whole = columns.rows([name])
     parts = [whole]
-    for view in sorted({c.view for c in columns.columns if c.term == name and c.view >= 0}):
-        here = whole & np.array([c.view == view for c in columns.columns])
+    of_view = np.array([c.view for c in columns.columns], dtype=int)
+    steady = np.array([c.component.endswith("P1") for c in columns.columns], dtype=bool)
+    for view in sorted(set(of_view[whole].tolist()) - {-1}):
+        here = whole & (of_view == view)
         parts.append(here)
         if name is TermName.DRIFT:
-            parts.append(here & np.array([c.component.endswith("P1") for c in columns.columns]))
+            parts.append(here & steady)
     return [Group(str(name), rows, places=len(parts)) for rows in parts]
 
 
