@@ -16,6 +16,9 @@ from selfcal_ros.nodes.running import run
 from selfcal_ros.sessions.ports import Diagnosis
 from selfcal_ros.sessions.solving import Outcome, SolvingSession, solve, warm_up
 
+READY_FOR = 21
+"""Marks along each side of the plate for which the worker makes memory ready."""
+
 SWEEP_S = 0.5
 """Time between two looks for what no event has brought forward, as a solution that was ready while
 the node was not active. A solution itself wakes the executor."""
@@ -43,6 +46,7 @@ class Solver(ManagedNode[SolverSettings]):
         self._worker = self.own(ThreadPoolExecutor(1, thread_name_prefix="solver"), stop)
         self._running = None
         warm_up()
+        self._worker.submit(warm_up, READY_FOR)
         self._outputs = {"map": self.output(names.ERROR_MAP),
                          "summary": self.output(names.SUMMARY)}
         self._markers = self.publisher(names.MAP_MARKERS)

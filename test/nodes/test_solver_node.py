@@ -101,13 +101,17 @@ def test_a_solution_wakes_the_node_that_waits_for_it(solve, graph, monkeypatch):
     same_map(maps[-1], calibrate(measurements).error_map)
 
 
-def test_what_solving_needs_is_loaded_before_there_is_another_thread(graph, monkeypatch):
-    before: list[str] = []
-    monkeypatch.setattr(solver_module, "warm_up", lambda: before.extend(
-        thread.name for thread in [threading.current_thread(), *threading.enumerate()]))
+def test_what_solving_needs_is_loaded_before_there_is_another_thread_then_its_memory(
+        graph, monkeypatch):
+    calls: list[tuple[tuple, str, list[str]]] = []
+    monkeypatch.setattr(solver_module, "warm_up", lambda *marks: calls.append(
+        (marks, threading.current_thread().name, [one.name for one in threading.enumerate()])))
     graph.node(Solver)
-    assert before[0] == "MainThread"
+    graph.until(lambda: len(calls) == 2, "both")
+    (first, main, before), (then, worker, _) = calls
+    assert (first, main) == ((), "MainThread")
     assert not [name for name in before if name.startswith("solver")]
+    assert then == (21,) and worker.startswith("solver")
 
 
 def test_a_solution_that_was_ready_while_the_node_was_not_active_is_taken_later(

@@ -3,6 +3,9 @@
 
 import json
 import os
+import platform
+import subprocess
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -329,3 +332,32 @@ def test_what_is_noted_of_the_session_is_a_warning_of_the_result(desk):
     first.session_notes = []
     desk.take([first])  # the newest word counts
     assert "more" not in desk.session.result.warnings
+
+
+FAULTS = """
+import resource
+import numpy as np
+from selfcal_ros.sessions.solving import keep_freed_memory
+
+def faults():
+    def work():
+        return [np.ones(12_500) for _ in range(20)]
+    work()
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    for _ in range(20):
+        work()
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
+
+print(faults())
+keep_freed_memory()
+print(faults())
+"""
+"""Twenty times two megabytes in small blocks, taken and freed: pages that come anew."""
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="another allocator")
+def test_memory_that_is_freed_is_kept_for_the_next_solution():
+    done = subprocess.run([sys.executable, "-c", FAULTS], capture_output=True, text=True,
+                          check=True)
+    before, after = map(int, done.stdout.split())
+    assert before > 5000 > 100 > after
