@@ -21,6 +21,7 @@ from selfcal_ros.estimation.joint.fit import JointFit, fit
 from selfcal_ros.estimation.joint.problem import Problem
 from selfcal_ros.estimation.joint.solve import prepare
 from selfcal_ros.estimation.lattice.maps import PHASES
+from selfcal_ros.estimation.normal.alone import angular_residuals, grid_residuals
 from selfcal_ros.estimation.normal.equations import NormalEquations
 from selfcal_ros.estimation.normal.memo import Memo
 from selfcal_ros.estimation.options import Options
@@ -181,25 +182,6 @@ def drawn_redundancy(system: NormalEquations) -> np.ndarray:
         residuals = grid_residuals(system, noise[0] + 1j * noise[1])
         total += abs(residuals) ** 2 * grid.weight
     return np.where(grid.read, np.minimum(total / (2 * N_DRAWS), 1.0), 0.0)
-
-
-def grid_residuals(system: NormalEquations, y: np.ndarray) -> np.ndarray:
-    """Return what the grid readings `y` (views, nx, ny) leave over when fitted alone."""
-    grid = system.grid
-    free, d = grid.reduced(y)
-    parameters = system.grid_inverse @ d
-    field = (free - grid.response @ parameters).reshape(grid.views.shape)
-    return grid.plate(y, field, parameters)[1]
-
-
-def angular_residuals(system: NormalEquations, y: np.ndarray) -> np.ndarray:
-    """Return what the angular readings `y` (views, K) leave over when fitted alone."""
-    angular = system.angular
-    if not angular.n_views:
-        return np.zeros(y.shape)
-    free, d = angular.reduced(y)
-    phi = system.angular_inverse @ d
-    return angular.plate(y, free - angular.response @ phi, phi)[1]
 
 
 def view_noise(residuals: Residuals) -> np.ndarray:

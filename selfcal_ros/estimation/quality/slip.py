@@ -17,8 +17,9 @@ from selfcal_ros.estimation.joint.fit import JointFit, fit
 from selfcal_ros.estimation.joint.problem import Problem
 from selfcal_ros.estimation.joint.solve import prepare
 from selfcal_ros.estimation.lattice.maps import PHASES
+from selfcal_ros.estimation.normal.alone import grid_residuals
 from selfcal_ros.estimation.options import Options
-from selfcal_ros.estimation.quality.leverage import Residuals, grid_residuals
+from selfcal_ros.estimation.quality.leverage import Residuals
 from selfcal_ros.model.readings import Measurements, ViewReadings
 
 AMBIGUOUS = 16.0
