@@ -99,6 +99,14 @@ class SlipCause(Finding):
 
 
 @dataclass(frozen=True)
+class ReadingCause(Finding):
+    """A reading that the others contradict: its view, and its mark (m, n), or line (k,)."""
+
+    view: str
+    mark: tuple[int, ...]
+
+
+@dataclass(frozen=True)
 class SizeCause(Finding):
     """The size that was given for a term, and the largest that the readings show."""
 

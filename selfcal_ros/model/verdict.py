@@ -21,8 +21,8 @@ class Cause(Finding):
     Attributes
     ----------
     name : str
-        A `selfcal_ros.model.terms.TermName`, ``slip`` (of a plate within a view) or ``noise`` (of
-        a view).
+        A `selfcal_ros.model.terms.TermName`, ``slip`` (of a plate within a view), ``reading`` (a
+        mark or line that is off in a view) or ``noise`` (of a view).
     text : str
         What, with size, uncertainty and what to do, for a person; empty before it is worded.
     size, u : float

@@ -38,7 +38,7 @@ def likelier_term(measurements: Measurements, options: Options, slip: Slip) -> C
     ground = problem.ground
     placed = PlacedSlip(slip_at_line(ground, row, slip, PHASES[-problem.grid.poses[row].q % 4]),
                         row, 2 * MAX_PLACES)
-    found = find_explanations(model, slips=True, placed=placed)
+    found = find_explanations(model, slips=True, readings=False, placed=placed)
     if not found or found[0].name == SLIP:
         return None
     return cause_of(found[0], ground.names, problem.half_width_m)

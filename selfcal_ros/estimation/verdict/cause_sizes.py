@@ -15,11 +15,13 @@ from selfcal_ros.estimation.findings import (
     NoiseCause,
     PlateScaleCause,
     PlateShapeCause,
+    ReadingCause,
     SizeCause,
     SlipCause,
 )
 from selfcal_ros.estimation.terms.sizes import SizeTest
 from selfcal_ros.estimation.verdict.causes import Explanation
+from selfcal_ros.estimation.verdict.reading_columns import READING
 from selfcal_ros.estimation.verdict.slip_columns import SLIP
 from selfcal_ros.model.terms import TermName
 from selfcal_ros.model.verdict import Cause, Finding, TermEstimate
@@ -130,6 +132,14 @@ def _approach(found: Explanation, *_: object) -> Sized:
     return Sized(value, u, "m", ApproachCause(found.columns[at].component))
 
 
+def _reading(found: Explanation, names: tuple[str, ...], _: float) -> Sized:
+    toward = found.values / np.hypot(*found.values)
+    value, u = _linear(found, toward)
+    if found.mark is None:
+        raise ValueError("a reading without its mark")
+    return Sized(value, u, "m", ReadingCause(names[found.columns[0].view], found.mark))
+
+
 def _slip(found: Explanation, names: tuple[str, ...], half_width_m: float) -> Sized:
     order = {column.component: i for i, column in enumerate(found.columns)}
     x, y, phi = (float(found.values[order[part]]) for part in ("x", "y", "phi"))
@@ -143,4 +153,5 @@ def _slip(found: Explanation, names: tuple[str, ...], half_width_m: float) -> Si
 
 _SIZES: dict[str, Callable[..., Sized]] = {
     TermName.MICROSCOPE: _microscope, TermName.DRIFT: _drift, TermName.PLATE_SCALE: _plate_scale,
-    TermName.PLATE_SHAPE: _plate_shape, TermName.APPROACH: _approach, SLIP: _slip}
+    TermName.PLATE_SHAPE: _plate_shape, TermName.APPROACH: _approach, SLIP: _slip,
+    READING: _reading}

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What else the readings show: each term, and a slip, scored by what it takes off the residuals.
+"""What else the readings show: terms, slips, single readings, by what they take off the residuals.
 
 A term that the model does not hold is scored by the sum of squares that its columns explain, for
 the number of their combinations that the readings tell (F-test against what is then left). The
@@ -16,10 +16,12 @@ import numpy as np
 from scipy.special import fdtrc
 
 from selfcal_ros.estimation.joint.model_fit import ModelFit, equations_of, squares
+from selfcal_ros.estimation.lattice.maps import PHASES
 from selfcal_ros.estimation.terms.columns import Column, TermColumns, joined, term_columns
 from selfcal_ros.estimation.terms.equations import TermEquations
 from selfcal_ros.estimation.terms.ground import Ground, without_noise
 from selfcal_ros.estimation.terms.solution import Score, score
+from selfcal_ros.estimation.verdict.reading_columns import READING, reading_columns
 from selfcal_ros.estimation.verdict.slip_columns import SLIP, slip_columns
 from selfcal_ros.model.terms import VISIT_TERMS, ModelTerm, TermName
 
@@ -42,7 +44,7 @@ class Explanation:
     Attributes
     ----------
     name : str
-        Name of the term, or ``slip``.
+        Name of the term, ``slip`` or ``reading``.
     columns : tuple of Column
         Its coefficients.
     values : float array (p,)
@@ -56,7 +58,9 @@ class Explanation:
     effect_m : float
         Root mean square of what it does to a coordinate of the map, as far as it is told.
     part : float
-        Part of the view's visits before a slip; NaN for a term.
+        Part of the view's visits before a slip; NaN for what is none.
+    mark : tuple of int, optional
+        Mark (m, n) of a single reading; None for what is none.
     """
 
     name: str
@@ -67,17 +71,19 @@ class Explanation:
     whole: bool
     effect_m: float
     part: float = float("nan")
+    mark: tuple[int, int] | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class Group:
-    """Columns that stand or fall together: a term, or a slip of `places` that were tried."""
+    """Columns that stand or fall together: a term, or a slip or reading of `places` tried."""
 
     name: str
     rows: np.ndarray
     view: int = -1
     part: float = float("nan")
     places: int = 1
+    mark: tuple[int, int] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,7 +191,7 @@ class PlacedSlip:
     places: int
 
 
-def find_explanations(model: ModelFit, *, slips: bool,
+def find_explanations(model: ModelFit, *, slips: bool, readings: bool = True,
                       placed: PlacedSlip | None = None) -> list[Explanation]:
     """Return what explains the residuals of a fit significantly, the likeliest first.
 
@@ -195,6 +201,8 @@ def find_explanations(model: ModelFit, *, slips: bool,
         The fit; its own terms are not looked for again.
     slips : bool
         Whether slips of the plate within a view are looked for as well.
+    readings : bool
+        Whether single readings that are off are looked for as well.
     placed : PlacedSlip, optional
         A slip that competes with the others.
     """
@@ -210,12 +218,12 @@ def find_explanations(model: ModelFit, *, slips: bool,
     groups = [group for term in more for group in _groups(columns, term.name)]
     if slips:
         columns, groups = _with_slips(ground, columns, groups)
+    if readings:
+        columns, groups = _with_readings(model, ground, columns, groups)
     if placed is not None:
-        before, after = len(columns.columns), len(placed.columns.columns)
-        columns = joined(ground, columns, placed.columns)
-        groups = [replace(g, rows=np.pad(g.rows, (0, after))) for g in groups]
-        groups.append(Group(SLIP, np.arange(before + after) >= before, placed.view,
-                            places=placed.places))
+        all_of_it = np.ones(len(placed.columns.columns), dtype=bool)
+        columns, groups = _with(ground, (columns, groups), placed.columns, [
+            Group(SLIP, all_of_it, placed.view, places=placed.places)])
     equations = equations_of(problem, model.found, columns)
     taken = np.zeros(equations.n)
     taken[:len(model.coefficients)] = model.coefficients
@@ -238,15 +246,29 @@ def _groups(columns: TermColumns, name: TermName) -> list[Group]:
     return [Group(str(name), rows, places=len(parts)) for rows in parts]
 
 
+def _with(ground: Ground, before: tuple[TermColumns, list[Group]], columns: TermColumns,
+          groups: list[Group]) -> tuple[TermColumns, list[Group]]:
+    """Return columns and groups with more of both behind them."""
+    n_before, n_after = len(before[0].columns), len(columns.columns)
+    return joined(ground, before[0], columns), [
+        *(replace(g, rows=np.pad(g.rows, (0, n_after))) for g in before[1]),
+        *(replace(g, rows=np.pad(g.rows, (n_before, 0))) for g in groups)]
+
+
 def _with_slips(ground: Ground, columns: TermColumns,
                 groups: list[Group]) -> tuple[TermColumns, list[Group]]:
     steps, places = slip_columns(ground)
-    both = joined(ground, columns, steps)
-    before, after = len(columns.columns), len(steps.columns)
-    groups = [Group(g.name, np.pad(g.rows, (0, after)), places=g.places) for g in groups]
-    return both, groups + [
-        Group(SLIP, np.pad(rows, (before, 0)), view, part, len(places))
-        for (view, part), rows in places.items()]
+    return _with(ground, (columns, groups), steps, [
+        Group(SLIP, rows, view, part, len(places)) for (view, part), rows in places.items()])
+
+
+def _with_readings(model: ModelFit, ground: Ground, columns: TermColumns,
+                   groups: list[Group]) -> tuple[TermColumns, list[Group]]:
+    phases = PHASES[[-pose.q % 4 for pose in model.problem.grid.poses]]
+    single, suspects = reading_columns(ground, model.found.residuals, phases)
+    tried = int(np.count_nonzero(ground.weight))
+    return _with(ground, (columns, groups), single, [
+        Group(READING, s.rows, s.view, places=tried, mark=s.mark) for s in suspects])
 
 
 def select_explanations(pool: Pool, groups: list[Group], taken: np.ndarray) -> list[Explanation]:
@@ -277,7 +299,7 @@ def select_explanations(pool: Pool, groups: list[Group], taken: np.ndarray) -> l
 
 def _replaces(pool: Pool, taken: np.ndarray, group: Group, best: Group) -> bool:
     """Return whether a term explains the residuals so well that `best` adds nothing to it."""
-    if SLIP in (group.name, best.name):
+    if {SLIP, READING} & {group.name, best.name}:
         return False
     more = _test(pool, pool.beside(taken | group.rows), best)
     return more is None or more[0] >= LEVEL
@@ -311,4 +333,5 @@ def _explanation(pool: Pool, taken: np.ndarray, group: Group, p: float) -> Expla
         pool.equations.columns.columns, group.rows, strict=True) if here)
     return Explanation(group.name, columns, values[group.rows],
                        variance * beside.inverse[np.ix_(group.rows, group.rows)], p,
-                       pool.beside(group.rows).rank == int(group.rows.sum()), effect, group.part)
+                       pool.beside(group.rows).rank == int(group.rows.sum()), effect, group.part,
+                       group.mark)

@@ -29,7 +29,9 @@ from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.verdict.cause_sizes import cause_of, noise_cause, size_cause
 from selfcal_ros.estimation.verdict.causes import LEVEL, Explanation, find_explanations
 from selfcal_ros.estimation.verdict.coverage import with_coverage
+from selfcal_ros.estimation.verdict.line_readings import line_cause
 from selfcal_ros.estimation.verdict.provenance import provenance_of
+from selfcal_ros.estimation.verdict.reading_columns import READING
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.statistics import rms
@@ -144,7 +146,8 @@ def _causes(solved: Solved, measurements: Measurements, options: Options, *,
         found = find_explanations(model, slips=True)
     causes = [cause_of(item, model.problem.ground.names, model.problem.half_width_m)
               for item in found]
-    return causes or _noisy_views(measurements, model)
+    line = line_cause(model.problem, measurements, LEVEL)
+    return [*causes, *([line] if line else [])] or _noisy_views(measurements, model)
 
 
 def are_looked_for(sites: int, options: Options, *, failed: bool) -> bool:
@@ -166,7 +169,7 @@ def are_looked_for(sites: int, options: Options, *, failed: bool) -> bool:
 
 def _counts(found: Explanation, solved: Solved) -> bool:
     """Return whether an explanation is worth a word: by what it does to the map."""
-    if not found.whole:
+    if not found.whole or found.name == READING:  # one node may be far off, and the rest not
         return True
     emap = solved.result.error_map
     u = np.concatenate([emap.u_gx[emap.valid], emap.u_gy[emap.valid]])

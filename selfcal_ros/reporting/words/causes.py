@@ -10,12 +10,13 @@ from selfcal_ros.estimation.findings import (
     NoiseCause,
     PlateScaleCause,
     PlateShapeCause,
+    ReadingCause,
     SizeCause,
     SlipCause,
 )
 from selfcal_ros.model.terms import TermName
 from selfcal_ros.model.verdict import Cause, Finding
-from selfcal_ros.reporting.words.units import MRAD, PERCENT, RATIO, UM, plus_minus
+from selfcal_ros.reporting.words.units import ARCSEC, MRAD, PERCENT, RATIO, UM, plus_minus
 from selfcal_ros.units import UM_PER_M, URAD_PER_RAD
 
 _OF_SIZES = {TermName.MICROSCOPE: MRAD, TermName.PLATE_SCALE: RATIO}
@@ -86,6 +87,15 @@ def _(what: SlipCause, _: Cause) -> str:
     return (f"the plate slipped by ({what.x_m * UM_PER_M:.3g}, {what.y_m * UM_PER_M:.3g}) µm and "
             f"{what.phi_rad * URAD_PER_RAD:.3g} µrad after about {what.part:.0%} of view "
             f"'{what.view}': measure the view again, or solve with --robust")
+
+
+@_text.register
+def _(what: ReadingCause, cause: Cause) -> str:
+    grid = len(what.mark) > 1
+    name = f"mark {what.mark}" if grid else f"line {what.mark[0]}"
+    size = plus_minus(cause.size, cause.u, UM if grid else ARCSEC)
+    return (f"a reading of {name} in view '{what.view}' that is off by {size}: solve with "
+            "--robust, or measure it again")
 
 
 @_text.register

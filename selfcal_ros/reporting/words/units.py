@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Quantities as sentences name them: lengths in µm, ratios in µm/m, turns in mrad."""
+"""Quantities as sentences name them: lengths in µm, ratios in µm/m, turns in mrad or arcsec."""
 
 import math
 from typing import NamedTuple
 
-from selfcal_ros.units import MRAD_PER_RAD, PPM_PER_ONE, UM_PER_M
+from selfcal_ros.units import ARCSEC_PER_RAD, MRAD_PER_RAD, PPM_PER_ONE, UM_PER_M
 
 
 class Unit(NamedTuple):
@@ -16,6 +16,7 @@ class Unit(NamedTuple):
 
 UM, RATIO = Unit(UM_PER_M, "µm"), Unit(PPM_PER_ONE, "µm/m")
 MRAD, PERCENT = Unit(MRAD_PER_RAD, "mrad"), Unit(100.0, "%")
+ARCSEC = Unit(ARCSEC_PER_RAD, "arcsec")
 
 
 def plus_minus(value: float, u: float, unit: Unit) -> str:

@@ -63,7 +63,10 @@ def microscope(*values):
     # 3 and 4 make 5; a rotation is in units of what it does at the half width, 0.05 m
     (explanation("slip", [(1, "x"), (1, "y"), (1, "phi")], [3e-7, -4e-7, 5e-8], 1e-8, part=0.4),
      "the plate slipped by (0.3, -0.4) µm and 1 µrad after about 40% of view '90': measure the "
-     "view again, or solve with --robust", 5e-7, 1e-8, "m")])
+     "view again, or solve with --robust", 5e-7, 1e-8, "m"),
+    (explanation("reading", [(2, "x"), (2, "y")], [-3e-7, 4e-7], 1e-8, mark=(-2, 5)),
+     "a reading of mark (-2, 5) in view '+x' that is off by 0.500 ± 0.010 µm: solve with --robust, "
+     "or measure it again", 5e-7, 1e-8, "m")])
 def test_a_cause_in_words(found, text, size, u, unit):
     cause = cause_of(found, NAMES, 0.05)
     assert (cause.name, cause_text(cause), cause.unit, cause.p) == (found.name, text, unit, 1e-6)

@@ -1,0 +1,100 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A single reading that is off, in all its repeats, is named with its mark, its view, its size."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from selfcal_ros.estimation.api import calibrate
+from selfcal_ros.estimation.findings import ReadingCause
+from selfcal_ros.estimation.joint.solve import prepare
+from selfcal_ros.estimation.options import Options
+from selfcal_ros.estimation.quality.outliers import robust_calibrate
+from selfcal_ros.estimation.verdict.reading_columns import MOST, reading_columns
+from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.reporting.words.result import worded
+from selfcal_ros.simulation.truth import hu_plan, random_truth, simulate_measurements
+
+ARTIFACT = Artifact(7, 0.01, 24)
+SIGMA_M, SIGMA_RAD = 2e-8, 2e-5
+
+
+def measured(seed, *, repeats=1, visits=True):
+    plan, rng = hu_plan(ARTIFACT, repeats), np.random.default_rng(seed)
+    truth = random_truth(ARTIFACT, len(plan.views), rng)
+    return simulate_measurements(truth, plan, rng, sigma_m=SIGMA_M, sigma_theta_rad=SIGMA_RAD,
+                                 visits=visits)
+
+
+def misread(readings, index, *, mark=None, by_m=(0.0, 0.0), line=None, by_rad=0.0):
+    """Move a mark, or a line, in all repeats of one view."""
+    view = readings.views[index]
+    at = (view.m == mark[0]) & (view.n == mark[1]) if mark else np.zeros(len(view.m), dtype=bool)
+    turned = view.dtheta + by_rad * (view.k == line)
+    views = list(readings.views)
+    views[index] = replace(view, dx=view.dx + at * by_m[0], dy=view.dy + at * by_m[1],
+                           dtheta=turned)
+    return replace(readings, views=tuple(views))
+
+
+@pytest.mark.parametrize(("index", "mark", "repeats", "visits"), [
+    (1, (2, -1), 1, True), (1, (2, -1), 4, True), (0, (0, 3), 1, False), (3, (-3, 1), 4, False)])
+def test_a_mark_that_is_off_in_one_view_is_named(index, mark, repeats, visits):
+    readings = measured(3, repeats=repeats, visits=visits)
+    size, noise = 1e-6, SIGMA_M / np.sqrt(repeats)
+    bad = misread(readings, index, mark=mark, by_m=(0.6 * size, -0.8 * size))
+    clean, result = worded(calibrate(readings)), worded(calibrate(bad))
+    name = readings.views[index].view.name
+    cause = result.verdict.causes[0]
+    assert clean.verdict.qualified and not result.verdict.qualified
+    assert cause.name == "reading" and cause.unit == "m" and cause.p < 5e-4
+    assert cause.text.startswith(f"a reading of mark {mark} in view '{name}' that is off by ")
+    # other views check it but in part: it is known to a few noises of a mean
+    assert cause.size == pytest.approx(size, abs=4.5 * cause.u) and noise < cause.u < 20 * noise
+    assert result.verdict.sentence == f"Not qualified: most likely {cause.text}"
+
+
+def test_a_line_that_is_off_in_one_view_is_named():
+    readings = measured(4)
+    bad = worded(calibrate(misread(readings, 1, line=5, by_rad=-1e-3)))
+    assert calibrate(readings).verdict.qualified and not bad.verdict.qualified
+    (cause,) = bad.verdict.causes
+    assert (cause.name, cause.unit) == ("reading", "rad")
+    assert cause.size == pytest.approx(-1e-3, abs=4.5 * cause.u)
+    assert SIGMA_RAD < cause.u < 4 * SIGMA_RAD
+    assert cause.text.startswith(f"a reading of line 5 in view 'rot90' that is off by "
+                                 f"{cause.size * 180 * 3600 / np.pi:.1f} ± ")
+    assert calibrate(misread(readings, 1, line=5, by_rad=-1e-3)).verdict.causes[0].what == (
+        ReadingCause("rot90", (5,)))
+
+
+def test_the_remedy_that_is_named_mends_it():
+    readings = measured(3)
+    bad = misread(readings, 1, mark=(2, -1), by_m=(1e-6, 0.0), line=5, by_rad=1e-3)
+    assert {cause.unit for cause in calibrate(bad).verdict.causes} == {"m", "rad"}
+    assert robust_calibrate(bad).verdict.qualified
+
+
+def test_nothing_is_said_of_exact_readings():
+    plan, rng = hu_plan(ARTIFACT), np.random.default_rng(1)
+    exact = simulate_measurements(random_truth(ARTIFACT, 4, rng), plan, rng, sigma_m=0.0,
+                                  sigma_theta_rad=0.0)
+    assert calibrate(exact).verdict.qualified
+
+
+def test_those_with_the_largest_residuals_are_tried():
+    """By hand: a plate of 3 x 3 marks, two readings that stand out, one in a turned view."""
+    plan = hu_plan(Artifact(3, 0.01, 4))
+    rng = np.random.default_rng(0)
+    readings = simulate_measurements(random_truth(plan.artifact, 4, rng), plan, rng, sigma_m=1e-8)
+    ground = prepare(readings, Options())[0].ground
+    residuals = np.zeros(ground.weight.shape, dtype=complex)
+    residuals[1, 0, 2], residuals[0, 1, 1] = 3e-8j, 2e-8
+    columns, suspects = reading_columns(ground, residuals, np.array([1, -1j, 1]))
+    assert [(s.view, s.mark) for s in suspects[:2]] == [(1, (-1, 1)), (0, (0, 0))]
+    assert len(suspects) == MOST and len(columns.columns) == 2 * MOST
+    first = columns.grid[suspects[0].rows]
+    assert np.count_nonzero(columns.grid) == 2 * MOST
+    assert first[:, 1, 0, 2].tolist() == [-1j, 1]  # stage x, then stage y, in the plate's frame
+    assert [c.component for c in columns.columns[:2]] == ["x", "y"]
