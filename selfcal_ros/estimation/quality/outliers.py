@@ -25,6 +25,7 @@ from selfcal_ros.estimation.findings import (
     OutliersKept,
     OutliersRemoved,
     Removed,
+    SlipFound,
     SlipsGivenUp,
     TakenForSlip,
     TooManyOutliers,
@@ -92,7 +93,8 @@ def robust_calibrate(measurements: Measurements,
     CalibrationResult
         `findings` tells what was found, ``extra["outliers"]`` lists with view and mark
         what was removed, ``extra["slips"]`` and ``extra["noisy_views"]`` the bad views;
-        `rejected` counts the removed detections under ``outlier_among_views``.
+        `rejected` counts the removed detections under ``outlier_among_views``. What could not
+        be mended disqualifies the result.
 
     Raises
     ------
@@ -107,8 +109,19 @@ def robust_calibrate(measurements: Measurements,
                          "solve with --method joint")
     cleaned = clean(measurements, options)
     result = calibrate(cleaned.measurements, options)
-    return replace(result, findings=(*result.findings, *cleaned.findings),
+    left = tuple(finding for finding in cleaned.findings if _is_left(finding))
+    verdict = result.verdict
+    if left:
+        verdict = replace(verdict, qualified=False, findings=(*verdict.findings, *left))
+    return replace(result, findings=(*result.findings, *cleaned.findings), verdict=verdict,
                    extra={**result.extra, **_listed(cleaned)})
+
+
+def _is_left(finding: Finding) -> bool:
+    """Return whether something is wrong with the readings that was found, but not mended."""
+    return isinstance(finding, (NoisyView, TooManyOutliers, OutliersKept, OutliersGivenUp,
+                                SlipsGivenUp)) or (
+        isinstance(finding, SlipFound) and finding.spoils)
 
 
 def _listed(cleaned: OutlierScreening) -> dict[str, Any]:

@@ -11,11 +11,18 @@ from selfcal_ros.estimation.findings import (
     FiniteRotation,
     NoiseContradicted,
     NoiseUnknown,
+    NoisyView,
+    OutliersGivenUp,
+    OutliersKept,
     PredictionFailed,
+    SlipFound,
+    SlipsGivenUp,
+    TooManyOutliers,
 )
 from selfcal_ros.model.result import Noise
 from selfcal_ros.model.verdict import Cause, Finding, Verdict
 from selfcal_ros.reporting.words.causes import cause_text, what_it_is
+from selfcal_ros.reporting.words.screening import warning
 from selfcal_ros.units import ARCSEC_PER_RAD, RAD_PER_MRAD, UM_PER_M
 
 
@@ -97,3 +104,7 @@ def _(found: AxesNotMet) -> str:
 def _(found: PredictionFailed) -> str:
     return (f"{found.what} is predicted with {found.ratio:.2f} times the noise, beyond the limit "
             f"of {found.limit:.2f}")
+
+
+for _kind in (NoisyView, TooManyOutliers, OutliersKept, OutliersGivenUp, SlipFound, SlipsGivenUp):
+    reason.register(_kind, warning)  # what screening could not mend is a reason in the same words

@@ -67,6 +67,14 @@ def error_rms(result, truth):
     return float(np.sqrt(np.nanmean(np.stack([emap.gx - truth.g[0], emap.gy - truth.g[1]]) ** 2)))
 
 
+def refused(result, reason):
+    """What could not be mended is a reason not to qualify the result, as well as a warning."""
+    said = worded(result)
+    assert not said.verdict.qualified
+    (text,) = {text for text in said.verdict.reasons if text.startswith(reason)}
+    assert text in said.warnings
+
+
 def removed(result):
     return {(row["view"], row["kind"], row["mark"]) for row in result.extra["outliers"]["removed"]}
 
@@ -214,6 +222,7 @@ def test_giving_up_is_said(monkeypatch):
     bad = with_errors(readings, 1, dx={(-4, 2): 1e-6, (0, 0): 3e-6, (3, -3): 5e-7})
     text = " ".join(worded(robust_calibrate(bad, ZERO_MEAN)).warnings)
     assert "gave up on outliers after 1 rounds: more of them seem to be in the readings" in text
+    refused(robust_calibrate(bad, ZERO_MEAN), "gave up on outliers after 1 rounds")
     monkeypatch.setattr("selfcal_ros.estimation.quality.outliers.MAX_SLIPS", 0)
     _, readings = measured(4, more=True)
     moved = slipped(readings, 3, "m", 2, (2e-7, -1e-7, 0.0))
@@ -221,6 +230,7 @@ def test_giving_up_is_said(monkeypatch):
     assert "gave up on slips after 0: more of them seem to be in the readings" in " ".join(
         worded(result).warnings)
     assert result.extra["slips"] == []
+    refused(result, "gave up on slips after 0")
 
 
 def test_a_view_is_compared_by_its_own_repeats():
@@ -355,6 +365,7 @@ def test_a_noisy_view_is_named(index):
     (named,) = result.extra["noisy_views"]
     assert named["view"] == view.view.name and 3 < named["ratio"] <= 20
     assert "times as noisy as the others: measure it again" in worded(result).warnings[-1]
+    refused(result, f"view '{view.view.name}' is ")
 
 
 def test_too_many_contradictions_remove_nothing():

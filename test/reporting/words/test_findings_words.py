@@ -92,6 +92,19 @@ def test_warnings(found, text):
     assert warning(found) == text
 
 
+LEFT = (f.NoisyView, f.TooManyOutliers, f.OutliersKept, f.OutliersGivenUp, f.SlipFound,
+        f.SlipsGivenUp)
+
+
+@pytest.mark.parametrize("found", WARNINGS, ids=lambda x: type(x).__name__)
+def test_what_screening_leaves_is_a_reason_in_the_same_words(found):
+    if isinstance(found, LEFT):
+        assert reason(found) == WARNINGS[found]
+    else:
+        with pytest.raises(TypeError, match="no words for"):
+            reason(found)
+
+
 @pytest.mark.parametrize(("size", "text"), [
     (f.SizeCause(1e-6, 2.04e-3), "microscope up to 2 mrad, 2000 times the size given"),
     (f.SizeCause(8e-4, 2.04e-3), "microscope up to 2 mrad, 2.5 times the size given")])
