@@ -16,6 +16,7 @@ from selfcal_ros.errors import NotSettledError
 from selfcal_ros.estimation.datum.covariance import TermSpread
 from selfcal_ros.estimation.joint.fit import JointFit, angular_part, fit
 from selfcal_ros.estimation.joint.problem import ROUNDING, Problem, grid_dof, sigma_of
+from selfcal_ros.estimation.normal.grid import GridSystem
 from selfcal_ros.estimation.terms.columns import TermColumns, made_anew, term_columns
 from selfcal_ros.estimation.terms.equations import TermEquations
 from selfcal_ros.estimation.terms.ground import without_noise
@@ -188,7 +189,8 @@ class _State:
 
     def __init__(self, problem: Problem) -> None:
         self.problem, self.steps, self.theta = problem, 0, angular_part(problem)
-        self.found = fit(problem, problem.grid.y, self.theta)
+        self.y = problem.grid.y - self._beginning()
+        self.found = fit(problem, self.y, self.theta)
         self.offset_steps = OFFSET_STEPS
         self.equations: TermEquations | None = None
         self.reduced: ReducedColumns | None = None
@@ -201,7 +203,19 @@ class _State:
         equations = self.equations
         self.coefficients = np.zeros(equations.n if equations else 0)
         self.sums = self._sums()
-        self.y = problem.grid.y
+
+    def _beginning(self) -> np.ndarray | float:
+        """Return what finite rotations add to the linear model, by what each view shows of its own.
+
+        Of stage and plate little is in these rotations: one or two of five steps are saved. Not
+        with terms, whose first equations say whether they are told at all: with nothing but
+        rounding left of the readings an offset would not count as noise.
+        """
+        if not self.problem.rigid or self.problem.terms:
+            return 0.0
+        grid, length = self.problem.system.grid, self.problem.half_width_m
+        phi = own_rotations(grid, self.problem.grid.y)[:, None, None] / length
+        return np.where(grid.read, (np.expm1(1j * phi) - 1j * phi) * (grid.views.z * length), 0.0)
 
     def _linearise(self, columns: TermColumns, reduced: ReducedColumns) -> None:
         """Set up the equations of the terms about the present solution."""
@@ -304,6 +318,27 @@ class _State:
                         coefficients=self.coefficients)
             return residual_sums(self.equations, now)
         return Sums(*squares(self.problem, self.found), float("nan"), 0)
+
+
+def own_rotations(grid: GridSystem, y: np.ndarray) -> np.ndarray:
+    """Return the rotation of each view that its own readings show, times the half width, m.
+
+    The weighted least-squares fit of offset, rotation and magnification to each view alone.
+
+    Parameters
+    ----------
+    grid : GridSystem
+        The measured plan.
+    y : complex array (views, nx, ny)
+        Deviations in the plate frame, m.
+    """
+    marks = grid.views.z.reshape(-1)
+    weight, values = (array.reshape(grid.n_views, -1) for array in (grid.weight, y))
+    total = weight.sum(axis=1)
+    z = marks - (weight @ marks / total)[:, None]
+    moment = (weight * (z.real**2 + z.imag**2)).sum(axis=1)
+    turned = (weight * z.conj() * values).sum(axis=1).imag
+    return turned / np.where(moment > 0, moment, 1.0)
 
 
 def squares(problem: Problem, found: JointFit) -> tuple[float, float]:

@@ -8,13 +8,15 @@ import pytest
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.joint import model_fit
-from selfcal_ros.estimation.joint.model_fit import fit_model, squares
+from selfcal_ros.estimation.joint.model_fit import fit_model, own_rotations, squares
 from selfcal_ros.estimation.joint.solve import prepare
+from selfcal_ros.estimation.normal.grid import GridSystem
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.terms import parse_terms
-from selfcal_ros.model.view import Plan, View
+from selfcal_ros.model.view import LatticePose, Plan, View
 from selfcal_ros.simulation.truth import random_truth, simulate_measurements
+from test.support.lattice_plans import plan_of
 
 PITCH, LINES = 0.01, 8
 ARTIFACT = Artifact(5, PITCH, LINES)
@@ -78,3 +80,27 @@ def test_what_does_not_settle_is_named(monkeypatch, terms, message):
     with pytest.raises(InputError) as caught:
         fit_model(prepare(readings, Options(terms=parse_terms([terms], "")))[0])
     assert str(caught.value) == message
+
+
+def test_the_rotation_that_a_view_shows_of_its_own_is_that_of_its_marks_about_their_middle():
+    rng = np.random.default_rng(2)
+    poses = tuple(LatticePose(q, (0, 0), None) for q in (0, 1, 2))
+    weight = rng.integers(1, 5, (3, 5, 7)) * (rng.random((3, 5, 7)) > 0.3) * 1.0
+    weight[2] = 0.0
+    weight[2, 1, 4] = 3.0  # a single mark shows no rotation
+    grid = GridSystem(poses, weight)
+    turned = np.array([2e-3, -5e-3, 1e-3])[:, None, None]
+    y = (1e-4 - 2e-4j) + (1j * turned + 3e-3) * grid.views.z
+    assert own_rotations(grid, y) == pytest.approx([2e-3, -5e-3, 0.0], abs=1e-15)
+
+
+def test_rotations_settle_in_four_steps_from_what_the_views_show(monkeypatch):
+    """From nothing, or with rotations of the other sense, five are needed."""
+    artifact = Artifact(11, 0.01)
+    rng = np.random.default_rng(3)
+    readings = simulate_measurements(random_truth(artifact, 3, rng), plan_of("0,90,tx", artifact),
+                                     rng, sigma_m=2e-8)
+    fits, plain = [], model_fit.fit
+    monkeypatch.setattr(model_fit, "fit", lambda *args: fits.append(1) or plain(*args))
+    model_fit.fit_model(prepare(readings, Options())[0])
+    assert len(fits) == 1 + 4
