@@ -99,6 +99,13 @@ class SlipCause(Finding):
 
 
 @dataclass(frozen=True)
+class RotationCause(Finding):
+    """The view whose lines are turned against its marks."""
+
+    view: str
+
+
+@dataclass(frozen=True)
 class ReadingCause(Finding):
     """A reading that the others contradict: its view, and its mark (m, n), or line (k,)."""
 

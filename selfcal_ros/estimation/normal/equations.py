@@ -159,8 +159,12 @@ class NormalEquations:
         """Rank of the angular readings (method eq. 6.2)."""
         parts = self.angular.components
         nodes = np.count_nonzero(parts.of_site >= 0) + np.count_nonzero(parts.of_mark >= 0)
-        rank = _rank(np.linalg.eigvalsh(self.angular.schur), self.angular_scale)
-        return int(nodes - len(parts.balanced) + rank)
+        return int(nodes - len(parts.balanced) + self.rank_turns)
+
+    @cached_property
+    def rank_turns(self) -> int:
+        """Rank of the angular misalignment matrix: rotations that the lines alone tell."""
+        return _rank(np.linalg.eigvalsh(self.angular.schur), self.angular_scale)
 
     @cached_property
     def _null(self) -> np.ndarray:

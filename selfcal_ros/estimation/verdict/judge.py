@@ -32,6 +32,7 @@ from selfcal_ros.estimation.verdict.coverage import with_coverage
 from selfcal_ros.estimation.verdict.line_readings import line_cause
 from selfcal_ros.estimation.verdict.provenance import provenance_of
 from selfcal_ros.estimation.verdict.reading_columns import READING
+from selfcal_ros.estimation.verdict.rotations import bends, rotation_cause, solved_apart
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.statistics import rms
@@ -140,6 +141,22 @@ def _causes(solved: Solved, measurements: Measurements, options: Options, *,
         return []
     if not are_looked_for(model.problem.system.grid.n_sites, options, failed=failed):
         return []
+    turned = rotation_cause(model, LEVEL)
+    if turned is None:
+        return _explained(solved, model, measurements, failed=failed)
+    # what the marks leave is bent by the lines then: it tells nothing of other causes
+    apart = solved_apart(measurements, options)
+    if apart is None or apart.model is None:
+        return [turned]
+    counts = failed or bends(solved.result, apart.result, MATTERS)
+    # what spoils the marks turns them as well: a rotation is the cause where nothing else is
+    others = _explained(apart, apart.model, measurements, failed=counts)
+    return others or ([turned] if counts else [])
+
+
+def _explained(solved: Solved, model: ModelFit, measurements: Measurements, *,
+               failed: bool) -> list[Cause]:
+    """Return what explains the residuals of a solution, the likeliest first."""
     found = [item for item in find_explanations(model, slips=False)
              if failed or _counts(item, solved)]
     if found or failed:

@@ -11,6 +11,7 @@ from selfcal_ros.estimation.findings import (
     PlateScaleCause,
     PlateShapeCause,
     ReadingCause,
+    RotationCause,
     SizeCause,
     SlipCause,
 )
@@ -87,6 +88,13 @@ def _(what: SlipCause, _: Cause) -> str:
     return (f"the plate slipped by ({what.x_m * UM_PER_M:.3g}, {what.y_m * UM_PER_M:.3g}) µm and "
             f"{what.phi_rad * URAD_PER_RAD:.3g} µrad after about {what.part:.0%} of view "
             f"'{what.view}': measure the view again, or solve with --robust")
+
+
+@_text.register
+def _(what: RotationCause, cause: Cause) -> str:
+    return (f"lines of view '{what.view}' turned by {plus_minus(cause.size, cause.u, ARCSEC)} "
+            "against its marks: look whether the plate moved between them, and at the sign of the "
+            "lines' offsets")
 
 
 @_text.register

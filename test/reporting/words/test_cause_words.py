@@ -4,9 +4,11 @@
 import numpy as np
 import pytest
 
+from selfcal_ros.estimation.findings import ReadingCause, RotationCause
 from selfcal_ros.estimation.terms.columns import Column
 from selfcal_ros.estimation.verdict.cause_sizes import cause_of, noise_cause
 from selfcal_ros.estimation.verdict.causes import Explanation
+from selfcal_ros.model.verdict import Cause
 from selfcal_ros.reporting.words.causes import cause_text
 
 NAMES = ("0", "90", "+x")
@@ -71,6 +73,16 @@ def test_a_cause_in_words(found, text, size, u, unit):
     cause = cause_of(found, NAMES, 0.05)
     assert (cause.name, cause_text(cause), cause.unit, cause.p) == (found.name, text, unit, 1e-6)
     assert (cause.size, cause.u) == pytest.approx((size, u), rel=1e-12)
+
+
+@pytest.mark.parametrize(("what", "text"), [
+    (ReadingCause("90", (7,)), "a reading of line 7 in view '90' that is off by -2.00 ± 0.10 "
+     "arcsec: solve with --robust, or measure it again"),
+    (RotationCause("90"), "lines of view '90' turned by -2.00 ± 0.10 arcsec against its marks: "
+     "look whether the plate moved between them, and at the sign of the lines' offsets")])
+def test_angles_in_words(what, text):
+    arcsec = np.pi / 648_000
+    assert cause_text(Cause("", "", -2 * arcsec, 0.1 * arcsec, "rad", 1e-6, what)) == text
 
 
 def test_a_noisy_view_in_words():

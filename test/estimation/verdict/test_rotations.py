@@ -1,0 +1,136 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Marks and lines that turn differently: found, named where it matters, and kept apart."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import kstest
+
+from selfcal_ros.errors import InputError, NotIdentifiableError
+from selfcal_ros.estimation.api import calibrate
+from selfcal_ros.estimation.joint.model_fit import fit_model
+from selfcal_ros.estimation.joint.solve import prepare
+from selfcal_ros.estimation.options import Options
+from selfcal_ros.estimation.verdict import rotations
+from selfcal_ros.estimation.verdict.rotations import rotation_cause, solved_apart
+from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.terms import parse_terms
+from selfcal_ros.model.view import Plan, View
+from selfcal_ros.reporting.words.result import worded
+from selfcal_ros.simulation.machine import Spread, random_truth
+from selfcal_ros.simulation.settings import CellSettings
+from selfcal_ros.simulation.truth import hu_plan, simulate_measurements
+
+ARTIFACT = Artifact(7, 0.01, 24)
+FINE_RAD, COARSE_RAD = 2e-7, 2e-5
+"""Noise of lines: 2e-7 rad is 6 nm at the edge of the plate, less than that of a mark."""
+
+
+def measured(seed, sigma_rad, *, repeats=2, spread=None, **how):
+    plan, rng = hu_plan(ARTIFACT, repeats), np.random.default_rng(seed)
+    truth = random_truth(ARTIFACT, len(plan.views), rng, spread or Spread(rotation="finite"))
+    settings = CellSettings(sigma_xy_m=2e-8, sigma_theta_rad=sigma_rad, servo_sigma_m=0.0,
+                            servo_sigma_rad=0.0, **how)
+    return simulate_measurements(truth, plan, rng, settings=settings, visits=True)
+
+
+def turned(readings, index, by_rad):
+    """Turn the plate between the marks and the lines of a view."""
+    views = list(readings.views)
+    views[index] = replace(views[index], dtheta=views[index].dtheta + by_rad)
+    return replace(readings, views=tuple(views))
+
+
+def cause_in(readings, level=1.1):
+    return rotation_cause(fit_model(prepare(readings, Options())[0]), level)
+
+
+@pytest.mark.parametrize(("index", "by_rad"), [(1, 4e-6), (3, -4e-6)])
+def test_a_plate_that_turns_between_marks_and_lines_is_named(index, by_rad):
+    readings = measured(1, FINE_RAD)
+    clean, result = calibrate(readings), worded(calibrate(turned(readings, index, by_rad)))
+    name = readings.views[index].view.name
+    assert clean.verdict.qualified and not result.verdict.qualified
+    (cause,) = result.verdict.causes
+    assert (cause.name, cause.unit) == ("rotation", "rad") and cause.p < 5e-4
+    # the median of three views is the datum: a third one may carry noise of the same size
+    assert cause.size == pytest.approx(by_rad, abs=6 * cause.u) and cause.u < 0.1 * abs(by_rad)
+    assert cause.text.startswith(f"lines of view '{name}' turned by {cause.size * 206264.8:.3f} ± ")
+    assert "look whether the plate moved between them" in cause.text
+
+
+def test_what_moves_no_map_disqualifies_nothing():
+    # all lines were read in every view: a turn of all lines of one moves none against another
+    readings = turned(measured(2, COARSE_RAD), 1, 1e-4)
+    assert cause_in(readings).p < 1e-6
+    verdict = calibrate(readings).verdict
+    assert verdict.qualified and verdict.causes == ()
+
+
+def test_without_an_uncertainty_it_cannot_be_said_to_be_harmless():
+    readings = turned(measured(2, COARSE_RAD), 1, 1e-4)
+    (cause,) = calibrate(readings, Options(uncertainty=False)).verdict.causes
+    assert cause.name == "rotation"
+
+
+def test_offsets_of_lines_with_the_other_sign_are_no_bent_plate():
+    readings = measured(3, COARSE_RAD)
+    wrong = replace(readings, views=tuple(replace(v, dtheta=-v.dtheta) for v in readings.views))
+    verdict = worded(calibrate(wrong)).verdict
+    assert [cause.name for cause in verdict.causes] == ["rotation"]
+    assert "at the sign of the lines' offsets" in verdict.sentence
+
+
+def test_another_cause_comes_first_for_it_turns_the_marks_as_well():
+    """A microscope of another scale shows plates turned by more, and lines know nothing of it."""
+    spread = Spread(rotation="finite", microscope_scale=5e-3)
+    readings = measured(4, FINE_RAD, spread=spread, repeats=4, stop_sigma_m=20e-6)
+    assert cause_in(readings).p < 1e-6
+    for by_rad in (0.0, 1e-5):
+        (cause,) = calibrate(turned(readings, 1, by_rad)).verdict.causes
+        assert cause.name == "microscope"
+        assert cause.size == pytest.approx(5e-3, abs=4.5 * cause.u)
+    held = Options(terms=parse_terms(["microscope"], ""))
+    assert calibrate(readings, held).verdict.qualified
+    (left,) = calibrate(turned(readings, 1, 1e-5), held).verdict.causes
+    assert left.name == "rotation" and left.size == pytest.approx(1e-5, abs=6 * left.u)
+
+
+@pytest.mark.parametrize("error", [
+    InputError("model", "the estimate does not settle", "leave a term out"),
+    NotIdentifiableError("the readings do not tell drift from the stage")])
+def test_where_they_cannot_be_solved_apart_nothing_else_is_named(monkeypatch, error):
+    def fails(*_):
+        raise error
+    monkeypatch.setattr(rotations, "solve_joint", fails)
+    readings = turned(measured(1, COARSE_RAD), 1, 1e-4)
+    assert solved_apart(readings, Options()) is None
+    assert [cause.name for cause in calibrate(readings).verdict.causes] == ["rotation"]
+
+
+def test_apart_a_turn_of_the_lines_moves_nothing():
+    readings = measured(1, FINE_RAD)
+    bent = turned(readings, 1, 4e-6)
+    maps = [solved_apart(r, Options()).result.error_map for r in (readings, bent)]
+    together = calibrate(bent).error_map
+    for name, moved in (("gx", 1e-10), ("gy", 1e-10), ("g_theta", 0.0)):
+        one, other = (getattr(emap, name) for emap in maps)
+        assert abs(one - other).max() < 1e-14
+        assert abs(getattr(together, name) - one).max() > moved
+
+
+def test_the_probability_is_one():
+    """Of good readings it is even between 0 and 1, with noise from repeats."""
+    found = [cause_in(measured(seed, FINE_RAD)).p for seed in range(80)]
+    assert kstest(found, "uniform").pvalue > 1e-3
+
+
+def test_one_common_view_tells_nothing():
+    grids = [View(name, q * np.pi / 2, (a * 0.01, 0.0), True, name == "0", 2)
+             for name, q, a in (("0", 0, 0), ("90", 1, 0), ("+x", 0, 1))]
+    views = (*grids, *(View(f"lines {k}", k * np.pi / 12, (0.0, 0.0), False, True, 2)
+                       for k in (1, 6)))
+    plan, rng = Plan("p", ARTIFACT, views), np.random.default_rng(0)
+    readings = simulate_measurements(random_truth(ARTIFACT, 5, rng), plan, rng)
+    assert cause_in(readings) is None
