@@ -127,6 +127,9 @@ def run(args: argparse.Namespace) -> int:
     if args.report:
         check_name(args.report)
     collector, solver = parameters(args)
+    if args.validate and solver.method == "law":  # what is validated is the joint solution
+        raise InputError("--validate", "Hu's law needs every reading and cannot hold any out",
+                         "solve with --method joint")
     with progress_bar("reading") as bar:
         measurements, _, lost, findings = collect_bag(
             args.bag, collector, namespace=args.namespace,

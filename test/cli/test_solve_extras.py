@@ -30,6 +30,17 @@ def test_validation_and_budget_are_printed_and_written(solved):
     assert labels[-2:] == ["combined", "expanded"]
 
 
+def test_the_law_cannot_hold_readings_out(capsys, tmp_path):
+    """What was validated in its place was the joint solution, under the law's name."""
+    args = ["solve", str(BAGS / "hu_noise"), "--method", "law", "--validate"]
+    assert main([*args, "-o", str(tmp_path / "r.json")]) == 2
+    printed = capsys.readouterr()
+    assert (printed.out, printed.err) == (
+        "", "selfcal solve: --validate: Hu's law needs every reading and cannot hold any out; solve "
+        "with --method joint\n")
+    assert not list(tmp_path.iterdir())
+
+
 def test_without_an_uncertainty_map_the_budget_is_one_line(solved):
     code, result, printed = solved("hu_noise", "--uncertainty", "never", "--budget")
     assert code == 0 and "budget" not in result
