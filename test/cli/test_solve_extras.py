@@ -36,8 +36,8 @@ def test_the_law_cannot_hold_readings_out(capsys, tmp_path):
     assert main([*args, "-o", str(tmp_path / "r.json")]) == 2
     printed = capsys.readouterr()
     assert (printed.out, printed.err) == (
-        "", "selfcal solve: --validate: Hu's law needs every reading and cannot hold any out; solve "
-        "with --method joint\n")
+        "", "selfcal solve: --validate: Hu's law needs every reading and cannot hold any out; "
+        "solve with --method joint\n")
     assert not list(tmp_path.iterdir())
 
 
