@@ -251,8 +251,10 @@ def _with(ground: Ground, before: tuple[TermColumns, list[Group]], columns: Term
     """Return columns and groups with more of both behind them."""
     n_before, n_after = len(before[0].columns), len(columns.columns)
     return joined(ground, before[0], columns), [
-        *(replace(g, rows=np.pad(g.rows, (0, n_after))) for g in before[1]),
-        *(replace(g, rows=np.pad(g.rows, (n_before, 0))) for g in groups)]
+        *(replace(g, rows=np.concatenate([g.rows, np.zeros(n_after, dtype=bool)]))
+          for g in before[1]),
+        *(replace(g, rows=np.concatenate([np.zeros(n_before, dtype=bool), g.rows]))
+          for g in groups)]
 
 
 def _with_slips(ground: Ground, columns: TermColumns,
