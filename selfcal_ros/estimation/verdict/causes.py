@@ -181,7 +181,9 @@ def select_explanations(pool: Pool, groups: list[Group], taken: np.ndarray) -> l
     found: list[Explanation] = []
     while groups and len(found) < MAX_CAUSES:
         before = pool.beside(taken)
-        tests = [(_test(pool, before, group), group) for group in groups]
+        beside = pool.each([taken | group.rows for group in groups])
+        tests = [(_test(pool, before, after, group), group)
+                 for after, group in zip(beside, groups, strict=True)]
         good = [(test, group) for test, group in tests if test is not None and test[0] < LEVEL]
         if not good:
             break
@@ -206,13 +208,17 @@ def _replaces(pool: Pool, taken: np.ndarray, group: Group, best: Group) -> bool:
     """Return whether a term explains the residuals so well that `best` adds nothing to it."""
     if {SLIP, READING} & {group.name, best.name}:
         return False
-    more = _test(pool, pool.beside(taken | group.rows), best)
+    before, after = pool.each([taken | group.rows, taken | group.rows | best.rows])
+    more = _test(pool, before, after, best)
     return more is None or more[0] >= LEVEL
 
 
-def _test(pool: Pool, before: Beside, group: Group) -> tuple[float, float] | None:
-    """Return probability and evidence of a group beside others; None if nothing tells it."""
-    after = pool.beside(before.rows | group.rows)
+def _test(pool: Pool, before: Beside, after: Beside,
+          group: Group) -> tuple[float, float] | None:
+    """Return probability and evidence of a group beside others; None if nothing tells it.
+
+    `before` is without the group, `after` with it.
+    """
     gained, more = max(after.explained - before.explained, 0.0), after.rank - before.rank
     variance, dof = pool.noise(after)
     if more <= 0 or not variance > FLOOR_M**2:  # NaN where nothing is left to test against

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What columns explain of the residuals together, and what they leave (method eqs. 7.7, 7.8)."""
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -28,6 +29,8 @@ class Beside:
         Their estimated coefficients.
     explained : float
         The sum of squares that they explain, m^2.
+    between, dof_between : float
+        Squares of the marks' means beside them, m^2, and their degrees of freedom.
     """
 
     rows: np.ndarray
@@ -36,6 +39,8 @@ class Beside:
     rank: int
     own_values: np.ndarray
     explained: float
+    between: float
+    dof_between: float
 
     @property
     def inverse(self) -> np.ndarray:
@@ -61,16 +66,41 @@ class Pool:
 
     def beside(self, rows: np.ndarray) -> Beside:
         """Return what the columns of `rows`, bool (p,), explain together."""
-        at = rows.nonzero()[0]
-        if not len(at):
-            return Beside(rows, at, np.zeros((0, 0)), 0, np.zeros(0), 0.0)
-        values, vectors = np.linalg.eigh(self._scaled[at[:, None], at])
-        told = values > self.equations.limit(rows)
-        vectors = vectors[:, told] / self.equations.norm[at, None]
-        inverse = (vectors / values[told]) @ vectors.T
-        right = self._total[at]
-        own = inverse @ right
-        return Beside(rows, at, inverse, vectors.shape[1], own, float(right @ own))
+        return self.each([rows])[0]
+
+    def each(self, many: Sequence[np.ndarray]) -> list[Beside]:
+        """Return what each of many sets of columns, bool (p,), explains by itself.
+
+        Sets of one size are worked out together: for few columns a call costs more than its work.
+        """
+        places = [rows.nonzero()[0] for rows in many]
+        found: dict[int, Beside] = {}
+        for size in {len(at) for at in places}:
+            mine = [number for number, at in enumerate(places) if len(at) == size]
+            limits = np.array([self.equations.limit(many[number]) for number in mine])
+            blocks = self._of_one_size(np.array([places[number] for number in mine]), limits)
+            for number, block in zip(mine, blocks, strict=True):
+                found[number] = Beside(many[number], places[number], *block)
+        return [found[number] for number in range(len(many))]
+
+    def _of_one_size(self, at: np.ndarray, limits: np.ndarray) -> Iterator[tuple]:
+        """Yield what `Beside` has of the columns `at`, int (n, k), less the columns themselves.
+
+        Their eigenvalues up to `limits`, (n,), count as 0.
+        """
+        sums, square = self.right.sums, (at[:, :, None], at[:, None, :])
+        values, vectors = np.linalg.eigh(self._scaled[square])
+        told = values > limits[:, None]
+        vectors = vectors / self.equations.norm[at][:, :, None]
+        inverse = (vectors * (told / np.where(told, values, 1.0))[:, None]) @ vectors.swapaxes(1, 2)
+        right, gram = self._total[at], self.equations.projected.gram[square]
+        own = (inverse @ right[:, :, None])[:, :, 0]
+        left = (gram @ own[:, :, None])[:, :, 0] - 2 * self.right.between[at]
+        between = sums.between + (own * left).sum(axis=1)
+        dof = sums.dof_between - (inverse * gram).sum(axis=(1, 2))
+        explained = (right * own).sum(axis=1)
+        return zip(inverse, told.sum(axis=1).tolist(), own, explained.tolist(), between.tolist(),
+                   dof.tolist(), strict=True)
 
     @cached_property
     def _scaled(self) -> np.ndarray:
@@ -94,10 +124,7 @@ class Pool:
         Visits of one mark agree better than marks do where a cause is not held: the larger counts.
         NaN and 0 where the columns take all degrees of freedom.
         """
-        sums, at, values = self.right.sums, beside.at, beside.own_values
-        gram = self.equations.projected.gram[at[:, None], at]
-        between = float(sums.between - 2 * values @ self.right.between[at] + values @ gram @ values)
-        dof = sums.dof_between - float(np.vdot(beside.own_inverse, gram))
+        sums, between, dof = self.right.sums, beside.between, beside.dof_between
         both = sums.dof - beside.rank
         if sums.dof_within >= 1 and both > 0:
             total = (sums.total - beside.explained) / both
