@@ -176,3 +176,18 @@ def test_of_equal_samples_the_faster_tells_the_speed():
             for speed in speeds:
                 joint.add(stamp, 0.0, speed)
         assert joint.query(np.array([5 * MS]))[1].tolist() == [Reason.MOVING]
+
+
+def test_the_noise_is_that_beside_each_exposure_however_many_are_asked_for():
+    """Displacements about as large as the noise tells: a sample further on some would turn."""
+    rng = np.random.default_rng(5)
+    stamps = np.arange(4000) * 10 * MS
+    track = JointTrack(TrackLimits(100 * MS, 1e-9, 1e-9))
+    track.store.add_block(stamps, 8.5e-9 * np.arange(4000) + rng.normal(0, 1e-9, 4000))
+    asked = np.sort(rng.choice(stamps[100:-100], 3000, replace=False)) + 3 * MS
+    series = track.between(stamps[0], stamps[-1])
+    at_once = series.moving(asked, series.query(asked)[1])
+    one_by_one = np.concatenate([series.moving(one, series.query(one)[1])
+                                 for one in np.split(asked, len(asked))])
+    assert 0.2 < at_once.mean() < 0.8
+    np.testing.assert_array_equal(at_once, one_by_one)

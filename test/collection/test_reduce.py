@@ -90,6 +90,19 @@ def test_the_place_of_a_rejected_grid_detection_is_where_the_stage_stood(fault, 
     assert places.y == pytest.approx([sign * n * PITCH], abs=1e-4)
 
 
+@pytest.mark.parametrize("sense", ["microscope_moves", "plate_moves"])
+def test_the_place_of_an_outlier_is_where_the_stage_stood(sense):
+    spoilt = scene(repeats=4, sense=Sense(sense))
+    index = spoilt.grid(30)
+    bad = spoilt.detections[index]
+    spoilt.spoil(index, offset_x=bad.offset_x + 5e-6)
+    places = collect(spoilt.events, measurement_sense=sense)[0].views[0].places
+    sign = -1 if sense == "plate_moves" else 1
+    assert bad.m and bad.n and places.reason == ("outlier_among_repeats",)
+    assert places.x == pytest.approx([sign * bad.m * PITCH], abs=1e-4)
+    assert places.y == pytest.approx([sign * bad.n * PITCH], abs=1e-4)
+
+
 def test_a_place_that_the_encoder_does_not_tell_is_unknown_and_lines_have_none():
     spoilt = scene()
     spoilt.spoil(spoilt.angular(3), k=8)

@@ -125,6 +125,16 @@ def test_outliers_are_told_in_units_of_the_declared_sigma():
     assert reduce_repeats(key, values, 0 * sigma, limit=LIMIT).outlier[coarse].sum() > 10
 
 
+def test_marks_with_declared_sigmas_far_apart_are_held_to_their_own():
+    rng, marks = np.random.default_rng(3), 200
+    sigma = np.repeat(np.where(np.arange(marks) % 2, 30 * SIGMA, SIGMA), 4)
+    values = rng.normal(0, 1, (2, 4 * marks)) * sigma
+    values[0, 9] += 12 * SIGMA  # of a mark read well; nothing among those of the others
+    for size in (1.0, 1e3):  # declared in whatever unit
+        means = reduce_repeats(np.repeat(np.arange(marks), 4), values, size * sigma, limit=LIMIT)
+        assert np.flatnonzero(means.outlier).tolist() == [9]
+
+
 def test_mean_count_repeatability_and_degrees_of_freedom_as_by_hand():
     rng = np.random.default_rng(2)
     key = rng.permutation(np.repeat([3, 5, 8, 9], [4, 1, 2, 5]))

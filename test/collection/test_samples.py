@@ -51,6 +51,21 @@ def test_what_is_near_is_all_of_it_and_its_neighbours(parts, start, width, besid
     assert store.count_between(start, end) >= sum(start <= row[0] <= end for row in every)
 
 
+@pytest.mark.parametrize("order", [1, -1])
+@pytest.mark.parametrize("beside", [1, 4, 11])
+def test_neighbours_come_from_as_many_blocks_as_they_lie_in(order, beside):
+    """Of blocks of 8: the nearest ones, in whatever order they were filled, and no others."""
+    store = SampleStore(Limits(block=8, in_memory=1))
+    for block in range(8)[::order]:
+        t = np.arange(8 * block, 8 * block + 8)
+        store.add_block(t, 10.0 * t)
+    for at in (24, 28, 31):  # at either end of a block, and within one
+        found = store.near(at, at, beside)[0]
+        assert set(range(at - beside, at + beside + 1)) <= set(found.tolist())
+        assert len(found) <= 8 + 2 * beside + 16
+        assert store.count_between(at, at) == 8
+
+
 @given(st.lists(STAMPS, max_size=8))
 def test_new_stamps_are_handed_out_once_in_their_order(parts):
     store = SampleStore(Limits(block=8, in_memory=1))

@@ -209,11 +209,10 @@ class SampleStore:
         self._flush()
         open_samples = self._open()
         parts = [_cut(open_samples, start_ns, end_ns, beside)] if len(open_samples[0]) else []
-        touched = self._touched(start_ns, end_ns)
         parts += [_cut(self._samples(self._blocks[number]), start_ns, end_ns, beside)
-                  for number in np.flatnonzero(touched)]
+                  for number in np.flatnonzero(self._touched(start_ns, end_ns))]
         before = np.flatnonzero(self._lasts < start_ns)
-        after = np.flatnonzero(~touched & (self._lasts >= start_ns))
+        after = np.flatnonzero(self._firsts > end_ns)
         for side, sign, edge, known in ((before, -1, start_ns, -self._lasts[before]),
                                         (after, 1, end_ns, self._firsts[after])):
             for at in np.argsort(known, kind="stable"):
