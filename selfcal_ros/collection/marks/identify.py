@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from selfcal_ros.collection.marks.medians import distances
+from selfcal_ros.collection.marks.medians import PART, distances
 from selfcal_ros.collection.marks.rigid import (
     LARGEST_TURN_RAD,
     MotionEstimate,
@@ -25,8 +25,6 @@ SURE = 0.25
 with an unknown offset of a quarter pitch it stays below half a pitch."""
 OFF_ANY_PLATE_M = 1e9
 """Coordinate beyond which a reading is not looked at more closely."""
-PART = 32_768
-"""Readings that are looked at together where they do not depend on each other."""
 HALF_A_LINE = 0.45
 """Largest rotation to reckon with, in lines, at which the nearest line is the one seen."""
 

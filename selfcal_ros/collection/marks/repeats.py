@@ -19,15 +19,12 @@ from functools import lru_cache
 
 import numpy as np
 
-from selfcal_ros.collection.marks.medians import median, row_medians
+from selfcal_ros.collection.marks.medians import PART, median, row_medians
 
 MIN_PAIRS = 12
 """Pairs of repeats below which a view is too small to tell outliers."""
 ALL_PAIRS = 33
 """Repeats of a mark up to which all their pairs are looked at; of more, 16 for each repeat."""
-PART = 32_768
-"""Numbers that are worked on together where marks do not depend on each other: they stay in the
-cache of a processor, and take no memory beside the readings."""
 STEPS = 3
 """Steps of a sensor by which repeats may differ that otherwise agree to the bit."""
 
