@@ -140,7 +140,7 @@ class SolvingSession:
         self._notes: tuple[str, ...] = ()  # on the session, of the newest message
         self._run = Run()
         self._planned: dict[Run, int] = {}
-        self._ended: set[Run] = set()  # a DONE was heard, but no number of views
+        self._ended: set[Run] = set()  # a DONE was heard
         self._stale = False
         self._left_aside = 0
         self._saved = ""  # absolute path of the map that is shown
@@ -170,11 +170,12 @@ class SolvingSession:
         run = Run(message.plan_id, message.run_id)
         known = self._planned.get(run, 0)
         self._planned[run] = max(known, message.views_planned)
-        ends = (message.phase == Phase.DONE and not self._planned_views(run)
-                and run not in self._ended)
+        ends = message.phase == Phase.DONE and run not in self._ended
         if ends:
             self._ended.add(run)
-        if run in (self._run, Run(self._run.plan_id)) and (message.views_planned > known or ends):
+        tells = not self._planned_views(run) or isinstance(self.shown.problem, NoDataError)
+        if run in (self._run, Run(self._run.plan_id)) and (
+                message.views_planned > known or (ends and tells)):
             self._stale = True  # the summary says how many views are planned, or still to come
 
     def _planned_views(self, run: Run) -> int:
@@ -302,16 +303,16 @@ class SolvingSession:
     def _unfinished(self) -> bool:
         """Return whether views to come may bring what is missing.
 
-        Where no command has told how many there are, lines without a single grid mark are taken
-        for a beginning until DONE: readings may arrive before any command.
+        Lines without a single grid mark are taken for a beginning until DONE: readings may arrive
+        before any command, and where all come shuffled those of lines may be the first of each
+        view.
         """
         run, problem = self.shown.run, self.shown.problem
         planned = self._planned_views(run)
-        if planned == 0:
-            return (isinstance(problem, NoDataError)
-                    and not self._ended & {run, Run(run.plan_id)})
-        return (isinstance(problem, NotIdentifiableError | NoDataError)
-                and self.shown.views_done < planned)
+        if isinstance(problem, NoDataError):
+            over = bool(self._ended & {run, Run(run.plan_id)})
+            return not over or self.shown.views_done < planned
+        return isinstance(problem, NotIdentifiableError) and self.shown.views_done < planned
 
     def _state(self) -> str:
         if self._unfinished():

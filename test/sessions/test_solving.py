@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from selfcal_ros.collection.messages import Phase
+from selfcal_ros.collection.messages import Detection, Kind, Phase
 from selfcal_ros.errors import InputError, NoDataError, NotIdentifiableError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.messages import from_model, to_model
@@ -25,9 +25,11 @@ from test.support.sessions import collected, events_of, small_plan
 PLAN = small_plan()
 
 
-def views_of(plan=PLAN, seed: int = 5, run_id: str = "", **changes) -> list:
-    """Return the ViewMeasurement messages of a run, stamps 10, 11, ..."""
-    _, measurements, progress = collected(events_of(plan, seed))
+def views_of(plan=PLAN, seed: int = 5, run_id: str = "", *, grid: bool = True, **changes) -> list:
+    """Return the ViewMeasurement messages of a run, stamps 10, 11, ...; with marks or without."""
+    _, measurements, progress = collected([
+        event for event in events_of(plan, seed)
+        if grid or not isinstance(event, Detection) or event.kind == Kind.ANGULAR])
     return [message("ViewMeasurement", from_model.view_measurement(
         view, measurements, 10 + index, "stage") | {"run_id": run_id} | changes)
         for index, view in progress.items()]
@@ -172,11 +174,33 @@ def test_a_view_of_lines_alone_is_no_error_while_others_are_to_come(desk):
     assert desk.session.diagnosis().level == Level.OK
     with pytest.raises(NoDataError, match="no grid mark was read"):
         desk.session.save("x.json")
+
+
+def test_lines_of_all_views_are_a_beginning_until_done(desk):
+    """Of messages that come shuffled, lines of every view may be there before any mark is."""
+    lines = views_of(grid=False)
+    assert [len(view.m) for view in lines] == [0] * 4 and all(len(view.k) for view in lines)
+    desk.session.take_command(command(4))
+    desk.take(lines)
+    state = "4 of 4 views measured, not yet enough to identify the stage."
+    assert desk.hands.said == [(Level.OK, state)]
+    told = desk.session.diagnosis()
+    assert (told.level, told.message) == (Level.OK, state)
+    desk.take(views_of())
+    assert desk.session.shown.problem is None
+    desk.session.take_command(command(4, phase=Phase.DONE))
+    assert not desk.solve()  # nothing is missing: DONE tells nothing new
     alone = Desk()
-    alone.session.take_command(command(1))
+    alone.session.take_command(command(4))
+    alone.take(lines)
+    alone.session.take_command(command(4, phase=Phase.DONE))
     with pytest.raises(NoDataError, match="no grid mark was read"):
-        alone.take(lines)
+        alone.solve()
     assert alone.session.diagnosis().level == Level.WARN
+    ended = Desk()  # where DONE came first
+    ended.session.take_command(command(4, phase=Phase.DONE))
+    with pytest.raises(NoDataError, match="no grid mark was read"):
+        ended.take(lines)
 
 
 def test_lines_that_come_before_any_command_are_no_error(desk):
