@@ -97,6 +97,17 @@ def collect_bag(path: str | Path, settings: CollectorSettings, *, namespace: str
     return BagSession(measurements, views, [*reader.lost, *clock], [*clock, *findings])
 
 
+def clock_lines(path: str | Path, settings: CollectorSettings,
+                namespace: str | None = None) -> list[str]:
+    """Return one line for each step of a clock that a bag shows, as `collect_bag` has them."""
+    reader, collector = BagReader(Path(path), namespace, settings.clock_limit), Collector(settings)
+    take_command = input_handlers(collector, [])[COMMAND_TOPIC]
+    for topic, item in reader.columns():
+        if topic == COMMAND_TOPIC:
+            take_command(item)
+    return step_lines(reader.steps, collector.timeline)
+
+
 def topics_like(topic: str, topics: dict[str, str]) -> str:
     """Return which of a bag's topics (name -> type) were probably meant, by type, then by name.
 

@@ -54,9 +54,12 @@ def run(args: argparse.Namespace) -> int:
           domain() as environment):
         saved = Path(folder, "result.json")
         code, lost = _play(args, saved, environment)
+        clock = _clock_lines(args)
         if code or not saved.exists():
             return code or 1
-        result = with_input(result_from_dict(read_json(saved), str(saved)), source, lost)
+        result = result_from_dict(read_json(saved), str(saved))
+        noted = [line for line in clock if line not in result.warnings]  # by the live collector
+        result = with_input(result, source, [*lost, *noted])
     data = result_to_dict(result)
     if file_of(args):
         write_json(args.output, data)
@@ -65,6 +68,22 @@ def run(args: argparse.Namespace) -> int:
     if not args.quiet:
         show(result, args.bag, file_of(args), aside(args))
     return exit_code(result)
+
+
+def _clock_lines(args: argparse.Namespace) -> list[str]:
+    """Say which clocks stepped in the bag, and return it: played fast, no node can see it."""
+    from selfcal_ros.bagio.offline import clock_lines
+    from selfcal_ros.collection.settings.nodes import CollectorSettings
+    from selfcal_ros.collection.settings.ros_file import overrides_in
+    from selfcal_ros.files import read_yaml
+
+    where = args.params or "options"
+    given = overrides_in(read_yaml(args.params) if args.params else {}, CollectorSettings.NODE,
+                         where)
+    lines = clock_lines(args.bag, CollectorSettings.checked(given, where), args.namespace)
+    for line in lines:
+        print(f"selfcal replay: {args.bag}: {line}", file=sys.stderr)
+    return lines
 
 
 def _play(args: argparse.Namespace, saved: Path, environment: dict) -> tuple[int, list[str]]:

@@ -4,18 +4,13 @@
 import json
 from dataclasses import replace
 
-import numpy as np
 import pytest
 
-from selfcal_ros.bagio.simulated import event_fields
-from selfcal_ros.bagio.writer import BagWriter
 from selfcal_ros.cli.main import main
 from selfcal_ros.collection.messages import Command, Detection, Phase
-from selfcal_ros.messages.topics import INPUT_TOPICS
-from selfcal_ros.simulation.faults import Faults, apply_faults
 from test.support.bags import Foreign, shuffled
 from test.support.plans import plan_of
-from test.support.sessions import events_of, small_plan
+from test.support.sessions import events_of, small_plan, stepped_bag
 
 
 def test_lines_that_cannot_be_told_apart_are_said_with_their_mend(tmp_path, capsys):
@@ -59,15 +54,7 @@ def test_commands_that_cannot_be_followed_are_said_and_change_nothing(tmp_path, 
 @pytest.mark.parametrize("step_s, code, way", [
     (37.0, 3, "back by 37 s"), (-37.0, 0, "ahead by 37 s"), (0.2, 0, "back by 0.2 s")])
 def test_a_clock_that_stepped_is_named_first_and_in_the_result(tmp_path, capsys, step_s, code, way):
-    events = events_of(small_plan("0, 90, tx"))
-    arrivals, _ = apply_faults(events, Faults(clock_step_s=step_s), np.random.default_rng(1))
-    with BagWriter(tmp_path / "bag") as writer:
-        for topic, typename in INPUT_TOPICS.items():
-            writer.add_topic(f"/{topic}", typename, [])
-        for arrival_ns, event in arrivals:
-            topic, fields = event_fields(event, "stage")
-            writer.write(f"/{topic}", fields, arrival_ns)
-    bag, out = str(tmp_path / "bag"), tmp_path / "r.json"
+    bag, out = str(stepped_bag(tmp_path, step_s)), tmp_path / "r.json"
     assert main(["solve", bag, "-o", str(out), "--quiet"]) == code
     first, *rest = capsys.readouterr().err.splitlines()
     line = ("the clock that stamps stage/joint_states and stage/mark_detections stepped "

@@ -25,7 +25,7 @@ from selfcal_ros.nodes.pose_sequencer import PoseSequencer
 from selfcal_ros.nodes.replay_session import ReplaySession
 from selfcal_ros.nodes.solver import Solver
 from test.support.bags import Foreign
-from test.support.sessions import events_of, small_bag, small_plan
+from test.support.sessions import events_of, small_bag, small_plan, stepped_bag
 
 
 def undated(text: str) -> str:
@@ -146,6 +146,30 @@ def test_a_deficient_bag_ends_with_code_3_and_says_why(graph, tmp_path, capfd):
     assert selfcal(["solve", str(bag), "--quiet"]) == 3
     [same] = [text for text in capfd.readouterr().err.splitlines() if "selfcal solve: " in text]
     assert line.removeprefix("selfcal replay: ") == same.removeprefix("selfcal solve: ")
+
+
+@pytest.mark.parametrize("noted", [False, True], ids=["played fast", "in real time"])
+def test_a_clock_that_stepped_is_said_once_as_solve_says_it(monkeypatch, tmp_path, capsys, noted):
+    """Played fast no node can see it; in real time the collector notes the same line."""
+    bag, folder = str(stepped_bag(tmp_path, 0.2)), tmp_path
+    assert selfcal(["solve", bag, "--quiet", "-o", str(folder / "solved.json")]) == 0
+    line = capsys.readouterr().err.splitlines()[0]
+    solved = read_json(folder / "solved.json")
+
+    @contextmanager
+    def process(module, given, *_, **__):
+        if module.endswith("replay_session"):
+            write_json(given[3], solved | {"warnings": solved["warnings"] if noted else []})
+        yield SimpleNamespace(stdout=[], wait=lambda: 0)
+    monkeypatch.setattr(replay_verb, "process", process)
+    assert selfcal(["replay", bag, "--fast", "--quiet", "-o", str(folder / "replayed.json")]) == 0
+    assert capsys.readouterr().err == line.replace("selfcal solve: ", "selfcal replay: ") + "\n"
+    assert undated((folder / "replayed.json").read_text()) == undated(
+        (folder / "solved.json").read_text())
+    params = folder / "p.yaml"
+    params.write_text("measurement_collector: {ros__parameters: {clock_limit: 5.0}}")
+    assert selfcal(["replay", bag, "--fast", "--quiet", "--params", str(params)]) == 0
+    assert capsys.readouterr().err == ""
 
 
 def test_the_map_is_saved_once_the_solver_has_solved_what_the_collector_sent_last(graph):

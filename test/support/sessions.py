@@ -9,12 +9,14 @@ import yaml
 from selfcal_ros.bagio.build import build
 from selfcal_ros.bagio.schemas import typestore
 from selfcal_ros.bagio.simulated import event_fields, write_simulation
+from selfcal_ros.bagio.writer import BagWriter
 from selfcal_ros.collection.collector import Collector
 from selfcal_ros.collection.expected import ViewProgress
 from selfcal_ros.messages.topics import INPUT_TOPICS
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.view import Plan
 from selfcal_ros.simulation.cell import CellSettings, Event, plan_events
+from selfcal_ros.simulation.faults import Faults, apply_faults
 from selfcal_ros.simulation.spec import read_simulation
 from selfcal_ros.simulation.truth import random_truth
 from test.support.collecting import gathered
@@ -76,4 +78,17 @@ def small_bag(folder: Path, plan: Plan | None = None) -> Path:
         "plan": "plan.yaml", "seed": 7, "noise": {"sigma_xy": 2e-8, "sigma_theta": 2e-5},
         "faults": {"lost": 0.02, "duplicated": 0.02, "delay": 0.05}}))
     write_simulation(read_simulation(simulation), folder / "bag")
+    return folder / "bag"
+
+
+def stepped_bag(folder: Path, step_s: float) -> Path:
+    """Write a bag in whose midst the clock of stage and microscope steps back, and return it."""
+    arrivals, _ = apply_faults(events_of(small_plan()), Faults(clock_step_s=step_s),
+                               np.random.default_rng(1))
+    with BagWriter(folder / "bag") as writer:
+        for topic, typename in INPUT_TOPICS.items():
+            writer.add_topic(f"/{topic}", typename, [])
+        for arrival_ns, event in arrivals:
+            topic, fields = event_fields(event, "stage")
+            writer.write(f"/{topic}", fields, arrival_ns)
     return folder / "bag"
