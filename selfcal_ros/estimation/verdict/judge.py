@@ -141,30 +141,36 @@ def _causes(solved: Solved, measurements: Measurements, options: Options, *,
         return []
     if not are_looked_for(model.problem.system.grid.n_sites, options, failed=failed):
         return []
+    line = line_cause(model.problem, measurements, LEVEL)
+    causes = [*_of_marks(solved, model, measurements, options, failed=failed),
+              *([line] if line else [])]
+    return causes or _noisy_views(measurements, model)
+
+
+def _of_marks(solved: Solved, model: ModelFit, measurements: Measurements, options: Options, *,
+              failed: bool) -> list[Cause]:
+    """Return what the marks show beside the model, or a rotation that they do not share."""
     turned = rotation_cause(model, LEVEL)
     if turned is None:
-        return _explained(solved, model, measurements, failed=failed)
+        return _explained(solved, model, failed=failed)
     # what the marks leave is bent by the lines then: it tells nothing of other causes
     apart = solved_apart(measurements, options)
     if apart is None or apart.model is None:
         return [turned]
     counts = failed or bends(solved.result, apart.result, MATTERS)
     # what spoils the marks turns them as well: a rotation is the cause where nothing else is
-    others = _explained(apart, apart.model, measurements, failed=counts)
+    others = _explained(apart, apart.model, failed=counts)
     return others or ([turned] if counts else [])
 
 
-def _explained(solved: Solved, model: ModelFit, measurements: Measurements, *,
-               failed: bool) -> list[Cause]:
+def _explained(solved: Solved, model: ModelFit, *, failed: bool) -> list[Cause]:
     """Return what explains the residuals of a solution, the likeliest first."""
     found = [item for item in find_explanations(model, slips=False)
              if failed or _counts(item, solved)]
     if found or failed:
         found = find_explanations(model, slips=True)
-    causes = [cause_of(item, model.problem.ground.names, model.problem.half_width_m)
-              for item in found]
-    line = line_cause(model.problem, measurements, LEVEL)
-    return [*causes, *([line] if line else [])] or _noisy_views(measurements, model)
+    return [cause_of(item, model.problem.ground.names, model.problem.half_width_m)
+            for item in found]
 
 
 def are_looked_for(sites: int, options: Options, *, failed: bool) -> bool:

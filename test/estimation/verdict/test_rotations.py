@@ -97,6 +97,16 @@ def test_another_cause_comes_first_for_it_turns_the_marks_as_well():
     assert left.name == "rotation" and left.size == pytest.approx(1e-5, abs=6 * left.u)
 
 
+def test_a_line_that_is_off_is_named_beside_it():
+    readings = turned(measured(1, FINE_RAD), 1, 1e-5)
+    view = readings.views[3]
+    off = replace(view, dtheta=view.dtheta + 5e-6 * (view.k == 7))
+    both = replace(readings, views=(*readings.views[:3], off))
+    causes = worded(calibrate(both)).verdict.causes
+    assert {cause.name for cause in causes} == {"rotation", "reading"}
+    assert "a reading of line 7 in view 'shift_x'" in causes[-1].text
+
+
 @pytest.mark.parametrize("error", [
     InputError("model", "the estimate does not settle", "leave a term out"),
     NotIdentifiableError("the readings do not tell drift from the stage")])
