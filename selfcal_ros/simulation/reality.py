@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What real machines do, one effect at a time, and what a calibration makes of it.
+"""What real machines do, one effect at a time and several, and what a calibration makes of it.
 
 Every case simulates a machine by the places of its things (`simulation.physics`), not by the
 estimator's model, calibrates with the defaults or with a term in the model, and compares with the
@@ -18,11 +18,12 @@ from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.datum.modes import datum_modes, remove_modes
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.statistics import rms
 from selfcal_ros.model.terms import parse_terms
 from selfcal_ros.model.view import Plan, View
-from selfcal_ros.simulation.machine import Spread, Truth, random_truth
+from selfcal_ros.simulation.machine import WALK_STEPS, Spread, Truth, random_truth
 from selfcal_ros.simulation.settings import CellSettings
 from selfcal_ros.simulation.truth import hu_plan, simulate_measurements
 
@@ -71,6 +72,8 @@ class Case:
         Why no reading can show it; empty where one can.
     missing : float
         Part of the marks and lines that are not read in a view.
+    spoil : callable
+        Readings and random numbers -> the readings as they are in this case.
     """
 
     name: str
@@ -81,6 +84,8 @@ class Case:
     options: Options = Options()
     hidden: str = ""
     missing: float = 0.0
+    spoil: Callable[[Measurements, np.random.Generator], Measurements] = (
+        lambda readings, rng: readings)
 
 
 @dataclass(frozen=True)
@@ -128,7 +133,7 @@ def run_case(case: Case, seed: int) -> Run | None:
     readings = simulate_measurements(truth, case.plan, rng, settings=case.settings, visits=True,
                                      missing=case.missing)
     try:
-        return compared(calibrate(readings, case.options), truth)
+        return compared(calibrate(case.spoil(readings, rng), case.options), truth)
     except NotIdentifiableError:
         return None
 
@@ -165,7 +170,8 @@ def summarise(case: Case, found: list[Run | None]) -> Summary:
 
 def cases() -> list[Case]:
     """Return all cases, those with the defaults first."""
-    return [*_turned(), *_microscopes(), *_drifts(), *_plates(), *_noises(), *_with_terms()]
+    return [*_turned(), *_microscopes(), *_drifts(), *_plates(), *_noises(), *_with_terms(),
+            *_together()]
 
 
 def _turned() -> list[Case]:
@@ -281,3 +287,71 @@ def _with_terms() -> list[Case]:
             case("all of them", "microscope,drift,plate_scale,approach", spread=everything,
                  settings=stops),
             *too_small]
+
+
+def creeping(size_m: float) -> Callable[[Truth, np.random.Generator], Truth]:
+    """Return a change: the plate creeps along x and y after it was laid down, alike each time."""
+    def change(truth: Truth, rng: np.random.Generator) -> Truth:
+        course = size_m * np.exp(-np.linspace(0, 1, WALK_STEPS + 1) / 0.2)
+        walk = np.stack([course, -course / 2])
+        return replace(truth, walk_m=np.tile(walk, (len(truth.phi_rad), 1, 1)))
+    return change
+
+
+def misread(size_m: float) -> Callable[[Measurements, np.random.Generator], Measurements]:
+    """Return what spoils readings: one mark is off in all repeats of the second view."""
+    def spoil(readings: Measurements, rng: np.random.Generator) -> Measurements:
+        view, angle = readings.views[1], rng.uniform(0, 2 * np.pi)
+        at = np.arange(len(view.m)) == rng.integers(len(view.m))
+        off = replace(view, dx=view.dx + at * size_m * np.cos(angle),
+                      dy=view.dy + at * size_m * np.sin(angle))
+        return replace(readings, views=(readings.views[0], off, *readings.views[2:]))
+    return spoil
+
+
+def lines_turned(angle_rad: float) -> Callable[[Measurements, np.random.Generator], Measurements]:
+    """Return what spoils readings: the plate turns between marks and lines of the second view."""
+    def spoil(readings: Measurements, rng: np.random.Generator) -> Measurements:
+        view = readings.views[1]
+        turned = replace(view, dtheta=view.dtheta + angle_rad)
+        return replace(readings, views=(readings.views[0], turned, *readings.views[2:]))
+    return spoil
+
+
+def both(*changes: Callable[[Truth, np.random.Generator], Truth]
+         ) -> Callable[[Truth, np.random.Generator], Truth]:
+    """Return the changes one after the other."""
+    def change(truth: Truth, rng: np.random.Generator) -> Truth:
+        for one in changes:
+            truth = one(truth, rng)
+        return truth
+    return change
+
+
+HIDDEN_CREEP = ("where every view is measured in the stage's order, once, what repeats itself in "
+                "each view is a part of the map: measure there and back, along x and along y")
+
+
+def _together() -> list[Case]:
+    askew = replace(MODEL, microscope_rotation_rad=0.5e-3)
+    back = replace(askew, backlash_x_m=10e-9, backlash_y_m=10e-9)
+    stops = replace(SETTINGS, stop_sigma_m=20e-6)
+    fine = replace(SETTINGS, sigma_theta_rad=np.deg2rad(1e-5))
+    small = both(drifting(30e-9, view=3), scaled(0.2e-6))
+    held = Options(terms=parse_terms(["microscope"], "reality"))
+    return [*(Case(f"creep of {size} nm after each laying down, one pass", plan=hu(1),
+                   change=creeping(size * 1e-9), hidden=HIDDEN_CREEP) for size in (100, 200)),
+            Case("creep of 200 nm after each laying down, x, back, y, back",
+                 change=creeping(200e-9), plan=resistant()),
+            Case("drift 30 nm in a view, plate scale 0.2 um/m in each view", change=small),
+            Case("drift 30 nm in a view, plate scale 0.2 um/m in each view, one pass",
+                 change=small, plan=hu(1)),
+            Case("microscope turned by 0.5 mrad, backlash 10 nm, stop errors 20 um", back,
+                 settings=stops),
+            Case("microscope turned by 0.5 mrad, backlash 10 nm, stop errors 20 um; model "
+                 "microscope", back, settings=stops, options=held, plan=resistant()),
+            Case("a mark off by 300 nm in a view, one pass", plan=hu(1), spoil=misread(300e-9)),
+            Case("a mark off by 300 nm in a view, plate scale 0.2 um/m in each view",
+                 change=scaled(0.2e-6), spoil=misread(300e-9)),
+            Case("lines of a view turned by 1 arcsec, 20 % missing, lines read to 0.04 arcsec",
+                 settings=fine, missing=0.2, spoil=lines_turned(np.pi / 648_000))]
