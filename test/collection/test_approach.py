@@ -60,6 +60,19 @@ def test_a_displacement_counts_beyond_the_noise_at_rest(step, found):
     assert asked(track(samples), 50.5, 150.5) == [0, found]
 
 
+@pytest.mark.parametrize(("step_ms", "known"), [(10, True), (20, True), (50, False)])
+def test_samples_of_a_stage_that_mostly_moves_tell_no_wrong_direction(step_ms, known):
+    """An exposure every 200 ms, moves of 80 ms between: a slow encoder has few samples at rest."""
+    stops = np.random.default_rng(2).permutation(60) * 1e-3
+    times, course = np.array([[-60.0, 60.0]]) + 200 * np.arange(60)[:, None], np.repeat(stops, 2)
+    at = np.arange(-60.0, 200 * 59 + 61, step_ms)
+    joint = track(zip(at, np.interp(at, times.ravel(), course), strict=True))
+    true = np.sign(np.diff(stops))
+    said = np.array(asked(joint, *(200.0 * np.arange(60))))[1:]
+    assert not np.any(said * true < 0)
+    assert (said == true).all() if known else (said == 0).mean() > 0.3
+
+
 def test_a_gap_leaves_unknown_what_happened_in_it():
     before, after = path(0.0, 0.01), [(t + 300, p) for t, p in path(0.01, 0.01, 0.0)]
     assert asked(track(before + after), 70, 320, 370, 420) == [1, 0, 0, -1]

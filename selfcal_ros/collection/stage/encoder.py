@@ -22,6 +22,9 @@ NEAR = 16
 DEPTH = 2 * NEAR + 4
 """Stamps on either side of an exposure on which it depends: where one side has too few samples
 for the noise, the other gives as many more."""
+MOST_NOISE_M = 1e-4
+"""Size of what passes for noise, m, from which on it is none: the samples beside the exposure are
+too few, most of them of a stage that moves."""
 LOOK_BACK_NS = 60_000_000_000
 """Time before an exposure in which a motion is looked for."""
 NEVER, EVER = np.iinfo(np.int64).min, np.iinfo(np.int64).max
@@ -214,8 +217,8 @@ class Series:
 
         A motion is a displacement beyond `threshold`, m, and beyond the noise at rest. It is
         looked for from the exposure back to the one before; where there is none, the sign is
-        `AS_BEFORE`. It is 0, not known, after a gap in the samples, and where the last exposure is
-        more than `LOOK_BACK_NS` ago.
+        `AS_BEFORE`. It is 0, not known, after a gap in the samples, where the last exposure is
+        more than `LOOK_BACK_NS` ago, and where too few samples are of a stage at rest.
 
         Parameters
         ----------
@@ -250,6 +253,7 @@ class Series:
         out[told] = np.sign(positions[told] - p[last[told]])
         lost = (resumed >= 0) | ~np.isfinite(positions)
         lost |= np.diff(stamps_ns, prepend=stamps_ns[0]) > LOOK_BACK_NS
+        lost |= limit > max(MOST_NOISE_M, threshold)
         out[lost & ~told] = 0
         return out
 
