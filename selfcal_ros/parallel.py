@@ -174,16 +174,21 @@ def _beside(function: Callable[[], None] | None) -> Iterator[None]:
     """Run `function`, if there is one, in a thread while the block runs; both end together.
 
     This process waits for the one that forks workers, which is still importing, and works later.
+    Where the block is given up, by Ctrl-C or by who takes the outcomes, the function is not waited
+    for: the thread ends with the process. (To raise an exception in it would leave the locks of
+    its imports taken.)
     """
     if function is None:
         yield
         return
-    thread = threading.Thread(target=function)
+    thread = threading.Thread(target=function, daemon=True)
     thread.start()
     try:
         yield
-    finally:
+    except Exception:
         thread.join()
+        raise
+    thread.join()
 
 
 def _with_processes(function: Callable[[Any], Any], items: Sequence[Any],
@@ -249,10 +254,25 @@ def _pool(workers: int, function: Callable[[Any], Any]) -> Iterator[ProcessPoolE
     try:
         yield pool
         pool.shutdown()
+    except (KeyboardInterrupt, GeneratorExit):
+        _end_server()
+        raise
     finally:
         for child in set(multiprocessing.active_children()) - before:
             child.terminate()
         pool.shutdown(cancel_futures=True)
+
+
+def _end_server() -> None:
+    """End the process that forks workers; the next pool starts another.
+
+    It may still import. Then it would fork those that it was asked for when this process has ended,
+    and they would fail, with a traceback.
+    """
+    pid = getattr(getattr(forkserver, "_forkserver", None), "_forkserver_pid", None)
+    if pid is not None:
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGKILL)
 
 
 def begin_worker() -> None:

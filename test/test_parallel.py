@@ -17,6 +17,8 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.parallel import WorkerDied, check_workers, cores, mapped, mapped_in_parts, outcomes
 from test.support.waiting import wait_until
 
+ROOT = Path(__file__).parents[1]
+
 
 @pytest.mark.parametrize("workers", [1, 2])
 def test_values_come_back_in_their_places(workers):
@@ -204,11 +206,53 @@ def test_what_is_loaded_meanwhile_is_loaded_once_beside_the_workers(workers, tol
     assert loaded == told
 
 
-def test_a_consumer_that_stops_waits_for_what_is_loaded_meanwhile():
+def test_a_consumer_that_stops_does_not_wait_for_what_is_loaded_meanwhile():
+    """It stops by Ctrl-C: imports that take a second are nothing to wait for."""
     stopped, loaded = threading.Event(), []
     running = outcomes(abs, [-1, -2, -3], workers=2,
                        meanwhile=lambda: loaded.append(stopped.wait(60.0)))
     next(running)
-    stopped.set()
     running.close()
-    assert loaded == [True]
+    assert loaded == []
+    stopped.set()
+    assert mapped(abs, [-1, -2], workers=2) == [1, 2]  # with workers of another server
+
+
+SLOW = """
+import os
+from pathlib import Path
+from test.support.waiting import wait_until
+if os.getpid() != int(os.environ["MAIN"]):
+    Path(__file__).with_name("begun").touch()
+    wait_until(Path(__file__).with_name("go").exists, "the end of the import")
+
+def twice(number):
+    return 2 * number
+"""
+STOPPED = """
+import os, signal, threading
+from pathlib import Path
+from test.support.waiting import wait_until
+from selfcal_ros import parallel
+os.environ["MAIN"] = str(os.getpid())
+import slow
+
+def interrupt():
+    wait_until(Path(slow.__file__).with_name("begun").exists, "the import of the server")
+    os.kill(os.getpid(), signal.SIGINT)
+threading.Thread(target=interrupt).start()
+try:
+    parallel.mapped(slow.twice, [1, 2], workers=2)
+except KeyboardInterrupt:
+    print("stopped", flush=True)
+Path(slow.__file__).with_name("go").touch()
+"""
+
+
+def test_workers_that_are_not_there_yet_do_not_come_after_an_interrupt(tmp_path):
+    """They would find their queues gone, and say so in a traceback behind the prompt."""
+    (tmp_path / "slow.py").write_text(SLOW)
+    done = subprocess.run(
+        [sys.executable, "-c", STOPPED], capture_output=True, text=True, check=False,
+        env=os.environ | {"PYTHONPATH": os.pathsep.join([str(tmp_path), str(ROOT)])})
+    assert (done.returncode, done.stdout, done.stderr) == (0, "stopped\n", "")
