@@ -157,8 +157,7 @@ class Factor:
         """
         lower, below = self._blocks[number]
         carried = below @ lower
-        return (np.einsum("ki,ki->i", lower, lower)
-                + np.einsum("ki,ki->i", carried, z22 @ carried))
+        return (lower * lower).sum(axis=0) + (carried * (z22 @ carried)).sum(axis=0)
 
     def _selected(self, number: int, z22: np.ndarray) -> np.ndarray:
         """Return the inverse over one front, given that over its boundary."""
