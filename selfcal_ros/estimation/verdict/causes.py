@@ -9,6 +9,7 @@ given: the readings do not tell which it is.
 """
 
 import math
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -118,7 +119,7 @@ def find_explanations(model: ModelFit, *, slips: bool, readings: bool = True,
     more = [ModelTerm(name) for name in TermName
             if name not in own and (told or name not in VISIT_TERMS)]
     columns = term_columns(ground, (*problem.terms, *more), problem.drift_degree)
-    groups = [group for term in more for group in _groups(columns, term.name)]
+    groups = list(_groups(columns, [term.name for term in more]))
     if slips:
         columns, groups = _with_slips(ground, columns, groups)
     if readings:
@@ -135,18 +136,19 @@ def find_explanations(model: ModelFit, *, slips: bool, readings: bool = True,
     return select_explanations(Pool(equations, right), groups, columns.rows(own))
 
 
-def _groups(columns: TermColumns, name: TermName) -> list[Group]:
-    """Return the columns of a term as a whole, and those of each view, steady drift apart."""
-    whole = columns.rows([name])
-    parts = [whole]
+def _groups(columns: TermColumns, names: Iterable[TermName]) -> Iterator[Group]:
+    """Yield the columns of each term as a whole, and those of each view, steady drift apart."""
     of_view = np.array([c.view for c in columns.columns], dtype=int)
     steady = np.array([c.component.endswith("P1") for c in columns.columns], dtype=bool)
-    for view in sorted(set(of_view[whole].tolist()) - {-1}):
-        here = whole & (of_view == view)
-        parts.append(here)
-        if name is TermName.DRIFT:
-            parts.append(here & steady)
-    return [Group(str(name), rows, places=len(parts)) for rows in parts]
+    for name in names:
+        whole = columns.rows([name])
+        parts = [whole]
+        for view in sorted(set(of_view[whole].tolist()) - {-1}):
+            here = whole & (of_view == view)
+            parts.append(here)
+            if name is TermName.DRIFT:
+                parts.append(here & steady)
+        yield from (Group(str(name), rows, places=len(parts)) for rows in parts)
 
 
 def _with(ground: Ground, before: tuple[TermColumns, list[Group]], columns: TermColumns,

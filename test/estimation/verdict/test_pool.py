@@ -67,6 +67,33 @@ def test_the_larger_of_the_noises_of_marks_and_of_all_visits_counts(within, dof_
     assert found == (pytest.approx(variance), pytest.approx(dof))
 
 
+def test_sets_of_all_sizes_are_each_as_a_dense_solution_has_them():
+    """The sixth column is the sum of two: with both of them it tells nothing more."""
+    rng = np.random.default_rng(8)
+    readings = rng.normal(size=(12, 6)) * [1.0, 1e3, 1.0, 1e-3, 1.0, 1.0]
+    readings[:, 5] = readings[:, 0] + readings[:, 2]
+    marks, left = readings[:8], rng.normal(size=12)
+    equations = SimpleNamespace(
+        information=readings.T @ readings, norm=np.sqrt((readings**2).sum(axis=0)),
+        limit=lambda rows: 1e-9, projected=SimpleNamespace(gram=marks.T @ marks))
+    pools = Pool(equations, Score(marks.T @ left[:8], readings[8:].T @ left[8:], Sums(
+        float(left[:8] @ left[:8]), 8, float(left[8:] @ left[8:]), 4)))
+    sets = [(), (3,), (0, 1), (1, 3, 4), (5,), (0, 2, 5), (0, 2), (0, 1, 2, 3, 4, 5), (1, 5)]
+    many = [np.isin(np.arange(6), chosen) for chosen in sets]
+    for chosen, found in zip(sets, pools.each(many), strict=True):
+        used = readings[:, list(chosen)]
+        values = np.linalg.pinv(used) @ left
+        rank = np.linalg.matrix_rank(used) if chosen else 0
+        assert found.rank == rank and found.at.tolist() == list(chosen)
+        rest = left - used @ values
+        assert found.explained == pytest.approx(left @ left - rest @ rest)
+        assert used @ found.own_values == pytest.approx(used @ values, abs=1e-9)
+        assert found.between == pytest.approx(rest[:8] @ rest[:8])
+        follows = used @ np.linalg.pinv(used)
+        assert found.dof_between == pytest.approx(8 - np.trace(follows[:8, :8]))
+        assert found.values[list(chosen)] == pytest.approx(found.own_values)
+
+
 def test_at_most_four_causes_are_named_the_likeliest_first():
     """Six terms of one column each, at right angles; each takes more off than the one before."""
     names = ["a", "b", "c", "d", "e", "f"]
