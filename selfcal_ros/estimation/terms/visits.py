@@ -69,6 +69,8 @@ class ViewVisits:
 
     def about_means(self, values: np.ndarray, n_marks: int) -> np.ndarray:
         """Return complex values (k, V) less the mean of their mark."""
+        if not self.repeated:
+            return np.zeros_like(values, dtype=complex)
         return values - self.means(values, n_marks)[:, self.mark]
 
 
