@@ -328,6 +328,16 @@ def test_only_regular_files_are_loaded(tmp_path):
             read_result(str(path))
 
 
+def test_a_file_beyond_any_result_is_not_read(tmp_path):
+    """It has no blocks: whoever reads it reads zeros, a GiB of them."""
+    with (tmp_path / "huge.json").open("wb") as file:
+        file.truncate(2**30 + 1)
+    with pytest.raises(InputError) as caught:
+        read_result(str(tmp_path / "huge.json"))
+    assert str(caught.value) == (
+        f"{tmp_path / 'huge.json'}: is larger than 1 GiB; name a RESULT.json")
+
+
 def test_a_number_of_400_digits_is_refused(tmp_path):
     desk = Desk(result_folder=str(tmp_path))
     desk.take(views_of())

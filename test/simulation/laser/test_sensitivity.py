@@ -67,6 +67,12 @@ def test_the_unit_of_the_laser_on_one_diagonal_leans_the_axes():
     assert new.squareness_m == pytest.approx(1e-7 * 0.06, rel=0.01)
 
 
+def test_what_is_no_fault_has_no_size():
+    none = [fault for fault in FAULTS if fault.name.startswith("none")]
+    assert len(none) == 2 and all((fault.size, fault.unit) == (0.0, "") for fault in none)
+    assert all(fault.size and fault.unit for fault in FAULTS if fault not in none)
+
+
 def test_the_table_has_a_line_for_every_row():
     values = dict.fromkeys(("linear_m", "transverse_m", "squareness_m", "straightness_m"), 1e-6)
     rows = [{"fault": "mirror off", "size": 1e-3, "unit": "rad", "conventional": values,
