@@ -13,6 +13,7 @@ from scipy.special import fdtrc
 from selfcal_ros.errors import InputError, NotIdentifiableError
 from selfcal_ros.estimation.findings import RotationCause
 from selfcal_ros.estimation.joint.model_fit import ModelFit
+from selfcal_ros.estimation.joint.problem import FLOOR
 from selfcal_ros.estimation.joint.solve import solve_joint
 from selfcal_ros.estimation.joint.solved import Solved
 from selfcal_ros.estimation.normal.alone import angular_residuals, grid_residuals
@@ -42,7 +43,7 @@ def rotation_cause(model: ModelFit, level: float) -> Cause | None:
     both = set(system.grid_index) & set(system.angular_index)
     dof = system.rank_schur + system.rank_turns - (system.size - system.nullity)
     noise = np.array([found.xy.sigma, found.theta.sigma])
-    if len(both) < 2 or dof < 1 or not (noise > 0).all():
+    if len(both) < 2 or dof < 1 or not (noise > FLOOR).all():  # rounding is not tested
         return None
     alone = _squares(model, grid_residuals(system, model.y),
                      angular_residuals(system, model.problem.angular.y))

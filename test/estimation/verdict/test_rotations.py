@@ -144,3 +144,8 @@ def test_one_common_view_tells_nothing():
     plan, rng = Plan("p", ARTIFACT, views), np.random.default_rng(0)
     readings = simulate_measurements(random_truth(ARTIFACT, 5, rng), plan, rng)
     assert cause_in(readings) is None
+
+
+def test_lines_without_noise_turn_by_rounding_alone():
+    assert cause_in(measured(1, FINE_RAD)) is not None  # of any probability
+    assert cause_in(measured(1, 0.0)) is None
