@@ -171,6 +171,11 @@ class NoUncertainty(Finding):
 
 
 @dataclass(frozen=True)
+class VisitedOnce(Finding):
+    """Each mark was visited once in a view, its repeats one after the other."""
+
+
+@dataclass(frozen=True)
 class DrawnUncertainty(Finding):
     """The uncertainty of Hu's law comes from that many draws of unit noise."""
 

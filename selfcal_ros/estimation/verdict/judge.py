@@ -20,6 +20,7 @@ from selfcal_ros.estimation.findings import (
     FiniteRotation,
     NoiseContradicted,
     NoiseUnknown,
+    VisitedOnce,
 )
 from selfcal_ros.estimation.joint.model_fit import ModelFit
 from selfcal_ros.estimation.joint.noise import pooled
@@ -36,6 +37,7 @@ from selfcal_ros.estimation.verdict.rotations import bends, rotation_cause, solv
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.statistics import rms
+from selfcal_ros.model.terms import TermName
 from selfcal_ros.model.verdict import Cause, Finding, Verdict
 
 ALWAYS_SITES = 41 * 41
@@ -77,7 +79,8 @@ def judged(solved: Solved, measurements: Measurements, options: Options) -> Cali
     reference = options.reference
     result = with_coverage(solved.result, reference)
     return replace(
-        result, verdict=verdict, provenance=provenance_of(measurements, options),
+        result, verdict=verdict, findings=(*result.findings, *_visits_findings(checked)),
+        provenance=provenance_of(measurements, options),
         reference=None if reference is None else {
             "kind": str(reference.kind), "relative_error": reference.relative_error,
             "u_relative": reference.u_relative, "certificate": reference.certificate})
@@ -131,6 +134,17 @@ def _noise_findings(solved: Solved) -> list[Finding]:
 def _axes_findings(solved: Solved) -> list[Finding]:
     p, size_rad = solved.axes
     return [] if p >= MISCLOSURE_LEVEL else [AxesNotMet(size_rad, p)]
+
+
+def _visits_findings(solved: Solved) -> list[Finding]:
+    """Return whether repeats are there, and none of them at another time."""
+    if solved.model is None:
+        return []
+    problem = solved.model.problem
+    held = any(term.name is TermName.DRIFT for term in problem.terms)
+    visits = [view for view in problem.ground.visits if view is not None]
+    once = len(visits) == len(problem.ground.visits) and not any(v.repeated for v in visits)
+    return [VisitedOnce()] if once and not held and problem.repeats_xy[1] > 0 else []
 
 
 def _causes(solved: Solved, measurements: Measurements, options: Options, *,

@@ -16,6 +16,7 @@ from selfcal_ros.estimation.findings import (
     SlipsGivenUp,
     TakenForSlip,
     TooManyOutliers,
+    VisitedOnce,
 )
 from selfcal_ros.model.verdict import Finding
 from selfcal_ros.reporting.words.causes import what_it_is
@@ -35,6 +36,13 @@ def warning(finding: Finding) -> str:
 def _(_: NoUncertainty) -> str:
     return ("no uncertainty map, because of the size of the field: ask for it "
             "(--uncertainty always)")
+
+
+@warning.register
+def _(_: VisitedOnce) -> str:
+    return ("each mark was visited once in a view, its repeats one after the other: a drift that "
+            "is alike in all views is a part of the map, and repeats do not show it; visit the "
+            "marks there and back, along x and along y")
 
 
 @warning.register

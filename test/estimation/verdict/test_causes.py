@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from selfcal_ros.estimation.api import calibrate
+from selfcal_ros.estimation.findings import VisitedOnce
 from selfcal_ros.estimation.joint.model_fit import fit_model
 from selfcal_ros.estimation.joint.solve import prepare
 from selfcal_ros.estimation.options import Options
@@ -151,3 +152,16 @@ def test_the_effect_of_a_cause_is_what_holding_it_does_to_the_map():
     moved = np.stack([held.gx - without.gx, held.gy - without.gy])
     assert found.name == "microscope"
     assert found.effect_m == pytest.approx(np.sqrt((moved**2).mean()), rel=0.02)
+
+
+@pytest.mark.parametrize(("consecutive", "repeats", "terms", "said"), [
+    (True, 4, (), True), (False, 4, (), False), (True, 1, (), False),
+    (True, 4, ("drift:1e-8",), False), (True, 4, ("plate_scale:1e-8",), True)])
+def test_repeats_that_are_of_one_time_are_said_to_be(consecutive, repeats, terms, said):
+    plan, rng = plan_of("serpentine", repeats), np.random.default_rng(1)
+    truth = random_truth(plan.artifact, len(plan.views), rng, CLEAN)
+    readings = simulate_measurements(truth, plan, rng, visits=True,
+                                     settings=replace(SETTINGS, consecutive=consecutive))
+    result = calibrate(readings, replace(OPTIONS, terms=parse_terms(terms, "")))
+    assert result.verdict.qualified
+    assert result.findings == ((VisitedOnce(),) if said else ())

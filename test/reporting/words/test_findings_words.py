@@ -46,6 +46,10 @@ MANY = tuple(f.Removed("90", "grid", (i, -2), 5.04 + i, 0.1, 1e-6) for i in rang
 WARNINGS = {
     f.NoUncertainty(): (
         "no uncertainty map, because of the size of the field: ask for it (--uncertainty always)"),
+    f.VisitedOnce(): (
+        "each mark was visited once in a view, its repeats one after the other: a drift that is "
+        "alike in all views is a part of the map, and repeats do not show it; visit the marks "
+        "there and back, along x and along y"),
     f.DrawnUncertainty(200): (
         "uncertainties of the law from 200 draws of unit noise: 5.0 % standard error"),
     f.OutliersRemoved((*MANY[:1], f.Removed("a", "angular", (7,), 9.0, 0.0, 1e-5))): (
