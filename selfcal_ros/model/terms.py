@@ -14,6 +14,9 @@ MAX_DRIFT_DEGREE = 9
 DRIFT_DEGREE = 3
 """Degree of that polynomial if nothing else is said."""
 
+SMALLEST, LARGEST = 1e-18, 1.0
+"""Sizes of terms that are written down: nothing is known better, and no more is left open."""
+
 
 class TermName(StrEnum):
     """Names of the terms, as in ``--model``, ``model_terms`` and RESULT.json.
@@ -93,7 +96,7 @@ def parse_terms(texts: Iterable[str], where: str) -> tuple[ModelTerm, ...]:
     Raises
     ------
     InputError
-        For an unknown term, one given twice, or a size that is not a positive number.
+        For an unknown term, one given twice, or a size that is none.
     """
     found: dict[TermName, ModelTerm] = {}
     for text in (part.strip() for item in texts for part in item.split(",")):
@@ -116,5 +119,8 @@ def _size(text: str, where: str) -> float:
         size = math.nan
     if not 0 < size < math.inf:
         raise InputError(where, f"the size '{text}' is not a positive number",
+                         "give a standard deviation in SI units, as in plate_shape:30e-9")
+    if not SMALLEST <= size <= LARGEST:
+        raise InputError(where, f"the size {text} is outside {SMALLEST:g} to {LARGEST:g}",
                          "give a standard deviation in SI units, as in plate_shape:30e-9")
     return size

@@ -2,6 +2,7 @@
 """What the settings of the solver ask of the estimator."""
 
 from selfcal_ros.collection.settings.nodes import NO_TERMS, UNCERTAINTY, SolverSettings
+from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.options import Options, ReferenceKind, ReferenceLength
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.readings import Measurements
@@ -35,9 +36,13 @@ def solver_options(settings: SolverSettings,
 def _terms(given: list[str],
            measurements: Measurements | None) -> tuple[tuple[ModelTerm, ...], str]:
     """Return the terms of the model, and where they come from: ``options`` or ``plan``."""
-    if [text.strip() for text in given] == [NO_TERMS]:
+    words = [word for text in given for part in text.split(",") if (word := part.strip())]
+    if words == [NO_TERMS]:
         return (), ""
-    if any(text.strip() for text in given) or measurements is None:
+    if NO_TERMS in words:
+        raise InputError("model_terms", f"'{NO_TERMS}' and other terms exclude each other",
+                         f"leave out '{NO_TERMS}', or all the others")
+    if words or measurements is None:
         return parse_terms(given, "model_terms"), "options"
     where = f"plan '{measurements.plan_id}': model_terms"
     return parse_terms(measurements.model_terms, where), "plan"

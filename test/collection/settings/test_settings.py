@@ -186,6 +186,7 @@ def asked(*terms: str) -> Measurements:
     ([""], (), [], ""), ([""], ("drift:1e-08",), ["drift:1e-08"], "plan"),
     (["approach,microscope"], ("drift:1e-08",), ["microscope", "approach"], "options"),
     (["none"], ("drift:1e-08",), [], ""), ([" none "], (), [], ""),
+    (["none,"], ("drift:1e-08",), [], ""), ([" , "], ("drift:1e-08",), ["drift:1e-08"], "plan"),
     (["drift"], (), ["drift"], "options")])
 def test_given_terms_win_over_those_of_the_plan(given, planned, terms, origin):
     settings = SolverSettings.checked({"model_terms": given}, "here")
@@ -196,7 +197,8 @@ def test_given_terms_win_over_those_of_the_plan(given, planned, terms, origin):
 @pytest.mark.parametrize(("given", "planned", "message"), [
     ([""], ("creep",), "plan 'p': model_terms: the term 'creep' is unknown; known are "),
     (["creep"], (), "model_terms: the term 'creep' is unknown; known are "),
-    (["none,drift"], (), "model_terms: the term 'none' is unknown; known are microscope, "),
+    (["none,drift"], (), "model_terms: 'none' and other terms exclude each other; leave out "),
+    (["drift", "none"], (), "model_terms: 'none' and other terms exclude each other; leave out "),
     ([""], ("drift:x",), "plan 'p': model_terms: drift: the size 'x' is not a positive number; ")])
 def test_terms_that_cannot_be(given, planned, message):
     settings = SolverSettings.checked({"model_terms": given}, "here")

@@ -248,6 +248,9 @@ def test_terms_need_visits():
     ("drift:x", "--model: drift: the size 'x' is not a positive number"),
     ("drift:-1e-9", "the size '-1e-9' is not a positive number"),
     ("drift:inf", "the size 'inf' is not a positive number"),
+    ("drift:1e300", "--model: drift: the size 1e300 is outside 1e-18 to 1; give a standard"),
+    ("drift:9e-19", "the size 9e-19 is outside 1e-18 to 1"),
+    ("drift:1.01", "the size 1.01 is outside 1e-18 to 1"),
     ("drift:", "the size '' is not a positive number")])
 def test_terms_that_cannot_be_read(text, said):
     with pytest.raises(InputError) as caught:
