@@ -226,19 +226,23 @@ def _suggest(args: argparse.Namespace, plan: Plan) -> int:
     with late_progress("judging plans") as progress:
         if args.views is not None:
             angular = any(view.angular for view in plan.views) and plan.artifact.angular_count > 0
-            repeats = min(view.repeats for view in plan.views)
+            grids = [view for view in plan.views if view.grid]
+            order = next((view.visit_order for view in grids), "")
             best, score, search = best_plan(
                 plan.artifact, args.views, angular=angular, criterion=args.criterion,
-                repeats=repeats, datum=datum, against=against, progress=progress)
+                repeats=min(view.repeats for view in grids or plan.views), datum=datum,
+                against=against and replace(against, assumed=replace(
+                    against.assumed, order=order)), progress=progress)
         else:
             now, ranked = rank_next(plan, criterion=args.criterion, datum=datum, against=against,
                                     progress=progress)
     # without terms and without a noise that is given the figures are gains
-    unit = _averaged_m(plan, assumed_of(args)) if against or args.sigma is not None else None
+    told = against is not None or args.sigma is not None
+    unit = _averaged_m(plan if args.views is None else best, assumed_of(args)) if told else None
     if args.views is not None:
         best = replace(best, plan_id=f"{plan.plan_id}_best{args.views}",
                        model_terms=plan.model_terms)
-        best = _in_order(best, next((v.visit_order for v in plan.views if v.grid), ""))
+        best = _in_order(best, order)
         _show_best(args, best, (score, unit), search_text(search))
     else:
         best = replace(plan, views=ranked[0].views)

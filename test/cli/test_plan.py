@@ -185,6 +185,26 @@ def test_suggest_against_terms(capsys, tmp_path):
     assert plan_from_dict(read_yaml(out), "next").model_terms == ("plate_shape:3e-08",)
 
 
+def test_the_best_plan_is_judged_as_it_is_written(capsys, tmp_path):
+    """With the order and the repeats of the plan's grid views, which tell a drift."""
+    plan, out = tmp_path / "plan.yaml", tmp_path / "best.yaml"
+    plan.write_text(yaml.safe_dump({
+        "plan_id": "p", "visit_order": "x_back_y_back", "model_terms": ["drift"],
+        "artifact": {"grid_size": 3, "grid_pitch": 0.01, "angular_count": 4}, "views": [
+            {"name": "a", "repeats": 4}, {"name": "b", "rotation_deg": 90, "repeats": 4},
+            {"name": "c", "translation_pitch": [1, 0], "repeats": 4},
+            {"name": "l", "rotation_deg": 90, "grid": False, "repeats": 1}]}))
+    assert main(["plan", "suggest", str(plan), "--views", "4", "--json", "-o", str(out)]) == 0
+    best = json.loads(capsys.readouterr().out)
+    assert best["deficiency"] == 0
+    assert {view["repeats"] for view in best["views"]} == {4}
+    assert main(["plan", "check", str(out), "--json", "--sigma", "20nm"]) == 0
+    found = json.loads(capsys.readouterr().out)["predicted"]
+    for name in ("rms", "max"):
+        assert best[f"{name}_gain_xy"] == pytest.approx(found[f"{name}_gain_xy_with_terms"])
+        assert best[f"u_{name}_m"] == pytest.approx(found[f"{name}_u_xy_um_with_terms"] * 1e-6)
+
+
 def test_suggest_does_not_write_over_its_plan(capsys, tmp_path):
     plan = tmp_path / "plan.yaml"
     plan.write_bytes(Path(shipped("qiao")).read_bytes())

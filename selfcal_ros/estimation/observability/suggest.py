@@ -48,19 +48,27 @@ CRITERIA = ("rms", "max")
 
 @dataclass(frozen=True)
 class Score:
-    """What a plan promises, for unit noise of one reading; infinite if it is deficient."""
+    """What a plan promises, for unit noise of one reading; infinite if it is deficient.
+
+    `of_terms`: the deficiency is what free terms hide of a stage that is identified without them.
+    """
 
     deficiency: int
     rms_xy: float
     max_xy: float
     rms_theta: float
+    of_terms: bool = False
 
     def key(self, criterion: str) -> tuple[float, ...]:
-        """Return the order of plans: deficiency first, then the criterion, then the other."""
+        """Return the order of plans: deficiency first, then the criterion, then the other.
+
+        What terms hide is not counted of a plan that is deficient without them: it comes last.
+        """
         first, second = ((self.rms_xy, self.max_xy) if criterion == "rms"
                          else (self.max_xy, self.rms_xy))
         # rounding must not decide between plans that are equal by symmetry
-        return (self.deficiency, round(first, 9), round(second, 9), round(self.rms_theta, 9))
+        return (bool(self.deficiency and not self.of_terms), self.deficiency, round(first, 9),
+                round(second, 9), round(self.rms_theta, 9))
 
 
 @dataclass(frozen=True)
@@ -152,7 +160,7 @@ def score_plan(plan: Plan, datum: ThetaDatum = ThetaDatum.ZERO_MEAN, *,
         terms = planned_equations(system, ground, against.terms, against.assumed)
         hidden = terms.unseen(terms.free).shape[1]
         if hidden:
-            return Score(hidden, inf, inf, inf)
+            return Score(hidden, inf, inf, inf, of_terms=True)
         found = with_part_of_terms(found, terms, repeats)
     theta = found.rms_theta if len(found.u_theta) else 0.0
     return Score(0, found.rms_xy, found.max_xy, theta)

@@ -252,6 +252,16 @@ def test_free_terms_that_are_not_told_are_a_deficiency():
     assert score_plan(plan, against=free).rms_xy == np.inf
 
 
+def test_what_terms_hide_is_better_than_a_plan_that_is_deficient_without_them():
+    """Of such a plan nobody counts what the terms would hide besides."""
+    free = Against(parse_terms(["drift"], ""), Assumed(order="raster"))
+    hidden, none = (score_plan(plan_of(text, 5), against=free)
+                    for text in ("0, 90, tx", "0, tx, ty"))
+    assert hidden.of_terms and not none.of_terms and 0 < none.deficiency < hidden.deficiency
+    assert hidden.key("rms") < none.key("rms")
+    assert score_plan(plan_of("0, 90, tx", 5)).key("max") < hidden.key("max")
+
+
 def test_the_best_plan_against_bent_plates_shifts_both_ways(few_candidates):
     plan, found, _ = best_plan(Artifact(5, 0.01), 4, angular=False, against=Against(BENT))
     every = [score_plan(replace(plan, views=(few_candidates[0], *views)), against=Against(BENT))
