@@ -30,11 +30,14 @@ class TermSpread:
         Misalignments that belong to it.
     covariance : float array (p, p)
         Of the coefficients, for unit noise of one grid reading.
+    of_marks : float array (p,)
+        Scale of what a unit of each coefficient adds to the mean of every mark.
     """
 
     fields: np.ndarray
     parameters: np.ndarray
     covariance: np.ndarray
+    of_marks: np.ndarray
 
 
 class FieldCovariance:
@@ -60,8 +63,9 @@ class FieldCovariance:
         self.system, self.inverse = system, inverse
         if terms is None:
             terms = TermSpread(np.zeros((system.grid.n_sites, 0), dtype=complex),
-                               np.zeros((system.size, 0)), np.zeros((0, 0)))
+                               np.zeros((system.size, 0)), np.zeros((0, 0)), np.zeros(0))
         self.terms = terms
+        self._of_marks = terms.of_marks * (scale is not None and scale.of_plate)
         self.scale, self._u2 = scale, 0.0
         if scale is not None:
             self._u2 = scale.variance + (scale.u_m / max(sigma, NO_NOISE_M)) ** 2
@@ -92,6 +96,7 @@ class FieldCovariance:
         flat = rows.reshape(len(rows), -1).T
         out, extra = self.project(flat), np.zeros((len(rows), len(rows)))
         moved = np.zeros((self.system.grid.response.shape[1], len(rows)))
+        grown = np.zeros(len(rows))
         if self.scale is not None:
             grown = np.real(self.system.grid.views.z.ravel().conj() @ flat)
             out = out + self.scale.rows[:, None] * grown
@@ -101,6 +106,7 @@ class FieldCovariance:
         cov = np.real(out.conj().T @ solved) + answer.T @ self._p @ answer + extra
         n = len(moved)
         of_terms = np.real(self.terms.fields.conj().T @ out) + self.terms.parameters[:n].T @ moved
+        of_terms += np.outer(self._of_marks, grown)
         cov += of_terms.T @ self.terms.covariance @ of_terms
         return (cov + cov.T) / 2
 
@@ -114,7 +120,7 @@ class FieldCovariance:
         variance = float(np.real(np.vdot(rows, solved)) + answer @ self._p @ answer) + self._u2
         terms, n = self.terms, len(answer)
         of_terms = np.real(terms.fields.conj().T @ rows) + terms.parameters[:n].T @ (
-            scale.parameters)
+            scale.parameters) + self._of_marks
         spread = spread + terms.fields @ (terms.covariance @ of_terms)
         variance += float(of_terms @ terms.covariance @ of_terms)
         return spread - basis @ np.real(basis.conj().T @ spread), variance
@@ -126,7 +132,7 @@ class FieldCovariance:
             return maps
         n = 3 * self.system.grid.n_views
         grown = np.real(self.scale.rows.conj() @ self.terms.fields) + (
-            self.scale.parameters @ self.terms.parameters[:n])
+            self.scale.parameters @ self.terms.parameters[:n]) + self._of_marks
         return maps + np.outer(self.system.grid.views.z.ravel(), grown)
 
     def diagonal(self) -> tuple[np.ndarray, np.ndarray]:

@@ -28,12 +28,15 @@ class ScaleDatum:
         Of what is neither, for unit noise of one grid reading.
     u_m : float
         Standard uncertainty of the reference itself, m at the unit of position.
+    of_plate : bool
+        Whether the plate sets the scale: what a term adds to its marks moves the scale as well.
     """
 
     rows: np.ndarray
     parameters: np.ndarray
     variance: float
     u_m: float
+    of_plate: bool = False
 
 
 def scale_datum(system: NormalEquations, reference: ReferenceLength,
@@ -62,7 +65,7 @@ def scale_datum(system: NormalEquations, reference: ReferenceLength,
     parameters = np.stack([sums[:, 0].real, sums[:, 1].real, sums[:, 1].imag], axis=1).ravel()
     total = grid.weight.sum(axis=0)
     variance = float((abs(dual) ** 2 / np.where(grid.mark_read, total, np.inf)).sum())
-    return ScaleDatum(rows, parameters, variance, u)
+    return ScaleDatum(rows, parameters, variance, u, of_plate=True)
 
 
 def scale_of(system: NormalEquations, reference: ReferenceLength, *, field: np.ndarray,

@@ -16,6 +16,7 @@ from selfcal_ros.errors import NotSettledError
 from selfcal_ros.estimation.datum.covariance import TermSpread
 from selfcal_ros.estimation.joint.fit import JointFit, angular_part, fit
 from selfcal_ros.estimation.joint.problem import ROUNDING, Problem, grid_dof, sigma_of
+from selfcal_ros.estimation.lattice.gauge import Gauge
 from selfcal_ros.estimation.normal.grid import GridSystem
 from selfcal_ros.estimation.terms.columns import TermColumns, made_anew, term_columns
 from selfcal_ros.estimation.terms.equations import TermEquations
@@ -103,8 +104,11 @@ class ModelFit:
         if self.equations is None:
             return None
         now = equations_of(self.problem, self.found, self.equations.columns, self.reduced)
+        system, shapes = self.problem.system, now.columns.shapes
+        dual = Gauge(system.grid.views.z, system.known_marks, scale=True).dual(3)
+        of_marks = shapes.against(shapes.sums(system.grid.relative_weight * dual))
         return TermSpread(now.projected.fields, now.projected.parameters,
-                          now.inverse(self.found.xy.sigma))
+                          now.inverse(self.found.xy.sigma), of_marks)
 
 
 def fit_model(problem: Problem,
