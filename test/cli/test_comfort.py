@@ -139,7 +139,7 @@ def test_a_plan_is_judged_in_um_where_the_noise_is_given(capsys, tmp_path):
             f"{found['max_u_xy_um_with_terms']:.4f} µm (k=1) for") in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("more", [[], ["--views", "4"]])
+@pytest.mark.parametrize("more", [[], ["--views", "3"]])
 def test_plans_are_ranked_in_um_where_the_noise_is_given(capsys, tmp_path, more):
     plan = tmp_path / "plan.yaml"
     plan.write_text(yaml.safe_dump({"plan_id": "p", "artifact": {

@@ -186,8 +186,8 @@ def test_the_noise_is_that_beside_each_exposure_however_many_are_asked_for():
     track.store.add_block(stamps, 8.5e-9 * np.arange(4000) + rng.normal(0, 1e-9, 4000))
     asked = np.sort(rng.choice(stamps[100:-100], 3000, replace=False)) + 3 * MS
     series = track.between(stamps[0], stamps[-1])
-    at_once = series.moving(asked, series.query(asked)[1])
+    at_once = series.moving(asked, series.query(asked)[1])[::10]
     one_by_one = np.concatenate([series.moving(one, series.query(one)[1])
-                                 for one in np.split(asked, len(asked))])
+                                 for one in np.split(asked[::10], 300)])
     assert 0.2 < at_once.mean() < 0.8
     np.testing.assert_array_equal(at_once, one_by_one)
