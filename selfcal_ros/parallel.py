@@ -267,12 +267,14 @@ def _end_server() -> None:
     """End the process that forks workers; the next pool starts another.
 
     It may still import. Then it would fork those that it was asked for when this process has ended,
-    and they would fail, with a traceback.
+    and they would fail, with a traceback. It has ended when this returns, and is left for
+    `multiprocessing` to find so: a pool that took it for alive would be refused by it.
     """
     pid = getattr(getattr(forkserver, "_forkserver", None), "_forkserver_pid", None)
     if pid is not None:
-        with contextlib.suppress(ProcessLookupError):
+        with contextlib.suppress(ProcessLookupError, ChildProcessError):
             os.kill(pid, signal.SIGKILL)
+            os.waitid(os.P_PID, pid, os.WEXITED | os.WNOWAIT)
 
 
 def begin_worker() -> None:

@@ -8,11 +8,13 @@ import subprocess
 import sys
 import threading
 from functools import partial
+from multiprocessing import forkserver
 from pathlib import Path
 
 import pytest
 from threadpoolctl import threadpool_info
 
+from selfcal_ros import parallel
 from selfcal_ros.errors import InputError
 from selfcal_ros.parallel import WorkerDied, check_workers, cores, mapped, mapped_in_parts, outcomes
 from test.support.waiting import wait_until
@@ -216,6 +218,17 @@ def test_a_consumer_that_stops_does_not_wait_for_what_is_loaded_meanwhile():
     assert loaded == []
     stopped.set()
     assert mapped(abs, [-1, -2], workers=2) == [1, 2]  # with workers of another server
+
+
+def test_a_server_that_is_ended_has_ended_and_is_left_to_be_found_so():
+    """The next pool asks whether it lives: one that is about to end would refuse the pool."""
+    for _ in range(3):
+        parallel._start_server("builtins")
+        server = forkserver._forkserver._forkserver_pid
+        parallel._end_server()
+        assert os.waitid(os.P_PID, server, os.WEXITED | os.WNOWAIT | os.WNOHANG) is not None
+    parallel._end_server()  # once more: there is none
+    assert mapped(abs, [-1, -2], workers=2) == [1, 2]
 
 
 SLOW = """
