@@ -54,6 +54,10 @@ class Cell:
         graph.hand.create_subscription(
             names.RECEIVED.type, self.name("measurement_collector/received"), self._on_told,
             names.RECEIVED.qos)
+        self.newest_ns, self.newest_told = 0, ""
+        graph.hand.create_subscription(
+            names.HEALTH.type, self.name("measurement_collector/health"), self._on_health,
+            names.HEALTH.qos)
         self.solved: list = []
         graph.hand.create_subscription(
             names.SOLVED.type, self.name("solver/solved"), self.solved.append, names.SOLVED.qos)
@@ -73,6 +77,10 @@ class Cell:
     def _on_told(self, message: object) -> None:
         self.told = tuple(message.data)
 
+    def _on_health(self, message: Any) -> None:
+        self.newest_told = {value.key: value.value for value in message.values}.get(
+            "command_stamp", "")
+
     def start(self, node: str, **parameters: object) -> None:
         if node in self.inside:
             self.inside[node] = self.graph.node(
@@ -90,7 +98,7 @@ class Cell:
     def start_collector(self) -> None:
         """Start it and wait until it knows what its journal holds."""
         before, self.told = self.told, (-1, -1, -1)
-        heard = {kind: self.matched[kind] for kind in (EncoderSample, Detection)}
+        heard = dict(self.matched)
         self.start("measurement_collector", journal=self.folder, status_period=0.1)
         # a reader that was killed counts as a reader for a while: wait for a new one
         self.graph.until(lambda: all(self.matched[kind] > count for kind, count in heard.items()),
@@ -126,6 +134,8 @@ class Cell:
             number[kind] += 1
             new = index >= first if kind is Command else number[kind] > self.told[
                 KINDS.index(kind)]
+            if kind is Command:
+                self.newest_ns = max(self.newest_ns, event.stamp_ns)
             if new:
                 self.publishers[kind].publish(cdr_of(event))
 
@@ -154,6 +164,8 @@ class Cell:
     def saved(self) -> dict | str:
         """Return the result that the solver saves, or why there is none."""
         path = self.folder / "map.json"
+        if self.newest_ns:  # a count does not tell: a collector that starts hears commands again
+            self.graph.until(lambda: self.newest_told == str(self.newest_ns), "the last command")
         finished = self.answer(Trigger, "measurement_collector/finish")
         assert finished.success, finished.message
         end = time.monotonic() + 4 * IDLE_S  # where the readings are refused it says nothing
