@@ -73,14 +73,11 @@ def run(args: argparse.Namespace) -> int:
 def _clock_lines(args: argparse.Namespace) -> list[str]:
     """Say which clocks stepped in the bag, and return it: played fast, no node can see it."""
     from selfcal_ros.bagio.offline import clock_lines
+    from selfcal_ros.cli.solve import node_settings
     from selfcal_ros.collection.settings.nodes import CollectorSettings
-    from selfcal_ros.collection.settings.ros_file import overrides_in
-    from selfcal_ros.files import read_yaml
 
-    where = args.params or "options"
-    given = overrides_in(read_yaml(args.params) if args.params else {}, CollectorSettings.NODE,
-                         where)
-    lines = clock_lines(args.bag, CollectorSettings.checked(given, where), args.namespace)
+    settings = node_settings(args.params, CollectorSettings)
+    lines = clock_lines(args.bag, settings, args.namespace)
     for line in lines:
         print(f"selfcal replay: {args.bag}: {line}", file=sys.stderr)
     return lines

@@ -9,7 +9,7 @@ from selfcal_ros.cli.terminal.output import add_json, aside, file_of, on_stdout,
 from selfcal_ros.errors import InputError
 
 if TYPE_CHECKING:
-    from selfcal_ros.collection.settings.nodes import CollectorSettings, SolverSettings
+    from selfcal_ros.collection.settings.nodes import CollectorSettings, Settings, SolverSettings
 
 HELP = "calibrate from a bag: MCAP file or rosbag2 folder"
 
@@ -64,24 +64,27 @@ def add_options(parser: argparse.ArgumentParser) -> None:
                         "(docs/identifiability.md)")
 
 
-def parameters(args: argparse.Namespace) -> "tuple[CollectorSettings, SolverSettings]":
-    """Return the settings of the collector and of the solver; options win over the file."""
-    from selfcal_ros.collection.settings.nodes import CollectorSettings, Settings, SolverSettings
+def node_settings[S: "Settings"](params: str | None, kind: type[S], **given: Any) -> S:
+    """Return the settings of a node in a parameter file, if any; what is given wins over it."""
     from selfcal_ros.collection.settings.ros_file import overrides_in
     from selfcal_ros.files import read_yaml
 
-    data = read_yaml(args.params) if args.params else {}
-    where = args.params or "options"
+    where = params or "options"
+    overrides = overrides_in(read_yaml(params) if params else {}, kind.NODE, where)
+    overrides |= {name: value for name, value in given.items() if value is not None}
+    return kind.checked(overrides, where)
 
-    def settings[S: Settings](kind: type[S], **given: Any) -> S:
-        overrides = overrides_in(data, kind.NODE, where)
-        overrides |= {name: value for name, value in given.items() if value is not None}
-        return kind.checked(overrides, where)
-    collector = settings(CollectorSettings, measurement_sense=args.sense)
-    solver = settings(SolverSettings, method=args.method, theta_datum=args.theta_datum,
-                      misalignment_model=args.misalignment, uncertainty=args.uncertainty,
-                      model_terms=args.model, drift_degree=args.drift_degree,
-                      reference_certificate=args.certificate, **_reference(args.reference))
+
+def parameters(args: argparse.Namespace) -> "tuple[CollectorSettings, SolverSettings]":
+    """Return the settings of the collector and of the solver; options win over the file."""
+    from selfcal_ros.collection.settings.nodes import CollectorSettings, SolverSettings
+
+    collector = node_settings(args.params, CollectorSettings, measurement_sense=args.sense)
+    solver = node_settings(
+        args.params, SolverSettings, method=args.method, theta_datum=args.theta_datum,
+        misalignment_model=args.misalignment, uncertainty=args.uncertainty,
+        model_terms=args.model, drift_degree=args.drift_degree,
+        reference_certificate=args.certificate, **_reference(args.reference))
     if args.certificate is not None and solver.reference_kind == "none":
         raise InputError("--certificate", "it belongs to a reference length, and none is given",
                          "name the length with --reference KIND:ERROR:U")

@@ -13,6 +13,7 @@ from selfcal_ros.cli.step_diagonal_bag import (
     joints_of,
     measurement_from_bag,
     refuse_for_table,
+    refuse_given,
 )
 from selfcal_ros.cli.terminal.output import add_json, put, say, tell
 from selfcal_ros.cli.terminal.progress import busy
@@ -141,11 +142,9 @@ def _check_outputs(args: argparse.Namespace) -> None:
 
 def _refuse_machine(args: argparse.Namespace) -> None:
     """Refuse options of a calibration file where none is written."""
-    for name, default in {"x_axis": 1, "y_axis": 2, "unit": "mm", "home_x": None, "home_y": None,
-                          "reverse_x": False, "reverse_y": False, "force": False}.items():
-        if getattr(args, name) != default:
-            raise InputError(f"--{name.replace('_', '-')}", "it belongs to a calibration file",
-                             "name one with --cal, or leave it out")
+    refuse_given(args, {"x_axis": 1, "y_axis": 2, "unit": "mm", "home_x": None, "home_y": None,
+                        "reverse_x": False, "reverse_y": False, "force": False},
+                 "it belongs to a calibration file", "name one with --cal, or leave it out")
 
 
 def _write_cal(args: argparse.Namespace, found: "StepDiagonalResult") -> None:

@@ -4,7 +4,7 @@
 import argparse
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.units import M_PER, M_PER_UM
@@ -51,10 +51,15 @@ def refuse_for_table(args: argparse.Namespace) -> None:
     given = {"laser_topic": None, "laser_field": "", "laser_unit": "m", "laser_sign": 1,
              "position_topic": None, "joints": JOINTS, "rest_tolerance": REST_TOLERANCE_UM,
              "min_rest": MIN_REST_S, "settle": SETTLE_S}
-    for name, default in given.items():
+    refuse_given(args, given, f"it is for a bag, and {args.data} is a table", "leave it out")
+
+
+def refuse_given(args: argparse.Namespace, defaults: dict[str, Any], why: str,
+                 remedy: str) -> None:
+    """Refuse options that are not at their default, by the names of `args`, and say why."""
+    for name, default in defaults.items():
         if getattr(args, name) != default:
-            raise InputError(f"--{name.replace('_', '-')}", f"it is for a bag, and {args.data} is "
-                             "a table", "leave it out")
+            raise InputError(f"--{name.replace('_', '-')}", why, remedy)
 
 
 def is_bag(path: str) -> bool:
