@@ -93,6 +93,30 @@ def test_speeds_that_are_told_come_back_from_the_file():
     assert rows(store.near(25, 26, 1))[1] == (25, 0.0, 7.0)
 
 
+@pytest.mark.parametrize("beside", [1, 12])
+def test_samples_that_came_in_order_are_in_order_from_whatever_blocks_they_come(beside):
+    """Else each look at the end of a block and the beginning of the next one sorts them all."""
+    store = SampleStore(Limits(block=8, in_memory=2))
+    for start in range(0, 45, 5):
+        store.add_block(np.arange(start, start + 5), np.zeros(5))
+        for first in range(0, start + 5, 3):
+            assert (np.diff(store.near(first, start + 4, beside)[0]) == 1).all()
+
+
+def test_what_was_returned_stays_as_it_was_whatever_comes_later():
+    store, rng = SampleStore(Limits(block=8, in_memory=1)), np.random.default_rng(2)
+    kept, every = [], []
+    for size in (3, 1, 6, 0, 9, 2, 20, 5):
+        t = rng.integers(0, 100, size)
+        store.add_block(t, t * 10.0)
+        every += t.tolist()
+        found = store.near(-1, 101, 1)
+        assert rows(found) == sorted((stamp, stamp * 10.0, -1.0) for stamp in every)
+        kept.append((found, rows(found)))
+    for found, before in kept:
+        assert rows(found) == before
+
+
 def test_minus_zero_is_zero_and_the_arrays_given_are_not_kept():
     store = SampleStore()
     t, p = np.array([3, 1]), np.array([-0.0, 1.0])

@@ -64,7 +64,7 @@ class SampleStore:
         self._unseen: list[np.ndarray] = []
         self._count, self._end = 0, 0
         self._file: io.FileIO | None = None
-        self._read: tuple[_Block, Samples] | None = None  # the block read last
+        self._read: tuple[_Block, tuple[np.ndarray, ...]] | None = None  # the block read last
         self.newest_ns, self.problem = int(np.iinfo(np.int64).min), ""
 
     def __len__(self) -> int:
@@ -153,12 +153,12 @@ class SampleStore:
                                       place=self._end)
         self._end += sum(column.nbytes for column in block.columns)
 
-    def _samples(self, block: _Block) -> Samples:
-        """Return the samples of a block, read back if it is not in memory."""
+    def _columns(self, block: _Block) -> tuple[np.ndarray, ...]:
+        """Return the columns of a block, read back if it is not in memory."""
         if block.columns:
-            return _with_speeds(block.columns)
+            return block.columns
         if self._read is None or self._read[0] is not block:
-            self._read = block, _with_speeds(self._read_back(block))
+            self._read = block, self._read_back(block)
         return self._read[1]
 
     def _read_back(self, block: _Block) -> tuple[np.ndarray, ...]:
@@ -204,12 +204,13 @@ class SampleStore:
         """Return the samples from `start_ns` to `end_ns`, and their neighbours, in any order.
 
         Of each side at least the `beside` nearest stamps are there with all of their samples, or
-        as many as exist.
+        as many as exist. Samples that came in the order of their stamps are returned in it. What
+        is returned may be the store's own: it is not to be written to.
         """
         self._flush()
         open_samples = self._open()
         parts = [_cut(open_samples, start_ns, end_ns, beside)] if len(open_samples[0]) else []
-        parts += [_cut(self._samples(self._blocks[number]), start_ns, end_ns, beside)
+        parts += [_cut(self._columns(self._blocks[number]), start_ns, end_ns, beside)
                   for number in np.flatnonzero(self._touched(start_ns, end_ns))]
         before = np.flatnonzero(self._lasts < start_ns)
         after = np.flatnonzero(self._firsts > end_ns)
@@ -218,13 +219,14 @@ class SampleStore:
             for at in np.argsort(known, kind="stable"):
                 if known[at] > _nth(parts, edge, sign, beside):
                     break
-                parts.append(_cut(self._samples(self._blocks[side[at]]), start_ns, end_ns, beside))
-        if not parts:
-            return NO_STAMPS, np.zeros(0), np.zeros(0)
-        return _joined(parts)
+                parts.append(_cut(self._columns(self._blocks[side[at]]), start_ns, end_ns, beside))
+        parts = [part for part in parts if len(part[0])]
+        return _joined(sorted(parts, key=lambda part: part[0][0]))
 
 
 def _joined(parts: list[Samples]) -> Samples:
+    if len(parts) < 2:
+        return parts[0] if parts else (NO_STAMPS, np.zeros(0), np.zeros(0))
     stamps, positions, speeds = (np.concatenate(column) for column in zip(*parts, strict=True))
     return stamps, positions, speeds
 
@@ -243,14 +245,14 @@ def _nth(parts: list[Samples], edge: int, sign: int, n: int) -> float:
     return float("inf") if len(stamps) < n else int(stamps[n - 1])
 
 
-def _cut(samples: Samples, start_ns: int, end_ns: int, beside: int) -> Samples:
+def _cut(columns: tuple[np.ndarray, ...], start_ns: int, end_ns: int, beside: int) -> Samples:
     """Return the samples between two stamps and of at least `beside` stamps on either side."""
-    t = samples[0]
+    t = columns[0]
     low = _reach(t[:np.searchsorted(t, start_ns)][::-1], beside)
     high = _reach(t[np.searchsorted(t, end_ns, "right"):], beside)
     first = int(np.searchsorted(t, start_ns)) - low
     last = int(np.searchsorted(t, end_ns, "right")) + high
-    return t[first:last], samples[1][first:last], samples[2][first:last]
+    return _with_speeds(tuple(column[first:last] for column in columns))
 
 
 def _reach(stamps: np.ndarray, n: int) -> int:
