@@ -57,7 +57,7 @@ class SampleStore:
     def __init__(self, limits: Limits | None = None) -> None:
         self._limits = limits or Limits()
         self._single = (array("q"), array("d"), array("d"))  # added one by one
-        self._parts: list[Samples] = []  # of the block that is being filled
+        self._filling = self._empty()  # the block that is being filled
         self._filled, self._rising, self._last_ns = 0, True, np.iinfo(np.int64).min
         self._blocks: list[_Block] = []
         self._firsts = self._lasts = self._counts = NO_STAMPS  # of the blocks
@@ -82,9 +82,7 @@ class SampleStore:
                   speeds: np.ndarray | None = None) -> None:
         """Add samples in any order; `speeds` None or NaN where they are not told."""
         self._flush()
-        self._append(np.array(stamps_ns, dtype=np.int64), np.array(positions, dtype=float),
-                     np.full(len(stamps_ns), np.nan) if speeds is None
-                     else np.array(speeds, dtype=float))
+        self._append(np.asarray(stamps_ns), np.asarray(positions), speeds)
 
     def _flush(self) -> None:
         if len(self._single[0]):
@@ -92,32 +90,44 @@ class SampleStore:
             self._single = (array("q"), array("d"), array("d"))
             self._append(stamps, positions, speeds)
 
-    def _append(self, stamps: np.ndarray, positions: np.ndarray, speeds: np.ndarray) -> None:
+    def _empty(self) -> Samples:
+        """Return the columns of a block that has no samples yet, and no pages before it has."""
+        size = self._limits.block
+        return np.empty(size, dtype=np.int64), np.empty(size), np.empty(size)
+
+    def _append(self, stamps: np.ndarray, positions: np.ndarray,
+                speeds: np.ndarray | None) -> None:
         """Fill the open block, closing it whenever it is full."""
-        positions = positions + 0.0  # -0.0 and 0.0 sort alike: keep one of them
-        for start in range(0, len(stamps), self._limits.block):
-            part = slice(start, start + self._limits.block)
-            t = stamps[part]
+        start = 0
+        while start < len(stamps):
+            taken = min(self._limits.block - self._filled, len(stamps) - start)
+            here, part = (slice(at, at + taken) for at in (self._filled, start))
+            t = self._filling[0][here]
+            t[:] = stamps[part]
+            np.add(positions[part], 0.0, out=self._filling[1][here])  # -0.0 and 0.0 sort alike
+            self._filling[2][here] = np.nan if speeds is None else speeds[part]
             self._rising &= bool(t[0] >= self._last_ns and (t[1:] >= t[:-1]).all())
             self._last_ns = max(self._last_ns, int(t[-1]))
             self.newest_ns = max(self.newest_ns, int(t.max()))
-            self._parts.append((t, positions[part], speeds[part]))
             self._unseen.append(t)
-            self._filled += len(t)
-            self._count += len(t)
-            if self._filled >= self._limits.block:
+            self._filled += taken
+            self._count += taken
+            start += taken
+            if self._filled == self._limits.block:
                 self._close()
 
     def _open(self) -> Samples:
         """Return the samples of the block that is being filled, in the order of their stamps."""
-        if len(self._parts) > 1 or not self._rising:
-            stamps, positions, speeds = _joined(self._parts)
-            if not self._rising:
-                order = np.argsort(stamps, kind="stable")
-                stamps, positions, speeds = stamps[order], positions[order], speeds[order]
-            self._parts, self._rising = [(stamps, positions, speeds)], True
-            self._last_ns = int(stamps[-1])
-        return self._parts[0] if self._parts else (NO_STAMPS, np.zeros(0), np.zeros(0))
+        filled = tuple(column[:self._filled] for column in self._filling)
+        if not self._rising:
+            order = np.argsort(filled[0], kind="stable")
+            self._filling = self._empty()  # what was returned before stays as it is
+            for column, old in zip(self._filling, filled, strict=True):
+                column[:self._filled] = old[order]
+            self._rising, self._last_ns = True, int(self._filling[0][self._filled - 1])
+            filled = tuple(column[:self._filled] for column in self._filling)
+        stamps, positions, speeds = filled
+        return stamps, positions, speeds
 
     def _close(self) -> None:
         stamps, positions, speeds = self._open()
@@ -126,7 +136,7 @@ class SampleStore:
         self._blocks.append(_Block(int(stamps[0]), int(stamps[-1]), len(stamps), told, columns))
         self._firsts, self._lasts, self._counts = (np.append(known, new) for known, new in (
             (self._firsts, stamps[0]), (self._lasts, stamps[-1]), (self._counts, len(stamps))))
-        self._parts, self._filled, self._rising = [], 0, True
+        self._filling, self._filled, self._rising = self._empty(), 0, True
         self._last_ns = np.iinfo(np.int64).min
         held = [number for number, block in enumerate(self._blocks) if block.columns]
         if len(held) > self._limits.in_memory and not self.problem:
