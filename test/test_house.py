@@ -8,12 +8,13 @@ import pytest
 
 from test.support.sources import PACKAGE, SOURCES, source
 
-BASE = {"errors", "files", "units"}
+BASE = {"errors", "files", "memory", "units"}
 DOMAIN = {"model"} | BASE
 ESTIMATION = {"estimation", "compensation", "laser"}
 MIDDLE = {"messages", "bagio", "reporting", "collection", "simulation", "parallel"}
 MAY_IMPORT = {
     "errors": set(),
+    "memory": set(),
     "units": set(),
     "files": {"errors"},
     "model": BASE,

@@ -14,6 +14,7 @@ from selfcal_ros.collection.settings.nodes import SolverSettings
 from selfcal_ros.errors import InputError, NoDataError, NotIdentifiableError, SelfcalError
 from selfcal_ros.estimation.api import Options, calibrate
 from selfcal_ros.files import write_json
+from selfcal_ros.memory import keep_freed_memory
 from selfcal_ros.messages import from_model, to_model
 from selfcal_ros.messages.sizes import check_plate, check_view
 from selfcal_ros.messages.topics import COMMAND_TOPIC, MEASUREMENT_TOPIC
@@ -35,9 +36,6 @@ from selfcal_ros.sessions.ports import Diagnosis, Level, Ports
 from selfcal_ros.sessions.runs import Run, supersedes
 from selfcal_ros.sessions.verdicts import is_qualified
 from selfcal_ros.simulation.truth import hu_plan, random_truth, simulate_measurements
-
-LARGEST_KEPT = 31 * 2**20
-"""Bytes of a block that is freed, just below the largest that counts (32 MB)."""
 
 ECHO_LENGTH = 128
 """Characters of a string that `ros2 topic echo` shows."""
@@ -95,17 +93,6 @@ def warm_up(marks: int = 5) -> None:
     rng = np.random.default_rng(1)
     calibrate(simulate_measurements(random_truth(plan.artifact, len(plan.views), rng), plan, rng,
                                     sigma_m=2e-8, sigma_theta_rad=1e-6, visits=True))
-
-
-def keep_freed_memory() -> None:
-    """Have the allocator keep what is freed, up to 64 MB, instead of giving it back at once.
-
-    A solution takes and frees some hundred arrays of 0.1 to 1 MB. Each page that comes from the
-    system anew costs 2 to 5 us: a tenth of a solution. The allocator of glibc takes what is freed
-    as the measure of what to keep (mallopt(3), M_MMAP_THRESHOLD: "adjusted dynamically"); nothing
-    is written to the block, so it takes no memory. Other allocators are not impressed.
-    """
-    np.empty(LARGEST_KEPT, dtype=np.uint8)
 
 
 @dataclass
