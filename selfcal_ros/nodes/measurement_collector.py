@@ -11,6 +11,7 @@ from std_srvs.srv import Trigger
 
 from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.errors import InputError
+from selfcal_ros.memory import keep_freed_memory
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes.encoder_input import EncoderInput
 from selfcal_ros.nodes.managed import WhileConfigured, stop
@@ -51,6 +52,7 @@ class MeasurementCollector(PollingNode[CollectorSettings]):
 
     def configure(self) -> None:
         """Make the session, the journal and the publishers."""
+        keep_freed_memory()
         ports = self.ports(self._publish)
         self.session = CollectingSession(self.settings, ports)
         journal = JournalKeeper(self._journal_folder(), {
