@@ -65,7 +65,8 @@ RESULT = {
                  "where not known; g_theta, u_g_theta: K numbers in rad; nonorthogonality, "
                  "scale_difference, datum_theta",
     "artifact_map": "ax, ay (m), a_theta (rad) of the plate, as error_map",
-    "observability": "rank, unknowns, deficiency, identifiable, modes, advice",
+    "observability": "rank, unknowns, deficiency, identifiable, modes, advice; unchecked_sites, "
+                     "unchecked_lines: how many rest on single readings, null where not counted",
     "noise": "sigma_* of one reading (m, rad): used, from repeats, from residuals, declared; "
              "dof_*; k_*; p_* of the F-test",
     "rejected": "reason -> number of detections", "warnings": "a list of sentences",

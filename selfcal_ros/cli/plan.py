@@ -152,7 +152,8 @@ def _check_json(plan: Plan, seen: Observability, predicted: Prediction | None, *
 
     out = {"plan_id": plan.plan_id, "rank": seen.rank, "unknowns": seen.unknowns,
            "deficiency": seen.deficiency, "identifiable": seen.identifiable,
-           "modes": list(seen.modes), "advice": list(seen.advice), "predicted": None}
+           "modes": list(seen.modes), "advice": list(seen.advice), "predicted": None,
+           "unchecked_sites": seen.unchecked_sites, "unchecked_lines": seen.unchecked_lines}
     if predicted is not None:
         out["predicted"] = plain({
             "rms_gain_xy": predicted.rms_xy, "max_gain_xy": predicted.max_xy,
@@ -173,13 +174,20 @@ def _check_text(plan: Plan, seen: Observability, predicted: Prediction | None) -
         lines += [f"  - {text}" for text in seen.modes]
         lines += ["it would, if you"] + [f"  - {text}" for text in seen.advice]
         return lines
-    lines += ["the plan identifies the stage",
+    lines += ["the plan identifies the stage", *_unchecked_text(seen),
               "predicted standard uncertainty, for unit noise of one averaged reading:",
               f"  XY     rms {predicted.rms_xy:.4f}   largest {predicted.max_xy:.4f}"]
     if len(predicted.u_theta):
         lines.append(f"  theta  rms {predicted.rms_theta:.4f}")
     note = field_note(predicted, plan)
     return [*lines, *([f"  ({note})"] if note else [])]
+
+
+def _unchecked_text(seen: Observability) -> list[str]:
+    counts = ((seen.unchecked_sites, "sites"), (seen.unchecked_lines, "lines"))
+    found = " and ".join(f"{count} {what}" for count, what in counts if count)
+    return [f"{found} rest on single readings that no other checks: a further view would check "
+            "them"] if found else []
 
 
 def field_note(predicted: Prediction, plan: Plan) -> str:

@@ -176,6 +176,14 @@ class VisitedOnce(Finding):
 
 
 @dataclass(frozen=True)
+class Unchecked(Finding):
+    """Sites (m, n) and lines (k,) of the map that rest on readings which no other checks."""
+
+    sites: tuple[tuple[int, ...], ...]
+    lines: tuple[tuple[int, ...], ...] = ()
+
+
+@dataclass(frozen=True)
 class DrawnUncertainty(Finding):
     """The uncertainty of Hu's law comes from that many draws of unit noise."""
 

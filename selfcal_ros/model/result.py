@@ -77,6 +77,9 @@ class Observability:
         The unseen modes in words.
     advice : tuple of str
         Views or marks that would cure a deficiency.
+    unchecked_sites, unchecked_lines : int, optional
+        Sites and lines of the map that rest on single readings, which no other reading checks;
+        None where it was not counted.
     """
 
     rank: int
@@ -85,6 +88,8 @@ class Observability:
     identifiable: bool
     modes: tuple[str, ...] = ()
     advice: tuple[str, ...] = ()
+    unchecked_sites: int | None = None
+    unchecked_lines: int | None = None
 
 
 @dataclass(frozen=True)
@@ -333,6 +338,8 @@ def _parse(data: dict) -> CalibrationResult:
     seen |= {key: tuple(_of(str, mode) for mode in _of(list, seen.get(key, [])))
              for key in ("modes", "advice")}
     seen |= {key: _of(int, seen[key]) for key in ("rank", "unknowns", "deficiency")}
+    for key in ("unchecked_sites", "unchecked_lines"):
+        seen[key] = None if seen.get(key) is None else _of(int, seen[key])
     _of(bool, seen["identifiable"])
     noise = {key: _number(value) for key, value in data["noise"].items()}
     return CalibrationResult(

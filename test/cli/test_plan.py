@@ -33,6 +33,7 @@ def test_every_shipped_plan_is_what_its_name_says(path, capsys):
     assert found["identifiable"] is not deficient
     assert (found["deficiency"] > 0) is deficient
     assert bool(found["modes"]) is deficient and bool(found["advice"]) is deficient
+    assert found["unchecked_sites"] == found["unchecked_lines"] == (None if deficient else 0)
     if deficient:
         assert found["predicted"] is None
     else:
@@ -51,6 +52,14 @@ def test_check_as_json_has_the_keys_of_the_contract(capsys):
     assert found["predicted"]["rms_gain_theta"] == pytest.approx(0.752, abs=5e-4)
     assert main(["plan", "check", shipped("qiao"), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["predicted"]["rms_gain_theta"] is None
+
+
+def test_check_tells_what_nothing_checks(tmp_path, capsys):
+    text = Path(shipped("hu")).read_text().replace("size: 11", "size: 11, grid_size_y: 5")
+    (tmp_path / "long.yaml").write_text(text)
+    assert main(["plan", "check", str(tmp_path / "long.yaml")]) == 0
+    assert ("\n30 sites rest on single readings that no other checks: a further view would check "
+            "them\n") in capsys.readouterr().out
 
 
 def test_check_in_words(capsys):

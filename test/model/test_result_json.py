@@ -51,6 +51,14 @@ def test_a_result_survives_its_json_to_the_last_bit(lines, size_y):
     assert_same(through_json(result), result)
 
 
+def test_a_result_of_before_does_not_tell_what_nothing_checks():
+    data = result_to_dict(known_result()[0])
+    assert data["observability"].pop("unchecked_sites") is None
+    assert result_from_dict(data, "old").observability.unchecked_sites is None
+    data["observability"]["unchecked_lines"] = 3
+    assert result_from_dict(data, "new").observability.unchecked_lines == 3
+
+
 def test_unknown_places_are_null_and_come_back_as_nan():
     result, _ = known_result()
     result.error_map.gx[2, 3] = result.error_map.u_gy[0, 0] = np.nan
@@ -113,6 +121,7 @@ def damaged(path, value):
     (("rejected",), {"a": "many"}, "'many' is not of type int"),
     (("warnings",), "one", "'one' is not of type list"),
     (("observability", "identifiable"), 1, "1 is not of type bool"),
+    (("observability", "unchecked_sites"), 1.5, "1.5 is not of type int"),
     (("views",), 3, "'int' object is not iterable")])
 def test_damaged_results_are_refused(path, value, message):
     with pytest.raises(InputError) as caught:

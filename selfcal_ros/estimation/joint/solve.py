@@ -10,7 +10,7 @@ from selfcal_ros.estimation.blas_threads import one_thread
 from selfcal_ros.estimation.datum.angular import conditions_for, misclosure_test
 from selfcal_ros.estimation.datum.covariance import FieldCovariance, angular_variance
 from selfcal_ros.estimation.datum.scale import scale_datum
-from selfcal_ros.estimation.findings import NoUncertainty
+from selfcal_ros.estimation.findings import NoUncertainty, Unchecked
 from selfcal_ros.estimation.joint.fit import JointFit
 from selfcal_ros.estimation.joint.kept_residuals import kept_residuals
 from selfcal_ros.estimation.joint.model_fit import ModelFit, fit_model
@@ -20,7 +20,7 @@ from selfcal_ros.estimation.joint.solved import Solved, noise_of
 from selfcal_ros.estimation.lattice.maps import PHASES
 from selfcal_ros.estimation.lattice.readings import angular_data, grid_data
 from selfcal_ros.estimation.normal.cache import system_for
-from selfcal_ros.estimation.normal.equations import MAX_DIRECT_SITES
+from selfcal_ros.estimation.normal.equations import MAX_DIRECT_SITES, NormalEquations
 from selfcal_ros.estimation.observability.plan_check import with_unseen_modes
 from selfcal_ros.estimation.observability.rank import identifies, measured_observability, refusal
 from selfcal_ros.estimation.options import Options
@@ -34,7 +34,7 @@ from selfcal_ros.model.result import (
     Observability,
     ViewResult,
 )
-from selfcal_ros.model.verdict import ModelResult, TermEstimate, TermResult
+from selfcal_ros.model.verdict import Finding, ModelResult, TermEstimate, TermResult
 from selfcal_ros.model.view import Plan
 
 
@@ -83,7 +83,9 @@ def _solved(measurements: Measurements, options: Options, *, model: ModelFit,
             seen: Observability) -> Solved:
     problem, found = model.problem, model.found
     error_map, closure, kept = _error_map(measurements, options, model=model)
-    findings = () if problem.direct or options.uncertainty is not None else (NoUncertainty(),)
+    findings = _unchecked(problem.system, measurements.sense)
+    if not problem.direct and options.uncertainty is None:
+        findings = (NoUncertainty(), *findings)
     axes = (1.0, 0.0)
     if problem.conditions.datum is ThetaDatum.XY_AXES and closure is not None:
         axes = misclosure_test(found.misclosure, closure)
@@ -96,6 +98,17 @@ def _solved(measurements: Measurements, options: Options, *, model: ModelFit,
         run_id=measurements.run_id,
         model=ModelResult("rigid" if problem.rigid else "linear", term_results(model)))
     return Solved(result, found.xy, found.theta, model, axes)
+
+
+def _unchecked(system: NormalEquations, sense: Sense) -> tuple[Finding, ...]:
+    """Return the sites and lines of the map, stage frame, that single readings alone tell."""
+    sites = np.argwhere(system.unchecked_sites) - np.array(system.grid.views.half)
+    lines = np.argwhere(system.unchecked_lines)
+    if not len(sites) and not len(lines):
+        return ()
+    if sense is Sense.PLATE_MOVES:  # as the map itself: G(X) = -H(-X)
+        sites, lines = -sites[::-1], np.sort(-lines % max(system.angular.n_lines, 1), axis=0)
+    return (Unchecked(tuple(map(tuple, sites.tolist())), tuple(map(tuple, lines.tolist()))),)
 
 
 def weights_read(problem: Problem, index: int) -> dict[str, Any]:

@@ -83,7 +83,9 @@ def solve_law(measurements: Measurements, options: Options) -> Solved:
         ArtifactMap(found.a[0, ..., 0], found.a[1, ..., 0], found.a_theta[:, 0]),
         tuple(_view_result(view, order.index(i), found)
               for i, view in enumerate(measurements.views)),
-        Observability(4 * sites + 9, 4 * sites + 9, 0, True), noise,
+        # complete views: each site and each line has two readings or more
+        Observability(4 * sites + 9, 4 * sites + 9, 0, True, unchecked_sites=0, unchecked_lines=0),
+        noise,
         measurements.all_rejected(), findings=_findings(artifact, options), method="law",
         sense=str(measurements.sense), run_id=measurements.run_id)
     return Solved(result, xy, theta)

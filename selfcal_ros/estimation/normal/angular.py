@@ -13,6 +13,7 @@ from scipy.sparse import coo_matrix, csc_matrix
 from scipy.sparse.linalg import splu
 
 from selfcal_ros.estimation.lattice.connectivity import Components, components
+from selfcal_ros.estimation.lattice.unchecked import rest_on_one
 
 DENSE_LINES = 512
 """Largest K that is solved with dense matrices."""
@@ -59,6 +60,13 @@ class AngularSystem:
         view, line = np.nonzero(self.read)
         return components(self.site[view, line], line, np.zeros(len(line), dtype=int),
                           n_sites=self.n_lines, n_marks=self.n_lines)
+
+    @cached_property
+    def unchecked(self) -> np.ndarray:
+        """Stage lines that rest on readings which no other checks, bool (K,)."""
+        view, line = np.nonzero(self.read)
+        return rest_on_one(self.site[view, line], line, n_sites=self.n_lines,
+                           n_marks=self.n_lines)
 
     def centred(self, y: np.ndarray) -> np.ndarray:
         """Return `y` (views, K, ...) less the weighted mean of each line over its views."""

@@ -224,6 +224,16 @@ class NormalEquations:
                 known &= abs(residual) <= 1e-6
         return known.reshape(self.grid.views.shape)
 
+    @property
+    def unchecked_sites(self) -> np.ndarray:
+        """Known sites that rest on readings which no other checks, bool (nx, ny)."""
+        return self.grid.unchecked & self.known_sites
+
+    @property
+    def unchecked_lines(self) -> np.ndarray:
+        """Known stage lines that rest on readings which no other checks, bool (K,)."""
+        return self.angular.unchecked & self.known_lines
+
     @cached_property
     def known_views(self) -> np.ndarray:
         """Misalignments that are determined up to the datum, bool (size,)."""

@@ -13,6 +13,7 @@ import numpy as np
 
 from selfcal_ros.estimation.lattice.connectivity import Components, components
 from selfcal_ros.estimation.lattice.maps import LatticeViews, rigid_parameters
+from selfcal_ros.estimation.lattice.unchecked import rest_on_one
 from selfcal_ros.estimation.multifrontal.factor import Factor
 from selfcal_ros.estimation.multifrontal.symmetry import fold
 from selfcal_ros.model.view import LatticePose
@@ -68,6 +69,13 @@ class GridSystem:
         site, mark, q = self.edges
         return components(site, mark, q, n_sites=self.n_sites, n_marks=self.n_sites,
                           turning=self._find_turning_site())
+
+    @cached_property
+    def unchecked(self) -> np.ndarray:
+        """Sites that rest on readings which no other checks, bool (nx, ny)."""
+        site, mark, _ = self.edges
+        return rest_on_one(site, mark, n_sites=self.n_sites,
+                           n_marks=self.n_sites).reshape(self.views.shape)
 
     def _find_turning_site(self) -> int:
         """Return a site that one mark visits in two turns, which closes a path; -1 = none."""

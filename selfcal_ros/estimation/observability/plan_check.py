@@ -10,7 +10,11 @@ from selfcal_ros.estimation.blas_threads import one_thread
 from selfcal_ros.estimation.normal.equations import NormalEquations
 from selfcal_ros.estimation.normal.planned import planned_system
 from selfcal_ros.estimation.observability.prediction import MAX_SITES, Prediction, predict
-from selfcal_ros.estimation.observability.rank import full_observability, identifies
+from selfcal_ros.estimation.observability.rank import (
+    full_observability,
+    identifies,
+    with_unchecked,
+)
 from selfcal_ros.estimation.observability.unseen import (
     UnseenMode,
     angular_families,
@@ -60,7 +64,7 @@ class PlanCheck:
 def check_plan(plan: Plan) -> PlanCheck:
     """Return rank, deficiency, unseen modes and cures of a plan with every mark read."""
     system = planned_system(plan.artifact, plan.views)
-    seen = full_observability(system, plan.artifact, plan.views)
+    seen = with_unchecked(full_observability(system, plan.artifact, plan.views), system)
     return PlanCheck(seen, ()) if seen.identifiable else with_unseen_modes(seen, system, plan)
 
 

@@ -9,6 +9,7 @@ three rows a view, whose zeros and non-zeros lie ten orders of magnitude apart (
 
 import math
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 
 from selfcal_ros.estimation.normal.equations import NormalEquations
 from selfcal_ros.estimation.normal.memo import Memo
@@ -104,8 +105,15 @@ def measured_observability(system: NormalEquations, artifact: Artifact,
     views : tuple of View
         The views that were read.
     """
-    return _measured.get(system, (artifact, views),
-                         lambda: _measured_observability(system, artifact, views))
+    return _measured.get(system, (artifact, views), lambda: with_unchecked(
+        _measured_observability(system, artifact, views), system))
+
+
+def with_unchecked(seen: Observability, system: NormalEquations) -> Observability:
+    """Return what readings tell with the sites and lines that single readings alone tell."""
+    return seen if not seen.identifiable else replace(
+        seen, unchecked_sites=int(system.unchecked_sites.sum()),
+        unchecked_lines=int(system.unchecked_lines.sum()))
 
 
 def _measured_observability(system: NormalEquations, artifact: Artifact,

@@ -16,6 +16,7 @@ from selfcal_ros.estimation.findings import (
     SlipsGivenUp,
     TakenForSlip,
     TooManyOutliers,
+    Unchecked,
     VisitedOnce,
 )
 from selfcal_ros.model.verdict import Finding
@@ -23,7 +24,7 @@ from selfcal_ros.reporting.words.causes import what_it_is
 from selfcal_ros.units import UM_PER_M, URAD_PER_RAD
 
 NAMED = 5
-"""Removed readings that are named; the rest is in the list."""
+"""Readings, sites or lines that are named one by one; the others are counted."""
 
 
 @singledispatch
@@ -43,6 +44,24 @@ def _(_: VisitedOnce) -> str:
     return ("each mark was visited once in a view, its repeats one after the other: a drift that "
             "is alike in all views is a part of the map, and repeats do not show it; visit the "
             "marks there and back, along x and along y")
+
+
+@warning.register
+def _(found: Unchecked) -> str:
+    what = " and ".join(_counted(places, kind) for places, kind in (
+        (found.sites, "site"), (found.lines, "line")) if places)
+    one = len(found.sites) + len(found.lines) == 1
+    rest, them = ("rests on a single reading", "it") if one else ("rest on single readings", "them")
+    return (f"{what} of the map {rest} that no other checks; what is wrong with {them} is in the "
+            "map, and no residual shows it: measure the marks that are missing, or add a view")
+
+
+def _counted(places: tuple[tuple[int, ...], ...], kind: str) -> str:
+    named = ", ".join(str(at if len(at) > 1 else at[0]) for at in places[:NAMED])
+    more = f" and {len(places) - NAMED} more" if len(places) > NAMED else ""
+    if len(places) == 1:
+        return f"1 {kind} {named}"
+    return f"{len(places)} {kind}s ({named}{more})"
 
 
 @warning.register

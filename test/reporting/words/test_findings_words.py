@@ -50,6 +50,14 @@ WARNINGS = {
         "each mark was visited once in a view, its repeats one after the other: a drift that is "
         "alike in all views is a part of the map, and repeats do not show it; visit the marks "
         "there and back, along x and along y"),
+    f.Unchecked(((5, -3),)): (
+        "1 site (5, -3) of the map rests on a single reading that no other checks; what is wrong "
+        "with it is in the map, and no residual shows it: measure the marks that are missing, or "
+        "add a view"),
+    f.Unchecked(tuple((m, 5) for m in range(7)), ((4,), (11,))): (
+        "7 sites ((0, 5), (1, 5), (2, 5), (3, 5), (4, 5) and 2 more) and 2 lines (4, 11) of the "
+        "map rest on single readings that no other checks; what is wrong with them is in the map, "
+        "and no residual shows it: measure the marks that are missing, or add a view"),
     f.DrawnUncertainty(200): (
         "uncertainties of the law from 200 draws of unit noise: 5.0 % standard error"),
     f.OutliersRemoved((*MANY[:1], f.Removed("a", "angular", (7,), 9.0, 0.0, 1e-5))): (

@@ -1,0 +1,36 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which sites rest on readings that no other reading checks."""
+
+import numpy as np
+
+
+def rest_on_one(site: np.ndarray, mark: np.ndarray, *, n_sites: int, n_marks: int) -> np.ndarray:
+    """Return the sites whose error is known through single readings, bool (sites,).
+
+    A reading that is the only one of a site gives the site's error, and the only one of a mark
+    gives the mark's: the fit follows it wholly (1 - h = 0, method eq. 4.10), and no residual shows
+    what is wrong with it. Without such readings, which tell nothing of the other sites, others may
+    be the last of a site or mark: they are taken off until each site and mark that is left has
+    two or more. Sites that none is left of rest on single readings.
+
+    Parameters
+    ----------
+    site, mark : int arrays (readings,)
+        Site and mark that each reading joins: one a mark and view, however often it was repeated.
+    n_sites, n_marks : int
+        Number of sites and marks.
+    """
+    ends = np.stack([site, mark + n_sites])
+    number = np.broadcast_to(np.arange(len(site)), ends.shape)
+    left = np.bincount(ends.ravel(), minlength=n_sites + n_marks)
+    # of a node that has one reading left this sum is that reading's number
+    total = np.bincount(ends.ravel(), number.ravel(), n_sites + n_marks).astype(np.int64)
+    read = left[:n_sites] > 0
+    last = np.flatnonzero(left == 1)
+    while len(last):
+        off = np.unique(total[last])
+        at = ends[:, off].ravel()
+        np.subtract.at(left, at, 1)
+        np.subtract.at(total, at, np.tile(off, 2))
+        last = np.unique(at[left[at] == 1])
+    return read & (left[:n_sites] == 0)
