@@ -34,6 +34,9 @@ if TYPE_CHECKING:
 
 HELP = "check a plan of views before it is measured, or suggest views"
 
+SHOWN = 8
+"""Suggestions, unless it is said how many."""
+
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the sub-verbs ``check`` and ``suggest``."""
@@ -60,8 +63,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
                          help="find the best plan of N views for the plan's plate")
     suggest.add_argument("--criterion", choices=("rms", "max"), default="rms",
                          help="which XY uncertainty is to become small (default rms)")
-    suggest.add_argument("--top", type=int, default=8, metavar="N",
-                         help="number of suggestions to show (default 8)")
+    suggest.add_argument("--top", type=int, metavar="N",
+                         help=f"number of suggestions to show (default {SHOWN})")
     suggest.add_argument("-o", "--output", metavar="PLAN.yaml",
                          help="write the plan with the best suggestion")
 
@@ -225,8 +228,11 @@ def _suggest(args: argparse.Namespace, plan: Plan) -> int:
     from selfcal_ros.model.error_map import ThetaDatum
     from selfcal_ros.reporting.words.steps import search_text
 
-    if args.top < 1:
-        raise InputError("--top", f"{args.top} is not positive", "give 1 or more")
+    if args.top is not None and args.views is not None:
+        raise InputError("--top", "with --views one plan is found, not a list", "leave it out")
+    shown = SHOWN if args.top is None else args.top
+    if shown < 1:
+        raise InputError("--top", f"{shown} is not positive", "give 1 or more")
     check_outputs([args.plan], [args.output])
     plan = _in_order(plan, args.order)
     against = _against(args, plan)
@@ -254,7 +260,7 @@ def _suggest(args: argparse.Namespace, plan: Plan) -> int:
         _show_best(args, best, (score, unit), search_text(search))
     else:
         best = replace(plan, views=ranked[0].views)
-        _show_ranked(args, plan, (now, unit), ranked[:args.top])
+        _show_ranked(args, plan, (now, unit), ranked[:shown])
     if args.output:
         _write_plan(args.output, best)
     return int(ExitCode.DONE)

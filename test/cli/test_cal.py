@@ -361,6 +361,17 @@ def test_lines_from_a_result_and_from_measured_errors(run, tmp_path):
 
 
 @pytest.mark.parametrize("args", [
+    ["accuracy", "d.csv"], ["straightness", "d.csv"],
+    ["orthogonality", "--measured", "5um", "--over", "1m", "--travel", "1m"]])
+def test_force_without_a_file_to_replace_is_refused(run, tmp_path, args):
+    (tmp_path / "d.csv").write_text("position,error\n0,0\n10,1\n20,3\n")
+    assert run(*args)[0] == 0
+    code, out, err = run(*args, "--force")
+    assert code == 2 and not out
+    one_line(err, "--force: it replaces a file, and none is named; name one with -o")
+
+
+@pytest.mark.parametrize("args", [
     ["accuracy", "d.csv", "--home-x", "-50"], ["accuracy", "d.csv", "--reverse-x"],
     ["straightness", "d.csv", "--along", "y", "--home-y", "5"],
     ["orthogonality", "--measured", "5um", "--over", "1m", "--travel", "1m", "--reverse-y"]])

@@ -239,6 +239,8 @@ def test_suggest_the_best_plan(capsys, tmp_path):
 @pytest.mark.parametrize(("arguments", "message"), [
     (["suggest", "--views", "2"], "--views: 2 views cannot identify the stage; give 3 or more"),
     (["suggest", "--top", "0"], "--top: 0 is not positive"),
+    (["suggest", "--views", "4", "--top", "2"],
+     "--top: with --views one plan is found, not a list; leave it out"),
     (["suggest", "-o", "/no/such/folder/p.yaml"], "cannot be written"),
 ])
 def test_bad_arguments(arguments, message, capsys):

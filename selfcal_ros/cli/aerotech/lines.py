@@ -61,11 +61,19 @@ def _common(parser: argparse.ArgumentParser, run: object) -> None:
     parser.set_defaults(run_sub_verb=run)
 
 
+def _frame(args: argparse.Namespace) -> "MachineFrame":
+    """Return the frame of the machine; refuse what would change nothing."""
+    if args.force and not args.output:
+        raise InputError("--force", "it replaces a file, and none is named",
+                         "name one with -o, or leave it out")
+    return frame_of(args)
+
+
 def _orthogonality(args: argparse.Namespace) -> int:
     from selfcal_ros.compensation.aerotech import lines as cal_lines
     from selfcal_ros.compensation.machine import UNITS_M
 
-    frame = frame_of(args)
+    frame = _frame(args)
     other: Axis = "y" if args.along == "x" else "x"
     measured = (args.measured, args.over, args.travel)
     if args.source is not None:
@@ -117,7 +125,7 @@ def _line(args: argparse.Namespace, corrected: Axis) -> int:
     from selfcal_ros.compensation.aerotech import lines as cal_lines
     from selfcal_ros.files import read_text
 
-    frame, result = frame_of(args), None
+    frame, result = _frame(args), None
     if Path(args.source).suffix.lower() == ".csv":
         _refuse_frame(args, "measured errors, whose positions are the controller's own",
                       "leave it out")

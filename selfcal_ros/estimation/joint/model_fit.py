@@ -7,6 +7,7 @@ what the terms make of the readings, are taken off with the last solution until 
 Every step solves the same factored equations (Gauss-Newton).
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -169,9 +170,10 @@ def _settled(problem: Problem, check: Callable[[TermEquations], None]) -> ModelF
             return state.finished()
         before = change
     if problem.terms:
+        free = " or ".join(str(term.name) for term in problem.terms if math.isinf(term.size))
         raise NotSettledError(f"model {', '.join(str(term.name) for term in problem.terms)}",
                               "the estimate does not settle",
-                              "leave a term out, or give it a size")
+                              "leave a term out" + (f", or give {free} a size" if free else ""))
     raise NotSettledError("misalignment model 'rigid'", "the rotations do not settle",
                           "check the readings for misalignments of more than a few degrees")
 

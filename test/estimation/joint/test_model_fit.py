@@ -71,7 +71,9 @@ def test_degrees_of_freedom_count_rotations_that_marks_and_lines_share_once(shar
     ("", "misalignment model 'rigid': the rotations do not settle; check the readings for "
      "misalignments of more than a few degrees"),
     ("plate_scale,drift:1e-8", "model drift, plate_scale: the estimate does not settle; leave a "
-     "term out, or give it a size")])
+     "term out, or give plate_scale a size"),
+    ("plate_scale:1e-7,drift:1e-8", "model drift, plate_scale: the estimate does not settle; leave "
+     "a term out")])
 def test_what_does_not_settle_is_named(monkeypatch, terms, message):
     monkeypatch.setattr(model_fit, "MAX_STEPS", 1)
     plan, rng = plan_with(0, 0), np.random.default_rng(6)
