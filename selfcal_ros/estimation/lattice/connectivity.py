@@ -101,3 +101,34 @@ def _cover(a: np.ndarray, b: np.ndarray, turn: np.ndarray, n: int) -> np.ndarray
     from_a = np.broadcast_to(turns * n + a, (4, len(a)))
     to_b = ((turns + turn) % 4) * n + b
     return _connect(from_a.ravel(), to_b.ravel(), 4 * n).reshape(4, n)
+
+
+def free_turns(site: np.ndarray, mark: np.ndarray, q: np.ndarray,
+               parts: Components) -> tuple[np.ndarray, np.ndarray]:
+    """Return the quarter turns that a component's free vector takes, int (sites,), (marks,).
+
+    Against the first site of the component: with v the vector there, G = i^turn v and
+    A = -i^turn v change no reading. 0 outside the components that are balanced.
+
+    Parameters
+    ----------
+    site, mark, q : int arrays (readings,)
+        As for `components`.
+    parts : Components
+        The components of these readings.
+    """
+    of_site, of_mark = np.zeros(len(parts.of_site), dtype=int), np.zeros(len(parts.of_mark), int)
+    free = parts.balanced[parts.of_site[site]]
+    if not free.any():
+        return of_site, of_mark
+    ends, place = np.unique(np.stack([site, mark + len(of_site)])[:, free], return_inverse=True)
+    start, end = place.reshape(2, -1)
+    # a vector v of a mark appears as i^q v on its site
+    label = _cover(end, start, q[free], len(ends))
+    at_site = ends < len(of_site)
+    part = np.where(at_site, parts.of_site[np.where(at_site, ends, 0)],
+                    parts.of_mark[np.where(at_site, 0, ends - len(of_site))])
+    home = label[0][np.searchsorted(ends, parts.first_sites[part])]
+    turn = np.argmax(label == home, axis=0)
+    of_site[ends[at_site]], of_mark[ends[~at_site] - len(of_site)] = turn[at_site], turn[~at_site]
+    return of_site, of_mark

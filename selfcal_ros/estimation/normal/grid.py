@@ -11,7 +11,11 @@ from itertools import combinations
 
 import numpy as np
 
-from selfcal_ros.estimation.lattice.connectivity import Components, components
+from selfcal_ros.estimation.lattice.connectivity import (
+    Components,
+    components,
+    free_turns,
+)
 from selfcal_ros.estimation.lattice.maps import LatticeViews, rigid_parameters
 from selfcal_ros.estimation.lattice.unchecked import rest_on_one
 from selfcal_ros.estimation.multifrontal.factor import Factor
@@ -69,6 +73,11 @@ class GridSystem:
         site, mark, q = self.edges
         return components(site, mark, q, n_sites=self.n_sites, n_marks=self.n_sites,
                           turning=self._find_turning_site())
+
+    @cached_property
+    def free_turns(self) -> tuple[np.ndarray, np.ndarray]:
+        """Quarter turns of the free vectors of components at sites and marks, int (sites,) each."""
+        return free_turns(*self.edges, self.components)
 
     @cached_property
     def unchecked(self) -> np.ndarray:

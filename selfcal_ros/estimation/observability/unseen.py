@@ -9,8 +9,6 @@ that no reading tells move whole fields.
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
 from selfcal_ros.estimation.lattice.connectivity import Components
 from selfcal_ros.estimation.lattice.maps import PHASES
@@ -86,7 +84,7 @@ def known_families(system: NormalEquations) -> list[UnseenMode]:
 def component_family(system: NormalEquations) -> UnseenMode | None:
     """Return the family of vectors left free by balanced components, None if one spans all."""
     grid = system.grid
-    parts, phase = grid.components, phases(grid)
+    parts, phase = grid.components, grid.free_turns[0]
     free = np.flatnonzero(parts.balanced)
     seen = parts.of_site >= 0
     if len(free) < 2 and not (len(free) == 1 and len(parts.balanced) > 1):
@@ -98,22 +96,6 @@ def component_family(system: NormalEquations) -> UnseenMode | None:
     # the example: one component against the rest
     example = np.where(label == free[0], PHASES[signs], 0)
     return UnseenMode(name, text, as_map(example))
-
-
-def phases(grid: GridSystem) -> np.ndarray:
-    """Return the quarter turns that a free vector of each site's component takes, (sites,)."""
-    site, mark, q = grid.edges
-    n = 2 * grid.n_sites
-    turns = np.arange(4)[:, None]
-    a = ((turns + q) % 4) * n + site
-    b = np.broadcast_to(turns * n + mark + grid.n_sites, a.shape)
-    edges = coo_matrix((np.ones(a.size, dtype=np.int8), (a.ravel(), b.ravel())),
-                       shape=(4 * n, 4 * n))
-    cover = connected_components(edges, directed=False)[1].reshape(4, n)[:, :grid.n_sites]
-    parts = grid.components
-    home = cover[0][parts.first_sites]
-    wanted = np.where(parts.of_site >= 0, home[parts.of_site], -1)
-    return np.argmax(cover == wanted, axis=0)
 
 
 def _shape_of(grid: GridSystem, label: np.ndarray, signs: np.ndarray, *,
