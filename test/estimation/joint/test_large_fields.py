@@ -16,7 +16,7 @@ from threadpoolctl import threadpool_limits
 
 from selfcal_ros.errors import InputError, NotIdentifiableError
 from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.estimation.findings import NoUncertainty
+from selfcal_ros.estimation.findings import NoUncertainty, Unchecked
 from selfcal_ros.estimation.joint import pcg
 from selfcal_ros.estimation.normal import cache, equations
 from selfcal_ros.estimation.normal.grid import GridSystem
@@ -91,7 +91,9 @@ def test_iteration_takes_fields_in_pieces(as_large):
     assert 0.9 < valid.mean() < 1 and found.extra["solver"]["iterations"] < 150
     assert np.nanmax(np.abs(found.error_map.gx - truth.g[0])) < EXACT
     assert np.isnan(found.error_map.u_gx).all()
-    assert found.findings == (NoUncertainty(),)
+    assert found.findings[0] == NoUncertainty()
+    single = [len(finding.sites) for finding in found.findings if isinstance(finding, Unchecked)]
+    assert single == [found.observability.unchecked_sites] and single[0] > 0
 
 
 @pytest.mark.parametrize(("missing", "steps"), [(0.0, 26), (0.03, 42), (0.2, 112)])
