@@ -1,0 +1,43 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Sites that are not known because they hang on no others: what they do to those that are."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from selfcal_ros.estimation.api import calibrate
+from selfcal_ros.estimation.datum.modes import datum_modes, remove_modes
+from selfcal_ros.simulation.truth import Spread, random_truth, simulate_measurements
+from test.support.plans import plan_of
+
+# a turn joins these four sites to each other; without these marks no shift joins them to the others
+APART = {(2, 1), (-1, 2), (-2, -1), (1, -2)}
+LOST = {(1, 1), (-2, 2), (0, -2), (-1, 2), (-2, -1), (1, -2)}
+
+
+def test_sites_that_hang_on_no_others_leave_no_residuals_where_plates_turn():
+    """Nothing tells by how much they are off together, and a turned plate turns that amount."""
+    plan, rng = plan_of("0, 90, tx, ty", 5), np.random.default_rng(3)
+    truth = random_truth(plan.artifact, len(plan.views), rng,
+                         Spread(phi_rad=np.deg2rad(1), rotation="finite"))
+    readings = simulate_measurements(truth, plan, rng)
+    views = []
+    for view in readings.views:
+        at = [*zip(view.m.tolist(), view.n.tolist(), strict=True)]
+        if view.view.name == "tx":
+            keep = np.array([mark not in LOST for mark in at])
+        elif view.view.name == "ty":
+            keep = np.array([mark not in APART and (mark[0], mark[1] + 1) not in APART
+                             for mark in at])
+        else:
+            keep = np.ones(len(at), dtype=bool)
+        views.append(replace(view, m=view.m[keep], n=view.n[keep], dx=view.dx[keep],
+                             dy=view.dy[keep], count=view.count[keep]))
+    result = calibrate(replace(readings, views=tuple(views)))
+    emap = result.error_map
+    known = np.isfinite(emap.gx)
+    assert {(int(i) - 2, int(j) - 2) for i, j in np.argwhere(~known)} == APART
+    error = np.stack([emap.gx, emap.gy]) - np.where(known, truth.g, np.nan)
+    error = remove_modes(error, datum_modes(plan.artifact, scale=True))
+    # what rotations of 17 mrad make of plate errors of 0.3 um, not of offsets of 30 um
+    assert np.nanmax(abs(error)) < 2e-9 and result.noise.sigma_xy_residuals < 5e-9
