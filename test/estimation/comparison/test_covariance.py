@@ -23,6 +23,7 @@ from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.result import result_from_dict, result_to_dict
 from selfcal_ros.model.terms import ModelTerm, TermName
 from selfcal_ros.model.view import View
+from selfcal_ros.reporting.words.result import worded
 from selfcal_ros.simulation.truth import Spread, hu_plan, random_truth, simulate_measurements
 from test.support.lattice_plans import plan_of
 from test.support.recalibrations import responses, sizes_of
@@ -71,7 +72,7 @@ def test_covariance_of_a_saved_map_with_missing_marks_and_terms(sense, reference
     options = Options(reference=reference, terms=(
         ModelTerm(TermName.PLATE_SCALE), ModelTerm(TermName.PLATE_SHAPE, 3e-8)))
     result = calibrate(readings, options)
-    saved = result_from_dict(json.loads(json.dumps(result_to_dict(result))), "r")
+    saved = result_from_dict(json.loads(json.dumps(result_to_dict(worded(result)))), "r")
     known = result.error_map.valid
     found, correlated = xy_covariance(saved, known)
     wanted = map_covariance(readings, options).nodes(*np.nonzero(known))

@@ -15,6 +15,7 @@ from selfcal_ros.estimation.comparison.significance import LEVEL, significance
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.result import result_from_dict, result_to_dict
+from selfcal_ros.reporting.words.result import worded
 from selfcal_ros.simulation.truth import random_truth, simulate_measurements
 from test.support.lattice_plans import plan_of
 
@@ -126,7 +127,8 @@ def test_one_node_that_moved_is_found():
 
 def test_the_comparison_is_the_same_after_the_file():
     a, b = pair_of(5, missing=0.2)
-    again = [result_from_dict(json.loads(json.dumps(result_to_dict(r))), "r") for r in (a, b)]
+    again = [result_from_dict(json.loads(json.dumps(result_to_dict(worded(r)))), "r")
+             for r in (a, b)]
     one, two = compare(a, b), compare(*again)
     assert two.xy.chi2_ratio == pytest.approx(one.xy.chi2_ratio, rel=1e-9)
     assert (two.xy.dof, two.xy.noise_dof) == (one.xy.dof, one.xy.noise_dof)
