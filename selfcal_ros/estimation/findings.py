@@ -122,6 +122,13 @@ class SizeCause(Finding):
 
 
 @dataclass(frozen=True)
+class OffSitesCause(Finding):
+    """How far the stage stood off the sites of the marks at its visits, rms."""
+
+    away_m: float
+
+
+@dataclass(frozen=True)
 class NoiseCause(Finding):
     """A view that is noisier than the others."""
 

@@ -22,8 +22,8 @@ class Cause(Finding):
     ----------
     name : str
         A `selfcal_ros.model.terms.TermName`, ``slip`` (of a plate within a view), ``reading`` (a
-        mark or line that is off in a view), ``rotation`` (of a view's lines against its marks)
-        or ``noise`` (of a view).
+        mark or line that is off in a view), ``rotation`` (of a view's lines against its marks),
+        ``off_sites`` (of the stage) or ``noise`` (of a view).
     text : str
         What, with size, uncertainty and what to do, for a person; empty before it is worded.
     size, u : float

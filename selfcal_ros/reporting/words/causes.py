@@ -8,6 +8,7 @@ from selfcal_ros.estimation.findings import (
     DriftCause,
     MicroscopeCause,
     NoiseCause,
+    OffSitesCause,
     PlateScaleCause,
     PlateShapeCause,
     ReadingCause,
@@ -18,7 +19,7 @@ from selfcal_ros.estimation.findings import (
 from selfcal_ros.model.terms import TermName
 from selfcal_ros.model.verdict import Cause, Finding
 from selfcal_ros.reporting.words.units import ARCSEC, MRAD, PERCENT, RATIO, UM, plus_minus
-from selfcal_ros.units import UM_PER_M, URAD_PER_RAD
+from selfcal_ros.units import MM_PER_M, UM_PER_M, URAD_PER_RAD
 
 _OF_SIZES = {TermName.MICROSCOPE: MRAD, TermName.PLATE_SCALE: RATIO}
 """Unit in which a person reads the coefficients of a term; µm for the others."""
@@ -114,6 +115,13 @@ def _(what: SizeCause, cause: Cause) -> str:
     return (f"{cause.name} up to {cause.size * unit.per_si:.3g} {unit.name}, {times} times the "
             f"size given: give a larger size, as in --model {cause.name}:{what.shown:.1e}, or "
             "leave it free")
+
+
+@_text.register
+def _(what: OffSitesCause, cause: Cause) -> str:
+    return (f"the stage standing {what.away_m * MM_PER_M:.3g} mm off the sites, where its error is "
+            f"another one by {plus_minus(cause.size, cause.u, UM)}: lay the plate nearer to its "
+            "place, or let the stage go to the sites")
 
 
 @_text.register

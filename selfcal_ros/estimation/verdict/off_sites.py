@@ -1,0 +1,121 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Whether the stage stood so far off the sites that the map is that of other places.
+
+A reading has the stage error of the place where the stage stood and counts for the mark's site
+(method eq. 7.10). Where all views lie beside their places alike, residuals show nothing of
+it; but deviation and offset of a visit, and the map, tell how far off the stage stood.
+"""
+
+import math
+
+import numpy as np
+
+from selfcal_ros.estimation.findings import OffSitesCause
+from selfcal_ros.estimation.joint.fit import fit
+from selfcal_ros.estimation.joint.model_fit import ModelFit
+from selfcal_ros.model.error_map import ErrorMap
+from selfcal_ros.model.statistics import rms
+from selfcal_ros.model.verdict import Cause
+
+OFF_SITES = "off_sites"
+
+SMALL = 0.02
+"""Change of the readings, in standard uncertainties of the map (rms), that is not looked into."""
+
+RMS_MATTERS = 0.5
+"""Effect on the map, in standard uncertainties (rms), from which it is named."""
+
+NODE_MATTERS = 2.0
+"""Effect on a coordinate of a node, in its standard uncertainty, from which it is named."""
+
+
+def off_sites_cause(model: ModelFit, error_map: ErrorMap, level: float) -> Cause | None:
+    """Return what the places of the stage do to the map as a cause, None where that is little.
+
+    Parameters
+    ----------
+    model : ModelFit
+        The fit; views whose visits are not known count as measured at the sites.
+    error_map : ErrorMap
+        Its map with uncertainties; without them nothing is said.
+    level : float
+        Level at which the noise of the map alone does not seem to do as much.
+    """
+    u = _uncertainty(model, error_map)
+    known = model.problem.system.known_sites
+    field = np.where(known, model.found.field, np.nan)
+    away, changed = _at_visits(model, field)
+    if not rms(_parts(changed)) > SMALL * rms(u):
+        return None
+    before, at_sites = model.found.xy.residuals, fit(model.problem, model.y - changed)
+    if at_sites.xy.residuals < before:  # the places are behind the noise as well
+        u = u * (at_sites.xy.residuals / before)
+    moved = _parts(model.found.field - at_sites.field)
+    ratio = np.where(known, np.abs(moved) / u, np.nan)
+    if not (rms(ratio) > RMS_MATTERS or np.nanmax(ratio) > NODE_MATTERS):
+        return None
+    noise = _noise(u, _pitch_m(model), (rms(away.real), rms(away.imag)))
+    effect = np.where(np.isfinite(ratio), np.abs(moved), 0.0)
+    p = effect.size * math.erfc(float(np.nanmax(effect / noise)) / math.sqrt(2))
+    if p >= level:
+        return None
+    worst = np.unravel_index(int(effect.argmax()), effect.shape)
+    return Cause(OFF_SITES, "", float(effect[worst]), float(noise[worst]), "m", p,
+                 OffSitesCause(rms(np.abs(away))))
+
+
+def _parts(field: np.ndarray) -> np.ndarray:
+    return np.stack([field.real, field.imag])
+
+
+def _pitch_m(model: ModelFit) -> float:
+    return model.problem.half_width_m / model.problem.system.grid.views.unit
+
+
+def _uncertainty(model: ModelFit, error_map: ErrorMap) -> np.ndarray:
+    """Return the standard uncertainty in the frame of the equations, (2, nx, ny), m."""
+    u = np.stack([error_map.u_gx, error_map.u_gy])
+    return u if model.problem.ground.indicated > 0 else u[:, ::-1, ::-1]  # method eq. 1.6
+
+
+def _slopes(field: np.ndarray, pitch_m: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the slopes of a field along x and y, 0 where a neighbour is not known.
+
+    Central inside, one-sided at the border.
+    """
+    along_x, along_y = np.gradient(field, pitch_m)
+    return np.nan_to_num(along_x), np.nan_to_num(along_y)
+
+
+def _noise(u: np.ndarray, pitch_m: float, away_m: tuple[float, float]) -> np.ndarray:
+    """Return what noise of the nodes does to slopes times distances, (2, nx, ny), m."""
+    total = np.zeros_like(u)
+    for axis, away in zip((1, 2), away_m, strict=True):
+        square = np.moveaxis(u**2, axis, 0)
+        of_slope = np.empty_like(square)
+        of_slope[1:-1] = (square[2:] + square[:-2]) / 4
+        of_slope[0], of_slope[-1] = square[0] + square[1], square[-1] + square[-2]
+        total += np.moveaxis(of_slope, 0, axis) * (away / pitch_m) ** 2
+    return np.sqrt(total)
+
+
+def _at_visits(model: ModelFit, field: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return how far the stage stood off the sites, and what that changes of the readings.
+
+    Complex: the visits' distances in the stage frame, and means at the marks in the plate frame,
+    (views, nx, ny), m.
+    """
+    grid = model.problem.system.grid
+    along_x, along_y = (slope.reshape(-1) for slope in _slopes(field, _pitch_m(model)))
+    error = np.nan_to_num(field).reshape(-1)
+    changed, distances = np.zeros_like(model.y), [np.zeros(1, dtype=complex)]
+    for view, visits in enumerate(model.problem.ground.visits):
+        if visits is None:
+            continue
+        site = grid.views.site_index[view].reshape(-1)[visits.mark]
+        away = visits.y / visits.phase - visits.offset - error[site]  # indicated less true
+        change = away.real * along_x[site] + away.imag * along_y[site]
+        mean = visits.means((change * visits.phase)[None], grid.n_sites)[0]
+        changed[view] = np.where(grid.read[view], mean.reshape(grid.views.shape), 0.0)
+        distances.append(away)
+    return np.concatenate(distances), changed

@@ -1,0 +1,111 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A stage that stood off the sites of the marks: what its error is there, and that it is told."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from selfcal_ros.estimation.api import calibrate
+from selfcal_ros.estimation.options import Options
+from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.readings import GridVisits, Measurements, Sense, ViewReadings
+from selfcal_ros.model.view import View
+from selfcal_ros.reporting.words.result import worded
+
+N, PITCH_M, SIGMA_M = 7, 0.01, 1e-8
+HALF_M = (N - 1) // 2 * PITCH_M
+BESIDE_M = np.array([1.5e-3, -0.8e-3])
+"""Where every view lies beside its place."""
+VIEWS = ((0, 0, 0), (1, 0, 0), (0, 1, 0), (0, -1, 0))
+STEPS = np.arange(N) - (N - 1) // 2
+
+
+def stage_error(x, y, bend_m=5e-7):
+    """Indicated minus true position where the stage is, m."""
+    u, v = np.array([x, y]) / HALF_M
+    return bend_m * np.array([u**2 + 0.5 * u * v, v**2 - u * v])
+
+
+def readings(*, follow, sense=Sense.MICROSCOPE_MOVES, beside=BESIDE_M, seed=1, visits=True,
+             **stage):
+    """Return what a stage reads that goes to the marks as they lie, or to their sites."""
+    rng, views = np.random.default_rng(seed), []
+    sign = -1 if sense is Sense.PLATE_MOVES else 1
+    m, n = (array.ravel() for array in np.meshgrid(STEPS, STEPS, indexing="ij"))
+    for quarter, a, b in VIEWS:
+        turned = np.array([(m, n), (-n, m)][quarter]) + np.array([[a], [b]])
+        here = (abs(turned) <= (N - 1) // 2).all(axis=0)
+        site = turned[:, here] * PITCH_M
+        mark = site + beside[:, None]  # a plate without errors, laid down beside its place
+        true = sign * (mark if follow else site)
+        indicated = true + stage_error(*true, **stage)
+        seen = mark - sign * true + rng.normal(0, SIGMA_M, mark.shape)
+        dx, dy = sign * indicated + seen - site
+        count = np.ones(here.sum(), dtype=int)
+        at = GridVisits(np.arange(here.sum()), dx, dy, count, np.arange(here.sum()) * 10**9, *seen,
+                        0 * count.astype("i1"), 0 * count.astype("i1"))
+        view = View(f"{quarter} {a} {b}", quarter * np.pi / 2, (a * PITCH_M, b * PITCH_M))
+        views.append(ViewReadings(view, m[here], n[here], dx, dy, count,
+                                  visits=at if visits else None))
+    return Measurements("beside", Artifact(N, PITCH_M, 0), tuple(views), sense)
+
+
+def without_datum(field):
+    """Return a field (2, N, N) without translation, rotation and magnification, flat."""
+    x, y = (array.ravel() * PITCH_M for array in np.meshgrid(STEPS, STEPS, indexing="ij"))
+    one, none = np.ones_like(x), np.zeros_like(x)
+    modes = np.array([[*one, *none], [*none, *one], [*-y, *x], [*x, *y]]).T
+    flat = field.reshape(-1)
+    return flat - modes @ np.linalg.lstsq(modes, flat, rcond=None)[0]
+
+
+def error_of(result, **stage):
+    x, y = np.meshgrid(STEPS * PITCH_M, STEPS * PITCH_M, indexing="ij")
+    emap = result.error_map
+    return without_datum(np.stack([emap.gx, emap.gy]) - stage_error(x, y, **stage))
+
+
+@pytest.mark.parametrize("sense", Sense)
+def test_a_stage_that_follows_plates_beside_their_places_is_not_qualified(sense):
+    result = worded(calibrate(readings(follow=True, sense=sense)))
+    u = result.error_map.u_gx.ravel()
+    wrong = abs(error_of(result)).max()
+    assert wrong > 3 * u.max()  # the map is wrong, and its residuals are nothing but noise
+    assert result.noise.sigma_xy_residuals == pytest.approx(SIGMA_M, rel=0.15)
+    assert not result.verdict.qualified
+    cause = result.verdict.causes[0]
+    assert (cause.name, cause.unit) == ("off_sites", "m") and cause.p < 5e-4
+    assert cause.size == pytest.approx(wrong, rel=0.35)
+    assert cause.text.startswith("the stage standing 1.7 mm off the sites, where its error is ")
+    assert "lay the plate nearer to its place" in cause.text
+
+
+@pytest.mark.parametrize("sense", Sense)
+def test_a_stage_at_the_sites_of_such_plates_is(sense):
+    result = calibrate(readings(follow=False, sense=sense))
+    assert result.verdict.qualified
+    assert abs(error_of(result)).max() < 4 * result.error_map.u_gx.max()
+
+
+def test_a_little_beside_is_no_matter():
+    assert calibrate(readings(follow=True, beside=BESIDE_M / 20)).verdict.qualified
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_noise_of_the_map_is_no_slope_of_the_stage(seed):
+    assert calibrate(readings(follow=True, seed=seed, beside=2 * BESIDE_M, bend_m=0.0)
+                     ).verdict.qualified
+
+
+def test_where_visits_are_not_known_or_causes_not_wanted_nothing_is_said():
+    assert calibrate(readings(follow=True, visits=False)).verdict.qualified
+    assert calibrate(readings(follow=True), Options(causes=False)).verdict.qualified
+    assert calibrate(readings(follow=True), Options(uncertainty=False)).verdict.qualified
+
+
+def test_views_beside_their_places_each_in_its_way_are_named_so_first():
+    whole = readings(follow=True)
+    shifted = readings(follow=True, beside=-BESIDE_M)
+    mixed = replace(whole, views=(*whole.views[:2], *shifted.views[2:]))
+    assert calibrate(mixed).verdict.causes[0].name == "off_sites"
