@@ -123,9 +123,13 @@ class SizeCause(Finding):
 
 @dataclass(frozen=True)
 class OffSitesCause(Finding):
-    """How far the stage stood off the sites of the marks at its visits, rms."""
+    """How far the stage stood off the sites of the marks at its visits, rms.
+
+    `shown`: residuals are smaller without what that makes of the readings.
+    """
 
     away_m: float
+    shown: bool
 
 
 @dataclass(frozen=True)

@@ -20,6 +20,7 @@ from selfcal_ros.estimation.findings import (
     FiniteRotation,
     NoiseContradicted,
     NoiseUnknown,
+    OffSitesCause,
     VisitedOnce,
 )
 from selfcal_ros.estimation.joint.model_fit import ModelFit
@@ -74,8 +75,10 @@ def judged(solved: Solved, measurements: Measurements, options: Options) -> Cali
     noises = _noise_findings(solved)
     checked = checked_by(solved, measurements, options, failed=bool(noises))
     failed = [*_rotation_findings(solved, checked), *noises, *_axes_findings(checked)]
-    known = [*_off_sites(checked, options), *_sizes(solved)]
-    causes = (*known, *_causes(checked, measurements, options, failed=bool(failed or known)))
+    places, sizes = _off_sites(checked, options), _sizes(solved)
+    others = [*sizes, *_causes(checked, measurements, options,
+                               failed=bool(failed or sizes or places))]
+    causes = _in_order(places, others)
     verdict = Verdict(not (failed or causes), causes=causes, findings=(*failed, *causes))
     reference = options.reference
     result = with_coverage(solved.result, reference)
@@ -144,6 +147,15 @@ def _off_sites(solved: Solved, options: Options) -> list[Cause]:
         return []
     cause = off_sites_cause(model, solved.result.error_map, LEVEL)
     return [cause] if cause else []
+
+
+def _in_order(places: list[Cause], others: list[Cause]) -> tuple[Cause, ...]:
+    """Return the causes, the likeliest first: places of the stage last, unless residuals show them.
+
+    What spoils the readings spoils the slopes of the map, on which the effect of places rests.
+    """
+    first = any(isinstance(cause.what, OffSitesCause) and cause.what.shown for cause in places)
+    return (*places, *others) if first else (*others, *places)
 
 
 def _visits_findings(solved: Solved) -> list[Finding]:

@@ -19,8 +19,18 @@ from selfcal_ros.model.verdict import Cause
 
 OFF_SITES = "off_sites"
 
+ROUNDING_M = 1e-15
+"""Noise that stands for none."""
+
 SMALL = 0.02
 """Change of the readings, in standard uncertainties of the map (rms), that is not looked into."""
+
+LEAST_U_M = 1e-10
+"""Standard uncertainty of the map that is reckoned with at least: what finite rotations leave of a
+stage that is turned against its datum is as much."""
+
+SHOWN = 0.9
+"""Ratio of residuals without the change to residuals from which these show it as well."""
 
 RMS_MATTERS = 0.5
 """Effect on the map, in standard uncertainties (rms), from which it is named."""
@@ -41,7 +51,7 @@ def off_sites_cause(model: ModelFit, error_map: ErrorMap, level: float) -> Cause
     level : float
         Level at which the noise of the map alone does not seem to do as much.
     """
-    u = _uncertainty(model, error_map)
+    u = np.maximum(_uncertainty(model, error_map), LEAST_U_M)
     known = model.problem.system.known_sites
     field = np.where(known, model.found.field, np.nan)
     away, changed = _at_visits(model, field)
@@ -54,14 +64,15 @@ def off_sites_cause(model: ModelFit, error_map: ErrorMap, level: float) -> Cause
     ratio = np.where(known, np.abs(moved) / u, np.nan)
     if not (rms(ratio) > RMS_MATTERS or np.nanmax(ratio) > NODE_MATTERS):
         return None
-    noise = _noise(u, _pitch_m(model), (rms(away.real), rms(away.imag)))
+    noise = np.maximum(_noise(u, _pitch_m(model), (rms(away.real), rms(away.imag))), ROUNDING_M)
     effect = np.where(np.isfinite(ratio), np.abs(moved), 0.0)
-    p = effect.size * math.erfc(float(np.nanmax(effect / noise)) / math.sqrt(2))
+    most = float(np.nanmax(effect / noise, initial=0.0))
+    p = effect.size * math.erfc(most / math.sqrt(2))
     if p >= level:
         return None
     worst = np.unravel_index(int(effect.argmax()), effect.shape)
     return Cause(OFF_SITES, "", float(effect[worst]), float(noise[worst]), "m", p,
-                 OffSitesCause(rms(np.abs(away))))
+                 OffSitesCause(rms(np.abs(away)), bool(at_sites.xy.residuals < SHOWN * before)))
 
 
 def _parts(field: np.ndarray) -> np.ndarray:

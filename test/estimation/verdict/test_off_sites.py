@@ -28,7 +28,7 @@ def stage_error(x, y, bend_m=5e-7):
 
 
 def readings(*, follow, sense=Sense.MICROSCOPE_MOVES, beside=BESIDE_M, seed=1, visits=True,
-             **stage):
+             sigma_m=SIGMA_M, **stage):
     """Return what a stage reads that goes to the marks as they lie, or to their sites."""
     rng, views = np.random.default_rng(seed), []
     sign = -1 if sense is Sense.PLATE_MOVES else 1
@@ -40,7 +40,7 @@ def readings(*, follow, sense=Sense.MICROSCOPE_MOVES, beside=BESIDE_M, seed=1, v
         mark = site + beside[:, None]  # a plate without errors, laid down beside its place
         true = sign * (mark if follow else site)
         indicated = true + stage_error(*true, **stage)
-        seen = mark - sign * true + rng.normal(0, SIGMA_M, mark.shape)
+        seen = mark - sign * true + rng.normal(0, sigma_m, mark.shape)
         dx, dy = sign * indicated + seen - site
         count = np.ones(here.sum(), dtype=int)
         at = GridVisits(np.arange(here.sum()), dx, dy, count, np.arange(here.sum()) * 10**9, *seen,
@@ -96,6 +96,18 @@ def test_a_little_beside_is_no_matter():
 def test_noise_of_the_map_is_no_slope_of_the_stage(seed):
     assert calibrate(readings(follow=True, seed=seed, beside=2 * BESIDE_M, bend_m=0.0)
                      ).verdict.qualified
+
+
+def test_without_noise_a_stage_at_the_sites_is_at_the_sites():
+    assert not calibrate(readings(follow=False, sigma_m=0.0)).verdict.causes
+
+
+def test_what_spoils_the_map_comes_before_places_that_residuals_do_not_show():
+    whole = readings(follow=True)
+    off = whole.views[0].visits.dx + np.where(np.arange(N * N) == 10, 5e-7, 0.0)
+    first = replace(whole.views[0], dx=off, visits=replace(whole.views[0].visits, dx=off))
+    causes = calibrate(replace(whole, views=(first, *whole.views[1:]))).verdict.causes
+    assert [cause.name for cause in causes] == ["reading", "off_sites"]
 
 
 def test_where_visits_are_not_known_or_causes_not_wanted_nothing_is_said():
