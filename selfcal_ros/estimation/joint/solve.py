@@ -26,6 +26,7 @@ from selfcal_ros.estimation.observability.rank import identifies, measured_obser
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.terms.ground import ground_of
 from selfcal_ros.estimation.terms.identifiable import require_terms_told
+from selfcal_ros.estimation.terms.visits import check_visits
 from selfcal_ros.model.error_map import ErrorMap, ThetaDatum
 from selfcal_ros.model.readings import Measurements, Sense
 from selfcal_ros.model.result import (
@@ -54,6 +55,7 @@ def prepare(measurements: Measurements, options: Options) -> tuple[Problem, Obse
     NoDataError, NotIdentifiableError, InputError
         As `selfcal_ros.estimation.api.calibrate`.
     """
+    check_visits(measurements)
     grid, angular = grid_data(measurements), angular_data(measurements)
     if not grid.index:
         raise NoDataError(f"plan '{measurements.plan_id}'", "no grid mark was read",

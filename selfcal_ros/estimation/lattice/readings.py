@@ -67,6 +67,9 @@ def grid_data(measurements: Measurements) -> GridData:
         pose = _grid_pose(readings, artifact)
         where = f"view '{readings.view.name}' grid readings"
         flat = _flat_marks(readings, artifact, pose, where=where)
+        if not len(readings.dx) == len(readings.dy) == len(flat):
+            raise InputError(where, "marks and deviations differ in length",
+                             "give one value a mark")
         if not (np.isfinite(readings.dx).all() and np.isfinite(readings.dy).all()):
             raise InputError(where, "a deviation is not a finite number", "remove the mark")
         values = (readings.dx + 1j * readings.dy) * PHASES[-pose.q % 4]

@@ -10,9 +10,13 @@ from functools import cached_property
 
 import numpy as np
 
+from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.lattice.maps import PHASES
 from selfcal_ros.estimation.lattice.readings import GridData
 from selfcal_ros.model.readings import GridVisits, Measurements, Sense, ViewReadings
+
+FARTHEST_M = 1e6
+"""Deviation or offset that no visit has."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,6 +103,31 @@ def _visits_of(view: ViewReadings, grid: GridData, row: int) -> ViewVisits | Non
     return ViewVisits(mark, weight, (visits.dx + 1j * visits.dy) * phase,
                       view_time(visits.stamp_ns), visits.offset_x + 1j * visits.offset_y,
                       visits.approach_x.astype(float), visits.approach_y.astype(float), phase)
+
+
+def check_visits(measurements: Measurements) -> None:
+    """Raise InputError for visits that cannot be: of no mark, or without a finite number."""
+    for view in measurements.views:
+        if view.visits is not None and len(view.visits.mark):
+            _check(view.visits, view)
+
+
+def _check(visits: GridVisits, view: ViewReadings) -> None:
+    where, number = f"view '{view.view.name}' visits of grid marks", len(visits.mark)
+    columns = (visits.dx, visits.dy, visits.count, visits.stamp_ns, visits.offset_x,
+               visits.offset_y, visits.approach_x, visits.approach_y)
+    if any(len(column) != number for column in columns):
+        raise InputError(where, "marks, deviations, counts, stamps, offsets and approaches differ "
+                         "in length", "give one value a visit")
+    if visits.mark.min() < 0 or visits.mark.max() >= len(view.m):
+        raise InputError(where, "a visit is of none of the marks that were read",
+                         "number the marks as `m` and `n` have them")
+    if visits.count.min() < 1:
+        raise InputError(where, "a count below 1", "leave out visits without a reading")
+    for values in (visits.dx, visits.dy, visits.offset_x, visits.offset_y):
+        if not (np.abs(values) < FARTHEST_M).all():
+            raise InputError(where, "a deviation or offset is not a finite number, or no length "
+                             "of a stage", "remove the visit")
 
 
 def _own_weights(visits: GridVisits, mark: np.ndarray, n_marks: int) -> np.ndarray:

@@ -85,3 +85,11 @@ def test_the_first_and_the_last_line_of_the_plate_are_read():
     view = ViewReadings(View("a", grid=False), k=np.array([0, 3]), dtheta=np.array([1e-6, 2e-6]),
                         count_theta=np.array([1, 1]))
     assert angular_data(measurements(view)).y.tolist() == [[1e-6, 0, 0, 2e-6]]
+
+
+@pytest.mark.parametrize("lengths", [(2, 3, 3), (3, 2, 3), (3, 3, 2), (2, 2, 2)])
+def test_marks_and_deviations_of_different_number_are_refused(lengths):
+    dx, dy, count = (np.ones(length) for length in lengths)
+    view = ViewReadings(View("a"), np.array([0, 1, -1]), np.array([2, 0, -2]), dx, dy, count)
+    with pytest.raises(InputError, match=r"view 'a' grid readings: marks.* differ in length"):
+        grid_data(measurements(view))
