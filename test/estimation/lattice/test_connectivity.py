@@ -6,7 +6,7 @@ from collections import defaultdict
 import numpy as np
 import pytest
 
-from selfcal_ros.estimation.lattice.connectivity import components
+from selfcal_ros.estimation.lattice.connectivity import components, free_turns
 
 
 def walked(site, mark, q):
@@ -50,3 +50,19 @@ def test_components_are_those_that_a_walk_finds(readings, seed):
     assert set(np.flatnonzero(found.of_site < 0)) == set(range(14)) - set(site.tolist())
     assert found.largest in [found.of_site[min(sites)] for sites, _ in expected
                              if len(sites) == max(len(one) for one, _ in expected)]
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_free_vectors_change_no_reading(seed):
+    """Each component that no path turns has its own vector; of the others nothing is turned."""
+    rng = np.random.default_rng(seed)
+    site, mark = rng.integers(0, 30, 24), rng.integers(0, 30, 24)
+    q = rng.integers(0, 4, 24)
+    parts = components(site, mark, q, n_sites=31, n_marks=31)
+    at_site, at_mark = free_turns(site, mark, q, parts)
+    vector = np.append(parts.balanced * (rng.normal(size=(2, len(parts.balanced))).T @ [1, 1j]), 0)
+    g, a = 1j**at_site * vector[parts.of_site], -(1j**at_mark) * vector[parts.of_mark]
+    assert abs(g).any() and abs(1j**-q * g[site] + a[mark]).max() < 1e-12
+    held = np.append(parts.balanced, False)
+    assert not at_site[~held[parts.of_site]].any() and not at_mark[~held[parts.of_mark]].any()
+    assert not at_site[parts.first_sites].any()
