@@ -13,6 +13,7 @@ from selfcal_ros.collection.expected import ViewProgress
 from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.errors import InputError, NoDataError, did_you_mean
 from selfcal_ros.files import add_file
+from selfcal_ros.memory import keep_freed_memory
 from selfcal_ros.messages import to_model
 from selfcal_ros.messages.input_columns import EncoderBlock
 from selfcal_ros.messages.topics import COMMAND_TOPIC, DETECTION_TOPIC, ENCODER_TOPIC, INPUT_TOPICS
@@ -66,6 +67,7 @@ def collect_bag(path: str | Path, settings: CollectorSettings, *, namespace: str
     NoDataError
         If it has no commands or no detections, or no detection became a reading.
     """
+    keep_freed_memory()
     reader = BagReader(Path(path), namespace, settings.clock_limit)
     collector = Collector(settings)
     take = block_handlers(collector, reader.lost)
