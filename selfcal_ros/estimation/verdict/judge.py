@@ -143,7 +143,7 @@ def _axes_findings(solved: Solved) -> list[Finding]:
 def _off_sites(solved: Solved, options: Options) -> list[Cause]:
     """Return whether the stage stood off the sites where that matters."""
     model = solved.model
-    if options.causes is False or model is None or not solved.result.has_uncertainty:
+    if options.causes is False or model is None or not model.problem.direct:
         return []
     cause = off_sites_cause(model, solved.result.error_map, LEVEL)
     return [cause] if cause else []

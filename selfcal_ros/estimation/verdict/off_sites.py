@@ -47,7 +47,7 @@ def off_sites_cause(model: ModelFit, error_map: ErrorMap, level: float) -> Cause
     model : ModelFit
         The fit; views whose visits are not known count as measured at the sites.
     error_map : ErrorMap
-        Its map with uncertainties; without them nothing is said.
+        Its map.
     level : float
         Level at which the noise of the map alone does not seem to do as much.
     """
@@ -84,8 +84,13 @@ def _pitch_m(model: ModelFit) -> float:
 
 
 def _uncertainty(model: ModelFit, error_map: ErrorMap) -> np.ndarray:
-    """Return the standard uncertainty in the frame of the equations, (2, nx, ny), m."""
-    u = np.stack([error_map.u_gx, error_map.u_gy])
+    """Return the standard uncertainty in the frame of the equations, (2, nx, ny), m.
+
+    Where nobody asked for it that of a reading, which a map of three views comes near to.
+    """
+    u, grid = np.stack([error_map.u_gx, error_map.u_gy]), model.problem.system.grid
+    if not np.isfinite(u).any():
+        return np.full_like(u, model.found.xy.sigma / math.sqrt(grid.weight[grid.read].mean()))
     return u if model.problem.ground.indicated > 0 else u[:, ::-1, ::-1]  # method eq. 1.6
 
 

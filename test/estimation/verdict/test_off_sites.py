@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.estimation.options import Options
+from selfcal_ros.estimation.options import Options, ReferenceLength
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import GridVisits, Measurements, Sense, ViewReadings
+from selfcal_ros.model.terms import parse_terms
 from selfcal_ros.model.view import View
 from selfcal_ros.reporting.words.result import worded
 
@@ -113,7 +114,15 @@ def test_what_spoils_the_map_comes_before_places_that_residuals_do_not_show():
 def test_where_visits_are_not_known_or_causes_not_wanted_nothing_is_said():
     assert calibrate(readings(follow=True, visits=False)).verdict.qualified
     assert calibrate(readings(follow=True), Options(causes=False)).verdict.qualified
-    assert calibrate(readings(follow=True), Options(uncertainty=False)).verdict.qualified
+
+
+@pytest.mark.parametrize("options", [
+    Options(uncertainty=False), Options(misalignment_model="linear"),
+    Options(terms=parse_terms(["plate_scale:1e-7"], "")),
+    Options(reference=ReferenceLength("artifact", 0.0, 1e-7))])
+def test_it_is_found_whatever_else_is_asked_for(options):
+    assert calibrate(readings(follow=True), options).verdict.causes[0].name == "off_sites"
+    assert calibrate(readings(follow=False), options).verdict.qualified
 
 
 def test_views_beside_their_places_each_in_its_way_are_named_so_first():
