@@ -64,7 +64,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
                         "(docs/identifiability.md)")
 
 
-def node_settings[S: "Settings"](params: str | None, kind: type[S], **given: Any) -> S:
+def node_settings[S: Settings](params: str | None, kind: type[S], **given: Any) -> S:
     """Return the settings of a node in a parameter file, if any; what is given wins over it."""
     from selfcal_ros.collection.settings.ros_file import overrides_in
     from selfcal_ros.files import read_yaml
