@@ -46,6 +46,15 @@ def test_room_is_taken_ahead_but_never_more_than_twice_what_is_held():
     assert len(rooms) < 10  # a copy of all rows at each doubling, not at each row
 
 
+def test_room_is_made_once_for_all_that_came_between_two_looks():
+    table = GrowingTable(PAIR)
+    for at in range(0, 1000, 10):
+        table.append(rows_of(at, 10))
+        assert len(table) == at + 10
+    assert len(table.rows.base) == 1000  # doubled on the way it would be 1024 or more
+    assert table.rows["a"].tolist() == list(range(1000))
+
+
 def test_rows_may_be_changed_in_place():
     table = GrowingTable(PAIR)
     table.append(rows_of(0, 3))

@@ -11,34 +11,40 @@ class GrowingTable:
 
     def __init__(self, dtype: np.dtype) -> None:
         self._room = np.zeros(64, dtype=dtype)
-        self._count = 0
+        self._count = 0  # of the rows in the room
+        self._waiting: list[np.ndarray] = []  # for a look at the rows, which makes room for them
+        self._total = 0
 
     def __len__(self) -> int:
         """Return the number of rows."""
-        return self._count
+        return self._total
 
     @property
     def rows(self) -> np.ndarray:
         """The rows, as a view that may be written to; valid until rows are added."""
+        if self._total > len(self._room):
+            room = np.empty(max(self._total, 2 * len(self._room)), dtype=self._room.dtype)
+            room[:self._count] = self._room[:self._count]
+            self._room = room
+        self._waiting.reverse()
+        while self._waiting:
+            rows = self._waiting.pop()  # and its memory is free
+            self._room[self._count:self._count + len(rows)] = rows
+            self._count += len(rows)
         return self._room[:self._count]
 
     def append(self, rows: np.ndarray) -> None:
-        """Add rows at the end."""
-        total = self._count + len(rows)
-        if total > len(self._room):
-            room = np.zeros(max(total, 2 * len(self._room)), dtype=self._room.dtype)
-            room[:self._count] = self.rows
-            self._room = room
-        self._room[self._count:total] = rows
-        self._count = total
+        """Add rows at the end; they are the table's from now on, not to be written to."""
+        self._waiting.append(rows)
+        self._total += len(rows)
 
     def insert(self, at: np.ndarray, rows: np.ndarray) -> None:
         """Add rows in front of the rows `at` (rising), as `numpy.insert` does."""
-        if not len(rows) or at[0] == self._count:
+        if not len(rows) or at[0] == self._total:
             self.append(rows)
             return
         self._room = np.insert(self.rows, at, rows)
-        self._count = len(self._room)
+        self._count = self._total = len(self._room)
 
 
 class GrowingColumns:
