@@ -86,6 +86,18 @@ def test_an_error_of_a_reading_that_no_other_checks_is_in_the_map_and_said(sense
     assert good.observability.unchecked_sites == 1 and good.observability.unchecked_lines == 0
 
 
+@pytest.mark.parametrize("sense", list(Sense))
+def test_an_error_of_a_line_that_no_other_checks_is_in_the_map_and_said(sense):
+    readings = measured("0, 90, tx", {}, sense=sense,
+                        lines={"90": {1}, "tx": {3}, "line": {2}}.items())
+    first = readings.views[0]
+    bad = replace(first, dtheta=first.dtheta + 1e-3 * (first.k == 3))
+    good, bad = calibrate(readings), calibrate(replace(readings, views=(bad, *readings.views[1:])))
+    moved = np.argmax(abs(bad.error_map.g_theta - good.error_map.g_theta))
+    assert moved == (3 if sense is Sense.MICROSCOPE_MOVES else 5)
+    assert bad.findings == good.findings == (Unchecked((), ((moved,),)),)
+
+
 @pytest.mark.parametrize(("names", "gone", "lines", "expected"), [
     ("0, 90, tx", {}, (), ()),
     # two readings are left of site (2, 1), but one of them is all that tells of mark (1, -2)

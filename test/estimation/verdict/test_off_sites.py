@@ -8,6 +8,7 @@ import pytest
 
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.options import Options, ReferenceLength
+from selfcal_ros.estimation.verdict import off_sites
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import GridVisits, Measurements, Sense, ViewReadings
 from selfcal_ros.model.terms import parse_terms
@@ -130,3 +131,25 @@ def test_views_beside_their_places_each_in_its_way_are_named_so_first():
     shifted = readings(follow=True, beside=-BESIDE_M)
     mixed = replace(whole, views=(*whole.views[:2], *shifted.views[2:]))
     assert calibrate(mixed).verdict.causes[0].name == "off_sites"
+
+
+def test_the_same_readings_tell_the_same_in_either_sense():
+    """The map is mirrored, and its uncertainty with it; what the places do to it is the same."""
+    whole = readings(follow=True)
+    views = tuple(replace(view, count=np.where(view.m < 0, 1, 9)) for view in whole.views)
+    one, two = (calibrate(replace(whole, views=views, sense=sense)) for sense in Sense)
+    assert not np.allclose(one.error_map.u_gx, one.error_map.u_gx[::-1], rtol=0.1, atol=0)
+    (first, *_), (second, *_) = one.verdict.causes, two.verdict.causes
+    assert (first.name, first.size, first.u) == (second.name, pytest.approx(second.size),
+                                                 pytest.approx(second.u))
+
+
+def test_noise_of_a_node_is_in_the_slopes_of_its_neighbours():
+    u = np.zeros((2, 5, 5))
+    u[0, 2, 3] = 1e-8
+    found = off_sites._noise(u, PITCH_M, (2e-3, 1e-3))
+    expected = np.zeros((2, 5, 5))
+    expected[0, [1, 3], 3] = 0.5 * 0.2 * 1e-8  # central differences along x, 0.2 pitch off
+    expected[0, 2, 2] = 0.5 * 0.1 * 1e-8
+    expected[0, 2, 4] = 0.1 * 1e-8  # one-sided at the border
+    np.testing.assert_allclose(found, expected, atol=1e-20)
