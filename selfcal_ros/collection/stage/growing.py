@@ -13,17 +13,17 @@ class GrowingTable:
         self._room = np.zeros(64, dtype=dtype)
         self._count = 0  # of the rows in the room
         self._waiting: list[np.ndarray] = []  # for a look at the rows, which makes room for them
-        self._total = 0
 
     def __len__(self) -> int:
         """Return the number of rows."""
-        return self._total
+        return self._count + sum(map(len, self._waiting))
 
     @property
     def rows(self) -> np.ndarray:
         """The rows, as a view that may be written to; valid until rows are added."""
-        if self._total > len(self._room):
-            room = np.empty(max(self._total, 2 * len(self._room)), dtype=self._room.dtype)
+        total = len(self)
+        if total > len(self._room):
+            room = np.empty(max(total, 2 * len(self._room)), dtype=self._room.dtype)
             room[:self._count] = self._room[:self._count]
             self._room = room
         self._waiting.reverse()
@@ -36,15 +36,14 @@ class GrowingTable:
     def append(self, rows: np.ndarray) -> None:
         """Add rows at the end; they are the table's from now on, not to be written to."""
         self._waiting.append(rows)
-        self._total += len(rows)
 
     def insert(self, at: np.ndarray, rows: np.ndarray) -> None:
         """Add rows in front of the rows `at` (rising), as `numpy.insert` does."""
-        if not len(rows) or at[0] == self._total:
+        if not len(rows) or at[0] == len(self):
             self.append(rows)
             return
         self._room = np.insert(self.rows, at, rows)
-        self._count = self._total = len(self._room)
+        self._count = len(self._room)
 
 
 class GrowingColumns:
