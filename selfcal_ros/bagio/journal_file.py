@@ -199,7 +199,7 @@ def _scan(file: BinaryIO, name: str, keep: str) -> Content:
         content.damaged = True
         return content
     while True:
-        block, end = stretch(file, content.end)
+        block, end = stretch(file, content.end, size)
         if block is None:
             head = _next_head(file, content.end)
             if head is None:

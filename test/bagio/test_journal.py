@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 import time
+from itertools import islice
 from pathlib import Path
 
 import pytest
@@ -20,6 +21,7 @@ from rosbags.rosbag2 import Reader
 from selfcal_ros.bagio import journal, journal_file
 from selfcal_ros.bagio.build import build
 from selfcal_ros.bagio.journal import resume, start, unfinished
+from selfcal_ros.bagio.mcap.stream import McapStream
 from selfcal_ros.bagio.offline import collect_bag
 from selfcal_ros.bagio.reader import BagReader
 from selfcal_ros.bagio.schemas import typestore
@@ -411,3 +413,23 @@ def test_nothing_follows_a_torn_record_that_cannot_be_taken_back(tmp_path, monke
     record(writer, samples(2, 3))
     writer.close()
     assert stamps(writer.path) == (list(range(5)), [])
+
+
+@pytest.mark.parametrize("torn", [0, 1, 40])
+def test_a_file_that_grows_as_fast_as_it_is_read_ends_where_it_was_opened(
+        tmp_path, monkeypatch, torn):
+    monkeypatch.setattr("selfcal_ros.bagio.mcap.chunk.STRETCH", 2000)
+    with declared(start(tmp_path, NOW)) as writer:
+        record(writer, samples(200))
+        [file] = writer.path.glob("*.mcap")
+        data = file.read_bytes()
+    grows = tmp_path / "grows.mcap"
+    grows.write_bytes(data[:len(data) - torn])  # of the last record a part may be missing
+    stream, found = McapStream(grows), []
+    for block in islice(stream.blocks(), 1000):
+        found += block.fronts["log_time"].tolist()
+        with grows.open("ab") as end:
+            end.write(data[-2000:])
+    assert found == [NOW + number + 5 for number in range(200 - (torn > 0))]
+    assert stream.lost == [f"the file is still being written: the messages in its first "
+                           f"{len(data) - torn} bytes are read"]

@@ -110,13 +110,16 @@ def message_block(data: bytes, at: int) -> tuple[Block, int]:
     return Block(fronts, Payloads(data, start + FRONT, length)), end
 
 
-def stretch(file: BinaryIO, at: int) -> tuple[Block | None, int]:
-    """Return messages that stand by themselves from `at` on and where they end, or None."""
+def stretch(file: BinaryIO, at: int, size: int) -> tuple[Block | None, int]:
+    """Return messages that stand by themselves from `at` on and where they end, or None.
+
+    Nothing is read from byte `size` on.
+    """
     file.seek(at)
     if file.read(1) != bytes([Opcode.MESSAGE]):
         return None, at
     file.seek(at)
-    block, end = message_block(file.read(STRETCH), 0)
+    block, end = message_block(file.read(min(STRETCH, size - at)), 0)
     return (block if len(block) else None), at + end
 
 

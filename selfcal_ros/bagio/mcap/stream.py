@@ -4,7 +4,8 @@
 The mcap library reads the records beside the messages. This module goes from one to the next, so
 that what a recorder that died leaves behind, or what is damaged in the middle, costs no more than
 itself. Messages come in blocks, as many as stand together. Files and messages that rosbag2
-compressed are decompressed on the way.
+compressed are decompressed on the way. Of a file that is still written, what it held when it was
+opened is read.
 """
 
 import struct
@@ -65,6 +66,7 @@ class McapStream:
     lost: list[str] = field(default_factory=list)
     wanted: Callable[[str], bool] | None = None
     _needless: dict[int, int] = field(default_factory=dict)
+    _size: int = 0  # bytes of the file when it was opened
     _n_read: int = 0
     _n_written: int = 0
     _chunked: bool = False
@@ -93,6 +95,7 @@ class McapStream:
                 head = file.read(len(MAGIC))
                 if head != MAGIC:
                     raise self._refusal(head + file.read(len(SQLITE)))
+                self._size = file.seek(0, 2)
                 self._look_ahead(file)
                 yield from self._records(file)
         except OSError as error:
@@ -126,11 +129,11 @@ class McapStream:
 
     def _records(self, file: BinaryIO) -> Iterator[Block]:
         """Go from record to record; what begins before `sure` has certainly been read."""
-        size = file.seek(0, 2)
+        size = self._size
         at = sure = clean = len(MAGIC)
         data_ended = passed = False
         while True:
-            block, end = stretch(file, at)
+            block, end = stretch(file, at, size)
             if block is not None:
                 sure, clean = at + int(block.payloads.start[-1]) - FRONT, end
                 at = end
@@ -144,7 +147,7 @@ class McapStream:
                 opcode, record, end = _record(file, at, size)
             except Exception as error:  # a damaged record may fail anywhere in its parser
                 if data_ended or at == size == clean:
-                    self._say_end(data_ended)
+                    self._say_end(file, data_ended)
                     return
                 file.seek(at)
                 start = at if file.read(1) == bytes([Opcode.CHUNK]) else sure
@@ -228,20 +231,28 @@ class McapStream:
                 pass
         return Block(block.fronts, Payloads.joined(payloads))[keep]
 
-    def _say_end(self, data_ended: bool) -> None:
+    def _say_end(self, file: BinaryIO, data_ended: bool) -> None:
         self.lost.append(
-            "the end of the file is damaged, after the last message: no message is lost"
-            if data_ended else "the file ends without its footer, as when a recorder is killed: "
-            "every message that was written is read")
+            self._grown(file) or (
+                "the end of the file is damaged, after the last message: no message is lost"
+                if data_ended else "the file ends without its footer, as when a recorder is "
+                "killed: every message that was written is read"))
+
+    def _grown(self, file: BinaryIO) -> str:
+        """Return what to say of a file that has grown since it was opened; "" if it has not."""
+        if file.seek(0, 2) == self._size:
+            return ""
+        return (f"the file is still being written: the messages in its first {self._size} bytes "
+                "are read")
 
     def _found(self, file: BinaryIO, start: int) -> int:
         """Return where reading can go on behind `start`."""
-        with mmap(file.fileno(), 0, access=ACCESS_READ) as data:
+        with mmap(file.fileno(), self._size, access=ACCESS_READ) as data:
             return next_record(data, start, None if self._chunked else self.channels)
 
     def _declare(self, file: BinaryIO) -> None:
         """Take from the summary what was declared in the part that is lost."""
-        with mmap(file.fileno(), 0, access=ACCESS_READ) as data:
+        with mmap(file.fileno(), self._size, access=ACCESS_READ) as data:
             for record in declarations(data):
                 if isinstance(record, Schema):
                     self.schemas.setdefault(record.id, record)
@@ -251,7 +262,7 @@ class McapStream:
     def _salvage(self, file: BinaryIO, start: int,
                  error: Exception) -> Iterator[Block]:
         """Yield what is readable of the record at `start`, and say what is not."""
-        stop, size = self._found(file, start), file.seek(0, 2)
+        stop, size = self._found(file, start), self._size
         file.seek(start)
         count = 0
         for item in gathered(list(front_of_chunk(file.read(stop - start)))):
@@ -263,6 +274,10 @@ class McapStream:
         if stop < size:
             self.lost.append(f"the file is damaged from byte {start} to {stop}: {count} messages "
                              "there could be saved, what else stood there is lost")
+            return
+        grown = self._grown(file) if isinstance(error, _Cut) else ""
+        if grown:
+            self.lost.append(grown)
             return
         reason = "truncated" if isinstance(error, _Cut) else f"damaged ({first_line(error)})"
         self.lost.append(f"the file is {reason} after byte {start} of {size}: {count} messages "
