@@ -10,10 +10,15 @@ from typing import Any
 import numpy as np
 
 from selfcal_ros.bagio.simulated import event_fields, write_truth
-from selfcal_ros.collection.messages import Command, Detection, EncoderSample, Phase
+from selfcal_ros.collection.messages import (
+    Command,
+    Detection,
+    EncoderSample,
+    Phase,
+    check_simulated,
+)
 from selfcal_ros.collection.settings.nodes import SimulatorSettings
 from selfcal_ros.messages import to_model
-from selfcal_ros.messages.sizes import check_simulated
 from selfcal_ros.model.view import Plan, View
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes.base import SelfcalNode

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from selfcal_ros.collection.digest import readings_digest, session_digest
-from selfcal_ros.collection.messages import MAX_VIEWS, Phase
+from selfcal_ros.collection.messages import MAX_VIEWS, Phase, check_plate, check_view
 from selfcal_ros.collection.settings.estimator import solver_options
 from selfcal_ros.collection.settings.nodes import SolverSettings
 from selfcal_ros.errors import InputError, NoDataError, NotIdentifiableError, SelfcalError
@@ -16,7 +16,6 @@ from selfcal_ros.estimation.api import Options, calibrate
 from selfcal_ros.files import write_json
 from selfcal_ros.memory import keep_freed_memory
 from selfcal_ros.messages import from_model, to_model
-from selfcal_ros.messages.sizes import check_plate, check_view
 from selfcal_ros.messages.topics import COMMAND_TOPIC, MEASUREMENT_TOPIC
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Measurements

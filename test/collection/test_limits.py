@@ -6,10 +6,9 @@ from dataclasses import replace
 
 import pytest
 
-from selfcal_ros.collection.messages import Command, Phase
+from selfcal_ros.collection.messages import MAX_EXPOSURES, Command, Phase, check_simulated
 from selfcal_ros.errors import InputError
 from selfcal_ros.messages import from_model
-from selfcal_ros.messages.sizes import MAX_EXPOSURES, check_simulated
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.view import View
 from selfcal_ros.sessions.solving import SolvingSession
