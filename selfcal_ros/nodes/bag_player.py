@@ -7,12 +7,15 @@ from typing import Any
 
 from rclpy.task import Future
 
-from selfcal_ros.collection.settings.nodes import PlayerSettings
-from selfcal_ros.errors import ExitCode, InputError
+from selfcal_ros.collection.settings.nodes import CollectorSettings, PlayerSettings
+from selfcal_ros.errors import ExitCode, InputError, SelfcalError
 from selfcal_ros.nodes.base import SelfcalNode
 from selfcal_ros.nodes.player import Player
 from selfcal_ros.nodes.running import run
 from selfcal_ros.sessions.ports import Diagnosis, Level
+
+STALLED_S = 2.0
+"""Time after which a listener that takes nothing more is a warning."""
 
 
 class BagPlayer(SelfcalNode[PlayerSettings]):
@@ -24,32 +27,49 @@ class BagPlayer(SelfcalNode[PlayerSettings]):
             raise InputError("bag_player", "no bag is named", "set the parameter 'bag'")
         self.finished = Future()
         self.exit_code = ExitCode.DONE
+        listener, patience_s = self.settings.listener, self.settings.wait_for_subscribers
         self.player = Player(self, self.settings.bag, rate=self.settings.rate,
-                             seed=self.settings.seed)
-        self._patience = time.monotonic() + self.settings.wait_for_subscribers
-        self._started = False
+                             seed=self.settings.seed, listener=listener or CollectorSettings.NODE)
+        self._patience = time.monotonic() + patience_s
+        self._started = not listener or not patience_s
         self.every(0.002, self._step)
 
     def diagnosis(self) -> Diagnosis:
-        """Return how far it is."""
-        return Diagnosis(Level.OK, "playing", {
-            "played": self.player.played, "total": self.player.total})
+        """Return how far it is, and for whom it waits."""
+        level, line = Level.OK, "playing"
+        if not self._started:
+            level, line = Level.WARN, f"waiting for {self.player.listener}"
+        elif self.player.stalled_s > STALLED_S:
+            level, line = Level.WARN, f"{self.player.listener} takes no more messages"
+        return Diagnosis(level, line, {"played": self.player.played, "total": self.player.total})
 
     def _step(self) -> None:
-        if not self._started:
-            alone = self.player.matched()
-            if alone and time.monotonic() < self._patience:
-                return
-            for topic in alone:
-                self.get_logger().warning(f"nobody listens to {topic}")
-            self._started = True
-        self.player.step()
-        if self.player.done and not self.finished.done():
+        if self.finished.done():
+            return
+        try:
+            self._started = self._started or self._is_heard()
+            if self._started:
+                self.player.step()
+        except SelfcalError as error:
+            self.say(Level.ERROR, str(error))
+            self.exit_code = error.exit_code
+            self.finished.set_result(None)
+            return
+        if self.player.done:
             self.player.drain()
             for line in self.player.playlist.lost:
                 self.get_logger().warning(line)
             self.get_logger().info(f"played {self.player.sent}")
             self.finished.set_result(None)
+
+    def _is_heard(self) -> bool:
+        unheard = self.player.unheard()
+        if unheard and time.monotonic() > self._patience:
+            raise InputError(
+                "bag_player", f"{self.player.listener} does not listen to {', '.join(unheard)} "
+                f"after {self.settings.wait_for_subscribers:g} s, nothing was played", "start it, "
+                "name another node as listener, or set listener to '' to wait for nobody")
+        return not unheard
 
 
 def main() -> None:

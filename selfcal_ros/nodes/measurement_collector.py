@@ -91,6 +91,8 @@ class MeasurementCollector(PollingNode[CollectorSettings]):
         self._busy = self.at_need(BUSY_S, self._on_timer)
         self._soon = self.at_need(SOON_S, self._on_soon)
         self.service(Trigger, "~/finish", lambda request: self._finish())
+        if not self._reception.restoring:
+            self._tell_received()
 
     def _publish(self, output: str, fields: dict[str, Any]) -> None:
         self._outputs[output](fields)
@@ -121,9 +123,12 @@ class MeasurementCollector(PollingNode[CollectorSettings]):
         self.poll()
         count = self._reception.n_waiting
         if self._reception.drain():
-            self._received.publish(names.RECEIVED.type(
-                data=list(self.session.collector.received.values())))
+            self._tell_received()
         return count
+
+    def _tell_received(self) -> None:
+        self._received.publish(names.RECEIVED.type(
+            data=list(self.session.collector.received.values())))
 
     def _finish(self) -> str:
         self._drain()

@@ -3,13 +3,17 @@
 
 import math
 import time
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from rclpy.duration import Duration
+from rclpy.publisher import Publisher
+from rclpy.qos import ReliabilityPolicy
 
 from selfcal_ros.bagio.playlist import Playlist
-from selfcal_ros.errors import NoDataError
+from selfcal_ros.collection.settings.nodes import CollectorSettings
+from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.messages.topics import COMMAND_TOPIC, DETECTION_TOPIC, ENCODER_TOPIC
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes.base import SelfcalNode
@@ -29,24 +33,32 @@ class Player:
 
     Messages go out as the bytes that the bag has, or are re-encoded where its types have other
     trailing fields than this package's. `seed` shuffles the order of arrival, not the stamps;
-    `namespace` is that of the cell in the bag, None = the only one.
+    `namespace` is that of the cell in the bag, None = the only one; `listener` is the node that
+    sets the pace.
     """
 
     def __init__(self, node: SelfcalNode, bag: str, *, rate: float, seed: int,
-                 namespace: str | None = None) -> None:
-        self.node, self.rate = node, rate
+                 namespace: str | None = None, listener: str = CollectorSettings.NODE) -> None:
+        self.node, self.rate, self._bag = node, rate, bag
+        own = node.get_namespace().rstrip("/")
+        self.listener = listener if listener.startswith("/") else f"{own}/{listener}"
         self.playlist = Playlist(Path(bag), namespace, seed)
         if not len(self.playlist):
             raise NoDataError(bag, "no message on the topics of the contract", "see the README")
         self._messages = iter(self.playlist)
-        self._next = next(self._messages)
-        self._first_ns = self._next[1]
+        first = next(self._messages)
+        self._next: tuple[str, int, bytes] | None = first
+        self._first_ns = first[1]
         self._publishers = {topic.name: node.publisher(topic) for topic in names.INPUTS}
         self.sent = dict.fromkeys(KINDS.values(), 0)
         self.heard: dict[str, int] | None = None
         self._at = 0
         self._began: float | None = None
-        node.subscribe(names.of_node("measurement_collector", names.RECEIVED), self._on_received)
+        self._published_s = 0.0  # when a message went out last, or none was due
+        self._before = 0  # messages that the listener had received before the first of these
+        received = names.of_node(self.listener, names.RECEIVED)
+        self._tells = partial(node.count_publishers, received.name)
+        node.subscribe(received, self._on_received)
 
     @property
     def total(self) -> int:
@@ -63,43 +75,75 @@ class Player:
         """Messages published so far."""
         return self._at
 
-    def matched(self) -> list[str]:
-        """Return the topics that have messages to play but no subscriber yet."""
-        return [topic for topic, publisher in self._publishers.items()
-                if topic in self.playlist.counts and publisher.get_subscription_count() == 0]
+    def unheard(self) -> list[str]:
+        """Return the topics that have messages to play but that `listener` does not hear yet.
+
+        Other subscribers (ros2 topic echo, foxglove_bridge) do not count, and a collector that
+        hears with best effort, because another publisher offers no more, would lose messages.
+        """
+        if self.heard is None and self._tells():
+            return list(self.playlist.counts)
+        hears = {topic: self._hears(publisher) for topic, publisher in self._publishers.items()
+                 if topic in self.playlist.counts}
+        return [topic + (" reliably (another publisher offers best effort)" if found else "")
+                for topic, found in hears.items() if ReliabilityPolicy.RELIABLE not in found]
+
+    def _hears(self, publisher: Publisher) -> list[ReliabilityPolicy]:
+        """Return how `listener` hears a publisher: as each of its subscriptions there asks for."""
+        if not publisher.get_subscription_count():
+            return []
+        readers = self.node.get_subscriptions_info_by_topic(publisher.topic_name)
+        return [reader.qos_profile.reliability for reader in readers if self.listener
+                == f"{reader.node_namespace.rstrip('/')}/{reader.node_name}"]
 
     def step(self) -> None:
         """Publish what is due now."""
         now = time.monotonic()
-        self._began = began = now if self._began is None else self._began
-        played_ns = (now - began) * self.rate / S_PER_NS
+        if self._began is None:
+            self._began, self._before = now, sum((self.heard or {}).values())
+        played_ns = (now - self._began) * self.rate / S_PER_NS
         due_ns = self._first_ns + played_ns if self.rate > 0 else math.inf
         while not self.done and (instant := time.monotonic()) < now + SLICE_S:
-            count = min(self._room(instant - began), BURST)
-            if count <= 0 or not self._publish(count, due_ns):
+            count = min(self._room(instant - self._began), BURST)
+            if count <= 0:
                 return
+            self._published_s = instant
+            if not self._publish(count, due_ns):
+                return
+
+    @property
+    def stalled_s(self) -> float:
+        """Seconds for which messages have been due and the listener had not taken those before."""
+        started = self._began is not None and not self.done
+        return time.monotonic() - self._published_s if started else 0.0
 
     def _publish(self, count: int, due_ns: float) -> bool:
         """Publish up to so many messages that were logged by then; tell if more may be due."""
         for _ in range(min(count, self.total - self._at)):
+            if self._next is None:
+                raise InputError(self._bag, f"{self.total} messages when it was opened, "
+                                 f"{self._at} now", "play a bag that nobody changes")
             topic, stamp, data = self._next
             if stamp > due_ns:
                 return False
             self._publishers[topic].publish(data)
             self.sent[KINDS[topic]] += 1
             self._at += 1
-            self._next = next(self._messages, self._next)
+            self._next = next(self._messages, None)
         return True
 
     def _room(self, played_s: float) -> int:
         """Return how many messages the subscribers can take, `played_s` after the first one."""
         if self.heard is None:
             return int(WINDOW + UNHEARD_RATE * played_s / 2) - self._at
-        return WINDOW - self._at + sum(self.heard.values())
+        return WINDOW - self._at + sum(self.heard.values()) - self._before
 
     def _on_received(self, message: Any) -> None:
-        if len(message.data) == len(self.sent):
-            self.heard = dict(zip(self.sent, map(int, message.data), strict=True))
+        if len(message.data) != len(self.sent):
+            return
+        if sum(message.data) < sum((self.heard or {}).values()):  # a listener that was restarted
+            self._before = sum(message.data) - self._at
+        self.heard = dict(zip(self.sent, map(int, message.data), strict=True))
 
     def drain(self) -> None:
         """Wait until everything has been acknowledged."""

@@ -63,13 +63,13 @@ class ReplaySession(SelfcalNode[PlayerSettings]):
         return time.monotonic() > self._deadline
 
     def _wait_for_nodes(self) -> None:
-        alone = self.player.matched()
+        alone = self.player.unheard()
         ready = self._finish.service_is_ready() and self._save.service_is_ready()
         if not alone and ready:
             self._go(self._play)
         elif self._late():
-            self._end(f"no subscriber for {', '.join(alone) or 'the services'}",
-                      ExitCode.INTERNAL)
+            self._end(f"{self.player.listener} does not listen to {', '.join(alone)}" if alone
+                      else "no services of collector and solver", ExitCode.INTERNAL)
 
     def _play(self) -> None:
         self.player.step()
@@ -79,6 +79,9 @@ class ReplaySession(SelfcalNode[PlayerSettings]):
             print(f"progress {self.player.played} {self.player.total}", flush=True)
         if self.player.done:
             self._go(self._wait_until_received)
+        elif self.player.stalled_s > PATIENCE_S:
+            self._end(f"{self.player.listener} takes no more messages: sent {self.player.sent}, "
+                      f"received {self.player.heard}", ExitCode.INTERNAL)
 
     def _wait_until_received(self) -> None:
         if self.player.heard == self.player.sent:

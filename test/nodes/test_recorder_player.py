@@ -9,15 +9,19 @@ from pathlib import Path
 import pytest
 import yaml
 from mcap.reader import make_reader
+from rclpy.node import Node
+from rclpy.qos import qos_profile_sensor_data
 
 from selfcal_ros.bagio.offline import collect_bag
 from selfcal_ros.bagio.reader import BagReader
 from selfcal_ros.collection.digest import readings_digest
 from selfcal_ros.collection.settings.nodes import CollectorSettings
-from selfcal_ros.errors import InputError, NoDataError
+from selfcal_ros.errors import ExitCode, InputError, NoDataError
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes.bag_player import BagPlayer
 from selfcal_ros.nodes.bag_recorder import BagRecorder
+from selfcal_ros.nodes.measurement_collector import MeasurementCollector
+from selfcal_ros.sessions.ports import Level
 from test.support.sessions import small_bag
 
 
@@ -68,7 +72,8 @@ def played(graph, tmp_path, bag):
     """Return a function that plays the bag into a recorder: (recorded, player)."""
     def play(**parameters):
         recorder = graph.node(BagRecorder, bag=str(tmp_path / "recorded"))
-        player = graph.node(BagPlayer, bag=str(bag), **({"rate": 0.0} | parameters))
+        player = graph.node(BagPlayer, bag=str(bag), **({
+            "rate": 0.0, "listener": "bag_recorder"} | parameters))
         graph.until(player.finished.done, "the end of the bag")
         total = player.player.total
         graph.until(lambda: sum(recorder._writer.counts.values()) >= total, "the last message")
@@ -131,6 +136,100 @@ def test_a_player_does_not_take_the_collector_of_another_cell_for_its_own(graph,
     own.publish(names.RECEIVED.type(data=[7, 7, 7]))
     graph.until(lambda: player.heard, "the counts")
     assert player.heard == dict.fromkeys(player.sent, 7)
+
+
+def endless(node, name: str, topics=names.INPUTS, **qos) -> list:
+    """Have `node` listen to topics of the cell whatever they are; return what it hears."""
+    heard: list = []
+    for topic in topics:
+        node.create_subscription(topic.type, name + topic.name, heard.append, **(
+            {"qos_profile": topic.qos} | qos))
+    return heard
+
+
+def test_nothing_is_lost_beside_strangers_who_listen_before_the_collector(graph, bag):
+    """As ros2 topic echo, foxglove_bridge and the compensator do."""
+    heard = endless(graph.hand, "")
+    endless(graph.add(Node("echo", context=graph.context)), "", qos_profile=qos_profile_sensor_data)
+    player = graph.node(BagPlayer, bag=str(bag), rate=0.0)
+    graph.until(lambda: all(publisher.get_subscription_count() == 2
+                            for publisher in player.player._publishers.values()), "the strangers")
+    looks: list = []
+    player.every(0.01, lambda: looks.append(player.player.played))
+    graph.until(lambda: len(looks) > 5, "looks at the player")
+    assert (set(looks), heard) == ({0}, [])
+    assert player.diagnosis().message == "waiting for /measurement_collector"
+    collector = graph.node(MeasurementCollector)
+    graph.until(player.finished.done, "the end of the bag")
+    graph.until(lambda: collector.session.collector.received == player.player.sent, "all of it")
+    measurements, _ = collector.session.collector.collect()
+    assert [readings_digest(view, {}) for view in measurements.views] == digests(bag)
+
+
+def test_a_player_whose_listener_does_not_come_ends_and_has_played_nothing(graph, bag):
+    heard = endless(graph.hand, "")
+    player = graph.node(BagPlayer, bag=str(bag), rate=0.0, wait_for_subscribers=0.2)
+    lines: list = []
+    player.say = lambda level, line: lines.append((level, line))
+    graph.until(player.finished.done, "its end")
+    assert (player.exit_code, player.player.played, heard) == (ExitCode.BAD_INPUT, 0, [])
+    assert lines == [(Level.ERROR, (
+        "bag_player: /measurement_collector does not listen to stage/joint_states, "
+        "stage/mark_detections, selfcal/view_command after 0.2 s, nothing was played; start it, "
+        "name another node as listener, or set listener to '' to wait for nobody"))]
+
+
+@pytest.mark.parametrize("parameters", [{"listener": ""}, {"wait_for_subscribers": 0.0}])
+def test_a_player_that_waits_for_nobody_plays_at_once(graph, bag, parameters):
+    player = graph.node(BagPlayer, bag=str(bag), rate=0.0, **parameters)
+    graph.until(player.finished.done, "the end of the bag")
+    assert (player.exit_code, player.player.done) == (ExitCode.DONE, True)
+
+
+@pytest.mark.parametrize("listener, heard", [
+    ("measurement_collector", False), ("/cell2/measurement_collector", True)])
+def test_a_listener_is_one_by_name_and_namespace(graph, bag, listener, heard):
+    other = graph.add(Node("measurement_collector", namespace="cell2", context=graph.context))
+    endless(other, "/")
+    player = graph.node(BagPlayer, bag=str(bag), rate=0.001, listener=listener).player
+    graph.until(lambda: all(publisher.get_subscription_count()
+                            for publisher in player._publishers.values()), "the subscriptions")
+    named = [f"{info.node_namespace}/{info.node_name}" for info in
+             graph.hand.get_subscriptions_info_by_topic("stage/joint_states")]
+    assert named == ["/cell2/measurement_collector"]
+    assert (player.unheard() == []) is heard
+
+
+def test_a_listener_of_one_topic_alone_is_not_enough(graph, bag):
+    node = graph.add(Node("one", context=graph.context))
+    endless(node, "", [names.DETECTIONS])
+    player = graph.node(BagPlayer, bag=str(bag), rate=0.001, listener="one").player
+    graph.until(lambda: names.DETECTIONS.name not in player.unheard(), "the one")
+    assert player.unheard() == [names.ENCODER.name, names.COMMAND.name]
+
+
+def test_a_collector_that_a_stranger_has_hear_with_best_effort_is_waited_for(graph, bag):
+    driver = graph.hand.create_publisher(names.ENCODER.type, names.ENCODER.name,
+                                         names.ENCODER_BEST_EFFORT.qos)
+    graph.node(MeasurementCollector)
+    player = graph.node(BagPlayer, bag=str(bag), rate=0.0).player
+    graph.until(lambda: len(player.unheard()) == 1, "the collector")
+    assert player.unheard() == [
+        "stage/joint_states reliably (another publisher offers best effort)"]
+    graph.hand.destroy_publisher(driver)
+    graph.until(lambda: player.done, "the end of the bag")
+
+
+def test_a_bag_that_goes_away_while_it_is_played_ends_the_player_with_a_line(graph, bag):
+    player = graph.node(BagPlayer, bag=str(bag), rate=0.0, listener="")
+    player.player._messages = iter(())
+    lines: list = []
+    player.say = lambda level, line: lines.append((level, line))
+    graph.until(player.finished.done, "its end")
+    assert (player.exit_code, player.player.played) == (ExitCode.BAD_INPUT, 1)
+    total = player.player.total
+    assert lines == [(Level.ERROR, f"{bag}: {total} messages when it was opened, 1 now; play a bag "
+                                   "that nobody changes")]
 
 
 def test_what_was_flushed_survives_a_crash(graph, tmp_path):

@@ -208,8 +208,13 @@ class PlayerSettings(Settings):
         1.0, "speed of the replay; 0 = as fast as the subscribers keep up", "", 0.0, 1000.0)
     seed: int = declared(
         -1, "shuffle the order of arrival with this seed; -1 = as recorded", "", -1, 2**31)
+    listener: str = declared(
+        CollectorSettings.NODE, "node that has to listen to every topic of the bag before the "
+        "first message is played, in the player's namespace unless it begins with /; empty = play "
+        "without waiting")
     wait_for_subscribers: float = declared(
-        10.0, "longest wait for a subscriber of each topic", "s", 0.0, 3600.0)
+        30.0, "longest wait for that node; then the player ends with code 2 and has played "
+        "nothing; 0 = play without waiting", "s", 0.0, 3600.0)
 
 
 @dataclass(frozen=True)
