@@ -24,8 +24,16 @@ MAX_REPEATS = 1_000_000
 """Repeats of a mark in a view."""
 SITES_A_MARK = 1000
 """Sites of the plate for each mark that was read, above which a plate cannot be calibrated."""
-LARGEST = 1e3
-"""Deviation or uncertainty, m or rad, beyond which nobody has measured anything."""
+LARGEST, LARGEST_OFFSET = 1e3, 100.0
+"""Deviation or uncertainty, and offset of a single detection, m or rad, beyond which nobody has
+measured anything: with the 10 m that the stage may be off, deviations stay below the former."""
+SMALLEST_SIGMA = 1e-12
+"""Standard uncertainty of a detection, m or rad, that nobody reaches; 0 = not known."""
+SMALLEST_U = SMALLEST_SIGMA / math.sqrt(MAX_REPEATS)
+"""The same of a mean."""
+SIGMA_SPAN = 1e4
+"""How far below the median of its view a declared sigma may lie: a reading of more weight would
+decide by itself, and the readings no longer tell the map."""
 MAX_EXPOSURES = 5_000_000
 """Exposures of one view that the simulated cell holds: 240 MB."""
 
@@ -156,6 +164,16 @@ def check_view(readings: ViewReadings, artifact: Artifact, view_index: int) -> N
             raise InputError(f"{where}, visits", "a count below 1", "correct the publisher")
 
 
+def good_sigmas(sigma: np.ndarray) -> np.ndarray:
+    """Return which of the sigmas of a view's detections of one kind can be used, bool array (n,).
+
+    A collector takes no others, so that a solver can use what it gives.
+    """
+    known = (sigma >= SMALLEST_SIGMA) & (sigma <= LARGEST)
+    least = np.median(sigma[known]) / SIGMA_SPAN if known.any() else 0.0
+    return (sigma == 0) | (known & (sigma >= least))
+
+
 def _check_values(where: str, table: ViewReadings | GridVisits, told: Iterable[str],
                   perhaps: Iterable[str]) -> None:
     """Raise InputError for values that are enormous, or NaN where they have to be told."""
@@ -163,6 +181,8 @@ def _check_values(where: str, table: ViewReadings | GridVisits, told: Iterable[s
         size = np.abs(getattr(table, name))
         if np.any(size > LARGEST) or (name in told and np.isnan(size).any()):
             raise InputError(where, f"{name} is no number up to {LARGEST:g}", "give m and rad")
+        if name in ("u", "u_theta") and np.any((size > 0) & (size < SMALLEST_U)):
+            raise InputError(where, f"{name} is below {SMALLEST_U:g}", "give m and rad")
 
 
 def check_plate(artifact: Artifact, views: Iterable[ViewReadings]) -> None:

@@ -16,6 +16,7 @@ class Reason(StrEnum):
     OTHER_RUN = "other_run"
     CONTRADICTION = "encoder_contradiction"
     NOT_FINITE = "not_finite"
+    BAD_SIGMA = "sigma_out_of_range"
     UNKNOWN_KIND = "unknown_kind"
     UNKNOWN_MARK = "unknown_mark"
     NOT_IN_VIEW = "mark_not_in_view"
@@ -36,8 +37,11 @@ ADVICE = {
     Reason.ROTATION: "the view's rotation is not known well enough to tell these marks or lines "
                      "from their neighbours; let the detections carry ids, or measure grid marks "
                      "in the same view, or state a max_rotation of less than half a line",
+    Reason.BAD_SIGMA: "their sigma is no standard uncertainty in m or rad (1e-12 to 1000, 0 = not "
+                      "known), or 10,000 times smaller than that of the others; correct the "
+                      "publisher of the detections",
 }
-"""What to do about a reason that is put right in the plan or in the parameters, one line each."""
+"""What to do about a reason of which a single detection is worth a line."""
 
 REMEDY = {
     Reason.NO_ENCODER: "the encoder has a gap around the exposures; let it send without gaps, or "
@@ -50,6 +54,7 @@ REMEDY = {
                           "joints, with a clock that does not step",
     Reason.NOT_FINITE: "NaN, infinite or negative where a length or an angle is wanted; correct "
                        "the publisher of the detections",
+    Reason.BAD_SIGMA: ADVICE[Reason.BAD_SIGMA],
     Reason.UNKNOWN_KIND: "kind is neither GRID nor ANGULAR; correct the publisher of the "
                          "detections",
     Reason.UNKNOWN_MARK: "their ids are not on the plate; check grid_size, angular_count and the "
@@ -71,5 +76,5 @@ REMEDY = {
 
 def advice(rejected: Mapping[str, int]) -> list[str]:
     """Return one line for each reason in `rejected` that has an advice, with its count."""
-    return [f"{rejected[reason]} detections rejected as {reason}: {text}"
-            for reason, text in ADVICE.items() if rejected.get(reason)]
+    return [f"{count} detection{'s' * (count != 1)} rejected as {reason}: {text}"
+            for reason, text in ADVICE.items() if (count := rejected.get(reason))]

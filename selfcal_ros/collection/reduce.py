@@ -15,7 +15,7 @@ from selfcal_ros.collection.marks.identify import (
 from selfcal_ros.collection.marks.places import PlaceList
 from selfcal_ros.collection.marks.repeats import reduce_repeats
 from selfcal_ros.collection.marks.visits import grid_visits
-from selfcal_ros.collection.messages import Kind
+from selfcal_ros.collection.messages import LARGEST_OFFSET, Kind, good_sigmas
 from selfcal_ros.collection.reasons import Reason
 from selfcal_ros.collection.stage.encoder import GOOD, MOVING, REASONS
 from selfcal_ros.collection.stage.exposures import Exposures, JointAt
@@ -76,8 +76,17 @@ def clean(detections: np.ndarray, rules: Rules, *, scored: bool,
         finite &= np.isfinite(d[field])
     rejected[Reason.NOT_FINITE] = int((~finite).sum())
     d = _where(finite, d)
+    far = (np.abs(d["ox"]) > LARGEST_OFFSET) | (np.abs(d["oy"]) > LARGEST_OFFSET)
+    rejected[Reason.TOO_FAR] = int(far.sum())
+    d = _where(~far, d)
     unique = _canonical(d)
     rejected[Reason.DUPLICATE] += len(d) - len(unique)
+    good = np.ones(len(unique), dtype=bool)
+    for kind in Kind if unique["sigma"].any() else ():
+        mine = unique["kind"] == kind
+        good[mine] = good_sigmas(unique["sigma"][mine])
+    rejected[Reason.BAD_SIGMA] = int((~good).sum())
+    unique = _where(good, unique)
     if scored:
         low = unique["score"] < rules.min_score
         rejected[Reason.LOW_SCORE] += int(low.sum())

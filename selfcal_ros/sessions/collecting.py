@@ -281,7 +281,8 @@ class CollectingSession:
             **received, "views": len(self._published), **self._newest(), **self._cost(),
             "detections_matched": "yes" if detections_matched else "no",
             **{f"rejected {reason}": n for reason, n in sorted(self._rejected.items())}})
-        found = Diagnosis(Level.WARN if self._findings else Level.OK, "; ".join(self._findings))
+        lines = self._findings or advice(self._rejected)
+        found = Diagnosis(Level.WARN if lines else Level.OK, "; ".join(lines))
         stepped = Diagnosis(Level.WARN if self._stepped else Level.OK, "; ".join(self._stepped))
         return merged(main, [
             found, self._clock.diagnosis(), stepped,

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from selfcal_ros.cli.main import main
-from selfcal_ros.collection.messages import Command, Detection, Phase
+from selfcal_ros.collection.messages import Command, Detection, Kind, Phase
 from test.support.bags import Foreign, shuffled
 from test.support.plans import plan_of
 from test.support.sessions import events_of, small_plan, stepped_bag
@@ -71,3 +71,18 @@ def test_the_same_messages_without_a_step_name_no_clock(tmp_path, capsys):
     path = Foreign().write(tmp_path / "x.mcap", shuffled(events_of(small_plan("0, 90, tx"))))
     assert main(["solve", str(path), "--quiet"]) == 0
     assert capsys.readouterr().err == ""
+
+
+@pytest.mark.parametrize("kind", [Kind.GRID, Kind.ANGULAR])
+@pytest.mark.parametrize("sigma", [1e4, 1e-200])
+def test_a_sigma_that_cannot_be_is_one_line_and_costs_that_detection(tmp_path, capsys, sigma, kind):
+    events = [replace(e, sigma=2e-8 if e.kind == Kind.GRID else 2e-5)
+              if isinstance(e, Detection) else e for e in events_of(small_plan("0, 90, tx"))]
+    index = next(n for n, e in enumerate(events) if isinstance(e, Detection) and e.kind == kind)
+    events[index] = replace(events[index], sigma=sigma)
+    path = Foreign().write(tmp_path / "x.mcap", events)
+    assert main(["solve", str(path), "--quiet", "-o", str(tmp_path / "r.json")]) == 0
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(f"selfcal solve: {path}: 1 detection rejected as sigma_out_of_range: ")
+    result = json.loads((tmp_path / "r.json").read_text())
+    assert result["rejected"] == {"sigma_out_of_range": 1}

@@ -4,14 +4,22 @@
 import tracemalloc
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
-from selfcal_ros.collection.messages import MAX_EXPOSURES, Command, Phase, check_simulated
-from selfcal_ros.errors import InputError
+from selfcal_ros.collection.messages import (
+    MAX_EXPOSURES,
+    Command,
+    Phase,
+    check_simulated,
+    good_sigmas,
+)
+from selfcal_ros.errors import InputError, SelfcalError
 from selfcal_ros.messages import from_model
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.view import View
-from selfcal_ros.sessions.solving import SolvingSession
+from selfcal_ros.sessions.solving import SolvingSession, solve
+from test.support.collecting import collect, scene
 from test.support.ports import Hands, message, settings_of
 from test.support.sessions import collected, events_of, small_plan
 
@@ -43,6 +51,8 @@ def session():
     ({"dy": [float("nan")] * 25}, "'0': dy is no number up to 1000"),
     ({"dtheta": [float("-inf")] * 8}, "'0': dtheta is no number up to 1000"),
     ({"u": [1e300] * 25}, "'0': u is no number up to 1000"),
+    ({"u": [1e-200] + [2e-8] * 24}, "'0': u is below 1e-15; give m and rad"),
+    ({"u_theta": [9e-16] * 8}, "'0': u_theta is below 1e-15; give m and rad"),
     ({"sigma_theta": -1e4}, "'0': sigma_theta is no number up to 1000"),
     ({"visit_offset_y": [float("nan")] * 25}, "'0', visits: offset_y is no number up to 1000"),
     ({"visit_count": [0] * 25}, "'0', visits: a count below 1; correct the publisher")])
@@ -95,3 +105,41 @@ def test_the_limit_itself_is_simulated():
     check_simulated(command)
     with pytest.raises(InputError, match="at most 10000 views"):
         check_simulated(replace(command, view_index=2**31))
+
+
+@pytest.mark.parametrize(("sigma", "good"), [
+    ([0.0], [True]), ([1e-12], [True]), ([0.99e-12], [False]), ([1000.0], [True]),
+    ([1000.1], [False]), ([1e-200, 0.0], [False, True]),
+    ([2e-8, 2e-8, 2.1e-12], [True] * 3), ([2e-8, 2e-8, 1.9e-12], [True, True, False]),
+    ([1e4, 2e-8, 2e-8, 1.9e-12], [False, True, True, False]),  # one that is refused moves no median
+    ([2e-8, 2e-8, 1.0], [True] * 3)])
+def test_sigmas_that_a_reading_can_have(sigma, good):
+    assert good_sigmas(np.array(sigma)).tolist() == good
+
+
+EDGES = [("offset_x", 100.0), ("offset_x", 100.1), ("offset_y", -1e9), ("sigma", 1e4),
+         ("sigma", 1000.0), ("sigma", 1e-12), ("sigma", 2e-12), ("sigma", 1e-200),
+         ("offset_theta", 3.0), ("offset_theta", 101.0)]
+
+
+@pytest.mark.parametrize("alike", [False, True], ids=["one", "all"])
+@pytest.mark.parametrize("declared", [0.0, 2e-8])
+@pytest.mark.parametrize(("field", "value"), EDGES)
+def test_what_the_collector_takes_of_a_detection_the_solver_can_use(field, value, declared, alike):
+    cell = scene("0, 90, tx", line=True, repeats=2, sigma_xy_m=2e-8, sigma_theta_rad=2e-5)
+    for index, seen in enumerate(cell.detections):
+        spoilt = alike or index in (cell.grid(3), cell.angular(3))
+        cell.spoil(index, **{"sigma": declared} | ({field: value} if spoilt else {}))
+        if alike and field.startswith("offset"):  # a plate that lies there
+            cell.spoil(index, **{field: value + getattr(seen, field)})
+    measurements, progress = collect(cell.events)
+    messages = [message("ViewMeasurement", from_model.view_measurement(
+        view, measurements, 10, "stage")) for view in progress.values()]
+    session = SolvingSession(settings_of("solver"), Hands().ports)
+    for item in messages:
+        session.take_measurement(item)
+    outcome = solve(session.next_job())
+    lost = sum(measurements.all_rejected().values())
+    assert lost + sum(view.used for view in measurements.views) == len(cell.detections)
+    assert alike or (outcome.problem is None and lost <= 2)
+    assert outcome.problem is None or isinstance(outcome.problem, SelfcalError)

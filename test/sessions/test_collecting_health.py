@@ -416,3 +416,18 @@ def test_the_jitter_of_the_encoder_is_told_and_held_against_its_limit(limit, lev
     assert float(told.values["encoder_jitter_s"]) == pytest.approx(2e-4, rel=0.01)
     assert told.level == level
     assert ("vary by 0.0002 s, the limit is 0.00019 s" in told.message) is (level == Level.WARN)
+
+
+def test_a_sigma_that_cannot_be_costs_that_detection_and_is_a_warning():
+    desk, events = Desk(), first_view()
+    index = next(n for n, event in enumerate(events) if isinstance(event, Detection))
+    events[index] = replace(events[index], sigma=1e4)
+    desk.feed(events)
+    desk.session.tick()
+    status = desk.hands.of("status")[-1]
+    assert (status["reject_reasons"], status["reject_counts"]) == (["sigma_out_of_range"], [1])
+    assert status["missing_m"] == [events[index].m] and status["missing_n"] == [events[index].n]
+    told = desk.told()
+    assert told.level == Level.WARN
+    assert "1 detection rejected as sigma_out_of_range: their sigma is no " in told.message
+    assert told.values["rejected sigma_out_of_range"] == 1
