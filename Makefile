@@ -40,7 +40,7 @@ chaos: setup  # minutes; e.g. make chaos ROUNDS=3 SEED=7
 mutants: setup  # e.g. make mutants MUTANTS="--number 200 --only selfcal_ros/estimation"
 	@$(BIN)/python tools/mutants.py $(MUTANTS)
 reality: setup  # minutes; e.g. make reality REALITY="--runs 10 --only drift"
-	@$(BIN)/python tools/reality.py $(REALITY)
+	@$(BIN)/python -m tools.reality $(REALITY)
 pictures: setup  # those of README and docs
 	@$(BIN)/python tools/pictures.py
 reference: setup  # docs/reference.md

@@ -8,7 +8,8 @@ import pytest
 
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.simulation.machine import random_truth
-from selfcal_ros.simulation.reality import (
+from selfcal_ros.simulation.truth import simulate_measurements
+from tools.reality.cases import (
     MODEL,
     Case,
     both,
@@ -21,7 +22,6 @@ from selfcal_ros.simulation.reality import (
     run_case,
     scaled,
 )
-from selfcal_ros.simulation.truth import simulate_measurements
 
 
 def test_the_plan_that_resists_turns_and_shifts_both_ways():

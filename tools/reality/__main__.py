@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """`make reality`: what real machines do, what the calibration makes of it, as a table.
 
-reality.py [--runs N] [--workers N] [--only TEXT] [-o TABLE.md]
+python -m tools.reality [--runs N] [--workers N] [--only TEXT] [-o TABLE.md]
 """
 
 import argparse
@@ -10,8 +10,8 @@ from functools import partial
 
 from selfcal_ros.files import write_text
 from selfcal_ros.parallel import check_workers, outcomes
-from selfcal_ros.simulation.reality import Case, Run, Summary, cases, run_case, summarise
 from selfcal_ros.units import NM_PER_M
+from tools.reality.cases import Case, Run, Summary, cases, run_case, summarise
 
 HEADER = ("| what the machine does | map error, nm, largest (median) | in U | XY error / u | "
           "θ error / u | not qualified | wrong and qualified | first cause |\n"
