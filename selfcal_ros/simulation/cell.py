@@ -39,7 +39,8 @@ def view_events(truth: Truth, plan: Plan, index: int, *, settings: CellSettings,
             at = start_ns + (exposed + 1) * period_ns + settings.exposure_ns
             if at > stamp:
                 break
-            yield _detection(at, offsets[exposed], marks[exposed], settings)
+            if (mark := marks[exposed]) is not None:
+                yield _detection(at, offsets[exposed], mark, settings)
             exposed += 1
         yield EncoderSample(stamp, JOINTS, _position(stops, stamp - start_ns, settings))
 
@@ -62,25 +63,28 @@ def plan_events(truth: Truth, plan: Plan, *, settings: CellSettings, rng: np.ran
 
 
 def _exposures(truth: Truth, index: int, view: View, settings: CellSettings,
-               rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, list[tuple]]:
+               rng: np.random.Generator,
+               ) -> tuple[np.ndarray, np.ndarray, list[tuple | None]]:
     """Return stops (E + 1, 3), the first before any exposure, offsets (E, 3) and marks.
 
-    A mark is (kind, m, n, k).
+    A mark is (kind, m, n, k), None where the plate has none.
     """
-    stops, offsets, marks = [np.zeros((0, 3))], [np.zeros((0, 3))], []
+    stops, offsets = [np.zeros((0, 3))], [np.zeros((0, 3))]
+    marks: list[tuple | None] = []
     if view.grid:
         grid = grid_exposures(truth, index, view, settings=settings, rng=rng)
         zero = np.zeros(grid.position.shape[1])
         stops.append(np.stack([*grid.position, zero], axis=1))
         offsets.append(np.stack([*grid.offset, zero], axis=1))
-        m, n = (ids[grid.visit].tolist() for ids in (grid.visits.m, grid.visits.n))
-        marks += [(Kind.GRID, *ids, 0) for ids in zip(m, n, strict=True)]
+        m, n, there = (row[grid.visit].tolist() for row in (*grid.mark, grid.there))
+        marks += [(Kind.GRID, *ids, 0) if seen else None
+                  for *ids, seen in zip(m, n, there, strict=True)]
     if view.angular:
         lines = angular_exposures(truth, index, view, settings=settings, rng=rng)
         zero = np.zeros(len(lines.k))
         stops.append(np.stack([zero, zero, lines.position], axis=1))
         offsets.append(np.stack([zero, zero, lines.offset], axis=1))
-        marks += [(Kind.ANGULAR, 0, 0, k) for k in lines.k.tolist()]
+        marks += [(Kind.ANGULAR, 0, 0, k) for k in lines.line.tolist()]
     every = np.concatenate(stops)
     before = every[:1].copy()
     if view.grid:

@@ -21,6 +21,8 @@ def measured_view(truth: Truth, item: tuple[int, View], rng: np.random.Generator
                   settings: CellSettings, missing: float, start_ns: int) -> ViewReadings:
     """Return the readings of a view, with its visits, as the collector would from its messages.
 
+    Marks are those that the view expects, as for detections without ids.
+
     Parameters
     ----------
     truth : Truth
@@ -63,7 +65,7 @@ def _read(sense: Sense, found: GridExposures | AngularExposures) -> np.ndarray:
 def _grid(readings: ViewReadings, truth: Truth, found: GridExposures, *, settings: CellSettings,
           lost: np.ndarray, start_ns: int) -> ViewReadings:
     visits, (hx, hy) = found.visits, truth.artifact.half
-    kept = ~lost[visits.m + hx, visits.n + hy]
+    kept = ~lost[visits.m + hx, visits.n + hy] & found.there
     key = (visits.m + hx) * (2 * hy + 1) + visits.n + hy
     marks, mark = np.unique(key[kept], return_inverse=True)
     number = np.cumsum(kept) - 1  # of a visit among those kept

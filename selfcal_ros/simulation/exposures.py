@@ -30,6 +30,10 @@ class GridExposures:
         Indicated position of the stage, m.
     offset : float array (2, E)
         Offset that the microscope tells, m.
+    mark : int array (2, V)
+        m and n of the mark that lies there: the one visited where the plate lies as commanded.
+    there : bool array (V,)
+        Whether a mark lies there at all.
     approach : int8 array (2, V)
         Sign of the last motion of each stage axis before the visit.
     site : float array (2, V)
@@ -40,15 +44,26 @@ class GridExposures:
     visit: np.ndarray
     position: np.ndarray
     offset: np.ndarray
+    mark: np.ndarray
+    there: np.ndarray
     approach: np.ndarray
     site: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
 class AngularExposures:
-    """Exposures of angular lines in their order: line, indicated angle, offset told, (E,) each."""
+    """Exposures of angular lines in their order, (E,) each.
+
+    Attributes
+    ----------
+    k, line : int arrays
+        The line that the view expects, and the one that lies there.
+    position, offset : float arrays
+        Indicated angle, and the offset told, rad.
+    """
 
     k: np.ndarray
+    line: np.ndarray
     position: np.ndarray
     offset: np.ndarray
 
@@ -64,26 +79,56 @@ def grid_exposures(truth: Truth, index: int, view: View, *, settings: CellSettin
                             consecutive=settings.consecutive, rng=rng)
     visit = np.repeat(np.arange(len(visits)), visits.count)
     size = len(visit)
-    place, site = physics.mark_places(truth, index, view, (visits.m, visits.n))
-    moved = physics.drift(truth, index, np.arange(size) / max(size - 1, 1))
+    m, n, there = physics.marks_below(truth, index, view, (visits.m, visits.n))
+    place, _ = physics.mark_places(truth, index, truth.placed_as(index, view), (m, n))
+    site = (np.stack(view.lattice_pose(truth.artifact).site_of(visits.m, visits.n))
+            * truth.artifact.grid_pitch_m)
+    tau = np.arange(size) / max(size - 1, 1)
+    moved = physics.drift(truth, index, tau)
     sign = -1 if settings.sense is Sense.PLATE_MOVES else 1
     stop = sign * site
     if settings.follow_mark:  # the stage goes on until the mark is under the microscope
         centre = sign * (place + moved[:, np.cumsum(visits.count) - visits.count])
-        stop = centre + physics.stage_error(truth, centre)
+        stop = centre + physics.stage_error(truth, centre, index)
     stop = stop + _normal(rng, settings.stop_sigma_m, stop.shape)
-    approach = np.stack([approach_signs(np.append(lead_in(truth, row[:1]), row), NO_MOTION_M)[1:]
-                         for row in stop])
+    came = np.concatenate([lead_in(truth, stop[:, :1]), stop], axis=1)
+    approach = np.stack([approach_signs(row, NO_MOTION_M)[1:] for row in came])
     position = stop[:, visit] + _normal(rng, settings.servo_sigma_m, (2, size))
-    stage = (position - physics.stage_error(truth, position)
-             - (truth.backlash_m[:, None] * approach)[:, visit])
+    lag = ((truth.backlash_m[:, None] + truth.backlash_growth_m * tau) * approach[:, visit]
+           + _settling(truth, came, visit, settings.exposure_period_s))
+    stage = position - physics.stage_error(truth, position, index) - lag
     offset = physics.true_offset(settings.sense, place[:, visit] + moved, stage)
-    told = (physics.seen_offset(truth, offset)
-            + _normal(rng, settings.sigma_xy_m, (2, size))
+    white = _normal(rng, settings.sigma_xy_m, (2, size))
+    white *= np.array([[1.0], [settings.noise_ratio]])
+    told = (physics.seen_offset(truth, offset) + white
             + _normal(rng, settings.visit_xy_m, (2, len(visits)))[:, visit]
             + _flicker(rng, settings.flicker_xy_m, (2, size)))
-    return GridExposures(visits, visit, position, quantised(told, settings.resolution_xy_m),
-                         approach, site)
+    indicated = position + _normal(rng, settings.encoder_sigma_m, (2, size))
+    return GridExposures(visits, visit, indicated, quantised(told, settings.resolution_xy_m),
+                         np.stack([m, n]), there, approach, site)
+
+
+def _settling(truth: Truth, came: np.ndarray, visit: np.ndarray, period_s: float,
+              ) -> np.ndarray | float:
+    """Return what the axes are short of at each exposure, (2, E), m.
+
+    Parameters
+    ----------
+    truth
+        What is true.
+    came : float array (2, V + 1)
+        Stops of the stage, the first that before the first visit.
+    visit : int array (E,)
+        Number of the visit of each exposure.
+    period_s : float
+        Time from one exposure to the next.
+    """
+    if not truth.settling_m:
+        return 0.0
+    step = np.diff(came, axis=1)
+    sign = np.where(np.abs(step) > NO_MOTION_M, np.sign(step), 0)
+    rested = np.arange(len(visit)) - np.searchsorted(visit, visit)
+    return truth.settling_m * sign[:, visit] * np.exp(-rested * period_s / truth.settling_time_s)
 
 
 def lead_in(truth: Truth, first: np.ndarray) -> np.ndarray:
@@ -94,7 +139,7 @@ def lead_in(truth: Truth, first: np.ndarray) -> np.ndarray:
 def angular_exposures(truth: Truth, index: int, view: View, *, settings: CellSettings,
                       rng: np.random.Generator) -> AngularExposures:
     """Return the exposures of the angular lines of view number `index`, line by line."""
-    direction, nominal = physics.line_directions(truth, index, view)
+    direction, nominal, there = physics.line_directions(truth, index, view)
     line = np.arange(len(nominal))
     k = (np.repeat(line, view.repeats) if settings.consecutive
          else np.tile(line, view.repeats))
@@ -108,9 +153,10 @@ def angular_exposures(truth: Truth, index: int, view: View, *, settings: CellSet
     position = centre[k] + stop + _normal(rng, settings.servo_sigma_rad, len(k))
     stage = position - physics.encoder_error(truth, position)
     offset = physics.true_offset(settings.sense, direction[k], stage)
-    told = (offset + _normal(rng, settings.sigma_theta_rad, len(k))
+    told = (truth.line_factor * offset + _normal(rng, settings.sigma_theta_rad, len(k))
             + _flicker(rng, settings.flicker_theta_rad, (len(k),)))
-    return AngularExposures(k, position, quantised(told, settings.resolution_theta_rad))
+    indicated = position + _normal(rng, settings.encoder_sigma_rad, len(k))
+    return AngularExposures(k, there[k], indicated, quantised(told, settings.resolution_theta_rad))
 
 
 def quantised(told: np.ndarray, step: float) -> np.ndarray:

@@ -8,11 +8,15 @@ import numpy as np
 
 from selfcal_ros.estimation.datum.modes import datum_modes, half_axis_slopes, remove_modes
 from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.view import View
 
 WALK_STEPS = 256
 """Steps of a random walk from the first grid exposure of a view to the last."""
 ENCODERS = ("independent", "xy_axes")
 ROTATIONS = ("finite", "linear")
+AXES = {"xy": (1, 0, 0, 1), "-x-y": (-1, 0, 0, -1), "-xy": (-1, 0, 0, 1), "x-y": (1, 0, 0, -1),
+        "yx": (0, 1, 1, 0), "-y-x": (0, -1, -1, 0), "y-x": (0, 1, -1, 0), "-yx": (0, -1, 1, 0)}
+"""What is told as the offset's x and y of its true x and y: rows of a matrix, one after another."""
 DRIFT_POWERS = (1, 2, 3)
 """Powers of time behind the columns of `Truth.drift_m`: linear, quadratic, cubic."""
 
@@ -35,12 +39,39 @@ class Spread:
     microscope_scale, microscope_stretch, microscope_rotation_rad, microscope_shear : float
         The microscope itself: a true length over the seen one, less 1; the same for x more and
         for y less; its turn against the stage, counter-clockwise; the symmetric shear.
+    microscope_axes, microscope_pixels, line_factor : str, float, float
+        What is told of an offset: which axes with which signs (`AXES`), how many times its
+        length; how many times the true offset is told of a line (-1: the other sign).
+    microscope_distortion, microscope_field_m : float
+        Part by which the seen offset is too long at this distance from the axis; it grows with
+        the square of the distance.
+    optical_tilt_x_rad, optical_tilt_y_rad : float
+        Direction of the optical axis against the normal of the stage: a mark that lies higher
+        is seen moved by this times its height.
     backlash_x_m, backlash_y_m : float
         What the indicated position has too much after a motion towards plus, and too little
         after one towards minus.
-    plate_scale, plate_shape_m : float
-        Standard deviations by which the plate grows (relative), and bends at mid-edge, in each
-        view after the first.
+    backlash_growth_m : float
+        By how much both have grown at the last grid exposure of a view, in proportion to time.
+    settling_m, settling_time_s : float
+        What an axis is short of its indicated position at the first exposure after it has moved,
+        and the time in which that falls to 1/e while it rests.
+    stage_bend_m : float
+        Standard deviation by which the stage error differs in each view: coefficients of u^2, uv
+        and v^2, where u and v are the indicated position over half the size of the field.
+    plate_scale, plate_shape_m, plate_strain : float
+        Standard deviations by which the plate grows (relative), bends at mid-edge and is strained
+        (symmetric matrix, relative) in each view after the first.
+    plate_tilt_rad, plate_bow_m : float
+        Standard deviation of the tilt of the plate about stage x and y in each view; height of the
+        plate's centre above its edges' middles.
+    line_eccentricity_rad : float
+        Standard deviation, along x and y, of the place of the circle of lines off the turning
+        axis in each view, over its radius.
+    phi_common_rad, t_common_m : float
+        Standard deviations of a misalignment that all views share: a plate laid against pins.
+    pitch_error : float
+        True pitch of the plate over the declared one, less 1.
     drift_linear_m, drift_quadratic_m, drift_cubic_m, drift_walk_m : float
         Standard deviations of the drift in each view, in x and in y, at its last grid exposure.
     """
@@ -57,10 +88,28 @@ class Spread:
     microscope_stretch: float = 0.0
     microscope_rotation_rad: float = 0.0
     microscope_shear: float = 0.0
+    microscope_axes: str = "xy"
+    microscope_pixels: float = 1.0
+    line_factor: float = 1.0
+    microscope_distortion: float = 0.0
+    microscope_field_m: float = 250e-6
+    optical_tilt_x_rad: float = 0.0
+    optical_tilt_y_rad: float = 0.0
     backlash_x_m: float = 0.0
     backlash_y_m: float = 0.0
+    backlash_growth_m: float = 0.0
+    settling_m: float = 0.0
+    settling_time_s: float = 0.01
+    stage_bend_m: float = 0.0
     plate_scale: float = 0.0
     plate_shape_m: float = 0.0
+    plate_strain: float = 0.0
+    plate_tilt_rad: float = 0.0
+    plate_bow_m: float = 0.0
+    line_eccentricity_rad: float = 0.0
+    phi_common_rad: float = 0.0
+    t_common_m: float = 0.0
+    pitch_error: float = 0.0
     drift_linear_m: float = 0.0
     drift_quadratic_m: float = 0.0
     drift_cubic_m: float = 0.0
@@ -72,6 +121,11 @@ class Spread:
         scale, stretch = self.microscope_scale, self.microscope_stretch
         turn, shear = self.microscope_rotation_rad, self.microscope_shear
         return np.array([[scale + stretch, shear - turn], [shear + turn, scale - stretch]])
+
+    @property
+    def wiring(self) -> np.ndarray:
+        """The matrix that makes the offset told of the offset seen, (2, 2)."""
+        return self.microscope_pixels * np.reshape(AXES[self.microscope_axes], (2, 2)).astype(float)
 
 
 def _zeros(*shape: int) -> Any:
@@ -100,13 +154,38 @@ class Truth:
         at all; otherwise by a rotation.
     microscope : float array (2, 2)
         E: true offset = (1 + E) seen offset, stage axes.
+    wiring : float array (2, 2)
+        Told offset = wiring times seen offset.
+    line_factor : float
+        Told offset of a line = this times the true one.
+    distortion : float
+        Relative length that the seen offset has too much, over the square of its length, 1/m^2.
+    optical_tilt_rad : float array (2,)
+        What a mark is seen moved by along stage x and y, over its height.
     backlash_m : float array (2,)
         Indicated - true position of each axis after a motion towards plus, beside g.
+    backlash_growth_m : float
+        What is added to both until the last grid exposure of a view.
+    settling_m, settling_time_s : float
+        Indicated - true position of an axis at the first exposure after its motion towards plus,
+        beside g and backlash, and the time in which it falls to 1/e.
+    stage_bend_m : float array (views, 2, 3) or (0, 2, 3)
+        What is added to g in a view: as `plate_shape_m`, of the indicated position.
     plate_scale : float array (views,) or (0,)
         Relative growth of the plate.
     plate_shape_m : float array (views, 2, 3) or (0, 2, 3)
         Displacement of the marks along plate x and y: coefficients of u^2, uv and v^2, where u and
         v are the nominal place over half the size of the field.
+    plate_strain : float array (views, 2, 2) or (0, 2, 2)
+        Displacement of the marks over their nominal place, plate axes.
+    plate_tilt_rad : float array (views, 2) or (0, 2)
+        Rotation vector of the plate along stage x and y, about its centre.
+    plate_bow_m : float
+        Height of the plate's centre above the middles of its edges.
+    line_eccentricity_rad : float array (views, 2) or (0, 2)
+        Centre of the circle of lines from the turning axis, stage axes, over its radius.
+    placed : tuple of View or None
+        How the plate lies where that is not as commanded, view by view.
     drift_m : float array (views, 2, 3) or (0, 2, 3)
         Motion of the plate at the last grid exposure, stage x and y, that grew with the first,
         second and third power of time.
@@ -123,21 +202,40 @@ class Truth:
     t_m: np.ndarray
     linear: bool = False
     microscope: np.ndarray = _zeros(2, 2)
+    wiring: np.ndarray = field(default_factory=lambda: np.eye(2))
+    line_factor: float = 1.0
+    distortion: float = 0.0
+    optical_tilt_rad: np.ndarray = _zeros(2)
     backlash_m: np.ndarray = _zeros(2)
+    backlash_growth_m: float = 0.0
+    settling_m: float = 0.0
+    settling_time_s: float = 0.01
+    stage_bend_m: np.ndarray = _zeros(0, 2, 3)
     plate_scale: np.ndarray = _zeros(0)
     plate_shape_m: np.ndarray = _zeros(0, 2, 3)
+    plate_strain: np.ndarray = _zeros(0, 2, 2)
+    plate_tilt_rad: np.ndarray = _zeros(0, 2)
+    plate_bow_m: float = 0.0
+    line_eccentricity_rad: np.ndarray = _zeros(0, 2)
+    placed: tuple[View | None, ...] = ()
     drift_m: np.ndarray = _zeros(0, 2, 3)
     walk_m: np.ndarray = _zeros(0, 2, 1)
 
     @property
     def by_visit(self) -> bool:
-        """Whether visits of a mark differ by more than noise."""
-        return any(values.any() for values in (self.microscope, self.backlash_m, self.drift_m,
-                                               self.walk_m))
+        """Whether visits of a mark differ by more than noise, or are not read as they lie."""
+        return bool(self.placed) or any(np.any(values) for values in (
+            self.microscope, self.wiring - np.eye(2), self.line_factor - 1, self.distortion,
+            self.backlash_m, self.backlash_growth_m, self.settling_m, self.drift_m, self.walk_m))
+
+    def placed_as(self, index: int, commanded: View) -> View:
+        """Return how the plate lies in view `index`."""
+        return (self.placed[index] if index < len(self.placed) else None) or commanded
 
 
 def random_truth(artifact: Artifact, n_views: int, rng: np.random.Generator,
-                 spread: Spread | None = None) -> Truth:
+                 spread: Spread | None = None, *,
+                 placing: np.random.Generator | None = None) -> Truth:
     """Draw a truth that satisfies Hu's datum (eqs. 5, 11) exactly.
 
     Parameters
@@ -150,19 +248,32 @@ def random_truth(artifact: Artifact, n_views: int, rng: np.random.Generator,
         Source of the draw.
     spread : Spread, optional
         What is drawn, before the datum is removed.
+    placing : numpy.random.Generator, optional
+        Source of what differs from view to view, and so from one measurement to the next: how the
+        plate lies, its temperature, its strain, drifts. Without it `rng` goes on.
     """
     spread = spread or Spread()
     g = remove_modes(rng.normal(0, spread.g_m, (2, *artifact.shape)),
                      datum_modes(artifact, scale=True))
     a = remove_modes(rng.normal(0, spread.a_m, (2, *artifact.shape)),
                      datum_modes(artifact, scale=False))
+    a += spread.pitch_error * np.stack([artifact.x_m, artifact.y_m])
     g_theta = _encoder(artifact, g, rng.normal(0, spread.g_theta_rad, artifact.angular_count),
                        spread.encoder)
     a_theta = rng.normal(0, spread.a_theta_rad, artifact.angular_count)
+    rng = placing or rng
     phi, t = rng.normal(0, spread.phi_rad, n_views), rng.normal(0, spread.t_m, (n_views, 2))
-    return Truth(artifact, g, a, g_theta, a_theta, phi, t, spread.rotation == "linear",
-                 spread.microscope, np.array([spread.backlash_x_m, spread.backlash_y_m]),
-                 **_of_views(spread, n_views, rng))
+    drawn = _of_views(spread, n_views, rng)
+    if spread.phi_common_rad or spread.t_common_m:
+        phi += rng.normal(0, spread.phi_common_rad)
+        t += rng.normal(0, spread.t_common_m, 2)
+    return Truth(
+        artifact, g, a, g_theta, a_theta, phi, t, spread.rotation == "linear", spread.microscope,
+        spread.wiring, spread.line_factor,
+        spread.microscope_distortion / spread.microscope_field_m**2,
+        np.array([spread.optical_tilt_x_rad, spread.optical_tilt_y_rad]),
+        np.array([spread.backlash_x_m, spread.backlash_y_m]), spread.backlash_growth_m,
+        spread.settling_m, spread.settling_time_s, plate_bow_m=spread.plate_bow_m, **drawn)
 
 
 def _encoder(artifact: Artifact, g: np.ndarray, drawn: np.ndarray, encoder: str) -> np.ndarray:
@@ -177,13 +288,16 @@ def _encoder(artifact: Artifact, g: np.ndarray, drawn: np.ndarray, encoder: str)
     return drawn
 
 
-def _of_views(spread: Spread, n_views: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
+def _of_views(spread: Spread, n_views: int, rng: np.random.Generator) -> dict[str, Any]:
     """Return what is drawn for each view; nothing of what has no size."""
-    drawn: dict[str, np.ndarray] = {}
+    drawn: dict[str, Any] = {}
     if spread.plate_scale:
         drawn["plate_scale"] = rng.normal(0, spread.plate_scale, n_views)
     if spread.plate_shape_m:
         drawn["plate_shape_m"] = rng.normal(0, spread.plate_shape_m, (n_views, 2, 3))
+    if spread.plate_strain:
+        xx, xy, yy = rng.normal(0, spread.plate_strain, (3, n_views))
+        drawn["plate_strain"] = np.stack([xx, xy, xy, yy], axis=1).reshape(-1, 2, 2)
     for values in drawn.values():
         values[:1] = 0  # the plate is what it is in the first view
     sizes = np.array([spread.drift_linear_m, spread.drift_quadratic_m, spread.drift_cubic_m])
@@ -192,4 +306,8 @@ def _of_views(spread: Spread, n_views: int, rng: np.random.Generator) -> dict[st
     if spread.drift_walk_m:
         steps = rng.normal(0, spread.drift_walk_m / np.sqrt(WALK_STEPS), (n_views, 2, WALK_STEPS))
         drawn["walk_m"] = np.insert(steps.cumsum(axis=2), 0, 0.0, axis=2)
+    for name, shape in (("stage_bend_m", (2, 3)), ("plate_tilt_rad", (2,)),
+                        ("line_eccentricity_rad", (2,))):
+        if getattr(spread, name):
+            drawn[name] = rng.normal(0, getattr(spread, name), (n_views, *shape))
     return drawn

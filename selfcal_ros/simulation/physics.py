@@ -36,15 +36,38 @@ def plate_displacement(truth: Truth, index: int, m: np.ndarray, n: np.ndarray) -
     if len(truth.plate_shape_m):
         u, v = m / hx, n / hy
         moved = moved + truth.plate_shape_m[index] @ np.stack([u * u, u * v, v * v])
+    if len(truth.plate_strain):
+        moved = moved + truth.plate_strain[index] @ np.stack([m, n]) * pitch
     return moved
+
+
+def marks_below(truth: Truth, index: int, view: View, marks: tuple[np.ndarray, np.ndarray],
+                ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return which marks lie where `marks` would, had the plate been laid down as commanded.
+
+    Returns
+    -------
+    m, n : int arrays (V,)
+        The marks that lie there.
+    there : bool array (V,)
+        Whether the plate has a mark there at all; `m` and `n` are 0 where it has none.
+    """
+    artifact = truth.artifact
+    lies = truth.placed_as(index, view).lattice_pose(artifact)
+    site = np.stack(view.lattice_pose(artifact).site_of(*marks))
+    m, n = rotate(-lies.q, site - np.array([[lies.a], [lies.b]]))
+    hx, hy = artifact.half
+    there = (np.abs(m) <= hx) & (np.abs(n) <= hy)
+    return m * there, n * there, there
 
 
 def mark_places(truth: Truth, index: int, view: View,
                 marks: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """Return where marks lie in the stage frame when a view begins, and where nominally.
 
-    The plate is turned about its centre, by the view's quarter turns and by its misalignment,
-    and its centre is put down at the view's translation plus the offset.
+    The plate is turned about its centre, by the view's quarter turns, by its misalignment and by
+    its tilt, and its centre is put down at the view's translation plus the offset. Where the
+    optical axis is not normal to the stage a mark is seen moved by its height.
 
     Returns
     -------
@@ -62,7 +85,34 @@ def mark_places(truth: Truth, index: int, view: View,
     else:  # R(phi) (arm + error) - arm, without the loss of digits
         away = (np.sin(phi) * rotate(1, arm + error) - 2 * np.sin(phi / 2) ** 2 * (arm + error)
                 + error)
+    height = _bow(truth, m, n)
+    if len(truth.plate_tilt_rad):
+        sunk, risen = _tilted(truth.plate_tilt_rad[index], arm + away, height)
+        away, height = away + sunk, height + risen
+    away = away + truth.optical_tilt_rad[:, None] * height
     return site + (away + truth.t_m[index][:, None]), site
+
+
+def _bow(truth: Truth, m: np.ndarray, n: np.ndarray) -> np.ndarray:
+    """Return the height of marks on the plate, (V,), m; the plate is a part of a sphere."""
+    hx, hy = truth.artifact.half
+    return truth.plate_bow_m * (1 - (m / hx) ** 2 - (n / hy) ** 2)
+
+
+def _tilted(tilt: np.ndarray, arm: np.ndarray, height: np.ndarray,
+            ) -> tuple[np.ndarray, np.ndarray]:
+    """Return how far points (2, V) at heights (V,) move along stage x, y, and upwards.
+
+    They turn about the horizontal axis `tilt` (2,) by its length (Rodrigues).
+    """
+    angle = np.hypot(*tilt)
+    if not angle:
+        return np.zeros_like(arm), np.zeros_like(height)
+    kx, ky = tilt / angle
+    along = kx * arm[1] - ky * arm[0]  # axis x arm, upwards
+    sine, less = np.sin(angle), 2 * np.sin(angle / 2) ** 2
+    aside = np.array([[ky], [-kx]])
+    return aside * (sine * height + less * along), sine * along - less * height
 
 
 def drift(truth: Truth, index: int, tau: np.ndarray) -> np.ndarray:
@@ -76,14 +126,26 @@ def drift(truth: Truth, index: int, tau: np.ndarray) -> np.ndarray:
     return moved
 
 
-def stage_error(truth: Truth, position: np.ndarray) -> np.ndarray:
-    """Return indicated minus true position at indicated positions (2, E), m: bilinear."""
+def stage_error(truth: Truth, position: np.ndarray, index: int = 0) -> np.ndarray:
+    """Return indicated minus true position at indicated positions (2, E) in a view, m.
+
+    Bilinear between the sites, and what the stage bends by in that view.
+    """
     (hx, hy), (nx, ny) = truth.artifact.half, truth.artifact.shape
     u, v = position / truth.artifact.grid_pitch_m + np.array([[hx], [hy]])
     i, j = (np.clip(np.floor(w), 0, size - 2).astype(int) for w, size in ((u, nx), (v, ny)))
     u, v, g = u - i, v - j, truth.g
     return ((1 - u) * ((1 - v) * g[:, i, j] + v * g[:, i, j + 1])
-            + u * ((1 - v) * g[:, i + 1, j] + v * g[:, i + 1, j + 1]))
+            + u * ((1 - v) * g[:, i + 1, j] + v * g[:, i + 1, j + 1])
+            + stage_bending(truth, position, index))
+
+
+def stage_bending(truth: Truth, position: np.ndarray, index: int) -> np.ndarray | float:
+    """Return what is added to the stage error at indicated positions (2, E) in a view, m."""
+    if not len(truth.stage_bend_m):
+        return 0.0
+    u, v = position / (truth.artifact.grid_pitch_m * np.array(truth.artifact.half)[:, None])
+    return truth.stage_bend_m[index] @ np.stack([u * u, u * v, v * v])
 
 
 def encoder_error(truth: Truth, position: np.ndarray) -> np.ndarray:
@@ -112,23 +174,35 @@ def true_offset(sense: Sense, place: np.ndarray, stage: np.ndarray) -> np.ndarra
 
 
 def seen_offset(truth: Truth, offset: np.ndarray) -> np.ndarray:
-    """Return what the microscope makes of true offsets (2, E): (1 + E)^-1 offset."""
-    if not truth.microscope.any():
-        return offset
-    return np.linalg.solve(np.eye(2) + truth.microscope, offset)
+    """Return what is told of true offsets (2, E): (1 + E)^-1 offset, distorted, then wired."""
+    if truth.microscope.any():
+        offset = np.linalg.solve(np.eye(2) + truth.microscope, offset)
+    if truth.distortion:
+        offset = offset * (1 + truth.distortion * (offset**2).sum(axis=0))
+    return offset if np.array_equal(truth.wiring, np.eye(2)) else truth.wiring @ offset
 
 
-def line_directions(truth: Truth, index: int, view: View) -> tuple[np.ndarray, np.ndarray]:
-    """Return the true and the nominal direction of every line in the stage frame, (K,), rad.
+def line_directions(truth: Truth, index: int, view: View,
+                    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the true and the nominal direction in the stage frame of every line expected, rad.
 
-    The nominal direction is within one turn, 0 included.
+    The nominal direction is within one turn, 0 included. The true one is as seen from the turning
+    axis, off which the circle of lines may lie. With them goes the number of the line that lies
+    there; all (K,).
     """
     count = truth.artifact.angular_count
     if not count:
-        return np.zeros(0), np.zeros(0)
+        return np.zeros(0), np.zeros(0), np.zeros(0, dtype=int)
     turn = (np.arange(count) + view.lattice_pose(truth.artifact).s) % count
     nominal = turn * (2 * np.pi / count)
-    return nominal + (truth.a_theta + truth.phi_rad[index]), nominal
+    lies = truth.placed_as(index, view).lattice_pose(truth.artifact).s
+    line = (turn - lies) % count
+    direction = nominal + (truth.a_theta[line] + truth.phi_rad[index])
+    if len(truth.line_eccentricity_rad):
+        x, y = truth.line_eccentricity_rad[index]
+        cos, sin = np.cos(direction), np.sin(direction)
+        direction = direction + np.arctan2(cos * y - sin * x, 1 + cos * x + sin * y)
+    return direction, nominal, line
 
 
 def all_marks(artifact: Artifact) -> tuple[np.ndarray, np.ndarray]:

@@ -22,12 +22,17 @@ class CellSettings:
         Who moves.
     sigma_xy_m, sigma_theta_rad : float
         White noise of one exposure.
+    noise_ratio : float
+        That of y over that of x, which is `sigma_xy_m`.
     encoder_rate_hz, exposure_period_s : float
         Encoder samples, and the time from one exposure to the next.
     with_ids, declare_sigma : bool
         Whether detections name their marks, and state their noise.
     servo_sigma_m, servo_sigma_rad : float
-        How far the stage stands off where it stopped, exposure by exposure.
+        How far the stage stands off where it stopped, exposure by exposure: motion, which the
+        encoders tell.
+    encoder_sigma_m, encoder_sigma_rad : float
+        Noise of what the encoders tell, exposure by exposure: no motion.
     visit_order : str
         Order of the marks where a view does not ask for one (`selfcal_ros.model.orders`).
     consecutive : bool
@@ -53,12 +58,15 @@ class CellSettings:
     sense: Sense = Sense.MICROSCOPE_MOVES
     sigma_xy_m: float = 0.0
     sigma_theta_rad: float = 0.0
+    noise_ratio: float = 1.0
     encoder_rate_hz: float = 500.0
     exposure_period_s: float = 0.01
     with_ids: bool = True
     declare_sigma: bool = False
     servo_sigma_m: float = 20e-9
     servo_sigma_rad: float = 1e-7
+    encoder_sigma_m: float = 0.0
+    encoder_sigma_rad: float = 0.0
     visit_order: str = ""
     consecutive: bool = False
     stop_sigma_m: float = 0.0

@@ -38,14 +38,16 @@ def grid_deviation(truth: Truth, index: int, view: View, *,
     i, j = sign * node
     out = np.full_like(site, np.nan)
     hx, hy = artifact.half
-    out[:, inside] = (place - site)[:, inside] + sign * truth.g[:, i[inside] + hx, j[inside] + hy]
+    out[:, inside] = (place - site)[:, inside] + sign * (
+        truth.g[:, i[inside] + hx, j[inside] + hy]
+        + physics.stage_bending(truth, (sign * site)[:, inside], index))
     return out.reshape(2, *artifact.shape)
 
 
 def angular_deviation(truth: Truth, index: int, view: View, *,
                       sense: Sense = Sense.MICROSCOPE_MOVES) -> np.ndarray:
     """Return the noise-free deviation of every angular line in a view, (K,), rad."""
-    direction, nominal = physics.line_directions(truth, index, view)
+    direction, nominal, _ = physics.line_directions(truth, index, view)
     sign = -1 if sense is Sense.PLATE_MOVES else 1
     return direction - nominal + sign * physics.encoder_error(truth, sign * nominal)
 

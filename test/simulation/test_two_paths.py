@@ -23,6 +23,12 @@ CASES = {
                                 "flicker_xy_m": 1e-8, "visit_xy_m": 1e-8}),
     "consecutive": (EVERYTHING, {"consecutive": True, "visit_order": "random",
                                  "flicker_theta_rad": 1e-6, "resolution_theta_rad": 1e-7}),
+    "beside the model": (
+        Spread(microscope_axes="y-x", microscope_pixels=2.0, line_factor=-1.0,
+               microscope_distortion=1e-3, optical_tilt_x_rad=5e-3, backlash_growth_m=3e-8,
+               settling_m=1e-8, stage_bend_m=1e-8, plate_strain=1e-6, plate_tilt_rad=1e-3,
+               plate_bow_m=5e-6, line_eccentricity_rad=1e-5, phi_common_rad=1e-3),
+        {"noise_ratio": 0.25, "encoder_sigma_m": 2e-8, "encoder_sigma_rad": 1e-7}),
     "followed": (EVERYTHING, {"follow_mark": True, "visit_order": "there_and_back@plate"})}
 
 
