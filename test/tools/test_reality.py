@@ -13,14 +13,22 @@ from tools.reality.cases import (
     MODEL,
     Case,
     both,
-    cases,
-    compared,
     creeping,
     lines_turned,
     misread,
     resistant,
-    run_case,
     scaled,
+)
+from tools.reality.machines import laid
+from tools.reality.runs import (
+    Course,
+    Run,
+    compared,
+    every_case,
+    measured,
+    rows,
+    run_case,
+    summarise,
 )
 
 
@@ -55,7 +63,7 @@ def test_a_site_that_is_wrong_by_more_than_its_u_is_counted_and_sized():
 
 
 def test_cases_have_the_stop_errors_that_their_names_say():
-    said = [(case.name, case.settings.stop_sigma_m) for case in cases()
+    said = [(case.name, case.settings.stop_sigma_m) for case in every_case()
             if "stop errors" in case.name]
     assert len(said) == 6
     for name, stop_m in said:
@@ -98,6 +106,65 @@ def test_a_creep_is_alike_in_all_views_and_comes_to_rest():
 
 def test_what_is_spoilt_reaches_the_calibration():
     spoilt = Case("a mark off", plan=resistant(1), spoil=misread(2e-6))
-    assert run_case(replace(spoilt, spoil=Case("clean").spoil), 1).qualified
-    run = run_case(spoilt, 1)
-    assert not run.qualified and run.causes[0] == "reading"
+    assert run_case(replace(spoilt, spoil=Case("clean").spoil), 1).first.grade == "good"
+    run = run_case(spoilt, 1).first
+    assert run.grade == "not_qualified" and run.causes[0] == "reading"
+
+
+def test_every_case_has_a_name_of_its_own_and_can_be_drawn():
+    names = [case.name for case in every_case()]
+    assert len(set(names)) == len(names)
+    for case in every_case():
+        truth, readings = measured(drawn(case), 0, 1)
+        assert len(readings.views) == len(truth.phi_rad)
+
+
+def drawn(case):
+    return case.draw(np.random.default_rng(5), case) if case.draw else case
+
+
+def test_one_machine_is_measured_again_with_other_noise():
+    case = Case("clean", plan=resistant(1))
+    (one, first), (_, again), (other, second) = (measured(case, 3, part) for part in (1, 1, 2))
+    np.testing.assert_array_equal(one.g, other.g)
+    np.testing.assert_array_equal(first.views[0].dx, again.views[0].dx)
+    assert not np.array_equal(first.views[0].dx, second.views[0].dx)
+    assert not np.array_equal(one.phi_rad, other.phi_rad)
+    assert not np.array_equal(one.g, measured(case, 4, 1)[0].g)
+
+
+def test_a_plate_is_laid_down_otherwise_in_one_view():
+    case = Case("turned wrongly", change=laid(1, -90.0, (0, 0)))
+    truth, _ = measured(case, 0, 1)
+    assert [view is not None for view in truth.placed] == [False, True, False, False]
+    assert truth.placed[1].lattice_pose(truth.artifact).q == 3
+
+
+def test_advice_is_followed_until_none_is_left():
+    turned = replace(next(case for case in every_case()
+                          if case.name == "microscope turned by 2 mrad, stop errors 20 um"),
+                     plan=resistant(2))
+    course = run_case(turned, 0)
+    assert course.first.grade == "not_qualified" and course.first.causes[0] == "microscope"
+    assert course.steps == ("--model microscope",)
+    assert course.end.grade == "good" and course.end.z_xy < 1.2
+
+
+def test_what_is_wrong_and_accepted_is_counted_with_its_seeds():
+    wrong = Run("good", 1e-6, 0.5, 0.96, 3.0, 1.0)
+    told, refused = replace(wrong, grade="not_qualified"), Run("refused")
+    angle = Run("enlarged", 1e-8, 0.95, 0.75, 1.0, 3.0)
+    right = Run("good", 1e-8, 0.95, 0.96, 1.0, 1.0)
+    found = summarise([wrong, told, refused, angle, right], [7, 8, 9, 10, 11])
+    assert (found.wrong, found.wrong_seeds) == (2, (7, 10))
+    assert found.grades == {"good": 2, "not_qualified": 1, "refused": 1, "enlarged": 1}
+    assert found.within == pytest.approx((0.5 + 0.5 + 0.95 + 0.95) / 4)
+
+
+def test_a_row_says_what_comes_after_the_advice():
+    bad, good = Run("not_qualified", 1e-7, 0.5, 0.9, 3, 1), Run("good", 1e-8, 0.95, 0.9, 1, 1)
+    courses = {0: Course(bad, ("--model drift",), good), 1: Course(good)}
+    (name, first), (after, end) = rows(Case("drift"), courses)
+    assert (name, after) == ("drift", "after the advice (1 of 2 followed)")
+    assert first.grades == {"not_qualified": 1, "good": 1} and end.grades == {"good": 2}
+    assert len(list(rows(Case("none"), {0: Course(good)}))) == 1

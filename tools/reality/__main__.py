@@ -1,66 +1,97 @@
 # SPDX-License-Identifier: Apache-2.0
 """`make reality`: what real machines do, what the calibration makes of it, as a table.
 
-python -m tools.reality [--runs N] [--workers N] [--only TEXT] [-o TABLE.md]
+python -m tools.reality [--runs N] [--first SEED] [--workers N] [--only TEXT] [-o FILE]
 """
 
 import argparse
 import sys
+from dataclasses import asdict
 from functools import partial
 
-from selfcal_ros.files import write_text
+from selfcal_ros.files import write_json, write_text
+from selfcal_ros.model.result import plain
 from selfcal_ros.parallel import check_workers, outcomes
 from selfcal_ros.units import NM_PER_M
-from tools.reality.cases import Case, Run, Summary, cases, run_case, summarise
+from tools.reality.cases import Case
+from tools.reality.runs import GRADES, Course, Summary, every_case, once, rows
 
-HEADER = ("| what the machine does | map error, nm, largest (median) | in U | XY error / u | "
-          "θ error / u | not qualified | wrong and qualified | first cause |\n"
-          "|---|---|---|---|---|---|---|---|")
-
-
-def row(found: Summary) -> str:
-    causes = ", ".join(f"{name} ({count})" for name, count in found.causes) or "–"
-    refused = f" ({found.refused} refused)" if found.refused else ""
-    return (f"| {found.case.name.replace('um', 'µm').replace(' deg', '°')} "
-            f"| {found.error_m * NM_PER_M:.1f} | {100 * found.within:.1f} % | {found.z_xy:.3f} "
-            f"| {found.z_theta:.3f} | {found.told} of {found.runs}{refused} | {found.wrong} "
-            f"| {causes} |")
+HEADER = ("| what the machine does | largest error, nm (median) | in U: XY, θ | "
+          "error / u: XY, θ | good | enlarged | not qualified | refused | wrong and accepted | "
+          "first cause |\n|---|---|---|---|---|---|---|---|---|---|")
 
 
-def once(numbers: tuple[int, int]) -> Run:
-    index, seed = numbers
-    return run_case(cases()[index], 10_000 * index + seed)
+def row(name: str, found: Summary) -> str:
+    causes = ", ".join(f"{cause} ({count})" for cause, count in found.causes) or "–"
+    name = name.replace("um", "µm").replace(" deg", "°").replace("urad", "µrad")
+    grades = " | ".join(str(found.grades.get(grade, 0)) for grade in GRADES)
+    seeds = f" (seeds {', '.join(map(str, found.wrong_seeds[:5]))})" if found.wrong else ""
+    return (f"| {name} | {found.error_m * NM_PER_M:.3g} | {100 * found.within:.1f} ± "
+            f"{200 * found.u_within:.1f} %, {100 * found.within_theta:.1f} % | {found.z_xy:.2f}, "
+            f"{found.z_theta:.2f} | {grades} | {found.wrong}{seeds} | {causes} |")
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--runs", type=int, default=40, help="runs of each case (default: 40)")
+    parser.add_argument("--runs", type=int, default=40, help="runs of each case (default: 40); "
+                        "of populations of clean machines 25 times as many, of others 5 times")
+    parser.add_argument("--first", type=int, default=0, help="seed of the first run (default: 0)")
     parser.add_argument("--workers", type=int, help="processes (default: one a core)")
-    parser.add_argument("--only", default="", help="only cases whose name holds this text")
-    parser.add_argument("-o", "--output", help="write the table to this file")
+    parser.add_argument("--only", action="append", help="only cases whose name holds this text; "
+                        "may be given again for others")
+    parser.add_argument("--list", action="store_true", help="list the cases and do nothing")
+    parser.add_argument("-o", "--output", help="write the table to this file, or every run if it "
+                        "ends in .json")
     args = parser.parse_args()
-    every: list[Case] = cases()
-    chosen = [i for i, case in enumerate(every) if args.only in case.name]
-    jobs = [(index, seed) for index in chosen for seed in range(args.runs)]
-    runs: dict[int, dict[int, Run]] = {index: {} for index in chosen}
-    waiting, lines, write = list(chosen), [HEADER], partial(print, flush=True)
+    every = every_case()
+    chosen = [i for i, case in enumerate(every)
+              if not args.only or any(text in case.name for text in args.only)]
+    if args.list:
+        print("\n".join(every[i].name for i in chosen))
+        return 0
+    jobs = [(index, args.first + run) for index in chosen
+            for run in range(args.runs * every[index].times)]
+    lines, found = [HEADER], {}
+    write = partial(print, flush=True)
     write(HEADER)
-    for outcome in outcomes(once, jobs, workers=check_workers(args.workers)):
-        if outcome.error is not None:
-            raise outcome.error
-        index = jobs[outcome.index][0]
-        runs[index][jobs[outcome.index][1]] = outcome.value
-        while waiting and len(runs[waiting[0]]) == args.runs:
-            done = waiting.pop(0)
-            found = [runs[done][seed] for seed in range(args.runs)]
-            lines.append(row(summarise(every[done], found)))
+    for index, courses in finished(jobs, check_workers(args.workers)):
+        found[index] = courses
+        for name, summary in rows(every[index], courses):
+            lines.append(row(name, summary))
             write(lines[-1])
-    notes = [f"- {every[i].name}: {every[i].hidden}." for i in chosen if every[i].hidden]
-    lines += ["", "Not told, or not always, by the readings:", "", *notes] if notes else []
-    write("\n".join(lines[-len(notes) - 3:] if notes else []))
-    if args.output:
+    lines += notes([every[i] for i in chosen])
+    if args.output and args.output.endswith(".json"):
+        write_json(args.output, plain([as_json(every[i], found[i]) for i in chosen]))
+    elif args.output:
         write_text(args.output, "\n".join(lines) + "\n")
     return 0
+
+
+def finished(jobs: list[tuple[int, int]], workers: int):
+    """Yield (case, seed -> course) of each case in order, as soon as it is complete."""
+    waiting = list(dict.fromkeys(index for index, _ in jobs))
+    courses: dict[int, dict[int, Course]] = {index: {} for index in waiting}
+    wanted = {index: sum(one == index for one, _ in jobs) for index in waiting}
+    for outcome in outcomes(once, jobs, workers=workers):
+        if outcome.error is not None:
+            raise RuntimeError(f"case and seed {jobs[outcome.index]}") from outcome.error
+        index, seed = jobs[outcome.index]
+        courses[index][seed] = outcome.value
+        while waiting and len(courses[waiting[0]]) == wanted[waiting[0]]:
+            done = waiting.pop(0)
+            yield done, dict(sorted(courses[done].items()))
+
+
+def notes(chosen: list[Case]) -> list[str]:
+    """Return why readings cannot tell some of the cases."""
+    told = [f"- {case.name}: {case.hidden}." for case in chosen if case.hidden]
+    return ["", "Not told, or not always, by the readings:", "", *told] if told else []
+
+
+def as_json(case: Case, courses: dict[int, Course]) -> dict:
+    return {"case": case.name, "rows": [{"row": name, **asdict(summary)}
+                                        for name, summary in rows(case, courses)],
+            "runs": [{"seed": seed, **asdict(course)} for seed, course in courses.items()]}
 
 
 if __name__ == "__main__":

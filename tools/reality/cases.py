@@ -1,37 +1,35 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What real machines do, one effect at a time and several, and what a calibration makes of it.
+"""What real machines do: one effect at a time and several, larger than the model takes them.
 
-Every case simulates a machine by the places of its things (`simulation.physics`), not by the
-estimator's model, calibrates with the defaults or with a term in the model, and compares with the
-truth: how wrong is the map, does its expanded uncertainty cover that, and is it told.
+Each case is simulated by the places of things (`simulation.physics`), not by the estimator's model.
 """
 
-from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
-from selfcal_ros.errors import NotIdentifiableError
-from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.estimation.datum.modes import datum_modes, remove_modes
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Measurements
-from selfcal_ros.model.result import CalibrationResult
-from selfcal_ros.model.statistics import rms
 from selfcal_ros.model.terms import parse_terms
 from selfcal_ros.model.view import Plan, View
-from selfcal_ros.simulation.machine import WALK_STEPS, Spread, Truth, random_truth
+from selfcal_ros.simulation.machine import WALK_STEPS, Spread, Truth
 from selfcal_ros.simulation.settings import CellSettings
-from selfcal_ros.simulation.truth import hu_plan, simulate_measurements
+from selfcal_ros.simulation.truth import hu_plan
 
 ARTIFACT = Artifact(11, 0.01, 24)
 SIGMA_M, SIGMA_RAD = 20e-9, np.deg2rad(0.001)
 MODEL = Spread(encoder="independent", rotation="finite")
 SETTINGS = CellSettings(sigma_xy_m=SIGMA_M, sigma_theta_rad=SIGMA_RAD, servo_sigma_m=0.0,
                         servo_sigma_rad=0.0)
+
+
+Change = Callable[[Truth, np.random.Generator], Truth]
+"""Truth and random numbers -> the truth as it is in a case."""
+Spoil = Callable[[Measurements, np.random.Generator], Measurements]
+"""Readings and random numbers -> the readings as they are in a case."""
 
 
 def hu(repeats: int = 5) -> Plan:
@@ -74,102 +72,29 @@ class Case:
         Part of the marks and lines that are not read in a view.
     spoil : callable
         Readings and random numbers -> the readings as they are in this case.
+    draw : callable, optional
+        Random numbers and the case -> the case as it is in one run, where runs differ.
     """
 
     name: str
     spread: Spread = MODEL
-    change: Callable[[Truth, np.random.Generator], Truth] = lambda truth, rng: truth
+    change: Change = lambda truth, rng: truth
     settings: CellSettings = SETTINGS
     plan: Plan = field(default_factory=hu)
     options: Options = Options()
     hidden: str = ""
     missing: float = 0.0
-    spoil: Callable[[Measurements, np.random.Generator], Measurements] = (
-        lambda readings, rng: readings)
+    spoil: Spoil = lambda readings, rng: readings
+    draw: Callable[[np.random.Generator, "Case"], "Case"] | None = None
+
+    @property
+    def times(self) -> int:
+        """How many times as many runs as of other cases tell what is asked."""
+        return 1 if self.draw is None else 25 if "clean" in self.name else 5
 
 
-@dataclass(frozen=True)
-class Run:
-    """One calibration of a case against its truth.
-
-    `error_m` is the largest error of a coordinate of the map, `within` the part of the map's
-    coordinates inside k u, `z_xy` and `z_theta` the rms of the errors over their u, `causes` the
-    names of the causes given.
-    """
-
-    error_m: float
-    within: float
-    z_xy: float
-    z_theta: float
-    qualified: bool
-    causes: tuple[str, ...]
-
-
-@dataclass(frozen=True)
-class Summary:
-    """All runs of a case: medians and counts; those that were refused count as told."""
-
-    case: Case
-    runs: int
-    error_m: float
-    within: float
-    z_xy: float
-    z_theta: float
-    refused: int
-    told: int
-    wrong: int
-    causes: tuple[tuple[str, int], ...]
-
-
-WRONG = 0.85
-"""Part of the map inside k u below which a single map is called wrong: of 242 correlated
-coordinates 95 % are inside on average, and hardly ever fewer than 85 % in a clean run."""
-
-
-def run_case(case: Case, seed: int) -> Run | None:
-    """Simulate, calibrate and compare once; None where too little was read to calibrate."""
-    rng = np.random.default_rng(seed)
-    truth = case.change(random_truth(ARTIFACT, len(case.plan.views), rng, case.spread), rng)
-    readings = simulate_measurements(truth, case.plan, rng, settings=case.settings, visits=True,
-                                     missing=case.missing)
-    try:
-        return compared(calibrate(case.spoil(readings, rng), case.options), truth)
-    except NotIdentifiableError:
-        return None
-
-
-def compared(result: CalibrationResult, truth: Truth) -> Run:
-    """Return how far a calibration lies from the truth, in its datum."""
-    emap = result.error_map
-    error = np.stack([emap.gx, emap.gy]) - truth.g
-    error = remove_modes(error, datum_modes(truth.artifact, scale=True))
-    u_xy = np.stack([emap.u_gx, emap.u_gy])
-    inside = np.abs(error) <= result.noise.k_xy * u_xy
-    theta = emap.g_theta - truth.g_theta
-    theta = theta - np.nanmean(theta)
-    z = theta / emap.u_g_theta
-    known = np.isfinite(error)
-    return Run(float(np.nanmax(np.abs(error))), float(inside[known].mean()),
-               rms(error / u_xy), rms(z), result.verdict.qualified,
-               tuple(cause.name for cause in result.verdict.causes))
-
-
-def summarise(case: Case, found: list[Run | None]) -> Summary:
-    """Return the medians and counts of a case."""
-    runs = [run for run in found if run is not None]
-    refused = len(found) - len(runs)
-    causes = Counter(name for run in runs for name in run.causes[:1])
-    return Summary(
-        case, len(found), float(np.median([run.error_m for run in runs])),
-        float(np.mean([run.within for run in runs])),
-        rms(np.array([run.z_xy for run in runs])),
-        rms(np.array([run.z_theta for run in runs])), refused,
-        refused + sum(not run.qualified for run in runs),
-        sum(run.qualified and run.within < WRONG for run in runs), tuple(causes.most_common(3)))
-
-
-def cases() -> list[Case]:
-    """Return all cases, those with the defaults first."""
+def term_cases() -> list[Case]:
+    """Return the cases of the terms of the model, those with the defaults first."""
     return [*_turned(), *_microscopes(), *_drifts(), *_plates(), *_noises(), *_with_terms(),
             *_together()]
 
@@ -193,7 +118,7 @@ def _microscopes() -> list[Case]:
                  settings=replace(SETTINGS, stop_sigma_m=50e-6))]
 
 
-def drifting(size_m: float, view: int = 1) -> Callable[[Truth, np.random.Generator], Truth]:
+def drifting(size_m: float, view: int = 1) -> Change:
     """Return a change: one view drifts along x by `size_m`, steadily."""
     def change(truth: Truth, rng: np.random.Generator) -> Truth:
         drift = np.zeros((len(truth.phi_rad), 2, 3))
@@ -218,14 +143,14 @@ def grown(truth: Truth, rng: np.random.Generator) -> Truth:
     return replace(truth, plate_scale=scale)
 
 
-def scaled(size: float) -> Callable[[Truth, np.random.Generator], Truth]:
+def scaled(size: float) -> Change:
     """Return a change: the plate is larger by its own amount in each view."""
     def change(truth: Truth, rng: np.random.Generator) -> Truth:
         return replace(truth, plate_scale=rng.normal(0, size, len(truth.phi_rad)))
     return change
 
 
-def bent(size_m: float) -> Callable[[Truth, np.random.Generator], Truth]:
+def bent(size_m: float) -> Change:
     """Return a change: the plate is bent as (x^2 - y^2, -2xy) by its own amount in each view."""
     def change(truth: Truth, rng: np.random.Generator) -> Truth:
         amounts = rng.normal(0, size_m, len(truth.phi_rad))
@@ -289,7 +214,7 @@ def _with_terms() -> list[Case]:
             *too_small]
 
 
-def creeping(size_m: float) -> Callable[[Truth, np.random.Generator], Truth]:
+def creeping(size_m: float) -> Change:
     """Return a change: the plate creeps along x and y after it was laid down, alike each time."""
     def change(truth: Truth, rng: np.random.Generator) -> Truth:
         course = size_m * np.exp(-np.linspace(0, 1, WALK_STEPS + 1) / 0.2)
@@ -298,7 +223,7 @@ def creeping(size_m: float) -> Callable[[Truth, np.random.Generator], Truth]:
     return change
 
 
-def misread(size_m: float) -> Callable[[Measurements, np.random.Generator], Measurements]:
+def misread(size_m: float) -> Spoil:
     """Return what spoils readings: one mark is off in all repeats of the second view."""
     def spoil(readings: Measurements, rng: np.random.Generator) -> Measurements:
         view, angle = readings.views[1], rng.uniform(0, 2 * np.pi)
@@ -309,7 +234,7 @@ def misread(size_m: float) -> Callable[[Measurements, np.random.Generator], Meas
     return spoil
 
 
-def lines_turned(angle_rad: float) -> Callable[[Measurements, np.random.Generator], Measurements]:
+def lines_turned(angle_rad: float) -> Spoil:
     """Return what spoils readings: the plate turns between marks and lines of the second view."""
     def spoil(readings: Measurements, rng: np.random.Generator) -> Measurements:
         view = readings.views[1]
@@ -318,8 +243,7 @@ def lines_turned(angle_rad: float) -> Callable[[Measurements, np.random.Generato
     return spoil
 
 
-def both(*changes: Callable[[Truth, np.random.Generator], Truth]
-         ) -> Callable[[Truth, np.random.Generator], Truth]:
+def both(*changes: Change) -> Change:
     """Return the changes one after the other."""
     def change(truth: Truth, rng: np.random.Generator) -> Truth:
         for one in changes:

@@ -1,0 +1,146 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What machines do that no residual shows, or that is none of the model's terms."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.readings import Sense
+from selfcal_ros.simulation.machine import Spread, Truth
+from selfcal_ros.simulation.settings import CellSettings
+from selfcal_ros.simulation.truth import hu_plan
+from tools.reality.cases import (
+    ARTIFACT,
+    SETTINGS,
+    SIGMA_M,
+    Case,
+    Change,
+    hu,
+    resistant,
+)
+
+SERVO = replace(SETTINGS, servo_sigma_m=20e-9, servo_sigma_rad=1e-7)
+"""A stage that scatters about its stops as far as its encoders tell."""
+WITHOUT_LINES = Artifact(ARTIFACT.grid_size, ARTIFACT.grid_pitch_m, 0)
+
+
+def machine_cases() -> list[Case]:
+    """Return the cases, those of the microscope first."""
+    return [*_wired(), *_scaled(), *_plates(), *_stages(), *_noises(), *_laid(), *_exact()]
+
+
+def _case(name: str, phi_deg: float = 0.03, *, settings: CellSettings = SERVO,
+          more: dict[str, Any] | None = None, **spread: Any) -> Case:
+    """Return a case whose plates lie turned by `phi_deg` (sigma)."""
+    return Case(f"{name}, plates turned by {phi_deg:g} deg",
+                Spread(phi_rad=float(np.deg2rad(phi_deg)), **spread), settings=settings,
+                **(more or {}))
+
+
+def _wired() -> list[Case]:
+    still = replace(SERVO, servo_sigma_m=0.0, servo_sigma_rad=0.0)
+    moved = replace(SERVO, sense=Sense.PLATE_MOVES)
+    bare = {"plan": hu_plan(WITHOUT_LINES, 5)}
+    other = {"microscope_axes": "-x-y", "line_factor": -1.0}
+    return [
+        *(_case("offsets of the other sign", phi, **other) for phi in (0.003, 0.01)),
+        _case("offsets of the other sign, plate moves", 0.01, settings=moved, **other),
+        _case("offsets of the other sign, no lines", 0.01, more=bare, microscope_axes="-x-y"),
+        _case("offsets of the other sign, no lines, stage that never scatters", 0.01, more=bare,
+              settings=still, microscope_axes="-x-y"),
+        _case("offsets of the other sign, marks alone", 0.01, microscope_axes="-x-y"),
+        _case("offsets of the other sign, lines alone", 0.01, line_factor=-1.0),
+        _case("offsets of the other sign along x alone", 0.01, microscope_axes="-xy"),
+        _case("axes of the microscope exchanged", 0.01, microscope_axes="yx"),
+        _case("microscope turned by 90 deg", 0.01, microscope_axes="-yx"),
+        _case("pixels twice as large as declared", 0.003, microscope_pixels=0.5),
+        _case("pixels half as large as declared", 0.003, microscope_pixels=2.0),
+        _case("pixels twice as large as declared, encoders with 20 nm of noise", 0.003,
+              settings=replace(SERVO, encoder_sigma_m=20e-9), microscope_pixels=0.5)]
+
+
+def _scaled() -> list[Case]:
+    return [
+        *(_case(f"scale of the microscope {100 * scale:+g} %", phi, microscope_scale=scale)
+          for scale, phi in ((0.1, 0.03), (0.05, 0.05), (0.05, 0.1), (0.02, 0.03), (0.02, 0.3),
+                             (-0.01, 0.03))),
+        _case("scale of the microscope +5 %, no lines", more={"plan": hu_plan(WITHOUT_LINES, 5)},
+              microscope_scale=0.05),
+        _case("microscope turned by 5 mrad", 0.005, microscope_rotation_rad=5e-3),
+        _case("microscope turned by 20 mrad", 0.03, microscope_rotation_rad=20e-3),
+        _case("shear of the microscope 2 mrad", 0.1, microscope_shear=2e-3),
+        _case("camera distortion 0.1 % at 250 um, plate against pins", 0.003,
+              microscope_distortion=1e-3, phi_common_rad=float(np.deg2rad(0.2)), t_common_m=50e-6),
+        _case("scale of the microscope +2 %, plate against pins", 0.003, microscope_scale=0.02,
+              phi_common_rad=float(np.deg2rad(0.1)), t_common_m=50e-6)]
+
+
+def _plates() -> list[Case]:
+    five = {"plan": resistant()}
+    return [
+        _case("plate strained by 1 um/m in each view", plate_strain=1e-6),
+        _case("plate strained by 1 um/m in each view, five views", more=five, plate_strain=1e-6),
+        _case("plate 0.1 K warmer or colder in each view", plate_scale=0.9e-6),
+        _case("plate tilted by 1 mrad in each view", plate_tilt_rad=1e-3),
+        _case("plate tilted by 1 mrad in each view, optical axis by 5 mrad", plate_tilt_rad=1e-3,
+              optical_tilt_x_rad=5e-3),
+        _case("plate bowed by 5 um, optical axis tilted by 5 mrad", plate_bow_m=5e-6,
+              optical_tilt_x_rad=5e-3),
+        _case("circle of lines off the axis by 15 urad in each view",
+              line_eccentricity_rad=15e-6),
+        _case("pitch declared 800 um/m wrong", pitch_error=800e-6)]
+
+
+def _stages() -> list[Case]:
+    five = {"plan": resistant()}
+    once = replace(SERVO, consecutive=True)
+    return [
+        _case("stage bends by 10 nm in each view", stage_bend_m=10e-9),
+        _case("stage bends by 10 nm in each view, five views", more=five, stage_bend_m=10e-9),
+        _case("backlash that grows to 35 nm in a view", backlash_growth_m=35e-9),
+        _case("settling of 12 nm", settling_m=12e-9),
+        _case("settling of 12 nm, repeats consecutive", settings=once, settling_m=12e-9,
+              settling_time_s=0.02),
+        _case("drift of 0.36 um a view, one raster, repeats consecutive",
+              settings=replace(once, visit_order="raster"), drift_linear_m=0.36e-6),
+        _case("drift as a random walk of 100 nm a view", drift_walk_m=100e-9)]
+
+
+def _noises() -> list[Case]:
+    return [
+        _case("noise of 40 nm along x and 10 nm along y",
+              settings=replace(SERVO, sigma_xy_m=40e-9, noise_ratio=0.25)),
+        _case("encoders with 20 nm of noise", settings=replace(SERVO, encoder_sigma_m=20e-9)),
+        _case("servo scatter of 1 um", settings=replace(SERVO, servo_sigma_m=1e-6)),
+        _case("offsets in steps of 50 nm", settings=replace(SERVO, resolution_xy_m=50e-9)),
+        _case("1/f noise of 20 nm beside white noise of 5 nm",
+              settings=replace(SERVO, sigma_xy_m=5e-9, flicker_xy_m=SIGMA_M))]
+
+
+def laid(index: int, rotation_deg: float, shift: tuple[int, int]) -> Change:
+    """Return a change: in view `index` the plate lies so instead, shifts in pitches."""
+    def change(truth: Truth, rng: np.random.Generator) -> Truth:
+        pitch = truth.artifact.grid_pitch_m
+        view = replace(hu(1).views[index], rotation_rad=float(np.deg2rad(rotation_deg)),
+                       translation_m=(shift[0] * pitch, shift[1] * pitch))
+        placed = [view if i == index else None for i in range(len(truth.phi_rad))]
+        return replace(truth, placed=tuple(placed))
+    return change
+
+
+def _laid() -> list[Case]:
+    return [_case(f"view {name}", more={"change": laid(index, turn, shift)})
+            for name, index, turn, shift in (
+                ("not turned", 1, 0.0, (0, 0)), ("turned by -90 deg", 1, -90.0, (0, 0)),
+                ("turned by 180 deg", 1, 180.0, (0, 0)), ("not shifted", 3, 0.0, (0, 0)),
+                ("shifted along y", 3, 0.0, (0, 1)), ("shifted to the other side", 3, 0.0, (-1, 0)),
+                ("shifted by two pitches", 3, 0.0, (2, 0)))]
+
+
+def _exact() -> list[Case]:
+    exact = CellSettings(servo_sigma_m=0.0, servo_sigma_rad=0.0)
+    five = {"plan": resistant()}
+    return [_case("nothing, and no noise", settings=exact),
+            _case("nothing, and no noise, five views", settings=exact, more=five)]
