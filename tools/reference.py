@@ -115,14 +115,16 @@ def described(keys: list[str], words: dict[str, str], what: str) -> list[tuple[s
 
 def sim_rows() -> Iterator[tuple[str, ...]]:
     for p in spec.TOP:
-        yield f"`{p.name}`", value(p.default), bounds(vars(p)), p.unit
+        default = "as `seed` goes on" if p.name == "noise_seed" else value(p.default)
+        yield f"`{p.name}`", default, bounds(vars(p)), p.unit
     yield "`plan`", "", "a path beside the file, or a plan", ""
-    for name, section, default in (
+    yield "`placed`", "none", "views as in a plan, where the plate lies otherwise", ""
+    for name, section, defaults in (
             ("truth", spec.TRUTH, Spread()), ("physics", spec.PHYSICS, Spread()),
             ("noise", spec.NOISE, CellSettings()), ("cell", spec.CELL, CellSettings()),
             ("faults", spec.FAULTS, Faults())):
         for key, (field, limits) in section.items():
-            yield (f"`{name}.{key}`", value(getattr(default, field)), bounds(limits),
+            yield (f"`{name}.{key}`", value(getattr(defaults, field)), bounds(limits),
                    str(limits.get("unit", "")))
 
 

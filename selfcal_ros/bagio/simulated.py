@@ -63,8 +63,9 @@ def _write(simulation: Simulation, path: Path,
             writer.write(f"/{topic}", fields, arrival_ns)
             if number % 1000 == 0:
                 progress(number, len(arrivals))
-        write_truth(path / TRUTH_FILE, truth, seed=simulation.seed, faults=ledger,
-                    cell=asdict(simulation.settings))
+        write_truth(path / TRUTH_FILE, truth, seed=simulation.seed,
+                    noise_seed=simulation.noise_seed, faults=ledger,
+                    cell=asdict(simulation.settings), spread=asdict(simulation.spread))
         return writer.counts
 
 
@@ -81,7 +82,9 @@ def write_truth(path: Path, truth: Truth, **more: object) -> None:
     """Write the known truth.
 
     gx, gy, ax, ay (m), g_theta, a_theta (rad); of each view phi (rad), t, drift, drift_walk,
-    plate_shape (m) and plate_scale, empty where there is none; rotation, microscope, backlash (m).
+    plate_shape, stage_bend (m), plate_scale, plate_strain, plate_tilt and line_eccentricity (rad),
+    empty where there is none; rotation, microscope, backlash (m); placed, how the plate lies in
+    views where that is not as commanded.
     """
     write_json(path, plain({
         "gx": truth.g[0], "gy": truth.g[1], "g_theta": truth.g_theta, "ax": truth.a[0],
@@ -89,7 +92,11 @@ def write_truth(path: Path, truth: Truth, **more: object) -> None:
         "rotation": "linear" if truth.linear else "finite", "microscope": truth.microscope,
         "backlash": truth.backlash_m, "plate_scale": truth.plate_scale,
         "plate_shape": truth.plate_shape_m, "drift": truth.drift_m, "drift_walk": truth.walk_m,
-        **more}))
+        "stage_bend": truth.stage_bend_m, "plate_strain": truth.plate_strain,
+        "plate_tilt": truth.plate_tilt_rad, "line_eccentricity": truth.line_eccentricity_rad,
+        "placed": [None if view is None else {
+            "rotation": view.rotation_rad, "translation": view.translation_m}
+            for view in truth.placed], **more}))
 
 
 def read_truth(bag: str | Path) -> dict | None:

@@ -2,7 +2,7 @@
 """SIM.yaml: what `selfcal simulate` is to simulate."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +12,17 @@ from selfcal_ros.collection.settings.parameter import Parameter
 from selfcal_ros.errors import InputError, known_are
 from selfcal_ros.files import read_yaml
 from selfcal_ros.model.readings import Sense
-from selfcal_ros.model.view import Plan, plan_from_dict
+from selfcal_ros.model.view import Plan, View, plan_from_dict
 from selfcal_ros.simulation.cell import Event, plan_events
 from selfcal_ros.simulation.faults import PARTS, Faults, apply_faults
-from selfcal_ros.simulation.machine import ENCODERS, ROTATIONS, Spread, Truth, random_truth
+from selfcal_ros.simulation.machine import (
+    AXES,
+    ENCODERS,
+    ROTATIONS,
+    Spread,
+    Truth,
+    random_truth,
+)
 from selfcal_ros.simulation.settings import CellSettings
 from selfcal_ros.units import NS_PER_S
 
@@ -34,13 +41,16 @@ LAST_START_S = 2.1e9
 
 RATIO: Bounds = {"unit": "m/m", "low": 0.0, "high": 0.1}
 SIGNED_RATIO = RATIO | {"low": -0.1}
+FACTOR: Bounds = {"low": -100.0, "high": 100.0}
 
 TRUTH: Section = {
     "g": ("g_m", LENGTH), "a": ("a_m", LENGTH), "g_theta": ("g_theta_rad", ANGLE),
     "a_theta": ("a_theta_rad", ANGLE), "phi": ("phi_rad", ANGLE), "t": ("t_m", LENGTH),
+    "phi_common": ("phi_common_rad", ANGLE), "t_common": ("t_common_m", LENGTH),
     "encoder": ("encoder", {"choices": ENCODERS}), "rotation": ("rotation", {"choices": ROTATIONS})}
 NOISE: Section = {
     "sigma_xy": ("sigma_xy_m", LENGTH), "sigma_theta": ("sigma_theta_rad", ANGLE),
+    "noise_ratio": ("noise_ratio", {"low": 0.0, "high": 100.0}),
     "visit_xy": ("visit_xy_m", LENGTH), "flicker_xy": ("flicker_xy_m", LENGTH),
     "flicker_theta": ("flicker_theta_rad", ANGLE), "resolution_xy": ("resolution_xy_m", LENGTH),
     "resolution_theta": ("resolution_theta_rad", ANGLE)}
@@ -50,6 +60,8 @@ CELL: Section = {
     "exposure_period": ("exposure_period_s", {"unit": "s", "low": 0.001, "high": 10.0}),
     "with_ids": ("with_ids", {}), "declare_sigma": ("declare_sigma", {}),
     "servo_sigma": ("servo_sigma_m", LENGTH), "servo_sigma_theta": ("servo_sigma_rad", ANGLE),
+    "encoder_sigma": ("encoder_sigma_m", LENGTH),
+    "encoder_sigma_theta": ("encoder_sigma_rad", ANGLE),
     "stop_sigma": ("stop_sigma_m", LENGTH), "stop_sigma_theta": ("stop_sigma_rad", ANGLE),
     "follow_mark": ("follow_mark", {}), "visit_order": ("visit_order", {}),
     "consecutive": ("consecutive", {})}
@@ -58,9 +70,23 @@ PHYSICS: Section = {
     "microscope_stretch": ("microscope_stretch", SIGNED_RATIO),
     "microscope_rotation": ("microscope_rotation_rad", ANGLE | {"low": -0.1}),
     "microscope_shear": ("microscope_shear", SIGNED_RATIO),
+    "microscope_axes": ("microscope_axes", {"choices": tuple(AXES)}),
+    "microscope_pixels": ("microscope_pixels", FACTOR), "line_factor": ("line_factor", FACTOR),
+    "microscope_distortion": ("microscope_distortion", SIGNED_RATIO),
+    "microscope_field": ("microscope_field_m", LENGTH | {"low": 1e-6}),
+    "optical_tilt_x": ("optical_tilt_x_rad", ANGLE | {"low": -0.1}),
+    "optical_tilt_y": ("optical_tilt_y_rad", ANGLE | {"low": -0.1}),
     "backlash_x": ("backlash_x_m", LENGTH | {"low": -1e-3}),
     "backlash_y": ("backlash_y_m", LENGTH | {"low": -1e-3}),
+    "backlash_growth": ("backlash_growth_m", LENGTH | {"low": -1e-3}),
+    "settling": ("settling_m", LENGTH | {"low": -1e-3}),
+    "settling_time": ("settling_time_s", {"unit": "s", "low": 1e-6, "high": 3600.0}),
+    "stage_bend": ("stage_bend_m", LENGTH),
     "plate_scale": ("plate_scale", RATIO), "plate_shape": ("plate_shape_m", LENGTH),
+    "plate_strain": ("plate_strain", RATIO), "plate_tilt": ("plate_tilt_rad", ANGLE),
+    "plate_bow": ("plate_bow_m", LENGTH | {"low": -1e-3}),
+    "line_eccentricity": ("line_eccentricity_rad", ANGLE),
+    "pitch_error": ("pitch_error", SIGNED_RATIO),
     **{f"drift_{name}": (f"drift_{name}_m", LENGTH)
        for name in ("linear", "quadratic", "cubic", "walk")}}
 FAULTS: Section = {name: (name, PART) for name in PARTS} | {
@@ -68,6 +94,8 @@ FAULTS: Section = {name: (name, PART) for name in PARTS} | {
     for key in ("delay", "clock_step", "encoder_gap", "delay_s", "clock_step_s", "encoder_gap_s")}
 TOP = (
     Parameter("seed", 0, "of truth, noise and faults", low=0, high=2**61),
+    Parameter("noise_seed", 0, "of all that a new measurement of the machine changes", low=0,
+              high=2**61),
     Parameter("start_time", 1.7e9, "first stamp", "s", 0.0, LAST_START_S),
     Parameter("compression", "zstd", "of the bag", choices=("zstd", "lz4", "none")),
 )
@@ -75,7 +103,11 @@ TOP = (
 
 @dataclass(frozen=True)
 class Simulation:
-    """A parsed SIM.yaml: plan, seed, spread of the truth, cell, faults, start time."""
+    """A parsed SIM.yaml: plan, seeds, spread of the truth, cell, faults, start time.
+
+    `noise_seed` is None where `seed` is that of everything; `placed` says how the plate lies in
+    views in which that is not as the plan commands.
+    """
 
     plan: Plan
     seed: int
@@ -84,11 +116,17 @@ class Simulation:
     faults: Faults
     start_ns: int
     compression: str
+    noise_seed: int | None = None
+    placed: tuple[View | None, ...] = ()
 
     def run(self) -> tuple[Truth, list[tuple[int, Event]], dict[str, int]]:
         """Return the truth, the messages with their times of arrival, and the ledger of faults."""
-        rng = np.random.default_rng(self.seed)
-        truth = random_truth(self.plan.artifact, len(self.plan.views), rng, self.spread)
+        machine = rng = np.random.default_rng(self.seed)
+        if self.noise_seed is not None:
+            rng = np.random.default_rng(self.noise_seed)
+        truth = random_truth(self.plan.artifact, len(self.plan.views), machine, self.spread,
+                             placing=rng)
+        truth = replace(truth, placed=self.placed)
         events = list(plan_events(truth, self.plan, settings=self.settings, rng=rng,
                                   start_ns=self.start_ns))
         arrivals, ledger = apply_faults(events, self.faults, rng)
@@ -98,9 +136,10 @@ class Simulation:
 def read_simulation(path: str | Path) -> Simulation:
     """Return the simulation in a SIM.yaml.
 
-    Keys: ``plan`` (a path beside the file, or a plan inline), ``seed``, ``truth``, ``physics``
-    (fields of `Spread`), ``noise``, ``cell`` (fields of `CellSettings`), ``faults`` (fields of
-    `Faults`), ``start_time`` (s), ``compression``; see docs/simulate.md. SI units.
+    Keys: ``plan`` (a path beside the file, or a plan inline), ``seed``, ``noise_seed``, ``truth``,
+    ``physics`` (fields of `Spread`), ``placed``, ``noise``, ``cell`` (fields of `CellSettings`),
+    ``faults`` (fields of `Faults`), ``start_time`` (s), ``compression``; see docs/simulate.md. SI
+    units.
 
     Raises
     ------
@@ -110,7 +149,7 @@ def read_simulation(path: str | Path) -> Simulation:
     """
     where = str(path)
     data = _mapping(read_yaml(path), where, (
-        "plan", "truth", "physics", "noise", "cell", "faults",
+        "plan", "truth", "physics", "placed", "noise", "cell", "faults",
         *(parameter.name for parameter in TOP)))
     if "plan" not in data:
         raise InputError(where, "the key 'plan' is missing", "name a PLAN.yaml")
@@ -126,9 +165,11 @@ def read_simulation(path: str | Path) -> Simulation:
         faults = Faults(**read["faults"])
     except InputError as error:
         raise InputError(f"{where}: {error.where}", error.what, error.remedy) from error
-    return Simulation(_plan(data["plan"], Path(path)), top["seed"],
-                      Spread(**read["truth"], **read["physics"]), settings, faults,
-                      round(top["start_time"] * NS_PER_S), top["compression"])
+    plan = _plan(data["plan"], Path(path))
+    return Simulation(plan, top["seed"], Spread(**read["truth"], **read["physics"]), settings,
+                      faults, round(top["start_time"] * NS_PER_S), top["compression"],
+                      top["noise_seed"] if "noise_seed" in data else None,
+                      _placed(data.get("placed", []), plan, f"{where}: placed"))
 
 
 def settings_of(values: Mapping[str, Any]) -> CellSettings:
@@ -152,6 +193,22 @@ def _plan(plan: Any, path: Path) -> Plan:
         source = path.parent / plan
         return plan_from_dict(read_yaml(source), str(source))
     return plan_from_dict(plan, f"{path}: plan")
+
+
+def _placed(views: Any, plan: Plan, where: str) -> tuple[View | None, ...]:
+    """Return how the plate lies in the views that are named; empty if in none."""
+    if not views:
+        return ()
+    plate = plan.artifact
+    lies = {view.name: view for view in plan_from_dict(
+        {"plan_id": plan.plan_id, "views": views, "artifact": {
+            "grid_size": plate.grid_size, "grid_pitch": plate.grid_pitch_m,
+            "angular_count": plate.angular_count, "grid_size_y": plate.grid_size_y}}, where).views}
+    names = [view.name for view in plan.views]
+    for name in lies:
+        if name not in names:
+            raise InputError(where, f"the plan has no view '{name}'", known_are(name, names))
+    return tuple(lies.get(name) for name in names)
 
 
 def _mapping(data: Any, where: str, known: tuple[str, ...]) -> dict:

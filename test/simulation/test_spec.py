@@ -94,18 +94,61 @@ def test_a_seed_gives_the_same_messages(tmp_path):
     assert first[1] != other[1]
 
 
+def test_the_machine_stays_when_it_is_measured_again(tmp_path):
+    data = {"plan": PLAN, "seed": 4, "noise": {"sigma_xy": 1e-8}, "faults": {"lost": 0.1}}
+    alone, first, same, other = (simulation(tmp_path, {**data, **more}).run() for more in (
+        {}, {"noise_seed": 1}, {"noise_seed": 1}, {"noise_seed": 2}))
+    for name in ("g", "a", "g_theta", "a_theta"):
+        np.testing.assert_array_equal(getattr(first[0], name), getattr(other[0], name))
+        np.testing.assert_array_equal(getattr(first[0], name), getattr(alone[0], name))
+    assert not np.array_equal(first[0].phi_rad, other[0].phi_rad)
+    assert first[1:] == same[1:] and first[1] != other[1]
+
+
+def test_every_effect_beside_the_model_reaches_its_field(tmp_path):
+    """Each key alone changes its field, and no other."""
+    values = {key: -1e-6 if bounds.get("low", 0.0) < 0 else 1e-3
+              for key, (_, bounds) in PHYSICS.items() if "choices" not in bounds}
+    for key, value in (values | {"microscope_axes": "y-x"}).items():
+        made = simulation(tmp_path, {"plan": PLAN, "physics": {key: value}})
+        changed = {name: at for name, at in vars(made.spread).items()
+                   if at != getattr(Spread(), name)}
+        assert changed == {PHYSICS[key][0]: value}
+    made = simulation(tmp_path, {"plan": PLAN, "truth": {"phi_common": 1e-3, "t_common": 1e-5},
+                                 "noise": {"noise_ratio": 0.5},
+                                 "cell": {"encoder_sigma": 1e-8, "encoder_sigma_theta": 1e-7}})
+    assert (made.spread.phi_common_rad, made.spread.t_common_m) == (1e-3, 1e-5)
+    cell = made.settings
+    assert (cell.noise_ratio, cell.encoder_sigma_m, cell.encoder_sigma_rad) == (0.5, 1e-8, 1e-7)
+
+
+def test_a_plate_lies_otherwise_than_its_view_says(tmp_path):
+    truth, _, _ = simulation(tmp_path, {"plan": PLAN, "placed": [
+        {"name": "b", "rotation_deg": -90, "translation_pitch": [0, 1]}]}).run()
+    assert truth.placed[0] is None
+    pose = truth.placed[1].lattice_pose(truth.artifact)
+    assert (pose.q, pose.shift) == (3, (0, 1))
+    assert simulation(tmp_path, {"plan": PLAN}).run()[0].placed == ()
+
+
 @pytest.mark.parametrize(("data", "message"), [
     ("[1]", ": not a mapping; see docs/simulate.md"),
     ({}, ": the key 'plan' is missing; name a PLAN.yaml"),
     ({"plan": PLAN, "sed": 1}, ": sed: unknown key; did you mean 'seed'? known are plan, truth, "
-     "physics, noise, cell, faults, seed, start_time, compression"),
+     "physics, placed, noise, cell, faults, seed, noise_seed, start_time, compression"),
     ({"plan": {**PLAN, "views": []}}, ": plan: the plan has no views; add at least one view"),
     ({"plan": True}, ": plan: not a mapping of keys to values; see config/plans for examples"),
     ({"plan": PLAN, "truth": 5}, ": truth: not a mapping; see docs/simulate.md"),
     ({"plan": PLAN, "faults": None}, ": faults: not a mapping; see docs/simulate.md"),
     ({"plan": PLAN, "noise": {"encoder_rate": 500}}, ": noise: encoder_rate: unknown key; known "
-     "are sigma_xy, sigma_theta, visit_xy, flicker_xy, flicker_theta, resolution_xy, "
-     "resolution_theta"),
+     "are sigma_xy, sigma_theta, noise_ratio, visit_xy, flicker_xy, flicker_theta, "
+     "resolution_xy, resolution_theta"),
+    ({"plan": PLAN, "placed": [{"name": "c"}]}, ": placed: the plan has no view 'c'; known are a, "
+     "b"),
+    ({"plan": PLAN, "placed": {"b": {}}}, ": placed: views: {'b': {}} is not of type list; correct "
+     "the value"),
+    ({"plan": PLAN, "placed": [{"name": "b", "turn": 90}]}, ": placed: views[0]: turn: unknown "
+     "key; known are name, rotation_deg, translation_pitch, grid, angular, repeats, visit_order"),
     ({"plan": PLAN, "cell": {"visit_order": "spiral"}}, ": simulated cell: visit_order: 'spiral' "
      "is not a visiting order; use one of raster, serpentine, there_and_back, x_then_y, "
      "x_back_y_back, random, if need be with @plate"),
@@ -128,21 +171,30 @@ def test_a_plan_that_is_not_there(tmp_path):
 
 
 KEYS = {
-    None: {"seed": (int, 0, 2**61), "start_time": (float, 0.0, 2.1e9), "compression": str},
-    "truth": dict.fromkeys(("g", "a", "t"), (float, 0.0, 1e-3))
-    | dict.fromkeys(("g_theta", "a_theta", "phi"), (float, 0.0, 0.1))
+    None: {"seed": (int, 0, 2**61), "noise_seed": (int, 0, 2**61),
+           "start_time": (float, 0.0, 2.1e9), "compression": str},
+    "truth": dict.fromkeys(("g", "a", "t", "t_common"), (float, 0.0, 1e-3))
+    | dict.fromkeys(("g_theta", "a_theta", "phi", "phi_common"), (float, 0.0, 0.1))
     | {"encoder": str, "rotation": str},
     "physics": dict.fromkeys(("microscope_scale", "microscope_stretch", "microscope_rotation",
-                              "microscope_shear"), (float, -0.1, 0.1))
-    | dict.fromkeys(("backlash_x", "backlash_y"), (float, -1e-3, 1e-3))
-    | {"plate_scale": (float, 0.0, 0.1)}
-    | dict.fromkeys(("plate_shape", "drift_linear", "drift_quadratic", "drift_cubic",
+                              "microscope_shear", "microscope_distortion", "optical_tilt_x",
+                              "optical_tilt_y", "pitch_error"), (float, -0.1, 0.1))
+    | dict.fromkeys(("backlash_x", "backlash_y", "backlash_growth", "settling", "plate_bow"),
+                    (float, -1e-3, 1e-3))
+    | dict.fromkeys(("plate_scale", "plate_strain", "plate_tilt", "line_eccentricity"),
+                    (float, 0.0, 0.1))
+    | dict.fromkeys(("microscope_pixels", "line_factor"), (float, -100.0, 100.0))
+    | {"microscope_axes": str, "microscope_field": (float, 1e-6, 1e-3),
+       "settling_time": (float, 1e-6, 3600.0)}
+    | dict.fromkeys(("stage_bend", "plate_shape", "drift_linear", "drift_quadratic", "drift_cubic",
                      "drift_walk"), (float, 0.0, 1e-3)),
     "noise": dict.fromkeys(("sigma_xy", "visit_xy", "flicker_xy", "resolution_xy"),
                            (float, 0.0, 1e-3))
-    | dict.fromkeys(("sigma_theta", "flicker_theta", "resolution_theta"), (float, 0.0, 0.1)),
+    | dict.fromkeys(("sigma_theta", "flicker_theta", "resolution_theta"), (float, 0.0, 0.1))
+    | {"noise_ratio": (float, 0.0, 100.0)},
     "cell": {"sense": str, "with_ids": bool, "declare_sigma": bool,
              "encoder_rate": (float, 1.0, 10000.0), "exposure_period": (float, 0.001, 10.0),
+             "encoder_sigma": (float, 0.0, 1e-3), "encoder_sigma_theta": (float, 0.0, 0.1),
              "servo_sigma": (float, 0.0, 1e-3), "servo_sigma_theta": (float, 0.0, 0.1),
              "stop_sigma": (float, 0.0, 1e-3), "stop_sigma_theta": (float, 0.0, 0.1),
              "follow_mark": bool, "consecutive": bool},

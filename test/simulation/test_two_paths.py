@@ -1,10 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Messages through the collector and the direct readings of one truth are the same readings."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from selfcal_ros.model.readings import Sense
+from selfcal_ros.model.view import View
 from selfcal_ros.simulation.cell import plan_events
 from selfcal_ros.simulation.machine import Spread, random_truth
 from selfcal_ros.simulation.settings import CellSettings
@@ -55,6 +58,25 @@ def test_both_give_the_same_readings_visit_by_visit(case, sense):
         np.testing.assert_allclose(one.sigma_theta, other.sigma_theta, rtol=1e-9)
         if one.view.grid:
             assert_same_visits(one.visits, other.visits)
+
+
+def test_both_read_the_marks_that_lie_there_where_they_have_no_ids():
+    plan = plan_of("0, 90, tx", 7, count=8, repeats=2)
+    spread = Spread(g_m=1e-7, a_m=1e-7, phi_rad=1e-5, t_m=1e-6)
+    truth = random_truth(plan.artifact, 3, np.random.default_rng(2), spread)
+    truth = replace(truth, placed=(None, View("turned back", -np.pi / 2),
+                                   View("aside", 0.0, (0.0, plan.artifact.grid_pitch_m))))
+    settings = CellSettings(Sense.PLATE_MOVES, 2e-8, 1e-6, with_ids=False)
+    direct = simulate_measurements(truth, plan, np.random.default_rng(4), settings=settings)
+    events = plan_events(truth, plan, settings=settings, rng=np.random.default_rng(4),
+                         start_ns=START_NS)
+    collected, _ = collect(events, measurement_sense="plate_moves", outlier_limit=0.0)
+    assert [len(view.m) for view in direct.views] == [49, 49, 36]
+    for one, other in zip(direct.views, collected.views, strict=True):
+        for name in ("m", "n", "count", "k", "count_theta"):
+            np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+        np.testing.assert_allclose([one.dx, one.dy], [other.dx, other.dy], atol=2e-17)
+        np.testing.assert_allclose(one.dtheta, other.dtheta, atol=4e-15)
 
 
 def assert_same_visits(one, other):

@@ -238,6 +238,7 @@ class SimulatorSettings(Settings):
     sigma_xy: float = declared(2e-8, "standard deviation of one grid reading", **_LENGTH)
     sigma_theta: float = declared(
         1.7453292519943296e-05, "standard deviation of one angular reading", **_ANGLE)
+    noise_ratio: float = declared(1.0, "noise of y over that of x", "", 0.0, 100.0)
     encoder_rate: float = declared(500.0, "encoder samples a second", "Hz", 1.0, 10000.0)
     exposure_period: float = declared(0.01, "time between two exposures", "s", 0.001, 10.0)
     with_ids: bool = declared(True, "detections name their marks")
@@ -245,6 +246,9 @@ class SimulatorSettings(Settings):
     declare_sigma: bool = declared(False, "detections state their standard deviation")
     servo_sigma: float = declared(2e-8, "scatter of the stage about where it stopped", **_LENGTH)
     servo_sigma_theta: float = declared(1e-7, "the same of theta", **_ANGLE)
+    encoder_sigma: float = declared(
+        0.0, "noise of what the encoders tell, which is no motion", **_LENGTH)
+    encoder_sigma_theta: float = declared(0.0, "the same of theta", **_ANGLE)
     stop_sigma: float = declared(0.0, "how far from its target the stage stops", **_LENGTH)
     stop_sigma_theta: float = declared(0.0, "the same of theta", **_ANGLE)
     follow_mark: bool = declared(
@@ -262,15 +266,47 @@ class SimulatorSettings(Settings):
     microscope_rotation: float = declared(
         0.0, "turn of the microscope against the stage", "rad", -0.1, 0.1)
     microscope_shear: float = declared(0.0, "symmetric shear of the microscope", **_RATIO)
+    microscope_axes: str = declared(
+        "xy", "what is told as x and y of an offset", choices=(
+            "xy", "-x-y", "-xy", "x-y", "yx", "-y-x", "y-x", "-yx"))
+    microscope_pixels: float = declared(1.0, "told over seen offset", "", -100.0, 100.0)
+    line_factor: float = declared(1.0, "told over true offset of a line", "", -100.0, 100.0)
+    microscope_distortion: float = declared(
+        0.0, "part by which offsets are too long at the edge of the field", **_RATIO)
+    microscope_field: float = declared(
+        250e-6, "distance of that edge from the optical axis", "m", 1e-6, 1e-3)
+    optical_tilt_x: float = declared(
+        0.0, "tilt of the optical axis: a mark is seen moved by it times its height", "rad", -0.1,
+        0.1)
+    optical_tilt_y: float = declared(0.0, "the same along y", "rad", -0.1, 0.1)
     backlash_x: float = declared(
         0.0, "indicated - true position of x after a motion towards plus", "m", -1e-3, 1e-3)
     backlash_y: float = declared(0.0, "the same of y", "m", -1e-3, 1e-3)
+    backlash_growth: float = declared(
+        0.0, "growth of both during a view", "m", -1e-3, 1e-3)
+    settling: float = declared(
+        0.0, "what an axis that moved is short of at the next exposure", "m", -1e-3, 1e-3)
+    settling_time: float = declared(
+        0.01, "time in which that falls to 1/e while the axis rests", "s", 1e-6, 3600.0)
+    stage_bend: float = declared(
+        0.0, "bending of the stage in each view, at mid-edge, standard deviation", **_LENGTH)
     plate_scale: float = declared(
         0.0, "growth of the plate in each view after the first, standard deviation", "m/m", 0.0,
         0.1)
     plate_shape: float = declared(
         0.0, "bending of the plate in each view after the first, at mid-edge, standard deviation",
         **_LENGTH)
+    plate_strain: float = declared(
+        0.0, "strain of the plate in each view after the first, standard deviation", "m/m", 0.0,
+        0.1)
+    plate_tilt: float = declared(
+        0.0, "tilt of the plate in each view, standard deviation", **_ANGLE)
+    plate_bow: float = declared(
+        0.0, "height of the plate's centre above its edges", "m", -1e-3, 1e-3)
+    line_eccentricity: float = declared(
+        0.0, "circle of lines off the turning axis in each view, over its radius, standard "
+        "deviation", **_ANGLE)
+    pitch_error: float = declared(0.0, "true over declared pitch, less 1", **_RATIO)
     drift_linear: float = declared(0.0, _DRIFT + "with time", **_LENGTH)
     drift_quadratic: float = declared(0.0, _DRIFT + "with its square", **_LENGTH)
     drift_cubic: float = declared(0.0, _DRIFT + "with its cube", **_LENGTH)
