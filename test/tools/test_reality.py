@@ -21,10 +21,13 @@ from tools.reality.cases import (
 )
 from tools.reality.machines import laid
 from tools.reality.runs import (
+    WRONG,
+    WRONG_THETA,
     Course,
     Run,
     compared,
     every_case,
+    limit,
     measured,
     rows,
     run_case,
@@ -151,14 +154,22 @@ def test_advice_is_followed_until_none_is_left():
 
 
 def test_what_is_wrong_and_accepted_is_counted_with_its_seeds():
-    wrong = Run("good", 1e-6, 0.5, 0.96, 3.0, 1.0)
+    wrong = Run("good", 1e-6, 0.5, 0.96, 3.0, 1.0, holds=False)
     told, refused = replace(wrong, grade="not_qualified"), Run("refused")
-    angle = Run("enlarged", 1e-8, 0.95, 0.75, 1.0, 3.0)
+    angle = Run("enlarged", 1e-8, 0.95, 0.75, 1.0, 3.0, holds=False)
     right = Run("good", 1e-8, 0.95, 0.96, 1.0, 1.0)
     found = summarise([wrong, told, refused, angle, right], [7, 8, 9, 10, 11])
     assert (found.wrong, found.wrong_seeds) == (2, (7, 10))
     assert found.grades == {"good": 2, "not_qualified": 1, "refused": 1, "enlarged": 1}
     assert found.within == pytest.approx((0.5 + 0.5 + 0.95 + 0.95) / 4)
+
+
+def test_how_many_errors_outside_make_a_map_wrong():
+    assert limit(WRONG, np.zeros((2, 11, 11))) == pytest.approx(0.85)
+    assert limit(WRONG_THETA, np.zeros(24)) == pytest.approx(0.78)
+    # of four times as few the part scatters twice as much about 95.45 %
+    assert limit((0.85, 200), np.zeros(50)) == pytest.approx(0.9545 - 2 * 0.1045)
+    assert limit((0.85, 50), np.array([0.0, np.nan] * 50)) == pytest.approx(0.85)
 
 
 def test_a_row_says_what_comes_after_the_advice():

@@ -25,11 +25,13 @@ from tools.reality.cases import Case, term_cases
 from tools.reality.machines import machine_cases
 from tools.reality.populations import populations
 
-WRONG = 0.85
+WRONG = (0.85, 242)
 """Part of the map inside k u below which a single map is called wrong: of 242 correlated
 coordinates 95 % are inside on average, and hardly ever fewer than 85 % in a clean run."""
-WRONG_THETA = 0.78
+WRONG_THETA = (0.78, 24)
 """The same of a map of 24 angles: 19 inside are right, 18 come once in a thousand clean runs."""
+COVERAGE = 0.9545
+"""Part of the errors that k u is to hold."""
 STEPS = 4
 """Advice that is followed at most, one after another."""
 GRADES = ("good", "enlarged", "not_qualified", "refused")
@@ -40,8 +42,8 @@ class Run:
     """One calibration against its truth; of a refused one only `grade` and `causes` count.
 
     `error_m` is the largest error of a coordinate of the map, `within` and `within_theta` the parts
-    of the maps inside k u, `z_xy` and `z_theta` the rms of the errors over their u, `causes` the
-    names of the causes given.
+    of the maps inside k u, `z_xy` and `z_theta` the rms of the errors over their u, `holds` whether
+    enough of both maps is inside, `causes` the names of the causes given.
     """
 
     grade: str
@@ -50,13 +52,13 @@ class Run:
     within_theta: float = float("nan")
     z_xy: float = float("nan")
     z_theta: float = float("nan")
+    holds: bool = True
     causes: tuple[str, ...] = ()
 
     @property
     def wrong(self) -> bool:
         """Whether the map is accepted and its uncertainty does not hold the error."""
-        return self.grade in GRADES[:2] and (self.within < WRONG
-                                             or self.within_theta < WRONG_THETA)
+        return self.grade in GRADES[:2] and not self.holds
 
 
 @dataclass(frozen=True)
@@ -140,8 +142,15 @@ def compared(result: CalibrationResult | str, truth: Truth) -> Run:
     theta = theta - np.nanmean(theta) if np.isfinite(theta).any() else theta
     within, z_xy = _covered(error, np.stack([emap.u_gx, emap.u_gy]), result.noise.k_xy)
     within_theta, z_theta = _covered(theta, emap.u_g_theta, result.noise.k_theta)
+    holds = not (within < limit(WRONG, error) or within_theta < limit(WRONG_THETA, theta))
     return Run(grade_of(result), float(np.nanmax(np.abs(error))), within, within_theta, z_xy,
-               z_theta, tuple(cause.name for cause in result.verdict.causes))
+               z_theta, holds, tuple(cause.name for cause in result.verdict.causes))
+
+
+def limit(wrong: tuple[float, int], error: np.ndarray) -> float:
+    """Return the part inside k u below which a map is wrong; fewer errors scatter more."""
+    at, count = wrong
+    return COVERAGE - (COVERAGE - at) * float(np.sqrt(count / max(np.isfinite(error).sum(), 1)))
 
 
 ROUNDING = 1e-13
