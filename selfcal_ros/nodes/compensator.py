@@ -7,6 +7,7 @@ from typing import Any
 from selfcal_ros.collection.settings.nodes import CompensatorSettings
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes.managed import ManagedNode, WhileConfigured
+from selfcal_ros.nodes.polling import ByTheClock
 from selfcal_ros.nodes.running import run
 from selfcal_ros.sessions.compensating import CompensatingSession
 from selfcal_ros.sessions.ports import Diagnosis
@@ -30,13 +31,15 @@ class CompensatorNode(ManagedNode[CompensatorSettings]):
         """Listen to the maps and to the encoder."""
         self.subscribe(names.SUMMARY, self.session.take_summary)
         self.subscribe(names.ERROR_MAP, self.session.take_map)
-        self.subscribe(names.ENCODER_BEST_EFFORT, self._on_sample)
+        self._input = ByTheClock(names.ENCODER.name, self.session.receive,
+                                 self.guarded(self._on_samples, names.ENCODER.name))
+        self._encoder = self.subscribe(names.ENCODER_NEWEST, self._input, raw=True)
 
-    def _on_sample(self, message: Any) -> None:
-        corrected = self.session.correct(list(message.name), list(message.position))
-        if corrected is not None:
-            message.position = corrected
-            self._corrected.publish(message)
+    def _on_samples(self) -> None:
+        """Correct what has come: the first sample of it calls, the others are taken here."""
+        with self._encoder.handle:
+            missing = self._input.empty(self._encoder, names.ENCODER_NEWEST.qos.depth)
+        self.session.correct_waiting(missing.lost, self._corrected.publish)
 
     def diagnose_session(self) -> Diagnosis:
         """Return what the session says."""

@@ -39,6 +39,8 @@ def _qos(depth: int, *, reliable: bool = True, latched: bool = False) -> QoSProf
 # 1 kHz of encoder: a hiccup of a second must not overwrite a sample
 ENCODER = Topic(topics.ENCODER_TOPIC, JointState, _qos(5000))
 ENCODER_BEST_EFFORT = Topic(topics.ENCODER_TOPIC, JointState, _qos(5000, reliable=False))
+# of what came earlier, and was displaced, nobody wants the corrected position
+ENCODER_NEWEST = Topic(topics.ENCODER_TOPIC, JointState, _qos(100, reliable=False))
 DETECTIONS = Topic(topics.DETECTION_TOPIC, MarkDetection, _qos(5000))
 COMMAND = Topic(topics.COMMAND_TOPIC, ViewCommand, _qos(256, latched=True))
 STATUS = Topic(topics.STATUS_TOPIC, ViewStatus, _qos(64, latched=True))

@@ -2,7 +2,9 @@
 """The session of compensator: which map is used, and what is done with a sample."""
 
 import math
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 import numpy as np
@@ -13,12 +15,17 @@ from selfcal_ros.compensation.compensator import Compensator
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import read_json
 from selfcal_ros.messages import to_model
+from selfcal_ros.messages.input_columns import PositionEditor
 from selfcal_ros.model.error_map import ErrorMap
 from selfcal_ros.model.result import result_from_dict
+from selfcal_ros.sessions.health import merged
 from selfcal_ros.sessions.ports import Diagnosis, Level, Ports
 from selfcal_ros.sessions.verdicts import is_qualified
-from selfcal_ros.units import S_PER_NS
+from selfcal_ros.units import MS_PER_S, S_PER_NS
 
+KEEPS_UP = 20
+"""Samples that are corrected one after another where so many wait: a millisecond of work. Where
+more wait, the newest alone is corrected."""
 FARTHEST = 1e12
 """Position, m or rad, beyond which a sample is none of a stage."""
 
@@ -41,7 +48,11 @@ class CompensatingSession:
     def __init__(self, settings: CompensatorSettings, ports: Ports) -> None:
         self._settings, self._ports = settings, ports
         self.compensator: Compensator | None = None
-        self.counts = {"corrected": 0, "without_map": 0, "refused": 0}
+        self.counts = {"corrected": 0, "without_map": 0, "refused": 0, "skipped": 0}
+        self._waiting: list[tuple[bytes, int]] = []
+        self._editor = PositionEditor()
+        self._ages_s: list[float] = []  # of what was corrected since the last diagnosis
+        self._skipped = 0  # since then
         self._map: Any = None  # newest message of each, until they are judged together
         self._summary: Any = None
         self._waits = ""
@@ -101,14 +112,43 @@ class CompensatingSession:
         self._used, self._since_s, self._map_ns = source, self._ports.now_s(), stamp_ns
         self._ports.say(Level.OK, f"correcting by the map of {source} from now on")
 
-    def correct(self, names: list[str], positions: list[float]) -> list[float] | None:
+    def receive(self, data: bytes, received_ns: int) -> None:
+        """Take a sensor_msgs/JointState as received; it waits for `correct_waiting`."""
+        self._waiting.append((data, received_ns))
+
+    def correct_waiting(self, lost: int, publish: Callable[[bytes], None]) -> None:
+        """Correct what waits, in the order of its arrival, or the newest alone where much waits.
+
+        Parameters
+        ----------
+        lost : int
+            Samples that newer ones have displaced in the queue, or that did not come.
+        publish : callable (data)
+            Takes each corrected sample.
+        """
+        waiting, self._waiting = self._waiting, []
+        kept = waiting if lost + len(waiting) <= KEEPS_UP else waiting[-1:]
+        skipped = lost + len(waiting) - len(kept)
+        self._skipped += skipped
+        self.counts["skipped"] += skipped
+        for data, received_ns in kept:
+            sample = self._editor.read(data)
+            if sample is None:
+                self.counts["refused"] += 1
+                continue
+            corrected = self.correct(*sample)
+            if corrected is not None:
+                publish(self._editor.replaced(data, corrected))
+                self._ages_s.append((self._ports.wall_ns() - received_ns) * S_PER_NS)
+
+    def correct(self, names: Sequence[str], positions: Sequence[float]) -> list[float] | None:
         """Return the positions of all joints, stage joints corrected; None if it cannot be told.
 
         Parameters
         ----------
-        names : list of str
+        names : sequence of str
             Joints of the sample.
-        positions : list of float
+        positions : sequence of float
             Their indicated positions, m and rad.
         """
         if self.compensator is None:
@@ -123,30 +163,50 @@ class CompensatingSession:
         self.counts["corrected"] += 1
         return [corrected.get(index, position) for index, position in enumerate(positions)]
 
-    def _corrected(self, names: list[str], positions: list[float]) -> dict[int, float] | None:
+    def _corrected(self, names: Sequence[str], positions: Sequence[float],
+                   ) -> dict[int, float] | None:
         """Return the corrected positions by index of the joint."""
         if len(positions) != len(names):
             return None
         place = {name: index for index, name in enumerate(names)}
         joints = (self._settings.joint_x, self._settings.joint_y, self._settings.joint_theta)
         x, y, theta = map(place.get, joints)
-        if any(index is not None and abs(positions[index]) > FARTHEST for index in (x, y, theta)):
+        if not all(abs(positions[index]) <= FARTHEST  # NaN neither
+                   for index in (x, y, theta) if index is not None):
             return None
         corrected: dict[int, float] = {}
         if self.compensator is None:
             return None
         try:
             if x is not None and y is not None:
-                corrected |= zip((x, y), map(float, self.compensator.correct(
-                    positions[x], positions[y])), strict=True)
+                corrected[x], corrected[y] = self.compensator.correct_point(
+                    positions[x], positions[y])
             if theta is not None and self.compensator.has_theta:
-                corrected[theta] = float(self.compensator.correct_theta(positions[theta]))
+                corrected[theta] = self.compensator.correct_angle(positions[theta])
         except InputError:
             return None
         return corrected
 
     def diagnosis(self) -> Diagnosis:
-        """Return what the node says of itself."""
+        """Return what the node says of itself, and of its pace since it was asked last."""
+        return merged(self._state(), [self._pace()])
+
+    def _pace(self) -> Diagnosis:
+        ages_s, self._ages_s = self._ages_s, []
+        skipped, self._skipped = self._skipped, 0
+        oldest, limit = max(ages_s, default=0.0), self._settings.max_age
+        lines = []
+        if skipped:
+            lines.append(f"{skipped} samples skipped since the last status: newer ones had come "
+                         "before they could be corrected, or they were lost on the way")
+        if oldest > limit:
+            lines.append(f"a corrected position was {oldest * MS_PER_S:.1f} ms old when it was "
+                         f"published, max_age is {limit * MS_PER_S:g} ms")
+        values = {"age_ms": f"{median(ages_s) * MS_PER_S:.2f}",
+                  "age_ms_max": f"{oldest * MS_PER_S:.2f}"} if ages_s else {}
+        return Diagnosis(Level.WARN if lines else Level.OK, "; ".join(lines), values)
+
+    def _state(self) -> Diagnosis:
         waits = f"; not used: {self._waits}" if self._waits else ""
         if self.compensator is None:
             return Diagnosis(Level.WARN, f"no error map yet{waits}", self.counts)

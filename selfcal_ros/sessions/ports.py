@@ -50,6 +50,8 @@ class Ports:
         The clock that stamps messages, integer ns.
     cpu_s : callable
         Seconds that a processor has worked for this thread.
+    wall_ns : callable
+        The clock by which the middleware states when it received a message, integer ns.
     """
 
     publish: Callable[[str, dict[str, Any]], None]
@@ -57,3 +59,4 @@ class Ports:
     now_s: Callable[[], float]
     now_ns: Callable[[], int]
     cpu_s: Callable[[], float] = time.thread_time
+    wall_ns: Callable[[], int] = time.time_ns

@@ -5,7 +5,8 @@ Same readings, same files. Every measurement is a process of its own with a limi
 memory; what goes beyond is skipped and says so. Writes build/bench.json.
 
     python test/bench/run.py [--sizes 11,21] [--methods selfcal,"scipy lsmr"]
-                             [--ingest MESSAGES] [--detections NUMBER] [-o FILE]
+                             [--ingest MESSAGES] [--detections NUMBER] [--compensate SECONDS]
+                             [-o FILE]
 """
 
 import argparse
@@ -15,11 +16,13 @@ import resource
 import subprocess
 import sys
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
 sys.path.insert(0, str(ROOT))
 
+import compensate  # noqa: E402
 import ingest  # noqa: E402
 import with_terms  # noqa: E402
 from rivals import RIVALS, Rival, installed  # noqa: E402
@@ -172,6 +175,18 @@ def measure_ingest(benchmark: str, number: int):
                else {**row, "note": f"failed: {last}"})
 
 
+def measure_compensation(seconds: float):
+    """Yield a row for each compensator at each rate."""
+    for rate in compensate.RATES:
+        for method in compensate.METHODS:
+            if find_spec("rclpy") is None:
+                yield {"benchmark": f"compensate {rate} Hz", "method": method,
+                       "n": round(rate * seconds), "seconds": None, "peak_mb": None,
+                       "max_error": None, "note": "not installed"}
+            else:
+                yield compensate.measured(method, rate, seconds)
+
+
 def show(row: dict) -> None:
     """Print one line of the table."""
     if row["seconds"] is None:
@@ -193,6 +208,8 @@ def main() -> int:
                         help="encoder messages of the bag that is read; 0 = leave it out")
     parser.add_argument("--detections", type=int, default=3_200_000,
                         help="detections of the other bag that is read; 0 = leave it out")
+    parser.add_argument("--compensate", type=float, default=5.0, metavar="SECONDS",
+                        help="time for which each compensator gets samples; 0 = leave it out")
     parser.add_argument("--ingest-worker", nargs=3, help=argparse.SUPPRESS)
     parser.add_argument("--worker", nargs=3, help=argparse.SUPPRESS)
     args = parser.parse_args()
@@ -225,6 +242,9 @@ def main() -> int:
         for row in measure_ingest(benchmark, number) if number else ():
             rows.append(row)
             show(row)
+    for row in measure_compensation(args.compensate) if args.compensate else ():
+        rows.append(row)
+        (show if row["seconds"] is None else compensate.show)(row)
     Path(args.output).parent.mkdir(parents=True, exist_ok=True)
     write_json(args.output, rows)
     print(f"written to {args.output}")

@@ -36,7 +36,7 @@ def bench(tmp_path, monkeypatch, capsys):
 
     def measured(*args):
         target = tmp_path / "bench.json"
-        monkeypatch.setattr(sys, "argv", [str(RUN), "-o", str(target), *args])
+        monkeypatch.setattr(sys, "argv", [str(RUN), "-o", str(target), "--compensate", "0", *args])
         assert run.main() == 0
         return capsys.readouterr().out, json.loads(target.read_text())
 
@@ -92,3 +92,11 @@ def test_processor_time_counts_what_the_process_and_its_children_do(monkeypatch)
     work = "import time\nwhile time.process_time() < 0.05: pass"
     taken, done = ingest.timed(lambda: subprocess.run([sys.executable, "-c", work], check=True))
     assert done.returncode == 0 and taken.cpu_s >= 0.05
+
+
+def test_without_ros_compensators_are_left_out_with_a_reason(bench, monkeypatch):
+    monkeypatch.setattr(sys.modules["run"], "find_spec", lambda name: None)
+    _, rows = bench("--sizes", "", "--ingest", "0", "--detections", "0", "--compensate", "2")
+    assert [(row["benchmark"], row["n"], row["note"]) for row in rows[::2]] == [
+        (f"compensate {rate} Hz", 2 * rate, "not installed") for rate in (500, 1000, 2000, 10000)]
+    assert all(row.keys() >= KEYS for row in rows)

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from selfcal_ros.bagio.schemas import fields_of, typestore
-from selfcal_ros.messages import cdr_columns
+from selfcal_ros.messages import cdr_columns, input_columns
 from selfcal_ros.messages.cdr_columns import ColumnDecoder, Payloads
 from selfcal_ros.messages.cdr_layout import layout_of
 from selfcal_ros.messages.input_columns import (
@@ -16,6 +16,7 @@ from selfcal_ros.messages.input_columns import (
     MARK_DETECTION,
     DetectionColumns,
     EncoderColumns,
+    PositionEditor,
 )
 
 STORE = typestore()
@@ -219,3 +220,40 @@ def test_a_field_that_is_not_there():
 def test_nothing_gives_nothing():
     blocks, rest = EncoderColumns().decode(Payloads.joined([]))
     assert blocks == [] and len(rest) == 0
+
+
+@pytest.mark.parametrize("little", [True, False])
+@pytest.mark.parametrize("count", [0, 1, 3])
+def test_of_a_joint_state_the_positions_alone_are_replaced(little, count):
+    before = joint_state(7, names=("a", "bcd", "theta"), positions=np.arange(count) + 0.5,
+                         velocities=[1.0, 2.0], effort=[3.0])
+    editor, data = PositionEditor(), cdr(before, little, tail=b"tail")
+    assert editor.read(data) == (("a", "bcd", "theta"), tuple(before.position))
+    after = editor.replaced(data, (-before.position).tolist())
+    before.position = -before.position
+    assert after == cdr(before, little, tail=b"tail")
+
+
+def test_an_editor_keeps_the_layouts_of_several_publishers_apart(monkeypatch):
+    editor = PositionEditor()
+    data = [cdr(joint_state(i, names=("x", "y", "theta")[i:][:1], positions=[float(i)]))
+            for i in range(3)]
+    for _ in range(2):
+        for number, message in enumerate(data):
+            [name], [position] = editor.read(message)
+            assert (name, position) == (("x", "y", "theta")[number], number)
+            assert editor.replaced(message, [9.0]) == cdr(joint_state(
+                number, names=[name], positions=[9.0]))
+        monkeypatch.setattr(input_columns, "layout_of", None)  # each is walked once
+    monkeypatch.undo()
+    for i in range(cdr_columns.MAX_KNOWN + 9):
+        editor.read(cdr(joint_state(0, frame=f"{i:04d}")))
+    assert len(editor._known) == cdr_columns.MAX_KNOWN
+
+
+def test_an_editor_refuses_what_is_cut_or_too_long():
+    editor = PositionEditor()
+    whole = cdr(joint_state(5, velocities=[1.0, 2.0, 3.0]))
+    assert editor.read(whole) is not None
+    assert [size for size in range(len(whole)) if editor.read(whole[:size])] == []
+    assert editor.read(cdr(joint_state(5, positions=np.zeros(cdr_columns.MAX_LENGTH // 8)))) is None

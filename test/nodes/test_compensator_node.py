@@ -3,6 +3,9 @@
 
 import json
 import math
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,9 +18,11 @@ from selfcal_ros.model.result import result_to_dict
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes.compensator import CompensatorNode
 from selfcal_ros.nodes.filling import fill
+from selfcal_ros.sessions.compensating import KEEPS_UP
 from test.support.maps import random_map, result_of
 
 MAP = random_map(Artifact(5, 0.01, 8), 3)
+BENCH = Path(__file__).parents[1] / "bench" / "compensate.py"
 PLACES = [(0.0, 0.0, 0.0), (0.0123, -0.0071, 0.4), (0.02, 0.02, 3.0), (0.09, -0.09, -1.0)]
 
 
@@ -90,6 +95,26 @@ def test_joints_are_found_by_name_and_others_pass_unchanged(graph, tmp_path):
     assert list(answer.position) == [7.0, y, x]
 
 
+@pytest.mark.parametrize("count", [KEEPS_UP + 40, 3 * names.ENCODER_NEWEST.qos.depth])
+def test_after_a_standstill_the_newest_sample_comes_first(graph, tmp_path, count):
+    """Nothing runs while these are published; of the larger number most are displaced."""
+    node = graph.node(CompensatorNode, map=map_file(tmp_path))
+    heard, publisher = graph.listen(names.CORRECTED), graph.publisher(names.ENCODER)
+    publisher.publish(sample(0.0, 0.0, 0.0))  # with the number that the others are counted from
+    graph.until(lambda: len(heard) == 1, "the first answer")
+    for number in range(1, count + 1):
+        message = sample(0.01, 0.0, 0.0)
+        message.header.stamp.nanosec = number
+        publisher.publish(message)
+    graph.until(lambda: node.session.counts["skipped"] == count - 1, "all of them")
+    graph.until(lambda: len(heard) == 2, "the answer")
+    assert heard[1].header.stamp.nanosec == count
+    publisher.publish(sample(0.02, 0.0, 0.0))
+    graph.until(lambda: len(heard) == 3, "the answer to one that comes alone")
+    assert node.session.counts == {"corrected": 3, "without_map": 0, "refused": 0,
+                                   "skipped": count - 1}
+
+
 @pytest.mark.usefixtures("quick_beat")
 def test_what_is_not_corrected_is_counted_and_not_published(graph, tmp_path):
     node = graph.node(CompensatorNode, map=map_file(tmp_path), outside="refuse")
@@ -140,3 +165,13 @@ def test_a_malformed_map_does_not_end_the_node(graph):
     publisher.publish(names.ERROR_MAP.type(grid_size=5, grid_pitch=0.01, gx=[0.0] * 3))
     latch_map(graph)
     graph.until(lambda: node.session.compensator is not None, "the good map")
+
+
+@pytest.mark.parametrize("method", ["selfcal", "rclpy + RegularGridInterpolator"])
+def test_the_bench_takes_corrected_samples_of_either_node(ros_environment, method):
+    done = subprocess.run([sys.executable, BENCH, "--worker", method, "100", "--seconds", "0.2"],
+                          capture_output=True, text=True, check=True)
+    row = json.loads(done.stdout)
+    assert (row["benchmark"], row["method"], row["n"]) == ("compensate 100 Hz", method, 20)
+    assert row["corrected"] > 0
+    assert row["max_error"] < 1e-12

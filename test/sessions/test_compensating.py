@@ -2,16 +2,19 @@
 """The session of the compensator: which map is used, since when, and why another is not."""
 
 import json
+import math
 
 import numpy as np
 import pytest
 
+from selfcal_ros.bagio.build import build
+from selfcal_ros.bagio.schemas import typestore
 from selfcal_ros.errors import InputError
 from selfcal_ros.messages import from_model
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.result import result_to_dict
 from selfcal_ros.sessions import compensating
-from selfcal_ros.sessions.compensating import CompensatingSession
+from selfcal_ros.sessions.compensating import KEEPS_UP, CompensatingSession
 from selfcal_ros.sessions.ports import Level
 from test.support.maps import random_map, result_of
 from test.support.ports import START_NS, Hands, message, settings_of
@@ -152,3 +155,91 @@ def test_a_position_that_no_stage_has_is_refused(desk, joint, position, refused)
     sample[joint] = position
     assert (desk.session.correct(NAMES, sample) is None) is refused
     assert desk.session.counts["refused"] == refused
+
+
+JOINT_STATE = "sensor_msgs/msg/JointState"
+
+
+def sample(number: int, x: float = 0.01) -> bytes:
+    """Return the bytes of a sample with a stamp of its own."""
+    return bytes(typestore().serialize_cdr(build(typestore(), JOINT_STATE, {
+        "header": from_model.header(START_NS + number, "stage"), "name": NAMES,
+        "position": np.array([x, 0.0, 0.0]), "velocity": np.array([1.0, 2.0, 3.0]),
+        "effort": np.zeros(0)}), JOINT_STATE))
+
+
+def corrected(desk, samples: list[bytes], lost: int = 0, age_ms: float = 0.0) -> list:
+    """Have what came so long ago corrected; return the messages that are published."""
+    out: list = []
+    for data in samples:
+        desk.session.receive(data, desk.hands.now_ns - round(age_ms * 1e6))
+    desk.session.correct_waiting(lost, out.append)
+    return [typestore().deserialize_cdr(data, JOINT_STATE) for data in out]
+
+
+def numbers(messages: list) -> list[int]:
+    return [message.header.stamp.nanosec for message in messages]
+
+
+@pytest.fixture
+def busy():
+    """Return a desk whose map corrects at once."""
+    desk = Desk(require_qualified=False, max_age=0.005)
+    desk.session.take_map(map_of())
+    return desk
+
+
+def test_of_the_bytes_of_a_sample_the_positions_alone_change(busy):
+    [message] = corrected(busy, [sample(7)])
+    assert list(message.position) == busy.session.correct(NAMES, [0.01, 0.0, 0.0])
+    assert message.position[0] != 0.01
+    assert (message.name, list(message.velocity), message.header.frame_id, numbers([message])) == (
+        NAMES, [1.0, 2.0, 3.0], "stage", [7])
+
+
+@pytest.mark.parametrize("waiting, lost, out", [
+    (KEEPS_UP, 0, range(KEEPS_UP)), (KEEPS_UP + 1, 0, [KEEPS_UP]),
+    (KEEPS_UP - 2, 2, range(KEEPS_UP - 2)), (KEEPS_UP - 2, 3, [KEEPS_UP - 3]), (0, 4, [])])
+def test_few_samples_are_corrected_in_order_and_of_many_the_newest_alone(busy, waiting, lost, out):
+    found = corrected(busy, [sample(number) for number in range(waiting)], lost)
+    assert numbers(found) == list(out)
+    skipped = waiting + lost - len(out)
+    assert (busy.session.counts["corrected"], busy.session.counts["skipped"]) == (
+        len(out), skipped)
+    told = busy.session.diagnosis()
+    assert told.level == (Level.WARN if skipped else Level.OK)
+    assert told.message.startswith(f"{skipped} samples skipped since the last status: ") is (
+        skipped > 0)
+
+
+def test_skipped_samples_are_a_warning_once_and_a_count_for_good(busy):
+    corrected(busy, [sample(1)], lost=40)
+    assert busy.session.diagnosis().level == Level.WARN
+    told = busy.session.diagnosis()
+    assert (told.level, told.values["skipped"]) == (Level.OK, 40)
+    assert corrected(busy, [sample(2)]) != []
+
+
+@pytest.mark.parametrize("age_ms, level", [(5.0, Level.OK), (5.1, Level.WARN)])
+def test_the_age_of_corrected_samples_is_told_and_beyond_max_age_a_warning(busy, age_ms, level):
+    corrected(busy, [sample(1)], age_ms=1.0)
+    corrected(busy, [sample(2)], age_ms=2.0)
+    corrected(busy, [sample(3)], age_ms=age_ms)
+    told = busy.session.diagnosis()
+    assert told.level == level
+    assert (told.values["age_ms"], told.values["age_ms_max"]) == ("2.00", f"{age_ms:.2f}")
+    assert ("a corrected position was 5.1 ms old when it was published, max_age is 5 ms"
+            in told.message) is (level == Level.WARN)
+    assert busy.session.diagnosis().level == Level.OK
+
+
+def test_samples_that_cannot_be_read_are_refused_and_those_behind_them_corrected(busy):
+    bad = sample(1)
+    found = corrected(busy, [bad[:40], b"", sample(2, math.nan), b"\xff" * len(bad), sample(3)])
+    assert numbers(found) == [3]
+    assert (busy.session.counts["refused"], busy.session.counts["corrected"]) == (4, 1)
+
+
+def test_without_a_map_samples_are_counted_not_published(desk):
+    assert corrected(desk, [sample(1), sample(2)]) == []
+    assert desk.session.counts["without_map"] == 2

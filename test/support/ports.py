@@ -20,7 +20,8 @@ class Hands:
         self.said: list[tuple[Level, str]] = []
         self.ports = Ports(self._publish,
                            lambda level, line: self.said.append((level, line)),
-                           lambda: self.seconds, lambda: self.now_ns, lambda: self.worked)
+                           lambda: self.seconds, lambda: self.now_ns, lambda: self.worked,
+                           lambda: self.now_ns)
 
     def _publish(self, output: str, fields: dict) -> None:
         """Take what is published; a status takes the time `costs`, and the CPU time `works`."""

@@ -196,6 +196,9 @@ class CompensatorSettings(ManagedSettings):
         "map")
     max_map_age: float = declared(
         0.0, "age of the map in use above which there is a warning; 0 = none", "s", 0.0, 1e9)
+    max_age: float = declared(
+        0.02, "time from the reception of a sample to its corrected one above which there is a "
+        "warning", "s", 0.0, 3600.0)
 
 
 @dataclass(frozen=True)
