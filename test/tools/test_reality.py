@@ -14,6 +14,7 @@ from tools.reality.cases import (
     Case,
     both,
     creeping,
+    hu,
     lines_turned,
     misread,
     resistant,
@@ -118,7 +119,7 @@ def test_every_case_has_a_name_of_its_own_and_can_be_drawn():
     names = [case.name for case in every_case()]
     assert len(set(names)) == len(names)
     for case in every_case():
-        truth, readings = measured(drawn(case), 0, 1)
+        truth, readings, _ = measured(drawn(case), 0, 1)
         assert len(readings.views) == len(truth.phi_rad)
 
 
@@ -128,7 +129,8 @@ def drawn(case):
 
 def test_one_machine_is_measured_again_with_other_noise():
     case = Case("clean", plan=resistant(1))
-    (one, first), (_, again), (other, second) = (measured(case, 3, part) for part in (1, 1, 2))
+    (one, first, _), (_, again, _), (other, second, _) = (
+        measured(case, 3, part) for part in (1, 1, 2))
     np.testing.assert_array_equal(one.g, other.g)
     np.testing.assert_array_equal(first.views[0].dx, again.views[0].dx)
     assert not np.array_equal(first.views[0].dx, second.views[0].dx)
@@ -138,9 +140,19 @@ def test_one_machine_is_measured_again_with_other_noise():
 
 def test_a_plate_is_laid_down_otherwise_in_one_view():
     case = Case("turned wrongly", change=laid(1, -90.0, (0, 0)))
-    truth, _ = measured(case, 0, 1)
+    truth, _, _ = measured(case, 0, 1)
     assert [view is not None for view in truth.placed] == [False, True, False, False]
     assert truth.placed[1].lattice_pose(truth.artifact).q == 3
+
+
+def test_readings_of_a_bag_are_those_of_the_cell_and_say_what_is_wrong():
+    case = Case("bag", plan=hu(1), spread=replace(MODEL, phi_rad=1e-4), messages=True)
+    _, direct, said = measured(replace(case, messages=False), 0, 1)
+    _, collected, nothing = measured(case, 0, 1)
+    assert said == nothing == ()
+    np.testing.assert_allclose(collected.views[0].dx, direct.views[0].dx, atol=1e-15)
+    _, _, said = measured(replace(case, change=laid(1, -90.0, (0, 0))), 0, 1)
+    assert len(said) == 1 and "minus the marks' sites" in said[0]
 
 
 def test_advice_is_followed_until_none_is_left():

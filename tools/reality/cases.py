@@ -72,6 +72,9 @@ class Case:
         Part of the marks and lines that are not read in a view.
     spoil : callable
         Readings and random numbers -> the readings as they are in this case.
+    messages : bool
+        Whether the readings are collected from the messages of the cell; otherwise they are
+        those of detections without ids of which none is rejected, which takes a tenth of the time.
     draw : callable, optional
         Random numbers and the case -> the case as it is in one run, where runs differ.
     """
@@ -85,6 +88,7 @@ class Case:
     hidden: str = ""
     missing: float = 0.0
     spoil: Spoil = lambda readings, rng: readings
+    messages: bool = False
     draw: Callable[[np.random.Generator, "Case"], "Case"] | None = None
 
     @property

@@ -8,7 +8,7 @@ import numpy as np
 
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Sense
-from selfcal_ros.simulation.machine import Spread, Truth
+from selfcal_ros.simulation.machine import WALK_STEPS, Spread, Truth
 from selfcal_ros.simulation.settings import CellSettings
 from selfcal_ros.simulation.truth import hu_plan
 from tools.reality.cases import (
@@ -105,7 +105,12 @@ def _stages() -> list[Case]:
               settling_time_s=0.02),
         _case("drift of 0.36 um a view, one raster, repeats consecutive",
               settings=replace(once, visit_order="raster"), drift_linear_m=0.36e-6),
-        _case("drift as a random walk of 100 nm a view", drift_walk_m=100e-9)]
+        _case("drift as a random walk of 100 nm a view", drift_walk_m=100e-9),
+        _case("plate slips by 100 nm half-way through a view", more={"change": slipping(100e-9)}),
+        _case("stage follows marks that lie 2 mm beside their sites",
+              settings=replace(SERVO, follow_mark=True), t_m=2e-3),
+        _case("stage follows marks that lie 2 mm beside their sites, alike in all views",
+              settings=replace(SERVO, follow_mark=True), t_common_m=2e-3)]
 
 
 def _noises() -> list[Case]:
@@ -131,12 +136,27 @@ def laid(index: int, rotation_deg: float, shift: tuple[int, int]) -> Change:
 
 
 def _laid() -> list[Case]:
-    return [_case(f"view {name}", more={"change": laid(index, turn, shift)})
-            for name, index, turn, shift in (
-                ("not turned", 1, 0.0, (0, 0)), ("turned by -90 deg", 1, -90.0, (0, 0)),
-                ("turned by 180 deg", 1, 180.0, (0, 0)), ("not shifted", 3, 0.0, (0, 0)),
-                ("shifted along y", 3, 0.0, (0, 1)), ("shifted to the other side", 3, 0.0, (-1, 0)),
-                ("shifted by two pitches", 3, 0.0, (2, 0)))]
+    poses = (("not turned", 1, 0.0, (0, 0)), ("turned by -90 deg", 1, -90.0, (0, 0)),
+             ("turned by 180 deg", 1, 180.0, (0, 0)), ("not shifted", 3, 0.0, (0, 0)),
+             ("shifted along y", 3, 0.0, (0, 1)), ("shifted to the other side", 3, 0.0, (-1, 0)),
+             ("shifted by two pitches", 3, 0.0, (2, 0)))
+    bag = {"messages": True, "plan": hu(2)}
+    bare = replace(SERVO, with_ids=False)
+    return [*(_case(f"view {name}", more={"change": laid(*how)}) for name, *how in poses),
+            *(_case(f"bag, {ids}: view {name}", settings=settings,
+                    more={"change": laid(*how), **bag})
+              for ids, settings in (("with ids", SERVO), ("without ids", bare))
+              for name, *how in poses),
+            _case("bag, with ids: nothing", more=bag)]
+
+
+def slipping(size_m: float) -> Change:
+    """Return a change: the plate slips along x and y half-way through the second view."""
+    def change(truth: Truth, rng: np.random.Generator) -> Truth:
+        walk = np.zeros((len(truth.phi_rad), 2, WALK_STEPS + 1))
+        walk[1, :, WALK_STEPS // 2:] = np.array([[size_m], [-size_m / 2]])
+        return replace(truth, walk_m=walk)
+    return change
 
 
 def _exact() -> list[Case]:

@@ -10,6 +10,9 @@ from functools import cache
 
 import numpy as np
 
+from selfcal_ros.collection.collector import Collector
+from selfcal_ros.collection.messages import Command, Detection, EncoderSample
+from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.errors import InputError, NotIdentifiableError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.datum.modes import datum_modes, remove_modes
@@ -19,8 +22,9 @@ from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.statistics import rms
 from selfcal_ros.model.terms import ModelTerm, parse_terms
 from selfcal_ros.reporting.words.causes import cause_text
+from selfcal_ros.simulation.cell import plan_events
 from selfcal_ros.simulation.machine import Truth, random_truth
-from selfcal_ros.simulation.truth import simulate_measurements
+from selfcal_ros.simulation.truth import FIRST_STAMP_NS, simulate_measurements
 from tools.reality.cases import Case, term_cases
 from tools.reality.machines import machine_cases
 from tools.reality.populations import populations
@@ -89,10 +93,10 @@ def once(numbers: tuple[int, int]) -> Course:
 def run_case(case: Case, seed: int) -> Course:
     """Simulate, calibrate, and follow the advice to its end; the same seed is the same machine."""
     case = case.draw(_rng(case, seed, 0), case) if case.draw else case
-    truth, readings = measured(case, seed, 1)
+    truth, readings, said = measured(case, seed, 1)
     options = case.options
     result = _calibrated(readings, options)
-    first = last = compared(result, truth)
+    first = last = compared(result, truth, said)
     steps: list[str] = []
     while len(steps) < STEPS and isinstance(result, CalibrationResult):
         advice = advised(result, options)
@@ -100,10 +104,10 @@ def run_case(case: Case, seed: int) -> Course:
             break
         text, options = advice
         if options.terms == case.options.terms:  # nothing to solve anew with: measure it again
-            truth, readings = measured(case, seed, 2 + len(steps))
+            truth, readings, said = measured(case, seed, 2 + len(steps))
         steps.append(text)
         result = _calibrated(readings, options)
-        last = compared(result, truth)
+        last = compared(result, truth, said)
     return Course(first, tuple(steps), last if steps else None)
 
 
@@ -112,15 +116,36 @@ def _rng(case: Case, seed: int, part: int) -> np.random.Generator:
     return np.random.default_rng([zlib.crc32(case.name.encode()), seed, part])
 
 
-def measured(case: Case, seed: int, part: int) -> tuple[Truth, Measurements]:
-    """Return the machine of a run, and a measurement of it: number `part`, from 1."""
+def measured(case: Case, seed: int, part: int) -> tuple[Truth, Measurements, tuple[str, ...]]:
+    """Return the machine of a run, a measurement of it, number `part`, from 1, and what it says.
+
+    What is said is why most detections of a view were rejected.
+    """
     machine, placing = _rng(case, seed, 0), _rng(case, seed, part)
     truth = random_truth(case.plan.artifact, len(case.plan.views), machine, case.spread,
                          placing=placing)
     truth = case.change(truth, placing)
+    if case.messages:
+        return truth, *_collected(truth, case, placing)
     readings = simulate_measurements(truth, case.plan, placing, settings=case.settings,
                                      visits=True, missing=case.missing)
-    return truth, case.spoil(readings, placing)
+    return truth, case.spoil(readings, placing), ()
+
+
+def _collected(truth: Truth, case: Case, rng: np.random.Generator,
+               ) -> tuple[Measurements, tuple[str, ...]]:
+    """Return the readings, and what is said of them, as `selfcal solve` has them from a bag."""
+    collector = Collector(CollectorSettings(measurement_sense=str(case.settings.sense)))
+    take = {Command: collector.add_command, Detection: collector.add_detection,
+            EncoderSample: collector.add_encoder}
+    for event in plan_events(truth, case.plan, settings=case.settings, rng=rng,
+                             start_ns=FIRST_STAMP_NS):
+        take[type(event)](event)
+    measurements, views = collector.collect()
+    findings = collector.findings(measurements, views).values()
+    return measurements, tuple(
+        str(found).partition("stage_not_at_mark: ")[2].partition("; ")[0] or str(found)
+        for found in findings)
 
 
 def _calibrated(readings: Measurements, options: Options) -> CalibrationResult | str:
@@ -131,10 +156,10 @@ def _calibrated(readings: Measurements, options: Options) -> CalibrationResult |
         return type(error).__name__
 
 
-def compared(result: CalibrationResult | str, truth: Truth) -> Run:
+def compared(result: CalibrationResult | str, truth: Truth, said: tuple[str, ...] = ()) -> Run:
     """Return how far a calibration lies from the truth, in its datum."""
     if isinstance(result, str):
-        return Run("refused", causes=(result,))
+        return Run("refused", causes=(*said, result))
     emap = result.error_map
     error = np.stack([emap.gx, emap.gy]) - truth.g
     error = remove_modes(error, datum_modes(truth.artifact, scale=True))
@@ -144,7 +169,7 @@ def compared(result: CalibrationResult | str, truth: Truth) -> Run:
     within_theta, z_theta = _covered(theta, emap.u_g_theta, result.noise.k_theta)
     holds = not (within < limit(WRONG, error) or within_theta < limit(WRONG_THETA, theta))
     return Run(grade_of(result), float(np.nanmax(np.abs(error))), within, within_theta, z_xy,
-               z_theta, holds, tuple(cause.name for cause in result.verdict.causes))
+               z_theta, holds, (*said, *(cause.name for cause in result.verdict.causes)))
 
 
 def limit(wrong: tuple[float, int], error: np.ndarray) -> float:
