@@ -20,10 +20,14 @@ HEADER = ("| what the machine does | largest error, nm (median) | in U: XY, θ |
           "error / u: XY, θ | good | enlarged | not qualified | refused | wrong and accepted | "
           "first cause |\n|---|---|---|---|---|---|---|---|---|---|")
 
+SHOWN = {"plates turned by": "φσ", "um": "µm", " deg": "°", "urad": "µrad"}
+"""Text of a case's name -> how the table shows it."""
+
 
 def row(name: str, found: Summary) -> str:
     causes = ", ".join(f"{cause} ({count})" for cause, count in found.causes) or "–"
-    name = name.replace("um", "µm").replace(" deg", "°").replace("urad", "µrad")
+    for plain_text, shown in SHOWN.items():
+        name = name.replace(plain_text, shown)
     grades = " | ".join(str(found.grades.get(grade, 0)) for grade in GRADES)
     seeds = f" (seeds {', '.join(map(str, found.wrong_seeds[:5]))})" if found.wrong else ""
     return (f"| {name} | {found.error_m * NM_PER_M:.3g} | {100 * found.within:.1f} ± "

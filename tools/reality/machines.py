@@ -71,10 +71,19 @@ def _scaled() -> list[Case]:
         _case("microscope turned by 5 mrad", 0.005, microscope_rotation_rad=5e-3),
         _case("microscope turned by 20 mrad", 0.03, microscope_rotation_rad=20e-3),
         _case("shear of the microscope 2 mrad", 0.1, microscope_shear=2e-3),
-        _case("camera distortion 0.1 % at 250 um, plate against pins", 0.003,
-              microscope_distortion=1e-3, phi_common_rad=float(np.deg2rad(0.2)), t_common_m=50e-6),
-        _case("scale of the microscope +2 %, plate against pins", 0.003, microscope_scale=0.02,
-              phi_common_rad=float(np.deg2rad(0.1)), t_common_m=50e-6)]
+        _case("camera distortion 0.1 % at 250 um, plate against pins", 0.001,
+              microscope_distortion=1e-3, **_pins(0.2)),
+        _case("camera distortion 0.1 % at 250 um, plate laid by hand", 0.1,
+              microscope_distortion=1e-3),
+        _case("scale of the microscope +2 %, plate against pins", 0.001, microscope_scale=0.02,
+              **_pins(0.1)),
+        _case("microscope turned by 5 mrad, plate against pins", 0.001,
+              microscope_rotation_rad=5e-3, **_pins(0.1))]
+
+
+def _pins(phi_deg: float) -> dict[str, float]:
+    """Return how a plate lies against pins: 50 um and `phi_deg` (sigma) off, alike in all views."""
+    return {"t_m": 1e-6, "t_common_m": 50e-6, "phi_common_rad": float(np.deg2rad(phi_deg))}
 
 
 def _plates() -> list[Case]:
@@ -100,6 +109,8 @@ def _stages() -> list[Case]:
         _case("stage bends by 10 nm in each view", stage_bend_m=10e-9),
         _case("stage bends by 10 nm in each view, five views", more=five, stage_bend_m=10e-9),
         _case("backlash that grows to 35 nm in a view", backlash_growth_m=35e-9),
+        _case("backlash that grows to 35 nm in a view, repeats consecutive", settings=once,
+              backlash_growth_m=35e-9),
         _case("settling of 12 nm", settling_m=12e-9),
         _case("settling of 12 nm, repeats consecutive", settings=once, settling_m=12e-9,
               settling_time_s=0.02),
