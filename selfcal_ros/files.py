@@ -1,16 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files: atomic writing, digests, and JSON and YAML whose errors name file and place."""
+"""Files: digests, and JSON and YAML whose errors name file and place."""
 
 import contextlib
 import hashlib
 import json
 import os
 import re
-import stat
-import tempfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, BinaryIO, ClassVar
+from typing import Any, ClassVar
 
 import yaml
 from yaml.composer import Composer
@@ -18,6 +16,7 @@ from yaml.constructor import SafeConstructor
 from yaml.resolver import Resolver
 
 from selfcal_ros.errors import InputError, first_line
+from selfcal_ros.outputs import atomic_file
 
 MAX_YAML_NODES = 1_000_000
 """Values in a YAML file, each alias counted as often as what it stands for."""
@@ -122,48 +121,6 @@ for _class in (*LOADERS, YamlDumper):
     _class.add_implicit_resolver("tag:yaml.org,2002:float", FLOATS, list("-+.0123456789"))
 
 
-@contextlib.contextmanager
-def atomic_file(path: str | os.PathLike) -> Iterator[BinaryIO]:
-    """Yield a binary file that becomes `path` only if the block ends without an error.
-
-    A file that exists keeps its permissions, a link stays a link, and what is no file (a pipe,
-    /dev/null) is written into as it is.
-
-    Raises
-    ------
-    InputError
-        If the folder does not exist, or the file or folder cannot be written.
-    """
-    target = Path(path)
-    try:
-        if target.exists() and not target.is_file() and not target.is_dir():
-            with target.open("wb") as file:
-                yield file
-        else:
-            with _replacement(Path(os.path.realpath(target))) as file:
-                yield file
-    except OSError as error:
-        raise InputError(str(target), f"cannot be written ({_reason(error)})",
-                         "name a folder that exists and that you may write") from error
-
-
-@contextlib.contextmanager
-def _replacement(target: Path) -> Iterator[BinaryIO]:
-    """Yield a temporary file beside `target` that takes its place in one step, or vanishes."""
-    fd, name = tempfile.mkstemp(prefix=".selfcal.", dir=target.parent)
-    try:
-        with os.fdopen(fd, "wb") as file:
-            yield file
-            file.flush()
-            os.fsync(file.fileno())
-        os.chmod(name, _mode(target))
-        os.replace(name, target)
-    except BaseException:
-        with contextlib.suppress(FileNotFoundError):
-            os.unlink(name)
-        raise
-
-
 def sync_folder(folder: Path) -> None:
     """Wait until the names in a folder are on the disk."""
     fd = os.open(folder, os.O_RDONLY)
@@ -171,15 +128,6 @@ def sync_folder(folder: Path) -> None:
         os.fsync(fd)
     finally:
         os.close(fd)
-
-
-def _mode(target: Path) -> int:
-    """Return the permissions of a file that exists, or those that a new one gets."""
-    if target.is_file():
-        return stat.S_IMODE(target.stat().st_mode)
-    umask = os.umask(0)
-    os.umask(umask)
-    return 0o666 & ~umask
 
 
 def _reason(error: Exception) -> str:

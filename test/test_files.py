@@ -15,7 +15,6 @@ from hypothesis import strategies as st
 from selfcal_ros import files
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import (
-    atomic_file,
     check_outputs,
     read_bytes,
     read_json,
@@ -27,6 +26,7 @@ from selfcal_ros.files import (
     write_text,
     write_yaml,
 )
+from selfcal_ros.outputs import atomic_file
 
 
 def names(folder):

@@ -8,7 +8,7 @@ import pytest
 
 from test.support.sources import PACKAGE, SOURCES, source
 
-BASE = {"errors", "files", "memory", "units"}
+BASE = {"errors", "files", "memory", "outputs", "units"}
 DOMAIN = {"model"} | BASE
 ESTIMATION = {"estimation", "compensation", "laser"}
 MIDDLE = {"messages", "bagio", "reporting", "collection", "simulation", "parallel"}
@@ -16,7 +16,8 @@ MAY_IMPORT = {
     "errors": set(),
     "memory": set(),
     "units": set(),
-    "files": {"errors"},
+    "outputs": {"errors"},
+    "files": {"errors", "outputs"},
     "model": BASE,
     **{name: DOMAIN | ESTIMATION for name in ESTIMATION},
     **{name: DOMAIN | ESTIMATION | MIDDLE for name in MIDDLE},
