@@ -2,6 +2,7 @@
 """Files: digests, and JSON and YAML whose errors name file and place."""
 
 import contextlib
+import csv
 import hashlib
 import json
 import os
@@ -171,7 +172,7 @@ def write_bytes(path: str | os.PathLike, data: bytes) -> None:
 
 def write_text(path: str | os.PathLike, text: str) -> None:
     """Write `text` as UTF-8 to `path` atomically."""
-    write_bytes(path, text.encode())
+    write_bytes(path, text.encode(errors="backslashreplace"))  # names of files may be no UTF-8
 
 
 def write_json(path: str | os.PathLike, value: Any) -> None:
@@ -193,6 +194,8 @@ def read_bytes(path: str | os.PathLike) -> bytes:
         If the file is missing or cannot be read.
     """
     try:
+        if Path(path).is_char_device():
+            raise InputError(str(path), "is a device", "name a file")
         return Path(path).read_bytes()
     except FileNotFoundError as error:
         raise InputError(str(path), "no such file", "check the path") from error
@@ -208,6 +211,14 @@ def read_text(path: str | os.PathLike) -> str:
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: byte {error.start}", "not UTF-8 text",
                          "save the file as UTF-8") from error
+
+
+def csv_cells(line: str, where: str) -> list[str]:
+    """Return the cells of a line of a table; InputError if it cannot be one."""
+    try:
+        return [cell.strip() for cell in next(csv.reader([line]))]
+    except csv.Error as error:
+        raise InputError(where, f"not a line of a table ({error})", "correct the line") from error
 
 
 def read_json(path: str | os.PathLike) -> Any:

@@ -2,14 +2,21 @@
 """Files that are written whole or not at all."""
 
 import contextlib
+import fcntl
 import os
+import re
+import secrets
+import shutil
 import stat
-import tempfile
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 from typing import BinaryIO
 
 from selfcal_ros.errors import InputError, first_line
+
+TEMPORARY = re.compile(r"\.selfcal\.[0-9a-f]{16}")
+"""Names of files and folders that are not whole yet; their writer holds a lock on them."""
 
 
 @contextlib.contextmanager
@@ -40,18 +47,66 @@ def atomic_file(path: str | os.PathLike) -> Iterator[BinaryIO]:
 @contextlib.contextmanager
 def _replacement(target: Path) -> Iterator[BinaryIO]:
     """Yield a temporary file beside `target` that takes its place in one step, or vanishes."""
-    fd, name = tempfile.mkstemp(prefix=".selfcal.", dir=target.parent)
+    temporary, fd = _temporary(target.parent)
     try:
         with os.fdopen(fd, "wb") as file:
             yield file
             file.flush()
-            os.fsync(file.fileno())
-        os.chmod(name, _mode(target))
-        os.replace(name, target)
+            os.fsync(fd)
+            temporary.chmod(_mode(target))
+            temporary.replace(target)
     except BaseException:
-        with contextlib.suppress(FileNotFoundError):
-            os.unlink(name)
+        temporary.unlink(missing_ok=True)
         raise
+
+
+@contextlib.contextmanager
+def temporary_folder(parent: Path) -> Iterator[Path]:
+    """Yield a hidden folder in `parent` that is removed when the block ends."""
+    temporary, fd = _temporary(parent, folder=True)
+    try:
+        yield temporary
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+        os.close(fd)
+
+
+def _temporary(parent: Path, *, folder: bool = False) -> tuple[Path, int]:
+    """Make a temporary file or folder; return it and the descriptor that holds its lock."""
+    sweep(parent)
+    while True:
+        path = parent / f".selfcal.{secrets.token_hex(8)}"
+        if folder:
+            path.mkdir(0o700)
+        fd = os.open(path, os.O_RDONLY if folder else os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o600)
+        with contextlib.suppress(OSError):  # a file system without locks
+            fcntl.flock(fd, fcntl.LOCK_EX)
+        if path.exists():  # it was not swept before it was locked
+            return path, fd
+        os.close(fd)
+
+
+@cache
+def sweep(folder: Path) -> None:
+    """Remove what killed processes left unfinished in a folder; looked for once a process."""
+    with contextlib.suppress(OSError):
+        for path in list(folder.iterdir()):
+            if TEMPORARY.fullmatch(path.name) and (path.is_file() or path.is_dir()):
+                with contextlib.suppress(OSError):
+                    _remove_abandoned(path)
+
+
+def _remove_abandoned(path: Path) -> None:
+    """Remove a temporary file or folder; OSError if its writer lives, which holds the lock."""
+    fd = os.open(path, os.O_RDONLY | os.O_NOFOLLOW)
+    try:
+        fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        if path.is_dir():
+            shutil.rmtree(path)
+        else:
+            path.unlink()
+    finally:
+        os.close(fd)
 
 
 def _mode(target: Path) -> int:

@@ -5,7 +5,11 @@ import hashlib
 import json
 import math
 import os
+import signal
 import stat
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 import yaml
@@ -26,7 +30,9 @@ from selfcal_ros.files import (
     write_text,
     write_yaml,
 )
-from selfcal_ros.outputs import atomic_file
+from selfcal_ros.outputs import atomic_file, sweep, temporary_folder
+
+ROOT = Path(__file__).parents[1]
 
 
 def names(folder):
@@ -91,6 +97,51 @@ def test_a_full_disk_is_one_line_and_keeps_the_old_file(tmp_path, monkeypatch, s
         write()
     assert path.read_bytes() == b"old"
     assert names(tmp_path) == ["a.json"]
+
+
+KILLED = """
+import os, signal, sys
+from pathlib import Path
+from selfcal_ros.outputs import atomic_file, temporary_folder
+folder = Path(sys.argv[1])
+with temporary_folder(folder) as beside, atomic_file(folder / "a.json") as file:
+    (beside / "half").write_text("of a bag")
+    file.write(b"half")
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def test_the_next_write_removes_what_killed_processes_left(tmp_path):
+    kept = [".selfcal.settings", ".selfcal.0123456789abcdef.json", ".selfcal.0123456789abcdeg"]
+    for name in kept:
+        (tmp_path / name).write_text("not ours")
+    (tmp_path / ".selfcal.00000000000000aa").symlink_to(tmp_path / kept[0])
+    killed = subprocess.run([sys.executable, "-c", KILLED, str(tmp_path)], check=False, cwd=ROOT)
+    assert killed.returncode == -signal.SIGKILL
+    assert len(names(tmp_path)) == len(kept) + 3
+    write_bytes(tmp_path / "b", b"whole")
+    assert names(tmp_path) == sorted([*kept, ".selfcal.00000000000000aa", "b"])
+
+
+def test_what_is_still_being_written_is_left_alone(tmp_path):
+    with atomic_file(tmp_path / "a") as file, temporary_folder(tmp_path) as beside:
+        file.write(b"a")
+        (beside / "part").write_text("of a bag")
+        sweep.cache_clear()
+        write_bytes(tmp_path / "b", b"b")
+        assert (beside / "part").exists()
+    assert names(tmp_path) == ["a", "b"]
+    assert (tmp_path / "a").read_bytes() == b"a"
+
+
+def test_endless_devices_are_refused():
+    with pytest.raises(InputError, match="/dev/zero: is a device"):
+        read_text("/dev/zero")
+
+
+def test_a_name_that_is_not_utf8_can_be_written_and_read_as_utf8(tmp_path):
+    write_text(tmp_path / "a", os.fsdecode(b"n\xff.mcap"))
+    assert read_text(tmp_path / "a") == "n\\udcff.mcap"
 
 
 def test_a_write_replaces_all_of_the_old_file(tmp_path):

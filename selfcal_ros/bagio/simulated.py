@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A simulation written as a bag, with its truth beside it."""
 
-import tempfile
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
@@ -14,6 +13,7 @@ from selfcal_ros.messages import from_model
 from selfcal_ros.messages.qos import qos_profile
 from selfcal_ros.messages.topics import COMMAND_TOPIC, DETECTION_TOPIC, ENCODER_TOPIC, INPUT_TOPICS
 from selfcal_ros.model.result import plain
+from selfcal_ros.outputs import temporary_folder
 from selfcal_ros.simulation.cell import Event
 from selfcal_ros.simulation.spec import Simulation
 from selfcal_ros.simulation.truth import Truth
@@ -43,7 +43,7 @@ def write_simulation(simulation: Simulation, path: str | Path, *,
         raise InputError(str(target), "exists already", "remove it or name another folder")
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=target.parent, prefix=f".{target.name}_") as beside:
+        with temporary_folder(target.parent) as beside:
             counts = _write(simulation, Path(beside, target.name), progress)
             Path(beside, target.name).rename(target)
     except OSError as error:

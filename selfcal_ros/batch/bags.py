@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Which bags a batch is made of, and whether one has changed."""
 
+import os
 from collections.abc import Iterable
 from pathlib import Path
+from typing import NoReturn
 
 from selfcal_ros.errors import InputError, NoDataError
 
@@ -23,31 +25,35 @@ def find_bags(paths: Iterable[str]) -> list[Path]:
     NoDataError
         If there is no bag.
     """
-    found: dict[Path, Path] = {}
+    found: dict[str, Path] = {}
     for name in paths:
         path = Path(name)
         if not path.exists():
             raise InputError(name, "no such file or folder", "check the path")
         for bag in sorted(_below(path)) if path.is_dir() else [path]:
-            found.setdefault(bag.resolve(), bag)
+            found.setdefault(os.path.realpath(bag), bag)
     if not found:
         raise NoDataError(", ".join(paths), "no bag in it", "give MCAP files, rosbag2 folders or "
                           "folders that hold them")
     return list(found.values())
 
 
-def _below(folder: Path) -> list[Path]:
-    if (folder / METADATA).is_file():
-        return [folder]
+def _below(top: Path) -> list[Path]:
     bags = []
-    for entry in _entries(folder):
-        if entry.name.startswith("."):
-            continue
-        if entry.is_dir() and not entry.is_symlink():
-            bags += _below(entry)
-        elif entry.suffix == STORAGE:
-            bags.append(entry)
+    for folder, folders, files in top.walk(on_error=_refuse):
+        if METADATA in files:
+            bags.append(folder)
+            folders.clear()
+        else:
+            folders[:] = [name for name in folders if not name.startswith(".")]
+            bags += [folder / name for name in files
+                     if not name.startswith(".") and Path(name).suffix == STORAGE]
     return bags
+
+
+def _refuse(error: OSError) -> NoReturn:
+    raise InputError(str(error.filename), f"cannot be read ({error.strerror})",
+                     "name a folder that you may read") from error
 
 
 def stat_of(bag: Path) -> list[list]:
@@ -66,5 +72,4 @@ def _entries(folder: Path) -> list[Path]:
     try:
         return list(folder.iterdir())
     except OSError as error:
-        raise InputError(str(folder), f"cannot be read ({error.strerror})",
-                         "name a folder that you may read") from error
+        _refuse(error)

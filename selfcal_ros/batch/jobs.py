@@ -6,6 +6,7 @@ that a batch that was interrupted, moved or made larger does only what is new.
 """
 
 import hashlib
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -50,7 +51,7 @@ def run_job(job: Job) -> Record:
     InputError
         If the folder of the batch cannot be written.
     """
-    record: Record = {"schema": SCHEMA, "bag": str(job.bag.resolve()),
+    record: Record = {"schema": SCHEMA, "bag": os.path.realpath(job.bag),
                       "settings": job.settings.digest()}
     try:
         source = bag_input(job.bag)

@@ -3,6 +3,7 @@
 
 import contextlib
 import fcntl
+import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -17,6 +18,7 @@ from selfcal_ros.batch.records import (
     read_record,
 )
 from selfcal_ros.errors import InputError
+from selfcal_ros.outputs import sweep
 
 LOCK = ".lock"
 
@@ -44,8 +46,7 @@ def opened(folder: Path) -> Iterator[None]:
             raise InputError(str(folder), "another batch works in this folder",
                              "wait for its end or name another folder") from error
         for part in (folder / RECORDS, folder / RESULTS):
-            for stray in part.glob(".selfcal.*"):  # of a batch that was killed as it wrote
-                stray.unlink()
+            sweep(part)
         yield
 
 
@@ -68,7 +69,7 @@ def done_and_to_do(kept: Sequence[Record], bags: Sequence[Path],
     done, sizes = {}, {}
     for index, bag in enumerate(bags):
         files = stat_of(bag)
-        record = known.get(str(bag.resolve()))
+        record = known.get(os.path.realpath(bag))
         if record is not None and record["files"] == files:
             done[index] = record
         else:

@@ -2,6 +2,7 @@
 """``selfcal batch``: hundreds of bags on all cores, one table, what changes over time."""
 
 import argparse
+import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -53,7 +54,7 @@ def run(args: argparse.Namespace) -> int:
     settings = Settings(*parameters(args), args.robust, args.namespace)
     bags, folder = find_bags(args.bags), Path(args.output)
     for bag in bags:
-        if folder.resolve().is_relative_to(bag.resolve()):
+        if Path(os.path.realpath(folder)).is_relative_to(os.path.realpath(bag)):
             raise InputError(str(folder), f"it is in the bag {bag}", "name another folder")
     with opened(folder):
         kept = [] if args.redo else kept_records(folder, settings)
@@ -87,7 +88,7 @@ def _worked(args: argparse.Namespace, bags: Sequence[Path], settings: "Settings"
 
     found: dict[int, Record] = {}
     workers = check_workers(args.workers)
-    jobs = jobs_of(Path(args.output).resolve(), bags, settings, places, redo=args.redo)
+    jobs = jobs_of(Path(args.output).absolute(), bags, settings, places, redo=args.redo)
     with late_progress("solving bags") as progress:
         for outcome in outcomes(work_on, jobs, workers=workers, dask=args.dask or "",
                                 meanwhile=_load_table):
@@ -108,7 +109,7 @@ def _load_table() -> None:
 def _failed(bag: Path, error: BaseException | None) -> dict[str, Any]:
     """Return the record of a bag that met a fault of ours; it is not kept."""
     said = first_line(error) if error is not None else "no outcome"
-    return {"bag": str(bag.resolve()), "exit_code": int(ExitCode.INTERNAL), "qualified": None,
+    return {"bag": os.path.realpath(bag), "exit_code": int(ExitCode.INTERNAL), "qualified": None,
             "message": f"{type(error).__name__}: {said}"}
 
 

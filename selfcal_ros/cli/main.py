@@ -16,7 +16,7 @@ from types import ModuleType
 
 from selfcal_ros import __version__, cli
 from selfcal_ros.cli.terminal.parser import Parser
-from selfcal_ros.errors import ExitCode, SelfcalError
+from selfcal_ros.errors import ExitCode, InputError, SelfcalError
 
 COMPLETE = "_ARGCOMPLETE"
 """Set in the environment by a shell that asks for completions."""
@@ -82,3 +82,10 @@ def main(argv: list[str] | None = None) -> int:
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return int(ExitCode.DONE)
+    except OSError as error:  # a name too long, a disk that fails
+        if error.errno is None:
+            raise
+        fault = InputError(error.filename or "system", str(error.strerror),
+                           "check path, disk and permissions")
+        print(f"{said}: {fault}", file=sys.stderr)
+        return int(fault.exit_code)

@@ -41,6 +41,7 @@ def run(args: argparse.Namespace) -> int:
     from selfcal_ros.errors import InputError
     from selfcal_ros.files import check_outputs, read_json, write_json
     from selfcal_ros.model.result import result_from_dict, result_to_dict, with_input
+    from selfcal_ros.outputs import temporary_folder
 
     need_ros(", or use `selfcal solve`")
     if not args.fast and not args.rate > 0:
@@ -50,9 +51,9 @@ def run(args: argparse.Namespace) -> int:
                          f"give a number from 0 to {LARGEST_SEED}")
     check_outputs([args.bag, args.params], [file_of(args)])
     source = bag_input(args.bag)
-    with (ended_by_signals(), tempfile.TemporaryDirectory() as folder,
+    with (ended_by_signals(), temporary_folder(Path(tempfile.gettempdir())) as folder,
           domain() as environment):
-        saved = Path(folder, "result.json")
+        saved = folder / "result.json"
         code, lost = _play(args, saved, environment)
         clock = _clock_lines(args)
         if code or not saved.exists():

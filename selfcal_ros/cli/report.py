@@ -2,6 +2,7 @@
 """``selfcal report``: a result in, one HTML or PDF file (and a picture, and the summary) out."""
 
 import argparse
+import os
 import sys
 from pathlib import Path
 
@@ -30,7 +31,7 @@ def run(args: argparse.Namespace) -> int:
     from selfcal_ros.reporting.summary.text import can_print_symbols, summary_text
     from selfcal_ros.reporting.write import check_name, write_report
 
-    output = Path(args.output) if args.output else Path(args.result).with_suffix(".html")
+    output = Path(args.output or f"{os.path.splitext(args.result)[0]}.html")
     check_outputs([args.result, args.truth], [output, args.plot])
     check_name(output)
     result = result_from_dict(read_json(args.result), args.result)

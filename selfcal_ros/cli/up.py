@@ -60,7 +60,7 @@ def commands(args: argparse.Namespace) -> dict[str, list[str]]:
     if args.namespace.strip("/"):
         common += ["-r", f"__ns:=/{args.namespace.strip('/')}"]
     if args.params:
-        common += ["--params-file", str(Path(args.params).resolve())]
+        common += ["--params-file", str(Path(args.params).absolute())]
 
     def with_parameters(**values: str) -> list[str]:
         return common + [word for name, value in values.items()
@@ -71,14 +71,14 @@ def commands(args: argparse.Namespace) -> dict[str, list[str]]:
     of = "_simulated" if args.simulate else ""
     # first, so that a parameter file may name another
     saved = Path(args.results, f"{Path(args.plan).stem}{of}_{{run_id}}.json")
-    nodes = {"measurement_collector": with_parameters(journal=str(Path(journal).resolve())),
-             "solver": ["--ros-args", "-p", f"save_path:={saved.resolve()}", *common[1:], "-p",
-                        f"result_folder:={Path(args.results).resolve()}"],
-             "pose_sequencer": with_parameters(plan=str(Path(args.plan).resolve()))}
+    nodes = {"measurement_collector": with_parameters(journal=str(Path(journal).absolute())),
+             "solver": ["--ros-args", "-p", f"save_path:={saved.absolute()}", *common[1:], "-p",
+                        f"result_folder:={Path(args.results).absolute()}"],
+             "pose_sequencer": with_parameters(plan=str(Path(args.plan).absolute()))}
     if args.compensate:
         nodes["compensator"] = with_parameters()
     if args.bag:
-        nodes["bag_recorder"] = with_parameters(bag=str(Path(args.bag).resolve()))
+        nodes["bag_recorder"] = with_parameters(bag=str(Path(args.bag).absolute()))
     if args.simulate:
         nodes["stage_simulator"] = with_parameters()
     return nodes

@@ -25,6 +25,8 @@ from selfcal_ros.model.verdict_json import (
 )
 
 SCHEMA = "selfcal.result/1"
+LARGEST = 1e3
+"""Errors and uncertainties beyond it, in m or rad, are damage: sums of their squares overflow."""
 REFERENCES = ("artifact", "stage_x", "stage_y")
 """Kinds of a reference length."""
 
@@ -374,6 +376,8 @@ def _array(value: Any, shape: tuple[int, ...], name: str) -> np.ndarray:
     array = np.array(value, dtype=float)
     if array.shape != shape:
         raise ValueError(f"{name} has the shape {array.shape}, not {shape}")
+    if (np.abs(array) > LARGEST).any():
+        raise ValueError(f"{name} has values beyond {LARGEST:g}")
     return array
 
 

@@ -5,6 +5,7 @@ import csv
 import html.parser
 import io
 import json
+import os
 import shutil
 import signal
 import subprocess
@@ -206,6 +207,33 @@ def test_bags_are_found_at_any_depth_once(shelf, tmp_path):
     with pytest.raises(NoDataError) as nothing:
         find_bags([str(_empty(tmp_path))])
     assert str(nothing.value).startswith(f"{tmp_path / 'empty'}: no bag in it; give MCAP files")
+
+
+@pytest.fixture
+def top(tmp_path):
+    """A folder that may become deeper than Python can remove."""
+    (tmp_path / "top").mkdir()
+    yield tmp_path / "top"
+    subprocess.run(["rm", "-r", str(tmp_path / "top")], check=True)
+
+
+def test_bags_are_found_below_1500_folders_and_links_to_themselves_are_passed(
+        shelf, top, tmp_path, monkeypatch, capsys):
+    with monkeypatch.context() as here:
+        here.chdir(top)
+        for _ in range(1500):
+            os.mkdir("d")
+            here.chdir("d")
+        shutil.copy(shelf / "a.mcap", os.fsdecode(b"n\xff.mcap"))
+    (top / "self.mcap").symlink_to("self.mcap")
+    (top / "here").symlink_to(".")
+    out = tmp_path / "out"
+    assert batch(top, "-o", out, "--workers", 1) == 2
+    [line] = capsys.readouterr().err.splitlines()
+    assert "self.mcap: cannot be read (Too many levels of symbolic links)" in line
+    assert {record["exit_code"] for record in content(out)["records"]} == {0, 2}
+    assert "n\\udcff.mcap" in (out / "table.csv").read_text()
+    assert "udcff.mcap" in (out / "index.html").read_text()
 
 
 def _empty(folder: Path) -> Path:

@@ -56,6 +56,19 @@ def test_a_fault_on_the_command_line_is_one_line(capsys, words, message):
     assert capsys.readouterr() == ("", message + "\n")
 
 
+@pytest.mark.parametrize("words", [
+    "solve LONG", "report LONG", "table R.json -o LONG.csv", "plan check LONG", "batch LONG -o out",
+    "step-diagonal LONG --method new", "cal check LONG", "simulate LONG -o out", "solve x -o LONG",
+    "report ."])
+def test_a_name_that_no_file_can_have_is_one_line(tmp_path, monkeypatch, capsys, words):
+    monkeypatch.chdir(tmp_path)
+    write_json("R.json", result_to_dict(known_result(5, 8)[0]))
+    assert main(words.replace("LONG", "x" * 300).split()) == 2
+    out, err = capsys.readouterr()
+    assert not out
+    assert re.fullmatch(r"selfcal \S+: \S+: .*(File name too long|Is a directory).*\n", err)
+
+
 def test_names_like_one_another():
     assert did_you_mean("Viws", ["views", "plan_id"]) == "did you mean 'views'?"
     assert did_you_mean("nothing", ["views", "plan_id"]) == ""

@@ -112,6 +112,7 @@ def damaged(path, value):
     (("error_map",), KeyError, "the key 'error_map' is missing"),
     (("error_map", "gx"), [[1.0]], "gx has the shape (1, 1), not (5, 5)"),
     (("error_map", "g_theta"), [], "g_theta has the shape (0,), not (8,)"),
+    (("error_map", "gy"), [[0.0] * 4 + [-1e308]] * 5, "gy has values beyond 1000"),
     (("error_map", "nonorthogonality"), "0", "'0' is not a number"),
     (("error_map", "datum_theta"), "free", "'free' is not a valid ThetaDatum"),
     (("plan_id",), 3, "3 is not of type str"),

@@ -2,6 +2,7 @@
 """``selfcal cal export`` and ``selfcal cal verify``: between error maps and tables."""
 
 import argparse
+import os
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -67,7 +68,7 @@ def _export(args: argparse.Namespace) -> int:
     if frame.theta_axis is not None:
         target = Path(args.output)
         beside = args.theta_output or str(target.with_name(f"{target.stem}_theta{target.suffix}"))
-        if Path(beside).resolve() == target.resolve():
+        if os.path.realpath(beside) == os.path.realpath(target):
             raise InputError(beside, "a 1D and a 2D table cannot share a file", "name another file")
         table = export.table_theta(result.error_map, frame)
         texts[beside] = cal_text([table], comments=comments,

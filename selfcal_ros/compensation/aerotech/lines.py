@@ -6,8 +6,6 @@ correction is opposite to it (Aerotech, 1D Axis Calibration). From an error map,
 G = indicated - true already is the opposite, the correction is +G.
 """
 
-import csv
-import io
 import re
 from dataclasses import dataclass
 from typing import Literal
@@ -20,6 +18,7 @@ from selfcal_ros.compensation.aerotech.keywords import number as plain_number
 from selfcal_ros.compensation.aerotech.model import Table1D
 from selfcal_ros.compensation.machine import UNITS_M, MachineFrame
 from selfcal_ros.errors import InputError
+from selfcal_ros.files import csv_cells
 from selfcal_ros.model.error_map import ErrorMap
 from selfcal_ros.units import M_PER_NM, M_PER_UM
 
@@ -95,15 +94,16 @@ def measured_line(text: str, where: str, unit_m: float) -> AxisCorrection:
     InputError
         For another header, a value that is no number, or positions that are not equidistant.
     """
-    rows = [(number, row) for number, row in enumerate(csv.reader(io.StringIO(text)), 1)
-            if any(cell.strip() for cell in row)]
-    if not rows or [cell.strip().lower() for cell in rows[0][1]] != ["position", "error"]:
+    lines = enumerate(text.splitlines(), 1)
+    rows = [(number, csv_cells(line, f"{where}:{number}")) for number, line in lines
+            if line.strip(", ")]
+    if not rows or [cell.lower() for cell in rows[0][1]] != ["position", "error"]:
         raise InputError(f"{where}:1", "the header is not position,error",
                          "name the columns: position in primary units, error in um")
     values = []
     for number, row in rows[1:]:
         try:
-            position, error = (plain_number(cell.strip()) for cell in row)
+            position, error = (plain_number(cell) for cell in row)
         except (ArgumentFault, ValueError):
             raise InputError(f"{where}:{number}", "not two numbers",
                              "give position,error") from None

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from selfcal_ros.errors import InputError, NoDataError
-from selfcal_ros.files import read_text, write_text
+from selfcal_ros.files import csv_cells, read_text, write_text
 from selfcal_ros.laser.data import AXES, DIAGONALS, MAX_BLOCKS, StepDiagonal
 from selfcal_ros.laser.profiles import name_of
 from selfcal_ros.laser.readings.plausible import check_linear, check_reading
@@ -103,8 +103,7 @@ def _rows(path: str | os.PathLike) -> list[tuple[int, list[str]]]:
     if ";" in kept[0][1] and "," not in kept[0][1]:
         raise InputError(f"{path}:{kept[0][0]}", "columns are separated by semicolons",
                          "separate them by commas, with a point in decimals")
-    rows = [(number, [cell.strip() for cell in next(csv.reader([line]))])
-            for number, line in kept]
+    rows = [(number, csv_cells(line, f"{path}:{number}")) for number, line in kept]
     if len(rows) == 1:
         raise NoDataError(str(path), "the table has a header only", "give one row a block")
     return rows

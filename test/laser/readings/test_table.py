@@ -40,6 +40,15 @@ def test_a_table_with_repeats_comments_and_blank_lines(tmp_path):
     assert len(warnings) == 1 and warnings[0].endswith("column 'note' is not used")
 
 
+def test_lines_may_end_as_on_any_system(tmp_path):
+    lines = [HEAD, f"1,{GOOD}", f"2,{GOOD}", ""]
+    expected, _ = read(tmp_path, "\n".join(lines))
+    for end in ("\r", "\r\n"):
+        (tmp_path / "d.csv").write_bytes(end.join(lines).encode())
+        found, _ = read_table(tmp_path / "d.csv", NEW)
+        np.testing.assert_array_equal(found.readings_m, expected.readings_m)
+
+
 def test_blocks_may_be_numbered_from_zero(tmp_path):
     data, _ = read(tmp_path, f"{HEAD}\n0,{GOOD}\n1,{GOOD}\n")
     assert data.n_blocks == 2
@@ -132,6 +141,8 @@ HOSTILE = {
                   "the column 'ex_x', 'ey_y' is missing; the new formulation needs the linear"),
     "one linear": ("block,rx_pp,ry_pp,rx_np,ry_np,ex_x\n1,7,7,7,7,0\n", InputError,
                    "the column 'ey_y' is missing"),
+    "long cell": (f"{HEAD}\n{'1' * 140_000},7\n", InputError, "d.csv:2: not a line of a table "
+                  "(field larger than field limit (131072)); correct the line"),
     "semicolons": ("block;rx_pp\n1;7,07\n", InputError, "separated by semicolons"),
 }
 
