@@ -5,18 +5,52 @@ Python would end in the middle of an import with a traceback. Blocked, Ctrl-C is
 system until `cli.main.main` or `nodes.running.run` let it through to where it is handled.
 """
 
-import importlib
+import importlib.util
 import signal
+import sys
 from functools import partial
 
+BUILD = "colcon build --base-paths src/selfcal_ros src/selfcal_ros/msg_defs"
+"""What builds the messages too: colcon looks for no package below a package."""
 
-def _run(module: str) -> int | None:
+
+NEEDED = {
+    "rclpy": "source a ROS 2 installation, or use the environment of `make setup`",
+    "selfcal_msgs": f"run `make setup`, or in the workspace `{BUILD}` and "
+                    "source install/setup.bash",
+    "threadpoolctl": "`sudo apt install python3-threadpoolctl`, or with pip"}
+"""Modules of a node that neither pip nor rosdep brings without more, and what brings them."""
+
+
+def missing_ros() -> str:
+    """Return which module of a node is not in this environment, and the remedy; "" if none."""
+    for name, remedy in NEEDED.items():
+        if importlib.util.find_spec(name) is None:
+            return f"there is no {name} in this environment; {remedy}"
+    return ""
+
+
+def begin_node() -> None:
+    """Block interrupts while a node is imported; end the process if it cannot be."""
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    return importlib.import_module(module).main()
+    missing = missing_ros()
+    if missing:
+        print(f"selfcal: environment: {missing}", file=sys.stderr)
+        sys.exit(2)
 
 
-selfcal = partial(_run, "selfcal_ros.cli.main")
+def selfcal() -> int:
+    """Run the command ``selfcal``."""
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    return importlib.import_module("selfcal_ros.cli.main").main()
+
+
+def _run(node: str) -> int | None:
+    begin_node()
+    return importlib.import_module(f"selfcal_ros.nodes.{node}").main()
+
+
 measurement_collector, pose_sequencer, solver, compensator, bag_player, bag_recorder, \
-    stage_simulator = (partial(_run, f"selfcal_ros.nodes.{name}") for name in (
+    stage_simulator = (partial(_run, node) for node in (
         "measurement_collector", "pose_sequencer", "solver", "compensator", "bag_player",
         "bag_recorder", "stage_simulator"))

@@ -24,8 +24,9 @@ MAY_IMPORT = {
     "parallel": {"errors"},
     "batch": DOMAIN | ESTIMATION | MIDDLE,
     "sessions": DOMAIN | ESTIMATION | MIDDLE,
-    "nodes": DOMAIN | ESTIMATION | MIDDLE | {"sessions"},
-    "cli": DOMAIN | ESTIMATION | MIDDLE | {"batch"},
+    "start": set(),
+    "nodes": DOMAIN | ESTIMATION | MIDDLE | {"sessions", "start"},
+    "cli": DOMAIN | ESTIMATION | MIDDLE | {"batch", "start"},
 }
 ONLY_IN = {
     "rclpy": "nodes", "mcap": "bagio", "rosbags": "bagio", "matplotlib": "reporting",

@@ -82,6 +82,10 @@ def main(argv: list[str] | None = None) -> int:
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return int(ExitCode.DONE)
+    except ModuleNotFoundError as error:
+        print(f"{said}: there is no module {error.name} in this environment; install it, see "
+              "README", file=sys.stderr)
+        return int(ExitCode.BAD_INPUT)
     except OSError as error:  # a name too long, a disk that fails
         if error.errno is None:
             raise

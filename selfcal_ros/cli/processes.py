@@ -4,7 +4,6 @@
 import contextlib
 import ctypes
 import fcntl
-import importlib.util
 import os
 import signal
 import subprocess
@@ -15,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from selfcal_ros.errors import InputError
+from selfcal_ros.start import missing_ros
 
 PR_SET_PDEATHSIG = 1
 """Of prctl(2): the signal that a process gets when its parent has died, also by SIGKILL."""
@@ -22,11 +22,9 @@ PR_SET_PDEATHSIG = 1
 
 def need_ros(alternative: str) -> None:
     """Raise InputError if there is no ROS in this environment."""
-    for package in ("rclpy", "selfcal_msgs"):
-        if importlib.util.find_spec(package) is None:
-            raise InputError("environment", f"there is no {package} in this environment",
-                             "source a ROS 2 installation with this package built, or use the "
-                             f"environment of `make setup`{alternative}")
+    missing = missing_ros()
+    if missing:
+        raise InputError("environment", missing + alternative)
 
 
 @contextlib.contextmanager

@@ -41,6 +41,13 @@ class Group:
         self.running.append(process)
         return process
 
+    def customize(self, folder: Path, code: str) -> None:
+        """Run `code` as every new interpreter starts."""
+        (folder / "site").mkdir()
+        (folder / "site" / "sitecustomize.py").write_text(code)
+        self.environment["PYTHONPATH"] = os.pathsep.join(
+            [str(folder / "site"), self.environment.get("PYTHONPATH", "")])
+
     def close(self) -> None:
         for process in self.running:
             with contextlib.suppress(ProcessLookupError):
@@ -178,15 +185,6 @@ def test_a_signal_while_a_node_is_imported_ends_it_cleanly(group):
     assert (code, out, err) == (0, "", "")
 
 
-@pytest.mark.parametrize("module", ["argparse", "selfcal_ros.cli.solve", "selfcal_ros.errors"])
-def test_a_signal_while_the_command_is_imported_is_one_line(group, module):
-    code, out, err = ended(group.start("-c", INTERRUPT_WHILE_IMPORTING.format(
-        modules=(module,), argv=["selfcal", "solve", "none"], command="selfcal")))
-    assert (out, err) == ("", "selfcal: interrupted\n")
-    # the interpreter may repeat the signal for its parent: a shell has 130 for both
-    assert code in (128 + signal.SIGINT, -signal.SIGINT)
-
-
 SITE = """
 import signal, sys
 
@@ -197,6 +195,51 @@ class Finder:
 
 sys.meta_path.insert(0, Finder())
 """
+
+
+def test_a_signal_while_a_node_is_imported_by_its_module_ends_it_cleanly(group, tmp_path):
+    group.customize(tmp_path, SITE)
+    code, out, err = ended(group.start("-m", "selfcal_ros.nodes.compensator"))
+    assert (code, out, err) == (0, "", "")
+
+
+HIDING = """
+import sys
+from importlib.machinery import PathFinder
+
+class Finder:
+    def find_spec(self, name, *more):
+        return None if name == {module!r} else PathFinder.find_spec(name, *more)
+
+sys.meta_path[sys.meta_path.index(PathFinder)] = Finder()
+"""
+
+
+@pytest.mark.parametrize(("module", "remedy"), [
+    ("selfcal_msgs", "run `make setup`, or in the workspace `colcon build --base-paths "
+     "src/selfcal_ros src/selfcal_ros/msg_defs` and source install/setup.bash"),
+    ("threadpoolctl", "`sudo apt install python3-threadpoolctl`, or with pip")])
+@pytest.mark.parametrize(("words", "who"), [
+    (["-m", "selfcal_ros.nodes.solver"], "selfcal"),
+    (["-c", "from selfcal_ros import start; start.pose_sequencer()"], "selfcal"),
+    (["-m", "selfcal_ros", "monitor"], "selfcal monitor")])
+def test_whatever_needs_a_module_that_is_not_there_says_what_brings_it(
+        group, tmp_path, module, remedy, words, who):
+    group.customize(tmp_path, HIDING.format(module=module))
+    code, out, err = ended(group.start(*words))
+    assert (code, out) == (2, "")
+    assert err == f"{who}: environment: there is no {module} in this environment; {remedy}\n"
+
+
+@pytest.mark.parametrize("module", ["argparse", "selfcal_ros.cli.solve", "selfcal_ros.errors"])
+def test_a_signal_while_the_command_is_imported_is_one_line(group, module):
+    code, out, err = ended(group.start("-c", INTERRUPT_WHILE_IMPORTING.format(
+        modules=(module,), argv=["selfcal", "solve", "none"], command="selfcal")))
+    assert (out, err) == ("", "selfcal: interrupted\n")
+    # the interpreter may repeat the signal for its parent: a shell has 130 for both
+    assert code in (128 + signal.SIGINT, -signal.SIGINT)
+
+
 INTERRUPTED_REPLAY = """
 import os, signal, sys
 from selfcal_ros import start
@@ -216,10 +259,7 @@ sys.exit(start.selfcal())
 
 
 def test_a_replay_interrupted_while_its_nodes_are_imported_is_one_line(group, tmp_path):
-    (tmp_path / "site").mkdir()
-    (tmp_path / "site" / "sitecustomize.py").write_text(SITE)
-    group.environment["PYTHONPATH"] = os.pathsep.join(
-        [str(tmp_path / "site"), group.environment.get("PYTHONPATH", "")])
+    group.customize(tmp_path, SITE)
     argv = ["selfcal", "replay", str(small_bag(tmp_path)), "--rate", "0.001"]
     code, out, err = ended(group.start("-c", INTERRUPTED_REPLAY.format(argv=argv)))
     assert (code, out, err) == (128 + signal.SIGINT, "", "selfcal replay: interrupted\n")
