@@ -29,7 +29,7 @@ from selfcal_ros.bagio.journal_file import (
 )
 from selfcal_ros.bagio.metadata import Closing, Metadata, Topic, writing
 from selfcal_ros.bagio.schemas import definition_of, store_of_schema
-from selfcal_ros.collection.messages import Phase
+from selfcal_ros.collection.messages import MAX_AHEAD_NS, Phase
 from selfcal_ros.errors import InputError, SelfcalError
 from selfcal_ros.messages.to_model import stamp_ns
 from selfcal_ros.messages.topics import COMMAND_TOPIC
@@ -44,7 +44,7 @@ def resume(folder: str | os.PathLike) -> "Journal | None":
     """Return the journal of the plan that is running, ready to go on; None if there is none.
 
     That is the journal in `folder` that was written last, unless its last command, by stamp, is
-    DONE or ABORT. Read it first (`BagReader(journal.path).columns()`), then go on writing.
+    DONE or ABORT or lies in the future. Read it first (`BagReader(path).columns()`), then write.
 
     Parameters
     ----------
@@ -351,8 +351,9 @@ def _taken_up(bag: Path) -> tuple[Metadata, list[tuple[int, Phase]]]:
 
 
 def _is_over(commands: list[tuple[int, Phase]]) -> bool:
-    """Return whether the last of the commands, by stamp, ends a run."""
-    return bool(commands) and commands[-1][1] in OVER
+    """Return whether the last command, by stamp, ends a run, or would hide every later one."""
+    latest_ns = time.time_ns() + MAX_AHEAD_NS
+    return bool(commands) and (commands[-1][1] in OVER or commands[-1][0] > latest_ns)
 
 
 def _locked(path: Path) -> int:

@@ -10,6 +10,7 @@ from selfcal_ros.bagio.reader import BagReader
 from selfcal_ros.collection.clock.steps import step_lines
 from selfcal_ros.collection.collector import Collector
 from selfcal_ros.collection.expected import ViewProgress
+from selfcal_ros.collection.reasons import Reason
 from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.errors import InputError, NoDataError, did_you_mean
 from selfcal_ros.files import add_file
@@ -134,7 +135,7 @@ def input_handlers(collector: Collector,
         try:
             collector.add_command(to_model.command(message))
         except InputError as error:
-            collector.refuse_command()
+            collector.refuse("command", Reason.COMMAND_BAD)
             complaints.append(f"a view command was not used: {error}")
 
     return {ENCODER_TOPIC: lambda m: collector.add_encoder(to_model.encoder_sample(m)),

@@ -22,7 +22,7 @@ from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.collection.stage.encoder import NEVER, JointTrack, TrackLimits
 from selfcal_ros.collection.stage.exposures import Exposures, Tracks
 from selfcal_ros.collection.stage.samples import Limits
-from selfcal_ros.collection.timeline import Timeline, build_timeline
+from selfcal_ros.collection.timeline import Timeline, build_timeline, without_strays
 from selfcal_ros.collection.view_cache import ViewCache
 from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.messages.topics import COMMAND_TOPIC
@@ -79,6 +79,7 @@ class Collector:
         self._commands: dict[Command, None] = {}
         self._rejected_input: Counter = Counter()
         self._timeline: Timeline | None = None
+        self._newest: Command | None = None
         self._foreign: dict[str, None] = {}  # joint names that are not ours
         self._seen: Seen | None = None
         self.received = {"encoder": 0, "detection": 0, "command": 0}
@@ -183,12 +184,12 @@ class Collector:
         self.received["command"] += 1
         if command not in self._commands:
             self._commands[command] = None
-            self._timeline = None
+            self._timeline = self._newest = None
 
-    def refuse_command(self) -> None:
-        """Count a command that could not be used."""
-        self.received["command"] += 1
-        self._rejected_input[Reason.COMMAND_BAD] += 1
+    def refuse(self, kind: str, reason: Reason, count: int = 1) -> None:
+        """Count messages that are not used: encoder, detection or command."""
+        self.received[kind] += count
+        self._rejected_input[reason] += count
 
     def knows(self, command: Command) -> bool:
         """Return whether a command has come before."""
@@ -196,8 +197,12 @@ class Collector:
 
     @property
     def newest_command(self) -> Command | None:
-        """The command with the latest stamp, of equal ones that which came last."""
-        return max(reversed(self._commands), key=lambda c: c.stamp_ns, default=None)
+        """The command with the latest stamp, of equal ones that which came last; no stray."""
+        if self._newest is None and self._commands:
+            kept = set(without_strays(self._commands))
+            self._newest = max((c for c in reversed(self._commands) if c in kept),
+                               key=lambda c: c.stamp_ns)
+        return self._newest
 
     @property
     def encoder_until_ns(self) -> int:

@@ -17,6 +17,7 @@ from selfcal_ros.messages.topics import MEASUREMENT_TOPIC
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import GridVisits, ViewReadings
 from selfcal_ros.model.view import View
+from selfcal_ros.units import NS_PER_S
 
 MAX_VIEWS = 10_000
 """Views of a plan."""
@@ -34,6 +35,9 @@ SMALLEST_U = SMALLEST_SIGMA / math.sqrt(MAX_REPEATS)
 SIGMA_SPAN = 1e4
 """How far below the median of its view a declared sigma may lie: a reading of more weight would
 decide by itself, and the readings no longer tell the map."""
+MAX_AHEAD_NS = 60 * NS_PER_S
+"""How far a stamp may lie ahead of the clock of the node that gets it: beyond that it would hide
+what is stamped later by a clock that is right."""
 MAX_EXPOSURES = 5_000_000
 """Exposures of one view that the simulated cell holds: 240 MB."""
 
@@ -123,6 +127,11 @@ class Command:
         return self.artifact
 
 
+def begun_ns(run_id: str) -> int | None:
+    """Return when a run began, by its name; None where the name is no stamp."""
+    return int(run_id) if run_id.isascii() and run_id.isdecimal() and len(run_id) <= 20 else None
+
+
 def check_command(command: Command) -> None:
     """Raise InputError for a command that no cell can follow.
 
@@ -131,6 +140,9 @@ def check_command(command: Command) -> None:
     where = f"view command {command.view_index}"
     if not 0 <= command.view_index <= MAX_VIEWS or not 0 <= command.views_planned <= MAX_VIEWS:
         raise InputError(where, f"a plan has at most {MAX_VIEWS} views", "correct the view_index")
+    if (begun_ns(command.run_id) or 0) > command.stamp_ns:
+        raise InputError(where, f"its run {command.run_id} begins after its own stamp",
+                         "let run_id be the stamp of the run's first command, ns")
     if command.view is None or command.artifact is None:
         if command.phase in (Phase.PLACE, Phase.MEASURE):
             raise InputError(where, "it describes no view", "fill its pose and its plate")

@@ -30,7 +30,10 @@ class Reason(StrEnum):
     ENCODER_UNKNOWN_JOINT = "encoder_sample_unknown_joint"
     ENCODER_NOT_FINITE = "encoder_sample_not_finite"
     ENCODER_MALFORMED = "encoder_sample_malformed"
+    ENCODER_FUTURE = "encoder_sample_from_the_future"
     COMMAND_BAD = "command_unusable"
+    COMMAND_FUTURE = "command_from_the_future"
+    FUTURE = "from_the_future"
 
 
 ADVICE = {
@@ -40,6 +43,8 @@ ADVICE = {
     Reason.BAD_SIGMA: "their sigma is no standard uncertainty in m or rad (1e-12 to 1000, 0 = not "
                       "known), or 10,000 times smaller than that of the others; correct the "
                       "publisher of the detections",
+    Reason.FUTURE: "they were stamped more than a minute ahead of the collector's clock; set the "
+                   "clock that stamps them",
 }
 """What to do about a reason of which a single detection is worth a line."""
 
@@ -55,6 +60,7 @@ REMEDY = {
     Reason.NOT_FINITE: "NaN, infinite or negative where a length or an angle is wanted; correct "
                        "the publisher of the detections",
     Reason.BAD_SIGMA: ADVICE[Reason.BAD_SIGMA],
+    Reason.FUTURE: ADVICE[Reason.FUTURE],
     Reason.UNKNOWN_KIND: "kind is neither GRID nor ANGULAR; correct the publisher of the "
                          "detections",
     Reason.UNKNOWN_MARK: "their ids are not on the plate; check grid_size, angular_count and the "

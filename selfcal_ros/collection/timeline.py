@@ -5,6 +5,9 @@ A plan may be measured again and again: each run counts for itself, and readings
 are never mixed. Commands name their run (`run_id`). Where they do not, a run begins with a command
 of view 0 that follows DONE or ABORT, or that places the plate anew once a later view has been
 measured; it is then named by the stamp of its first command.
+
+A run that names itself and whose first command is there goes on until it ends or another one
+begins: a command in between that belongs to no run which has begun is a stray and changes nothing.
 """
 
 from collections.abc import Iterable
@@ -56,6 +59,8 @@ class Timeline:
         and while its first command may not have come.
     model_terms : tuple of str
         Terms that the plan wants estimated, as the last MEASURE tells them.
+    strays : tuple of Command
+        Commands that were left out, see `without_strays`.
     """
 
     plan_id: str = ""
@@ -67,6 +72,7 @@ class Timeline:
     last_stamp_ns: int = 0
     run_id: str = ""
     model_terms: tuple[str, ...] = ()
+    strays: tuple[Command, ...] = ()
 
     def assign(self, stamps_ns: np.ndarray) -> np.ndarray:
         """Return the index of the interval of each stamp, int array; -1 before the first."""
@@ -91,6 +97,34 @@ class Timeline:
         return [i for i in self.intervals if i.view_index == view_index]
 
 
+def begins_run(command: Command) -> bool:
+    """Return whether a command is the first of a run that names itself."""
+    return (command.phase in (Phase.PLACE, Phase.MEASURE)
+            and command.run_id == str(command.stamp_ns))
+
+
+def without_strays(commands: Iterable[Command]) -> list[Command]:
+    """Return the commands by their stamps, each once, without those that nobody meant.
+
+    Within a run that names itself and whose first command is there, until its DONE or ABORT, these
+    are the commands of runs that have not begun: forged ones, or what is left of a recording.
+    """
+    kept: list[Command] = []
+    begun: set[tuple[str, str]] = set()
+    current: tuple[str, str] | None = None
+    for command in sorted(set(commands), key=_sort_key):
+        run = (command.plan_id, command.run_id)
+        if begins_run(command):
+            begun.add(run)
+            current = run
+        elif current is not None and run not in begun:
+            continue
+        if run == current and command.phase in (Phase.DONE, Phase.ABORT):
+            current = None
+        kept.append(command)
+    return kept
+
+
 def build_timeline(commands: Iterable[Command]) -> Timeline:
     """Return the timeline of a set of commands.
 
@@ -103,11 +137,14 @@ def build_timeline(commands: Iterable[Command]) -> Timeline:
     InputError
         If two commands of the plan describe different plates.
     """
-    ordered = sorted(set(commands), key=_sort_key)
+    commands = tuple(dict.fromkeys(commands))
+    ordered = without_strays(commands)
+    strays = tuple(sorted(set(commands) - set(ordered), key=_sort_key))
     measures = [number for number, c in enumerate(ordered) if c.phase == Phase.MEASURE]
     if not measures:
         last = ordered[-1].stamp_ns if ordered else 0
-        return Timeline(intervals=tuple(_unused(ordered)), views={}, last_stamp_ns=last)
+        return Timeline(intervals=tuple(_unused(ordered)), views={}, last_stamp_ns=last,
+                        strays=strays)
     newest = ordered[measures[-1]]
     plan_id, artifact = newest.plan_id, newest.artifact
     runs = _runs(ordered, plan_id)
@@ -126,7 +163,7 @@ def build_timeline(commands: Iterable[Command]) -> Timeline:
     return Timeline(plan_id, artifact, dict(sorted(views.items())),
                     tuple(_intervals(ordered, runs, run_id)), planned,
                     ordered[-1].phase in (Phase.DONE, Phase.ABORT), ordered[-1].stamp_ns,
-                    run_id if _begin_is_known(mine[0], runs) else "", newest.model_terms)
+                    run_id if _begin_is_known(mine[0], runs) else "", newest.model_terms, strays)
 
 
 def _begin_is_known(first: Command, runs: list[str | None]) -> bool:

@@ -14,7 +14,7 @@ from selfcal_ros.collection.collector import Collector
 from selfcal_ros.collection.digest import placing_digest, readings_digest, session_digest
 from selfcal_ros.collection.expected import ViewProgress
 from selfcal_ros.collection.messages import Command, Phase
-from selfcal_ros.collection.reasons import advice
+from selfcal_ros.collection.reasons import Reason, advice
 from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.messages import from_model, to_model
@@ -24,6 +24,7 @@ from selfcal_ros.model.readings import Measurements
 from selfcal_ros.sessions.clocks import ClockWatch
 from selfcal_ros.sessions.health import Rate, merged
 from selfcal_ros.sessions.ports import Diagnosis, Level, Ports
+from selfcal_ros.sessions.runs import RunWatch
 from selfcal_ros.units import MS_PER_S, S_PER_NS, UM_PER_M
 
 HEARD_S = 1.0
@@ -57,6 +58,7 @@ class CollectingSession:
         self._stepped: list[str] = []
         self._noted: list[str] = []  # what the readings of a view that were sent last say of clocks
         self._clock = ClockWatch(settings.clock_limit)
+        self._runs, self._run_lines = RunWatch(), list[str]()
         self._encoder_rate = Rate(ports.now_s)
         self._encoder_s = float("-inf")
         self._noise: tuple[float, float] = (math.nan, math.nan)
@@ -65,6 +67,11 @@ class CollectingSession:
         self._problem = ""
         self._state = "waiting for a MEASURE command"
         self._rejected: Counter = Counter()
+
+    @property
+    def now_ns(self) -> int:
+        """The time of this node, ns."""
+        return self._ports.now_ns()
 
     def take_encoder(self, block: EncoderBlock, age_ns: int = 0) -> None:
         """Take encoder samples, the newest of which was received `age_ns` ago."""
@@ -123,9 +130,10 @@ class CollectingSession:
             self._clock.command(command.stamp_ns, self._ports.now_ns(), is_older=is_older,
                                 run_id=command.run_id)
             if not known:
+                self._runs.command(command, self.collector.newest_command, self.now_ns)
                 self._note_missed(command, is_older=is_older)
         except InputError:
-            self.collector.refuse_command()
+            self.collector.refuse("command", Reason.COMMAND_BAD)
             raise
         finally:
             self._next_status = 0.0
@@ -195,6 +203,7 @@ class CollectingSession:
         if (timeline.plan_id, timeline.run_id) != self._run:
             self._run, self._published = (timeline.plan_id, timeline.run_id), {}
             self._advised, self._warned, self._noted = set(), set(), []
+        self._tell_runs()
         self._tell_steps()
         self._warn(measurements, progress)
         for index, view in progress.items():
@@ -245,6 +254,16 @@ class CollectingSession:
                 self._ports.say(Level.WARN, line)
         self._stepped = lines
 
+    def _tell_runs(self) -> None:
+        """Say once what keeps a run from being shown; the health says it as long as it holds."""
+        lines = self._runs.lines(self.collector.newest_command, self.collector.timeline.strays,
+                                 self.now_ns)
+        for line in lines:
+            # amounts of time change
+            if line.partition(":")[2] not in [told.partition(":")[2] for told in self._run_lines]:
+                self._ports.say(Level.WARN, line)
+        self._run_lines = lines
+
     def _describe(self, measurements: Measurements, progress: dict[int, ViewProgress]) -> None:
         """Keep for the diagnostics how far the view is and what was rejected so far."""
         self._rejected = Counter(measurements.rejected)
@@ -283,9 +302,10 @@ class CollectingSession:
             **{f"rejected {reason}": n for reason, n in sorted(self._rejected.items())}})
         lines = self._findings or advice(self._rejected)
         found = Diagnosis(Level.WARN if lines else Level.OK, "; ".join(lines))
+        runs = Diagnosis(Level.WARN if self._run_lines else Level.OK, "; ".join(self._run_lines))
         stepped = Diagnosis(Level.WARN if self._stepped else Level.OK, "; ".join(self._stepped))
         return merged(main, [
-            found, self._clock.diagnosis(), stepped,
+            runs, found, self._clock.diagnosis(), stepped,
             self._encoder(), self._repeatability()])
 
     def _cost(self) -> dict[str, str]:

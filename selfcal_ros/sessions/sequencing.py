@@ -11,15 +11,18 @@ import numpy as np
 
 from selfcal_ros.collection.digest import placing_digest
 from selfcal_ros.collection.expected import expected_marks
-from selfcal_ros.collection.messages import Command, Phase
+from selfcal_ros.collection.messages import Command, Phase, check_command
 from selfcal_ros.collection.sequencer import ENDED, Sequencer, State
 from selfcal_ros.collection.settings.nodes import SequencerSettings
+from selfcal_ros.collection.timeline import begins_run
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import read_yaml
 from selfcal_ros.messages import from_model, to_model
+from selfcal_ros.messages.topics import COMMAND_TOPIC
 from selfcal_ros.model.view import Plan, View, plan_from_dict
 from selfcal_ros.sessions.health import Presence
 from selfcal_ros.sessions.ports import Diagnosis, Level, Ports
+from selfcal_ros.sessions.runs import is_future
 from selfcal_ros.sessions.stalls import StallWatch, missing_marks
 from selfcal_ros.units import NS_PER_S, S_PER_NS
 
@@ -65,6 +68,7 @@ class SequencingSession:
         self._stall = StallWatch(settings.stall_time, ports.now_s)
         self._status: Any = None  # newest of the current view
         self._stalled = self._set_back = self._silent = ""
+        self._strayed = False  # a command of somebody else was not followed in this run
         if self.waiting:
             self.machine.need_plan()
 
@@ -173,7 +177,19 @@ class SequencingSession:
 
     def take_command(self, message: Any) -> None:
         """Follow a command that somebody else published."""
-        if _key(to_model.command(message)) in self._own:
+        command = to_model.command(message)
+        if _key(command) in self._own:
+            return
+        check_command(command)
+        if is_future(command.stamp_ns, self._ports.now_ns()):
+            raise InputError(COMMAND_TOPIC, "stamped in the future of this node's clock: not "
+                             "followed", "set the clock that stamps it")
+        if self.current is not None and not (
+                begins_run(command) and command.stamp_ns > self._commanded_ns):
+            if not self._strayed:
+                self._ports.say(Level.WARN, "another publisher sends view commands that begin no "
+                                "run later than this one: not followed; find who sends them")
+            self._strayed = True
             return
         said = "another publisher sends view commands: following them; abort ends that"
         if self.machine.state in ENDED:
@@ -278,7 +294,11 @@ class SequencingSession:
 
     def _send(self, commands: list[Command], stamp_ns: int = 0) -> None:
         for command in commands:
-            stamp = stamp_ns or max(self._ports.now_ns(), self._commanded_ns + 1)
+            now_ns = self._ports.now_ns()
+            if not self.run_id and is_future(self._commanded_ns, now_ns):
+                self._commanded_ns = 0  # the clock was set back: a new run has its time
+            stamp = stamp_ns or max(now_ns, self._commanded_ns + 1)
+            self._strayed &= bool(self.run_id)
             self.run_id = self.run_id or str(stamp)
             command = replace(command, stamp_ns=stamp, run_id=self.run_id)
             self._own.add(_key(command))

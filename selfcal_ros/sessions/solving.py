@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The session of solver: which readings are solved together, what is published and saved."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from functools import cache
 from typing import Any
@@ -8,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from selfcal_ros.collection.digest import readings_digest, session_digest
-from selfcal_ros.collection.messages import MAX_VIEWS, Phase, check_plate, check_view
+from selfcal_ros.collection.messages import MAX_VIEWS, Phase, begun_ns, check_plate, check_view
 from selfcal_ros.collection.settings.estimator import solver_options
 from selfcal_ros.collection.settings.nodes import SolverSettings
 from selfcal_ros.errors import InputError, NoDataError, NotIdentifiableError, SelfcalError
@@ -32,7 +33,7 @@ from selfcal_ros.reporting.summary.text import state_sentence
 from selfcal_ros.reporting.words.result import worded
 from selfcal_ros.sessions.map_files import read_result, result_file, run_file
 from selfcal_ros.sessions.ports import Diagnosis, Level, Ports
-from selfcal_ros.sessions.runs import Run, supersedes
+from selfcal_ros.sessions.runs import Run, begins_in_future, supersedes
 from selfcal_ros.sessions.verdicts import is_qualified
 from selfcal_ros.simulation.truth import hu_plan, random_truth, simulate_measurements
 
@@ -178,9 +179,13 @@ class SolvingSession:
         """
         check_view(to_model.view_readings(message), to_model.artifact_of(message),
                    int(message.view_index))
-        run = Run(message.plan_id, message.run_id)
+        run, now_ns = Run(message.plan_id, message.run_id), self._ports.now_ns()
+        if begins_in_future(run, now_ns):
+            raise InputError(MEASUREMENT_TOPIC, f"run {run.run_id} begins in the future of this "
+                             "node's clock", "set the clocks, and start the plan again")
         if run != self._run:
-            if self._messages and not supersedes(run, self._run):
+            if self._messages and not (supersedes(run, self._run)
+                                       or begins_in_future(self._run, now_ns)):
                 self._left_aside += 1
                 return
             self._run, self._messages = run, {}
@@ -329,7 +334,22 @@ class SolvingSession:
         target = result_file(path, self._settings.result_folder)
         write_json(target, result_to_dict(created_now(self.shown.result)))
         self._saved = str(target)
-        return f"saved to {target}; readings {self.digest() or 'of a loaded map'}", str(target)
+        run = self.shown.run
+        named = f"plan '{run.plan_id}'" + (f", run {run.run_id}" if run.run_id else "")
+        line = f"saved to {target}: {named}; readings {self.digest() or 'of a loaded map'}"
+        newer = self._newer(self._planned)
+        return line + (f"; WARNING: {newer}" if newer else ""), str(target)
+
+    def _newer(self, runs: Iterable[Run]) -> str:
+        """Return what is to be said of a run that is newer than the one shown; "" without one."""
+        now_ns, shown = self._ports.now_ns(), begun_ns(self.shown.run.run_id)
+        later = [(begun, run) for run in runs if (begun := begun_ns(run.run_id))
+                 and shown and begun > shown and not begins_in_future(run, now_ns)]
+        if not later:
+            return ""
+        run = max(later, key=lambda item: item[0])[1]
+        return (f"the newer run {run.run_id} of plan '{run.plan_id}' is not in this map: none of "
+                "its readings has come; the health of measurement_collector says why")
 
     def load(self, path: str) -> str:
         """Publish the map of a RESULT.json and say so."""
@@ -344,10 +364,12 @@ class SolvingSession:
         """Return what the node says of itself."""
         shown = self.shown
         known = shown.result is not None or shown.problem is not None
+        newer = self._newer(self._ended)  # one that goes on may yet send its readings
         fine = (shown.problem is None or self._unfinished()) and (
             shown.problem is not None or shown.result is None or is_qualified(shown.result))
-        return Diagnosis(Level.OK if fine else Level.WARN,
-                         self._state() if known else "waiting for views",
+        state = self._state() if known else "waiting for views"
+        return Diagnosis(Level.OK if fine and not newer else Level.WARN,
+                         f"{newer}; {state}" if newer else state,
                          {"views": len(self._messages), "readings": self.digest(),
                           "plan_id": self._run.plan_id, "run_id": self._run.run_id,
                           "left_aside": self._left_aside, "saved": self._saved})

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from selfcal_ros.collection.expected import ViewProgress
 from selfcal_ros.collection.messages import Command, Detection, EncoderSample, Phase
+from selfcal_ros.collection.reasons import Reason
 from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Sense, ViewReadings
@@ -238,7 +239,7 @@ def test_a_command_off_the_lattice_is_refused_and_changes_nothing(rotation):
         collector.add_command(bad)
     assert collector.received["command"] == 3
     assert table(collector.collect()[0].views[0]) == table(collect(cell.events)[0].views[0])
-    collector.refuse_command()
+    collector.refuse("command", Reason.COMMAND_BAD)
     assert collector.collect()[0].all_rejected() == {"command_unusable": 1}
 
 

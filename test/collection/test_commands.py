@@ -5,7 +5,8 @@ from dataclasses import replace
 
 import pytest
 
-from selfcal_ros.collection.messages import Command, Phase
+from selfcal_ros.collection.messages import Command, Phase, check_command
+from selfcal_ros.collection.reasons import Reason
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.artifact import Artifact
 from test.support.collecting import collect, gathered, scene, table
@@ -33,7 +34,7 @@ def test_a_command_with_impossible_numbers_is_refused(of_view, of_command, messa
     with pytest.raises(InputError) as caught:
         collector.add_command(replace(bad, **of_command))
     assert str(caught.value).startswith(message)
-    collector.refuse_command()
+    collector.refuse("command", Reason.COMMAND_BAD)
     found, _ = collector.collect()
     assert found.all_rejected() == {"command_unusable": 1}
     assert table(found.views[0]) == table(collect(cell.events)[0].views[0])
@@ -72,3 +73,15 @@ def test_minus_zero_is_zero(field):
     assert found.all_rejected() == {"duplicate": 1}
     assert found.views[0].u.tobytes() == want.views[0].u.tobytes()
     assert table(found.views[0]) == table(want.views[0])
+
+
+@pytest.mark.parametrize(("run_id", "good"), [
+    ("", True), ("x", True), ("50", True), ("49", True), ("51", False), ("9" * 20, False),
+    ("9" * 21, True)])
+def test_a_run_does_not_begin_after_its_own_command(run_id, good):
+    ends = Command(50, Phase.DONE, "p", run_id=run_id)
+    if good:
+        check_command(ends)
+    else:
+        with pytest.raises(InputError, match="begins after its own stamp; let run_id be the stamp"):
+            check_command(ends)

@@ -202,3 +202,34 @@ def test_a_later_run_is_named_though_the_one_before_is_known_in_part_only():
     again = [replace(c, stamp_ns=c.stamp_ns + 100) for c in WHOLE]
     assert build_timeline([*WHOLE[2:], *again]).run_id == "110"
     assert build_timeline([*WHOLE[2:], *again[1:]]).run_id == "120"
+
+
+RUN_10 = of_run(WHOLE, "10")
+
+
+def stray(stamp, phase, run_id="", index=0, **fields):
+    return command(stamp, phase, index, run_id=run_id, **fields)
+
+
+@pytest.mark.parametrize("odd", [
+    stray(25, MEASURE, index=2), stray(25, PLACE), stray(25, ABORT), stray(25, DONE),
+    stray(25, MEASURE, "7"), stray(25, MEASURE, "24"), stray(25, MEASURE, "x"),
+    stray(25, MEASURE, plan_id="other"), stray(25, MEASURE, "10", plan_id="other")])
+def test_a_command_of_no_run_that_has_begun_changes_nothing_within_one_that_has(odd):
+    clean, timeline = build_timeline(RUN_10), build_timeline([odd, *RUN_10])
+    assert timeline == replace(clean, strays=(odd,))
+    assert clean.strays == ()
+    open_run = build_timeline([*RUN_10[:2], odd])  # it came last
+    assert open_run == replace(build_timeline(RUN_10[:2]), strays=(odd,))
+
+
+@pytest.mark.parametrize(("events", "run_id"), [
+    ([*RUN_10[:2], stray(25, MEASURE, "25", index=2)], "25"),  # another one begins
+    ([*RUN_10, stray(60, PLACE), stray(70, MEASURE)], "60"),  # behind the end
+    ([*of_run(WHOLE[1:-1], "10"), stray(45, MEASURE, "7")], "7"),  # no begin is there
+    ([*of_run(WHOLE[:2], "5"), stray(25, MEASURE, "7")], "7"),
+    ([*RUN_10[:2], *of_run([command(25, PLACE), command(26, MEASURE)], "25"),
+      stray(28, MEASURE, "10", index=1)], "10")])  # two that have begun take turns
+def test_a_command_is_no_stray_where_it_may_be_meant(events, run_id):
+    timeline = build_timeline(events)
+    assert (timeline.run_id, timeline.strays) == (run_id, ())

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """pose_sequencer: services, status, foreign commands, time-outs and the action."""
 
+from itertools import product
 from types import SimpleNamespace
 
 import pytest
@@ -134,15 +135,17 @@ def test_a_late_joiner_hears_every_command(desk):
     assert [message.phase for message in late] == [PLACE, MEASURE]
 
 
-def test_recorded_commands_win_over_its_own(desk):
+def test_the_run_of_another_sequencer_wins_over_its_own(desk):
     desk.ask("start")
     desk.expect((PLACE, 0))
-    foreign = [Command(1_000 + index, phase, "recorded", index, PLAN.views[index], PLAN.artifact)
-               for index in (0, 1) for phase in (PLACE, MEASURE)]
+    begun = desk.graph.hand.get_clock().now().nanoseconds
+    foreign = [Command(begun + 10 * number, phase, "other", index, PLAN.views[index],
+                       PLAN.artifact, run_id=str(begun)) for number, (index, phase) in
+               enumerate(product((0, 1), (PLACE, MEASURE)))]
     publisher = desk.graph.publisher(names.COMMAND, readers=2)
     for command in foreign:
         publisher.publish(fill(names.COMMAND.type(), from_model.command(command, "stage")))
-    desk.graph.until(lambda: len(desk.heard) >= 5, "the recorded commands")
+    desk.graph.until(lambda: len(desk.heard) >= 5, "the commands of the other")
     for service in ("start", "confirm_view", "skip_view"):
         answer = desk.ask(service)
         assert not answer.success
@@ -216,9 +219,10 @@ def test_following_is_a_warning_only_where_a_plan_is_given_up(desk, monkeypatch)
     monkeypatch.setattr(desk.node, "get_logger", lambda: SimpleNamespace(
         info=lambda text: said.append(("info", text)),
         warning=lambda text: said.append(("warning", text))))
-    for stamp, level in ((1, "info"), (2, "warning")):
+    for level in ("info", "warning"):
+        stamp = desk.node.get_clock().now().nanoseconds
         message = fill(names.COMMAND.type(), from_model.command(Command(
-            stamp, PLACE, "recorded", 0, PLAN.views[0], PLAN.artifact), "stage"))
+            stamp, PLACE, "other", 0, PLAN.views[0], PLAN.artifact, run_id=str(stamp)), "stage"))
         desk.node.session.take_command(message)
         desk.node.session.take_command(message)
         assert [item for item in said if item[1].startswith("another publisher")] == [

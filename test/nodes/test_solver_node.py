@@ -25,7 +25,7 @@ from selfcal_ros.reporting.maps.markers import map_geometry
 from selfcal_ros.reporting.words.result import worded
 from selfcal_ros.sessions.solving import short
 from test.support.maps import random_map, result_of
-from test.support.sessions import collected, events_of, small_plan
+from test.support.sessions import START_NS, collected, events_of, small_plan
 
 PLAN = small_plan()
 
@@ -292,7 +292,8 @@ def test_a_loaded_map_is_not_said_to_come_from_the_readings(solve, graph, tmp_pa
     assert graph.call(SaveMap, "solver/save_map", path=path).success
     assert graph.call(LoadMap, "solver/load_map", path=path).success
     answer = graph.call(SaveMap, "solver/save_map", path=path)
-    assert answer.message == f"saved to {path}; readings of a loaded map"
+    assert answer.message == (f"saved to {path}: plan '{PLAN.plan_id}', run {START_NS}; readings "
+                              "of a loaded map")
 
 
 def command_of(plan_id: str, views_planned: int):

@@ -290,7 +290,8 @@ def test_a_stall_ends_with_the_next_detection_and_a_slow_cell_gets_more_time(mea
 
 
 def test_a_foreign_command_ends_waiting_and_its_own_plan(desk, measuring):
-    foreign = Command(5, PLACE, "recorded", 0, PLAN.views[0], PLAN.artifact)
+    stamp = measuring.session._commanded_ns + 1
+    foreign = Command(stamp, PLACE, "other", 0, PLAN.views[0], PLAN.artifact, run_id=str(stamp))
     measuring.session.take_command(message("ViewCommand", from_model.command(foreign, "stage")))
     assert measuring.session.machine.state is State.FOLLOWING
     with pytest.raises(InputError, match="cannot start while following recorded commands"):
@@ -319,3 +320,43 @@ def test_a_companion_that_falls_silent_within_a_run_is_named_until_it_is_back(
     measuring.hands.pass_time(60)
     measuring.session.tick()
     assert len(measuring.hands.lines(Level.WARN)) == said  # no run, nobody is waited for
+
+
+@pytest.mark.parametrize(("later_ns", "run_id"), [
+    (-1, None), (0, None), (-10**18, ""), (1, ""), (1, "17"), (10**9, "no stamp")])
+@pytest.mark.parametrize("phase", [PLACE, MEASURE, Phase.DONE, Phase.ABORT])
+def test_a_forged_or_old_command_does_not_end_the_run_of_its_own_plan(
+        measuring, later_ns, run_id, phase):
+    """`run_id` None: the stamp itself, as of a run that begins."""
+    stamp = measuring.session._commanded_ns + later_ns
+    placed = phase in (PLACE, MEASURE)
+    foreign = Command(stamp, phase, "other", 0, PLAN.views[0] if placed else None,
+                      PLAN.artifact if placed else None,
+                      run_id=str(stamp) if run_id is None else run_id)
+    published = len(measuring.hands.published)
+    for _ in range(2):
+        measuring.session.take_command(message("ViewCommand", from_model.command(foreign, "f")))
+    assert measuring.session.machine.state is State.MEASURING
+    assert len(measuring.hands.published) == published
+    assert measuring.hands.lines(Level.WARN) == [
+        "another publisher sends view commands that begin no run later than this one: not "
+        "followed; find who sends them"]
+
+
+def test_a_command_of_the_future_is_refused_by_an_idle_sequencer_too(desk):
+    stamp = START_NS + 61 * 10**9
+    foreign = Command(stamp, PLACE, "other", 0, PLAN.views[0], PLAN.artifact, run_id=str(stamp))
+    with pytest.raises(InputError, match="stamped in the future of this node's clock"):
+        desk.session.take_command(message("ViewCommand", from_model.command(foreign, "f")))
+    assert desk.session.machine.state is State.IDLE
+
+
+def test_a_run_that_begins_after_the_clock_was_set_back_has_the_time_of_the_clock(desk):
+    desk.hands.seconds += 86400
+    desk.session.begin()
+    ahead = desk.session.run_id
+    desk.session.give_up()
+    desk.hands.seconds -= 86400
+    desk.session.begin()
+    assert desk.session.run_id == str(START_NS)
+    assert int(ahead) == START_NS + 86400 * 10**9

@@ -19,7 +19,7 @@ from selfcal_ros.sessions.map_files import plan_file_name, read_result, result_f
 from selfcal_ros.sessions.ports import Level
 from selfcal_ros.sessions.runs import Run, supersedes
 from selfcal_ros.sessions.solving import SolvingSession, solve
-from test.support.ports import Hands, message, settings_of
+from test.support.ports import START_NS, Hands, message, settings_of
 from test.support.sessions import collected, events_of, small_plan
 
 PLAN = small_plan()
@@ -272,7 +272,7 @@ def test_maps_are_saved_in_the_folder_of_results_alone(tmp_path):
     desk.take(views_of())
     line, path = desk.session.save("map.json")
     assert path == str(tmp_path / "map.json")
-    assert line.startswith(f"saved to {path}; readings ")
+    assert line.startswith(f"saved to {path}: plan '{PLAN.plan_id}'; readings ")
     assert json.loads((tmp_path / "map.json").read_text())["plan_id"] == PLAN.plan_id
     for outside in ("../map.json", "/tmp/map.json", f"{tmp_path}/../x.json"):
         with pytest.raises(InputError, match=r"lies outside of .*; name a file in it, or set the "):
@@ -395,3 +395,47 @@ def test_memory_that_is_freed_is_kept_for_the_next_solution():
                           check=True)
     before, after = map(int, done.stdout.split())
     assert before > 5000 > 100 > after
+
+
+NOW = START_NS
+DAY_NS = 86400 * 10**9
+
+
+def test_a_saved_map_names_its_run_and_a_newer_one_that_is_not_in_it(tmp_path):
+    desk = Desk(result_folder=str(tmp_path))
+    desk.session.take_command(command(4, run_id=str(NOW)))
+    desk.take(views_of(run_id=str(NOW)))
+    line, _ = desk.session.save("map.json")
+    assert f": plan '{PLAN.plan_id}', run {NOW}; readings " in line
+    assert "WARNING" not in line
+    desk.session.take_command(command(4, run_id=str(NOW - 5)))  # an older one, heard late
+    desk.session.take_command(command(4, run_id=str(NOW + DAY_NS)))  # of a clock that is ahead
+    assert "WARNING" not in desk.session.save("map.json")[0]
+    desk.session.take_command(command(4, run_id=str(NOW + 7)))
+    line, _ = desk.session.save("map.json")
+    assert line.endswith(
+        f"; WARNING: the newer run {NOW + 7} of plan '{PLAN.plan_id}' is not in this map: none of "
+        "its readings has come; the health of measurement_collector says why")
+    assert desk.session.diagnosis().level == Level.OK  # it may be measured just now
+    desk.session.take_command(command(4, run_id=str(NOW + 7), phase=Phase.DONE))
+    told = desk.session.diagnosis()
+    assert told.level == Level.WARN and told.message.startswith(f"the newer run {NOW + 7} of plan")
+    desk.take(views_of(run_id=str(NOW + 7)))
+    assert desk.session.diagnosis().level == Level.OK
+    assert "WARNING" not in desk.session.save("map.json")[0]
+
+
+def test_readings_of_a_run_of_the_future_are_refused(desk):
+    desk.take(views_of(run_id=str(NOW)))
+    with pytest.raises(InputError, match="begins in the future of this node's clock; set the"):
+        desk.take(views_of(run_id=str(NOW + DAY_NS)))
+    assert desk.session.shown.run.run_id == str(NOW)
+
+
+def test_a_run_from_before_the_clock_was_set_back_gives_way(desk):
+    desk.hands.seconds += 86400
+    desk.take(views_of(run_id=str(NOW + DAY_NS)))
+    desk.hands.seconds -= 86400
+    desk.take(views_of(run_id=str(NOW)))
+    assert desk.hands.of("summary")[-1]["run_id"] == str(NOW)
+    assert desk.session.diagnosis().values["left_aside"] == 0

@@ -11,15 +11,26 @@ from collections.abc import Callable
 from concurrent.futures import Executor, Future
 from typing import Any
 
+import numpy as np
+
 from selfcal_ros.bagio.channels import ChannelDecoder
 from selfcal_ros.bagio.schemas import typestore
-from selfcal_ros.collection.messages import Phase
+from selfcal_ros.collection.messages import MAX_AHEAD_NS, Phase
+from selfcal_ros.collection.reasons import Reason
+from selfcal_ros.errors import InputError
 from selfcal_ros.messages.cdr_columns import Payloads
+from selfcal_ros.messages.input_columns import first_stamps_ns
 from selfcal_ros.messages.topics import COMMAND_TOPIC, DETECTION_TOPIC, ENCODER_TOPIC, INPUT_TOPICS
 from selfcal_ros.sessions.collecting import CollectingSession
 from selfcal_ros.sessions.ports import Diagnosis, Level
 from selfcal_ros.sessions.receiving.journal_keeper import JournalKeeper, TakenUp, bad_input, take_up
 from selfcal_ros.sessions.receiving.resting import Resting
+from selfcal_ros.units import S_PER_NS
+
+FROM_THE_FUTURE = {ENCODER_TOPIC: ("encoder", Reason.ENCODER_FUTURE),
+                   DETECTION_TOPIC: ("detection", Reason.FUTURE),
+                   COMMAND_TOPIC: ("command", Reason.COMMAND_FUTURE)}
+"""How messages that are stamped in the future are counted."""
 
 
 class Reception:
@@ -108,6 +119,7 @@ class Reception:
         While a journal is being taken up, what comes meanwhile is written and held back.
         """
         adopted, waiting, self._waiting, self._n_detections = False, self._waiting, [], 0
+        waiting = self._believable(waiting)
         self._advance()
         self._write(waiting)
         try:
@@ -124,6 +136,32 @@ class Reception:
         waiting, self._held = [*self._held, *waiting], []
         self._feed(waiting)
         return adopted or bool(waiting)
+
+    def _believable(self, waiting: list[tuple[str, bytes, int, bool]],
+                    ) -> list[tuple[str, bytes, int, bool]]:
+        """Return what is not stamped in the future of this node; the rest is counted and told.
+
+        It is not in the journal either: it would hide what is stamped later by a clock that is
+        right, and a restart would not end that.
+        """
+        if not waiting:
+            return []
+        now_ns = self.session.now_ns
+        stamps, there = first_stamps_ns(Payloads.joined([item[1] for item in waiting]))
+        ahead = np.zeros(len(waiting), dtype=np.int64)
+        ahead[there] = stamps - now_ns
+        refused = (ahead > MAX_AHEAD_NS) & (now_ns > 0)
+        if not refused.any():
+            return waiting
+        topics = np.array([item[0] for item in waiting])
+        for topic in np.unique(topics[refused]).tolist():
+            mine = refused & (topics == topic)
+            kind, reason = FROM_THE_FUTURE[topic]
+            self.session.collector.refuse(kind, reason, int(mine.sum()))
+            self._refuse(topic, InputError(
+                topic, f"stamped {ahead[mine].max() * S_PER_NS:.0f} s ahead of this node's clock: "
+                "not used", "set the clock that stamps it; what is stamped right counts"))
+        return [item for item, left_out in zip(waiting, refused, strict=True) if not left_out]
 
     def _write(self, waiting: list[tuple[str, bytes, int, bool]]) -> None:
         """Hand what has come to the journal; of an encoder at rest, little."""

@@ -3,9 +3,11 @@
 
 import errno
 import os
+import re
 import time
 from collections import Counter
 from concurrent.futures import Future
+from dataclasses import replace
 
 import pytest
 
@@ -14,7 +16,7 @@ from selfcal_ros.bagio.journal import resume
 from selfcal_ros.bagio.offline import collect_bag
 from selfcal_ros.bagio.reader import BagReader
 from selfcal_ros.collection.digest import readings_digest
-from selfcal_ros.collection.messages import Command, Detection, Phase
+from selfcal_ros.collection.messages import Command, Detection, EncoderSample, Phase
 from selfcal_ros.errors import InputError
 from selfcal_ros.messages.topics import COMMAND_TOPIC, DETECTION_TOPIC, ENCODER_TOPIC, INPUT_TOPICS
 from selfcal_ros.sessions.collecting import CollectingSession
@@ -23,7 +25,7 @@ from selfcal_ros.sessions.receiving import journal_keeper
 from selfcal_ros.sessions.receiving.journal_keeper import JournalKeeper, KeptTopic
 from selfcal_ros.sessions.receiving.reception import Reception
 from test.support.bags import Foreign
-from test.support.ports import Hands, settings_of
+from test.support.ports import START_NS, Hands, settings_of
 from test.support.sessions import cdr_of, collected, events_of, small_plan
 
 QOS = {"reliability": "reliable"}
@@ -522,3 +524,130 @@ def test_a_journal_none_of_whose_files_can_be_read_is_refused(tmp_path, events):
     assert sum(desk.session.collector.received.values()) == 10
     assert desk.refused == {f"journal: {file}: not an MCAP file; give an .mcap file or a rosbag2 "
                             "folder": 1}
+
+
+DAY_NS = 86400 * 10**9
+
+
+def run_of(events, begin_ns):
+    """Return the events of a run that begins then and names itself."""
+    by = begin_ns - events[0].stamp_ns
+    return [replace(event, stamp_ns=event.stamp_ns + by,
+                    **({"run_id": str(begin_ns)} if isinstance(event, Command) else {}))
+            for event in events]
+
+
+def digests(measurements):
+    return [readings_digest(view, {}) for view in measurements.views]
+
+
+def test_a_run_stamped_a_day_ahead_hides_no_later_one_nor_does_its_journal(tmp_path, events):
+    ahead, honest = run_of(events, START_NS + DAY_NS), run_of(events, START_NS)
+    _, expected, _ = collected(honest)
+    desk = Desk(tmp_path).receive(ahead)
+    desk.reception.drain()
+    assert desk.session.collector.newest_command is None
+    told = desk.session.diagnosis(detections_matched=True)
+    counts = [sum(isinstance(event, kind) for event in events)
+              for kind in (Command, Detection, EncoderSample)]
+    assert desk.session.collector.unusable == dict(zip((
+        "command_from_the_future", "from_the_future", "encoder_sample_from_the_future"),
+        counts, strict=True))
+    assert told.level == Level.WARN
+    assert {line.partition(": ")[0] for line in desk.refused} == set(INPUT_TOPICS)
+    assert all(re.search(r"stamped 864\d\d s ahead of this node's clock: not used; set the clock "
+                         "that stamps it; what is stamped right counts$", line)
+               for line in desk.refused)
+    desk.receive(honest).reception.drain()
+    measurements, _ = desk.session.collector.collect()
+    assert measurements.run_id == str(START_NS)
+    assert digests(measurements) == digests(expected)
+    desk.keeper.close()
+    again = collect_bag(desk_path(tmp_path), settings_of("measurement_collector")).measurements
+    assert digests(again) == digests(expected)
+    assert Desk(tmp_path).receive(honest, is_older=True).reception.drain()
+
+
+@pytest.mark.parametrize("ahead_s, used", [(59.9, True), (60.1, False)])
+@pytest.mark.parametrize("kind", [Command, Detection, EncoderSample])
+def test_how_far_ahead_a_stamp_may_lie(events, ahead_s, used, kind):
+    event = next(event for event in events if isinstance(event, kind))
+    desk = Desk().receive([replace(event, stamp_ns=START_NS + round(ahead_s * 1e9))])
+    desk.reception.drain()
+    assert sum(desk.session.collector.received.values()) == 1
+    assert (desk.session.collector.unusable == {}) is used is (not desk.refused)
+
+
+def test_without_a_clock_nothing_is_from_the_future(monkeypatch, events):
+    """use_sim_time, and nobody publishes /clock."""
+    monkeypatch.setattr(Hands, "now_ns", 0)
+    desk = Desk().receive(events)
+    desk.reception.drain()
+    assert desk.session.collector.unusable == {}
+
+
+def test_a_clock_that_was_set_back_is_a_warning_and_a_restart_ends_it(
+        tmp_path, monkeypatch, events):
+    first = Desk(tmp_path)
+    first.hands.seconds += 86400
+    first.receive(run_of(events, START_NS + DAY_NS)[:300]).reception.drain()
+    first.session.tick()
+    first.hands.seconds -= 86400
+    honest = run_of(events, START_NS)
+    first.receive(honest).reception.drain()
+    first.hands.pass_time(1.0)
+    first.session.tick()
+    told = first.session.diagnosis(detections_matched=True)
+    line = ("the newest view command is stamped 86399 s ahead of this machine's clock, which was "
+            "set back: no later run is shown; restart measurement_collector, which leaves such a "
+            "run aside, and start the plan again")
+    assert told.level == Level.WARN and line in told.message
+    assert first.hands.lines(Level.WARN).count(line) == 1
+    first.keeper.close()
+    monkeypatch.setattr(journal.time, "time_ns", lambda: START_NS)
+    second = Desk(tmp_path).receive(honest)
+    second.reception.drain()
+    measurements, _ = second.session.collector.collect()
+    assert digests(measurements) == digests(collected(honest)[1])
+    assert line not in second.session.diagnosis(detections_matched=True).message
+
+
+def test_a_newer_run_that_is_not_shown_is_a_warning_until_it_is(events):
+    """The sequencer that began it has a clock that is behind that of the one before."""
+    desk = Desk()
+    commands = [event for event in events if isinstance(event, Command)]
+    desk.receive(run_of(commands, START_NS + 30 * 10**9)[:2])
+    desk.receive(run_of(commands, START_NS)[:2]).reception.drain()
+    desk.session.tick()
+    told = desk.session.diagnosis(detections_matched=True)
+    assert told.level == Level.WARN
+    assert (f"run {START_NS} is not shown: it began 30" in told.message
+            and "abort it, synchronise the clocks, and start it again" in told.message)
+    desk.receive(run_of(commands, START_NS + 50 * 10**9)[:2]).reception.drain()
+    desk.hands.pass_time(1.0)
+    desk.session.tick()
+    assert "is not shown" not in desk.session.diagnosis(detections_matched=True).message
+
+
+def test_a_recorded_run_of_long_ago_is_no_newer_one(events):
+    desk = Desk()
+    commands = [event for event in events if isinstance(event, Command)]
+    desk.receive(run_of(commands, START_NS)[:2])
+    desk.receive(run_of(commands, START_NS - DAY_NS)[:2]).reception.drain()
+    desk.session.tick()
+    assert "is not shown" not in desk.session.diagnosis(detections_matched=True).message
+
+
+def test_a_forged_command_within_a_run_changes_nothing_and_is_a_warning(events):
+    honest = run_of(events, START_NS)
+    begin = next(e for e in honest if isinstance(e, Command) and e.phase == Phase.MEASURE)
+    forged = replace(begin, stamp_ns=begin.stamp_ns + 10**8, run_id="", plan_id="forged")
+    desk = Desk().receive([*honest, forged])
+    desk.reception.drain()
+    desk.session.tick()
+    measurements, _ = desk.session.collector.collect()
+    assert digests(measurements) == digests(collected(honest)[1])
+    assert measurements.all_rejected() == {}
+    told = desk.session.diagnosis(detections_matched=True)
+    assert told.level == Level.WARN
+    assert "1 view command of plan 'forged' came within a run that goes on" in told.message

@@ -13,7 +13,7 @@ from selfcal_ros.messages.topics import ENCODER_TOPIC
 from selfcal_ros.sessions.receiving.resting import REACH_NS, Resting
 from selfcal_ros.units import S_PER_NS
 from test.sessions.receiving.test_reception import Desk, desk_path
-from test.support.ports import settings_of
+from test.support.ports import START_NS, settings_of
 from test.support.sessions import cdr_of, events_of, small_plan
 
 STEP_NS = 100_000_000
@@ -84,6 +84,7 @@ def live(desk, events, idle_s):
             away = tuple(p + 1e-3 for p in there.positions)
             for step in range(idle_s * 10):
                 late_ns += STEP_NS
+                desk.hands.seconds = 100.0 + (last + late_ns - START_NS) * S_PER_NS
                 where = there.positions if step > (idle_s - 30) * 10 else away
                 sample = replace(there, stamp_ns=last + late_ns, positions=where)
                 desk.reception.encoder(cdr_of(sample), last + late_ns)
