@@ -115,7 +115,6 @@ def run(args: argparse.Namespace) -> int:
     from selfcal_ros.collection.reasons import advice
     from selfcal_ros.collection.settings.estimator import solver_options
     from selfcal_ros.errors import NotIdentifiableError
-    from selfcal_ros.estimation.api import calibrate
     from selfcal_ros.files import check_outputs
     from selfcal_ros.model.result import (
         created_now,
@@ -143,11 +142,7 @@ def run(args: argparse.Namespace) -> int:
     options = solver_options(solver, measurements)
     try:
         with busy("solving"):
-            if args.robust:
-                from selfcal_ros.estimation.quality.outliers import robust_calibrate
-                result = robust_calibrate(measurements, options)
-            else:
-                result = calibrate(measurements, options)
+            result = _calibrated(args, measurements, options)
     except NotIdentifiableError as error:
         if (args.output or args.json) and error.observability is not None:
             result = unidentified_result(measurements, error.observability)
@@ -166,6 +161,20 @@ def run(args: argparse.Namespace) -> int:
         show(result, args.bag, file_of(args), aside(args))
         print("\n".join(lines), end="\n" * bool(lines), file=aside(args))
     return exit_code(result)
+
+
+def _calibrated(args: argparse.Namespace, measurements: Any, options: Any) -> Any:
+    """Return the result, not worded; what is wrong with the offsets names the bag."""
+    from selfcal_ros.estimation.api import calibrate
+    from selfcal_ros.estimation.verdict.wiring import WiringError
+
+    try:
+        if args.robust:
+            from selfcal_ros.estimation.quality.outliers import robust_calibrate
+            return robust_calibrate(measurements, options)
+        return calibrate(measurements, options)
+    except WiringError as error:
+        raise InputError(f"{args.bag}: {error.where}", error.what, error.remedy) from error
 
 
 def _write(args: argparse.Namespace, data: dict[str, Any]) -> None:

@@ -36,6 +36,9 @@ def _digest(readings: ViewReadings) -> str:
             digest.update(np.ascontiguousarray(getattr(table, name), dtype=kind).tobytes())
     if visits:
         digest.update(repr((visits.sigma_m, visits.dof)).encode())
+    for motion in (readings.motion, readings.motion_theta):
+        if motion:
+            digest.update(motion.products.tobytes() + repr(motion.dof).encode())
     view = replace(readings.view, visit_order="")  # how it was to be measured, not what was read
     digest.update(repr((view, readings.sigma_xy, readings.sigma_theta, readings.dof_xy,
                         readings.dof_theta, readings.used, readings.rejected)).encode())

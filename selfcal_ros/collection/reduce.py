@@ -11,10 +11,11 @@ from selfcal_ros.collection.marks.identify import (
     IdentityRules,
     identify_angular,
     identify_grid,
+    wrap,
 )
 from selfcal_ros.collection.marks.places import PlaceList
 from selfcal_ros.collection.marks.repeats import reduce_repeats
-from selfcal_ros.collection.marks.visits import grid_visits
+from selfcal_ros.collection.marks.visits import grid_visits, repeat_motion
 from selfcal_ros.collection.messages import LARGEST_OFFSET, Kind, good_sigmas
 from selfcal_ros.collection.reasons import Reason
 from selfcal_ros.collection.stage.encoder import GOOD, MOVING, REASONS
@@ -185,12 +186,15 @@ def _reduce_grid(artifact: Artifact, view: View, d: np.ndarray, exposures: Expos
     _count(rejected, Reason.OUTLIER, means.outlier)
     out = np.flatnonzero(means.outlier)
     places.add(np.full(len(out), Reason.OUTLIER, dtype=object), marks.position[:, out])
+    offset = np.stack([d["ox"], d["oy"]])
     visits = grid_visits(means, key, d["sigma"], stamps_ns=d["stamp"], deviation=marks.deviation,
-                         offset=np.stack([d["ox"], d["oy"]]), approach=marks.approach)
+                         offset=offset, approach=marks.approach)
+    motion = repeat_motion(key, _reading(rules.sense, marks.position, 0.0), offset, means.outlier)
     mark = means.key.astype(np.int64)
     return {"m": mark // (2 * hy + 1) - hx, "n": mark % (2 * hy + 1) - hy, "dx": means.mean[0],
             "dy": means.mean[1], "count": means.count, "u": means.u, "sigma_xy": means.sigma,
-            "dof_xy": means.dof, "visits": visits, "places": places.places()}, marks.phi_rad
+            "dof_xy": means.dof, "visits": visits, "motion": motion,
+            "places": places.places()}, marks.phi_rad
 
 
 def _reduce_angular(artifact: Artifact, view: View, d: np.ndarray, exposures: Exposures,
@@ -207,8 +211,11 @@ def _reduce_angular(artifact: Artifact, view: View, d: np.ndarray, exposures: Ex
     means = reduce_repeats(k, v[None], d["sigma"], limit=rules.outlier_limit,
                            extent=4 * np.pi, residual=rest[None])
     _count(rejected, Reason.OUTLIER, means.outlier)
+    place = wrap(v - d["ot"])  # of the axis from the line, so that no turn is in it
+    motion = repeat_motion(k, place[None], d["ot"][None], means.outlier)
     return {"k": means.key.astype(np.int64), "dtheta": means.mean[0], "count_theta": means.count,
-            "u_theta": means.u, "sigma_theta": means.sigma, "dof_theta": means.dof}
+            "u_theta": means.u, "sigma_theta": means.sigma, "dof_theta": means.dof,
+            "motion_theta": motion}
 
 
 def _reading(sense: Sense, position: np.ndarray,

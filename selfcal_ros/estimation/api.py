@@ -5,6 +5,7 @@ from selfcal_ros.estimation.joint.solve import solve_joint
 from selfcal_ros.estimation.law.solve import solve_law
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.verdict.judge import judged
+from selfcal_ros.estimation.verdict.wiring import check_wiring
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.result import CalibrationResult
 
@@ -31,8 +32,10 @@ def calibrate(measurements: Measurements, options: Options | None = None) -> Cal
     NotIdentifiableError
         If the marks that were read do not identify the stage.
     InputError
-        If readings contradict the plan, or an option does not fit them.
+        If readings contradict the plan, an option does not fit them, or the offsets do not follow
+        the stage (`WiringError`).
     """
+    check_wiring(measurements)
     options = options or Options()
     solve = solve_law if options.method == "law" else solve_joint
     return judged(solve(measurements, options), measurements, options)

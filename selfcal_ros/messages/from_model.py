@@ -11,7 +11,7 @@ from selfcal_ros.collection.expected import ViewProgress
 from selfcal_ros.collection.messages import Command, Detection, EncoderSample
 from selfcal_ros.collection.timeline import Timeline
 from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.model.readings import GridVisits, Measurements
+from selfcal_ros.model.readings import GridVisits, Measurements, RepeatMotion
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.view import View
 from selfcal_ros.units import NS_PER_S
@@ -98,7 +98,8 @@ def view_measurement(progress: ViewProgress, measurements: Measurements, stamp_n
         **_rejected(readings.rejected, "reject"),
         "measurement_sense": str(measurements.sense),
         **_rejected(measurements.rejected, "session_reject"),
-        **_visits(readings.visits), "run_id": measurements.run_id,
+        **_visits(readings.visits), **_motion("motion", readings.motion),
+        **_motion("motion_theta", readings.motion_theta), "run_id": measurements.run_id,
         "model_terms": list(measurements.model_terms), "session_notes": list(notes)}
 
 
@@ -109,6 +110,12 @@ def _visits(visits: GridVisits | None) -> Fields:
     return {**fields, "visit_stamp": visits.stamp_ns if visits else [],
             "sigma_visit": visits.sigma_m if visits else float("nan"),
             "dof_visit": visits.dof if visits else 0}
+
+
+def _motion(name: str, motion: RepeatMotion | None) -> Fields:
+    """Return the fields of sums over repeats; empty where they are not known."""
+    return {name: motion.products.ravel() if motion else [],
+            f"dof_{name}": motion.dof if motion else 0}
 
 
 def _rejected(rejected: dict[str, int], prefix: str) -> Fields:

@@ -13,7 +13,7 @@ from selfcal_ros.messages.topics import COMMAND_TOPIC, ERROR_MAP_TOPIC, MEASUREM
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ErrorMap, ThetaDatum
 from selfcal_ros.model.orders import parse_order
-from selfcal_ros.model.readings import GridVisits, Sense, ViewReadings
+from selfcal_ros.model.readings import GridVisits, RepeatMotion, Sense, ViewReadings
 from selfcal_ros.model.view import View
 from selfcal_ros.units import NS_PER_S
 
@@ -130,7 +130,20 @@ def view_readings(message: Any) -> ViewReadings:
         sigma_xy=float(message.sigma_xy), sigma_theta=float(message.sigma_theta),
         dof_xy=int(message.dof_xy), dof_theta=int(message.dof_theta),
         used=int(message.detections_used), rejected=counts(message, "reject"),
-        visits=_visits_of(message))
+        visits=_visits_of(message), motion=_motion_of(message, "motion", 4),
+        motion_theta=_motion_of(message, "motion_theta", 2))
+
+
+def _motion_of(message: Any, name: str, size: int) -> RepeatMotion | None:
+    """Return the sums over repeats in a ViewMeasurement; None where it has none."""
+    products = np.array(getattr(message, name, ()), dtype=float)
+    if not len(products):
+        return None
+    if len(products) != size**2:
+        raise InputError(f"{MEASUREMENT_TOPIC} of '{message.view_name}'",
+                         f"{name} has {len(products)} values, not {size**2}",
+                         "correct the publisher")
+    return RepeatMotion(products.reshape(size, size), int(getattr(message, f"dof_{name}")))
 
 
 _VISITS = (("mark", "mark", np.int64), ("dx", "dx", float), ("dy", "dy", float),

@@ -78,6 +78,24 @@ class GridVisits:
 
 
 @dataclass(frozen=True, eq=False)
+class RepeatMotion:
+    """How the offsets of the marks of one view follow the stage, from one repeat to the next.
+
+    Attributes
+    ----------
+    products : float array (2c, 2c)
+        Sums of products of the c coordinates of the axis' place over the plate (reading less
+        offset), then of the c offsets, each about the mean of its mark and without slow changes;
+        m^2 or rad^2.
+    dof : int
+        Degrees of freedom behind the sums.
+    """
+
+    products: np.ndarray
+    dof: int
+
+
+@dataclass(frozen=True, eq=False)
 class RejectedPlaces:
     """Where the stage stood at detections of grid marks that were rejected, at most MOST of a view.
 
@@ -129,6 +147,8 @@ class ViewReadings:
         The visits behind the means of the grid marks; None where they are not known.
     places : RejectedPlaces
         Where grid detections were rejected; empty where that is not known.
+    motion, motion_theta : RepeatMotion, optional
+        How offsets follow the stage, x and y and the angle; None without repeats.
     """
 
     view: View
@@ -150,6 +170,8 @@ class ViewReadings:
     rejected: dict[str, int] = field(default_factory=dict)
     visits: GridVisits | None = None
     places: RejectedPlaces = RejectedPlaces()
+    motion: RepeatMotion | None = None
+    motion_theta: RepeatMotion | None = None
 
 
 @dataclass(frozen=True, eq=False)

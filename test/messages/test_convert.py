@@ -19,7 +19,13 @@ from selfcal_ros.messages import from_model, to_model
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.orders import ORDERS
-from selfcal_ros.model.readings import GridVisits, Measurements, Sense, ViewReadings
+from selfcal_ros.model.readings import (
+    GridVisits,
+    Measurements,
+    RepeatMotion,
+    Sense,
+    ViewReadings,
+)
 from selfcal_ros.model.view import View
 from test.support.bags import contract_message, contract_types
 from test.support.results import known_result
@@ -194,7 +200,8 @@ READ = ViewReadings(
     View("a", 0.5, (0.01, -0.02), True, False, 3), np.array([-1]), np.array([2]), np.array([3e-6]),
     np.array([-4e-6]), np.array([5]), np.array([6e-8]), np.array([7]), np.array([-8e-3]),
     np.array([9]), np.array([1e-5]), 1.1e-8, 1.2e-6, 13, 14, 15, {"low_score": 16},
-    VISITS)
+    VISITS, motion=RepeatMotion(1e-15 * np.arange(16.0).reshape(4, 4), 21),
+    motion_theta=RepeatMotion(1e-12 * np.array([[1.0, 2.0], [3.0, 4.0]]), 22))
 MEASURED = Measurements("p", Artifact(5, 0.01, 8, 7), (READ,), Sense.PLATE_MOVES, {"other": 17},
                         "77", ("approach",))
 PROGRESS = ViewProgress(18, READ.view, 19, 20, 21, 22, READ, 23)
@@ -209,9 +216,21 @@ def test_the_visits_of_a_view_survive_the_message():
     assert to_model.view_readings(old).visits is None
 
 
+def test_sums_over_repeats_come_back():
+    message = through_cdr("ViewMeasurement", from_model.view_measurement(
+        PROGRESS, MEASURED, STAMP_NS, "f"))
+    found = to_model.view_readings(message)
+    for name in ("motion", "motion_theta"):
+        got, wanted = getattr(found, name), getattr(READ, name)
+        np.testing.assert_array_equal(got.products, wanted.products)
+        assert got.dof == wanted.dof
+
+
 def test_fields_of_a_view_measurement_by_name():
     made = from_model.view_measurement(PROGRESS, MEASURED, STAMP_NS, "f")
     del made["header"]
+    np.testing.assert_array_equal(made.pop("motion"), 1e-15 * np.arange(16.0))
+    np.testing.assert_array_equal(made.pop("motion_theta"), 1e-12 * np.arange(1.0, 5.0))
     for name in [name for name in made if name.startswith("visit_")]:
         del made[name]
     assert made == {
@@ -223,7 +242,7 @@ def test_fields_of_a_view_measurement_by_name():
         "detections_used": 15, "reject_reasons": ["low_score"], "reject_counts": [16],
         "measurement_sense": "plate_moves", "session_reject_reasons": ["other"],
         "session_reject_counts": [17], "run_id": "77", "sigma_visit": 9e-9, "dof_visit": 6,
-        "model_terms": ["approach"], "session_notes": []}
+        "model_terms": ["approach"], "session_notes": [], "dof_motion": 21, "dof_motion_theta": 22}
 
 
 def test_fields_of_a_view_status_by_name():
@@ -246,6 +265,8 @@ def test_fields_of_a_view_status_by_name():
     ({"u_theta": [1.0, 2.0]}, "k, dtheta, count_theta, u_theta differ in length"),
     ({"reject_counts": []}, "reject_reasons and reject_counts differ in length"),
     ({"visit_dy": [1.0]}, "the visits differ in length or name marks that were not read"),
+    ({"motion": [1.0, 2.0]}, "motion has 2 values, not 16"),
+    ({"motion_theta": [1.0]}, "motion_theta has 1 values, not 4"),
     ({"visit_mark": [0, 1]}, "the visits differ in length or name marks that were not read")])
 def test_arrays_that_do_not_belong_together(changes, said):
     values = from_model.view_measurement(PROGRESS, MEASURED, STAMP_NS, "f")

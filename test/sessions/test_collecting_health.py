@@ -19,6 +19,8 @@ from selfcal_ros.sessions.collecting import CollectingSession
 from selfcal_ros.sessions.ports import Level
 from selfcal_ros.sessions.receiving.journal_keeper import take_up
 from selfcal_ros.sessions.solving import SolvingSession, solve
+from selfcal_ros.simulation.cell import CellSettings, plan_events
+from selfcal_ros.simulation.truth import random_truth
 from test.support.collecting import detection_table, encoder_block
 from test.support.ports import START_NS, Hands, message, settings_of
 from test.support.sessions import events_of, small_plan
@@ -431,3 +433,26 @@ def test_a_sigma_that_cannot_be_costs_that_detection_and_is_a_warning():
     assert told.level == Level.WARN
     assert "1 detection rejected as sigma_out_of_range: their sigma is no " in told.message
     assert told.values["rejected sigma_out_of_range"] == 1
+
+
+def test_reversed_offsets_are_an_error_while_the_first_view_is_measured():
+    desk = Desk()
+    rng = np.random.default_rng(4)
+    plan = small_plan(repeats=6)
+    cell = CellSettings(sigma_xy_m=1e-8, servo_sigma_m=5e-8, sigma_theta_rad=1e-5)
+    events = list(plan_events(random_truth(plan.artifact, 4, rng), plan, settings=cell, rng=rng,
+                              start_ns=START_NS))
+    spoilt = [replace(e, offset_y=-e.offset_y) if isinstance(e, Detection) else e for e in events]
+    end = next(i for i, e in enumerate(spoilt) if isinstance(e, Command) and e.view_index == 1)
+    for event in spoilt[:end]:
+        desk.feed([event])
+        desk.session.tick()
+        if desk.told().level is Level.ERROR:
+            break
+    (line,) = [line for level, line in desk.hands.said if level is Level.ERROR]
+    assert line.startswith("stage/mark_detections: offsets of the other sign: offset_y rises where")
+    assert desk.told().message.startswith(line)
+    assert 0 < len(desk.session.collector.collect()[0].views[0].visits.mark) < 150
+    desk.feed(spoilt[end:])
+    desk.session.tick()
+    assert [line for level, line in desk.hands.said if level is Level.ERROR] == [line]

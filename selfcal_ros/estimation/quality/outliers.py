@@ -40,6 +40,7 @@ from selfcal_ros.estimation.quality.slip import Slip, find_slip, split_view
 from selfcal_ros.estimation.quality.slip_or_term import likelier_term
 from selfcal_ros.estimation.quality.thinning import Key, left_out, without
 from selfcal_ros.estimation.terms.identifiable import require_terms_told
+from selfcal_ros.estimation.verdict.wiring import check_wiring
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.result import CalibrationResult
@@ -107,6 +108,7 @@ def robust_calibrate(measurements: Measurements,
     if options.method != "joint":
         raise InputError("--robust", "Hu's law needs every reading and cannot leave any out",
                          "solve with --method joint")
+    check_wiring(measurements)
     cleaned = clean(measurements, options)
     result = calibrate(cleaned.measurements, options)
     left = tuple(finding for finding in cleaned.findings if _is_left(finding))

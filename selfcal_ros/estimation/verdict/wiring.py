@@ -1,0 +1,253 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Whether the microscope's offsets follow the stage as they should, before any map is made.
+
+Where the stage stands off by m from one repeat of a mark to the next, the offset that the
+microscope sees is -m. With readout noise of the encoder, which is no motion, and noise of the
+detection, independent of each other and of the motion, the covariance of place and offset is
+-S D', where S is the covariance of the motion and D the way the offsets are wired: the identity, or
+one of the other seven that exchange and reverse axes. For the right one tr(S D' D) is largest, so
+neither noise can make another one win. Noise of the place draws the slope of the offset on it
+towards 0, noise of the offset the slope of the place: the scale lies between the two.
+Of 2,000 clean simulated measurements none was refused (test_wiring.py).
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cache
+from itertools import product
+from math import exp, lgamma, log, pi
+
+import numpy as np
+
+from selfcal_ros.errors import InputError
+from selfcal_ros.model.readings import Measurements, RepeatMotion
+
+LEVEL = 1e-6
+"""Probability, all tries together, of refusing a measurement whose offsets are wired well."""
+TOLD = 1e-3
+"""Probability below which a single offset counts as following a single axis the wrong way."""
+DOUBLED, HALVED = 1.5, 0.7
+"""Scales beyond which an offset is in wrong units; what is nearer to 1 is fitted."""
+LEAST_SLOPE = 0.3
+"""Scale below which an offset is not taken to follow the stage at all."""
+LEAST_MOTION = 1e-12
+"""Standard deviation of the place, m or rad, that is rounding."""
+AXES = {"grid": ("x", "y"), "angular": ("theta",)}
+
+
+class WiringError(InputError):
+    """Raised for offsets of the other sign, on exchanged axes, or in wrong units."""
+
+
+@dataclass(frozen=True)
+class OffsetResponse:
+    """How one offset follows the place of the optical axis over the plate; it should by -1.
+
+    Attributes
+    ----------
+    offset, axis : str
+        ``x``, ``y`` or ``theta``: the offset, and the axis that it follows.
+    slope, u_slope : float
+        Regression of the offset on the place, and its standard uncertainty.
+    most : float
+        Offset over place by the regression of the place on the offset: between this and the slope
+        lies what both are without noise.
+    p : float
+        Probability of a covariance as large without any motion.
+    """
+
+    offset: str
+    axis: str
+    slope: float
+    u_slope: float
+    most: float
+    p: float
+
+    @property
+    def crossed(self) -> bool:
+        """Whether the offset follows the other axis."""
+        return self.offset != self.axis
+
+
+@dataclass(frozen=True)
+class WiringFault:
+    """Offsets that do not follow the stage as they should.
+
+    Attributes
+    ----------
+    view : str
+        Name of the view that shows it; empty = all together.
+    kind : str
+        ``grid`` or ``angular``.
+    responses : tuple of OffsetResponse
+        Those that are wrong, at least one.
+    """
+
+    view: str
+    kind: str
+    responses: tuple[OffsetResponse, ...]
+
+
+def check_wiring(measurements: Measurements) -> None:
+    """Raise WiringError for the first fault of `wiring_faults`."""
+    for error in map(worded, wiring_faults(measurements)):
+        raise WiringError(f"plan '{measurements.plan_id}', {error.where}", error.what, error.remedy)
+
+
+def wiring_faults(measurements: Measurements) -> list[WiringFault]:
+    """Return how offsets are wired wrongly, as far as the repeats of marks tell it.
+
+    All views together, else the first view that shows a fault by itself.
+    """
+    found = []
+    for kind, name in (("grid", "motion"), ("angular", "motion_theta")):
+        told = [(view.view.name, motion) for view in measurements.views
+                if (motion := getattr(view, name)) is not None and motion.dof > 1]
+        tries = (len(AXES[kind]) ** 3 + len(AXES[kind])) * (len(told) + 1)
+        for view, motion in _together(told):
+            responses = _wrong(motion, AXES[kind], LEVEL / tries)
+            if responses:
+                found.append(WiringFault(view, kind, responses))
+                break
+    return found
+
+
+def _together(told: list[tuple[str, RepeatMotion]]) -> Iterator[tuple[str, RepeatMotion]]:
+    """Yield the sums of all views, then those of each view with its name."""
+    if told:
+        yield "", RepeatMotion(np.sum([motion.products for _, motion in told], axis=0),
+                               sum(motion.dof for _, motion in told))
+    if len(told) > 1:
+        yield from told
+
+
+@cache
+def _wirings(n: int) -> tuple[np.ndarray, ...]:
+    """Return the ways to wire n offsets, the right one first: offset = -D motion."""
+    orders = [np.eye(n), np.eye(n)[::-1]][:n]
+    return tuple(np.array(signs)[:, None] * order
+                 for order in orders for signs in product((1.0, -1.0), repeat=n))
+
+
+def _wrong(motion: RepeatMotion, axes: tuple[str, ...], level: float,
+           ) -> tuple[OffsetResponse, ...]:
+    """Return the offsets that follow the stage wrongly; none where nothing is beyond doubt."""
+    n, least = len(axes), LEAST_MOTION**2 * motion.dof
+    moved = np.diag(motion.products) > np.repeat([least, 0.0], n)
+    if not moved[:n].any() or not moved[n:].any():
+        return ()
+    wiring, out = _wiring(motion, level), []
+    for j in range(n):
+        i = int(np.abs(wiring[j]).argmax())
+        if not (moved[i] and moved[n + j]) or motion.products[i, n + j] * wiring[j, i] >= 0:
+            continue
+        response = _response(motion, (i, j), axes)
+        if response.p >= TOLD or response.most < LEAST_SLOPE:
+            continue
+        if response.crossed or wiring[j, i] < 0 or _p_of_scale(motion, (i, j)) < level:
+            out.append(response)
+    return tuple(out)
+
+
+def _wiring(motion: RepeatMotion, level: float) -> np.ndarray:
+    """Return how the offsets are wired: the right way unless another is beyond doubt.
+
+    Where the axes move together, exchanged and reversed offsets look alike: reversed, then.
+    """
+    n = len(motion.products) // 2
+
+    def likely(wiring: np.ndarray) -> float:
+        return float(-np.trace(motion.products[:n, n:] @ wiring))
+
+    right, *others = _wirings(n)
+    sure = [wiring for wiring in others if _p_for(motion, wiring, right) < level]
+    if not sure:
+        return right
+    best = max(sure, key=likely)
+    straight = [wiring for wiring in others
+                if wiring[0, 0] and _p_for(motion, best, wiring) > TOLD]
+    return max(straight, key=likely, default=best)
+
+
+def _p_for(motion: RepeatMotion, wiring: np.ndarray, other: np.ndarray) -> float:
+    """Return the probability of what speaks for one wiring and against another.
+
+    That is tr(C (D' - D)): negative, or 0 without any motion, where the other one holds.
+    """
+    n = len(wiring)
+    change = other - wiring
+    size2 = np.trace(motion.products[:n, :n] @ change.T @ motion.products[n:, n:] @ change)
+    if not size2 > 0:
+        return 1.0
+    found, rank = np.trace(motion.products[:n, n:] @ change), int(np.linalg.matrix_rank(change))
+    return _p_of(float(found / np.sqrt(rank * size2)), rank * (motion.dof - 1) + 1)
+
+
+def _p_of_scale(motion: RepeatMotion, at: tuple[int, int]) -> float:
+    """Return the probability of a scale as far from 1 where it is `HALVED` to `DOUBLED`.
+
+    With o the offset and p the place: o - s p goes with p if even the smallest scale is beyond s,
+    p - o / s with o if even the largest is below it.
+    """
+    (i, j), n = at, len(motion.products) // 2
+    place, offset = np.eye(2 * n)[i], np.eye(2 * n)[n + j]
+    if motion.products[i, n + j] < 0:
+        offset = -offset
+    large = _correlation(motion.products, place, offset - DOUBLED * place)
+    small = _correlation(motion.products, offset, place - offset / HALVED)
+    return min(_p_of(large, motion.dof), _p_of(small, motion.dof))
+
+
+def _correlation(products: np.ndarray, a: np.ndarray, b: np.ndarray) -> float:
+    """Return the correlation of two combinations of places and offsets."""
+    size2 = (a @ products @ a) * (b @ products @ b)
+    return float(a @ products @ b / np.sqrt(size2)) if size2 > 0 else 0.0
+
+
+def _p_of(correlation: float, dof: int) -> float:
+    """Return the probability of a larger correlation by chance, or little more: no scipy needed.
+
+    The density goes with (1 - r^2)^(d/2 - 1), which is integrated with a factor of r / correlation.
+    """
+    d = dof - 1
+    if correlation <= 0:
+        return 0.5
+    density = lgamma((d + 1) / 2) - lgamma(d / 2) - 0.5 * log(pi)
+    left = log(max(1 - correlation**2, 1e-30))
+    return min(0.5, exp(max(d / 2 * left + density - log(d * correlation), -700.0)))
+
+
+def _response(motion: RepeatMotion, at: tuple[int, int], axes: tuple[str, ...]) -> OffsetResponse:
+    """Return how offset j follows axis i, `at` = (i, j)."""
+    (i, j), n = at, len(axes)
+    place, offset = motion.products[i, i], motion.products[n + j, n + j]
+    cross = float(motion.products[i, n + j])
+    r2 = min(cross**2 / (place * offset), 1.0)
+    return OffsetResponse(
+        axes[j], axes[i], cross / place, float(np.sqrt((1 - r2) * offset / place
+                                                       / (motion.dof - 1))),
+        offset / abs(cross), _p_of(float(np.sqrt(r2)), motion.dof))
+
+
+def worded(fault: WiringFault) -> WiringError:
+    """Return a fault as the error that says in one line what is wrong and how to correct it."""
+    responses = fault.responses
+    names = " and ".join(f"offset_{response.offset}" for response in responses)
+    told = ", ".join(
+        f"offset_{r.offset} against {r.axis}: {r.slope:+.2f} ± {r.u_slope:.2g}, expected "
+        f"{0 if r.crossed else -1}" for r in responses)
+    if any(response.crossed for response in responses):
+        what = "exchanged axes: " + " and ".join(
+            f"offset_{r.offset} follows {r.axis}" for r in responses)
+        remedy = "publish offsets along the stage's axes, mark - optical axis"
+    elif any(response.slope > 0 for response in responses):
+        what = "offsets of the other sign: " + names + (
+            " rise" if len(responses) > 1 else " rises") + " where the optical axis moves on"
+        remedy = f"publish mark - optical axis: turn the sign of {names}"
+    else:
+        what = f"offsets in wrong units: {names} " + ", ".join(
+            f"{abs(r.slope):.3g}" for r in responses) + " times what the stage moves"
+        remedy = "correct the pixel size, or the unit: offsets are in " + (
+            "rad" if fault.kind == "angular" else "m")
+    where = "stage/mark_detections" + (f" of view '{fault.view}'" if fault.view else "")
+    return WiringError(where, f"{what} (slope among repeats of {told})", remedy)
