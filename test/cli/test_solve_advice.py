@@ -86,3 +86,15 @@ def test_a_sigma_that_cannot_be_is_one_line_and_costs_that_detection(tmp_path, c
     assert line.startswith(f"selfcal solve: {path}: 1 detection rejected as sigma_out_of_range: ")
     result = json.loads((tmp_path / "r.json").read_text())
     assert result["rejected"] == {"sigma_out_of_range": 1}
+
+
+def test_reversed_offsets_are_one_line_that_names_the_bag_and_no_result(tmp_path, capsys):
+    events = [replace(e, offset_x=-e.offset_x, offset_y=-e.offset_y) if isinstance(e, Detection)
+              else e for e in events_of(small_plan(repeats=9))]
+    path, out = Foreign().write(tmp_path / "x.mcap", events), tmp_path / "r.json"
+    for more in ([], ["--robust"], ["--method", "law"]):
+        assert main(["solve", str(path), "-o", str(out), *more]) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert line.startswith(f"selfcal solve: {path}: plan '0, 90, tx', stage/mark_detections: "
+                               "offsets of the other sign: offset_x and offset_y rise")
+        assert not out.exists()
