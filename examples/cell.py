@@ -97,11 +97,10 @@ class Cell(Node):
             depth=1000, reliability=ReliabilityPolicy.RELIABLE))
         self._marks = self.create_publisher(MarkDetection, "stage/mark_detections", QoSProfile(
             depth=1000, reliability=ReliabilityPolicy.RELIABLE))
-        # Commands are latched. With a depth of 1 a cell that starts late hears the newest alone,
-        # not every command of the run: an old MEASURE would set it off. (A MEASURE that follows its
-        # PLACE at once would overtake it: the sequencer's settle_time is for that.)
+        # The sequencer latches its newest command alone: a cell that starts late carries it out.
+        # Of a depth of 1 a MEASURE that follows its PLACE at once would overtake it.
         self.create_subscription(ViewCommand, "selfcal/view_command", self._on_command, QoSProfile(
-            depth=1, reliability=ReliabilityPolicy.RELIABLE,
+            depth=10, reliability=ReliabilityPolicy.RELIABLE,
             durability=DurabilityPolicy.TRANSIENT_LOCAL))
         self._work: Iterator[None] = iter(())
         self._heard: tuple[int, int, int] | None = None

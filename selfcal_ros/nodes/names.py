@@ -43,6 +43,8 @@ ENCODER_BEST_EFFORT = Topic(topics.ENCODER_TOPIC, JointState, _qos(5000, reliabl
 ENCODER_NEWEST = Topic(topics.ENCODER_TOPIC, JointState, _qos(100, reliable=False))
 DETECTIONS = Topic(topics.DETECTION_TOPIC, MarkDetection, _qos(5000))
 COMMAND = Topic(topics.COMMAND_TOPIC, ViewCommand, _qos(256, latched=True))
+NEWEST_COMMAND = Topic(topics.COMMAND_TOPIC, ViewCommand, _qos(1, latched=True))
+"""As a sequencer offers it: a cell that joins late acts on the first command that it hears."""
 STATUS = Topic(topics.STATUS_TOPIC, ViewStatus, _qos(64, latched=True))
 STATUS_AS_IT_COMES = Topic(topics.STATUS_TOPIC, ViewStatus, _qos(64))
 MEASUREMENT = Topic(topics.MEASUREMENT_TOPIC, ViewMeasurement, _qos(64, latched=True))

@@ -31,7 +31,7 @@ class PoseSequencer(ManagedNode[SequencerSettings]):
 
     def configure(self) -> None:
         """Make the session, with its plan, and the publisher of commands."""
-        command = self.output(names.COMMAND)
+        command = self.output(names.NEWEST_COMMAND)
         self.session = SequencingSession(
             self.settings, self.ports(lambda _, fields: command(fields)))
 

@@ -127,12 +127,24 @@ def test_without_a_plan_start_says_so(graph, tmp_path):
     assert answer.message == "pose_sequencer: there is no plan; set the parameter 'plan'"
 
 
-def test_a_late_joiner_hears_every_command(desk):
-    desk.ask("start")
-    desk.ask("confirm_view")
+def test_a_late_joiner_hears_the_newest_command_alone(desk):
+    """An older one, a MEASURE of a run that was aborted, would set a cell off."""
+    for request in ("start", "confirm_view", "abort"):
+        assert desk.ask(request).success
     late = desk.graph.listen(names.COMMAND)
-    desk.graph.until(lambda: len(late) >= 2, "the latched commands")
-    assert [message.phase for message in late] == [PLACE, MEASURE]
+    desk.graph.until(lambda: late, "the latched command")
+    assert desk.ask("start").success
+    desk.graph.until(lambda: late[-1].phase == PLACE, "the next command")
+    assert [message.phase for message in late] == [ABORT, PLACE]
+
+
+def test_who_is_there_hears_every_command(desk):
+    for _ in range(20):
+        for request in ("start", "confirm_view", "redo_view", "abort"):
+            assert desk.ask(request).success
+    phases = [PLACE, MEASURE, PLACE, ABORT] * 20
+    desk.graph.until(lambda: len(desk.heard) == len(phases), "the commands")
+    assert [message.phase for message in desk.heard] == phases
 
 
 def test_the_run_of_another_sequencer_wins_over_its_own(desk):
