@@ -112,18 +112,6 @@ class NodeBase[S: Settings](Answering):
         """Return `entity`; a managed node notes how to take it down."""
         return entity
 
-    def guarded(self, callback: Callable[..., Any], place: str = "") -> Callable[..., Any]:
-        """Return `callback` with whatever it raises counted and logged instead of raised."""
-        place = place or getattr(callback, "__name__", "callback").strip("_")
-
-        def call(*args: Any) -> Any:
-            try:
-                return callback(*args)
-            except Exception as error:  # nothing that is received may end a node
-                self.refusals.add(place, error)
-                return None
-        return call
-
     def ports(self, publish: Callable[[str, dict[str, Any]], None]) -> Ports:
         """Return what a session needs of this node; `publish` takes its outputs."""
         return Ports(publish, self.say, time.monotonic,

@@ -1,9 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Callbacks as rclpy, which counts their parameters, has to see them."""
+"""Callbacks as rclpy calls them: guarded, so that none of them ends a node."""
 
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from functools import wraps
 from typing import Any
+
+from rcl_interfaces.msg import SetParametersResult
+from rcl_interfaces.srv import SetParameters, SetParametersAtomically
+from rclpy.node import Node
+from rclpy.service import Service
+from rclpy.subscription import Subscription
+
+from selfcal_ros.errors import as_answer
+from selfcal_ros.sessions.health import Refusals
 
 
 class WithInfo:
@@ -23,3 +33,66 @@ class WithInfo:
     def __call__(self, *received: Any) -> None:
         """Take a message and its info."""
         self._call(*received)
+
+
+class Guarded(Node):
+    """A node that no callback ends: what one raises is counted in `refusals` and logged.
+
+    The node's own callbacks are guarded where they are registered. The services of rclpy
+    (parameters, lifecycle, types) and its subscription to ``/clock`` are guarded when an executor
+    asks for them. `running.spin` catches the rest: tasks and waitables, as those of an action.
+    """
+
+    refusals: Refusals
+
+    def guarded(self, callback: Callable[..., Any], place: str = "") -> Callable[..., Any]:
+        """Return `callback` with whatever it raises counted and logged instead of raised."""
+        place = place or getattr(callback, "__name__", "callback").strip("_")
+
+        @wraps(callback)
+        def call(*args: Any) -> Any:
+            try:
+                return callback(*args)
+            except Exception as error:
+                self.refusals.add(place, error)
+                return None
+        return call
+
+    @property
+    def services(self) -> Iterator[Service]:
+        """The services, each answering with a failure where its callback raises."""
+        for service in super().services:
+            if not hasattr(service.callback, "__wrapped__"):
+                self._guard(service)
+            yield service
+
+    @property
+    def subscriptions(self) -> Iterator[Subscription]:
+        """The subscriptions, those of rclpy guarded."""
+        for item in super().subscriptions:
+            if not any(hasattr(item.callback, name) for name in ("__wrapped__", "__signature__")):
+                item.callback = self.guarded(item.callback, item.topic)
+            yield item
+
+    def _guard(self, service: Any) -> None:
+        answer, place = service.callback, service.srv_name.rpartition("/")[2]
+
+        @wraps(answer)
+        def call(request: Any, response: Any) -> Any:
+            try:
+                return answer(request, response)
+            except Exception as error:
+                self.refusals.add(place, error)
+                return failed(request, response, error)
+        service.callback = call
+        service.send_response = self.guarded(service.send_response, place)
+
+
+def failed(request: Any, response: Any, error: Exception) -> Any:
+    """Return `response` with `error` as the reason where its type has a field for one."""
+    result = SetParametersResult(successful=False, reason=as_answer(error)[1])
+    if isinstance(response, SetParameters.Response):
+        response.results += [result] * (len(request.parameters) - len(response.results))
+    elif isinstance(response, SetParametersAtomically.Response):
+        response.result = result
+    return response

@@ -4,7 +4,7 @@
 import traceback
 from collections.abc import Callable
 from concurrent.futures import Executor
-from functools import partial
+from functools import partial, wraps
 from typing import Any
 
 from rclpy._rclpy_pybind11 import RCLError
@@ -107,7 +107,7 @@ class ManagedNode[S: ManagedSettings](NodeBase[S], LifecycleNode):
         if not step:
             return inner
         mine = self._made[step]
-        return lambda *args: inner(*args) if self._made[step] is mine else None
+        return wraps(callback)(lambda *args: inner(*args) if self._made[step] is mine else None)
 
     def diagnosis(self) -> Diagnosis:
         """Return the state of the node where it is not active, else what the session says."""

@@ -67,7 +67,8 @@ class MeasurementCollector(PollingNode[CollectorSettings]):
         self._received = self.publisher(names.private(names.RECEIVED))
         self._inputs = {names.ENCODER.name: ByTheClock(names.ENCODER.name, self._reception.encoder),
                         names.DETECTIONS.name: ByTheClock(
-                            names.DETECTIONS.name, self._reception.detection, self._on_detection)}
+                            names.DETECTIONS.name, self._reception.detection,
+                            self.guarded(self._on_detection))}
         self.alone_on += [names.STATUS.name, names.ENCODER.name]
 
     def _kept(self, topic: names.Topic) -> KeptTopic:

@@ -19,12 +19,12 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.clock import Clock, ClockType
-from rclpy.node import Node
 from rclpy.task import Future
 from std_srvs.srv import Trigger
 
 from selfcal_ros.errors import printable
 from selfcal_ros.nodes import names
+from selfcal_ros.nodes.callbacks import Guarded
 from selfcal_ros.nodes.filling import diagnosis_of
 from selfcal_ros.nodes.running import run
 from selfcal_ros.sessions.health import Refusals
@@ -39,7 +39,7 @@ PERIOD_S = 0.2
 PATIENCE_S = 10.0
 
 
-class MonitorSession(Node):
+class MonitorSession(Guarded):
     """Shows what the topics of a cell say, and asks its sequencer for what a person wants."""
 
     def __init__(self, namespace: str, **kwargs: Any) -> None:
@@ -60,21 +60,12 @@ class MonitorSession(Node):
         self._asked: list[tuple[str, float, Any]] = []
         self._shown = ""
         steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self.create_timer(PERIOD_S, self._guarded(self._show, "the picture"), clock=steady)
-        self.create_timer(0.05, self._guarded(self._serve, "requests"), clock=steady)
+        self.create_timer(PERIOD_S, self.guarded(self._show, "the picture"), clock=steady)
+        self.create_timer(0.05, self.guarded(self._serve, "requests"), clock=steady)
         threading.Thread(target=self._listen, name="stdin", daemon=True).start()
 
     def _hear(self, topic: names.Topic, take: Callable[[Any], None]) -> None:
-        self.create_subscription(topic.type, topic.name, self._guarded(take, topic.name), topic.qos)
-
-    def _guarded(self, callback: Callable[..., None], place: str) -> Callable[..., None]:
-        """Return `callback` with whatever it raises counted and said instead of raised."""
-        def call(*args: Any) -> None:
-            try:
-                callback(*args)
-            except Exception as error:  # nothing that is heard may end the screen
-                self.refusals.add(place, error)
-        return call
+        self.create_subscription(topic.type, topic.name, self.guarded(take, topic.name), topic.qos)
 
     def _say(self, level: Level, line: str) -> None:
         self._write(json.dumps({"said": printable(line)}))

@@ -8,28 +8,38 @@ from collections.abc import Callable
 
 import rclpy
 from rclpy._rclpy_pybind11 import RCLError, UnknownROSArgsError
-from rclpy.executors import ExternalShutdownException
+from rclpy.executors import Executor, ExternalShutdownException
 from rclpy.experimental.events_executor import EventsExecutor
-from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 
 from selfcal_ros.errors import ExitCode, InputError, SelfcalError
+from selfcal_ros.nodes.callbacks import Guarded
 from selfcal_ros.nodes.stopping import complete_on_signal, ignore_signals
 
 SPIN_SECONDS = 86400.0
 """An infinite time-out overflows in the executor of the wheels; a day is long enough to loop."""
 
+_raised: list[Executor] = []
+"""Executors that raised an error: they left a callback with the future, which calls into them."""
 
-def spin(node: Node, until: Future) -> None:
-    """Spin a node with the events executor until `until` is done or the context is shut down."""
+
+def spin(node: Guarded, until: Future) -> None:
+    """Spin a node with the events executor until `until` is done or the context is shut down.
+
+    What the executor raises (of a task, an action, the middleware) is counted as a refusal.
+    """
     executor = EventsExecutor()
     executor.add_node(node)
     try:
         while rclpy.ok() and not until.done():
-            executor.spin_until_future_complete(until, timeout_sec=SPIN_SECONDS)
-    except ExternalShutdownException:
-        pass
+            try:
+                executor.spin_until_future_complete(until, timeout_sec=SPIN_SECONDS)
+            except ExternalShutdownException:
+                break
+            except Exception as error:
+                _raised[:] = [executor]
+                node.refusals.add("executor", error)
     finally:
         executor.remove_node(node)
         executor.shutdown()
@@ -51,7 +61,7 @@ def _keep_what_is_loaded() -> None:
     gc.freeze()
 
 
-def run(make_node: Callable[[], Node], argv: list[str] | None = None) -> int:
+def run(make_node: Callable[[], Guarded], argv: list[str] | None = None) -> int:
     """Run one node as a process; SIGINT and SIGTERM end it cleanly. Return the exit code.
 
     A signal completes the future that the executor spins on, between two callbacks, so that no

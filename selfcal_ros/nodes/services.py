@@ -5,10 +5,8 @@ import inspect
 from collections.abc import Callable
 from typing import Any
 
-from rclpy.node import Node
-
 from selfcal_ros.errors import SelfcalError, as_answer, printable
-from selfcal_ros.sessions.health import Refusals
+from selfcal_ros.nodes.callbacks import Guarded
 
 
 def answered(response: Any, answer: Callable[[], str],
@@ -69,14 +67,12 @@ def answering_later(service: Any) -> Any:
     return service
 
 
-class Answering(Node):
+class Answering(Guarded):
     """A node whose services answer with success and message, whatever happens.
 
-    What has these: `refusals`, which counts what is raised, and `own`, which notes how to take a
-    service down.
+    `own` notes how to take a service down.
     """
 
-    refusals: Refusals
     own: Callable[[Any, Callable[[Any], Any]], Any]
 
     def service(self, kind: type, name: str, answer: Callable[..., str]) -> Any:
@@ -101,8 +97,8 @@ class Answering(Node):
         """
         def call(request: Any, response: Any) -> Later:
             later = Later()
-            when(lambda: later.give(answered(response, lambda: answer(request, response),
-                                             self.refusals.add)))
+            when(self.guarded(lambda: later.give(answered(
+                response, lambda: answer(request, response), self.refusals.add)), name))
             return later
         return self.own(answering_later(self.create_service(kind, name, call)),
                         self.destroy_service)

@@ -114,7 +114,7 @@ class Solver(ManagedNode[SolverSettings]):
     def _once_solved(self, then: Callable[[], None]) -> None:
         """Call `then` once the readings that have come so far are solved."""
         self._waiting.append((self._begun + self.session.stale, then))
-        self._advance()
+        self.guarded(self._advance)()
 
     def _go_on(self) -> None:
         done = self._begun - (self._running is not None)
