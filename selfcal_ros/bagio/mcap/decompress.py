@@ -95,18 +95,15 @@ def lz4_chunk(data: bytes, declared: int) -> bytes:
     RuntimeError
         If the frame is damaged.
     """
-    inside = lz4.frame.get_frame_info(data)["content_size"]
-    check_size(inside, len(data), declared)
-    decoder = lz4.frame.LZ4FrameDecompressor()
-    out = [decoder.decompress(data, max_length=max(inside or min(declared, FREE), 1))]
-    size = len(out[0])
-    while not decoder.eof and not decoder.needs_input:
-        out.append(decoder.decompress(b"", max_length=BLOCK))
+    check_size(lz4.frame.get_frame_info(data)["content_size"], len(data), declared)
+    decoder, out, size = lz4.frame.LZ4FrameDecompressor(), [], 0
+    for start in range(0, len(data), BLOCK):  # a block becomes at most 255 times as large
+        out.append(decoder.decompress(data[start:start + BLOCK]))
         size += len(out[-1])
         check_size(size, len(data), declared)
-    if not decoder.eof:
-        raise RuntimeError("the LZ4 frame is incomplete")
-    return b"".join(out) if len(out) > 1 else out[0]
+        if decoder.eof:
+            return b"".join(out)
+    raise RuntimeError("the LZ4 frame is incomplete")
 
 
 def zstd_message(data: bytes) -> bytes:
