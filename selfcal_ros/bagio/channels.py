@@ -16,7 +16,7 @@ from rosbags.typesys.store import Typestore
 
 from selfcal_ros.bagio.schemas import OWN, fields_of, own_message, same_layout, typestore
 from selfcal_ros.collection.reduce import DETECTION
-from selfcal_ros.messages.cdr_columns import Payloads
+from selfcal_ros.messages.cdr_columns import MAX_LENGTH, Payloads
 from selfcal_ros.messages.cdr_layout import LITTLE, layout_of
 from selfcal_ros.messages.input_columns import DetectionColumns, EncoderBlock, EncoderColumns
 from selfcal_ros.messages.to_model import detection, encoder_sample
@@ -71,7 +71,13 @@ class ChannelDecoder:
             self._columns = DetectionColumns(self._fields, tail)
 
     def one(self, data: bytes) -> Any:
-        """Return a message as rosbags has it; None if it cannot be decoded, which is counted."""
+        """Return a message as rosbags has it; None if it cannot be decoded, which is counted.
+
+        One that is too long is not looked at.
+        """
+        if len(data) > MAX_LENGTH:
+            self.bad[self.role, f": they are longer than {MAX_LENGTH} bytes"] += 1
+            return None
         for store in self.stores:
             try:
                 return store.deserialize_cdr(data, self.name)

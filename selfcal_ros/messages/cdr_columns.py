@@ -12,13 +12,17 @@ import numpy as np
 
 from selfcal_ros.messages.cdr_layout import HEAD, WORD, Field, Layout, layout_of
 
+MAX_LENGTH = 1 << 13
+"""Bytes of the longest message that is decoded: 140 joints with names of 30 letters, positions,
+velocities and efforts."""
 MAX_KNOWN = 16
 """Layouts of one length that are kept for the next messages."""
-MAX_LENGTHS = 256
-MAX_LENGTH = 1 << 16
-"""Bytes of a message beyond which it is not worth a layout of its own."""
+MAX_LENGTHS, MAX_KNOWN_BYTES = 256, 1 << 17
+"""Lengths of which layouts are kept, and bytes of all messages that have one."""
 FREE_TRIES, WORTH = 16, 32
 """Layouts that may be new in one call, and messages that allow one more."""
+TRY_BYTES = 512
+"""A layout of more bytes counts as several: it takes 1 ms a kB."""
 
 
 @dataclass(frozen=True)
@@ -138,7 +142,7 @@ class ColumnDecoder:
             index, rows = _take(known, index, rows, groups)
         failed = []
         while len(index) and tries > 0:
-            tries -= 1
+            tries -= 1 + length // TRY_BYTES
             layout = layout_of(self._fields, rows[0].tobytes())
             if layout is None or (self._tail is not None
                                   and layout.length - layout.end > self._tail):
@@ -150,11 +154,11 @@ class ColumnDecoder:
         return tries, np.concatenate([np.array(failed, dtype=np.int64), index])
 
     def _remember(self, layout: Layout) -> None:
-        if layout.length not in self._known and len(self._known) >= MAX_LENGTHS:
+        known = [*self._known.pop(layout.length, []), layout]
+        self._known[layout.length] = known[-MAX_KNOWN:]
+        while len(self._known) > MAX_LENGTHS or sum(
+                length * len(found) for length, found in self._known.items()) > MAX_KNOWN_BYTES:
             self._known.pop(next(iter(self._known)))
-        known = self._known.setdefault(layout.length, [])
-        known.append(layout)
-        del known[:-MAX_KNOWN]
 
 
 def _by_length(length: np.ndarray) -> list[np.ndarray]:

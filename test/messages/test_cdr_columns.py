@@ -209,6 +209,25 @@ def test_the_memory_of_layouts_is_bounded():
     assert max(map(len, decoder._known.values())) == cdr_columns.MAX_KNOWN
 
 
+def test_long_messages_have_few_layouts_and_longer_ones_none(monkeypatch):
+    """Names of random length: each message would have a layout of its own, of 1 ms a kB."""
+    def named(length):
+        return cdr(joint_state(0, names=["x" * (length - len(cdr(joint_state(0, names=[""]))))]))
+    longest = named(cdr_columns.MAX_LENGTH - 4) + bytes(4)
+    assert len(longest) == cdr_columns.MAX_LENGTH
+    decoder = ColumnDecoder(JOINT_STATE)
+    groups, rest = decoder.decode(Payloads.joined([longest, *(
+        named(length) for length in range(4004, 4404, 8))]))
+    assert [len(group.layout.example) for group in groups] == [4004, 4012, 4020]
+    assert len(rest) == 48
+    for length in range(2000, cdr_columns.MAX_LENGTH, 100):
+        decoder.decode(Payloads.joined([named(length)]))
+    kept = [layout.length for known in decoder._known.values() for layout in known]
+    assert cdr_columns.MAX_KNOWN_BYTES - 2 * max(kept) < sum(kept) <= cdr_columns.MAX_KNOWN_BYTES
+    assert decoder.decode(Payloads.joined([longest]))[1].tolist() == []
+    assert decoder.decode(Payloads.joined([longest + b"0"]))[1].tolist() == [0]
+
+
 def test_a_field_that_is_not_there():
     decoder = ColumnDecoder(JOINT_STATE)
     [columns], _ = decoder.decode(Payloads.joined([cdr(joint_state(0))]))

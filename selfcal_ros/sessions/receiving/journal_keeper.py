@@ -363,6 +363,6 @@ def bad_input(bad: Counter) -> InputError | None:
     """Return an error that tells what could not be decoded and empties the count of it."""
     if not bad:
         return None
-    line = "; ".join(f"{count} messages on {topic}" for (topic, _), count in bad.items())
+    line = "; ".join(f"{count} messages on {topic}{why}" for (topic, why), count in bad.items())
     bad.clear()
     return InputError(line, "cannot be decoded", "correct their publisher")

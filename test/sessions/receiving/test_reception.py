@@ -106,6 +106,18 @@ def test_bytes_give_the_readings_of_the_messages(events, expected):
     assert not desk.refused
 
 
+def test_messages_that_are_too_long_are_counted_with_the_reason(events, expected):
+    desk = Desk()
+    sample = next(event for event in events if isinstance(event, EncoderSample))
+    wide = replace(sample, names=tuple(f"joint_{i}" for i in range(100_000)))
+    for event in (wide, replace(wide, names=wide.names[:999])):
+        desk.receive([event])
+    desk.receive(events)
+    assert desk.read() == expected
+    assert desk.refused == {f"decoding: 2 messages on {ENCODER_TOPIC}: they are longer than 8192 "
+                            "bytes: cannot be decoded; correct their publisher": 1}
+
+
 def test_what_cannot_be_decoded_is_counted_by_topic_and_the_rest_is_used(events, expected):
     desk = Desk()
     for _ in range(2):
