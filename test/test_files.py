@@ -6,6 +6,7 @@ import json
 import math
 import os
 import signal
+import socket
 import stat
 import subprocess
 import sys
@@ -217,6 +218,46 @@ def test_what_cannot_be_read(tmp_path, source, message):
         assert str(caught.value) == f"{tmp_path / source}: {message}".replace("\0", "\\x00")
 
 
+@pytest.mark.parametrize("path", ["pipe", "/dev/zero", "/dev/tty", "socket"])
+def test_with_a_limit_only_regular_files_are_read(tmp_path, monkeypatch, path):
+    """A device is not even opened: that may do something."""
+    os.mkfifo(tmp_path / "pipe")
+    with socket.socket(socket.AF_UNIX) as ear:
+        ear.bind(str(tmp_path / "socket"))
+        monkeypatch.setattr(files.os, "open", lambda *_: pytest.fail("opened"))
+        with pytest.raises(InputError, match=r": is not a regular file; name a file on a disk$"):
+            read_bytes(tmp_path / path, 100)
+
+
+def test_a_file_that_becomes_a_pipe_while_it_is_opened_is_not_waited_for(tmp_path, monkeypatch):
+    (tmp_path / "a").write_bytes(b"x")
+    os.mkfifo(tmp_path / "pipe")
+    opened = os.open
+    monkeypatch.setattr(files.os, "open", lambda _, flags: opened(tmp_path / "pipe", flags))
+    with pytest.raises(InputError, match="is not a regular file"):
+        read_bytes(tmp_path / "a", 100)
+
+
+def test_with_a_limit_a_file_has_that_many_bytes_or_is_refused(tmp_path):
+    (tmp_path / "a").write_bytes(b"12345")
+    assert read_bytes(tmp_path / "a", 5) == b"12345"
+    with pytest.raises(InputError) as caught:
+        read_bytes(tmp_path / "a", 4)
+    assert str(caught.value) == (
+        f"{tmp_path / 'a'}: has 5 bytes, more than 4; name a smaller file")
+    assert read_bytes("/proc/self/pagemap", 5) == b"", "the kernel makes it up, without end"
+
+
+def test_json_of_too_many_values_is_refused_where_somebody_waits(tmp_path, monkeypatch):
+    monkeypatch.setattr(files, "MAX_JSON_VALUES", 3)
+    (tmp_path / "a").write_text("[1, 2, 3, 4]")
+    assert read_json(tmp_path / "a") == [1, 2, 3, 4]
+    with pytest.raises(InputError, match="more than 3 values; name a smaller file"):
+        read_json(tmp_path / "a", 100)
+    (tmp_path / "a").write_text("[1, 2, 3]")
+    assert read_json(tmp_path / "a", 100) == [1, 2, 3]
+
+
 def test_text_that_is_not_utf8(tmp_path):
     (tmp_path / "a").write_bytes(b"abc\xff")
     for read in (read_text, read_json, read_yaml):
@@ -354,16 +395,45 @@ def test_what_json_writes_is_what_json_reads(tmp_path):
     ("a: " + "9" * 400, r"f\.yaml: not usable YAML \(a whole number beyond 64 bits\); correct"),
     ("a: 9223372036854775808", "a whole number beyond 64 bits"),
     ("a: -9223372036854775809", "a whole number beyond 64 bits"),
-    ("a: &a [*a]", "its aliases stand for more than 1000000 values"),
+    ("a: &a [*a]", "its aliases stand for more than 50000 values"),
     ("\n".join(["a0: &a0 [0, 0]"] + [f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 10)}]"
                                      for i in range(1, 12)]),
-     r"f\.yaml:1:1: not YAML \(its aliases stand for more than 1000000 values\)")])
+     r"f\.yaml:1:1: not YAML \(its aliases stand for more than 50000 values\)")])
 @pytest.mark.usefixtures("loaders")
 def test_yaml_that_means_harm_or_is_ambiguous_is_refused(tmp_path, text, problem):
     path = tmp_path / "f.yaml"
     path.write_text(text)
     with pytest.raises(InputError, match=problem):
         files.read_yaml(path)
+
+
+@pytest.mark.usefixtures("loaders")
+def test_yaml_is_bounded_while_it_is_parsed(tmp_path, monkeypatch):
+    """What follows the last value that there may be is not looked at: there is no fault in it."""
+    monkeypatch.setattr(files, "MAX_YAML_NODES", 5)
+    path = tmp_path / "f.yaml"
+    path.write_text("[1, 2, 3, 4]")
+    assert files.read_yaml(path) == [1, 2, 3, 4]
+    path.write_text("- 1\n- 2\n- 3\n- 4\n- 5\n]")
+    with pytest.raises(InputError, match=r"f\.yaml:5:3: not YAML \(more than 5 values\)"):
+        files.read_yaml(path)
+    monkeypatch.setattr(files, "MAX_YAML_BYTES", 8)
+    with pytest.raises(InputError, match="has 21 bytes, more than 8; name a smaller file"):
+        files.read_yaml(path)
+
+
+def test_a_large_faulty_document_is_read_once(tmp_path, monkeypatch):
+    """The second way, which has the better words, takes five times as long."""
+    monkeypatch.setattr(files, "EXPLAINED", 4)
+    monkeypatch.setattr(files, "LOADERS", [files.LOADERS[0], None])
+    with pytest.raises(InputError, match=r"x\.yaml:1:7: not YAML \("):
+        (tmp_path / "x.yaml").write_text("a: 'bc")
+        read_yaml(tmp_path / "x.yaml")
+
+
+def test_a_number_without_end_takes_no_time(tmp_path):
+    """Half a million digits: what tried each way to split them would not come back."""
+    assert yaml_of(tmp_path, f"a: {'9' * 500_000}.x")["a"].endswith("9.x")
 
 
 @pytest.mark.parametrize("text, value", [

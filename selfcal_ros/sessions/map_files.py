@@ -9,8 +9,8 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.files import read_json
 from selfcal_ros.model.result import CalibrationResult, result_from_dict
 
-LARGEST_FILE = 1 << 30
-"""Bytes of the largest result that is read: 1001 x 1001 sites take a quarter of it."""
+LARGEST_FILE = 32 << 20
+"""Bytes of the largest result that is read for somebody else, who is not to wait for it."""
 
 
 def result_file(path: str, folder: str) -> Path:
@@ -26,15 +26,17 @@ def result_file(path: str, folder: str) -> Path:
     Raises
     ------
     InputError
-        If `path` is empty or lies outside of the folder.
+        If `path` is empty, lies outside of the folder, or is there and no regular file.
     """
-    if not path:
-        raise InputError("path", "is empty", "name a file")
+    if not path or "\0" in path:
+        raise InputError("path", "is no file name" if path else "is empty", "name a file")
     root = Path(os.path.realpath(folder or os.curdir))
     target = Path(os.path.realpath(root / path))
     if not target.is_relative_to(root):
         raise InputError(path, f"lies outside of {root}", "name a file in it, or set the parameter "
                          "result_folder of the solver")
+    if os.path.exists(target) and not os.path.isfile(target):  # a pipe would be waited for
+        raise InputError(path, "is not a regular file", "name another file")
     return target
 
 
@@ -58,19 +60,8 @@ def read_result(path: str) -> CalibrationResult:
     Raises
     ------
     InputError
-        If it is no regular file of a sensible size, or holds no result.
+        If it is no regular file of at most `LARGEST_FILE`, or holds no result.
     """
     if not path:
         raise InputError("path", "is empty", "name a file")
-    file = Path(path)
-    try:
-        if file.exists() and not file.is_file():
-            raise InputError(path, "is not a regular file", "name a RESULT.json")
-        if file.exists() and file.stat().st_size > LARGEST_FILE:
-            raise InputError(path, "is larger than 1 GiB", "name a RESULT.json")
-    except OSError as error:
-        raise InputError(path, f"cannot be read ({error.strerror})", "name a readable file") \
-            from error
-    except ValueError as error:  # a NUL in the name
-        raise InputError(path, f"is not a file name ({error})", "name a RESULT.json") from error
-    return result_from_dict(read_json(path), path)
+    return result_from_dict(read_json(path, LARGEST_FILE), path)
