@@ -32,7 +32,7 @@ PLAN = {
     "visit_order": "order of the marks in views that have none of their own "
                    "(docs/identifiability.md); default: as the cell likes",
     "model_terms": "list of TERM or TERM:SIZE that are estimated with the map; default: none",
-    "artifact.grid_size": "N, marks along x; odd, 3 to 4001",
+    "artifact.grid_size": "N, marks along x; odd, 3 to 1001",
     "artifact.grid_pitch": "distance between neighbouring marks, m",
     "artifact.angular_count": "K, angular lines; a multiple of 4, 0 without lines",
     "artifact.grid_size_y": "marks along y where the plate is not square; default: N",

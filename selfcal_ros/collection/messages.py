@@ -16,11 +16,9 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.messages.topics import MEASUREMENT_TOPIC
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import GridVisits, ViewReadings
-from selfcal_ros.model.view import View
+from selfcal_ros.model.view import MAX_VIEWS, View
 from selfcal_ros.units import NS_PER_S
 
-MAX_VIEWS = 10_000
-"""Views of a plan."""
 MAX_REPEATS = 1_000_000
 """Repeats of a mark in a view."""
 SITES_A_MARK = 1000

@@ -8,7 +8,7 @@ import numpy as np
 
 from selfcal_ros.errors import InputError
 
-MAX_GRID_SIZE = 4001
+MAX_GRID_SIZE = 1001
 MAX_ANGULAR_COUNT = 1_000_000
 PITCH_RANGE_M = (1e-7, 1.0)
 """Distances between marks that a plate can have."""

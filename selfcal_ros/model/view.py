@@ -14,6 +14,9 @@ from selfcal_ros.model.terms import parse_terms
 LATTICE_TOLERANCE = 1e-3
 """Largest distance of a commanded pose from the lattice, in pitches or lines."""
 
+MAX_VIEWS = 1000
+"""Largest number of views of a plan."""
+
 MAX_SHIFT = 100_000
 """Largest translation of a view, in pitches."""
 
@@ -203,14 +206,19 @@ def plan_from_dict(data: object, where: str) -> Plan:
     artifact = Artifact(raw["grid_size"], raw["grid_pitch"], raw["angular_count"],
                         raw["grid_size_y"])
     order = _order(fields["visit_order"], where)
+    if len(fields["views"]) > MAX_VIEWS:
+        raise InputError(f"{where}: views", f"{len(fields['views'])} views are more than "
+                         f"{MAX_VIEWS}", "measure fewer views")
     views = tuple(_view_from_dict(view, f"{where}: views[{index}]", artifact, order)
                   for index, view in enumerate(fields["views"]))
     if not views:
         raise InputError(where, "the plan has no views", "add at least one view")
+    names: set[str] = set()
     for index, view in enumerate(views):
-        if view.name in [other.name for other in views[:index]]:
+        if view.name in names:
             raise InputError(f"{where}: views[{index}]", f"the name '{view.name}' is used twice",
                              "give every view its own name")
+        names.add(view.name)
     return Plan(fields["plan_id"], artifact, views, _terms(fields["model_terms"], where))
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from selfcal_ros.collection.digest import readings_digest, session_digest
-from selfcal_ros.collection.messages import MAX_VIEWS, Phase, begun_ns, check_plate, check_view
+from selfcal_ros.collection.messages import Phase, begun_ns, check_plate, check_view
 from selfcal_ros.collection.settings.estimator import solver_options
 from selfcal_ros.collection.settings.nodes import SolverSettings
 from selfcal_ros.errors import InputError, NoDataError, NotIdentifiableError, SelfcalError
@@ -27,6 +27,7 @@ from selfcal_ros.model.result import (
     unidentified_result,
     with_warnings,
 )
+from selfcal_ros.model.view import MAX_VIEWS
 from selfcal_ros.reporting.summary.format import counted
 from selfcal_ros.reporting.summary.numbers import summary_numbers
 from selfcal_ros.reporting.summary.text import state_sentence

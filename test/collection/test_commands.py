@@ -19,8 +19,8 @@ ODD = [
      "view command 0: neither grid nor angular marks are wanted; set one to true"),
     ({"repeats": 2**32 - 1}, {}, "view command 0: 4294967295 repeats; ask for 1 to 1000000"),
     ({"repeats": 0}, {}, "view command 0: 0 repeats; ask for 1 to 1000000"),
-    ({}, {"view_index": 2**31}, "view command 2147483648: a plan has at most 10000 views; "),
-    ({}, {"views_planned": 2**32 - 1}, "view command 0: a plan has at most 10000 views; correct"),
+    ({}, {"view_index": 2**31}, "view command 2147483648: a plan has at most 1000 views; "),
+    ({}, {"views_planned": 2**32 - 1}, "view command 0: a plan has at most 1000 views; correct"),
     ({}, {"view": None}, "view command 0: it describes no view; fill its pose and its plate"),
 ]
 
@@ -44,20 +44,20 @@ def test_limits_themselves_are_kept():
     cell = scene(count=0)
     measure = cell.commands[1]
     collector = gathered([])
-    collector.add_command(replace(measure, view_index=10_000, views_planned=10_000,
+    collector.add_command(replace(measure, view_index=1000, views_planned=1000,
                                   view=replace(measure.view, repeats=1_000_000)))
-    collector.add_command(Command(0, Phase.ABORT, "p", 10_000))
+    collector.add_command(Command(0, Phase.ABORT, "p", 1000))
     collector.add_command(replace(measure, view=replace(
         measure.view, translation_m=(1000.0, 0.0))))
     assert collector.received["command"] == 3
 
 
-def test_a_plate_of_4001_marks_a_side_of_which_25_were_read():
+def test_a_plate_of_1001_marks_a_side_of_which_25_were_read():
     cell = scene(count=0)
-    wide = [replace(c, artifact=Artifact(4001, 0.01)) if c.artifact else c for c in cell.commands]
+    wide = [replace(c, artifact=Artifact(1001, 0.01)) if c.artifact else c for c in cell.commands]
     _, progress = collect([*wide, *cell.samples, *cell.detections])
-    assert (progress[0].grid_expected, progress[0].grid_done) == (4001**2, 25)
-    assert (progress[0].missing.m[0], progress[0].missing.n[199]) == (-2000, -1801)
+    assert (progress[0].grid_expected, progress[0].grid_done) == (1001**2, 25)
+    assert (progress[0].missing.m[0], progress[0].missing.n[199]) == (-500, -301)
 
 
 @pytest.mark.parametrize("field", ["sigma", "score"])

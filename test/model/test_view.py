@@ -70,7 +70,7 @@ def test_poses_off_the_lattice_are_refused(view, plate, message):
 
 
 @pytest.mark.parametrize(("arguments", "message"), [
-    ((10, 0.01), "artifact grid_size: 10 is not an odd number from 3 to 4001"),
+    ((10, 0.01), "artifact grid_size: 10 is not an odd number from 3 to 1001"),
     ((1, 0.01), "artifact grid_size: 1 is not"), ((-3, 0.01), "artifact grid_size: -3 is not"),
     ((4003, 0.01), "artifact grid_size: 4003 is not"),
     ((11, 0.01, 0, 4), "artifact grid_size_y: 4 is not"),
@@ -122,6 +122,8 @@ def test_a_plan_with_its_defaults_and_with_all_its_keys():
     (plan_with(plan_id=3), "f: plan_id: 3 is not of type str; correct the value"),
     (plan_with(views=[]), "f: the plan has no views; add at least one view"),
     (plan_with(views=[3]), "f: views[0]: not a mapping of keys to values"),
+    (plan_with(views=[{"name": "a"}] * 1001), "f: views: 1001 views are more than 1000; "),
+    (plan_with(views=[{"name": "a"}] * 1000), "f: views[1]: the name 'a' is used twice; give"),
     (plan_with(views=[{"name": "a"}] * 2), "f: views[1]: the name 'a' is used twice; give every"),
     (plan_with(artifact=[]), "f: artifact: [] is not of type dict"),
     (plan_with(artifact={"grid_size": 11.0, "grid_pitch": 1, "angular_count": 0}),
