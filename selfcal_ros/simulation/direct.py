@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from selfcal_ros.collection.marks.visits import repeat_motion
 from selfcal_ros.model.readings import GridVisits, Sense, ViewReadings
 from selfcal_ros.model.view import View
 from selfcal_ros.simulation.exposures import (
@@ -46,7 +47,7 @@ def measured_view(truth: Truth, item: tuple[int, View], rng: np.random.Generator
                          lost=_lost(rng, missing, truth.artifact.shape), start_ns=start_ns)
     if view.angular and truth.artifact.angular_count:
         found = angular_exposures(truth, index, view, settings=settings, rng=rng)
-        readings = _angular(readings, truth, found.k, _read(settings.sense, found),
+        readings = _angular(readings, truth, found, sense=settings.sense,
                             lost=_lost(rng, missing, truth.artifact.angular_count))
     return replace(readings, used=int(readings.count.sum() + readings.count_theta.sum()))
 
@@ -76,6 +77,8 @@ def _grid(readings: ViewReadings, truth: Truth, found: GridExposures, *, setting
     by_visit, sigma_visit, dof_visit = _means(deviation, visit, count)
     by_mark, sigma, dof = _means(deviation, of_mark, np.bincount(mark, count).astype(int))
     offset, _, _ = _means(found.offset[:, here], visit, count)
+    motion = repeat_motion(of_mark, (_read(settings.sense, found) - found.offset)[:, here],
+                           found.offset[:, here], np.zeros(len(of_mark), dtype=bool))
     # the stage leaves for the first mark one period after the view begins
     first = start_ns + settings.period_ns + settings.exposure_ns
     stamp = first + np.rint(visits.time[kept] * settings.period_ns).astype(np.int64)
@@ -85,21 +88,24 @@ def _grid(readings: ViewReadings, truth: Truth, found: GridExposures, *, setting
     return replace(
         readings, m=marks // (2 * hy + 1) - hx, n=marks % (2 * hy + 1) - hy, dx=by_mark[0],
         dy=by_mark[1], count=np.bincount(mark, count).astype(int), sigma_xy=sigma, dof_xy=dof,
+        motion=motion,
         visits=GridVisits(mark[order], dx, dy, count[order], stamp[order], ox, oy, approach[0],
                           approach[1], sigma_m=sigma_visit, dof=dof_visit))
 
 
-def _angular(readings: ViewReadings, truth: Truth, k: np.ndarray, reading: np.ndarray, *,
+def _angular(readings: ViewReadings, truth: Truth, found: AngularExposures, *, sense: Sense,
              lost: np.ndarray) -> ViewReadings:
     count = truth.artifact.angular_count
     turn = readings.view.lattice_pose(truth.artifact).s
-    nominal = (k + turn) % count * (2 * np.pi / count)
-    kept = ~lost[k]
-    lines, line = np.unique(k[kept], return_inverse=True)
+    nominal = (found.k + turn) % count * (2 * np.pi / count)
+    kept = ~lost[found.k]
+    lines, line = np.unique(found.k[kept], return_inverse=True)
     repeats = np.bincount(line, minlength=len(lines))
-    (mean,), sigma, dof = _means((reading - nominal)[None, kept], line, repeats)
+    deviation, offset = (_read(sense, found) - nominal)[None, kept], found.offset[None, kept]
+    (mean,), sigma, dof = _means(deviation, line, repeats)
+    motion = repeat_motion(line, deviation - offset, offset, np.zeros(len(line), dtype=bool))
     return replace(readings, k=lines, dtheta=mean, count_theta=repeats, sigma_theta=sigma,
-                   dof_theta=dof)
+                   dof_theta=dof, motion_theta=motion)
 
 
 def _means(values: np.ndarray, group: np.ndarray, count: np.ndarray,

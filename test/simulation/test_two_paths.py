@@ -58,6 +58,15 @@ def test_both_give_the_same_readings_visit_by_visit(case, sense):
         np.testing.assert_allclose(one.sigma_theta, other.sigma_theta, rtol=1e-9)
         if one.view.grid:
             assert_same_visits(one.visits, other.visits)
+        for name in ("motion", "motion_theta"):
+            assert_same_motion(getattr(one, name), getattr(other, name))
+
+
+def assert_same_motion(one, other):
+    assert (one is None) == (other is None)
+    if one is not None:
+        assert one.dof == other.dof
+        np.testing.assert_allclose(one.products, other.products, rtol=1e-6, atol=1e-26)
 
 
 def test_both_read_the_marks_that_lie_there_where_they_have_no_ids():
