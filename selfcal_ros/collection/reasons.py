@@ -24,6 +24,7 @@ class Reason(StrEnum):
     ROTATION = "rotation_not_known"
     TOO_FAR = "too_far_from_nominal"
     NOT_AT_MARK = "stage_not_at_mark"
+    SEVERAL = "other_mark_of_one_exposure"
     LOW_SCORE = "low_score"
     DUPLICATE = "duplicate"
     OUTLIER = "outlier_among_repeats"
@@ -73,6 +74,9 @@ REMEDY = {
                     "of the offsets (m, stage axes) and the ids, or raise max_deviation",
     Reason.NOT_AT_MARK: "the stage does not stand at the marks that are seen; check joint_x, "
                         "joint_y and measurement_sense, or set max_stage_distance",
+    Reason.SEVERAL: "an exposure shows several marks, and only that at which the stage stands is "
+                    "read: the stage's error is mapped where it stands; go to every mark, and "
+                    "publish of each image the mark nearest to the optical axis",
     Reason.LOW_SCORE: "their score is below min_score; correct the detection, or lower min_score",
     Reason.OUTLIER: "repeats of a mark contradict each other; check that each id is of one mark, "
                     "or raise outlier_limit",

@@ -165,6 +165,10 @@ def _grid_marks(artifact: Artifact, view: View, d: np.ndarray, *, exposures: Exp
         artifact, view, _reading(rules.sense, position, np.stack([d["ox"], d["oy"]])),
         ids=np.stack([d["m"], d["n"]]), has_id=d["has_id"], rules=rules.identity,
         stage_m=_reading(rules.sense, position, 0.0))
+    away = found.reasons == Reason.NOT_AT_MARK
+    if away.any():
+        away &= np.isin(d["stamp"], d["stamp"][found.reasons == None])  # noqa: E711
+        found.reasons[away] = Reason.SEVERAL
     d, (position, index, deviation, residual, approach) = _keep(
         d, found.reasons, rejected, position, found.index, found.deviation, found.residual,
         approach, places=places)

@@ -8,7 +8,7 @@ import pytest
 
 from selfcal_ros.collection.marks import identify
 from selfcal_ros.model.readings import Sense
-from test.support.collecting import collect, scene, table
+from test.support.collecting import collect, gathered, scene, table
 
 REASON = "stage_not_at_mark"
 PITCH = 0.01
@@ -84,3 +84,35 @@ def test_marks_at_whose_sites_the_stage_does_not_stand_do_not_move_the_others():
     found, _ = collect(cell.events)
     assert found.all_rejected() == {REASON: 13}
     assert table(found.views[0]).items() <= whole.items()
+
+
+@pytest.mark.parametrize("with_ids", [True, False])
+@pytest.mark.parametrize("sense", Sense)
+def test_of_an_image_of_many_marks_the_one_at_which_the_stage_stands_is_read(with_ids, sense):
+    """At each stop the microscope sees the whole plate; the other marks are named as that."""
+    cell = scene(count=0, sense=sense)
+    plain, _ = collect(cell.events, measurement_sense=str(sense))
+    seen = []
+    for at in cell.detections:
+        for other in cell.detections:
+            away = [0.01 * (getattr(other, k) - getattr(at, k)) for k in "mn"]
+            seen.append(replace(other, stamp_ns=at.stamp_ns, has_id=with_ids,
+                                offset_x=at.offset_x + away[0], offset_y=at.offset_y + away[1]))
+    events = [*cell.commands, *cell.samples, *seen]
+    collector = gathered(events, measurement_sense=str(sense))
+    found, progress = collector.collect()
+    assert found.all_rejected() == {"other_mark_of_one_exposure": 600}
+    assert table(found.views[0]) == table(plain.views[0])
+    assert progress[0].complete
+    (line,) = [str(item) for item in collector.findings(found, progress).values()]
+    assert line.startswith("600 of 625 detections were rejected as other_mark_of_one_exposure: an "
+                           "exposure shows several marks, and only that at which the stage stands")
+
+
+def test_two_marks_of_one_exposure_with_the_stage_at_neither_are_not_at_their_mark():
+    cell = scene(count=0)
+    first, second = cell.grid(3), cell.grid(4)
+    led_astray(cell, first, 2 * PITCH)
+    cell.spoil(second, stamp_ns=cell.detections[first].stamp_ns)
+    led_astray(cell, second, 2 * PITCH)
+    assert collect(cell.events)[0].all_rejected() == {REASON: 2}
