@@ -98,7 +98,7 @@ class CollectingSession:
     def _note_clock(self, topic: str, stamps_ns: np.ndarray, age_ns: int) -> None:
         """Hold stamps against their reception."""
         self._clock.data(topic, int(stamps_ns.max()), self._ports.now_ns() - age_ns,
-                         self._ports.now_s())
+                         self._ports.now_s() - age_ns * S_PER_NS)
 
     def adopt(self, collector: Collector, journal: str,
               steps: Mapping[str, list[Step]] | None = None) -> None:

@@ -15,6 +15,8 @@ from selfcal_ros.units import NS_PER_S, S_PER_NS
 
 GROUP, BESIDE = 5, 3
 """Messages that are looked at as one, and such groups on either side of a step."""
+SLEW = 2000
+"""A clock that is kept by another runs away from it by at most one part in so many."""
 REMEDY = ("let clocks slew, not step, while a run is measured (chrony, ptp4l: no step after the "
           "start)")
 
@@ -39,8 +41,10 @@ class StepWatch:
     """Finds the steps of the clock that stamps a stream of messages.
 
     A step parts the stamps from the instants of reception at once and for good: what lies before
-    and behind it do not overlap. Late, bundled or lost messages do not look like that. Where the
-    clock of reception steps as well, only a step back can be told from a pause.
+    and behind it do not overlap. Late, bundled or lost messages do not look like that: where a
+    delay ends, and what waited was lost, stamps come nearer to their reception again, but no nearer
+    than they were before. Where the clock of reception steps as well, only a step back can be told
+    from a pause.
 
     Parameters
     ----------
@@ -52,6 +56,7 @@ class StepWatch:
         self._limit_ns = round(limit_s * NS_PER_S)
         self._rest = np.zeros((2, 0), dtype=np.int64)  # less than a group
         self._groups = np.zeros((6, 0), dtype=np.int64)
+        self._nearest: tuple[int, int] | None = None  # largest offset, and when
         self._quiet = 0  # groups in which a step that has been told is still seen
 
     def add(self, stamps_ns: np.ndarray, received_ns: np.ndarray) -> list[Step]:
@@ -87,17 +92,39 @@ class StepWatch:
         before = (low[:, :count], high[:, :count])
         after = (low[:, BESIDE + 1:][:, :count], high[:, BESIDE + 1:][:, :count])
         size = _parted(before, after, self._limit_ns)
+        offset = (after[0][0] + after[1][0]) // 2
         out = []
         for number in range(count):
             if self._quiet:
                 self._quiet -= 1
-            elif size[number]:
+                continue
+            nearest, when = self._nearest_so_far(before[1][:, number])
+            ahead = offset[number] > nearest + self._limit_ns // 2
+            if size[number] < 0 or (size[number] and ahead):
                 # of the groups that see it, the one in the midst has the step within it
                 last = min(number + BESIDE, count)
                 best = number + int(np.abs(size[number:last]).argmax())
                 out.append(Step(int(before[1][1, best]), int(size[best])))
                 self._quiet = 2 * BESIDE
+                self._nearest = nearest + int(size[best]), when
         return out
+
+    def _nearest_so_far(self, before: np.ndarray) -> tuple[int, int]:
+        """Return how near to their reception stamps have come, and the reception of the last.
+
+        Of a clock that stepped since, as if it always had been where it is.
+
+        Parameters
+        ----------
+        before : int array (3,)
+            Highest offset, stamp and reception of the messages that come next, ns.
+        """
+        offset_ns, _, received_ns = before.tolist()
+        if self._nearest is not None:
+            known, when = self._nearest
+            offset_ns = max(offset_ns, known - max(received_ns - when, 0) // SLEW)
+        self._nearest = offset_ns, received_ns
+        return self._nearest
 
 
 Span = tuple[np.ndarray, np.ndarray]

@@ -100,12 +100,31 @@ def mixed():
     return np.random.default_rng(1).permutation(TRUE), TRUE
 
 
+def late_then_dropped(late_s=0.425, start=400, stop=1000):
+    """Messages wait 0.425 s in a queue, which is then emptied: those that wait are lost."""
+    lost = round(late_s * 200)
+    kept = np.r_[TRUE[:stop], TRUE[stop + lost:]]
+    delay = np.where((np.arange(len(kept)) >= start) & (np.arange(len(kept)) < stop),
+                     round(late_s * S), MS)
+    return kept, kept + delay
+
+
+def late_for_long():
+    """The same for 10 s; then a second time."""
+    stamps, received = late_then_dropped(stop=2400)
+    again = np.where(np.arange(len(stamps)) >= 2600, 425 * MS, 0)
+    kept = np.r_[:2700, 2785:len(stamps)]
+    again[2700:] = 0
+    return stamps[kept], (received + again)[kept]
+
+
 def faster():
     """A recording that is played at eight times its speed."""
     return TRUE, TRUE[0] + (TRUE - TRUE[0]) // 8
 
 
-@pytest.mark.parametrize("case", [bundles, hole, stall, transport, shuffled, mixed, faster],
+@pytest.mark.parametrize("case", [bundles, hole, stall, transport, shuffled, mixed, faster,
+                                  late_then_dropped, late_for_long],
                          ids=lambda case: case.__name__)
 def test_what_only_looks_like_a_step_is_none(case):
     assert found(*case()) == []
@@ -136,3 +155,24 @@ def test_steps_of_two_clocks_are_two_lines():
     assert [line.split(" by ")[0] for line in lines] == [
         "the clock that stamps a stepped ahead", "the clock that stamps b stepped back"]
     assert step_lines({"a": []}, timeline()) == []
+
+
+def test_a_step_ahead_while_messages_are_late_is_still_found():
+    stamps, received = late_then_dropped()
+    stamps[700:] += S
+    steps = found(stamps, received)
+    assert [step.by_ns for step in steps] == [S]
+
+
+def test_a_step_ahead_after_one_back_is_found_though_stamps_were_nearer_before():
+    stamps = stepped(1000, -3 * S)
+    stamps[2000:] += S
+    assert [step.by_ns for step in found(stamps, TRUE)] == [-3 * S, S]
+
+
+def test_a_clock_that_runs_away_slowly_hides_no_later_step():
+    """Behind by 500 us each second for 1,000 s: what was nearest at the begin tells no more."""
+    true = TRUE[0] + np.arange(20_000) * 50 * MS
+    stamps = true - (true - true[0]) // 2000
+    stamps[19_000:] += 200 * MS
+    assert [round(step.by_ns / MS, -1) for step in found(stamps, true)] == [200]
