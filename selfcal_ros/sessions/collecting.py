@@ -215,7 +215,9 @@ class CollectingSession:
             key = readings_digest(view.readings, measurements.rejected)
             closed = view.end_ns <= timeline.last_stamp_ns
             ready = final or closed or view.complete
-            worth = view.readings.used or view.readings.rejected or index in self._published
+            # empty: unless a collector before this one may have sent its readings
+            worth = view.readings.used or view.readings.rejected or index in self._published or (
+                (final or closed) and (timeline.plan_id, index) not in self.missed)
             is_new = self._published.get(index) != key or self._noted != self._stepped
             if ready and worth and is_new:
                 self._published[index], self._noted = key, self._stepped

@@ -278,6 +278,8 @@ class SolvingSession:
                 result, shown.stamp_ns, frame_id) | verdict)
         numbers = summary_numbers(result)
         seen = result.observability
+        to_come = self._planned_views(run) - shown.views_done
+        advice = [f"{counted(to_come, 'view')} to come"] if self._unfinished() else seen.advice
         fields = {name: getattr(numbers, name) for name in (
             "max_error_um", "rms_error_um", "rms_uncertainty_um", "max_theta_error_arcsec",
             "rms_theta_uncertainty_arcsec")}
@@ -286,7 +288,7 @@ class SolvingSession:
             "state": short(self._state()), "views_done": shown.views_done,
             "views_planned": self._planned_views(run),
             "identifiable": seen.identifiable, "rank_deficiency": seen.deficiency, **fields,
-            "advice": [*seen.advice, *result.warnings], "causes": [
+            "advice": [*advice, *result.warnings], "causes": [
                 cause.text for cause in result.verdict.causes], **verdict})
         if shown.problem is None:  # last: pictures take their time
             self._ports.publish("markers", {"error_map": result.error_map,

@@ -11,7 +11,7 @@ from selfcal_ros.messages import from_model
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.sessions.collecting import CollectingSession
 from selfcal_ros.sessions.ports import Level, Ports
-from test.support.collecting import scene
+from test.support.collecting import gathered, scene
 from test.support.ports import message
 
 
@@ -66,11 +66,27 @@ def test_a_view_of_which_all_was_rejected_is_published_as_it_is_offline():
     assert cell.said[0][1].startswith("view '0': 25 of 25 detections were rejected as unknown_mark")
 
 
-def test_a_view_of_which_nothing_came_is_not_published():
+def without_first_view():
     events = scene("0, 90", count=0)
     begin = next(c for c in events.commands if c.view_index == 1).stamp_ns
-    cell = Cell().feed(e for e in events.events
-                       if isinstance(e, Command) or e.stamp_ns > begin)
+    return [e for e in events.events if isinstance(e, Command) or e.stamp_ns > begin]
+
+
+def test_a_view_of_which_nothing_came_is_published_empty_when_it_is_over_as_offline():
+    events = without_first_view()
+    cell = Cell().feed(events)
+    assert [(fields["view_index"], len(fields["m"])) for fields in cell.of("measurement")] == [
+        (0, 0), (1, 25)]
+    assert [len(view.m) for view in gathered(events).collect()[0].views] == [0, 25]
+    begun = [e for e in events if isinstance(e, Command)][:2]
+    assert Cell().feed(begun).of("measurement") == []  # it is still to be measured
+
+
+def test_a_view_that_a_collector_before_this_one_may_have_sent_is_not_published_empty():
+    cell, events = Cell(), without_first_view()
+    for command in [e for e in events if isinstance(e, Command)][:2]:
+        cell.session.take_command(message("ViewCommand", from_model.command(command, "s")), True)
+    cell.feed(events)
     assert [fields["view_index"] for fields in cell.of("measurement")] == [1]
 
 

@@ -450,3 +450,18 @@ def test_a_run_from_before_the_clock_was_set_back_gives_way(desk):
     desk.take(views_of(run_id=str(NOW)))
     assert desk.hands.of("summary")[-1]["run_id"] == str(NOW)
     assert desk.session.diagnosis().values["left_aside"] == 0
+
+
+@pytest.mark.parametrize("phase", [Phase.MEASURE, Phase.DONE])
+def test_while_views_are_to_come_no_view_is_advised(desk, phase):
+    """After DONE they are missing as well: what was skipped may be measured in a redo."""
+    views = views_of()
+    desk.session.take_command(command(4))
+    desk.take(views[:1])
+    assert desk.hands.of("summary")[-1]["advice"] == ["3 views to come"]
+    desk.take(views[1:2])
+    assert desk.hands.of("summary")[-1]["advice"][0] == "2 views to come"
+    short = Desk()
+    short.session.take_command(command(1))
+    short.take(views[:1])
+    assert "add a view turned by 90" in short.hands.of("summary")[-1]["advice"][0]
