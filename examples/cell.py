@@ -126,12 +126,10 @@ class Cell(Node):
 
     def _measure(self, view: ViewCommand) -> Iterator[None]:
         """Visit every mark as often as asked: move, rest, expose, rest."""
-        for _ in range(view.repeats):
+        for number in range(view.repeats):
             for m, n, position in grid_sites(view) if view.grid else ():
                 yield from self._settle(position)
-                x, y = self.machine.see_mark(m, n, view)
-                self._expose(MarkDetection(kind=MarkDetection.GRID, has_id=True, m=m, n=n,
-                                           offset_x=x, offset_y=y, score=1.0))
+                self._expose(self._see(m, n, view))
                 yield
             for k in range(view.angular_count) if view.angular else ():
                 yield from self._settle((0.0, 0.0, view.rotation
@@ -139,6 +137,27 @@ class Cell(Node):
                 self._expose(MarkDetection(kind=MarkDetection.ANGULAR, has_id=True, k=k,
                                            offset_theta=self.machine.see_line(k, view), score=1.0))
                 yield
+            if number == (view.repeats - 1) // 2:  # half way: a drift does not add up in them
+                yield from self._check_stops(view)
+
+    def _check_stops(self, view: ViewCommand) -> Iterator[None]:
+        """See some marks again with the stage off them: +x, -x, +y, -y.
+
+        Any marks will do that are spread over the plate. One side after the other, each in the same
+        order of marks: backlash is then the same in all of them and looks like no scale.
+        """
+        sites = list(grid_sites(view)) if view.grid and view.check_marks else []
+        step, off = max(1, len(sites) // max(1, view.check_marks)), view.check_offset
+        for side_x, side_y in ((off, 0.0), (-off, 0.0), (0.0, off), (0.0, -off)):
+            for m, n, (x, y, theta) in sites[step // 2::step][:view.check_marks]:
+                yield from self._settle((x + side_x, y + side_y, theta))
+                self._expose(self._see(m, n, view))
+                yield
+
+    def _see(self, m: int, n: int, view: ViewCommand) -> MarkDetection:
+        x, y = self.machine.see_mark(m, n, view)
+        return MarkDetection(kind=MarkDetection.GRID, has_id=True, m=m, n=n, offset_x=x, offset_y=y,
+                             score=1.0)
 
     def _settle(self, position: Position) -> Iterator[None]:
         """Move, then wait until two encoder samples have told that the stage rests."""

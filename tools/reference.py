@@ -32,6 +32,10 @@ PLAN = {
     "visit_order": "order of the marks in views that have none of their own "
                    "(docs/identifiability.md); default: as the cell likes",
     "model_terms": "list of TERM or TERM:SIZE that are estimated with the map; default: none",
+    "check_stops": "marks of each grid view that are seen four times more, the stage deliberately "
+                   "off them (docs/cell.md); default: none",
+    "check_stops.marks": "how many marks",
+    "check_stops.offset": "how far off the stage stops, m; at most a quarter of the pitch",
     "artifact.grid_size": "N, marks along x; odd, 3 to 1001",
     "artifact.grid_pitch": "distance between neighbouring marks, m",
     "artifact.angular_count": "K, angular lines; a multiple of 4, 0 without lines",

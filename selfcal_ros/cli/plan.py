@@ -183,7 +183,16 @@ def _check_text(plan: Plan, seen: Observability, predicted: Prediction | None) -
     if len(predicted.u_theta):
         lines.append(f"  theta  rms {predicted.rms_theta:.4f}")
     note = field_note(predicted, plan)
-    return [*lines, *([f"  ({note})"] if note else [])]
+    return [*lines, *([f"  ({note})"] if note else []), _check_stops_text(plan)]
+
+
+def _check_stops_text(plan: Plan) -> str:
+    marks, offset_m = _check_stops(plan)
+    if not marks:
+        return ("no check stops: nothing but stop errors and turns of the plate shows scale, turn "
+                "and sign of the microscope; add check_stops: {marks: 5, offset: 20e-6}")
+    return (f"check stops: {marks} marks of each grid view, {offset_m * UM_PER_M:g} µm off in x "
+            f"and y: {4 * marks} exposures more")
 
 
 def _unchecked_text(seen: Observability) -> list[str]:
@@ -256,7 +265,7 @@ def _suggest(args: argparse.Namespace, plan: Plan) -> int:
     if args.views is not None:
         best = replace(best, plan_id=f"{plan.plan_id}_best{args.views}",
                        model_terms=plan.model_terms)
-        best = _in_order(best, order)
+        best = _checked_like(_in_order(best, order), plan)
         _show_best(args, best, (score, unit), search_text(search))
     else:
         best = replace(plan, views=ranked[0].views)
@@ -277,6 +286,22 @@ def _in_order(plan: Plan, order: str) -> Plan:
     order = str(parse_order(order, "--order"))
     return replace(plan, views=tuple(replace(view, visit_order=order) if view.grid else view
                                      for view in plan.views))
+
+
+def _checked_like(plan: Plan, other: Plan) -> Plan:
+    """Return the plan with the check stops of another one in its views with grid marks."""
+    from dataclasses import replace
+
+    marks, offset_m = _check_stops(other)
+    return replace(plan, views=tuple(
+        replace(view, check_marks=marks, check_offset_m=offset_m) if view.grid else view
+        for view in plan.views))
+
+
+def _check_stops(plan: Plan) -> tuple[int, float]:
+    """Return how many marks of each view are checked, and from how far off, m."""
+    return next(((view.check_marks, view.check_offset_m) for view in plan.views if view.grid),
+                (0, 0.0))
 
 
 def _against(args: argparse.Namespace, plan: Plan) -> Against | None:
@@ -364,6 +389,8 @@ def _write_plan(path: str, plan: Plan) -> None:
              "angular_count": artifact.angular_count}
     if artifact.grid_size_y:
         plate["grid_size_y"] = artifact.grid_size_y
+    marks, offset_m = _check_stops(plan)
     write_yaml(path, {"plan_id": plan.plan_id, "artifact": plate,
                       "views": [view_to_dict(view, artifact) for view in plan.views],
+                      **({"check_stops": {"marks": marks, "offset": offset_m}} if marks else {}),
                       **({"model_terms": list(plan.model_terms)} if plan.model_terms else {})})

@@ -138,11 +138,12 @@ def _measured(picture: dict[str, Any], width: int, rows: int) -> list[Text]:
 
 def _coverage(view: dict[str, Any], width: int) -> list[Text]:
     """Return the numbers of a view."""
-    (grid, all_grid), (lines, all_lines) = view["grid"], view["angular"]
-    share = min(1.0, (grid + lines) / max(1, all_grid + all_lines))
+    counted = [("marks", *view["grid"]), ("lines", *view["angular"]),
+               ("check stops of marks", *view["checks"])]
+    share = min(1.0, sum(done for _, done, _ in counted)
+                / max(1, sum(wanted for *_, wanted in counted)))
     wide = width - 6
-    counts = [f"{what} {done} of {wanted}" for what, done, wanted in (
-        ("marks", grid, all_grid), ("lines", lines, all_lines)) if wanted]
+    counts = [f"{what} {done} of {wanted}" for what, done, wanted in counted if wanted]
     texts = [Text.assemble(("█" * int(share * wide), "green"), "░" * (wide - int(share * wide)),
                            f" {int(100 * share):3d} %"),
              Text(", ".join([*counts, *["complete"] * view["complete"]]))]

@@ -14,6 +14,7 @@ import numpy as np
 from selfcal_ros.collection.diagnosis import Finding
 from selfcal_ros.collection.evidence import EncoderFacts, Seen
 from selfcal_ros.collection.expected import ViewProgress, expected_marks
+from selfcal_ros.collection.marks.check_stops import count_stops
 from selfcal_ros.collection.marks.identify import IdentityRules
 from selfcal_ros.collection.messages import Command, Detection, EncoderSample, check_command
 from selfcal_ros.collection.reasons import Reason
@@ -277,6 +278,8 @@ def view_progress(timeline: Timeline, index: int, readings: ViewReadings) -> Vie
     """Return how far a view has come."""
     artifact, view = timeline.planned_view(index)
     grid, angular = expected_marks(artifact, view)
-    return ViewProgress(index, view, grid, int((readings.count >= view.repeats).sum()), angular,
+    count, checked = count_stops(view, readings)
+    return ViewProgress(index, view, grid, int((count >= view.repeats).sum()), angular,
                         int((readings.count_theta >= view.repeats).sum()), readings,
-                        max(i.end_ns for i in timeline.of_view(index)), artifact)
+                        max(i.end_ns for i in timeline.of_view(index)), artifact,
+                        min(checked, view.check_marks))

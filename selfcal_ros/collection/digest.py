@@ -39,7 +39,8 @@ def _digest(readings: ViewReadings) -> str:
     for motion in (readings.motion, readings.motion_theta):
         if motion:
             digest.update(motion.products.tobytes() + repr(motion.dof).encode())
-    view = replace(readings.view, visit_order="")  # how it was to be measured, not what was read
+    # what was read, not how it was to be measured
+    view = replace(readings.view, visit_order="", check_marks=0, check_offset_m=0.0)
     digest.update(repr((view, readings.sigma_xy, readings.sigma_theta, readings.dof_xy,
                         readings.dof_theta, readings.used, readings.rejected)).encode())
     return digest.hexdigest()
@@ -48,7 +49,8 @@ def _digest(readings: ViewReadings) -> str:
 def placing_digest(artifact: Artifact, view: View) -> str:
     """Return a short digest of a plate and of how a view lays and reads it, names left out."""
     numbers = (*artifact.shape, artifact.grid_pitch_m, artifact.angular_count, view.rotation_rad,
-               *view.translation_m, view.grid, view.angular, view.repeats)
+               *view.translation_m, view.grid, view.angular, view.repeats,
+               view.check_marks, view.check_offset_m)
     text = ",".join(float(number).hex() for number in numbers)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from selfcal_ros.collection.marks.check_stops import count_stops
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import ViewReadings
 from selfcal_ros.model.view import View
@@ -50,7 +51,7 @@ def missing_marks(artifact: Artifact, view: View, readings: ViewReadings) -> Mis
     (m_low, _), (n_low, n_high) = mark_range(artifact, view)
     grid, angular = expected_marks(artifact, view)
     width = max(n_high - n_low + 1, 1)
-    done = readings.count >= view.repeats
+    done = count_stops(view, readings)[0] >= view.repeats
     number = (readings.m[done] - m_low) * width + readings.n[done] - n_low
     number = first_missing(np.sort(number), grid)
     lines = first_missing(np.sort(readings.k[readings.count_theta >= view.repeats]), angular)
@@ -77,6 +78,12 @@ class ViewProgress:
     readings: ViewReadings
     end_ns: int
     artifact: Artifact | None = None
+    check_done: int = 0
+
+    @property
+    def check_expected(self) -> int:
+        """Grid marks that are to be seen from all four sides as well."""
+        return self.view.check_marks if self.view.grid else 0
 
     @property
     def missing(self) -> Missing:
@@ -89,17 +96,21 @@ class ViewProgress:
     def needed(self) -> int:
         """Number of readings without which the view cannot be complete."""
         told, repeats = self.readings, self.view.repeats
-        have = [int(np.minimum(count, repeats).sum()) for count in (told.count, told.count_theta)]
-        return repeats * (self.grid_expected + self.angular_expected) - sum(have)
+        have = [int(np.minimum(count, repeats).sum()) for count in (
+            count_stops(self.view, told)[0], told.count_theta)]
+        return (repeats * (self.grid_expected + self.angular_expected) - sum(have)
+                + self.check_expected - self.check_done)
 
     @property
     def complete(self) -> bool:
-        """Whether every expected mark has been read as often as the plan asks."""
+        """Whether every expected mark has been read as often as the plan asks, and checked."""
         return (self.grid_done >= self.grid_expected
-                and self.angular_done >= self.angular_expected)
+                and self.angular_done >= self.angular_expected
+                and self.check_done >= self.check_expected)
 
     @property
     def coverage(self) -> float:
-        """Part of the expected marks that have been read as often as the plan asks, 0..1."""
-        expected = self.grid_expected + self.angular_expected
-        return (self.grid_done + self.angular_done) / expected if expected else 1.0
+        """Part of the expected marks and checks that are complete, 0..1."""
+        expected = self.grid_expected + self.angular_expected + self.check_expected
+        done = self.grid_done + self.angular_done + self.check_done
+        return done / expected if expected else 1.0

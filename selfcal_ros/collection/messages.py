@@ -150,6 +150,7 @@ def check_command(command: Command) -> None:
     if not 1 <= command.view.repeats <= MAX_REPEATS:
         raise InputError(where, f"{command.view.repeats} repeats", f"ask for 1 to {MAX_REPEATS}")
     command.view.lattice_pose(command.artifact)
+    command.view.require_check_stops(command.artifact)
 
 
 def check_view(readings: ViewReadings, artifact: Artifact, view_index: int) -> None:

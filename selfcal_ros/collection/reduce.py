@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from selfcal_ros.collection.marks.check_stops import without_aside
 from selfcal_ros.collection.marks.identify import (
     IdentityRules,
     identify_angular,
@@ -184,15 +185,18 @@ def _reduce_grid(artifact: Artifact, view: View, d: np.ndarray, exposures: Expos
                         places=places)
     d, (hx, hy) = marks.detections, artifact.half
     key = (marks.index[0] + hx) * (2 * hy + 1) + marks.index[1] + hy
-    means = reduce_repeats(key, marks.deviation, d["sigma"], limit=rules.outlier_limit,
-                           extent=2 * max(hx, hy) * artifact.grid_pitch_m,
-                           residual=marks.residual)
+    offset = np.stack([d["ox"], d["oy"]])
+    means = reduce_repeats(
+        key, marks.deviation, d["sigma"], limit=rules.outlier_limit,
+        extent=2 * max(hx, hy) * artifact.grid_pitch_m, residual=marks.residual,
+        steady=without_aside(key, marks.deviation, offset, view.check_offset_m))
     _count(rejected, Reason.OUTLIER, means.outlier)
     out = np.flatnonzero(means.outlier)
     places.add(np.full(len(out), Reason.OUTLIER, dtype=object), marks.position[:, out])
     offset = np.stack([d["ox"], d["oy"]])
     visits = grid_visits(means, key, d["sigma"], stamps_ns=d["stamp"], deviation=marks.deviation,
-                         offset=offset, approach=marks.approach)
+                         offset=offset, approach=marks.approach,
+                         step_m=view.check_offset_m / 2 or np.inf)
     motion = repeat_motion(key, _reading(rules.sense, marks.position, 0.0), offset, means.outlier)
     mark = means.key.astype(np.int64)
     return {"m": mark // (2 * hy + 1) - hx, "n": mark % (2 * hy + 1) - hy, "dx": means.mean[0],

@@ -61,7 +61,9 @@ def command(c: Command, frame_id: str) -> Fields:
     return {"header": header(c.stamp_ns, frame_id), "phase": int(c.phase), "plan_id": c.plan_id,
             "view_index": c.view_index, **view, **plate, "views_planned": c.views_planned,
             "visit_order": c.view.visit_order if c.view else "", "run_id": c.run_id,
-            "model_terms": list(c.model_terms)}
+            "model_terms": list(c.model_terms),
+            "check_marks": c.view.check_marks if c.view else 0,
+            "check_offset": c.view.check_offset_m if c.view else 0.0}
 
 
 def view_status(progress: ViewProgress, plan_id: str, stamp_ns: int, frame_id: str, *,
@@ -79,7 +81,8 @@ def view_status(progress: ViewProgress, plan_id: str, stamp_ns: int, frame_id: s
         "sigma_xy": readings.sigma_xy, "sigma_theta": readings.sigma_theta,
         "complete": progress.complete,
         "missing_m": list(missing.m), "missing_n": list(missing.n),
-        "missing_k": list(missing.k), "run_id": run_id}
+        "missing_k": list(missing.k), "run_id": run_id,
+        "check_expected": progress.check_expected, "check_done": progress.check_done}
 
 
 def view_measurement(progress: ViewProgress, measurements: Measurements, stamp_ns: int,

@@ -90,7 +90,8 @@ def view_of(message: Any, *, repeats: int, grid: bool, angular: bool) -> View:
     """Return the view that a ViewCommand or ViewMeasurement describes."""
     return View(str(message.view_name), float(message.rotation),
                 (float(message.translation_x), float(message.translation_y)), grid, angular,
-                repeats, _order_of(message))
+                repeats, _order_of(message), int(getattr(message, "check_marks", 0)),
+                float(getattr(message, "check_offset", 0.0)))
 
 
 def _order_of(message: Any) -> str:

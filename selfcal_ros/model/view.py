@@ -2,7 +2,8 @@
 """Views: how the plate lies on the stage, and plans: which views are measured."""
 
 import math
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -19,6 +20,9 @@ MAX_VIEWS = 1000
 
 MAX_SHIFT = 100_000
 """Largest translation of a view, in pitches."""
+
+MOST_CHECK_OFFSET = 0.25
+"""Largest distance of a check stop from its mark, in pitches."""
 
 
 @dataclass(frozen=True)
@@ -86,6 +90,19 @@ class LatticePose:
         x, y = ((m, n), (-n, m), (-m, -n), (n, -m))[self.q]
         return x + self.a, y + self.b
 
+    def marks_in_field(self, artifact: Artifact) -> tuple[np.ndarray, np.ndarray]:
+        """Return marks and their sites, int arrays (2, V), that lie in the field of the stage."""
+        marks = np.stack([artifact.m.ravel(), artifact.n.ravel()])
+        sites = np.stack(self.site_of(*marks))
+        inside = (np.abs(sites) <= np.array(artifact.half)[:, None]).all(axis=0)
+        return marks[:, inside], sites[:, inside]
+
+    def n_in_field(self, artifact: Artifact) -> int:
+        """Return how many marks lie in the field of the stage."""
+        plate = artifact.half[::-1] if self.q % 2 else artifact.half
+        return math.prod(max(0, min(h, s + p) - max(-h, s - p) + 1) for h, s, p in zip(
+            artifact.half, self.shift, plate, strict=True))
+
 
 @dataclass(frozen=True)
 class View:
@@ -106,6 +123,10 @@ class View:
     visit_order : str
         Order in which the grid marks are visited, see `selfcal_ros.model.orders`; empty = as
         the cell likes.
+    check_marks : int
+        Grid marks that are seen four times more, the stage at +x, -x, +y and -y of the mark.
+    check_offset_m : float
+        How far from the mark the stage stops for these, m.
     """
 
     name: str
@@ -115,6 +136,29 @@ class View:
     angular: bool = True
     repeats: int = 1
     visit_order: str = ""
+    check_marks: int = 0
+    check_offset_m: float = 0.0
+
+    def require_check_stops(self, artifact: Artifact) -> None:
+        """Raise InputError for check stops that no cell can do at the marks in this view.
+
+        At more than a quarter of the pitch a microscope need not see the mark, and a mark without
+        an id is not identified.
+        """
+        where = f"view '{self.name}' check_stops"
+        if not self.check_marks and not self.check_offset_m:
+            return
+        if self.check_marks < 1 or not self.check_offset_m > 0:
+            raise InputError(where, f"{self.check_marks} marks, {self.check_offset_m:g} m off",
+                             "give marks and offset both, e.g. {marks: 5, offset: 20e-6}")
+        most = MOST_CHECK_OFFSET * artifact.grid_pitch_m
+        if self.check_offset_m > most:
+            raise InputError(where, f"{self.check_offset_m:g} m is more than a quarter of the "
+                             "pitch", f"stop at most {most:g} m off the mark; 20e-6 is usual")
+        there = self.lattice_pose(artifact).n_in_field(artifact) if self.grid else 0
+        if self.check_marks > there:
+            raise InputError(where, f"{self.check_marks} marks are wanted, {there} lie in the "
+                             "field", "ask for fewer marks")
 
     def lattice_pose(self, artifact: Artifact) -> LatticePose:
         """Return the pose in whole steps of the artifact's lattice.
@@ -187,8 +231,9 @@ def plan_from_dict(data: object, where: str) -> Plan:
     data : object
         Parsed YAML: ``plan_id``, ``artifact {grid_size, grid_pitch, angular_count}`` (m),
         ``views [{name, rotation_deg, translation_pitch, grid, angular, repeats, visit_order}]``,
-        ``visit_order``, which holds for views that have none of their own, and ``model_terms``,
-        a list of ``TERM`` or ``TERM:SIZE``.
+        ``visit_order``, which holds for views that have none of their own, ``model_terms``,
+        a list of ``TERM`` or ``TERM:SIZE``, and ``check_stops {marks, offset}`` (m) of all views
+        with grid marks.
     where : str
         File name, for messages.
 
@@ -199,7 +244,8 @@ def plan_from_dict(data: object, where: str) -> Plan:
         off the lattice.
     """
     fields = _fields(data, where, {"plan_id": str, "artifact": dict, "views": list},
-                     {"visit_order": (str, ""), "model_terms": (list, [])})
+                     {"visit_order": (str, ""), "model_terms": (list, []),
+                      "check_stops": (dict, {})})
     raw = _fields(fields["artifact"], f"{where}: artifact",
                   {"grid_size": int, "grid_pitch": float, "angular_count": int},
                   {"grid_size_y": (int, 0)})
@@ -209,7 +255,9 @@ def plan_from_dict(data: object, where: str) -> Plan:
     if len(fields["views"]) > MAX_VIEWS:
         raise InputError(f"{where}: views", f"{len(fields['views'])} views are more than "
                          f"{MAX_VIEWS}", "measure fewer views")
-    views = tuple(_view_from_dict(view, f"{where}: views[{index}]", artifact, order)
+    checks = _checks(fields["check_stops"], f"{where}: check_stops")
+    views = tuple(_with_checks(_view_from_dict(view, f"{where}: views[{index}]", artifact, order),
+                               *checks, artifact, where)
                   for index, view in enumerate(fields["views"]))
     if not views:
         raise InputError(where, "the plan has no views", "add at least one view")
@@ -228,6 +276,29 @@ def _terms(texts: list, where: str) -> tuple[str, ...]:
         if not isinstance(text, str):
             raise InputError(where, f"{text!r} is not a text", "write TERM or TERM:SIZE")
     return tuple(str(term) for term in parse_terms(texts, where))
+
+
+def _checks(data: dict, where: str) -> tuple[int, float]:
+    """Return how many marks are checked, and from how far off, m; (0, 0) if none are."""
+    if not data:
+        return 0, 0.0
+    if isinstance(data.get("offset"), str):  # YAML takes 20e-6, without a point, for a text
+        with suppress(ValueError):  # refused below as what it is
+            data = data | {"offset": float(data["offset"])}
+    raw = _fields(data, where, {"marks": int, "offset": float})
+    return raw["marks"], raw["offset"]
+
+
+def _with_checks(view: View, marks: int, offset_m: float, artifact: Artifact, where: str) -> View:
+    """Return the view with check stops if it has grid marks."""
+    if not view.grid:
+        return view
+    checked = replace(view, check_marks=marks, check_offset_m=offset_m)
+    try:
+        checked.require_check_stops(artifact)
+    except InputError as error:
+        raise InputError(f"{where}: {error.where}", error.what, error.remedy) from error
+    return checked
 
 
 def _order(text: str, where: str) -> str:

@@ -9,6 +9,9 @@ from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.orders import DEFAULT_ORDER, VisitOrder, parse_order
 from selfcal_ros.model.view import View
 
+SIDES = ((1, 0), (-1, 0), (0, 1), (0, -1))
+"""Where the stage stands from the mark in check stops, along its x and y, in their order."""
+
 
 @dataclass(frozen=True, eq=False)
 class VisitSequence:
@@ -26,9 +29,11 @@ class VisitSequence:
     count : int array (V,)
         Exposures of the visit.
     pass_number : int array (V,)
-        Pass over the plate in which the visit begins, from 0.
+        Pass over the plate in which the visit begins, from 0; each side of check stops is one.
     time : float array (V,)
         Mean number of its exposures, counted from 0 over the whole view.
+    aside_m : float array (2, V)
+        How far from the mark the stage stops along its x and y: check stops; else 0.
     """
 
     m: np.ndarray
@@ -38,6 +43,7 @@ class VisitSequence:
     count: np.ndarray
     pass_number: np.ndarray
     time: np.ndarray
+    aside_m: np.ndarray
 
     def __len__(self) -> int:
         """Return the number of visits."""
@@ -76,14 +82,11 @@ def visit_sequence(artifact: Artifact, view: View, *, order: str = "", consecuti
     chosen = parse_order(order or view.visit_order or DEFAULT_ORDER)
     if not view.grid:
         m, n, i, j, count, index = np.zeros((6, 0), dtype=int)
-        return VisitSequence(m, n, i, j, count, index, np.zeros(0))
-    marks = np.stack([artifact.m.ravel(), artifact.n.ravel()])
-    sites = np.stack(view.lattice_pose(artifact).site_of(*marks))
-    inside = (np.abs(sites) <= np.array(artifact.half)[:, None]).all(axis=0)
-    marks, sites = marks[:, inside], sites[:, inside]
+        return VisitSequence(m, n, i, j, count, index, np.zeros(0), np.zeros((2, 0)))
+    marks, sites = view.lattice_pose(artifact).marks_in_field(artifact)
     n_passes = 1 if consecutive else view.repeats
     passes = _passes(chosen, marks if chosen.of_plate else sites, n_passes, rng)
-    return _visits(marks, sites, passes, view.repeats if consecutive else 1)
+    return _visits(marks, sites, passes, together=view.repeats if consecutive else 1, view=view)
 
 
 def _passes(order: VisitOrder, places: np.ndarray, n_passes: int,
@@ -104,16 +107,49 @@ def _passes(order: VisitOrder, places: np.ndarray, n_passes: int,
     return np.stack([cycle[number % len(cycle)] for number in range(n_passes)])
 
 
-def _visits(marks: np.ndarray, sites: np.ndarray, passes: np.ndarray,
-            together: int) -> VisitSequence:
-    """Return the visits of passes (P, n) in which each mark is exposed `together` times."""
-    index = passes.ravel()
-    first = np.flatnonzero(np.diff(index, prepend=-1))
-    count = np.diff(first, append=len(index)) * together
-    time = first * together + (count - 1) / 2
-    index = index[first]
-    (m, n), (i, j) = marks[:, index], sites[:, index]
-    return VisitSequence(m, n, i, j, count, first // passes.shape[1], time)
+def _visits(marks: np.ndarray, sites: np.ndarray, passes: np.ndarray, *, together: int,
+            view: View) -> VisitSequence:
+    """Return the visits of passes (P, n) in which each mark is exposed `together` times.
+
+    Check stops come half way, one exposure each. All marks are seen from +x, then all in the same
+    order from -x, +y and -y: each stop of a mark is reached from the same side, so that backlash
+    does not look like a scale of the microscope.
+    """
+    half = (len(passes) + 1) // 2
+    checks = np.tile(check_marks(sites, view.check_marks), (4, 1))
+    rows = [*passes[:half], *checks, *passes[half:]]
+    sides = [(0.0, 0.0)] * half + list(SIDES) + [(0.0, 0.0)] * (len(passes) - half)
+    index, number = np.concatenate(rows), np.repeat(np.arange(len(rows)), [*map(len, rows)])
+    aside = view.check_offset_m * np.array(sides).T[:, number]
+    exposures = np.where(aside.any(axis=0), 1, together)
+    other = (np.diff(index, prepend=-1) != 0) | np.diff(aside, prepend=0.0).any(axis=0)
+    first = np.flatnonzero(other)
+    count = np.add.reduceat(exposures, first)
+    time = np.cumsum(count) - (count + 1) / 2
+    (m, n), (i, j) = marks[:, index[first]], sites[:, index[first]]
+    return VisitSequence(m, n, i, j, count, number[first], time, aside[:, first])
+
+
+def check_marks(sites: np.ndarray, number: int) -> np.ndarray:
+    """Return which of the sites (2, V) are checked by a cell that has no choice of its own.
+
+    The one in the middle of them and others evenly around it half way out, the first towards
+    (+x, +y), counter-clockwise; where a site is taken already, the nearest that is free.
+    """
+    number = min(number, sites.shape[1])
+    if not number:
+        return np.zeros(0, dtype=int)
+    middle = (sites.min(axis=1) + sites.max(axis=1)) / 2
+    angle = np.pi / 4 + 2 * np.pi * np.arange(number - 1) / max(number - 1, 1)
+    out = np.sqrt(0.5) * np.stack([np.cos(angle), np.sin(angle)])  # half way to the corners
+    targets = middle[:, None] + np.ptp(sites, axis=1)[:, None] / 2 * np.hstack(
+        [np.zeros((2, 1)), out])
+    chosen: list[int] = []
+    for target in targets.T:
+        away = np.round(np.hypot(*(sites - target[:, None])), 6)  # of equal ones the first
+        away[chosen] = np.inf
+        chosen.append(int(np.argmin(away)))
+    return np.array(chosen)
 
 
 def approach_signs(position: np.ndarray, threshold: float = 0.0) -> np.ndarray:

@@ -206,9 +206,10 @@ class SequencingSession:
             return  # of before the command: a redone view would look complete
         if message.run_id and message.run_id != self.run_id:
             return  # of another run
-        expected = message.grid_expected + message.angular_expected
+        expected = message.grid_expected + message.angular_expected + message.check_expected
         if message.view_index == self.machine.index and expected:
-            self.coverage = (message.grid_done + message.angular_done) / expected
+            done = message.grid_done + message.angular_done + message.check_done
+            self.coverage = done / expected
             self._status = message
             self._stall.take(message.detections_used + message.detections_rejected)
         moved_on = self.machine.status(message.plan_id, message.view_index, message.complete)

@@ -43,13 +43,16 @@ class StallWatch:
 
 
 def missing_marks(status: Any) -> str:
-    """Return the missing marks and lines of a ViewStatus in words, "" if it names none."""
+    """Return the missing marks, lines and check stops of a ViewStatus in words, "" if none."""
     marks = [f"({m}, {n})" for m, n in zip(status.missing_m, status.missing_n, strict=False)]
     grid = status.grid_expected - status.grid_done
     lines = [str(k) for k in status.missing_k]
     angular = status.angular_expected - status.angular_done
+    checks = status.check_expected - status.check_done
     parts = [_named(words, count, what) for words, count, what in (
         (marks, grid, "mark"), (lines, angular, "line")) if count > 0]
+    parts += [f"check stops of {checks} mark{'s' * (checks != 1)} (see check_marks of the view "
+              "command)"] if checks > 0 else []
     return " and ".join(parts)
 
 

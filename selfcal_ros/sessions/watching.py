@@ -102,6 +102,7 @@ class Watch:
             "view_name": printable(status.view_name), "complete": bool(status.complete),
             "grid": [status.grid_done, status.grid_expected],
             "angular": [status.angular_done, status.angular_expected],
+            "checks": [status.check_done, status.check_expected],
             "used": status.detections_used,
             "rejected": dict(zip(_lines(status.reject_reasons), map(int, status.reject_counts),
                                  strict=False)),

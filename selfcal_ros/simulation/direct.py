@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from selfcal_ros.collection.marks.check_stops import without_aside
 from selfcal_ros.collection.marks.visits import repeat_motion
 from selfcal_ros.model.readings import GridVisits, Sense, ViewReadings
 from selfcal_ros.model.view import View
@@ -75,7 +76,11 @@ def _grid(readings: ViewReadings, truth: Truth, found: GridExposures, *, setting
     deviation = (_read(settings.sense, found) - found.site[:, found.visit])[:, here]
     count, of_mark = visits.count[kept], mark[visit]
     by_visit, sigma_visit, dof_visit = _means(deviation, visit, count)
-    by_mark, sigma, dof = _means(deviation, of_mark, np.bincount(mark, count).astype(int))
+    readings_of = np.bincount(mark, count).astype(int)
+    by_mark, _, _ = _means(deviation, of_mark, readings_of)
+    steady, fitted = without_aside(of_mark, deviation, found.offset[:, here],
+                                   readings.view.check_offset_m)
+    _, sigma, dof = _means(steady, of_mark, readings_of, fitted)
     offset, _, _ = _means(found.offset[:, here], visit, count)
     motion = repeat_motion(of_mark, (_read(settings.sense, found) - found.offset)[:, here],
                            found.offset[:, here], np.zeros(len(of_mark), dtype=bool))
@@ -87,7 +92,7 @@ def _grid(readings: ViewReadings, truth: Truth, found: GridExposures, *, setting
     approach = found.approach[:, kept][:, order]
     return replace(
         readings, m=marks // (2 * hy + 1) - hx, n=marks % (2 * hy + 1) - hy, dx=by_mark[0],
-        dy=by_mark[1], count=np.bincount(mark, count).astype(int), sigma_xy=sigma, dof_xy=dof,
+        dy=by_mark[1], count=readings_of, sigma_xy=sigma, dof_xy=dof,
         motion=motion,
         visits=GridVisits(mark[order], dx, dy, count[order], stamp[order], ox, oy, approach[0],
                           approach[1], sigma_m=sigma_visit, dof=dof_visit))
@@ -108,7 +113,7 @@ def _angular(readings: ViewReadings, truth: Truth, found: AngularExposures, *, s
                    dof_theta=dof, motion_theta=motion)
 
 
-def _means(values: np.ndarray, group: np.ndarray, count: np.ndarray,
+def _means(values: np.ndarray, group: np.ndarray, count: np.ndarray, fitted: int = 0,
            ) -> tuple[np.ndarray, float, int]:
     """Return means (c, groups), the pooled standard deviation of one value, its freedom.
 
@@ -120,9 +125,11 @@ def _means(values: np.ndarray, group: np.ndarray, count: np.ndarray,
         Group of each value.
     count : int array (groups,)
         Values in each group.
+    fitted : int
+        Numbers that were fitted to the values before.
     """
     mean = np.stack([np.bincount(group, row, len(count)) / count for row in values])
-    dof = len(values) * int((count - 1).sum())
-    if not dof:
+    dof = len(values) * int((count - 1).sum()) - fitted
+    if dof <= 0:
         return mean, float("nan"), 0
     return mean, float(np.sqrt(((values - mean[:, group]) ** 2).sum() / dof)), dof

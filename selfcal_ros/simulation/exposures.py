@@ -90,7 +90,7 @@ def grid_exposures(truth: Truth, index: int, view: View, *, settings: CellSettin
     if settings.follow_mark:  # the stage goes on until the mark is under the microscope
         centre = sign * (place + moved[:, np.cumsum(visits.count) - visits.count])
         stop = centre + physics.stage_error(truth, centre, index)
-    stop = stop + _normal(rng, settings.stop_sigma_m, stop.shape)
+    stop = stop + _normal(rng, settings.stop_sigma_m, stop.shape) + visits.aside_m
     came = np.concatenate([lead_in(truth, stop[:, :1]), stop], axis=1)
     approach = np.stack([approach_signs(row, NO_MOTION_M)[1:] for row in came])
     position = stop[:, visit] + _normal(rng, settings.servo_sigma_m, (2, size))

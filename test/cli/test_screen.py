@@ -72,6 +72,7 @@ def test_coverage_rejections_map_verdict_and_health_are_shown():
                    "solver": told("", "readings cannot be used", 1)},
         "command": COMMAND,
         "view": {"view_name": "rot90", "complete": False, "grid": [7, 9], "angular": [3, 8],
+                 "checks": [2, 5],
                  "used": 20, "rejected": {"stage_moving": 3, "duplicate": 12},
                  "repeatability_um": 0.0213, "repeatability_arcsec": None,
                  "plate": ["oo.", "o.o", "ooo"], "missing_lines": [0, 2, 4, 5, 7]},
@@ -81,6 +82,7 @@ def test_coverage_rejections_map_verdict_and_health_are_shown():
         "map": {"run_id": "17", "qualified": False, "um": [[0.0, 1.0], [None, 0.5]]}},
         ["first", "escape \x1b[2J"])
     for words in ("view 2 of 4: rot90", "plan hu, run 17", "marks 7 of 9, lines 3 of 8",
+                  "check stops of marks 2 of 5",
                   "repeatability 0.0213 µm, -", "o o .", "missing lines 0, 2, 4, 5, 7",
                   "12  duplicate", "not qualified", "the plate slipped", "add a view",
                   "'@' = 1 µm", "solver: warn readings cannot be used", "first"):
@@ -98,6 +100,7 @@ MEASURED = {
                "measurement_collector": told("", "view 'rot90': 35 % of the marks read")},
     "command": COMMAND | {"phase": "MEASURE"},
     "view": {"view_name": "rot90", "complete": False, "grid": [430, 441], "angular": [3, 8],
+             "checks": [0, 0],
              "used": 20, "rejected": {"stage_moving": 3}, "repeatability_um": 0.0213,
              "repeatability_arcsec": 0.5, "plate": ["o" * 20 + "."] + ["o" * 21] * 20,
              "plate_step": 1, "missing_lines": [0, 2, 4, 5, 7]},

@@ -31,6 +31,7 @@ def test_the_marks_in_the_field_are_those_whose_sites_are_sites(hx, hy, turn, a,
     i, j = view.lattice_pose(plate).site_of(plate.m, plate.n)
     inside = (abs(i) <= hx) & (abs(j) <= hy)
     assert expected_marks(plate, view) == (inside.sum(), 0)
+    assert view.lattice_pose(plate).n_in_field(plate) == inside.sum()
     (m_low, m_high), (n_low, n_high) = mark_range(plate, view)
     ranged = (plate.m >= m_low) & (plate.m <= m_high) & (plate.n >= n_low) & (plate.n <= n_high)
     np.testing.assert_array_equal(ranged, inside)

@@ -47,7 +47,8 @@ VIEWS = st.builds(View, TEXTS, FLOATS, st.tuples(FLOATS, FLOATS), st.booleans(),
                   st.integers(1, 2**32 - 1))
 ORDER_TEXTS = st.sampled_from(["", *ORDERS]) | st.sampled_from(ORDERS).map(lambda o: o + "@plate")
 ASKING = st.builds(Command, STAMPS, st.sampled_from([Phase.PLACE, Phase.MEASURE]), TEXTS, U32,
-                   st.builds(replace, VIEWS, visit_order=ORDER_TEXTS), ARTIFACTS, U32)
+                   st.builds(replace, VIEWS, visit_order=ORDER_TEXTS, check_marks=U32,
+                             check_offset_m=st.floats(0, 1)), ARTIFACTS, U32)
 ENDING = st.builds(Command, STAMPS, st.sampled_from([Phase.DONE, Phase.ABORT]), TEXTS, U32,
                    views_planned=U32)
 COUNTS = st.dictionaries(TEXTS, U32, max_size=3)
@@ -87,7 +88,8 @@ def test_a_message_of_somebody_else_is_what_it_says(event):
     """The contract's fields by name, filled by another hand: no two are swapped both ways."""
     if isinstance(event, Command):
         event = replace(event, views_planned=0, artifact=replace(event.artifact, grid_size_y=0),
-                        view=replace(event.view, visit_order=""))
+                        view=replace(event.view, visit_order="", check_marks=0,
+                                     check_offset_m=0.0))
     topic, typename, message = contract_message(contract_types(), event)
     read = {"stage/joint_states": to_model.encoder_sample, "selfcal/view_command":
             to_model.command, "stage/mark_detections": to_model.detection}[topic]
@@ -104,7 +106,7 @@ def test_fields_of_a_detection_by_name():
 
 
 def test_fields_of_a_command_by_name():
-    view = View("turned", math.pi / 2, (0.01, -0.02), True, False, 7, "x_then_y")
+    view = View("turned", math.pi / 2, (0.01, -0.02), True, False, 7, "x_then_y", 3, 2e-5)
     made = from_model.command(Command(STAMP_NS, Phase.MEASURE, "p", 3, view,
                                        Artifact(5, 0.0125, 8, 7), 9,
                                        model_terms=("drift:1e-08",)), "f")
@@ -114,7 +116,7 @@ def test_fields_of_a_command_by_name():
         "rotation": math.pi / 2, "translation_x": 0.01, "translation_y": -0.02, "grid": True,
         "angular": False, "repeats": 7, "grid_size": 5, "grid_pitch": 0.0125, "angular_count": 8,
         "grid_size_y": 7, "views_planned": 9, "visit_order": "x_then_y", "run_id": "",
-        "model_terms": ["drift:1e-08"]}
+        "model_terms": ["drift:1e-08"], "check_marks": 3, "check_offset": 2e-5}
 
 
 @pytest.mark.parametrize(("changes", "message"), [
@@ -204,7 +206,8 @@ READ = ViewReadings(
     motion_theta=RepeatMotion(1e-12 * np.array([[1.0, 2.0], [3.0, 4.0]]), 22))
 MEASURED = Measurements("p", Artifact(5, 0.01, 8, 7), (READ,), Sense.PLATE_MOVES, {"other": 17},
                         "77", ("approach",))
-PROGRESS = ViewProgress(18, READ.view, 19, 20, 21, 22, READ, 23)
+PROGRESS = ViewProgress(18, replace(READ.view, check_marks=4, check_offset_m=2e-5), 19, 20, 21, 22,
+                        READ, 23, check_done=23)
 
 
 def test_the_visits_of_a_view_survive_the_message():
@@ -253,7 +256,8 @@ def test_fields_of_a_view_status_by_name():
         "angular_expected": 21, "angular_done": 22, "detections_used": 15,
         "detections_rejected": 16, "reject_reasons": ["low_score"], "reject_counts": [16],
         "sigma_xy": 1.1e-8, "sigma_theta": 1.2e-6, "complete": True,
-        "missing_m": [], "missing_n": [], "missing_k": [], "run_id": ""}
+        "missing_m": [], "missing_n": [], "missing_k": [], "run_id": "", "check_expected": 4,
+        "check_done": 23}
     through_cdr("ViewStatus", {"header": from_model.header(0, ""), **made})
 
 

@@ -156,6 +156,38 @@ def test_plans_that_are_refused(data, message):
     assert str(caught.value).startswith(message)
 
 
+def test_check_stops_hold_for_all_views_with_grid_marks():
+    """20e-6 is a text to YAML, which wants a point in a number."""
+    data = plan_with({}, check_stops={"marks": 5, "offset": "20e-6"})
+    data["views"].append({"name": "line", "grid": False})
+    views = plan_from_dict(data, "f").views
+    assert [(v.check_marks, v.check_offset_m) for v in views] == [(5, 2e-5), (0, 0.0)]
+    for none in ({}, {"marks": 0, "offset": 0}):
+        assert plan_from_dict(plan_with({}, check_stops=none), "f") == plan_from_dict(
+            plan_with({}), "f")
+    at_most = plan_with({"translation_pitch": [10, 0]}, check_stops={"marks": 11, "offset": 0.0025})
+    assert plan_from_dict(at_most, "f").views[0].check_marks == 11
+
+
+@pytest.mark.parametrize(("stops", "message"), [
+    ({"marks": 5}, "f: check_stops: the key 'offset' is missing; add it"),
+    ({"marks": 5.0, "offset": 2e-5}, "f: check_stops: marks: 5.0 is not of type int"),
+    ({"marks": 5, "offset": "20 um"}, "f: check_stops: offset: '20 um' is not of type float"),
+    ({"marks": 5, "offset": 0.0}, "f: view 'a' check_stops: 5 marks, 0 m off; give marks and "),
+    ({"marks": 5, "offset": -2e-5}, "f: view 'a' check_stops: 5 marks, -2e-05 m off; give marks"),
+    ({"marks": -1, "offset": 2e-5}, "f: view 'a' check_stops: -1 marks, 2e-05 m off; give marks"),
+    ({"marks": 0, "offset": 2e-5}, "f: view 'a' check_stops: 0 marks, 2e-05 m off; give marks"),
+    ({"marks": 5, "offset": math.nan}, "f: view 'a' check_stops: 5 marks, nan m off; give marks"),
+    ({"marks": 5, "offset": 0.00251}, "f: view 'a' check_stops: 0.00251 m is more than a quarter "
+     "of the pitch; stop at most 0.0025 m off the mark; 20e-6 is usual"),
+    ({"marks": 12, "offset": 2e-5}, "f: view 'a' check_stops: 12 marks are wanted, 11 lie in the "
+     "field; ask for fewer marks")])
+def test_check_stops_that_are_refused(stops, message):
+    with pytest.raises(InputError) as caught:
+        plan_from_dict(plan_with({"translation_pitch": [10, 0]}, check_stops=stops), "f")
+    assert str(caught.value).startswith(message)
+
+
 def test_terms_of_a_plan_are_read_and_checked():
     plan = plan_from_dict(plan_with(model_terms=["plate_shape:30e-9", "drift"]), "here")
     assert plan.model_terms == ("drift", "plate_shape:3e-08")

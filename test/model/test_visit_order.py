@@ -2,6 +2,7 @@
 """Visiting orders: written out by hand on a small plate, and what holds on any."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.orders import ORDERS, VisitOrder, parse_order
 from selfcal_ros.model.view import View
-from selfcal_ros.model.visit_order import approach_signs, visit_sequence
+from selfcal_ros.model.visit_order import approach_signs, check_marks, visit_sequence
 
 PLATE = Artifact(3, 0.01, 0, 5)
 """Three marks along x, five along y: no order may mix up its axes unseen."""
@@ -164,3 +165,63 @@ def test_an_order_begins_again_after_its_passes(order):
     each = np.repeat(found.i * 100 + found.j, found.count).reshape(8, n)
     same = [p for p in (1, 2, 4, 8) if (each == np.tile(each[:p], (8 // p, 1))).all()]
     assert parse_order(order + "@plate").passes == same[0]
+
+
+CHECKED = replace(ONCE, check_marks=3, check_offset_m=2e-5)
+
+
+@pytest.mark.parametrize(("repeats", "before"), [(1, 1), (2, 1), (3, 2), (4, 2), (5, 3)])
+def test_check_stops_come_half_way_side_by_side_in_the_same_order(repeats, before):
+    found = visit_sequence(PLATE, replace(CHECKED, repeats=repeats), order="raster")
+    where = list(zip(found.i, found.j, strict=True))
+    stops = slice(15 * before, 15 * before + 12)
+    assert where[:stops.start] == before * ALONG_X
+    assert where[stops.stop:] == (repeats - before) * ALONG_X
+    one = [(0, 0), (0, 1), (-1, -1)]  # of two as near the first
+    assert where[stops] == 4 * one
+    assert (found.aside_m[:, stops] * 1e5).T.tolist() == [
+        *3 * [[2, 0]], *3 * [[-2, 0]], *3 * [[0, 2]], *3 * [[0, -2]]]
+    assert np.count_nonzero(found.aside_m) == 12
+    assert found.count.tolist() == len(found) * [1]
+    assert found.time.tolist() == list(range(len(found)))
+    assert (np.diff(found.pass_number) >= 0).all()
+    assert (found.pass_number[stops] - before).tolist() == [0, 0, 0, 1, 1, 1, 2, 2, 2, 3, 3, 3]
+    assert found.pass_number[-1] == repeats + 3 * (repeats > 1) + 2 * (repeats == 1)
+
+
+def test_check_stops_part_the_two_exposures_where_the_stage_turns_back():
+    """Consecutive repeats are one visit, a check stop is always one exposure."""
+    found = visit_sequence(PLATE, replace(CHECKED, repeats=2), order="there_and_back")
+    assert found.count.tolist() == 42 * [1]
+    together = visit_sequence(PLATE, replace(CHECKED, repeats=3), order="raster", consecutive=True)
+    assert together.count.tolist() == 15 * [3] + 12 * [1]
+    assert together.time.tolist() == [*range(1, 45, 3), *range(45, 57)]
+
+
+def test_check_stops_are_along_the_axes_of_the_stage_whatever_the_turn():
+    view = replace(CHECKED, rotation_rad=math.pi / 2)
+    turned = visit_sequence(Artifact(5, 0.01, 0), view)
+    straight = visit_sequence(Artifact(5, 0.01, 0), CHECKED)
+    assert turned.aside_m.tolist() == straight.aside_m.tolist()
+    assert turned.i[turned.aside_m.any(axis=0)].tolist() == straight.i[
+        straight.aside_m.any(axis=0)].tolist()
+    assert turned.m[turned.aside_m.any(axis=0)].tolist() == straight.j[
+        straight.aside_m.any(axis=0)].tolist()  # the mark that lies there
+
+
+def test_a_view_without_grid_marks_has_no_check_stops():
+    assert len(visit_sequence(PLATE, replace(CHECKED, grid=False))) == 0
+
+
+def test_marks_of_check_stops_spread_over_what_lies_in_the_field():
+    def chosen(number, i, j):
+        sites = np.array([part.ravel() for part in np.meshgrid(i, j, indexing="ij")])
+        return sites[:, check_marks(sites, number)].T.tolist()
+
+    field = np.arange(-4, 5)
+    assert chosen(5, field, field) == [[0, 0], [2, 2], [-2, 2], [-2, -2], [2, -2]]
+    assert chosen(1, field, field) == [[0, 0]]
+    assert chosen(5, field[2:], field) == [[1, 0], [2, 2], [-1, 2], [-1, -2], [2, -2]]
+    every = chosen(9, np.arange(-1, 2), np.arange(-1, 2))
+    assert len({tuple(site) for site in every}) == 9
+    assert chosen(20, np.arange(-1, 2), np.arange(-1, 2)) == every  # no more than there are

@@ -19,6 +19,7 @@ EXAMPLE = Path(__file__).parents[2] / "examples/cell.py"
 PLAN = """
 plan_id: example
 artifact: {grid_size: 5, grid_pitch: 0.01, angular_count: 8}
+check_stops: {marks: 5, offset: 20e-6}
 views:
   - {name: identity, repeats: 2}
   - {name: rot90, rotation_deg: 90, repeats: 2}
@@ -39,6 +40,7 @@ def test_the_example_is_calibrated_to_its_true_error(graph, tmp_path):
     cell = example().Cell(context=graph.context)
     graph.add(cell)
     summaries, maps = graph.listen(names.SUMMARY), graph.listen(names.ERROR_MAP)
+    statuses = graph.listen(names.STATUS)
     # the cell tells the time of the clock, and a busy machine may stop it for longer than 0.1 s
     graph.node(MeasurementCollector, max_encoder_gap=10.0)
     graph.node(Solver)
@@ -47,6 +49,10 @@ def test_the_example_is_calibrated_to_its_true_error(graph, tmp_path):
     graph.until(lambda: summaries and summaries[-1].views_done == 4 and maps
                 and maps[-1].header.stamp == summaries[-1].header.stamp, "the final map")
     assert summaries[-1].identifiable, summaries[-1].state
+    assert {(status.view_index, status.check_expected, status.check_done)
+            for status in statuses if status.complete} == {
+        (0, 5, 5), (1, 5, 5), (2, 0, 0), (3, 5, 5)}
+    assert sum(sum(status.reject_counts) for status in statuses) == 0
     found = maps[-1]
     index = np.arange(5) - 2
     x, y = (0.01 * part.ravel() for part in np.meshgrid(index, index, indexing="ij"))

@@ -46,6 +46,7 @@ class Desk:
             "header": SimpleNamespace(stamp=SimpleNamespace(sec=0, nanosec=stamp_ns)),
             "plan_id": PLAN.plan_id, "view_index": index, "complete": complete,
             "grid_expected": 25, "grid_done": done, "angular_expected": 0, "angular_done": 0,
+            "check_expected": 0, "check_done": 0,
             "detections_used": done, "detections_rejected": 0, "missing_m": [], "missing_n": [],
             "missing_k": [], "run_id": self.session.run_id} | fields)))
 
@@ -264,6 +265,16 @@ def test_a_view_that_stalls_names_its_missing_marks(measuring, seconds, said):
     assert measuring.session.diagnosis().level == (Level.WARN if said else Level.OK)
     measuring.session.tick()
     assert measuring.hands.lines(Level.WARN) == [line] * said  # once
+
+
+def test_check_stops_that_are_missing_count_and_are_named(measuring):
+    measuring.status(done=25, check_expected=5, check_done=3)
+    assert measuring.session.coverage == 28 / 30
+    measuring.hands.pass_time(5.0)
+    measuring.session.tick()
+    assert measuring.hands.lines(Level.WARN) == [
+        "view '0' stalls at 93.3 %: missing check stops of 2 marks (see check_marks of the view "
+        "command); measurement_collector gives no sign of life"]
 
 
 def test_a_view_without_any_detection_stalls_too_and_the_collector_is_quoted(measuring):

@@ -40,7 +40,8 @@ def status(index: int, missing: list, **fields) -> object:
     return SimpleNamespace(**({
         "plan_id": PLAN.plan_id, "view_index": index, "view_name": PLAN.views[index].name,
         "complete": False, "grid_done": 25 - len(missing), "grid_expected": 25, "angular_done": 7,
-        "angular_expected": 8, "detections_used": 50, "reject_reasons": ["duplicate"],
+        "angular_expected": 8, "check_done": 2, "check_expected": 5,
+        "detections_used": 50, "reject_reasons": ["duplicate"],
         "reject_counts": [2], "sigma_xy": 2e-8, "sigma_theta": float("nan"),
         "missing_m": [m for m, _ in missing], "missing_n": [n for _, n in missing],
         "missing_k": [3], "run_id": ""} | fields))

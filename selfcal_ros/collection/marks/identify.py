@@ -85,8 +85,7 @@ def identify_grid(artifact: Artifact, view: View, reading_m: np.ndarray, *, ids:
     stage_m : float array (2, n), optional
         Site at which the stage stood, by its own indication; None = at the mark.
     """
-    pose = view.lattice_pose(artifact)
-    pitch = artifact.grid_pitch_m
+    pose, pitch = view.lattice_pose(artifact), artifact.grid_pitch_m
     reasons = np.full(reading_m.shape[1], None, dtype=object)
     if not view.grid or pose.quarter_turns is None:
         reasons[:] = Reason.NOT_IN_VIEW
@@ -97,7 +96,8 @@ def identify_grid(artifact: Artifact, view: View, reading_m: np.ndarray, *, ids:
     marks = np.where(has_id & ~named_unknown, ids, 0)
     reading_m = np.clip(reading_m, -OFF_ANY_PLATE_M, OFF_ANY_PLATE_M)  # squares stay finite
     centred = reading_m - np.array(pose.shift)[:, None] * pitch  # about the plate's centre
-    astray = _astray(pose, marks, stage_m, artifact, rules, among=has_id)
+    limit_m = rules.stage_limit_m(artifact) + view.check_offset_m
+    astray = _astray(pose, marks, stage_m, artifact, limit_m, among=has_id)
     named = has_id & ~named_unknown & ~astray
     free = ~has_id
     known, fit = _settle(pose, centred, half, marks, (named, free), pitch, rules)
@@ -119,7 +119,7 @@ def identify_grid(artifact: Artifact, view: View, reading_m: np.ndarray, *, ids:
         limit = pitch / 4  # too few marks to know the view's own rotation and offset
     residual = deviation - rigid.at(about)
     far |= ~ambiguous & (distances(residual) > limit)
-    astray |= _astray(pose, marks, stage_m, artifact, rules, among=free & ~far)
+    astray |= _astray(pose, marks, stage_m, artifact, limit_m, among=free & ~far)
     reasons[far] = Reason.TOO_FAR
     reasons[astray] = Reason.NOT_AT_MARK
     reasons[ambiguous] = Reason.AMBIGUOUS
@@ -135,7 +135,7 @@ def _at_most_two(numbers: np.ndarray) -> bool:
 
 
 def _astray(pose: LatticePose, marks: np.ndarray, stage_m: np.ndarray | None, artifact: Artifact,
-            rules: IdentityRules, *, among: np.ndarray) -> np.ndarray:
+            limit_m: float, *, among: np.ndarray) -> np.ndarray:
     """Return which `among` marks (2, n) have the stage further from their sites than it may be."""
     if stage_m is None or not among.any():
         return np.zeros(marks.shape[1], dtype=bool)
@@ -144,7 +144,7 @@ def _astray(pose: LatticePose, marks: np.ndarray, stage_m: np.ndarray | None, ar
         here = slice(start, start + PART)
         site = np.stack(pose.site_of(marks[0, here], marks[1, here])) * artifact.grid_pitch_m
         away = np.clip(stage_m[:, here] - site, -OFF_ANY_PLATE_M, OFF_ANY_PLATE_M)
-        astray[here] = distances(away) > rules.stage_limit_m(artifact)
+        astray[here] = distances(away) > limit_m
     return astray & among
 
 

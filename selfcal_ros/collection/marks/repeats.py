@@ -48,8 +48,8 @@ class Means:
 
 
 def reduce_repeats(key: np.ndarray, values: np.ndarray, sigma: np.ndarray, *,
-                   limit: float, extent: float = 0.0,
-                   residual: np.ndarray | None = None) -> Means:
+                   limit: float, extent: float = 0.0, residual: np.ndarray | None = None,
+                   steady: tuple[np.ndarray, int] | None = None) -> Means:
     """Reject outliers and average the repeats of every mark.
 
     Parameters
@@ -68,6 +68,9 @@ def reduce_repeats(key: np.ndarray, values: np.ndarray, sigma: np.ndarray, *,
     residual : float array (c, n), optional
         The readings without the view's own motion. Where too few repeats tell the noise, it is at
         most the scatter of these from mark to mark.
+    steady : tuple, optional
+        Values (c, n) that tell outliers and repeatability instead of the readings, and how many
+        numbers were fitted to them; see `check_stops.without_aside`.
 
     Returns
     -------
@@ -76,11 +79,16 @@ def reduce_repeats(key: np.ndarray, values: np.ndarray, sigma: np.ndarray, *,
         weighted by 1/sigma^2. `sigma` is the pooled repeatability (NaN without repeats),
         `dof` its degrees of freedom, `outlier` a mask over the readings.
     """
-    outlier = np.zeros(len(key), dtype=bool)
+    outlier, (judged, fitted) = np.zeros(len(key), dtype=bool), steady or (values, 0)
     if limit > 0 and len(key):
-        outlier = _outliers(key, values, _relative(sigma), (limit, extent),
+        outlier = _outliers(key, judged, _relative(sigma), (limit, extent),
                             residual)
     means = average(key[~outlier], values[:, ~outlier], sigma[~outlier])
+    if fitted:
+        told = average(key[~outlier], judged[:, ~outlier], sigma[~outlier])
+        dof = max(told.dof - fitted, 0)
+        pooled = told.sigma * np.sqrt(told.dof / dof) if dof else float("nan")
+        means = replace(means, sigma=float(pooled), dof=dof)
     return replace(means, outlier=outlier)
 
 
@@ -140,7 +148,7 @@ def _relative(sigma: np.ndarray) -> np.ndarray:
 
 def _outliers(key: np.ndarray, values: np.ndarray, relative: np.ndarray,
               limits: tuple[float, float], residual: np.ndarray | None) -> np.ndarray:
-    groups = _groups(key)
+    groups = groups_of(key)
     limit, extent = limits
     scale, pairs = _pair_scale(groups, values, relative)
     if groups and pairs < MIN_PAIRS and residual is not None:
@@ -165,7 +173,7 @@ def _outliers(key: np.ndarray, values: np.ndarray, relative: np.ndarray,
     return out
 
 
-def _groups(key: np.ndarray) -> list[np.ndarray]:
+def groups_of(key: np.ndarray) -> list[np.ndarray]:
     """Return the indices of the repeats of each mark: one array (marks, r) for each r > 1."""
     order = np.argsort(key, kind="stable")
     start = np.flatnonzero(np.diff(key[order], prepend=key[order[:1]] - 1))
@@ -196,7 +204,7 @@ def _sensor_step(groups: list[np.ndarray], values: np.ndarray, floor: float) -> 
 
 
 @lru_cache(64)
-def _pairs(count: int) -> tuple[np.ndarray, np.ndarray]:
+def pairs_of(count: int) -> tuple[np.ndarray, np.ndarray]:
     """Return pairs of `count` repeats: all, or of many repeats each with 16 others, evenly."""
     if count <= ALL_PAIRS:
         return np.triu_indices(count, 1)
@@ -210,11 +218,11 @@ def _pair_scale(groups: list[np.ndarray], values: np.ndarray,
     """Return the robust standard deviation of one reading, and how many pairs told it."""
     if not groups:
         return float("nan"), 0
-    every = np.empty(len(values) * sum(len(group) * len(_pairs(group.shape[1])[0])
+    every = np.empty(len(values) * sum(len(group) * len(pairs_of(group.shape[1])[0])
                                        for group in groups))
     done, alike = 0, bool((relative == 1).all())  # as where no sigma is declared
     for group in groups:
-        i, j = _pairs(group.shape[1])
+        i, j = pairs_of(group.shape[1])
         for part in _parts(group, len(i)):
             weights, repeats = relative[part], np.take(values, part, axis=1)
             norm = np.sqrt(2) if alike else np.hypot(np.take(weights, i, axis=1),

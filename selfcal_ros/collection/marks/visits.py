@@ -15,11 +15,12 @@ may come of the microscope's wiring: reversed offsets make 2 of it, doubled ones
 
 def grid_visits(means: Means, key: np.ndarray, sigma: np.ndarray, *, stamps_ns: np.ndarray,
                 deviation: np.ndarray, offset: np.ndarray, approach: np.ndarray,
-                ) -> GridVisits | None:
+                step_m: float = np.inf) -> GridVisits | None:
     """Return the visits behind the means of a view's grid marks; None without any.
 
     A visit is a run of successive exposures of one mark: any other mark that was exposed in
-    between ends it, also one whose reading is an outlier. Outliers are in no visit. Deviations,
+    between ends it, also one whose reading is an outlier, and so does a motion of the stage beyond
+    `step_m`, as from one check stop to the next. Outliers are in no visit. Deviations,
     offsets and instants of a visit are averaged with the weights of `reduce_repeats`. The approach
     is the one that all its exposures have in common, 0 where they differ.
 
@@ -37,11 +38,14 @@ def grid_visits(means: Means, key: np.ndarray, sigma: np.ndarray, *, stamps_ns: 
         Deviation and offset as seen, stage axes, m.
     approach : int8 array (2, n)
         Signs of the last motions of x and y.
+    step_m : float
+        Motion of the stage along an axis that ends a visit, m.
     """
     kept = ~means.outlier
     if not kept.any():
         return None
-    number = np.cumsum(np.diff(key, prepend=key[:1]) != 0)[kept]
+    moved = np.abs(np.diff(deviation - offset, prepend=(deviation - offset)[:, :1])) > step_m
+    number = np.cumsum((np.diff(key, prepend=key[:1]) != 0) | moved.any(axis=0))[kept]
     key, stamps_ns = key[kept], stamps_ns[kept]
     begins = np.diff(number, prepend=-1) != 0
     first, visit = np.flatnonzero(begins), np.cumsum(begins) - 1

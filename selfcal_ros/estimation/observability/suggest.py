@@ -213,10 +213,12 @@ def _more_views(plan: Plan) -> list[Step]:
     angular = any(view.angular for view in plan.views) and plan.artifact.angular_count > 0
     unit = unit_repeats(plan)
     out: list[Step] = []
-    order = next((view.visit_order for view in plan.views if view.grid), "")
+    like = next((view for view in plan.views if view.grid), View(""))
     for view in candidate_views(plan.artifact, angular=angular):
-        named = replace(view, name=unused_name(view.name, plan.views), repeats=unit,
-                        visit_order=order if view.grid else "")
+        named = replace(view, name=unused_name(view.name, plan.views), repeats=unit)
+        if view.grid:
+            named = replace(named, visit_order=like.visit_order, check_marks=like.check_marks,
+                            check_offset_m=like.check_offset_m)
         out.append((named, (*plan.views, named), {}))
     return out
 

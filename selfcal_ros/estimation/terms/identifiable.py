@@ -9,8 +9,8 @@ from selfcal_ros.model.result import Observability
 from selfcal_ros.model.terms import TermName
 
 CURES = {
-    TermName.MICROSCOPE: "let the stage stop off the marks by some tens of µm, on purpose, or "
-                         "align the microscope and leave the term out",
+    TermName.MICROSCOPE: "ask for check_stops in the plan, or align the microscope and leave "
+                         "the term out",
     TermName.DRIFT: "visit the marks in more than one order, e.g. visit_order: x_back_y_back",
     TermName.PLATE_SCALE: "add views that are turned and shifted",
     TermName.PLATE_SHAPE: "add views shifted both ways along both axes, and one along a diagonal",

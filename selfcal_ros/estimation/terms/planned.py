@@ -89,15 +89,16 @@ def _visits(artifact: Artifact, view: View, assumed: Assumed,
     found = visit_sequence(artifact, view, order=assumed.order, rng=rng)
     n = len(found)
     sites = (found.i + 1j * found.j) * artifact.grid_pitch_m
+    aside = found.aside_m[0] + 1j * found.aside_m[1]
     stops = assumed.stop_error_m * (rng.normal(size=n) + 1j * rng.normal(size=n))
     (hx, hy), phase = artifact.half, PHASES[-view.lattice_pose(artifact).q % 4]
     mark = (found.m + hx) * artifact.shape[1] + found.n + hy
     # which way the stage carries the plate changes nothing: its motion and its part of a reading
     # both change their sign
     return ViewVisits(mark, found.count.astype(float), np.zeros(n, dtype=complex),
-                      _view_time(found), 1j * turn * sites + complex(x, y) - stops,
-                      approach_signs(found.i.astype(float)).astype(float),
-                      approach_signs(found.j.astype(float)).astype(float), phase)
+                      _view_time(found), 1j * turn * sites + complex(x, y) - stops - aside,
+                      approach_signs((sites + aside).real).astype(float),
+                      approach_signs((sites + aside).imag).astype(float), phase)
 
 
 def _view_time(found: VisitSequence) -> np.ndarray:
