@@ -105,6 +105,7 @@ def plan_keys() -> list[str]:
         "grid_size": 3, "grid_pitch": 0.01, "angular_count": 0}, "views": [{"name": "a"}]}
     strange = {"?": 1}
     return [*known_keys(whole | strange),
+            *(f"check_stops.{key}" for key in known_keys(whole | {"check_stops": strange})),
             *(f"artifact.{key}" for key in known_keys(whole | {
                 "artifact": whole["artifact"] | strange})),
             *(f"views[].{key}" for key in known_keys(whole | {"views": [{"name": "a"} | strange]}))]
