@@ -116,9 +116,9 @@ def _visits(marks: np.ndarray, sites: np.ndarray, passes: np.ndarray, *, togethe
     does not look like a scale of the microscope.
     """
     half = (len(passes) + 1) // 2
-    checks = np.tile(check_marks(sites, view.check_marks), (4, 1))
-    rows = [*passes[:half], *checks, *passes[half:]]
-    sides = [(0.0, 0.0)] * half + list(SIDES) + [(0.0, 0.0)] * (len(passes) - half)
+    stops = SIDES if view.check_marks else ()
+    rows = [*passes[:half], *[check_marks(sites, view.check_marks)] * len(stops), *passes[half:]]
+    sides = [(0, 0)] * half + list(stops) + [(0, 0)] * (len(passes) - half)
     index, number = np.concatenate(rows), np.repeat(np.arange(len(rows)), [*map(len, rows)])
     aside = view.check_offset_m * np.array(sides).T[:, number]
     exposures = np.where(aside.any(axis=0), 1, together)
@@ -137,8 +137,6 @@ def check_marks(sites: np.ndarray, number: int) -> np.ndarray:
     (+x, +y), counter-clockwise; where a site is taken already, the nearest that is free.
     """
     number = min(number, sites.shape[1])
-    if not number:
-        return np.zeros(0, dtype=int)
     middle = (sites.min(axis=1) + sites.max(axis=1)) / 2
     angle = np.pi / 4 + 2 * np.pi * np.arange(number - 1) / max(number - 1, 1)
     out = np.sqrt(0.5) * np.stack([np.cos(angle), np.sin(angle)])  # half way to the corners

@@ -186,7 +186,7 @@ def test_check_stops_come_half_way_side_by_side_in_the_same_order(repeats, befor
     assert found.time.tolist() == list(range(len(found)))
     assert (np.diff(found.pass_number) >= 0).all()
     assert (found.pass_number[stops] - before).tolist() == [0, 0, 0, 1, 1, 1, 2, 2, 2, 3, 3, 3]
-    assert found.pass_number[-1] == repeats + 3 * (repeats > 1) + 2 * (repeats == 1)
+    assert found.pass_number[-1] == repeats + 3
 
 
 def test_check_stops_part_the_two_exposures_where_the_stage_turns_back():
