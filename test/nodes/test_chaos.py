@@ -4,9 +4,18 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from selfcal_ros.collection.messages import Detection
-from test.support.chaos import HARMLESS, full_disk, one_round, story
+from test.support.chaos import (
+    HARMLESS,
+    STEPS_S,
+    faults_of,
+    full_disk,
+    killed_sequencers,
+    one_round,
+    story,
+)
 
 
 def test_nothing_is_lost_without_a_word_and_the_maps_are_the_right_ones(
@@ -24,6 +33,20 @@ def test_a_disk_that_is_full_for_a_while_costs_its_part_of_the_journal_alone(
     line, wrong = full_disk(3, ros_environment, tmp_path, forks=forks)
     assert wrong == []
     assert " used + " in line
+
+
+def test_a_run_whose_sequencers_are_killed_is_taken_up_in_its_view(
+        ros_environment, tmp_path, forks):
+    line, wrong = killed_sequencers(6, ros_environment, tmp_path, kills=2, forks=forks)
+    assert wrong == []
+    assert line.startswith("killed in views ")
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_each_step_of_the_clock_has_its_round(seed):
+    """Whatever the step, back and ahead, the readings are those of a quiet process."""
+    assert faults_of(seed)[1].clock_step_s == STEPS_S[seed]
+    assert faults_of(seed)[0].clock_step_s == 0.0
 
 
 class Result:

@@ -13,9 +13,8 @@ from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.estimation.api import Options, calibrate
 from selfcal_ros.files import read_json
 from selfcal_ros.nodes import names
-from test.support.independent_cell import IndependentCell, largest_deviation
-from test.support.killed import NODES, Cell
-from test.support.sessions import collected, events_of, plan_file, small_plan
+from test.support.killed import Cell
+from test.support.sessions import collected, events_of, small_plan
 
 VALUES = CollectorSettings.checked({}, "test")
 
@@ -99,47 +98,6 @@ def test_a_solver_that_hangs_for_a_while_solves_then_what_it_missed(cell, run):
     cell.deliver(run, first=half)
     cell.running["solver"].send_signal(signal.SIGCONT)
     same(cell.saved()["error_map"], undisturbed(run))
-
-
-def start_sequencer(cell, plan):
-    cell.start("pose_sequencer", plan=plan_file(cell.folder, plan), auto_confirm=True,
-               settle_time=0.0)
-    cell.answer(Trigger, "pose_sequencer/start", again_s=2.0)  # a second start changes nothing
-
-
-def test_a_sequencer_killed_within_views_takes_up_the_run_there(cell):
-    plan = small_plan("0, 90, tx", repeats=1)
-    machine = cell.graph.add(IndependentCell(context=cell.graph.context))
-    machine.hold_at = (0, 1)
-    commands, maps = cell.graph.listen(names.COMMAND), cell.graph.listen(names.ERROR_MAP)
-    cell.inside = dict.fromkeys(NODES)
-    cell.start("solver", result_folder=cell.folder)
-    cell.start_collector()
-    start_sequencer(cell, plan)
-    for view, hold_at in ((0, (1, 20)), (1, None)):
-        cell.graph.until(lambda: machine.held, "the middle of the view")
-        cell.kill("pose_sequencer")
-        began = commands[-1]
-        assert (began.phase, began.view_index) == (Phase.MEASURE, view)
-        commands.clear()
-        start_sequencer(cell, plan)
-        cell.graph.until(lambda: commands, "the command of the view in which it was")
-        assert commands[0] == began
-        machine.hold_at = hold_at
-    cell.graph.until(lambda: commands[-1].phase == Phase.DONE, "the end of the plan")
-    measured = [command.view_index for command in commands if command.phase == Phase.MEASURE]
-    assert measured == list(range(1, len(plan.views)))
-    assert {command.run_id for command in commands} == {began.run_id}
-    saved = cell.saved()
-    cell.graph.until(lambda: maps[-1].run_id == began.run_id and maps[-1].identifiable, "the map")
-    off_m, off_rad = largest_deviation(maps[-1])
-    assert off_m < 2e-8 and off_rad < 1e-6
-    [journal] = (path for path in cell.folder.iterdir() if path.name.startswith("journal_"))
-    cell.end("measurement_collector")
-    offline = collect_bag(journal, VALUES)
-    assert (offline.measurements.run_id, offline.measurements.all_rejected()) == (
-        began.run_id, {})
-    same(saved["error_map"], calibrate(offline.measurements, Options()).error_map)
 
 
 def test_a_second_collector_on_one_journal_is_refused(cell):

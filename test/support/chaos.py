@@ -2,39 +2,54 @@
 """Cells whose messages are lost, doubled and late, and whose nodes are killed, side by side.
 
 In one cell messages only overtake each other and come twice; in the other some are lost or spoiled
-as well and the clock steps. Collectors and solvers are killed (SIGKILL) at random moments and
+as well and the clock steps, back or ahead. Somebody listened to everything in either cell before
+its nodes were there. Collectors and solvers are killed (SIGKILL) at random moments and
 started again. Every detection that was sent must be used, or rejected by reason; the map must be
 the one of the same messages in a quiet process and, in the first cell, that of the undisturbed
-run, bit for bit. The disk of a third cell is full for a while.
+run, bit for bit. The disk of a third cell is full for a while; in a fourth one, which follows
+commands, sequencers are killed.
 """
 
 import contextlib
 import resource
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
+from rclpy.node import Node
+from selfcal_msgs.msg import ViewCommand
+from std_srvs.srv import Trigger
 
+from selfcal_ros.bagio.offline import collect_bag
 from selfcal_ros.bagio.reader import BagReader
 from selfcal_ros.collection.expected import ViewProgress
 from selfcal_ros.collection.messages import Detection
+from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.errors import NotIdentifiableError
 from selfcal_ros.estimation.api import calibrate
+from selfcal_ros.model.view import Plan
 from selfcal_ros.nodes import names
 from selfcal_ros.simulation.cell import Event
 from selfcal_ros.simulation.faults import Faults, apply_faults
 from test.support.forked import Forks
+from test.support.independent_cell import IndependentCell, largest_deviation
 from test.support.killed import Cell
 from test.support.ros import Graph
-from test.support.sessions import collected, events_of, small_plan
+from test.support.sessions import collected, events_of, plan_file, small_plan
 
 HARMLESS = Faults(duplicated=0.05, delay_s=0.05)
 HARMFUL = Faults(lost=0.05, duplicated=0.05, outliers=0.03, low_score=0.02, not_finite=0.02,
                  unknown_mark=0.02, delay_s=0.05, clock_step_s=0.2, encoder_gap_s=0.3)
-CELLS = {"quiet_messages": HARMLESS, "lost_messages": HARMFUL}
+CELLS = ("quiet_messages", "lost_messages")
+STEPS_S = (-5.0, -0.2, 0.2, 5.0)
+"""By how much the clock of the second cell is set back, one in each round; < 0 = ahead."""
 NODES = ("measurement_collector", "solver")
 COMPARED = ("gx", "gy", "u_gx", "u_gy", "g_theta", "u_g_theta")
+FEWEST_MARKS, FEWEST_LINES = 20, 8
+"""Exposures of a view between which sequencers are killed."""
+NOISE_M, NOISE_RAD = 2e-8, 1e-6
+"""Largest deviations from the truth that the noise of the cell that follows commands gives."""
 WHILE_TRYING = 0.1
 """Share of the messages that may not get into the journal although there is disk again."""
 
@@ -117,6 +132,23 @@ def named_missing(progress: dict[int, ViewProgress]) -> int:
     return sum(view.needed for view in progress.values())
 
 
+def faults_of(seed: int) -> tuple[Faults, Faults]:
+    """Return what goes wrong in the two cells of a round."""
+    return HARMLESS, replace(HARMFUL, clock_step_s=STEPS_S[seed % len(STEPS_S)])
+
+
+def listen(cell: Cell) -> None:
+    """Have a stranger listen to everything in a cell, as `ros2 topic echo` and bridges do.
+
+    Before the nodes are there: who takes it for one of them loses what it sends.
+    """
+    stranger = cell.graph.add(Node(f"stranger_{cell.namespace}", context=cell.graph.context))
+    for topic in (*names.INPUTS, *names.RESULTS):
+        stranger.create_subscription(topic.type, cell.name(topic.name), lambda _: None, topic.qos,
+                                     raw=True)
+    cell.graph.until(lambda: all(cell.matched.values()), "the stranger")
+
+
 def story(cell: Cell, faults: Faults, rng: np.random.Generator, kills: int) -> Story:
     """Return what happens to a cell."""
     measured = events_of(small_plan("0, 90, tx", repeats=2), int(rng.integers(2**31)))
@@ -151,8 +183,9 @@ def one_round(seed: int, environment: dict, folder: Path, *, kills: int = 3,
     rng = np.random.default_rng(seed)
     with cells(environment, folder, forks) as running:
         stories = [story(cell, faults, rng, kills)
-                   for cell, faults in zip(running, CELLS.values(), strict=True)]
+                   for cell, faults in zip(running, faults_of(seed), strict=True)]
         for one in stories:
+            listen(one.cell)
             if forks:
                 one.cell.inside = dict.fromkeys(set(NODES) - {node for _, node in one.kills})
             one.start()
@@ -203,3 +236,79 @@ def full_disk(seed: int, environment: dict, folder: Path, *, forks: Forks | None
     finally:
         cell.close()
         graph.close()
+
+
+def killed_sequencers(seed: int, environment: dict, folder: Path, *, kills: int = 3,
+                      forks: Forks | None = None) -> tuple[str, list[str]]:
+    """Measure in a cell that follows commands and whose sequencers are killed within views.
+
+    Each one that is started takes up the run in its view, by the command that the last one gave;
+    the map is the truth to the noise and, bit for bit, that of the journal.
+    """
+    rng, plan = np.random.default_rng(seed), small_plan("0, 90, tx", repeats=1)
+    exposures = [(index, number) for index, view in enumerate(plan.views)
+                 for number in range(FEWEST_MARKS * view.grid + FEWEST_LINES * view.angular)]
+    stops = [exposures[place] for place in np.sort(rng.choice(len(exposures), kills, False))]
+    graph = Graph(int(environment["ROS_DOMAIN_ID"]))
+    cell = Cell(graph, environment, folder, "killed_sequencers", forks=forks)
+    cell.inside = dict.fromkeys(NODES) if forks else {}
+    try:
+        listen(cell)
+        maps = graph.listen(replace(names.ERROR_MAP, name=cell.name(names.ERROR_MAP.name)))
+        cell.start("solver", result_folder=cell.folder)
+        cell.start_collector()
+        run_id, faults = _taken_up(cell, plan, stops)
+        saved = cell.saved()
+        graph.until(lambda: maps and maps[-1].run_id == run_id and maps[-1].identifiable, "the map")
+        off_m, off_rad = largest_deviation(maps[-1])
+        if off_m > NOISE_M or off_rad > NOISE_RAD:
+            faults.append(f"the map is off by {off_m:.1e} m, {off_rad:.1e} rad")
+        cell.end("measurement_collector")
+        [journal] = folder.glob(f"{cell.namespace}/journal_*")
+        offline = collect_bag(journal, CollectorSettings()).measurements
+        if (offline.run_id, offline.all_rejected()) != (run_id, {}):
+            faults.append(f"run {offline.run_id}, rejected {offline.all_rejected()}")
+        expected = calibrate(offline).error_map
+        faults += [f"{name} is not that of the journal" for name in COMPARED
+                   if not np.array_equal(np.array(saved["error_map"][name], dtype=float),
+                                         getattr(expected, name), equal_nan=True)]
+        return (f"killed in views {', '.join(str(view) for view, _ in stops)}; the map is off by "
+                f"{off_m:.1e} m, {off_rad:.1e} rad"), faults
+    finally:
+        cell.close()
+        graph.close()
+
+
+def _taken_up(cell: Cell, plan: Plan, stops: list[tuple[int, int]]) -> tuple[str, list[str]]:
+    """Run a plan with kills of the sequencer; return the run and what was wrong with it."""
+    graph, faults, run_ids = cell.graph, [], set()
+    machine = graph.add(IndependentCell(context=graph.context, namespace=cell.namespace))
+    commands = graph.listen(replace(names.COMMAND, name=cell.name(names.COMMAND.name)))
+    machine.hold_at = stops[0]
+    start_sequencer(cell, plan)
+    for stop, after in zip(stops, [*stops[1:], None], strict=True):
+        graph.until(lambda: machine.held, "the place of the next kill")
+        cell.kill("pose_sequencer")
+        last = commands[-1]
+        run_ids |= {command.run_id for command in commands}
+        commands.clear()
+        start_sequencer(cell, plan)
+        graph.until(lambda: commands, "the command of the view in which it was")
+        if commands[0] != last or (last.phase, last.view_index) != (ViewCommand.MEASURE, stop[0]):
+            faults.append(f"killed in view {stop[0]} after {last}, taken up with {commands[0]}")
+        machine.hold_at = after
+    graph.until(lambda: commands[-1].phase == ViewCommand.DONE, "the end of the plan")
+    run_ids |= {command.run_id for command in commands}
+    wanted = list(range(stops[-1][0], len(plan.views)))
+    measured = [item.view_index for item in commands if item.phase == ViewCommand.MEASURE]
+    if measured != wanted or len(run_ids) != 1:
+        faults.append(f"views {measured} of runs {sorted(run_ids)} after the last kill instead of "
+                      f"{wanted} of one run")
+    return last.run_id, faults
+
+
+def start_sequencer(cell: Cell, plan: Plan) -> None:
+    """Start a sequencer and have it begin, or take up, the run of a plan."""
+    cell.start("pose_sequencer", plan=plan_file(cell.folder, plan), auto_confirm=True,
+               settle_time=0.0)
+    cell.answer(Trigger, "pose_sequencer/start", again_s=2.0)  # a second start changes nothing
