@@ -114,12 +114,12 @@ class Reception:
         self._waiting.append((COMMAND_TOPIC, data, when_ns, is_older))
 
     def drain(self) -> bool:
-        """Write what has come to the journal, then give it to the session; tell if it has anything.
+        """Write what has come to the journal, then give it to the session; tell if counts changed.
 
         While a journal is being taken up, what comes meanwhile is written and held back.
         """
-        adopted, waiting, self._waiting, self._n_detections = False, self._waiting, [], 0
-        waiting = self._believable(waiting)
+        adopted, came, self._waiting, self._n_detections = False, self._waiting, [], 0
+        waiting = self._believable(came)
         self._advance()
         self._write(waiting)
         try:
@@ -135,7 +135,7 @@ class Reception:
             adopted = True
         waiting, self._held = [*self._held, *waiting], []
         self._feed(waiting)
-        return adopted or bool(waiting)
+        return adopted or bool(came)
 
     def _believable(self, waiting: list[tuple[str, bytes, int, bool]],
                     ) -> list[tuple[str, bytes, int, bool]]:
