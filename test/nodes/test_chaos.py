@@ -10,6 +10,7 @@ from selfcal_ros.collection.messages import Detection
 from test.support.chaos import (
     HARMLESS,
     STEPS_S,
+    clock_ahead,
     faults_of,
     full_disk,
     killed_sequencers,
@@ -40,6 +41,13 @@ def test_a_run_whose_sequencers_are_killed_is_taken_up_in_its_view(
     line, wrong = killed_sequencers(6, ros_environment, tmp_path, kills=2, forks=forks)
     assert wrong == []
     assert line.startswith("killed in views ")
+
+
+def test_a_run_after_one_that_was_stamped_a_day_ahead_is_as_if_that_had_not_been(
+        ros_environment, tmp_path, forks):
+    line, wrong = clock_ahead(4, ros_environment, tmp_path, kills=1, forks=forks)
+    assert wrong == []
+    assert " used + " in line
 
 
 @pytest.mark.parametrize("seed", range(4))
