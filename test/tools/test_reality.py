@@ -9,10 +9,12 @@ import pytest
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.simulation.machine import random_truth
 from selfcal_ros.simulation.truth import simulate_measurements
+from tools.reality.__main__ import BEGIN, END, write_table
 from tools.reality.cases import (
     MODEL,
     Case,
     both,
+    checked,
     creeping,
     hu,
     lines_turned,
@@ -72,6 +74,11 @@ def test_cases_have_the_stop_errors_that_their_names_say():
     assert len(said) == 6
     for name, stop_m in said:
         assert stop_m == pytest.approx(float(name.split("stop errors ")[1].split(" um")[0]) * 1e-6)
+
+
+def test_check_stops_are_in_every_grid_view():
+    asked = [(view.check_marks, view.check_offset_m) for view in checked(resistant()).views]
+    assert asked == [(5, 20e-6)] * 5 + [(0, 0.0)]
 
 
 def test_one_mark_of_the_second_view_is_misread():
@@ -182,6 +189,15 @@ def test_how_many_errors_outside_make_a_map_wrong():
     # of four times as few the part scatters twice as much about 95.45 %
     assert limit((0.85, 200), np.zeros(50)) == pytest.approx(0.9545 - 2 * 0.1045)
     assert limit((0.85, 50), np.array([0.0, np.nan] * 50)) == pytest.approx(0.85)
+
+
+def test_a_table_takes_its_place_in_a_page(tmp_path):
+    page = tmp_path / "page.md"
+    page.write_text(f"# Title\n\n{BEGIN}old\nrows{END}\n\nThe end.\n")
+    write_table(str(page), ["| a |", "|---|", "| b |"])
+    assert page.read_text() == f"# Title\n\n{BEGIN}| a |\n|---|\n| b |{END}\n\nThe end.\n"
+    write_table(str(tmp_path / "new.md"), ["| a |"])
+    assert (tmp_path / "new.md").read_text() == "| a |\n"
 
 
 def test_a_row_says_what_comes_after_the_advice():

@@ -7,7 +7,7 @@ python -m tools.reality [--runs N] [--first SEED] [--workers N] [--only TEXT] [-
 import argparse
 import sys
 from dataclasses import asdict
-from functools import partial
+from pathlib import Path
 
 from selfcal_ros.files import write_json, write_text
 from selfcal_ros.model.result import plain
@@ -30,22 +30,23 @@ def row(name: str, found: Summary) -> str:
         name = name.replace(plain_text, shown)
     grades = " | ".join(str(found.grades.get(grade, 0)) for grade in GRADES)
     seeds = f" (seeds {', '.join(map(str, found.wrong_seeds[:5]))})" if found.wrong else ""
-    return (f"| {name} | {found.error_m * NM_PER_M:.3g} | {100 * found.within:.1f} ± "
+    text = (f"| {name} | {found.error_m * NM_PER_M:.3g} | {100 * found.within:.1f} ± "
             f"{200 * found.u_within:.1f} %, {100 * found.within_theta:.1f} % | {found.z_xy:.2f}, "
             f"{found.z_theta:.2f} | {grades} | {found.wrong}{seeds} | {causes} |")
+    return text.replace("nan ± nan %", "–").replace("nan %", "–").replace("nan", "–")
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--runs", type=int, default=40, help="runs of each case (default: 40); "
-                        "of populations of clean machines 25 times as many, of others 5 times")
+                        "of the population of clean machines 25 times as many, of others 5 times")
     parser.add_argument("--first", type=int, default=0, help="seed of the first run (default: 0)")
     parser.add_argument("--workers", type=int, help="processes (default: one a core)")
     parser.add_argument("--only", action="append", help="only cases whose name holds this text; "
                         "may be given again for others")
     parser.add_argument("--list", action="store_true", help="list the cases and do nothing")
-    parser.add_argument("-o", "--output", help="write the table to this file, or every run if it "
-                        "ends in .json")
+    parser.add_argument("-o", "--output", help="write the table to this file (of a page with "
+                        "marks between these), or every run if it ends in .json")
     args = parser.parse_args()
     every = every_case()
     chosen = [i for i, case in enumerate(every)
@@ -55,20 +56,30 @@ def main() -> int:
         return 0
     jobs = [(index, args.first + run) for index in chosen
             for run in range(args.runs * every[index].times)]
-    lines, found = [HEADER], {}
-    write = partial(print, flush=True)
-    write(HEADER)
+    lines, done = [HEADER], []
+    print(HEADER, flush=True)
     for index, courses in finished(jobs, check_workers(args.workers)):
-        found[index] = courses
-        for name, summary in rows(every[index], courses):
-            lines.append(row(name, summary))
-            write(lines[-1])
-    lines += notes([every[i] for i in chosen])
-    if args.output and args.output.endswith(".json"):
-        write_json(args.output, plain([as_json(every[i], found[i]) for i in chosen]))
-    elif args.output:
-        write_text(args.output, "\n".join(lines) + "\n")
+        case = every[index]
+        done.append(as_json(case, courses))
+        lines += [row(name, summary) for name, summary in rows(case, courses)]
+        print("\n".join(lines[-len(done[-1]["rows"]):]), flush=True)
+        if args.output and args.output.endswith(".json"):
+            write_json(args.output, plain(done))  # what is done is kept if the rest is stopped
+        elif args.output:
+            write_table(args.output, lines)
     return 0
+
+
+BEGIN, END = "<!-- rows -->\n", "\n<!-- end of rows -->"
+
+
+def write_table(path: str, lines: list[str]) -> None:
+    """Write the table to a file: between the marks of a page that has them."""
+    table = "\n".join(lines)
+    page = Path(path).read_text() if Path(path).exists() else ""
+    before, begin, rest = page.partition(BEGIN)
+    _, end, after = rest.partition(END)
+    write_text(path, before + begin + table + end + after if end else table + "\n")
 
 
 def finished(jobs: list[tuple[int, int]], workers: int):
@@ -84,12 +95,6 @@ def finished(jobs: list[tuple[int, int]], workers: int):
         while waiting and len(courses[waiting[0]]) == wanted[waiting[0]]:
             done = waiting.pop(0)
             yield done, dict(sorted(courses[done].items()))
-
-
-def notes(chosen: list[Case]) -> list[str]:
-    """Return why readings cannot tell some of the cases."""
-    told = [f"- {case.name}: {case.hidden}." for case in chosen if case.hidden]
-    return ["", "Not told, or not always, by the readings:", "", *told] if told else []
 
 
 def as_json(case: Case, courses: dict[int, Course]) -> dict:

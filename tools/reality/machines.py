@@ -17,6 +17,7 @@ from tools.reality.cases import (
     SIGMA_M,
     Case,
     Change,
+    checked,
     hu,
     resistant,
 )
@@ -28,7 +29,38 @@ WITHOUT_LINES = Artifact(ARTIFACT.grid_size, ARTIFACT.grid_pitch_m, 0)
 
 def machine_cases() -> list[Case]:
     """Return the cases, those of the microscope first."""
-    return [*_wired(), *_scaled(), *_plates(), *_stages(), *_noises(), *_laid(), *_exact()]
+    return [*_wired(), *_scaled(), *_plates(), *_stages(), *_noises(), *_laid(), *_exact(),
+            *_checked()]
+
+
+def _checked() -> list[Case]:
+    """Return cases with check stops, which tell the microscope."""
+    stops = {"plan": checked(hu())}
+    still = replace(SERVO, servo_sigma_m=0.0, servo_sigma_rad=0.0)
+    bare = {"plan": checked(hu_plan(WITHOUT_LINES, 5))}
+    return [
+        _case("check stops: nothing", more=stops),
+        _case("check stops: offsets of the other sign, no lines, stage that never scatters", 0.01,
+              more=bare, settings=still, microscope_axes="-x-y"),
+        _case("check stops: pixels twice as large as declared", 0.003, more=stops,
+              microscope_pixels=0.5),
+        _case("check stops: scale of the microscope +5 %", 0.05, more=stops,
+              microscope_scale=0.05),
+        _case("check stops: scale of the microscope +5 %, no lines", more=bare,
+              microscope_scale=0.05),
+        _case("check stops: microscope turned by 5 mrad", 0.005, more=stops,
+              microscope_rotation_rad=5e-3),
+        _case("check stops: shear of the microscope 2 mrad", 0.1, more=stops,
+              microscope_shear=2e-3),
+        _case("check stops: camera distortion 0.1 % at 250 um, plate against pins", 0.001,
+              more=stops, microscope_distortion=1e-3, **_pins(0.2)),
+        _case("check stops: plate strained by 1 um/m in each view", more=stops, plate_strain=1e-6),
+        _case("check stops: plate bowed by 5 um, optical axis tilted by 5 mrad", more=stops,
+              plate_bow_m=5e-6, optical_tilt_x_rad=5e-3),
+        _case("check stops: stage bends by 10 nm in each view", more=stops, stage_bend_m=10e-9),
+        _case("check stops: drift of 0.36 um a view, one raster, repeats consecutive", more=stops,
+              settings=replace(SERVO, consecutive=True, visit_order="raster"),
+              drift_linear_m=0.36e-6)]
 
 
 def _case(name: str, phi_deg: float = 0.03, *, settings: CellSettings = SERVO,

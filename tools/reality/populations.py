@@ -10,7 +10,7 @@ from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.view import Plan, View
 from selfcal_ros.simulation.machine import Spread
 from selfcal_ros.simulation.settings import CellSettings
-from tools.reality.cases import SIGMA_RAD, Case
+from tools.reality.cases import SIGMA_RAD, Case, checked
 
 POSES = {"hu": "0 90 +x", "five": "0 90 +x -x +y", "six": "0 90 180 270 +x +y",
          "seven": "0 90 180 +x -x +y -y"}
@@ -37,10 +37,11 @@ def _clean(rng: np.random.Generator, case: Case) -> Case:
         sense, float(10 ** rng.uniform(-8.3, -7.3)), SIGMA_RAD,
         servo_sigma_m=float(rng.choice([0.0, 20e-9, 200e-9])),
         visit_order=str(rng.choice(ORDERS)), consecutive=bool(rng.random() < 0.3))
-    return replace(
-        case, spread=Spread(phi_rad=float(np.deg2rad(10 ** rng.uniform(-2.5, -0.5)))),
-        settings=settings, plan=_plan(artifact, str(rng.choice(list(POSES))), repeats),
-        missing=float(rng.choice([0.0, rng.uniform(0, 0.2)])))
+    spread = Spread(phi_rad=float(np.deg2rad(10 ** rng.uniform(-2.5, -0.5))))
+    plan = _plan(artifact, str(rng.choice(list(POSES))), repeats)
+    missing = float(rng.choice([0.0, rng.uniform(0, 0.2)]))
+    return replace(case, spread=spread, settings=settings, missing=missing,
+                   plan=checked(plan) if rng.random() < 0.5 else plan)
 
 
 def _plan(artifact: Artifact, name: str, repeats: int) -> Plan:

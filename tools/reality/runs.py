@@ -36,8 +36,8 @@ WRONG_THETA = (0.78, 24)
 """The same of a map of 24 angles: 19 inside are right, 18 come once in a thousand clean runs."""
 COVERAGE = 0.9545
 """Part of the errors that k u is to hold."""
-STEPS = 4
-"""Advice that is followed at most, one after another."""
+STEPS, AGAIN = 4, 2
+"""Advice that is followed at most, one after another, and how often the same in a row."""
 GRADES = ("good", "enlarged", "not_qualified", "refused")
 
 
@@ -103,6 +103,8 @@ def run_case(case: Case, seed: int) -> Course:
         if advice is None:
             break
         text, options = advice
+        if steps[-AGAIN:] == [text] * AGAIN:
+            break
         if options.terms == case.options.terms:  # nothing to solve anew with: measure it again
             truth, readings, said = measured(case, seed, 2 + len(steps))
         steps.append(text)
