@@ -1,15 +1,93 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the launch files share: a node that cannot start ends the launch, with the reason."""
+"""What the launch files share: arguments, nodes, and an end with the reason if one cannot start."""
 
+import os
+from pathlib import Path
 from typing import Any
 
-from launch.actions import LogInfo, Shutdown
+from ament_index_python.packages import get_package_share_directory
+from launch.actions import DeclareLaunchArgument, OpaqueFunction
+from launch.conditions import IfCondition
+from launch.launch_context import LaunchContext
+from launch.substitutions import LaunchConfiguration
+from launch_ros.actions import Node
+from launch_ros.parameter_descriptions import ParameterValue
 
-from selfcal_ros.errors import ExitCode
+from selfcal_ros.errors import ExitCode, InputError
+
+SHARED = ("namespace", "params", "plan", "use_sim_time", "log_level", "foxglove")
+"""Arguments of all launch files."""
 
 
-def end_if_it_cannot_start(event: Any, _context: Any) -> list[Any]:
-    """Return the actions after a node's exit: shutdown, if it was for bad parameters or input.
+def share() -> Path:
+    """Return the folder of the installed configurations and launch files."""
+    return Path(get_package_share_directory("selfcal_ros"))
+
+
+def arguments(params: str) -> list[Any]:
+    """Return the declarations of the `SHARED` arguments, and the check of their files.
+
+    Parameters
+    ----------
+    params : str
+        Name of the parameter file that is the default.
+    """
+    argument = DeclareLaunchArgument
+    return [
+        argument("namespace", default_value="", description="namespace of the cell"),
+        argument("params", default_value=str(share() / "config/params" / params),
+                 description="ROS parameter file for all nodes"),
+        argument("plan", default_value=str(share() / "config/plans/resistant.yaml"),
+                 description="PLAN.yaml with plate and views"),
+        argument("use_sim_time", default_value="false", choices=["true", "false"],
+                 description="stamp by /clock, as of a simulator or `ros2 bag play --clock`"),
+        argument("log_level", default_value="info",
+                 choices=["debug", "info", "warn", "error", "fatal"],
+                 description="least level that nodes log"),
+        argument("foxglove", default_value="false", choices=["true", "false"],
+                 description="start foxglove_bridge as well, port 8765 (package foxglove_bridge)"),
+        OpaqueFunction(function=refuse_missing)]
+
+
+def journal_argument(folder: str) -> DeclareLaunchArgument:
+    """Return the declaration of `journal`, which is `folder` below ROS_HOME by default."""
+    home = Path(os.environ.get("ROS_HOME") or Path.home() / ".ros")
+    return DeclareLaunchArgument(
+        "journal", default_value=str(home / folder), description="folder for journals, from which "
+        "a collector that died goes on; none = no journal")
+
+
+def refuse_missing(context: LaunchContext) -> None:
+    """End the launch if the parameter file is none: launch_ros would start the nodes without."""
+    path = context.launch_configurations["params"]
+    if not Path(path).is_file():
+        raise InputError(f"params:={path}", "no such file", "check the path")
+
+
+def text(name: str) -> ParameterValue:
+    """Return a launch argument as a text, whatever YAML would take it for."""
+    return ParameterValue(LaunchConfiguration(name), value_type=str)
+
+
+def node(name: str, *parameters: Any, **kwargs: Any) -> Node:
+    """Return the action that starts a node of this package with the shared arguments."""
+    simulated = ParameterValue(LaunchConfiguration("use_sim_time"), value_type=bool)
+    return Node(package="selfcal_ros", executable=name, name=name, output="screen",
+                namespace=LaunchConfiguration("namespace"),
+                parameters=[LaunchConfiguration("params"), *parameters,
+                            {"use_sim_time": simulated}],
+                ros_arguments=["--log-level", LaunchConfiguration("log_level")],
+                on_exit=end_if_it_cannot_start, **kwargs)
+
+
+def foxglove() -> Node:
+    """Return the action that starts foxglove_bridge if it is wanted."""
+    return Node(package="foxglove_bridge", executable="foxglove_bridge", output="screen",
+                condition=IfCondition(LaunchConfiguration("foxglove")))
+
+
+def end_if_it_cannot_start(event: Any, _context: Any) -> None:
+    """End the launch with code 1 if a node ended for bad parameters or input.
 
     A node that ends later, or by a signal, ends alone: it can be started again beside the others.
 
@@ -20,7 +98,5 @@ def end_if_it_cannot_start(event: Any, _context: Any) -> list[Any]:
     _context : launch.LaunchContext
         Not needed.
     """
-    if event.returncode != int(ExitCode.BAD_INPUT):
-        return []
-    reason = f"{event.process_name} cannot start; its last line above says why"
-    return [LogInfo(msg=reason), Shutdown(reason=reason)]
+    if event.returncode == int(ExitCode.BAD_INPUT):
+        raise InputError(event.process_name, "cannot start", "its last line above says why")

@@ -32,6 +32,9 @@ to be told that they have come."""
 SOON_S, SOON_TICKS = 0.002, 50
 """The same while the last exposure of a view waits for the samples behind it, and how often."""
 
+NO_JOURNAL = "none"
+"""As the parameter `journal`: what can be said in a launch file, where nothing is no value."""
+
 
 class MeasurementCollector(PollingNode[CollectorSettings]):
     """Feeds a `CollectingSession`; publishes ViewStatus and ViewMeasurement.
@@ -78,6 +81,8 @@ class MeasurementCollector(PollingNode[CollectorSettings]):
     def _journal_folder(self) -> str:
         """Return the folder of this cell's journals: one of its own for each namespace."""
         folder = self.settings.journal
+        if folder == NO_JOURNAL:
+            return ""
         return folder and str(Path(folder, self.get_namespace().strip("/")))
 
     def activate(self) -> None:

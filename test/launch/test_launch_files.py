@@ -8,13 +8,15 @@ import pytest
 
 ROOT = Path(__file__).parents[2]
 FILES = sorted((ROOT / "launch").glob("*.launch.py"))
+SHARED = {"namespace", "params", "plan", "use_sim_time", "log_level", "foxglove"}
 ARGUMENTS = {
-    "calibrate.launch.py": {"namespace", "params", "plan", "compensate", "journal"},
-    "replay.launch.py": {"bag", "rate", "namespace", "params", "plan"},
-    "simulated_cell.launch.py": {"namespace", "bag", "params", "plan", "journal"},
+    "calibrate.launch.py": SHARED | {"compensate", "journal"},
+    "replay.launch.py": SHARED | {"bag", "rate"},
+    "simulated_cell.launch.py": SHARED | {"bag", "journal"},
 }
 STARTED = {
-    "calibrate.launch.py": {"measurement_collector", "solver", "pose_sequencer", "compensator"},
+    "calibrate.launch.py": {"measurement_collector", "solver", "pose_sequencer", "compensator",
+                            "foxglove_bridge"},
     "replay.launch.py": {"bag_player"},
     "simulated_cell.launch.py": {"bag_recorder", "stage_simulator"},
 }
@@ -61,8 +63,8 @@ def test_it_starts_executables_of_this_package(description, path):
 
     nodes = [entity for entity in description(path).entities if isinstance(entity, Node)]
     assert {node.node_executable for node in nodes} == STARTED[path.name]
-    assert {node.node_executable for node in nodes} <= set(NODE_PARAMETERS)
-    assert {node.node_package for node in nodes} == {"selfcal_ros"}
+    assert {node.node_executable for node in nodes} <= {*NODE_PARAMETERS, "foxglove_bridge"}
+    assert {node.node_package for node in nodes} <= {"selfcal_ros", "foxglove_bridge"}
 
 
 def test_shipped_files_that_are_defaults_exist(description):
@@ -81,21 +83,33 @@ def test_shipped_files_that_are_defaults_exist(description):
                 assert not value.startswith("/") or Path(value).is_file(), value
 
 
-@pytest.mark.parametrize("name", ["bag", "plan"])
-def test_a_name_like_a_date_or_a_number_stays_text(description, name):
+def parameters_of(description, **given: str) -> list[dict]:
+    """Return the parameters by name that each node of the launch files is given."""
     from launch import LaunchContext
     from launch_ros.actions import Node
     from launch_ros.utilities import evaluate_parameters
 
-    told = set()
+    found = []
     for path in FILES:
         context = LaunchContext()
         context.launch_configurations.update({
             argument: "" for arguments in ARGUMENTS.values() for argument in arguments}
-            | {name: "2026_01_05", "rate": "1.0"})
+            | {"rate": "1.0", "use_sim_time": "false"} | given)
         for entity in description(path).entities:
-            if isinstance(entity, Node):
+            if isinstance(entity, Node) and entity.node_package == "selfcal_ros":
                 rows = [row for row in entity._Node__parameters if isinstance(row, dict)]
-                for row in evaluate_parameters(context, rows):
-                    told |= {value for key, value in row.items() if key == name}
+                found.append({key: value for row in evaluate_parameters(context, rows)
+                              for key, value in row.items()})
+    return found
+
+
+@pytest.mark.parametrize("name", ["bag", "plan"])
+def test_a_name_like_a_date_or_a_number_stays_text(description, name):
+    told = {row[name] for row in parameters_of(description, **{name: "2026_01_05"}) if name in row}
     assert told == {"2026_01_05"}
+
+
+def test_simulated_time_is_for_every_node(description):
+    rows = parameters_of(description, use_sim_time="true")
+    assert len(rows) == 7
+    assert all(row["use_sim_time"] is True for row in rows)

@@ -81,15 +81,35 @@ def test_a_sequencer_without_its_plan_ends_the_launch_with_the_reason(run, tmp_p
     said = done.stdout + done.stderr
     assert "no.yaml: no such file; check the path" in said
     assert "cannot start; its last line above says why" in said
+    assert done.returncode == 1
+
+
+@pytest.mark.parametrize("file", ["calibrate", "replay", "simulated_cell"])
+def test_a_parameter_file_that_is_not_there_starts_nothing(run, tmp_path, file):
+    done = launched(run, f"{file}.launch.py", f"params:={tmp_path / 'no.yaml'}", "bag:=x")
+    said = done.stdout + done.stderr
+    assert f"params:={tmp_path / 'no.yaml'}: no such file; check the path" in said
+    assert "process started" not in said
+    assert done.returncode == 1
+
+
+def test_foxglove_bridge_is_started_where_it_is_wanted(run, tmp_path):
+    from ament_index_python.packages import get_packages_with_prefixes
+
+    if "foxglove_bridge" in get_packages_with_prefixes():
+        pytest.skip("foxglove_bridge is installed: the launch would not end")
+    done = launched(run, "calibrate.launch.py", "foxglove:=true", "journal:=none")
+    assert "package 'foxglove_bridge' not found" in done.stdout + done.stderr
+    assert done.returncode == 1
 
 
 def test_an_exit_later_ends_nothing():
     from types import SimpleNamespace
 
+    from selfcal_ros.errors import InputError
     from selfcal_ros.nodes.launching import end_if_it_cannot_start
 
     for code in (0, 1, -9, -2):
-        event = SimpleNamespace(process_name="solver-2", returncode=code)
-        assert end_if_it_cannot_start(event, None) == []
-    event = SimpleNamespace(process_name="solver-2", returncode=2)
-    assert len(end_if_it_cannot_start(event, None)) == 2
+        end_if_it_cannot_start(SimpleNamespace(process_name="solver-2", returncode=code), None)
+    with pytest.raises(InputError, match="solver-2: cannot start"):
+        end_if_it_cannot_start(SimpleNamespace(process_name="solver-2", returncode=2), None)

@@ -468,3 +468,10 @@ def test_a_remapped_topic_is_in_the_journal_under_the_name_of_the_contract(graph
                      "/cell/stage/mark_detections": None, "/cell/selfcal/view_command": None}
     again = graph.node(remapped, journal=str(tmp_path))
     graph.until(lambda: again.session.collector.received["encoder"] == 1, "the journal")
+
+
+@pytest.mark.parametrize("journal", ["", "none"])
+def test_no_journal_is_kept_where_none_is_wanted(graph, tmp_path, monkeypatch, journal):
+    monkeypatch.chdir(tmp_path)
+    graph.node(MeasurementCollector, journal=journal)
+    assert not list(tmp_path.iterdir())

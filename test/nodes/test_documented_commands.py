@@ -52,9 +52,10 @@ def test_launch_files_have_the_arguments_that_are_given():
     assert len(lines("launch")) >= 4
     for package, name, *arguments in lines("launch"):
         assert package == "selfcal_ros"
-        text = (ROOT / "launch" / name).read_text()
+        text = "".join((ROOT / path).read_text() for path in (
+            f"launch/{name}", "selfcal_ros/nodes/launching.py"))
         for argument in arguments:
-            assert f'DeclareLaunchArgument("{argument.partition(":=")[0]}"' in text, argument
+            assert re.search(rf'rgument\(\s*"{argument.partition(":=")[0]}"', text), argument
 
 
 @pytest.fixture

@@ -102,7 +102,7 @@ class CollectorSettings(ManagedSettings):
         0.0, 0.1)
     journal: str = declared(
         "", "folder for journals: what is received, written before it is used, and taken up again "
-        "after a crash; empty = none")
+        "after a crash; empty or none = no journal")
     journal_lag_limit: float = declared(
         5.0, "time by which the disk may lag behind the journal before there is a warning", "s",
         0.1, 3600.0)
