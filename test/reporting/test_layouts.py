@@ -8,6 +8,9 @@ from pathlib import Path
 import pytest
 import yaml
 
+from selfcal_ros.collection.settings.nodes import NODE_PARAMETERS
+from selfcal_ros.messages.topics import MAP_MARKERS_TOPIC
+
 ROOT = Path(__file__).parents[2]
 FOXGLOVE = ROOT / "config" / "foxglove" / "selfcal.json"
 RVIZ = ROOT / "config" / "rviz" / "selfcal.rviz"
@@ -42,7 +45,8 @@ def foxglove():
 def test_every_foxglove_panel_is_placed_once(foxglove):
     placed = list(leaves(foxglove["layout"]))
     assert sorted(placed) == sorted(foxglove["configById"])
-    assert all(re.fullmatch(r"(Plot|RawMessages|DiagnosticSummary)!\w+", name) for name in placed)
+    assert all(re.fullmatch(r"(3D|Plot|RawMessages|DiagnosticSummary)!\w+", name)
+               for name in placed)
 
 
 def test_every_foxglove_path_names_a_field_of_the_contract(foxglove):
@@ -53,6 +57,45 @@ def test_every_foxglove_path_names_a_field_of_the_contract(foxglove):
         assert field in fields_of(topic), path
     raw = {c["topicPath"] for c in foxglove["configById"].values() if "topicPath" in c}
     assert raw == {"/selfcal/summary", "/selfcal/view_command"} and raw <= set(TYPES)
+
+
+def shown(label: str, needle: str) -> bool:
+    """Return whether the panel's fuzzy filter shows a status: the letters in their order."""
+    place, label = -1, label.lower()
+    for letter in re.sub(r"[^a-z0-9]", "", needle.lower()):
+        place = label.find(letter, place + 1)
+        if place < 0:
+            return False
+    return True
+
+
+@pytest.mark.parametrize("namespace", ["", "cell1/"])
+def test_the_foxglove_panel_of_nodes_shows_each_of_them_once(foxglove, namespace):
+    """Pinned statuses stand on top, the others below if their label passes the filter."""
+    panel = foxglove["configById"]["DiagnosticSummary!nodes"]
+    stage = namespace.strip("/") or "stage"  # of a node whose parameter hardware_id is empty
+    pinned = set()
+    for node in NODE_PARAMETERS:
+        if f"|{stage}|{namespace}{node}|" in panel["pinnedIds"]:
+            pinned.add(node)
+        else:
+            assert shown(f"{stage}: {namespace}{node}", panel["hardwareIdFilter"]), node
+    assert len(pinned) == (4 if not namespace else 0)
+    assert not shown("stage: solver", "selfcal")
+
+
+def test_foxglove_shows_the_map_from_above_over_the_field_of_the_shipped_plan(foxglove):
+    panel = foxglove["configById"]["3D!map"]
+    assert panel["topics"] == {f"/{MAP_MARKERS_TOPIC}": {"visible": True}}
+    grid, plate = panel["layers"]["grid"], yaml.safe_load(
+        (ROOT / "config" / "plans" / "hu.yaml").read_text())["artifact"]
+    assert grid["divisions"] == plate["grid_size"] - 1
+    assert grid["size"] == pytest.approx(grid["divisions"] * plate["grid_pitch"])
+    frame = next(p.default for p in NODE_PARAMETERS["solver"] if p.name == "frame_id")
+    assert panel["followTf"] == grid["frameId"] == frame
+    camera = panel["cameraState"]
+    assert (camera["phi"], camera["perspective"]) == (0, False)
+    assert camera["near"] < camera["distance"] < camera["far"]
 
 
 def test_rviz_layout_shows_the_stage_frame_from_above():
