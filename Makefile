@@ -3,9 +3,9 @@
 SHELL := /bin/bash
 BIN := .venv/bin
 
-.PHONY: setup demo test test-oldest lint ament-lint bench soak chaos mutants reality pictures reference clean help
+.PHONY: setup demo test test-oldest lint ament-lint bench soak chaos mutants reality pictures reference sbom clean help
 help:
-	@echo "make setup | demo | test | test-oldest | lint | ament-lint | bench | soak | chaos | mutants | reality | pictures | reference | clean"
+	@echo "make setup | demo | test | test-oldest | lint | ament-lint | bench | soak | chaos | mutants | reality | pictures | reference | sbom | clean"
 setup:
 	@tools/setup.sh
 demo: setup
@@ -24,7 +24,10 @@ ament-lint: setup  # what ament_flake8 and ament_pep257 check, with setup.cfg
 test: lint
 	@PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -n 3 --dist worksteal
 test-oldest:  # with the libraries of Ubuntu 24.04; e.g. make test-oldest TESTS=test/laser
-	@VENV=.venv-oldest PINS=tools/oldest.txt tools/setup.sh
+	@pkg-config --exists freetype2 && test -e /usr/include/libqhull_r/qhull_ra.h || { \
+		echo "test-oldest: apt install pkg-config libfreetype-dev libqhull-dev" >&2; exit 2; }
+	@VENV=.venv-oldest PINS=tools/oldest.txt SOURCES=matplotlib MPLSETUPCFG="$$PWD/tools/matplotlib.cfg" \
+		tools/setup.sh
 	@.venv-oldest/bin/python -m pytest -n 3 --dist worksteal $(TESTS)
 bench: setup
 	@test build/rivals/.complete -nt tools/bench-requirements.txt || { mkdir -p build/rivals; \
@@ -45,6 +48,8 @@ pictures: setup  # those of README and docs
 	@$(BIN)/python tools/pictures.py
 reference: setup  # docs/reference.md
 	@$(BIN)/python tools/reference.py
+sbom: setup  # sbom.json: pins, hashes, licences
+	@$(BIN)/python tools/sbom.py
 clean:
 	rm -rf .venv .venv-oldest build install log selfcal_ros.egg-info
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

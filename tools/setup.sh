@@ -1,7 +1,8 @@
 #!/usr/bin/env bash
 # SPDX-License-Identifier: Apache-2.0
 # Build the environment .venv of a user without ROS 2; does nothing when nothing has changed.
-# VENV names another folder for it, PINS a file whose pins replace those of tools/requirements.txt.
+# VENV names another folder for it, PINS a file whose pins replace those of tools/requirements.txt,
+# SOURCES packages that are built from their source archives.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 venv="$PWD/${VENV:-.venv}"
@@ -58,7 +59,7 @@ if ! fresh wheels "$wheels"; then
   [ -f "$include/Python.h" ] || die "Python.h is missing; install the headers, e.g. 'apt install python3.12-dev'"
   replaced > "$build/requirements.txt"
   step "installing the pinned wheels (about a minute)" "$venv/bin/python" -m pip install \
-    --disable-pip-version-check --no-deps --no-compile --only-binary :all: --no-binary empy -r "$build/requirements.txt"
+    --disable-pip-version-check --no-deps --no-compile --require-hashes --only-binary :all: --no-binary "empy${SOURCES:+,$SOURCES}" -r "$build/requirements.txt"
   step "mending the wheels' CMake paths" "$venv/bin/python" tools/mend_wheels.py
   # here and on both cores: else every process that may not write bytecode compiles all it imports
   step "compiling them" compile "$venv/lib"
