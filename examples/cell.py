@@ -16,7 +16,7 @@ import rclpy
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from selfcal_msgs.msg import MarkDetection, ViewCommand
+from selfcal_msgs.msg import MarkDetection, ViewCommand, ViewStatus
 from sensor_msgs.msg import JointState
 
 Position = tuple[float, float, float]
@@ -87,6 +87,10 @@ def grid_sites(view: ViewCommand) -> Iterator[tuple[int, int, Position]]:
                 yield m, n, (i * view.grid_pitch, j * view.grid_pitch, 0.0)
 
 
+REVISIT_TICKS = 500
+"""Ticks until the status is that of all marks of a pass: a second."""
+
+
 class Cell(Node):
     """Encoders, microscope and the hand that lays the plate, as a ROS node."""
 
@@ -102,6 +106,9 @@ class Cell(Node):
         self.create_subscription(ViewCommand, "selfcal/view_command", self._on_command, QoSProfile(
             depth=10, reliability=ReliabilityPolicy.RELIABLE,
             durability=DurabilityPolicy.TRANSIENT_LOCAL))
+        self.create_subscription(ViewStatus, "selfcal/view_status", self._on_status, QoSProfile(
+            depth=10, reliability=ReliabilityPolicy.RELIABLE))
+        self._status: ViewStatus | None = None
         self._work: Iterator[None] = iter(())
         self._heard: tuple[int, int, int] | None = None
         self.create_timer(0.002, self._tick)
@@ -117,6 +124,9 @@ class Cell(Node):
         elif view.phase == ViewCommand.MEASURE:
             self._work = self._measure(view)
 
+    def _on_status(self, status: ViewStatus) -> None:
+        self._status = status
+
     def _tick(self) -> None:
         """Take one step of the work and tell where the stage is: it rests between two ticks."""
         next(self._work, None)
@@ -125,20 +135,41 @@ class Cell(Node):
         self._encoder.publish(message)
 
     def _measure(self, view: ViewCommand) -> Iterator[None]:
-        """Visit every mark as often as asked: move, rest, expose, rest."""
+        """Visit every mark as often as asked, then those that are missing, until a command comes.
+
+        A detection that is lost on the way, or rejected, has to be seen again.
+        """
+        marks = [(m, n) for m, n, _ in grid_sites(view)] if view.grid else []
+        lines = list(range(view.angular_count)) if view.angular else []
         for number in range(view.repeats):
-            for m, n, position in grid_sites(view) if view.grid else ():
-                yield from self._settle(position)
-                self._expose(self._see(m, n, view))
-                yield
-            for k in range(view.angular_count) if view.angular else ():
-                yield from self._settle((0.0, 0.0, view.rotation
-                                         + 2 * math.pi * k / view.angular_count))
-                self._expose(MarkDetection(kind=MarkDetection.ANGULAR, has_id=True, k=k,
-                                           offset_theta=self.machine.see_line(k, view), score=1.0))
-                yield
+            yield from self._visit(view, marks, lines)
             if number == (view.repeats - 1) // 2:  # half way: a drift does not add up in them
                 yield from self._check_stops(view)
+        while True:
+            self._status = None
+            for _ in range(REVISIT_TICKS):
+                yield
+            status = self._status
+            if status is not None and (status.view_index, status.run_id) == (
+                    view.view_index, view.run_id):
+                missing = list(zip(status.missing_m, status.missing_n, strict=True))
+                yield from self._visit(view, missing, list(status.missing_k))
+
+    def _visit(self, view: ViewCommand, marks: list[tuple[int, int]],
+               lines: list[int]) -> Iterator[None]:
+        """See some of the marks and lines of a view once: move, rest, expose, rest."""
+        for m, n, position in grid_sites(view) if marks else ():
+            if (m, n) not in marks:
+                continue
+            yield from self._settle(position)
+            self._expose(self._see(m, n, view))
+            yield
+        for k in lines:
+            yield from self._settle((0.0, 0.0, view.rotation
+                                     + 2 * math.pi * k / view.angular_count))
+            self._expose(MarkDetection(kind=MarkDetection.ANGULAR, has_id=True, k=k,
+                                       offset_theta=self.machine.see_line(k, view), score=1.0))
+            yield
 
     def _check_stops(self, view: ViewCommand) -> Iterator[None]:
         """See some marks again with the stage off them: +x, -x, +y, -y.

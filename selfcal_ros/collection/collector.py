@@ -13,7 +13,7 @@ import numpy as np
 
 from selfcal_ros.collection.diagnosis import Finding
 from selfcal_ros.collection.evidence import EncoderFacts, Seen
-from selfcal_ros.collection.expected import ViewProgress, expected_marks
+from selfcal_ros.collection.expected import ViewProgress, expected_marks, read_enough
 from selfcal_ros.collection.marks.check_stops import count_stops
 from selfcal_ros.collection.marks.identify import IdentityRules
 from selfcal_ros.collection.messages import Command, Detection, EncoderSample, check_command
@@ -72,6 +72,7 @@ class Collector:
             self.sense, IdentityRules(settings.max_deviation, settings.ambiguity_ratio,
                                       settings.max_rotation, settings.max_stage_distance),
             settings.min_score, settings.outlier_limit)
+        self._min_repeats = settings.min_repeats
         self._exposures = Exposures(self.tracks,
                                     approach_threshold_m=settings.approach_threshold)
         self._views = ViewCache(self._rules)
@@ -246,7 +247,7 @@ class Collector:
         self._seen = Seen(self._views.table, self._views.view_of, self._exposures, self._facts,
                           (min(stamps), max(stamps)), timeline.artifact, self._rules.identity,
                           self.sense)
-        progress = {index: view_progress(timeline, index, found)
+        progress = {index: view_progress(timeline, index, found, self._min_repeats)
                     for index, found in readings.items()}
         return Measurements(timeline.plan_id, timeline.artifact, tuple(readings.values()),
                             self.sense, dict(sorted(loose.items())), timeline.run_id,
@@ -274,12 +275,13 @@ class Collector:
             self.tracks.x.usual_step_s(), self.tracks.x.limits.max_gap_ns / NS_PER_S)
 
 
-def view_progress(timeline: Timeline, index: int, readings: ViewReadings) -> ViewProgress:
+def view_progress(timeline: Timeline, index: int, readings: ViewReadings,
+                  min_repeats: int = 0) -> ViewProgress:
     """Return how far a view has come."""
     artifact, view = timeline.planned_view(index)
     grid, angular = expected_marks(artifact, view)
-    count, checked = count_stops(view, readings)
-    return ViewProgress(index, view, grid, int((count >= view.repeats).sum()), angular,
-                        int((readings.count_theta >= view.repeats).sum()), readings,
-                        max(i.end_ns for i in timeline.of_view(index)), artifact,
-                        min(checked, view.check_marks))
+    done, done_theta = read_enough(view, readings, min_repeats)
+    checked = min(count_stops(view, readings)[1], view.check_marks)
+    return ViewProgress(index, view, grid, int(done.sum()), angular, int(done_theta.sum()),
+                        readings, max(i.end_ns for i in timeline.of_view(index)), artifact,
+                        checked, min_repeats)

@@ -46,15 +46,39 @@ def expected_marks(artifact: Artifact, view: View) -> tuple[int, int]:
     return grid, artifact.angular_count if view.angular else 0
 
 
-def missing_marks(artifact: Artifact, view: View, readings: ViewReadings) -> Missing:
+def read_enough(view: View, readings: ViewReadings,
+                min_repeats: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Return which marks, and which lines, of the readings were read often enough, bool arrays.
+
+    As often as the plan asks; with `min_repeats` also where so many readings are left of as many
+    repeats, the others being outliers.
+    """
+    found = []
+    for count, tries in _tried(view, readings):
+        enough = count >= view.repeats
+        if min_repeats:
+            enough |= (tries >= view.repeats) & (count >= min_repeats)
+        found.append(enough)
+    return found[0], found[1]
+
+
+def _tried(view: View, readings: ViewReadings) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Return readings and repeats, outliers included, of marks (but check stops) and of lines."""
+    return [(count, count + outliers if len(outliers) else count) for count, outliers in (
+        (count_stops(view, readings)[0], readings.outliers),
+        (readings.count_theta, readings.outliers_theta))]
+
+
+def missing_marks(artifact: Artifact, view: View, readings: ViewReadings,
+                  min_repeats: int = 0) -> Missing:
     """Return the first marks, in the order of (m, n) and of k, that were not read often enough."""
     (m_low, _), (n_low, n_high) = mark_range(artifact, view)
     grid, angular = expected_marks(artifact, view)
     width = max(n_high - n_low + 1, 1)
-    done = count_stops(view, readings)[0] >= view.repeats
+    done, done_theta = read_enough(view, readings, min_repeats)
     number = (readings.m[done] - m_low) * width + readings.n[done] - n_low
     number = first_missing(np.sort(number), grid)
-    lines = first_missing(np.sort(readings.k[readings.count_theta >= view.repeats]), angular)
+    lines = first_missing(np.sort(readings.k[done_theta]), angular)
     return Missing(tuple((m_low + number // width).tolist()),
                    tuple((n_low + number % width).tolist()), tuple(lines.tolist()))
 
@@ -79,6 +103,7 @@ class ViewProgress:
     end_ns: int
     artifact: Artifact | None = None
     check_done: int = 0
+    min_repeats: int = 0
 
     @property
     def check_expected(self) -> int:
@@ -90,20 +115,23 @@ class ViewProgress:
         """Marks that have not been read as often as the plan asks, at most 200 of each kind."""
         if self.artifact is None:
             return Missing()
-        return missing_marks(self.artifact, self.view, self.readings)
+        return missing_marks(self.artifact, self.view, self.readings, self.min_repeats)
 
     @property
     def needed(self) -> int:
-        """Number of readings without which the view cannot be complete."""
-        told, repeats = self.readings, self.view.repeats
-        have = [int(np.minimum(count, repeats).sum()) for count in (
-            count_stops(self.view, told)[0], told.count_theta)]
-        return (repeats * (self.grid_expected + self.angular_expected) - sum(have)
+        """Number of detections without which the view cannot be complete."""
+        repeats, have = self.view.repeats, 0
+        for count, tries in _tried(self.view, self.readings):
+            more = repeats - count
+            if self.min_repeats:
+                more = np.minimum(more, np.maximum(repeats - tries, self.min_repeats - count))
+            have += int((repeats - np.maximum(more, 0)).sum())
+        return (repeats * (self.grid_expected + self.angular_expected) - have
                 + self.check_expected - self.check_done)
 
     @property
     def complete(self) -> bool:
-        """Whether every expected mark has been read as often as the plan asks, and checked."""
+        """Whether every expected mark has been read often enough, and checked."""
         return (self.grid_done >= self.grid_expected
                 and self.angular_done >= self.angular_expected
                 and self.check_done >= self.check_expected)

@@ -15,7 +15,7 @@ from selfcal_ros.collection.marks.identify import (
     wrap,
 )
 from selfcal_ros.collection.marks.places import PlaceList
-from selfcal_ros.collection.marks.repeats import reduce_repeats
+from selfcal_ros.collection.marks.repeats import Means, reduce_repeats
 from selfcal_ros.collection.marks.visits import grid_visits, repeat_motion
 from selfcal_ros.collection.messages import LARGEST_OFFSET, Kind, good_sigmas
 from selfcal_ros.collection.reasons import Reason
@@ -202,7 +202,7 @@ def _reduce_grid(artifact: Artifact, view: View, d: np.ndarray, exposures: Expos
     return {"m": mark // (2 * hy + 1) - hx, "n": mark % (2 * hy + 1) - hy, "dx": means.mean[0],
             "dy": means.mean[1], "count": means.count, "u": means.u, "sigma_xy": means.sigma,
             "dof_xy": means.dof, "visits": visits, "motion": motion,
-            "places": places.places()}, marks.phi_rad
+            "places": places.places(), "outliers": _outliers_of(means, key)}, marks.phi_rad
 
 
 def _reduce_angular(artifact: Artifact, view: View, d: np.ndarray, exposures: Exposures,
@@ -223,7 +223,15 @@ def _reduce_angular(artifact: Artifact, view: View, d: np.ndarray, exposures: Ex
     motion = repeat_motion(k, place[None], d["ot"][None], means.outlier)
     return {"k": means.key.astype(np.int64), "dtheta": means.mean[0], "count_theta": means.count,
             "u_theta": means.u, "sigma_theta": means.sigma, "dof_theta": means.dof,
-            "motion_theta": motion}
+            "motion_theta": motion, "outliers_theta": _outliers_of(means, k)}
+
+
+def _outliers_of(means: Means, key: np.ndarray) -> np.ndarray:
+    """Return how many outliers each mark has that has a mean, int array."""
+    marks = np.append(means.key, -1)
+    place = np.searchsorted(means.key, key[means.outlier])
+    place = place[marks[place] == key[means.outlier]]
+    return np.bincount(place, minlength=len(means.key))
 
 
 def _reading(sense: Sense, position: np.ndarray,

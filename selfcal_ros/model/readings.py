@@ -147,6 +147,8 @@ class ViewReadings:
         The visits behind the means of the grid marks; None where they are not known.
     places : RejectedPlaces
         Where grid detections were rejected; empty where that is not known.
+    outliers, outliers_theta : int array (P,) or (0,), (Q,) or (0,)
+        Further repeats of each mark and line that are outliers; empty where that is not known.
     motion, motion_theta : RepeatMotion, optional
         How offsets follow the stage, x and y and the angle; None without repeats.
     """
@@ -170,6 +172,8 @@ class ViewReadings:
     rejected: dict[str, int] = field(default_factory=dict)
     visits: GridVisits | None = None
     places: RejectedPlaces = RejectedPlaces()
+    outliers: np.ndarray = _empty(int)
+    outliers_theta: np.ndarray = _empty(int)
     motion: RepeatMotion | None = None
     motion_theta: RepeatMotion | None = None
 

@@ -16,6 +16,7 @@ from selfcal_ros.collection.expected import (
     mark_range,
     missing_marks,
 )
+from selfcal_ros.collection.messages import Kind
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import ViewReadings
 from selfcal_ros.model.view import View
@@ -87,3 +88,56 @@ def test_a_view_beyond_the_field_lacks_nothing(shift):
     view = View("v", 0.0, (shift * 0.01, 0.0), angular=False)
     assert expected_marks(Artifact(5, 0.01), view) == (0, 0)
     assert missing_marks(Artifact(5, 0.01), view, ViewReadings(view)).m == ()
+
+
+OFF_M = 1e-4
+"""Of an outlier: within max_deviation, and far beyond the noise."""
+
+
+def with_outliers(repeats, marks, lines=(), **settings):
+    """Return a scene in which so many repeats of the first marks and lines are outliers."""
+    cell = scene(repeats=repeats, sigma_xy_m=2e-8, sigma_theta_rad=2e-6)
+    for field, kind, numbers, by in (("offset_x", Kind.GRID, marks, OFF_M),
+                                     ("offset_theta", Kind.ANGULAR, lines, 1e-2)):
+        for mark, count in enumerate(numbers):
+            named = sorted({(d.m, d.n, d.k) for d in cell.detections if d.kind == kind})[mark]
+            mine = [i for i, d in enumerate(cell.detections)
+                    if d.kind == kind and (d.m, d.n, d.k) == named]
+            for turn, index in enumerate(mine[:count]):
+                cell.spoil(index, **{field: getattr(cell.detections[index], field)
+                                     + by * (1 + turn)})
+    return cell
+
+
+@pytest.mark.parametrize("least", [0, 1, 3, 4, 5, 9])
+def test_outliers_do_not_keep_a_mark_open_where_enough_is_left(least):
+    """Of five repeats one, two and three are outliers; of the last mark nothing is believed."""
+    cell = with_outliers(5, (1, 2, 3))
+    _, progress = collect(cell.events, min_repeats=least)
+    found = progress[0]
+    counts = dict(zip(zip(found.readings.m.tolist(), found.readings.n.tolist(), strict=True),
+                      found.readings.count.tolist(), strict=True))
+    assert counts[-2, -2] == 4 and counts[-2, -1] == 3 and (-2, 0) not in counts
+    wanted = [mark for mark, count in (((-2, -2), 4), ((-2, -1), 3), ((-2, 0), 0))
+              if count < (least or 5) or count < 1]
+    assert list(zip(found.missing.m, found.missing.n, strict=True)) == wanted
+    assert found.grid_done == 25 - len(wanted)
+    assert not found.complete
+    assert found.readings.outliers.sum() == 3
+
+
+@pytest.mark.parametrize(("least", "complete"), [(0, False), (1, True), (2, True), (3, False)])
+def test_a_view_with_outliers_of_marks_and_lines_is_complete_with_min_repeats(least, complete):
+    cell = with_outliers(3, (1, 1), (0, 1))
+    _, progress = collect(cell.events, min_repeats=least)
+    assert progress[0].complete is complete
+    assert (progress[0].needed == 0) is complete
+
+
+def test_a_mark_that_was_not_read_often_enough_yet_is_not_done_with_min_repeats():
+    """Or the view would be over after the first pass."""
+    cell = scene(repeats=3, count=8)
+    lost = cell.detections.pop(cell.grid(7))
+    _, progress = collect(cell.events, min_repeats=1)
+    assert (progress[0].missing.m, progress[0].missing.n) == ((lost.m,), (lost.n,))
+    assert progress[0].needed == 1

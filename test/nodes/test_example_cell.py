@@ -111,3 +111,29 @@ def test_a_command_latched_anew_is_not_carried_out_again(graph):
     message.header.stamp.sec = 8  # another one is
     commands.publish(message)
     graph.until(lambda: len(marks) == 50, "all marks again")
+
+
+@pytest.mark.parametrize("min_repeats", [0, 1])
+def test_a_view_with_a_detection_that_is_an_outlier_comes_to_its_end(
+        graph, tmp_path, monkeypatch, min_repeats):
+    """The cell sees the mark again; with `min_repeats` it need not."""
+    (tmp_path / "plan.yaml").write_text(
+        "plan_id: one\nartifact: {grid_size: 5, grid_pitch: 0.01, angular_count: 0}\n"
+        "views: [{name: identity, angular: false, repeats: 3}]\n")
+    module, seen = example(), []
+    monkeypatch.setattr(module, "REVISIT_TICKS", 10**9 if min_repeats else 50)
+
+    class Spoilt(module.Machine):
+        def see_mark(self, m, n, view):
+            seen.append((m, n))
+            x, y = super().see_mark(m, n, view)
+            return (x + 3e-4 * (seen.count((m, n)) == 1 and (m, n) == (1, 2)), y)
+
+    graph.add(module.Cell(Spoilt(), context=graph.context))
+    commands = graph.listen(names.COMMAND)
+    graph.node(MeasurementCollector, max_encoder_gap=10.0, min_repeats=min_repeats)
+    graph.node(Solver)
+    graph.node(PoseSequencer, plan=str(tmp_path / "plan.yaml"), auto_confirm=True,
+               auto_start=True)
+    graph.until(lambda: commands and commands[-1].phase == ViewCommand.DONE, "the end")
+    assert seen.count((1, 2)) > 3 if not min_repeats else len(seen) == 75

@@ -81,6 +81,9 @@ class CollectorSettings(ManagedSettings):
     outlier_limit: float = declared(
         6.0, "distance from the median of a mark's repeats, in standard deviations of one reading, "
         "beyond which a repeat is an outlier; 0 = keep all", "", 0.0, 1000.0)
+    min_repeats: int = declared(
+        0, "readings of a mark that are enough once it has been read as often as the plan asks, "
+        "outliers included; 0 = all that the plan asks", "", 0, 1_000_000)
     approach_threshold: float = declared(
         1e-6, "displacement of x or y before an exposure that counts as a motion and tells the "
         "direction of approach", "m", 0.0, 1e-2)
