@@ -332,7 +332,7 @@ def _taken_up(cell: Cell, plan: Plan, stops: list[tuple[int, int]]) -> tuple[str
         commands.clear()
         start_sequencer(cell, plan)
         graph.until(lambda: commands, "the command of the view in which it was")
-        if commands[0] != last or (last.phase, last.view_index) != (ViewCommand.MEASURE, stop[0]):
+        if commands[0] != last or last.view_index != stop[0]:  # PLACE before the first exposure
             faults.append(f"killed in view {stop[0]} after {last}, taken up with {commands[0]}")
         machine.hold_at = after
     graph.until(lambda: commands[-1].phase == ViewCommand.DONE, "the end of the plan")
