@@ -3,6 +3,7 @@
 
 from matplotlib.axes import Axes
 from matplotlib.collections import EllipseCollection
+from matplotlib.colors import to_rgba
 from matplotlib.patches import PathPatch
 from matplotlib.path import Path as Outline
 
@@ -49,8 +50,7 @@ def _path(item: Path, axes: Axes, points: float, order: int) -> None:
             vertices.append(line[0])
             codes.append(Outline.CLOSEPOLY)
     dash = (0, tuple(part * points for part in item.dash)) if item.dash else "solid"
-    fill, stroke = ((_light(name), part) if name else "none" for name, part in (
-        (item.fill, item.opacity), (item.stroke, 1.0)))
+    fill, stroke = to_rgba(_light(item.fill), item.opacity), to_rgba(_light(item.stroke))
     axes.add_artist(PathPatch(Outline(vertices, codes), facecolor=fill, edgecolor=stroke,
                               linewidth=item.width * points if item.stroke else 0,
                               linestyle=dash, zorder=order, clip_on=False))
@@ -58,8 +58,7 @@ def _path(item: Path, axes: Axes, points: float, order: int) -> None:
 
 def _discs(item: Discs, axes: Axes, points: float, order: int) -> None:
     wide, high = zip(*item.radii, strict=True)
-    fill, stroke = ((_light(name), part) if name else "none" for name, part in (
-        (item.fill, item.opacity), (item.stroke, 1.0)))
+    fill, stroke = to_rgba(_light(item.fill), item.opacity), to_rgba(_light(item.stroke))
     axes.add_collection(EllipseCollection(
         [2 * r for r in wide], [2 * r for r in high], [0.0] * len(wide), units="xy",
         offsets=item.centres, offset_transform=axes.transData, facecolor=fill, edgecolor=stroke,
