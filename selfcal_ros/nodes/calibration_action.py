@@ -110,7 +110,7 @@ class CalibrationAction:
         patience = self._node.settings.save_timeout
         self._saved, self._save_until = Future(), time.monotonic() + patience
         answer = self._saver.call_async(SaveMap.Request(path=path))
-        answer.add_done_callback(self._on_saved)
+        answer.add_done_callback(self._node.guarded(self._on_saved))
         try:
             await self._saved
         finally:

@@ -11,9 +11,13 @@ from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from rclpy.node import Node
 from rclpy.service import Service
 from rclpy.subscription import Subscription
+from rclpy.waitable import Waitable
 
 from selfcal_ros.errors import as_answer
 from selfcal_ros.sessions.health import Refusals
+
+TASKS = ("execute", "_execute_goal", "_send_result_response")
+"""Methods of events and actions of rclpy that an executor runs as tasks."""
 
 
 class WithInfo:
@@ -39,8 +43,8 @@ class Guarded(Node):
     """A node that no callback ends: what one raises is counted in `refusals` and logged.
 
     The node's own callbacks are guarded where they are registered. The services of rclpy
-    (parameters, lifecycle, types) and its subscription to ``/clock`` are guarded when an executor
-    asks for them. `running.spin` catches the rest: tasks and waitables, as those of an action.
+    (parameters, lifecycle, types), its subscription to ``/clock`` and its tasks of actions and
+    events are guarded when an executor asks for them. `running.spin` catches the rest.
     """
 
     refusals: Refusals
@@ -48,6 +52,15 @@ class Guarded(Node):
     def guarded(self, callback: Callable[..., Any], place: str = "") -> Callable[..., Any]:
         """Return `callback` with whatever it raises counted and logged instead of raised."""
         place = place or getattr(callback, "__name__", "callback").strip("_")
+        if inspect.iscoroutinefunction(callback):
+            @wraps(callback)
+            async def task(*args: Any) -> Any:
+                try:
+                    return await callback(*args)
+                except Exception as error:
+                    self.refusals.add(place, error)
+                    return None
+            return task
 
         @wraps(callback)
         def call(*args: Any) -> Any:
@@ -72,6 +85,16 @@ class Guarded(Node):
         for item in super().subscriptions:
             if not any(hasattr(item.callback, name) for name in ("__wrapped__", "__signature__")):
                 item.callback = self.guarded(item.callback, item.topic)
+            yield item
+
+    @property
+    def waitables(self) -> Iterator[Waitable]:
+        """The actions and events; a task that raises ends the process with the events executor."""
+        for item in super().waitables:
+            for name in TASKS:
+                task = getattr(item, name, None)
+                if task is not None and not hasattr(task, "__wrapped__"):
+                    setattr(item, name, self.guarded(task, type(item).__name__))
             yield item
 
     def _guard(self, service: Any) -> None:

@@ -27,7 +27,7 @@ _raised: list[Executor] = []
 def spin(node: Guarded, until: Future) -> None:
     """Spin a node with the events executor until `until` is done or the context is shut down.
 
-    What the executor raises (of a task, an action, the middleware) is counted as a refusal.
+    What the executor raises in spite of `Guarded` is counted as a refusal.
     """
     executor = EventsExecutor()
     executor.add_node(node)

@@ -1,15 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Every node among publishers that send each field at its worst, and torn bytes: it goes on."""
+"""Every node among hostile publishers and clients: each field at its worst, torn bytes."""
 
 import io
 import json
+import os
 from collections import Counter
 from dataclasses import replace
-from itertools import batched
+from functools import partial
+from itertools import batched, islice
 
 import numpy as np
 import pytest
 from diagnostic_msgs.msg import KeyValue
+from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
+from selfcal_msgs.action import RunCalibration
 from std_srvs.srv import Trigger
 
 from selfcal_ros.collection.messages import Command, Detection, EncoderSample
@@ -17,19 +21,21 @@ from selfcal_ros.errors import InputError, SelfcalError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.messages import from_model
 from selfcal_ros.nodes import monitor_session, names
+from selfcal_ros.nodes.bag_player import BagPlayer
 from selfcal_ros.nodes.bag_recorder import BagRecorder
 from selfcal_ros.nodes.compensator import CompensatorNode
 from selfcal_ros.nodes.filling import fill
 from selfcal_ros.nodes.measurement_collector import MeasurementCollector
 from selfcal_ros.nodes.pose_sequencer import PoseSequencer
 from selfcal_ros.nodes.solver import Solver
+from selfcal_ros.nodes.stage_simulator import StageSimulator
 from selfcal_ros.sessions.health import Refusals
 from selfcal_ros.sessions.solving import SolvingSession, solve
-from test.support.hostile import torn, worst
+from test.support.hostile import TEXTS, torn, worst
 from test.support.maps import random_map, result_of
 from test.support.plans import plan_of
 from test.support.ports import Hands, settings_of
-from test.support.sessions import cdr_of, collected, events_of, plan_file, small_plan
+from test.support.sessions import cdr_of, collected, events_of, plan_file, small_bag, small_plan
 
 PLAN = small_plan("0, 90, tx", repeats=1)
 TEXT_FIELDS = ("stamp.sec", "nanosec", "_id", "view_name", "reasons", "_terms", "_counts",
@@ -160,6 +166,10 @@ def test_each_field_at_its_worst_ends_nothing(graph, cell, refused, good, capfd)
     everybody_is_well(graph, cell, refused, capfd)
     places = {place for place, _ in refused}
     assert {names.COMMAND.name, names.MEASUREMENT.name, names.ERROR_MAP.name} <= places
+    assert any("longer than 8192 bytes" in str(error) for _, error in refused)
+    spoilt = {f"/{topic.name}" for topic, _ in good} | {
+        f"/{node}/health" for node in ("measurement_collector", "solver")}
+    assert {name for node in cell for name in node._heard_on} == spoilt
 
 
 def test_torn_bytes_end_nothing(graph, cell, refused, good, capfd):
@@ -191,3 +201,119 @@ def test_numbers_of_readings_at_their_worst_are_solved_or_refused_in_one_line():
     enormous_or_none = 5  # of FLOATS
     assert answers["dtheta"] == enormous_or_none
     assert answers["dx"] == answers["dy"] == 2 * enormous_or_none  # of means and of visits
+
+
+RAISED_BY_RCLPY = {"set_parameters", "set_parameters_atomically"}
+"""Services of rclpy whose own callback raises something at the worst requests."""
+ACTION = "/pose_sequencer/run_calibration/_action"
+TEXT = ParameterValue(type=ParameterType.PARAMETER_STRING, string_value="x")
+BASES = {"parameters": [[Parameter(name=name, value=TEXT)] for name in (
+    "hardware_id", "use_sim_time")], "names": [["none"]], "prefixes": [["none"]]}
+"""What stands in the sequences of a request whose elements are spoilt."""
+
+
+@pytest.fixture
+def all_kinds(graph, cell, tmp_path):
+    """Return all nodes, the screen included: those beside the cell in a namespace of their own."""
+    (tmp_path / "beside").mkdir()
+    graph.node(partial(StageSimulator, namespace="beside"))
+    graph.node(partial(BagPlayer, namespace="beside"), bag=str(small_bag(tmp_path / "beside")),
+               wait_for_subscribers=3600.0)
+    return [node for node in graph.nodes if node is not graph.hand]
+
+
+@pytest.fixture
+def traps(tmp_path):
+    """Return names of files that hang, are without end, or large, or folders."""
+    os.mkfifo(tmp_path / "pipe")
+    with (tmp_path / "large").open("wb") as file:
+        file.truncate(120_000_000)
+    (tmp_path / "deep").write_text("[" * 100_000)
+    (tmp_path / "long").write_text("- 1\n" * 1_000_000)
+    return [*(str(tmp_path / name) for name in ("pipe", "large", "deep", "long", "")),
+            "/dev/zero", "/dev/stdin", "/proc/kmsg", "/proc/self/mem", "/proc/self/pagemap", "a\0b"]
+
+
+def requests_of(kind, traps):
+    """Yield requests of a service: an empty one, and one with each field at its worst."""
+    fields = kind.Request.get_fields_and_field_types()
+    [name] = BASES.keys() & fields or [None]
+    for base in BASES.get(name, [None]):
+        request = kind.Request(**({} if name is None else {name: base}))
+        yield request
+        for _, spoilt in worst(request):
+            yield spoilt
+    for path in traps if "path" in fields else ():
+        yield kind.Request(path=path)
+
+
+def reached(graph, kind, name, hello=None):
+    """Return a client that is answered: a server drops answers until it has found the client."""
+    client, asked = graph.hand.create_client(kind, name), []
+    graph.until(client.service_is_ready, f"service {name}")
+
+    def is_answered():
+        asked.append(client.call_async(hello or kind.Request()))
+        graph.executor.spin_once(timeout_sec=0.02)
+        return any(one.done() for one in asked)
+    graph.until(is_answered, f"an answer of {name}")
+    return client
+
+
+def ask(graph, client, requests):
+    """Return the answers to all requests; each has one."""
+    answers, requests = [], iter(requests)
+    while group := list(islice(requests, AT_ONCE // 4)):  # services have queues of 10
+        futures = [client.call_async(request) for request in group]
+        graph.until(lambda asked=futures: all(one.done() for one in asked),
+                    f"answers of {client.service_name}")
+        answers += [one.result() for one in futures]
+    return answers
+
+
+def goal_of(path, number):
+    """Return the request of a goal."""
+    request = RunCalibration.Impl.SendGoalService.Request()
+    request.goal.plan_path, request.goal_id.uuid = path, [*divmod(number, 256), *[0] * 14]
+    return request
+
+
+def results_of(graph, traps):
+    """Return the results of goals of which none can be reached, one after the other."""
+    impl, found = RunCalibration.Impl, []
+    send = reached(graph, impl.SendGoalService, f"{ACTION}/send_goal", goal_of("no such", 0))
+    get = reached(graph, impl.GetResultService, f"{ACTION}/get_result")
+    cancel = reached(graph, impl.CancelGoalService, f"{ACTION}/cancel_goal")
+    for number, path in enumerate([*filter(None, TEXTS), *traps], 1):  # "" is the plan it has
+        goal = goal_of(path, number)
+        assert [answer.accepted for answer in ask(graph, send, [goal, goal])] == [True, False]
+        asked = impl.GetResultService.Request(goal_id=goal.goal_id)
+        found += ask(graph, get, [asked])
+        ask(graph, cancel, [impl.CancelGoalService.Request(), asked_to_end(goal)])
+    return [item.result for item in found]
+
+
+def asked_to_end(goal):
+    """Return the request that cancels a goal which has ended."""
+    request = RunCalibration.Impl.CancelGoalService.Request()
+    request.goal_info.goal_id = goal.goal_id
+    return request
+
+
+def test_each_request_at_its_worst_is_answered_and_ends_nothing(
+        graph, cell, all_kinds, refused, traps, capfd):
+    asked = Counter()
+    for node in all_kinds:
+        for service in [*node.services]:
+            client = reached(graph, service.srv_type, service.service_name)
+            answers = ask(graph, client, requests_of(service.srv_type, traps))
+            asked[node.get_name()] += len(answers)
+            graph.hand.destroy_client(client)
+    assert len(asked) == 8 and min(asked.values()) > 300, asked
+    graph.call(Trigger, "pose_sequencer/abort")  # or it rejects goals
+    results = results_of(graph, traps)
+    assert {result.error_code for result in results} == {2}
+    odd = [(place, error) for place, error in refused if not isinstance(error, SelfcalError)]
+    assert {place for place, _ in odd} == RAISED_BY_RCLPY, odd
+    refused.clear()
+    everybody_is_well(graph, cell, refused, capfd)

@@ -12,6 +12,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from selfcal_msgs.srv import LoadMap, SaveMap
 from visualization_msgs.msg import Marker
 
+from selfcal_ros.errors import ExitCode, NotSettledError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.messages import from_model, to_model
 from selfcal_ros.model.artifact import Artifact
@@ -23,7 +24,7 @@ from selfcal_ros.nodes.filling import fill
 from selfcal_ros.nodes.solver import Solver
 from selfcal_ros.reporting.maps.markers import map_geometry
 from selfcal_ros.reporting.words.result import worded
-from selfcal_ros.sessions.solving import short
+from selfcal_ros.sessions.solving import Outcome, short
 from test.support.maps import random_map, result_of
 from test.support.sessions import START_NS, collected, events_of, small_plan
 
@@ -191,6 +192,22 @@ def test_a_late_joiner_gets_map_and_summary(solve, graph):
     maps, summaries = graph.listen(names.ERROR_MAP), graph.listen(names.SUMMARY)
     graph.until(lambda: maps and summaries, "the latched messages")
     assert len(maps) == len(summaries) == 1
+
+
+def test_save_map_before_a_solution_that_failed_is_taken_says_why(graph, monkeypatch, tmp_path):
+    """It takes the solution itself; what that raises ended the node."""
+    monkeypatch.setattr(solver_module, "SWEEP_S", 3600.0)
+    monkeypatch.setattr(Solver, "_wake", lambda node, solution: None)
+    problem = NotSettledError("the readings", "did not converge", "measure anew")
+    monkeypatch.setattr(solver_module, "solve", lambda job: Outcome(job, None, problem))
+    node = graph.node(Solver, result_folder=str(tmp_path))
+    messages, _ = measured(PLAN)
+    graph.publisher(names.MEASUREMENT).publish(messages[0])
+    graph.until(lambda: node._running is not None and node._running.done(), "a solution")
+    answer = graph.call(SaveMap, "solver/save_map", path="map.json")
+    assert (answer.success, answer.error_code) == (False, ExitCode.BAD_INPUT)
+    assert answer.message == str(problem)
+    assert node.refusals.counts == {"advance": 1}
 
 
 def test_save_map_writes_the_result_of_the_readings(solve, graph, tmp_path):
