@@ -166,7 +166,7 @@ def run(args: argparse.Namespace) -> int:
 def _calibrated(args: argparse.Namespace, measurements: Any, options: Any) -> Any:
     """Return the result, not worded; what is wrong with the offsets names the bag."""
     from selfcal_ros.estimation.api import calibrate
-    from selfcal_ros.estimation.verdict.wiring import WiringError
+    from selfcal_ros.estimation.checks.wiring import WiringError
 
     try:
         if args.robust:

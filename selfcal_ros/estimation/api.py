@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """The one call of the estimators: readings in, calibration out."""
 
+from selfcal_ros.estimation.checks.wiring import check_wiring
 from selfcal_ros.estimation.joint.solve import solve_joint
 from selfcal_ros.estimation.law.solve import solve_law
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.verdict.judge import judged
-from selfcal_ros.estimation.verdict.wiring import check_wiring
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.result import CalibrationResult
 

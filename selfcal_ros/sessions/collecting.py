@@ -17,7 +17,7 @@ from selfcal_ros.collection.messages import Command, Phase
 from selfcal_ros.collection.reasons import Reason, advice
 from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.errors import InputError, NoDataError
-from selfcal_ros.estimation.verdict.wiring import wiring_faults, worded
+from selfcal_ros.estimation.checks.wiring import wiring_faults, worded
 from selfcal_ros.messages import from_model, to_model
 from selfcal_ros.messages.input_columns import EncoderBlock
 from selfcal_ros.messages.topics import DETECTION_TOPIC, ENCODER_TOPIC

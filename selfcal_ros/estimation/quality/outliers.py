@@ -19,6 +19,7 @@ from scipy.special import chdtri, gammaincinv
 from selfcal_ros.errors import InputError, NotIdentifiableError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.blas_threads import one_thread
+from selfcal_ros.estimation.checks.wiring import check_wiring
 from selfcal_ros.estimation.findings import (
     NoisyView,
     OutliersGivenUp,
@@ -40,7 +41,6 @@ from selfcal_ros.estimation.quality.slip import Slip, find_slip, split_view
 from selfcal_ros.estimation.quality.slip_or_term import likelier_term
 from selfcal_ros.estimation.quality.thinning import Key, left_out, without
 from selfcal_ros.estimation.terms.identifiable import require_terms_told
-from selfcal_ros.estimation.verdict.wiring import check_wiring
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.result import CalibrationResult

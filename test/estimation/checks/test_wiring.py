@@ -11,15 +11,15 @@ from selfcal_ros.collection.marks.visits import repeat_motion
 from selfcal_ros.collection.messages import Detection, Kind
 from selfcal_ros.errors import ExitCode
 from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.estimation.options import Options
-from selfcal_ros.estimation.quality.outliers import robust_calibrate
-from selfcal_ros.estimation.verdict.wiring import (
+from selfcal_ros.estimation.checks.wiring import (
     WiringError,
     _p_of,
     check_wiring,
     wiring_faults,
     worded,
 )
+from selfcal_ros.estimation.options import Options
+from selfcal_ros.estimation.quality.outliers import robust_calibrate
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Measurements, Sense, ViewReadings
 from selfcal_ros.model.view import View
