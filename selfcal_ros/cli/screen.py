@@ -69,7 +69,8 @@ def what_now(picture: dict[str, Any]) -> str:
     if state == "PLACING":
         x, y = command.get("translation_mm") or (None, None)
         turn = command.get("rotation_deg")
-        pose = "" if None in (x, y, turn) else f" turned by {turn:g} deg, at x {x:g} mm, y {y:g} mm"
+        pose = "" if None in (x, y, turn) else (
+            f" turned by {turn:g} deg{_sense_of(turn)}, at x {x:g} mm, y {y:g} mm")
         name = command.get("view_name") or told["values"].get("view_name", "")
         return f"Place the plate for view '{printable(name)}'{pose}; then press c. {look}".rstrip()
     if state == "MEASURING":
@@ -78,6 +79,16 @@ def what_now(picture: dict[str, Any]) -> str:
             "ABORTED": "Aborted. s starts a new run.",
             "FOLLOWING": "Nothing: somebody else commands; a ends that.",
             }.get(state, printable(told["message"]))
+
+
+def _sense_of(turn_deg: Any) -> str:
+    """Return which way a plate is turned, and where its first corner is then."""
+    quarters = round(turn_deg / 90)
+    if not quarters % 4 or abs(turn_deg - 90 * quarters) > 1:
+        return " counter-clockwise" if turn_deg > 0 else " clockwise" if turn_deg < 0 else ""
+    corner = ("", "top left", "bottom left", "bottom right")[quarters % 4]
+    way = "↺ counter-clockwise" if turn_deg > 0 else "↻ clockwise"
+    return f" {way} (the corner at the top right goes to the {corner})"
 
 
 def saved_as(picture: dict[str, Any]) -> str:

@@ -164,8 +164,9 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _calibrated(args: argparse.Namespace, measurements: Any, options: Any) -> Any:
-    """Return the result, not worded; what is wrong with the offsets names the bag."""
+    """Return the result, not worded; what is wrong with offsets or plate names the bag."""
     from selfcal_ros.estimation.api import calibrate
+    from selfcal_ros.estimation.checks.placing import PlacingError
     from selfcal_ros.estimation.checks.wiring import WiringError
 
     try:
@@ -173,7 +174,7 @@ def _calibrated(args: argparse.Namespace, measurements: Any, options: Any) -> An
             from selfcal_ros.estimation.quality.outliers import robust_calibrate
             return robust_calibrate(measurements, options)
         return calibrate(measurements, options)
-    except WiringError as error:
+    except (WiringError, PlacingError) as error:
         raise InputError(f"{args.bag}: {error.where}", error.what, error.remedy) from error
 
 

@@ -52,6 +52,9 @@ class Evidence:
         Distance between marks, and from a mark's site at which the stage still stands at it.
     sense : Sense
         Sense of measurement.
+    lies : str
+        How the plate lies, and what to do, where the ids of the marks tell that it lies otherwise
+        than planned.
     """
 
     rejected: Mapping[str, int]
@@ -68,6 +71,7 @@ class Evidence:
     pitch_m: float = 0.0
     limit_m: float = 0.0
     sense: Sense = Sense.MICROSCOPE_MOVES
+    lies: str = ""
 
 
 @dataclass(frozen=True)
@@ -110,7 +114,7 @@ def diagnose(evidence: Evidence) -> Finding | None:
     elif reason == Reason.OUTSIDE_VIEWS:
         cause = _command_clock(evidence)
     elif reason in PLACED:
-        cause = _stage(evidence)
+        cause = evidence.lies or _stage(evidence)
     return Finding(reason, count, total, cause or REMEDY[Reason(reason)])
 
 

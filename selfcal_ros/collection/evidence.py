@@ -10,6 +10,7 @@ from selfcal_ros.collection.diagnosis import Evidence, Finding, Span, diagnose, 
 from selfcal_ros.collection.marks.identify import IdentityRules
 from selfcal_ros.collection.messages import Kind
 from selfcal_ros.collection.stage.exposures import Exposures
+from selfcal_ros.estimation.checks.placing import Misplaced, other_poses, said
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Sense, ViewReadings
 from selfcal_ros.model.view import View
@@ -93,7 +94,7 @@ class Seen:
             for reason, count in readings.rejected.items():
                 rejected[reason] = rejected.get(reason, 0) + count
         used = sum(readings.used for readings in views.values())
-        whole = self._finding(rejected, used, views)
+        whole = self._finding(rejected, used, views, whole=True)
         if whole is not None:
             return {None: whole}
         found = {index: self._finding(readings.rejected, readings.used, {index: readings})
@@ -101,7 +102,7 @@ class Seen:
         return {index: finding for index, finding in found.items() if finding is not None}
 
     def _finding(self, rejected: Mapping[str, int], used: int,
-                 views: Mapping[int, ViewReadings]) -> Finding | None:
+                 views: Mapping[int, ViewReadings], *, whole: bool = False) -> Finding | None:
         if main_reason(rejected, used) is None:
             return None
         here = np.isin(self.view_of, list(views))
@@ -111,10 +112,33 @@ class Seen:
         missing = tuple(encoder.names[axis] for axis, kind in kinds.items()
                         if not encoder.sampled[axis] and (table["kind"] == kind).any())
         stage, site = self._stage_and_sites(rows[-LOOKED_AT:], views)
+        # where all views are spoilt the sense may be wrong: it looks like half a turn
+        lies = "" if whole else self._lies(rows[-LOOKED_AT:], views)
         return diagnose(Evidence(
             rejected, used, missing, encoder.foreign, _span(table["stamp"]), encoder.span_ns,
             self.commands_ns, encoder.step_s, encoder.max_gap_s, stage, site,
-            self.artifact.grid_pitch_m, self.rules.stage_limit_m(self.artifact), self.sense))
+            self.artifact.grid_pitch_m, self.rules.stage_limit_m(self.artifact), self.sense, lies))
+
+    def _lies(self, rows: np.ndarray, views: Mapping[int, ViewReadings]) -> str:
+        """Return how the plate of a view lies, if its marks are where another pose has them."""
+        ((_, readings),) = views.items()
+        table, view = self.table[rows], readings.view
+        if not _on_lattice(self.artifact, view):
+            return ""
+        stage, limit = self.exposures.at(table["stamp"]), self.rules.stage_limit_m(self.artifact)
+        where = np.stack([stage.x.position, stage.y.position])
+        where *= -1 if self.sense is Sense.PLATE_MOVES else 1
+        good = (table["kind"] == Kind.GRID) & table["has_id"] & np.isfinite(where).all(axis=0)
+        pose = view.lattice_pose(self.artifact)
+        away = []
+        for other in (pose, *other_poses(pose)):
+            site = np.stack(other.site_of(table["m"], table["n"])) * self.artifact.grid_pitch_m
+            away.append(np.quantile(np.hypot(*(where - site))[good], 0.9) if good.any() else np.inf)
+        best = int(np.argmin(away))
+        if not best or away[best] > limit:
+            return ""
+        error = said(Misplaced.of(view.name, pose, [*other_poses(pose)][best - 1]))
+        return f"{error.what}; {error.remedy}"
 
     def _stage_and_sites(self, rows: np.ndarray, views: Mapping[int, ViewReadings],
                          ) -> tuple[np.ndarray, np.ndarray]:

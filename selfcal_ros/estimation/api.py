@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The one call of the estimators: readings in, calibration out."""
 
+from selfcal_ros.estimation.checks.placing import check_placing
 from selfcal_ros.estimation.checks.wiring import check_wiring
 from selfcal_ros.estimation.joint.solve import solve_joint
 from selfcal_ros.estimation.law.solve import solve_law
@@ -32,10 +33,13 @@ def calibrate(measurements: Measurements, options: Options | None = None) -> Cal
     NotIdentifiableError
         If the marks that were read do not identify the stage.
     InputError
-        If readings contradict the plan, an option does not fit them, or the offsets do not follow
-        the stage (`WiringError`).
+        If readings contradict the plan, an option does not fit them, the offsets do not follow the
+        stage (`WiringError`), or the plate lies otherwise than planned (`PlacingError`).
     """
     check_wiring(measurements)
     options = options or Options()
     solve = solve_law if options.method == "law" else solve_joint
-    return judged(solve(measurements, options), measurements, options)
+    result = judged(solve(measurements, options), measurements, options)
+    if not result.verdict.qualified:
+        check_placing(measurements)
+    return result

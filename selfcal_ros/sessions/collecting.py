@@ -17,13 +17,12 @@ from selfcal_ros.collection.messages import Command, Phase
 from selfcal_ros.collection.reasons import Reason, advice
 from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.errors import InputError, NoDataError
-from selfcal_ros.estimation.checks.wiring import wiring_faults, worded
 from selfcal_ros.messages import from_model, to_model
 from selfcal_ros.messages.input_columns import EncoderBlock
 from selfcal_ros.messages.topics import DETECTION_TOPIC, ENCODER_TOPIC
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.sessions.clocks import ClockWatch
-from selfcal_ros.sessions.health import Rate, merged
+from selfcal_ros.sessions.health import CellChecks, Rate, merged
 from selfcal_ros.sessions.ports import Diagnosis, Level, Ports
 from selfcal_ros.sessions.runs import RunWatch
 from selfcal_ros.units import MS_PER_S, S_PER_NS, UM_PER_M
@@ -57,7 +56,7 @@ class CollectingSession:
         self._warned: set[tuple[int | None, str]] = set()
         self._findings: list[str] = []
         self._stepped: list[str] = []
-        self._miswired: dict[str, str] = {}  # view and kind of marks -> what is wrong with offsets
+        self._checks = CellChecks(ports.say)
         self._noted: list[str] = []  # what the readings of a view that were sent last say of clocks
         self._clock = ClockWatch(settings.clock_limit)
         self._runs, self._run_lines = RunWatch(), list[str]()
@@ -207,7 +206,7 @@ class CollectingSession:
             self._advised, self._warned, self._noted = set(), set(), []
         self._tell_runs()
         self._tell_steps()
-        self._check_wiring(measurements)
+        self._checks.take(measurements)
         self._warn(measurements, progress)
         for index, view in progress.items():
             stamp = from_model.session_stamp_ns(timeline, view)
@@ -241,15 +240,6 @@ class CollectingSession:
             if (index, finding.reason) not in self._warned:
                 self._warned.add((index, finding.reason))
                 self._ports.say(Level.WARN, self._findings[-1])
-
-    def _check_wiring(self, measurements: Measurements) -> None:
-        """Say once what is wrong with the offsets; the health says it as long as it holds."""
-        faults = {f"{fault.view} {fault.kind}": str(worded(fault))
-                  for fault in wiring_faults(measurements)}
-        for place, line in faults.items():
-            if place not in self._miswired:
-                self._ports.say(Level.ERROR, line)
-        self._miswired = faults
 
     def _advise(self, index: int, view: ViewProgress) -> None:
         """Say once for each view that is over what would correct its rejections."""
@@ -317,11 +307,9 @@ class CollectingSession:
         lines = self._findings or advice(self._rejected)
         found = Diagnosis(Level.WARN if lines else Level.OK, "; ".join(lines))
         runs = Diagnosis(Level.WARN if self._run_lines else Level.OK, "; ".join(self._run_lines))
-        wired = Diagnosis(Level.ERROR if self._miswired else Level.OK,
-                          "; ".join(self._miswired.values()))
         stepped = Diagnosis(Level.WARN if self._stepped else Level.OK, "; ".join(self._stepped))
         return merged(main, [
-            runs, wired, found, self._clock.diagnosis(), stepped,
+            runs, self._checks.diagnosis(), found, self._clock.diagnosis(), stepped,
             self._encoder(), self._repeatability()])
 
     def _cost(self) -> dict[str, str]:

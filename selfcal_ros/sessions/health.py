@@ -7,6 +7,9 @@ from collections.abc import Callable, Iterable
 import numpy as np
 
 from selfcal_ros.errors import SelfcalError, first_line, printable
+from selfcal_ros.estimation.checks.placing import misplaced, said
+from selfcal_ros.estimation.checks.wiring import wiring_faults, worded
+from selfcal_ros.model.readings import Measurements
 from selfcal_ros.sessions.ports import Diagnosis, Level
 from selfcal_ros.units import NS_PER_S
 
@@ -16,6 +19,8 @@ MEMORY_S = 10.0
 """Time for which a refusal or a loss keeps the state at WARN."""
 LEAST_STEPS, MOST_STEPS = 40, 20_000
 """Intervals between stamps that tell a jitter, and that are kept to tell it."""
+MORE = 1.25
+"""Marks over those of the last time from which it is looked at again how the plate lies."""
 
 
 def merged(main: Diagnosis, others: Iterable[Diagnosis]) -> Diagnosis:
@@ -200,3 +205,49 @@ class Rate:
             return float("nan")
         low, high = np.percentile(steps, [2.5, 97.5])
         return float(high - low) / 2 / NS_PER_S
+
+
+class CellChecks:
+    """Looks at the readings so far; logs each fault once, and keeps it for the diagnosis.
+
+    Parameters
+    ----------
+    say : callable (level, line)
+        Writes to the log.
+    """
+
+    def __init__(self, say: Callable[[Level, str], None]) -> None:
+        self._say = say
+        self._miswired: dict[str, str] = {}  # view and kind of marks -> what is wrong with offsets
+        self._misplaced = ""
+        self._marks = 0  # that were read when it was looked at how the plate lies
+
+    def take(self, measurements: Measurements) -> None:
+        """Check the readings of all views so far."""
+        faults = {f"{fault.view} {fault.kind}": str(worded(fault))
+                  for fault in wiring_faults(measurements)}
+        for place in faults.keys() - self._miswired.keys():
+            self._say(Level.ERROR, faults[place])
+        self._miswired = faults
+        self._check_placing(measurements)
+
+    def _check_placing(self, measurements: Measurements) -> None:
+        """Look how the plate lies when there are more marks.
+
+        And whenever there are others as long as it lies wrongly, so that a view that is measured
+        again ends it.
+        """
+        marks = sum(len(view.m) for view in measurements.views)
+        if marks == self._marks or (not self._misplaced
+                                    and self._marks < marks < MORE * self._marks):
+            return
+        self._marks, found = marks, misplaced(measurements)
+        line = str(said(found)) if found else ""
+        if line and line != self._misplaced:
+            self._say(Level.ERROR, line)
+        self._misplaced = line
+
+    def diagnosis(self) -> Diagnosis:
+        """Return what is wrong, ERROR where something is."""
+        wrong = [line for line in (*self._miswired.values(), self._misplaced) if line]
+        return Diagnosis(Level.ERROR if wrong else Level.OK, "; ".join(wrong))

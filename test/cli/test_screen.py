@@ -22,6 +22,9 @@ def told(state: str, message: str = "", level: int = 0, **values: str) -> dict:
     return {"level": level, "message": message or state, "values": {"state": state} | values}
 
 
+TURN = "90 deg ↺ counter-clockwise (the corner at the top right goes to the top left)"
+
+
 def shown(picture: dict, log: tuple = (), size: tuple[int, int] = (140, 40)) -> str:
     console = Console(file=io.StringIO(), width=size[0], height=size[1], legacy_windows=False)
     console.print(screen(picture, list(log), size), end="")
@@ -33,12 +36,12 @@ def shown(picture: dict, log: tuple = (), size: tuple[int, int] = (140, 40)) -> 
     (told("IDLE"), "Press s to start the plan."),
     (told("IDLE", "waiting for solver (no sign of life)", 1),
      "Nothing: waiting for solver (no sign of life)."),
-    (told("PLACING", view_name="rot90"), "Place the plate for view 'rot90' turned by 90 deg, at x "
+    (told("PLACING", view_name="rot90"), f"Place the plate for view 'rot90' turned by {TURN}, at x "
                                          "10 mm, y -20 mm; then press c."),
     (told("MEASURING"), "Nothing: the view is being measured."),
     (told("MEASURING", "view 'rot90' stalls", 1), "Look: view 'rot90' stalls."),
     (told("PLACING", "no sign of life of solver", 1),
-     "Place the plate for view 'rot90' turned by 90 deg, at x 10 mm, y -20 mm; then press c. "
+     f"Place the plate for view 'rot90' turned by {TURN}, at x 10 mm, y -20 mm; then press c. "
      "Look: no sign of life of solver."),
     (told("DONE"), "Done. s starts another run."),
     (told("ABORTED"), "Aborted. s starts a new run."),
@@ -49,8 +52,8 @@ def test_what_a_person_has_to_do(sequencer, sentence):
 
 
 @pytest.mark.parametrize("phase, sentence", [
-    ("PLACE", "Place the plate for view 'rot90' turned by 90 deg, at x 10 mm, y -20 mm; then press "
-              "c."),
+    ("PLACE", f"Place the plate for view 'rot90' turned by {TURN}, at x 10 mm, y -20 mm; then "
+              "press c."),
     ("MEASURE", "Nothing: the view is being measured."), ("DONE", "Done. s starts another run."),
     ("ABORT", "Aborted. s starts a new run.")])
 @pytest.mark.parametrize("state", ["PLACING", "MEASURING"])
@@ -200,3 +203,14 @@ def test_a_number_of_views_that_is_none_is_not_shown(views, sentence):
     picture = EMPTY | {"health": {"pose_sequencer": told("MEASURING", views=views)},
                        "command": COMMAND | {"views_planned": 3}}
     assert sentence in shown(picture)
+
+
+@pytest.mark.parametrize(("turn", "said"), [
+    (0.0, "turned by 0 deg, at"),
+    (180.0, "↺ counter-clockwise (the corner at the top right goes to the bottom left), at"),
+    (270.0, "↺ counter-clockwise (the corner at the top right goes to the bottom right), at"),
+    (-90.0, "↻ clockwise (the corner at the top right goes to the bottom right), at"),
+    (15.0, "turned by 15 deg counter-clockwise, at")])
+def test_the_sense_of_a_turn_and_its_corner_are_said(turn, said):
+    assert said in what_now(EMPTY | {"health": {"pose_sequencer": told("PLACING")},
+                                     "command": COMMAND | {"rotation_deg": turn}})

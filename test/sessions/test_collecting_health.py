@@ -22,6 +22,7 @@ from selfcal_ros.sessions.solving import SolvingSession, solve
 from selfcal_ros.simulation.cell import CellSettings, plan_events
 from selfcal_ros.simulation.truth import random_truth
 from test.support.collecting import detection_table, encoder_block
+from test.support.misplaced import laid
 from test.support.ports import START_NS, Hands, message, settings_of
 from test.support.sessions import events_of, small_plan
 
@@ -456,3 +457,19 @@ def test_reversed_offsets_are_an_error_while_the_first_view_is_measured():
     desk.feed(spoilt[end:])
     desk.session.tick()
     assert [line for level, line in desk.hands.said if level is Level.ERROR] == [line]
+
+
+def test_a_plate_laid_the_other_way_round_is_an_error_during_the_next_view():
+    cell, _ = laid("0, 90, tx, ty", "0, 270, tx, ty", with_ids=False)
+    last = {c.view_index: c.stamp_ns for c in cell.commands}
+    desk, events = Desk(), sorted(cell.events, key=lambda e: e.stamp_ns)
+    for number, event in enumerate(events):
+        desk.feed([event])
+        if number % 50 == 0:
+            desk.session.tick()
+        if desk.told().level is Level.ERROR:
+            break
+    (line,) = [line for level, line in desk.hands.said if level is Level.ERROR]
+    assert line == ("view '90': the plate lies turned by 270°, not by 90°; turn it counter-"
+                    "clockwise and measure this view again, or correct its pose in the plan")
+    assert last[2] < event.stamp_ns < last[3] and desk.told().message.startswith(line)

@@ -1,0 +1,89 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Plates that lie otherwise than planned: told by the errors that marks carry along, and by ids."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from selfcal_ros.estimation.api import calibrate
+from selfcal_ros.estimation.checks.placing import PlacingError, misplaced, other_poses
+from selfcal_ros.model.readings import Sense
+from test.support.collecting import collect, gathered, scene
+from test.support.misplaced import NOISE, laid
+from test.support.plans import plan_of
+
+WRONG = {  # what the plan says, where the plate lies, in which view, and what is said
+    "clockwise": ("0, 90, tx", "0, 270, tx", 1, "turned by 270°, not by 90°; turn it counter-"
+                                                "clockwise"),
+    "half a turn": ("0, 90, tx", "0, 180, tx", 1, "turned by 180°, not by 90°; turn it as planned"),
+    "not turned": ("0, 90, tx, ty", "0, 0, tx, ty", 1, "turned by 0°, not by 90°; turn it as "),
+    "other side": ("0, 90, tx", "0, 90, -tx", 2, "shifted by (-1, +0) pitches, not by (+1, +0) "),
+    "other axis": ("0, 90, tx", "0, 90, ty", 2, "shifted by (+0, +1) pitches, not by (+1, +0) "),
+    "not shifted": ("0, 90, 180, tx", "0, 90, 180, 0", 3, "shifted by (+0, +0) pitches, not by ")}
+
+
+@pytest.mark.parametrize("sense", list(Sense))
+@pytest.mark.parametrize("name", WRONG)
+def test_without_ids_the_other_views_tell_how_a_plate_lies(name, sense):
+    planned, lies, index, said = WRONG[name]
+    cell, names = laid(planned, lies, with_ids=False, sense=sense)
+    readings = collect(cell.events, measurement_sense=str(sense))[0]
+    with pytest.raises(PlacingError) as error:
+        calibrate(readings)
+    assert str(error.value).startswith(
+        f"plan '{lies}', view '{names[index]}': the plate lies {said}")
+    assert str(error.value).endswith("and measure this view again, or correct its pose in the plan")
+
+
+@pytest.mark.parametrize("sense", list(Sense))
+@pytest.mark.parametrize("name", WRONG)
+def test_ids_tell_how_a_plate_lies_by_themselves(name, sense):
+    planned, lies, index, said = WRONG[name]
+    cell, _ = laid(planned, lies, with_ids=True, sense=sense)
+    collector = gathered(cell.events, measurement_sense=str(sense))
+    (finding,) = collector.findings(*collector.collect()).items()
+    assert finding[0] == index and said in finding[1].text
+
+
+def test_two_views_do_not_tell_which_of_them_lies_otherwise():
+    cell, _ = laid("0, 90", "0, 270", with_ids=False)
+    assert misplaced(collect(cell.events)[0]) is None
+
+
+def test_a_plate_without_errors_of_its_own_tells_nothing():
+    cell, _ = laid("0, 90, tx", "0, 270, tx", with_ids=False)
+    readings = collect(cell.events)[0]
+    noise = np.random.default_rng(1)
+    blank = replace(readings, views=tuple(
+        replace(v, dx=noise.normal(0, 1.4e-8, len(v.m)), dy=noise.normal(0, 1.4e-8, len(v.m)))
+        for v in readings.views))
+    assert misplaced(blank) is None
+
+
+def test_it_is_told_before_a_view_is_complete():
+    cell, names = laid("0, 90, tx", "0, 270, tx", with_ids=False)
+    begin = [c.stamp_ns for c in cell.commands if c.view_index == 2][-1]
+    third = [d for d in cell.detections if d.stamp_ns > begin]
+    assert len(third) > 80
+    cell.detections = [d for d in cell.detections if d.stamp_ns <= begin] + third[:28]
+    found = misplaced(collect(cell.events)[0])
+    assert found is not None and (found.view, found.found_deg) == (names[1], 270)
+
+
+@pytest.mark.parametrize("text", ["0, 90, tx", "0, 90, 180, tx, ty"])
+def test_plates_that_lie_as_planned_are_no_finding(text):
+    for seed in range(10):
+        for size in (1.0, 0.1, 0.01):
+            cell = scene(text, with_ids=False, seed=seed, **NOISE)
+            readings = collect(cell.events)[0]
+            views = tuple(replace(v, dx=size * v.dx, dy=size * v.dy) for v in readings.views)
+            assert misplaced(replace(readings, views=views)) is None
+
+
+def test_other_poses_are_turns_and_shifts_each_once():
+    pose = plan_of("tx", 5, count=0).views[0].lattice_pose(plan_of("tx", 5, count=0).artifact)
+    poses = [(other.q, other.shift) for other in other_poses(pose)]
+    assert len(poses) == len(set(poses)) and (0, (1, 0)) not in poses
+    assert {(1, (1, 0)), (2, (1, 0)), (3, (1, 0)), (0, (0, 0)), (0, (-1, 0)), (0, (0, 1)),
+            (0, (0, -1)), (0, (2, 0)), (0, (1, 1)), (0, (1, -1))} == set(poses)
