@@ -56,8 +56,9 @@ def main() -> int:
         return 0
     jobs = [(index, args.first + run) for index in chosen
             for run in range(args.runs * every[index].times)]
-    lines, done = [HEADER], []
-    print(HEADER, flush=True)
+    lines, done = [f"{args.runs} runs a case, {25 * args.runs} of the clean population and "
+                   f"{5 * args.runs} of the others:", "", HEADER], []
+    print("\n".join(lines), flush=True)
     for index, courses in finished(jobs, check_workers(args.workers)):
         case = every[index]
         done.append(as_json(case, courses))
