@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
+from scipy.stats import binom
 
 from selfcal_ros.collection.collector import Collector
 from selfcal_ros.collection.messages import Command, Detection, EncoderSample
@@ -32,8 +33,8 @@ from tools.reality.populations import populations
 WRONG = (0.85, 242)
 """Part of the map inside k u below which a single map is called wrong: of 242 correlated
 coordinates 95 % are inside on average, and hardly ever fewer than 85 % in a clean run."""
-WRONG_THETA = (0.78, 24)
-"""The same of a map of 24 angles: 19 inside are right, 18 come once in a thousand clean runs."""
+BY_CHANCE = 1e-4
+"""Probability of as few angles inside k u as make a map of angles wrong: 17 of 24, 3 of 8."""
 COVERAGE = 0.9545
 """Part of the errors that k u is to hold."""
 STEPS, AGAIN = 4, 2
@@ -169,15 +170,17 @@ def compared(result: CalibrationResult | str, truth: Truth, said: tuple[str, ...
     theta = theta - np.nanmean(theta) if np.isfinite(theta).any() else theta
     within, z_xy = _covered(error, np.stack([emap.u_gx, emap.u_gy]), result.noise.k_xy)
     within_theta, z_theta = _covered(theta, emap.u_g_theta, result.noise.k_theta)
-    holds = not (within < limit(WRONG, error) or within_theta < limit(WRONG_THETA, theta))
+    n_theta = int(np.isfinite(theta).sum())
+    holds = not (within < limit(int(np.isfinite(error).sum()))
+                 or within_theta < binom.ppf(BY_CHANCE, n_theta, COVERAGE) / max(n_theta, 1))
     return Run(grade_of(result), float(np.nanmax(np.abs(error))), within, within_theta, z_xy,
                z_theta, holds, (*said, *(cause.name for cause in result.verdict.causes)))
 
 
-def limit(wrong: tuple[float, int], error: np.ndarray) -> float:
-    """Return the part inside k u below which a map is wrong; fewer errors scatter more."""
-    at, count = wrong
-    return COVERAGE - (COVERAGE - at) * float(np.sqrt(count / max(np.isfinite(error).sum(), 1)))
+def limit(n_errors: int) -> float:
+    """Return the part inside k u below which an XY map is wrong; fewer errors scatter more."""
+    at, count = WRONG
+    return COVERAGE - (COVERAGE - at) * float(np.sqrt(count / max(n_errors, 1)))
 
 
 ROUNDING = 1e-13
