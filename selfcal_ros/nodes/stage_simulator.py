@@ -3,7 +3,7 @@
 
 import sys
 from collections.abc import Iterator
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +33,8 @@ from selfcal_ros.simulation.spec import settings_of, spread_of
 LEAD_NS = 20_000_000
 """Time between a MEASURE command, or its arrival if that is later, and the first encoder sample
 of its view: nothing is stamped at a time that has passed."""
+PATIENCE_NS = 1_000_000_000
+"""Time after the last exposure from which a status names what is missing for good."""
 
 
 class StageSimulator(SelfcalNode[SimulatorSettings]):
@@ -48,9 +50,13 @@ class StageSimulator(SelfcalNode[SimulatorSettings]):
         self._events: Iterator[Event] = iter(())
         self._next: Event | None = None
         self._idle_stamp = 0
+        self._command: Command | None = None  # the view that is being measured
+        self._acted: set[int] = set()  # stamps of commands
+        self._free_ns = 0  # stamp from which it has nothing to do
         self._encoder = self.publisher(names.ENCODER)
         self._detection = self.publisher(names.DETECTIONS)
         self.subscribe(names.COMMAND, self._on_command)
+        self.subscribe(names.STATUS_AS_IT_COMES, self._on_status)
         self.every(0.005, self._on_timer)
         self._sent = {"encoder_sent": 0, "detection_sent": 0}
 
@@ -60,12 +66,31 @@ class StageSimulator(SelfcalNode[SimulatorSettings]):
 
     def _on_command(self, message: Any) -> None:
         command = to_model.command(message)
-        self._next, self._events = None, iter(())
+        if command.stamp_ns in self._acted:
+            return  # latched anew by a sequencer that was restarted
+        self._acted.add(command.stamp_ns)
+        self._next, self._events, self._command = None, iter(()), None
         if command.phase == Phase.MEASURE:
             self._measure(command)
 
+    def _on_status(self, message: Any) -> None:
+        """See the marks again that are missing once all have been seen."""
+        command = self._command
+        if (command is None or self._next is not None or message.complete
+                or (message.view_index, message.run_id) != (command.view_index, command.run_id)
+                or to_model.stamp_ns(message) < self._free_ns + PATIENCE_NS):
+            return
+        missing = {*zip(message.missing_m, message.missing_n, strict=False), *message.missing_k}
+        view = replace(command.placed(), repeats=1, check_marks=0, check_offset_m=0.0)
+        if missing:
+            self._measure(replace(command, view=view))
+            self._events = (event for event in self._events if not isinstance(event, Detection)
+                            or not event.has_id  # nobody knows which it is: all of them, then
+                            or (event.k if event.kind else (event.m, event.n)) in missing)
+
     def _measure(self, command: Command) -> None:
         check_simulated(command)
+        self._command = self._command or command
         plan = self._plan_with(command)
         if self.truth is None or self.truth.artifact != plan.artifact:
             count = max(64, len(plan.views), command.views_planned)
@@ -94,6 +119,7 @@ class StageSimulator(SelfcalNode[SimulatorSettings]):
         while self._next is not None and self._next.stamp_ns <= now:
             self._publish(self._next)
             self._next = next(self._events, None)
+            self._free_ns = now
         if self._next is None:
             self._idle(now)
 

@@ -1,0 +1,78 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The node of `selfcal cell check`: plays sequencer and collector for one short run.
+
+Run as a process: ``python -m selfcal_ros.nodes.cell_checker PLAN.yaml SETTLE_S PATIENCE_S``. It
+takes the parameters of measurement_collector, and writes a line of JSON to stdout for each
+`CheckItem`.
+"""
+
+import json
+import sys
+from dataclasses import asdict
+from functools import partial
+from typing import Any
+
+from rclpy.task import Future
+
+from selfcal_ros.collection.settings.nodes import CollectorSettings
+from selfcal_ros.errors import ExitCode, InputError
+from selfcal_ros.model.view import Plan
+from selfcal_ros.nodes import names
+from selfcal_ros.nodes.base import SelfcalNode
+from selfcal_ros.nodes.encoder_input import EncoderInput
+from selfcal_ros.nodes.running import run
+from selfcal_ros.sessions.cell_check import CellCheck
+from selfcal_ros.sessions.ports import Level
+from selfcal_ros.sessions.sequencing import load_plan
+
+
+class CellChecker(SelfcalNode[CollectorSettings]):
+    """Commands a cell as a sequencer does and judges what it sends."""
+
+    def __init__(self, plan: Plan, *, settle_s: float, patience_s: float, **kwargs: Any) -> None:
+        super().__init__(CollectorSettings, **kwargs)
+        self.finished, self.exit_code = Future(), ExitCode.INTERNAL
+        self._said = 0
+        self._outputs = {"command": self.output(names.NEWEST_COMMAND),
+                         "status": self.output(names.STATUS)}
+        self.session = CellCheck(plan, self.settings, self.ports(
+            lambda output, fields: self._outputs[output](fields)),
+            settle_s=settle_s, patience_s=patience_s)
+        EncoderInput(self, self.session.take_encoder)
+        self.subscribe(names.DETECTIONS, self.session.take_detection)
+        self.every(0.02, self._tick)
+
+    def _tick(self) -> None:
+        if self.finished.done():
+            return
+        others = self.get_publishers_info_by_topic(self.resolve_topic_name(names.COMMAND.name))
+        if len(others) > 1:
+            self.say(Level.ERROR, "another node sends view commands: end the sequencer first")
+            self._end(ExitCode.BAD_INPUT)
+            return
+        self.session.tick()
+        for item in self.session.items[self._said:]:
+            print(json.dumps(asdict(item)), flush=True)
+        self._said = len(self.session.items)
+        if self.session.done:
+            good = all(item.passed for item in self.session.items)
+            self._end(ExitCode.DONE if good else ExitCode.NOT_QUALIFIED)
+
+    def _end(self, code: ExitCode) -> None:
+        self.exit_code = code
+        self.finished.set_result(None)
+
+
+def main() -> None:
+    """Run the node: PLAN.yaml SETTLE_S PATIENCE_S."""
+    try:
+        plan = load_plan(sys.argv[1])
+    except InputError as error:
+        print(f"selfcal: {error}", file=sys.stderr)
+        sys.exit(int(error.exit_code))
+    make = partial(CellChecker, plan, settle_s=float(sys.argv[2]), patience_s=float(sys.argv[3]))
+    sys.exit(run(make, sys.argv[4:]))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,329 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The session of `selfcal cell check`: a short run that shows what is wrong with a cell."""
+
+from collections.abc import Callable, Generator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from selfcal_ros.collection.collector import Collector
+from selfcal_ros.collection.expected import ViewProgress, expected_marks
+from selfcal_ros.collection.messages import Command, EncoderSample, Phase
+from selfcal_ros.collection.reasons import REMEDY, Reason
+from selfcal_ros.collection.settings.nodes import CollectorSettings
+from selfcal_ros.estimation.verdict.wiring import wiring_faults, worded
+from selfcal_ros.messages import from_model, to_model
+from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.readings import Measurements, RepeatMotion
+from selfcal_ros.model.view import Plan, View
+from selfcal_ros.sessions.ports import Ports
+from selfcal_ros.units import MS_PER_S, S_PER_NS
+
+PLAN_ID, MARKS, REPEATS, OFFSET_M = "cell_check", 3, 2, 20e-6
+"""Of the run: marks a side in the middle of the plate, repeats, offset of the check stops."""
+LISTEN_S, WATCH_S, STATUS_S, STALL_S = 2.0, 2.0, 0.5, 5.0
+"""Time for the encoder alone, for what should not come, from one status to the next, and without a
+detection until an incomplete view is over."""
+FOLLOWS = 0.9
+"""Part of the square of an offset that has to go with the stage for its slope to be known."""
+REVISIT_S = 10.0
+"""Time in which a cell revisits a mark that is named as missing."""
+OLDEST_S = 10.0
+"""Age of a detection at which its stamp is no instant of exposure any more."""
+MISTAKEN = (Reason.UNKNOWN_MARK, Reason.TOO_FAR, Reason.AMBIGUOUS, Reason.NOT_IN_VIEW,
+            Reason.ROTATION, Reason.NOT_AT_MARK)
+"""Reasons that an id, or the lack of it, can have."""
+
+type Steps[T] = Generator[None, None, T]
+"""What a script yields between two looks, and returns in the end."""
+
+
+@dataclass(frozen=True)
+class CheckItem:
+    """One thing that was checked: its name, whether it is well, the figure, what to do."""
+
+    name: str
+    passed: bool
+    figure: str
+    remedy: str = ""
+
+
+def checked_view(plan: Plan) -> tuple[Artifact, View]:
+    """Return the middle of a plan's plate, and the view that asks for it: straight, checked."""
+    plate = Artifact(MARKS, plan.artifact.grid_pitch_m, plan.artifact.angular_count)
+    marks = next((view for view in plan.views if view.check_marks), View(""))
+    offset = marks.check_offset_m or min(OFFSET_M, plate.grid_pitch_m / 4)
+    angular = plate.angular_count > 0 and any(view.angular for view in plan.views)
+    return plate, View("check", grid=True, angular=angular, repeats=REPEATS, check_marks=5,
+                       check_offset_m=offset)
+
+
+class CellCheck:
+    """Commands a short run as a sequencer does, and judges what comes as a collector does.
+
+    Parameters
+    ----------
+    plan : Plan
+        Its plate, and whether it has angular lines.
+    settings : CollectorSettings
+        Sense, names of joints and limits.
+    ports : Ports
+        Publishes ``command`` and ``status``.
+    settle_s, patience_s : float
+        Time from PLACE to MEASURE, and for the first message.
+    """
+
+    def __init__(self, plan: Plan, settings: CollectorSettings, ports: Ports, *,
+                 settle_s: float = 1.0, patience_s: float = 30.0) -> None:
+        self.plate, self.view = checked_view(plan)
+        self.items: list[CheckItem] = []
+        self.done = False
+        self._settings, self._ports = settings, ports
+        self._settle_s, self._patience_s = settle_s, patience_s
+        self._collector = Collector(settings)
+        self._samples: list[tuple[int, int]] = []  # stamp, and age at its reception, ns
+        self._seen: list[tuple[float, int, bool]] = []  # received, s; age, ns; whether with an id
+        self._joints: set[str] = set()
+        self._command = Command(0, Phase.ABORT, PLAN_ID)
+        self._pause_s = WATCH_S  # after which a detection that was under way has come
+        self._script = self._run()
+
+    def take_encoder(self, message: Any) -> None:
+        """Take a sample of the encoder."""
+        sample: EncoderSample = to_model.encoder_sample(message)
+        self._samples.append((sample.stamp_ns, self._ports.now_ns() - sample.stamp_ns))
+        self._joints.update(sample.names)
+        self._collector.add_encoder(sample)
+
+    def take_detection(self, message: Any) -> None:
+        """Take a detection."""
+        found = to_model.detection(message)
+        self._seen.append((self._ports.now_s(), self._ports.now_ns() - found.stamp_ns,
+                           found.has_id))
+        self._collector.add_detection(found)
+
+    def tick(self) -> None:
+        """Do what is due."""
+        if not self.done:
+            self.done = next(self._script, self) is self
+
+    def _run(self) -> Steps[None]:
+        if not (yield from self._until(lambda: self._samples, self._patience_s)):
+            self._tell("encoder", False, f"nothing on stage/joint_states in {self._patience_s:g} s",
+                       "publish sensor_msgs/JointState there all the time, at rest as well")
+            return
+        yield from self._wait(LISTEN_S)
+        self._judge_encoder()
+        aborted = yield from self._aborted()
+        if aborted is None:
+            return
+        measured = yield from self._measured()
+        revisited = yield from self._revisited()
+        self._send(Phase.DONE)
+        yield from self._wait(self._pause_s)
+        measurements, progress = self._collected()
+        self._judge_readings(measurements, progress)
+        self._tell("revisits", revisited, "a mark named as missing was "
+                   + ("seen again" if revisited else f"not seen again in {REVISIT_S:g} s"),
+                   "read missing_m, missing_n, missing_k of selfcal/view_status and visit these "
+                   "marks until the next command; without it set min_repeats")
+        yield from self._old(aborted, measured)
+
+    def _aborted(self) -> Steps[Command | None]:
+        """Begin a view and abort it; return its MEASURE, None if nothing came."""
+        command = yield from self._place_and_measure()
+        first = len(self._seen)
+        if not (yield from self._until(lambda: len(self._seen) >= first + 3, self._patience_s)):
+            self._send(Phase.ABORT)
+            self._tell("commands", False, f"{len(self._seen) - first} detections in "
+                       f"{self._patience_s:g} s after MEASURE", "subscribe selfcal/view_command "
+                       "reliable and transient local, act on MEASURE, publish "
+                       "stage/mark_detections reliable")
+            return None
+        self._send(Phase.ABORT)
+        self._pause_s = self._longest_pause_s()
+        yield from self._wait(self._pause_s)
+        before = len(self._seen)
+        yield from self._wait(self._pause_s)
+        late = len(self._seen) - before
+        self._tell("abort", not late, f"{late} detections later than {self._pause_s:.3g} s after "
+                   "ABORT", "give up what is being measured when ABORT comes")
+        return command
+
+    def _measured(self) -> Steps[Command]:
+        """Measure the view until it is complete or nothing comes any more; return its MEASURE."""
+        self._collector, self._seen = Collector(self._settings), []
+        command = yield from self._place_and_measure()
+        self._collector.add_command(command)
+        begin = self._ports.now_s()
+
+        def over() -> bool:
+            last = self._seen[-1][0] if self._seen else begin + self._patience_s
+            return (self._collected()[1].complete or self._ports.now_s() - last
+                    > max(STALL_S, 2 * self._longest_pause_s()))
+        while not over():  # without a status: nothing is to be revisited yet
+            yield from self._wait(STATUS_S)
+        self._pause_s = self._longest_pause_s()
+        return command
+
+    def _revisited(self) -> Steps[bool]:
+        """Name a mark as missing until it comes; return whether it did."""
+        progress = self._collected()[1]
+        if not len(progress.readings.m):
+            return False
+        yield from self._wait(self._pause_s)
+        before, end = len(self._seen), self._ports.now_s() + REVISIT_S + self._pause_s
+        mark = {"missing_m": [int(progress.readings.m[0])],
+                "missing_n": [int(progress.readings.n[0])], "complete": False,
+                "grid_done": progress.grid_done - 1}
+        while len(self._seen) == before and self._ports.now_s() < end:
+            self._status(progress, mark)
+            yield from self._wait(STATUS_S)
+        return len(self._seen) > before
+
+    def _old(self, *commands: Command) -> Steps[None]:
+        """Send commands again that the cell has acted on already."""
+        count = 0
+        for command in commands:
+            before = len(self._seen)
+            self._publish(command)
+            yield from self._wait(self._pause_s)
+            count += len(self._seen) - before
+            self._send(Phase.ABORT)
+            yield from self._wait(self._pause_s)
+        self._tell("old commands", not count, f"{count} detections after a MEASURE that was over "
+                   "had been sent again", "remember the stamps of the commands that were acted on "
+                   "and act on none of them again")
+
+    def _place_and_measure(self) -> Steps[Command]:
+        self._send(Phase.PLACE)
+        yield from self._wait(self._settle_s)
+        return self._send(Phase.MEASURE)
+
+    def _send(self, phase: Phase) -> Command:
+        """Send a command of a run of its own, stamped now."""
+        stamp = max(self._ports.now_ns(), self._command.stamp_ns + 1)
+        begins = phase is Phase.PLACE or not self._command.run_id
+        run_id = str(stamp) if begins else self._command.run_id
+        placed = phase in (Phase.PLACE, Phase.MEASURE)
+        self._command = Command(stamp, phase, PLAN_ID, 0, self.view if placed else None,
+                                self.plate if placed else None, 1, run_id)
+        self._publish(self._command)
+        return self._command
+
+    def _publish(self, command: Command) -> None:
+        self._ports.publish("command", from_model.command(command, self._settings.frame_id))
+
+    def _status(self, progress: ViewProgress, changes: dict[str, Any]) -> None:
+        fields = from_model.view_status(progress, PLAN_ID, self._ports.now_ns(),
+                                        self._settings.frame_id, run_id=self._command.run_id)
+        self._ports.publish("status", fields | changes)
+
+    def _wait(self, seconds: float) -> Steps[None]:
+        yield from self._until(lambda: False, seconds)
+
+    def _until(self, condition: Callable[[], Any], patience_s: float) -> Steps[bool]:
+        """Wait for a condition; return whether it holds."""
+        end = self._ports.now_s() + patience_s
+        while not condition():
+            if self._ports.now_s() >= end:
+                return False
+            yield
+        return True
+
+    def _longest_pause_s(self) -> float:
+        """Return after which time a detection under way has come: twice the longest between two."""
+        received = [at for at, _, _ in self._seen]
+        return max(WATCH_S, 2 * float(np.diff(received).max())) if len(received) > 1 else WATCH_S
+
+    def _collected(self) -> tuple[Measurements, ViewProgress]:
+        measurements, progress = self._collector.collect()
+        return measurements, progress[0]
+
+    def _tell(self, name: str, passed: bool, figure: str, remedy: str = "") -> None:
+        self.items.append(CheckItem(name, passed, figure, "" if passed else remedy))
+
+    def _judge_encoder(self) -> None:
+        settings, (stamps, ages) = self._settings, np.array(self._samples).T
+        joints = [settings.joint_x, settings.joint_y] + [settings.joint_theta] * self.view.angular
+        missing = [joint for joint in joints if joint not in self._joints]
+        self._tell("joints", not missing, f"heard {', '.join(sorted(self._joints))}",
+                   f"no joint {', '.join(missing)}: set joint_x, joint_y, joint_theta of "
+                   "measurement_collector")
+        steps = np.diff(np.sort(stamps)) * S_PER_NS
+        gap = float(steps.max()) if len(steps) else float("inf")
+        rate = len(steps) / float(steps.sum()) if steps.sum() > 0 else 0.0
+        jitter = float(np.ptp(np.quantile(steps, [0.025, 0.975]))) / 2 if len(steps) else 0.0
+        self._tell("encoder rate", gap <= settings.max_encoder_gap
+                   and rate >= settings.encoder_rate_min,
+                   f"{rate:.4g} Hz, intervals ± {jitter * MS_PER_S:.3g} ms, largest "
+                   f"{gap * MS_PER_S:.3g} ms", f"publish with gaps below max_encoder_gap "
+                   f"({settings.max_encoder_gap:g} s) and encoder_rate_min "
+                   f"({settings.encoder_rate_min:g} Hz), or set these")
+        age = float(np.median(ages)) * S_PER_NS
+        self._tell("encoder clock", abs(age) <= settings.clock_limit,
+                   f"stamps {age * MS_PER_S:.3g} ms old when they come",
+                   "stamp samples when they are taken, by a clock that is set as this machine's "
+                   "(NTP, PTP)")
+
+    def _judge_readings(self, measurements: Measurements, progress: ViewProgress) -> None:
+        rejected, used = measurements.all_rejected(), progress.readings.used
+        total = used + sum(rejected.values())
+        ages = [age for _, age, _ in self._seen] or [0]
+        age, earliest = (float(value) * S_PER_NS for value in (np.median(ages), min(ages)))
+        outside = rejected.get(Reason.OUTSIDE_VIEWS, 0) + rejected.get(Reason.FUTURE, 0)
+        self._tell("detection clock", not outside and age <= OLDEST_S
+                   and earliest >= -self._settings.clock_limit,
+                   f"stamps {age * MS_PER_S:.3g} ms old when they come, {outside} outside of the "
+                   "view", "stamp detections at the instant of exposure, by the clock of the "
+                   "joint states")
+        moving = rejected.get(Reason.MOVING, 0) + rejected.get(Reason.NO_ENCODER, 0)
+        self._tell("rest", not moving, f"{moving} of {total} exposures while the stage moved, or "
+                   "without samples around them", REMEDY[Reason.MOVING])
+        named = sum(has_id for *_, has_id in self._seen)
+        mistaken = {reason: rejected[reason] for reason in MISTAKEN if rejected.get(reason)}
+        self._tell("ids", not mistaken, f"{named} of {len(self._seen)} detections name their mark"
+                   + ("" if named else ": marks are told by where they lie")
+                   + "".join(f", {count} {reason}" for reason, count in mistaken.items()),
+                   "; ".join(REMEDY[reason] for reason in mistaken))
+        self._judge_loss(progress, rejected, total)
+        self._judge_wiring(measurements)
+
+    def _judge_loss(self, progress: ViewProgress, rejected: Mapping[str, int], total: int) -> None:
+        others = {reason: count for reason, count in rejected.items() if reason not in MISTAKEN}
+        grid, angular = expected_marks(self.plate, self.view)
+        self._tell("marks", progress.grid_done >= grid and progress.angular_done >= angular,
+                   f"{progress.grid_done} of {grid} marks and {progress.angular_done} of {angular} "
+                   f"lines {REPEATS} times; {progress.readings.used} of {total} detections used"
+                   + "".join(f", {count} {reason}" for reason, count in others.items()),
+                   "; ".join(REMEDY.get(Reason(reason), reason) for reason in others)
+                   or "see every mark of the view `repeats` times; publish reliable, depth 1000")
+        self._tell("check stops", progress.check_done >= progress.check_expected,
+                   f"{progress.check_done} of {progress.check_expected} marks from all four sides",
+                   "see check_marks marks again at +x, -x, +y and -y, check_offset off each "
+                   "(docs/cell.md)")
+
+    def _judge_wiring(self, measurements: Measurements) -> None:
+        [view] = measurements.views
+        faults = [worded(fault) for fault in wiring_faults(measurements)]
+        told = {"x": _slope(view.motion, 0), "y": _slope(view.motion, 1),
+                "theta": _slope(view.motion_theta, 0)}
+        figure = ", ".join(f"{axis} {slope:+.3f}" for axis, slope in told.items()
+                           if slope is not None)
+        shown = told["x"] is not None and told["y"] is not None
+        what = "; ".join(error.what for error in faults)
+        self._tell("signs", shown and not faults,
+                   what or f"offset against stage {figure or 'not known'} (-1 expected)",
+                   "; ".join(error.remedy for error in faults)
+                   or "let the stage stop off the marks: check stops")
+
+
+def _slope(motion: RepeatMotion | None, axis: int) -> float | None:
+    """Return how an offset follows its axis; None where that is mostly noise."""
+    if motion is None:
+        return None
+    n = len(motion.products) // 2
+    place, offset, both = (float(motion.products[at]) for at in (
+        (axis, axis), (n + axis, n + axis), (axis, n + axis)))
+    return both / place if both**2 > FOLLOWS * place * offset else None

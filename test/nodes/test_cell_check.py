@@ -1,0 +1,156 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`selfcal cell check` beside the simulated cell: all well, and each fault by its name."""
+
+from dataclasses import replace
+from functools import partial
+
+import pytest
+
+from selfcal_ros.collection.messages import Detection, EncoderSample, Phase
+from selfcal_ros.errors import ExitCode
+from selfcal_ros.messages import to_model
+from selfcal_ros.nodes import names
+from selfcal_ros.nodes.cell_checker import CellChecker
+from selfcal_ros.nodes.stage_simulator import StageSimulator
+from selfcal_ros.sessions import cell_check
+from test.support.sessions import small_plan
+
+SECOND = 10**9
+CHECKS = ["joints", "encoder rate", "encoder clock", "abort", "detection clock", "rest", "ids",
+          "marks", "check stops", "signs", "revisits", "old commands"]
+
+
+class FaultyCell(StageSimulator):
+    """The simulated cell with a fault of the integration."""
+
+    def __init__(self, fault, **kwargs):
+        self.fault, self.number = fault, 0
+        super().__init__(**kwargs)
+
+    def _on_command(self, message):
+        command = to_model.command(message)
+        if self.fault == "deaf":
+            return
+        if self.fault == "goes on after ABORT" and command.phase == Phase.ABORT:
+            return
+        if self.fault == "acts again":
+            self._acted.clear()
+        super()._on_command(message)
+
+    def _on_status(self, message):
+        if self.fault != "never revisits":
+            super()._on_status(message)
+
+    def _measure(self, command):
+        if self.fault == "no check stops":
+            command = replace(command, view=replace(
+                command.view, check_marks=0, check_offset_m=0.0))
+        super()._measure(command)
+
+    def _publish(self, event):
+        is_detection = isinstance(event, Detection)
+        self.number += is_detection
+        if self.fault == "loses" and is_detection and self.number % 7 == 0:
+            return
+        shift = {"detections ahead": 3 * SECOND * is_detection, "all behind": -5 * SECOND,
+                 "while it moves": 5_000_000 * is_detection}.get(self.fault, 0)
+        if self.fault == "other joints" and isinstance(event, EncoderSample):
+            event = replace(event, names=("a", "b", "c"))
+        if self.fault == "wrong ids" and is_detection and event.kind == 0:
+            event = replace(event, m=event.n, n=event.m)
+        super()._publish(replace(event, stamp_ns=event.stamp_ns + shift))
+
+
+@pytest.fixture
+def short(monkeypatch):
+    """Let the check wait for less: this cell exposes a hundred times a second."""
+    for name, seconds in (("LISTEN_S", 0.5), ("WATCH_S", 0.5), ("REVISIT_S", 3.0),
+                          ("STALL_S", 1.0)):
+        monkeypatch.setattr(cell_check, name, seconds)
+
+
+def checked(graph, fault="", checker=(), **cell):
+    """Return the node that has checked a cell, and its items by name."""
+    graph.node(partial(FaultyCell, fault), servo_sigma=1e-9, **cell)
+    node = graph.node(partial(CellChecker, small_plan(), settle_s=0.2, patience_s=5.0),
+                      **dict(checker))
+    graph.until(node.finished.done, "the end of the check")
+    return node, {item.name: item for item in node.session.items}
+
+
+def failed(items):
+    return {name for name, item in items.items() if not item.passed}
+
+
+@pytest.mark.usefixtures("short")
+@pytest.mark.parametrize("sense", ["microscope_moves", "plate_moves"])
+def test_a_good_cell_passes_every_check(graph, sense):
+    node, items = checked(graph, measurement_sense=sense, checker={"measurement_sense": sense})
+    assert failed(items) == set(), items
+    assert node.exit_code == ExitCode.DONE
+    assert list(items) == CHECKS
+    assert "9 of 9 marks and 8 of 8 lines 2 times" in items["marks"].figure
+    assert items["check stops"].figure == "5 of 5 marks from all four sides"
+    assert "x -1.00" in items["signs"].figure
+    assert "y -1.00" in items["signs"].figure
+    assert not any(item.remedy for item in items.values())
+
+
+@pytest.mark.usefixtures("short")
+def test_a_cell_without_ids_passes_and_that_is_said(graph):
+    _, items = checked(graph, with_ids=False)
+    assert failed(items) == set(), items
+    assert items["ids"].figure.endswith("name their mark: marks are told by where they lie")
+
+
+@pytest.mark.usefixtures("short")
+@pytest.mark.parametrize(("cell", "figure", "remedy"), [
+    ({"microscope_axes": "-x-y"}, "offsets of the other sign", "turn the sign"),
+    ({"microscope_axes": "-xy"}, "offsets of the other sign: offset_x", "turn the sign"),
+    ({"microscope_axes": "yx"}, "exchanged axes", "along the stage's axes"),
+    ({"microscope_pixels": 2.0}, "offsets in wrong units", "correct the pixel size"),
+    ({"microscope_pixels": 0.5}, "offsets in wrong units", "correct the pixel size")],
+    ids=lambda value: "-".join(map(str, value.values())) if isinstance(value, dict) else "")
+def test_offsets_that_do_not_follow_the_stage(graph, cell, figure, remedy):
+    node, items = checked(graph, **cell)
+    assert "signs" in failed(items)
+    assert items["signs"].figure.startswith(figure)
+    assert remedy in items["signs"].remedy
+    assert node.exit_code == ExitCode.NOT_QUALIFIED
+
+
+@pytest.mark.usefixtures("short")
+@pytest.mark.parametrize(("fault", "name", "figure"), [
+    ("deaf", "commands", "0 detections in 5 s after MEASURE"),
+    ("goes on after ABORT", "abort", "detections later than"),
+    ("acts again", "old commands", "detections after a MEASURE that was over"),
+    ("never revisits", "revisits", "not seen again in 3 s"),
+    ("no check stops", "check stops", "0 of 5 marks from all four sides"),
+    ("loses", "marks", "of 9 marks"),
+    ("detections ahead", "detection clock", "stamps -3"),
+    ("all behind", "encoder clock", "stamps 5"),
+    ("while it moves", "rest", "exposures while the stage moved"),
+    ("other joints", "joints", "heard a, b, c"),
+    ("wrong ids", "ids", "stage_not_at_mark")])
+def test_a_fault_of_the_cell_is_named(graph, fault, name, figure):
+    node, items = checked(graph, fault, exposure_period=0.04 if "ABORT" in fault else 0.01)
+    assert name in failed(items), items
+    assert figure in items[name].figure
+    assert items[name].remedy
+    assert node.exit_code == ExitCode.NOT_QUALIFIED
+
+
+@pytest.mark.usefixtures("short")
+def test_a_cell_that_says_nothing(graph):
+    node = graph.node(partial(CellChecker, small_plan(), settle_s=0.0, patience_s=0.5))
+    graph.until(node.finished.done, "the end of the check")
+    [item] = node.session.items
+    assert (item.name, item.passed) == ("encoder", False)
+
+
+def test_a_sequencer_beside_it_is_refused(graph):
+    node = graph.node(partial(CellChecker, small_plan(), settle_s=0.0, patience_s=60.0))
+    graph.hand.create_publisher(names.COMMAND.type, names.COMMAND.name, names.COMMAND.qos)
+    graph.until(node.finished.done, "the refusal")
+    assert node.exit_code == ExitCode.BAD_INPUT
+    assert node.session.items == []
