@@ -110,14 +110,14 @@ class Cell(Node):
             depth=10, reliability=ReliabilityPolicy.RELIABLE))
         self._status: ViewStatus | None = None
         self._work: Iterator[None] = iter(())
-        self._heard: tuple[int, int, int] | None = None
+        self._acted: set[tuple[int, int]] = set()  # stamps of commands
         self.create_timer(0.002, self._tick)
 
     def _on_command(self, view: ViewCommand) -> None:
-        command = (view.phase, view.header.stamp.sec, view.header.stamp.nanosec)
-        if command == self._heard:
+        stamp = (view.header.stamp.sec, view.header.stamp.nanosec)
+        if stamp in self._acted:
             return  # a sequencer that was restarted latches its last command anew
-        self._heard = command
+        self._acted.add(stamp)
         self._work = iter(())  # whatever was measured is given up
         if view.phase == ViewCommand.PLACE:
             self.machine.lay_plate()  # then confirm_view is called, here by auto_confirm

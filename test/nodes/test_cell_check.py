@@ -1,11 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """`selfcal cell check` beside the simulated cell: all well, and each fault by its name."""
 
+import json
 from dataclasses import replace
 from functools import partial
 
 import pytest
 
+from selfcal_ros.cli.main import main
+from selfcal_ros.cli.processes import process
 from selfcal_ros.collection.messages import Detection, EncoderSample, Phase
 from selfcal_ros.errors import ExitCode
 from selfcal_ros.messages import to_model
@@ -13,7 +16,7 @@ from selfcal_ros.nodes import names
 from selfcal_ros.nodes.cell_checker import CellChecker
 from selfcal_ros.nodes.stage_simulator import StageSimulator
 from selfcal_ros.sessions import cell_check
-from test.support.sessions import small_plan
+from test.support.sessions import plan_file, small_plan
 
 SECOND = 10**9
 CHECKS = ["joints", "encoder rate", "encoder clock", "abort", "detection clock", "rest", "ids",
@@ -154,3 +157,31 @@ def test_a_sequencer_beside_it_is_refused(graph):
     graph.until(node.finished.done, "the refusal")
     assert node.exit_code == ExitCode.BAD_INPUT
     assert node.session.items == []
+
+
+@pytest.mark.parametrize("words", [[], ["--json"]])
+def test_the_verb_checks_a_simulated_cell(ros_environment, tmp_path, capfd, words):
+    """The cell tells the offsets of doubled pixels."""
+    plan = plan_file(tmp_path, small_plan())
+    with process("selfcal_ros.nodes.stage_simulator", [
+            "--ros-args", "-r", "__ns:=/left", "-p", "microscope_pixels:=2.0"], ros_environment):
+        assert main(["cell", "check", "--plan", plan, "--namespace", "left", *words]) == 5
+    said = capfd.readouterr().out
+    if words:
+        found = json.loads(said)
+        assert found["passed"] is False
+        assert [item["name"] for item in found["items"]] == CHECKS
+    else:
+        assert "pass  old commands: 0 detections after" in said
+        assert "FAIL  signs: offsets in wrong units" in said
+        assert said.splitlines()[-1] == "1 of 12 checks failed"
+
+
+@pytest.mark.parametrize(("words", "said"), [
+    (["--settle", "-1"], "--settle: -1 s is no time to wait; give 0 or more"),
+    (["--patience", "nan"], "--patience: nan s is no time to wait; give 0 or more"),
+    (["--params", "none.yaml"], "none.yaml")])
+def test_bad_options_of_the_verb(tmp_path, capsys, words, said):
+    plan = plan_file(tmp_path, small_plan())
+    assert main(["cell", "check", "--plan", plan, *words]) == 2
+    assert said in capsys.readouterr().err
