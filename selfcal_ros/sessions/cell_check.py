@@ -263,7 +263,7 @@ class CellCheck:
                    f"({settings.encoder_rate_min:g} Hz), or set these")
         age = float(np.median(ages)) * S_PER_NS
         self._tell("encoder clock", abs(age) <= settings.clock_limit,
-                   f"stamps {age * MS_PER_S:.3g} ms old when they come",
+                   f"stamps {age * MS_PER_S:.4g} ms old when they come",
                    "stamp samples when they are taken, by a clock that is set as this machine's "
                    "(NTP, PTP)")
 
@@ -275,7 +275,7 @@ class CellCheck:
         outside = rejected.get(Reason.OUTSIDE_VIEWS, 0) + rejected.get(Reason.FUTURE, 0)
         self._tell("detection clock", not outside and age <= OLDEST_S
                    and earliest >= -self._settings.clock_limit,
-                   f"stamps {age * MS_PER_S:.3g} ms old when they come, {outside} outside of the "
+                   f"stamps {age * MS_PER_S:.4g} ms old when they come, {outside} outside of the "
                    "view", "stamp detections at the instant of exposure, by the clock of the "
                    "joint states")
         moving = rejected.get(Reason.MOVING, 0) + rejected.get(Reason.NO_ENCODER, 0)

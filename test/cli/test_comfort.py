@@ -32,8 +32,8 @@ def bag(tmp_path_factory):
 
 @pytest.mark.parametrize(("words", "message"), [
     ("solv x", "selfcal: VERB 'solv' is unknown; did you mean 'solve'?; see selfcal --help"),
-    ("", "selfcal: VERB is missing: one of batch, cal, call, diff, monitor, plan, plot, replay, "
-     "report, reproduce, simulate, solve, step-diagonal, table, up; see selfcal --help"),
+    ("", "selfcal: VERB is missing: one of batch, cal, call, cell, diff, monitor, plan, plot, "
+     "replay, report, reproduce, simulate, solve, step-diagonal, table, up; see selfcal --help"),
     ("plan", "selfcal plan: check|suggest is missing; see selfcal plan --help"),
     ("solve", "selfcal solve: BAG is missing; see selfcal solve --help"),
     ("solve b --methd joint", "selfcal solve: the option --methd is unknown; did you mean "
@@ -274,7 +274,7 @@ RUNS = {
     "cal straightness": "cal straightness R -o s.cal",
     "cal orthogonality": "cal orthogonality --measured 5um --over 200mm --travel 300mm",
     "step-diagonal": "step-diagonal DATA --method new -o d.json"}
-NEEDS_NODES = {"replay", "up", "monitor", "call"}
+NEEDS_NODES = {"replay", "up", "monitor", "call", "cell check"}
 
 
 def test_every_verb_prints_one_json_object(bag, tmp_path, capsys, monkeypatch):

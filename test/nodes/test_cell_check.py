@@ -130,7 +130,7 @@ def test_offsets_that_do_not_follow_the_stage(graph, cell, figure, remedy):
     ("never revisits", "revisits", "not seen again in 3 s"),
     ("no check stops", "check stops", "0 of 5 marks from all four sides"),
     ("loses", "marks", "of 9 marks"),
-    ("detections ahead", "detection clock", "stamps -3"),
+    ("detections ahead", "detection clock", "stamps -2"),
     ("all behind", "encoder clock", "stamps 5"),
     ("while it moves", "rest", "exposures while the stage moved"),
     ("other joints", "joints", "heard a, b, c"),
