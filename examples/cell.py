@@ -154,6 +154,8 @@ class Cell(Node):
                     view.view_index, view.run_id):
                 missing = list(zip(status.missing_m, status.missing_n, strict=True))
                 yield from self._visit(view, missing, list(status.missing_k))
+                if status.check_done < status.check_expected:
+                    yield from self._check_stops(view)
 
     def _visit(self, view: ViewCommand, marks: list[tuple[int, int]],
                lines: list[int]) -> Iterator[None]:

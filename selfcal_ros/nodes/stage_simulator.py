@@ -34,7 +34,7 @@ LEAD_NS = 20_000_000
 """Time between a MEASURE command, or its arrival if that is later, and the first encoder sample
 of its view: nothing is stamped at a time that has passed."""
 PATIENCE_NS = 1_000_000_000
-"""Time after the last exposure from which a status names what is missing for good."""
+"""Time after the last exposure from which a status holds all of them."""
 
 
 class StageSimulator(SelfcalNode[SimulatorSettings]):
@@ -77,13 +77,16 @@ class StageSimulator(SelfcalNode[SimulatorSettings]):
         """See the marks again that are missing once all have been seen."""
         command = self._command
         if (command is None or self._next is not None or message.complete
-                or (message.view_index, message.run_id) != (command.view_index, command.run_id)
-                or to_model.stamp_ns(message) < self._free_ns + PATIENCE_NS):
+                or message.view_index != command.view_index
+                or command.run_id not in ("", message.run_id)
+                or self.get_clock().now().nanoseconds < self._free_ns + PATIENCE_NS):
             return
         missing = {*zip(message.missing_m, message.missing_n, strict=False), *message.missing_k}
-        view = replace(command.placed(), repeats=1, check_marks=0, check_offset_m=0.0)
-        if missing:
+        view = replace(command.placed(), repeats=1)
+        if message.check_done < message.check_expected:  # check stops, and all marks once more
             self._measure(replace(command, view=view))
+        elif missing:
+            self._measure(replace(command, view=replace(view, check_marks=0, check_offset_m=0.0)))
             self._events = (event for event in self._events if not isinstance(event, Detection)
                             or not event.has_id  # nobody knows which it is: all of them, then
                             or (event.k if event.kind else (event.m, event.n)) in missing)

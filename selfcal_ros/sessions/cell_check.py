@@ -12,7 +12,7 @@ from selfcal_ros.collection.expected import ViewProgress, expected_marks
 from selfcal_ros.collection.messages import Command, EncoderSample, Phase
 from selfcal_ros.collection.reasons import REMEDY, Reason
 from selfcal_ros.collection.settings.nodes import CollectorSettings
-from selfcal_ros.estimation.verdict.wiring import wiring_faults, worded
+from selfcal_ros.estimation.checks.wiring import wiring_faults, worded
 from selfcal_ros.messages import from_model, to_model
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Measurements, RepeatMotion
@@ -119,11 +119,11 @@ class CellCheck:
         if aborted is None:
             return
         measured = yield from self._measured()
+        yield from self._wait(self._pause_s)
+        self._judge_readings(*self._collected())
         revisited = yield from self._revisited()
         self._send(Phase.DONE)
         yield from self._wait(self._pause_s)
-        measurements, progress = self._collected()
-        self._judge_readings(measurements, progress)
         self._tell("revisits", revisited, "a mark named as missing was "
                    + ("seen again" if revisited else f"not seen again in {REVISIT_S:g} s"),
                    "read missing_m, missing_n, missing_k of selfcal/view_status and visit these "
@@ -172,7 +172,6 @@ class CellCheck:
         progress = self._collected()[1]
         if not len(progress.readings.m):
             return False
-        yield from self._wait(self._pause_s)
         before, end = len(self._seen), self._ports.now_s() + REVISIT_S + self._pause_s
         mark = {"missing_m": [int(progress.readings.m[0])],
                 "missing_n": [int(progress.readings.n[0])], "complete": False,

@@ -65,3 +65,8 @@ def read_result(path: str) -> CalibrationResult:
     if not path:
         raise InputError("path", "is empty", "name a file")
     return result_from_dict(read_json(path, LARGEST_FILE), path)
+
+
+def is_qualified(result: CalibrationResult) -> bool:
+    """Return whether the stage error is identified and the readings do not contradict the model."""
+    return result.observability.identifiable and result.verdict.qualified

@@ -6,12 +6,13 @@ from dataclasses import replace
 
 import pytest
 
-from selfcal_ros.collection.messages import Command, Phase
+from selfcal_ros.collection.messages import Command, Detection, Phase
 from selfcal_ros.messages import from_model
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.view import View
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes.filling import fill
+from selfcal_ros.nodes.measurement_collector import MeasurementCollector
 from selfcal_ros.nodes.stage_simulator import LEAD_NS, StageSimulator
 
 PLATE = Artifact(3, 0.01, 4)
@@ -22,9 +23,9 @@ def now_ns(graph) -> int:
     return graph.hand.get_clock().now().nanoseconds
 
 
-def measure(graph, view: View, *, late_ns: int = 0) -> int:
+def measure(graph, view: View, *, late_ns: int = 0, readers: int = 1) -> int:
     """Ask for a view with a command stamped `late_ns` ago, and return when it was sent, ns."""
-    publisher = graph.publisher(names.COMMAND)
+    publisher = graph.publisher(names.COMMAND, readers=readers)
     sent = now_ns(graph)
     command = Command(sent - late_ns, Phase.MEASURE, "p", 0, view, PLATE, 1)
     publisher.publish(fill(names.COMMAND.type(), from_model.command(command, "stage")))
@@ -80,3 +81,42 @@ def test_the_truth_that_its_parameters_ask_for_is_recorded(graph, tmp_path):
     assert abs(sum(truth["g_theta"])) < 1e-18
     assert (truth["cell"]["stop_sigma_m"], truth["cell"]["sense"]) == (5e-5, "plate_moves")
     assert truth["cell"]["exposure_period_s"] == 0.005
+
+
+CHECKED = View("a", angular=False, repeats=2, check_marks=5, check_offset_m=2e-5)
+
+
+@pytest.mark.parametrize("lost", [3, 12, 29, 30])
+def test_what_is_missing_is_seen_again(graph, lost):
+    """Lost are repeats of marks or check stops (10 to 29), and a collector says so."""
+
+    class Forgetful(StageSimulator):
+        number = 0
+
+        def _publish(self, event):
+            self.number += isinstance(event, Detection)
+            if not isinstance(event, Detection) or self.number != lost:
+                super()._publish(event)
+
+    statuses, seen = graph.listen(names.STATUS), graph.listen(names.DETECTIONS)
+    graph.node(MeasurementCollector, status_period=0.05)
+    graph.node(Forgetful, **QUICK)
+    measure(graph, CHECKED, readers=2)
+    graph.until(lambda: statuses and statuses[-1].complete, "all marks")
+    assert (statuses[-1].grid_done, statuses[-1].check_done) == (9, 5)
+    assert len(seen) >= 2 * 9 + 20
+
+
+def test_a_command_is_acted_on_once(graph):
+    seen = graph.listen(names.DETECTIONS)
+    graph.node(StageSimulator, **QUICK)
+    publisher = graph.publisher(names.COMMAND)
+    command = Command(now_ns(graph), Phase.MEASURE, "p", 0, View("a", angular=False), PLATE, 1)
+    message = fill(names.COMMAND.type(), from_model.command(command, "stage"))
+    publisher.publish(message)
+    graph.until(lambda: len(seen) == 9, "9 marks")
+    after = replace(command, stamp_ns=command.stamp_ns + 1, view=View("b", grid=False))
+    publisher.publish(message)
+    publisher.publish(fill(names.COMMAND.type(), from_model.command(after, "stage")))
+    graph.until(lambda: len(seen) == 13, "4 lines")
+    assert [d.kind for d in seen] == [0] * 9 + [1] * 4
