@@ -32,6 +32,12 @@ PLAN = {
     "visit_order": "order of the marks in views that have none of their own "
                    "(docs/identifiability.md); default: as the cell likes",
     "model_terms": "list of TERM or TERM:SIZE that are estimated with the map; default: none",
+    "microscope": "how well the microscope is known, standard uncertainties; default: as the "
+                  "solver's parameters of these names",
+    "microscope.scale_u": "of its scale, m/m; default 0.01",
+    "microscope.rotation_u": "of its turn against the axes, rad; default 0.01",
+    "microscope.shear_u": "of half the difference of its scales, and of half its error of "
+                          "squareness, m/m; default 0.002",
     "check_stops": "marks of each grid view that are seen four times more, the stage deliberately "
                    "off them (docs/cell.md); default: none",
     "check_stops.marks": "how many marks",
@@ -52,11 +58,14 @@ RESULT = {
     "schema": "`selfcal.result/1`", "plan_id": "plan that was measured",
     "method": "`joint` or `law`", "measurement_sense": "`microscope_moves` or `plate_moves`",
     "artifact": "the plate, as in PLAN.yaml", "run_id": "stamp of the run's first command, ns",
-    "verdict": "`qualified`, `sentence`, `reasons`, and `causes` (each name, text, size, u, unit, "
-               "p), the most likely first",
+    "verdict": "`grade` (good, enlarged, not_qualified), `qualified` (false for not_qualified), "
+               "`sentence`, `reasons`, `enlarged_by` (each name, u_rms, u_max, unit), and "
+               "`causes`, the most likely first (each name, text, view, axis, mark, size, u, unit, "
+               "p, effect_rms, effect_max, told, remedies)",
     "model": "`misalignment` (rigid, linear) and `terms`: name, size (null = free), estimates "
              "(view, component, value, u, unit), "
-             "size_used (where the readings contradict the size)",
+             "size_used (where the readings contradict the size), source (declared, default, "
+             "readings)",
     "reference": "kind, relative_error, u_relative, certificate of a known length; null without",
     "provenance": "created (ISO 8601, UTC), duration_s, version, first_exposure, last_exposure, "
                   "visit_order of each view",
@@ -75,6 +84,9 @@ RESULT = {
              "dof_*; k_*; p_* of the F-test",
     "rejected": "reason -> number of detections", "warnings": "a list of sentences",
     "input": "file and sha256 of the bag", "solver": "how the equations were solved",
+    "covariance_terms": "terms and factors (r, 2, N, N): what an exact comparison of results "
+                        "needs; up to 31 × 31 sites, and not with `--model none`",
+    "angular_terms": "standard uncertainty of the angular map that each term makes, rad",
     "residuals": "views: view, dx, dy (m, [i][j] by mark, stage axes), dtheta (rad), course "
                  "{time_s, dx, dy, count} over the view's time"}
 SOMETIMES = {
@@ -82,8 +94,7 @@ SOMETIMES = {
     "outliers": "`--robust`: rule, and what was removed", "slips": "`--robust`: slips of the plate",
     "noisy_views": "`--robust`: views noisier than the others",
     "validation": "`--validate`: what was held out, and how well it was predicted",
-    "budget": "`--budget`: components of the uncertainty, m and rad",
-    "covariance_terms": "what an exact comparison of results with terms needs"}
+    "budget": "`--budget`: components of the uncertainty, m and rad"}
 
 
 def table(head: tuple[str, ...], rows: Iterator[tuple[str, ...]] | list) -> list[str]:
@@ -105,7 +116,8 @@ def plan_keys() -> list[str]:
         "grid_size": 3, "grid_pitch": 0.01, "angular_count": 0}, "views": [{"name": "a"}]}
     strange = {"?": 1}
     return [*known_keys(whole | strange),
-            *(f"check_stops.{key}" for key in known_keys(whole | {"check_stops": strange})),
+            *(f"{part}.{key}" for part in ("microscope", "check_stops")
+              for key in known_keys(whole | {part: strange})),
             *(f"artifact.{key}" for key in known_keys(whole | {
                 "artifact": whole["artifact"] | strange})),
             *(f"views[].{key}" for key in known_keys(whole | {"views": [{"name": "a"} | strange]}))]

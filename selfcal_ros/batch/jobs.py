@@ -108,6 +108,7 @@ def _with_result(result: CalibrationResult) -> Record:
     good, artifact = result.verdict.qualified, result.artifact
     return {
         "exit_code": int(ExitCode.DONE if good else ExitCode.NOT_QUALIFIED), "qualified": good,
+        "grade": str(result.verdict.grade),
         "message": result.verdict.sentence, "plan_id": result.plan_id, "run_id": result.run_id,
         "plate": [*artifact.shape, artifact.grid_pitch_m, artifact.angular_count],
         "first_exposure": result.provenance.extra.get("first_exposure"),

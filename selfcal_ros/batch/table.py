@@ -16,7 +16,7 @@ from selfcal_ros.batch.records import SCHEMA, Record
 
 S_PER_DAY = 86400.0
 BASE = ("bag", "first_exposure", "exit_code", "qualified", "message", "plan_id", "run_id",
-        "sha256", "result")
+        "sha256", "result", "grade")
 
 
 @dataclass(frozen=True)

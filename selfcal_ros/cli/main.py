@@ -42,7 +42,7 @@ def build_parser(only: str | None = None) -> argparse.ArgumentParser:
     parser = Parser(
         prog="selfcal", description="Self-calibration of XY-theta stages.",
         epilog="exit codes: 0 done, 2 bad usage or input, 3 the measured plan does not identify "
-               "the stage, 4 no usable data, 5 not qualified, 1 our own fault")
+               "the stage, 4 no usable data, 5 not qualified, 1 internal error")
     parser.add_argument("--version", action="version", version=f"selfcal {__version__}")
     group = parser.add_subparsers(dest="verb", metavar="VERB", required=True)
     for name, module in (verbs(only) or verbs()).items():

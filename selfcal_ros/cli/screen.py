@@ -198,8 +198,11 @@ def _verdict(picture: dict[str, Any]) -> list[Text]:
     summary = picture["summary"]
     if summary is None:
         return [Text("no view has been solved yet")]
-    word, colour = ("qualified", "bold green") if summary["qualified"] else (
-        "not qualified" if summary["identifiable"] else "not identified yet", "bold yellow")
+    word, colour = ("not qualified" if summary["identifiable"] else "not identified yet",
+                    "bold yellow")
+    if summary["qualified"]:
+        word, colour = ("good within an enlarged U", "bold yellow") if summary["enlarged"] else (
+            "good", "bold green")
     done, planned = summary["views"]
     run, now = summary["run_id"], (picture["command"] or {}).get("run_id", "")
     earlier = "; an earlier run" if run and now and run != now else ""

@@ -52,9 +52,13 @@ def add_options(parser: argparse.ArgumentParser) -> None:
                         help="what states the reference: number and issuer of its certificate")
     parser.add_argument("--model", metavar="TERM[:SIZE],...", action="append",
                         help="terms estimated with the map: microscope, drift, plate_scale, "
-                        "plate_shape, approach; SIZE is a standard deviation known from elsewhere "
-                        "(SI), e.g. drift,plate_shape:30e-9; default: those of the plan; none: no "
-                        "terms")
+                        "plate_shape, approach, plate_strain, line_eccentricity; SIZE is a "
+                        "standard deviation known from elsewhere (SI; 0: known to be none), e.g. "
+                        "drift,plate_shape:30e-9; default: those of the plan; none: no terms, not "
+                        "even those assumed by default (docs/estimation.md)")
+    parser.add_argument("--microscope", metavar="SCALE_U[:ROTATION_U[:SHEAR_U]]",
+                        help="how well the microscope is known: standard uncertainties of its "
+                        "scale, turn (rad) and shear (default: 0.01:0.01:0.002)")
     parser.add_argument("--drift-degree", type=int, metavar="D",
                         help="degree of a drift's polynomial (default: 3)")
     parser.add_argument("--namespace", metavar="NAME", help="namespace of the cell's topics, "
@@ -83,7 +87,7 @@ def parameters(args: argparse.Namespace) -> "tuple[CollectorSettings, SolverSett
     solver = node_settings(
         args.params, SolverSettings, method=args.method, theta_datum=args.theta_datum,
         misalignment_model=args.misalignment, uncertainty=args.uncertainty,
-        model_terms=args.model, drift_degree=args.drift_degree,
+        model_terms=_model(args), drift_degree=args.drift_degree,
         reference_certificate=args.certificate, **_reference(args.reference))
     if args.certificate is not None and solver.reference_kind == "none":
         raise InputError("--certificate", "it belongs to a reference length, and none is given",
@@ -92,6 +96,18 @@ def parameters(args: argparse.Namespace) -> "tuple[CollectorSettings, SolverSett
         raise InputError("--misalignment", "Hu's law is linear, not rigid",
                          "leave it out, or use --method joint")
     return collector, solver
+
+
+def _model(args: argparse.Namespace) -> list[str] | None:
+    """Return the terms of --model and --microscope; None where neither is given."""
+    if args.microscope is None:
+        return args.model
+    sizes = args.microscope.split(":")
+    declared = ":".join(["microscope", *sizes, *("0.01", "0.01", "0.002")[len(sizes):]])
+    if len(sizes) > 3 or any("microscope" in text or text == "none" for text in args.model or ()):
+        raise InputError("--microscope", f"'{args.microscope}' does not fit",
+                         "give up to three sizes, and no microscope or none in --model")
+    return [*(args.model or ()), declared]
 
 
 def _reference(text: str | None) -> dict[str, Any]:

@@ -138,7 +138,8 @@ def check_command(command: Command) -> None:
     where = f"view command {command.view_index}"
     if not 0 <= command.view_index <= MAX_VIEWS or not 0 <= command.views_planned <= MAX_VIEWS:
         raise InputError(where, f"a plan has at most {MAX_VIEWS} views", "correct the view_index")
-    if (begun_ns(command.run_id) or 0) > command.stamp_ns:
+    begun = begun_ns(command.run_id)
+    if begun is not None and begun > command.stamp_ns:
         raise InputError(where, f"its run {command.run_id} begins after its own stamp",
                          "let run_id be the stamp of the run's first command, ns")
     if command.view is None or command.artifact is None:

@@ -30,6 +30,16 @@ class NoiseUnknown(Finding):
 
 
 @dataclass(frozen=True)
+class SignNotShown(Finding):
+    """Nothing in the readings shows the sign of the offsets, and nobody declared the microscope."""
+
+
+@dataclass(frozen=True)
+class NotConverged(Finding):
+    """The estimate converged only without what is assumed of the measurement."""
+
+
+@dataclass(frozen=True)
 class FiniteRotation(Finding):
     """A linear model was used, and finite rotations leave much less: `residuals_m`."""
 
@@ -78,6 +88,22 @@ class PlateShapeCause(Finding):
     view: str
     against: str
     whole: bool
+
+
+@dataclass(frozen=True)
+class PlateStrainCause(Finding):
+    """In which view the plate is strained against which: its scale, stretch (x - y) or shear."""
+
+    view: str
+    against: str
+    part: str
+
+
+@dataclass(frozen=True)
+class LineEccentricityCause(Finding):
+    """The view in which the circle of lines lies off the axis of rotation."""
+
+    view: str
 
 
 @dataclass(frozen=True)
@@ -192,6 +218,14 @@ class Unchecked(Finding):
 
     sites: tuple[tuple[int, ...], ...]
     lines: tuple[tuple[int, ...], ...] = ()
+
+
+@dataclass(frozen=True)
+class Magnification(Finding):
+    """Plate and encoders differ in scale, m/m, by more than they can between them; with u."""
+
+    value: float
+    u: float
 
 
 @dataclass(frozen=True)

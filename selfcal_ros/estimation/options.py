@@ -6,7 +6,7 @@ from enum import StrEnum
 
 from selfcal_ros.errors import InputError, known_are
 from selfcal_ros.model.error_map import ThetaDatum
-from selfcal_ros.model.terms import DRIFT_DEGREE, ModelTerm
+from selfcal_ros.model.terms import DEFAULT_TERMS, DRIFT_DEGREE, VISIT_TERMS, ModelTerm
 
 METHODS = ("joint", "law")
 MISALIGNMENT_MODELS = ("linear", "rigid")
@@ -85,6 +85,11 @@ class Options:
         in fields of up to 41 x 41 sites, and where a test fails.
     terms_from : str
         Who asks for the terms, for the provenance: ``options``, ``plan`` or empty.
+    assumed : tuple of ModelTerm
+        Terms with sizes that hold where `terms` does not name them: lines of type B of the budget
+        (GUM 4.3). Empty: all of them are known to be none.
+    magnification_limit : float
+        Difference of the scales of plate and encoders, m/m, beyond which there is a warning.
 
     Raises
     ------
@@ -101,6 +106,8 @@ class Options:
     drift_degree: int = DRIFT_DEGREE
     causes: bool | None = None
     terms_from: str = ""
+    assumed: tuple[ModelTerm, ...] = DEFAULT_TERMS
+    magnification_limit: float = 1e-4
 
     def __post_init__(self) -> None:
         """Fill in the model of the method; refuse unknown names."""
@@ -116,3 +123,18 @@ class Options:
         except ValueError as error:
             raise InputError("datum_theta", f"'{self.datum_theta}' is unknown",
                              known_are(str(self.datum_theta), ThetaDatum)) from error
+
+    def model_terms(self, *, visits: bool, assumed: bool = True) -> tuple[ModelTerm, ...]:
+        """Return all terms of the model, those that are asked for before those that are assumed.
+
+        Parameters
+        ----------
+        visits : bool
+            Whether the visits of every view are known, which a microscope needs.
+        assumed : bool
+            Whether those that nobody asks for count as well.
+        """
+        named = {term.name for term in self.terms}
+        more = [term for term in self.assumed if assumed and term.name not in named
+                and (visits or term.name not in VISIT_TERMS)]
+        return tuple(term for term in (*self.terms, *more) if term.size > 0)

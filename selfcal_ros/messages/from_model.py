@@ -13,6 +13,7 @@ from selfcal_ros.collection.timeline import Timeline
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import GridVisits, Measurements, RepeatMotion
 from selfcal_ros.model.result import CalibrationResult
+from selfcal_ros.model.verdict import Grade
 from selfcal_ros.model.view import View
 from selfcal_ros.units import NS_PER_S
 
@@ -137,7 +138,15 @@ def error_map(result: CalibrationResult, stamp_ns: int, frame_id: str) -> Fields
         "scale_difference": emap.scale_difference, "sigma_xy": result.noise.sigma_xy,
         "sigma_theta": result.noise.sigma_theta,
         "identifiable": result.observability.identifiable,
-        "qualified": result.verdict.qualified, "run_id": result.run_id}
+        "qualified": result.verdict.qualified, "run_id": result.run_id,
+        "grade": grade_number(result)}
+
+
+def grade_number(result: CalibrationResult) -> int:
+    """Return the grade of a result as ErrorMap and CalibrationSummary have it."""
+    if not result.observability.identifiable:
+        return 0
+    return {Grade.NOT_QUALIFIED: 0, Grade.ENLARGED: 1, Grade.GOOD: 2}[result.verdict.grade]
 
 
 def session_stamp_ns(timeline: Timeline, progress: ViewProgress) -> int:

@@ -14,12 +14,13 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ErrorMap, ThetaDatum
 from selfcal_ros.model.readings import Measurements
-from selfcal_ros.model.verdict import Finding, ModelResult, Provenance, Verdict
+from selfcal_ros.model.verdict import Finding, Grade, ModelResult, Provenance, Verdict
 from selfcal_ros.model.verdict_json import (
     model_from_dict,
     model_to_dict,
     provenance_from_dict,
     provenance_to_dict,
+    reference_from_dict,
     verdict_from_dict,
     verdict_to_dict,
 )
@@ -27,8 +28,7 @@ from selfcal_ros.model.verdict_json import (
 SCHEMA = "selfcal.result/1"
 LARGEST = 1e3
 """Errors and uncertainties beyond it, in m or rad, are damage: sums of their squares overflow."""
-REFERENCES = ("artifact", "stage_x", "stage_y")
-"""Kinds of a reference length."""
+NOT_IDENTIFIED = "Not qualified: the readings do not identify the stage"
 
 
 @dataclass(frozen=True)
@@ -56,11 +56,17 @@ class ViewResult:
 
 @dataclass(frozen=True, eq=False)
 class ArtifactMap:
-    """Plate error A = true - nominal, plate frame: ax, ay (nx, ny) in m, a_theta (K,) in rad."""
+    """Plate error A = true - nominal, plate frame: ax, ay (nx, ny) in m, a_theta (K,) in rad.
+
+    `magnification` is the least-squares scale of A, with its standard uncertainty: the plate
+    against the encoders, whose own scale the datum takes out of the map.
+    """
 
     ax: np.ndarray
     ay: np.ndarray
     a_theta: np.ndarray
+    magnification: float = math.nan
+    u_magnification: float = math.nan
 
 
 @dataclass(frozen=True)
@@ -157,7 +163,7 @@ class CalibrationResult:
     method: str = "joint"
     sense: str = "microscope_moves"
     extra: dict[str, Any] = field(default_factory=dict)
-    verdict: Verdict = Verdict(True)
+    verdict: Verdict = Verdict(Grade.GOOD)
     model: ModelResult = ModelResult()
     reference: dict[str, Any] | None = None
     provenance: Provenance = Provenance()
@@ -174,20 +180,6 @@ class CalibrationResult:
         """Whether the uncertainty of the XY map was computed."""
         emap = self.error_map
         return bool((np.isfinite(emap.u_gx) & np.isfinite(emap.u_gy)).any())
-
-
-def _reference(raw: Any) -> dict[str, Any] | None:
-    """Return the reference length of a result as it is; ValueError if it is none."""
-    if raw is None:
-        return None
-    told = _of(dict, raw)
-    if told["kind"] not in REFERENCES:
-        raise ValueError(f"the reference {told['kind']!r} is unknown")
-    error, u = _number(told["relative_error"]), _number(told["u_relative"])
-    if not (abs(error) < 0.1 and 0 <= u < 0.1):
-        raise ValueError(f"reference: {error!r} with u {u!r} is not a relative error")
-    _of(str, told.get("certificate") or "")
-    return told
 
 
 def _budget(rows: Any) -> None:
@@ -218,8 +210,8 @@ def created_now(result: CalibrationResult) -> CalibrationResult:
     return replace(result, provenance=replace(result.provenance, created=now))
 
 
-def unidentified_result(measurements: Measurements,
-                        observability: Observability) -> CalibrationResult:
+def unidentified_result(measurements: Measurements, observability: Observability
+                        ) -> CalibrationResult:
     """Return the result of a plan that does not identify the stage: all maps unknown."""
     artifact = measurements.artifact
     grid, circle = np.full(artifact.shape, np.nan), np.full(artifact.angular_count, np.nan)
@@ -231,8 +223,7 @@ def unidentified_result(measurements: Measurements,
         ErrorMap(artifact, grid, grid, grid, grid, circle, circle, nan, nan),
         ArtifactMap(grid, grid, circle), views, observability, Noise(nan, nan),
         measurements.all_rejected(), sense=str(measurements.sense),
-        verdict=Verdict(False, "Not qualified: the readings do not identify the stage"),
-        run_id=measurements.run_id)
+        verdict=Verdict(Grade.NOT_QUALIFIED, NOT_IDENTIFIED), run_id=measurements.run_id)
 
 
 def result_to_dict(result: CalibrationResult) -> dict[str, Any]:
@@ -253,7 +244,9 @@ def result_to_dict(result: CalibrationResult) -> dict[str, Any]:
         "measurement_sense": result.sense,
         "artifact": {"grid_size": artifact.grid_size, "grid_pitch": artifact.grid_pitch_m,
                      "angular_count": artifact.angular_count,
-                     **({"grid_size_y": artifact.grid_size_y} if artifact.grid_size_y else {})},
+                     **({"grid_size_y": artifact.grid_size_y} if artifact.grid_size_y else {}),
+                     **{key: plain(getattr(amap, key))
+                        for key in ("magnification", "u_magnification")}},
         "run_id": result.run_id,
         "verdict": plain(verdict_to_dict(result.verdict)),
         "model": plain(model_to_dict(result.model)),
@@ -348,7 +341,8 @@ def _parse(data: dict) -> CalibrationResult:
         _of(str, data["plan_id"]), error_map,
         ArtifactMap(_array(amap["ax"], artifact.shape, "ax"),
                     _array(amap["ay"], artifact.shape, "ay"),
-                    _array(amap["a_theta"], (artifact.angular_count,), "a_theta")),
+                    _array(amap["a_theta"], (artifact.angular_count,), "a_theta"),
+                    _number(raw.get("magnification")), _number(raw.get("u_magnification"))),
         tuple(map(_view, data["views"])), Observability(**seen), Noise(**noise),
         {key: _of(int, value) for key, value in data["rejected"].items()},
         {key: _of(str, value) for key, value in data["input"].items()},
@@ -357,7 +351,7 @@ def _parse(data: dict) -> CalibrationResult:
         _of(str, data.get("measurement_sense", "microscope_moves")),
         {key: value for key, value in data.items() if key not in _KNOWN},
         verdict_from_dict(data.get("verdict"), identifiable=seen["identifiable"]),
-        model_from_dict(data.get("model")), _reference(data.get("reference")),
+        model_from_dict(data.get("model")), reference_from_dict(data.get("reference")),
         provenance_from_dict(data.get("provenance")), _of(str, data.get("run_id", "")))
 
 

@@ -26,6 +26,9 @@ class TermName(StrEnum):
     PLATE_SCALE: the plate is larger by a factor 1 + b in a view (temperature).
     PLATE_SHAPE: the plate is bent in a view, quadratic in position (clamping, gravity).
     APPROACH: the indicated position depends on the direction from which an axis arrived.
+    PLATE_STRAIN: the plate is strained linearly in a view (clamping): scale, stretch and shear.
+    LINE_ECCENTRICITY: the circle of lines lies off the axis of rotation by its own amount in each
+    view, as a fraction of its radius.
     """
 
     MICROSCOPE = "microscope"
@@ -33,6 +36,8 @@ class TermName(StrEnum):
     PLATE_SCALE = "plate_scale"
     PLATE_SHAPE = "plate_shape"
     APPROACH = "approach"
+    PLATE_STRAIN = "plate_strain"
+    LINE_ECCENTRICITY = "line_eccentricity"
 
 
 VISIT_TERMS = frozenset({TermName.MICROSCOPE, TermName.DRIFT, TermName.APPROACH})
@@ -40,9 +45,13 @@ VISIT_TERMS = frozenset({TermName.MICROSCOPE, TermName.DRIFT, TermName.APPROACH}
 
 UNITS: dict[str, str] = {
     TermName.MICROSCOPE: "m/m", TermName.DRIFT: "m", TermName.PLATE_SCALE: "m/m",
-    TermName.PLATE_SHAPE: "m", TermName.APPROACH: "m"}
+    TermName.PLATE_SHAPE: "m", TermName.APPROACH: "m", TermName.PLATE_STRAIN: "m/m",
+    TermName.LINE_ECCENTRICITY: "rad"}
 """Unit of each term's size: a standard deviation known from elsewhere. For a drift it is that at
 the edge of the view's time, for a shape at the middle of the plate's edge."""
+
+OF_PLATE = (TermName.PLATE_SCALE, TermName.PLATE_SHAPE, TermName.PLATE_STRAIN)
+"""Terms of the plate itself, which differ from view to view and turn with it."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +64,10 @@ class ModelTerm:
         Which.
     size : float
         Standard deviation of its coefficients as known from elsewhere, in `UNITS`; infinite if
-        the readings alone are to tell them.
+        the readings alone are to determine them, 0 if they are known to be none.
+    parts : tuple of float
+        Of a microscope: standard deviations of scale, turn and shear, where they differ;
+        `size` is then the largest.
 
     Raises
     ------
@@ -65,6 +77,7 @@ class ModelTerm:
 
     name: TermName
     size: float = math.inf
+    parts: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         """Take a name that is given as plain text, too."""
@@ -72,19 +85,58 @@ class ModelTerm:
             raise InputError("ModelTerm", f"the term '{self.name}' is unknown",
                              known_are(self.name, TermName))
         object.__setattr__(self, "name", TermName(self.name))
+        if self.parts:
+            object.__setattr__(self, "size", max(self.parts))
 
     @property
     def free(self) -> bool:
-        """Whether the readings alone are to tell it."""
+        """Whether the readings alone are to determine it."""
         return math.isinf(self.size)
+
+    def size_of(self, component: str) -> float:
+        """Return the size of one coefficient; those of a microscope may differ."""
+        if not self.parts:
+            return self.size
+        return self.parts[{"scale": 0, "turn": 1}.get(component, 2)]
+
+    def scaled(self, factor: float) -> "ModelTerm":
+        """Return the term with all its sizes multiplied by `factor`."""
+        return ModelTerm(self.name, self.size * factor, tuple(factor * p for p in self.parts))
 
     def __str__(self) -> str:
         """Return the term as it is written in an option."""
-        return str(self.name) if self.free else f"{self.name}:{self.size:g}"
+        sizes = self.parts or (() if self.free else (self.size,))
+        return ":".join([str(self.name), *(f"{size:g}" for size in sizes)])
+
+
+def microscope_term(scale_u: float = 0.01, rotation_u: float = 0.01,
+                    shear_u: float = 0.002) -> ModelTerm:
+    """Return the microscope as it is known before anything is read.
+
+    Parameters
+    ----------
+    scale_u, rotation_u, shear_u : float
+        Standard uncertainty of its scale (m/m), of its turn against the axes (rad), and of the
+        difference of its scales and its squareness (half of either).
+    """
+    return ModelTerm(TermName.MICROSCOPE, parts=(scale_u, rotation_u, shear_u))
+
+
+DEFAULT_TERMS = (
+    microscope_term(),
+    ModelTerm(TermName.PLATE_STRAIN, 7e-8),
+    ModelTerm(TermName.LINE_ECCENTRICITY, 2e-6))
+"""What is assumed of every measurement where nothing else is declared (GUM type B): nobody knows
+pixels better than 1 % and a camera's turn better than 10 mrad unless he says so; a plate of fused
+silica is strained by clamping by 5e-8 and by 0.1 K as much again; the circle of lines is laid to
+0.1 um at a radius of 50 mm."""
 
 
 def parse_terms(texts: Iterable[str], where: str) -> tuple[ModelTerm, ...]:
     """Return the terms written as ``TERM`` or ``TERM:SIZE``, in the order of `TermName`.
+
+    A microscope may have three sizes, ``microscope:SCALE:TURN:SHEAR``. A size of 0 says that the
+    term is known to be none.
 
     Parameters
     ----------
@@ -105,11 +157,21 @@ def parse_terms(texts: Iterable[str], where: str) -> tuple[ModelTerm, ...]:
         name, colon, size = text.partition(":")
         if name not in list(TermName):
             raise InputError(where, f"the term '{name}' is unknown", known_are(name, TermName))
-        term = ModelTerm(TermName(name), _size(size, f"{where}: {name}") if colon else math.inf)
+        term = _term(TermName(name), size.split(":") if colon else [], f"{where}: {name}")
         if term.name in found:
             raise InputError(where, f"the term '{name}' is given twice", "remove one")
         found[term.name] = term
     return tuple(found[name] for name in TermName if name in found)
+
+
+def _term(name: TermName, texts: list[str], where: str) -> ModelTerm:
+    sizes = [_size(text, where) for text in texts]
+    if len(sizes) < 2:
+        return ModelTerm(name, sizes[0] if sizes else math.inf)
+    if name is not TermName.MICROSCOPE or len(sizes) != 3:
+        raise InputError(where, f"{len(sizes)} sizes are given",
+                         "give one, or those of microscope:SCALE:TURN:SHEAR")
+    return microscope_term(*sizes)
 
 
 def _size(text: str, where: str) -> float:
@@ -117,10 +179,11 @@ def _size(text: str, where: str) -> float:
         size = float(text)
     except ValueError:
         size = math.nan
-    if not 0 < size < math.inf:
+    if not 0 <= size < math.inf:
         raise InputError(where, f"the size '{text}' is not a positive number",
-                         "give a standard deviation in SI units, as in plate_shape:30e-9")
-    if not SMALLEST <= size <= LARGEST:
+                         "give a standard deviation in SI units, as in plate_shape:30e-9, or 0 "
+                         "for a term that is known to be none")
+    if size and not SMALLEST <= size <= LARGEST:
         raise InputError(where, f"the size {text} is outside {SMALLEST:g} to {LARGEST:g}",
                          "give a standard deviation in SI units, as in plate_shape:30e-9")
     return size

@@ -3,7 +3,8 @@
 
 import math
 from dataclasses import dataclass, field
-from typing import Any
+from enum import StrEnum
+from typing import Any, Literal
 
 
 @dataclass(frozen=True)
@@ -34,6 +35,17 @@ class Cause(Finding):
         Probability that readings without it show as much.
     what : Finding, optional
         Where and of what kind; None of a cause that has its text.
+    view, axis : str
+        Where it is: name of the view, ``x`` or ``y``; empty where that says nothing.
+    mark : tuple of int
+        Mark (m, n) or line (k,) of a single reading; else empty.
+    effect_rms, effect_max : float
+        What it does to the map: of one coordinate, m, or of the angular map, rad, if `unit` is
+        rad and it is in the lines; NaN where that is not known.
+    told : bool
+        Whether the readings determine all of it.
+    remedies : tuple of Remedy
+        What to do, the best first; those that name a model were tried on these readings.
     """
 
     name: str
@@ -43,6 +55,46 @@ class Cause(Finding):
     unit: str
     p: float
     what: Finding | None = None
+    view: str = ""
+    axis: str = ""
+    mark: tuple[int, ...] = ()
+    effect_rms: float = math.nan
+    effect_max: float = math.nan
+    told: bool = True
+    remedies: tuple["Remedy", ...] = ()
+
+
+@dataclass(frozen=True)
+class Remedy:
+    """What to do about a cause: solve with a `model`, measure a `view` (again), or an `action`."""
+
+    kind: Literal["model", "view", "action"]
+    value: str
+
+
+class Grade(StrEnum):
+    """What a result is worth.
+
+    GOOD: within its U. ENLARGED: within a U that was enlarged by what the readings show.
+    NOT_QUALIFIED: the readings contradict the model by more than any U given here covers.
+    """
+
+    GOOD = "good"
+    ENLARGED = "enlarged"
+    NOT_QUALIFIED = "not_qualified"
+
+
+@dataclass(frozen=True)
+class Enlargement:
+    """What enlarged the uncertainty: its name, rms and largest part of u, and their unit.
+
+    `unit` is ``m`` for the XY map, ``rad`` for what only the angular map has.
+    """
+
+    name: str
+    u_rms: float
+    u_max: float
+    unit: str = "m"
 
 
 @dataclass(frozen=True)
@@ -51,8 +103,8 @@ class Verdict:
 
     Attributes
     ----------
-    qualified : bool
-        The stage is identified and no test contradicts the model.
+    grade : Grade
+        Good, good within an enlarged uncertainty, or not qualified.
     sentence : str
         The verdict in one sentence; empty before it is worded.
     reasons : tuple of str
@@ -61,13 +113,21 @@ class Verdict:
         What explains it, the most likely first.
     findings : tuple of Finding
         The tests that failed and the causes as data, until they are worded.
+    enlarged_by : tuple of Enlargement
+        What enlarged the uncertainty, the most first.
     """
 
-    qualified: bool
+    grade: Grade
     sentence: str = ""
     reasons: tuple[str, ...] = ()
     causes: tuple[Cause, ...] = ()
     findings: tuple[Finding, ...] = ()
+    enlarged_by: tuple[Enlargement, ...] = ()
+
+    @property
+    def qualified(self) -> bool:
+        """Whether the stage is identified and U covers what the readings show."""
+        return self.grade is not Grade.NOT_QUALIFIED
 
 
 @dataclass(frozen=True)
@@ -90,13 +150,15 @@ class TermResult:
     """A term of the model with what was found.
 
     `size` is as it was given, None where the term was free; `size_used` the larger one of the
-    solution where the readings contradict that, else None.
+    solution where the readings contradict that, else None. `source` says who put it in:
+    ``declared``, ``default``, or ``readings``, which show it.
     """
 
     name: str
     size: float | None
     estimates: tuple[TermEstimate, ...] = ()
     size_used: float | None = None
+    source: str = "declared"
 
     @property
     def solved_with(self) -> float:

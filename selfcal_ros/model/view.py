@@ -10,7 +10,7 @@ import numpy as np
 from selfcal_ros.errors import InputError, known_are
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.orders import parse_order
-from selfcal_ros.model.terms import parse_terms
+from selfcal_ros.model.terms import TermName, parse_terms
 
 LATTICE_TOLERANCE = 1e-3
 """Largest distance of a commanded pose from the lattice, in pitches or lines."""
@@ -232,8 +232,9 @@ def plan_from_dict(data: object, where: str) -> Plan:
         Parsed YAML: ``plan_id``, ``artifact {grid_size, grid_pitch, angular_count}`` (m),
         ``views [{name, rotation_deg, translation_pitch, grid, angular, repeats, visit_order}]``,
         ``visit_order``, which holds for views that have none of their own, ``model_terms``,
-        a list of ``TERM`` or ``TERM:SIZE``, and ``check_stops {marks, offset}`` (m) of all views
-        with grid marks.
+        a list of ``TERM`` or ``TERM:SIZE``, ``check_stops {marks, offset}`` (m) of all views
+        with grid marks, and ``microscope {scale_u, rotation_u, shear_u}``, how well the
+        microscope is known.
     where : str
         File name, for messages.
 
@@ -245,7 +246,7 @@ def plan_from_dict(data: object, where: str) -> Plan:
     """
     fields = _fields(data, where, {"plan_id": str, "artifact": dict, "views": list},
                      {"visit_order": (str, ""), "model_terms": (list, []),
-                      "check_stops": (dict, {})})
+                      "check_stops": (dict, {}), "microscope": (dict, {})})
     raw = _fields(fields["artifact"], f"{where}: artifact",
                   {"grid_size": int, "grid_pitch": float, "angular_count": int},
                   {"grid_size_y": (int, 0)})
@@ -267,7 +268,21 @@ def plan_from_dict(data: object, where: str) -> Plan:
             raise InputError(f"{where}: views[{index}]", f"the name '{view.name}' is used twice",
                              "give every view its own name")
         names.add(view.name)
-    return Plan(fields["plan_id"], artifact, views, _terms(fields["model_terms"], where))
+    terms = _terms(fields["model_terms"], where)
+    return Plan(fields["plan_id"], artifact, views, _with_microscope(
+        terms, fields["microscope"], f"{where}: microscope"))
+
+
+def _with_microscope(terms: tuple[str, ...], raw: dict, where: str) -> tuple[str, ...]:
+    """Return the terms with the microscope as the plan knows it, written as one of them."""
+    if not raw:
+        return terms
+    fields = _fields(raw, where, {}, {
+        "scale_u": (float, 0.01), "rotation_u": (float, 0.01), "shear_u": (float, 0.002)})
+    if any(term.startswith(TermName.MICROSCOPE) for term in terms):
+        raise InputError(where, "model_terms has a microscope as well", "leave one of them out")
+    sizes = ":".join(f"{size:g}" for size in fields.values())
+    return tuple(map(str, parse_terms([*terms, f"{TermName.MICROSCOPE}:{sizes}"], where)))
 
 
 def _terms(texts: list, where: str) -> tuple[str, ...]:

@@ -22,6 +22,7 @@ from selfcal_ros.reporting.summary import sections
 from selfcal_ros.reporting.summary.format import fixed_column, printable
 from selfcal_ros.reporting.summary.sections import Section
 from selfcal_ros.reporting.words.budget import dof_text
+from selfcal_ros.reporting.words.causes import advice, what_it_is
 from selfcal_ros.units import ARCSEC_PER_RAD, PPM_PER_ONE, RAD_PER_MRAD, UM_PER_M
 
 AT_NODES = ("At the nodes: how well the map itself is known. Take it to compare two calibrations, "
@@ -88,9 +89,9 @@ def _causes(result: CalibrationResult) -> Chapter:
     for cause in verdict.causes:
         ratio = cause.name == "noise"
         unit, scale = ("times", 1.0) if ratio else units.get(cause.unit, (cause.unit, 1.0))
-        what, _, remedy = printable(cause.text).partition(": ")
-        rows.append((cause.name.replace("_", " "), what, *fixed_column([cause.size * scale,
-                     cause.u * scale], 3), unit, f"{cause.p:.1g}", remedy))
+        rows.append((cause.name.replace("_", " "), printable(what_it_is(cause)), *fixed_column(
+            [cause.size * scale, cause.u * scale], 3), unit, f"{cause.p:.1g}",
+            printable(advice(cause))))
     header = ("cause", "what the readings show", "size", "u", "unit", "p", "remedy")
     return Chapter("Verdict, drift and causes", _figures(
         (drift_found(result), "What the term drift took off the readings: the plate against the "

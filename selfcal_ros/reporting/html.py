@@ -10,6 +10,7 @@ import numpy as np
 
 from selfcal_ros.files import write_text
 from selfcal_ros.model.result import CalibrationResult
+from selfcal_ros.model.verdict import Grade
 from selfcal_ros.reporting.chapters import Chapter, Figure, chapters
 from selfcal_ros.reporting.html_page import page
 from selfcal_ros.reporting.sheet.svg import inline_svg
@@ -54,7 +55,8 @@ def report_html(result: CalibrationResult, *,
         If `truth` does not fit the map.
     """
     found = chapters(result, truth_arrays(result.error_map, truth))
-    good = result.verdict.qualified and result.observability.identifiable and not result.warnings
+    good = (result.verdict.grade is Grade.GOOD and result.observability.identifiable
+            and not result.warnings)
     parts = [f'<p class="verdict{"" if good else " bad"}">{_text(state_sentence(result))}</p>',
              _contents(found), *map(_chapter, found)]
     title = _text(f"Stage calibration: plan {result.plan_id}")

@@ -271,7 +271,8 @@ class SolvingSession:
     def _publish(self, result: CalibrationResult) -> None:
         shown, frame_id = self.shown, self._settings.frame_id
         run = shown.run
-        verdict = {"qualified": is_qualified(result), "run_id": run.run_id}
+        verdict = {"qualified": is_qualified(result), "run_id": run.run_id,
+                   "grade": from_model.grade_number(result)}
         if shown.problem is None:
             self._ports.publish("map", from_model.error_map(
                 result, shown.stamp_ns, frame_id) | verdict)

@@ -129,6 +129,7 @@ class Watch:
         return summary and {
             "state": printable(summary.state), "views": [summary.views_done, summary.views_planned],
             "identifiable": bool(summary.identifiable), "qualified": bool(summary.qualified),
+            "enlarged": bool(summary.qualified) and int(getattr(summary, "grade", 2)) == 1,
             "max_error_um": _finite(summary.max_error_um),
             "rms_uncertainty_um": _finite(summary.rms_uncertainty_um),
             "advice": _lines(summary.advice), "causes": _lines(summary.causes),

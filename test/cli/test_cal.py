@@ -11,7 +11,7 @@ from selfcal_ros.compensation.aerotech.read import load_cal
 from selfcal_ros.files import write_json
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.result import Observability, result_to_dict
-from selfcal_ros.model.verdict import Verdict
+from selfcal_ros.model.verdict import Grade, Verdict
 from test.support.maps import random_map, result_of
 
 MAP = random_map(Artifact(7, 0.01, 24), 11)
@@ -172,7 +172,7 @@ def test_results_that_cannot_be_exported(run):
 @pytest.mark.parametrize("verb", ["export", "orthogonality", "accuracy", "straightness"])
 def test_a_table_of_a_result_that_is_not_qualified_says_so_everywhere(run, verb):
     why = "the plate slipped: measure it again"
-    doubted = Verdict(False, f"Not qualified: {why}", (why,))
+    doubted = Verdict(Grade.NOT_QUALIFIED, f"Not qualified: {why}", (why,))
     write_json("r.json", result_to_dict(replace(result_of(MAP), verdict=doubted)))
     along = [] if verb == "export" else ["--along", "x"]
     code, out, err = run(verb, "r.json", *along, "-o", "f.cal")

@@ -18,7 +18,7 @@ from selfcal_ros.collection.messages import Detection
 from selfcal_ros.errors import InputError, did_you_mean, known_are
 from selfcal_ros.files import read_json, write_json
 from selfcal_ros.model.result import result_to_dict
-from selfcal_ros.model.verdict import Verdict
+from selfcal_ros.model.verdict import Grade, Verdict
 from selfcal_ros.model.view import plan_from_dict
 from test.support.bags import Foreign
 from test.support.results import known_result
@@ -220,7 +220,8 @@ def test_the_table_of_a_result(tmp_path, capsys):
     assert capsys.readouterr().out == text
     assert main(["table", str(tmp_path / "r.json"), "-o", "-", "--json"]) == 0
     assert json.loads(capsys.readouterr().out) == {"csv": text}
-    doubted = replace(result, verdict=Verdict(False, "Not qualified: the plate slipped"))
+    doubted = replace(result, verdict=Verdict(
+        Grade.NOT_QUALIFIED, "Not qualified: the plate slipped"))
     write_json(tmp_path / "r.json", result_to_dict(doubted))
     assert main(["table", str(tmp_path / "r.json"), "-o", str(tmp_path / "t.csv")]) == 5
     assert capsys.readouterr().err == "selfcal: Not qualified: the plate slipped\n"

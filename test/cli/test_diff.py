@@ -76,7 +76,8 @@ def test_maps_that_differ_and_maps_without_uncertainty_have_their_verdicts(files
 def test_a_result_that_is_not_qualified_is_named(files, tmp_path, capsys):
     """Its uncertainties are enlarged, so that it agrees with much: that is told beside it."""
     data = read_json(files[1])
-    data["verdict"] |= {"qualified": False, "sentence": "Not qualified: because"}
+    data["verdict"] |= {
+        "qualified": False, "grade": "not_qualified", "sentence": "Not qualified: because"}
     bad, laser = str(tmp_path / "bad.json"), str(tmp_path / "laser.json")
     write_json(bad, data)
     write_json(laser, {"ex_x": [], "error_map_equivalent": {

@@ -77,7 +77,8 @@ def test_check_judges_every_term(capsys):
     assert main(["plan", "check", shipped("hu_repeated"), "--json", "--sigma", "20nm"]) == 0
     found = json.loads(capsys.readouterr().out)
     terms = {term["name"]: term for term in found["terms"]}
-    assert list(terms) == ["microscope", "drift", "plate_scale", "plate_shape", "approach"]
+    assert list(terms) == ["microscope", "drift", "plate_scale", "plate_shape", "approach",
+                           "plate_strain"]
     assert {"name", "told", "unseen_modes", "size", "unit", "effect_rms_m", "effect_max_m",
             "power"} < set(terms["drift"])
     assert (terms["plate_shape"]["told"], terms["plate_shape"]["unseen_modes"]) == (False, 7)

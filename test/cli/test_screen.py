@@ -80,7 +80,8 @@ def test_coverage_rejections_map_verdict_and_health_are_shown():
                  "repeatability_um": 0.0213, "repeatability_arcsec": None,
                  "plate": ["oo.", "o.o", "ooo"], "missing_lines": [0, 2, 4, 5, 7]},
         "summary": {"state": "Calibrated.", "views": [2, 4], "identifiable": True,
-                    "qualified": False, "max_error_um": 0.84, "rms_uncertainty_um": None,
+                    "qualified": False, "enlarged": False, "max_error_um": 0.84,
+                    "rms_uncertainty_um": None,
                     "advice": ["add a view"], "causes": ["the plate slipped"], "run_id": "17"},
         "map": {"run_id": "17", "qualified": False, "um": [[0.0, 1.0], [None, 0.5]]}},
         ["first", "escape \x1b[2J"])
@@ -109,8 +110,9 @@ MEASURED = {
              "plate_step": 1, "missing_lines": [0, 2, 4, 5, 7]},
     "summary": {"state": "Calibrated from 4 views: largest error 0.713 µm at x 30 mm, y 50 mm, "
                          "every site known to ±0.0483 µm or better (k=2.01).",
-                "views": [4, 4], "identifiable": True, "qualified": True, "max_error_um": 0.713,
-                "rms_uncertainty_um": 0.0176, "advice": [], "causes": [], "run_id": "17"},
+                "views": [4, 4], "identifiable": True, "qualified": True, "enlarged": False,
+                "max_error_um": 0.713, "rms_uncertainty_um": 0.0176, "advice": [], "causes": [],
+                "run_id": "17"},
     "map": {"run_id": "17", "qualified": True, "step": 1,
             "um": [[0.713] + [0.1] * 20] + [[0.1] * 21] * 20}}
 BAD = {
@@ -142,7 +144,7 @@ def test_all_of_a_good_view_is_on_the_screen(size):
     for words in ("view 2 of 4: rot90 plan hu, run 17", "Nothing: the view is being measured.",
                   "The map is saved as /results/hu_17.json", "marks 430 of 441, lines 3 of 8",
                   "repeatability 0.0213 µm, 0.5 arcsec", "missing lines 0, 2, 4, 5, 7",
-                  "rejected by reason; 20 used", "3 stage_moving", "qualified; views 4 of 4",
+                  "rejected by reason; 20 used", "3 stage_moving", "good; views 4 of 4",
                   "every", "ok: pose_sequencer, solver, measurement_collector",
                   "pose_sequencer: PLACE rot90", "confirm: measuring",
                   "[s] start [c] confirm [r] redo [k] skip [a] abort [q] quit"):

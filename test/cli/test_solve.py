@@ -70,8 +70,9 @@ def test_the_terms_of_the_plan_travel_in_the_bag_and_options_win(tmp_path):
         result = json.loads(out.read_text())
         found[name] = ([term["name"] for term in result["model"]["terms"]],
                        result["provenance"].get("model_terms_from"))
-    assert found == {"plan": (["plate_scale"], "plan"), "options": (["drift"], "options"),
-                     "none": ([], None)}
+    assumed = ["microscope", "plate_strain", "line_eccentricity"]
+    assert found == {"plan": (["plate_scale", *assumed], "plan"),
+                     "options": (["drift", *assumed], "options"), "none": ([], None)}
 
 
 def test_what_is_no_bag(tmp_path, capsys):

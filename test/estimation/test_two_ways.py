@@ -9,7 +9,7 @@ import pytest
 from selfcal_ros.errors import InputError, NotIdentifiableError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.joint.covariance import map_covariance
-from selfcal_ros.estimation.options import Options, ReferenceLength
+from selfcal_ros.estimation.options import ReferenceLength
 from selfcal_ros.estimation.quality import prediction_limit
 from selfcal_ros.estimation.quality.leverage import residuals_of
 from selfcal_ros.estimation.quality.noisy import noisy_views
@@ -20,6 +20,7 @@ from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Sense, ViewReadings
 from selfcal_ros.simulation.truth import Spread, hu_plan, random_truth, simulate_measurements
 from test.support.lattice_plans import plan_of
+from test.support.options import BARE, bare
 from test.support.recalibrations import responses, sizes_of, values_of, with_values
 from test.support.two_ways import (
     maps_of,
@@ -60,7 +61,7 @@ def require_same(found, wanted, *, unit=1.0):
     ("artifact", "artifact", 0.1)])
 def test_order_turn_mirror_and_unit_change_nothing_but_the_frame(name, kind, turned_kind, missing):
     _, readings = measured(CASES[name], missing=missing)
-    options, of_turned = (Options(causes=False, reference=ReferenceLength(
+    options, of_turned = (bare(causes=False, reference=ReferenceLength(
         of, 3e-6, 1e-7) if of else None) for of in (kind, turned_kind))
     wanted = maps_of(calibrate(readings, options))
     require_same(maps_of(calibrate(permuted(readings), options)), wanted)
@@ -79,7 +80,7 @@ def test_the_angular_datum_decides_nothing_about_outliers(sense):
     views = [replace(view, dtheta=view.dtheta + 2e-4 * (((view.k + view.view.lattice_pose(
         readings.artifact).turn_lines) % 24) == 0)) for view in readings.views]
     bent = replace(readings, views=tuple(views))
-    found = [clean(bent, Options(datum_theta=datum)) for datum in ("xy_axes", "zero_mean")]
+    found = [clean(bent, bare(datum_theta=datum)) for datum in ("xy_axes", "zero_mean")]
     assert found[0].removed == found[1].removed == ()
     for one, two in zip(*(item.measurements.views for item in found), strict=True):
         assert np.array_equal(one.k, two.k)
@@ -91,10 +92,10 @@ def test_robust_knows_finite_rotations_of_a_rough_plate():
     truth, readings = measured(plan_of("0,90,180,tx,ty", Artifact(9, 0.01)), spread=spread,
                                linear=True)
     bent = with_finite_rotations(readings, truth)
-    result = robust_calibrate(bent)
+    result = robust_calibrate(bent, BARE)
     assert result.extra["outliers"]["removed"] == [] and result.extra["slips"] == []
     assert result.extra["noisy_views"] == []
-    require_same(maps_of(result), maps_of(calibrate(bent)))
+    require_same(maps_of(result), maps_of(calibrate(bent, BARE)))
 
 
 @pytest.fixture
@@ -108,9 +109,9 @@ def test_validation_predicts_by_the_model_that_was_fitted(sense, few_draws):
     plan = plan_of("0,90,180,tx,ty", Artifact(7, 0.01))
     truth, readings = measured(plan, sense=sense, spread=Spread(a_m=20e-6, phi_rad=0.02),
                                linear=True)
-    wanted = validate(readings, Options(misalignment_model="linear"), folds=1)
+    wanted = validate(readings, bare(misalignment_model="linear"), folds=1)
     bent = with_finite_rotations(readings, truth)
-    for one, two in zip(validate(bent, folds=1), wanted, strict=True):
+    for one, two in zip(validate(bent, BARE, folds=1), wanted, strict=True):
         assert one.n_grid == two.n_grid and one.why == two.why
         if one.n_grid:
             # a held-out whole view is placed anew, so that only the noise turns a little
@@ -120,8 +121,8 @@ def test_validation_predicts_by_the_model_that_was_fitted(sense, few_draws):
 
 def test_validation_does_not_depend_on_the_order_of_readings(few_draws):
     _, readings = measured(CASES["square"])
-    wanted = validate(readings, folds=2)
-    for one, two in zip(validate(permuted(readings), folds=2), wanted, strict=True):
+    wanted = validate(readings, BARE, folds=2)
+    for one, two in zip(validate(permuted(readings), BARE, folds=2), wanted, strict=True):
         assert (one.n_grid, one.n_angular, one.why) == (two.n_grid, two.n_angular, two.why)
         assert one.rms_m == pytest.approx(two.rms_m, nan_ok=True)
         assert one.rms_rad == pytest.approx(two.rms_rad, nan_ok=True)
@@ -132,7 +133,7 @@ def test_views_with_too_few_readings_to_tell_are_not_called_noisy():
     plan = plan_of("0,90,tx", Artifact(5, 0.01))
     for seed in range(25):
         readings = measured(plan, seed)[1]
-        assert noisy_views(residuals_of(readings, Options()), readings) == ()
+        assert noisy_views(residuals_of(readings, BARE), readings) == ()
 
 
 @pytest.mark.parametrize(("sigma_m", "sigma_rad", "limit_m"), [
@@ -156,13 +157,13 @@ def test_a_view_that_was_never_read_is_missed_by_name():
     views = tuple(ViewReadings(view.view) if i in gone else view
                   for i, view in enumerate(readings.views))
     with pytest.raises(NotIdentifiableError, match="add a view turned by 90 deg"):
-        calibrate(replace(readings, views=views))
+        calibrate(replace(readings, views=views), BARE)
 
 
 def test_readings_of_zero_alone_take_a_reference():
     still = Spread(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     _, readings = measured(CASES["square"], sigma_m=0.0, sigma_theta_rad=0.0, spread=still)
-    options = Options(reference=ReferenceLength("stage_x", 1e-6, 1e-6))
+    options = bare(reference=ReferenceLength("stage_x", 1e-6, 1e-6))
     emap = calibrate(readings, options).error_map
     assert np.allclose(emap.gx, 1e-6 * emap.artifact.x_m, rtol=1e-9, atol=0)
 
@@ -170,14 +171,14 @@ def test_readings_of_zero_alone_take_a_reference():
 def test_the_covariance_of_the_law_is_not_that_of_the_joint_map():
     _, readings = measured(hu_plan(Artifact(5, 0.01, 8)))
     with pytest.raises(InputError, match="covariance: that of the method 'law' is not known"):
-        map_covariance(readings, Options(method="law"))
+        map_covariance(readings, bare(method="law"))
 
 
 def test_a_line_of_a_fine_circle_that_is_read_once_cannot_be_checked():
     _, readings = measured(CASES["circle of 360"])
     views = tuple(subset(view, np.ones(len(view.m), dtype=bool), (view.k != 7) | (row == 0))
                   for row, view in enumerate(readings.views))
-    left = residuals_of(replace(readings, views=views), Options())
+    left = residuals_of(replace(readings, views=views), BARE)
     assert left.redundancy_theta[0, 7] < 1e-9 and np.isnan(left.squares_theta[0, 7])
     assert left.redundancy_theta.sum() == pytest.approx(left.found.theta.dof_residuals)
     # lines beside the gap are checked by fewer readings than the others
@@ -185,8 +186,8 @@ def test_a_line_of_a_fine_circle_that_is_read_once_cannot_be_checked():
 
 
 ROUGH = Spread(a_m=20e-6, phi_rad=0.02)
-PAPERS = Options(datum_theta="xy_axes", misalignment_model="linear")
-LINEAR = Options(misalignment_model="linear")
+PAPERS = bare(datum_theta="xy_axes", misalignment_model="linear")
+LINEAR = bare(misalignment_model="linear")
 SHIFTS = plan_of("0,90+tx,2ty,270-2tx+ty,tx", Artifact(7, 0.01, 12), lines=1)
 FOUR = plan_of("0,90,tx", Artifact(5, 0.01, 4), lines=1)
 
@@ -222,7 +223,7 @@ def test_uncertainties_are_the_scatter_of_recalibrations_of_rough_plates(plan, s
     truth, clean = measured(plan, sense=sense, missing=missing, sigma_m=0.0, sigma_theta_rad=0.0,
                             spread=ROUGH, linear=True)
     clean = with_finite_rotations(clean, truth)
-    options = Options(causes=False)
+    options = bare(causes=False)
     wanted, squares = maps_of(calibrate(clean, options)), {"xy": [], "theta": []}
     for _ in range(30):
         draw = rng.normal(size=len(values_of(clean))) * sizes_of(clean, SIGMA_M, SIGMA_RAD)
@@ -239,7 +240,7 @@ def test_uncertainties_are_the_scatter_of_recalibrations_of_rough_plates(plan, s
 @pytest.mark.parametrize("factor", [1e-3, 50.0])
 def test_finite_rotations_settle_in_any_unit(factor):
     _, readings = measured(CASES["square"], spread=ROUGH)
-    wanted, found = calibrate(readings), calibrate(scaled(readings, factor))
+    wanted, found = calibrate(readings, BARE), calibrate(scaled(readings, factor), BARE)
     assert np.allclose(found.error_map.gx / factor, wanted.error_map.gx, rtol=0, atol=1e-14)
     assert [v.phi for v in found.views] == pytest.approx([v.phi for v in wanted.views], abs=2e-13)
 
@@ -247,5 +248,5 @@ def test_finite_rotations_settle_in_any_unit(factor):
 def test_a_plate_laid_exactly_has_settled():
     straight = Spread(phi_rad=0.0, t_m=0.0)
     truth, readings = measured(CASES["square"], spread=straight, sigma_m=0.0, sigma_theta_rad=0.0)
-    found = calibrate(readings)
+    found = calibrate(readings, BARE)
     assert np.abs(found.error_map.gx - truth.g[0]).max() < 1e-15

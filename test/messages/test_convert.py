@@ -26,6 +26,7 @@ from selfcal_ros.model.readings import (
     Sense,
     ViewReadings,
 )
+from selfcal_ros.model.verdict import Grade, Verdict
 from selfcal_ros.model.view import View
 from test.support.bags import contract_message, contract_types
 from test.support.results import known_result
@@ -318,6 +319,17 @@ def test_an_error_map_comes_back(result):
     assert (message.sigma_xy, message.sigma_theta) == (result.noise.sigma_xy,
                                                        result.noise.sigma_theta)
     assert message.identifiable and message.plan_id == result.plan_id
+
+
+@pytest.mark.parametrize(("grade", "identifiable", "number"), [
+    (Grade.GOOD, True, 2), (Grade.ENLARGED, True, 1), (Grade.NOT_QUALIFIED, True, 0),
+    (Grade.GOOD, False, 0)])
+def test_the_grade_of_a_map_is_a_number(result, grade, identifiable, number):
+    seen = replace(result.observability, identifiable=identifiable)
+    graded = replace(result, verdict=Verdict(grade), observability=seen)
+    message = through_cdr("ErrorMap", from_model.error_map(graded, STAMP_NS, "f"))
+    assert (message.grade, from_model.grade_number(graded)) == (number, number)
+    assert message.qualified is (grade is not Grade.NOT_QUALIFIED)
 
 
 @pytest.mark.parametrize(("changes", "said"), [

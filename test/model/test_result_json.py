@@ -19,6 +19,15 @@ from selfcal_ros.model.result import (
     unidentified_result,
     with_input,
 )
+from selfcal_ros.model.verdict import (
+    Cause,
+    Enlargement,
+    Grade,
+    ModelResult,
+    Remedy,
+    TermResult,
+    Verdict,
+)
 from selfcal_ros.model.view import View
 from test.support.results import known_result
 
@@ -148,3 +157,34 @@ def test_a_reference_is_off_by_less_than_a_tenth(error, u, is_one):
         return
     with pytest.raises(InputError, match=f"reference: {error!r} with u {u!r} is not a relative"):
         result_from_dict(data, "r")
+
+
+CAUSE = Cause("drift", "drift along x", 5e-8, 1e-9, "m", 1e-7, view="tx", axis="x", mark=(1, -2),
+              effect_rms=2e-9, effect_max=6e-9, told=False,
+              remedies=(Remedy("model", "drift:8e-8"), Remedy("view", "tx")))
+
+
+@pytest.mark.parametrize("grade", Grade)
+def test_a_grade_with_its_causes_and_terms_comes_back(grade):
+    verdict = Verdict(grade, "So it is", ("why",), (CAUSE,), enlarged_by=(
+        Enlargement("drift", 3e-9, 9e-9), Enlargement("rotation", 1e-6, 2e-6, "rad")))
+    terms = (TermResult("plate_strain", 7e-8, (), 2e-7, "default"),
+             TermResult("drift", 5e-8, (), None, "readings"))
+    result = replace(known_result()[0], verdict=verdict, model=ModelResult("rigid", terms))
+    data = result_to_dict(result)["verdict"]
+    assert (data["grade"], data["qualified"]) == (str(grade), grade != "not_qualified")
+    assert data["causes"][0]["remedies"] == [{"model": "drift:8e-8"}, {"view": "tx"}]
+    assert through_json(result).verdict == verdict
+    assert through_json(result).model == result.model
+
+
+def test_a_verdict_of_before_has_the_grade_of_its_qualification():
+    data = result_to_dict(replace(known_result()[0], verdict=Verdict(Grade.GOOD, "Good")))
+    for key in ("grade", "enlarged_by"):
+        del data["verdict"][key]
+    assert result_from_dict(data, "old").verdict == Verdict(Grade.GOOD, "Good")
+    data["verdict"]["qualified"] = False
+    assert result_from_dict(data, "old").verdict == Verdict(Grade.NOT_QUALIFIED, "Good")
+    data["verdict"]["grade"] = "enlarged"
+    with pytest.raises(InputError, match="the grade 'enlarged' contradicts qualified False"):
+        result_from_dict(data, "old")

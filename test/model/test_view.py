@@ -194,10 +194,20 @@ def test_terms_of_a_plan_are_read_and_checked():
     assert plan_from_dict(PLAN, "here").model_terms == ()
     for terms, message in (
             (["creep"], "here: model_terms: the term 'creep' is unknown; known are microscope, "
-             "drift, plate_scale, plate_shape, approach"),
+             "drift, plate_scale, plate_shape, approach, plate_strain, line_eccentricity"),
             ([{"drift": 1e-9}], "here: model_terms: {'drift': 1e-09} is not a text; write TERM or "
              "TERM:SIZE"),
             ("drift", "here: model_terms: 'drift' is not of type list; correct the value")):
         with pytest.raises(InputError) as caught:
             plan_from_dict(plan_with(model_terms=terms), "here")
         assert str(caught.value) == message
+
+
+def test_a_plan_knows_its_microscope():
+    plan = plan_from_dict(plan_with(microscope={"rotation_u": 0.002}, model_terms=["drift"]), "p")
+    assert plan.model_terms == ("microscope:0.01:0.002:0.002", "drift")
+    with pytest.raises(InputError, match=r"^p: microscope: model_terms has a microscope as well; "
+                       "leave one of them out$"):
+        plan_from_dict(plan_with(microscope={"scale_u": 0.1}, model_terms=["microscope"]), "p")
+    with pytest.raises(InputError, match="p: microscope: microscope: the size 2 is"):
+        plan_from_dict(plan_with(microscope={"shear_u": 2.0}), "p")

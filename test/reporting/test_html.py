@@ -10,7 +10,7 @@ from selfcal_ros import __version__
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.joint.noise import coverage_factor
 from selfcal_ros.model.result import Observability, result_from_dict, result_to_dict
-from selfcal_ros.model.verdict import Cause, Verdict
+from selfcal_ros.model.verdict import Cause, Grade, Remedy, Verdict
 from selfcal_ros.reporting.extras import MAX_ROWS, convention_section, extra_sections
 from selfcal_ros.reporting.html import report_html, save_report
 from test.support.results import known_result, with_residuals
@@ -96,10 +96,11 @@ def test_both_kinds_of_uncertainty_are_told_with_what_each_is_for():
 def test_causes_come_as_a_table_with_one_unit_each():
     result, _ = known_result(3, 0)
     causes = (Cause("drift", "drift of 80 ± 3 nm along x: solve with --model drift", 8e-8, 3e-9,
-                    "m", 1e-9), Cause("noise", "view 'a' is 2 times as noisy: measure it again",
-                                      2.0, 0.1, "m/m", 2e-4))
-    verdict = Verdict(False, "Not qualified: most likely drift", ("grid readings: too much",),
-                      causes)
+                    "m", 1e-9, remedies=(Remedy("model", "drift"),)),
+              Cause("noise", "view 'a' is 2 times as noisy: measure it again", 2.0, 0.1, "m/m",
+                    2e-4))
+    verdict = Verdict(Grade.NOT_QUALIFIED, "Not qualified: most likely drift",
+                      ("grid readings: too much",), causes)
     html = report_html(replace(result, verdict=verdict))
     assert '<p class="verdict bad">Not qualified: most likely drift. Map as it is:' in html
     cells = re.findall(r"<td[^>]*>([^<]*)</td>", html)

@@ -35,7 +35,7 @@ def summary_of(stamp_ns: int = START_NS, **changes) -> object:
     return message("CalibrationSummary", {
         "header": from_model.header(stamp_ns, "stage"), "state": "as it is", "views_done": 4,
         "views_planned": 4, "identifiable": True, "rank_deficiency": 0, "advice": [],
-        "qualified": True, "causes": [], "run_id": "7", **numbers} | changes)
+        "qualified": True, "causes": [], "run_id": "7", "grade": 2, **numbers} | changes)
 
 
 class Desk:

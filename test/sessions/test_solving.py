@@ -15,6 +15,7 @@ from selfcal_ros.collection.messages import Detection, Kind, Phase
 from selfcal_ros.errors import InputError, NoDataError, NotIdentifiableError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.messages import from_model, to_model
+from selfcal_ros.model.terms import DEFAULT_TERMS
 from selfcal_ros.sessions.map_files import plan_file_name, read_result, result_file
 from selfcal_ros.sessions.ports import Level
 from selfcal_ros.sessions.runs import Run, supersedes
@@ -23,6 +24,7 @@ from test.support.ports import START_NS, Hands, message, settings_of
 from test.support.sessions import collected, events_of, small_plan
 
 PLAN = small_plan()
+ASSUMED = [term.name for term in DEFAULT_TERMS]
 
 
 def views_of(plan=PLAN, seed: int = 5, run_id: str = "", *, grid: bool = True, **changes) -> list:
@@ -67,11 +69,11 @@ def test_the_solver_estimates_the_terms_that_the_plan_asks_for(desk):
     plan = replace(PLAN, model_terms=("plate_scale:1e-06",))
     desk.take(views_of(plan))
     result = desk.session.result
-    assert [term.name for term in result.model.terms] == ["plate_scale"]
+    assert [term.name for term in result.model.terms] == ["plate_scale", *ASSUMED]
     assert result.provenance.extra["model_terms_from"] == "plan"
     own = Desk(model_terms=["plate_shape:1e-08"])
     own.take(views_of(plan))
-    assert [term.name for term in own.session.result.model.terms] == ["plate_shape"]
+    assert [term.name for term in own.session.result.model.terms] == ["plate_shape", *ASSUMED]
     assert own.session.result.provenance.extra["model_terms_from"] == "options"
     without = Desk(model_terms=["none"])
     without.take(views_of(plan))
@@ -91,7 +93,7 @@ def test_terms_that_nobody_knows_are_told_and_the_solver_lives(desk):
     assert str(caught.value).startswith(told)
     assert str(desk.session.shown.problem).startswith(told)
     desk.take(views_of())
-    assert desk.session.result.model.terms == ()
+    assert [term.name for term in desk.session.result.model.terms] == ASSUMED
 
 
 def test_readings_of_two_runs_are_never_mixed(desk):

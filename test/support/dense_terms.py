@@ -86,7 +86,8 @@ class Dense:
         out = []
         views = range(len(self.visits))
         if name is TermName.MICROSCOPE:
-            one = np.eye(4).reshape(4, 2, 2)
+            one = np.array([[[1, 0], [0, 1]], [[0, -1], [1, 0]],
+                            [[1, 0], [0, -1]], [[0, 1], [1, 0]]])
             out = [[-(e @ offset) for _, _, _, offset, _ in self.about] for e in one]
         elif name is TermName.APPROACH:
             out = [[self._indicated() * np.array(h) * came for *_, came in self.about]
@@ -101,9 +102,12 @@ class Dense:
             of_view = np.array([about[0] for about in self.about])
             x, y = np.array([place for _, place, *_ in self.about]).T
             turns = np.array([turn for _, _, turn, *_ in self.about])
-            shapes = ([np.stack([x, y]) * self.half] if name is TermName.PLATE_SCALE else
-                      [np.outer(d, q) for d in ((1, 0), (0, 1))
-                       for q in (x * x, 2 * x * y, y * y)])
+            scale = np.stack([x, y]) * self.half
+            shapes = {
+                TermName.PLATE_SCALE: [scale],
+                TermName.PLATE_STRAIN: [scale, scale * [[1], [-1]], scale[::-1]],
+                TermName.PLATE_SHAPE: [np.outer(d, q) for d in ((1, 0), (0, 1))
+                                       for q in (x * x, 2 * x * y, y * y)]}[name]
             out = [np.einsum("rij,jr->ri", turns, shape) * (of_view == v)[:, None]
                    for v in views[int(free):] for shape in shapes]
         return np.array(out).reshape(len(out), -1).T

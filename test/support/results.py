@@ -15,6 +15,7 @@ from selfcal_ros.model.result import (
     ViewResult,
 )
 from selfcal_ros.simulation.truth import hu_plan, random_truth
+from test.support.lattice_plans import in_datum
 from test.support.maps import first_order
 
 SIGMA_M, SIGMA_RAD = 0.02e-6, np.deg2rad(0.001)
@@ -66,3 +67,11 @@ def with_residuals(size: int = 5, lines: int = 24, *, size_y: int = 0) -> Calibr
     removed = {"removed": [{"view": result.views[1].name, "kind": "grid", "mark": "1, 0"}]}
     return replace(result, extra={"residuals": {"views": rows}, "rejected_at": rejected,
                                   "outliers": removed})
+
+
+def covered(result: CalibrationResult, g: np.ndarray) -> float:
+    """Return the part of the map's coordinates at which U = k u covers the true map `g`."""
+    emap = result.error_map
+    off = in_datum(np.stack([emap.gx, emap.gy]) - g, emap.valid, result.artifact, scale=True)
+    inside = abs(off) <= result.noise.k_xy * np.stack([emap.u_gx, emap.u_gy])
+    return float(inside[:, emap.valid].mean())

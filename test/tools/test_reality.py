@@ -117,7 +117,7 @@ def test_what_is_spoilt_reaches_the_calibration():
     spoilt = Case("a mark off", plan=resistant(1), spoil=misread(2e-6))
     assert run_case(replace(spoilt, spoil=Case("clean").spoil), 1).first.grade == "good"
     run = run_case(spoilt, 1).first
-    assert run.grade == "not_qualified" and run.causes[0] == "reading"
+    assert run.grade == "enlarged" and run.causes[0] == "reading"
 
 
 def test_every_case_has_a_name_of_its_own_and_can_be_drawn():
@@ -161,12 +161,16 @@ def test_readings_of_a_bag_are_those_of_the_cell_and_say_what_is_wrong():
 
 
 def test_advice_is_followed_until_none_is_left():
-    turned = replace(next(case for case in every_case()
-                          if case.name == "microscope turned by 2 mrad, stop errors 20 um"),
-                     plan=resistant(2))
-    course = run_case(turned, 0)
-    assert course.first.grade == "not_qualified" and course.first.causes[0] == "microscope"
-    assert course.steps == ("--model microscope",)
+    scaled_up = replace(next(
+        case for case in every_case()
+        if case.name == "scale of the microscope +5 %, plates turned by 0.05 deg"),
+        plan=resistant(2))
+    course = run_case(scaled_up, 0)
+    assert course.first.grade == "enlarged" and course.first.causes[0] == "microscope"
+    (step,) = course.steps
+    assert step.startswith("--model microscope:")
+    # the size that is advised covers the 5 %, and is not beyond three times as much
+    assert 0.05 < float(step.rpartition(":")[2]) < 0.15
     assert course.end.grade == "good" and course.end.z_xy < 1.2
 
 

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Runs of a case: simulate, calibrate, compare with the truth, follow the advice that is given."""
 
-import re
 import zlib
 from collections import Counter
 from collections.abc import Iterator
@@ -21,8 +20,7 @@ from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.statistics import rms
-from selfcal_ros.model.terms import ModelTerm, parse_terms
-from selfcal_ros.reporting.words.causes import cause_text
+from selfcal_ros.model.terms import parse_terms
 from selfcal_ros.simulation.cell import plan_events
 from selfcal_ros.simulation.machine import Truth, random_truth
 from selfcal_ros.simulation.truth import FIRST_STAMP_NS, simulate_measurements
@@ -198,31 +196,20 @@ def _covered(error: np.ndarray, u: np.ndarray, k: float) -> tuple[float, float]:
 
 def grade_of(result: CalibrationResult) -> str:
     """Return the grade of a result."""
-    return "good" if result.verdict.qualified else "not_qualified"
-
-
-_MODEL = re.compile(r"--model ([a-z_]+)(?::([-+.0-9e]+|SIZE))?")
+    return str(result.verdict.grade)
 
 
 def advised(result: CalibrationResult, options: Options) -> tuple[str, Options] | None:
     """Return what the verdict advises and the options to do it with; None if nothing new."""
-    for cause in result.verdict.causes:
-        found = _MODEL.search(cause_text(cause))
-        if found:
-            name, size = found.groups()
-            size = f"{abs(cause.size):.1e}" if size == "SIZE" else size
-            text = f"{name}:{size}" if size else name
-            terms = _with_term(options.terms, parse_terms([text], "advice")[0])
+    remedies = [remedy for cause in result.verdict.causes for remedy in cause.remedies]
+    for remedy in remedies:
+        if remedy.kind == "model":
+            terms = parse_terms([remedy.value], "advice")
             if terms != options.terms:
-                return f"--model {text}", replace(options, terms=terms)
-        elif "again" in cause_text(cause):
-            return "measure again", options
+                return f"--model {remedy.value}", replace(options, terms=terms)
+    if any(remedy.kind == "view" for remedy in remedies):
+        return "measure again", options
     return None
-
-
-def _with_term(terms: tuple[ModelTerm, ...], term: ModelTerm) -> tuple[ModelTerm, ...]:
-    others = [str(one) for one in terms if one.name != term.name]
-    return parse_terms([*others, str(term)], "advice")
 
 
 @dataclass(frozen=True)

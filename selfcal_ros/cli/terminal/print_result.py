@@ -32,11 +32,12 @@ def exit_code(result: "CalibrationResult") -> int:
 
 
 def say_unless_qualified(result: "CalibrationResult", who: str) -> bool:
-    """Say on stderr why a result is not qualified, and return whether that was to be said."""
+    """Say on stderr what the verdict has to say, and return whether a result is not qualified."""
+    from selfcal_ros.model.verdict import Grade
     from selfcal_ros.reporting.summary.format import can_print_symbols, printable, to_ascii
 
-    if result.verdict.qualified:
+    if result.verdict.grade is Grade.GOOD:
         return False
     line = printable(f"{who}: {result.verdict.sentence}")
     print(line if can_print_symbols(sys.stderr) else to_ascii(line), file=sys.stderr)
-    return True
+    return not result.verdict.qualified

@@ -6,7 +6,7 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.options import Options, ReferenceKind, ReferenceLength
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.readings import Measurements
-from selfcal_ros.model.terms import ModelTerm, parse_terms
+from selfcal_ros.model.terms import DEFAULT_TERMS, ModelTerm, microscope_term, parse_terms
 
 
 def solver_options(settings: SolverSettings,
@@ -25,12 +25,14 @@ def solver_options(settings: SolverSettings,
         ReferenceKind(kind), settings.reference_error, settings.reference_u,
         settings.reference_certificate)
     terms, origin = _terms(settings.model_terms, measurements)
+    assumed = _assumed(settings)
     return Options(method=settings.method, datum_theta=ThetaDatum(settings.theta_datum),
                    misalignment_model="" if settings.method == "law" else
                    settings.misalignment_model, reference=reference,
                    uncertainty=UNCERTAINTY[settings.uncertainty],
-                   terms=terms, terms_from=origin if terms else "",
-                   drift_degree=settings.drift_degree)
+                   terms=terms, terms_from=origin if terms else "", assumed=assumed,
+                   drift_degree=settings.drift_degree,
+                   magnification_limit=settings.magnification_limit)
 
 
 def _terms(given: list[str],
@@ -42,7 +44,21 @@ def _terms(given: list[str],
     if NO_TERMS in words:
         raise InputError("model_terms", f"'{NO_TERMS}' and other terms exclude each other",
                          f"leave out '{NO_TERMS}', or all the others")
-    if words or measurements is None:
-        return parse_terms(given, "model_terms"), "options"
-    where = f"plan '{measurements.plan_id}': model_terms"
-    return parse_terms(measurements.model_terms, where), "plan"
+    planned: tuple[ModelTerm, ...] = ()
+    if measurements is not None:
+        planned = parse_terms(measurements.model_terms,
+                              f"plan '{measurements.plan_id}': model_terms")
+    if not words and measurements is not None:
+        return planned, "plan"
+    terms = parse_terms(given, "model_terms")
+    # how well the plan knows its microscope is no choice of a model
+    known = [term for term in planned if term.parts and term.name not in {t.name for t in terms}]
+    return (*terms, *known), "options"
+
+
+def _assumed(settings: SolverSettings) -> tuple[ModelTerm, ...]:
+    """Return what is assumed where neither options nor plan name a term."""
+    if [word.strip() for word in settings.model_terms] == [NO_TERMS]:
+        return ()
+    microscope = microscope_term(settings.scale_u, settings.rotation_u, settings.shear_u)
+    return tuple(microscope if term.name == microscope.name else term for term in DEFAULT_TERMS)

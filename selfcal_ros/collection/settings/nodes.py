@@ -142,7 +142,20 @@ class SolverSettings(ManagedSettings):
         "", "what states that length: number and issuer of a certificate")
     model_terms: list[str] = declared(
         [""], f"terms estimated with the map, each TERM or TERM:SIZE of {', '.join(TermName)}; the "
-        f"size is a standard deviation, SI; empty = those of the plan, {NO_TERMS} = none")
+        f"size is a standard deviation, SI; 0 = known to be none; empty = those of the plan; "
+        f"{NO_TERMS} = none, not even those that are assumed by default")
+    scale_u: float = declared(
+        0.01, "standard uncertainty of the microscope's scale, where plan and model_terms do not "
+        "say it; 0 = known exactly", "m/m", 0.0, 1.0)
+    rotation_u: float = declared(
+        0.01, "standard uncertainty of the microscope's turn against the axes, likewise", "rad",
+        0.0, 1.0)
+    shear_u: float = declared(
+        0.002, "standard uncertainty of half the difference of the microscope's scales, and of "
+        "half its error of squareness, likewise", "m/m", 0.0, 1.0)
+    magnification_limit: float = declared(
+        1e-4, "difference of the scales of plate and encoders above which there is a warning",
+        "m/m", 0.0, 1.0)
     drift_degree: int = declared(
         DRIFT_DEGREE, "degree of the polynomial of time by which views drift, where drift is a "
         "term", "", 1, MAX_DRIFT_DEGREE)

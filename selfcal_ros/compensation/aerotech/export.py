@@ -19,6 +19,7 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.model.error_map import ErrorMap
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.statistics import rms
+from selfcal_ros.model.verdict import Grade
 from selfcal_ros.units import ARCSEC_PER_DEG, M_PER_UM, RAD_PER_ARCSEC, UM_PER_M
 
 DECIMALS = 5
@@ -195,8 +196,11 @@ def verdict_lines(result: CalibrationResult) -> list[str]:
     """Return the verdict, and why it is none where it is none."""
     verdict, when = result.verdict, result.provenance.extra.get("last_exposure", "")
     lines = [f"measured until {when}"] if when else []
-    if verdict.qualified:
-        return [*lines, "verdict: qualified, the readings agree with the model"]
+    if verdict.grade is Grade.GOOD:
+        return [*lines, "verdict: good, the readings agree with the model"]
+    if verdict.grade is Grade.ENLARGED:
+        return [*lines, "verdict: good within an enlarged uncertainty",
+                *(f"because: {reason}" for reason in verdict.reasons)]
     return [*lines, "verdict: NOT QUALIFIED, the readings contradict the model",
             *(f"because: {reason}" for reason in verdict.reasons)]
 

@@ -26,6 +26,8 @@ LEVEL = 1e-6
 """Probability, all tries together, of refusing a measurement whose offsets are wired well."""
 TOLD = 1e-3
 """Probability below which a single offset counts as following a single axis the wrong way."""
+SHOWN = 0.01
+"""Probability, without any motion, of what speaks for the sign of the offsets that counts."""
 DOUBLED, HALVED = 1.5, 0.7
 """Scales beyond which an offset is in wrong units; what is nearer to 1 is fitted."""
 LEAST_SLOPE = 0.3
@@ -110,6 +112,21 @@ def wiring_faults(measurements: Measurements) -> list[WiringFault]:
                 found.append(WiringFault(view, kind, responses))
                 break
     return found
+
+
+def sign_is_shown(measurements: Measurements) -> bool:
+    """Return whether the repeats of grid marks show that offsets follow the stage as they should.
+
+    That speaks for the sign that they have and against the other one, all views together.
+    """
+    motions = [view.motion for view in measurements.views if view.motion is not None]
+    if not motions:
+        return False
+    motion = RepeatMotion(np.sum([one.products for one in motions], axis=0),
+                          sum(one.dof for one in motions))
+    moved = np.diag(motion.products) > LEAST_MOTION**2 * motion.dof
+    return motion.dof > 1 and bool(moved.all()) and (
+        _p_for(motion, np.eye(2), -np.eye(2)) < SHOWN)
 
 
 def _together(told: list[tuple[str, RepeatMotion]]) -> Iterator[tuple[str, RepeatMotion]]:

@@ -32,12 +32,15 @@ class TermSpread:
         Of the coefficients, for unit noise of one grid reading.
     of_marks : float array (p,)
         Scale of what a unit of each coefficient adds to the mean of every mark.
+    turned : float array (K, p)
+        Angular map of a unit of each coefficient, sign reversed, rad.
     """
 
     fields: np.ndarray
     parameters: np.ndarray
     covariance: np.ndarray
     of_marks: np.ndarray
+    turned: np.ndarray
 
 
 class FieldCovariance:
@@ -63,7 +66,8 @@ class FieldCovariance:
         self.system, self.inverse = system, inverse
         if terms is None:
             terms = TermSpread(np.zeros((system.grid.n_sites, 0), dtype=complex),
-                               np.zeros((system.size, 0)), np.zeros((0, 0)), np.zeros(0))
+                               np.zeros((system.size, 0)), np.zeros((0, 0)), np.zeros(0),
+                               np.zeros((system.angular.n_lines, 0)))
         self.terms = terms
         self._of_marks = terms.of_marks * (scale is not None and scale.of_plate)
         self.scale, self._u2 = scale, 0.0
@@ -124,6 +128,11 @@ class FieldCovariance:
         spread = spread + terms.fields @ (terms.covariance @ of_terms)
         variance += float(of_terms @ terms.covariance @ of_terms)
         return spread - basis @ np.real(basis.conj().T @ spread), variance
+
+    @property
+    def scale_variance(self) -> float:
+        """Variance of the scale that the reference sets, at the unit of position."""
+        return 0.0 if self.scale is None else self._of_scale(self.scale)[1]
 
     def maps_of_terms(self) -> np.ndarray:
         """Return the map of a unit of each coefficient in the datum, complex (sites, p)."""
@@ -189,7 +198,7 @@ def angular_variance(field: FieldCovariance, conditions: Conditions, *,
     with_slopes = y @ (field.inverse[np.ix_(system.phi_at, np.arange(n))] @ answer)
     of_slopes = field.of(conditions.slopes) * sigma_xy**2
 
-    turned = y @ field.terms.parameters[system.phi_at] / half_width_m
+    turned = field.terms.turned
     cover = field.terms.covariance * sigma_xy**2
     sloped = np.real(flat.conj().T @ field.terms.fields)
     columns = columns + turned @ (cover @ (rows @ turned).T)

@@ -60,6 +60,11 @@ class JointFit:
     solver: dict
     ratio: float = 0.0
 
+    @property
+    def both_residuals(self) -> tuple[np.ndarray, np.ndarray]:
+        """Residuals of the marks and of the lines."""
+        return self.residuals, self.residuals_theta
+
 
 def fit(problem: Problem, y: np.ndarray, theta: AngularPart | None = None) -> JointFit:
     """Return the joint least-squares solution.
@@ -146,7 +151,7 @@ def angular_part(problem: Problem) -> AngularPart:
     free, d = angular.reduced(y)
     phi = problem.system.angular_inverse @ d
     _, residual = angular.plate(y, free - angular.response @ phi, phi)
-    dof = angular.n_readings - problem.system.rank_angular
+    dof = angular.n_readings - problem.system.rank_angular - problem.dof_lines
     total = float((angular.weight * residual**2).sum())
     found = noise_estimate(problem.repeats_theta, sigma_of(total, dof),
                            problem.angular.sigma_declared, floor=FLOOR)

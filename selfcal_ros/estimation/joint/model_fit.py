@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """The fit of the whole model: finite rotations and terms around the linear least squares.
 
-A mark lies at R(phi) R^q (m + A + B) + t, with B the plate's own change in a view. What that holds
-beyond the linear model, ((R(phi) - 1 - phi J) m + (R(phi) - 1) (A + B)) in the plate frame, and
-what the terms make of the readings, are taken off with the last solution until it stands still.
-Every step solves the same factored equations (Gauss-Newton).
+A mark lies at R(phi) R^q (m + A + B) + t, with B the plate's own change in a view. The readings are
+taken in the frame of the plate as it lies (`selfcal_ros.estimation.joint.problem.turned`), where
+what is left of phi is small. What finite rotations add to the linear model there, and what the
+terms make of the readings, are taken off with the last solution until it stands still. Every step
+solves the same factored equations (Gauss-Newton).
 """
 
 import math
@@ -18,7 +19,6 @@ from selfcal_ros.estimation.datum.covariance import TermSpread
 from selfcal_ros.estimation.joint.fit import JointFit, angular_part, fit
 from selfcal_ros.estimation.joint.problem import ROUNDING, Problem, grid_dof, sigma_of
 from selfcal_ros.estimation.lattice.gauge import Gauge
-from selfcal_ros.estimation.normal.grid import GridSystem
 from selfcal_ros.estimation.terms.columns import TermColumns, made_anew, term_columns
 from selfcal_ros.estimation.terms.equations import TermEquations
 from selfcal_ros.estimation.terms.ground import without_noise
@@ -27,10 +27,11 @@ from selfcal_ros.estimation.terms.projection import (
     project,
     reduce_anew,
     reduce_columns,
+    reduce_lines,
 )
 from selfcal_ros.estimation.terms.sizes import SizeTest, size_tests
 from selfcal_ros.estimation.terms.solution import Sums, next_coefficients, residual_sums, score
-from selfcal_ros.model.terms import ModelTerm, TermName
+from selfcal_ros.model.terms import OF_PLATE, ModelTerm, TermName
 
 MAX_STEPS = 100
 
@@ -40,9 +41,13 @@ RESOLUTION = 1e-12
 ROUGH_RESOLUTION = 1e-11
 """The same once steps no longer shrink."""
 
-OF_NOISE = 1e-4
+OF_NOISE = 1e-3
 """Change of a reading, against the standard uncertainty of a misalignment, that is none once steps
 no longer shrink: rounding moves it where weights lie far apart, or a term is hardly told."""
+
+LATE, OF_NOISE_LATE = 20, 0.1
+"""Steps after which rounding is all that moves, and the change that is none from then on: plates
+laid millimetres beside their places make the offsets, and their rounding, as large."""
 
 LINEAR = 1e-3
 """Relative change of the misalignments' covariance from which the terms' equations are set up
@@ -109,7 +114,7 @@ class ModelFit:
         dual = Gauge(system.grid.views.z, system.known_marks, scale=True).dual(3)
         of_marks = shapes.against(shapes.sums(system.grid.relative_weight * dual))
         return TermSpread(now.projected.fields, now.projected.parameters,
-                          now.inverse(self.found.xy.sigma), of_marks)
+                          now.inverse(self.found.xy.sigma), of_marks, now.projected.turned)
 
 
 def fit_model(problem: Problem,
@@ -136,7 +141,8 @@ def fit_model(problem: Problem,
     allowed = {test.name: test.allowed for test in sizes if test.contradicted}
     if not allowed:
         return replace(model, sizes=sizes)
-    terms = tuple(replace(term, size=allowed.get(term.name, term.size)) for term in problem.terms)
+    terms = tuple(term.scaled(allowed[term.name] / term.size) if term.name in allowed else term
+                  for term in problem.terms)
     return replace(_settled(replace(problem, terms=terms), check), sizes=sizes)
 
 
@@ -145,7 +151,7 @@ def _size_tests(model: ModelFit) -> tuple[SizeTest, ...]:
     equations = model.equations
     if equations is None or equations.free.all():
         return ()
-    scored = score(equations, model.found.residuals, squares(model.problem, model.found),
+    scored = score(equations, model.found.both_residuals, squares(model.problem, model.found),
                    coefficients=model.coefficients)
     right = scored.total + equations.information @ model.coefficients
     noise = model.found.xy
@@ -162,11 +168,12 @@ def _settled(problem: Problem, check: Callable[[TermEquations], None]) -> ModelF
     before = np.inf
     for number in range(MAX_STEPS):
         change = state.step()
-        largest = float(np.abs(state.found.parameters).max())
+        largest = max(float(np.abs(state.found.parameters).max()), problem.largest_turn_m)
         if change <= max(RESOLUTION * largest, ROUNDING * float(np.abs(problem.grid.y).max())):
             return state.finished()
         stuck = number > 2 and change > SHRINKS * before
-        if stuck and (change <= ROUGH_RESOLUTION * largest or state.within_noise(change)):
+        part = OF_NOISE if number < LATE else OF_NOISE_LATE
+        if stuck and (change <= ROUGH_RESOLUTION * largest or state.within_noise(change, part)):
             return state.finished()
         before = change
     if problem.terms:
@@ -186,8 +193,9 @@ def equations_of(problem: Problem, found: JointFit, columns: TermColumns,
     inverse = found.inverse if len(found.inverse) else problem.system.grid_inverse
     known = [sigma for sigma in (found.xy.declared, found.xy.repeats, found.xy.residuals)
              if np.isfinite(sigma)]
-    return TermEquations(problem.system, columns,
-                         project(problem.system, reduced, inverse), min(known, default=0.0))
+    lines = reduce_lines(problem.system.angular, columns.lines, found.ratio, problem.half_width_m)
+    return TermEquations(problem.system, columns, project(problem.system, reduced, inverse, lines),
+                         min(known, default=0.0), found.ratio * problem.half_width_m**2)
 
 
 class _State:
@@ -195,7 +203,8 @@ class _State:
 
     def __init__(self, problem: Problem) -> None:
         self.problem, self.steps, self.theta = problem, 0, angular_part(problem)
-        self.y = problem.grid.y - self._beginning()
+        self.lines_read = problem.angular.y
+        self.y = problem.grid.y
         self.found = fit(problem, self.y, self.theta)
         self.offset_steps = OFFSET_STEPS
         self.equations: TermEquations | None = None
@@ -209,19 +218,6 @@ class _State:
         equations = self.equations
         self.coefficients = np.zeros(equations.n if equations else 0)
         self.sums = self._sums()
-
-    def _beginning(self) -> np.ndarray | float:
-        """Return what finite rotations add to the linear model, by what each view shows of its own.
-
-        Of stage and plate little is in these rotations: one or two of five steps are saved. Not
-        with terms, whose first equations say whether they are told at all: with nothing but
-        rounding left of the readings an offset would not count as noise.
-        """
-        if not self.problem.rigid or self.problem.terms:
-            return 0.0
-        grid, length = self.problem.system.grid, self.problem.half_width_m
-        phi = own_rotations(grid, self.problem.grid.y)[:, None, None] / length
-        return np.where(grid.read, (np.expm1(1j * phi) - 1j * phi) * (grid.views.z * length), 0.0)
 
     def _linearise(self, columns: TermColumns, reduced: ReducedColumns) -> None:
         """Set up the equations of the terms about the present solution."""
@@ -247,7 +243,8 @@ class _State:
         rows = columns.rows([microscope.name])
         effect = columns.shapes.combined(self.coefficients, rows) - before.shapes.combined(
             self.coefficients, rows)
-        if np.abs(effect).max() <= RESOLUTION * np.abs(self.found.parameters).max():
+        largest = max(float(np.abs(self.found.parameters).max()), self.problem.largest_turn_m)
+        if np.abs(effect).max() <= RESOLUTION * largest:
             self.offset_steps = self.steps
         return columns
 
@@ -275,13 +272,13 @@ class _State:
         return float(min(np.abs(self.found.parameters - parameters).max(),
                          np.abs(self.y - y).max()))
 
-    def within_noise(self, change: float) -> bool:
-        """Return whether a change of the misalignments is nothing against their uncertainty."""
+    def within_noise(self, change: float, part: float) -> bool:
+        """Return whether a change of the misalignments is below a part of their uncertainty."""
         spread = np.diag(self.found.inverse)
         spread = spread[spread > FIXED * spread.max(initial=0.0)]
         sigma = self.found.xy.sigma
         return bool(len(spread) and np.isfinite(sigma)
-                    and change <= OF_NOISE * sigma * np.sqrt(spread.min()))
+                    and change <= part * sigma * np.sqrt(spread.min()))
 
     def finished(self) -> ModelFit:
         self.sums = self._sums()
@@ -289,12 +286,21 @@ class _State:
                         self.y, self.reduced)
 
     def _solve_terms(self, equations: TermEquations) -> None:
-        now = score(equations, self.found.residuals, squares(self.problem, self.found),
+        now = score(equations, self.found.both_residuals, squares(self.problem, self.found),
                     coefficients=self.coefficients)
         sums = residual_sums(equations, now)
         self.problem = with_noise(self.problem, sums)
         sigma = self.found.xy.sigma if np.isfinite(self.found.xy.sigma) else 0.0
         self.coefficients = next_coefficients(equations, now, self.coefficients, sigma)
+        lines = equations.columns.lines
+        if len(lines.at):
+            taken = np.tensordot(self.coefficients[lines.at], lines.values, axes=1)
+            own = equations.rows([TermName.LINE_ECCENTRICITY])
+            within = equations.inverse(sigma)[np.ix_(own, own)]
+            dof = float(np.sum(within * equations.information[np.ix_(own, own)]))
+            angular = replace(self.problem.angular, y=self.lines_read - taken)
+            self.problem = replace(self.problem, angular=angular, dof_lines=dof)
+            self.theta = angular_part(self.problem)
 
     def _of_terms(self) -> np.ndarray | float:
         if self.equations is None:
@@ -302,49 +308,32 @@ class _State:
         return self.equations.columns.shapes.combined(self.coefficients)
 
     def _excess(self) -> np.ndarray | float:
-        """Return what a finite rotation adds to the linear model, plate frame, m."""
+        """Return what finite rotations add to the linear model, in the frame of the plate, m.
+
+        What is left of the rotation there turns the plate; the rotation of the frame turns G.
+        """
         if not self.problem.rigid:
             return 0.0
         grid, length = self.problem.system.grid, self.problem.half_width_m
         phi = self.found.parameters[:3 * grid.n_views:3, None, None] / length
         turn = np.expm1(1j * phi)
+        frame = np.expm1(-1j * self.problem.turn_rad)[:, None, None]
         return (turn - 1j * phi) * (grid.views.z * length) + turn * (
-            self.found.plate + self._of_plate())
+            self.found.plate + self._of_plate()) + frame * grid.views.gather(self.found.field)
 
     def _of_plate(self) -> np.ndarray | float:
         """Return how the plate itself differs in each view, B, (views, nx, ny), m."""
         if self.equations is None:
             return 0.0
-        rows = self.equations.rows((TermName.PLATE_SCALE, TermName.PLATE_SHAPE))
+        rows = self.equations.rows(OF_PLATE)
         return self.equations.columns.shapes.combined(self.coefficients, rows)
 
     def _sums(self) -> Sums:
         if self.equations is not None:
-            now = score(self.equations, self.found.residuals, squares(self.problem, self.found),
-                        coefficients=self.coefficients)
+            now = score(self.equations, self.found.both_residuals,
+                        squares(self.problem, self.found), coefficients=self.coefficients)
             return residual_sums(self.equations, now)
         return Sums(*squares(self.problem, self.found), float("nan"), 0)
-
-
-def own_rotations(grid: GridSystem, y: np.ndarray) -> np.ndarray:
-    """Return the rotation of each view that its own readings show, times the half width, m.
-
-    The weighted least-squares fit of offset, rotation and magnification to each view alone.
-
-    Parameters
-    ----------
-    grid : GridSystem
-        The measured plan.
-    y : complex array (views, nx, ny)
-        Deviations in the plate frame, m.
-    """
-    marks = grid.views.z.reshape(-1)
-    weight, values = (array.reshape(grid.n_views, -1) for array in (grid.weight, y))
-    total = weight.sum(axis=1)
-    z = marks - (weight @ marks / total)[:, None]
-    moment = (weight * (z.real**2 + z.imag**2)).sum(axis=1)
-    turned = (weight * z.conj() * values).sum(axis=1).imag
-    return turned / np.where(moment > 0, moment, 1.0)
 
 
 def squares(problem: Problem, found: JointFit) -> tuple[float, float]:

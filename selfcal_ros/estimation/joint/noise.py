@@ -77,7 +77,7 @@ def coverage_factor(dof: float, probability: float = COVERAGE) -> float:
     return float(stdtrit(min(dof, MANY_DOF), (1 + probability) / 2))
 
 
-def pooled(parts: Iterable[tuple[float, int]]) -> tuple[float, int]:
+def pooled(parts: Iterable[tuple[float, float]]) -> tuple[float, float]:
     """Return the pooled standard deviation and degrees of freedom of (sigma, dof) pairs."""
     good = [(sigma, dof) for sigma, dof in parts if dof > 0 and np.isfinite(sigma)]
     total = sum(dof for _, dof in good)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What is to be fitted, and how its two kinds of readings weigh against each other."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -14,7 +14,9 @@ from selfcal_ros.estimation.joint.noise import (
 )
 from selfcal_ros.estimation.lattice.readings import AngularData, GridData
 from selfcal_ros.estimation.normal.equations import NormalEquations
+from selfcal_ros.estimation.normal.grid import GridSystem
 from selfcal_ros.estimation.options import ReferenceLength
+from selfcal_ros.estimation.terms.equations import LEAST_NOISE_M
 from selfcal_ros.estimation.terms.ground import Ground
 from selfcal_ros.estimation.terms.visits import between_visits
 from selfcal_ros.model.readings import Measurements
@@ -25,6 +27,9 @@ ROUNDING = 16 * np.finfo(float).eps
 
 FLOOR = 1e-13
 """Noise, m or rad, that is rounding and not tested."""
+
+LEAST_NOISE_RAD = 1e-10
+"""Noise of lines that counts in weights at least: less is rounding."""
 
 NO_NOISE = float(np.sqrt(np.finfo(float).tiny))
 """Noise that stands for none: its square is still a number."""
@@ -63,13 +68,17 @@ class Problem:
     residuals_xy : tuple, optional
         (sigma, degrees of freedom) of the residuals where they are not those of the grid alone:
         after terms were taken off.
+    dof_lines : float
+        Degrees of freedom that terms take from the readings of lines.
+    turn_rad : float array (grid views,)
+        Angle by which the frame of each view's readings is turned, see `turned`.
     """
 
     system: NormalEquations
     grid: GridData
     angular: AngularData
     repeats_xy: tuple[float, float]
-    repeats_theta: tuple[float, int]
+    repeats_theta: tuple[float, float]
     half_width_m: float
     conditions: Conditions
     direct: bool
@@ -79,6 +88,18 @@ class Problem:
     terms: tuple[ModelTerm, ...] = ()
     drift_degree: int = DRIFT_DEGREE
     residuals_xy: tuple[float, float] | None = None
+    dof_lines: float = 0.0
+    turn_rad: np.ndarray = field(default_factory=lambda: np.zeros(0))
+
+    @property
+    def largest_turn_m(self) -> float:
+        """What the largest turn of a frame is at the half width, m."""
+        return self.half_width_m * float(np.abs(self.turn_rad).max(initial=0.0))
+
+    @property
+    def frames(self) -> np.ndarray:
+        """exp(-i turn_rad) of each grid view: from the nominal to the turned plate frame."""
+        return np.exp(-1j * self.turn_rad)
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,7 +126,8 @@ class FreeNetworkSolution:
     ratio: float = 0.0
 
 
-def repeats_of(measurements: Measurements) -> tuple[tuple[float, int], tuple[float, int]]:
+def repeats_of(measurements: Measurements
+               ) -> tuple[tuple[float, float], tuple[float, float]]:
     """Return pooled (sigma, degrees of freedom) of the repeats, grid and angular."""
     views = measurements.views
     return (between_visits(measurements, MIN_REPEAT_DOF) or pooled(
@@ -142,9 +164,9 @@ def weight_ratio(problem: Problem, sigma_xy: float, sigma_theta: float, y: np.nd
     """
     if not (np.isfinite(sigma_xy) and np.isfinite(sigma_theta)):
         return 1.0
-    sigma_xy = max(sigma_xy, ROUNDING * float(np.abs(y).max()))
+    sigma_xy = max(sigma_xy, LEAST_NOISE_M, ROUNDING * float(np.abs(y).max()))
     peak = float(np.abs(problem.angular.y).max())
-    sigma_theta = max(sigma_theta, ROUNDING * peak)
+    sigma_theta = max(sigma_theta, LEAST_NOISE_RAD, ROUNDING * peak)
     return bounded_ratio(problem.system, sigma_xy, sigma_theta, problem.half_width_m)
 
 
@@ -167,3 +189,49 @@ def bounded_ratio(system: NormalEquations, sigma_xy: float, sigma_theta: float,
     ratio = (sigma_xy / (sigma_theta * half_width_m)) ** 2  # method eq. 4.2
     equal = system.grid_scale / system.angular_scale
     return float(np.clip(ratio, equal / MAX_WEIGHT, equal * MAX_WEIGHT))
+
+
+def own_rotations(grid: GridSystem, y: np.ndarray) -> np.ndarray:
+    """Return the rotation of each view that its own readings show, times the half width, m.
+
+    The weighted least-squares fit of offset, rotation and magnification to each view alone.
+
+    Parameters
+    ----------
+    grid : GridSystem
+        The measured plan.
+    y : complex array (views, nx, ny)
+        Deviations in the plate frame, m.
+    """
+    marks = grid.views.z.reshape(-1)
+    weight, values = (array.reshape(grid.n_views, -1) for array in (grid.weight, y))
+    total = weight.sum(axis=1)
+    z = marks - (weight @ marks / total)[:, None]
+    moment = (weight * (z.real**2 + z.imag**2)).sum(axis=1)
+    turned = (weight * z.conj() * values).sum(axis=1).imag
+    return turned / np.where(moment > 0, moment, 1.0)
+
+
+def turned(problem: Problem) -> Problem:
+    """Return the problem with the readings of each view in the frame of the plate as it lies.
+
+    With the rotation phi0 that a view shows by itself, y' = e^(-i phi0) (y + m) - m. Without it the
+    linear model would have the columns of the terms and that of the rotation apart by phi0, and
+    what only phi0^2 determines, the scale of a microscope, with the wrong sign.
+    """
+    grid, length = problem.system.grid, problem.half_width_m
+    phi = own_rotations(grid, problem.grid.y) / length
+    frame, bent = np.exp(-1j * phi), np.expm1(-1j * phi)
+    marks = grid.views.z * length
+    y = np.where(grid.read, frame[:, None, None] * problem.grid.y + bent[:, None, None] * marks, 0)
+    visits = tuple(None if v is None else replace(
+        v, y=f * v.y + e * marks.reshape(-1)[v.mark], phase=v.phase * complex(f))
+        for v, f, e in zip(problem.ground.visits, frame, bent, strict=True))
+    lines = problem.angular.y.copy()
+    for row, index in enumerate(problem.angular.index):
+        if index in problem.grid.index:
+            read = problem.angular.weight[row] > 0
+            lines[row] -= np.where(read, phi[problem.grid.index.index(index)], 0.0)
+    return replace(problem, grid=replace(problem.grid, y=y), turn_rad=phi,
+                   angular=replace(problem.angular, y=lines),
+                   ground=replace(problem.ground, visits=visits))

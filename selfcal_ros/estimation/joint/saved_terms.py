@@ -32,6 +32,9 @@ ROUNDING = 1e-12
 FREE = ""
 """Name under which the factors of all free terms are kept."""
 
+ANGULAR_KEY = "angular_terms"
+"""Where a result keeps the standard uncertainty of the angular map that each term makes, rad."""
+
 DIGITS = 7
 """Digits of a factor that are kept."""
 
@@ -122,6 +125,29 @@ def factors_of(result: CalibrationResult) -> np.ndarray:
         raise InputError(KEY, "no factors of this lattice",
                          "write the result again with `selfcal solve`")
     return factors
+
+
+def angular_terms(cover: FieldCovariance, columns: TermColumns, sigma_m: float,
+                  known: np.ndarray) -> dict[str, Any]:
+    """Return what each term of the lines makes of the angular map, for `extra`: rad, (K,).
+
+    Parameters
+    ----------
+    cover, columns : FieldCovariance, TermColumns
+        As in `saved_terms`.
+    sigma_m : float
+        Noise of one grid reading, m.
+    known : bool array (K,)
+        Lines of the map, whose mean is its datum.
+    """
+    out = {}
+    for name in dict.fromkeys(columns.columns[at].term for at in columns.lines.at):
+        rows = columns.rows([name])
+        moved = cover.terms.turned[:, rows]
+        moved = moved - moved[known].mean(axis=0)
+        power = np.einsum("kp,pq,kq->k", moved, cover.terms.covariance[np.ix_(rows, rows)], moved)
+        out[str(name)] = rounded(np.sqrt(np.maximum(power, 0.0)) * sigma_m)
+    return {ANGULAR_KEY: out} if out else {}
 
 
 def variance_of_terms(result: CalibrationResult) -> dict[str, np.ndarray]:

@@ -1,21 +1,28 @@
 # SPDX-License-Identifier: Apache-2.0
 """Calibration by joint least squares: readings to result."""
 
+from collections.abc import Collection
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from selfcal_ros.errors import InputError, NoDataError, NotIdentifiableError
+from selfcal_ros.errors import (
+    InputError,
+    NoDataError,
+    NotIdentifiableError,
+    NotSettledError,
+)
 from selfcal_ros.estimation.blas_threads import one_thread
 from selfcal_ros.estimation.datum.angular import conditions_for, misclosure_test
 from selfcal_ros.estimation.datum.covariance import FieldCovariance, angular_variance
-from selfcal_ros.estimation.datum.scale import scale_datum
-from selfcal_ros.estimation.findings import NoUncertainty, Unchecked
+from selfcal_ros.estimation.datum.scale import scale_datum, scale_of
+from selfcal_ros.estimation.findings import Magnification, NoUncertainty, Unchecked
 from selfcal_ros.estimation.joint.fit import JointFit
 from selfcal_ros.estimation.joint.kept_residuals import kept_residuals
 from selfcal_ros.estimation.joint.model_fit import ModelFit, fit_model
-from selfcal_ros.estimation.joint.problem import Problem, repeats_of
-from selfcal_ros.estimation.joint.saved_terms import saved_terms
+from selfcal_ros.estimation.joint.problem import Problem, repeats_of, turned
+from selfcal_ros.estimation.joint.saved_terms import angular_terms, saved_terms
 from selfcal_ros.estimation.joint.solved import Solved, noise_of
 from selfcal_ros.estimation.lattice.maps import PHASES
 from selfcal_ros.estimation.lattice.readings import angular_data, grid_data
@@ -23,7 +30,8 @@ from selfcal_ros.estimation.normal.cache import system_for
 from selfcal_ros.estimation.normal.equations import MAX_DIRECT_SITES, NormalEquations
 from selfcal_ros.estimation.observability.plan_check import with_unseen_modes
 from selfcal_ros.estimation.observability.rank import identifies, measured_observability, refusal
-from selfcal_ros.estimation.options import Options
+from selfcal_ros.estimation.options import Options, ReferenceKind, ReferenceLength
+from selfcal_ros.estimation.terms.equations import LEAST_NOISE_M
 from selfcal_ros.estimation.terms.ground import ground_of
 from selfcal_ros.estimation.terms.identifiable import require_terms_told
 from selfcal_ros.estimation.terms.visits import check_visits
@@ -35,16 +43,36 @@ from selfcal_ros.model.result import (
     Observability,
     ViewResult,
 )
+from selfcal_ros.model.terms import VISIT_TERMS, TermName
 from selfcal_ros.model.verdict import Finding, ModelResult, TermEstimate, TermResult
 from selfcal_ros.model.view import Plan
 
 
 def solve_joint(measurements: Measurements, options: Options) -> Solved:
-    """Calibrate by joint least squares; see `selfcal_ros.estimation.api.calibrate`."""
+    """Calibrate by joint least squares; see `selfcal_ros.estimation.api.calibrate`.
+
+    Readings so far from what is assumed of them that the estimate does not converge are solved
+    without the assumptions, and cannot be qualified. Where nothing but rounding is left no
+    assumption can be weighed against it: what the views determine by themselves is enough.
+    """
     with one_thread():
-        problem, seen = prepare(measurements, options)
-        model = fit_model(problem, lambda equations: require_terms_told(equations, seen))
-        return _solved(measurements, options, model=model, seen=seen)
+        for assumed in (options.assumed,
+                        tuple(t for t in options.assumed if t.name in VISIT_TERMS)):
+            try:
+                found = _attempt(measurements, replace(options, assumed=assumed))
+            except NotSettledError:
+                continue
+            return replace(found, converged=(
+                assumed == options.assumed or found.xy.sigma < LEAST_NOISE_M))
+        found = _attempt(measurements, replace(options, assumed=()))
+        return replace(found, converged=(
+            not options.assumed or found.xy.sigma < LEAST_NOISE_M))
+
+
+def _attempt(measurements: Measurements, options: Options) -> Solved:
+    problem, seen = prepare(measurements, options)
+    model = fit_model(problem, lambda equations: require_terms_told(equations, seen))
+    return _solved(measurements, options, model=model, seen=seen)
 
 
 def prepare(measurements: Measurements, options: Options) -> tuple[Problem, Observability]:
@@ -75,31 +103,49 @@ def prepare(measurements: Measurements, options: Options) -> tuple[Problem, Obse
     if direct and system.grid.n_sites > MAX_DIRECT_SITES:
         raise InputError("options", f"the uncertainty of {system.grid.n_sites} sites is beyond "
                          f"the limit of {MAX_DIRECT_SITES}", "solve without the uncertainty")
-    return Problem(
+    ground = ground_of(measurements, grid, half_width_m)
+    terms = tuple(
+        term for term in options.model_terms(
+            visits=all(v is not None for v in ground.visits), assumed=direct)
+        if angular.index or term.name is not TermName.LINE_ECCENTRICITY)
+    problem = Problem(
         system, grid, angular, *repeats_of(measurements), half_width_m, conditions, direct,
-        ground_of(measurements, grid, half_width_m), options.reference,
-        options.misalignment_model == "rigid", options.terms, options.drift_degree), seen
+        ground, options.reference, options.misalignment_model == "rigid", terms,
+        options.drift_degree)
+    return turned(problem) if problem.rigid else replace(
+        problem, turn_rad=np.zeros(len(grid.index))), seen
 
 
 def _solved(measurements: Measurements, options: Options, *, model: ModelFit,
             seen: Observability) -> Solved:
     problem, found = model.problem, model.found
     error_map, closure, kept = _error_map(measurements, options, model=model)
-    findings = _unchecked(problem.system, measurements.sense)
+    artifact_map = _artifact_map(model, options)
+    findings = (*_unchecked(problem.system, measurements.sense),
+                *_magnification(artifact_map, options))
     if not problem.direct and options.uncertainty is None:
         findings = (NoUncertainty(), *findings)
     axes = (1.0, 0.0)
     if problem.conditions.datum is ThetaDatum.XY_AXES and closure is not None:
         axes = misclosure_test(found.misclosure, closure)
     result = CalibrationResult(
-        measurements.plan_id, error_map, _artifact_map(problem, found),
+        measurements.plan_id, error_map, artifact_map,
         _views(measurements, problem, found), seen, noise_of(found.xy, found.theta),
         measurements.all_rejected(), findings=findings, method="joint",
         sense=str(measurements.sense),
         extra={"solver": found.solver, **kept, **kept_residuals(measurements, model)},
         run_id=measurements.run_id,
-        model=ModelResult("rigid" if problem.rigid else "linear", term_results(model)))
+        model=ModelResult("rigid" if problem.rigid else "linear", term_results(
+            model, {term.name for term in options.terms})))
     return Solved(result, found.xy, found.theta, model, axes)
+
+
+def _magnification(found: ArtifactMap, options: Options) -> tuple[Finding, ...]:
+    """Return whether plate and encoders differ in scale by more than they can."""
+    if options.reference is not None or not (
+            abs(found.magnification) > options.magnification_limit):
+        return ()
+    return (Magnification(found.magnification, found.u_magnification),)
 
 
 def _unchecked(system: NormalEquations, sense: Sense) -> tuple[Finding, ...]:
@@ -139,25 +185,25 @@ def _short(weight: float) -> float | int:
     return int(weight) if weight == int(weight) else float(f"{weight:.9g}")
 
 
-def term_results(model: ModelFit) -> tuple[TermResult, ...]:
-    """Return what was found of each term of the model."""
+def term_results(model: ModelFit, declared: Collection[str]) -> tuple[TermResult, ...]:
+    """Return what was found of each term of the model; those not `declared` are assumed."""
     if model.equations is None:
         return ()
     columns, covariance = model.equations.columns.columns, model.covariance
     told = np.abs(model.equations.untold(model.equations.free)).max(axis=1, initial=0.0) < 1e-6
-    names = (*model.problem.ground.names, "")  # -1: shared by all views
     given = {test.name: test.given for test in model.sizes if test.contradicted}
     out = []
     for term in model.problem.terms:
         estimates = tuple(
-            TermEstimate(names[c.view], c.component,
+            TermEstimate(model.problem.ground.name_of(c.term, c.view), c.component,
                          float(model.coefficients[i]) if told[i] else float("nan"),
                          float(np.sqrt(max(covariance[i, i], 0.0)) * model.found.xy.sigma)
                          if told[i] else float("nan"), c.unit)
             for i, c in enumerate(columns) if c.term == term.name)
         size = None if term.free else term.size
         out.append(TermResult(str(term.name), given.get(term.name, size), estimates,
-                              size if term.name in given else None))
+                              size if term.name in given else None,
+                              "declared" if term.name in declared else "default"))
     return tuple(out)
 
 
@@ -181,6 +227,8 @@ def _error_map(measurements: Measurements, options: Options, *, model: ModelFit,
             u_x, u_y = (np.sqrt(v) * found.xy.sigma for v in cover.diagonal())
         if wanted and model.equations is not None:
             kept = saved_terms(cover, model.equations.columns, measurements.sense)
+            kept |= angular_terms(cover, model.equations.columns, found.xy.sigma,
+                                  system.known_lines)
         if system.angular.n_views:
             variance, closure = angular_variance(
                 cover, problem.conditions, sigma=(found.xy.sigma, found.theta.sigma),
@@ -199,11 +247,20 @@ def _error_map(measurements: Measurements, options: Options, *, model: ModelFit,
                     problem.conditions.datum), closure, kept
 
 
-def _artifact_map(problem: Problem, found: JointFit) -> ArtifactMap:
-    system = problem.system
+def _artifact_map(model: ModelFit, options: Options) -> ArtifactMap:
+    problem, found = model.problem, model.found
+    system, length = problem.system, problem.half_width_m
     plate = np.where(system.known_marks, found.plate, complex(np.nan, np.nan))
+    alone = ReferenceLength(ReferenceKind.ARTIFACT, 0.0)
+    scale = scale_of(system, alone, field=found.field, plate=found.plate, half_width_m=length)
+    u = float("nan")
+    if problem.direct and options.uncertainty is not False:
+        cover = FieldCovariance(system, found.inverse, scale_datum(system, alone, length),
+                                found.xy.sigma, model.spread)
+        u = float(np.sqrt(cover.scale_variance)) * found.xy.sigma / length
     return ArtifactMap(plate.real.copy(), plate.imag.copy(),
-                       np.where(system.known_plate_lines, found.a_theta, np.nan))
+                       np.where(system.known_plate_lines, found.a_theta, np.nan),
+                       scale / length, u)
 
 
 def _views(measurements: Measurements, problem: Problem, found: JointFit) -> tuple[ViewResult, ...]:
@@ -212,8 +269,8 @@ def _views(measurements: Measurements, problem: Problem, found: JointFit) -> tup
     phi = dict(zip(system.angular_index, values[system.phi_at], strict=True))
     offset: dict[int, complex] = {}
     for row, i in enumerate(system.grid_index):
-        phi[i] = values[3 * row]
-        turn = PHASES[problem.grid.poses[row].q]
+        phi[i] = values[3 * row] + problem.turn_rad[row] * problem.half_width_m
+        turn = PHASES[problem.grid.poses[row].q] * np.exp(1j * problem.turn_rad[row])
         offset[i] = turn * complex(*values[3 * row + 1:3 * row + 3])
     nan = complex(np.nan, np.nan)
     return tuple(

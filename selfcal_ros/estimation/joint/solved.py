@@ -23,6 +23,8 @@ class Solved:
     axes : tuple of float
         Probability and size (rad) of the misclosure of the axis conditions; 1 and 0 where they
         were not asked for.
+    converged : bool
+        Whether the estimate converged with what is assumed of the measurement.
     """
 
     result: CalibrationResult
@@ -30,6 +32,7 @@ class Solved:
     theta: NoiseEstimate
     model: ModelFit | None = None
     axes: tuple[float, float] = (1.0, 0.0)
+    converged: bool = True
 
 
 def noise_of(xy: NoiseEstimate, theta: NoiseEstimate) -> Noise:

@@ -7,9 +7,9 @@ from enum import Enum
 import numpy as np
 
 from selfcal_ros.estimation.joint.noise import F_LEVEL, coverage_factor
-from selfcal_ros.estimation.joint.saved_terms import variance_of_terms
+from selfcal_ros.estimation.joint.saved_terms import ANGULAR_KEY, variance_of_terms
 from selfcal_ros.estimation.options import ReferenceLength
-from selfcal_ros.estimation.verdict.coverage import TOLD, remaining_part, with_coverage
+from selfcal_ros.estimation.verdict.enlarge import TOLD, remaining_part, with_coverage
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.result import CalibrationResult, Noise
 from selfcal_ros.model.statistics import rms
@@ -45,6 +45,13 @@ class FromTerm(Finding):
     given: float
     allowed: float | None
     remaining_part: float
+
+
+@dataclass(frozen=True)
+class FromEffect(Finding):
+    """A cause that the readings show and no term of the model holds: its effect on the map."""
+
+    cause: str
 
 
 @dataclass(frozen=True)
@@ -149,10 +156,14 @@ def budgets(result: CalibrationResult, reference: ReferenceLength | None = None)
     out = [_combine("xy", parts, nodes),
            _combine("xy", parts, nodes, _interpolation_xy(result))]
     if np.isfinite(emap.u_g_theta).any():
-        part = _noise_part(emap.u_g_theta, noise, "theta")
+        kept = {name: np.asarray(u, dtype=float)
+                for name, u in result.extra.get(ANGULAR_KEY, {}).items()}
+        own = emap.u_g_theta**2 - sum(u**2 for u in kept.values())
         lines = _dof(noise, "theta")
-        out += [_combine("theta", [part], lines),
-                _combine("theta", [part], lines, _interpolation_theta(result))]
+        parts = [_noise_part(np.sqrt(np.maximum(own, 0.0)), noise, "theta"),
+                 *(_angular_part(result, name, u, lines) for name, u in kept.items())]
+        out += [_combine("theta", parts, lines),
+                _combine("theta", parts, lines, _interpolation_theta(result))]
     return out
 
 
@@ -194,13 +205,26 @@ def _term_part(result: CalibrationResult, name: str, variance: np.ndarray,
 
     Of type A if the readings tell the term, of type B if its size does.
     """
-    term = next(term for term in result.model.terms if term.name == name)
+    known = variance[:, result.error_map.valid]
+    term = next((term for term in result.model.terms if term.name == name), None)
+    if term is None:
+        return Component(f"effect {name}", "B", float(np.sqrt(known.mean())),
+                         float(np.sqrt(known.max())), np.inf, FromEffect(name))
     part = remaining_part(term)
     told = part < TOLD
-    known = variance[:, result.error_map.valid]
     how = FromTerm(term.size or term.solved_with, term.size_used, part)
     return Component(f"term {name}", "A" if told else "B", float(np.sqrt(known.mean())),
                      float(np.sqrt(known.max())), dof if told else np.inf, how)
+
+
+def _angular_part(result: CalibrationResult, name: str, u: np.ndarray, dof: float) -> Component:
+    """Return what a term of the lines makes of the uncertainty of the angular map."""
+    term = next(term for term in result.model.terms if term.name == name)
+    part = remaining_part(term)
+    told = part < TOLD
+    return Component(f"term {name}", "A" if told else "B", rms(u), float(u.max(initial=0.0)),
+                     dof if told else np.inf, FromTerm(term.size or term.solved_with,
+                                                       term.size_used, part))
 
 
 def _reference_part(artifact: Artifact, reference: ReferenceLength | None) -> Component:

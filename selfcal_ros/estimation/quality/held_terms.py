@@ -16,9 +16,9 @@ from selfcal_ros.estimation.terms.columns import term_columns
 from selfcal_ros.estimation.terms.ground import Ground, ground_of
 from selfcal_ros.estimation.terms.visits import ViewVisits
 from selfcal_ros.model.readings import Measurements
-from selfcal_ros.model.terms import TermName
+from selfcal_ros.model.terms import OF_PLATE, TermName
 
-OF_A_VIEW = (TermName.DRIFT, TermName.PLATE_SCALE, TermName.PLATE_SHAPE)
+OF_A_VIEW = (TermName.DRIFT, *OF_PLATE)
 """Terms of which each view has its own."""
 
 
@@ -54,6 +54,8 @@ def held_readings(model: ModelFit, kept: Measurements, held: Measurements) -> He
         made = term_columns(ground, problem.terms, problem.drift_degree)
         at = {(c.term, c.view, c.component): k for k, c in enumerate(equations.columns.columns)}
         for column, block in zip(made.columns, made.grid, strict=True):
+            if column.term == TermName.LINE_ECCENTRICITY:
+                continue  # its views are those with lines, and no mark has a part of it
             row = -1 if column.view == -1 else rows[column.view]
             shared = column.view == -1
             if (row >= 0 or shared) and (key := (column.term, row, column.component)) in at:

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from scipy.special import chdtri, gammaincinv
 
-from selfcal_ros.errors import InputError, NotIdentifiableError
+from selfcal_ros.errors import InputError, NotIdentifiableError, NotSettledError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.blas_threads import one_thread
 from selfcal_ros.estimation.checks.wiring import check_wiring
@@ -45,7 +45,7 @@ from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.terms import ModelTerm, TermName
-from selfcal_ros.model.verdict import Finding
+from selfcal_ros.model.verdict import Finding, Grade
 
 LEVEL = 0.01
 """Probability that a measurement without outliers loses a reading."""
@@ -114,7 +114,7 @@ def robust_calibrate(measurements: Measurements,
     left = tuple(finding for finding in cleaned.findings if _is_left(finding))
     verdict = result.verdict
     if left:
-        verdict = replace(verdict, qualified=False, findings=(*verdict.findings, *left))
+        verdict = replace(verdict, grade=Grade.NOT_QUALIFIED, findings=(*verdict.findings, *left))
     return replace(result, findings=(*result.findings, *cleaned.findings), verdict=verdict,
                    extra={**result.extra, **_listed(cleaned)})
 
@@ -147,6 +147,7 @@ def clean(measurements: Measurements, options: Options) -> OutlierScreening:
     """Return the measurement split at slips and without outliers, and what was found."""
     # a pure datum: the redundant axis conditions of xy_axes would show in the angular residuals
     linear = replace(options, misalignment_model="linear", reference=None, terms=(),
+                     assumed=(),
                      datum_theta=ThetaDatum.ZERO_MEAN)
     screened = _without_slips(measurements, options, linear)
     gone, residuals, stopped = _reject(screened.flattened, linear, screened.residuals)
@@ -339,10 +340,17 @@ def _flattened(measurements: Measurements, options: Options) -> Measurements:
     if options.misalignment_model == "linear" and not options.terms:
         return measurements
     problem, seen = prepare(measurements, options)
-    model = fit_model(problem, lambda equations: require_terms_told(equations, seen))
+    try:
+        model = fit_model(problem, lambda equations: require_terms_told(equations, seen))
+    except NotSettledError:
+        if not options.assumed:
+            raise
+        return _flattened(measurements, replace(options, assumed=()))
     views, (hx, hy) = list(measurements.views), measurements.artifact.half
     for row, index in enumerate(problem.grid.index):
         view = views[index]
-        linear = model.y[row][view.m + hx, view.n + hy] * PHASES[problem.grid.poses[row].q]
+        marks = problem.system.grid.views.z * problem.half_width_m
+        flat = model.y[row] + 1j * problem.turn_rad[row] * marks
+        linear = flat[view.m + hx, view.n + hy] * PHASES[problem.grid.poses[row].q]
         views[index] = replace(view, dx=linear.real, dy=linear.imag, visits=None)
     return replace(measurements, views=tuple(views))

@@ -19,7 +19,7 @@ from selfcal_ros.estimation.terms.identifiable import require_terms_told
 from selfcal_ros.estimation.terms.shapes import shapes_of
 from selfcal_ros.estimation.verdict.cause_sizes import cause_of
 from selfcal_ros.estimation.verdict.causes import PlacedSlip, find_explanations
-from selfcal_ros.estimation.verdict.slip_columns import SLIP
+from selfcal_ros.estimation.verdict.fault_columns import SLIP
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.verdict import Cause
 

@@ -53,7 +53,7 @@ from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.readings import Measurements, Sense, ViewReadings
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.statistics import rms
-from selfcal_ros.model.verdict import Finding
+from selfcal_ros.model.verdict import Finding, Grade
 from selfcal_ros.model.view import Plan
 
 FRACTION = 0.1
@@ -320,5 +320,5 @@ def judged_by(result: CalibrationResult, found: list[HeldOut]) -> CalibrationRes
     if not failed:
         return result
     verdict = result.verdict
-    return replace(result, verdict=replace(verdict, qualified=False,
+    return replace(result, verdict=replace(verdict, grade=Grade.NOT_QUALIFIED,
                                            findings=(*verdict.findings, *failed)))

@@ -4,11 +4,13 @@
 In the plate frame, with o the offset seen, tau the view's time in [-1, 1], z the mark, H the half
 width and s the signs of approach (reality of machines; docs/method.md, terms of the model):
 
-    microscope   V has -E o                  4 coefficients, shared
+    microscope   V has -E o                  4 coefficients, shared: E o = (s + ir) o + (a + ih) o*
     drift        V has sum_l d_l P_l(tau)     2 a degree and view (Legendre)
     plate_scale  V has b z                    1 a view
+    plate_strain V has b z + (a + ih) z*      3 a view: scale, stretch, shear
     plate_shape  V has a quadratic form of z/H, 6 a view
     approach     V has +-(h_x s_x + i h_y s_y)  2, shared; minus where the plate moves
+    line_eccentricity  Vtheta has c cos theta_k + s sin theta_k, 2 a view, rad
 """
 
 from collections.abc import Iterable, Sequence
@@ -19,7 +21,7 @@ from scipy.special import eval_legendre
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.terms.ground import Ground
-from selfcal_ros.estimation.terms.shapes import Shapes, shapes_of
+from selfcal_ros.estimation.terms.shapes import NO_LINES, LineColumns, Shapes, shapes_of
 from selfcal_ros.estimation.terms.visits import ViewVisits
 from selfcal_ros.model.terms import UNITS, VISIT_TERMS, ModelTerm, TermName
 
@@ -31,7 +33,7 @@ AXES: tuple[tuple[str, complex], ...] = (("x", 1), ("y", 1j))
 
 @dataclass(frozen=True)
 class Column:
-    """One coefficient: its term (or ``slip``), grid view (-1 = all), what it is, its size."""
+    """One coefficient: its term (or ``slip``), view (-1 = all), what it is, its size."""
 
     term: str
     view: int
@@ -81,12 +83,15 @@ class TermColumns:
     at : list
         Values of each shape at the visits of each view, (V,), plate frame; None where they are
         those of the means.
+    lines : LineColumns
+        Those in the readings of lines, rad.
     """
 
     columns: tuple[Column, ...]
     shapes: Shapes
     within: WithinMarks
     at: Seen
+    lines: LineColumns = NO_LINES
 
     @property
     def grid(self) -> np.ndarray:
@@ -121,10 +126,10 @@ class TermColumns:
         wanted = set(names)
         return np.array([column.term in wanted for column in self.columns], dtype=bool)
 
-    def with_size(self, name: str, size: float) -> "TermColumns":
-        """Return the same columns with another size of the term `name`."""
+    def scaled(self, name: str, factor: float) -> "TermColumns":
+        """Return the same columns with the sizes of the term `name` multiplied by `factor`."""
         return replace(self, columns=tuple(
-            replace(column, size=size) if column.term == name else column
+            replace(column, size=column.size * factor) if column.term == name else column
             for column in self.columns))
 
 
@@ -137,6 +142,7 @@ class Made:
     unit: list[complex] = field(default_factory=list)
     means: list[dict[int, np.ndarray]] = field(default_factory=list)
     at: Seen = field(default_factory=list)
+    lines: list[tuple[int, np.ndarray]] = field(default_factory=list)
 
     def add(self, means: dict[int, np.ndarray], at: list[np.ndarray | None]) -> int:
         """Add a shape; return its number."""
@@ -145,7 +151,7 @@ class Made:
         return len(self.means) - 1
 
     def column(self, column: Column, shape: int, unit: complex) -> None:
-        """Add a column that is `unit`, 1 or i, times a shape."""
+        """Add a column that is `unit` times a shape."""
         self.columns.append(column)
         self.of_column.append(shape)
         self.unit.append(unit)
@@ -153,7 +159,9 @@ class Made:
     def done(self, ground: Ground) -> TermColumns:
         """Return the columns."""
         shapes = shapes_of(self.means, self.of_column, self.unit, ground.weight)
-        return TermColumns(tuple(self.columns), shapes, _within(ground, self.at, shapes), self.at)
+        at, values = zip(*self.lines, strict=True) if self.lines else ((), ())
+        return TermColumns(tuple(self.columns), shapes, _within(ground, self.at, shapes), self.at,
+                           LineColumns(np.array(at), np.stack(values)) if at else NO_LINES)
 
 
 def term_columns(ground: Ground, terms: Iterable[ModelTerm], degree: int) -> TermColumns:
@@ -175,11 +183,13 @@ def term_columns(ground: Ground, terms: Iterable[ModelTerm], degree: int) -> Ter
     """
     made = Made()
     for term in terms:
-        if term.name not in VISIT_TERMS:
+        if term.name in VISIT_TERMS:
+            _require_visits(ground, term.name)
+        if term.name is TermName.LINE_ECCENTRICITY:
+            _line_columns(made, ground, term)
+        elif term.name not in VISIT_TERMS:
             _plate_columns(made, ground, term)
-            continue
-        _require_visits(ground, term.name)
-        if term.name is TermName.DRIFT:
+        elif term.name is TermName.DRIFT:
             _drift_columns(made, ground, term, degree)
         else:
             _shared_columns(made, ground, term)
@@ -209,7 +219,7 @@ def made_anew(ground: Ground, term: ModelTerm, before: TermColumns) -> TermColum
     shapes = before.shapes.replaced(list(own.values()), [fresh.means[shape] for shape in own])
     within = _within_anew(ground, at, shapes, before=before.within,
                           changed=np.array(sorted(own.values()), dtype=int))
-    return TermColumns(before.columns, shapes, within, at)
+    return TermColumns(before.columns, shapes, within, at, before.lines)
 
 
 def columns_from(ground: Ground, columns: Iterable[Column],
@@ -245,7 +255,8 @@ def joined(ground: Ground, first: TermColumns, second: TermColumns) -> TermColum
     """Return the columns of both."""
     at = [*first.at, *second.at]
     shapes = first.shapes.with_others(second.shapes)
-    return TermColumns((*first.columns, *second.columns), shapes, _within(ground, at, shapes), at)
+    return TermColumns((*first.columns, *second.columns), shapes, _within(ground, at, shapes), at,
+                       first.lines)
 
 
 def _require_visits(ground: Ground, name: TermName) -> None:
@@ -273,28 +284,30 @@ def _drift_columns(made: Made, ground: Ground, term: ModelTerm, degree: int) -> 
 
 def _shared_columns(made: Made, ground: Ground, term: ModelTerm) -> None:
     """Add the columns of a term of the visits whose coefficients all views share."""
-    of_axes = [None if visits is None else _of_axes(ground, term.name, visits) * visits.phase
-               for visits in ground.visits]
+    both = [None if visits is None else _values(ground, term.name, visits) * visits.phase
+            for visits in ground.visits]
     means = [None if visits is None or values is None else visits.means(values, ground.z.size)
-             for visits, values in zip(ground.visits, of_axes, strict=True)]
-    numbers = [made.add({view: both[axis] for view, both in enumerate(means) if both is not None},
-                        [None if both is None else both[axis] for both in of_axes])
-               for axis in range(2)]
-    for (name, unit), own in zip(AXES, numbers, strict=True):
-        if term.name is TermName.APPROACH:
-            made.column(Column(term.name, -1, name, term.size), own, unit)
-            continue
-        # E o = (e_xx o_x + e_xy o_y) + i (e_yx o_x + e_yy o_y); a reading has o where it should
-        # have (1 + E) o
-        for (other, _), number in zip(AXES, numbers, strict=True):
-            made.column(Column(term.name, -1, name + other, term.size), number, unit)
+             for visits, values in zip(ground.visits, both, strict=True)]
+    for row, parts in enumerate(_SHARED[term.name]):
+        number = made.add(
+            {view: mean[row] for view, mean in enumerate(means) if mean is not None},
+            [None if values is None else values[row] for values in both])
+        for component, unit in parts:
+            if size := term.size_of(component):
+                made.column(Column(term.name, -1, component, size), number, unit)
 
 
-def _of_axes(ground: Ground, name: TermName, visits: ViewVisits) -> np.ndarray:
-    """Return what the visits say of each axis, (2, V): offsets seen, or where it came from."""
-    if name is TermName.MICROSCOPE:
-        return -np.stack([visits.offset.real, visits.offset.imag])
-    return ground.indicated * np.stack([visits.approach_x, visits.approach_y])
+_SHARED: dict[str, tuple[tuple[tuple[str, complex], ...], ...]] = {
+    TermName.MICROSCOPE: ((("scale", 1), ("turn", 1j)), (("stretch", 1), ("shear", 1j))),
+    TermName.APPROACH: ((("x", 1),), (("y", 1j),))}
+"""Columns of each shape of a shared term: a name and the unit that multiplies the shape."""
+
+
+def _values(ground: Ground, name: TermName, visits: ViewVisits) -> np.ndarray:
+    """Return the two shapes of a shared term at the visits, stage frame, (2, V)."""
+    if name is TermName.MICROSCOPE:  # a reading has o where it should have (1 + E) o
+        return -np.stack([visits.offset, visits.offset.conj()])
+    return ground.indicated * np.stack([visits.approach_x, visits.approach_y]).astype(complex)
 
 
 def _plate_columns(made: Made, ground: Ground, term: ModelTerm) -> None:
@@ -303,26 +316,46 @@ def _plate_columns(made: Made, ground: Ground, term: ModelTerm) -> None:
     A size says how far views scatter about what they have in common, so that each view has its
     own; free ones are relative to the first view, as what all have in common is the plate's.
     """
-    texts, forms, axes = _plate_forms(ground, term.name)
+    parts = _PLATE[term.name]
+    forms = _plate_forms(ground, term.name)
     nothing: list[np.ndarray | None] = [None] * len(ground.names)
     for view in range(1 if term.free else 0, len(ground.names)):
         here = ground.weight[view].reshape(-1) > 0
         numbers = [made.add({view: form}, nothing) for form in forms * here]
-        for axis, unit in axes:
-            for text, number in zip(texts, numbers, strict=True):
-                made.column(Column(term.name, view, axis + text, term.size), number, unit)
+        for component, form, unit in parts:
+            made.column(Column(term.name, view, component, term.size), numbers[form], unit)
 
 
-def _plate_forms(ground: Ground, name: TermName
-                 ) -> tuple[tuple[str, ...], np.ndarray, Sequence[tuple[str, complex]]]:
-    """Return names and values of forms, (k, marks), and along which axes each has a column."""
+_PLATE: dict[str, tuple[tuple[str, int, complex], ...]] = {
+    TermName.PLATE_SCALE: (("scale", 0, 1),),
+    TermName.PLATE_STRAIN: (("scale", 0, 1), ("stretch", 1, 1), ("shear", 1, 1j)),
+    TermName.PLATE_SHAPE: tuple((f"{axis} {form}", number, unit) for axis, unit in AXES
+                                for number, form in enumerate(("xx", "xy", "yy")))}
+"""Columns of each term of the plate: name, number of the form, and the unit that multiplies it."""
+
+
+def _plate_forms(ground: Ground, name: TermName) -> np.ndarray:
+    """Return the forms of a term of the plate at the marks, (k, marks)."""
     z = ground.z.reshape(-1)
-    if name is TermName.PLATE_SCALE:
-        return ("scale",), z[None] * ground.half_width_m, [("", 1)]
-    x, y = z.real, z.imag
-    # 2xy beside x^2 and y^2: a bending (x^2 - y^2, -2xy) then has coefficients of one size
-    return ("xx", "xy", "yy"), np.stack([x * x, 2 * x * y, y * y]), [
-        (f"{axis} ", unit) for axis, unit in AXES]
+    if name is TermName.PLATE_SHAPE:
+        x, y = z.real, z.imag
+        # 2xy beside x^2 and y^2: a bending (x^2 - y^2, -2xy) then has coefficients of one size
+        return np.stack([x * x, 2 * x * y, y * y]).astype(complex)
+    forms = np.stack([z, z.conj()]) * ground.half_width_m
+    return forms[:1] if name is TermName.PLATE_SCALE else forms
+
+
+def _line_columns(made: Made, ground: Ground, term: ModelTerm) -> None:
+    """Add the columns of the circle of lines, which no grid reading has."""
+    views = len(ground.line_names)
+    angle = 2 * np.pi / max(ground.n_lines, 1) * np.arange(ground.n_lines)
+    nothing: list[np.ndarray | None] = [None] * len(ground.names)
+    for view in range(1 if term.free else 0, views):
+        for component, wave in (("cos", np.cos(angle)), ("sin", np.sin(angle))):
+            values = np.zeros((views, ground.n_lines))
+            values[view] = wave
+            made.lines.append((len(made.columns), values))
+            made.column(Column(term.name, view, component, term.size), made.add({}, nothing), 1)
 
 
 def _within(ground: Ground, at: Seen, shapes: Shapes) -> WithinMarks:

@@ -15,6 +15,9 @@ from selfcal_ros.model.terms import TermName
 UNTOLD = 1e-9
 """Relative size below which an eigenvalue of the scaled equations is a zero."""
 
+LEAST_NOISE_M = 1e-12
+"""Noise against which sizes are weighed at least, m: less is rounding."""
+
 OVER_NOISE = 100.0
 """Power of the offsets over that of their noise from which they tell a microscope: what is not told
 by offsets that differ would be told by their own noise, which is in the readings as well."""
@@ -40,12 +43,15 @@ class TermEquations:
         What the estimate makes of them.
     noise_m : float
         Noise of one grid reading, m: that of the offsets a microscope sees; 0 if not known.
+    line_weight : float
+        Weight of a reading of a line with weight 1, rad^-2 m^2: that against a grid reading.
     """
 
     system: NormalEquations
     columns: TermColumns
     projected: ProjectedColumns
     noise_m: float = 0.0
+    line_weight: float = 0.0
 
     @property
     def n(self) -> int:
@@ -64,6 +70,8 @@ class TermEquations:
         Against it is judged what is told: what is left may be nothing but rounding.
         """
         grid = self.columns.shapes.squares(self.system.grid.weight)
+        lines = self.columns.lines
+        grid[lines.at] += self.line_weight * lines.sums(self.system.angular.weight, 2)
         return np.sqrt(np.maximum(grid + np.diag(self.columns.within.gram),
                                   np.finfo(float).tiny))
 
@@ -109,20 +117,41 @@ class TermEquations:
         basis = self.system.gauge.orthonormal
         return np.where(known, fields - basis @ np.real(basis.conj().T @ fields), 0.0)
 
+    @cached_property
+    def turned(self) -> np.ndarray:
+        """Angular map of a unit of each coefficient in the datum, sign reversed, (K, p)."""
+        known = self.system.known_lines
+        turned = self.projected.turned
+        return turned - turned[known].mean(axis=0) if known.any() else turned
+
     def unseen(self, rows: np.ndarray) -> np.ndarray:
         """Return untold combinations of `rows` that move the map, scaled, (p, modes)."""
         untold = self.untold(rows)
         if not untold.shape[1]:
             return untold
         grid = self.system.grid
-        moved = self.maps @ (untold / self.norm[:, None]) * np.sqrt(grid.weight.sum())
-        both = np.concatenate([moved.real, moved.imag])
-        _, size, right = np.linalg.svd(both / np.sqrt(grid.n_sites), full_matrices=False)
+        unit = untold / self.norm[:, None]
+        moved = self.maps @ unit * np.sqrt(grid.weight.sum() / grid.n_sites)
+        lines = (self.turned @ unit)[self.system.known_lines]
+        lines = lines * np.sqrt(self.line_weight * self.system.angular.weight.sum()
+                                / max(len(lines), 1))
+        both = np.concatenate([moved.real, moved.imag, lines])
+        _, size, right = np.linalg.svd(both, full_matrices=False)
         return untold @ right[size > MOVES_THE_MAP].T
 
     def rows(self, names: Iterable[str]) -> np.ndarray:
         """Return which coefficients belong to the terms `names`, bool (p,)."""
         return self.columns.rows(names)
+
+    def prior(self, sigma_m: float) -> np.ndarray:
+        """Return the information that each size gives, for unit noise, (p,); 0 of free ones.
+
+        Noise below `LEAST_NOISE_M` counts as that: what views have in common, no reading tells
+        from the plate, and without the sizes the equations are singular.
+        """
+        sized = ~self.free
+        size = np.where(sized, self.columns.size, 1.0)
+        return np.where(sized, (max(sigma_m, LEAST_NOISE_M) / size) ** 2, 0.0)
 
     def inverse(self, sigma_m: float) -> np.ndarray:
         """Return the covariance of the coefficients for unit noise, (p, p).
@@ -137,7 +166,7 @@ class TermEquations:
         # a sized coefficient in units of its size, a free one in those of its column
         scale = np.where(self.free, 1 / self.norm, self.columns.size)
         matrix = self.information * np.outer(scale, scale)
-        matrix[np.diag_indices(len(scale))] += np.where(self.free, 0.0, sigma_m**2)
+        matrix[np.diag_indices(len(scale))] += self.prior(sigma_m) * scale**2
         hold = self.untold(self.free)
         # sized coefficients may be told far better than free ones, in these units; the diagonal of
         # a free one that nothing tells is rounding

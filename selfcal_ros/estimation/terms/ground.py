@@ -10,6 +10,7 @@ from selfcal_ros.estimation.lattice.maps import LatticeViews
 from selfcal_ros.estimation.lattice.readings import GridData
 from selfcal_ros.estimation.terms.visits import ViewVisits, approach_sign, visits_of
 from selfcal_ros.model.readings import Measurements
+from selfcal_ros.model.terms import TermName
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,6 +31,10 @@ class Ground:
         Names of the views.
     indicated : int
         Sign of the indicated position in a reading.
+    line_names : tuple of str
+        Names of the views in which lines were read.
+    n_lines : int
+        Lines of the plate, K.
     """
 
     z: np.ndarray
@@ -38,14 +43,22 @@ class Ground:
     visits: tuple[ViewVisits | None, ...]
     names: tuple[str, ...]
     indicated: int = 1
+    line_names: tuple[str, ...] = ()
+    n_lines: int = 0
+
+    def name_of(self, term: str, view: int) -> str:
+        """Return the name of the view of a column; empty where all views share it (-1)."""
+        names = self.line_names if term == TermName.LINE_ECCENTRICITY else self.names
+        return (*names, "")[view]
 
 
 def ground_of(measurements: Measurements, grid: GridData, half_width_m: float) -> Ground:
     """Return the ground of a measurement whose grid readings are `grid`."""
+    lines = tuple(v.view.name for v in measurements.views if len(v.k))
     z = LatticeViews(grid.y.shape[1:], grid.poses).z
     names = tuple(measurements.views[i].view.name for i in grid.index)
     return Ground(z, half_width_m, grid.weight, visits_of(measurements, grid), names,
-                  approach_sign(measurements.sense))
+                  approach_sign(measurements.sense), lines, measurements.artifact.angular_count)
 
 
 def without_noise(ground: Ground, residuals: np.ndarray,

@@ -14,6 +14,8 @@ CURES = {
     TermName.DRIFT: "visit the marks in more than one order, e.g. visit_order: x_back_y_back",
     TermName.PLATE_SCALE: "add views that are turned and shifted",
     TermName.PLATE_SHAPE: "add views shifted both ways along both axes, and one along a diagonal",
+    TermName.PLATE_STRAIN: "add views shifted both ways along both axes",
+    TermName.LINE_ECCENTRICITY: "centre the circle of lines better",
     TermName.APPROACH: "visit the marks from both sides, e.g. visit_order: x_back_y_back",
 }
 """What makes a term visible, for a person."""

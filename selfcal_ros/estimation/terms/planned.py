@@ -22,10 +22,15 @@ from selfcal_ros.estimation.terms.columns import (
 )
 from selfcal_ros.estimation.terms.equations import TermEquations
 from selfcal_ros.estimation.terms.ground import Ground
-from selfcal_ros.estimation.terms.projection import ProjectedColumns, project, reduce_columns
+from selfcal_ros.estimation.terms.projection import (
+    ProjectedColumns,
+    project,
+    reduce_columns,
+    reduce_lines,
+)
 from selfcal_ros.estimation.terms.visits import ViewVisits
 from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.model.terms import DRIFT_DEGREE, ModelTerm, TermName
+from selfcal_ros.model.terms import DRIFT_DEGREE, OF_PLATE, ModelTerm
 from selfcal_ros.model.view import View
 from selfcal_ros.model.visit_order import VisitSequence, approach_signs, visit_sequence
 
@@ -119,7 +124,9 @@ def planned_equations(system: NormalEquations, ground: Ground, terms: Iterable[M
     n = 3 * system.grid.n_views
     inverse = np.zeros((system.size, system.size))
     inverse[:n, :n] = system.grid_inverse
-    return TermEquations(system, columns, project(system, reduced, inverse), assumed.sigma_m)
+    lines = reduce_lines(system.angular, columns.lines, 0.0, 1.0)
+    return TermEquations(system, columns, project(system, reduced, inverse, lines),
+                         assumed.sigma_m)
 
 
 def with_terms(every: TermEquations, terms: Iterable[ModelTerm]) -> TermEquations:
@@ -143,7 +150,7 @@ def with_terms(every: TermEquations, terms: Iterable[ModelTerm]) -> TermEquation
     return TermEquations(
         every.system, TermColumns(columns, known.shapes.part(rows), within, known.at),
         ProjectedColumns(lambda: part.fields[:, rows], part.parameters[:, rows],
-                         part.gram[np.ix_(rows, rows)]), every.noise_m)
+                         part.gram[np.ix_(rows, rows)], part.turned[:, rows]), every.noise_m)
 
 
 def rows_of(columns: TermColumns, terms: Iterable[ModelTerm]) -> np.ndarray:
@@ -154,4 +161,4 @@ def rows_of(columns: TermColumns, terms: Iterable[ModelTerm]) -> np.ndarray:
 
 
 def _first(column: Column) -> bool:
-    return column.view == 0 and column.term in (TermName.PLATE_SCALE, TermName.PLATE_SHAPE)
+    return column.view == 0 and column.term in OF_PLATE

@@ -17,9 +17,10 @@ from functools import cached_property
 
 import numpy as np
 
+from selfcal_ros.estimation.normal.angular import AngularSystem
 from selfcal_ros.estimation.normal.equations import NormalEquations
 from selfcal_ros.estimation.normal.grid import GridSystem, of_misalignments
-from selfcal_ros.estimation.terms.shapes import Shapes
+from selfcal_ros.estimation.terms.shapes import LineColumns, Shapes
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,11 +141,14 @@ class ProjectedColumns:
         Misalignments, as in `NormalEquations`.
     gram : float array (p, p)
         Weighted inner products of columns and residuals, c' W r.
+    turned : float array (K, p)
+        Angular map of each column, sign reversed, rad.
     """
 
     make_fields: Callable[[], np.ndarray]
     parameters: np.ndarray
     gram: np.ndarray
+    turned: np.ndarray
 
     @cached_property
     def fields(self) -> np.ndarray:
@@ -152,8 +156,49 @@ class ProjectedColumns:
         return self.make_fields()
 
 
-def project(system: NormalEquations, reduced: ReducedColumns,
-            inverse: np.ndarray) -> ProjectedColumns:
+@dataclass(frozen=True, eq=False)
+class ReducedLines:
+    """Columns of lines with the lines of stage and plate eliminated, in the units of the grid.
+
+    Attributes
+    ----------
+    at : int array (q,)
+        Which columns they are.
+    free : float array (K, q)
+        What the stage's lines alone make of them, rad.
+    right : float array (views, q)
+        Right-hand side of the misalignments.
+    gram : float array (q, q)
+        Weighted inner products of what is left.
+    half_width_m : float
+        Unit of the misalignments, m.
+    """
+
+    at: np.ndarray
+    free: np.ndarray
+    right: np.ndarray
+    gram: np.ndarray
+    half_width_m: float
+
+
+def reduce_lines(angular: AngularSystem, lines: LineColumns, ratio: float,
+                 half_width_m: float) -> ReducedLines:
+    """Return columns of lines, of which one reading weighs `ratio` times `half_width_m` squared."""
+    if not len(lines.at):
+        return ReducedLines(lines.at, np.zeros((angular.n_lines, 0)),
+                            np.zeros((angular.n_views, 0)), np.zeros((0, 0)), half_width_m)
+    values = np.moveaxis(lines.values, 0, -1)
+    weighted = angular.weight[:, :, None] * angular.centred(values)
+    lines_right = angular.scatter(weighted)
+    free = angular.solve(lines_right)
+    gram = np.einsum("vkp,vkq->pq", values, weighted) - lines_right.T @ free
+    right = weighted.sum(axis=1) - angular.columns.T @ free
+    return ReducedLines(lines.at, free, ratio * half_width_m * right,
+                        ratio * half_width_m**2 * (gram + gram.T) / 2, half_width_m)
+
+
+def project(system: NormalEquations, reduced: ReducedColumns, inverse: np.ndarray,
+            lines: ReducedLines) -> ProjectedColumns:
     """Return what the joint estimate makes of the columns.
 
     Parameters
@@ -164,9 +209,17 @@ def project(system: NormalEquations, reduced: ReducedColumns,
         The columns with their sites eliminated.
     inverse : float array (size, size)
         Covariance of the misalignments for unit noise of one grid reading.
+    lines : ReducedLines
+        The columns of lines.
     """
     grid, n = system.grid, 3 * system.grid.n_views
-    parameters = inverse[:, :n] @ reduced.right
-    gram = reduced.gram - reduced.right.T @ parameters[:n]
-    return ProjectedColumns(
-        lambda: reduced.free - grid.response @ parameters[:n], parameters, (gram + gram.T) / 2)
+    right = np.zeros((system.size, reduced.right.shape[1]))
+    right[:n] = reduced.right
+    right[np.ix_(system.phi_at, lines.at)] += lines.right
+    parameters = inverse @ right
+    gram = reduced.gram - right.T @ parameters
+    gram[np.ix_(lines.at, lines.at)] += lines.gram
+    turned = system.angular.response @ parameters[system.phi_at] / lines.half_width_m
+    turned[:, lines.at] -= lines.free
+    return ProjectedColumns(lambda: reduced.free - grid.response @ parameters[:n], parameters,
+                            (gram + gram.T) / 2, turned)

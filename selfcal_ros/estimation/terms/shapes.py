@@ -123,6 +123,21 @@ class Shapes:
         return replace(self, values=tuple(values))
 
 
+@dataclass(frozen=True, eq=False)
+class LineColumns:
+    """Columns that are in the readings of lines: which ones, int (q,), and values (q, views, K)."""
+
+    at: np.ndarray
+    values: np.ndarray
+
+    def sums(self, weighted: np.ndarray, power: int = 1) -> np.ndarray:
+        """Return the sums of values, to a power, times `weighted` (views, K), (q,)."""
+        return np.array([(value**power * weighted).sum() for value in self.values], dtype=float)
+
+
+NO_LINES = LineColumns(np.zeros(0, dtype=int), np.zeros((0, 0, 0)))
+
+
 def shapes_of(means: Sequence[Mapping[int, np.ndarray]], of_column: Sequence[int],
               unit: Sequence[complex], weight: np.ndarray) -> Shapes:
     """Return shapes given by their values in the views that they have.

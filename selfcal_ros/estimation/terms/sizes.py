@@ -36,7 +36,7 @@ class SizeTest:
     name : TermName
         The term.
     given : float
-        Its size, SI unit of the term.
+        Its size, SI unit of the term; the largest of those of a microscope.
     shown, allowed : float
         The size that the readings show, and the largest that they allow (of two limits with a
         coverage of 95.45 %); that given where they do not contradict it.
@@ -110,10 +110,10 @@ def _told(equations: TermEquations, right: np.ndarray, rows: np.ndarray, sigma_m
     """Return what the readings tell of coefficients that count as free.
 
     Their told combinations, scaled by the columns' norms, (r,), the variances of these by the
-    noise, (r,), and their covariance for coefficients of unit variance, (r, r).
+    noise, (r,), and their covariance where the largest size is 1, (r, r).
     """
     rest = ~rows
-    prior = np.where(rest & ~equations.free, sigma_m / equations.columns.size, 0.0)
+    prior = np.where(rest, np.sqrt(equations.prior(sigma_m)), 0.0)
     norm = np.hypot(equations.norm, prior)
     scaled = equations.information / np.outer(norm, norm) + np.diag((prior / norm) ** 2)
     hidden = equations.untold(equations.free & rest)[rest]
@@ -125,7 +125,8 @@ def _told(equations: TermEquations, right: np.ndarray, rows: np.ndarray, sigma_m
     told = size > equations.limit(rows)
     vectors, size = vectors[:, told], size[told]
     values = vectors.T @ (scores[rows] - couple @ scores[rest]) / size
-    turned = vectors * norm[rows][:, None]
+    own = equations.columns.size[rows]
+    turned = vectors * (norm[rows] * own / own.max())[:, None]
     return values, sigma_m**2 / size, turned.T @ turned
 
 
@@ -144,7 +145,7 @@ def size_tests(equations: TermEquations, right: np.ndarray, terms: Sequence[Mode
         All terms.
     """
     found: list[SizeTest] = []
-    sized = [term for term in terms if not term.free]
+    sized = [term for term in terms if not term.free and equations.rows([term.name]).any()]
     if not np.isfinite(noise[0]):
         return ()
     while sized:
@@ -155,6 +156,6 @@ def size_tests(equations: TermEquations, right: np.ndarray, terms: Sequence[Mode
         worst = max(failed, key=lambda test: test.statistic - test.rank)
         found.append(worst)
         sized = [term for term in sized if term.name != worst.name]
-        equations = replace(equations, columns=equations.columns.with_size(
-            worst.name, worst.allowed))
+        equations = replace(equations, columns=equations.columns.scaled(
+            worst.name, worst.allowed / worst.given))
     return tuple(found)

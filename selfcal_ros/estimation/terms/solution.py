@@ -53,16 +53,17 @@ class Score:
         return self.between + self.within
 
 
-def score(equations: TermEquations, residuals: np.ndarray, squares: tuple[float, float], *,
-          coefficients: np.ndarray | None = None) -> Score:
+def score(equations: TermEquations, residuals: tuple[np.ndarray, np.ndarray],
+          squares: tuple[float, float], *, coefficients: np.ndarray | None = None) -> Score:
     """Return the right-hand side of the coefficients that are still to come.
 
     Parameters
     ----------
     equations : TermEquations
         The columns.
-    residuals : complex array (views, nx, ny)
-        Residuals of the estimate, plate frame, m, from deviations less `coefficients` columns.
+    residuals : tuple of array
+        Residuals of the estimate from deviations less `coefficients` columns: of the marks, plate
+        frame, m, complex (views, nx, ny), and of the lines, rad, (views, K).
     squares : tuple of float
         Weighted squares of all residuals, angular ones included, m^2, and their degrees of
         freedom without terms.
@@ -73,7 +74,9 @@ def score(equations: TermEquations, residuals: np.ndarray, squares: tuple[float,
     shapes = columns.shapes
     within = columns.within
     taken = np.zeros(equations.n) if coefficients is None else coefficients
-    between = shapes.against(shapes.sums(weight * residuals))
+    between = shapes.against(shapes.sums(weight * residuals[0]))
+    between[columns.lines.at] += equations.line_weight * columns.lines.sums(
+        equations.system.angular.weight * residuals[1])
     inner = within.total - 2 * taken @ within.right + taken @ within.gram @ taken
     sums = Sums(*squares, float(inner), within.dof)
     return Score(between, within.right - within.gram @ taken, sums)
@@ -117,5 +120,5 @@ def next_coefficients(equations: TermEquations, found: Score, coefficients: np.n
     sigma_m : float
         Noise of one grid reading, m.
     """
-    prior = np.where(equations.free, 0.0, (sigma_m / equations.columns.size) ** 2)
+    prior = equations.prior(sigma_m)
     return coefficients + equations.inverse(sigma_m) @ (found.total - prior * coefficients)

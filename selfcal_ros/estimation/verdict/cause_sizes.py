@@ -11,18 +11,21 @@ from scipy.special import eval_legendre
 from selfcal_ros.estimation.findings import (
     ApproachCause,
     DriftCause,
+    LineEccentricityCause,
     MicroscopeCause,
     NoiseCause,
     PlateScaleCause,
     PlateShapeCause,
+    PlateStrainCause,
     ReadingCause,
     SizeCause,
     SlipCause,
 )
+from selfcal_ros.estimation.joint.model_fit import ModelFit
 from selfcal_ros.estimation.terms.sizes import SizeTest
 from selfcal_ros.estimation.verdict.causes import Explanation
-from selfcal_ros.estimation.verdict.reading_columns import READING
-from selfcal_ros.estimation.verdict.slip_columns import SLIP
+from selfcal_ros.estimation.verdict.fault_columns import READING, SLIP
+from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.terms import TermName
 from selfcal_ros.model.verdict import Cause, Finding, TermEstimate
 
@@ -47,12 +50,18 @@ def cause_of(found: Explanation, names: tuple[str, ...], half_width_m: float) ->
     found : Explanation
         What explains the residuals.
     names : tuple of str
-        Names of the grid views.
+        Names of its views: of the grid, or of the lines.
     half_width_m : float
         Longer half width of the plate, m: the unit of a slip's rotation.
     """
     sized = _SIZES[found.name](found, names, half_width_m)
-    return Cause(found.name, "", sized.value, sized.u, sized.unit, found.p, sized.what)
+    what = sized.what
+    moved = np.zeros(1) if found.moved is None else np.abs(found.moved)
+    return Cause(
+        found.name, "", sized.value, sized.u, sized.unit, found.p, what,
+        view=getattr(what, "view", ""), axis=getattr(what, "axis", ""),
+        mark=getattr(what, "mark", ()), effect_rms=found.effect_m,
+        effect_max=float(moved.max(initial=0.0)), told=found.whole)
 
 
 def size_cause(test: SizeTest, estimates: Iterable[TermEstimate]) -> Cause:
@@ -75,6 +84,27 @@ def noise_cause(view: str, ratio: float, u: float, p: float) -> Cause:
     return Cause("noise", "", ratio, u, "m/m", p, NoiseCause(view))
 
 
+def scatter_of_views(model: ModelFit, measurements: Measurements
+                     ) -> list[tuple[str, float, float]]:
+    """Return (name, noise of one reading, degrees of freedom) of each grid view's repeats.
+
+    Of its visits, less what the terms explain of them, where marks were visited again.
+    """
+    held, out = model.equations, []
+    known = [] if held is None else held.columns.at_visits(model.coefficients)
+    for row, index in enumerate(model.problem.grid.index):
+        view, visits = measurements.views[index], model.problem.ground.visits[row]
+        sigma, dof = view.sigma_xy, float(view.dof_xy)
+        if visits is not None and visits.repeated and known:
+            n_marks = model.problem.system.grid.n_sites
+            rest = visits.about_means((visits.y - known[row])[None], n_marks)[0]
+            dof = 2.0 * (len(visits.mark) - len(np.unique(visits.mark)))
+            sigma = float(np.sqrt(visits.weight @ abs(rest) ** 2 / dof))
+        if dof > 0 and np.isfinite(sigma):
+            out.append((view.view.name, sigma, dof))
+    return out
+
+
 def _linear(found: Explanation, weights: np.ndarray) -> tuple[float, float]:
     """Return weights @ values and its standard uncertainty."""
     variance = float(weights @ found.covariance @ weights)
@@ -89,9 +119,7 @@ def _likeliest[What](found: Explanation, options: list[tuple[What, np.ndarray]],
 
 
 def _microscope(found: Explanation, *_: object) -> Sized:
-    # components xx, xy, yx, yy of E
-    half = np.array([[1, 0, 0, 1], [0, -1, 1, 0], [1, 0, 0, -1], [0, 1, 1, 0]]) / 2
-    part, value, u = _likeliest(found, list(zip(("scale", "turn", "scales", "shear"), half,
+    part, value, u = _likeliest(found, list(zip(("scale", "turn", "scales", "shear"), np.eye(4),
                                                 strict=True)))
     return Sized(value, u, "rad" if part in ("turn", "shear") else "m/m", MicroscopeCause(part))
 
@@ -116,13 +144,41 @@ def _one_column(found: Explanation) -> tuple[int, float, float]:
     return _likeliest(found, list(enumerate(np.eye(len(found.columns)))))
 
 
+def _against_first(found: Explanation) -> tuple[int, float, float]:
+    """Return index, value and u of the coefficient that stands out most against the first view's.
+
+    The first view has none of its own where the term is free: then it is 0 there.
+    """
+    weights = np.eye(len(found.columns))
+    for at, column in enumerate(found.columns):
+        weights[at] -= [c.view == 0 and c.component == column.component for c in found.columns]
+    return _likeliest(found, [(at, row) for at, row in enumerate(weights) if row.any()])
+
+
 def _plate_scale(found: Explanation, names: tuple[str, ...], _: float) -> Sized:
-    at, value, u = _one_column(found)
+    at, value, u = _against_first(found)
     return Sized(value, u, "m/m", PlateScaleCause(names[found.columns[at].view], names[0]))
 
 
+def _plate_strain(found: Explanation, names: tuple[str, ...], _: float) -> Sized:
+    at, value, u = _against_first(found)
+    column = found.columns[at]
+    return Sized(value, u, "m/m", PlateStrainCause(names[column.view], names[0],
+                                                   column.component))
+
+
+def _line_eccentricity(found: Explanation, names: tuple[str, ...], _: float) -> Sized:
+    options: list[tuple[int, np.ndarray]] = []
+    for view in sorted({column.view for column in found.columns}):
+        mine = np.array([column.view == view for column in found.columns])
+        size = float(np.hypot.reduce(found.values[mine]))
+        options.append((view, np.where(mine, found.values, 0.0) / (size or 1.0)))
+    view, value, u = _likeliest(found, options)
+    return Sized(value, u, "rad", LineEccentricityCause(names[view]))
+
+
 def _plate_shape(found: Explanation, names: tuple[str, ...], _: float) -> Sized:
-    at, value, u = _one_column(found)
+    at, value, u = _against_first(found)
     return Sized(value, u, "m", PlateShapeCause(names[found.columns[at].view], names[0],
                                                 found.whole))
 
@@ -154,4 +210,5 @@ def _slip(found: Explanation, names: tuple[str, ...], half_width_m: float) -> Si
 _SIZES: dict[str, Callable[..., Sized]] = {
     TermName.MICROSCOPE: _microscope, TermName.DRIFT: _drift, TermName.PLATE_SCALE: _plate_scale,
     TermName.PLATE_SHAPE: _plate_shape, TermName.APPROACH: _approach, SLIP: _slip,
-    READING: _reading}
+    READING: _reading, TermName.PLATE_STRAIN: _plate_strain,
+    TermName.LINE_ECCENTRICITY: _line_eccentricity}

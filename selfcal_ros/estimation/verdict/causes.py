@@ -20,9 +20,13 @@ from selfcal_ros.estimation.lattice.maps import PHASES
 from selfcal_ros.estimation.terms.columns import Column, TermColumns, joined, term_columns
 from selfcal_ros.estimation.terms.ground import Ground, without_noise
 from selfcal_ros.estimation.terms.solution import score
+from selfcal_ros.estimation.verdict.fault_columns import (
+    READING,
+    SLIP,
+    reading_columns,
+    slip_columns,
+)
 from selfcal_ros.estimation.verdict.pool import Beside, Pool
-from selfcal_ros.estimation.verdict.reading_columns import READING, reading_columns
-from selfcal_ros.estimation.verdict.slip_columns import SLIP, slip_columns
 from selfcal_ros.model.terms import VISIT_TERMS, ModelTerm, TermName
 
 LEVEL = 5e-4
@@ -61,6 +65,10 @@ class Explanation:
         Part of the view's visits before a slip; NaN for what is none.
     mark : tuple of int, optional
         Mark (m, n) of a single reading; None for what is none.
+    moved : complex array (sites,), optional
+        What it does to the map, in the frame of the equations, m, in the datum.
+    rank : int
+        Which it is: explanations of one rank explain the same equally well.
     """
 
     name: str
@@ -72,6 +80,8 @@ class Explanation:
     effect_m: float
     part: float = float("nan")
     mark: tuple[int, int] | None = None
+    moved: np.ndarray | None = None
+    rank: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,9 +141,10 @@ def find_explanations(model: ModelFit, *, slips: bool, readings: bool = True,
     equations = equations_of(problem, model.found, columns)
     taken = np.zeros(equations.n)
     taken[:len(model.coefficients)] = model.coefficients
-    right = score(equations, model.found.residuals, squares(problem, model.found),
+    right = score(equations, model.found.both_residuals, squares(problem, model.found),
                   coefficients=taken)
-    return select_explanations(Pool(equations, right), groups, columns.rows(own))
+    prior = np.where(columns.rows(own), equations.prior(model.found.xy.sigma), 0.0)
+    return select_explanations(Pool(equations, right, prior, taken), groups, columns.rows(own))
 
 
 def _groups(columns: TermColumns, names: Iterable[TermName]) -> Iterator[Group]:
@@ -148,7 +159,7 @@ def _groups(columns: TermColumns, names: Iterable[TermName]) -> Iterator[Group]:
             parts.append(here)
             if name is TermName.DRIFT:
                 parts.append(here & steady)
-        yield from (Group(str(name), rows, places=len(parts)) for rows in parts)
+        yield from (Group(str(name), rows, places=len(parts)) for rows in parts if rows.any())
 
 
 def _with(ground: Ground, before: tuple[TermColumns, list[Group]], columns: TermColumns,
@@ -181,6 +192,7 @@ def _with_readings(model: ModelFit, ground: Ground, columns: TermColumns,
 def select_explanations(pool: Pool, groups: list[Group], taken: np.ndarray) -> list[Explanation]:
     """Return the explanations, each judged beside `taken` and those before it."""
     found: list[Explanation] = []
+    rank = 0
     while groups and len(found) < MAX_CAUSES:
         before = pool.beside(taken)
         beside = pool.each([taken | group.rows for group in groups])
@@ -198,7 +210,8 @@ def select_explanations(pool: Pool, groups: list[Group], taken: np.ndarray) -> l
         for (p, _), group in as_good:
             if group.name not in names:
                 names.append(group.name)
-                found.append(_explanation(pool, taken, group, p))
+                found.append(replace(_explanation(pool, taken, group, p), rank=rank))
+        rank += 1
         taken = taken | best.rows
         groups = [g for g in groups if (g.rows & ~taken).any() and (
             g.name == best.name or g.name not in names) and not (
@@ -247,4 +260,4 @@ def _explanation(pool: Pool, taken: np.ndarray, group: Group, p: float) -> Expla
     return Explanation(group.name, columns, values[group.rows],
                        variance * beside.inverse[np.ix_(group.rows, group.rows)], p,
                        pool.beside(group.rows).rank == int(group.rows.sum()), effect, group.part,
-                       group.mark)
+                       group.mark, moved)

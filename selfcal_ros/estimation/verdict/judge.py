@@ -1,62 +1,54 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The verdict on a solution: one, with the tests that failed and what explains them.
+"""The verdict on a solution: its grade, the tests that failed and what explains them.
 
 Tests: residuals against the scatter of repeats, or the declared noise, in either direction (F);
-each term that the model does not hold; each size of those that it holds (method eq. 7.9); where
-the stage stood (7.10); the noise of each view against the others; the axis conditions where they
-are the datum. Of 397 clean simulated measurements two were not qualified.
+the axis conditions where they are the datum; and all that `selfcal_ros.estimation.verdict.look`
+looks for. What is found and bounded enlarges U; what is not disqualifies.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy.special import fdtrc
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.blas_threads import one_thread
+from selfcal_ros.estimation.checks.wiring import sign_is_shown
 from selfcal_ros.estimation.datum.angular import MISCLOSURE_LEVEL
 from selfcal_ros.estimation.findings import (
     AxesNotMet,
     FiniteRotation,
     NoiseContradicted,
     NoiseUnknown,
-    OffSitesCause,
+    NotConverged,
+    SignNotShown,
     VisitedOnce,
 )
-from selfcal_ros.estimation.joint.model_fit import ModelFit
-from selfcal_ros.estimation.joint.noise import pooled
 from selfcal_ros.estimation.joint.solve import solve_joint
 from selfcal_ros.estimation.joint.solved import Solved
 from selfcal_ros.estimation.options import Options
-from selfcal_ros.estimation.verdict.cause_sizes import cause_of, noise_cause, size_cause
-from selfcal_ros.estimation.verdict.causes import LEVEL, Explanation, find_explanations
-from selfcal_ros.estimation.verdict.coverage import with_coverage
-from selfcal_ros.estimation.verdict.line_readings import line_cause
-from selfcal_ros.estimation.verdict.off_sites import off_sites_cause
+from selfcal_ros.estimation.terms.solution import free_inverse
+from selfcal_ros.estimation.verdict.enlarge import enlarged, enlargements, with_coverage
+from selfcal_ros.estimation.verdict.look import ALWAYS_SITES, Looked, look_into
 from selfcal_ros.estimation.verdict.provenance import provenance_of
-from selfcal_ros.estimation.verdict.reading_columns import READING
-from selfcal_ros.estimation.verdict.rotations import bends, rotation_cause, solved_apart
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.result import CalibrationResult
-from selfcal_ros.model.statistics import rms
 from selfcal_ros.model.terms import TermName
-from selfcal_ros.model.verdict import Cause, Finding, Verdict
-
-ALWAYS_SITES = 41 * 41
-"""Field up to which terms are looked for in any case; beyond, where another test fails."""
-
-MAX_SITES = 201 * 201
-"""Field up to which they are looked for at all."""
-
-NOISY = 1.5
-"""Ratio of the noise of a view to that of the others from which it matters."""
+from selfcal_ros.model.verdict import Finding, Grade, Verdict
 
 MUCH_MORE = 1.1
 """Ratio of what a linear model leaves to what finite rotations leave from which it is named."""
 
-MATTERS = 0.1
-"""Effect of a cause on the map, in standard uncertainties (rms), below which it is of no account
-where the readings tell all of it."""
+SIGN_U = 0.3
+"""Standard uncertainty of the microscope's scale, by the joint fit alone, up to which the readings
+show the sign of the offsets."""
+
+HIDDEN = 1e-3
+"""Part of the scale in a combination that no reading shows from which it is not known."""
+
+UNEXPLAINED = 1.5
+"""Ratio of the noise of residuals to that of repeats, with no cause left to explain it, up to which
+the uncertainty from the residuals counts as covering it."""
 
 
 @one_thread()
@@ -74,14 +66,22 @@ def judged(solved: Solved, measurements: Measurements, options: Options) -> Cali
     """
     noises = _noise_findings(solved)
     checked = checked_by(solved, measurements, options, failed=bool(noises))
-    failed = [*_rotation_findings(solved, checked), *noises, *_axes_findings(checked)]
-    places, sizes = _off_sites(checked, options), _sizes(solved)
-    others = [*sizes, *_causes(checked, measurements, options,
-                               failed=bool(failed or sizes or places))]
-    causes = _in_order(places, others)
-    verdict = Verdict(not (failed or causes), causes=causes, findings=(*failed, *causes))
+    failed = [*_rotation_findings(solved, checked), *_axes_findings(checked),
+              *([] if solved.converged else [NotConverged()]),
+              *_sign_findings(checked, measurements, options)]
+    looked = look_into(checked, measurements, options, failed=bool(noises))
+    own = checked is solved
+    if own:
+        solved = looked.solved
+        noises = _noise_findings(solved)
     reference = options.reference
-    result = with_coverage(solved.result, reference)
+    result = enlarged(solved.result, looked.effects)
+    result = with_coverage(result, reference)
+    shown = [*failed, *noises, *looked.causes]
+    verdict = Verdict(_grade(result, looked, failed=bool(failed), noises=noises,
+                             own=own or not looked.causes),
+                      causes=looked.causes, findings=tuple(shown),
+                      enlarged_by=enlargements(result, looked.terms, looked.effects))
     return replace(
         result, verdict=verdict, findings=(*result.findings, *_visits_findings(checked)),
         provenance=provenance_of(measurements, options),
@@ -90,13 +90,18 @@ def judged(solved: Solved, measurements: Measurements, options: Options) -> Cali
             "u_relative": reference.u_relative, "certificate": reference.certificate})
 
 
-def _sizes(solved: Solved) -> list[Cause]:
-    """Return the terms whose size the readings contradict, the worst first."""
-    if solved.model is None:
-        return []
-    found = {term.name: term.estimates for term in solved.result.model.terms}
-    return [size_cause(test, found[test.name]) for test in solved.model.sizes
-            if test.contradicted]
+def _grade(result: CalibrationResult, looked: Looked, *, failed: bool,
+           noises: Sequence[Finding], own: bool) -> Grade:
+    """Return the grade; `own`: the solution that was looked into is that of the result."""
+    if not (failed or noises or looked.causes):
+        return Grade.GOOD
+    if failed or not (looked.bounded and own and result.has_uncertainty):
+        return Grade.NOT_QUALIFIED
+    for finding in noises:
+        if not isinstance(finding, NoiseContradicted) or (
+                finding.residuals > UNEXPLAINED * finding.stated):
+            return Grade.NOT_QUALIFIED
+    return Grade.ENLARGED
 
 
 def checked_by(solved: Solved, measurements: Measurements, options: Options, *,
@@ -128,6 +133,31 @@ def _rotation_findings(solved: Solved, checked: Solved) -> list[Finding]:
                            checked.xy.residuals)]
 
 
+def _sign_findings(solved: Solved, measurements: Measurements,
+                   options: Options) -> list[Finding]:
+    """Return whether the sign of the offsets is a matter of belief: no reading would change.
+
+    Repeats show it, or the joint fit does (through rotations that lines share, and their squares),
+    or somebody has declared the microscope.
+    """
+    declared = not options.assumed or any(
+        term.name is TermName.MICROSCOPE and not term.free for term in options.terms)
+    model = solved.model
+    if declared or model is None or model.equations is None:
+        return []
+    if sign_is_shown(measurements):
+        return []
+    equations = model.equations
+    rows = equations.rows([TermName.MICROSCOPE])
+    scale = [at for at in np.flatnonzero(rows)
+             if equations.columns.columns[at].component == "scale"]
+    if not scale or not np.isfinite(model.found.xy.sigma):
+        return []
+    hidden = np.abs(equations.untold(rows)[scale[0]]).max(initial=0.0) > HIDDEN
+    variance = free_inverse(equations)[scale[0], scale[0]] * model.found.xy.sigma**2
+    return [] if not hidden and 0 <= variance <= SIGN_U**2 else [SignNotShown()]
+
+
 def _noise_findings(solved: Solved) -> list[Finding]:
     out: list[Finding] = [
         NoiseContradicted(kind, noise.residuals, noise.stated, bool(np.isfinite(noise.declared)))
@@ -138,24 +168,6 @@ def _noise_findings(solved: Solved) -> list[Finding]:
 def _axes_findings(solved: Solved) -> list[Finding]:
     p, size_rad = solved.axes
     return [] if p >= MISCLOSURE_LEVEL else [AxesNotMet(size_rad, p)]
-
-
-def _off_sites(solved: Solved, options: Options) -> list[Cause]:
-    """Return whether the stage stood off the sites where that matters."""
-    model = solved.model
-    if options.causes is False or model is None or not model.problem.direct:
-        return []
-    cause = off_sites_cause(model, solved.result.error_map, LEVEL)
-    return [cause] if cause else []
-
-
-def _in_order(places: list[Cause], others: list[Cause]) -> tuple[Cause, ...]:
-    """Return the causes, the likeliest first: places of the stage last, unless residuals show them.
-
-    What spoils the readings spoils the slopes of the map, on which the effect of places rests.
-    """
-    first = any(isinstance(cause.what, OffSitesCause) and cause.what.shown for cause in places)
-    return (*places, *others) if first else (*others, *places)
 
 
 def _visits_findings(solved: Solved) -> list[Finding]:
@@ -169,87 +181,3 @@ def _visits_findings(solved: Solved) -> list[Finding]:
     return [VisitedOnce()] if once and not held and problem.repeats_xy[1] > 0 else []
 
 
-def _causes(solved: Solved, measurements: Measurements, options: Options, *,
-            failed: bool) -> list[Cause]:
-    """Return what the readings show beside the model, the likeliest first."""
-    model = solved.model
-    if model is None or not model.problem.direct or not np.isfinite(solved.xy.sigma):
-        return []
-    if not are_looked_for(model.problem.system.grid.n_sites, options, failed=failed):
-        return []
-    line = line_cause(model.problem, measurements, LEVEL)
-    causes = [*_of_marks(solved, model, measurements, options, failed=failed),
-              *([line] if line else [])]
-    return causes or _noisy_views(measurements, model)
-
-
-def _of_marks(solved: Solved, model: ModelFit, measurements: Measurements, options: Options, *,
-              failed: bool) -> list[Cause]:
-    """Return what the marks show beside the model, or a rotation that they do not share."""
-    turned = rotation_cause(model, LEVEL)
-    if turned is None:
-        return _explained(solved, model, failed=failed)
-    # what the marks leave is bent by the lines then: it tells nothing of other causes
-    apart = solved_apart(measurements, options)
-    if apart is None or apart.model is None:
-        return [turned]
-    counts = failed or bends(solved.result, apart.result, MATTERS)
-    # what spoils the marks turns them as well: a rotation is the cause where nothing else is
-    others = _explained(apart, apart.model, failed=counts)
-    return others or ([turned] if counts else [])
-
-
-def _explained(solved: Solved, model: ModelFit, *, failed: bool) -> list[Cause]:
-    """Return what explains the residuals of a solution, the likeliest first."""
-    found = [item for item in find_explanations(model, slips=False)
-             if failed or _counts(item, solved)]
-    if found or failed:
-        found = find_explanations(model, slips=True)
-    return [cause_of(item, model.problem.ground.names, model.problem.half_width_m)
-            for item in found]
-
-
-def are_looked_for(sites: int, options: Options, *, failed: bool) -> bool:
-    """Return whether causes are looked for in a field of so many sites, unasked only in small ones.
-
-    Parameters
-    ----------
-    sites : int
-        Sites of the field.
-    options : Options
-        Whether somebody asked.
-    failed : bool
-        Whether another test failed.
-    """
-    if options.causes is False or sites > MAX_SITES:
-        return False
-    return failed or sites <= ALWAYS_SITES or bool(options.causes)
-
-
-def _counts(found: Explanation, solved: Solved) -> bool:
-    """Return whether an explanation is worth a word: by what it does to the map."""
-    if not found.whole or found.name == READING:  # one node may be far off, and the rest not
-        return True
-    emap = solved.result.error_map
-    u = np.concatenate([emap.u_gx[emap.valid], emap.u_gy[emap.valid]])
-    if not np.isfinite(u).any():
-        return True
-    return found.effect_m > MATTERS * rms(u)
-
-
-def _noisy_views(measurements: Measurements, model: ModelFit) -> list[Cause]:
-    """Return the views whose repeats scatter more than those of the others."""
-    if model.problem.terms:
-        return []  # their own scatter holds what the terms explain
-    views = [(v.view.name, v.sigma_xy, v.dof_xy) for v in measurements.views
-             if len(v.m) and v.dof_xy > 0 and np.isfinite(v.sigma_xy)]
-    out = []
-    for index, (name, sigma, dof) in enumerate(views):
-        others, rest = pooled((s, d) for i, (_, s, d) in enumerate(views) if i != index)
-        if not rest or not others > 0:
-            continue
-        ratio = sigma / others
-        p = float(fdtrc(dof, rest, ratio**2)) * len(views)
-        if p < LEVEL and ratio > NOISY:
-            out.append(noise_cause(name, ratio, ratio * np.sqrt((1 / dof + 1 / rest) / 2), p))
-    return sorted(out, key=lambda cause: cause.p)

@@ -10,7 +10,9 @@ from scipy.special import fdtrc
 from selfcal_ros.estimation.findings import ReadingCause
 from selfcal_ros.estimation.joint.problem import FLOOR, Problem
 from selfcal_ros.estimation.normal.alone import angular_residuals
-from selfcal_ros.estimation.verdict.reading_columns import MOST, READING
+from selfcal_ros.estimation.verdict.enlarge import Effect
+from selfcal_ros.estimation.verdict.fault_columns import MOST, READING
+from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.verdict import Cause
 
@@ -74,3 +76,10 @@ def _suspects(problem: Problem) -> Iterator[OffLine]:
             continue
         p = float(fdtrc(1, dof - 1, gained / variance)) * angular.n_readings
         yield OffLine(v, k, off, float(np.sqrt(variance / (weight * left))), min(p, 1.0))
+
+
+def effect_of_line(cause: Cause, artifact: Artifact) -> Effect:
+    """Return the effect of a reading of a line that is off: at most what it is off by."""
+    theta = np.zeros(artifact.angular_count)
+    theta[:] = abs(cause.size) / np.sqrt(max(len(theta), 1))
+    return Effect(cause.name, np.zeros((2, *artifact.shape)), theta)

@@ -7,6 +7,7 @@ it; but deviation and offset of a visit, and the map, tell how far off the stage
 """
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -39,7 +40,26 @@ NODE_MATTERS = 2.0
 """Effect on a coordinate of a node, in its standard uncertainty, from which it is named."""
 
 
-def off_sites_cause(model: ModelFit, error_map: ErrorMap, level: float) -> Cause | None:
+@dataclass(frozen=True, eq=False)
+class Place:
+    """Places of the stage as a cause, and what they do to the map.
+
+    Attributes
+    ----------
+    cause : Cause
+        The cause.
+    moved : complex array (nx, ny)
+        Bound of the effect on the map along x and along y, frame of the equations, m.
+    shown : bool
+        Whether residuals show it as well.
+    """
+
+    cause: Cause
+    moved: np.ndarray
+    shown: bool
+
+
+def off_sites_cause(model: ModelFit, error_map: ErrorMap, level: float) -> Place | None:
     """Return what the places of the stage do to the map as a cause, None where that is little.
 
     Parameters
@@ -71,8 +91,29 @@ def off_sites_cause(model: ModelFit, error_map: ErrorMap, level: float) -> Cause
     if p >= level:
         return None
     worst = np.unravel_index(int(effect.argmax()), effect.shape)
-    return Cause(OFF_SITES, "", float(effect[worst]), float(noise[worst]), "m", p,
-                 OffSitesCause(rms(np.abs(away)), bool(at_sites.xy.residuals < SHOWN * before)))
+    shown = bool(at_sites.xy.residuals < SHOWN * before)
+    cause = Cause(OFF_SITES, "", float(effect[worst]), float(noise[worst]), "m", p,
+                  OffSitesCause(rms(np.abs(away)), shown), effect_rms=rms(effect),
+                  effect_max=float(effect[worst]))
+    bound = _between(np.where(known, model.found.field, np.nan), _pitch_m(model), away)
+    return Place(cause, np.where(known, bound, 0.0), shown)
+
+
+def _between(field: np.ndarray, pitch_m: float, away: np.ndarray) -> np.ndarray:
+    """Return by how much the error may differ at that distance from the sites, complex (nx, ny).
+
+    A stage that is rough from site to site has another slope on either side: the steeper counts.
+    """
+    total = np.zeros((2, *field.shape))
+    for axis, distance in ((0, rms(away.real)), (1, rms(away.imag))):
+        step = np.abs(_parts(np.diff(field, axis=axis)))
+        pad = [(0, 0)] * 3
+        pad[axis + 1] = (1, 1)
+        both = np.pad(np.nan_to_num(step), pad)
+        sides = np.stack([np.take(both, range(field.shape[axis]), axis=axis + 1),
+                          np.take(both, range(1, field.shape[axis] + 1), axis=axis + 1)])
+        total += sides.max(axis=0) * distance / pitch_m
+    return total[0] + 1j * total[1]
 
 
 def _parts(field: np.ndarray) -> np.ndarray:
@@ -129,7 +170,11 @@ def _at_visits(model: ModelFit, field: np.ndarray) -> tuple[np.ndarray, np.ndarr
         if visits is None:
             continue
         site = grid.views.site_index[view].reshape(-1)[visits.mark]
-        away = visits.y / visits.phase - visits.offset - error[site]  # indicated less true
+        # the deviation as it was read: without the turn of the frame
+        turn = model.problem.turn_rad[view]
+        mark = grid.views.z.reshape(-1)[visits.mark] * model.problem.half_width_m
+        read = visits.y / visits.phase + mark * -np.expm1(-1j * turn) / visits.phase
+        away = read - visits.offset - error[site]  # indicated less true
         change = away.real * along_x[site] + away.imag * along_y[site]
         mean = visits.means((change * visits.phase)[None], grid.n_sites)[0]
         changed[view] = np.where(grid.read[view], mean.reshape(grid.views.shape), 0.0)

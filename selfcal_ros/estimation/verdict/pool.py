@@ -59,10 +59,24 @@ class Beside:
 
 @dataclass(frozen=True, eq=False)
 class Pool:
-    """All candidate columns at once, and the residuals that they are to explain."""
+    """All candidate columns at once, and the residuals that they are to explain.
+
+    Attributes
+    ----------
+    equations : TermEquations
+        All columns.
+    right : Score
+        What they can explain.
+    prior : float array (p,)
+        Information on each coefficient of the model that its size gives; 0 of all others.
+    taken : float array (p,)
+        Coefficients that the model has.
+    """
 
     equations: TermEquations
     right: Score
+    prior: np.ndarray
+    taken: np.ndarray
 
     def beside(self, rows: np.ndarray) -> Beside:
         """Return what the columns of `rows`, bool (p,), explain together."""
@@ -77,7 +91,8 @@ class Pool:
         found: dict[int, Beside] = {}
         for size in {len(at) for at in places}:
             mine = [number for number, at in enumerate(places) if len(at) == size]
-            limits = np.array([self.equations.limit(many[number]) for number in mine])
+            limits = np.array([self.equations.limit(many[number] & (self.prior == 0))
+                               for number in mine])
             blocks = self._of_one_size(np.array([places[number] for number in mine]), limits)
             for number, block in zip(mine, blocks, strict=True):
                 found[number] = Beside(many[number], places[number], *block)
@@ -91,7 +106,7 @@ class Pool:
         sums, square = self.right.sums, (at[:, :, None], at[:, None, :])
         values, vectors = np.linalg.eigh(self._scaled[square])
         told = values > limits[:, None]
-        vectors = vectors / self.equations.norm[at][:, :, None]
+        vectors = vectors / self._norm[at][:, :, None]
         inverse = (vectors * (told / np.where(told, values, 1.0))[:, None]) @ vectors.swapaxes(1, 2)
         right, gram = self._total[at], self.equations.projected.gram[square]
         own = (inverse @ right[:, :, None])[:, :, 0]
@@ -105,11 +120,16 @@ class Pool:
     @cached_property
     def _scaled(self) -> np.ndarray:
         """The information of columns of unit length, (p, p)."""
-        return self.equations.information / np.outer(self.equations.norm, self.equations.norm)
+        information = self.equations.information + np.diag(self.prior)
+        return information / np.outer(self._norm, self._norm)
+
+    @cached_property
+    def _norm(self) -> np.ndarray:
+        return np.hypot(self.equations.norm, np.sqrt(self.prior))
 
     @cached_property
     def _total(self) -> np.ndarray:
-        return self.right.total
+        return self.right.total - self.prior * self.taken
 
     @cached_property
     def everything(self) -> tuple[float, float]:

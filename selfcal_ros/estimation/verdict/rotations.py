@@ -125,3 +125,13 @@ def bends(together: CalibrationResult, apart: CalibrationResult, part: float) ->
     moved = np.stack([one.gx - other.gx, one.gy - other.gy])
     return bool(rms(moved) > part * rms(np.stack([one.u_gx, one.u_gy]))
                 or rms(turned) > part * rms(one.u_g_theta))
+
+
+def turns_apart(result: CalibrationResult, measurements: Measurements) -> float:
+    """Return by how much the views of marks and lines are turned against one another, rad.
+
+    Lines whose offsets have the other sign turn by twice that, and their map is bounded by nothing.
+    """
+    phi = [view.phi for view, readings in zip(result.views, measurements.views, strict=True)
+           if len(readings.m) and len(readings.k)]
+    return float(np.ptp(phi))

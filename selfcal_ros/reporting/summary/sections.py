@@ -9,6 +9,7 @@ import numpy as np
 
 from selfcal_ros.model.error_map import ErrorMap
 from selfcal_ros.model.result import CalibrationResult, Noise, ViewResult
+from selfcal_ros.model.verdict import Grade
 from selfcal_ros.reporting.summary.format import (
     UNKNOWN,
     aligned_numbers,
@@ -50,14 +51,22 @@ def verdict_section(result: CalibrationResult) -> Section:
     notes = [printable(reason) for reason in verdict.reasons]
     notes += [f"likely cause: {printable(cause.text)} (p = {cause.p:.1g})"
               for cause in verdict.causes]
-    return Section("Verdict: NOT QUALIFIED" if not verdict.qualified else "Verdict",
-                   notes=tuple(notes))
+    notes += [f"U enlarged by {printable(item.name)}: u {unit(item.u_rms)} rms, "
+              f"{unit(item.u_max)} largest" for item, unit in (
+                  (item, arcsec if item.unit == "rad" else um) for item in verdict.enlarged_by)]
+    return Section(_TITLES[verdict.grade], notes=tuple(notes))
+
+
+_TITLES = {Grade.GOOD: "Verdict", Grade.ENLARGED: "Verdict: GOOD WITHIN AN ENLARGED U",
+           Grade.NOT_QUALIFIED: "Verdict: NOT QUALIFIED"}
 
 
 def terms_section(result: CalibrationResult) -> Section:
     """Return what was estimated beside the map: the terms of the model."""
     rows = []
     for term in result.model.terms:
+        if term.source == "default" and term.size_used is None:
+            continue  # a line of the budget
         how = "free" if term.size is None else f"size {term.size:g}"
         if term.size_used is not None:
             how += f", contradicted: {term.size_used:.2g} used"
@@ -89,6 +98,13 @@ def measurement_section(result: CalibrationResult) -> Section:
               f"{result.model.misalignment} misalignments"),
              ("identifiable", f"{'yes' if seen.identifiable else 'NO'} (rank {seen.rank} of "
               f"{seen.unknowns} unknowns, {counted(seen.deficiency, 'unseen mode')})")]
+    plate_map = result.artifact_map
+    if math.isfinite(plate_map.magnification):
+        value, u = (x * UM_PER_M for x in (plate_map.magnification, plate_map.u_magnification))
+        spread = f" ± {significant(u)} (k=1)" if math.isfinite(u) else ""
+        word = "larger" if value >= 0 else "smaller"
+        facts.append(("magnification", f"plate {word} than the encoders say by "
+                      f"{significant(abs(value))}{spread} µm/m"))
     if result.input.get("file"):
         digest = printable(result.input.get("sha256") or "")
         facts.append(("input", printable(result.input["file"])

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from selfcal_ros.model.result import CalibrationResult
+from selfcal_ros.model.verdict import Grade
 from selfcal_ros.reporting.summary.format import (
     aligned,
     can_print_symbols,
@@ -45,9 +46,10 @@ def state_sentence(result: CalibrationResult) -> str:
         return "No calibration: not one site of the error map is known."
     k = result.noise.k_theta
     text = f"{_map_clause(result, figures)}{_theta_clause(figures, k)}{_warnings(result)}."
-    if result.verdict.qualified:
+    if result.verdict.grade is Grade.GOOD:
         return text
-    return f"{printable(result.verdict.sentence).rstrip('.')}. Map as it is: {text}"
+    said = printable(result.verdict.sentence).rstrip(".")
+    return f"{said}. {text}" if result.verdict.qualified else f"{said}. Map as it is: {text}"
 
 
 def _map_clause(result: CalibrationResult, figures: MapFigures) -> str:

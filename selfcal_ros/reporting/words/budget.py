@@ -7,6 +7,7 @@ from typing import Any
 from selfcal_ros.estimation.quality.budget import (
     Budget,
     FromCurvature,
+    FromEffect,
     FromReadings,
     FromReference,
     FromTerm,
@@ -52,6 +53,11 @@ def _(how: FromTerm) -> str:
              f"given as {how.given:.3g}, which the readings contradict; they allow "
              f"{how.allowed:.3g} and ")
     return f"{known}leave {how.remaining_part:.0%} of it"
+
+
+@how_text.register
+def _(how: FromEffect) -> str:
+    return f"effect of the cause '{how.cause}' that the readings show (see the verdict)"
 
 
 @how_text.register

@@ -6,6 +6,7 @@ from functools import singledispatch
 
 from selfcal_ros.estimation.findings import (
     DrawnUncertainty,
+    Magnification,
     NoisyView,
     NoUncertainty,
     OutliersGivenUp,
@@ -21,6 +22,7 @@ from selfcal_ros.estimation.findings import (
 )
 from selfcal_ros.model.verdict import Finding
 from selfcal_ros.reporting.words.causes import what_it_is
+from selfcal_ros.reporting.words.units import RATIO, plus_minus
 from selfcal_ros.units import UM_PER_M, URAD_PER_RAD
 
 NAMED = 5
@@ -54,6 +56,14 @@ def _(found: Unchecked) -> str:
     rest, them = ("rests on a single reading", "it") if one else ("rest on single readings", "them")
     return (f"{what} of the map {rest} that no other checks; what is wrong with {them} is in the "
             "map, and no residual shows it: measure the marks that are missing, or add a view")
+
+
+@warning.register
+def _(found: Magnification) -> str:
+    word = "larger" if found.value > 0 else "smaller"
+    return (f"the plate is {word} than the encoders say by "
+            f"{plus_minus(abs(found.value), found.u, RATIO)}, more than plate and encoders can "
+            "have between them: check the pitch in the plan (grid_pitch), and the encoders' scale")
 
 
 def _counted(places: tuple[tuple[int, ...], ...], kind: str) -> str:

@@ -4,7 +4,7 @@
 import math
 from typing import NamedTuple
 
-from selfcal_ros.units import ARCSEC_PER_RAD, MRAD_PER_RAD, PPM_PER_ONE, UM_PER_M
+from selfcal_ros.units import ARCSEC_PER_RAD, MRAD_PER_RAD, PPM_PER_ONE, UM_PER_M, URAD_PER_RAD
 
 
 class Unit(NamedTuple):
@@ -16,7 +16,7 @@ class Unit(NamedTuple):
 
 UM, RATIO = Unit(UM_PER_M, "µm"), Unit(PPM_PER_ONE, "µm/m")
 MRAD, PERCENT = Unit(MRAD_PER_RAD, "mrad"), Unit(100.0, "%")
-ARCSEC = Unit(ARCSEC_PER_RAD, "arcsec")
+ARCSEC, URAD = Unit(ARCSEC_PER_RAD, "arcsec"), Unit(URAD_PER_RAD, "µrad")
 
 
 def plus_minus(value: float, u: float, unit: Unit) -> str:

@@ -12,16 +12,18 @@ from selfcal_ros.estimation.findings import (
     NoiseContradicted,
     NoiseUnknown,
     NoisyView,
+    NotConverged,
     OutliersGivenUp,
     OutliersKept,
     PredictionFailed,
+    SignNotShown,
     SlipFound,
     SlipsGivenUp,
     TooManyOutliers,
 )
 from selfcal_ros.model.result import Noise
-from selfcal_ros.model.verdict import Cause, Finding, Verdict
-from selfcal_ros.reporting.words.causes import cause_text, what_it_is
+from selfcal_ros.model.verdict import Cause, Finding, Grade, Verdict
+from selfcal_ros.reporting.words.causes import cause_text, remedies, what_it_is
 from selfcal_ros.reporting.words.screening import warning
 from selfcal_ros.units import ARCSEC_PER_RAD, RAD_PER_MRAD, UM_PER_M
 
@@ -41,17 +43,20 @@ def worded_verdict(verdict: Verdict, noise: Noise) -> Verdict:
     if verdict.sentence and not verdict.findings:
         return verdict
     reasons = (*verdict.reasons, *(reason(finding) for finding in verdict.findings))
-    causes = tuple(replace(cause, text=cause_text(cause), what=None) for cause in verdict.causes)
-    return Verdict(verdict.qualified, _sentence(verdict.qualified, reasons, causes, noise),
-                   reasons, causes)
+    causes = tuple(replace(cause, text=cause_text(cause), remedies=remedies(cause), what=None)
+                   for cause in verdict.causes)
+    return Verdict(verdict.grade, _sentence(verdict.grade, reasons, causes, noise),
+                   reasons, causes, enlarged_by=verdict.enlarged_by)
 
 
-def _sentence(qualified: bool, reasons: tuple[str, ...], causes: tuple[Cause, ...],
+def _sentence(grade: Grade, reasons: tuple[str, ...], causes: tuple[Cause, ...],
               noise: Noise) -> str:
-    if qualified:
+    if grade is Grade.GOOD:
         tested = np.isfinite(noise.p_xy) or np.isfinite(noise.p_theta)
-        return ("Qualified: residuals and the noise of readings agree" if tested else
-                "Qualified: residuals show the noise; there are no repeats to compare it with")
+        return ("Good: residuals and the noise of readings agree" if tested else
+                "Good: residuals show the noise; there are no repeats to compare it with")
+    if grade is Grade.ENLARGED:
+        return f"Good within an enlarged U: {causes[0].text if causes else reasons[0]}"
     if causes:
         return f"Not qualified: most likely {causes[0].text}"
     return f"Not qualified: {reasons[0]}"
@@ -66,6 +71,21 @@ def reason(finding: Finding) -> str:
 @reason.register
 def _(cause: Cause) -> str:
     return f"the readings show {what_it_is(cause)}"
+
+
+@reason.register
+def _(_: SignNotShown) -> str:
+    return ("nothing in the readings shows the sign of the microscope's offsets, and with the "
+            "other sign the map would be that of another stage: let the stage stop beside the "
+            "marks on purpose (check_stops in the plan), or declare the microscope (--microscope "
+            "0.01)")
+
+
+@reason.register
+def _(_: NotConverged) -> str:
+    return ("the readings are so far from what is assumed of the measurement that the estimate "
+            "converged only without the assumptions: check the sense, the axes and the pixel size "
+            "of the microscope")
 
 
 @reason.register

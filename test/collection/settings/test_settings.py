@@ -22,6 +22,7 @@ from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.readings import Measurements
+from selfcal_ros.model.terms import DEFAULT_TERMS
 
 EVERY = [(node, p) for node, table in NODE_PARAMETERS.items() for p in table]
 
@@ -211,3 +212,33 @@ def test_terms_that_cannot_be(given, planned, message):
 def test_the_uncertainty_map_is_wanted_in_words(word, wanted):
     settings = SolverSettings.checked({"uncertainty": word}, "here")
     assert solver_options(settings).uncertainty is wanted
+
+
+def model_of(planned=(), **given):
+    """Return the model of a solver with a plan's terms, as they are written in an option."""
+    readings = Measurements("p", Artifact(5, 0.01), (), model_terms=planned)
+    options = solver_options(SolverSettings.checked(given, "here"), readings)
+    return [str(term) for term in options.model_terms(visits=True)]
+
+
+ASSUMED = [str(term) for term in DEFAULT_TERMS]
+
+
+def test_what_is_known_of_the_microscope_is_assumed_unless_somebody_says_otherwise():
+    assert ASSUMED[0] == "microscope:0.01:0.01:0.002"
+    assert model_of() == ASSUMED
+    assert model_of(scale_u=0.1, rotation_u=0.02, shear_u=0.003) == [
+        "microscope:0.1:0.02:0.003", *ASSUMED[1:]]
+    assert model_of(model_terms=["microscope"], scale_u=0.1) == ["microscope", *ASSUMED[1:]]
+    assert model_of(scale_u=0.0, rotation_u=0.0, shear_u=0.0) == ASSUMED[1:]
+
+
+def test_what_a_plan_knows_of_its_microscope_outlives_another_model():
+    planned = ("microscope:0.05:0.01:0.002", "approach")
+    assert model_of(planned) == [*planned, *ASSUMED[1:]]
+    assert model_of(planned, model_terms=["drift"], scale_u=0.1) == [
+        "drift", planned[0], *ASSUMED[1:]]
+    assert model_of(planned, model_terms=["microscope:0"]) == ASSUMED[1:]
+    assert model_of(planned, model_terms=["none"]) == []
+    # a plan that only wants one estimated says nothing about it
+    assert model_of(("microscope",), model_terms=["drift"]) == ["drift", *ASSUMED]

@@ -17,7 +17,7 @@ from selfcal_ros.estimation.comparison.covariance import (
 from selfcal_ros.estimation.comparison.maps import compare
 from selfcal_ros.estimation.joint.covariance import map_covariance
 from selfcal_ros.estimation.law.solve import hu_readings, hu_views, law_for
-from selfcal_ros.estimation.options import Options, ReferenceLength
+from selfcal_ros.estimation.options import ReferenceLength
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.result import result_from_dict, result_to_dict
@@ -26,6 +26,7 @@ from selfcal_ros.model.view import View
 from selfcal_ros.reporting.words.result import worded
 from selfcal_ros.simulation.truth import Spread, hu_plan, random_truth, simulate_measurements
 from test.support.lattice_plans import plan_of
+from test.support.options import BARE, bare
 from test.support.recalibrations import responses, sizes_of
 
 PLAN = plan_of("0,90,tx,2ty", Artifact(5, 0.01, 12), lines=1)
@@ -51,7 +52,7 @@ def measured(plan, seed, truth_seed=99, sense=Sense.MICROSCOPE_MOVES, missing=0.
     ReferenceLength("artifact", 1e-6, 2e-6)])
 def test_covariance_of_a_saved_map(sense, reference):
     readings = measured(PLAN, 1, sense=sense)
-    options = Options(reference=reference)
+    options = bare(reference=reference)
     result = calibrate(readings, options)
     known = result.error_map.valid
     found, correlated = xy_covariance(result, known)
@@ -69,7 +70,7 @@ def test_covariance_of_a_saved_map(sense, reference):
 @pytest.mark.parametrize("reference", [None, ReferenceLength("stage_x", 1e-6, 2e-6)])
 def test_covariance_of_a_saved_map_with_missing_marks_and_terms(sense, reference):
     readings = measured(TURNED, 1, sense=sense, missing=0.1)
-    options = Options(reference=reference, terms=(
+    options = bare(reference=reference, terms=(
         ModelTerm(TermName.PLATE_SCALE), ModelTerm(TermName.PLATE_SHAPE, 3e-8)))
     result = calibrate(readings, options)
     saved = result_from_dict(json.loads(json.dumps(result_to_dict(worded(result)))), "r")
@@ -81,23 +82,23 @@ def test_covariance_of_a_saved_map_with_missing_marks_and_terms(sense, reference
     u = np.concatenate([result.error_map.u_gx[known], result.error_map.u_gy[known]])
     assert np.sqrt(np.diag(wanted)) == pytest.approx(u, rel=1e-6)
     shear = first_order_u(saved)
-    assert shear[0] > 1.5 * first_order_u(calibrate(readings, Options(reference=reference)))[0]
-    bare = replace(saved, extra={})
-    assert xy_covariance(bare, known)[1] is False
+    assert shear[0] > 1.5 * first_order_u(calibrate(readings, bare(reference=reference)))[0]
+    alone = replace(saved, extra={})
+    assert xy_covariance(alone, known)[1] is False
 
 
 @pytest.mark.parametrize(("read", "message"), [
     ("x", "no weights of this field"), ([[1, 2], [3, 4]], "no weights of this field"),
     (-1, "no weights of this field")])
 def test_weights_that_are_none_are_refused(read, message):
-    result = calibrate(measured(PLAN, 1))
+    result = calibrate(measured(PLAN, 1), BARE)
     views = (replace(result.views[0], read_grid=read), *result.views[1:])
     with pytest.raises(InputError, match=f"view '0', read.grid: {message}; write the result again"):
         xy_covariance(replace(result, views=views), result.error_map.valid)
 
 
 def test_factors_of_another_lattice_are_refused():
-    result = calibrate(measured(PLAN, 1))
+    result = calibrate(measured(PLAN, 1), BARE)
     extra = {"covariance_terms": {"terms": [""], "factors": [[[1.0, 2.0], [3.0, 4.0]]]}}
     with pytest.raises(InputError, match="covariance_terms: no factors of this lattice"):
         xy_covariance(replace(result, extra=extra), result.error_map.valid)
@@ -105,15 +106,15 @@ def test_factors_of_another_lattice_are_refused():
 
 def test_a_reference_adds_nothing_to_the_uncertainty_of_squareness():
     readings = measured(PLAN, 1)
-    plain = first_order_u(calibrate(readings))
-    scaled = first_order_u(calibrate(readings, Options(
+    plain = first_order_u(calibrate(readings, BARE))
+    scaled = first_order_u(calibrate(readings, bare(
         reference=ReferenceLength("artifact", 1e-6, 2e-6))))
     assert scaled == pytest.approx(plain, rel=0.05)
 
 
 def test_the_uncertainty_of_squareness_of_an_old_result_has_its_size():
     """A result that does not keep what was read tells its noise by its uncertainty map."""
-    result = calibrate(measured(PLAN, 1))
+    result = calibrate(measured(PLAN, 1), BARE)
     old = replace(result, views=tuple(replace(v, read_grid=None, read_angular=None)
                                       for v in result.views))
     assert first_order_u(old) == pytest.approx(first_order_u(result), rel=0.02)
@@ -123,7 +124,7 @@ def test_the_uncertainty_of_squareness_of_an_old_result_has_its_size():
 def test_maps_with_references_agree_as_often_as_they_should(keep_scale):
     """Ratios of 12 pairs: each holds a chi^2 of 94 (95) degrees of freedom, so that their mean
     scatters by 0.04."""
-    found, options = [], Options(causes=False)
+    found, options = [], bare(causes=False)
     for seed in range(12):
         pair = []
         for one in range(2):
@@ -168,7 +169,7 @@ def stated(readings):
 def test_lines_in_views_of_their_own_have_the_covariance_of_their_readings(datum, sense, theta):
     """Angular noise alone tells how lines correlate: the slopes that the axes add are small."""
     readings = stated(measured(APART, 1, sense=sense, linear=True))
-    options = Options(misalignment_model="linear", datum_theta=datum, causes=False)
+    options = bare(misalignment_model="linear", datum_theta=datum, causes=False)
     quick = replace(options, uncertainty=False)
     answers = responses(lambda moved: map_of(calibrate(moved, quick)), readings,
                         sizes_of(readings, 2e-8, 2e-5))
@@ -179,7 +180,7 @@ def test_lines_in_views_of_their_own_have_the_covariance_of_their_readings(datum
 def test_maps_of_the_law_have_the_covariance_of_their_readings(sense):
     how = {"sense": sense, "linear": True, "spread": Spread(encoder="xy_axes")}
     readings = stated(measured(SMALL, 1, **how))
-    options = Options(method="law", datum_theta="xy_axes", causes=False)
+    options = bare(method="law", datum_theta="xy_axes", causes=False)
     result = calibrate(readings, options)
     law = law_for(readings.artifact, result.error_map.datum_theta, sense)
 

@@ -14,9 +14,9 @@ from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.comparison.maps import compare, compare_with_laser
 from selfcal_ros.estimation.normal import cache
 from selfcal_ros.estimation.normal.equations import NormalEquations
-from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.simulation.truth import hu_plan, random_truth, simulate_measurements
+from test.support.options import bare
 from test.support.recalibrations import responses, sizes_of
 
 ARTIFACT = Artifact(7, 0.01, 12)
@@ -28,7 +28,7 @@ def calibrated(seed, truth=None, *, method="joint", sigma=SIGMA_M):
     truth = truth or random_truth(ARTIFACT, 4, np.random.default_rng(99))
     readings = simulate_measurements(truth, hu_plan(truth.artifact), rng, sigma_m=sigma,
                                      sigma_theta_rad=SIGMA_RAD)
-    return calibrate(readings, Options(method=method, causes=False))
+    return calibrate(readings, bare(method=method, causes=False))
 
 
 A, B = calibrated(1), calibrated(2)
@@ -200,7 +200,7 @@ def test_uncertainty_of_squareness_is_that_of_every_reading_moved_in_turn():
     readings = replace(readings, views=tuple(
         replace(view, sigma_xy=SIGMA_M, dof_xy=1000, sigma_theta=SIGMA_RAD, dof_theta=1000)
         for view in readings.views))
-    linear = Options(misalignment_model="linear", causes=False)
+    linear = bare(misalignment_model="linear", causes=False)
     answers = responses(
         lambda moved: np.array([calibrate(moved, replace(
             linear, uncertainty=False)).error_map.nonorthogonality]),

@@ -6,12 +6,12 @@ import pytest
 
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.joint import kept_residuals
-from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.result import result_from_dict, result_to_dict
 from selfcal_ros.reporting.words.result import worded
 from selfcal_ros.simulation.truth import hu_plan, random_truth, simulate_measurements
+from test.support.options import BARE, bare
 
 
 def measured(sense=Sense.MICROSCOPE_MOVES, *, visits=False, missing=0.0):
@@ -28,7 +28,7 @@ def measured(sense=Sense.MICROSCOPE_MOVES, *, visits=False, missing=0.0):
 def test_residuals_are_what_maps_and_misalignment_leave_of_the_readings(sense):
     """Written out mark by mark from the published model, in the stage frame."""
     measurements = measured(sense, missing=0.1)
-    result = calibrate(measurements, Options(misalignment_model="linear"))
+    result = calibrate(measurements, bare(misalignment_model="linear"))
     emap, amap, artifact = result.error_map, result.artifact_map, result.artifact
     h, pitch, lines = artifact.half[0], artifact.grid_pitch_m, artifact.angular_count
     seen = 0
@@ -74,7 +74,7 @@ def test_a_course_follows_the_readings_of_each_visit():
         visits.mark, visits.count)
     views[0] = replace(views[0], dx=means, visits=jumped)
     kept = calibrate(replace(measurements, views=tuple(views)),
-                     Options(causes=False)).extra["residuals"]["views"]
+                     bare(causes=False)).extra["residuals"]["views"]
     course = kept[0]["course"]
     early = course["time_s"] < np.median(course["time_s"])
     assert course["dx"][~early].mean() - course["dx"][early].mean() == pytest.approx(5e-7, rel=0.1)
@@ -84,8 +84,8 @@ def test_a_course_follows_the_readings_of_each_visit():
 
 def test_the_course_of_marks_visited_once_is_that_of_their_residuals():
     measurements = measured(visits=True)
-    for view, entry in zip(measurements.views, calibrate(measurements).extra["residuals"]["views"],
-                           strict=True):
+    kept = calibrate(measurements, BARE).extra["residuals"]["views"]
+    for view, entry in zip(measurements.views, kept, strict=True):
         if not len(view.m):
             assert "course" not in entry
             continue
@@ -115,7 +115,7 @@ def test_each_part_of_a_course_is_a_mean_of_readings_in_the_order_of_time(monkey
         about.append((visits.dx - dx[visits.mark], visits.dy - dy[visits.mark]))
     views += measurements.views[2:]
     kept = calibrate(replace(measurements, views=tuple(views)),
-                     Options(causes=False)).extra["residuals"]["views"]
+                     bare(causes=False)).extra["residuals"]["views"]
     first = min(view.visits.stamp_ns.min() for view in views if len(view.m))
     for view, (dx, dy), entry in zip(views[:2], about, kept[:2], strict=True):
         visits, course = view.visits, entry["course"]
@@ -134,7 +134,7 @@ def test_each_part_of_a_course_is_a_mean_of_readings_in_the_order_of_time(monkey
 
 def test_residuals_survive_the_json_form_and_are_left_out_of_large_results(monkeypatch):
     measurements = measured()
-    result = calibrate(measurements)
+    result = calibrate(measurements, BARE)
     data = result_to_dict(worded(result))
     again = result_from_dict(data, "r.json").extra["residuals"]["views"]
     own = result.extra["residuals"]["views"]
@@ -142,6 +142,6 @@ def test_residuals_survive_the_json_form_and_are_left_out_of_large_results(monke
     assert again[3]["dx"] == [[None if np.isnan(v) else v for v in row]
                               for row in own[3]["dx"].tolist()]
     monkeypatch.setattr(kept_residuals, "MAX_READINGS", 49 + 49 + 42 - 1)
-    assert "residuals" not in calibrate(measurements).extra
+    assert "residuals" not in calibrate(measurements, BARE).extra
     monkeypatch.setattr(kept_residuals, "MAX_READINGS", 49 + 49 + 42)
-    assert "residuals" in calibrate(measurements).extra
+    assert "residuals" in calibrate(measurements, BARE).extra

@@ -21,11 +21,11 @@ from selfcal_ros.estimation.joint import pcg
 from selfcal_ros.estimation.normal import cache, equations
 from selfcal_ros.estimation.normal.grid import GridSystem
 from selfcal_ros.estimation.normal.planned import planned_system
-from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.quality.outliers import robust_calibrate
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.simulation.truth import hu_plan, random_truth, simulate_measurements
 from test.support.lattice_plans import in_datum, measured_in_datum, plan_of
+from test.support.options import BARE, bare
 
 EXACT = 1e-12
 ROOT = Path(__file__).parents[3]
@@ -67,7 +67,7 @@ def same(a, b, tolerance):
 def test_iterated_fields_have_the_map_of_factorised_ones(as_large, missing):
     _, readings = measured(hu_plan(Artifact(51, 0.002, 24)), sigma_m=2e-8, sigma_theta_rad=1e-7,
                            missing=missing)
-    options = Options(uncertainty=False)
+    options = bare(uncertainty=False)
     direct = calibrate(readings, options)
     as_large()
     iterated = calibrate(readings, options)
@@ -84,9 +84,9 @@ def test_iteration_takes_fields_in_pieces(as_large):
     """With a fifth of three views missing, sites are cut off that nothing determines."""
     as_large()
     truth, readings = measured_in_datum(
-        plan_of("0,90,tx", Artifact(51, 0.002)), 1, lambda some: calibrate(some).error_map.valid,
-        missing=0.2)
-    found = calibrate(readings)
+        plan_of("0,90,tx", Artifact(51, 0.002)), 1,
+        lambda some: calibrate(some, BARE).error_map.valid, missing=0.2)
+    found = calibrate(readings, BARE)
     valid = found.error_map.valid
     assert 0.9 < valid.mean() < 1 and found.extra["solver"]["iterations"] < 150
     assert np.nanmax(np.abs(found.error_map.gx - truth.g[0])) < EXACT
@@ -101,7 +101,7 @@ def test_the_number_of_steps_does_not_grow_with_the_field(as_large, missing, ste
     as_large()
     for size in (31, 91):
         _, readings = measured(plan_of("0,90,tx", Artifact(size, 0.002)), missing=missing)
-        solver = calibrate(readings, Options(uncertainty=False)).extra["solver"]
+        solver = calibrate(readings, bare(uncertainty=False)).extra["solver"]
         assert solver["iterations"] <= steps
 
 
@@ -110,11 +110,11 @@ def test_uneven_weights_are_factorised_or_iterated_to_the_truth(as_large, monkey
     readings = replace(readings, views=tuple(
         replace(view, count=1 + np.arange(len(view.m)) % 3) for view in readings.views))
     as_large()
-    factorised = calibrate(readings)
+    factorised = calibrate(readings, BARE)
     assert factorised.extra["solver"]["method"] == "multifrontal"
     monkeypatch.setattr(equations, "UNEVEN_SITES", 0)
     cache.clear_cache()
-    iterated = calibrate(readings)
+    iterated = calibrate(readings, BARE)
     assert iterated.extra["solver"]["method"] == "conjugate gradients"
     for found in (factorised.error_map, iterated.error_map):
         expected = in_datum(truth.g, found.valid, readings.artifact, scale=True)
@@ -126,7 +126,7 @@ def test_an_iteration_that_stalls_says_so(as_large, monkeypatch):
     as_large()
     monkeypatch.setattr(pcg, "MAX_ITERATIONS", 3)
     with pytest.raises(InputError, match=r"^weights: the residual stays at .* after 3 iterations"):
-        calibrate(readings)
+        calibrate(readings, BARE)
 
 
 @pytest.mark.parametrize(("names", "missing"), [
@@ -134,17 +134,17 @@ def test_an_iteration_that_stalls_says_so(as_large, monkeypatch):
 def test_deficient_plans_are_refused_at_any_size(as_large, names, missing):
     _, readings = measured(plan_of(names, Artifact(21, 0.005)), missing=missing)
     with pytest.raises(NotIdentifiableError) as small:
-        calibrate(readings)
+        calibrate(readings, BARE)
     as_large()
     with pytest.raises(NotIdentifiableError) as large:
-        calibrate(readings)
+        calibrate(readings, BARE)
     assert large.value.observability == small.value.observability
 
 
 def test_the_core_of_a_large_field_tells_its_rank_alone(as_large):
     """Uncertainty and robust estimate of a field of which only a core was ranked."""
     _, readings = measured(hu_plan(Artifact(21, 0.005, 24)), sigma_m=2e-8, sigma_theta_rad=1e-7)
-    wanted = Options(uncertainty=True)
+    wanted = bare(uncertainty=True)
     small, weighed = calibrate(readings, wanted), robust_calibrate(readings, wanted)
     as_large()
     large = calibrate(readings, wanted)

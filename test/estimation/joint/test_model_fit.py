@@ -8,15 +8,16 @@ import pytest
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.joint import model_fit
-from selfcal_ros.estimation.joint.model_fit import fit_model, own_rotations, squares
+from selfcal_ros.estimation.joint.model_fit import fit_model, squares
+from selfcal_ros.estimation.joint.problem import own_rotations
 from selfcal_ros.estimation.joint.solve import prepare
 from selfcal_ros.estimation.normal.grid import GridSystem
-from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.terms import parse_terms
 from selfcal_ros.model.view import LatticePose, Plan, View
 from selfcal_ros.simulation.truth import random_truth, simulate_measurements
 from test.support.lattice_plans import plan_of
+from test.support.options import BARE, bare
 
 PITCH, LINES = 0.01, 8
 ARTIFACT = Artifact(5, PITCH, LINES)
@@ -63,7 +64,7 @@ def test_degrees_of_freedom_count_rotations_that_marks_and_lines_share_once(shar
     plan, rng = plan_with(shared, alone), np.random.default_rng(6)
     readings = simulate_measurements(random_truth(ARTIFACT, len(plan.views), rng), plan, rng,
                                      sigma_m=2e-8, sigma_theta_rad=2e-6)
-    model = fit_model(prepare(readings, Options())[0])
+    model = fit_model(prepare(readings, BARE)[0])
     assert squares(model.problem, model.found)[1] == dense_dof(plan)
 
 
@@ -80,7 +81,7 @@ def test_what_does_not_settle_is_named(monkeypatch, terms, message):
     readings = simulate_measurements(random_truth(ARTIFACT, len(plan.views), rng), plan, rng,
                                      sigma_m=2e-8, visits=True)
     with pytest.raises(InputError) as caught:
-        fit_model(prepare(readings, Options(terms=parse_terms([terms], "")))[0])
+        fit_model(prepare(readings, bare(terms=parse_terms([terms], "")))[0])
     assert str(caught.value) == message
 
 
@@ -104,5 +105,5 @@ def test_rotations_settle_in_four_steps_from_what_the_views_show(monkeypatch):
                                      rng, sigma_m=2e-8)
     fits, plain = [], model_fit.fit
     monkeypatch.setattr(model_fit, "fit", lambda *args: fits.append(1) or plain(*args))
-    model_fit.fit_model(prepare(readings, Options())[0])
+    model_fit.fit_model(prepare(readings, BARE)[0])
     assert len(fits) == 1 + 4

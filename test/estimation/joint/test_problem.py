@@ -4,7 +4,13 @@
 import numpy as np
 import pytest
 
-from selfcal_ros.estimation.joint.problem import MAX_WEIGHT, repeats_of, sigma_of, weight_ratio
+from selfcal_ros.estimation.joint.problem import (
+    LEAST_NOISE_RAD,
+    MAX_WEIGHT,
+    repeats_of,
+    sigma_of,
+    weight_ratio,
+)
 from selfcal_ros.estimation.joint.solve import prepare
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact
@@ -44,7 +50,10 @@ def test_the_ratio_ends_where_the_lighter_kind_would_be_lost(problem):
 def test_readings_without_any_noise_weigh_as_much_as_rounding_bears(problem):
     system, y = problem[0].system, np.zeros_like(problem[0].grid.y)
     equal = system.grid_scale / system.angular_scale
-    assert weight_ratio(problem[0], 1e-8, 0.0, y) == pytest.approx(equal * MAX_WEIGHT)
+    least = (1e-8 / (LEAST_NOISE_RAD * problem[0].half_width_m)) ** 2
+    assert least < equal * MAX_WEIGHT
+    assert weight_ratio(problem[0], 1e-8, 0.0, y) == pytest.approx(least)
+    assert weight_ratio(problem[0], 1e-5, 0.0, y) == pytest.approx(equal * MAX_WEIGHT)
     assert weight_ratio(problem[0], 0.0, 1e-6, y) == pytest.approx(equal / MAX_WEIGHT)
 
 

@@ -11,13 +11,14 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.joint.covariance import map_covariance
 from selfcal_ros.estimation.joint.noise import coverage_factor
-from selfcal_ros.estimation.options import Options, ReferenceKind, ReferenceLength
+from selfcal_ros.estimation.options import ReferenceKind, ReferenceLength
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.reporting.words.result import worded
 from selfcal_ros.simulation.truth import Spread, hu_plan, random_truth, simulate_measurements
 from test.support.lattice_plans import in_datum, plan_of
+from test.support.options import BARE, bare
 from test.support.recalibrations import responses, sizes_of, values_of, with_values
 
 TABLE = {  # method, section 11: rms of u(G) / sigma of a reading for N = 5, 11, 21
@@ -36,7 +37,7 @@ def measured(plan, seed=1, **how):
 @pytest.mark.parametrize("size", [5, 11, 21])
 def test_rms_uncertainty_is_the_published_bound(names, size):
     _, readings = measured(plan_of(names, Artifact(size, 0.01)), sigma_m=1e-8)
-    found = calibrate(readings)
+    found = calibrate(readings, BARE)
     emap = found.error_map
     rms = np.sqrt(np.mean([emap.u_gx**2, emap.u_gy**2])) / found.noise.sigma_xy
     assert round(rms, 3) == TABLE[names][(5, 11, 21).index(size)]
@@ -49,7 +50,7 @@ def test_angular_bounds(lines, datum, bound):
     """With XY readings so good that the rotations are known (method, section 11)."""
     _, readings = measured(hu_plan(Artifact(11, 0.01, lines)), sigma_m=1e-12,
                            sigma_theta_rad=1e-5)
-    found = calibrate(readings, Options(datum_theta=ThetaDatum(datum)))
+    found = calibrate(readings, bare(datum_theta=ThetaDatum(datum), causes=False))
     rms = np.sqrt(np.mean(found.error_map.u_g_theta**2)) / found.noise.sigma_theta
     assert round(rms, 3) == bound
 
@@ -71,7 +72,7 @@ def map_numbers(options):
     return solve
 
 
-LINEAR = Options(misalignment_model="linear")
+LINEAR = bare(misalignment_model="linear")
 
 
 @pytest.mark.parametrize(("missing", "sigma_theta"), [(0.0, 1e-5), (0.2, 2e-8)])
@@ -84,7 +85,7 @@ def test_uncertainty_is_that_of_every_reading_moved_in_turn(missing, sigma_theta
     """
     sigma, rng = 2e-8, np.random.default_rng(3)
     plan = hu_plan(Artifact(5, 0.01, 12))
-    for options, exact, tolerance in ((LINEAR, True, 1e-6), (Options(), False, 0.03)):
+    for options, exact, tolerance in ((LINEAR, True, 1e-6), (BARE, False, 0.03)):
         _, readings = measured(plan, seed=12, missing=missing, sense=Sense.PLATE_MOVES,
                                linear=exact)
         readings = stated(replace(readings, views=tuple(
@@ -135,7 +136,7 @@ def bilinear(field, artifact, x, y):
 
 
 def test_positions_off_the_field_are_refused():
-    cover = map_covariance(measured(plan_of("0,90,tx", Artifact(5, 0.01)), sigma_m=1e-8)[1])
+    cover = map_covariance(measured(plan_of("0,90,tx", Artifact(5, 0.01)), sigma_m=1e-8)[1], BARE)
     with pytest.raises(InputError, match="off the calibrated field"):
         cover.between([0.021], [0.0])
 
@@ -153,7 +154,7 @@ def test_a_reference_length_sets_the_scale_and_its_uncertainty(kind, sense):
     artifact = Artifact(5, 0.01)
     plan = plan_of("0,90,tx", artifact)
     _, clean = measured(plan, seed=2, sense=sense, missing=0.05, linear=True)
-    linear = Options(misalignment_model="linear")
+    linear = bare(misalignment_model="linear")
     free = calibrate(clean, linear)
     grown = np.stack([artifact.x_m, artifact.y_m])
     if kind is ReferenceKind.ARTIFACT:
@@ -197,7 +198,7 @@ def test_a_reference_length_of_a_plate_that_turns_is_met_exactly(sense):
     plate_scale = (truth.a * grown).sum() / (grown**2).sum()
     long = replace(truth, g=truth.g + 3e-6 * grown)
     readings = simulate_measurements(long, plan, np.random.default_rng(1), sense=sense)
-    found = calibrate(readings, Options(reference=ReferenceLength("artifact", plate_scale)))
+    found = calibrate(readings, bare(reference=ReferenceLength("artifact", plate_scale)))
     assert np.abs(found.error_map.gx - long.g[0]).max() < 1e-12
     assert np.abs(found.error_map.gy - long.g[1]).max() < 1e-12
 
@@ -214,7 +215,7 @@ class TestNoise:
 
     def test_residuals_and_repeats_agree_on_honest_readings(self):
         _, readings = measured(self.plan, sigma_m=1e-8, sigma_theta_rad=1e-6)
-        noise = calibrate(readings).noise
+        noise = calibrate(readings, BARE).noise
         assert noise.sigma_xy == noise.sigma_xy_repeats == pytest.approx(1e-8)
         assert noise.dof_xy_residuals == 2 * (121 + 121 + 110) - (493 - 7)
         low, high = chi2.ppf([1e-4, 1 - 1e-4], noise.dof_xy_residuals) / noise.dof_xy_residuals
@@ -222,13 +223,13 @@ class TestNoise:
         low, high = chi2.ppf([1e-4, 1 - 1e-4], noise.dof_theta_residuals) \
             / noise.dof_theta_residuals
         assert low < (noise.sigma_theta_residuals / 1e-6) ** 2 < high
-        assert calibrate(readings).findings == ()
+        assert calibrate(readings, BARE).findings == ()
 
     def test_residuals_that_exceed_repeats_are_told(self):
         _, readings = measured(self.plan, sigma_m=1e-8, sigma_theta_rad=1e-6)
         calm = replace(readings, views=tuple(
             replace(view, sigma_xy=view.sigma_xy / 3) for view in readings.views))
-        found = worded(calibrate(calm))
+        found = worded(calibrate(calm, BARE))
         text = " ".join(found.verdict.reasons)
         assert "grid readings: residuals show a noise of" in text
         assert "something beside random noise" in text
@@ -241,7 +242,7 @@ class TestNoise:
         _, readings = measured(self.plan, sigma_m=1e-8, sigma_theta_rad=1e-6)
         wild = replace(readings, views=tuple(
             replace(view, sigma_xy=view.sigma_xy * 2) for view in readings.views))
-        found = worded(calibrate(wild))
+        found = worded(calibrate(wild, BARE))
         assert "the stated noise is too large" in found.verdict.reasons[0]
         assert found.noise.sigma_xy == found.noise.sigma_xy_repeats
 
@@ -250,7 +251,7 @@ class TestNoise:
         _, readings = measured(self.plan, sigma_m=sigma_m, sigma_theta_rad=1e-6)
         stuck = replace(readings, views=tuple(
             replace(view, sigma_xy=0.0) for view in readings.views))
-        found = calibrate(stuck)
+        found = calibrate(stuck, BARE)
         assert found.verdict.qualified
         if sigma_m:
             assert found.noise.sigma_xy == found.noise.sigma_xy_residuals
@@ -258,7 +259,7 @@ class TestNoise:
 
     def test_without_repeats_the_residuals_speak(self):
         _, readings = measured(hu_plan(Artifact(11, 0.01, 24)), sigma_m=1e-8)
-        noise = calibrate(readings).noise
+        noise = calibrate(readings, BARE).noise
         assert noise.sigma_xy == noise.sigma_xy_residuals
         assert noise.dof_xy_repeats == 0 and np.isnan(noise.sigma_xy_repeats)
 
@@ -266,7 +267,7 @@ class TestNoise:
         _, readings = measured(hu_plan(Artifact(11, 0.01)), sigma_m=1e-8)
         declared = replace(readings, views=tuple(
             replace(view, u=np.full(len(view.m), 1e-8)) for view in readings.views))
-        found = calibrate(declared)
+        found = calibrate(declared, BARE)
         assert found.noise.sigma_xy == pytest.approx(1e-8)
         assert np.sqrt(np.mean(found.error_map.u_gx**2)) == pytest.approx(0.89e-8, rel=0.02)
 
@@ -279,8 +280,8 @@ def test_an_encoder_that_does_not_follow_the_axes_is_told_and_bends_nothing():
     g_theta[6] += 1e-4
     readings = simulate_measurements(replace(truth, g_theta=g_theta), plan, rng, sigma_m=1e-9,
                                      sigma_theta_rad=1e-6)
-    axes = worded(calibrate(readings, Options(datum_theta="xy_axes")))
-    free = calibrate(readings, Options(datum_theta="zero_mean"))
+    axes = worded(calibrate(readings, bare(datum_theta="xy_axes")))
+    free = calibrate(readings, bare(datum_theta="zero_mean"))
     assert not axes.verdict.qualified and len(axes.verdict.reasons) == 1
     reason = axes.verdict.reasons[0]
     assert reason.startswith("theta: the stage does not satisfy the axis conditions")
@@ -293,7 +294,7 @@ def test_an_encoder_that_does_not_follow_the_axes_is_told_and_bends_nothing():
 def test_half_axes_that_are_not_known_as_a_whole_are_refused():
     plan, rng = plan_of("0,90,tx", Artifact(3, 0.01, 8), lines=1), np.random.default_rng(1)
     readings = simulate_measurements(random_truth(plan.artifact, 4, rng), plan, rng)
-    axes = Options(datum_theta="xy_axes")
+    axes = bare(datum_theta="xy_axes")
     with pytest.raises(InputError) as caught:
         calibrate(readings, axes)
     assert str(caught.value) == ("theta datum xy_axes: the half axis along +x has one site and no "
@@ -303,7 +304,7 @@ def test_half_axes_that_are_not_known_as_a_whole_are_refused():
         without_site(view, (0, -3), readings.artifact) for view in readings.views))
     with pytest.raises(InputError, match="half axis along -y is known at 2 of 3 sites"):
         calibrate(end, axes)
-    assert calibrate(end, Options(datum_theta="zero_mean")).observability.identifiable
+    assert calibrate(end, bare(datum_theta="zero_mean")).observability.identifiable
 
 
 def without_site(view, site, artifact):
@@ -336,8 +337,8 @@ def test_finite_rotations_need_and_take_the_rigid_model(degrees):
             + complex(*truth.t_m[index])
         views.append(replace(view, dx=v.real, dy=v.imag))
     bent = replace(readings, views=tuple(views))
-    rigid = calibrate(bent)
-    linear = calibrate(bent, Options(misalignment_model="linear"))
+    rigid = calibrate(bent, BARE)
+    linear = calibrate(bent, bare(misalignment_model="linear"))
     assert np.abs(rigid.error_map.gx - truth.g[0]).max() < 1e-12
     assert np.abs(rigid.error_map.gy - truth.g[1]).max() < 1e-12
     assert [view.phi for view in rigid.views] == pytest.approx(list(phi), abs=1e-12)

@@ -24,9 +24,9 @@ from selfcal_ros.estimation.observability.plan_check import (
 )
 from selfcal_ros.estimation.observability.rank import identifies, plan_observability
 from selfcal_ros.estimation.observability.unseen import is_unseen
-from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.view import View
 from selfcal_ros.simulation.truth import Spread, random_truth, simulate_measurements
+from test.support.options import BARE, bare
 from test.support.plans import POSES, QIAO_TABLES, plan_of
 
 
@@ -221,12 +221,12 @@ def test_missing_marks_change_the_verdict():
     plan = plan_of("0, 90, tx", 5)
     rng = np.random.default_rng(1)
     readings = simulate_measurements(random_truth(plan.artifact, 3, rng), plan, rng)
-    assert calibrate(readings, Options()).observability.identifiable
+    assert calibrate(readings, BARE).observability.identifiable
     shifted = readings.views[2]
     gone = replace(shifted, **{name: getattr(shifted, name)[:1]
                                for name in ("m", "n", "dx", "dy", "count")})
     with pytest.raises(NotIdentifiableError, match="do not identify the stage"):
-        calibrate(replace(readings, views=(*readings.views[:2], gone)), Options())
+        calibrate(replace(readings, views=(*readings.views[:2], gone)), BARE)
 
 
 def test_candidates_and_their_description():
@@ -267,7 +267,7 @@ def test_a_deficient_measurement_is_refused_with_its_modes_and_cures():
     rng = np.random.default_rng(1)
     readings = simulate_measurements(random_truth(plan.artifact, 3, rng), plan, rng)
     with pytest.raises(NotIdentifiableError) as refusal:
-        calibrate(readings, Options())
+        calibrate(readings, BARE)
     assert "2 modes unseen" in str(refusal.value)
     assert "add a view turned by 90 deg" in str(refusal.value)
     seen = refusal.value.observability
@@ -287,7 +287,7 @@ def test_lines_may_be_measured_in_views_of_their_own(datum):
     rng = np.random.default_rng(2)
     truth = random_truth(plan.artifact, 5, rng, Spread(
         encoder="xy_axes" if datum == "xy_axes" else "independent"))
-    result = calibrate(simulate_measurements(truth, plan, rng), Options(datum_theta=datum))
+    result = calibrate(simulate_measurements(truth, plan, rng), bare(datum_theta=datum))
     shift = truth.g_theta.mean() if datum == "zero_mean" else 0.0
     assert np.abs(result.error_map.g_theta - truth.g_theta + shift).max() < 1e-15
     # the rotation of the lines' own views and the constant of the plate's lines are one datum

@@ -41,7 +41,7 @@ def both(order, sense=Sense.MICROSCOPE_MOVES, degree=3):
 
 @pytest.mark.parametrize("sense", Sense)
 @pytest.mark.parametrize("order", [*ORDERS, "raster@plate"])
-@pytest.mark.parametrize("name", TermName)
+@pytest.mark.parametrize("name", resistance.SIZES)
 def test_each_term_as_the_dense_matrix_has_it(name, order, sense):
     planned, dense = both(order, sense)
     size = {TermName.MICROSCOPE: 1e-4}.get(name, resistance.SIZES[name])
@@ -61,7 +61,7 @@ UNLIKE = replace(plan_of("0, 90, tx, -ty", 5, size_y=3), views=tuple(
 """A plate of 5 x 3 marks, and views of unlike repeats."""
 
 
-@pytest.mark.parametrize("name", TermName)
+@pytest.mark.parametrize("name", resistance.SIZES)
 @pytest.mark.parametrize("size", ["", ":1e-7"], ids=["free", "sized"])
 def test_columns_are_as_long_as_those_of_all_visits(name, size):
     """Means of marks and visits about them hold together what every visit has."""

@@ -24,7 +24,6 @@ from selfcal_ros.estimation.observability.suggest import (
     score_plan,
     unused_name,
 )
-from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.terms.planned import Assumed
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ThetaDatum
@@ -34,6 +33,7 @@ from selfcal_ros.model.view import View
 from selfcal_ros.reporting.words.steps import search_text, step_text
 from selfcal_ros.simulation.truth import hu_plan, random_truth, simulate_measurements
 from test.support.dense_terms import Dense
+from test.support.options import BARE, bare
 from test.support.plans import plan_of
 from test.support.recalibrations import responses, sizes_of
 
@@ -66,7 +66,7 @@ def test_prediction_is_the_uncertainty_that_the_solver_reports():
     rng = np.random.default_rng(2)
     readings = simulate_measurements(random_truth(plan.artifact, 5, rng), plan, rng,
                                      sigma_m=1e-8, sigma_theta_rad=1e-3)
-    result = calibrate(readings, Options())
+    result = calibrate(readings, BARE)
     found = predict_plan(plan, ThetaDatum.ZERO_MEAN)
     assert np.allclose(result.error_map.u_gx / result.noise.sigma_xy, found.ux, rtol=1e-4)
     assert np.allclose(result.error_map.u_gy / result.noise.sigma_xy, found.uy, rtol=1e-4)
@@ -178,7 +178,7 @@ def test_gain_is_that_of_every_reading_moved_in_turn():
     found = predict(system, plan.artifact, ThetaDatum.XY_AXES)
     rng = np.random.default_rng(7)
     readings = simulate_measurements(random_truth(plan.artifact, 3, rng), plan, rng, linear=True)
-    options = Options(misalignment_model="linear", uncertainty=False, causes=False)
+    options = bare(misalignment_model="linear", uncertainty=False, causes=False)
 
     def solve(moved):
         emap = calibrate(moved, options).error_map

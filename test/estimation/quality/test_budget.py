@@ -8,7 +8,7 @@ import pytest
 from scipy.stats import t as student
 
 from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.estimation.options import Options, ReferenceKind, ReferenceLength
+from selfcal_ros.estimation.options import ReferenceKind, ReferenceLength
 from selfcal_ros.estimation.quality.budget import FromReadings, Source, budgets
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Measurements
@@ -16,6 +16,7 @@ from selfcal_ros.model.terms import ModelTerm, TermName
 from selfcal_ros.reporting.words.budget import budget_json, budget_text, how_text, quantity_text
 from selfcal_ros.simulation.truth import Spread, hu_plan, random_truth, simulate_measurements
 from test.support.lattice_plans import plan_of
+from test.support.options import BARE, bare
 
 ARTIFACT = Artifact(9, 0.01, 24)
 
@@ -28,7 +29,7 @@ def calibrated(repeats=5, *, extra_m=0.0, angular=True, g_m=0.0):
                                      sigma_theta_rad=2e-5)
     views = tuple(replace(v, dx=v.dx + rng.normal(0, extra_m, v.dx.shape),
                           dy=v.dy + rng.normal(0, extra_m, v.dy.shape)) for v in readings.views)
-    return calibrate(Measurements(readings.plan_id, artifact, views))
+    return calibrate(Measurements(readings.plan_id, artifact, views), BARE)
 
 
 def parts_of(budget):
@@ -89,7 +90,7 @@ def test_a_term_with_a_size_has_a_line_and_the_lines_add_up():
     plan = plan_of("0,90,tx,-tx,ty", artifact)
     truth = random_truth(artifact, 5, rng)
     readings = simulate_measurements(truth, plan, rng, sigma_m=2e-8)
-    plain = Options(datum_theta="zero_mean", causes=False)
+    plain = bare(datum_theta="zero_mean", causes=False)
     with_term = replace(plain, terms=(ModelTerm(TermName.PLATE_SHAPE, 1e-7),))
     alone, result = calibrate(readings, plain), calibrate(readings, with_term)
     parts = parts_of(budgets(result)[0])
@@ -97,8 +98,8 @@ def test_a_term_with_a_size_has_a_line_and_the_lines_add_up():
     total = np.mean(np.stack([emap.u_gx, emap.u_gy]) ** 2)
     line = parts["term plate_shape"]
     assert total == pytest.approx(sum(part.u_rms**2 for part in parts.values()), rel=1e-4)
-    bare = np.stack([alone.error_map.u_gx, alone.error_map.u_gy]) / alone.noise.sigma_xy
-    noise = np.sqrt(np.mean(bare**2)) * result.noise.sigma_xy
+    own = np.stack([alone.error_map.u_gx, alone.error_map.u_gy]) / alone.noise.sigma_xy
+    noise = np.sqrt(np.mean(own**2)) * result.noise.sigma_xy
     assert parts["reading noise"].u_rms == pytest.approx(noise, rel=1e-3)
     assert line.u_rms > 0.2 * noise
     assert how_text(line.how).startswith("known to 1e-07 beforehand; the readings leave ")
@@ -183,7 +184,7 @@ def test_noise_that_the_detections_declare_is_told_as_such():
         readings = simulate_measurements(truth, hu_plan(ARTIFACT, repeats), rng, sigma_m=2e-8,
                                          sigma_theta_rad=2e-5)
         views = tuple(replace(v, u=np.full(len(v.m), 5e-8)) for v in readings.views)
-        result = calibrate(replace(readings, views=views))
+        result = calibrate(replace(readings, views=views), BARE)
         parts = parts_of(budgets(result)[0])
         noise = parts["reading noise"]
         assert (noise.kind, noise.dof) == ("B", np.inf)

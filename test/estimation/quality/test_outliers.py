@@ -10,7 +10,6 @@ from scipy.stats import f as f_distribution
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.quality import leverage
 from selfcal_ros.estimation.quality.leverage import (
     angular_redundancy,
@@ -25,15 +24,17 @@ from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import GridVisits, Sense, ViewReadings
 from selfcal_ros.model.result import plain, result_from_dict, result_to_dict
 from selfcal_ros.model.terms import ModelTerm, TermName
+from selfcal_ros.model.verdict import Grade
 from selfcal_ros.model.view import View
 from selfcal_ros.reporting.words.result import worded
 from selfcal_ros.simulation.truth import hu_plan, random_truth, simulate_measurements
 from test.support.lattice_plans import plan_of
+from test.support.options import bare
 
 ARTIFACT = Artifact(9, 0.01, 24)
 SIGMA_M, SIGMA_RAD = 2e-8, 2e-5
-ZERO_MEAN = Options(datum_theta="zero_mean")
-LINEAR = Options(datum_theta="zero_mean", misalignment_model="linear")
+ZERO_MEAN = bare(datum_theta="zero_mean")
+LINEAR = bare(datum_theta="zero_mean", misalignment_model="linear")
 
 
 def measured(seed=0, *, repeats=1, sense=Sense.MICROSCOPE_MOVES, missing=0.0, sigma=SIGMA_M,
@@ -98,7 +99,7 @@ def test_drawn_and_exact_redundancies_agree(monkeypatch):
 
 def test_standardised_residuals_are_chi_square():
     squares = np.concatenate([
-        residuals_of(measured(seed, repeats=2, linear=True)[1], ZERO_MEAN).squares.ravel()
+        residuals_of(measured(seed, repeats=2, linear=True)[1], LINEAR).squares.ravel()
         for seed in range(10)]) / SIGMA_M**2
     squares = squares[np.isfinite(squares)]
     assert squares.mean() == pytest.approx(2, rel=0.08)
@@ -188,7 +189,8 @@ def test_a_turned_microscope_is_no_slip():
     result = robust_calibrate(turned, LINEAR)
     assert result.extra["slips"] == []
     assert [v.name for v in result.views] == [v.view.name for v in readings.views]
-    assert not result.verdict.qualified and result.verdict.causes[0].name == "microscope"
+    assert result.verdict.grade is not Grade.GOOD
+    assert result.verdict.causes[0].name == "microscope"
     assert "no view was split" in " ".join(worded(result).warnings)
     with_term = replace(LINEAR, terms=(ModelTerm(TermName.MICROSCOPE),))
     bad = with_errors(turned, 1, dx={(-4, 2): 1e-6})
@@ -389,7 +391,7 @@ def test_exact_readings_have_no_outliers():
 
 def test_the_law_is_refused():
     with pytest.raises(InputError, match="Hu's law needs every reading"):
-        robust_calibrate(measured()[1], Options(method="law"))
+        robust_calibrate(measured()[1], bare(method="law"))
 
 
 def test_order_of_readings_does_not_matter():

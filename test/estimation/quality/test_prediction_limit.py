@@ -8,7 +8,6 @@ import pytest
 
 from selfcal_ros.estimation.joint.model_fit import ModelFit
 from selfcal_ros.estimation.lattice.readings import GridData, grid_data
-from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.quality import prediction_limit, validation
 from selfcal_ros.estimation.quality.held_terms import HeldReadings
 from selfcal_ros.estimation.quality.prediction_limit import PredictionLimit, noise_of
@@ -17,6 +16,7 @@ from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.terms import ModelTerm, TermName
 from selfcal_ros.simulation.truth import random_truth, simulate_measurements
 from test.support.lattice_plans import plan_of
+from test.support.options import bare
 
 UNIT_M = 1e-10
 """What a unit of noise is in readings: what is of second order in it is a millionth here."""
@@ -70,7 +70,7 @@ def test_each_draw_is_predicted_as_such_readings_are(monkeypatch, of_view):
         plan.artifact, len(plan.views), rng), plan, rng, linear=True, sigma_m=UNIT_M, visits=True),
         rng)
     terms = [ModelTerm(TermName.MICROSCOPE), *[ModelTerm(TermName.DRIFT)] * of_view]
-    options = Options(misalignment_model="linear", terms=tuple(terms), drift_degree=1)
+    options = bare(misalignment_model="linear", terms=tuple(terms), drift_degree=1)
     seen = []
 
     def judged(model: ModelFit, held: HeldReadings, known: np.ndarray,

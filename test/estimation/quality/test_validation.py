@@ -10,7 +10,6 @@ from scipy.stats import binom
 
 from selfcal_ros.errors import InputError, NotIdentifiableError, NotSettledError
 from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.quality import prediction_limit, validation
 from selfcal_ros.estimation.quality.validation import (
     judged_by,
@@ -24,6 +23,7 @@ from selfcal_ros.reporting.words.result import worded
 from selfcal_ros.reporting.words.validation import validation_json, validation_text, why_text
 from selfcal_ros.simulation.truth import hu_plan, random_truth, simulate_measurements
 from test.support.lattice_plans import plan_of
+from test.support.options import BARE, bare
 
 ARTIFACT = Artifact(9, 0.01, 24)
 SIGMA_M, SIGMA_RAD = 2e-8, 2e-5
@@ -48,7 +48,7 @@ def few_draws(monkeypatch):
 
 @pytest.mark.parametrize("sense", list(Sense))
 def test_exact_readings_are_predicted_exactly(sense, few_draws):
-    found = {item.name: item for item in validate(measured(sense=sense, sigma=0.0), folds=1)}
+    found = {item.name: item for item in validate(measured(sense=sense, sigma=0.0), BARE, folds=1)}
     assert len(found) == 6
     for name in ("a random tenth (1)", "view 'identity'", "view 'rot90'", "view 'shift_x'",
                  "view 'both'"):
@@ -58,7 +58,7 @@ def test_exact_readings_are_predicted_exactly(sense, few_draws):
 
 @pytest.mark.parametrize("repeats", [1, 4])
 def test_noise_is_predicted_within_noise_and_leverage(repeats, few_draws):
-    found = validate(measured(repeats=repeats), folds=5)
+    found = validate(measured(repeats=repeats), BARE, folds=5)
     for item in found:
         if item.n_grid:
             # deletion residuals have sigma / sqrt(1 - h), h about 2/3 and below
@@ -69,20 +69,20 @@ def test_noise_is_predicted_within_noise_and_leverage(repeats, few_draws):
 
 def test_a_spoiled_view_is_predicted_badly(few_draws):
     readings = measured()
-    right = {item.name: item for item in validate(readings, folds=1)}
+    right = {item.name: item for item in validate(readings, BARE, folds=1)}
     view = readings.views[4]
     swapped = replace(view, dx=view.dy, dy=view.dx)
     wrong = {item.name: item for item in validate(
-        replace(readings, views=(*readings.views[:4], swapped)), folds=1)}
+        replace(readings, views=(*readings.views[:4], swapped)), BARE, folds=1)}
     for name in ("a random tenth (1)", "view 'both'"):
         assert wrong[name].rms_m > 3 * right[name].rms_m
     with pytest.raises(NotIdentifiableError):
-        validate(replace(readings, views=readings.views[:2]))
+        validate(replace(readings, views=readings.views[:2]), BARE)
 
 
 def test_views_that_are_needed_cannot_be_held_out(few_draws):
     readings = measured(more=False)
-    notes = {item.name: why_text(item.why) for item in validate(readings, folds=1)}
+    notes = {item.name: why_text(item.why) for item in validate(readings, BARE, folds=1)}
     assert notes["a random tenth (1)"] == ""
     for name in ("identity", "rot90", "line", "shift_x"):
         assert "does not identify the stage" in notes[f"view '{name}'"]
@@ -94,7 +94,7 @@ def test_views_that_are_needed_cannot_be_held_out(few_draws):
     plan = replace(plan, views=(*plan.views, View("more", pi / 2, (0.01, 0.0), True, True)))
     truth = random_truth(ARTIFACT, 5, rng)
     more = simulate_measurements(truth, plan, rng, sigma_m=SIGMA_M, sigma_theta_rad=SIGMA_RAD)
-    held = {item.name: item for item in validate(more, folds=1)}
+    held = {item.name: item for item in validate(more, BARE, folds=1)}
     assert held["view 'shift_x'"].why is None and held["view 'shift_x'"].n_grid > 0
 
 
@@ -107,7 +107,7 @@ def test_a_rest_that_does_not_settle_costs_its_own_line_alone(few_draws, monkeyp
             raise NotSettledError("model drift", "the estimate does not settle", "leave it out")
         return solve(kept, options)
     monkeypatch.setattr(validation, "solve_joint", without_first)
-    found = validate(readings, folds=1)
+    found = validate(readings, BARE, folds=1)
     line = "cannot be held out: the estimate does not settle on the rest"
     assert validation_text(found)[1] == f"view 'identity': {line}"
     assert validation_json(found)[1]["note"] == line and not found[1].exceeds
@@ -122,7 +122,7 @@ def drawn(seed, plan, **how):
 
 
 SMALL = plan_of("0,90,180,tx,ty", Artifact(5, 0.01))
-LINEAR = Options(datum_theta="zero_mean", misalignment_model="linear")
+LINEAR = bare(datum_theta="zero_mean", misalignment_model="linear")
 
 
 def test_the_limit_is_that_of_good_readings(monkeypatch):
@@ -194,17 +194,17 @@ def test_terms_are_predicted_with_the_readings(few_draws):
 
 def test_seeds_and_folds(few_draws):
     readings = drawn(0, SMALL)
-    assert validate(readings, folds=1) == validate(readings, folds=1)
-    assert validate(readings, folds=1)[0] != validate(readings, folds=1, seed=1)[0]
-    tenths = [item for item in validate(readings, folds=10) if "tenth" in item.name]
+    assert validate(readings, BARE, folds=1) == validate(readings, BARE, folds=1)
+    assert validate(readings, BARE, folds=1)[0] != validate(readings, BARE, folds=1, seed=1)[0]
+    tenths = [item for item in validate(readings, BARE, folds=10) if "tenth" in item.name]
     assert sum(item.n_grid for item in tenths) <= sum(len(v.m) for v in readings.views)
     for folds in (0, 11):
         with pytest.raises(InputError, match="number from 1 to 10"):
-            validate(readings, folds=folds)
+            validate(readings, BARE, folds=folds)
 
 
 def test_text_and_json(few_draws):
-    found = validate(measured(), Options(datum_theta="zero_mean"), folds=1)
+    found = validate(measured(), bare(datum_theta="zero_mean"), folds=1)
     text = validation_text(found)
     assert "marks predicted within" in text[0] and "arcsec rms" in text[0]
     assert len(validation_json(found)) == len(text) == 6

@@ -25,6 +25,7 @@ def equations(columns, size, whole, *, taken=()):
         information=left.T @ left, norm=whole * np.sqrt((columns**2).sum(axis=0)),
         limit=lambda _: 1e-9)
     own.untold = lambda rows: TermEquations.untold(own, rows)
+    own.prior = lambda sigma_m: TermEquations.prior(own, sigma_m)
     return own
 
 

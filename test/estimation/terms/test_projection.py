@@ -9,8 +9,13 @@ import pytest
 from selfcal_ros.estimation.normal.angular import AngularSystem
 from selfcal_ros.estimation.normal.equations import NormalEquations
 from selfcal_ros.estimation.normal.grid import GridSystem
-from selfcal_ros.estimation.terms.projection import project, reduce_anew, reduce_columns
-from selfcal_ros.estimation.terms.shapes import shapes_of
+from selfcal_ros.estimation.terms.projection import (
+    project,
+    reduce_anew,
+    reduce_columns,
+    reduce_lines,
+)
+from selfcal_ros.estimation.terms.shapes import NO_LINES, shapes_of
 from selfcal_ros.model.view import LatticePose
 
 POSES = ((0, 0, 0), (1, 0, 0), (0, 1, 0), (2, 0, -1))
@@ -77,7 +82,8 @@ def test_what_is_left_of_columns_and_their_maps_are_those_of_a_dense_solution(sy
     found = np.linalg.pinv(dense, rcond=1e-12) @ columns
     left = columns - dense @ found
     reduced = reduce_columns(grid, shapes)
-    projected = project(system, reduced, system.grid_inverse)
+    lines = reduce_lines(system.angular, NO_LINES, 0.0, 1.0)
+    projected = project(system, reduced, system.grid_inverse, lines)
     assert projected.gram == pytest.approx(left.T @ left, abs=1e-9)
     for mine, wanted in zip(projected.fields.T, found[:2 * grid.n_sites].T, strict=True):
         moved = mine - (wanted[::2] + 1j * wanted[1::2])

@@ -8,13 +8,14 @@ import pytest
 
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.joint.covariance import map_covariance
-from selfcal_ros.estimation.options import Options, ReferenceLength
+from selfcal_ros.estimation.options import ReferenceLength
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.terms import parse_terms
 from selfcal_ros.model.view import Plan, View
 from selfcal_ros.simulation.machine import Spread, random_truth
 from selfcal_ros.simulation.truth import simulate_measurements
+from test.support.options import bare
 
 PITCH, SIZE = 0.01, 1e-6
 ARTIFACT = Artifact(5, PITCH, 0)
@@ -36,7 +37,7 @@ def measured(seed, grown, *, sense=Sense.MICROSCOPE_MOVES, sigma=1e-10):
 
 
 def options(term, reference=PLATE):
-    return Options(terms=parse_terms([term], ""), reference=reference)
+    return bare(terms=parse_terms([term], ""), reference=reference)
 
 
 def scale_in(field):

@@ -9,15 +9,17 @@ import pytest
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.joint.model_fit import fit_model
 from selfcal_ros.estimation.joint.solve import prepare
-from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.quality.budget import budgets
 from selfcal_ros.model.result import result_from_dict, result_to_dict
-from selfcal_ros.model.terms import parse_terms
+from selfcal_ros.model.terms import ModelTerm, parse_terms
+from selfcal_ros.model.verdict import Grade
 from selfcal_ros.reporting.words.budget import how_text
 from selfcal_ros.reporting.words.result import worded
 from selfcal_ros.simulation.machine import Spread, random_truth
 from selfcal_ros.simulation.truth import simulate_measurements
-from test.estimation.terms.test_terms import dense, plan_of, settings
+from test.estimation.terms.test_terms import plan_of, settings
+from test.support.dense_fit import DenseFit
+from test.support.options import bare
 
 CLEAN = Spread(encoder="independent", rotation="finite", phi_rad=1e-4)
 SIZES = {"microscope": 1e-3, "drift": 50e-9, "plate_scale": 1e-6, "plate_shape": 30e-9,
@@ -35,7 +37,12 @@ def of_sizes(truth, rng, sizes):
         truth, drift_m=drift, plate_scale=rng.normal(0, of["plate_scale"], views),
         plate_shape_m=rng.normal(0, of["plate_shape"], (views, 2, 3)) * [1, 2, 1],
         backlash_m=rng.normal(0, of["approach"], 2),
-        microscope=rng.normal(0, of["microscope"], (2, 2)))
+        microscope=matrix_of(*rng.normal(0, of["microscope"], 4)))
+
+
+def matrix_of(scale, turn, stretch, shear):
+    """Return the matrix of a microscope, E o = (scale + i turn) o + (stretch + i shear) conj(o)."""
+    return np.array([[scale + stretch, shear - turn], [shear + turn, scale - stretch]])
 
 
 def measured(seed, sizes, *, sigma_m=20e-9, phi_rad=1e-4):
@@ -46,7 +53,7 @@ def measured(seed, sizes, *, sigma_m=20e-9, phi_rad=1e-4):
 
 
 def options(*terms, **more):
-    return Options(terms=parse_terms(terms, ""), **more)
+    return bare(terms=parse_terms(terms, ""), **more)
 
 
 def fitted(readings, wanted):
@@ -86,24 +93,14 @@ def test_the_statistic_is_what_the_size_adds_to_the_sum_of_squares():
     wanted = options("plate_scale:4e-7", "plate_shape:3e-8", "approach:2e-8", "drift",
                      misalignment_model="linear")
     model = fitted(readings, wanted)
-    rows, values, weights = dense(readings, model)
-    columns = model.equations.columns.columns
-    base, sigma = rows.shape[1] - len(columns), model.found.xy.sigma
-    tests = {test.name: test for test in model.sizes}
     assert not any(test.contradicted for test in model.sizes)
 
-    def squares(without=""):
-        held = [(k, c.size) for k, c in enumerate(columns)
-                if np.isfinite(c.size) and c.term != without]
-        prior = np.zeros((len(held), rows.shape[1]))
-        for row, (k, size) in enumerate(held):
-            prior[row, base + k] = 1 / size
-        left = np.vstack([rows * (weights / sigma)[:, None], prior])
-        right = np.concatenate([values * weights / sigma, np.zeros(len(held))])
-        norm = np.linalg.norm(left, axis=0)
-        found = np.linalg.lstsq(left / norm, right, rcond=1e-10)[0]
-        return float(((left / norm) @ found - right) @ ((left / norm) @ found - right))
+    def squares(without=None):
+        terms = tuple(ModelTerm(term.name) if term.name == without else term
+                      for term in wanted.terms)
+        return DenseFit(readings, terms, (model.found.xy.sigma, 1.0)).squares
 
+    tests = {test.name: test for test in model.sizes}
     for name in ("plate_scale", "plate_shape", "approach"):
         assert tests[name].statistic == pytest.approx(squares() - squares(name), rel=1e-5), name
 
@@ -111,18 +108,19 @@ def test_the_statistic_is_what_the_size_adds_to_the_sum_of_squares():
 @pytest.mark.parametrize(("term", "unit"), [
     ("plate_scale:1e-8", "µm/m"), ("plate_shape:1e-9", "µm"), ("drift:1e-9", "µm"),
     ("microscope:1e-6", "mrad"), ("approach:1e-10", "µm")])
-def test_a_calibration_with_a_contradicted_size_is_not_qualified_and_its_u_is_honest(term, unit):
+def test_a_calibration_with_a_contradicted_size_says_so_and_its_u_is_honest(term, unit):
     name, _, given = term.partition(":")
     truth, readings = measured(4, {name: 5 * SIZES[name]})
     result = worded(calibrate(readings, options(term)))
     verdict, cause = result.verdict, result.verdict.causes[0]
-    assert not verdict.qualified
+    assert verdict.grade is Grade.ENLARGED
     assert cause.name == name and cause.p < 5e-4
     assert cause.text.startswith(f"{name} up to ")
     assert f" {unit}, " in cause.text
-    assert "times the size given: give a larger size, as in --model " in cause.text
+    assert "times the size assumed: " in cause.text
     assert verdict.reasons[0].startswith(f"the readings show {name} up to ")
-    assert verdict.sentence.startswith(f"Not qualified: most likely {name} up to ")
+    assert verdict.sentence == f"Good within an enlarged U: {cause.text}"
+    assert [item.name for item in verdict.enlarged_by] == [name]
     estimates = result.model.terms[0].estimates
     assert cause.size == max(abs(e.value) for e in estimates) > 100 * float(given)
     error = np.stack([result.error_map.gx, result.error_map.gy]) - truth.g
@@ -142,7 +140,7 @@ def test_a_size_that_is_too_small_is_kept_beside_the_one_that_was_used():
     assert said.startswith("given as 1e-08, which the readings contradict; they allow ")
     right = calibrate(readings, options("plate_scale:5e-6"))
     assert right.model.terms[0].size_used is None
-    assert right.verdict.qualified
+    assert right.verdict.grade is Grade.GOOD
 
 
 def test_one_wrong_size_does_not_make_another_appear_wrong():

@@ -10,18 +10,21 @@ from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.findings import VisitedOnce
 from selfcal_ros.estimation.joint.model_fit import fit_model
 from selfcal_ros.estimation.joint.solve import prepare
-from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.verdict.causes import find_explanations
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.terms import parse_terms
+from selfcal_ros.model.verdict import Grade
 from selfcal_ros.model.view import Plan, View
 from selfcal_ros.reporting.words.result import worded
 from selfcal_ros.simulation.machine import Spread, random_truth
 from selfcal_ros.simulation.settings import CellSettings
 from selfcal_ros.simulation.truth import simulate_measurements
+from test.support.options import bare
+from test.support.results import covered
 
 PITCH = 0.01
-OPTIONS = Options(datum_theta="zero_mean", misalignment_model="rigid")
+OPTIONS = bare(datum_theta="zero_mean", misalignment_model="rigid")
+"""Nothing is assumed: what is wrong has to be found."""
 CLEAN = Spread(encoder="independent", rotation="finite")
 SETTINGS = CellSettings(sigma_xy_m=20e-9, sigma_theta_rad=2e-5, servo_sigma_m=0.0,
                         servo_sigma_rad=0.0)
@@ -36,13 +39,18 @@ def plan_of(order="x_back_y_back", repeats=4):
     return Plan("p", Artifact(7, PITCH, 24), (*grids, line))
 
 
-def judged(spread=CLEAN, *, change=lambda truth: truth, plan=None, seed=1, spoil=lambda m: m,
-           **how):
+def calibrated(spread=CLEAN, *, change=lambda truth: truth, plan=None, seed=1, spoil=lambda m: m,
+               **how):
+    """Return the truth and the result."""
     plan, rng = plan or plan_of(), np.random.default_rng(seed)
     truth = change(random_truth(plan.artifact, len(plan.views), rng, spread))
     readings = simulate_measurements(truth, plan, rng, settings=replace(SETTINGS, **how),
                                      visits=True)
-    return worded(calibrate(spoil(readings), OPTIONS))
+    return truth, worded(calibrate(spoil(readings), OPTIONS))
+
+
+def judged(*args, **how):
+    return calibrated(*args, **how)[1]
 
 
 def with_views(name, index, value, shape):
@@ -91,8 +99,11 @@ CASES = {
 @pytest.mark.parametrize("name", CASES)
 def test_what_is_wrong_is_named_first_with_its_size(name):
     term, size, said, how = CASES[name]
-    verdict = judged(**how).verdict
-    assert not verdict.qualified and verdict.reasons
+    truth, result = calibrated(**how)
+    verdict = result.verdict
+    assert verdict.grade is Grade.ENLARGED and verdict.reasons
+    assert term in {item.name for item in verdict.enlarged_by}
+    assert covered(result, truth.g) >= 0.85
     cause = verdict.causes[0]
     assert (cause.name, said in cause.text) == (term, True), cause.text
     assert cause.p < 5e-4
@@ -101,7 +112,7 @@ def test_what_is_wrong_is_named_first_with_its_size(name):
     else:
         assert cause.size == pytest.approx(size, abs=4.5 * cause.u)
         assert cause.u < 0.1 * abs(size)
-    assert verdict.sentence.startswith(f"Not qualified: most likely {cause.text}")
+    assert verdict.sentence.startswith(f"Good within an enlarged U: {cause.text}")
 
 
 def test_clean_machines_are_qualified_and_name_no_cause():
@@ -110,7 +121,8 @@ def test_clean_machines_are_qualified_and_name_no_cause():
     assert sum(not v.qualified for v in verdicts) <= 1
     assert sum(bool(v.causes) for v in verdicts) <= 1
     good = next(v for v in verdicts if v.qualified)
-    assert good.sentence == "Qualified: residuals and the noise of readings agree"
+    assert good.grade is Grade.GOOD
+    assert good.sentence == "Good: residuals and the noise of readings agree"
 
 
 def test_a_noisy_view_is_named():
@@ -118,9 +130,14 @@ def test_a_noisy_view_is_named():
         views = list(readings.views)
         views[3] = replace(views[3], sigma_xy=3 * views[3].sigma_xy, visits=None)
         return replace(readings, views=tuple(views))
-    verdict = judged(spoil=louder).verdict
+    truth, result = calibrated(spoil=louder)
+    verdict = result.verdict
     names = [cause.name for cause in verdict.causes]
-    assert "noise" in names and not verdict.qualified
+    assert "noise" in names and verdict.grade is Grade.ENLARGED
+    assert covered(result, truth.g) >= 0.85
+    # nobody knows which nodes rest on the view: u is as for its noise everywhere
+    wider = result.error_map.u_gx / judged().error_map.u_gx
+    assert wider == pytest.approx(3 * SETTINGS.sigma_xy_m / result.noise.sigma_xy, rel=0.1)
     cause = verdict.causes[names.index("noise")]
     assert cause.text.startswith("view '-x' is ") and cause.size == pytest.approx(3, rel=0.1)
 
@@ -128,7 +145,7 @@ def test_a_noisy_view_is_named():
 def test_an_effect_without_consequence_disqualifies_nothing():
     # a steady drift of a view read there and back along both axes does not reach the map
     verdict = judged(change=steadily(25e-9)).verdict
-    assert verdict.qualified
+    assert verdict.grade is Grade.GOOD
 
 
 def test_causes_can_be_left_out():

@@ -12,7 +12,7 @@ from scipy.stats import t as student
 from selfcal_ros.compensation.aerotech.export import provenance
 from selfcal_ros.compensation.machine import MachineFrame
 from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.estimation.options import Options, ReferenceLength
+from selfcal_ros.estimation.options import ReferenceLength
 from selfcal_ros.estimation.quality.budget import budgets
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.result import result_from_dict, result_to_dict
@@ -23,6 +23,7 @@ from selfcal_ros.reporting.summary.text import state_sentence
 from selfcal_ros.simulation.machine import Spread, random_truth
 from selfcal_ros.simulation.settings import CellSettings
 from selfcal_ros.simulation.truth import hu_plan, simulate_measurements
+from test.support.options import bare
 
 SETTINGS = CellSettings(sigma_xy_m=20e-9, sigma_theta_rad=2e-5, servo_sigma_m=0.0,
                         servo_sigma_rad=0.0, stop_sigma_m=20e-6)
@@ -36,7 +37,7 @@ def measured(size=3):
 
 
 def calibrated(size=3, **how):
-    result = calibrate(measured(size), Options(**how))
+    result = calibrate(measured(size), bare(**how))
     return result_from_dict(json.loads(json.dumps(result_to_dict(result))), "r.json")
 
 

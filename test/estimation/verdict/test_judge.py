@@ -7,15 +7,19 @@ import numpy as np
 import pytest
 
 from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.estimation.findings import AxesNotMet
+from selfcal_ros.estimation.findings import AxesNotMet, SignNotShown
 from selfcal_ros.estimation.joint.solve import solve_joint
 from selfcal_ros.estimation.law.solve import solve_law
 from selfcal_ros.estimation.options import Options
-from selfcal_ros.estimation.verdict.judge import are_looked_for, judged
+from selfcal_ros.estimation.verdict.judge import judged
+from selfcal_ros.estimation.verdict.look import are_looked_for
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ThetaDatum
-from selfcal_ros.model.terms import ModelTerm, TermName
-from selfcal_ros.simulation.truth import hu_plan, random_truth, simulate_measurements
+from selfcal_ros.model.terms import ModelTerm, TermName, parse_terms
+from selfcal_ros.model.verdict import Grade
+from selfcal_ros.simulation.machine import Spread, random_truth
+from selfcal_ros.simulation.settings import CellSettings
+from selfcal_ros.simulation.truth import hu_plan, simulate_measurements
 
 ARCSEC_RAD = np.pi / 648_000
 
@@ -33,7 +37,7 @@ def test_the_axis_conditions_are_tested_at_5_percent(readings, p, holds):
     options = Options(misalignment_model="linear", causes=False)
     solved = replace(solve_joint(readings, options), axes=(p, 3 * ARCSEC_RAD))
     verdict = judged(solved, readings, options).verdict
-    assert verdict.qualified == holds
+    assert verdict.grade is (Grade.GOOD if holds else Grade.NOT_QUALIFIED)
     assert verdict.findings == (() if holds else (AxesNotMet(3 * ARCSEC_RAD, p),))
 
 
@@ -52,7 +56,7 @@ def test_axes_that_the_stage_does_not_keep_are_found_without_an_uncertainty_map(
     assert wanted.verdict.findings == plain.verdict.findings
     (found,) = plain.verdict.findings
     assert isinstance(found, AxesNotMet) and found.misclosure_rad > 30 * ARCSEC_RAD
-    assert not plain.verdict.qualified
+    assert plain.verdict.grade is wanted.verdict.grade is Grade.NOT_QUALIFIED
     for name in ("u_gx", "u_gy", "u_g_theta"):
         assert np.isnan(getattr(plain.error_map, name)).all()
     assert "covariance_terms" not in plain.extra
@@ -69,3 +73,22 @@ def test_causes_are_looked_for_unasked_up_to_41_and_at_all_up_to_201_marks_a_sid
         beyond = are_looked_for(side**2 + 1, Options(causes=asked), failed=failed)
         assert beyond is (wanted and (side, asked, failed) not in (
             (41, None, False), (201, True, False), (201, None, True)))
+
+
+def offsets_of(stop_sigma_m):
+    """Return readings whose offsets have so much scatter, of plates that lie nearly straight."""
+    plan, rng = hu_plan(Artifact(7, 0.01, 24), 5), np.random.default_rng(3)
+    spread = Spread(encoder="independent", rotation="finite", phi_rad=1e-7)
+    settings = CellSettings(sigma_xy_m=20e-9, sigma_theta_rad=2e-5, servo_sigma_m=0.0,
+                            servo_sigma_rad=0.0, stop_sigma_m=stop_sigma_m)
+    return simulate_measurements(random_truth(plan.artifact, 4, rng, spread), plan, rng,
+                                 settings=settings, visits=True)
+
+
+@pytest.mark.parametrize(("stop_sigma_m", "how", "shown"), [
+    (0.0, {}, False), (20e-6, {}, True),
+    (0.0, {"terms": parse_terms(["microscope:1e-2"], "")}, True), (0.0, {"assumed": ()}, True)])
+def test_the_sign_of_offsets_is_shown_by_their_scatter_or_declared(stop_sigma_m, how, shown):
+    verdict = calibrate(offsets_of(stop_sigma_m), Options(**how)).verdict
+    assert verdict.findings == (() if shown else (SignNotShown(),))
+    assert verdict.grade is (Grade.GOOD if shown else Grade.NOT_QUALIFIED)

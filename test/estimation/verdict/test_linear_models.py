@@ -9,15 +9,18 @@ import pytest
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.verdict import Grade
 from selfcal_ros.reporting.words.result import worded
 from selfcal_ros.simulation.machine import Spread, random_truth
 from selfcal_ros.simulation.settings import CellSettings
 from selfcal_ros.simulation.truth import hu_plan, simulate_measurements
+from test.support.options import bare
+from test.support.results import covered
 
 SETTINGS = CellSettings(sigma_xy_m=20e-9, sigma_theta_rad=2e-5, servo_sigma_m=0.0,
                         servo_sigma_rad=0.0)
 FLAT = Spread(encoder="independent", rotation="finite", phi_rad=1e-7)
-LINEAR = [Options(method="law"), Options(misalignment_model="linear")]
+LINEAR = [bare(method="law"), bare(misalignment_model="linear")]
 NAMES = ["law", "linear"]
 
 
@@ -32,8 +35,8 @@ def judged(options, spread=FLAT, **how):
 @pytest.mark.parametrize("options", LINEAR, ids=NAMES)
 def test_a_linear_plate_is_qualified(options):
     verdict = judged(options)[1].verdict
-    assert verdict.qualified and not verdict.causes
-    assert verdict.sentence.startswith("Qualified")
+    assert verdict.grade is Grade.GOOD and not verdict.causes
+    assert verdict.sentence.startswith("Good: ")
 
 
 @pytest.mark.parametrize("options", LINEAR, ids=NAMES)
@@ -41,7 +44,7 @@ def test_a_plate_that_really_turns_is_told_with_its_largest_turn(options):
     truth, found = judged(options, replace(FLAT, phi_rad=5e-3))
     # the rotation that all views share is the theta of the stage's datum, and small
     largest = np.abs(truth.phi_rad).max() * 1e3
-    assert not found.verdict.qualified and not found.verdict.causes
+    assert found.verdict.grade is Grade.NOT_QUALIFIED and not found.verdict.causes
     head, _, tail = found.verdict.reasons[0].partition(" mrad")
     assert head.startswith("the model is linear, but the plate was turned by up to ")
     assert float(head.rpartition(" ")[2]) == pytest.approx(largest, abs=0.02)
@@ -51,22 +54,36 @@ def test_a_plate_that_really_turns_is_told_with_its_largest_turn(options):
 
 @pytest.mark.parametrize("options", LINEAR, ids=NAMES)
 def test_a_turned_microscope_is_named(options):
-    found = judged(options, replace(FLAT, microscope_rotation_rad=2e-3), stop_sigma_m=20e-6)[1]
+    truth, found = judged(options, replace(FLAT, microscope_rotation_rad=2e-3),
+                          stop_sigma_m=20e-6)
     assert [cause.name for cause in found.verdict.causes] == ["microscope"]
     assert found.verdict.causes[0].size == pytest.approx(2e-3, abs=4 * found.verdict.causes[0].u)
     assert not any("linear" in reason for reason in found.verdict.reasons)
+    if options.method == "law":  # which cannot hold it
+        assert found.verdict.grade is Grade.NOT_QUALIFIED
+    else:
+        assert found.verdict.grade is Grade.ENLARGED
+        assert covered(found, truth.g) >= 0.85
+
+
+def test_finite_rotations_within_what_is_assumed_of_a_linear_model_are_covered():
+    """The strain that is assumed takes them for its own: its size grows, and U with it."""
+    truth, found = judged(Options(misalignment_model="linear"), replace(FLAT, phi_rad=5e-3))
+    assert found.verdict.grade is Grade.ENLARGED
+    assert [cause.name for cause in found.verdict.causes] == ["plate_strain"]
+    assert covered(found, truth.g) >= 0.85
 
 
 @pytest.mark.parametrize("options", LINEAR, ids=NAMES)
 def test_nothing_is_looked_for_where_nobody_asks(options):
     found = judged(replace(options, causes=False), replace(FLAT, phi_rad=5e-3))
-    assert not found[1].verdict.qualified and len(found[1].verdict.reasons) == 1
+    assert found[1].verdict.grade is Grade.NOT_QUALIFIED and len(found[1].verdict.reasons) == 1
 
 
 @pytest.mark.parametrize("options", LINEAR, ids=NAMES)
 def test_axes_that_the_stage_does_not_have_are_not_qualified(options):
     own = judged(replace(options, datum_theta="xy_axes"))[1].verdict
-    assert not own.qualified
+    assert own.grade is Grade.NOT_QUALIFIED
     assert any("does not satisfy the axis conditions" in reason for reason in own.reasons)
     kept = judged(replace(options, datum_theta="xy_axes"), replace(FLAT, encoder="xy_axes"))[1]
-    assert kept.verdict.qualified
+    assert kept.verdict.grade is Grade.GOOD

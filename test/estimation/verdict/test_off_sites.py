@@ -7,13 +7,16 @@ import numpy as np
 import pytest
 
 from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.estimation.options import Options, ReferenceLength
+from selfcal_ros.estimation.findings import SignNotShown
+from selfcal_ros.estimation.options import ReferenceLength
 from selfcal_ros.estimation.verdict import off_sites
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import GridVisits, Measurements, Sense, ViewReadings
 from selfcal_ros.model.terms import parse_terms
+from selfcal_ros.model.verdict import Grade
 from selfcal_ros.model.view import View
 from selfcal_ros.reporting.words.result import worded
+from test.support.options import BARE, bare
 
 N, PITCH_M, SIGMA_M = 7, 0.01, 1e-8
 HALF_M = (N - 1) // 2 * PITCH_M
@@ -69,13 +72,17 @@ def error_of(result, **stage):
 
 
 @pytest.mark.parametrize("sense", Sense)
-def test_a_stage_that_follows_plates_beside_their_places_is_not_qualified(sense):
-    result = worded(calibrate(readings(follow=True, sense=sense)))
-    u = result.error_map.u_gx.ravel()
+def test_a_stage_that_follows_plates_beside_their_places_has_a_larger_u(sense):
+    whole = readings(follow=True, sense=sense)
+    result, unaware = worded(calibrate(whole, BARE)), calibrate(whole, bare(causes=False))
     wrong = abs(error_of(result)).max()
-    assert wrong > 3 * u.max()  # the map is wrong, and its residuals are nothing but noise
+    # the map is wrong, and its residuals are nothing but noise
+    assert wrong > 3 * unaware.error_map.u_gx.max()
     assert result.noise.sigma_xy_residuals == pytest.approx(SIGMA_M, rel=0.15)
-    assert not result.verdict.qualified
+    assert result.verdict.grade is Grade.ENLARGED
+    assert [item.name for item in result.verdict.enlarged_by] == ["off_sites"]
+    u = np.stack([result.error_map.u_gx, result.error_map.u_gy]).ravel()
+    assert np.mean(abs(error_of(result)) <= result.noise.k_xy * u) >= 0.85
     cause = result.verdict.causes[0]
     assert (cause.name, cause.unit) == ("off_sites", "m") and cause.p < 5e-4
     assert cause.size == pytest.approx(wrong, rel=0.35)
@@ -84,60 +91,70 @@ def test_a_stage_that_follows_plates_beside_their_places_is_not_qualified(sense)
 
 
 @pytest.mark.parametrize("sense", Sense)
-def test_a_stage_at_the_sites_of_such_plates_is(sense):
-    result = calibrate(readings(follow=False, sense=sense))
-    assert result.verdict.qualified
+def test_a_stage_at_the_sites_of_such_plates_is_good(sense):
+    result = calibrate(readings(follow=False, sense=sense), BARE)
+    assert result.verdict.grade is Grade.GOOD
     assert abs(error_of(result)).max() < 4 * result.error_map.u_gx.max()
 
 
 def test_a_little_beside_is_no_matter():
-    assert calibrate(readings(follow=True, beside=BESIDE_M / 20)).verdict.qualified
+    verdict = calibrate(readings(follow=True, beside=BESIDE_M / 20), BARE).verdict
+    assert verdict.grade is Grade.GOOD
+
+
+def test_with_a_microscope_that_nobody_knows_the_sign_of_its_offsets_is_not_shown():
+    """All views lie beside their places alike: a microscope of any scale shows the same."""
+    verdict = calibrate(readings(follow=True)).verdict
+    assert verdict.grade is Grade.NOT_QUALIFIED
+    assert verdict.findings[0] == SignNotShown() and verdict.causes[0].name == "off_sites"
 
 
 @pytest.mark.parametrize("seed", range(5))
 def test_noise_of_the_map_is_no_slope_of_the_stage(seed):
-    assert calibrate(readings(follow=True, seed=seed, beside=2 * BESIDE_M, bend_m=0.0)
-                     ).verdict.qualified
+    verdict = calibrate(readings(follow=True, seed=seed, beside=2 * BESIDE_M, bend_m=0.0), BARE
+                        ).verdict
+    assert verdict.grade is Grade.GOOD
 
 
 def test_without_noise_a_stage_at_the_sites_is_at_the_sites():
-    assert not calibrate(readings(follow=False, sigma_m=0.0)).verdict.causes
+    assert not calibrate(readings(follow=False, sigma_m=0.0), BARE).verdict.causes
 
 
 def test_what_spoils_the_map_comes_before_places_that_residuals_do_not_show():
     whole = readings(follow=True)
     off = whole.views[0].visits.dx + np.where(np.arange(N * N) == 10, 5e-7, 0.0)
     first = replace(whole.views[0], dx=off, visits=replace(whole.views[0].visits, dx=off))
-    causes = calibrate(replace(whole, views=(first, *whole.views[1:]))).verdict.causes
+    causes = calibrate(replace(whole, views=(first, *whole.views[1:])), BARE).verdict.causes
     assert [cause.name for cause in causes] == ["reading", "off_sites"]
 
 
 def test_where_visits_are_not_known_or_causes_not_wanted_nothing_is_said():
-    assert calibrate(readings(follow=True, visits=False)).verdict.qualified
-    assert calibrate(readings(follow=True), Options(causes=False)).verdict.qualified
+    for verdict in (calibrate(readings(follow=True, visits=False), BARE).verdict,
+                    calibrate(readings(follow=True), bare(causes=False)).verdict):
+        assert verdict.grade is Grade.GOOD and not verdict.causes
 
 
 @pytest.mark.parametrize("options", [
-    Options(uncertainty=False), Options(misalignment_model="linear"),
-    Options(terms=parse_terms(["plate_scale:1e-7"], "")),
-    Options(reference=ReferenceLength("artifact", 0.0, 1e-7))])
+    bare(uncertainty=False), bare(misalignment_model="linear"),
+    bare(terms=parse_terms(["plate_scale:1e-7"], "")),
+    bare(reference=ReferenceLength("artifact", 0.0, 1e-7))])
 def test_it_is_found_whatever_else_is_asked_for(options):
     assert calibrate(readings(follow=True), options).verdict.causes[0].name == "off_sites"
-    assert calibrate(readings(follow=False), options).verdict.qualified
+    assert calibrate(readings(follow=False), options).verdict.grade is Grade.GOOD
 
 
 def test_views_beside_their_places_each_in_its_way_are_named_so_first():
     whole = readings(follow=True)
     shifted = readings(follow=True, beside=-BESIDE_M)
     mixed = replace(whole, views=(*whole.views[:2], *shifted.views[2:]))
-    assert calibrate(mixed).verdict.causes[0].name == "off_sites"
+    assert calibrate(mixed, BARE).verdict.causes[0].name == "off_sites"
 
 
 def test_the_same_readings_tell_the_same_in_either_sense():
     """The map is mirrored, and its uncertainty with it; what the places do to it is the same."""
     whole = readings(follow=True)
     views = tuple(replace(view, count=np.where(view.m < 0, 1, 9)) for view in whole.views)
-    one, two = (calibrate(replace(whole, views=views, sense=sense)) for sense in Sense)
+    one, two = (calibrate(replace(whole, views=views, sense=sense), BARE) for sense in Sense)
     assert not np.allclose(one.error_map.u_gx, one.error_map.u_gx[::-1], rtol=0.1, atol=0)
     (first, *_), (second, *_) = one.verdict.causes, two.verdict.causes
     assert (first.name, first.size, first.u) == (second.name, pytest.approx(second.size),

@@ -20,7 +20,7 @@ def pool(sums: Sums) -> Pool:
     gram = np.diag(LENGTHS**2)
     equations = SimpleNamespace(information=gram, norm=LENGTHS, limit=lambda rows: 1e-9,
                                 projected=SimpleNamespace(gram=gram))
-    return Pool(equations, Score(FOUND * LENGTHS, np.zeros(3), sums))
+    return Pool(equations, Score(FOUND * LENGTHS, np.zeros(3), sums), np.zeros(3), np.zeros(3))
 
 
 def rows(*numbers: int) -> np.ndarray:
@@ -77,7 +77,7 @@ def test_sets_of_all_sizes_are_each_as_a_dense_solution_has_them():
         information=readings.T @ readings, norm=np.sqrt((readings**2).sum(axis=0)),
         limit=lambda rows: 1e-9, projected=SimpleNamespace(gram=marks.T @ marks))
     pools = Pool(equations, Score(marks.T @ left[:8], readings[8:].T @ left[8:], Sums(
-        float(left[:8] @ left[:8]), 8, float(left[8:] @ left[8:]), 4)))
+        float(left[:8] @ left[:8]), 8, float(left[8:] @ left[8:]), 4)), np.zeros(6), np.zeros(6))
     sets = [(), (3,), (0, 1), (1, 3, 4), (5,), (0, 2, 5), (0, 2), (0, 1, 2, 3, 4, 5), (1, 5)]
     many = [np.isin(np.arange(6), chosen) for chosen in sets]
     for chosen, found in zip(sets, pools.each(many), strict=True):
@@ -94,6 +94,28 @@ def test_sets_of_all_sizes_are_each_as_a_dense_solution_has_them():
         assert found.values[list(chosen)] == pytest.approx(found.own_values)
 
 
+def test_terms_of_the_model_stay_within_what_their_sizes_allow():
+    """Columns that the model has, with coefficients, against a least squares with prior rows."""
+    rng = np.random.default_rng(3)
+    columns, y = rng.normal(size=(30, 4)), rng.normal(size=30)
+    prior = np.array([4.0, 9.0, 0.0, 0.0])
+    rows = np.diag(np.sqrt(prior))[:2]
+    taken = np.zeros(4)
+    taken[:2] = np.linalg.lstsq(np.vstack([columns[:, :2], rows[:, :2]]),
+                                np.concatenate([y, np.zeros(2)]), rcond=None)[0]
+    left = y - columns @ taken
+    equations = SimpleNamespace(
+        information=columns.T @ columns, norm=np.sqrt((columns**2).sum(axis=0)),
+        limit=lambda rows: 1e-9, projected=SimpleNamespace(gram=columns.T @ columns))
+    pool = Pool(equations, Score(columns.T @ left, np.zeros(4), Sums(
+        float(left @ left), 30, float("nan"), 0)), prior, taken)
+    both = pool.beside(np.array([True, True, True, False]))
+    whole = np.linalg.lstsq(np.vstack([columns[:, :3], rows[:, :3]]),
+                            np.concatenate([y, np.zeros(2)]), rcond=None)[0]
+    assert both.own_values + taken[:3] == pytest.approx(whole)
+    assert pool.beside(np.array([True, True, False, False])).explained == pytest.approx(0, abs=1e-9)
+
+
 def test_at_most_four_causes_are_named_the_likeliest_first():
     """Six terms of one column each, at right angles; each takes more off than the one before."""
     names = ["a", "b", "c", "d", "e", "f"]
@@ -103,7 +125,7 @@ def test_at_most_four_causes_are_named_the_likeliest_first():
         columns=SimpleNamespace(columns=tuple(names)))
     parts = np.arange(1.0, 7.0) * 1e-6
     many = Pool(equations, Score(parts, np.zeros(6), Sums(
-        float(parts @ parts) + 1e-14, 100, float("nan"), 0)))
+        float(parts @ parts) + 1e-14, 100, float("nan"), 0)), np.zeros(6), np.zeros(6))
     groups = [Group(name, np.arange(6) == number) for number, name in enumerate(names)]
     found = select_explanations(many, groups, np.zeros(6, dtype=bool))
     assert [item.name for item in found] == ["f", "e", "d", "c"]

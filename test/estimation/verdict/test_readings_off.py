@@ -11,20 +11,27 @@ from selfcal_ros.estimation.findings import ReadingCause
 from selfcal_ros.estimation.joint.solve import prepare
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.quality.outliers import robust_calibrate
-from selfcal_ros.estimation.verdict.reading_columns import MOST, reading_columns
+from selfcal_ros.estimation.verdict.fault_columns import MOST, reading_columns
 from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.verdict import Grade
 from selfcal_ros.reporting.words.result import worded
 from selfcal_ros.simulation.truth import hu_plan, random_truth, simulate_measurements
+from test.support.options import BARE
+from test.support.results import covered
 
 ARTIFACT = Artifact(7, 0.01, 24)
 SIGMA_M, SIGMA_RAD = 2e-8, 2e-5
 
 
-def measured(seed, *, repeats=1, visits=True):
+def truth_and_readings(seed, *, repeats=1, visits=True):
     plan, rng = hu_plan(ARTIFACT, repeats), np.random.default_rng(seed)
     truth = random_truth(ARTIFACT, len(plan.views), rng)
-    return simulate_measurements(truth, plan, rng, sigma_m=SIGMA_M, sigma_theta_rad=SIGMA_RAD,
-                                 visits=visits)
+    return truth, simulate_measurements(truth, plan, rng, sigma_m=SIGMA_M,
+                                        sigma_theta_rad=SIGMA_RAD, visits=visits)
+
+
+def measured(seed, **how):
+    return truth_and_readings(seed, **how)[1]
 
 
 def misread(readings, index, *, mark=None, by_m=(0.0, 0.0), line=None, by_rad=0.0):
@@ -41,31 +48,40 @@ def misread(readings, index, *, mark=None, by_m=(0.0, 0.0), line=None, by_rad=0.
 @pytest.mark.parametrize(("index", "mark", "repeats", "visits"), [
     (1, (2, -1), 1, True), (1, (2, -1), 4, True), (0, (0, 3), 1, False), (3, (-3, 1), 4, False)])
 def test_a_mark_that_is_off_in_one_view_is_named(index, mark, repeats, visits):
-    readings = measured(3, repeats=repeats, visits=visits)
+    truth, readings = truth_and_readings(3, repeats=repeats, visits=visits)
     size, noise = 1e-6, SIGMA_M / np.sqrt(repeats)
     bad = misread(readings, index, mark=mark, by_m=(0.6 * size, -0.8 * size))
     clean, result = worded(calibrate(readings)), worded(calibrate(bad))
     name = readings.views[index].view.name
     cause = result.verdict.causes[0]
-    assert clean.verdict.qualified and not result.verdict.qualified
+    # repeats show the noise, and by how much more than it the mark is off
+    grade = Grade.ENLARGED if repeats == 1 else Grade.NOT_QUALIFIED
+    assert clean.verdict.grade is Grade.GOOD and result.verdict.grade is grade
+    assert covered(result, truth.g) >= 0.85
     assert cause.name == "reading" and cause.unit == "m" and cause.p < 5e-4
     assert cause.text.startswith(f"a reading of mark {mark} in view '{name}' that is off by ")
     # other views check it but in part: it is known to a few noises of a mean
     assert cause.size == pytest.approx(size, abs=4.5 * cause.u) and noise < cause.u < 20 * noise
-    assert result.verdict.sentence == f"Not qualified: most likely {cause.text}"
+    begins = "Good within an enlarged U: " if repeats == 1 else "Not qualified: most likely "
+    assert result.verdict.sentence == begins + cause.text
 
 
 def test_a_line_that_is_off_in_one_view_is_named():
-    readings = measured(4)
-    bad = worded(calibrate(misread(readings, 1, line=5, by_rad=-1e-3)))
-    assert calibrate(readings).verdict.qualified and not bad.verdict.qualified
+    truth, readings = truth_and_readings(4)
+    bad = worded(calibrate(misread(readings, 1, line=5, by_rad=-1e-3), BARE))
+    assert calibrate(readings, BARE).verdict.grade is Grade.GOOD
+    assert bad.verdict.grade is Grade.ENLARGED
+    (item,) = bad.verdict.enlarged_by
+    assert (item.name, item.unit) == ("reading", "rad")
+    off = bad.error_map.g_theta - truth.g_theta
+    assert np.mean(abs(off - off.mean()) <= bad.noise.k_theta * bad.error_map.u_g_theta) >= 0.85
     (cause,) = bad.verdict.causes
     assert (cause.name, cause.unit) == ("reading", "rad")
     assert cause.size == pytest.approx(-1e-3, abs=4.5 * cause.u)
     assert SIGMA_RAD < cause.u < 4 * SIGMA_RAD
     assert cause.text.startswith(f"a reading of line 5 in view 'rot90' that is off by "
                                  f"{cause.size * 180 * 3600 / np.pi:.1f} ± ")
-    assert calibrate(misread(readings, 1, line=5, by_rad=-1e-3)).verdict.causes[0].what == (
+    assert calibrate(misread(readings, 1, line=5, by_rad=-1e-3), BARE).verdict.causes[0].what == (
         ReadingCause("rot90", (5,)))
 
 
@@ -73,14 +89,14 @@ def test_the_remedy_that_is_named_mends_it():
     readings = measured(3)
     bad = misread(readings, 1, mark=(2, -1), by_m=(1e-6, 0.0), line=5, by_rad=1e-3)
     assert {cause.unit for cause in calibrate(bad).verdict.causes} == {"m", "rad"}
-    assert robust_calibrate(bad).verdict.qualified
+    assert robust_calibrate(bad).verdict.grade is Grade.GOOD
 
 
 def test_nothing_is_said_of_exact_readings():
     plan, rng = hu_plan(ARTIFACT), np.random.default_rng(1)
     exact = simulate_measurements(random_truth(ARTIFACT, 4, rng), plan, rng, sigma_m=0.0,
                                   sigma_theta_rad=0.0)
-    assert calibrate(exact).verdict.qualified
+    assert calibrate(exact).verdict.grade is Grade.GOOD
 
 
 def test_those_with_the_largest_residuals_are_tried():

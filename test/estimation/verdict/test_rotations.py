@@ -11,28 +11,34 @@ from selfcal_ros.errors import InputError, NotIdentifiableError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.joint.model_fit import fit_model
 from selfcal_ros.estimation.joint.solve import prepare
-from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.verdict import rotations
 from selfcal_ros.estimation.verdict.rotations import rotation_cause, solved_apart
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.terms import parse_terms
+from selfcal_ros.model.verdict import Grade
 from selfcal_ros.model.view import Plan, View
 from selfcal_ros.reporting.words.result import worded
 from selfcal_ros.simulation.machine import Spread, random_truth
 from selfcal_ros.simulation.settings import CellSettings
 from selfcal_ros.simulation.truth import hu_plan, simulate_measurements
+from test.support.options import BARE, bare
+from test.support.results import covered
 
 ARTIFACT = Artifact(7, 0.01, 24)
 FINE_RAD, COARSE_RAD = 2e-7, 2e-5
 """Noise of lines: 2e-7 rad is 6 nm at the edge of the plate, less than that of a mark."""
 
 
-def measured(seed, sigma_rad, *, repeats=2, spread=None, **how):
+def truth_and_readings(seed, sigma_rad, *, repeats=2, spread=None, **how):
     plan, rng = hu_plan(ARTIFACT, repeats), np.random.default_rng(seed)
     truth = random_truth(ARTIFACT, len(plan.views), rng, spread or Spread(rotation="finite"))
     settings = CellSettings(sigma_xy_m=2e-8, sigma_theta_rad=sigma_rad, servo_sigma_m=0.0,
                             servo_sigma_rad=0.0, **how)
-    return simulate_measurements(truth, plan, rng, settings=settings, visits=True)
+    return truth, simulate_measurements(truth, plan, rng, settings=settings, visits=True)
+
+
+def measured(*args, **how):
+    return truth_and_readings(*args, **how)[1]
 
 
 def turned(readings, index, by_rad):
@@ -43,43 +49,47 @@ def turned(readings, index, by_rad):
 
 
 def cause_in(readings, level=1.1):
-    return rotation_cause(fit_model(prepare(readings, Options())[0]), level)
+    return rotation_cause(fit_model(prepare(readings, BARE)[0]), level)
 
 
 @pytest.mark.parametrize(("index", "by_rad"), [(1, 4e-6), (3, -4e-6)])
 def test_a_plate_that_turns_between_marks_and_lines_is_named(index, by_rad):
-    readings = measured(1, FINE_RAD)
-    clean, result = calibrate(readings), worded(calibrate(turned(readings, index, by_rad)))
+    truth, readings = truth_and_readings(1, FINE_RAD)
+    clean = calibrate(readings, BARE)
+    result = worded(calibrate(turned(readings, index, by_rad), BARE))
     name = readings.views[index].view.name
-    assert clean.verdict.qualified and not result.verdict.qualified
+    assert clean.verdict.grade is Grade.GOOD and result.verdict.grade is Grade.ENLARGED
+    assert covered(clean, truth.g) >= 0.85 and covered(result, truth.g) >= 0.85
     (cause,) = result.verdict.causes
     assert (cause.name, cause.unit) == ("rotation", "rad") and cause.p < 5e-4
     # the median of three views is the datum: a third one may carry noise of the same size
     assert cause.size == pytest.approx(by_rad, abs=6 * cause.u) and cause.u < 0.1 * abs(by_rad)
     assert cause.text.startswith(f"lines of view '{name}' turned by {cause.size * 206264.8:.3f} ± ")
-    assert "look whether the plate moved between them" in cause.text
+    assert "check whether the plate moved between marks and lines" in cause.text
 
 
 def test_what_moves_no_map_disqualifies_nothing():
     # all lines were read in every view: a turn of all lines of one moves none against another
     readings = turned(measured(2, COARSE_RAD), 1, 1e-4)
     assert cause_in(readings).p < 1e-6
-    verdict = calibrate(readings).verdict
-    assert verdict.qualified and verdict.causes == ()
+    verdict = calibrate(readings, BARE).verdict
+    assert verdict.grade is Grade.GOOD and verdict.causes == ()
 
 
 def test_without_an_uncertainty_it_cannot_be_said_to_be_harmless():
     readings = turned(measured(2, COARSE_RAD), 1, 1e-4)
-    (cause,) = calibrate(readings, Options(uncertainty=False)).verdict.causes
-    assert cause.name == "rotation"
+    verdict = calibrate(readings, bare(uncertainty=False)).verdict
+    assert [cause.name for cause in verdict.causes] == ["rotation"]
+    assert verdict.grade is Grade.NOT_QUALIFIED
 
 
 def test_offsets_of_lines_with_the_other_sign_are_no_bent_plate():
     readings = measured(3, COARSE_RAD)
     wrong = replace(readings, views=tuple(replace(v, dtheta=-v.dtheta) for v in readings.views))
-    verdict = worded(calibrate(wrong)).verdict
+    verdict = worded(calibrate(wrong, BARE)).verdict
+    assert verdict.grade is Grade.NOT_QUALIFIED  # the angular map is that of another stage
     assert [cause.name for cause in verdict.causes] == ["rotation"]
-    assert "at the sign of the lines' offsets" in verdict.sentence
+    assert "and the sign of the lines' offsets" in verdict.sentence
 
 
 def test_another_cause_comes_first_for_it_turns_the_marks_as_well():
@@ -87,12 +97,12 @@ def test_another_cause_comes_first_for_it_turns_the_marks_as_well():
     spread = Spread(rotation="finite", microscope_scale=5e-3)
     readings = measured(4, FINE_RAD, spread=spread, repeats=4, stop_sigma_m=20e-6)
     assert cause_in(readings).p < 1e-6
-    for by_rad in (0.0, 1e-5):
-        (cause,) = calibrate(turned(readings, 1, by_rad)).verdict.causes
-        assert cause.name == "microscope"
-        assert cause.size == pytest.approx(5e-3, abs=4.5 * cause.u)
-    held = Options(terms=parse_terms(["microscope"], ""))
-    assert calibrate(readings, held).verdict.qualified
+    for by_rad, names in ((0.0, ["microscope"]), (1e-5, ["microscope", "rotation"])):
+        causes = calibrate(turned(readings, 1, by_rad), BARE).verdict.causes
+        assert [cause.name for cause in causes] == names
+        assert causes[0].size == pytest.approx(5e-3, abs=4.5 * causes[0].u)
+    held = bare(terms=parse_terms(["microscope"], ""))
+    assert calibrate(readings, held).verdict.grade is Grade.GOOD
     (left,) = calibrate(turned(readings, 1, 1e-5), held).verdict.causes
     assert left.name == "rotation" and left.size == pytest.approx(1e-5, abs=6 * left.u)
 
@@ -102,7 +112,7 @@ def test_a_line_that_is_off_is_named_beside_it():
     view = readings.views[3]
     off = replace(view, dtheta=view.dtheta + 5e-6 * (view.k == 7))
     both = replace(readings, views=(*readings.views[:3], off))
-    causes = worded(calibrate(both)).verdict.causes
+    causes = worded(calibrate(both, BARE)).verdict.causes
     assert {cause.name for cause in causes} == {"rotation", "reading"}
     assert "a reading of line 7 in view 'shift_x'" in causes[-1].text
 
@@ -115,15 +125,17 @@ def test_where_they_cannot_be_solved_apart_nothing_else_is_named(monkeypatch, er
         raise error
     monkeypatch.setattr(rotations, "solve_joint", fails)
     readings = turned(measured(1, COARSE_RAD), 1, 1e-4)
-    assert solved_apart(readings, Options()) is None
-    assert [cause.name for cause in calibrate(readings).verdict.causes] == ["rotation"]
+    assert solved_apart(readings, BARE) is None
+    verdict = calibrate(readings, BARE).verdict
+    assert [cause.name for cause in verdict.causes] == ["rotation"]
+    assert verdict.grade is Grade.NOT_QUALIFIED  # what it does to the map is not known
 
 
 def test_apart_a_turn_of_the_lines_moves_nothing():
     readings = measured(1, FINE_RAD)
     bent = turned(readings, 1, 4e-6)
-    maps = [solved_apart(r, Options()).result.error_map for r in (readings, bent)]
-    together = calibrate(bent).error_map
+    maps = [solved_apart(r, BARE).result.error_map for r in (readings, bent)]
+    together = calibrate(bent, BARE).error_map
     for name, moved in (("gx", 1e-10), ("gy", 1e-10), ("g_theta", 0.0)):
         one, other = (getattr(emap, name) for emap in maps)
         assert abs(one - other).max() < 1e-14

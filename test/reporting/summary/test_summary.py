@@ -15,7 +15,7 @@ from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ErrorMap, ThetaDatum
 from selfcal_ros.model.result import Noise, Observability, result_from_dict, result_to_dict
-from selfcal_ros.model.verdict import Cause, ModelResult, TermEstimate, TermResult, Verdict
+from selfcal_ros.model.verdict import Cause, Grade, ModelResult, TermEstimate, TermResult, Verdict
 from selfcal_ros.reporting.summary.format import aligned, fixed_column, significant, to_ascii
 from selfcal_ros.reporting.summary.numbers import map_figures, truth_figures
 from selfcal_ros.reporting.summary.sections import place_text, pose_text
@@ -160,8 +160,8 @@ def test_a_verdict_comes_before_everything_else():
     result, _ = known_result()
     cause = Cause("drift", "drift of 51 ± 2 nm along x: solve with --model drift", 5.1e-8, 2e-9,
                   "m", 1e-12)
-    bad = Verdict(False, "Not qualified: most likely drift of 51 nm", ("residuals exceed repeats",),
-                  (cause,))
+    bad = Verdict(Grade.NOT_QUALIFIED, "Not qualified: most likely drift of 51 nm",
+                  ("residuals exceed repeats",), (cause,))
     text = summary_text(replace(result, verdict=bad))
     assert text.startswith("Not qualified: most likely drift of 51 nm. Map as it is: Calibrated")
     assert "Verdict: NOT QUALIFIED\n  residuals exceed repeats\n" in text
@@ -253,7 +253,7 @@ def test_theta_of_a_real_calibration_lies_within_its_uncertainty_in_either_datum
     truth = random_truth(artifact, len(plan.views), rng, Spread(
         encoder="xy_axes" if datum is ThetaDatum.XY_AXES else "independent"))
     found = calibrate(simulate_measurements(truth, plan, rng, sigma_m=2e-9, sigma_theta_rad=2e-5),
-                      Options(datum_theta=datum))
+                      Options(datum_theta=datum, assumed=()))
     figures = truth_figures(found.error_map, {"gx": truth.g[0], "gy": truth.g[1],
                                               "g_theta": truth.g_theta})
     assert 0.7 < figures.rms_theta_in_u < 1.5 and figures.largest_theta_in_u < 5

@@ -10,7 +10,7 @@ import pytest
 from selfcal_ros.estimation import findings as f
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.result import Noise, result_to_dict
-from selfcal_ros.model.verdict import Cause, Finding, Verdict
+from selfcal_ros.model.verdict import Cause, Finding, Grade, Verdict
 from selfcal_ros.reporting.words.causes import cause_text
 from selfcal_ros.reporting.words.result import worded
 from selfcal_ros.reporting.words.screening import warning
@@ -118,11 +118,12 @@ def test_what_screening_leaves_is_a_reason_in_the_same_words(found):
 
 
 @pytest.mark.parametrize(("size", "text"), [
-    (f.SizeCause(1e-6, 2.04e-3), "microscope up to 2 mrad, 2000 times the size given"),
-    (f.SizeCause(8e-4, 2.04e-3), "microscope up to 2 mrad, 2.5 times the size given")])
+    (f.SizeCause(1e-6, 2.04e-3), "microscope up to 2 mrad, 2000 times the size assumed"),
+    (f.SizeCause(8e-4, 2.04e-3), "microscope up to 2 mrad, 2.5 times the size assumed")])
 def test_a_size_that_is_too_small_in_words(size, text):
     assert cause_text(replace(TURN, what=size)) == (
-        f"{text}: give a larger size, as in --model microscope:2.0e-03, or leave it free")
+        f"{text}: align the microscope, or let the stage stop beside the marks on purpose "
+        "(check_stops)")
 
 
 def test_what_nobody_worded_is_an_error():
@@ -136,27 +137,34 @@ def test_what_nobody_worded_is_an_error():
 def test_a_verdict_names_the_likeliest_cause_or_else_the_first_reason():
     drift = replace(TURN, name="drift", what=f.DriftCause("x", "90"), size=5e-7, u=1e-8)
     unknown = f.NoiseUnknown()
-    found = worded_verdict(Verdict(False, causes=(TURN, drift), findings=(unknown, TURN, drift)),
-                           TESTED)
+    found = worded_verdict(Verdict(Grade.NOT_QUALIFIED, causes=(TURN, drift),
+                                   findings=(unknown, TURN, drift)), TESTED)
     assert found.sentence == ("Not qualified: most likely microscope turned by 2.000 ± 0.010 mrad: "
-                              "solve with --model microscope, or align it")
+                              "align the microscope, or let the stage stop beside the marks on "
+                              "purpose (check_stops)")
     assert found.reasons == tuple(map(reason, (unknown, TURN, drift)))
     assert [cause.text for cause in found.causes] == [cause_text(TURN), cause_text(drift)]
     assert not found.findings and not found.qualified
-    alone = worded_verdict(Verdict(False, findings=(unknown,)), TESTED)
+    alone = worded_verdict(Verdict(Grade.NOT_QUALIFIED, findings=(unknown,)), TESTED)
     assert alone.sentence == f"Not qualified: {reason(unknown)}"
 
 
 def test_a_qualified_verdict_says_what_was_compared():
-    assert worded_verdict(Verdict(True), TESTED).sentence == (
-        "Qualified: residuals and the noise of readings agree")
-    assert worded_verdict(Verdict(True), UNTESTED).sentence == (
-        "Qualified: residuals show the noise; there are no repeats to compare it with")
+    assert worded_verdict(Verdict(Grade.GOOD), TESTED).sentence == (
+        "Good: residuals and the noise of readings agree")
+    assert worded_verdict(Verdict(Grade.GOOD), UNTESTED).sentence == (
+        "Good: residuals show the noise; there are no repeats to compare it with")
+
+
+def test_a_verdict_within_an_enlarged_uncertainty_names_what_enlarged_it():
+    found = worded_verdict(Verdict(Grade.ENLARGED, causes=(TURN,), findings=(TURN,)), TESTED)
+    assert found.sentence == f"Good within an enlarged U: {cause_text(TURN)}"
+    assert found.qualified
 
 
 def test_a_result_is_worded_once_and_only_then_written():
     plain = replace(result_of(random_map(Artifact(3, 0.01, 8), 1)), warnings=("as read",),
-                    verdict=Verdict(False, causes=(TURN,), findings=(TURN,)),
+                    verdict=Verdict(Grade.NOT_QUALIFIED, causes=(TURN,), findings=(TURN,)),
                     findings=(f.OutliersKept(), f.SlipsGivenUp(3)))
     with pytest.raises(ValueError, match="2 findings of the result are not worded"):
         result_to_dict(plain)
@@ -168,6 +176,9 @@ def test_a_result_is_worded_once_and_only_then_written():
     written = result_to_dict(found)
     assert result_to_dict(worded(found)) == written
     assert written["verdict"]["causes"] == [{
-        "name": "microscope", "text": cause_text(TURN), "size": 2e-3, "u": 1e-5, "unit": "rad",
-        "p": 1e-6}]
+        "name": "microscope", "text": cause_text(TURN), "view": "", "axis": "", "mark": [],
+        "size": 2e-3, "u": 1e-5, "unit": "rad", "p": 1e-6, "effect_rms": None, "effect_max": None,
+        "told": True, "remedies": [{"action": (
+            "align the microscope, or let the stage stop beside the marks on purpose "
+            "(check_stops)")}]}]
     assert np.array_equal(found.error_map.gx, plain.error_map.gx)

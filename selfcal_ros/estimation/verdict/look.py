@@ -1,0 +1,393 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the readings show besides the model: looked for, bounded, and added to the uncertainty.
+
+A term that they show joins the model with the largest size that they allow (method eq. 7.9), until
+they show no more. What is no term (a slip, a reading, a rotation of lines against marks, places of
+the stage) has an effect on the map, which enlarges its uncertainty.
+"""
+
+from collections.abc import Collection, Iterable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from scipy.special import fdtrc
+
+from selfcal_ros.errors import InputError, NotIdentifiableError
+from selfcal_ros.estimation.joint.model_fit import ModelFit, equations_of
+from selfcal_ros.estimation.joint.noise import pooled
+from selfcal_ros.estimation.joint.solve import solve_joint
+from selfcal_ros.estimation.joint.solved import Solved
+from selfcal_ros.estimation.options import Options
+from selfcal_ros.estimation.terms.equations import LEAST_NOISE_M
+from selfcal_ros.estimation.verdict.cause_sizes import (
+    cause_of,
+    noise_cause,
+    scatter_of_views,
+    size_cause,
+)
+from selfcal_ros.estimation.verdict.causes import FLOOR_M, LEVEL, Explanation, find_explanations
+from selfcal_ros.estimation.verdict.enlarge import Effect, difference, effect_of_field
+from selfcal_ros.estimation.verdict.fault_columns import READING
+from selfcal_ros.estimation.verdict.line_readings import effect_of_line, line_cause
+from selfcal_ros.estimation.verdict.off_sites import off_sites_cause
+from selfcal_ros.estimation.verdict.rotations import (
+    bends,
+    rotation_cause,
+    solved_apart,
+    turns_apart,
+)
+from selfcal_ros.model.readings import Measurements
+from selfcal_ros.model.statistics import rms
+from selfcal_ros.model.terms import ModelTerm, TermName
+from selfcal_ros.model.verdict import Cause, Remedy, TermResult
+
+ALWAYS_SITES = 41 * 41
+"""Field up to which causes are looked for in any case; beyond, where another test fails."""
+
+MAX_SITES = 201 * 201
+"""Field up to which they are looked for at all."""
+
+NOISY = 1.5
+"""Ratio of the noise of a view to that of the others from which it matters."""
+
+MATTERS = 0.1
+"""Effect of a cause on the map, in standard uncertainties (rms), below which it is of no account
+where the readings determine all of it."""
+
+MAX_JOINED = 4
+"""Most terms that join the model because the readings show them."""
+
+START: dict[str, float] = {
+    TermName.MICROSCOPE: 1e-6, TermName.DRIFT: 1e-12, TermName.PLATE_SCALE: 1e-10,
+    TermName.PLATE_SHAPE: 1e-12, TermName.APPROACH: 1e-12, TermName.PLATE_STRAIN: 1e-10,
+    TermName.LINE_ECCENTRICITY: 1e-9}
+"""Size with which a term joins: so small that the readings contradict it."""
+
+PLAUSIBLE = {TermName.MICROSCOPE: 0.1}
+"""Largest size that a term may have: beyond it is no term, but a fault."""
+
+
+@dataclass(frozen=True, eq=False)
+class Looked:
+    """What was found.
+
+    Attributes
+    ----------
+    solved : Solved
+        The solution with the terms that the readings show.
+    causes : tuple of Cause
+        The likeliest first.
+    effects : tuple of Effect
+        What enlarges the uncertainty beyond that of the solution.
+    terms : tuple of str
+        Terms whose size was enlarged, or that joined.
+    bounded : bool
+        Whether solution and effects cover all that was found.
+    """
+
+    solved: Solved
+    causes: tuple[Cause, ...] = ()
+    effects: tuple[Effect, ...] = ()
+    terms: tuple[str, ...] = ()
+    bounded: bool = True
+
+
+@dataclass
+class _Found:
+    """What is being found: see `Looked`."""
+
+    solved: Solved
+    causes: list[Cause] = field(default_factory=list)
+    effects: list[Effect] = field(default_factory=list)
+    joined: list[str] = field(default_factory=list)
+    bounded: bool = True
+
+
+def look_into(solved: Solved, measurements: Measurements, options: Options, *,
+              failed: bool, advise: bool = True) -> Looked:
+    """Return what the readings show besides the model.
+
+    Parameters
+    ----------
+    solved : Solved
+        A solution; one without a joint fit is not looked into.
+    measurements, options : Measurements, Options
+        The readings behind it and how they were solved.
+    failed : bool
+        Whether another test failed.
+    advise : bool
+        Whether remedies are tried.
+    """
+    if options.causes is False or solved.model is None or not solved.model.problem.direct:
+        return Looked(solved)
+    sizes = [test for test in solved.model.sizes if test.contradicted]
+    place = off_sites_cause(solved.model, solved.result.error_map, LEVEL)
+    failed = failed or bool(sizes or place)
+    found = _Found(solved)
+    n_sites = solved.model.problem.system.grid.n_sites
+    if are_looked_for(n_sites, options, failed=failed) and solved.xy.sigma > LEAST_NOISE_M:
+        _search(found, measurements, options, failed=failed)
+    solved, tests = found.solved, _model(found.solved).sizes
+    names = [str(test.name) for test in tests
+             if test.contradicted and test.name not in found.joined]
+    terms = {term.name: term for term in solved.result.model.terms}
+    raised = [size_cause(test, terms[test.name].estimates) for test in tests if test.name in names]
+    plausible = all(test.allowed <= PLAUSIBLE.get(test.name, np.inf) for test in tests)
+    causes = [*raised, *found.causes]
+    if place is not None:
+        causes = [place.cause, *causes] if place.shown else [*causes, place.cause]
+        found.effects.append(effect_of_field(place.cause.name, place.moved, measurements.sense,
+                                             measurements.artifact.angular_count))
+    looked = Looked(_from_readings(solved, found.joined), tuple(causes), tuple(found.effects),
+                    (*names, *found.joined), found.bounded and plausible)
+    if not advise or not causes:
+        return looked
+    model = _tried(looked, measurements, options) if looked.terms and plausible else None
+    return replace(looked, causes=tuple(_advised(cause, model, looked.terms) for cause in causes))
+
+
+def _advised(cause: Cause, model: str | None, terms: Collection[str]) -> Cause:
+    """Return a cause with what to do about it: a model that was tried, a view to measure again."""
+    remedies = []
+    if model is not None and cause.name in terms:
+        remedies.append(Remedy("model", model))
+    if cause.view and cause.name not in (TermName.DRIFT, READING):
+        remedies.append(Remedy("view", cause.view))
+    return replace(cause, remedies=tuple(remedies))
+
+
+def _tried(looked: Looked, measurements: Measurements, options: Options) -> str | None:
+    """Return the model with which these readings give a good map; None if none does.
+
+    With the terms free, or with the sizes that the readings allow: of those that nothing
+    contradicts the one with the smaller uncertainty.
+    """
+    used = {term.name: term for term in _model(looked.solved).problem.terms}
+    best, least = None, np.inf
+    for free in (True, False):
+        terms = [ModelTerm(TermName(name)) if free else _rounded_up(used[TermName(name)])
+                 for name in looked.terms]
+        solved = solved_with(measurements, options, terms)
+        if solved is None or solved.xy.contradicted or solved.theta.contradicted:
+            continue
+        emap = solved.result.error_map
+        u = rms(np.stack([emap.u_gx, emap.u_gy])) + rms(np.nan_to_num(emap.u_g_theta))
+        again = look_into(solved, measurements, replace(
+            options, terms=_merged(options.terms, terms)), failed=False, advise=False)
+        if not again.causes and u < least:
+            best, least = ",".join(map(str, _merged(options.terms, terms))), u
+    return best
+
+
+def _rounded_up(term: ModelTerm) -> ModelTerm:
+    """Return a term with its size to two figures, not smaller."""
+    power = 10.0 ** (np.floor(np.log10(term.size)) - 1)
+    return ModelTerm(term.name, float(f"{np.ceil(term.size / power) * power:.1e}"))
+
+
+def _merged(terms: Iterable[ModelTerm], more: Collection[ModelTerm]) -> tuple[ModelTerm, ...]:
+    """Return terms and further ones, which replace those of their names."""
+    named = {term.name for term in more}
+    return (*(term for term in terms if term.name not in named), *more)
+
+
+def _from_readings(solved: Solved, joined: Iterable[str]) -> Solved:
+    """Return a solution whose terms say which of them the readings put in."""
+    joined = set(joined)
+
+    def of(term: TermResult) -> TermResult:
+        if term.name not in joined:
+            return term
+        return replace(term, size=term.size_used or term.size, size_used=None, source="readings")
+
+    result = solved.result
+    model = replace(result.model, terms=tuple(of(term) for term in result.model.terms))
+    return replace(solved, result=replace(result, model=model))
+
+
+def are_looked_for(sites: int, options: Options, *, failed: bool) -> bool:
+    """Return whether causes are looked for in a field of so many sites, unasked only in small ones.
+
+    Parameters
+    ----------
+    sites : int
+        Sites of the field.
+    options : Options
+        Whether somebody asked.
+    failed : bool
+        Whether another test failed.
+    """
+    if options.causes is False or sites > MAX_SITES:
+        return False
+    return failed or sites <= ALWAYS_SITES or bool(options.causes)
+
+
+def _search(found: _Found, measurements: Measurements, options: Options, *, failed: bool) -> None:
+    """Let terms join while the readings show any; then bound what is left."""
+    left: list[Explanation] = []
+    alone = _turned_alone(found.solved, measurements, options, failed=failed)
+    for _ in range(0 if alone else MAX_JOINED + 1):
+        left = _explanations(found.solved, failed=failed)
+        first = [item for item in left if item.rank == 0 and item.name in START]
+        if not first or not _join(found, first, measurements, options):
+            break
+        failed = False
+    for item in left:
+        _bound(found, item, measurements)
+    _rotation(found, measurements, options)
+    if (line := line_cause(_model(found.solved).problem, measurements, LEVEL)) is not None:
+        found.causes.append(line)
+        found.effects.append(effect_of_line(line, measurements.artifact))
+    if not found.causes:
+        _noisy_views(found, measurements)
+
+
+def _model(solved: Solved) -> ModelFit:
+    if solved.model is None:
+        raise ValueError("a joint solution has its fit")
+    return solved.model
+
+
+def _explanations(solved: Solved, *, failed: bool) -> list[Explanation]:
+    """Return what explains the residuals of a solution, the likeliest first."""
+    model = _model(solved)
+    found = [item for item in find_explanations(model, slips=False)
+             if failed or _counts(item, solved)]
+    if found or failed:
+        found = [item for item in find_explanations(model, slips=True)
+                 if failed or _counts(item, solved)]
+    return found
+
+
+def _counts(found: Explanation, solved: Solved) -> bool:
+    """Return whether an explanation is worth a word: by what it does to the map."""
+    if not found.whole or found.name == READING:  # one node may be far off, and the rest not
+        return True
+    emap = solved.result.error_map
+    u = np.concatenate([emap.u_gx[emap.valid], emap.u_gy[emap.valid]])
+    if not np.isfinite(u).any():
+        return True
+    return found.effect_m > MATTERS * rms(u)
+
+
+def solved_with(measurements: Measurements, options: Options,
+                terms: Collection[ModelTerm]) -> Solved | None:
+    """Return the solution with further terms; None if there is none."""
+    try:
+        return solve_joint(measurements, replace(options, terms=_merged(options.terms, terms)))
+    except (NotIdentifiableError, InputError):
+        return None
+
+
+def _join(found: _Found, first: list[Explanation], measurements: Measurements,
+          options: Options) -> bool:
+    """Let the first of explanations that are equally good join; the others bound the map as well.
+
+    Return whether it did.
+    """
+    names = [*found.joined, first[0].name]
+    solved = solved_with(measurements, options, [ModelTerm(TermName(n), START[n]) for n in names])
+    if solved is None or not any(test.name == first[0].name and test.contradicted
+                                 for test in _model(solved).sizes):
+        return False
+    for other in first[1:]:
+        instead = [*found.joined, other.name]
+        starts = [ModelTerm(TermName(n), START[n]) for n in instead]
+        twin = solved_with(measurements, options, starts)
+        if twin is not None:
+            found.effects.append(difference(other.name, twin.result, solved.result))
+    found.causes += [_cause(found.solved, item) for item in first]
+    found.solved, found.joined = solved, names
+    found.causes[-len(first)] = _fitted_cause(solved, first[0])
+    return True
+
+
+def _cause(solved: Solved, item: Explanation) -> Cause:
+    ground = _model(solved).problem.ground
+    names = ground.line_names if item.name == TermName.LINE_ECCENTRICITY else ground.names
+    return cause_of(item, names, _model(solved).problem.half_width_m)
+
+
+def _fitted_cause(solved: Solved, item: Explanation) -> Cause:
+    """Return the cause as the solution that holds it finds it: within the size that it has."""
+    model = _model(solved)
+    if model.equations is None:
+        raise ValueError(f"the solution does not hold {item.name}")
+    equations = equations_of(model.problem, model.found, model.equations.columns, model.reduced)
+    rows = equations.rows([item.name])
+    values = np.where(rows, model.coefficients, 0.0)
+    moved = equations.maps @ values
+    known = max(int(model.problem.system.known_sites.sum()), 1)
+    covariance = model.covariance[np.ix_(rows, rows)] * model.found.xy.sigma**2
+    columns = tuple(c for c, here in zip(equations.columns.columns, rows, strict=True) if here)
+    return _cause(solved, replace(
+        item, columns=columns, values=model.coefficients[rows], covariance=covariance,
+        effect_m=float(np.sqrt((abs(moved) ** 2).sum() / (2 * known))), moved=moved))
+
+
+def _bound(found: _Found, item: Explanation, measurements: Measurements) -> None:
+    """Take up what did not join: its effect on the map is known as far as the readings tell."""
+    model = _model(found.solved)
+    cause = _cause(found.solved, item)
+    if cause.name in [known.name for known in found.causes] and cause.name in START:
+        return
+    found.causes.append(cause)
+    found.bounded &= item.whole
+    if item.moved is not None:
+        field = item.moved.reshape(model.problem.system.grid.views.shape)
+        found.effects.append(effect_of_field(item.name, field, measurements.sense,
+                                             measurements.artifact.angular_count))
+
+
+def _turned_alone(solved: Solved, measurements: Measurements, options: Options, *,
+                  failed: bool) -> bool:
+    """Return whether lines turned against marks are all there is: they bend what marks leave."""
+    if rotation_cause(_model(solved), LEVEL) is None:
+        return False
+    apart = solved_apart(measurements, options)
+    return apart is None or not _explanations(
+        apart, failed=failed or bends(solved.result, apart.result, MATTERS))
+
+
+def _rotation(found: _Found, measurements: Measurements, options: Options) -> None:
+    """Take up rotations that marks and lines of a view do not share.
+
+    What spoils the marks turns them as well: a rotation is the cause where nothing else is.
+    """
+    turned = rotation_cause(_model(found.solved), LEVEL)
+    if turned is None:
+        return
+    terms = [ModelTerm(TermName(name), START[name]) for name in found.joined]
+    apart = solved_apart(measurements, replace(options, terms=_merged(options.terms, terms)))
+    if apart is None:
+        found.causes.append(turned)
+        found.bounded = False
+        return
+    if bends(found.solved.result, apart.result, MATTERS):
+        found.causes.append(turned)
+        found.effects.append(difference(turned.name, found.solved.result, apart.result))
+        found.bounded &= abs(turned.size) < turns_apart(found.solved.result, measurements) / 2
+
+
+def _noisy_views(found: _Found, measurements: Measurements) -> None:
+    """Take up the views whose visits scatter more than those of the others.
+
+    Where a view is noisier than the uncertainty assumes, a node may rest on it alone.
+    """
+    views = scatter_of_views(_model(found.solved), measurements)
+    emap, used = found.solved.result.error_map, found.solved.xy.sigma
+    ratios = []
+    for index, (name, sigma, dof) in enumerate(views):
+        others, rest = pooled((s, d) for i, (_, s, d) in enumerate(views) if i != index)
+        if not rest or not others > FLOOR_M:
+            continue
+        ratio = sigma / others
+        p = float(fdtrc(dof, rest, ratio**2)) * len(views)
+        if p < LEVEL and ratio > NOISY:
+            u = ratio * np.sqrt((1 / dof + 1 / rest) / 2)
+            found.causes.append(noise_cause(name, ratio, u, p))
+            ratios.append(sigma / used)
+    if ratios and max(ratios) > 1:
+        more = np.nan_to_num(np.stack([emap.u_gx, emap.u_gy])) * np.sqrt(max(ratios) ** 2 - 1)
+        found.effects.append(Effect("noise", more, np.zeros(len(emap.g_theta))))
+    found.causes.sort(key=lambda cause: cause.p)

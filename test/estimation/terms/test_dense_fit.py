@@ -1,0 +1,133 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Maps, coefficients and all their uncertainties are those of one dense least squares."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from selfcal_ros.estimation.api import calibrate
+from selfcal_ros.estimation.options import Options
+from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.readings import Sense
+from selfcal_ros.model.terms import DEFAULT_TERMS, parse_terms
+from selfcal_ros.model.view import Plan, View
+from selfcal_ros.simulation.machine import Spread, random_truth
+from selfcal_ros.simulation.settings import CellSettings
+from selfcal_ros.simulation.truth import simulate_measurements
+from test.support.dense_fit import DenseFit
+
+PITCH = 0.01
+DEGREE = 2
+QUIET = {"servo_sigma_m": 0.0, "servo_sigma_rad": 0.0, "stop_sigma_m": 20e-6}
+MODELS = {
+    "none": "",
+    "assumed": ",".join(map(str, DEFAULT_TERMS)),
+    "sized": "microscope:0.01:0.02:0.001,drift:5e-8,plate_scale:3e-7,plate_shape:2e-8,"
+             "approach:3e-8,plate_strain:2e-7,line_eccentricity:3e-6",
+    "free": "microscope,drift,plate_scale,approach",
+    "mixed": "microscope:0:0.01:0.002,drift,plate_scale:1e-7,approach,line_eccentricity:2e-6"}
+MACHINE = Spread(
+    microscope_rotation_rad=4e-3, microscope_scale=-5e-3,
+    microscope_shear=5e-4, microscope_stretch=3e-4, backlash_x_m=20e-9, backlash_y_m=-15e-9,
+    plate_scale=3e-7, plate_shape_m=20e-9, plate_strain=1e-7, line_eccentricity_rad=3e-6,
+    drift_linear_m=40e-9, drift_quadratic_m=30e-9)
+PARTS = {"microscope": ("microscope_rotation_rad", "microscope_scale", "microscope_shear",
+                        "microscope_stretch"), "approach": ("backlash_x_m", "backlash_y_m"),
+         "plate_scale": ("plate_scale",), "plate_shape": ("plate_shape_m",),
+         "plate_strain": ("plate_strain",), "line_eccentricity": ("line_eccentricity_rad",),
+         "drift": ("drift_linear_m", "drift_quadratic_m")}
+
+
+def views(*poses, lines, repeats, order):
+    named = [View(name, q * np.pi / 2, (a * PITCH, b * PITCH), True, lines > 0, n, order)
+             for (name, q, a, b), n in zip(poses, repeats, strict=True)]
+    turned = [View("line", 2 * np.pi / lines, (0.0, 0.0), False, True, 3)] if lines else []
+    return (*named[:2], *turned, *named[2:])
+
+
+FIVE = (("0", 0, 0, 0), ("90", 1, 0, 0), ("+x", 0, 1, 0), ("-x", 0, -1, 0), ("+y", 0, 0, 1))
+PLANS = {
+    "lines": Plan("lines", Artifact(5, PITCH, 8), views(
+        *FIVE, lines=8, repeats=[4] * 5, order="x_back_y_back")),
+    "oblong": Plan("oblong", Artifact(5, PITCH, 12, 3), views(
+        ("0", 0, 0, 0), ("180", 2, 0, 0), ("90", 1, 0, 0), ("tx", 0, 1, 0), ("-ty", 3, 0, -1),
+        lines=12, repeats=[4, 2, 4, 6, 4], order="there_and_back@plate")),
+    "no lines": Plan("no lines", Artifact(3, PITCH), views(
+        *FIVE, lines=0, repeats=[4] * 5, order="x_back_y_back"))}
+
+
+@cache
+def measured(plan, model, sense=Sense.MICROSCOPE_MOVES, missing=0.0, rotation="linear"):
+    """Readings of a machine that has what the model holds, and no more."""
+    plan, rng = PLANS[plan], np.random.default_rng(3)
+    held = {term.name for term in parse_terms([MODELS[model]], "")}
+    spread = replace(MACHINE, rotation=rotation, **{part: 0.0 for name, parts in PARTS.items()
+                                                    if name not in held for part in parts})
+    truth = random_truth(plan.artifact, len(plan.views), rng, spread)
+    return simulate_measurements(truth, plan, rng, missing=missing, visits=True,
+                                 settings=CellSettings(sense, 20e-9, 2e-6, **QUIET))
+
+
+def both(readings, model, **how):
+    terms = parse_terms([MODELS[model]], "")
+    result = calibrate(readings, Options(terms=terms, assumed=(), causes=False, uncertainty=True,
+                                         drift_degree=DEGREE, **how))
+    assert all(term.size_used is None for term in result.model.terms)  # none is contradicted
+    dense = DenseFit(readings, terms, (result.noise.sigma_xy, result.noise.sigma_theta),
+                     degree=DEGREE, rigid=result.model.misalignment == "rigid")
+    return result, dense
+
+
+def require_same(result, dense, *, of_u=0.01, axes=False):
+    """Require all values within a part of their uncertainty, and the uncertainties themselves.
+
+    An estimate has converged when nothing changes by a thousandth of its uncertainty any more.
+    """
+    emap = result.error_map
+    valid = np.isfinite(emap.gx)
+    assert valid.sum() > 0.7 * valid.size
+    pairs = [(emap.gx, emap.u_gx), (emap.gy, emap.u_gy)]
+    for (value, u), wanted, spread in zip(pairs, *dense.grid(valid), strict=True):
+        assert np.abs(u[valid] / spread[valid] - 1).max() < 0.1 * of_u
+        assert np.abs((value - wanted)[valid] / u[valid]).max() < of_u
+    if result.artifact.angular_count:
+        known = np.isfinite(emap.g_theta)
+        wanted, spread = dense.theta(known, axes)
+        assert np.abs(emap.u_g_theta[known] / spread[known] - 1).max() < 0.1 * of_u
+        assert np.abs((emap.g_theta - wanted)[known] / spread[known]).max() < of_u
+    found = {(term.name, e.view, e.component): e for term in result.model.terms
+             for e in term.estimates}
+    coefficients = dense.coefficients()
+    assert set(found) == set(coefficients)
+    for key, (value, spread) in coefficients.items():
+        assert found[key].u == pytest.approx(spread, rel=0.1 * of_u), key
+        assert abs(found[key].value - value) < of_u * spread, key
+
+
+@pytest.mark.parametrize("sense", Sense)
+@pytest.mark.parametrize("model", MODELS)
+@pytest.mark.parametrize("plan", PLANS)
+def test_a_model_as_the_dense_matrix_has_it(plan, model, sense):
+    require_same(*both(measured(plan, model, sense), model, misalignment_model="linear"))
+
+
+@pytest.mark.parametrize("sense", Sense)
+@pytest.mark.parametrize("model", ["assumed", "sized", "mixed"])
+def test_with_marks_and_lines_missing(model, sense):
+    require_same(*both(measured("lines", model, sense, missing=0.15), model,
+                       misalignment_model="linear"))
+
+
+@pytest.mark.parametrize("sense", Sense)
+@pytest.mark.parametrize("model", ["assumed", "sized"])
+def test_in_the_datum_of_the_axes(model, sense):
+    require_same(*both(measured("lines", model, sense), model, misalignment_model="linear",
+                       datum_theta="xy_axes"), axes=True)
+
+
+@pytest.mark.parametrize("sense", Sense)
+@pytest.mark.parametrize("model", ["none", "assumed"])
+def test_plates_that_turn_by_finite_angles(model, sense):
+    require_same(*both(measured("lines", model, sense, rotation="finite"), model), of_u=0.03)

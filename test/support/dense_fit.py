@@ -1,0 +1,284 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A measurement with terms as one dense least squares: the slow way, for comparison.
+
+Written from docs/method.md, not from the code: every visit of a mark and every line is a row in the
+stage frame, every unknown a column, every size a row b / size. The columns are differences of what
+the whole model predicts, so that plates that turn by finite angles have theirs, too.
+"""
+
+from functools import cached_property
+from itertools import pairwise
+
+import numpy as np
+from scipy.special import eval_legendre
+
+from selfcal_ros.model.readings import Measurements, Sense
+from selfcal_ros.model.terms import ModelTerm, TermName
+
+STEP = 1e-5
+"""Of the differences, rad, m and m/m: what they leave out and what they round are then 1e-11."""
+
+STEPS = 6
+"""In which finite turns and offsets without their noise are found to rounding."""
+
+EXACTLY = 1e-4
+"""Part of the noise to which the map is held in its datum. Without finite turns no reading tells
+it; with them a microscope's turn and scale are those against the axes that it has."""
+
+NOTHING = 1e-8
+"""Singular value of columns of unit length that is none."""
+
+MARKS = {TermName.PLATE_SCALE: ("scale",), TermName.PLATE_STRAIN: ("scale", "stretch", "shear"),
+         TermName.PLATE_SHAPE: tuple(f"{axis} {form}" for axis in "xy"
+                                     for form in ("xx", "xy", "yy"))}
+
+
+class DenseFit:
+    """The solution of all readings for known noises of one reading, (m, rad)."""
+
+    def __init__(self, readings: Measurements, terms: tuple[ModelTerm, ...], sigma, *,
+                 degree=3, rigid=False):
+        self.readings, self.sigma, self.rigid = readings, sigma, rigid
+        self.artifact = readings.artifact
+        (self.hx, self.hy), self.pitch = self.artifact.half, self.artifact.grid_pitch_m
+        self.n, self.K = int(np.prod(self.artifact.shape)), self.artifact.angular_count
+        self.sign = -1 if readings.sense is Sense.PLATE_MOVES else 1
+        self.keys, self.size = self._coefficients(terms, degree)
+        self._visits()
+        self._lines()
+        ends = np.cumsum([0, 2 * self.n, 2 * self.n, self.K, self.K, 3 * len(readings.views),
+                          len(self.keys)])
+        self.g, self.a, self.gt, self.at, self.pose, self.b = (
+            slice(*pair) for pair in pairwise(ends))
+        self.offset, self.p = self.seen, np.zeros(ends[-1])
+        magnified = any(term == TermName.MICROSCOPE for term, *_ in self.keys)
+        for _ in range(STEPS if magnified or rigid else 1):
+            self._columns = self._of_coefficients()
+            self._step()
+            # the noise of a reading is in the offset that was seen as well (method, terms)
+            self.offset = self.seen - self.left
+
+    def _coefficients(self, terms, degree):
+        """Names (term, view, component) and sizes of all coefficients; view -1: all views."""
+        views = self.readings.views
+        grid = [v for v, view in enumerate(views) if len(view.m)]
+        lines = [v for v, view in enumerate(views) if len(view.k)]
+        keys, size = [], []
+        for term in terms:
+            if term.name is TermName.MICROSCOPE:
+                mine = [(-1, part) for part in ("scale", "turn", "stretch", "shear")]
+            elif term.name is TermName.APPROACH:
+                mine = [(-1, "x"), (-1, "y")]
+            elif term.name is TermName.DRIFT:
+                mine = [(v, f"{axis} P{order}") for v in grid for order in range(1, degree + 1)
+                        for axis in "xy"]
+            elif term.name is TermName.LINE_ECCENTRICITY:
+                mine = [(v, part) for v in lines[int(term.free):] for part in ("cos", "sin")]
+            else:
+                mine = [(v, part) for v in grid[int(term.free):] for part in MARKS[term.name]]
+            for v, part in mine:
+                if term.size_of(part):
+                    keys.append((term.name, v, part))
+                    size.append(term.size_of(part))
+        return keys, np.array(size)
+
+    def _visits(self):
+        """Every visit of every mark, one behind another."""
+        parts = {name: [] for name in ("view", "m", "n", "y", "weight", "tau", "o", "sx", "sy")}
+        for v, view in enumerate(self.readings.views):
+            if not len(view.m):
+                continue
+            seen = view.visits
+            first, last = seen.stamp_ns.min(), seen.stamp_ns.max()
+            for name, values in (
+                    ("view", np.full(len(seen.mark), v)), ("m", view.m[seen.mark]),
+                    ("n", view.n[seen.mark]), ("y", seen.dx + 1j * seen.dy),
+                    ("weight", seen.count),
+                    ("tau", 2 * (seen.stamp_ns - first) / (last - first) - 1),
+                    ("o", seen.offset_x + 1j * seen.offset_y), ("sx", seen.approach_x),
+                    ("sy", seen.approach_y)):
+                parts[name].append(values)
+        found = {name: np.concatenate(values) for name, values in parts.items()}
+        self.view, self.tau, self.seen = found["view"], found["tau"], found["o"]
+        self.sx, self.sy = found["sx"], found["sy"]
+        self.z = self.pitch * (found["m"] + 1j * found["n"])
+        self.mark = (found["m"] + self.hx) * self.artifact.shape[1] + found["n"] + self.hy
+        poses = [view.view for view in self.readings.views]
+        self.quarter = np.array([1j ** round(pose.rotation_rad / (np.pi / 2)) for pose in poses])
+        shift = np.array([complex(*pose.translation_m) for pose in poses])
+        place = self.quarter[self.view] * self.z + shift[self.view]
+        at = np.rint(self.sign * np.stack([place.real, place.imag]) / self.pitch).astype(int)
+        self.site = (at[0] + self.hx) * self.artifact.shape[1] + at[1] + self.hy
+        self.y, self.visit_weight = found["y"], found["weight"].astype(float)
+
+    def _lines(self):
+        """Every line of every view, one behind another."""
+        views = [(v, view) for v, view in enumerate(self.readings.views) if len(view.k)]
+        empty = [np.zeros(0, dtype=int)]
+        self.k = np.concatenate([view.k for _, view in views] or empty)
+        self.line_view = np.concatenate([np.full(len(view.k), v) for v, view in views] or empty)
+        self.line_y = np.concatenate([view.dtheta for _, view in views] or empty)
+        self.line_weight = np.concatenate([view.count_theta for _, view in views] or empty)
+        turn = np.array([round(view.view.rotation_rad / (2 * np.pi / self.K)) if self.K else 0
+                         for view in self.readings.views])
+        self.line_site = self.sign * (self.k + turn[self.line_view]) % max(self.K, 1)
+
+    def _predicted(self, p):
+        """What the model says of all readings: visits along x, along y, lines."""
+        g, a = (part[:self.n] + 1j * part[self.n:] for part in (p[self.g], p[self.a]))
+        phi, x, y = p[self.pose].reshape(-1, 3).T
+        strained, added, turned = (p[self.b] @ columns for columns in self._columns)
+        quarter, body = self.quarter[self.view], a[self.mark] + strained
+        t = (x + 1j * y)[self.view]
+        if self.rigid:
+            turn = np.exp(1j * phi)[self.view] * quarter
+            moved = turn * (self.z + body) + t - quarter * self.z
+        else:
+            moved = quarter * (body + 1j * phi[self.view] * self.z) + t
+        moved = moved + added + self.sign * g[self.site]
+        lines = self.sign * p[self.gt][self.line_site] + p[self.at][self.k] + phi[self.line_view]
+        return np.concatenate([moved.real, moved.imag, lines + turned])
+
+    def _of_coefficients(self):
+        """What a unit of each makes of the plate at the visits, of the visits, of the lines."""
+        strained, added = np.zeros((2, len(self.keys), len(self.z)), dtype=complex)
+        turned = np.zeros((len(self.keys), len(self.k)))
+        for row, (term, v, part) in enumerate(self.keys):
+            if term == TermName.LINE_ECCENTRICITY:
+                wave = {"cos": np.cos, "sin": np.sin}[part](2 * np.pi * self.k / self.K)
+                turned[row] = wave * (self.line_view == v)
+            elif term in MARKS:
+                strained[row] = self._of_plate(part, term) * (self.view == v)
+            else:
+                added[row] = self._of_visit(term, part) * ((self.view == v) | (v < 0))
+        return strained, added, turned
+
+    def _of_plate(self, part, term):
+        z, half = self.z, self.pitch * max(self.hx, self.hy)
+        if term == TermName.PLATE_SHAPE:
+            u, v = z.real / half, z.imag / half
+            form = {"xx": u * u, "xy": 2 * u * v, "yy": v * v}[part[2:]]
+            return form * (1 if part[0] == "x" else 1j)
+        x, y = z.real, z.imag
+        return {"scale": x + 1j * y, "stretch": x - 1j * y, "shear": y + 1j * x}[part]
+
+    def _of_visit(self, term, part):
+        if term == TermName.DRIFT:
+            return eval_legendre(int(part[3:]), self.tau) * (1 if part[0] == "x" else 1j)
+        if term == TermName.APPROACH:
+            return self.sign * (self.sx if part == "x" else 1j * self.sy)
+        x, y = self.offset.real, self.offset.imag
+        return -{"scale": x + 1j * y, "turn": -y + 1j * x, "stretch": x - 1j * y,
+                 "shear": y + 1j * x}[part]
+
+    @cached_property
+    def _root(self):
+        marks = np.sqrt(self.visit_weight) / self.sigma[0]
+        return np.concatenate([marks, marks, np.sqrt(self.line_weight) / self.sigma[1]])
+
+    @cached_property
+    def _values(self):
+        return np.concatenate([self.y.real, self.y.imag, self.line_y])
+
+    def _design(self, p):
+        unit = STEP * np.eye(len(p))
+        return np.array([(self._predicted(p + h) - self._predicted(p - h)) / (2 * STEP)
+                         for h in unit]).T
+
+    def _step(self):
+        """Take a step to the least squares; keep unknowns, covariance and what is left."""
+        p, sized = self.p, np.isfinite(self.size)
+        self.design = self._root[:, None] * self._design(p)
+        rest = self._root * (self._values - self._predicted(p))
+        prior = np.zeros((sized.sum(), len(p)))
+        prior[np.arange(len(prior)), np.arange(len(p))[self.b][sized]] = 1 / self.size[sized]
+        held = self._datum(np.unique(self.site)) / (EXACTLY * self.sigma[0])
+        solve = inverse_of(np.concatenate([self.design, prior, held]))
+        self.p = p + solve @ np.concatenate([rest, -prior @ p, -held @ p])
+        self.covariance = solve @ solve.T
+        left, n = self._values - self._predicted(self.p), len(self.y)
+        self.left = left[:n] + 1j * left[n:2 * n]
+
+    @property
+    def squares(self):
+        """Sum of squares of what is left and of the rows of the sizes."""
+        rest = self._root * (self._values - self._predicted(self.p))
+        return float(rest @ rest + ((self.p[self.b] / self.size) ** 2).sum())
+
+    def grid(self, known):
+        """Map and its u in the datum over the sites `known`: (2, nx, ny) each."""
+        sites = np.flatnonzero(known)
+        modes = self._datum(sites)
+        self.to_map = np.zeros((2 * self.n, len(self.p)))
+        here = np.concatenate([sites, self.n + sites])
+        self.to_map[here, here] = 1
+        self.to_map -= modes.T[:2 * self.n] @ modes
+        return self._quantity(self.to_map, (2, *self.artifact.shape))
+
+    def _datum(self, sites):
+        """Translation, rotation and scale of the map over sites as orthonormal rows."""
+        x, y = (part.ravel()[sites] for part in (self.artifact.x_m, self.artifact.y_m))
+        one, zero = np.ones(len(sites)), np.zeros(len(sites))
+        modes = np.stack([np.concatenate(pair) for pair in (
+            (one, zero), (zero, one), (-y, x), (x, y))], axis=1)
+        rows = np.zeros((4, len(self.p)))
+        rows[:, np.concatenate([sites, self.n + sites])] = np.linalg.qr(modes)[0].T
+        return rows
+
+    def theta(self, known, axes=False):
+        """Angular map and its standard uncertainty over the lines `known`, (K,) each.
+
+        In the datum zero_mean, or in xy_axes, after `grid` (method eqs. 3.7, 3.8).
+        """
+        pick = np.zeros((self.K, len(self.p)))
+        pick[:, self.gt] = np.eye(self.K)
+        if axes:
+            pick = pick + self._gain() @ self._misclosure(pick)
+        else:
+            pick = pick - pick[known].mean(axis=0)
+        return self._quantity(pick, (self.K,))
+
+    def _misclosure(self, pick):
+        """Slopes of the half axes less the angular map there, as rows over the unknowns."""
+        shape, rows = self.artifact.shape, []
+        number = np.arange(self.n).reshape(shape)
+        i, j = self.artifact.x_m, self.artifact.y_m
+        for line, (sites, along, part, sign) in enumerate((
+                (number[self.hx + 1:, self.hy], i, 1, 1), (number[self.hx, self.hy + 1:], j, 0, -1),
+                (number[:self.hx, self.hy], i, 1, 1), (number[self.hx, :self.hy], j, 0, -1))):
+            x = along.ravel()[sites] - along.ravel()[sites].mean()
+            slope = sign * (x / (x @ x)) @ self.to_map[part * self.n + sites]
+            rows.append(slope - pick[line * self.K // 4])
+        return np.array(rows)
+
+    def _gain(self):
+        """What the angular map makes of a misclosure, rotations of the grid's views held."""
+        lines = 2 * len(self.y) + np.arange(len(self.k))
+        columns = np.r_[np.arange(len(self.p))[self.gt], np.arange(len(self.p))[self.at],
+                        [self.pose.start + 3 * v for v, view in enumerate(self.readings.views)
+                         if len(view.k) and not len(view.m)]]
+        solve = inverse_of(self.design[np.ix_(lines, columns)])
+        spread = (solve @ solve.T)[:self.K, :self.K] / self.sigma[1] ** 2
+        b = np.eye(self.K)[np.arange(4) * self.K // 4]
+        one = b.sum(axis=1)[:, None]
+        border = np.block([[b @ spread @ b.T, one], [one.T, np.zeros((1, 1))]])
+        solved = np.linalg.pinv(border)[:, :4]
+        return spread @ b.T @ solved[:4] + solved[4]
+
+    def _quantity(self, rows, shape):
+        variance = np.einsum("ij,jk,ik->i", rows, self.covariance, rows)
+        return (rows @ self.p).reshape(shape), np.sqrt(variance).reshape(shape)
+
+    def coefficients(self):
+        """(value, standard uncertainty) of every coefficient by (term, view's name, component)."""
+        names = [*(view.view.name for view in self.readings.views), ""]
+        u = np.sqrt(np.diag(self.covariance)[self.b])
+        return {(str(term), names[v], part): (value, spread) for (term, v, part), value, spread
+                in zip(self.keys, self.p[self.b], u, strict=True)}
+
+
+def inverse_of(matrix):
+    """Return the pseudo-inverse of a matrix whose columns have unlike units."""
+    norm = np.linalg.norm(matrix, axis=0)
+    norm[norm == 0] = 1
+    return np.linalg.pinv(matrix / norm, rcond=NOTHING) / norm[:, None]
