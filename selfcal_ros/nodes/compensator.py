@@ -17,6 +17,8 @@ class CompensatorNode(ManagedNode[CompensatorSettings]):
     """Publishes stage/corrected_joint_states: each sample with the stage's error taken off."""
 
     session = WhileConfigured[CompensatingSession]()
+    _input = WhileConfigured[ByTheClock]()
+    _encoder = WhileConfigured[Any]()
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__(CompensatorSettings, **kwargs)
