@@ -179,5 +179,3 @@ def _visits_findings(solved: Solved) -> list[Finding]:
     visits = [view for view in problem.ground.visits if view is not None]
     once = len(visits) == len(problem.ground.visits) and not any(v.repeated for v in visits)
     return [VisitedOnce()] if once and not held and problem.repeats_xy[1] > 0 else []
-
-
