@@ -9,8 +9,7 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.blas_threads import one_thread
 from selfcal_ros.estimation.datum.covariance import FieldCovariance
 from selfcal_ros.estimation.datum.scale import scale_datum
-from selfcal_ros.estimation.joint.model_fit import fit_model
-from selfcal_ros.estimation.joint.solve import prepare
+from selfcal_ros.estimation.joint.solve import fit_joint
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Measurements, Sense
@@ -122,9 +121,8 @@ def map_covariance(measurements: Measurements, options: Options | None = None) -
                          "calibrate with the method joint")
     wanted = replace(options, uncertainty=True)
     with one_thread():
-        problem, _ = prepare(measurements, wanted)
-        model = fit_model(problem)
-        found = model.found
+        model = fit_joint(measurements, wanted)
+        problem, found = model.problem, model.found
         scale = (scale_datum(problem.system, options.reference, problem.half_width_m)
                  if options.reference else None)
         field = FieldCovariance(problem.system, found.inverse, scale, found.xy.sigma,

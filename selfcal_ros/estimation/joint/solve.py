@@ -3,6 +3,7 @@
 
 from collections.abc import Collection
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -56,23 +57,31 @@ def solve_joint(measurements: Measurements, options: Options) -> Solved:
     assumption can be weighed against it: what the views determine by themselves is enough.
     """
     with one_thread():
-        for assumed in (options.assumed,
-                        tuple(t for t in options.assumed if t.name in VISIT_TERMS)):
-            try:
-                found = _attempt(measurements, replace(options, assumed=assumed))
-            except NotSettledError:
+        model, seen, whole = _fitted(measurements, options)
+        return replace(_solved(measurements, options, model=model, seen=seen),
+                       converged=whole or model.found.xy.sigma < LEAST_NOISE_M)
+
+
+def fit_joint(measurements: Measurements, options: Options) -> ModelFit:
+    """Return the fit behind `solve_joint` alone."""
+    with one_thread():
+        return _fitted(measurements, options)[0]
+
+
+def _fitted(measurements: Measurements,
+            options: Options) -> tuple[ModelFit, Observability, bool]:
+    """Return the fit, what the readings determine, and if it has all that is assumed."""
+    of_visits = tuple(term for term in options.assumed if term.name in VISIT_TERMS)
+    for assumed in (options.assumed, of_visits, ()):
+        problem, seen = prepare(measurements, replace(options, assumed=assumed))
+        try:
+            model = fit_model(problem, partial(require_terms_told, seen=seen))
+        except NotSettledError:
+            if assumed:
                 continue
-            return replace(found, converged=(
-                assumed == options.assumed or found.xy.sigma < LEAST_NOISE_M))
-        found = _attempt(measurements, replace(options, assumed=()))
-        return replace(found, converged=(
-            not options.assumed or found.xy.sigma < LEAST_NOISE_M))
-
-
-def _attempt(measurements: Measurements, options: Options) -> Solved:
-    problem, seen = prepare(measurements, options)
-    model = fit_model(problem, lambda equations: require_terms_told(equations, seen))
-    return _solved(measurements, options, model=model, seen=seen)
+            raise
+        return model, seen, assumed == options.assumed
+    raise AssertionError("the last one has no assumption")
 
 
 def prepare(measurements: Measurements, options: Options) -> tuple[Problem, Observability]:

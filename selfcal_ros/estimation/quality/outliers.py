@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from scipy.special import chdtri, gammaincinv
 
-from selfcal_ros.errors import InputError, NotIdentifiableError, NotSettledError
+from selfcal_ros.errors import InputError, NotIdentifiableError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.blas_threads import one_thread
 from selfcal_ros.estimation.checks.wiring import check_wiring
@@ -31,8 +31,7 @@ from selfcal_ros.estimation.findings import (
     TakenForSlip,
     TooManyOutliers,
 )
-from selfcal_ros.estimation.joint.model_fit import fit_model
-from selfcal_ros.estimation.joint.solve import prepare
+from selfcal_ros.estimation.joint.solve import fit_joint
 from selfcal_ros.estimation.lattice.maps import PHASES
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.quality.leverage import ROUNDING, Residuals, residuals_of
@@ -40,7 +39,6 @@ from selfcal_ros.estimation.quality.noisy import noisy_views
 from selfcal_ros.estimation.quality.slip import Slip, find_slip, split_view
 from selfcal_ros.estimation.quality.slip_or_term import likelier_term
 from selfcal_ros.estimation.quality.thinning import Key, left_out, without
-from selfcal_ros.estimation.terms.identifiable import require_terms_told
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.result import CalibrationResult
@@ -339,13 +337,8 @@ def _flattened(measurements: Measurements, options: Options) -> Measurements:
     """Return the readings less what finite rotations and terms add to the linear model."""
     if options.misalignment_model == "linear" and not options.terms:
         return measurements
-    problem, seen = prepare(measurements, options)
-    try:
-        model = fit_model(problem, lambda equations: require_terms_told(equations, seen))
-    except NotSettledError:
-        if not options.assumed:
-            raise
-        return _flattened(measurements, replace(options, assumed=()))
+    model = fit_joint(measurements, options)
+    problem = model.problem
     views, (hx, hy) = list(measurements.views), measurements.artifact.half
     for row, index in enumerate(problem.grid.index):
         view = views[index]

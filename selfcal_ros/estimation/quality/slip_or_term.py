@@ -8,14 +8,12 @@ model does not hold, by what each takes off the residuals for its degrees of fre
 
 import numpy as np
 
-from selfcal_ros.estimation.joint.model_fit import fit_model
-from selfcal_ros.estimation.joint.solve import prepare
+from selfcal_ros.estimation.joint.solve import fit_joint
 from selfcal_ros.estimation.lattice.maps import PHASES
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.quality.slip import MAX_PLACES, Slip
 from selfcal_ros.estimation.terms.columns import Column, TermColumns, WithinMarks
 from selfcal_ros.estimation.terms.ground import Ground
-from selfcal_ros.estimation.terms.identifiable import require_terms_told
 from selfcal_ros.estimation.terms.shapes import shapes_of
 from selfcal_ros.estimation.verdict.cause_sizes import cause_of
 from selfcal_ros.estimation.verdict.causes import PlacedSlip, find_explanations
@@ -32,8 +30,8 @@ def likelier_term(measurements: Measurements, options: Options, slip: Slip) -> C
     NotIdentifiableError, InputError
         As `selfcal_ros.estimation.api.calibrate`.
     """
-    problem, seen = prepare(measurements, options)
-    model = fit_model(problem, lambda equations: require_terms_told(equations, seen))
+    model = fit_joint(measurements, options)
+    problem = model.problem
     row = problem.grid.index.index(slip.index)
     ground = problem.ground
     placed = PlacedSlip(slip_at_line(ground, row, slip, PHASES[-problem.grid.poses[row].q % 4]),
