@@ -167,11 +167,10 @@ def test_a_malformed_map_does_not_end_the_node(graph):
     graph.until(lambda: node.session.compensator is not None, "the good map")
 
 
-@pytest.mark.parametrize("method", ["selfcal", "rclpy + RegularGridInterpolator"])
-def test_the_bench_takes_corrected_samples_of_either_node(ros_environment, method):
-    done = subprocess.run([sys.executable, BENCH, "--worker", method, "100", "--seconds", "0.2"],
-                          capture_output=True, text=True, check=True)
+def test_the_bench_takes_corrected_samples(ros_environment):
+    done = subprocess.run([sys.executable, BENCH, "--worker", "selfcal", "100", "--seconds", "0.2"],
+                          capture_output=True, text=True, check=True, timeout=60)
     row = json.loads(done.stdout)
-    assert (row["benchmark"], row["method"], row["n"]) == ("compensate 100 Hz", method, 20)
+    assert (row["benchmark"], row["method"], row["n"]) == ("compensate 100 Hz", "selfcal", 20)
     assert row["corrected"] > 0
     assert row["max_error"] < 1e-12
