@@ -152,6 +152,8 @@ def test_a_good_run_says_no_error_and_a_stop_signal_takes_its_nodes_along(start,
     wait_until(lambda: not processes_of(up.process.pid), "all nodes to end")
     said = "\n".join(up.lines) + up.process.stderr.read()
     assert "PLACE line" in said  # the log is there
+    # on a busy machine the compensator rightly says that it skipped samples
+    said = re.sub(r"\d+ samples skipped since the last status: [^;\n]*", "", said)
     for word in ("ERROR", "FATAL", "Traceback", "Error:", "stalls", "lost"):
         assert word not in said
 
