@@ -1,0 +1,27 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The comparison of two trees: what counts as a difference, and what a session draws."""
+
+import pytest
+
+from tools.same import compare, leaves, session
+
+
+def test_numbers_and_names_are_recorded_and_sentences_left_out():
+    result = {"verdict": {"grade": "good", "sentence": "Good"}, "causes": [{"size": 1.5}],
+              "map": [[1.0, 2.0], [3.0, 4.0]]}
+    found = dict(leaves(result))
+    assert found.keys() == {"/verdict/grade", "/causes/0/size", "/map"}
+    assert found["/map"] != dict(leaves({"map": [[1.0, 2.0], [3.0, 4.000000000000001]]}))["/map"]
+
+
+@pytest.mark.parametrize(("after", "differing"), [
+    ({"case": {"/a": 1.0}}, 0), ({"case": {"/a": 1.0000000000000002}}, 1),
+    ({"case": {"/a": 1.0, "/new": 2}}, 0), ({"case": {"/a": None}}, 1)])
+def test_a_case_differs_where_one_value_of_both_trees_does(after, differing, capsys):
+    assert compare({"case": {"/a": 1.0}}, after) == differing
+    assert f"1 cases, {differing} differ" in capsys.readouterr().out
+
+
+def test_a_session_is_drawn_from_its_number_alone():
+    assert session(7) == session(7)
+    assert session(7) != session(8)

@@ -1,0 +1,182 @@
+#!/usr/bin/env python3
+# SPDX-License-Identifier: Apache-2.0
+"""Record what the package computes, or compare it with a record of another tree.
+
+    tools/same.py [--sessions N] [--only TEXT] RECORD.json.gz
+    tools/same.py --against RECORD.json.gz [--only TEXT]
+
+Solves every recorded bag by several models, and N (200) random simulated sessions: plans, sizes,
+effects, noises, faults and options drawn from the number of the session. Every number of each
+RESULT.json is recorded to the bit, and the names in it (grade, causes, views). Sentences are left
+out. A comparison ends with exit code 1 where a value differs; values of one tree alone are counted
+only. To record another commit: run this file with PYTHONPATH set to its work tree.
+"""
+
+import argparse
+import contextlib
+import gzip
+import hashlib
+import io
+import json
+import os
+import random
+import sys
+import tempfile
+from collections import Counter
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+
+for _libraries in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+    os.environ.setdefault(_libraries, "1")
+
+ROOT = Path(__file__).resolve().parents[1]
+SENTENCES = {"sentence", "text", "reasons", "warnings", "advice", "created", "file", "version",
+             "message", "rejected_text", "sha256"}
+"""Keys whose values are words for a reader, or differ from run to run."""
+
+OPTIONS = ([], ["--model", "none"], ["--robust"], ["--validate"], ["--misalignment", "linear"],
+           ["--theta-datum", "xy_axes"], ["--model", "drift"], ["--model", "plate_scale"],
+           ["--microscope", "0:0:0"], ["--uncertainty", "never"], ["--budget"])
+BAG_OPTIONS = (*OPTIONS, ["--method", "law"], ["--model", "microscope,drift"])
+PLANS = ("hu", "hu_two_shifts", "resistant", "six_views", "qiao", "hu_repeated")
+EFFECTS = {"microscope_scale": 1e-2, "microscope_rotation": 1e-2, "microscope_shear": 2e-3,
+           "backlash_x": 5e-8, "backlash_y": 5e-8, "plate_scale": 2e-6, "plate_shape": 5e-8,
+           "plate_strain": 1e-7, "plate_tilt": 1e-4, "line_eccentricity": 5e-6,
+           "drift_linear": 1e-7, "drift_walk": 1e-7, "optical_tilt_x": 1e-3, "settling": 5e-8,
+           "stage_bend": 3e-8, "pitch_error": 1e-5}
+FAULTS = {"lost": 0.05, "duplicated": 0.02, "outliers": 0.02, "low_score": 0.02,
+          "not_finite": 0.01, "unknown_mark": 0.01, "delay": 0.2}
+ORDERS = ("serpentine", "raster", "there_and_back", "x_back_y_back", "random")
+
+
+def session(number: int) -> tuple[dict[str, object], list[str]]:
+    """Return the SIM.yaml of a random session, and the options of its solution."""
+    draw = random.Random(number)
+    physics = {name: draw.choice((-1, 1)) * size * draw.random() if "microscope" in name
+               else size * draw.random()
+               for name, size in EFFECTS.items() if draw.random() < 0.15}
+    noise = {"sigma_xy": 2e-8 * 10 ** draw.uniform(-1, 1), "sigma_theta": 1.7e-5 * draw.random()}
+    if draw.random() < 0.2:
+        noise["noise_ratio"] = 10 ** draw.uniform(-0.5, 0.5)
+    if draw.random() < 0.1:
+        noise = {}
+    cell: dict[str, object] = {"with_ids": draw.random() < 0.7}
+    if draw.random() < 0.5:
+        cell["visit_order"] = draw.choice(ORDERS)
+    if draw.random() < 0.3:
+        cell["stop_sigma"] = 2e-5
+    if draw.random() < 0.2:
+        cell["sense"] = "plate_moves"
+    faults = {name: part * draw.random() for name, part in FAULTS.items() if draw.random() < 0.1}
+    simulation = {"plan": str(ROOT / f"config/plans/{draw.choice(PLANS)}.yaml"), "seed": number,
+                  "physics": physics, "noise": noise, "cell": cell, "faults": faults}
+    return simulation, draw.choice(OPTIONS) if draw.random() < 0.5 else []
+
+
+def leaves(node: object, path: str = "") -> Iterator[tuple[str, object]]:
+    """Yield path and value of each number, name and array of a JSON document."""
+    if isinstance(node, dict):
+        for key, value in node.items():
+            if key not in SENTENCES:
+                yield from leaves(value, f"{path}/{key}")
+    elif isinstance(node, list):
+        if any(isinstance(item, dict) for item in node):
+            for place, item in enumerate(node):
+                yield from leaves(item, f"{path}/{place}")
+        else:  # an array, row by row
+            yield path, hashlib.sha256(json.dumps(node).encode()).hexdigest()[:16]
+    else:
+        yield path, node
+
+
+def _run(*words: str) -> tuple[int, str]:
+    from selfcal_ros.cli.main import main
+
+    shown = io.StringIO()
+    with contextlib.redirect_stdout(shown), contextlib.redirect_stderr(shown):
+        code = main(list(words))
+    return code, shown.getvalue()
+
+
+def solved(bag: Path, options: list[str], scratch: Path) -> dict[str, object]:
+    """Return all values of the solution of one bag, its exit code among them."""
+    result = scratch / "result.json"
+    result.unlink(missing_ok=True)
+    code, shown = _run("solve", str(bag), "-o", str(result), "--quiet", *options)
+    values: dict[str, object] = {"/exit_code": code}
+    if code == 1:
+        values["/fault"] = shown[-300:]
+    if result.exists():
+        values |= dict(leaves(json.loads(result.read_text())))
+    return values
+
+
+def case(name: str) -> tuple[str, dict[str, object]]:
+    """Return one case's name and values."""
+    kind, _, rest = name.partition(" ")
+    with tempfile.TemporaryDirectory() as folder:
+        scratch = Path(folder)
+        if kind == "bag":
+            bag, *options = rest.split()
+            return name, solved(ROOT / "bags" / bag, options, scratch)
+        simulation, options = session(int(rest))
+        (scratch / "sim.yaml").write_text(json.dumps(simulation))  # JSON is YAML
+        code, shown = _run("simulate", str(scratch / "sim.yaml"), "-o", str(scratch / "bag"))
+        if code:
+            return name, {"/simulate": code, "/fault": shown[-300:]}
+        return name, solved(scratch / "bag", options, scratch)
+
+
+def record(names: list[str]) -> dict[str, dict[str, object]]:
+    """Return the values of all cases, computed by two processes."""
+    with ProcessPoolExecutor(2) as pool:
+        done = {}
+        for name, values in pool.map(case, names, chunksize=1):
+            done[name] = values
+            print(f"\r{len(done)}/{len(names)} ", end="", file=sys.stderr, flush=True)
+    print(file=sys.stderr)
+    return done
+
+
+def compare(before: dict[str, dict[str, object]], after: dict[str, dict[str, object]]) -> int:
+    """Print which values differ, and return how many cases have any."""
+    different = 0
+    alone: Counter[str] = Counter()
+    for name in before.keys() & after.keys():
+        old, new = before[name], after[name]
+        wrong = [path for path in old.keys() & new.keys() if old[path] != new[path]]
+        for path in old.keys() ^ new.keys():
+            alone["/".join(part for part in path.split("/") if not part.isdigit())] += 1
+        if wrong:
+            different += 1
+            print(f"{name}: {len(wrong)} values differ, first {sorted(wrong)[0]}: "
+                  f"{old[sorted(wrong)[0]]} -> {new[sorted(wrong)[0]]}")
+    for path, count in sorted(alone.items()):
+        print(f"in one tree alone: {path} ({count} times)")
+    print(f"{len(before.keys() & after.keys())} cases, {different} differ")
+    return different
+
+
+def main() -> int:
+    """Record or compare."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("record", type=Path, metavar="RECORD.json.gz")
+    parser.add_argument("--against", action="store_true", help="compare with RECORD.json.gz")
+    parser.add_argument("--sessions", type=int, default=200, metavar="N")
+    parser.add_argument("--only", default="", metavar="TEXT", help="cases with TEXT in their name")
+    args = parser.parse_args()
+    if args.against:
+        before = json.loads(gzip.decompress(args.record.read_bytes()))
+        names = [name for name in before if args.only in name]
+        return 1 if compare(before, record(names)) else 0
+    bags = sorted(bag.name for bag in (ROOT / "bags").iterdir() if bag.is_dir())
+    names = [" ".join(("bag", bag, *options)) for bag in bags for options in BAG_OPTIONS]
+    names += [f"session {number}" for number in range(args.sessions)]
+    done = record([name for name in names if args.only in name])
+    args.record.write_bytes(gzip.compress(json.dumps(done).encode()))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
