@@ -10,14 +10,12 @@ from selfcal_ros.errors import InputError, NotIdentifiableError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.joint.covariance import map_covariance
 from selfcal_ros.estimation.options import ReferenceLength
-from selfcal_ros.estimation.quality import prediction_limit
-from selfcal_ros.estimation.quality.leverage import residuals_of
-from selfcal_ros.estimation.quality.noisy import noisy_views
+from selfcal_ros.estimation.quality import prediction
 from selfcal_ros.estimation.quality.outliers import clean, robust_calibrate
-from selfcal_ros.estimation.quality.thinning import subset
+from selfcal_ros.estimation.quality.residuals import noisy_views, residuals_of
 from selfcal_ros.estimation.quality.validation import validate
 from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.model.readings import Sense, ViewReadings
+from selfcal_ros.model.readings import Sense, ViewReadings, subset
 from selfcal_ros.simulation.truth import Spread, hu_plan, random_truth, simulate_measurements
 from test.support.lattice_plans import plan_of
 from test.support.options import BARE, bare
@@ -101,7 +99,7 @@ def test_robust_knows_finite_rotations_of_a_rough_plate():
 @pytest.fixture
 def few_draws(monkeypatch):
     """Draw the limits of predictions roughly: what is compared here is the prediction."""
-    monkeypatch.setattr(prediction_limit, "DRAWS", 16)
+    monkeypatch.setattr(prediction, "DRAWS", 16)
 
 
 @pytest.mark.parametrize("sense", Sense)

@@ -34,13 +34,10 @@ from selfcal_ros.estimation.findings import (
 from selfcal_ros.estimation.joint.solve import fit_joint
 from selfcal_ros.estimation.lattice.maps import PHASES
 from selfcal_ros.estimation.options import Options
-from selfcal_ros.estimation.quality.leverage import ROUNDING, Residuals, residuals_of
-from selfcal_ros.estimation.quality.noisy import noisy_views
-from selfcal_ros.estimation.quality.slip import Slip, find_slip, split_view
-from selfcal_ros.estimation.quality.slip_or_term import likelier_term
-from selfcal_ros.estimation.quality.thinning import Key, left_out, without
+from selfcal_ros.estimation.quality.residuals import ROUNDING, Residuals, noisy_views, residuals_of
+from selfcal_ros.estimation.quality.slip import Slip, find_slip, likelier_term, split_view
 from selfcal_ros.model.error_map import ThetaDatum
-from selfcal_ros.model.readings import Measurements
+from selfcal_ros.model.readings import Key, Measurements, left_out, without
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.terms import ModelTerm, TermName
 from selfcal_ros.model.verdict import Finding, Grade

@@ -40,17 +40,16 @@ from selfcal_ros.estimation.observability.plan_check import (
 from selfcal_ros.estimation.observability.rank import identifies
 from selfcal_ros.estimation.observability.suggest import FULL_SIZE, SEARCH_SIZE
 from selfcal_ros.estimation.options import Options
-from selfcal_ros.estimation.quality.held_terms import (
+from selfcal_ros.estimation.quality.prediction import (
     OF_A_VIEW,
     HeldReadings,
     held_readings,
     of_terms,
+    prediction_limit,
 )
-from selfcal_ros.estimation.quality.leverage import ROUNDING
-from selfcal_ros.estimation.quality.prediction_limit import prediction_limit
-from selfcal_ros.estimation.quality.thinning import subset
+from selfcal_ros.estimation.quality.residuals import ROUNDING
 from selfcal_ros.model.error_map import ThetaDatum
-from selfcal_ros.model.readings import Measurements, Sense, ViewReadings
+from selfcal_ros.model.readings import Measurements, Sense, ViewReadings, subset
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.statistics import rms
 from selfcal_ros.model.verdict import Finding, Grade

@@ -12,10 +12,9 @@ from selfcal_ros.estimation.joint.fit import fit
 from selfcal_ros.estimation.joint.solve import prepare
 from selfcal_ros.estimation.normal.planned import planned_system
 from selfcal_ros.estimation.options import Options
-from selfcal_ros.estimation.quality.thinning import subset
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ThetaDatum
-from selfcal_ros.model.readings import Sense
+from selfcal_ros.model.readings import Sense, subset
 from selfcal_ros.simulation.truth import Spread, random_truth, simulate_measurements
 from test.support.lattice_plans import plan_of
 

@@ -11,9 +11,9 @@ from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.normal.planned import planned_system
 from selfcal_ros.estimation.observability.prediction import predict, theta_variance
 from selfcal_ros.estimation.options import Options
-from selfcal_ros.estimation.quality.thinning import subset
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ThetaDatum
+from selfcal_ros.model.readings import subset
 from selfcal_ros.simulation.truth import hu_plan, random_truth, simulate_measurements
 from test.support.lattice_plans import plan_of
 

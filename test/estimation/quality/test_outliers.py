@@ -10,18 +10,17 @@ from scipy.stats import f as f_distribution
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.estimation.quality import leverage
-from selfcal_ros.estimation.quality.leverage import (
+from selfcal_ros.estimation.quality import residuals
+from selfcal_ros.estimation.quality.outliers import clean, robust_calibrate
+from selfcal_ros.estimation.quality.residuals import (
     angular_redundancy,
+    by_repeats,
     drawn_redundancy,
     exact_redundancy,
     residuals_of,
 )
-from selfcal_ros.estimation.quality.noisy import by_repeats
-from selfcal_ros.estimation.quality.outliers import clean, robust_calibrate
-from selfcal_ros.estimation.quality.thinning import REASON, subset, without
 from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.model.readings import GridVisits, Sense, ViewReadings
+from selfcal_ros.model.readings import OUTLIER, GridVisits, Sense, ViewReadings, subset, without
 from selfcal_ros.model.result import plain, result_from_dict, result_to_dict
 from selfcal_ros.model.terms import ModelTerm, TermName
 from selfcal_ros.model.verdict import Grade
@@ -93,7 +92,7 @@ def test_redundancies_add_up_to_the_degrees_of_freedom():
 def test_drawn_and_exact_redundancies_agree(monkeypatch):
     _, readings = measured(missing=0.1, repeats=3)
     system = residuals_of(readings, ZERO_MEAN).problem.system
-    monkeypatch.setattr(leverage, "N_DRAWS", 400)
+    monkeypatch.setattr(residuals, "N_DRAWS", 400)
     assert np.abs(drawn_redundancy(system) - exact_redundancy(system)).max() < 0.06
 
 
@@ -279,7 +278,7 @@ def test_planted_outliers_are_removed_and_nothing_else(sense):
                                ("rot90", "grid", "3, -3"), ("identity", "angular", "5")}
     assert error_rms(result, truth) < 1.2 * error_rms(calibrate(readings, ZERO_MEAN), truth)
     assert error_rms(calibrate(bad, ZERO_MEAN), truth) > 1.5 * error_rms(result, truth)
-    assert result.rejected[REASON] == 4
+    assert result.rejected[OUTLIER] == 4
     assert result.views[1].used == bad.views[1].used - 3 and result.views[1].rejected == 3
     row = next(r for r in result.extra["outliers"]["removed"] if r["mark"] == "-4, 2")
     assert row["standardised"] > 10 and 0 < row["leverage"] < 1
@@ -435,7 +434,7 @@ def test_a_view_whose_slip_cannot_be_placed_is_left_out_if_it_can_be_spared(monk
     view = result.views[3]
     lost = len(readings.views[3].m) + len(readings.views[3].k)
     assert view.name == "shift_x" and view.used == 0 and view.rejected == lost
-    assert np.isnan(view.tx) and result.rejected[REASON] == lost
+    assert np.isnan(view.tx) and result.rejected[OUTLIER] == lost
     assert error_rms(result, truth) < 1.5 * error_rms(calibrate(readings, ZERO_MEAN), truth)
 
 

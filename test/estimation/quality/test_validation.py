@@ -10,7 +10,7 @@ from scipy.stats import binom
 
 from selfcal_ros.errors import InputError, NotIdentifiableError, NotSettledError
 from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.estimation.quality import prediction_limit, validation
+from selfcal_ros.estimation.quality import prediction, validation
 from selfcal_ros.estimation.quality.validation import (
     judged_by,
     validate,
@@ -43,7 +43,7 @@ def measured(*, more=True, sense=Sense.MICROSCOPE_MOVES, sigma=SIGMA_M, repeats=
 @pytest.fixture
 def few_draws(monkeypatch):
     """Draw the limits roughly, in tests that do not ask for them."""
-    monkeypatch.setattr(prediction_limit, "DRAWS", 16)
+    monkeypatch.setattr(prediction, "DRAWS", 16)
 
 
 @pytest.mark.parametrize("sense", list(Sense))
@@ -127,7 +127,7 @@ LINEAR = bare(datum_theta="zero_mean", misalignment_model="linear")
 
 def test_the_limit_is_that_of_good_readings(monkeypatch):
     """At a level of 5 % as many good sets exceed it as should; at 0.1 % hardly any."""
-    monkeypatch.setattr("selfcal_ros.estimation.quality.prediction_limit.LEVEL", 0.05)
+    monkeypatch.setattr("selfcal_ros.estimation.quality.prediction.LEVEL", 0.05)
     plan = replace(SMALL, views=tuple(replace(v, repeats=repeats) for v, repeats in zip(
         SMALL.views, (1, 3, 1, 3, 2), strict=True)))
     found = [item for seed in range(8) for item in validate(

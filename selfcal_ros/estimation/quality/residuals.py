@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Residuals of a measurement with their leverage: how far each reading checks itself.
+"""Residuals with their leverage, the part of a reading that the fit follows; noisy views.
 
 The leverage h of a reading is the part of it that the fit follows; its residual has the standard
 deviation sigma sqrt((1 - h) / weight). For a grid reading of weight w in a mark of total weight W,
@@ -7,7 +7,8 @@ h = w (1/W + var(x - mean x)), with x the part of the model other than the plate
 coordinates share a 2 x 2 matrix h + (a, b; b, -a): `skew` is a + ib, which rotations make.
 
 Grid and angular readings are fitted apart here, so that each kind is judged by itself and the sums
-of squares have exactly known distributions.
+of squares have exactly known distributions. Views noisier than the others are found by their own
+repeats and by their residuals.
 """
 
 from dataclasses import dataclass, replace
@@ -18,6 +19,7 @@ from scipy.special import fdtrc
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.joint.fit import JointFit, fit
+from selfcal_ros.estimation.joint.noise import pooled
 from selfcal_ros.estimation.joint.problem import Problem
 from selfcal_ros.estimation.joint.solve import prepare
 from selfcal_ros.estimation.lattice.maps import PHASES
@@ -25,6 +27,7 @@ from selfcal_ros.estimation.normal.alone import angular_residuals, grid_residual
 from selfcal_ros.estimation.normal.equations import NormalEquations
 from selfcal_ros.estimation.normal.memo import Memo
 from selfcal_ros.estimation.options import Options
+from selfcal_ros.estimation.verdict.causes import LEVEL
 from selfcal_ros.model.readings import Measurements
 
 EXACT_SITES = 31 * 31
@@ -242,3 +245,53 @@ def angular_redundancy(system: NormalEquations) -> np.ndarray:
                       zip(angular.response.T, np.eye(angular.n_views), strict=True)])
     spread = np.einsum("pvk,pq,qvk->vk", basis, system.angular_inverse, basis)
     return _redundancy(angular.weight, variance + spread)
+
+
+NOISY_REPEATS = 1.5
+"""Ratio of the noise of a view's repeats to that of the others from which it is named."""
+
+NOISY_RESIDUALS = 3.0
+"""The same for the noise that residuals show, which is known far less well."""
+
+MIN_VIEW_DOF = 5.0
+"""Degrees of freedom of a view's own noise below which it is not judged: chance does as much."""
+
+MAX_RATIO = 20.0
+"""Largest ratio of noises that residuals can tell: a noisy view hides the noise of the others."""
+
+
+def noisy_views(residuals: Residuals, measurements: Measurements
+                ) -> tuple[tuple[str, float], ...]:
+    """Return the views whose noise stands out, with its ratio to that of the others."""
+    found = by_repeats(measurements)
+    for name, ratio in _by_residuals(residuals, measurements).items():
+        found[name] = max(ratio, found.get(name, 0.0))
+    return tuple((view.view.name, found[view.view.name]) for view in measurements.views
+                 if view.view.name in found)
+
+
+def by_repeats(measurements: Measurements) -> dict[str, float]:
+    """Return the views whose repeats scatter more than those of the others (F-test)."""
+    views = [(v.view.name, v.sigma_xy, v.dof_xy) for v in measurements.views
+             if len(v.m) and v.dof_xy > 0 and np.isfinite(v.sigma_xy)]
+    out = {}
+    for index, (name, sigma, dof) in enumerate(views):
+        others, rest = pooled((s, d) for i, (_, s, d) in enumerate(views) if i != index)
+        if not rest or not others > ROUNDING:
+            continue
+        p = float(fdtrc(dof, rest, (sigma / others) ** 2)) * len(views)
+        if p < LEVEL and sigma > NOISY_REPEATS * others:
+            out[name] = float(sigma / others)
+    return out
+
+
+def _by_residuals(residuals: Residuals, measurements: Measurements) -> dict[str, float]:
+    if residuals.problem.system.grid.n_views < 2:
+        return {}
+    out = {}
+    for index, (own, others, dof) in zip(residuals.problem.grid.index, view_noise(residuals),
+                                         strict=True):
+        ratio = float(own / max(others, own / MAX_RATIO, ROUNDING))
+        if ratio > NOISY_RESIDUALS and dof >= MIN_VIEW_DOF:
+            out[measurements.views[index].view.name] = ratio
+    return out

@@ -8,9 +8,8 @@ import pytest
 
 from selfcal_ros.estimation.joint.model_fit import ModelFit
 from selfcal_ros.estimation.lattice.readings import GridData, grid_data
-from selfcal_ros.estimation.quality import prediction_limit, validation
-from selfcal_ros.estimation.quality.held_terms import HeldReadings
-from selfcal_ros.estimation.quality.prediction_limit import PredictionLimit, noise_of
+from selfcal_ros.estimation.quality import prediction, validation
+from selfcal_ros.estimation.quality.prediction import HeldReadings, PredictionLimit, noise_of
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.terms import ModelTerm, TermName
@@ -63,7 +62,7 @@ def test_each_draw_is_predicted_as_such_readings_are(monkeypatch, of_view):
     Terms are free and each mark is visited once, so that no other draw has a part in it. A drift
     is of each view, a turned microscope common to all; only with that can a view be held out.
     """
-    monkeypatch.setattr(prediction_limit, "DRAWS", 4)
+    monkeypatch.setattr(prediction, "DRAWS", 4)
     plan = plan_of("0,90,180,tx,ty", Artifact(5, 0.01))
     rng = np.random.default_rng(8)
     readings = with_visits(simulate_measurements(random_truth(
@@ -75,7 +74,7 @@ def test_each_draw_is_predicted_as_such_readings_are(monkeypatch, of_view):
 
     def judged(model: ModelFit, held: HeldReadings, known: np.ndarray,
                weight: np.ndarray) -> PredictionLimit:
-        limit = prediction_limit.prediction_limit(model, held, known, weight)
+        limit = prediction.prediction_limit(model, held, known, weight)
         seen.append((model, held, known, weight, limit))
         return limit
     monkeypatch.setattr(validation, "prediction_limit", judged)
