@@ -141,7 +141,7 @@ def _judge(plan: Plan, model: tuple[ModelTerm, ...], assumed: Assumed,
     `without`: observability and prediction without terms.
     """
     from selfcal_ros.estimation.observability.resistance import PlannedTerms, check_terms
-    from selfcal_ros.estimation.verdict.causes import LEVEL
+    from selfcal_ros.estimation.verdict.explanations import LEVEL
 
     terms = PlannedTerms(plan, model, assumed)
     seen = terms.told(without[0])

@@ -27,7 +27,7 @@ from selfcal_ros.estimation.normal.alone import angular_residuals, grid_residual
 from selfcal_ros.estimation.normal.equations import NormalEquations
 from selfcal_ros.estimation.normal.memo import Memo
 from selfcal_ros.estimation.options import Options
-from selfcal_ros.estimation.verdict.causes import LEVEL
+from selfcal_ros.estimation.verdict.explanations import LEVEL
 from selfcal_ros.model.readings import Measurements
 
 EXACT_SITES = 31 * 31

@@ -23,7 +23,7 @@ from selfcal_ros.estimation.findings import (
 )
 from selfcal_ros.estimation.joint.model_fit import ModelFit
 from selfcal_ros.estimation.terms.sizes import SizeTest
-from selfcal_ros.estimation.verdict.causes import Explanation
+from selfcal_ros.estimation.verdict.explanations import Explanation
 from selfcal_ros.estimation.verdict.fault_columns import READING, SLIP
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.terms import TermName

@@ -3,14 +3,18 @@
 
 Tests: residuals against the scatter of repeats, or the declared noise, in either direction (F);
 the axis conditions where they are the datum; and all that `selfcal_ros.estimation.verdict.look`
-looks for. What is found and bounded enlarges U; what is not disqualifies.
+looks for. What is found and bounded enlarges U; what is not disqualifies. The result also says when
+the readings were taken.
 """
 
 from collections.abc import Sequence
 from dataclasses import replace
+from datetime import UTC, datetime
+from typing import Any
 
 import numpy as np
 
+from selfcal_ros import __version__
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.blas_threads import one_thread
 from selfcal_ros.estimation.checks.wiring import sign_is_shown
@@ -30,11 +34,11 @@ from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.terms.solution import free_inverse
 from selfcal_ros.estimation.verdict.enlarge import enlarged, enlargements, with_coverage
 from selfcal_ros.estimation.verdict.look import ALWAYS_SITES, Looked, look_into
-from selfcal_ros.estimation.verdict.provenance import provenance_of
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.terms import TermName
-from selfcal_ros.model.verdict import Finding, Grade, Verdict
+from selfcal_ros.model.verdict import Finding, Grade, Provenance, Verdict
+from selfcal_ros.units import NS_PER_S
 
 MUCH_MORE = 1.1
 """Ratio of what a linear model leaves to what finite rotations leave from which it is named."""
@@ -179,3 +183,33 @@ def _visits_findings(solved: Solved) -> list[Finding]:
     visits = [view for view in problem.ground.visits if view is not None]
     once = len(visits) == len(problem.ground.visits) and not any(v.repeated for v in visits)
     return [VisitedOnce()] if once and not held and problem.repeats_xy[1] > 0 else []
+
+
+def provenance_of(measurements: Measurements, options: Options) -> Provenance:
+    """Return what the readings tell of their origin: first and last exposure, visiting order.
+
+    Where terms were estimated, who asked for them: ``options`` or ``plan``.
+
+    The time of creation is left open: the same readings give the same result.
+    """
+    stamps = [stamp for view in measurements.views
+              if view.visits is not None and len(view.visits.stamp_ns)
+              for stamp in (int(view.visits.stamp_ns.min()), int(view.visits.stamp_ns.max()))]
+    extra: dict[str, Any] = {"visit_order": {
+        view.view.name: view.view.visit_order for view in measurements.views
+        if view.view.visit_order}}
+    if options.terms_from:
+        extra["model_terms_from"] = options.terms_from
+    duration = float("nan")
+    if stamps:
+        extra |= {"first_exposure": _iso(min(stamps)), "last_exposure": _iso(max(stamps))}
+        duration = (max(stamps) - min(stamps)) / NS_PER_S
+    return Provenance("", duration, __version__, extra)
+
+
+def _iso(stamp_ns: int) -> str:
+    """Return a stamp as ISO 8601 in UTC; unchanged where it is not a date."""
+    try:
+        return datetime.fromtimestamp(stamp_ns / NS_PER_S, UTC).isoformat(timespec="milliseconds")
+    except (OverflowError, ValueError, OSError):
+        return f"{stamp_ns} ns"

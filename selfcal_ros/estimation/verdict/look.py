@@ -25,17 +25,23 @@ from selfcal_ros.estimation.verdict.cause_sizes import (
     scatter_of_views,
     size_cause,
 )
-from selfcal_ros.estimation.verdict.causes import FLOOR_M, LEVEL, Explanation, find_explanations
 from selfcal_ros.estimation.verdict.enlarge import Effect, difference, effect_of_field
+from selfcal_ros.estimation.verdict.explanations import (
+    FLOOR_M,
+    LEVEL,
+    Explanation,
+    find_explanations,
+)
 from selfcal_ros.estimation.verdict.fault_columns import READING
-from selfcal_ros.estimation.verdict.line_readings import effect_of_line, line_cause
-from selfcal_ros.estimation.verdict.off_sites import off_sites_cause
-from selfcal_ros.estimation.verdict.rotations import (
+from selfcal_ros.estimation.verdict.lines import (
     bends,
+    effect_of_line,
+    line_cause,
     rotation_cause,
     solved_apart,
     turns_apart,
 )
+from selfcal_ros.estimation.verdict.off_sites import off_sites_cause
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.statistics import rms
 from selfcal_ros.model.terms import ModelTerm, TermName

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from selfcal_ros.estimation.terms.solution import Score, Sums
-from selfcal_ros.estimation.verdict.causes import Group, Pool, select_explanations
+from selfcal_ros.estimation.verdict.explanations import Group, Pool, select_explanations
 
 LENGTHS = np.array([2.0, 0.5, 4.0])
 """Of three columns that all marks' means tell alone, in weighted readings."""

@@ -9,7 +9,7 @@ import pytest
 from selfcal_ros.estimation.findings import ReadingCause, RotationCause
 from selfcal_ros.estimation.terms.columns import Column
 from selfcal_ros.estimation.verdict.cause_sizes import cause_of, noise_cause
-from selfcal_ros.estimation.verdict.causes import Explanation
+from selfcal_ros.estimation.verdict.explanations import Explanation
 from selfcal_ros.model.verdict import Cause, Remedy
 from selfcal_ros.reporting.words.causes import advice, cause_text, remedies, what_it_is
 

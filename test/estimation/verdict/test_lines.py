@@ -11,8 +11,8 @@ from selfcal_ros.errors import InputError, NotIdentifiableError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.joint.model_fit import fit_model
 from selfcal_ros.estimation.joint.solve import prepare
-from selfcal_ros.estimation.verdict import rotations
-from selfcal_ros.estimation.verdict.rotations import rotation_cause, solved_apart
+from selfcal_ros.estimation.verdict import lines
+from selfcal_ros.estimation.verdict.lines import rotation_cause, solved_apart
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.terms import parse_terms
 from selfcal_ros.model.verdict import Grade
@@ -123,7 +123,7 @@ def test_a_line_that_is_off_is_named_beside_it():
 def test_where_they_cannot_be_solved_apart_nothing_else_is_named(monkeypatch, error):
     def fails(*_):
         raise error
-    monkeypatch.setattr(rotations, "solve_joint", fails)
+    monkeypatch.setattr(lines, "solve_joint", fails)
     readings = turned(measured(1, COARSE_RAD), 1, 1e-4)
     assert solved_apart(readings, BARE) is None
     verdict = calibrate(readings, BARE).verdict

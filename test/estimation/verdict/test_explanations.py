@@ -10,7 +10,7 @@ from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.findings import VisitedOnce
 from selfcal_ros.estimation.joint.model_fit import fit_model
 from selfcal_ros.estimation.joint.solve import prepare
-from selfcal_ros.estimation.verdict.causes import find_explanations
+from selfcal_ros.estimation.verdict.explanations import find_explanations
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.terms import parse_terms
 from selfcal_ros.model.verdict import Grade

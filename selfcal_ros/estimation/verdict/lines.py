@@ -1,23 +1,29 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Do marks and lines see the same rotations of the plate: each kind alone against both together.
+"""What angular lines show: rotations that are not those of the marks, a reading that is off.
 
 A view's rotation is one number for both (method eq. 2.2, 2.3). If the plate moved between them, or
-offsets of lines have the other sign, both fit well alone, and not together.
+offsets of lines have the other sign, both fit well alone, and not together. A single reading that
+the others contradict is sought among the lines alone.
 """
 
+from collections.abc import Iterator
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import fdtrc
 
 from selfcal_ros.errors import InputError, NotIdentifiableError
-from selfcal_ros.estimation.findings import RotationCause
+from selfcal_ros.estimation.findings import ReadingCause, RotationCause
 from selfcal_ros.estimation.joint.model_fit import ModelFit
-from selfcal_ros.estimation.joint.problem import FLOOR
+from selfcal_ros.estimation.joint.problem import FLOOR, Problem
 from selfcal_ros.estimation.joint.solve import solve_joint
 from selfcal_ros.estimation.joint.solved import Solved
 from selfcal_ros.estimation.normal.alone import angular_residuals, grid_residuals
 from selfcal_ros.estimation.options import Options
+from selfcal_ros.estimation.verdict.enlarge import Effect
+from selfcal_ros.estimation.verdict.fault_columns import MOST, READING
+from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Measurements, ViewReadings
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.statistics import MANY_DOF, rms
@@ -135,3 +141,72 @@ def turns_apart(result: CalibrationResult, measurements: Measurements) -> float:
     phi = [view.phi for view, readings in zip(result.views, measurements.views, strict=True)
            if len(readings.m) and len(readings.k)]
     return float(np.ptp(phi))
+
+
+CHECKED = 1e-6
+"""Smallest part of a reading that its residual must hold: what others check of it."""
+
+
+class OffLine(NamedTuple):
+    """A line's reading: row of its view, line, by what it is off with u, rad, and probability."""
+
+    view: int
+    k: int
+    off_rad: float
+    u_rad: float
+    p: float
+
+
+def line_cause(problem: Problem, measurements: Measurements, level: float) -> Cause | None:
+    """Return the reading of a line that contradicts the others most, None if none does.
+
+    Lines are fitted alone. By how much a reading is off is its residual over the part 1 - h of it
+    that the fit does not follow; what it takes off the sum of squares is tested against what is
+    left (F-test; the level holds for all lines together).
+
+    Parameters
+    ----------
+    problem : Problem
+        Plan and readings.
+    measurements : Measurements
+        The same, for the names of the views.
+    level : float
+        Level of the test.
+    """
+    worst = min(_suspects(problem), key=lambda line: line.p, default=None)
+    if worst is None or not worst.p < level:
+        return None
+    view = measurements.views[problem.angular.index[worst.view]].view.name
+    return Cause(READING, "", worst.off_rad, worst.u_rad, "rad", worst.p,
+                 ReadingCause(view, (worst.k,)))
+
+
+def _suspects(problem: Problem) -> Iterator[OffLine]:
+    """Yield the lines with the largest residuals, each tested."""
+    system, angular = problem.system, problem.system.angular
+    dof = angular.n_readings - system.rank_angular
+    if dof < 2:
+        return
+    residuals = angular_residuals(system, problem.angular.y)
+    squares = angular.weight * residuals**2
+    for at in np.argsort(squares, axis=None, kind="stable")[::-1][:MOST]:
+        v, k = (int(i) for i in np.unravel_index(at, squares.shape))
+        unit = np.zeros(squares.shape)
+        unit[v, k] = 1.0
+        left, weight = float(angular_residuals(system, unit)[v, k]), float(angular.weight[v, k])
+        if weight <= 0 or left < CHECKED:
+            continue
+        off = float(residuals[v, k]) / left
+        gained = weight * left * off**2
+        variance = max(float(squares.sum()) - gained, 0.0) / (dof - 1)
+        if variance <= FLOOR**2:
+            continue
+        p = float(fdtrc(1, dof - 1, gained / variance)) * angular.n_readings
+        yield OffLine(v, k, off, float(np.sqrt(variance / (weight * left))), min(p, 1.0))
+
+
+def effect_of_line(cause: Cause, artifact: Artifact) -> Effect:
+    """Return the effect of a reading of a line that is off: at most what it is off by."""
+    theta = np.zeros(artifact.angular_count)
+    theta[:] = abs(cause.size) / np.sqrt(max(len(theta), 1))
+    return Effect(cause.name, np.zeros((2, *artifact.shape)), theta)
