@@ -10,8 +10,9 @@ from test.support.sources import PACKAGE, SOURCES, source
 
 BASE = {"errors", "files", "memory", "outputs", "units"}
 DOMAIN = {"model"} | BASE
-ESTIMATION = {"estimation", "compensation", "laser"}
+ESTIMATION = {"estimation", "compensation"}
 MIDDLE = {"messages", "bagio", "reporting", "collection", "simulation", "parallel"}
+GUESTS = {"aerotech", "laser", "papers"}
 MAY_IMPORT = {
     "errors": set(),
     "memory": set(),
@@ -22,11 +23,13 @@ MAY_IMPORT = {
     **{name: DOMAIN | ESTIMATION for name in ESTIMATION},
     **{name: DOMAIN | ESTIMATION | MIDDLE for name in MIDDLE},
     "parallel": {"errors"},
+    "reporting": DOMAIN | ESTIMATION | MIDDLE | GUESTS,
+    **{name: DOMAIN | ESTIMATION | MIDDLE | GUESTS for name in GUESTS},
     "batch": DOMAIN | ESTIMATION | MIDDLE,
     "sessions": DOMAIN | ESTIMATION | MIDDLE,
     "start": set(),
     "nodes": DOMAIN | ESTIMATION | MIDDLE | {"sessions", "start"},
-    "cli": DOMAIN | ESTIMATION | MIDDLE | {"batch", "start"},
+    "cli": DOMAIN | ESTIMATION | MIDDLE | GUESTS | {"batch", "start"},
 }
 ONLY_IN = {
     "rclpy": "nodes", "mcap": "bagio", "rosbags": "bagio", "matplotlib": "reporting",

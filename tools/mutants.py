@@ -51,8 +51,9 @@ TEST_CPU_S = 120
 TIMEOUT_S = 3600
 """Time of a group of tests beyond which it waits for what does not come."""
 
-WIDER = {"estimation": ["test/estimation"], "laser": ["test/laser", "test/simulation"],
-         "compensation": ["test/compensation"], "model": ["test/model", "test/estimation"],
+WIDER = {"estimation": ["test/estimation"], "laser": ["test/laser"],
+         "aerotech": ["test/aerotech"], "compensation": ["test/compensation"],
+         "model": ["test/model", "test/estimation"],
          "simulation": ["test/simulation"], "collection": ["test/collection"],
          "messages": ["test/messages", "test/bagio"], "bagio": ["test/bagio"],
          "sessions": ["test/sessions"], "nodes": ["test/nodes"]}

@@ -67,7 +67,7 @@ def _make(folder: Path) -> None:
 
 
 def _hu(args: argparse.Namespace, workers: int, progress: "Progress") -> tuple:
-    from selfcal_ros.simulation.reproduce.hu import hu_text, reproduce_hu
+    from selfcal_ros.papers.hu import hu_text, reproduce_hu
 
     found = reproduce_hu(args.draws, args.seed, workers=workers, progress=progress)
 
@@ -85,7 +85,7 @@ def _hu(args: argparse.Namespace, workers: int, progress: "Progress") -> tuple:
 
 
 def _qiao(args: argparse.Namespace, workers: int, progress: "Progress") -> tuple:
-    from selfcal_ros.simulation.reproduce.qiao import SIZES, qiao_text, reproduce_qiao
+    from selfcal_ros.papers.qiao import SIZES, qiao_text, reproduce_qiao
 
     found = reproduce_qiao(args.draws, args.seed, workers=workers, progress=progress)
 

@@ -78,10 +78,9 @@ def run(args: argparse.Namespace) -> int:
     """Identify, write the result, and say what was found."""
     from selfcal_ros.files import write_json
     from selfcal_ros.laser.data import Form, Method
-    from selfcal_ros.laser.identify import Choice, identify
+    from selfcal_ros.laser.identify import EQUAL_READINGS, Choice, identify, readings_are_equal
     from selfcal_ros.laser.profiles import ReferenceLine
     from selfcal_ros.laser.result_json import outcome, summary
-    from selfcal_ros.laser.wang import EQUAL_READINGS, readings_are_equal
 
     _check_outputs(args)
     if args.sensitivity:
@@ -117,7 +116,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _check_outputs(args: argparse.Namespace) -> None:
     """Refuse outputs that would not be written, or not all of them."""
-    from selfcal_ros.compensation.aerotech.write import refuse_existing
+    from selfcal_ros.aerotech.write import refuse_existing
     from selfcal_ros.files import check_outputs
 
     if args.sensitivity and args.simulate:
@@ -150,9 +149,9 @@ def _refuse_machine(args: argparse.Namespace) -> None:
 def _write_cal(args: argparse.Namespace, found: "StepDiagonalResult") -> None:
     """Write the corrections as 1D tables."""
     from selfcal_ros import __version__
-    from selfcal_ros.compensation.aerotech.export import DECIMALS
-    from selfcal_ros.compensation.aerotech.write import cal_text, write_cal
-    from selfcal_ros.laser.map_equivalent import correction_tables
+    from selfcal_ros.aerotech.export import DECIMALS
+    from selfcal_ros.aerotech.write import cal_text, write_cal
+    from selfcal_ros.laser.profiles import correction_tables
 
     frame = frame_of(args)
     comments = [f"written by selfcal {__version__} from the step-diagonal measurement {args.data}",
@@ -170,8 +169,8 @@ def _sensitivity(args: argparse.Namespace) -> int:
     import numpy as np
 
     from selfcal_ros.files import write_json
-    from selfcal_ros.simulation.laser.measure import case_study_machine
-    from selfcal_ros.simulation.laser.sensitivity import sensitivity, sensitivity_text, sweep
+    from selfcal_ros.laser.simulation.measure import case_study_machine
+    from selfcal_ros.laser.simulation.sensitivity import sensitivity, sensitivity_text, sweep
 
     if args.data is not None:
         raise InputError("arguments", "--sensitivity simulates and reads no data",
@@ -192,9 +191,9 @@ def _sensitivity(args: argparse.Namespace) -> int:
 def _simulate(args: argparse.Namespace) -> int:
     """Write the readings of a simulated measurement as a table."""
     from selfcal_ros.files import read_yaml, write_json, write_text
-    from selfcal_ros.laser.readings.table import table_text
-    from selfcal_ros.simulation.laser.config import simulation_from_dict, truth_of
-    from selfcal_ros.simulation.laser.measure import simulate_step_diagonal
+    from selfcal_ros.laser.simulation.config import simulation_from_dict, truth_of
+    from selfcal_ros.laser.simulation.measure import simulate_step_diagonal
+    from selfcal_ros.laser.table import table_text
 
     if args.data is not None:
         raise InputError("arguments", "--simulate makes data and reads none",
@@ -217,7 +216,7 @@ def _simulate(args: argparse.Namespace) -> int:
 def _measurement(args: argparse.Namespace) -> tuple:
     """Return the measurement, its warnings, and where it came from."""
     from selfcal_ros.files import sha256_of
-    from selfcal_ros.laser.readings.table import Columns, dimension_of, read_table
+    from selfcal_ros.laser.table import Columns, dimension_of, read_table
 
     if is_bag(args.data):
         data, warnings = measurement_from_bag(args, _steps(args, len(joints_of(args))))

@@ -85,9 +85,9 @@ def measurement_from_bag(args: argparse.Namespace,
     InputError
         If a topic is not named, an option is no sensible number, or the bag cannot be used.
     """
-    from selfcal_ros.bagio.laser_series import SeriesTopics, read_series
-    from selfcal_ros.laser.readings.table import write_table
-    from selfcal_ros.laser.readings.zigzag import CutRule, cut_zigzag
+    from selfcal_ros.laser.bag import SeriesTopics, read_series
+    from selfcal_ros.laser.table import write_table
+    from selfcal_ros.laser.zigzag import CutRule, cut_zigzag
 
     for option, value in (("--laser-topic", args.laser_topic),
                           ("--position-topic", args.position_topic)):

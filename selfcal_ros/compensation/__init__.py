@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Use of an error map: evaluation, inversion, axis-calibration files."""
+"""Use of an error map: evaluation and inversion."""

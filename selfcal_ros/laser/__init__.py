@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Step-diagonal laser measurement."""
+"""Step-diagonal laser measurement: readings, identification, simulation."""

@@ -6,7 +6,7 @@ import numpy as np
 from selfcal_ros.errors import InputError
 from selfcal_ros.laser.adjust import Adjusted
 from selfcal_ros.laser.data import DIAGONALS, StepDiagonal
-from selfcal_ros.laser.readings.noise import (
+from selfcal_ros.laser.noise import (
     linear_covariance,
     linear_noise,
     reading_covariance,

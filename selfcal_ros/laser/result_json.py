@@ -7,11 +7,12 @@ from typing import Any
 import numpy as np
 
 from selfcal_ros.laser.data import AXES, Method, StepDiagonal, StepDiagonalResult
-from selfcal_ros.laser.map_equivalent import map_equivalent
+from selfcal_ros.laser.noise import linear_noise, reading_noise
 from selfcal_ros.laser.profiles import (
     ReferenceLine,
     Value,
     axis_pairs,
+    map_equivalent,
     name_of,
     positions_m,
     profile_m,
@@ -21,7 +22,6 @@ from selfcal_ros.laser.profiles import (
     straightness,
     u_profile_m,
 )
-from selfcal_ros.laser.readings.noise import linear_noise, reading_noise
 from selfcal_ros.model.result import plain
 from selfcal_ros.units import M_PER_MM, UM_PER_M, UM_PER_MM
 

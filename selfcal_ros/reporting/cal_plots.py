@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from selfcal_ros.compensation.aerotech.verify import Residual, Verification
+from selfcal_ros.aerotech.verify import Residual, Verification
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import write_bytes
 from selfcal_ros.reporting.picture import picture

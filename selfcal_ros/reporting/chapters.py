@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from selfcal_ros.compensation.aerotech.verify import Verification
+from selfcal_ros.aerotech.verify import Verification
 from selfcal_ros.estimation.options import ReferenceLength
 from selfcal_ros.estimation.quality.budget import Budget, budgets
 from selfcal_ros.model.result import CalibrationResult

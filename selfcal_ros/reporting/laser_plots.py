@@ -53,7 +53,7 @@ def plot_sensitivity(rows: list[dict], curves: list[dict], path: str | os.PathLi
     Parameters
     ----------
     rows, curves : list of dict
-        What `sensitivity` and `sweep` of `selfcal_ros.simulation.laser.sensitivity` give.
+        What `sensitivity` and `sweep` of `selfcal_ros.laser.simulation.sensitivity` give.
     path : str or path
         Picture to write.
     """

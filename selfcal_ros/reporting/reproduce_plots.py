@@ -14,9 +14,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from selfcal_ros.files import write_bytes
+from selfcal_ros.papers.hu import HuReproduction, HuRun
+from selfcal_ros.papers.qiao import Program, QiaoReproduction
 from selfcal_ros.reporting.picture import picture
-from selfcal_ros.simulation.reproduce.hu import HuReproduction, HuRun
-from selfcal_ros.simulation.reproduce.qiao import Program, QiaoReproduction
 from selfcal_ros.units import MM_PER_M, UM_PER_M
 
 DPI = 110

@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from selfcal_ros.aerotech.read import load_cal
 from selfcal_ros.cli.main import main
-from selfcal_ros.compensation.aerotech.read import load_cal
 from selfcal_ros.files import write_json
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.result import Observability, result_to_dict

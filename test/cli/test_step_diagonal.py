@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from selfcal_ros.cli.main import main
-from selfcal_ros.laser.readings.table import write_table
-from selfcal_ros.simulation.laser.measure import (
+from selfcal_ros.laser.simulation.measure import (
     LaserNoise,
     Measurement,
     SetUp,
     random_machine,
     simulate_step_diagonal,
 )
+from selfcal_ros.laser.table import write_table
 
 CONFIG = Path(__file__).parents[2] / "config" / "step_diagonal"
 EXAMPLE = CONFIG / "case_study.csv"
@@ -185,7 +185,7 @@ def test_the_profiles_are_drawn(tmp_path, capsys):
 
 
 def test_the_sensitivity_table(tmp_path, capsys, monkeypatch):
-    from selfcal_ros.simulation.laser import sensitivity
+    from selfcal_ros.laser.simulation import sensitivity
 
     monkeypatch.setattr(sensitivity, "NOISE_DRAWS", 2)
     monkeypatch.setattr(sensitivity, "SWEEP", (1e-4, 1e-3))
@@ -212,7 +212,7 @@ def test_a_picture_has_a_known_format(tmp_path, capsys):
 
 
 def test_the_corrections_are_written_as_tables(tmp_path, capsys):
-    from selfcal_ros.compensation.aerotech.read import load_cal
+    from selfcal_ros.aerotech.read import load_cal
 
     cal = tmp_path / "s.cal"
     args = (EXAMPLE, "--method", "new", "--cal", cal, "--x-axis", 3, "--y-axis", 4,
@@ -231,7 +231,7 @@ def test_the_corrections_are_written_as_tables(tmp_path, capsys):
 
 
 def recorded_bag(path, **options):
-    from selfcal_ros.simulation.laser.measure import case_study_machine
+    from selfcal_ros.laser.simulation.measure import case_study_machine
     from test.support.laser import recorded
     from test.support.laser_bags import write_laser_bag
 

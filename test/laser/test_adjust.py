@@ -4,8 +4,8 @@ import pytest
 
 from selfcal_ros.laser.adjust import Geometry, adjust
 from selfcal_ros.laser.data import DIAGONALS, StepDiagonal
-from selfcal_ros.laser.wang import jacobian
-from selfcal_ros.simulation.laser.measure import (
+from selfcal_ros.laser.identify import jacobian
+from selfcal_ros.laser.simulation.measure import (
     Measurement,
     SetUp,
     random_machine,

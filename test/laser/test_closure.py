@@ -6,14 +6,14 @@ import pytest
 
 from selfcal_ros.laser.closure import length_closure
 from selfcal_ros.laser.data import DIAGONALS, StepDiagonal
-from selfcal_ros.laser.readings.noise import (
+from selfcal_ros.laser.identify import jacobian
+from selfcal_ros.laser.noise import (
     linear_covariance,
     linear_noise,
     reading_covariance,
     reading_noise,
 )
-from selfcal_ros.laser.wang import jacobian
-from selfcal_ros.simulation.laser.measure import (
+from selfcal_ros.laser.simulation.measure import (
     LaserNoise,
     Measurement,
     random_machine,

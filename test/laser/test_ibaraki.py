@@ -7,11 +7,10 @@ from hypothesis import strategies as st
 from selfcal_ros.errors import InputError, NotIdentifiableError
 from selfcal_ros.laser.closure import check_lengths
 from selfcal_ros.laser.data import DIAGONALS, Form, StepDiagonal
-from selfcal_ros.laser.ibaraki import identify_ibaraki
+from selfcal_ros.laser.identify import identify_ibaraki, identify_wang
 from selfcal_ros.laser.profiles import squareness, straightness
 from selfcal_ros.laser.published_equations import Erratum
-from selfcal_ros.laser.wang import identify_wang
-from selfcal_ros.simulation.laser.measure import (
+from selfcal_ros.laser.simulation.measure import (
     LaserNoise,
     Measurement,
     SetUp,

@@ -2,19 +2,19 @@
 import numpy as np
 import pytest
 
-from selfcal_ros.compensation.aerotech.evaluate import CalEvaluator
-from selfcal_ros.compensation.machine import MachineFrame
+from selfcal_ros.aerotech.evaluate import CalEvaluator
+from selfcal_ros.aerotech.machine import MachineFrame
 from selfcal_ros.errors import InputError
-from selfcal_ros.laser.ibaraki import identify_ibaraki
-from selfcal_ros.laser.map_equivalent import (
+from selfcal_ros.laser.identify import identify_ibaraki, identify_wang
+from selfcal_ros.laser.profiles import (
     axis_corrections,
     correction_tables,
     map_equivalent,
+    squareness,
+    squareness_rad,
+    u_slope,
 )
-from selfcal_ros.laser.profiles import squareness, squareness_rad, u_slope
-from selfcal_ros.laser.wang import identify_wang
-from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.simulation.laser.measure import (
+from selfcal_ros.laser.simulation.measure import (
     LaserNoise,
     Measurement,
     StepMachine,
@@ -22,6 +22,7 @@ from selfcal_ros.simulation.laser.measure import (
     random_machine,
     simulate_step_diagonal,
 )
+from selfcal_ros.model.artifact import Artifact
 from test.support.laser import scatter_of
 from test.support.maps import first_order
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from selfcal_ros.laser.data import StepDiagonal
-from selfcal_ros.laser.ibaraki import identify_ibaraki
+from selfcal_ros.laser.identify import identify_ibaraki
 from selfcal_ros.laser.result_json import outcome
 from test.support.laser import planar
 

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from selfcal_ros.laser.data import StepDiagonal
-from selfcal_ros.laser.ibaraki import identify_ibaraki
-from selfcal_ros.laser.wang import identify_wang
+from selfcal_ros.laser.identify import identify_ibaraki, identify_wang
 
 NAMES = {2: ("pp", "np"), 3: ("ppp", "npp", "pnp", "ppn")}
 

@@ -6,11 +6,10 @@ from hypothesis import strategies as st
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.laser.data import DIAGONALS, Method, StepDiagonal, signs_of, step_vectors
-from selfcal_ros.laser.identify import Choice, identify
+from selfcal_ros.laser.identify import Choice, identify, identify_wang, jacobian, readings_are_equal
 from selfcal_ros.laser.profiles import squareness
 from selfcal_ros.laser.published_equations import Erratum
-from selfcal_ros.laser.wang import identify_wang, jacobian, readings_are_equal
-from selfcal_ros.simulation.laser.measure import (
+from selfcal_ros.laser.simulation.measure import (
     Measurement,
     SetUp,
     random_machine,

@@ -6,14 +6,14 @@ from dataclasses import replace
 import numpy as np
 
 from selfcal_ros.laser.data import DIAGONALS, StepDiagonal, signs_of, step_vectors
-from selfcal_ros.laser.readings.zigzag import Series
-from selfcal_ros.simulation.laser.measure import (
+from selfcal_ros.laser.simulation.measure import (
     LaserNoise,
     Measurement,
     SetUp,
     simulate_step_diagonal,
     trace,
 )
+from selfcal_ros.laser.zigzag import Series
 
 MM = 1e-3
 

@@ -10,8 +10,8 @@ from selfcal_ros.cli.aerotech.options import in_unit, numbers, pairs
 from selfcal_ros.errors import ExitCode, InputError
 
 if TYPE_CHECKING:
-    from selfcal_ros.compensation.aerotech.evaluate import MachineSetup
-    from selfcal_ros.compensation.aerotech.model import Table1D, Table2D
+    from selfcal_ros.aerotech.evaluate import MachineSetup
+    from selfcal_ros.aerotech.model import Table1D, Table2D
 
 SCANNER_BITS = 16
 
@@ -52,9 +52,9 @@ def add_to(group: argparse._SubParsersAction) -> None:
 
 
 def _check(args: argparse.Namespace) -> int:
-    from selfcal_ros.compensation.aerotech.model import Severity
-    from selfcal_ros.compensation.aerotech.read import read_cal, refuse_errors
-    from selfcal_ros.compensation.aerotech.rules import Gi4
+    from selfcal_ros.aerotech.model import Severity
+    from selfcal_ros.aerotech.read import read_cal, refuse_errors
+    from selfcal_ros.aerotech.rules import Gi4
 
     if args.scanner_bits is not None and not args.gi4:
         raise InputError("--scanner-bits", "they are those behind a GI4", "add --gi4")
@@ -95,9 +95,9 @@ def _described(table: "Table1D | Table2D") -> dict:
 
 
 def _evaluate(args: argparse.Namespace) -> int:
-    from selfcal_ros.compensation.aerotech.evaluate import CalEvaluator
-    from selfcal_ros.compensation.aerotech.read import load_cal
-    from selfcal_ros.compensation.machine import frame_from_comments
+    from selfcal_ros.aerotech.evaluate import CalEvaluator
+    from selfcal_ros.aerotech.machine import frame_from_comments
+    from selfcal_ros.aerotech.read import load_cal
 
     cal = load_cal(args.file)
     frame = frame_from_comments(cal.comments)
@@ -115,7 +115,7 @@ def _evaluate(args: argparse.Namespace) -> int:
 
 
 def _setup(args: argparse.Namespace) -> "MachineSetup":
-    from selfcal_ros.compensation.aerotech.evaluate import AxisSetup, MachineSetup
+    from selfcal_ros.aerotech.evaluate import AxisSetup, MachineSetup
 
     if args.temperature is not None and not math.isfinite(args.temperature):
         raise InputError("--temperature", f"{args.temperature} is not a temperature", "give degC")

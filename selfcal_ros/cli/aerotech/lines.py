@@ -12,8 +12,8 @@ from selfcal_ros.errors import ExitCode, InputError
 from selfcal_ros.units import M_PER_UM, UM_PER_M
 
 if TYPE_CHECKING:
-    from selfcal_ros.compensation.aerotech.lines import AxisCorrection
-    from selfcal_ros.compensation.machine import MachineFrame
+    from selfcal_ros.aerotech.lines import AxisCorrection
+    from selfcal_ros.aerotech.machine import MachineFrame
     from selfcal_ros.model.result import CalibrationResult
 
 Axis = Literal["x", "y"]
@@ -70,8 +70,8 @@ def _frame(args: argparse.Namespace) -> "MachineFrame":
 
 
 def _orthogonality(args: argparse.Namespace) -> int:
-    from selfcal_ros.compensation.aerotech import lines as cal_lines
-    from selfcal_ros.compensation.machine import UNITS_M
+    from selfcal_ros.aerotech import lines as cal_lines
+    from selfcal_ros.aerotech.machine import UNITS_M
 
     frame = _frame(args)
     other: Axis = "y" if args.along == "x" else "x"
@@ -122,7 +122,7 @@ def _straightness(args: argparse.Namespace) -> int:
 
 
 def _line(args: argparse.Namespace, corrected: Axis) -> int:
-    from selfcal_ros.compensation.aerotech import lines as cal_lines
+    from selfcal_ros.aerotech import lines as cal_lines
     from selfcal_ros.files import read_text
 
     frame, result = _frame(args), None
@@ -154,10 +154,10 @@ def _deliver(args: argparse.Namespace, line: "AxisCorrection", frame: "MachineFr
     from datetime import UTC, datetime
 
     from selfcal_ros import __version__
+    from selfcal_ros.aerotech.export import DECIMALS, verdict_lines
+    from selfcal_ros.aerotech.lines import line_table
+    from selfcal_ros.aerotech.write import cal_text, write_cal
     from selfcal_ros.cli.terminal.print_result import exit_code
-    from selfcal_ros.compensation.aerotech.export import DECIMALS, verdict_lines
-    from selfcal_ros.compensation.aerotech.lines import line_table
-    from selfcal_ros.compensation.aerotech.write import cal_text, write_cal
     from selfcal_ros.files import check_outputs
 
     source = args.source or f"{args.measured} over {args.over}, travel {args.travel}"

@@ -14,7 +14,7 @@ from selfcal_ros.errors import ExitCode, InputError, NotIdentifiableError
 from selfcal_ros.units import M_PER_UM, RAD_PER_ARCSEC
 
 if TYPE_CHECKING:
-    from selfcal_ros.compensation.aerotech.verify import Verification
+    from selfcal_ros.aerotech.verify import Verification
 
 
 def add_to(group: argparse._SubParsersAction) -> None:
@@ -46,9 +46,9 @@ def add_to(group: argparse._SubParsersAction) -> None:
 def _export(args: argparse.Namespace) -> int:
     from dataclasses import replace
 
+    from selfcal_ros.aerotech import export
+    from selfcal_ros.aerotech.write import cal_text, refuse_existing, write_cal
     from selfcal_ros.cli.terminal.print_result import exit_code
-    from selfcal_ros.compensation.aerotech import export
-    from selfcal_ros.compensation.aerotech.write import cal_text, refuse_existing, write_cal
     from selfcal_ros.files import check_outputs
 
     result, frame = read_result(args.result), frame_of(args)
@@ -91,10 +91,10 @@ def _export(args: argparse.Namespace) -> int:
 
 
 def _verify(args: argparse.Namespace) -> int:
-    from selfcal_ros.compensation.aerotech.model import Table2D
-    from selfcal_ros.compensation.aerotech.read import load_cal
-    from selfcal_ros.compensation.aerotech.verify import verify_tables
-    from selfcal_ros.compensation.machine import MachineFrame, frame_from_comments
+    from selfcal_ros.aerotech.machine import MachineFrame, frame_from_comments
+    from selfcal_ros.aerotech.model import Table2D
+    from selfcal_ros.aerotech.read import load_cal
+    from selfcal_ros.aerotech.verify import verify_tables
 
     result, cal = read_result(args.result), load_cal(args.file)
     base = frame_from_comments(cal.comments)

@@ -12,7 +12,7 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.units import M_PER
 
 if TYPE_CHECKING:
-    from selfcal_ros.compensation.machine import MachineFrame
+    from selfcal_ros.aerotech.machine import MachineFrame
     from selfcal_ros.model.result import CalibrationResult
 
 
@@ -32,7 +32,7 @@ def pairs(texts: list[str] | None, option: str) -> dict[int, str]:
 
 def numbers(texts: list[str] | None, option: str, *, positive: bool = False) -> dict[int, float]:
     """Return axis -> number of options AXIS=NUMBER; InputError for anything else."""
-    from selfcal_ros.compensation.aerotech.keywords import SMALLEST, ArgumentFault, number
+    from selfcal_ros.aerotech.keywords import SMALLEST, ArgumentFault, number
 
     found = {}
     for axis, text in pairs(texts, option).items():
@@ -101,7 +101,7 @@ def frame_of(args: argparse.Namespace, base: "MachineFrame | None" = None) -> "M
     """Return the frame that the options describe, upon `base` where they are silent."""
     from dataclasses import replace
 
-    from selfcal_ros.compensation.machine import UNITS_M, MachineFrame
+    from selfcal_ros.aerotech.machine import UNITS_M, MachineFrame
 
     base = base or MachineFrame()
     changes: dict[str, Any] = {

@@ -5,9 +5,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from selfcal_ros.compensation.aerotech.export import table_xy
-from selfcal_ros.compensation.aerotech.verify import Residual, Verification, verify_tables
-from selfcal_ros.compensation.machine import MachineFrame
+from selfcal_ros.aerotech.export import table_xy
+from selfcal_ros.aerotech.machine import MachineFrame
+from selfcal_ros.aerotech.verify import Residual, Verification, verify_tables
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.reporting.figures.fields import MAX_ARROWS, arrow_key, arrows, enlargement

@@ -1,0 +1,171 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The start lines of a table: positional arguments and keywords."""
+
+import re
+from dataclasses import dataclass, field
+from typing import Any
+
+from selfcal_ros.aerotech.keywords import (
+    ALIASES,
+    ALL_KEYWORDS,
+    KEYWORDS,
+    OLD_UNITS,
+    POSITIONAL,
+    ArgumentFault,
+    integer,
+    number,
+    short,
+)
+from selfcal_ros.aerotech.model import Kind, Unit
+from selfcal_ros.aerotech.text import Findings
+
+_WORD = re.compile(r"""[ \t]*(?:
+    (?P<key>[A-Za-z_]\w*) (?P<blank>[ \t]*) = (?P<blank2>[ \t]*) (?P<value>"[^"]*"|[^ \t]*)
+    | (?P<word>[^ \t]+))""", re.VERBOSE)
+_POSITION = re.compile(r"[+\-.\d]")
+
+
+@dataclass
+class Header:
+    """What the start lines of one table say."""
+
+    kind: Kind
+    line: int
+    positional: list[float] = field(default_factory=list)
+    values: dict[str, Any] = field(default_factory=dict)
+    lines: dict[str, int] = field(default_factory=dict)
+    broken: bool = False
+
+
+def read_header(kind: Kind, heads: list[tuple[int, str]], findings: Findings) -> Header:
+    """Return the arguments on the start lines `heads` (line number, text after the token)."""
+    header = Header(kind, heads[0][0])
+    for index, (line, text) in enumerate(heads):
+        words: list[str] = []
+        at = 0
+        text = text.rstrip(" \t")
+        while at < len(text):
+            match = _WORD.match(text, at)
+            assert match is not None, "the pattern takes any text"
+            at = match.end()
+            if match["key"]:
+                if match["blank"] or match["blank2"]:
+                    findings.tolerated(line, "blanks around =", "write KEYWORD=argument")
+                _argument(header, (line, match["key"]), match["value"], findings)
+            elif _POSITION.match(match["word"]):
+                words.append(match["word"])
+            else:
+                _flag(header, line, match["word"], findings)
+        _positional(header, (index, line), words, findings)
+    return header
+
+
+def _keyword(header: Header, line: int, name: str, findings: Findings) -> str | None:
+    """Return the strict spelling of a keyword of this kind of table, or None with an error."""
+    strict = name.upper()
+    if strict in ALIASES:
+        findings.tolerated(line, f"the keyword {short(strict)}", f"write {ALIASES[strict]}")
+        strict = ALIASES[strict]
+    if strict in KEYWORDS[header.kind]:
+        if strict != name and name.upper() == strict:
+            findings.tolerated(line, "a keyword in lower case", "write keywords in upper case")
+        return strict
+    header.broken = True
+    if strict in ALL_KEYWORDS:
+        findings.error(line, f"a {header.kind} table must not have {strict}", "remove the keyword")
+    else:
+        findings.error(line, f"unknown keyword {short(name)}",
+                       "known are " + ", ".join(sorted(KEYWORDS[header.kind])))
+    return None
+
+
+def _argument(header: Header, place: tuple[int, str], text: str, findings: Findings) -> None:
+    line, name = place
+    strict = _keyword(header, line, name, findings)
+    if strict is None:
+        return
+    keyword = KEYWORDS[header.kind][strict]
+    try:
+        if keyword.read is None:
+            raise ArgumentFault(f"{strict} takes no argument", f"write {strict} alone")
+        if not text:
+            raise ArgumentFault(f"{strict} has no argument", f"write {strict}=value")
+        value = keyword.read(text)
+    except ArgumentFault as fault:
+        header.broken = True
+        findings.error(line, f"{strict}: {fault.what}" if strict not in fault.what else fault.what,
+                       fault.remedy)
+        return
+    _tolerances(line, strict, (text, value), findings)
+    _set(header, (line, strict), (keyword.field, value), findings)
+
+
+def _tolerances(line: int, strict: str, argument: tuple[str, Any], findings: Findings) -> None:
+    text, value = argument
+    if isinstance(value, Unit):
+        word = text.partition("/")[0]
+        if word.upper() in OLD_UNITS:
+            findings.tolerated(line, f"the unit {word.upper()} of older controllers, read as "
+                               f"{value.word}", f"write {value.word}")
+        if word != word.upper():
+            findings.tolerated(line, "a unit in lower case", "write units in upper case")
+    elif strict == "HOMEDIRECTION" and text != value:
+        findings.tolerated(line, "a home direction in lower case", "write CW or CCW")
+    elif strict == "SERIALNUMBER" and not (len(text) >= 2 and text[0] == text[-1] == '"'):
+        findings.tolerated(line, "a serial number without quotes", 'write SERIALNUMBER="..."')
+
+
+def _flag(header: Header, line: int, word: str, findings: Findings) -> None:
+    if word.startswith("/"):
+        header.broken = True
+        findings.error(line, "white space before the / of a unit",
+                       "write it without, such as PRIMARY/1000")
+        return
+    strict = _keyword(header, line, word, findings)
+    if strict is None:
+        return
+    keyword = KEYWORDS[header.kind][strict]
+    if keyword.read is not None:
+        header.broken = True
+        findings.error(line, f"{strict} has no argument", f"write {strict}=value")
+        return
+    _set(header, (line, strict), (keyword.field, True), findings)
+
+
+def _set(header: Header, place: tuple[int, str], item: tuple[str, Any],
+         findings: Findings) -> None:
+    (line, strict), (name, value) = place, item
+    if name in header.values and header.values[name] != value:
+        header.broken = True
+        findings.error(line, f"{strict} is given twice, here and in line {header.lines[name]}, "
+                       "and differs", "keep one of them")
+    elif name in header.values:
+        findings.warning(line, f"{strict} is given twice", "keep one of them")
+    header.values[name] = value
+    header.lines.setdefault(name, line)
+
+
+def _positional(header: Header, place: tuple[int, int], words: list[str],
+                findings: Findings) -> None:
+    index, line = place
+    names = POSITIONAL[header.kind]
+    if index > 0:
+        if words:
+            header.broken = True
+            findings.error(line, f"{short(words[0])} on a later {header.kind.start} line",
+                           f"only the first {header.kind.start} line of a table carries "
+                           f"{', '.join(names)}; a new table needs {':END'} before it")
+        return
+    if len(words) != len(names):
+        header.broken = True
+        findings.error(line, f"{header.kind.start} has {len(words)} arguments, not {len(names)}",
+                       f"write {', '.join(names)} after it")
+        return
+    for name, word in zip(names, words, strict=True):
+        try:
+            value = number(word) if name.startswith("Samp") else integer(word)
+        except ArgumentFault as fault:
+            header.broken = True
+            findings.error(line, f"{name}: {fault.what}", fault.remedy)
+            value = 0
+        header.positional.append(value)

@@ -1,0 +1,180 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Laser distances and axis positions from a bag, for the step-diagonal measurement.
+
+Messages are decoded by the definitions that the bag brings along. A message with a header counts
+at its stamp, one without at the time of its logging. Samples are sorted by time, whatever their
+order in the file; a time that comes twice keeps the first.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from selfcal_ros.bagio.mcap.stream import McapStream
+from selfcal_ros.bagio.reader import BagReader
+from selfcal_ros.bagio.schemas import store_of_schema
+from selfcal_ros.errors import InputError, NoDataError
+from selfcal_ros.laser.zigzag import Series
+from selfcal_ros.messages.to_model import stamp_ns
+
+FIELDS = {"std_msgs/msg/Float64": "data", "std_msgs/msg/Float32": "data",
+          "sensor_msgs/msg/Range": "range"}
+"""Where the distance stands in a message, unless a field is named."""
+POINTS = {"geometry_msgs/msg/PointStamped": "point", "geometry_msgs/msg/PoseStamped":
+          "pose.position", "geometry_msgs/msg/Point": ""}
+"""Where x, y, z stand in a message that is no JointState."""
+JOINT_STATE = "sensor_msgs/msg/JointState"
+
+
+@dataclass(frozen=True)
+class SeriesTopics:
+    """Where laser and positions are recorded.
+
+    Attributes
+    ----------
+    laser, position : str
+        Topics.
+    joints : tuple of str
+        Names of the axes in a JointState, in the order of the steps.
+    laser_field : str
+        Field of the distance (``a.b`` goes deeper), or the joint's name in a JointState; empty =
+        that of the type.
+    laser_unit_m, position_unit_m : float
+        Metres in a unit of the values.
+    """
+
+    laser: str
+    position: str
+    joints: tuple[str, ...] = ("x", "y")
+    laser_field: str = ""
+    laser_unit_m: float = 1.0
+    position_unit_m: float = 1.0
+
+
+def read_series(path: Path, topics: SeriesTopics) -> tuple[Series, list[str]]:
+    """Return the recording in a bag, and what has to be said about it.
+
+    Raises
+    ------
+    InputError
+        If the bag cannot be read, a type has no such field, or a joint is missing.
+    NoDataError
+        If a topic is not in the bag or empty.
+    """
+    reader = BagReader(Path(path))
+    wanted = {topics.laser: _laser_value(topics), topics.position: _position_value(topics)}
+    if len(wanted) < 2:
+        raise InputError("--position-topic", "it is the laser's topic", "name two topics")
+    found: dict[str, list[tuple[int, Any]]] = {topic: [] for topic in wanted}
+    others: set[str] = set()
+    unstamped: set[str] = set()
+    for file in reader.files:
+        stream = McapStream(file, lost=reader.lost)
+        decoders: dict[int, Callable] = {}
+        for channel, message in stream.messages():
+            topic = _match(channel.topic, wanted)
+            if topic is None:
+                others.add(channel.topic)
+                continue
+            if channel.id not in decoders:
+                decoders[channel.id] = _decoder(stream, channel, f"{path}: topic {topic}")
+            name, decoded = decoders[channel.id](message.data)
+            if not hasattr(decoded, "header"):
+                unstamped.add(topic)
+            stamp = stamp_ns(decoded) if hasattr(decoded, "header") else message.log_time
+            if stamp > np.iinfo(np.int64).max:
+                raise InputError(f"{path}: topic {topic}", f"{stamp} ns is no time of logging",
+                                 "record the bag anew")
+            found[topic].append((stamp, wanted[topic](name, decoded, f"{path}: topic {topic}")))
+    for topic, samples in found.items():
+        if not samples:
+            raise NoDataError(f"{path}: topic {topic}", "no message of it in the bag",
+                              "the bag has " + (", ".join(sorted(others)) or "no other topic"))
+    notes = [f"{path}: {line}" for line in reader.lost]
+    if len(unstamped) == 1:
+        notes.append(f"{path}: {unstamped.pop()} has no stamps of its own and counts at its time "
+                     "of logging, the other topic at its stamps: both clocks must agree")
+    laser_ns, laser = _sorted(found[topics.laser])
+    position_ns, positions = _sorted(found[topics.position])
+    return Series(laser_ns, laser * topics.laser_unit_m, position_ns,
+                  positions * topics.position_unit_m), notes
+
+
+def _match(topic: str, wanted: dict[str, Callable]) -> str | None:
+    return next((name for name in wanted if name.strip("/") == topic.strip("/")), None)
+
+
+def _decoder(stream: McapStream, channel: Any, where: str) -> Callable:
+    schema = stream.schemas.get(channel.schema_id)
+    if channel.message_encoding != "cdr" or schema is None:
+        raise InputError(where, f"message encoding '{channel.message_encoding}' instead of cdr "
+                         "with a definition", "convert the bag to ROS 2, e.g. with rosbags-convert")
+    store = store_of_schema(schema.name, schema.encoding, schema.data.decode(errors="replace"),
+                            where)
+
+    def decode(data: bytes) -> tuple[str, Any]:
+        try:
+            return schema.name, store.deserialize_cdr(data, schema.name)
+        except Exception as error:  # a damaged payload may fail anywhere in the decoder
+            raise InputError(where, "a message cannot be decoded", "record the bag anew") from error
+
+    return decode
+
+
+def _laser_value(topics: SeriesTopics) -> Callable:
+    def value(name: str, message: Any, where: str) -> float:
+        if name == JOINT_STATE:
+            return _joints(message, (topics.laser_field or "laser",), where)[0]
+        field = topics.laser_field or FIELDS.get(name)
+        if field is None:
+            raise InputError(where, f"the type {name} has no distance known by itself",
+                             "name its field with --laser-field")
+        return _number(message, field, where)
+
+    return value
+
+
+def _position_value(topics: SeriesTopics) -> Callable:
+    def value(name: str, message: Any, where: str) -> list[float]:
+        if name == JOINT_STATE:
+            return _joints(message, topics.joints, where)
+        if name not in POINTS:
+            raise InputError(where, f"the type {name} holds no axis positions", "record a "
+                             "JointState, or one of " + ", ".join(sorted(POINTS)))
+        prefix = f"{POINTS[name]}." if POINTS[name] else ""
+        return [_number(message, f"{prefix}{axis}", where)
+                for axis in ("x", "y", "z")[:len(topics.joints)]]
+
+    return value
+
+
+def _joints(message: Any, joints: Sequence[str], where: str) -> list[float]:
+    named = dict(zip(message.name, message.position, strict=False))
+    missing = [joint for joint in joints if joint not in named]
+    if missing:
+        raise InputError(where, f"no joint '{missing[0]}', only {', '.join(named)}",
+                         "name the joints with --joints, the laser's with --laser-field")
+    return [float(named[joint]) for joint in joints]
+
+
+def _number(message: Any, field: str, where: str) -> float:
+    for part in field.split("."):
+        if not hasattr(message, part):
+            raise InputError(where, f"the message has no field '{field}'",
+                             "name the field with --laser-field, a.b for a nested one")
+        message = getattr(message, part)
+    try:
+        return float(message)
+    except (TypeError, ValueError) as error:
+        raise InputError(where, f"the field '{field}' is no number", "name a numeric field"
+                         ) from error
+
+
+def _sorted(samples: list[tuple[int, Any]]) -> tuple[np.ndarray, np.ndarray]:
+    stamps = np.array([stamp for stamp, _ in samples], dtype=np.int64)
+    values = np.array([value for _, value in samples], dtype=float)
+    stamps, first = np.unique(stamps, return_index=True)
+    return stamps, values[first]
