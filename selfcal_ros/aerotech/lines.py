@@ -13,8 +13,8 @@ from typing import Literal
 import numpy as np
 
 from selfcal_ros.aerotech.export import DECIMALS, PRIMARY, micrometres, tidy
-from selfcal_ros.aerotech.keywords import ArgumentFault
-from selfcal_ros.aerotech.keywords import number as plain_number
+from selfcal_ros.aerotech.header import ArgumentFault
+from selfcal_ros.aerotech.header import number as plain_number
 from selfcal_ros.aerotech.machine import UNITS_M, MachineFrame
 from selfcal_ros.aerotech.model import Table1D
 from selfcal_ros.errors import InputError

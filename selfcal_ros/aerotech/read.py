@@ -8,9 +8,19 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from selfcal_ros.aerotech.header import Header, read_header
-from selfcal_ros.aerotech.keywords import LIMIT, ArgumentFault, number, short
-from selfcal_ros.aerotech.model import CalFile, Kind, Severity, Table, Table1D, Table2D
+from selfcal_ros.aerotech.header import LIMIT, ArgumentFault, Header, number, read_header, short
+from selfcal_ros.aerotech.model import (
+    CalFile,
+    Findings,
+    Kind,
+    Severity,
+    Table,
+    Table1D,
+    Table2D,
+    TooManyFindings,
+    decode,
+    strip_comment,
+)
 from selfcal_ros.aerotech.rules import (
     MAX_1D_TABLES,
     Gi4,
@@ -18,7 +28,6 @@ from selfcal_ros.aerotech.rules import (
     check_table,
     mixed_kinds,
 )
-from selfcal_ros.aerotech.text import Findings, TooManyFindings, decode, strip_comment
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import read_bytes
 

@@ -7,9 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from selfcal_ros.aerotech.keywords import LIMIT, SMALLEST
-from selfcal_ros.aerotech.model import Kind, Table, Table1D, Table2D, UnitWord
-from selfcal_ros.aerotech.text import Findings
+from selfcal_ros.aerotech.header import LIMIT, SMALLEST
+from selfcal_ros.aerotech.model import Findings, Kind, Table, Table1D, Table2D, UnitWord
 
 MAX_AXIS = 32
 MAX_1D_TABLES = 100

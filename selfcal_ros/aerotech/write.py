@@ -9,11 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
-from selfcal_ros.aerotech.keywords import KEYWORDS
-from selfcal_ros.aerotech.model import CalFile, Table, Table1D, Unit, same_table
+from selfcal_ros.aerotech.header import KEYWORDS
+from selfcal_ros.aerotech.model import CalFile, Findings, Table, Table1D, Unit, same_table
 from selfcal_ros.aerotech.read import parse_cal, refuse_errors
 from selfcal_ros.aerotech.rules import check_tables
-from selfcal_ros.aerotech.text import Findings
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import read_bytes, write_bytes
 

@@ -11,9 +11,13 @@ import numpy as np
 
 from selfcal_ros.collection.messages import Command, Detection, EncoderSample, Kind, Phase
 from selfcal_ros.model.view import Plan, View
-from selfcal_ros.simulation.exposures import angular_exposures, grid_exposures, lead_in
+from selfcal_ros.simulation.exposures import (
+    CellSettings,
+    angular_exposures,
+    grid_exposures,
+    lead_in,
+)
 from selfcal_ros.simulation.machine import Truth
-from selfcal_ros.simulation.settings import CellSettings
 from selfcal_ros.units import NS_PER_S
 
 __all__ = ["JOINTS", "CellSettings", "Event", "plan_events", "view_events"]

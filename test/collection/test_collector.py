@@ -17,7 +17,7 @@ from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Sense, ViewReadings
 from selfcal_ros.model.view import View
-from selfcal_ros.simulation.faults import Faults, apply_faults
+from selfcal_ros.simulation.spec import Faults, apply_faults
 from selfcal_ros.simulation.truth import angular_deviation, grid_deviation
 from test.support.collecting import START_NS, collect, digest, gathered, scene, table
 

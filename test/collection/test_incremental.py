@@ -20,7 +20,7 @@ from selfcal_ros.collection.stage.encoder import JointTrack, TrackLimits
 from selfcal_ros.collection.stage.exposures import Exposures, Tracks
 from selfcal_ros.collection.stage.samples import Limits
 from selfcal_ros.errors import NoDataError
-from selfcal_ros.simulation.faults import Faults, apply_faults
+from selfcal_ros.simulation.spec import Faults, apply_faults
 from test.support.collecting import collect, digest, scene
 
 FAULTS = Faults(lost=0.02, duplicated=0.03, outliers=0.02, low_score=0.01, not_finite=0.01,

@@ -10,15 +10,15 @@ import yaml
 from selfcal_ros.collection.settings.nodes import NODE_PARAMETERS
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.readings import Sense
-from selfcal_ros.simulation.faults import Faults
+from selfcal_ros.simulation.exposures import CellSettings
 from selfcal_ros.simulation.machine import Spread
-from selfcal_ros.simulation.settings import CellSettings
 from selfcal_ros.simulation.spec import (
     CELL,
     FAULTS,
     NOISE,
     PHYSICS,
     TRUTH,
+    Faults,
     read_simulation,
     settings_of,
     spread_of,

@@ -9,7 +9,7 @@ import pytest
 
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Sense
-from selfcal_ros.simulation.settings import CellSettings
+from selfcal_ros.simulation.exposures import CellSettings
 from selfcal_ros.simulation.truth import (
     Spread,
     angular_deviation,

@@ -32,7 +32,7 @@ from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.model.view import Plan
 from selfcal_ros.nodes import names
 from selfcal_ros.simulation.cell import Event
-from selfcal_ros.simulation.faults import Faults, apply_faults
+from selfcal_ros.simulation.spec import Faults, apply_faults
 from selfcal_ros.units import NS_PER_S
 from test.support.forked import Forks
 from test.support.independent_cell import IndependentCell, largest_deviation

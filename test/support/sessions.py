@@ -16,8 +16,7 @@ from selfcal_ros.messages.topics import INPUT_TOPICS
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.view import Plan
 from selfcal_ros.simulation.cell import CellSettings, Event, plan_events
-from selfcal_ros.simulation.faults import Faults, apply_faults
-from selfcal_ros.simulation.spec import read_simulation
+from selfcal_ros.simulation.spec import Faults, apply_faults, read_simulation
 from selfcal_ros.simulation.truth import random_truth
 from test.support.collecting import gathered
 from test.support.plans import plan_of

@@ -8,8 +8,8 @@ import numpy as np
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.view import Plan, View
+from selfcal_ros.simulation.exposures import CellSettings
 from selfcal_ros.simulation.machine import Spread
-from selfcal_ros.simulation.settings import CellSettings
 from tools.reality.cases import SIGMA_RAD, Case, checked
 
 POSES = {"hu": "0 90 +x", "five": "0 90 +x -x +y", "six": "0 90 180 270 +x +y",

@@ -32,7 +32,7 @@ def pairs(texts: list[str] | None, option: str) -> dict[int, str]:
 
 def numbers(texts: list[str] | None, option: str, *, positive: bool = False) -> dict[int, float]:
     """Return axis -> number of options AXIS=NUMBER; InputError for anything else."""
-    from selfcal_ros.aerotech.keywords import SMALLEST, ArgumentFault, number
+    from selfcal_ros.aerotech.header import SMALLEST, ArgumentFault, number
 
     found = {}
     for axis, text in pairs(texts, option).items():

@@ -20,8 +20,8 @@ from selfcal_ros.model.terms import parse_terms
 from selfcal_ros.reporting.chapters import chapters
 from selfcal_ros.reporting.summary.sections import error_section
 from selfcal_ros.reporting.summary.text import state_sentence
+from selfcal_ros.simulation.exposures import CellSettings
 from selfcal_ros.simulation.machine import Spread, random_truth
-from selfcal_ros.simulation.settings import CellSettings
 from selfcal_ros.simulation.truth import hu_plan, simulate_measurements
 from test.support.options import bare
 

@@ -16,8 +16,8 @@ from selfcal_ros.model.terms import parse_terms
 from selfcal_ros.model.verdict import Grade
 from selfcal_ros.model.view import Plan, View
 from selfcal_ros.reporting.words.result import worded
+from selfcal_ros.simulation.exposures import CellSettings
 from selfcal_ros.simulation.machine import Spread, random_truth
-from selfcal_ros.simulation.settings import CellSettings
 from selfcal_ros.simulation.truth import simulate_measurements
 from test.support.options import bare
 from test.support.results import covered
