@@ -16,8 +16,7 @@ from selfcal_ros.reporting.html_page import page
 from selfcal_ros.reporting.sheet.svg import inline_svg
 from selfcal_ros.reporting.summary.format import numeric_columns, printable
 from selfcal_ros.reporting.summary.numbers import truth_arrays
-from selfcal_ros.reporting.summary.sections import Section
-from selfcal_ros.reporting.summary.text import state_sentence
+from selfcal_ros.reporting.summary.sections import Section, state_sentence
 
 WIDE = 40
 """Characters from which a cell of words is given room."""

@@ -20,8 +20,7 @@ from selfcal_ros.reporting.maps.style import RC, drawable
 from selfcal_ros.reporting.sheet.paper import put
 from selfcal_ros.reporting.summary.format import aligned, numeric_columns
 from selfcal_ros.reporting.summary.numbers import truth_arrays
-from selfcal_ros.reporting.summary.sections import Section
-from selfcal_ros.reporting.summary.text import state_sentence
+from selfcal_ros.reporting.summary.sections import Section, state_sentence
 
 WIDTH, HEIGHT, MARGIN = 595.0, 842.0, 48.0
 """A4 in points, and what is left free at each edge."""

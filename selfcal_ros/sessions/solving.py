@@ -30,7 +30,7 @@ from selfcal_ros.model.result import (
 from selfcal_ros.model.view import MAX_VIEWS
 from selfcal_ros.reporting.summary.format import counted
 from selfcal_ros.reporting.summary.numbers import summary_numbers
-from selfcal_ros.reporting.summary.text import state_sentence
+from selfcal_ros.reporting.summary.sections import state_sentence
 from selfcal_ros.reporting.words.result import worded
 from selfcal_ros.sessions.map_files import is_qualified, read_result, result_file, run_file
 from selfcal_ros.sessions.ports import Diagnosis, Level, Ports

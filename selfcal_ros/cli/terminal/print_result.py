@@ -12,7 +12,7 @@ def show(result: "CalibrationResult", bag: str, output: str | None, stream: Text
     """Print the summary, against the known truth where the bag folder holds one."""
     from selfcal_ros.bagio.simulated import read_truth
     from selfcal_ros.reporting.summary.format import can_print_symbols
-    from selfcal_ros.reporting.summary.text import summary_text
+    from selfcal_ros.reporting.summary.sections import summary_text
 
     print(summary_text(result, truth=read_truth(bag), ascii_only=not can_print_symbols(stream)),
           file=stream)

@@ -23,7 +23,7 @@ from selfcal_ros.reporting.maps.theta import draw_theta
 from selfcal_ros.reporting.maps.xy import draw_error_map
 from selfcal_ros.reporting.picture import picture
 from selfcal_ros.reporting.summary.numbers import truth_arrays
-from selfcal_ros.reporting.summary.text import state_sentence
+from selfcal_ros.reporting.summary.sections import state_sentence
 
 DPI = 150
 KINDS: dict[str, dict[str, str | None]] = {

@@ -16,13 +16,18 @@ from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ErrorMap, ThetaDatum
 from selfcal_ros.model.result import Noise, Observability, result_from_dict, result_to_dict
 from selfcal_ros.model.verdict import Cause, Grade, ModelResult, TermEstimate, TermResult, Verdict
-from selfcal_ros.reporting.summary.format import aligned, fixed_column, significant, to_ascii
-from selfcal_ros.reporting.summary.numbers import map_figures, truth_figures
-from selfcal_ros.reporting.summary.sections import place_text, pose_text
-from selfcal_ros.reporting.summary.text import (
+from selfcal_ros.reporting.summary.format import (
+    aligned,
     can_print_symbols,
+    fixed_column,
+    significant,
+    to_ascii,
+)
+from selfcal_ros.reporting.summary.numbers import map_figures, summary_numbers, truth_figures
+from selfcal_ros.reporting.summary.sections import (
+    place_text,
+    pose_text,
     state_sentence,
-    summary_numbers,
     summary_text,
 )
 from selfcal_ros.simulation.truth import Spread, hu_plan, random_truth, simulate_measurements
@@ -322,6 +327,6 @@ def test_symbols_only_where_the_stream_has_them():
 
 
 def test_summary_does_not_load_matplotlib():
-    code = ("import sys, selfcal_ros.reporting.summary.text; "
+    code = ("import sys, selfcal_ros.reporting.summary.sections; "
             "sys.exit('matplotlib' in sys.modules)")
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
