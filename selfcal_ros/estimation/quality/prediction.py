@@ -1,12 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """How well readings that were held out should be predicted: the distribution of the error.
 
-A prediction errs by the noise of the reading and by what the fit is off. Their sum of squares over
-the noise is a weighted sum of chi^2; seeded draws of unit noise through the same fit give its mean
+A prediction errs by the noise of the reading, by what the fit is off, and in a view that was held
+out as a whole by its own terms within their sizes. Their sum of squares over the noise is a
+weighted sum of chi^2; seeded draws of unit noise through the same fit give its mean
 and variance, and with these a scaled chi^2 (Satterthwaite), or F, as the noise is estimated.
 
-Microscope and direction of approach are shared by all views; drift, plate scale and plate shape
-belong to one view each, and are known of a view only if some of its readings were fitted.
+Microscope and direction of approach are shared by all views; drift, plate and circle of lines have
+coefficients of one view each, which are estimated only if some of its readings were fitted. Of a
+view that was held out as a whole they are known within their sizes.
 """
 
 from dataclasses import dataclass, replace
@@ -18,6 +20,7 @@ from selfcal_ros.estimation.joint.model_fit import ModelFit, equations_of
 from selfcal_ros.estimation.lattice.maps import PHASES, LatticeViews
 from selfcal_ros.estimation.lattice.readings import GridData, grid_data
 from selfcal_ros.estimation.terms.columns import term_columns
+from selfcal_ros.estimation.terms.equations import LEAST_NOISE_M
 from selfcal_ros.estimation.terms.ground import Ground, ground_of
 from selfcal_ros.estimation.terms.projection import reduce_columns
 from selfcal_ros.estimation.terms.shapes import shapes_in_full
@@ -42,7 +45,7 @@ TOGETHER = 20_000
 
 
 OF_A_VIEW = (TermName.DRIFT, *OF_PLATE)
-"""Terms of which each view has its own."""
+"""Terms of the marks of which each view has its own."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,11 +60,15 @@ class HeldReadings:
         What a unit of each fitted coefficient does to them, plate frame.
     rows : tuple of int
         Row of each of their views in the fit; -1 where it has none.
+    own : complex array (q, views, nx, ny)
+        What one standard deviation of each coefficient with a size that only views without a row
+        have does to them, plate frame, m.
     """
 
     grid: GridData
     columns: np.ndarray
     rows: tuple[int, ...]
+    own: np.ndarray
 
 
 def held_readings(model: ModelFit, kept: Measurements, held: Measurements) -> HeldReadings:
@@ -72,6 +79,7 @@ def held_readings(model: ModelFit, kept: Measurements, held: Measurements) -> He
     equations = model.equations
     n = 0 if equations is None else equations.n
     out: np.ndarray = np.zeros((n, *grid.y.shape), dtype=complex)
+    own = [out[:0]]
     if equations is not None:
         ground = _in_time_of(ground_of(held, grid, problem.half_width_m), grid, kept, held)
         made = term_columns(ground, problem.terms, problem.drift_degree)
@@ -79,11 +87,13 @@ def held_readings(model: ModelFit, kept: Measurements, held: Measurements) -> He
         for column, block in zip(made.columns, made.grid, strict=True):
             if column.term == TermName.LINE_ECCENTRICITY:
                 continue  # its views are those with lines, and no mark has a part of it
-            row = -1 if column.view == -1 else rows[column.view]
             shared = column.view == -1
-            if (row >= 0 or shared) and (key := (column.term, row, column.component)) in at:
+            row = -1 if shared else rows[column.view]
+            if row < 0 and not shared:
+                own.append(np.where(np.isfinite(column.size), column.size, 0.0) * block[None])
+            elif (key := (column.term, row, column.component)) in at:
                 out[at[key]] += block
-    return HeldReadings(grid, out, rows)
+    return HeldReadings(grid, out, rows, np.concatenate(own))
 
 
 def _in_time_of(ground: Ground, grid: GridData, kept: Measurements, held: Measurements) -> Ground:
@@ -120,6 +130,26 @@ def of_terms(model: ModelFit, held: HeldReadings, index: int,
     row = held.grid.index.index(index)
     plate = np.tensordot(model.coefficients, held.columns[:, row], axes=1)
     return plate[view_marks] * PHASES[held.grid.poses[row].q]
+
+
+def of_line_terms(model: ModelFit, index: int, k: np.ndarray) -> np.ndarray:
+    """Return what the terms make of the lines `k` of one view, (Q,), rad.
+
+    Parameters
+    ----------
+    model : ModelFit
+        The fit.
+    index : int
+        Position of the view in the measurement; 0 is returned where none of its lines was fitted.
+    k : int array (Q,)
+        The lines.
+    """
+    if model.equations is None or index not in model.problem.angular.index:
+        return np.zeros(len(k))
+    lines, row = model.equations.columns.lines, model.problem.angular.index.index(index)
+    if not len(lines.at):
+        return np.zeros(len(k))
+    return model.coefficients[lines.at] @ lines.values[:, row, k]
 
 
 @dataclass(frozen=True)
@@ -159,6 +189,7 @@ def prediction_limit(model: ModelFit, held: HeldReadings, known: np.ndarray,
     noise = noise_of(rng, (n, *grid.weight.shape), grid.weight)
     fields, parameters, coefficients = _fitted(model, noise, rng)
     own = noise_of(rng, (n, *weight.shape), weight)
+    own_terms = rng.standard_normal((len(held.own), n)) / max(model.found.xy.sigma, LEAST_NOISE_M)
     views = LatticeViews(grid.views.shape, held.grid.poses)
     placings = [None if fitted >= 0 else Placing(views.z, known[row])
                 for row, fitted in enumerate(held.rows)]
@@ -174,6 +205,8 @@ def prediction_limit(model: ModelFit, held: HeldReadings, known: np.ndarray,
         error = own[draws] - views.gather(field) - plate[:, None]
         if len(coefficients):
             error = error - _of_terms(coefficients[:, draws], held.columns)
+        if len(held.own):
+            error = error + _of_terms(own_terms[:, draws], held.own)
         for row, (fitted, placing) in enumerate(zip(held.rows, placings, strict=True)):
             error[:, row] -= (misaligned[:, fitted] if placing is None else
                               np.array([placing.of(one) for one in error[:, row]]))

@@ -44,6 +44,7 @@ from selfcal_ros.estimation.quality.prediction import (
     OF_A_VIEW,
     HeldReadings,
     held_readings,
+    of_line_terms,
     of_terms,
     prediction_limit,
 )
@@ -175,7 +176,8 @@ def _held_out(measurements: Measurements, options: Options,
     for index, view in enumerate(held.views):
         at = view.m + measurements.artifact.half[0], view.n + measurements.artifact.half[1]
         more = of_terms(model, of, index, at)
-        less = replace(view, dx=view.dx - more.real, dy=view.dy - more.imag)
+        less = replace(view, dx=view.dx - more.real, dy=view.dy - more.imag,
+                       dtheta=view.dtheta - of_line_terms(model, index, view.k))
         residual, residual_theta = prediction_errors(measurements, solved.result, index, less,
                                                      rigid=rigid)
         errors.append(residual)
@@ -207,7 +209,8 @@ def _judged(solved: Solved, model: ModelFit, held: HeldReadings, *, known: np.nd
         weight = weight * (noise.sigma_xy_declared / held.grid.sigma_declared) ** 2
     square = float((weight * abs(error) ** 2)[known].sum()) / (2 * int(known.sum()))
     ratio = float(np.sqrt(square)) / max(noise.sigma_xy, 1e-300)
-    own = tuple(str(term.name) for term in model.problem.terms if term.name in OF_A_VIEW)
+    own = tuple(str(term.name) for term in model.problem.terms
+                if term.free and term.name in OF_A_VIEW)
     if own and -1 in held.rows:
         return ratio, NOTHING, OwnTermsUnknown(own)
     if not (noise.sigma_xy > ROUNDING and noise.dof_xy > 0 and model.problem.direct):

@@ -21,6 +21,7 @@ from selfcal_ros.model.terms import ModelTerm, TermName
 from selfcal_ros.model.view import View
 from selfcal_ros.reporting.words.result import worded
 from selfcal_ros.reporting.words.validation import validation_json, validation_text, why_text
+from selfcal_ros.simulation.machine import Spread
 from selfcal_ros.simulation.truth import hu_plan, random_truth, simulate_measurements
 from test.support.lattice_plans import plan_of
 from test.support.options import BARE, bare
@@ -115,10 +116,10 @@ def test_a_rest_that_does_not_settle_costs_its_own_line_alone(few_draws, monkeyp
         "a random tenth (1)", "view 'rot90'", "view 'shift_x'", "view 'both'"]
 
 
-def drawn(seed, plan, **how):
+def drawn(seed, plan, spread=None, **how):
     rng = np.random.default_rng(seed)
-    truth = random_truth(plan.artifact, len(plan.views), rng)
-    return simulate_measurements(truth, plan, rng, sigma_m=SIGMA_M, linear=True, **how)
+    truth = random_truth(plan.artifact, len(plan.views), rng, spread or Spread())
+    return simulate_measurements(truth, plan, rng, sigma_m=SIGMA_M, linear=spread is None, **how)
 
 
 SMALL = plan_of("0,90,180,tx,ty", Artifact(5, 0.01))
@@ -190,6 +191,33 @@ def test_terms_are_predicted_with_the_readings(few_draws):
         assert poor.rms_m > 2 * tenths[0].rms_m
     shared = validate(readings, replace(LINEAR, terms=terms[:1]), folds=1)[1]
     assert why_text(shared.why) == "" and np.isfinite(shared.limit)
+
+
+def test_a_view_held_out_has_own_terms_within_their_sizes(few_draws, monkeypatch):
+    """Its own strain is unknown and as large as its size: one in twenty exceeds a limit of 5 %."""
+    monkeypatch.setattr(prediction, "LEVEL", 0.05)
+    strained = bare(terms=(ModelTerm(TermName.PLATE_STRAIN, 5e-6),))
+    spread = Spread(plate_strain=5e-6)
+    found = [item for seed in range(8) for item in validate(
+        drawn(seed, SMALL, spread=spread), strained, folds=1)
+        if "view" in item.name and item.n_grid]
+    assert len(found) >= 30 and all(item.why is None for item in found)
+    assert sum(item.exceeds for item in found) <= binom.ppf(0.9995, len(found), 0.05)
+    assert min(item.ratio for item in found) > 1 and np.mean([item.ratio for item in found]) > 3
+
+
+@pytest.mark.parametrize("sense", list(Sense))
+def test_lines_are_predicted_with_the_eccentricity_of_their_view(sense, few_draws):
+    """Lines read to 0.02 urad on circles 15 urad off: off by more where it is no term."""
+    rng = np.random.default_rng(2)
+    plan = hu_plan(Artifact(7, 0.01, 24), 1)
+    truth = random_truth(plan.artifact, 4, rng, Spread(line_eccentricity_rad=15e-6))
+    readings = simulate_measurements(truth, plan, rng, sense=sense, sigma_m=SIGMA_M,
+                                     sigma_theta_rad=2e-8)
+    model = bare(terms=(ModelTerm(TermName.LINE_ECCENTRICITY, 15e-6),))
+    for item in validate(readings, model, folds=2)[:2]:
+        assert 1e-8 < item.rms_rad < 1e-7
+    assert validate(readings, BARE, folds=1)[0].rms_rad > 5e-6
 
 
 def test_seeds_and_folds(few_draws):
