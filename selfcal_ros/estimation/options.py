@@ -87,7 +87,8 @@ class Options:
         Who asks for the terms, for the provenance: ``options``, ``plan`` or empty.
     assumed : tuple of ModelTerm
         Terms with sizes that hold where `terms` does not name them: lines of type B of the budget
-        (GUM 4.3). Empty: all of them are known to be none.
+        (GUM 4.3). Empty: all of them are known to be none. Linear models assume none: they would
+        take the finite rotations that they leave out for strain.
     magnification_limit : float
         Difference of the scales of plate and encoders, m/m, beyond which there is a warning.
 
@@ -123,6 +124,11 @@ class Options:
         except ValueError as error:
             raise InputError("datum_theta", f"'{self.datum_theta}' is unknown",
                              known_are(str(self.datum_theta), ThetaDatum)) from error
+
+    @property
+    def finite_rotations(self) -> bool:
+        """Whether the plate turns by finite angles in the model."""
+        return self.misalignment_model == "rigid"
 
     def model_terms(self, *, visits: bool, assumed: bool = True) -> tuple[ModelTerm, ...]:
         """Return all terms of the model, those that are asked for before those that are assumed.

@@ -40,7 +40,7 @@ FACTORS = {
     "quiet": ([], ["--quiet"]),
     "json": ([], ["--json"])}
 ASSUMED = {"microscope", "plate_strain", "line_eccentricity"}
-"""What is in the model unless it is none."""
+"""What is in the model unless it is none, or linear."""
 CLASHES = {("reference", 1), ("reference", 2), ("model", 1), ("model", 2), ("model", 3),
            ("misalignment", 2), ("robust", 1), ("validate", 1)}
 """What Hu's law does not go together with."""
@@ -192,7 +192,7 @@ def assert_as_asked(data, row):
     assert data["model"]["misalignment"] == ("linear" if linear else "rigid")
     given = ",".join(FACTORS["model"][row["model"]][1::2]).replace("none", "")
     names = {text.split(":")[0] for text in given.split(",") if text}
-    bare = row["method"] or row["model"] == 4
+    bare = linear or row["model"] == 4
     assert {term["name"] for term in data["model"]["terms"]
             if term["source"] != "readings"} == names | (set() if bare else ASSUMED)
     degrees = {1 if row["degree"] else 2 if row["params"] else 3} if "drift" in given else set()

@@ -112,15 +112,14 @@ def prepare(measurements: Measurements, options: Options) -> tuple[Problem, Obse
     if direct and system.grid.n_sites > MAX_DIRECT_SITES:
         raise InputError("options", f"the uncertainty of {system.grid.n_sites} sites is beyond "
                          f"the limit of {MAX_DIRECT_SITES}", "solve without the uncertainty")
-    ground = ground_of(measurements, grid, half_width_m)
+    ground, rigid = ground_of(measurements, grid, half_width_m), options.finite_rotations
     terms = tuple(
         term for term in options.model_terms(
-            visits=all(v is not None for v in ground.visits), assumed=direct)
+            visits=all(v is not None for v in ground.visits), assumed=direct and rigid)
         if angular.index or term.name is not TermName.LINE_ECCENTRICITY)
     problem = Problem(
         system, grid, angular, *repeats_of(measurements), half_width_m, conditions, direct,
-        ground, options.reference, options.misalignment_model == "rigid", terms,
-        options.drift_degree)
+        ground, options.reference, rigid, terms, options.drift_degree)
     return turned(problem) if problem.rigid else replace(
         problem, turn_rad=np.zeros(len(grid.index))), seen
 

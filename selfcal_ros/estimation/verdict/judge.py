@@ -28,7 +28,8 @@ from selfcal_ros.estimation.findings import (
     SignNotShown,
     VisitedOnce,
 )
-from selfcal_ros.estimation.joint.solve import solve_joint
+from selfcal_ros.estimation.joint.model_fit import ModelFit
+from selfcal_ros.estimation.joint.solve import fit_joint, solve_joint
 from selfcal_ros.estimation.joint.solved import Solved
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.terms.solution import free_inverse
@@ -146,10 +147,10 @@ def _sign_findings(solved: Solved, measurements: Measurements,
     """
     declared = not options.assumed or any(
         term.name is TermName.MICROSCOPE and not term.free for term in options.terms)
-    model = solved.model
-    if declared or model is None or model.equations is None:
+    if declared or sign_is_shown(measurements):
         return []
-    if sign_is_shown(measurements):
+    model = solved.model if options.finite_rotations else _rigid_fit(measurements, options)
+    if model is None or model.equations is None:
         return []
     equations = model.equations
     rows = equations.rows([TermName.MICROSCOPE])
@@ -160,6 +161,15 @@ def _sign_findings(solved: Solved, measurements: Measurements,
     hidden = np.abs(equations.untold(rows)[scale[0]]).max(initial=0.0) > HIDDEN
     variance = free_inverse(equations)[scale[0], scale[0]] * model.found.xy.sigma**2
     return [] if not hidden and 0 <= variance <= SIGN_U**2 else [SignNotShown()]
+
+
+def _rigid_fit(measurements: Measurements, options: Options) -> ModelFit | None:
+    """Return the fit with finite rotations in place of a linear model, which has no microscope."""
+    try:
+        return fit_joint(measurements, replace(options, method="joint",
+                                               misalignment_model="rigid"))
+    except InputError:
+        return None
 
 
 def _noise_findings(solved: Solved) -> list[Finding]:

@@ -72,8 +72,8 @@ def measured(plan, model, sense=Sense.MICROSCOPE_MOVES, missing=0.0, rotation="l
 
 def both(readings, model, **how):
     terms = parse_terms([MODELS[model]], "")
-    result = calibrate(readings, Options(terms=terms, assumed=(), causes=False, uncertainty=True,
-                                         drift_degree=DEGREE, **how))
+    result = calibrate(readings, Options(terms=terms, causes=False, uncertainty=True,
+                                         drift_degree=DEGREE, **{"assumed": (), **how}))
     assert all(term.size_used is None for term in result.model.terms)  # none is contradicted
     dense = DenseFit(readings, terms, (result.noise.sigma_xy, result.noise.sigma_theta),
                      degree=DEGREE, rigid=result.model.misalignment == "rigid")
@@ -111,6 +111,12 @@ def require_same(result, dense, *, of_u=0.01, axes=False):
 @pytest.mark.parametrize("plan", PLANS)
 def test_a_model_as_the_dense_matrix_has_it(plan, model, sense):
     require_same(*both(measured(plan, model, sense), model, misalignment_model="linear"))
+
+
+@pytest.mark.parametrize("model", ["none", "free"])
+def test_nothing_more_is_assumed_of_a_linear_model(model):
+    require_same(*both(measured("lines", model), model, misalignment_model="linear",
+                       assumed=DEFAULT_TERMS))
 
 
 @pytest.mark.parametrize("sense", Sense)
