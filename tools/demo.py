@@ -4,10 +4,17 @@
 import signal
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from selfcal_ros.model.error_map import ErrorMap
 
 ROOT = Path(__file__).parents[1]
 BAG = ROOT / "bags" / "hu_noise"
 FOLDER = ROOT / "build" / "demo"
+
+MOST = 27
+"""Sites along a side; of larger fields every second, third, ... is shown."""
 
 
 def main() -> int:
@@ -23,7 +30,6 @@ def demo() -> int:
     """Replay, plot, report; what takes long to import is imported here, where Ctrl-C is caught."""
     from selfcal_ros.bagio.simulated import read_truth
     from selfcal_ros.cli.main import main as selfcal
-    from selfcal_ros.cli.terminal.map_picture import map_picture
     from selfcal_ros.cli.terminal.output import tell
     from selfcal_ros.files import read_json
     from selfcal_ros.model.result import result_from_dict
@@ -48,6 +54,28 @@ def demo() -> int:
                        ("report.html", "report: open it")):
         print(f"{what:18} {(FOLDER / name).relative_to(ROOT)}")
     return 0
+
+
+def map_picture(emap: "ErrorMap") -> list[str]:
+    """Return the length of the error at the sites as shades, y upwards; ``?`` = not known."""
+    import numpy as np
+
+    from selfcal_ros.cli.screen import SHADES
+    from selfcal_ros.units import UM_PER_M
+
+    artifact = emap.artifact
+    step = max(1, -(-max(artifact.shape) // MOST))
+    sites = tuple(slice(half % step, None, step) for half in artifact.half)
+    length = np.hypot(emap.gx, emap.gy)[sites] * UM_PER_M
+    known = np.isfinite(length)
+    most = float(length[known].max()) if known.any() else 0.0
+    part = np.where(known, length, 0.0) / (most or 1.0)
+    level = np.minimum((part * len(SHADES)).astype(int), len(SHADES) - 1)
+    rows = [" ".join(SHADES[k] if good else "?" for k, good in zip(levels, goods, strict=True))
+            for levels, goods in zip(level.T[::-1].tolist(), known.T[::-1].tolist(), strict=True)]
+    return [f"  {row}" for row in rows] + [
+        f"  length of the error: from ' ' = 0 to '{SHADES[-1]}' = {most:.3g} µm; x to the right, "
+        "y upwards"]
 
 
 if __name__ == "__main__":

@@ -6,9 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from selfcal_ros.errors import InputError, NotIdentifiableError
+from selfcal_ros.errors import NotIdentifiableError
 from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.estimation.joint.covariance import map_covariance
 from selfcal_ros.estimation.options import ReferenceLength
 from selfcal_ros.estimation.quality import prediction
 from selfcal_ros.estimation.quality.outliers import clean, robust_calibrate
@@ -164,12 +163,6 @@ def test_readings_of_zero_alone_take_a_reference():
     options = bare(reference=ReferenceLength("stage_x", 1e-6, 1e-6))
     emap = calibrate(readings, options).error_map
     assert np.allclose(emap.gx, 1e-6 * emap.artifact.x_m, rtol=1e-9, atol=0)
-
-
-def test_the_covariance_of_the_law_is_not_that_of_the_joint_map():
-    _, readings = measured(hu_plan(Artifact(5, 0.01, 8)))
-    with pytest.raises(InputError, match="covariance: that of the method 'law' is not known"):
-        map_covariance(readings, bare(method="law"))
 
 
 def test_a_line_of_a_fine_circle_that_is_read_once_cannot_be_checked():

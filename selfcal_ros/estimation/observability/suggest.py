@@ -43,8 +43,6 @@ MAX_TIES = 64
 FINALISTS = 5
 """Plans of a search on a smaller field that are judged on the plan's own field."""
 
-CRITERIA = ("rms", "max")
-
 
 @dataclass(frozen=True)
 class Score:

@@ -133,19 +133,14 @@ def residuals_of(measurements: Measurements, options: Options) -> Residuals:
     found = replace(fit(problem, problem.grid.y), residuals=grid_residuals(system, problem.grid.y),
                     residuals_theta=angular_residuals(system, problem.angular.y))
     if system.grid.n_sites <= EXACT_SITES:
-        redundancy, skew = _exact_leverage(system)
+        redundancy, skew = exact_leverage(system)
     else:
         redundancy = drawn_redundancy(system)
         skew = np.zeros(redundancy.shape, dtype=complex)
     return Residuals(problem, found, redundancy, angular_redundancy(system), skew)
 
 
-def exact_redundancy(system: NormalEquations) -> np.ndarray:
-    """Return 1 - h of every grid reading, (views, nx, ny), mean of both coordinates."""
-    return _exact_leverage(system)[0]
-
-
-def _exact_leverage(system: NormalEquations) -> tuple[np.ndarray, np.ndarray]:
+def exact_leverage(system: NormalEquations) -> tuple[np.ndarray, np.ndarray]:
     """Return 1 - h and the skew of every grid reading, (views, nx, ny)."""
     grid = system.grid
     inverse = grid.factor.solve(np.eye(grid.n_sites, dtype=complex))

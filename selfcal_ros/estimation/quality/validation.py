@@ -56,9 +56,6 @@ from selfcal_ros.model.statistics import rms
 from selfcal_ros.model.verdict import Finding, Grade
 from selfcal_ros.model.view import Plan
 
-FRACTION = 0.1
-"""Part of the readings that is held out at random."""
-
 MAX_FOLDS = 10
 
 NOTHING = float("nan")

@@ -15,7 +15,6 @@ from selfcal_ros.estimation.comparison.covariance import (
     xy_covariance,
 )
 from selfcal_ros.estimation.comparison.maps import compare
-from selfcal_ros.estimation.joint.covariance import map_covariance
 from selfcal_ros.estimation.law.solve import hu_readings, hu_views, law_for
 from selfcal_ros.estimation.options import ReferenceLength
 from selfcal_ros.model.artifact import Artifact
@@ -26,6 +25,7 @@ from selfcal_ros.model.view import View
 from selfcal_ros.reporting.words.result import worded
 from selfcal_ros.simulation.truth import Spread, hu_plan, random_truth, simulate_measurements
 from test.support.lattice_plans import plan_of
+from test.support.map_covariance import map_covariance
 from test.support.options import BARE, bare
 from test.support.recalibrations import responses, sizes_of
 

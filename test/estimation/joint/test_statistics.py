@@ -9,7 +9,6 @@ from scipy.stats import chi2
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.estimation.joint.covariance import map_covariance
 from selfcal_ros.estimation.joint.noise import coverage_factor
 from selfcal_ros.estimation.options import ReferenceKind, ReferenceLength
 from selfcal_ros.model.artifact import Artifact
@@ -18,6 +17,7 @@ from selfcal_ros.model.readings import Sense
 from selfcal_ros.reporting.words.result import worded
 from selfcal_ros.simulation.truth import Spread, hu_plan, random_truth, simulate_measurements
 from test.support.lattice_plans import in_datum, plan_of
+from test.support.map_covariance import map_covariance
 from test.support.options import BARE, bare
 from test.support.recalibrations import responses, sizes_of, values_of, with_values
 
@@ -106,13 +106,12 @@ def test_uncertainty_is_that_of_every_reading_moved_in_turn(missing, sigma_theta
             assert np.abs(errors / u[known]).max() < tolerance
 
 
-def test_covariance_and_use_between_nodes_are_those_of_every_reading_moved_in_turn():
+def test_covariance_is_that_of_every_reading_moved_in_turn():
     sigma, artifact = 2e-8, Artifact(7, 0.01)
     _, readings = measured(plan_of("0,90,tx", artifact), seed=4, sense=Sense.PLATE_MOVES,
                            linear=True)
     readings = stated(readings, sigma, 1.0)
     cover = map_covariance(readings, LINEAR)
-    x, y = np.array([0.004, -0.0251, 0.03]), np.array([0.013, 0.0299, -0.03])
     i, j = np.array([0, 3, 6]), np.array([1, 3, 6])
     answers = responses(map_numbers(LINEAR), readings, sizes_of(readings, sigma, 1.0))
     answers = answers[:, :2 * 49].reshape(-1, 2, *artifact.shape)
@@ -120,25 +119,9 @@ def test_covariance_and_use_between_nodes_are_those_of_every_reading_moved_in_tu
     predicted = cover.nodes(i, j)
     size = np.sqrt(np.outer(np.diag(predicted), np.diag(predicted)))
     assert np.abs((at_nodes.T @ at_nodes - predicted) / size).max() < 1e-8
-    at_points = np.array([bilinear(field, artifact, x, y) for field in answers])
-    assert np.sqrt((at_points**2).sum(axis=0)) == pytest.approx(cover.between(x, y), rel=1e-8)
     emap = calibrate(readings, LINEAR).error_map
     assert np.sqrt(np.diag(predicted)) == pytest.approx(np.r_[emap.u_gx[i, j], emap.u_gy[i, j]],
                                                         rel=1e-9)
-
-
-def bilinear(field, artifact, x, y):
-    from scipy.interpolate import RegularGridInterpolator
-
-    axes = artifact.x_m[:, 0], artifact.y_m[0]
-    return np.stack([RegularGridInterpolator(axes, part)(np.stack([x, y], axis=-1))
-                     for part in field], axis=-1)
-
-
-def test_positions_off_the_field_are_refused():
-    cover = map_covariance(measured(plan_of("0,90,tx", Artifact(5, 0.01)), sigma_m=1e-8)[1], BARE)
-    with pytest.raises(InputError, match="off the calibrated field"):
-        cover.between([0.021], [0.0])
 
 
 def test_coverage_factor_grows_with_few_degrees_of_freedom():

@@ -133,7 +133,7 @@ def few_candidates(monkeypatch):
     return few
 
 
-@pytest.mark.parametrize("criterion", suggest.CRITERIA)
+@pytest.mark.parametrize("criterion", ("rms", "max"))
 def test_best_plan_of_three_views_is_the_best_of_all(criterion, few_candidates):
     plan, score, how = best_plan(Artifact(3, 0.01), 3, angular=False, criterion=criterion)
     assert search_text(how) == "all 28 plans tried"

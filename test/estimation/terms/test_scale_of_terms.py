@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.estimation.joint.covariance import map_covariance
 from selfcal_ros.estimation.options import ReferenceLength
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Sense
@@ -15,6 +14,7 @@ from selfcal_ros.model.terms import parse_terms
 from selfcal_ros.model.view import Plan, View
 from selfcal_ros.simulation.machine import Spread, random_truth
 from selfcal_ros.simulation.truth import simulate_measurements
+from test.support.map_covariance import map_covariance
 from test.support.options import bare
 
 PITCH, SIZE = 0.01, 1e-6

@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
+"""The picture of the map in letters that `make demo` shows in a terminal."""
+
 from dataclasses import replace
 
 import numpy as np
 
-from selfcal_ros.cli.terminal.map_picture import map_picture
 from test.support.results import known_result
+from tools.demo import map_picture
 
 
 def picture(size, fill):
