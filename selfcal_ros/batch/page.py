@@ -12,7 +12,7 @@ from selfcal_ros.batch.quantities import described
 from selfcal_ros.batch.records import Record
 from selfcal_ros.batch.table import Series, in_time
 from selfcal_ros.errors import printable
-from selfcal_ros.reporting.html_page import page
+from selfcal_ros.reporting.report import page
 
 WIDTH, HEIGHT, LEFT, EDGE = 560, 150, 64, 14
 STYLE = """

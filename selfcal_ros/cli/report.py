@@ -28,9 +28,9 @@ def run(args: argparse.Namespace) -> int:
     """Read the result, write the report, say where it is."""
     from selfcal_ros.files import check_outputs, read_json
     from selfcal_ros.model.result import result_from_dict
+    from selfcal_ros.reporting.report import check_name, write_report
     from selfcal_ros.reporting.summary.format import can_print_symbols
     from selfcal_ros.reporting.summary.sections import summary_text
-    from selfcal_ros.reporting.write import check_name, write_report
 
     output = Path(args.output or f"{os.path.splitext(args.result)[0]}.html")
     check_outputs([args.result, args.truth], [output, args.plot])

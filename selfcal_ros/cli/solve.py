@@ -138,8 +138,8 @@ def run(args: argparse.Namespace) -> int:
         unidentified_result,
         with_input,
     )
+    from selfcal_ros.reporting.report import check_name, write_report
     from selfcal_ros.reporting.words.result import worded
-    from selfcal_ros.reporting.write import check_name, write_report
 
     check_outputs([args.bag, args.params], [file_of(args), args.report])
     if args.report:

@@ -11,7 +11,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 from selfcal_ros.messages.from_model import header
 from selfcal_ros.model.error_map import ErrorMap
 from selfcal_ros.nodes.filling import fill
-from selfcal_ros.reporting.maps.markers import map_geometry
+from selfcal_ros.reporting.markers import map_geometry
 
 INK = (0.1, 0.1, 0.1)
 

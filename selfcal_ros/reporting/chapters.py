@@ -11,13 +11,22 @@ from selfcal_ros.estimation.options import ReferenceLength
 from selfcal_ros.estimation.quality.budget import Budget, budgets
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.reporting.extras import convention_section, extra_sections, provenance_section
-from selfcal_ros.reporting.figures.angular import angular_map
 from selfcal_ros.reporting.figures.correction import before_and_after, tried
-from selfcal_ros.reporting.figures.distributions import courses, distributions, drift_found
-from selfcal_ros.reporting.figures.maps import component_maps, error_map, uncertainty_map
-from selfcal_ros.reporting.figures.rejected import rejected_map
-from selfcal_ros.reporting.figures.residuals import residual_maps, residuals_in
-from selfcal_ros.reporting.sheet.drawing import Drawing
+from selfcal_ros.reporting.figures.drawing import Drawing
+from selfcal_ros.reporting.figures.maps import (
+    angular_map,
+    component_maps,
+    error_map,
+    uncertainty_map,
+)
+from selfcal_ros.reporting.figures.places import rejected_map
+from selfcal_ros.reporting.figures.residuals import (
+    courses,
+    distributions,
+    drift_found,
+    residual_maps,
+    residuals_in,
+)
 from selfcal_ros.reporting.summary import sections
 from selfcal_ros.reporting.summary.format import fixed_column, printable
 from selfcal_ros.reporting.summary.sections import Section

@@ -22,7 +22,7 @@ from selfcal_ros.nodes import names
 from selfcal_ros.nodes import solver as solver_module
 from selfcal_ros.nodes.filling import fill
 from selfcal_ros.nodes.solver import Solver
-from selfcal_ros.reporting.maps.markers import map_geometry
+from selfcal_ros.reporting.markers import map_geometry
 from selfcal_ros.reporting.words.result import worded
 from selfcal_ros.sessions.solving import Outcome, short
 from test.support.maps import random_map, result_of

@@ -12,7 +12,7 @@ from selfcal_ros.estimation.joint.noise import coverage_factor
 from selfcal_ros.model.result import Observability, result_from_dict, result_to_dict
 from selfcal_ros.model.verdict import Cause, Grade, Remedy, Verdict
 from selfcal_ros.reporting.extras import MAX_ROWS, convention_section, extra_sections
-from selfcal_ros.reporting.html import report_html, save_report
+from selfcal_ros.reporting.report import report_html, save_report
 from test.support.results import known_result, with_residuals
 
 VOID = {"meta", "img", "br"}

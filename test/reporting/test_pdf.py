@@ -8,8 +8,8 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.reporting import pdf
 from selfcal_ros.reporting.chapters import Chapter
 from selfcal_ros.reporting.pdf import COLUMNS, _lines, report_pdf, save_pdf
+from selfcal_ros.reporting.report import write_report
 from selfcal_ros.reporting.summary.sections import Section
-from selfcal_ros.reporting.write import write_report
 from test.support.results import known_result, with_residuals
 
 SMALL = replace(known_result(3, 0)[0], plan_id=r"$\frac{ \n 長", warnings=("$x$ \x1b[2J",))

@@ -10,10 +10,10 @@ from selfcal_ros.aerotech.machine import MachineFrame
 from selfcal_ros.aerotech.verify import Residual, Verification, verify_tables
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.result import CalibrationResult
-from selfcal_ros.reporting.figures.fields import MAX_ARROWS, arrow_key, arrows, enlargement
+from selfcal_ros.reporting.figures.drawing import Drawing
 from selfcal_ros.reporting.figures.maps import WIDTH
+from selfcal_ros.reporting.figures.parts import MAX_ARROWS, arrow_key, arrows, enlargement
 from selfcal_ros.reporting.figures.residuals import panels
-from selfcal_ros.reporting.sheet.drawing import Drawing
 from selfcal_ros.units import MM_PER_M
 
 MAX_SITES = 10_201

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pictures of an error map: plots, and geometry for RViz."""
+"""Plots of an error map."""

@@ -10,17 +10,36 @@ import pytest
 
 from selfcal_ros.model.verdict import ModelResult, TermEstimate, TermResult
 from selfcal_ros.reporting.chapters import chapters
-from selfcal_ros.reporting.figures.angular import CENTRE, ZERO, angular_map
 from selfcal_ros.reporting.figures.correction import tried
-from selfcal_ros.reporting.figures.distributions import courses, distributions, drift_found
-from selfcal_ros.reporting.figures.fields import levels, text_width
-from selfcal_ros.reporting.figures.maps import component_maps, error_map, uncertainty_map
-from selfcal_ros.reporting.figures.rejected import rejected_in, rejected_map
-from selfcal_ros.reporting.figures.residuals import residual_maps, residuals_in
-from selfcal_ros.reporting.sheet.drawing import Discs, Drawing, Label, Path, Spot
-from selfcal_ros.reporting.sheet.frame import Frame, round_step, round_ticks
-from selfcal_ros.reporting.sheet.palette import COLOURS
-from selfcal_ros.reporting.sheet.svg import inline_svg, svg_file
+from selfcal_ros.reporting.figures.drawing import (
+    COLOURS,
+    Discs,
+    Drawing,
+    Frame,
+    Label,
+    Path,
+    Spot,
+    round_step,
+    round_ticks,
+)
+from selfcal_ros.reporting.figures.maps import (
+    CENTRE,
+    ZERO,
+    angular_map,
+    component_maps,
+    error_map,
+    uncertainty_map,
+)
+from selfcal_ros.reporting.figures.parts import levels, text_width
+from selfcal_ros.reporting.figures.places import rejected_in, rejected_map
+from selfcal_ros.reporting.figures.residuals import (
+    courses,
+    distributions,
+    drift_found,
+    residual_maps,
+    residuals_in,
+)
+from selfcal_ros.reporting.figures.svg import inline_svg, svg_file
 from test.support.results import known_result, with_residuals
 
 

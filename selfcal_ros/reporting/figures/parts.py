@@ -7,9 +7,17 @@ from collections.abc import Sequence
 import numpy as np
 
 from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.reporting.sheet.drawing import Drawing, Point
-from selfcal_ros.reporting.sheet.frame import TICK, Frame, round_step, round_ticks, tick_text
-from selfcal_ros.reporting.sheet.palette import LEVELS, SIDES
+from selfcal_ros.reporting.figures.drawing import (
+    LEVELS,
+    SIDES,
+    TICK,
+    Drawing,
+    Frame,
+    Point,
+    round_step,
+    round_ticks,
+    tick_text,
+)
 from selfcal_ros.reporting.summary.format import significant
 from selfcal_ros.units import MM_PER_M, UM_PER_M
 

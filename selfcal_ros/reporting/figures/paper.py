@@ -7,9 +7,8 @@ from matplotlib.colors import to_rgba
 from matplotlib.patches import PathPatch
 from matplotlib.path import Path as Outline
 
+from selfcal_ros.reporting.figures.drawing import COLOURS, Discs, Drawing, Label, Path, Point
 from selfcal_ros.reporting.maps.style import drawable
-from selfcal_ros.reporting.sheet.drawing import Discs, Drawing, Label, Path, Point
-from selfcal_ros.reporting.sheet.palette import COLOURS
 
 
 def put(drawing: Drawing, axes: Axes, points: float) -> None:

@@ -5,8 +5,17 @@ import math
 from collections.abc import Iterable
 from html import escape
 
-from selfcal_ros.reporting.sheet.drawing import Discs, Drawing, Item, Label, Path, Point, Spot
-from selfcal_ros.reporting.sheet.palette import classes_css, variables_css
+from selfcal_ros.reporting.figures.drawing import (
+    Discs,
+    Drawing,
+    Item,
+    Label,
+    Path,
+    Point,
+    Spot,
+    classes_css,
+    variables_css,
+)
 from selfcal_ros.reporting.summary.format import printable
 
 FONT = 'system-ui, "Segoe UI", "DejaVu Sans", sans-serif'

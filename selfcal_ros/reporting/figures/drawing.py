@@ -1,0 +1,298 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A drawing in pixels: lines, shapes and words, their colours, and frames with axes."""
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+
+LEVELS = 10
+"""Steps of a sequential scale, ``e0`` to ``e9`` (error) and ``v0`` to ``v9`` (uncertainty)."""
+
+SIDES = 5
+"""Steps of a diverging scale to either side of its middle: ``d0`` to ``d10``."""
+
+SERIES = 6
+"""Colours of series, ``c0`` to ``c5`` (Okabe and Ito); then they begin anew."""
+
+_PLAIN = {
+    "ink": ("#16202a", "#e7ecf1"), "soft": ("#55606a", "#a3afba"), "paper": ("#ffffff", "#14191e"),
+    "line": ("#d5dbe1", "#36414b"), "card": ("#f5f7f9", "#1d242b"), "good": ("#00664b", "#4cc9a0"),
+    "bad": ("#a83a00", "#ff9a5c"), "none": ("#e3e3e3", "#2b3137"), "band": ("#56b4e9", "#2f7fb0"),
+    "truth": ("#d55e00", "#ff8f3f"),
+    "c0": ("#0072b2", "#5ab4e8"), "c1": ("#d55e00", "#ff8f3f"), "c2": ("#008060", "#3fcf9f"),
+    "c3": ("#a0509a", "#e39ad0"), "c4": ("#7a6a00", "#e0cc55"), "c5": ("#404a54", "#b9c3cc")}
+_RAMPS = {
+    "e": (("#ffffff", "#b5d3ea", "#4f93cc"), ("#171d23", "#22476a", "#2f74b0")),
+    "v": (("#ffffff", "#c3b8de", "#7761ab"), ("#171d23", "#41346a", "#7058b0")),
+    "d": (("#2b6cb0", "#ffffff", "#c8601a"), ("#3f86d0", "#171d23", "#d06a20"))}
+
+
+def _mixed(stops: tuple[str, ...], part: float) -> str:
+    """Return the colour at `part` (0 to 1) of a ramp of evenly spaced stops."""
+    place = part * (len(stops) - 1)
+    index = min(int(place), len(stops) - 2)
+    low, high = (tuple(int(stops[i][at:at + 2], 16) for at in (1, 3, 5))
+                 for i in (index, index + 1))
+    return "#" + "".join(f"{round(a + (b - a) * (place - index)):02x}"
+                         for a, b in zip(low, high, strict=True))
+
+
+def _all_colours() -> dict[str, tuple[str, str]]:
+    colours = dict(_PLAIN)
+    for name, (light, dark) in _RAMPS.items():
+        count = 2 * SIDES + 1 if name == "d" else LEVELS
+        for i in range(count):
+            part = i / (count - 1)
+            colours[f"{name}{i}"] = (_mixed(light, part), _mixed(dark, part))
+    return colours
+
+
+COLOURS: dict[str, tuple[str, str]] = _all_colours()
+"""Name -> colour on light and on dark paper."""
+
+
+def _variables(column: int) -> str:
+    return " ".join(f"--{name}: {pair[column]};" for name, pair in COLOURS.items())
+
+
+def variables_css(root: str = ":root") -> str:
+    """Return the rules that define all colours as CSS variables; on paper they are light."""
+    return (f"{root} {{ color-scheme: light dark; {_variables(0)} }}\n"
+            f"@media screen and (prefers-color-scheme: dark) {{ {root} {{ {_variables(1)} }} }}\n")
+
+
+def classes_css() -> str:
+    """Return the classes of figures: ``f-NAME`` fills, ``s-NAME`` strokes."""
+    return "".join(f"svg.figure .f-{name}{{fill:var(--{name})}}"
+                   f"svg.figure .s-{name}{{stroke:var(--{name})}}\n" for name in COLOURS)
+
+
+Point = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Path:
+    """Lines through points, x to the right and y down; closed where they are filled.
+
+    Attributes
+    ----------
+    lines : tuple of tuples of points
+        One or more lines with the same look.
+    fill, stroke : str
+        Names of colours (`palette.COLOURS`); empty = none.
+    width : float
+        Of the stroke.
+    dash : tuple of float
+        Lengths of dashes and gaps; empty = solid.
+    opacity : float
+        Of the fill.
+    title : str
+        What is shown where a pointer rests on it.
+    """
+
+    lines: tuple[tuple[Point, ...], ...]
+    fill: str = ""
+    stroke: str = ""
+    width: float = 1.0
+    dash: tuple[float, ...] = ()
+    opacity: float = 1.0
+    title: str = ""
+
+
+@dataclass(frozen=True)
+class Discs:
+    """Ellipses with axes along x and y, all of one look; `centres` and `radii` pair by pair."""
+
+    centres: tuple[Point, ...]
+    radii: tuple[Point, ...]
+    fill: str = ""
+    stroke: str = ""
+    width: float = 1.0
+    opacity: float = 1.0
+
+
+@dataclass(frozen=True)
+class Spot:
+    """An invisible disc that tells something where a pointer rests on it."""
+
+    at: Point
+    radius: float
+    title: str
+
+
+@dataclass(frozen=True)
+class Label:
+    """Words. `anchor` is start, middle or end; `turned` reads upwards."""
+
+    at: Point
+    text: str
+    size: float = 12.0
+    anchor: str = "start"
+    colour: str = "ink"
+    bold: bool = False
+    turned: bool = False
+
+
+Item = Path | Discs | Spot | Label
+
+
+@dataclass
+class Drawing:
+    """Items on a sheet of `width` x `height` pixels, drawn in their order.
+
+    `name` makes a file name or an anchor, `says` tells in one sentence what is to be seen.
+    """
+
+    name: str
+    says: str
+    width: float
+    height: float
+    items: list[Item] = field(default_factory=list)
+
+    def line(self, points: Iterable[Point], *, stroke: str = "ink", width: float = 1.0,
+             dash: Sequence[float] = ()) -> None:
+        """Draw one line through points."""
+        self.items.append(Path((tuple(points),), stroke=stroke, width=width, dash=tuple(dash)))
+
+    def lines(self, lines: Iterable[Iterable[Point]], *, stroke: str = "ink",
+              width: float = 1.0) -> None:
+        """Draw many lines of one look."""
+        together = tuple(tuple(line) for line in lines)
+        if together:
+            self.items.append(Path(together, stroke=stroke, width=width))
+
+    def shapes(self, outlines: Iterable[Iterable[Point]], *, fill: str, stroke: str = "",
+               width: float = 1.0, opacity: float = 1.0) -> None:
+        """Fill outlines of one look."""
+        together = tuple(tuple(outline) for outline in outlines)
+        if together:
+            self.items.append(Path(together, fill=fill, stroke=stroke, width=width,
+                                   opacity=opacity))
+
+    def box(self, left: float, top: float, width: float, height: float, *, fill: str = "",
+            stroke: str = "") -> None:
+        """Draw a rectangle."""
+        self.items.append(Path((((left, top), (left + width, top), (left + width, top + height),
+                                 (left, top + height), (left, top)),), fill=fill, stroke=stroke))
+
+    def discs(self, centres: Sequence[Point], radii: Sequence[Point] | float, *, fill: str = "",
+              stroke: str = "", width: float = 1.0, opacity: float = 1.0) -> None:
+        """Draw ellipses of one look; a single number is the radius of all."""
+        if not len(centres):
+            return
+        sizes = ((float(radii), float(radii)),) * len(centres) if isinstance(
+            radii, int | float) else tuple(radii)
+        self.items.append(Discs(tuple(centres), sizes, fill, stroke, width, opacity))
+
+    def label(self, x: float, y: float, text: str, *, size: float = 12.0, anchor: str = "start",
+              colour: str = "ink", bold: bool = False, turned: bool = False) -> None:
+        """Write words with their baseline at (x, y)."""
+        self.items.append(Label((x, y), text, size, anchor, colour, bold, turned))
+
+    def spot(self, x: float, y: float, radius: float, title: str) -> None:
+        """Tell something where a pointer rests."""
+        self.items.append(Spot((x, y), radius, title))
+
+
+TICK = 11.0
+"""Size of the numbers at the axes, in pixels."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A rectangle of a drawing that stands for a range of x and of y.
+
+    Attributes
+    ----------
+    drawing : Drawing
+        Where it is drawn.
+    box : tuple of float
+        Left, top, width, height; pixels.
+    x, y : tuple of float
+        Lowest and highest value along each axis; y grows upwards.
+    """
+
+    drawing: Drawing
+    box: tuple[float, float, float, float]
+    x: tuple[float, float]
+    y: tuple[float, float]
+
+    def at(self, x: float, y: float) -> Point:
+        """Return the pixel of a point, kept within ten sizes of the frame."""
+        left, top, width, height = self.box
+        along = (x - self.x[0]) / (self.x[1] - self.x[0])
+        up = (y - self.y[0]) / (self.y[1] - self.y[0])
+        return (left + width * min(max(along, -10.0), 10.0),
+                top + height * (1 - min(max(up, -10.0), 10.0)))
+
+    @property
+    def per_x(self) -> float:
+        """Pixels of a unit along x."""
+        return self.box[2] / (self.x[1] - self.x[0])
+
+    @property
+    def per_y(self) -> float:
+        """Pixels of a unit along y."""
+        return self.box[3] / (self.y[1] - self.y[0])
+
+    def border(self) -> None:
+        """Draw the outline."""
+        self.drawing.box(*self.box, stroke="soft")
+
+    def axes(self, *, x_label: str = "", y_label: str = "", grid: bool = False,
+             ticks: tuple[int, int] = (5, 5), size: float = TICK) -> None:
+        """Draw outline, ticks with numbers, and what the axes are."""
+        left, top, width, height = self.box
+        bottom = top + height
+        for value in round_ticks(*self.x, ticks[0]):
+            x = self.at(value, self.y[0])[0]
+            if grid:
+                self.drawing.line([(x, top), (x, bottom)], stroke="line")
+            self.drawing.line([(x, bottom), (x, bottom + 4)], stroke="soft")
+            self.drawing.label(x, bottom + 6 + size, tick_text(value), size=size,
+                               anchor="middle", colour="soft")
+        for value in round_ticks(*self.y, ticks[1]):
+            y = self.at(self.x[0], value)[1]
+            if grid:
+                self.drawing.line([(left, y), (left + width, y)], stroke="line")
+            self.drawing.line([(left - 4, y), (left, y)], stroke="soft")
+            self.drawing.label(left - 7, y + 0.35 * size, tick_text(value), size=size,
+                               anchor="end", colour="soft")
+        self.border()
+        if x_label:
+            self.drawing.label(left + width / 2, bottom + 2.4 * size + 8, x_label, size=size + 1,
+                               anchor="middle", colour="soft")
+        if y_label:
+            self.drawing.label(left - 40, top + height / 2, y_label, size=size + 1,
+                               anchor="middle", colour="soft", turned=True)
+
+
+def round_step(span: float, count: int) -> float:
+    """Return the smallest of 1, 2, 5 times a power of ten that divides `span` into `count` or less.
+
+    1 where the span is not positive.
+    """
+    if not (math.isfinite(span) and span > 0):
+        return 1.0
+    rough = span / max(count, 1)
+    power = 10.0 ** math.floor(math.log10(rough))
+    return next((step * power for step in (1, 2, 5) if step * power >= rough * (1 - 1e-9)),
+                10 * power)
+
+
+def round_ticks(low: float, high: float, count: int) -> list[float]:
+    """Return round values from `low` to `high`, about `count` of them."""
+    step = round_step(high - low, count)
+    first, last = math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9)
+    return [index * step + 0.0 for index in range(first, last + 1)]
+
+
+def tick_text(value: float) -> str:
+    """Return a tick with the figures that it has, and a minus of full width."""
+    text = f"{value:.6g}"
+    return text.replace("-", "−")
+
+
+def span_of(values: Sequence[float], least: float = 0.0) -> float:
+    """Return the largest magnitude of the finite values; `least` or 1 where there is none."""
+    return max((abs(v) for v in values if math.isfinite(v)), default=0.0) or least or 1.0
