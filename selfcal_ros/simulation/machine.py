@@ -31,6 +31,10 @@ class Spread:
         Standard deviations of stage and plate error.
     phi_rad, t_m : float
         Standard deviations of each view's misalignment.
+    correlation_pitches : float
+        Length over which the stage error, and that of the rotary encoder in lines, stays alike:
+        its correlation falls with the distance d as exp(-d^2 / 2 L^2). 0: that of each site and
+        line is its own, and bilinear in between.
     encoder : str
         ``independent``: the rotary encoder owes nothing to the axes, only its mean is 0.
         ``xy_axes``: it is true to the slopes of the half axes (Hu eq. 9).
@@ -82,6 +86,7 @@ class Spread:
     a_theta_rad: float = np.deg2rad(0.01)
     phi_rad: float = np.deg2rad(0.3)
     t_m: float = 30e-6
+    correlation_pitches: float = 0.0
     encoder: str = "independent"
     rotation: str = "finite"
     microscope_scale: float = 0.0
@@ -133,6 +138,35 @@ def _zeros(*shape: int) -> Any:
 
 
 @dataclass(frozen=True, eq=False)
+class Waves:
+    """Waves that add up to a smooth error: of a stage along x and y, or of an encoder.
+
+    Attributes
+    ----------
+    number : float array (n, d)
+        Angle that each wave turns by over the unit of each coordinate.
+    size : complex array (n, components)
+        Amplitude and phase of each, m or rad.
+    """
+
+    number: np.ndarray
+    size: np.ndarray
+
+    def at(self, place: np.ndarray) -> np.ndarray:
+        """Return the sum of the waves at places (d, E), (components, E)."""
+        parts = np.array_split(place, 1 + place.shape[1] // MOST_PLACES, axis=1)
+        return np.concatenate([np.real(self.size.T @ np.exp(1j * (self.number @ part)))
+                               for part in parts], axis=1)
+
+
+NO_WAVES = Waves(np.zeros((0, 2)), np.zeros((0, 2), dtype=complex))
+N_WAVES = 300
+"""Waves of random direction that a smooth stage error is made of."""
+MOST_PLACES = 4096
+"""Places at which waves are added up at once, 20 MB."""
+
+
+@dataclass(frozen=True, eq=False)
 class Truth:
     """Stage error, plate error, the misalignment of each view, and what else is true.
 
@@ -142,9 +176,10 @@ class Truth:
         The lattice.
     g, a : float array (2, nx, ny)
         Stage error at the sites (stage frame) and plate error of the marks (plate frame), m.
-        Between sites the stage error is bilinear.
+        Between sites the stage error less `waves` is bilinear.
     g_theta, a_theta : float array (K,)
-        The same for the angular lines, rad; between lines the stage error is linear.
+        The same for the angular lines, rad; between lines the stage error less `waves_theta` is
+        linear.
     phi_rad : float array (views,)
         Rotation of each view, counter-clockwise, about the plate's centre.
     t_m : float array (views, 2)
@@ -191,6 +226,8 @@ class Truth:
         second and third power of time.
     walk_m : float array (views, 2, steps + 1) or (0, 2, 1)
         Motion of the plate at equal steps of time from the first grid exposure to the last.
+    waves, waves_theta : Waves
+        What the stage error has between sites (places in pitches), and between lines (in lines).
     """
 
     artifact: Artifact
@@ -220,6 +257,8 @@ class Truth:
     placed: tuple[View | None, ...] = ()
     drift_m: np.ndarray = _zeros(0, 2, 3)
     walk_m: np.ndarray = _zeros(0, 2, 1)
+    waves: Waves = NO_WAVES
+    waves_theta: Waves = NO_WAVES
 
     @property
     def by_visit(self) -> bool:
@@ -253,13 +292,13 @@ def random_truth(artifact: Artifact, n_views: int, rng: np.random.Generator,
         plate lies, its temperature, its strain, drifts. Without it `rng` goes on.
     """
     spread = spread or Spread()
-    g = remove_modes(rng.normal(0, spread.g_m, (2, *artifact.shape)),
-                     datum_modes(artifact, scale=True))
+    drawn_g, waves = _stage(artifact, spread, rng)
+    g = remove_modes(drawn_g, datum_modes(artifact, scale=True))
     a = remove_modes(rng.normal(0, spread.a_m, (2, *artifact.shape)),
                      datum_modes(artifact, scale=False))
     a += spread.pitch_error * np.stack([artifact.x_m, artifact.y_m])
-    g_theta = _encoder(artifact, g, rng.normal(0, spread.g_theta_rad, artifact.angular_count),
-                       spread.encoder)
+    drawn_theta, waves_theta = _circle(artifact.angular_count, spread, rng)
+    g_theta = _encoder(artifact, g, drawn_theta, spread.encoder)
     a_theta = rng.normal(0, spread.a_theta_rad, artifact.angular_count)
     rng = placing or rng
     phi, t = rng.normal(0, spread.phi_rad, n_views), rng.normal(0, spread.t_m, (n_views, 2))
@@ -273,7 +312,40 @@ def random_truth(artifact: Artifact, n_views: int, rng: np.random.Generator,
         spread.microscope_distortion / spread.microscope_field_m**2,
         np.array([spread.optical_tilt_x_rad, spread.optical_tilt_y_rad]),
         np.array([spread.backlash_x_m, spread.backlash_y_m]), spread.backlash_growth_m,
-        spread.settling_m, spread.settling_time_s, plate_bow_m=spread.plate_bow_m, **drawn)
+        spread.settling_m, spread.settling_time_s, plate_bow_m=spread.plate_bow_m,
+        waves=waves, waves_theta=waves_theta, **drawn)
+
+
+def _stage(artifact: Artifact, spread: Spread,
+           rng: np.random.Generator) -> tuple[np.ndarray, Waves]:
+    """Return the stage error at the sites, (2, nx, ny), m, and the waves that it consists of."""
+    length = spread.correlation_pitches
+    if not length:
+        return rng.normal(0, spread.g_m, (2, *artifact.shape)), NO_WAVES
+    # directions and lengths whose spectrum is that of exp(-d^2 / 2 L^2)
+    number = rng.normal(0, 1 / length, (N_WAVES, 2))
+    waves = Waves(number, _amplitudes(rng, np.full(N_WAVES, spread.g_m / np.sqrt(N_WAVES)), 2))
+    sites = np.stack([artifact.m.ravel(), artifact.n.ravel()])
+    return waves.at(sites).reshape(2, *artifact.shape), waves
+
+
+def _circle(count: int, spread: Spread, rng: np.random.Generator) -> tuple[np.ndarray, Waves]:
+    """Return the error of the rotary encoder at the lines, (K,), rad, and its waves."""
+    if not (spread.correlation_pitches and count):
+        return rng.normal(0, spread.g_theta_rad, count), NO_WAVES
+    line = 2 * np.pi / count
+    reach = spread.correlation_pitches * line
+    harmonic = np.arange(1, 2 + int(6 / reach))
+    power = np.exp((1 - harmonic**2) * reach**2 / 2)
+    size = spread.g_theta_rad * np.sqrt(power / power.sum())
+    waves = Waves(harmonic[:, None] * line, _amplitudes(rng, size, 1))
+    return waves.at(np.arange(count)[None])[0], waves
+
+
+def _amplitudes(rng: np.random.Generator, size: np.ndarray, components: int) -> np.ndarray:
+    """Return complex amplitudes of waves of standard deviation `size` (n,), (n, components)."""
+    parts = rng.normal(0, 1, (2, len(size), components))
+    return (parts[0] + 1j * parts[1]) * size[:, None]
 
 
 def _encoder(artifact: Artifact, g: np.ndarray, drawn: np.ndarray, encoder: str) -> np.ndarray:

@@ -129,15 +129,21 @@ def drift(truth: Truth, index: int, tau: np.ndarray) -> np.ndarray:
 def stage_error(truth: Truth, position: np.ndarray, index: int = 0) -> np.ndarray:
     """Return indicated minus true position at indicated positions (2, E) in a view, m.
 
-    Bilinear between the sites, and what the stage bends by in that view.
+    Bilinear between the sites, waves, and what the stage bends by in that view.
     """
-    (hx, hy), (nx, ny) = truth.artifact.half, truth.artifact.shape
-    u, v = position / truth.artifact.grid_pitch_m + np.array([[hx], [hy]])
+    artifact = truth.artifact
+    (hx, hy), (nx, ny) = artifact.half, artifact.shape
+    place, g = position / artifact.grid_pitch_m, truth.g
+    if len(truth.waves.number):
+        sites = np.stack([artifact.m.ravel(), artifact.n.ravel()])
+        g = g - truth.waves.at(sites).reshape(g.shape)
+    u, v = place + np.array([[hx], [hy]])
     i, j = (np.clip(np.floor(w), 0, size - 2).astype(int) for w, size in ((u, nx), (v, ny)))
-    u, v, g = u - i, v - j, truth.g
-    return ((1 - u) * ((1 - v) * g[:, i, j] + v * g[:, i, j + 1])
-            + u * ((1 - v) * g[:, i + 1, j] + v * g[:, i + 1, j + 1])
-            + stage_bending(truth, position, index))
+    u, v = u - i, v - j
+    error = ((1 - u) * ((1 - v) * g[:, i, j] + v * g[:, i, j + 1])
+             + u * ((1 - v) * g[:, i + 1, j] + v * g[:, i + 1, j + 1])
+             + stage_bending(truth, position, index))
+    return error + truth.waves.at(place) if len(truth.waves.number) else error
 
 
 def stage_bending(truth: Truth, position: np.ndarray, index: int) -> np.ndarray | float:
@@ -149,12 +155,18 @@ def stage_bending(truth: Truth, position: np.ndarray, index: int) -> np.ndarray 
 
 
 def encoder_error(truth: Truth, position: np.ndarray) -> np.ndarray:
-    """Return indicated minus true angle at indicated angles (E,), rad: linear between lines."""
-    count = truth.artifact.angular_count
-    u = position * (count / (2 * np.pi))
-    k = np.floor(u).astype(int)
-    u = u - k
-    return (1 - u) * truth.g_theta[k % count] + u * truth.g_theta[(k + 1) % count]
+    """Return indicated minus true angle at indicated angles (E,), rad.
+
+    Linear between lines, and waves.
+    """
+    count, g = truth.artifact.angular_count, truth.g_theta
+    place = position * (count / (2 * np.pi))
+    if len(truth.waves_theta.number):
+        g = g - truth.waves_theta.at(np.arange(count)[None])[0]
+    k = np.floor(place).astype(int)
+    u = place - k
+    error = (1 - u) * g[k % count] + u * g[(k + 1) % count]
+    return error + truth.waves_theta.at(place[None])[0] if len(truth.waves_theta.number) else error
 
 
 def true_offset(sense: Sense, place: np.ndarray, stage: np.ndarray) -> np.ndarray:

@@ -162,6 +162,7 @@ FACTOR: Bounds = {"low": -100.0, "high": 100.0}
 TRUTH: Section = {
     "g": ("g_m", LENGTH), "a": ("a_m", LENGTH), "g_theta": ("g_theta_rad", ANGLE),
     "a_theta": ("a_theta_rad", ANGLE), "phi": ("phi_rad", ANGLE), "t": ("t_m", LENGTH),
+    "correlation": ("correlation_pitches", {"unit": "pitches", "low": 0.0, "high": 1000.0}),
     "phi_common": ("phi_common_rad", ANGLE), "t_common": ("t_common_m", LENGTH),
     "encoder": ("encoder", {"choices": ENCODERS}), "rotation": ("rotation", {"choices": ROTATIONS})}
 NOISE: Section = {

@@ -114,10 +114,12 @@ def test_every_effect_beside_the_model_reaches_its_field(tmp_path):
         changed = {name: at for name, at in vars(made.spread).items()
                    if at != getattr(Spread(), name)}
         assert changed == {PHYSICS[key][0]: value}
-    made = simulation(tmp_path, {"plan": PLAN, "truth": {"phi_common": 1e-3, "t_common": 1e-5},
+    made = simulation(tmp_path, {"plan": PLAN, "truth": {"phi_common": 1e-3, "t_common": 1e-5,
+                                                          "correlation": 4},
                                  "noise": {"noise_ratio": 0.5},
                                  "cell": {"encoder_sigma": 1e-8, "encoder_sigma_theta": 1e-7}})
     assert (made.spread.phi_common_rad, made.spread.t_common_m) == (1e-3, 1e-5)
+    assert made.spread.correlation_pitches == 4.0
     cell = made.settings
     assert (cell.noise_ratio, cell.encoder_sigma_m, cell.encoder_sigma_rad) == (0.5, 1e-8, 1e-7)
 
@@ -175,7 +177,7 @@ KEYS = {
            "start_time": (float, 0.0, 2.1e9), "compression": str},
     "truth": dict.fromkeys(("g", "a", "t", "t_common"), (float, 0.0, 1e-3))
     | dict.fromkeys(("g_theta", "a_theta", "phi", "phi_common"), (float, 0.0, 0.1))
-    | {"encoder": str, "rotation": str},
+    | {"correlation": (float, 0.0, 1000.0), "encoder": str, "rotation": str},
     "physics": dict.fromkeys(("microscope_scale", "microscope_stretch", "microscope_rotation",
                               "microscope_shear", "microscope_distortion", "optical_tilt_x",
                               "optical_tilt_y", "pitch_error"), (float, -0.1, 0.1))

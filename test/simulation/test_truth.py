@@ -7,9 +7,12 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from selfcal_ros.estimation.datum.modes import datum_modes, remove_modes
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.simulation.exposures import CellSettings
+from selfcal_ros.simulation.machine import _stage
+from selfcal_ros.simulation.physics import encoder_error, stage_error
 from selfcal_ros.simulation.truth import (
     Spread,
     angular_deviation,
@@ -155,3 +158,57 @@ def test_visits_are_known_where_they_are_wanted_or_the_cell_is_told(how, known):
     readings = simulate_measurements(random_truth(plan.artifact, 2, rng, AS_PUBLISHED), plan, rng,
                                      **how)
     assert [view.visits is not None for view in readings.views] == [known] * 2
+
+
+LONG = Spread(correlation_pitches=3.0)
+
+
+def test_without_a_correlation_each_site_has_an_error_of_its_own():
+    artifact = Artifact(5, 0.01, 8)
+    truth = random_truth(artifact, 2, np.random.default_rng(7), Spread(correlation_pitches=0.0))
+    drawn = np.random.default_rng(7).normal(0, Spread().g_m, (2, 5, 5))
+    np.testing.assert_array_equal(truth.g, remove_modes(drawn, datum_modes(artifact, scale=True)))
+
+
+def test_a_smooth_stage_stays_alike_over_its_correlation():
+    """As exp(-d^2 / 2 L^2), along either axis, and alone in each component."""
+    place = np.array([[0.0, 1.5, 3.0, 0.0, 6.0], [0.0, 0.0, 0.0, 3.0, 0.0]])
+    found = np.stack([_stage(Artifact(5, 0.01, 8), LONG, np.random.default_rng(seed))[1].at(place)
+                      for seed in range(2000)])
+    cover = np.einsum("sci,sdj->cidj", found, found) / len(found) / LONG.g_m**2
+    distance = np.hypot(*(place[:, :, None] - place[:, None]))
+    for axis in range(2):
+        np.testing.assert_allclose(cover[axis, :, axis], np.exp(-distance**2 / 18), atol=0.1)
+    assert np.abs(cover[0, :, 1]).max() < 0.1
+
+
+def test_a_smooth_stage_is_its_map_at_the_sites_and_its_waves_between():
+    artifact = Artifact(5, 0.01, 8)
+    truth = random_truth(artifact, 2, np.random.default_rng(3), LONG)
+    sites = np.stack([artifact.x_m.ravel(), artifact.y_m.ravel()])
+    np.testing.assert_allclose(stage_error(truth, sites), truth.g.reshape(2, -1), atol=1e-21)
+    u = np.linspace(-0.02, 0.02, 41)
+    row = stage_error(truth, np.stack([u, np.full(41, 0.003)]))
+    bend = np.diff(row, 2)
+    assert np.abs(np.diff(bend)).max() < 0.2 * np.abs(bend).max()  # no corner at a site
+    waves = truth.waves.at(np.stack([u, np.full(41, 0.003)]) / 0.01)
+    np.testing.assert_allclose(np.diff(row - waves, 2), 0.0, atol=1e-20)  # the datum is linear
+
+
+def test_a_smooth_encoder_closes_and_is_its_map_at_the_lines():
+    found = []
+    for seed in range(400):
+        truth = random_truth(Artifact(5, 0.01, 24), 1, np.random.default_rng(seed), LONG)
+        lines = np.arange(24) * np.pi / 12
+        np.testing.assert_allclose(encoder_error(truth, lines), truth.g_theta, atol=1e-18)
+        asked = np.array([0.1, 2.3, 5.0])
+        np.testing.assert_allclose(encoder_error(truth, asked + 2 * np.pi),
+                                   encoder_error(truth, asked), atol=1e-16)
+        found.append(truth.g_theta)
+    cover = np.mean([np.roll(found, -d, axis=1) * found for d in (0, 3, 6)], axis=(1, 2))
+    # the mean, which no encoder has, is taken off what falls as exp(-d^2 / 2 L^2)
+    away = np.minimum(np.arange(24), 24 - np.arange(24))
+    want = np.exp(-away**2 / 18)
+    want = (want - want.mean()) / (want - want.mean())[0]
+    np.testing.assert_allclose(cover / cover[0], want[[0, 3, 6]], atol=0.06)
+    assert cover[0] == pytest.approx(LONG.g_theta_rad**2, rel=0.1)
