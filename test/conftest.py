@@ -7,6 +7,7 @@ The number is set before NumPy is loaded; processes that tests start inherit it.
 
 import gc
 import os
+import signal
 from pathlib import Path
 
 import pytest
@@ -17,6 +18,8 @@ for _libraries in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
 
 settings.register_profile("repeatable", deadline=None, derandomize=True)
 settings.load_profile("repeatable")
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # in the background of a shell: children too
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 gc.disable()  # nothing that is collected goes before the tests do
 
 RARELY = (100_000, 50, 100)

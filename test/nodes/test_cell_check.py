@@ -1,12 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`selfcal cell check` beside the simulated cell: all well, and each fault by its name."""
+"""`selfcal cell check` beside the simulated cell: all well, and each fault by its name.
+
+The cell moves the time of both on, by a step for each look at its clock: a machine that is busy
+makes it slow, and nothing late.
+"""
 
 import json
+import re
+import time
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
+from types import SimpleNamespace
 
 import pytest
+from builtin_interfaces.msg import Time
+from rosgraph_msgs.msg import Clock
 
+from selfcal_ros.cli import processes
 from selfcal_ros.cli.main import main
 from selfcal_ros.cli.processes import process
 from selfcal_ros.collection.messages import Detection, EncoderSample, Phase
@@ -19,6 +30,7 @@ from selfcal_ros.sessions import cell_check
 from test.support.sessions import plan_file, small_plan
 
 SECOND = 10**9
+STEP_NS = 20_000_000
 CHECKS = ["joints", "encoder rate", "encoder clock", "abort", "detection clock", "rest", "ids",
           "marks", "check stops", "signs", "revisits", "old commands"]
 
@@ -29,6 +41,14 @@ class FaultyCell(StageSimulator):
     def __init__(self, fault, **kwargs):
         self.fault, self.number = fault, 0
         super().__init__(**kwargs)
+        self._clock_voice = self.create_publisher(Clock, "/clock", names._qos(10))
+
+    def _on_timer(self):
+        now = self.get_clock().now().nanoseconds
+        if now:
+            super()._on_timer()
+        second, nanosecond = divmod(now + STEP_NS if now else time.time_ns(), SECOND)
+        self._clock_voice.publish(Clock(clock=Time(sec=second, nanosec=nanosecond)))
 
     def _on_command(self, message):
         command = to_model.command(message)
@@ -64,6 +84,14 @@ class FaultyCell(StageSimulator):
         super()._publish(replace(event, stamp_ns=event.stamp_ns + shift))
 
 
+class Checker(CellChecker):
+    """Waits by the time of the cell."""
+
+    def ports(self, publish):
+        return replace(super().ports(publish),
+                       now_s=lambda: self.get_clock().now().nanoseconds / SECOND)
+
+
 @pytest.fixture
 def short(monkeypatch):
     """Let the check wait for less: this cell exposes a hundred times a second."""
@@ -74,9 +102,9 @@ def short(monkeypatch):
 
 def checked(graph, fault="", checker=(), **cell):
     """Return the node that has checked a cell, and its items by name."""
-    graph.node(partial(FaultyCell, fault), servo_sigma=1e-9, **cell)
-    node = graph.node(partial(CellChecker, small_plan(), settle_s=0.2, patience_s=5.0),
-                      **dict(checker))
+    graph.node(partial(FaultyCell, fault), servo_sigma=1e-9, use_sim_time=True, **cell)
+    node = graph.node(partial(Checker, small_plan(), settle_s=0.2, patience_s=5.0),
+                      use_sim_time=True, **dict(checker))
     graph.until(node.finished.done, "the end of the check")
     return node, {item.name: item for item in node.session.items}
 
@@ -159,22 +187,37 @@ def test_a_sequencer_beside_it_is_refused(graph):
     assert node.session.items == []
 
 
-@pytest.mark.parametrize("words", [[], ["--json"]])
-def test_the_verb_checks_a_simulated_cell(ros_environment, tmp_path, capfd, words):
+def test_the_verb_checks_a_simulated_cell(ros_environment, tmp_path, capfd):
     """The cell tells the offsets of doubled pixels."""
     plan = plan_file(tmp_path, small_plan())
     with process("selfcal_ros.nodes.stage_simulator", [
             "--ros-args", "-r", "__ns:=/left", "-p", "microscope_pixels:=2.0"], ros_environment):
-        assert main(["cell", "check", "--plan", plan, "--namespace", "left", *words]) == 5
+        assert main(["cell", "check", "--plan", plan, "--namespace", "left"]) == 5
     said = capfd.readouterr().out
-    if words:
-        found = json.loads(said)
-        assert found["passed"] is False
-        assert [item["name"] for item in found["items"]] == CHECKS
-    else:
-        assert "pass  old commands: 0 detections after" in said
-        assert "FAIL  signs: offsets in wrong units" in said
-        assert said.splitlines()[-1].endswith(" of 12 checks failed")
+    assert [re.match("(pass|FAIL)  (.*?): ", line)[2] for line in said.splitlines()[:-1]
+            if not line.startswith(" ")] == CHECKS
+    assert "FAIL  signs: offsets in wrong units" in said
+    assert said.splitlines()[-1].endswith(" of 12 checks failed")
+
+
+@pytest.mark.parametrize(("code", "words", "said"), [
+    (0, [], "pass  rest: still\nall 1 checks passed: the cell is ready for a calibration\n"),
+    (0, ["--json"], {"passed": True, "items": [
+        {"name": "rest", "passed": True, "figure": "still", "remedy": ""}]}),
+    (5, ["--json"], {"passed": False, "items": [
+        {"name": "rest", "passed": False, "figure": "moves", "remedy": "wait"}]}),
+    (5, [], "FAIL  rest: moves\n      wait\n1 of 1 checks failed\n")])
+def test_what_the_verb_says(tmp_path, monkeypatch, capfd, code, words, said):
+    item = {"name": "rest", "passed": not code, "figure": "moves" if code else "still",
+            "remedy": "wait" if code else ""}
+
+    @contextmanager
+    def child(*_, **__):
+        yield SimpleNamespace(stdout=[json.dumps(item)], wait=lambda: code)
+    monkeypatch.setattr(processes, "process", child)
+    assert main(["cell", "check", "--plan", plan_file(tmp_path, small_plan()), *words]) == code
+    found = capfd.readouterr().out
+    assert (json.loads(found) if words else found) == said
 
 
 @pytest.mark.parametrize(("words", "said"), [
