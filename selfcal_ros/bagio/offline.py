@@ -2,7 +2,7 @@
 """A bag straight into the collector, without middleware."""
 
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,6 +20,10 @@ from selfcal_ros.messages.input_columns import EncoderBlock
 from selfcal_ros.messages.topics import COMMAND_TOPIC, DETECTION_TOPIC, ENCODER_TOPIC, INPUT_TOPICS
 from selfcal_ros.model.readings import Measurements
 
+FROM_THE_FUTURE = {ENCODER_TOPIC: ("encoder", Reason.ENCODER_FUTURE),
+                   DETECTION_TOPIC: ("detection", Reason.FUTURE),
+                   COMMAND_TOPIC: ("command", Reason.COMMAND_FUTURE)}
+"""How messages that are stamped in the future of their reception are counted."""
 MAX_SAID = 3
 """Lines of what was lost that an error repeats."""
 
@@ -70,11 +74,7 @@ def collect_bag(path: str | Path, settings: CollectorSettings, *, namespace: str
     """
     keep_freed_memory()
     reader = BagReader(Path(path), namespace, settings.clock_limit)
-    collector = Collector(settings)
-    take = block_handlers(collector, reader.lost)
-    for topic, item in reader.columns():
-        take[topic](item)
-        progress(sum(collector.received.values()))
+    reader, collector = _fed(reader, settings, INPUT_TOPICS, progress)
     received = collector.received
     cell = None if namespace is None else namespace.strip("/")
     if cell is not None and reader.cells and cell not in reader.cells:
@@ -88,7 +88,7 @@ def collect_bag(path: str | Path, settings: CollectorSettings, *, namespace: str
                               f"{topics_like(topic, reader.topics)}record this topic too, see "
                               "the README")
     measurements, views = collector.collect()
-    clock = step_lines(reader.steps, collector.timeline)
+    clock = [*step_lines(reader.steps, collector.timeline), *reader.future_lines()]
     findings = [(f"view '{views[index].view.name}': " if index is not None else "") + str(finding)
                 for index, finding in collector.findings(measurements, views).items()]
     if not any(view.used for view in measurements.views):
@@ -100,15 +100,29 @@ def collect_bag(path: str | Path, settings: CollectorSettings, *, namespace: str
     return BagSession(measurements, views, [*reader.lost, *clock], [*clock, *findings])
 
 
-def clock_lines(path: str | Path, settings: CollectorSettings,
-                namespace: str | None = None) -> list[str]:
-    """Return one line for each step of a clock that a bag shows, as `collect_bag` has them."""
-    reader, collector = BagReader(Path(path), namespace, settings.clock_limit), Collector(settings)
-    take_command = input_handlers(collector, [])[COMMAND_TOPIC]
+def _fed(reader: BagReader, settings: CollectorSettings, roles: Collection[str],
+         progress: Callable[[int], None] = lambda count: None) -> tuple[BagReader, Collector]:
+    """Return what has read a bag, and a collector that has taken these topics of it."""
+    collector = Collector(settings)
+    take = block_handlers(collector, reader.lost)
     for topic, item in reader.columns():
-        if topic == COMMAND_TOPIC:
-            take_command(item)
-    return step_lines(reader.steps, collector.timeline)
+        if topic in roles:
+            take[topic](item)
+        progress(sum(collector.received.values()))
+    if reader.mixes_clocks and not reader.leave_ahead:
+        honest = BagReader(reader.path, reader.namespace, reader.clock_limit_s, leave_ahead=True)
+        return _fed(honest, settings, roles, progress)
+    for topic, count in reader.ahead.items() if reader.leave_ahead else ():
+        collector.refuse(*FROM_THE_FUTURE[topic], count)
+    return reader, collector
+
+
+def clock_lines(path: str | Path, settings: CollectorSettings,
+                namespace: str | None = None) -> tuple[list[str], dict[str, int]]:
+    """Return a line for each step of a clock, and refused messages by reason, as `collect_bag`."""
+    reader = BagReader(Path(path), namespace, settings.clock_limit)
+    reader, collector = _fed(reader, settings, [COMMAND_TOPIC])
+    return step_lines(reader.steps, collector.timeline), collector.unusable
 
 
 def topics_like(topic: str, topics: dict[str, str]) -> str:

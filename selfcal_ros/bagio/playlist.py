@@ -39,11 +39,12 @@ class Playlist:
     def __init__(self, bag: Path, namespace: str | None = None, seed: int = -1) -> None:
         self._bag, self._namespace = bag, namespace
         reader = BagReader(bag, namespace)
-        times, topics = array("Q"), array("B")
-        for topic, stamp, _ in reader.cdr_messages():
-            times.append(stamp)
-            topics.append(TOPICS.index(topic))
-        self.lost = reader.lost
+        times, topics = _times_and_topics(reader)
+        self._leave_ahead = reader.mixes_clocks
+        if self._leave_ahead:
+            reader = self._reader()
+            times, topics = _times_and_topics(reader)
+        self.lost = [*reader.lost, *reader.future_lines()]
         self._times = np.array(times, dtype=np.uint64)
         numbers, counts = np.unique(np.array(topics, dtype=np.uint8), return_counts=True)
         self.counts = {TOPICS[number]: int(count)
@@ -56,13 +57,16 @@ class Playlist:
             order = mixed if order is None else order[mixed]
         self._order = order
 
+    def _reader(self) -> BagReader:
+        return BagReader(self._bag, self._namespace, leave_ahead=self._leave_ahead)
+
     def __len__(self) -> int:
         """Return the number of messages."""
         return len(self._times)
 
     def __iter__(self) -> Iterator[tuple[str, int, bytes]]:
         """Yield topic, time of logging in ns, and CDR bytes."""
-        messages = BagReader(self._bag, self._namespace).cdr_messages()
+        messages = self._reader().cdr_messages()
         if self._order is None:
             yield from messages
             return
@@ -70,3 +74,12 @@ class Playlist:
         for number, stamp in zip(self._order.tolist(), self._times.tolist(), strict=True):
             topic, data = kept[number]
             yield topic, stamp, data
+
+
+def _times_and_topics(reader: BagReader) -> tuple[array, array]:
+    """Return the time of logging of each message, and the number of its topic."""
+    times, topics = array("Q"), array("B")
+    for topic, stamp, _ in reader.cdr_messages():
+        times.append(stamp)
+        topics.append(TOPICS.index(topic))
+    return times, topics

@@ -14,12 +14,14 @@ from selfcal_ros.bagio.channels import ChannelDecoder, Input, Waiting
 from selfcal_ros.bagio.mcap.chunk import Block
 from selfcal_ros.bagio.mcap.stream import CONVERT, McapStream
 from selfcal_ros.bagio.schemas import other_field, shorter_stores, store_of_schema
-from selfcal_ros.collection.clock.steps import Step, StepWatch
+from selfcal_ros.collection.clock.steps import Step, StepWatch, future_lines
+from selfcal_ros.collection.messages import MAX_AHEAD_NS
 from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import read_yaml
 from selfcal_ros.messages.input_columns import first_stamps_ns
 from selfcal_ros.messages.topics import COMMAND_TOPIC, DETECTION_TOPIC, ENCODER_TOPIC, INPUT_TOPICS
+from selfcal_ros.units import NS_PER_S
 
 LAST_FIELDS = {ENCODER_TOPIC: "position", DETECTION_TOPIC: "score", COMMAND_TOPIC: "angular_count"}
 """Last field that the contract asks for; what stands behind it may be missing."""
@@ -27,6 +29,7 @@ SUFFIXES = (".mcap", ".mcap.zstd")
 CLOCK_LIMIT_S = CollectorSettings().clock_limit
 LOOKED_AT = 200
 """Stamps of a topic in a chunk that are held against the times of logging."""
+NEVER_NS = np.iinfo(np.int64).max
 
 
 @dataclass
@@ -42,6 +45,8 @@ class BagReader:
         only one.
     clock_limit_s : float
         Steps of clocks that are larger are noted.
+    leave_ahead : bool
+        Leave out what is stamped in the future of its logging (not by `stamped_messages`).
 
     Attributes
     ----------
@@ -49,6 +54,9 @@ class BagReader:
         What could not be read, one line each, after reading.
     steps : dict
         Topic -> steps of the clock that stamps it, after reading (not by `stamped_messages`).
+    ahead : Counter
+        Topic -> messages stamped in the future of their logging, after reading, left out or not
+        (not by `stamped_messages`).
     cells : set of str
         Namespaces of the input topics that were met, without slashes.
     topics : dict of str
@@ -58,10 +66,13 @@ class BagReader:
     path: Path
     namespace: str | None = None
     clock_limit_s: float = CLOCK_LIMIT_S
+    leave_ahead: bool = False
     lost: list[str] = field(default_factory=list)
     steps: dict[str, list[Step]] = field(default_factory=dict)
+    ahead: Counter = field(default_factory=Counter)
     cells: set[str] = field(default_factory=set)
     topics: dict[str, str] = field(default_factory=dict)
+    _n_commands: int = 0
 
     def __post_init__(self) -> None:
         """Find the MCAP files, refuse what is no bag."""
@@ -107,6 +118,23 @@ class BagReader:
             self.lost.append("metadata.yaml is damaged and was not used")
             return []
         return [name for name in dict.fromkeys(names) if name.endswith(SUFFIXES)]
+
+    @property
+    def mixes_clocks(self) -> bool:
+        """Whether messages are stamped in the future of their logging, and commands are not.
+
+        A live collector refuses such messages, or they would hide what is stamped later by a clock
+        that is right. Where all commands are like that, the times of logging tell nothing.
+        """
+        return bool(self.ahead.total()) and self._n_commands > self.ahead[COMMAND_TOPIC]
+
+    def future_lines(self) -> list[str]:
+        """Return a line, after reading, if messages were stamped in the future of their logging."""
+        if self.leave_ahead or not self.ahead:
+            return future_lines(self.ahead)
+        return [f"{COMMAND_TOPIC}: stamped more than {MAX_AHEAD_NS // NS_PER_S} s ahead of its "
+                "logging: a live collector refuses that; set the clock that stamps, or the "
+                "recorder's"]
 
     def messages(self) -> Iterator[tuple[str, object]]:
         """Yield (topic, decoded message) of the three input topics, names without namespace.
@@ -209,12 +237,24 @@ class BagReader:
                     decoders[key] = self._decoder(stream, stream.channels[number], bad)
                 decoder = decoders[key]
                 if decoder is not None:
-                    parts.append((decoder, np.flatnonzero(block.fronts["channel"] == number)))
+                    parts.append((decoder, self._in_time(decoder.role, block, np.flatnonzero(
+                        block.fronts["channel"] == number))))
             for decoder, index in parts:
                 if decoder.role in watches:
                     self._note_steps(watches[decoder.role], decoder.role, block[
-                        index[::max(1, len(index) // LOOKED_AT)]])
+                        index[::_stride(index)]])
             yield block, parts
+
+    def _in_time(self, role: str, block: Block, index: np.ndarray) -> np.ndarray:
+        """Count what is stamped in the future of its logging; return indices of what is read."""
+        self._n_commands += len(index) * (role == COMMAND_TOPIC)
+        if role == ENCODER_TOPIC and not _ahead(block, index[::_stride(index)]).any():
+            return index
+        ahead = _ahead(block, index)
+        if not ahead.any():
+            return index
+        self.ahead[role] += int(ahead.sum())
+        return index[~ahead] if self.leave_ahead else index
 
     def _note_steps(self, watch: StepWatch, role: str, block: Block) -> None:
         stamps, there = first_stamps_ns(block.payloads)
@@ -263,6 +303,20 @@ class BagReader:
                                  "choose one with --namespace")
             return role
         return None
+
+
+def _stride(index: np.ndarray) -> int:
+    """Return at every how many of the messages of a topic in a chunk it is looked."""
+    return max(1, len(index) // LOOKED_AT)
+
+
+def _ahead(block: Block, index: np.ndarray) -> np.ndarray:
+    """Return which messages are stamped in the future of their logging."""
+    stamps, there = first_stamps_ns(block.payloads[index])
+    ahead = np.zeros(len(index), dtype=bool)
+    logged = np.minimum(block.fronts["log_time"][index[there]], NEVER_NS).astype(np.int64)
+    ahead[there] = (stamps - logged > MAX_AHEAD_NS) & (logged > 0)  # 0: not known
+    return ahead
 
 
 def _roles(topic: str) -> list[str]:

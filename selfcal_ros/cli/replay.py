@@ -6,6 +6,7 @@ import contextlib
 import subprocess
 import sys
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 
 from selfcal_ros.cli.processes import domain, ended_by_signals, need_ros, process
@@ -55,12 +56,13 @@ def run(args: argparse.Namespace) -> int:
           domain() as environment):
         saved = folder / "result.json"
         code, lost = _play(args, saved, environment)
-        clock = _clock_lines(args)
+        clock, refused = _clock_lines(args)
         if code or not saved.exists():
             return code or 1
         result = result_from_dict(read_json(saved), str(saved))
         noted = [line for line in clock if line not in result.warnings]  # by the live collector
         result = with_input(result, source, [*lost, *noted])
+        result = replace(result, rejected=dict(sorted((result.rejected | refused).items())))
     data = result_to_dict(result)
     if file_of(args):
         write_json(args.output, data)
@@ -71,17 +73,20 @@ def run(args: argparse.Namespace) -> int:
     return exit_code(result)
 
 
-def _clock_lines(args: argparse.Namespace) -> list[str]:
-    """Say which clocks stepped in the bag, and return it: played fast, no node can see it."""
+def _clock_lines(args: argparse.Namespace) -> tuple[list[str], dict[str, int]]:
+    """Say which clocks stepped in the bag, and return it: played fast, no node can see it.
+
+    And return the messages stamped in the future, which were not played, by reason.
+    """
     from selfcal_ros.bagio.offline import clock_lines
     from selfcal_ros.cli.solve import node_settings
     from selfcal_ros.collection.settings.nodes import CollectorSettings
 
     settings = node_settings(args.params, CollectorSettings)
-    lines = clock_lines(args.bag, settings, args.namespace)
+    lines, refused = clock_lines(args.bag, settings, args.namespace)
     for line in lines:
         print(f"selfcal replay: {args.bag}: {line}", file=sys.stderr)
-    return lines
+    return lines, refused
 
 
 def _play(args: argparse.Namespace, saved: Path, environment: dict) -> tuple[int, list[str]]:

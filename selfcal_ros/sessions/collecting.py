@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from selfcal_ros.collection.clock.steps import Step, step_lines
+from selfcal_ros.bagio.offline import FROM_THE_FUTURE
+from selfcal_ros.collection.clock.steps import Step, future_lines, step_lines
 from selfcal_ros.collection.collector import Collector
 from selfcal_ros.collection.digest import placing_digest, readings_digest, session_digest
 from selfcal_ros.collection.expected import ViewProgress
@@ -251,8 +252,10 @@ class CollectingSession:
             self._advised.add(index)
 
     def _tell_steps(self) -> None:
-        """Say once that a clock has stepped; the health says it to the end of the run."""
-        lines = step_lines(self._clock.steps, self.collector.timeline)
+        """Say once that a clock has stepped or is ahead; the health says it until the run ends."""
+        refused = self.collector.unusable
+        lines = [*step_lines(self._clock.steps, self.collector.timeline), *future_lines(
+            [topic for topic, (_, reason) in FROM_THE_FUTURE.items() if refused.get(reason)])]
         for line in lines:
             if line not in self._stepped:
                 self._ports.say(Level.WARN, line)

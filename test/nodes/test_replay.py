@@ -3,6 +3,7 @@
 
 import re
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -13,8 +14,12 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from selfcal_ros.bagio.offline import bag_input
+from selfcal_ros.bagio.playlist import Playlist
+from selfcal_ros.bagio.simulated import event_fields
+from selfcal_ros.bagio.writer import BagWriter
 from selfcal_ros.cli import replay as replay_verb
 from selfcal_ros.cli.main import main as selfcal
+from selfcal_ros.collection.messages import Detection
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import read_json, write_json
 from selfcal_ros.model.result import result_from_dict, result_to_dict, with_input
@@ -171,6 +176,34 @@ def test_a_clock_that_stepped_is_said_once_as_solve_says_it(monkeypatch, tmp_pat
     params.write_text("measurement_collector: {ros__parameters: {clock_limit: 5.0}}")
     assert selfcal(["replay", bag, "--fast", "--quiet", "--params", str(params)]) == 0
     assert capsys.readouterr().err == ""
+
+
+def test_messages_of_the_future_are_rejected_by_the_command_as_by_solve(monkeypatch, tmp_path):
+    """They are not played: here a detection that is stamped a day late."""
+    bag = stepped_bag(tmp_path, 0.0)
+    with BagWriter(tmp_path / "more") as writer:
+        writer.add_topic(f"/{names.DETECTIONS.name}", "selfcal_msgs/msg/MarkDetection", [])
+        late = next(e for e in events_of(small_plan()) if isinstance(e, Detection))
+        writer.write(f"/{names.DETECTIONS.name}", event_fields(
+            replace(late, stamp_ns=late.stamp_ns + 86400 * 10**9), "stage")[1], late.stamp_ns)
+    (tmp_path / "more" / "more_0.mcap").rename(bag / "bag_1.mcap")
+    (bag / "metadata.yaml").unlink()
+    assert selfcal(["solve", str(bag), "--quiet", "-o", str(tmp_path / "solved.json")]) == 0
+    solved = read_json(tmp_path / "solved.json")
+    assert solved["rejected"] == {"from_the_future": 1}
+    *before, line = solved["warnings"]
+    assert "stage/mark_detections: what was stamped more than 60 s ahead" in line
+
+    @contextmanager
+    def process(module, given, *_, **__):
+        if module.endswith("replay_session"):
+            write_json(given[3], solved | {"rejected": {}, "warnings": before})
+        yield SimpleNamespace(stdout=[f"lost {text}" for text in Playlist(bag).lost],
+                              wait=lambda: 0)
+    monkeypatch.setattr(replay_verb, "process", process)
+    assert selfcal(["replay", str(bag), "--fast", "--quiet", "-o", str(tmp_path / "r.json")]) == 0
+    assert undated((tmp_path / "r.json").read_text()) == undated(
+        (tmp_path / "solved.json").read_text())
 
 
 def test_the_map_is_saved_once_the_solver_has_solved_what_the_collector_sent_last(graph):

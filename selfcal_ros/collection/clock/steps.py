@@ -5,11 +5,12 @@ Readings follow stamps alone and never the order of arrival; what is found here 
 It names the clock where stamps are no longer those of one clock, which stamps alone cannot tell.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
+from selfcal_ros.collection.messages import MAX_AHEAD_NS
 from selfcal_ros.collection.timeline import Timeline
 from selfcal_ros.units import NS_PER_S, S_PER_NS
 
@@ -170,6 +171,12 @@ def step_lines(steps: Mapping[str, Iterable[Step]], timeline: Timeline) -> list[
         topics = " and ".join(sorted({topic for _, topic in same}))
         lines.append(_line(topics, step, timeline))
     return lines
+
+
+def future_lines(topics: Collection[str]) -> list[str]:
+    """Return a line for topics of which messages were refused as stamped in the future, if any."""
+    return [f"{', '.join(sorted(topics))}: what was stamped more than {MAX_AHEAD_NS // NS_PER_S} s "
+            "ahead of its reception was not used; set the clock that stamps it"] if topics else []
 
 
 def _alike(one: Step, other: Step) -> bool:

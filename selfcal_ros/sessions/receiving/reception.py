@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 
 from selfcal_ros.bagio.channels import ChannelDecoder
+from selfcal_ros.bagio.offline import FROM_THE_FUTURE
 from selfcal_ros.bagio.schemas import typestore
 from selfcal_ros.collection.messages import MAX_AHEAD_NS, Phase
-from selfcal_ros.collection.reasons import Reason
 from selfcal_ros.errors import InputError
 from selfcal_ros.messages.cdr_columns import Payloads
 from selfcal_ros.messages.input_columns import first_stamps_ns
@@ -26,11 +26,6 @@ from selfcal_ros.sessions.ports import Diagnosis, Level
 from selfcal_ros.sessions.receiving.journal_keeper import JournalKeeper, TakenUp, bad_input, take_up
 from selfcal_ros.sessions.receiving.resting import Resting
 from selfcal_ros.units import S_PER_NS
-
-FROM_THE_FUTURE = {ENCODER_TOPIC: ("encoder", Reason.ENCODER_FUTURE),
-                   DETECTION_TOPIC: ("detection", Reason.FUTURE),
-                   COMMAND_TOPIC: ("command", Reason.COMMAND_FUTURE)}
-"""How messages that are stamped in the future are counted."""
 
 
 class Reception:
