@@ -8,7 +8,6 @@ gather of a row and a short Horner scheme; positions go through in blocks that s
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 
@@ -23,11 +22,46 @@ SNAP = 1e-9
 """Distance to a node, in pitches, below which a position counts as lying on it."""
 
 
-def cubic_spline(nodes: np.ndarray, values: np.ndarray, **kwargs: Any) -> Any:
-    """Return the scipy.interpolate.CubicSpline through `values` at `nodes`."""
-    from scipy.interpolate import CubicSpline  # most of a second, which bilinear does without
+def cubic_pieces(values: np.ndarray, *, periodic: bool = False) -> np.ndarray:
+    """Return the cubic spline through `values` (n, ...) one apart, (4, intervals, ...).
 
-    return CubicSpline(nodes, values, **kwargs)
+    Coefficients of 1, u, u^2, u^3 with u from 0 to 1 in each interval. Not-a-knot ends; a parabola
+    through three values. A periodic spline has n intervals, the last of which leads to the first
+    value.
+    """
+    slope = _slopes_of_circle(values) if periodic else _slopes(values)
+    if periodic:
+        values, slope = (np.concatenate([rows, rows[:1]]) for rows in (values, slope))
+    low, left, right, step = values[:-1], slope[:-1], slope[1:], np.diff(values, axis=0)
+    return np.stack([low, left, 3 * step - 2 * left - right, left + right - 2 * step])
+
+
+def _slopes(values: np.ndarray) -> np.ndarray:
+    """Return the slopes of the not-a-knot spline through `values` (n, ...), n at least 3."""
+    n = len(values)
+    slope = np.empty_like(values)  # first the right-hand side
+    slope[1:-1] = 3 * (values[2:] - values[:-2])
+    for end, inward in ((0, 1), (-1, -1)):
+        f0, f1, f2 = (values[end + k * inward] for k in range(3))
+        slope[end] = inward * (4 * f1 - 5 * f0 + f2) / 2
+    before, own = [0.0, *[1.0] * (n - 2), 2.0], [1.0, *[4.0] * (n - 2), 1.0]
+    after = [2.0, *[1.0] * (n - 2), 0.0]
+    if n == 3:  # both ends are one condition: the parabola has no third derivative
+        before[2], slope[2] = 0.0, (values[0] - 4 * values[1] + 3 * values[2]) / 2
+    for i in range(1, n):  # each row less the one before it
+        part = 1 / (own[i] - before[i] * after[i - 1])
+        after[i] *= part
+        slope[i] = (slope[i] - before[i] * slope[i - 1]) * part
+    for i in range(n - 2, -1, -1):
+        slope[i] -= after[i] * slope[i + 1]
+    return slope
+
+
+def _slopes_of_circle(values: np.ndarray) -> np.ndarray:
+    """Return the slopes of the periodic spline through `values` (n, ...)."""
+    turn = 2 * np.pi * np.fft.rfftfreq(len(values)).reshape(-1, *[1] * (values.ndim - 1))
+    spectrum = np.fft.rfft(values, axis=0) * (3j * np.sin(turn) / (2 + np.cos(turn)))
+    return np.fft.irfft(spectrum, len(values), axis=0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -238,10 +272,8 @@ def bicubic_cells(fields: np.ndarray) -> Cells:
 
     Not-a-knot ends; along a direction of three nodes that spline is a parabola.
     """
-    nx, ny = fields.shape[1:]
-    along_x = cubic_spline(np.arange(nx), fields, axis=1).c[::-1]
-    both = cubic_spline(np.arange(ny), along_x, axis=3).c[::-1]
-    # Axes now: q, j, p, i, field.
+    along_x = cubic_pieces(fields.swapaxes(0, 1))  # p, i, field, j
+    both = cubic_pieces(along_x.transpose(3, 0, 1, 2))  # q, j, p, i, field
     return _cells(both.transpose(4, 3, 1, 2, 0), 4, fields)
 
 

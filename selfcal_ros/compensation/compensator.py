@@ -21,7 +21,7 @@ from selfcal_ros.compensation.cells import (
     Cells,
     bicubic_cells,
     bilinear_cells,
-    cubic_spline,
+    cubic_pieces,
 )
 from selfcal_ros.compensation.options import Interpolation, Outside
 from selfcal_ros.errors import InputError
@@ -296,15 +296,12 @@ class _Circle:
         steps = np.abs(np.diff(self._closed))
         if np.any(steps > MAX_SLOPE * 2 * np.pi / max(self._count, 1)):
             raise _steep("angular lines")
-        self._spline = (cubic_spline(np.arange(self._count + 1), self._closed, bc_type="periodic")
-                        if cubic and self._count else None)
+        self._pieces = cubic_pieces(values, periodic=True) if cubic and self._count else None
 
     def at(self, angle_rad: np.ndarray) -> np.ndarray:
         """Return the values at `angle_rad`, any shape; NaN next to unknown lines."""
         s = angle_rad * (self._count / (2 * np.pi))
         s = np.where(np.isfinite(s), s, np.nan)
-        if self._spline is not None:
-            return self._spline(np.mod(s, self._count))
         if self._holes:
             s = np.where(np.abs(s - np.round(s)) < SNAP, np.round(s), s)
         below = np.floor(s)
@@ -312,13 +309,16 @@ class _Circle:
         with np.errstate(invalid="ignore"):
             # A position that is not finite turns into some integer; u is NaN and so is the result.
             i = below.astype(np.int64) % self._count
+        if self._pieces is not None:
+            c = self._pieces[:, i]
+            return ((c[3] * u + c[2]) * u + c[1]) * u + c[0]
         low, high = self._closed[i], self._closed[i + 1]
         # A line of zero weight does not count, so that a known line stays known.
         return np.where(u == 0, low, low + u * (high - low))
 
     def at_point(self, angle_rad: float) -> float:
         """Return `at` of one finite angle."""
-        if self._spline is not None or self._holes:
+        if self._pieces is not None or self._holes:
             return float(self.at(np.asarray(angle_rad)))
         s = angle_rad * (self._count / (2 * np.pi))
         below = math.floor(s)

@@ -7,10 +7,7 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-import numpy as np
-
 from selfcal_ros.collection.settings.nodes import CompensatorSettings
-from selfcal_ros.compensation.cells import cubic_spline
 from selfcal_ros.compensation.compensator import Compensator
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import read_json
@@ -57,8 +54,6 @@ class CompensatingSession:
         self._summary: Any = None
         self._waits = ""
         self._used, self._since_s, self._map_ns = "", 0.0, 0
-        if settings.interpolation == "bicubic":
-            cubic_spline(np.arange(4.0), np.zeros(4))  # loaded now, lest the first map wait for it
         if settings.map:
             self._load_file(settings.map)
 

@@ -3,9 +3,9 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.interpolate import RectBivariateSpline
+from scipy.interpolate import CubicSpline, RectBivariateSpline
 
-from selfcal_ros.compensation.cells import bicubic_cells
+from selfcal_ros.compensation.cells import bicubic_cells, cubic_pieces
 from selfcal_ros.compensation.compensator import Compensator
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.artifact import Artifact
@@ -302,3 +302,13 @@ def test_points_outside_are_refused_on_request_and_angles_without_lines():
     assert refusing.correct_point(0.049, 0.0) == OF_MAP["bilinear"].correct_point(0.049, 0.0)
     with pytest.raises(InputError, match="has no angular lines"):
         Compensator(random_map(Artifact(5, 0.01, 0), 1)).correct_angle(0.0)
+
+
+@pytest.mark.parametrize("periodic", [False, True])
+@pytest.mark.parametrize("count", [3, 4, 5, 12])
+def test_cubic_pieces_are_those_of_scipy(count, periodic):
+    values = np.random.default_rng(count).normal(size=(count, 2))
+    closed = np.concatenate([values, values[:1]]) if periodic else values
+    want = CubicSpline(np.arange(len(closed)), closed,
+                       bc_type="periodic" if periodic else "not-a-knot").c[::-1]
+    np.testing.assert_allclose(cubic_pieces(values, periodic=periodic), want, atol=1e-14)

@@ -13,7 +13,6 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.messages import from_model
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.result import result_to_dict
-from selfcal_ros.sessions import compensating
 from selfcal_ros.sessions.compensating import KEEPS_UP, CompensatingSession
 from selfcal_ros.sessions.ports import Level
 from test.support.maps import random_map, result_of
@@ -52,14 +51,6 @@ class Desk:
 @pytest.fixture
 def desk():
     return Desk()
-
-
-@pytest.mark.parametrize("method, made", [("bicubic", 1), ("bilinear", 0)])
-def test_a_spline_is_made_before_there_is_a_map_where_splines_will_be(monkeypatch, method, made):
-    splines = []
-    monkeypatch.setattr(compensating, "cubic_spline", lambda *given: splines.append(given))
-    Desk(interpolation=method)
-    assert len(splines) == made
 
 
 @pytest.mark.parametrize("order", [1, -1])
