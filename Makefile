@@ -13,15 +13,17 @@ demo: setup
 lint: setup
 	@$(BIN)/ruff check .
 	@$(BIN)/mypy
-ament-lint: setup  # what ament_flake8 and ament_pep257 check, with setup.cfg
-	@test build/linters/.complete -nt tools/linter-requirements.txt || { \
-		$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --upgrade \
-		--target build/linters -r tools/linter-requirements.txt && touch build/linters/.complete; }
-	@PYTHONPATH=build/linters $(BIN)/python -m flake8 --config setup.cfg selfcal_ros launch tools examples setup.py test
-	@echo "ament-lint: nothing found"
+build/linters/.complete: tools/linter-requirements.txt | setup
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --upgrade \
+		--target build/linters -r $< && touch $@ || echo "ament-lint: left out: its linters cannot be installed"
+LINTED := selfcal_ros launch tools examples setup.py test
+build/linters/.clean: build/linters/.complete setup.cfg $(shell find $(LINTED) -name '*.py')
+	@test ! -e $< || { PYTHONPATH=build/linters $(BIN)/python -m flake8 --config setup.cfg $(LINTED) \
+		&& touch $@ && echo "ament-lint: nothing found"; }
+ament-lint: build/linters/.clean  # what ament_flake8 and ament_pep257 check, with setup.cfg
 # bytecode is kept: else each worker compiles all tests anew, and each process that they start the package
 # three workers on two cores: as a rule one waits for a message
-test: lint
+test: lint ament-lint
 	@PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -n 3 --dist worksteal
 test-oldest:  # with the libraries of Ubuntu 24.04; e.g. make test-oldest TESTS=test/laser
 	@pkg-config --exists freetype2 && test -e /usr/include/libqhull_r/qhull_ra.h || { \

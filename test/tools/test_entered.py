@@ -11,7 +11,7 @@ SPEC = importlib.util.spec_from_file_location("entered", ROOT / "tools/entered.p
 entered = importlib.util.module_from_spec(SPEC)
 SPEC.loader.exec_module(entered)
 
-FIRST = '''
+FIRST = """
 import second
 
 class Box:
@@ -30,14 +30,14 @@ def inner():
 
 def unused():
     return 0
-'''
-SECOND = '''
+"""
+SECOND = """
 def double(value):
     return 2 * value
 
 def never_first():
     return double(1)
-'''
+"""
 
 
 @pytest.fixture
