@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`make reality`: what real machines do, what the calibration makes of it, as a table.
+"""`make reality`: a table of real machines' effects and of the results of calibrating with them.
 
 python -m tools.reality [--runs N] [--first SEED] [--workers N] [--only TEXT] [-o FILE]
 """
@@ -16,12 +16,23 @@ from selfcal_ros.units import NM_PER_M
 from tools.reality.cases import Case
 from tools.reality.runs import GRADES, Course, Summary, every_case, once, rows
 
-HEADER = ("| what the machine does | largest error, nm (median) | in U: XY, θ | "
+HEADER = ("| effect | largest error, nm (median) | in U: XY, θ | "
           "error / u: XY, θ | good | enlarged | not qualified | refused | wrong and accepted | "
           "first cause |\n|---|---|---|---|---|---|---|---|---|---|")
 
-SHOWN = {"plates turned by": "φσ", "um": "µm", " deg": "°", "urad": "µrad"}
-"""Text of a case's name -> how the table shows it."""
+SHOWN = {
+    "plates turned by": "φσ", "um": "µm", " deg": "°", "urad": "µrad",
+    "of the other sign": "with the wrong sign",
+    "stage that never scatters": "stage without scatter",
+    "laid by hand": "placed by hand", "after each laying down": "after each placement",
+    "marks that lie 2 mm beside": "marks 2 mm away from", "alike in": "the same in",
+    "beside white noise": "plus white noise",
+    "declared 800 µm/m wrong": "declared wrong by 800 µm/m",
+    "to the other side": "in the opposite direction", "all of them": "all of these",
+    "nothing, and no noise": "no effect, no noise", "stops: nothing": "stops: no effect",
+    "ids: nothing": "ids: no effect",
+    "microscope as its default uncertainty says": "microscope drawn from its default uncertainty"}
+"""Text of a case's name -> how the table shows it. Seeds depend on the name itself."""
 
 
 def row(name: str, found: Summary) -> str:
@@ -39,14 +50,14 @@ def row(name: str, found: Summary) -> str:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--runs", type=int, default=40, help="runs of each case (default: 40); "
-                        "of the population of clean machines 25 times as many, of others 5 times")
+                        "25 times as many of the clean population, 5 times of the others")
     parser.add_argument("--first", type=int, default=0, help="seed of the first run (default: 0)")
-    parser.add_argument("--workers", type=int, help="processes (default: one a core)")
-    parser.add_argument("--only", action="append", help="only cases whose name holds this text; "
+    parser.add_argument("--workers", type=int, help="processes (default: one per core)")
+    parser.add_argument("--only", action="append", help="only cases whose name contains this text; "
                         "may be given again for others")
     parser.add_argument("--list", action="store_true", help="list the cases and do nothing")
-    parser.add_argument("-o", "--output", help="write the table to this file (of a page with "
-                        "marks between these), or every run if it ends in .json")
+    parser.add_argument("-o", "--output", help="write the table to this file (between the "
+                        "marks of a page that has them), or every run if it ends in .json")
     args = parser.parse_args()
     every = every_case()
     chosen = [i for i, case in enumerate(every)
@@ -56,7 +67,7 @@ def main() -> int:
         return 0
     jobs = [(index, args.first + run) for index in chosen
             for run in range(args.runs * every[index].times)]
-    lines, done = [f"{args.runs} runs a case, {25 * args.runs} of the clean population and "
+    lines, done = [f"{args.runs} runs per case, {25 * args.runs} of the clean population and "
                    f"{5 * args.runs} of the others:", "", HEADER], []
     print("\n".join(lines), flush=True)
     for index, courses in finished(jobs, check_workers(args.workers)):
@@ -65,7 +76,7 @@ def main() -> int:
         lines += [row(name, summary) for name, summary in rows(case, courses)]
         print("\n".join(lines[-len(done[-1]["rows"]):]), flush=True)
         if args.output and args.output.endswith(".json"):
-            write_json(args.output, plain(done))  # what is done is kept if the rest is stopped
+            write_json(args.output, plain(done))  # kept if the rest is interrupted
         elif args.output:
             write_table(args.output, lines)
     return 0
