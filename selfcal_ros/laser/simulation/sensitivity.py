@@ -78,7 +78,7 @@ def _setup_fault(name: str, make: Callable[[float], tuple[SetUp, SetUp]]) -> Fau
 
 
 def _yaw(axis: int, *, wavy: bool = False, abbe_m: float = 0.0, stacked: bool = False) -> Callable:
-    """Return a fault of an axis that turns by `size` in every block, or to and fro."""
+    """Return a fault of an axis that turns by `size` in every block, or back and forth."""
     def apply(machine: StepMachine, size: float) -> tuple[StepMachine, Measurement]:
         turns = np.zeros((machine.dim, machine.n_blocks, 3))
         turns[axis, :, 2] = size * ((-1.0) ** np.arange(machine.n_blocks) if wavy else 1.0)
@@ -99,18 +99,18 @@ FAULTS = (
     Fault("none: laser along the nominal diagonal", 0.0, "", lambda machine, _: (
         machine, Measurement(dict.fromkeys((PP, NP), SetUp(to_machine=False))))),
     _setup_fault("mirror off, pp", lambda s: (SetUp(mirror_rad=(s,)), SetUp())),
-    _setup_fault("mirror off, pp and np alike", lambda s: (SetUp(mirror_rad=(s,)),) * 2),
+    _setup_fault("mirror off, pp and np equally", lambda s: (SetUp(mirror_rad=(s,)),) * 2),
     _setup_fault("laser off, pp", lambda s: (SetUp(laser_rad=(s,)), SetUp())),
-    _setup_fault("laser off, pp and np alike", lambda s: (SetUp(laser_rad=(s,)),) * 2),
+    _setup_fault("laser off, pp and np equally", lambda s: (SetUp(laser_rad=(s,)),) * 2),
     _setup_fault("laser and mirror off, pp",
                  lambda s: (SetUp(laser_rad=(s,), mirror_rad=(s,)), SetUp())),
-    _setup_fault("laser and mirror off, pp and np alike",
+    _setup_fault("laser and mirror off, pp and np equally",
                  lambda s: (SetUp(laser_rad=(s,), mirror_rad=(s,)),) * 2),
     Fault("X turns steadily, per block", 1e-6, "rad", _yaw(0)),
-    Fault("X turns to and fro, per block", 1e-6, "rad", _yaw(0, wavy=True)),
+    Fault("X turns back and forth, per block", 1e-6, "rad", _yaw(0, wavy=True)),
     Fault("Y turns steadily, per block", 1e-6, "rad", _yaw(1)),
     Fault("X turns and carries Y, per block", 1e-6, "rad", _yaw(0, stacked=True)),
-    Fault("X turns steadily, beam 10 mm beside the point", 1e-6, "rad", _yaw(0, abbe_m=0.01)),
+    Fault("X turns steadily, beam 10 mm off the point", 1e-6, "rad", _yaw(0, abbe_m=0.01)),
     Fault("unit of length of the laser, pp", 1e-7, "relative", lambda machine, size: (
         machine, Measurement({PP: SetUp(scale=size)}))),
     Fault("noise of a laser distance, 3 repeats", 10e-9, "m",

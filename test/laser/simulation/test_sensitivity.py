@@ -40,7 +40,7 @@ def test_a_laser_off_on_one_diagonal_errs_by_its_cosine():
     _, new = effects("laser off, pp")
     # |D| psi^2/2 = 42.4 nm too short; half of it counts, times |D|/L = sqrt(2).
     assert new.squareness_m == pytest.approx(60e-3 * np.sqrt(2) * 0.5e-6 / 2 * np.sqrt(2), rel=0.01)
-    _, alike = effects("laser off, pp and np alike")
+    _, alike = effects("laser off, pp and np equally")
     assert alike.squareness_m < 1e-2 * NM
     _, smaller = effects("laser off, pp", 1e-4)
     assert smaller.squareness_m == pytest.approx(new.squareness_m / 100, rel=0.02)
@@ -51,7 +51,7 @@ def test_angular_errors_act_on_both_formulations_alike():
     # After i blocks the mirror has turned by i urad; the reading of a step errs by turn x step.
     assert new.transverse_m == pytest.approx(5 * 1e-6 * 0.01, rel=0.01)
     assert conventional.transverse_m == pytest.approx(new.transverse_m, rel=0.01)
-    _, beside = effects("X turns steadily, beam 10 mm beside the point")
+    _, beside = effects("X turns steadily, beam 10 mm off the point")
     assert beside.squareness_m > new.squareness_m + 30 * NM
 
 
@@ -85,9 +85,9 @@ def test_the_sweep_is_over_the_angles_of_laser_and_mirror(monkeypatch):
     monkeypatch.setattr("selfcal_ros.laser.simulation.sensitivity.SWEEP", (1e-4, 1e-3))
     rows = sweep(case_study_machine(), np.random.default_rng(0))
     assert [row["fault"] for row in rows] == [
-        "mirror off, pp", "mirror off, pp and np alike", "laser off, pp",
-        "laser off, pp and np alike", "laser and mirror off, pp",
-        "laser and mirror off, pp and np alike"]
+        "mirror off, pp", "mirror off, pp and np equally", "laser off, pp",
+        "laser off, pp and np equally", "laser and mirror off, pp",
+        "laser and mirror off, pp and np equally"]
     for row in rows:
         assert row["size"] == [1e-4, 1e-3]
         for place, size in enumerate(row["size"]):
