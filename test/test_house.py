@@ -8,7 +8,7 @@ import pytest
 
 from test.support.sources import PACKAGE, SOURCES, source
 
-BASE = {"errors", "files", "memory", "outputs", "units"}
+BASE = {"errors", "files", "memory", "outputs", "topics", "units"}
 DOMAIN = {"model"} | BASE
 ESTIMATION = {"estimation", "compensation"}
 MIDDLE = {"messages", "bagio", "reporting", "collection", "simulation", "parallel"}
@@ -16,6 +16,7 @@ GUESTS = {"aerotech", "laser", "papers"}
 MAY_IMPORT = {
     "errors": set(),
     "memory": set(),
+    "topics": set(),
     "units": set(),
     "outputs": {"errors"},
     "files": {"errors", "outputs"},

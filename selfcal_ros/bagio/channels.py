@@ -20,7 +20,7 @@ from selfcal_ros.messages.cdr_columns import MAX_LENGTH, Payloads
 from selfcal_ros.messages.cdr_layout import LITTLE, layout_of
 from selfcal_ros.messages.input_columns import DetectionColumns, EncoderBlock, EncoderColumns
 from selfcal_ros.messages.to_model import detection, encoder_sample
-from selfcal_ros.messages.topics import DETECTION_TOPIC, ENCODER_TOPIC, INPUT_TOPICS
+from selfcal_ros.topics import DETECTION_TOPIC, ENCODER_TOPIC, INPUT_TOPICS
 
 Input = EncoderBlock | np.ndarray | object
 """Encoder samples, a table of detections, or a command as rosbags has it."""

@@ -32,7 +32,7 @@ from selfcal_ros.bagio.schemas import definition_of, store_of_schema
 from selfcal_ros.collection.messages import MAX_AHEAD_NS, Phase
 from selfcal_ros.errors import InputError, SelfcalError
 from selfcal_ros.messages.to_model import stamp_ns
-from selfcal_ros.messages.topics import COMMAND_TOPIC
+from selfcal_ros.topics import COMMAND_TOPIC
 from selfcal_ros.units import NS_PER_S, S_PER_NS
 
 SYNC_PERIOD_S = 0.5

@@ -17,8 +17,8 @@ from selfcal_ros.files import add_file
 from selfcal_ros.memory import keep_freed_memory
 from selfcal_ros.messages import to_model
 from selfcal_ros.messages.input_columns import EncoderBlock
-from selfcal_ros.messages.topics import COMMAND_TOPIC, DETECTION_TOPIC, ENCODER_TOPIC, INPUT_TOPICS
 from selfcal_ros.model.readings import Measurements
+from selfcal_ros.topics import COMMAND_TOPIC, DETECTION_TOPIC, ENCODER_TOPIC, INPUT_TOPICS
 
 FROM_THE_FUTURE = {ENCODER_TOPIC: ("encoder", Reason.ENCODER_FUTURE),
                    DETECTION_TOPIC: ("detection", Reason.FUTURE),

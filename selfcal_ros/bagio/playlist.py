@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from selfcal_ros.bagio.reader import BagReader
-from selfcal_ros.messages.topics import INPUT_TOPICS
+from selfcal_ros.topics import INPUT_TOPICS
 
 TOPICS = list(INPUT_TOPICS)
 

@@ -10,13 +10,18 @@ from selfcal_ros.collection.messages import Command, Detection
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import read_json, write_json
 from selfcal_ros.messages import from_model
-from selfcal_ros.messages.qos import qos_profile
-from selfcal_ros.messages.topics import COMMAND_TOPIC, DETECTION_TOPIC, ENCODER_TOPIC, INPUT_TOPICS
 from selfcal_ros.model.result import plain
 from selfcal_ros.outputs import temporary_folder
 from selfcal_ros.simulation.cell import Event
 from selfcal_ros.simulation.spec import Simulation
 from selfcal_ros.simulation.truth import Truth
+from selfcal_ros.topics import (
+    COMMAND_TOPIC,
+    DETECTION_TOPIC,
+    ENCODER_TOPIC,
+    INPUT_TOPICS,
+    qos_profile,
+)
 
 QOS = {
     ENCODER_TOPIC: qos_profile(reliable=True, transient_local=False, depth=1000),

@@ -26,8 +26,8 @@ from selfcal_ros.collection.stage.samples import Limits
 from selfcal_ros.collection.timeline import Timeline, build_timeline, without_strays
 from selfcal_ros.collection.view_cache import ViewCache
 from selfcal_ros.errors import InputError, NoDataError
-from selfcal_ros.messages.topics import COMMAND_TOPIC
 from selfcal_ros.model.readings import Measurements, Sense, ViewReadings
+from selfcal_ros.topics import COMMAND_TOPIC
 from selfcal_ros.units import NS_PER_S
 
 MOST_NAMES = 20

@@ -9,12 +9,12 @@ import numpy as np
 
 from selfcal_ros.collection.messages import Command, Detection, EncoderSample, Phase
 from selfcal_ros.errors import InputError, printable
-from selfcal_ros.messages.topics import COMMAND_TOPIC, ERROR_MAP_TOPIC, MEASUREMENT_TOPIC
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ErrorMap, ThetaDatum
 from selfcal_ros.model.orders import parse_order
 from selfcal_ros.model.readings import GridVisits, RepeatMotion, Sense, ViewReadings
 from selfcal_ros.model.view import View
+from selfcal_ros.topics import COMMAND_TOPIC, ERROR_MAP_TOPIC, MEASUREMENT_TOPIC
 from selfcal_ros.units import NS_PER_S
 
 MOST_NOTES = 20

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Every topic with its type and QoS; its name is declared in `messages.topics`."""
+"""Every topic with its type and QoS; its name is declared in `topics`."""
 
 from dataclasses import dataclass
 
@@ -17,7 +17,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import String, UInt64MultiArray
 from visualization_msgs.msg import MarkerArray
 
-from selfcal_ros.messages import topics
+from selfcal_ros import topics
 
 
 @dataclass(frozen=True)

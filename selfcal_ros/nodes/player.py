@@ -14,9 +14,9 @@ from rclpy.qos import ReliabilityPolicy
 from selfcal_ros.bagio.playlist import Playlist
 from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.errors import InputError, NoDataError
-from selfcal_ros.messages.topics import COMMAND_TOPIC, DETECTION_TOPIC, ENCODER_TOPIC
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes.base import SelfcalNode
+from selfcal_ros.topics import COMMAND_TOPIC, DETECTION_TOPIC, ENCODER_TOPIC
 from selfcal_ros.units import S_PER_NS
 
 KINDS = {ENCODER_TOPIC: "encoder", DETECTION_TOPIC: "detection", COMMAND_TOPIC: "command"}

@@ -12,9 +12,9 @@ from rclpy.qos import (
     qos_check_compatible,
 )
 
-from selfcal_ros.messages.qos import qos_profile
 from selfcal_ros.nodes.names import Topic
 from selfcal_ros.sessions.ports import Diagnosis, Level
+from selfcal_ros.topics import qos_profile
 
 
 def mismatched(node: Node, heard_on: Mapping[str, Topic]) -> Diagnosis:

@@ -17,7 +17,6 @@ from selfcal_ros.estimation.api import Options, calibrate
 from selfcal_ros.files import write_json
 from selfcal_ros.memory import keep_freed_memory
 from selfcal_ros.messages import from_model, to_model
-from selfcal_ros.messages.topics import COMMAND_TOPIC, MEASUREMENT_TOPIC
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.result import (
@@ -36,6 +35,7 @@ from selfcal_ros.sessions.map_files import is_qualified, read_result, result_fil
 from selfcal_ros.sessions.ports import Diagnosis, Level, Ports
 from selfcal_ros.sessions.runs import Run, begins_in_future, supersedes
 from selfcal_ros.simulation.truth import hu_plan, random_truth, simulate_measurements
+from selfcal_ros.topics import COMMAND_TOPIC, MEASUREMENT_TOPIC
 
 ECHO_LENGTH = 128
 """Characters of a string that `ros2 topic echo` shows."""

@@ -11,11 +11,11 @@ from selfcal_ros.bagio.playlist import Playlist
 from selfcal_ros.bagio.simulated import event_fields
 from selfcal_ros.bagio.writer import BagWriter
 from selfcal_ros.collection.messages import Command, Detection, EncoderSample
-from selfcal_ros.messages.topics import COMMAND_TOPIC, DETECTION_TOPIC, ENCODER_TOPIC, INPUT_TOPICS
 from selfcal_ros.sessions.collecting import CollectingSession
 from selfcal_ros.sessions.ports import Level
 from selfcal_ros.sessions.receiving.journal_keeper import JournalKeeper
 from selfcal_ros.sessions.receiving.reception import Reception
+from selfcal_ros.topics import COMMAND_TOPIC, DETECTION_TOPIC, ENCODER_TOPIC, INPUT_TOPICS
 from test.support.ports import START_NS, Hands, settings_of
 from test.support.sessions import cdr_of, events_of, small_plan
 

@@ -17,7 +17,7 @@ from selfcal_ros.bagio.mcap.chunk import Block, chunk_items
 from selfcal_ros.bagio.reader import BagReader
 from selfcal_ros.collection.messages import Detection, EncoderSample
 from selfcal_ros.messages.to_model import detection, encoder_sample
-from selfcal_ros.messages.topics import COMMAND_TOPIC, DETECTION_TOPIC, ENCODER_TOPIC
+from selfcal_ros.topics import COMMAND_TOPIC, DETECTION_TOPIC, ENCODER_TOPIC
 from test.support import bags
 from test.support.bags import COMPRESSIONS, Foreign
 from test.support.sessions import events_of, small_plan

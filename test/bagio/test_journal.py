@@ -30,9 +30,8 @@ from selfcal_ros.collection.messages import Command, EncoderSample, Phase
 from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.api import Options, calibrate
-from selfcal_ros.messages.qos import qos_profile
-from selfcal_ros.messages.topics import INPUT_TOPICS
 from selfcal_ros.model.result import result_to_dict
+from selfcal_ros.topics import INPUT_TOPICS, qos_profile
 from test.support.bags import Foreign
 from test.support.sessions import events_of, small_plan
 

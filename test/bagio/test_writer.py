@@ -17,7 +17,7 @@ from selfcal_ros.bagio.writer import BagWriter
 from selfcal_ros.collection.messages import Detection, EncoderSample
 from selfcal_ros.errors import InputError
 from selfcal_ros.messages import from_model
-from selfcal_ros.messages.qos import qos_profile
+from selfcal_ros.topics import qos_profile
 from test.support.sessions import events_of, small_plan
 
 STRING_HASH = "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"

@@ -22,7 +22,7 @@ from selfcal_ros.collection.messages import Command, Detection, EncoderSample, K
 from selfcal_ros.messages import from_model
 from selfcal_ros.messages.cdr_layout import layout_of
 from selfcal_ros.messages.input_columns import JOINT_STATE, MARK_DETECTION
-from selfcal_ros.messages.topics import COMMAND_TOPIC, DETECTION_TOPIC, ENCODER_TOPIC, INPUT_TOPICS
+from selfcal_ros.topics import COMMAND_TOPIC, DETECTION_TOPIC, ENCODER_TOPIC, INPUT_TOPICS
 
 START_NS = 1_700_000_000_000_000_000
 PAUSE_NS = 1_000_000_000

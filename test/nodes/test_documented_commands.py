@@ -102,7 +102,7 @@ def test_nodes_transitions_and_parameters_exist(cell):
 
 
 def test_what_is_recorded_are_the_topics_of_a_bag():
-    from selfcal_ros.messages.topics import INPUT_TOPICS
+    from selfcal_ros.topics import INPUT_TOPICS
 
     recorded = next(words for words in lines("bag") if words[0] == "record" and len(words) > 4)
     assert {word[1:] for word in plain(recorded) if word.startswith("/") and word != "/tmp/session"

@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 from selfcal_ros.collection.settings.nodes import NODE_PARAMETERS
-from selfcal_ros.messages.topics import MAP_MARKERS_TOPIC
+from selfcal_ros.topics import MAP_MARKERS_TOPIC
 
 ROOT = Path(__file__).parents[2]
 FOXGLOVE = ROOT / "config" / "foxglove" / "selfcal.json"

@@ -13,7 +13,6 @@ from selfcal_ros.bagio.simulated import event_fields
 from selfcal_ros.bagio.writer import BagWriter
 from selfcal_ros.collection.messages import Command, Detection, EncoderSample, Phase
 from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.messages.topics import INPUT_TOPICS
 from selfcal_ros.model.result import with_input
 from selfcal_ros.sessions.collecting import CollectingSession
 from selfcal_ros.sessions.ports import Level
@@ -21,6 +20,7 @@ from selfcal_ros.sessions.receiving.journal_keeper import take_up
 from selfcal_ros.sessions.solving import SolvingSession, solve
 from selfcal_ros.simulation.cell import CellSettings, plan_events
 from selfcal_ros.simulation.truth import random_truth
+from selfcal_ros.topics import INPUT_TOPICS
 from test.support.collecting import detection_table, encoder_block
 from test.support.misplaced import laid
 from test.support.ports import START_NS, Hands, message, settings_of

@@ -2,7 +2,7 @@
 """Bags of a step-diagonal measurement."""
 
 from selfcal_ros.bagio.writer import BagWriter
-from selfcal_ros.messages.qos import qos_profile
+from selfcal_ros.topics import qos_profile
 
 EPOCH_NS = 1_700_000_000_000_000_000
 QOS = [qos_profile(reliable=True, transient_local=False, depth=10)]

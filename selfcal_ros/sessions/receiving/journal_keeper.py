@@ -27,8 +27,8 @@ from selfcal_ros.collection.clock.steps import Step
 from selfcal_ros.collection.collector import Collector
 from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.errors import InputError
-from selfcal_ros.messages.topics import INPUT_TOPICS
 from selfcal_ros.sessions.ports import Diagnosis, Level, Ports
+from selfcal_ros.topics import INPUT_TOPICS
 from selfcal_ros.units import S_PER_H
 
 RETRY_S = 10.0

@@ -20,11 +20,11 @@ from selfcal_ros.collection.messages import MAX_AHEAD_NS, Phase
 from selfcal_ros.errors import InputError
 from selfcal_ros.messages.cdr_columns import Payloads
 from selfcal_ros.messages.input_columns import first_stamps_ns
-from selfcal_ros.messages.topics import COMMAND_TOPIC, DETECTION_TOPIC, ENCODER_TOPIC, INPUT_TOPICS
 from selfcal_ros.sessions.collecting import CollectingSession
 from selfcal_ros.sessions.ports import Diagnosis, Level
 from selfcal_ros.sessions.receiving.journal_keeper import JournalKeeper, TakenUp, bad_input, take_up
 from selfcal_ros.sessions.receiving.resting import Resting
+from selfcal_ros.topics import COMMAND_TOPIC, DETECTION_TOPIC, ENCODER_TOPIC, INPUT_TOPICS
 from selfcal_ros.units import S_PER_NS
 
 
