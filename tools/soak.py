@@ -31,7 +31,7 @@ from std_srvs.srv import Trigger
 from selfcal_ros.bagio.build import build
 from selfcal_ros.bagio.schemas import typestore
 from selfcal_ros.cli.processes import domain, process
-from selfcal_ros.collection.messages import Phase
+from selfcal_ros.collection.inputs import Phase
 from selfcal_ros.files import read_json
 from selfcal_ros.messages import from_model
 from selfcal_ros.model.artifact import Artifact

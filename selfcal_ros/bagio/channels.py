@@ -15,7 +15,7 @@ from rosbags.serde import SerdeError
 from rosbags.typesys.store import Typestore
 
 from selfcal_ros.bagio.schemas import OWN, fields_of, own_message, same_layout, typestore
-from selfcal_ros.collection.reduce import DETECTION
+from selfcal_ros.collection.inputs import DETECTION
 from selfcal_ros.messages.cdr_columns import MAX_LENGTH, Payloads
 from selfcal_ros.messages.cdr_layout import LITTLE, layout_of
 from selfcal_ros.messages.input_columns import DetectionColumns, EncoderBlock, EncoderColumns

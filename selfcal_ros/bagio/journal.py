@@ -29,7 +29,7 @@ from selfcal_ros.bagio.journal_file import (
 )
 from selfcal_ros.bagio.metadata import Closing, Metadata, Topic, writing
 from selfcal_ros.bagio.schemas import definition_of, store_of_schema
-from selfcal_ros.collection.messages import MAX_AHEAD_NS, Phase
+from selfcal_ros.collection.inputs import MAX_AHEAD_NS, Phase
 from selfcal_ros.errors import InputError, SelfcalError
 from selfcal_ros.messages.to_model import stamp_ns
 from selfcal_ros.topics import COMMAND_TOPIC

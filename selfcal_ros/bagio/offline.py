@@ -10,7 +10,7 @@ from selfcal_ros.bagio.reader import BagReader
 from selfcal_ros.collection.clock.steps import step_lines
 from selfcal_ros.collection.collector import Collector
 from selfcal_ros.collection.expected import ViewProgress
-from selfcal_ros.collection.reasons import Reason
+from selfcal_ros.collection.inputs import Reason
 from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.errors import InputError, NoDataError, did_you_mean
 from selfcal_ros.files import add_file

@@ -15,7 +15,7 @@ from selfcal_ros.bagio.mcap.chunk import Block
 from selfcal_ros.bagio.mcap.stream import CONVERT, McapStream
 from selfcal_ros.bagio.schemas import other_field, shorter_stores, store_of_schema
 from selfcal_ros.collection.clock.steps import Step, StepWatch, future_lines
-from selfcal_ros.collection.messages import MAX_AHEAD_NS
+from selfcal_ros.collection.inputs import MAX_AHEAD_NS
 from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import read_yaml

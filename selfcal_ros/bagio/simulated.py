@@ -6,7 +6,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from selfcal_ros.bagio.writer import BagWriter
-from selfcal_ros.collection.messages import Command, Detection
+from selfcal_ros.collection.inputs import Command, Detection
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import read_json, write_json
 from selfcal_ros.messages import from_model

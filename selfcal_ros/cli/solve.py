@@ -128,7 +128,7 @@ def run(args: argparse.Namespace) -> int:
     from selfcal_ros.bagio.simulated import read_truth
     from selfcal_ros.cli.terminal.print_result import exit_code, show
     from selfcal_ros.cli.terminal.progress import busy, progress_bar
-    from selfcal_ros.collection.reasons import advice
+    from selfcal_ros.collection.inputs import advice
     from selfcal_ros.collection.settings.estimator import solver_options
     from selfcal_ros.errors import NotIdentifiableError
     from selfcal_ros.files import check_outputs

@@ -14,11 +14,17 @@ import numpy as np
 from selfcal_ros.collection.diagnosis import Finding
 from selfcal_ros.collection.evidence import EncoderFacts, Seen
 from selfcal_ros.collection.expected import ViewProgress, expected_marks, read_enough
+from selfcal_ros.collection.inputs import (
+    DETECTION,
+    Command,
+    Detection,
+    EncoderSample,
+    Reason,
+    check_command,
+)
 from selfcal_ros.collection.marks.check_stops import count_stops
 from selfcal_ros.collection.marks.identify import IdentityRules
-from selfcal_ros.collection.messages import Command, Detection, EncoderSample, check_command
-from selfcal_ros.collection.reasons import Reason
-from selfcal_ros.collection.reduce import DETECTION, Rules
+from selfcal_ros.collection.reduce import Rules
 from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.collection.stage.encoder import NEVER, JointTrack, TrackLimits
 from selfcal_ros.collection.stage.exposures import Exposures, Tracks

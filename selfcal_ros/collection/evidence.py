@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from selfcal_ros.collection.diagnosis import Evidence, Finding, Span, diagnose, main_reason
+from selfcal_ros.collection.inputs import Kind
 from selfcal_ros.collection.marks.identify import IdentityRules
-from selfcal_ros.collection.messages import Kind
 from selfcal_ros.collection.stage.exposures import Exposures
 from selfcal_ros.estimation.checks.placing import Misplaced, other_poses, said
 from selfcal_ros.model.artifact import Artifact

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from selfcal_ros.collection.inputs import LARGEST_OFFSET, Kind, Reason, good_sigmas
 from selfcal_ros.collection.marks.check_stops import without_aside
 from selfcal_ros.collection.marks.identify import (
     IdentityRules,
@@ -17,17 +18,11 @@ from selfcal_ros.collection.marks.identify import (
 from selfcal_ros.collection.marks.places import PlaceList
 from selfcal_ros.collection.marks.repeats import Means, reduce_repeats
 from selfcal_ros.collection.marks.visits import grid_visits, repeat_motion
-from selfcal_ros.collection.messages import LARGEST_OFFSET, Kind, good_sigmas
-from selfcal_ros.collection.reasons import Reason
 from selfcal_ros.collection.stage.encoder import GOOD, MOVING, REASONS
 from selfcal_ros.collection.stage.exposures import Exposures, JointAt
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Sense, ViewReadings
 from selfcal_ros.model.view import View
-
-DETECTION = np.dtype([
-    ("stamp", "i8"), ("kind", "u1"), ("has_id", "?"), ("m", "i8"), ("n", "i8"), ("k", "i8"),
-    ("ox", "f8"), ("oy", "f8"), ("ot", "f8"), ("sigma", "f8"), ("score", "f8")])
 
 
 @dataclass(frozen=True)

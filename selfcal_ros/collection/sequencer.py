@@ -4,7 +4,7 @@
 from dataclasses import dataclass
 from enum import StrEnum
 
-from selfcal_ros.collection.messages import Command, Phase
+from selfcal_ros.collection.inputs import Command, Phase
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.view import Plan
 

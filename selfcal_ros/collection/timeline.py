@@ -15,8 +15,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from selfcal_ros.collection.messages import Command, Phase
-from selfcal_ros.collection.reasons import Reason
+from selfcal_ros.collection.inputs import Command, Phase, Reason
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.view import View

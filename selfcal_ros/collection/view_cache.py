@@ -6,15 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from selfcal_ros.collection.reasons import Reason
-from selfcal_ros.collection.reduce import (
-    DETECTION,
-    Rules,
-    canonical,
-    clean,
-    reduce_view,
-    with_low_scores,
-)
+from selfcal_ros.collection.inputs import DETECTION, Reason
+from selfcal_ros.collection.reduce import Rules, canonical, clean, reduce_view, with_low_scores
 from selfcal_ros.collection.stage.exposures import Exposures
 from selfcal_ros.collection.stage.growing import GrowingColumns, GrowingTable
 from selfcal_ros.collection.timeline import Timeline

@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from typing import Any
 
 from selfcal_ros.collection.expected import ViewProgress
-from selfcal_ros.collection.messages import Command, Detection, EncoderSample
+from selfcal_ros.collection.inputs import Command, Detection, EncoderSample
 from selfcal_ros.collection.timeline import Timeline
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import GridVisits, Measurements, RepeatMotion

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from selfcal_ros.collection.reduce import DETECTION
+from selfcal_ros.collection.inputs import DETECTION
 from selfcal_ros.messages.cdr_columns import MAX_KNOWN, MAX_LENGTH, ColumnDecoder, Columns, Payloads
 from selfcal_ros.messages.cdr_layout import SEQUENCE, TEXT, Field, layout_of
 from selfcal_ros.units import NS_PER_S
@@ -125,7 +125,7 @@ class DetectionColumns:
         self._decoder = ColumnDecoder(fields, tail)
 
     def decode(self, messages: Payloads) -> tuple[list[np.ndarray], np.ndarray]:
-        """Return tables of `collection.reduce.DETECTION`, and the indices of what remains."""
+        """Return tables of `collection.inputs.DETECTION`, and the indices of what remains."""
         groups, rest = self._decoder.decode(messages)
         return [_detection_table(group) for group in groups], rest
 

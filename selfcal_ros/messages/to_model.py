@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from selfcal_ros.collection.messages import Command, Detection, EncoderSample, Phase
+from selfcal_ros.collection.inputs import Command, Detection, EncoderSample, Phase
 from selfcal_ros.errors import InputError, printable
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ErrorMap, ThetaDatum

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from selfcal_ros.bagio.simulated import event_fields, write_truth
-from selfcal_ros.collection.messages import (
+from selfcal_ros.collection.inputs import (
     Command,
     Detection,
     EncoderSample,

@@ -9,8 +9,7 @@ import numpy as np
 
 from selfcal_ros.collection.collector import Collector
 from selfcal_ros.collection.expected import ViewProgress, expected_marks
-from selfcal_ros.collection.messages import Command, EncoderSample, Phase
-from selfcal_ros.collection.reasons import REMEDY, Reason
+from selfcal_ros.collection.inputs import REMEDY, Command, EncoderSample, Phase, Reason
 from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.estimation.checks.wiring import wiring_faults, worded
 from selfcal_ros.messages import from_model, to_model

@@ -14,8 +14,7 @@ from selfcal_ros.collection.clock.steps import Step, future_lines, step_lines
 from selfcal_ros.collection.collector import Collector
 from selfcal_ros.collection.digest import placing_digest, readings_digest, session_digest
 from selfcal_ros.collection.expected import ViewProgress
-from selfcal_ros.collection.messages import Command, Phase
-from selfcal_ros.collection.reasons import Reason, advice
+from selfcal_ros.collection.inputs import Command, Phase, Reason, advice
 from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.messages import from_model, to_model
@@ -87,7 +86,7 @@ class CollectingSession:
         self._dirty = True
 
     def take_detections(self, table: np.ndarray, age_ns: int = 0) -> None:
-        """Take detections (`collection.reduce.DETECTION`), received as `take_encoder` says."""
+        """Take detections (`collection.inputs.DETECTION`), received as `take_encoder` says."""
         if not len(table):
             return
         self.collector.add_detection_block(table)

@@ -3,7 +3,7 @@
 
 from dataclasses import dataclass
 
-from selfcal_ros.collection.messages import MAX_AHEAD_NS, Command, begun_ns
+from selfcal_ros.collection.inputs import MAX_AHEAD_NS, Command, begun_ns
 from selfcal_ros.collection.timeline import begins_run
 from selfcal_ros.units import NS_PER_S, S_PER_NS
 

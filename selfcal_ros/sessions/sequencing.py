@@ -11,7 +11,7 @@ import numpy as np
 
 from selfcal_ros.collection.digest import placing_digest
 from selfcal_ros.collection.expected import expected_marks
-from selfcal_ros.collection.messages import Command, Phase, check_command
+from selfcal_ros.collection.inputs import Command, Phase, check_command
 from selfcal_ros.collection.sequencer import ENDED, Sequencer, State
 from selfcal_ros.collection.settings.nodes import SequencerSettings
 from selfcal_ros.collection.timeline import begins_run

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from selfcal_ros.collection.digest import readings_digest, session_digest
-from selfcal_ros.collection.messages import Phase, begun_ns, check_plate, check_view
+from selfcal_ros.collection.inputs import Phase, begun_ns, check_plate, check_view
 from selfcal_ros.collection.settings.estimator import solver_options
 from selfcal_ros.collection.settings.nodes import SolverSettings
 from selfcal_ros.errors import InputError, NoDataError, NotIdentifiableError, SelfcalError

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from selfcal_ros.collection.messages import Phase
+from selfcal_ros.collection.inputs import Phase
 from selfcal_ros.collection.plate_picture import plate_picture
 from selfcal_ros.errors import printable
 from selfcal_ros.messages import to_model

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from selfcal_ros.collection.messages import Command, Detection, EncoderSample, Kind, Phase
+from selfcal_ros.collection.inputs import Command, Detection, EncoderSample, Kind, Phase
 from selfcal_ros.model.view import Plan, View
 from selfcal_ros.simulation.exposures import (
     CellSettings,

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from selfcal_ros.collection.messages import Detection, EncoderSample, Kind
+from selfcal_ros.collection.inputs import Detection, EncoderSample, Kind
 from selfcal_ros.collection.settings.parameter import Parameter
 from selfcal_ros.errors import InputError, known_are
 from selfcal_ros.files import read_yaml

@@ -10,7 +10,7 @@ from selfcal_ros.bagio.offline import collect_bag
 from selfcal_ros.bagio.playlist import Playlist
 from selfcal_ros.bagio.simulated import event_fields
 from selfcal_ros.bagio.writer import BagWriter
-from selfcal_ros.collection.messages import Command, Detection, EncoderSample
+from selfcal_ros.collection.inputs import Command, Detection, EncoderSample
 from selfcal_ros.sessions.collecting import CollectingSession
 from selfcal_ros.sessions.ports import Level
 from selfcal_ros.sessions.receiving.journal_keeper import JournalKeeper

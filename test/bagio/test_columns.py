@@ -15,7 +15,7 @@ from selfcal_ros.bagio.mcap import chunk as mcap_chunk
 from selfcal_ros.bagio.mcap import stream as mcap_stream
 from selfcal_ros.bagio.mcap.chunk import Block, chunk_items
 from selfcal_ros.bagio.reader import BagReader
-from selfcal_ros.collection.messages import Detection, EncoderSample
+from selfcal_ros.collection.inputs import Detection, EncoderSample
 from selfcal_ros.messages.to_model import detection, encoder_sample
 from selfcal_ros.topics import COMMAND_TOPIC, DETECTION_TOPIC, ENCODER_TOPIC
 from test.support import bags

@@ -12,7 +12,7 @@ from selfcal_ros.bagio.offline import collect_bag, input_handlers
 from selfcal_ros.bagio.reader import INPUT_TOPICS, BagReader
 from selfcal_ros.bagio.schemas import typestore
 from selfcal_ros.collection.collector import Collector
-from selfcal_ros.collection.messages import Command, Detection, EncoderSample
+from selfcal_ros.collection.inputs import Command, Detection, EncoderSample
 from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.estimation.api import calibrate

@@ -26,7 +26,7 @@ from selfcal_ros.bagio.offline import collect_bag
 from selfcal_ros.bagio.reader import BagReader
 from selfcal_ros.bagio.schemas import typestore
 from selfcal_ros.bagio.simulated import event_fields
-from selfcal_ros.collection.messages import Command, EncoderSample, Phase
+from selfcal_ros.collection.inputs import Command, EncoderSample, Phase
 from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.api import Options, calibrate

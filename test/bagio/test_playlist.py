@@ -5,7 +5,7 @@ import pytest
 
 from selfcal_ros.bagio.playlist import Playlist
 from selfcal_ros.bagio.reader import BagReader
-from selfcal_ros.collection.messages import EncoderSample
+from selfcal_ros.collection.inputs import EncoderSample
 from test.support import bags
 from test.support.bags import Foreign
 from test.support.sessions import events_of, small_plan

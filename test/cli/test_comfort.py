@@ -14,7 +14,7 @@ from matplotlib.backends.backend_svg import RendererSVG
 
 from selfcal_ros.bagio.offline import topics_like
 from selfcal_ros.cli.main import build_parser, main
-from selfcal_ros.collection.messages import Detection
+from selfcal_ros.collection.inputs import Detection
 from selfcal_ros.errors import InputError, did_you_mean, known_are
 from selfcal_ros.files import read_json, write_json
 from selfcal_ros.model.result import result_to_dict

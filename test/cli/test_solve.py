@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 from selfcal_ros.cli.main import main
-from selfcal_ros.collection.messages import Command, Detection, EncoderSample
+from selfcal_ros.collection.inputs import Command, Detection, EncoderSample
 from test.support import bags
 from test.support.bags import Foreign
 from test.support.sessions import events_of, small_bag, small_plan

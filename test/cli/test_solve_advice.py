@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from selfcal_ros.cli.main import main
-from selfcal_ros.collection.messages import Command, Detection, Kind, Phase
+from selfcal_ros.collection.inputs import Command, Detection, Kind, Phase
 from test.support.bags import Foreign, shuffled
 from test.support.plans import plan_of
 from test.support.sessions import events_of, small_plan, stepped_bag

@@ -7,8 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from selfcal_ros.collection.messages import EncoderSample, Kind
-from selfcal_ros.collection.reasons import Reason
+from selfcal_ros.collection.inputs import EncoderSample, Kind, Reason
 from selfcal_ros.collection.stage.encoder import JointTrack, TrackLimits
 from test.support.collecting import collect, scene, table
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from selfcal_ros.collection.collector import view_progress
+from selfcal_ros.collection.inputs import Command, Detection, EncoderSample
 from selfcal_ros.collection.marks.check_stops import stage_aside, without_aside
-from selfcal_ros.collection.messages import Command, Detection, EncoderSample
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.simulation.cell import CellSettings, plan_events
 from selfcal_ros.simulation.truth import random_truth

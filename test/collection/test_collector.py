@@ -11,8 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from selfcal_ros.collection.expected import ViewProgress
-from selfcal_ros.collection.messages import Command, Detection, EncoderSample, Phase
-from selfcal_ros.collection.reasons import Reason
+from selfcal_ros.collection.inputs import Command, Detection, EncoderSample, Phase, Reason
 from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Sense, ViewReadings

@@ -5,8 +5,7 @@ from dataclasses import replace
 
 import pytest
 
-from selfcal_ros.collection.messages import Command, Phase, check_command
-from selfcal_ros.collection.reasons import Reason
+from selfcal_ros.collection.inputs import Command, Phase, Reason, check_command
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.artifact import Artifact
 from test.support.collecting import collect, gathered, scene, table

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from selfcal_ros.collection.diagnosis import Evidence, diagnose, main_reason
-from selfcal_ros.collection.reasons import REMEDY, Reason
+from selfcal_ros.collection.inputs import REMEDY, Reason
 from selfcal_ros.model.readings import Sense
 from test.support.collecting import gathered, scene
 

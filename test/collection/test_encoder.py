@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from selfcal_ros.collection.reasons import Reason
+from selfcal_ros.collection.inputs import Reason
 from selfcal_ros.collection.stage.encoder import JointTrack, TrackLimits
 
 MS = 1_000_000

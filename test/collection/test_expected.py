@@ -16,7 +16,7 @@ from selfcal_ros.collection.expected import (
     mark_range,
     missing_marks,
 )
-from selfcal_ros.collection.messages import Kind
+from selfcal_ros.collection.inputs import Kind
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import ViewReadings
 from selfcal_ros.model.view import View

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from selfcal_ros.collection.inputs import Phase
 from selfcal_ros.collection.marks.repeats import MIN_PAIRS, reduce_repeats
-from selfcal_ros.collection.messages import Phase
 from selfcal_ros.errors import InputError
 from selfcal_ros.simulation.truth import angular_deviation, grid_deviation
 from test.support.collecting import START_NS, collect, digest, gathered, scene, table

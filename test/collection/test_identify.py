@@ -6,6 +6,7 @@ from math import pi
 import numpy as np
 import pytest
 
+from selfcal_ros.collection.inputs import Reason
 from selfcal_ros.collection.marks.identify import (
     IdentityRules,
     identify_angular,
@@ -13,7 +14,6 @@ from selfcal_ros.collection.marks.identify import (
     wrap,
 )
 from selfcal_ros.collection.marks.rigid import Rigid, fit_motion
-from selfcal_ros.collection.reasons import Reason
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.view import View

@@ -12,9 +12,8 @@ from hypothesis import strategies as st
 from selfcal_ros.collection import view_cache
 from selfcal_ros.collection.collector import Collector
 from selfcal_ros.collection.digest import readings_digest, session_digest
+from selfcal_ros.collection.inputs import DETECTION, Command, Detection, EncoderSample
 from selfcal_ros.collection.marks import identify, repeats
-from selfcal_ros.collection.messages import Command, Detection, EncoderSample
-from selfcal_ros.collection.reduce import DETECTION
 from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.collection.stage.encoder import JointTrack, TrackLimits
 from selfcal_ros.collection.stage.exposures import Exposures, Tracks

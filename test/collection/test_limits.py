@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from selfcal_ros.collection.messages import (
+from selfcal_ros.collection.inputs import (
     MAX_EXPOSURES,
     Command,
     Phase,

@@ -6,9 +6,8 @@ import math
 import numpy as np
 import pytest
 
+from selfcal_ros.collection.inputs import Kind, Reason
 from selfcal_ros.collection.marks.places import PlaceList
-from selfcal_ros.collection.messages import Kind
-from selfcal_ros.collection.reasons import Reason
 from selfcal_ros.model.readings import RejectedPlaces, Sense
 from test.support.collecting import collect, scene, table
 

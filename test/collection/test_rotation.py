@@ -7,6 +7,7 @@ from math import pi
 import numpy as np
 import pytest
 
+from selfcal_ros.collection.inputs import Kind, Reason, advice
 from selfcal_ros.collection.marks.identify import (
     IdentityRules,
     _middle,
@@ -14,8 +15,6 @@ from selfcal_ros.collection.marks.identify import (
     identify_grid,
 )
 from selfcal_ros.collection.marks.rigid import LARGEST_TURN_RAD, MotionEstimate, Rigid, fit_motion
-from selfcal_ros.collection.messages import Kind
-from selfcal_ros.collection.reasons import Reason, advice
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.view import View
 from selfcal_ros.simulation.cell import CellSettings, plan_events

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 
-from selfcal_ros.collection.messages import Phase
+from selfcal_ros.collection.inputs import Phase
 from selfcal_ros.collection.sequencer import Sequencer, State
 from selfcal_ros.errors import InputError
 from test.support.plans import plan_of

@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 from selfcal_ros.collection.collector import Collector
+from selfcal_ros.collection.inputs import Command, EncoderSample, Phase, Reason
 from selfcal_ros.collection.marks.repeats import reduce_repeats
-from selfcal_ros.collection.messages import Command, EncoderSample, Phase
-from selfcal_ros.collection.reasons import Reason
 from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.collection.timeline import build_timeline
 from selfcal_ros.model.artifact import Artifact

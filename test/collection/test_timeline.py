@@ -8,8 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from selfcal_ros.collection.messages import Command, Phase
-from selfcal_ros.collection.reasons import Reason
+from selfcal_ros.collection.inputs import Command, Phase, Reason
 from selfcal_ros.collection.timeline import NO_END, build_timeline
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.artifact import Artifact

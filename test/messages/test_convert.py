@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from selfcal_ros.bagio.build import build
 from selfcal_ros.bagio.schemas import typestore
 from selfcal_ros.collection.expected import ViewProgress
-from selfcal_ros.collection.messages import Command, Detection, EncoderSample, Phase
+from selfcal_ros.collection.inputs import Command, Detection, EncoderSample, Phase
 from selfcal_ros.collection.timeline import Timeline
 from selfcal_ros.errors import InputError
 from selfcal_ros.messages import from_model, to_model

@@ -20,7 +20,7 @@ from rosgraph_msgs.msg import Clock
 from selfcal_ros.cli import processes
 from selfcal_ros.cli.main import main
 from selfcal_ros.cli.processes import process
-from selfcal_ros.collection.messages import Detection, EncoderSample, Phase
+from selfcal_ros.collection.inputs import Detection, EncoderSample, Phase
 from selfcal_ros.errors import ExitCode
 from selfcal_ros.messages import to_model
 from selfcal_ros.nodes import names

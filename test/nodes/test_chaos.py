@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from selfcal_ros.collection.messages import Detection
+from selfcal_ros.collection.inputs import Detection
 from test.support.chaos import (
     HARMLESS,
     STEPS_S,

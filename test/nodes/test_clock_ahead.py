@@ -7,7 +7,7 @@ from dataclasses import replace
 from selfcal_msgs.srv import SaveMap
 
 from selfcal_ros.bagio.offline import collect_bag
-from selfcal_ros.collection.messages import Command, Phase
+from selfcal_ros.collection.inputs import Command, Phase
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes.measurement_collector import MeasurementCollector

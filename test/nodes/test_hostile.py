@@ -16,7 +16,7 @@ from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from selfcal_msgs.action import RunCalibration
 from std_srvs.srv import Trigger
 
-from selfcal_ros.collection.messages import Command, Detection, EncoderSample
+from selfcal_ros.collection.inputs import Command, Detection, EncoderSample
 from selfcal_ros.errors import InputError, SelfcalError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.messages import from_model

@@ -8,7 +8,7 @@ import pytest
 from std_srvs.srv import Trigger
 
 from selfcal_ros.bagio.offline import collect_bag
-from selfcal_ros.collection.messages import Command, Phase
+from selfcal_ros.collection.inputs import Command, Phase
 from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.estimation.api import Options, calibrate
 from selfcal_ros.files import read_json

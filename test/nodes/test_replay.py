@@ -19,7 +19,7 @@ from selfcal_ros.bagio.simulated import event_fields
 from selfcal_ros.bagio.writer import BagWriter
 from selfcal_ros.cli import replay as replay_verb
 from selfcal_ros.cli.main import main as selfcal
-from selfcal_ros.collection.messages import Detection
+from selfcal_ros.collection.inputs import Detection
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import read_json, write_json
 from selfcal_ros.model.result import result_from_dict, result_to_dict, with_input

@@ -13,7 +13,7 @@ from selfcal_msgs.action import RunCalibration
 from selfcal_msgs.srv import SaveMap
 from std_srvs.srv import Trigger
 
-from selfcal_ros.collection.messages import Command, Phase
+from selfcal_ros.collection.inputs import Command, Phase
 from selfcal_ros.collection.sequencer import State
 from selfcal_ros.messages import from_model, to_model
 from selfcal_ros.nodes import names, pose_sequencer

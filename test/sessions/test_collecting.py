@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 
-from selfcal_ros.collection.messages import Command, Detection, Phase
+from selfcal_ros.collection.inputs import Command, Detection, Phase
 from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.messages import from_model
 from selfcal_ros.model.readings import Sense

@@ -11,7 +11,7 @@ import pytest
 from selfcal_ros.bagio.offline import collect_bag
 from selfcal_ros.bagio.simulated import event_fields
 from selfcal_ros.bagio.writer import BagWriter
-from selfcal_ros.collection.messages import Command, Detection, EncoderSample, Phase
+from selfcal_ros.collection.inputs import Command, Detection, EncoderSample, Phase
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.model.result import with_input
 from selfcal_ros.sessions.collecting import CollectingSession

@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from selfcal_ros.collection.messages import Detection, Kind, Phase
+from selfcal_ros.collection.inputs import Detection, Kind, Phase
 from selfcal_ros.errors import InputError, NoDataError, NotIdentifiableError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.messages import from_model, to_model

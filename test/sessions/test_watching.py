@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from selfcal_ros.collection.messages import Command, Phase
+from selfcal_ros.collection.inputs import Command, Phase
 from selfcal_ros.messages import from_model
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.sessions.ports import Diagnosis, Level

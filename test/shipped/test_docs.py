@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from selfcal_ros.cli.main import main, verbs
-from selfcal_ros.collection.reasons import Reason
+from selfcal_ros.collection.inputs import Reason
 from selfcal_ros.collection.settings.nodes import NODE_PARAMETERS
 
 ROOT = Path(__file__).parents[2]

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from selfcal_ros.collection.messages import Command, Detection, EncoderSample, Kind, Phase
+from selfcal_ros.collection.inputs import Command, Detection, EncoderSample, Kind, Phase
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.simulation.cell import CellSettings, plan_events, view_events

@@ -12,7 +12,7 @@ from math import cos, pi, sin
 import numpy as np
 import pytest
 
-from selfcal_ros.collection.messages import Detection, Kind
+from selfcal_ros.collection.inputs import Detection, Kind
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.view import Plan, View
 from selfcal_ros.simulation.cell import plan_events

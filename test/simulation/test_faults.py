@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from selfcal_ros.collection.messages import Detection, EncoderSample
+from selfcal_ros.collection.inputs import Detection, EncoderSample
 from selfcal_ros.simulation.spec import Faults, apply_faults
 from selfcal_ros.simulation.truth import angular_deviation, grid_deviation
 from test.support.collecting import collect, scene

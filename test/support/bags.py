@@ -18,7 +18,7 @@ from rosbags.rosbag2 import Writer as RosbagsWriter
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-from selfcal_ros.collection.messages import Command, Detection
+from selfcal_ros.collection.inputs import Command, Detection
 from selfcal_ros.model.view import View
 from selfcal_ros.simulation.cell import Event
 

@@ -25,7 +25,7 @@ from std_srvs.srv import Trigger
 from selfcal_ros.bagio.offline import collect_bag
 from selfcal_ros.bagio.reader import BagReader
 from selfcal_ros.collection.expected import ViewProgress
-from selfcal_ros.collection.messages import Detection
+from selfcal_ros.collection.inputs import Detection
 from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.errors import NotIdentifiableError
 from selfcal_ros.estimation.api import calibrate

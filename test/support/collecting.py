@@ -10,8 +10,7 @@ import numpy as np
 from selfcal_ros.collection.collector import Collector
 from selfcal_ros.collection.digest import readings_digest, session_digest
 from selfcal_ros.collection.expected import ViewProgress
-from selfcal_ros.collection.messages import Command, Detection, EncoderSample, Kind
-from selfcal_ros.collection.reduce import DETECTION
+from selfcal_ros.collection.inputs import DETECTION, Command, Detection, EncoderSample, Kind
 from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.messages.input_columns import EncoderBlock
 from selfcal_ros.model.readings import Measurements, ViewReadings

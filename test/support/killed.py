@@ -16,7 +16,7 @@ from selfcal_msgs.srv import SaveMap
 from std_srvs.srv import Trigger
 
 from selfcal_ros.cli.processes import process
-from selfcal_ros.collection.messages import Command, Detection, EncoderSample
+from selfcal_ros.collection.inputs import Command, Detection, EncoderSample
 from selfcal_ros.files import read_json
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes.measurement_collector import MeasurementCollector

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.stats import binom
 
 from selfcal_ros.collection.collector import Collector
-from selfcal_ros.collection.messages import Command, Detection, EncoderSample
+from selfcal_ros.collection.inputs import Command, Detection, EncoderSample
 from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.errors import InputError, NotIdentifiableError
 from selfcal_ros.estimation.api import calibrate

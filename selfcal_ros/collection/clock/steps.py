@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from selfcal_ros.collection.messages import MAX_AHEAD_NS
+from selfcal_ros.collection.inputs import MAX_AHEAD_NS
 from selfcal_ros.collection.timeline import Timeline
 from selfcal_ros.units import NS_PER_S, S_PER_NS
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from selfcal_ros.collection.inputs import Reason
 from selfcal_ros.collection.marks.medians import PART, distances
 from selfcal_ros.collection.marks.rigid import (
     LARGEST_TURN_RAD,
@@ -14,7 +15,6 @@ from selfcal_ros.collection.marks.rigid import (
     columns_where,
     fit_motion,
 )
-from selfcal_ros.collection.reasons import Reason
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.view import LatticePose, View
 

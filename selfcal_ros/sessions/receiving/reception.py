@@ -16,7 +16,7 @@ import numpy as np
 from selfcal_ros.bagio.channels import ChannelDecoder
 from selfcal_ros.bagio.offline import FROM_THE_FUTURE
 from selfcal_ros.bagio.schemas import typestore
-from selfcal_ros.collection.messages import MAX_AHEAD_NS, Phase
+from selfcal_ros.collection.inputs import MAX_AHEAD_NS, Phase
 from selfcal_ros.errors import InputError
 from selfcal_ros.messages.cdr_columns import Payloads
 from selfcal_ros.messages.input_columns import first_stamps_ns
