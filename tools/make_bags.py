@@ -12,8 +12,8 @@ from pathlib import Path
 
 import yaml
 
-from selfcal_ros.bagio.offline import bag_input, collect_bag
-from selfcal_ros.bagio.simulated import TRUTH_FILE, write_simulation
+from selfcal_ros.bagio.offline import TRUTH_FILE, bag_input, collect_bag
+from selfcal_ros.bagio.simulated import write_simulation
 from selfcal_ros.cli.replay import domain, process
 from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.errors import NotIdentifiableError

@@ -4,8 +4,7 @@
 import sys
 from pathlib import Path
 
-from selfcal_ros.bagio.offline import bag_input, collect_bag
-from selfcal_ros.bagio.simulated import read_truth
+from selfcal_ros.bagio.offline import bag_input, collect_bag, read_truth
 from selfcal_ros.collection.settings.estimator import solver_options
 from selfcal_ros.collection.settings.nodes import CollectorSettings, SolverSettings
 from selfcal_ros.estimation.api import calibrate

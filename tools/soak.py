@@ -28,8 +28,7 @@ from rclpy.node import Node
 from selfcal_msgs.srv import SaveMap
 from std_srvs.srv import Trigger
 
-from selfcal_ros.bagio.build import build
-from selfcal_ros.bagio.schemas import typestore
+from selfcal_ros.bagio.schemas import build, typestore
 from selfcal_ros.cli.processes import domain, process
 from selfcal_ros.collection.inputs import Phase
 from selfcal_ros.files import read_json

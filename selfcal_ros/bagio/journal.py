@@ -27,8 +27,8 @@ from selfcal_ros.bagio.journal_file import (
     records,
     scan_file,
 )
-from selfcal_ros.bagio.metadata import Closing, Metadata, Topic, writing
 from selfcal_ros.bagio.schemas import definition_of, store_of_schema
+from selfcal_ros.bagio.writer import Closing, Metadata, Topic, writing
 from selfcal_ros.collection.inputs import MAX_AHEAD_NS, Phase
 from selfcal_ros.errors import InputError, SelfcalError
 from selfcal_ros.messages.to_model import stamp_ns

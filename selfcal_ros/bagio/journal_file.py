@@ -18,10 +18,9 @@ from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 from mcap.records import Channel, Footer, Header, McapRecord, Schema, Statistics
 
-from selfcal_ros.bagio.mcap.chunk import Block, message_block, stretch
-from selfcal_ros.bagio.mcap.index import FOOTER_SIZE, MAGIC
-from selfcal_ros.bagio.mcap.salvage import HEAD, MESSAGE_FRONT, parsed
-from selfcal_ros.bagio.metadata import FileEntry
+from selfcal_ros.bagio.mcap_chunk import FOOTER_SIZE, MAGIC, Block, message_block, stretch
+from selfcal_ros.bagio.mcap_salvage import HEAD, MESSAGE_FRONT, parsed
+from selfcal_ros.bagio.writer import FileEntry
 from selfcal_ros.files import sync_folder
 
 MESSAGE = struct.Struct("<BQHIQQ")

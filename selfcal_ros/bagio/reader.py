@@ -11,8 +11,8 @@ import numpy as np
 from mcap.records import Channel, Message
 
 from selfcal_ros.bagio.channels import ChannelDecoder, Input, Waiting
-from selfcal_ros.bagio.mcap.chunk import Block
-from selfcal_ros.bagio.mcap.stream import CONVERT, McapStream
+from selfcal_ros.bagio.mcap_chunk import Block
+from selfcal_ros.bagio.mcap_stream import CONVERT, McapStream
 from selfcal_ros.bagio.schemas import other_field, shorter_stores, store_of_schema
 from selfcal_ros.collection.clock.steps import Step, StepWatch, future_lines
 from selfcal_ros.collection.inputs import MAX_AHEAD_NS

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Message definitions without ROS: the contract's own, and those that a bag brings along."""
+"""Message definitions without ROS, the contract's own and those of a bag, and messages of them."""
 
 from functools import cache, lru_cache
 from pathlib import Path
@@ -12,6 +12,7 @@ from rosbags.typesys.store import Typestore
 
 from selfcal_ros.errors import InputError, first_line
 from selfcal_ros.messages.cdr_layout import SEQUENCE, TEXT, Field
+from selfcal_ros.messages.from_model import Fields
 
 OWN = "selfcal_msgs"
 
@@ -220,3 +221,27 @@ def _free_of_bounds(kind: Any) -> Any:
     if node in (Nodetype.SEQUENCE, Nodetype.ARRAY):
         return node, _free_of_bounds(inner[0])
     return node, inner
+
+
+def build(store: Typestore, typename: str, fields: Fields) -> object:
+    """Return a rosbags message of type `typename` with these fields.
+
+    Raises
+    ------
+    KeyError
+        If a field of the type is not given.
+    """
+    values: dict[str, Any] = {}
+    for name, (kind, argument) in store.fielddefs[typename][1]:
+        value = fields[name]
+        if isinstance(argument, str):  # a type of its own
+            values[name] = build(store, argument, value)
+        elif kind == Nodetype.BASE:
+            values[name] = value
+        else:
+            element = argument[0]
+            if element[0] == Nodetype.BASE and element[1][0] != "string":
+                values[name] = np.array(value, dtype=element[1][0])
+            else:
+                values[name] = list(value)
+    return store.types[typename](**values)

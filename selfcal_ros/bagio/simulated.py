@@ -5,10 +5,11 @@ from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 
+from selfcal_ros.bagio.offline import TRUTH_FILE
 from selfcal_ros.bagio.writer import BagWriter
 from selfcal_ros.collection.inputs import Command, Detection
 from selfcal_ros.errors import InputError
-from selfcal_ros.files import read_json, write_json
+from selfcal_ros.files import write_json
 from selfcal_ros.messages import from_model
 from selfcal_ros.model.result import plain
 from selfcal_ros.outputs import temporary_folder
@@ -28,7 +29,6 @@ QOS = {
     DETECTION_TOPIC: qos_profile(reliable=True, transient_local=False, depth=1000),
     COMMAND_TOPIC: qos_profile(reliable=True, transient_local=True, depth=64),
 }
-TRUTH_FILE = "truth.json"
 
 
 def write_simulation(simulation: Simulation, path: str | Path, *,
@@ -104,7 +104,3 @@ def write_truth(path: Path, truth: Truth, **more: object) -> None:
             for view in truth.placed], **more}))
 
 
-def read_truth(bag: str | Path) -> dict | None:
-    """Return the truth that lies in a bag folder, or None."""
-    path = Path(bag) / TRUTH_FILE
-    return read_json(path) if path.is_file() else None

@@ -124,8 +124,7 @@ def _reference(text: str | None) -> dict[str, Any]:
 
 def run(args: argparse.Namespace) -> int:
     """Collect, calibrate, print the summary and write the result."""
-    from selfcal_ros.bagio.offline import bag_input, collect_bag
-    from selfcal_ros.bagio.simulated import read_truth
+    from selfcal_ros.bagio.offline import bag_input, collect_bag, read_truth
     from selfcal_ros.cli.terminal.print_result import exit_code, show
     from selfcal_ros.cli.terminal.progress import busy, progress_bar
     from selfcal_ros.collection.inputs import advice

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from selfcal_ros.bagio.mcap.stream import McapStream
+from selfcal_ros.bagio.mcap_stream import McapStream
 from selfcal_ros.bagio.reader import BagReader
 from selfcal_ros.bagio.schemas import store_of_schema
 from selfcal_ros.errors import InputError, NoDataError

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """From the model to the fields of messages, as plain nested dicts.
 
-`bagio.build` makes a rosbags message of them; nodes fill rclpy messages from the same dicts.
+`bagio.schemas.build` makes messages of rosbags from them, nodes fill those of rclpy.
 """
 
 from collections.abc import Iterable

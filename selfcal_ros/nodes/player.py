@@ -11,7 +11,7 @@ from rclpy.duration import Duration
 from rclpy.publisher import Publisher
 from rclpy.qos import ReliabilityPolicy
 
-from selfcal_ros.bagio.playlist import Playlist
+from selfcal_ros.bagio.offline import Playlist
 from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.nodes import names

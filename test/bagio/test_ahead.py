@@ -6,8 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from selfcal_ros.bagio.offline import collect_bag
-from selfcal_ros.bagio.playlist import Playlist
+from selfcal_ros.bagio.offline import Playlist, collect_bag
 from selfcal_ros.bagio.simulated import event_fields
 from selfcal_ros.bagio.writer import BagWriter
 from selfcal_ros.collection.inputs import Command, Detection, EncoderSample

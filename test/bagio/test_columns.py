@@ -10,10 +10,9 @@ from mcap.records import Channel, Message, Schema
 from mcap.stream_reader import breakup_chunk
 from mcap.writer import CompressionType, Writer
 
+from selfcal_ros.bagio import mcap_chunk, mcap_stream
 from selfcal_ros.bagio.channels import ENOUGH
-from selfcal_ros.bagio.mcap import chunk as mcap_chunk
-from selfcal_ros.bagio.mcap import stream as mcap_stream
-from selfcal_ros.bagio.mcap.chunk import Block, chunk_items
+from selfcal_ros.bagio.mcap_chunk import Block, chunk_items
 from selfcal_ros.bagio.reader import BagReader
 from selfcal_ros.collection.inputs import Detection, EncoderSample
 from selfcal_ros.messages.to_model import detection, encoder_sample

@@ -14,8 +14,8 @@ import pytest
 import zstandard
 from mcap.opcode import Opcode
 
-from selfcal_ros.bagio.mcap import decompress
-from selfcal_ros.bagio.mcap.decompress import (
+from selfcal_ros.bagio import mcap_salvage
+from selfcal_ros.bagio.mcap_salvage import (
     FREE,
     RATIO,
     TooLargeError,
@@ -41,7 +41,7 @@ LOOSE = {"zstd": lambda data: zstandard.ZstdCompressor(write_content_size=False)
 @pytest.fixture
 def tight(monkeypatch):
     """Let the limits be small, so that the bombs can be."""
-    monkeypatch.setattr(decompress, "FREE", SMALL_FREE)
+    monkeypatch.setattr(mcap_salvage, "FREE", SMALL_FREE)
     return SMALL_FREE
 
 
@@ -75,11 +75,11 @@ def test_lz4_is_fed_in_blocks(monkeypatch):
         def decompress(self, data, max_length=-1):
             fed.append(len(data))
             return super().decompress(data, max_length)
-    monkeypatch.setattr(decompress.lz4.frame, "LZ4FrameDecompressor", Decoder)
-    data = np.random.default_rng(2).bytes(5 * decompress.BLOCK + 7)
+    monkeypatch.setattr(mcap_salvage.lz4.frame, "LZ4FrameDecompressor", Decoder)
+    data = np.random.default_rng(2).bytes(5 * mcap_salvage.BLOCK + 7)
     packed = LOOSE["lz4"](data)
     assert lz4_chunk(packed, 10) == data
-    assert max(fed) == decompress.BLOCK and sum(fed) == len(packed)
+    assert max(fed) == mcap_salvage.BLOCK and sum(fed) == len(packed)
 
 
 def test_what_is_declared_is_a_limit_beyond_the_free_size(tight):
@@ -92,7 +92,7 @@ def test_what_is_declared_is_a_limit_beyond_the_free_size(tight):
 
 
 def test_the_limit_follows_size_declaration_and_memory(monkeypatch):
-    monkeypatch.setattr(decompress, "memory_left", lambda: 100 * FREE)
+    monkeypatch.setattr(mcap_salvage, "memory_left", lambda: 100 * FREE)
     assert limit_of(10) == FREE
     assert limit_of(FREE) == 25 * FREE
     assert limit_of(FREE // 10) == RATIO * (FREE // 10)
@@ -104,9 +104,9 @@ def test_the_limit_follows_size_declaration_and_memory(monkeypatch):
 def test_the_memory_that_is_left(monkeypatch, tmp_path):
     page = resource.getpagesize()
     assert 100 * page < memory_left() < 2**50
-    monkeypatch.setattr(decompress, "MEMORY", tmp_path / "meminfo")
+    monkeypatch.setattr(mcap_salvage, "MEMORY", tmp_path / "meminfo")
     assert 100 * page < memory_left() < 2**50
-    decompress.MEMORY.write_text("MemTotal: 9 kB\nMemAvailable:  1234 kB\n")
+    mcap_salvage.MEMORY.write_text("MemTotal: 9 kB\nMemAvailable:  1234 kB\n")
     assert memory_left() == 1234 * 1024
 
 

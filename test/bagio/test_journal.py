@@ -19,12 +19,11 @@ from mcap.reader import make_reader
 from rosbags.rosbag2 import Reader
 
 from selfcal_ros.bagio import journal, journal_file
-from selfcal_ros.bagio.build import build
 from selfcal_ros.bagio.journal import resume, start, unfinished
-from selfcal_ros.bagio.mcap.stream import McapStream
+from selfcal_ros.bagio.mcap_stream import McapStream
 from selfcal_ros.bagio.offline import collect_bag
 from selfcal_ros.bagio.reader import BagReader
-from selfcal_ros.bagio.schemas import typestore
+from selfcal_ros.bagio.schemas import build, typestore
 from selfcal_ros.bagio.simulated import event_fields
 from selfcal_ros.collection.inputs import Command, EncoderSample, Phase
 from selfcal_ros.collection.settings.nodes import CollectorSettings
@@ -418,7 +417,7 @@ def test_nothing_follows_a_torn_record_that_cannot_be_taken_back(tmp_path, monke
 @pytest.mark.parametrize("torn", [0, 1, 40])
 def test_a_file_that_grows_as_fast_as_it_is_read_ends_where_it_was_opened(
         tmp_path, monkeypatch, torn):
-    monkeypatch.setattr("selfcal_ros.bagio.mcap.chunk.STRETCH", 2000)
+    monkeypatch.setattr("selfcal_ros.bagio.mcap_chunk.STRETCH", 2000)
     with declared(start(tmp_path, NOW)) as writer:
         record(writer, samples(200))
         [file] = writer.path.glob("*.mcap")

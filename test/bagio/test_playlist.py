@@ -3,7 +3,7 @@
 
 import pytest
 
-from selfcal_ros.bagio.playlist import Playlist
+from selfcal_ros.bagio.offline import Playlist
 from selfcal_ros.bagio.reader import BagReader
 from selfcal_ros.collection.inputs import EncoderSample
 from test.support import bags

@@ -16,8 +16,7 @@ from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 from mcap.records import Channel, ChunkIndex, Footer, Header, Schema, Statistics
 
-from selfcal_ros.bagio.build import build
-from selfcal_ros.bagio.schemas import typestore
+from selfcal_ros.bagio.schemas import build, typestore
 from selfcal_ros.collection.inputs import Command, Detection, EncoderSample, Kind, Phase
 from selfcal_ros.messages import from_model
 from selfcal_ros.messages.cdr_layout import layout_of

@@ -9,8 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from selfcal_ros.bagio.build import build
-from selfcal_ros.bagio.schemas import typestore
+from selfcal_ros.bagio.schemas import build, typestore
 from selfcal_ros.collection.expected import ViewProgress
 from selfcal_ros.collection.inputs import Command, Detection, EncoderSample, Phase
 from selfcal_ros.collection.timeline import Timeline

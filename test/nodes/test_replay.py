@@ -13,8 +13,7 @@ from selfcal_msgs.srv import SaveMap
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
-from selfcal_ros.bagio.offline import bag_input
-from selfcal_ros.bagio.playlist import Playlist
+from selfcal_ros.bagio.offline import Playlist, bag_input
 from selfcal_ros.bagio.simulated import event_fields
 from selfcal_ros.bagio.writer import BagWriter
 from selfcal_ros.cli import replay as replay_verb

@@ -7,8 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from selfcal_ros.bagio.build import build
-from selfcal_ros.bagio.schemas import typestore
+from selfcal_ros.bagio.schemas import build, typestore
 from selfcal_ros.errors import InputError
 from selfcal_ros.messages import from_model
 from selfcal_ros.model.artifact import Artifact

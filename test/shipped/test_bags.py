@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 import yaml
 
-from selfcal_ros.bagio.offline import bag_input, collect_bag
-from selfcal_ros.bagio.simulated import read_truth
+from selfcal_ros.bagio.offline import bag_input, collect_bag, read_truth
 from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.errors import NotIdentifiableError
 from selfcal_ros.estimation.api import calibrate

@@ -2,8 +2,7 @@
 """Ports of a session that a test holds in its hands: what was published, said, and the time."""
 
 
-from selfcal_ros.bagio.build import build
-from selfcal_ros.bagio.schemas import typestore
+from selfcal_ros.bagio.schemas import build, typestore
 from selfcal_ros.collection.settings.nodes import NODE_SETTINGS, Settings
 from selfcal_ros.sessions.ports import Level, Ports
 

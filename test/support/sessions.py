@@ -6,8 +6,7 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from selfcal_ros.bagio.build import build
-from selfcal_ros.bagio.schemas import typestore
+from selfcal_ros.bagio.schemas import build, typestore
 from selfcal_ros.bagio.simulated import event_fields, write_simulation
 from selfcal_ros.bagio.writer import BagWriter
 from selfcal_ros.collection.collector import Collector

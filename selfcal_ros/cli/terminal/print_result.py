@@ -10,7 +10,7 @@ if TYPE_CHECKING:
 
 def show(result: "CalibrationResult", bag: str, output: str | None, stream: TextIO) -> None:
     """Print the summary, against the known truth where the bag folder holds one."""
-    from selfcal_ros.bagio.simulated import read_truth
+    from selfcal_ros.bagio.offline import read_truth
     from selfcal_ros.reporting.summary.format import can_print_symbols
     from selfcal_ros.reporting.summary.sections import summary_text
 

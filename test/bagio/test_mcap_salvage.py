@@ -7,7 +7,7 @@ import lz4.frame
 import pytest
 import zstandard
 
-from selfcal_ros.bagio.mcap.salvage import declarations, front_of_chunk, next_record
+from selfcal_ros.bagio.mcap_salvage import declarations, front_of_chunk, next_record
 
 DATA_END = b"\x0f" + struct.pack("<QI", 4, 0) + b"\x0b"
 """The end of the data section, and the opcode of what stands behind it."""

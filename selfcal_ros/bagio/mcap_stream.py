@@ -21,10 +21,26 @@ import zstandard
 from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, McapRecord, Message, Schema, Statistics
 
-from selfcal_ros.bagio.mcap.chunk import FRONT, Block, block_of, chunk_items, gathered, stretch
-from selfcal_ros.bagio.mcap.decompress import TooLargeError, plain_file, zstd_message
-from selfcal_ros.bagio.mcap.index import MAGIC, read_summary
-from selfcal_ros.bagio.mcap.salvage import HEAD, declarations, front_of_chunk, next_record, parsed
+from selfcal_ros.bagio.mcap_chunk import (
+    FRONT,
+    MAGIC,
+    Block,
+    block_of,
+    chunk_items,
+    gathered,
+    read_summary,
+    stretch,
+)
+from selfcal_ros.bagio.mcap_salvage import (
+    HEAD,
+    TooLargeError,
+    declarations,
+    front_of_chunk,
+    next_record,
+    parsed,
+    plain_file,
+    zstd_message,
+)
 from selfcal_ros.errors import InputError, first_line
 from selfcal_ros.messages.cdr_columns import Payloads
 
