@@ -16,10 +16,14 @@ from rosbags.typesys.store import Typestore
 
 from selfcal_ros.bagio.schemas import OWN, fields_of, own_message, same_layout, typestore
 from selfcal_ros.collection.inputs import DETECTION
-from selfcal_ros.messages.cdr_columns import MAX_LENGTH, Payloads
-from selfcal_ros.messages.cdr_layout import LITTLE, layout_of
-from selfcal_ros.messages.input_columns import DetectionColumns, EncoderBlock, EncoderColumns
-from selfcal_ros.messages.to_model import detection, encoder_sample
+from selfcal_ros.messages.cdr import LITTLE, MAX_LENGTH, Payloads, layout_of
+from selfcal_ros.messages.to_model import (
+    DetectionColumns,
+    EncoderBlock,
+    EncoderColumns,
+    detection,
+    encoder_sample,
+)
 from selfcal_ros.topics import DETECTION_TOPIC, ENCODER_TOPIC, INPUT_TOPICS
 
 Input = EncoderBlock | np.ndarray | object

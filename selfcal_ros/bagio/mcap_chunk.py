@@ -31,7 +31,7 @@ from selfcal_ros.bagio.mcap_salvage import (
     parsed,
     zstd_chunk,
 )
-from selfcal_ros.messages.cdr_columns import Payloads
+from selfcal_ros.messages.cdr import Payloads
 
 FRONT = HEAD.size + MESSAGE_FRONT
 """Bytes of a message record before its payload."""

@@ -42,7 +42,7 @@ from selfcal_ros.bagio.mcap_salvage import (
     zstd_message,
 )
 from selfcal_ros.errors import InputError, first_line
-from selfcal_ros.messages.cdr_columns import Payloads
+from selfcal_ros.messages.cdr import Payloads
 
 CHECKED = (Opcode.HEADER, Opcode.CHUNK, Opcode.MESSAGE_INDEX, Opcode.MESSAGE, Opcode.SCHEMA,
            Opcode.CHANNEL)

@@ -19,7 +19,7 @@ from selfcal_ros.errors import InputError, NoDataError, did_you_mean
 from selfcal_ros.files import add_file, read_json
 from selfcal_ros.memory import keep_freed_memory
 from selfcal_ros.messages import to_model
-from selfcal_ros.messages.input_columns import EncoderBlock
+from selfcal_ros.messages.to_model import EncoderBlock
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.topics import COMMAND_TOPIC, DETECTION_TOPIC, ENCODER_TOPIC, INPUT_TOPICS
 

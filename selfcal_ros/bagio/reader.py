@@ -19,7 +19,7 @@ from selfcal_ros.collection.inputs import MAX_AHEAD_NS
 from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import read_yaml
-from selfcal_ros.messages.input_columns import first_stamps_ns
+from selfcal_ros.messages.to_model import first_stamps_ns
 from selfcal_ros.topics import COMMAND_TOPIC, DETECTION_TOPIC, ENCODER_TOPIC, INPUT_TOPICS
 from selfcal_ros.units import NS_PER_S
 

@@ -11,7 +11,7 @@ from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_
 from rosbags.typesys.store import Typestore
 
 from selfcal_ros.errors import InputError, first_line
-from selfcal_ros.messages.cdr_layout import SEQUENCE, TEXT, Field
+from selfcal_ros.messages.cdr import SEQUENCE, TEXT, Field
 from selfcal_ros.messages.from_model import Fields
 
 OWN = "selfcal_msgs"
@@ -149,7 +149,7 @@ NUMBERS = {"bool": "u1", "byte": "u1", "char": "u1", "uint8": "u1", "int8": "i1"
 
 
 def fields_of(store: Typestore, name: str) -> tuple[Field, ...] | None:
-    """Return the fields of a type for `messages.cdr_layout`; None if it holds others."""
+    """Return the fields of a type for `messages.cdr`; None if it holds others."""
     try:
         return tuple(_field(store, field, kind) for field, kind in store.fielddefs[name][1])
     except KeyError:

@@ -18,7 +18,7 @@ from selfcal_ros.collection.inputs import Command, Phase, Reason, advice
 from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.messages import from_model, to_model
-from selfcal_ros.messages.input_columns import EncoderBlock
+from selfcal_ros.messages.to_model import EncoderBlock
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.sessions.clocks import ClockWatch
 from selfcal_ros.sessions.health import CellChecks, Rate, merged

@@ -12,7 +12,7 @@ from selfcal_ros.compensation.compensator import Compensator
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import read_json
 from selfcal_ros.messages import to_model
-from selfcal_ros.messages.input_columns import PositionEditor
+from selfcal_ros.messages.to_model import PositionEditor
 from selfcal_ros.model.error_map import ErrorMap
 from selfcal_ros.model.result import result_from_dict
 from selfcal_ros.sessions.health import merged

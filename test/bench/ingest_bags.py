@@ -19,8 +19,8 @@ from mcap.records import Channel, ChunkIndex, Footer, Header, Schema, Statistics
 from selfcal_ros.bagio.schemas import build, typestore
 from selfcal_ros.collection.inputs import Command, Detection, EncoderSample, Kind, Phase
 from selfcal_ros.messages import from_model
-from selfcal_ros.messages.cdr_layout import layout_of
-from selfcal_ros.messages.input_columns import JOINT_STATE, MARK_DETECTION
+from selfcal_ros.messages.cdr import layout_of
+from selfcal_ros.messages.to_model import JOINT_STATE, MARK_DETECTION
 from selfcal_ros.topics import COMMAND_TOPIC, DETECTION_TOPIC, ENCODER_TOPIC, INPUT_TOPICS
 
 START_NS = 1_700_000_000_000_000_000

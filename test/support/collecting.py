@@ -12,7 +12,7 @@ from selfcal_ros.collection.digest import readings_digest, session_digest
 from selfcal_ros.collection.expected import ViewProgress
 from selfcal_ros.collection.inputs import DETECTION, Command, Detection, EncoderSample, Kind
 from selfcal_ros.collection.settings.nodes import CollectorSettings
-from selfcal_ros.messages.input_columns import EncoderBlock
+from selfcal_ros.messages.to_model import EncoderBlock
 from selfcal_ros.model.readings import Measurements, ViewReadings
 from selfcal_ros.model.view import Plan
 from selfcal_ros.simulation.cell import CellSettings, Event, plan_events

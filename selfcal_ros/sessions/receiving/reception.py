@@ -18,8 +18,8 @@ from selfcal_ros.bagio.offline import FROM_THE_FUTURE
 from selfcal_ros.bagio.schemas import typestore
 from selfcal_ros.collection.inputs import MAX_AHEAD_NS, Phase
 from selfcal_ros.errors import InputError
-from selfcal_ros.messages.cdr_columns import Payloads
-from selfcal_ros.messages.input_columns import first_stamps_ns
+from selfcal_ros.messages.cdr import Payloads
+from selfcal_ros.messages.to_model import first_stamps_ns
 from selfcal_ros.sessions.collecting import CollectingSession
 from selfcal_ros.sessions.ports import Diagnosis, Level
 from selfcal_ros.sessions.receiving.journal_keeper import JournalKeeper, TakenUp, bad_input, take_up

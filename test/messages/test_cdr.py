@@ -8,10 +8,9 @@ from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from selfcal_ros.bagio.schemas import fields_of, typestore
-from selfcal_ros.messages import cdr_columns, input_columns
-from selfcal_ros.messages.cdr_columns import ColumnDecoder, Payloads
-from selfcal_ros.messages.cdr_layout import layout_of
-from selfcal_ros.messages.input_columns import (
+from selfcal_ros.messages import cdr, to_model
+from selfcal_ros.messages.cdr import ColumnDecoder, Payloads, layout_of
+from selfcal_ros.messages.to_model import (
     JOINT_STATE,
     MARK_DETECTION,
     DetectionColumns,
@@ -43,7 +42,7 @@ def mark(stamp_ns, rng):
         sigma=rng.normal(), score=float(np.float32(rng.uniform())))
 
 
-def cdr(message, little=True, tail=b"", name=JOINTS, store=STORE):
+def as_cdr(message, little=True, tail=b"", name=JOINTS, store=STORE):
     return bytes(store.serialize_cdr(message, name, little_endian=little)) + tail
 
 
@@ -72,18 +71,19 @@ def test_any_mixture_of_layouts_gives_what_rosbags_gives(drawn):
     data, expected = [], []
     for number, (names, position, velocity, effort, frame, little, tail) in enumerate(drawn * 3):
         stamp = number * 1_500_000_001
-        data.append(cdr(joint_state(stamp, names, position, velocity, effort, frame), little, tail))
+        message = joint_state(stamp, names, position, velocity, effort, frame)
+        data.append(as_cdr(message, little, tail))
         expected.append((stamp, tuple(names), tuple(position), tuple(velocity)))
     blocks, rest = EncoderColumns().decode(Payloads.joined(data))
     left = {number * 1_500_000_001 for number in rest.tolist()}
     assert samples(blocks) == [item for item in expected if item[0] not in left]
-    assert len(left) <= max(0, len(data) - cdr_columns.FREE_TRIES)
+    assert len(left) <= max(0, len(data) - cdr.FREE_TRIES)
 
 
 def test_detections_of_both_byte_orders():
     rng = np.random.default_rng(1)
     marks = [mark(1_700_000_000_999_999_999 + 10**9 * i, rng) for i in range(50)]
-    data = [cdr(m, little=bool(i % 3), name=MARK) for i, m in enumerate(marks)]
+    data = [as_cdr(m, little=bool(i % 3), name=MARK) for i, m in enumerate(marks)]
     tables, rest = DetectionColumns().decode(Payloads.joined(data))
     assert len(tables) == 2 and not len(rest)
     rows = sorted(row for table in tables for row in table.tolist())
@@ -95,7 +95,7 @@ def test_detections_of_both_byte_orders():
 def test_a_stamp_before_1970_is_negative():
     message = joint_state(0)
     message.header.stamp = STORE.types["builtin_interfaces/msg/Time"](-2, 5)
-    [block], _ = EncoderColumns().decode(Payloads.joined([cdr(message)]))
+    [block], _ = EncoderColumns().decode(Payloads.joined([as_cdr(message)]))
     assert block.stamps_ns.tolist() == [-1_999_999_995]
 
 
@@ -113,7 +113,7 @@ def test_fields_before_between_and_behind_the_known_ones():
             first=7, parts=parts[:i % 2], header=header(i, store=store), pair=["a", "bc"],
             name=["x", "y"], velocity=np.array([0.5, i]), b=True, position=np.array([i, -1.0]),
             two=parts[:2], one=parts[0])
-        data.append(cdr(message, i < 4, name="pkg/msg/Odd", store=store))
+        data.append(as_cdr(message, i < 4, name="pkg/msg/Odd", store=store))
     blocks, rest = EncoderColumns(fields_of(store, "pkg/msg/Odd")).decode(Payloads.joined(data))
     assert not len(rest) and len(blocks) == 4
     assert samples(blocks) == [(i, ("x", "y"), (i, -1.0), (0.5, i)) for i in range(6)]
@@ -126,8 +126,8 @@ def test_a_basic_type_without_a_numpy_code_is_left_to_rosbags():
 
 
 def test_padding_may_hold_anything():
-    data = bytearray(cdr(joint_state(5, effort=[1.0])))
-    other = bytearray(cdr(joint_state(6, effort=[1.0])))
+    data = bytearray(as_cdr(joint_state(5, effort=[1.0])))
+    other = bytearray(as_cdr(joint_state(6, effort=[1.0])))
     layout = layout_of(JOINT_STATE, bytes(data))
     inside = set(range(2, len(data))) - {i for i, fixed in enumerate(layout.fixed) if fixed}
     for code, at, count in layout.values.values():
@@ -141,7 +141,7 @@ def test_padding_may_hold_anything():
 
 @pytest.mark.parametrize("little", [True, False])
 def test_no_part_of_a_message_is_taken_for_a_whole_one(little):
-    whole = cdr(joint_state(5, velocities=[1.0, 2.0, 3.0]), little)
+    whole = as_cdr(joint_state(5, velocities=[1.0, 2.0, 3.0]), little)
     cut = [whole[:size] for size in range(len(whole))]
     blocks, rest = EncoderColumns().decode(Payloads.joined([*cut, whole, whole]))
     assert [len(block) for block in blocks] == [2]
@@ -158,7 +158,7 @@ def test_no_part_of_a_message_is_taken_for_a_whole_one(little):
     ids=["XCDR", "encapsulation", "no end of a name", "no UTF-8", "no end of the frame",
          "text of length 0", "very many names"])
 def test_damaged_messages_are_left_to_rosbags_which_refuses_them(spoil):
-    good = cdr(joint_state(5))
+    good = as_cdr(joint_state(5))
     bad = spoil(good)
     assert bad != good
     with pytest.raises(Exception, match=r"deserialize|Invalid|Missing"):
@@ -170,18 +170,18 @@ def test_damaged_messages_are_left_to_rosbags_which_refuses_them(spoil):
 
 
 def test_how_much_may_stand_behind_the_last_field():
-    data = [cdr(joint_state(i), tail=bytes(i)) for i in range(12)]
+    data = [as_cdr(joint_state(i), tail=bytes(i)) for i in range(12)]
     assert EncoderColumns().decode(Payloads.joined(data))[1].tolist() == []
     assert EncoderColumns(tail=3).decode(Payloads.joined(data))[1].tolist() == list(range(4, 12))
 
 
 def test_layouts_that_few_share_are_not_tried_without_end(monkeypatch):
     tried = []
-    monkeypatch.setattr(cdr_columns, "layout_of",
+    monkeypatch.setattr(cdr, "layout_of",
                         lambda fields, data: tried.append(1) or layout_of(fields, data))
-    data = [cdr(joint_state(i, frame=f"{i:05d}")) for i in range(640)]
+    data = [as_cdr(joint_state(i, frame=f"{i:05d}")) for i in range(640)]
     blocks, rest = EncoderColumns().decode(Payloads.joined(data))
-    assert len(tried) == len(blocks) == cdr_columns.FREE_TRIES + 640 // cdr_columns.WORTH
+    assert len(tried) == len(blocks) == cdr.FREE_TRIES + 640 // cdr.WORTH
     assert len(rest) == 640 - len(blocks)
     assert samples(blocks) == [(i, ("x", "y", "theta"), (1.0, -2.0, 3.0), ())
                                for i in sorted(set(range(640)) - set(rest.tolist()))]
@@ -189,48 +189,49 @@ def test_layouts_that_few_share_are_not_tried_without_end(monkeypatch):
 
 def test_known_layouts_are_not_walked_again(monkeypatch):
     decoder = EncoderColumns()
-    data = [cdr(joint_state(i, names=("x", "y", "theta")[i % 3:][:1], positions=[i]))
+    data = [as_cdr(joint_state(i, names=("x", "y", "theta")[i % 3:][:1], positions=[i]))
             for i in range(30)]
     blocks, _ = decoder.decode(Payloads.joined(data))
     assert sorted(len(block) for block in blocks) == [10, 10, 10]
-    monkeypatch.setattr(cdr_columns, "layout_of", None)
+    monkeypatch.setattr(cdr, "layout_of", None)
     assert samples(decoder.decode(Payloads.joined(data))[0]) == samples(blocks)
 
 
 def test_the_memory_of_layouts_is_bounded():
     decoder = ColumnDecoder(JOINT_STATE)
-    for i in range(cdr_columns.MAX_LENGTHS + 9):
+    for i in range(cdr.MAX_LENGTHS + 9):
         for frame in ("a", "b"):
-            data = cdr(joint_state(0, frame=frame * (i + 1)))
+            data = as_cdr(joint_state(0, frame=frame * (i + 1)))
             assert len(decoder.decode(Payloads.joined([data]))[0]) == 1
-    assert len(decoder._known) <= cdr_columns.MAX_LENGTHS
-    for i in range(cdr_columns.MAX_KNOWN + 9):
-        decoder.decode(Payloads.joined([cdr(joint_state(0, frame=f"{i:04d}"))]))
-    assert max(map(len, decoder._known.values())) == cdr_columns.MAX_KNOWN
+    assert len(decoder._known) <= cdr.MAX_LENGTHS
+    for i in range(cdr.MAX_KNOWN + 9):
+        decoder.decode(Payloads.joined([as_cdr(joint_state(0, frame=f"{i:04d}"))]))
+    assert max(map(len, decoder._known.values())) == cdr.MAX_KNOWN
 
 
 def test_long_messages_have_few_layouts_and_longer_ones_none(monkeypatch):
     """Names of random length: each message would have a layout of its own, of 1 ms a kB."""
     def named(length):
-        return cdr(joint_state(0, names=["x" * (length - len(cdr(joint_state(0, names=[""]))))]))
-    longest = named(cdr_columns.MAX_LENGTH - 4) + bytes(4)
-    assert len(longest) == cdr_columns.MAX_LENGTH
+        shortest = len(as_cdr(joint_state(0, names=[""])))
+        return as_cdr(joint_state(0, names=["x" * (length - shortest)]))
+    longest = named(cdr.MAX_LENGTH - 4) + bytes(4)
+    assert len(longest) == cdr.MAX_LENGTH
     decoder = ColumnDecoder(JOINT_STATE)
     groups, rest = decoder.decode(Payloads.joined([longest, *(
         named(length) for length in range(4004, 4404, 8))]))
     assert [len(group.layout.example) for group in groups] == [4004, 4012, 4020]
     assert len(rest) == 48
-    for length in range(2000, cdr_columns.MAX_LENGTH, 100):
+    for length in range(2000, cdr.MAX_LENGTH, 100):
         decoder.decode(Payloads.joined([named(length)]))
     kept = [layout.length for known in decoder._known.values() for layout in known]
-    assert cdr_columns.MAX_KNOWN_BYTES - 2 * max(kept) < sum(kept) <= cdr_columns.MAX_KNOWN_BYTES
+    assert cdr.MAX_KNOWN_BYTES - 2 * max(kept) < sum(kept) <= cdr.MAX_KNOWN_BYTES
     assert decoder.decode(Payloads.joined([longest]))[1].tolist() == []
     assert decoder.decode(Payloads.joined([longest + b"0"]))[1].tolist() == [0]
 
 
 def test_a_field_that_is_not_there():
     decoder = ColumnDecoder(JOINT_STATE)
-    [columns], _ = decoder.decode(Payloads.joined([cdr(joint_state(0))]))
+    [columns], _ = decoder.decode(Payloads.joined([as_cdr(joint_state(0))]))
     assert "position" in columns and "word 0" not in columns
     with pytest.raises(KeyError, match="acceleration"):
         columns["acceleration"]
@@ -246,33 +247,33 @@ def test_nothing_gives_nothing():
 def test_of_a_joint_state_the_positions_alone_are_replaced(little, count):
     before = joint_state(7, names=("a", "bcd", "theta"), positions=np.arange(count) + 0.5,
                          velocities=[1.0, 2.0], effort=[3.0])
-    editor, data = PositionEditor(), cdr(before, little, tail=b"tail")
+    editor, data = PositionEditor(), as_cdr(before, little, tail=b"tail")
     assert editor.read(data) == (("a", "bcd", "theta"), tuple(before.position))
     after = editor.replaced(data, (-before.position).tolist())
     before.position = -before.position
-    assert after == cdr(before, little, tail=b"tail")
+    assert after == as_cdr(before, little, tail=b"tail")
 
 
 def test_an_editor_keeps_the_layouts_of_several_publishers_apart(monkeypatch):
     editor = PositionEditor()
-    data = [cdr(joint_state(i, names=("x", "y", "theta")[i:][:1], positions=[float(i)]))
+    data = [as_cdr(joint_state(i, names=("x", "y", "theta")[i:][:1], positions=[float(i)]))
             for i in range(3)]
     for _ in range(2):
         for number, message in enumerate(data):
             [name], [position] = editor.read(message)
             assert (name, position) == (("x", "y", "theta")[number], number)
-            assert editor.replaced(message, [9.0]) == cdr(joint_state(
+            assert editor.replaced(message, [9.0]) == as_cdr(joint_state(
                 number, names=[name], positions=[9.0]))
-        monkeypatch.setattr(input_columns, "layout_of", None)  # each is walked once
+        monkeypatch.setattr(to_model, "layout_of", None)  # each is walked once
     monkeypatch.undo()
-    for i in range(cdr_columns.MAX_KNOWN + 9):
-        editor.read(cdr(joint_state(0, frame=f"{i:04d}")))
-    assert len(editor._known) == cdr_columns.MAX_KNOWN
+    for i in range(cdr.MAX_KNOWN + 9):
+        editor.read(as_cdr(joint_state(0, frame=f"{i:04d}")))
+    assert len(editor._known) == cdr.MAX_KNOWN
 
 
 def test_an_editor_refuses_what_is_cut_or_too_long():
     editor = PositionEditor()
-    whole = cdr(joint_state(5, velocities=[1.0, 2.0, 3.0]))
+    whole = as_cdr(joint_state(5, velocities=[1.0, 2.0, 3.0]))
     assert editor.read(whole) is not None
     assert [size for size in range(len(whole)) if editor.read(whole[:size])] == []
-    assert editor.read(cdr(joint_state(5, positions=np.zeros(cdr_columns.MAX_LENGTH // 8)))) is None
+    assert editor.read(as_cdr(joint_state(5, positions=np.zeros(cdr.MAX_LENGTH // 8)))) is None
