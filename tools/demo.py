@@ -33,7 +33,8 @@ def demo() -> int:
     from selfcal_ros.cli.terminal.output import tell
     from selfcal_ros.files import read_json
     from selfcal_ros.model.result import result_from_dict
-    from selfcal_ros.reporting.maps.plot import save_map_plot
+    from selfcal_ros.reporting.figures.maps import map_picture
+    from selfcal_ros.reporting.figures.paper import save_picture
 
     FOLDER.mkdir(parents=True, exist_ok=True)
     output = (FOLDER / "result.json").relative_to(Path.cwd(), walk_up=True)
@@ -43,7 +44,7 @@ def demo() -> int:
     if code:
         return code
     result = result_from_dict(read_json(output), str(output))
-    save_map_plot(result, FOLDER / "map.png", truth=read_truth(BAG))
+    save_picture(map_picture(result, read_truth(BAG)), FOLDER / "map.png")
     code = selfcal(["report", str(output), "-o", str(FOLDER / "report.html"),
                     "--truth", str(BAG / "truth.json")])
     if code:

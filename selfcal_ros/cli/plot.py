@@ -27,13 +27,14 @@ def run(args: argparse.Namespace) -> int:
     from selfcal_ros.errors import ExitCode
     from selfcal_ros.files import check_outputs, read_json
     from selfcal_ros.model.result import result_from_dict
-    from selfcal_ros.reporting.maps.plot import save_map_plot
+    from selfcal_ros.reporting.figures.maps import map_picture
+    from selfcal_ros.reporting.figures.paper import save_picture
 
     check_outputs([args.result, args.truth], [args.output])
     result = result_from_dict(read_json(args.result), args.result)
     truth = read_truth(args.truth) if args.truth else None
     with busy("drawing"):
-        save_map_plot(result, args.output, truth=truth)
+        save_picture(map_picture(result, truth), args.output)
     say(args, f"written: {args.output}",
         {"written": args.output, "kind": Path(args.output).suffix.lower().lstrip(".")})
     return int(ExitCode.DONE)

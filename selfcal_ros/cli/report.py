@@ -39,8 +39,9 @@ def run(args: argparse.Namespace) -> int:
     truth = read_truth(args.truth) if args.truth else None
     with busy("drawing"):
         if args.plot:
-            from selfcal_ros.reporting.maps.plot import save_map_plot
-            save_map_plot(result, args.plot, truth=truth)
+            from selfcal_ros.reporting.figures.maps import map_picture
+            from selfcal_ros.reporting.figures.paper import save_picture
+            save_picture(map_picture(result, truth), args.plot)
         write_report(result, output, truth=truth)
     written = [str(name) for name in (output, args.plot) if name]
     text = [summary_text(result, truth=truth, ascii_only=not can_print_symbols(sys.stdout))

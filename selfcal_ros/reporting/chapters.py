@@ -17,7 +17,6 @@ from selfcal_ros.reporting.figures.maps import (
     angular_map,
     component_maps,
     error_map,
-    uncertainty_map,
 )
 from selfcal_ros.reporting.figures.places import rejected_map
 from selfcal_ros.reporting.figures.residuals import (
@@ -115,13 +114,12 @@ def _maps(result: CalibrationResult, truth: Mapping[str, np.ndarray] | None) -> 
     pairs: list[tuple[Drawing | None, str]] = [
         (error_map(result, truth), "Each vector leads from where the stage is to where its "
                                    "encoders say it is. A pointer shows the numbers of a site."),
-        (component_maps(result), "Gx and Gy beside their standard uncertainties, in the same "
-                                 "colours: what stands out of u is known.")]
+        (component_maps(result), "Gx and Gy at one scale, and below how well each is known. Sites "
+                                 "that are not known are grey. Edges and corners are seen by fewer "
+                                 "views.")]
     if result.artifact.angular_count:
         pairs.append((angular_map(result, truth), "Error of the angle at every line; on the "
                                                   "dashed circle there is none."))
-    pairs.append((uncertainty_map(result), "Where the map is known best: U of x or of y, whichever "
-                                           "is larger. Edges and corners are seen by fewer views."))
     tables = [sections.error_section(result)]
     if truth is not None:
         tables.append(sections.truth_section(result.error_map, truth))

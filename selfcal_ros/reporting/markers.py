@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from selfcal_ros.model.error_map import ErrorMap
+from selfcal_ros.reporting.figures.drawing import round_down
 from selfcal_ros.units import UM_PER_M
 
 MOST_SITES = 51
@@ -72,9 +73,7 @@ def enlargement(spacing_m: float, longest_m: float) -> float:
     """Return the largest of 1, 2, 5, 10, ... times that keeps `longest_m` within `spacing_m`."""
     if longest_m <= 0 or longest_m >= spacing_m:
         return 1.0
-    ratio = spacing_m / longest_m
-    power = 10.0 ** math.floor(math.log10(ratio))
-    return power * max(digit for digit in (1, 2, 5) if digit * power <= ratio * (1 + 1e-12))
+    return round_down(spacing_m / longest_m)
 
 
 def _colours(u: np.ndarray, largest: float) -> np.ndarray:

@@ -16,8 +16,7 @@ from selfcal_ros import __version__
 from selfcal_ros.files import write_bytes
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.reporting.chapters import Chapter, Figure, chapters
-from selfcal_ros.reporting.figures.paper import put
-from selfcal_ros.reporting.maps.style import RC, drawable
+from selfcal_ros.reporting.figures.paper import RC, drawable, put
 from selfcal_ros.reporting.summary.format import aligned, numeric_columns
 from selfcal_ros.reporting.summary.numbers import truth_arrays
 from selfcal_ros.reporting.summary.sections import Section, state_sentence

@@ -53,7 +53,7 @@ def test_report_picture_summary_and_truth(folder, capsys):
     assert code == 0
     out = capsys.readouterr().out
     assert "Against the known truth" in out and f"written: {folder / 'm.png'}" in out
-    assert imread(folder / "m.png").shape[1] == 2160
+    assert imread(folder / "m.png").shape[1] == 2175
     assert "Against the known truth" in (folder / "r.html").read_text(encoding="utf-8")
 
 

@@ -11,9 +11,14 @@ from selfcal_ros.aerotech.verify import Residual, Verification, verify_tables
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.reporting.figures.drawing import Drawing
-from selfcal_ros.reporting.figures.maps import WIDTH
-from selfcal_ros.reporting.figures.parts import MAX_ARROWS, arrow_key, arrows, enlargement
-from selfcal_ros.reporting.figures.residuals import panels
+from selfcal_ros.reporting.figures.parts import (
+    MAX_ARROWS,
+    arrow_key,
+    arrows,
+    enlargement,
+    panels,
+    titled,
+)
 from selfcal_ros.units import MM_PER_M
 
 MAX_SITES = 10_201
@@ -52,11 +57,10 @@ def before_and_after(result: CalibrationResult, found: Verification) -> Drawing 
     if residual is None:
         return None
     artifact = result.artifact
-    drawing = Drawing("before-after", "Error of a simulated controller at the middle of the cells "
-                      "before and after it has loaded the exported table.", WIDTH, 0)
-    drawing.label(0, 16, "Exported table: error of position before and after", size=13, bold=True)
+    drawing = titled("before-after", "Exported table: error of position before and after")
     reach = [(half + 2.0) * artifact.grid_pitch_m * MM_PER_M for half in artifact.half]
-    for title, frame in panels(drawing, ["before", "after"], reach):
+    for title, frame in zip(("before", "after"), panels(drawing, ["before", "after"], reach),
+                            strict=True):
         frame.axes(ticks=(4, 4))
         place, vectors = _shown(residual, title, artifact)
         factor = enlargement(np.hypot(*vectors), _spacing(artifact))

@@ -3,7 +3,7 @@
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 LEVELS = 10
 """Steps of a sequential scale, ``e0`` to ``e9`` (error) and ``v0`` to ``v9`` (uncertainty)."""
@@ -190,12 +190,27 @@ class Drawing:
         self.items.append(Label((x, y), text, size, anchor, colour, bold, turned))
 
     def spot(self, x: float, y: float, radius: float, title: str) -> None:
-        """Tell something where a pointer rests."""
+        """Show words where a pointer rests."""
         self.items.append(Spot((x, y), radius, title))
+
+    def add(self, other: "Drawing", x: float, y: float) -> None:
+        """Put the items of another drawing with its upper left corner at (x, y)."""
+        def moved(points: Iterable[Point]) -> tuple[Point, ...]:
+            return tuple((across + x, down + y) for across, down in points)
+
+        for item in other.items:
+            if isinstance(item, Path):
+                self.items.append(replace(item, lines=tuple(map(moved, item.lines))))
+            elif isinstance(item, Discs):
+                self.items.append(replace(item, centres=moved(item.centres)))
+            else:
+                self.items.append(replace(item, at=moved([item.at])[0]))
 
 
 TICK = 11.0
 """Size of the numbers at the axes, in pixels."""
+
+SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 @dataclass(frozen=True)
@@ -210,12 +225,15 @@ class Frame:
         Left, top, width, height; pixels.
     x, y : tuple of float
         Lowest and highest value along each axis; y grows upwards.
+    log : bool
+        Whether the values are decimal logarithms: ticks are powers of ten.
     """
 
     drawing: Drawing
     box: tuple[float, float, float, float]
     x: tuple[float, float]
     y: tuple[float, float]
+    log: bool = False
 
     def at(self, x: float, y: float) -> Point:
         """Return the pixel of a point, kept within ten sizes of the frame."""
@@ -239,32 +257,35 @@ class Frame:
         """Draw the outline."""
         self.drawing.box(*self.box, stroke="soft")
 
-    def axes(self, *, x_label: str = "", y_label: str = "", grid: bool = False,
-             ticks: tuple[int, int] = (5, 5), size: float = TICK) -> None:
+    def axes(self, *, x_label: str = "", y_label: str = "",
+             ticks: tuple[int, int] = (5, 5)) -> None:
         """Draw outline, ticks with numbers, and what the axes are."""
         left, top, width, height = self.box
         bottom = top + height
-        for value in round_ticks(*self.x, ticks[0]):
+        for value, text in self._ticks(self.x, ticks[0]):
             x = self.at(value, self.y[0])[0]
-            if grid:
-                self.drawing.line([(x, top), (x, bottom)], stroke="line")
             self.drawing.line([(x, bottom), (x, bottom + 4)], stroke="soft")
-            self.drawing.label(x, bottom + 6 + size, tick_text(value), size=size,
-                               anchor="middle", colour="soft")
-        for value in round_ticks(*self.y, ticks[1]):
+            self.drawing.label(x, bottom + 6 + TICK, text, size=TICK, anchor="middle",
+                               colour="soft")
+        for value, text in self._ticks(self.y, ticks[1]):
             y = self.at(self.x[0], value)[1]
-            if grid:
-                self.drawing.line([(left, y), (left + width, y)], stroke="line")
             self.drawing.line([(left - 4, y), (left, y)], stroke="soft")
-            self.drawing.label(left - 7, y + 0.35 * size, tick_text(value), size=size,
-                               anchor="end", colour="soft")
+            self.drawing.label(left - 7, y + 0.35 * TICK, text, size=TICK, anchor="end",
+                               colour="soft")
         self.border()
         if x_label:
-            self.drawing.label(left + width / 2, bottom + 2.4 * size + 8, x_label, size=size + 1,
+            self.drawing.label(left + width / 2, bottom + 2.4 * TICK + 8, x_label, size=TICK + 1,
                                anchor="middle", colour="soft")
         if y_label:
-            self.drawing.label(left - 40, top + height / 2, y_label, size=size + 1,
+            self.drawing.label(left - 40, top + height / 2, y_label, size=TICK + 1,
                                anchor="middle", colour="soft", turned=True)
+
+    def _ticks(self, span: tuple[float, float], count: int) -> list[tuple[float, str]]:
+        if not self.log:
+            return [(value, tick_text(value)) for value in round_ticks(*span, count)]
+        step = max(1, round((span[1] - span[0]) / count))
+        decades = range(math.ceil(span[0]), math.floor(span[1]) + 1, step)
+        return [(decade, "10" + str(decade).translate(SUPERSCRIPT)) for decade in decades]
 
 
 def round_step(span: float, count: int) -> float:
@@ -278,6 +299,12 @@ def round_step(span: float, count: int) -> float:
     power = 10.0 ** math.floor(math.log10(rough))
     return next((step * power for step in (1, 2, 5) if step * power >= rough * (1 - 1e-9)),
                 10 * power)
+
+
+def round_down(value: float) -> float:
+    """Return the largest of 1, 2, 5 times a power of ten that is not above `value` > 0."""
+    power = 10.0 ** math.floor(math.log10(value))
+    return next((step * power for step in (5, 2) if step * power <= value * (1 + 1e-12)), power)
 
 
 def round_ticks(low: float, high: float, count: int) -> list[float]:

@@ -1,14 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Figures of the map: vectors, components beside their uncertainty, and the angular error."""
+"""Figures of the map: vectors, components with their uncertainty, and the angular error."""
 
 import math
+import os
 from collections.abc import Mapping
 from dataclasses import replace
+from textwrap import wrap
 
 import numpy as np
 
+from selfcal_ros import __version__
 from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.model.error_map import ErrorMap
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.reporting.figures.drawing import (
     TICK,
@@ -20,7 +22,7 @@ from selfcal_ros.reporting.figures.drawing import (
 )
 from selfcal_ros.reporting.figures.parts import (
     MAX_ARROWS,
-    MAX_SPOTS,
+    WIDTH,
     Scale,
     arrow_key,
     arrows,
@@ -28,174 +30,175 @@ from selfcal_ros.reporting.figures.parts import (
     enlargement,
     legend,
     map_frame,
+    ordinal,
+    range_scale,
     round_end,
     scale_bar,
+    shortened,
     thinned,
+    titled,
 )
 from selfcal_ros.reporting.summary.format import UNKNOWN, significant
+from selfcal_ros.reporting.summary.numbers import truth_arrays
+from selfcal_ros.reporting.summary.sections import state_sentence
 from selfcal_ros.units import ARCSEC_PER_RAD, MM_PER_M, UM_PER_M
 
-WIDTH = 480.0
-"""Width of a figure in pixels: its words can still be read on a telephone."""
-
 LEFT, TOP, SIDE = 58.0, 40.0, 336.0
-"""Place and width of a map in its figure."""
+"""Place and width of the vector map in its figure."""
 
-AXES = {"x_label": "stage x in mm", "y_label": "stage y in mm"}
-
-
-def error_map(result: CalibrationResult,
-              truth: Mapping[str, np.ndarray] | None = None) -> Drawing:
-    """Return the vectors of G over their length, with the truth beneath where it is known."""
-    emap, artifact = result.error_map, result.artifact
-    length = np.hypot(emap.gx, emap.gy) * UM_PER_M
-    sites = thinned(artifact, MAX_ARROWS)
-    factor = enlargement(length / UM_PER_M, (sites[0].step or 1) * artifact.grid_pitch_m)
-    drawing, frame = _sheet("error-map", "Error of the stage in X and Y: vectors from the nominal "
-                            "sites, enlarged, over their length.", artifact,
-                            _reach(emap, truth, factor))
-    scale: Scale = ("e", round_end(length))
-    cells(frame, artifact, length, scale)
-    at = np.stack([artifact.x_m[sites].ravel(), artifact.y_m[sites].ravel()]) * MM_PER_M
-    entries = [("ink", "measured")]
-    if truth is not None:
-        true = np.stack([np.where(emap.valid, truth[key], np.nan)[sites].ravel()
-                         for key in ("gx", "gy")])
-        arrows(frame, at, true, factor, colour="truth", width=3.4, heads=False)
-        entries.append(("truth", "known truth"))
-    found = np.stack([emap.gx[sites].ravel(), emap.gy[sites].ravel()])
-    if _circles(frame, result, at, found, factor):
-        entries.append(("band", f"U, k = {result.noise.k_xy:.3g}"))
-    arrows(frame, at, found, factor)
-    _finish(frame, "Error of the stage, G = indicated − true", scale)
-    _spots(frame, emap)
-    bottom = frame.box[1] + frame.box[3]
-    arrow_key(frame, factor, (LEFT, bottom + 58))
-    thin = "" if sites[0].step == 1 else f", every {_ordinal(sites[0].step or 1)} site"
-    drawing.label(LEFT + 130, bottom + 62, f"vectors enlarged {factor:,.0f} ×{thin}", size=12)
-    legend(drawing, entries, (LEFT, bottom + 82))
-    drawing.height = bottom + 92
-    return drawing
-
-
-def component_maps(result: CalibrationResult) -> Drawing:
-    """Return Gx, Gy and their standard uncertainties as four fields at one scale."""
-    emap, artifact = result.error_map, result.artifact
-    parts = {"Gx": emap.gx, "Gy": emap.gy, "u(Gx)": emap.u_gx, "u(Gy)": emap.u_gy}
-    end = round_end(np.stack([emap.gx, emap.gy]) * UM_PER_M)
-    side, gap, left = 158.0, 44.0, 44.0
-    drawing = Drawing("components", "Components of the error and their standard uncertainty, all "
-                      "at one scale.", WIDTH, 0)
-    drawing.label(0, 16, "Components and their standard uncertainty, one scale", size=13, bold=True)
-    top = 50.0
-    for number, (name, values) in enumerate(parts.items()):
-        column = number % 2
-        frame = map_frame(drawing, artifact, (left + column * (side + gap), top, side))
-        cells(frame, artifact, values * UM_PER_M, ("d", end))
-        frame.axes(ticks=(4, 4), x_label="mm" if number > 1 else "")
-        drawing.label(frame.box[0], top - 7, name, size=12, bold=True)
-        if column:
-            top += frame.box[3] + 56
-    first = 50.0
-    scale_bar(drawing, ("d", end), (left + 2 * side + gap + 14, first, 12.0, top - 56 - first))
-    drawing.height = top - 8
-    return drawing
-
-
-def uncertainty_map(result: CalibrationResult) -> Drawing:
-    """Return the expanded uncertainty of a coordinate, the larger of x and y, at every site."""
-    emap = result.error_map
-    values = np.fmax(emap.u_gx, emap.u_gy) * result.noise.k_xy * UM_PER_M
-    values = np.where(emap.valid, values, np.nan)
-    drawing, frame = _sheet("uncertainty", "Expanded uncertainty of a coordinate at every site.",
-                            result.artifact, 0.0)
-    scale: Scale = ("v", round_end(values))
-    cells(frame, result.artifact, values, scale)
-    _finish(frame, f"Expanded uncertainty U at the nodes, k = {result.noise.k_xy:.3g}", scale)
-    drawing.height = frame.box[1] + frame.box[3] + 44
-    return drawing
-
-
-def _sheet(name: str, says: str, artifact: Artifact, reach: float) -> tuple[Drawing, Frame]:
-    """Return a drawing and the frame of a map that has room for vectors of `reach` pitches."""
-    drawing = Drawing(name, says, WIDTH, 0)
-    plain = map_frame(drawing, artifact, (LEFT, TOP, SIDE))
-    extra = max(reach - 0.5, 0.0) * artifact.grid_pitch_m * MM_PER_M
-    x, y = (end[1] + extra for end in (plain.x, plain.y))
-    return drawing, replace(plain, box=(LEFT, TOP, SIDE, SIDE * y / x), x=(-x, x), y=(-y, y))
-
-
-def _reach(emap: ErrorMap, truth: Mapping[str, np.ndarray] | None, factor: float) -> float:
-    """Return how far enlarged vectors reach beyond the outermost sites, in pitches."""
-    artifact = emap.artifact
-    most = 0.0
-    for field in (emap, truth):
-        if field is None:
-            continue
-        for key, at, half in (("gx", artifact.m, artifact.half[0]),
-                              ("gy", artifact.n, artifact.half[1])):
-            g = getattr(emap, key) if isinstance(field, ErrorMap) else np.asarray(field[key])
-            ends = np.abs(at + g * factor / artifact.grid_pitch_m)
-            known = ends[np.isfinite(ends)]
-            most = max(most, float(known.max()) - half if known.size else 0.0)
-    return min(most + 0.2, 4.0)
-
-
-def _finish(frame: Frame, title: str, scale: Scale) -> None:
-    frame.axes(x_label=AXES["x_label"], y_label=AXES["y_label"])
-    left, top, width, height = frame.box
-    frame.drawing.label(0, 16, title, size=13, bold=True)
-    scale_bar(frame.drawing, scale, (left + width + 16, top, 14.0, height))
-
-
-def _circles(frame: Frame, result: CalibrationResult, at: np.ndarray, found: np.ndarray,
-             factor: float) -> bool:
-    """Draw U around the heads; return whether it is large enough to be seen."""
-    emap, sites = result.error_map, thinned(result.artifact, MAX_ARROWS)
-    u = np.stack([part[sites].ravel() for part in (emap.u_gx, emap.u_gy)]) * (
-        result.noise.k_xy * factor * MM_PER_M)
-    known = np.isfinite(u).all(axis=0) & np.isfinite(found).all(axis=0)
-    radii = np.stack([u[0] * frame.per_x, u[1] * frame.per_y])[:, known]
-    if not known.any() or radii.max() < 0.7:
-        return False
-    tips = (at + found * factor * MM_PER_M)[:, known]
-    frame.drawing.discs([frame.at(x, y) for x, y in tips.T], [(a, b) for a, b in radii.T],
-                        fill="band", opacity=0.6)
-    return True
-
-
-def _spots(frame: Frame, emap: ErrorMap) -> None:
-    """Tell a pointer the values of each site of a field that is not too large."""
-    artifact = emap.artifact
-    if max(artifact.shape) > MAX_SPOTS:
-        return
-    radius = 0.45 * artifact.grid_pitch_m * MM_PER_M * frame.per_x
-    for index in np.ndindex(artifact.shape):
-        x, y = (float(part[index]) * MM_PER_M for part in (artifact.x_m, artifact.y_m))
-        g, u = ((_um(float(a[index])), _um(float(b[index]))) for a, b in ((emap.gx, emap.gy),
-                                                            (emap.u_gx, emap.u_gy)))
-        frame.drawing.spot(*frame.at(x, y), radius,
-                           f"x {x:.6g} mm, y {y:.6g} mm: Gx {g[0]} µm, Gy {g[1]} µm, "
-                           f"u {u[0]}, {u[1]} µm")
-
-
-def _um(value_m: float) -> str:
-    return significant(value_m * UM_PER_M) if math.isfinite(value_m) else UNKNOWN
-
-
-def _ordinal(number: int) -> str:
-    return {2: "2nd", 3: "3rd"}.get(number, f"{number}th")
-
+MAX_SPOTS = 31
+"""Sites along a side up to which a pointer shows their values."""
 
 CENTRE: Point = (240.0, 232.0)
 ZERO, ROOM = 112.0, 66.0
 """Radius of the circle of no error, and of the largest error above it; pixels."""
 
 MARKED_LINES = 120
-"""Up to so many lines each gets a dot that tells a pointer its value."""
+"""Lines up to which each has a dot that shows a pointer its value."""
 
 SCALE_AT = math.radians(22.5)
 """Where the radial scale is labelled."""
+
+
+def map_picture(result: CalibrationResult,
+                truth: Mapping[str, np.ndarray] | None = None) -> Drawing:
+    """Return the map as one picture: verdict, vectors, angular error, and where it comes from.
+
+    Raises
+    ------
+    InputError
+        If `truth` does not fit the map.
+    """
+    truth = truth_arrays(result.error_map, truth)
+    parts = [error_map(result, truth)]
+    if result.artifact.angular_count:
+        parts.append(angular_map(result, truth))
+    margin, top = 28.0, 30.0
+    drawing = Drawing("map", state_sentence(result), margin + len(parts) * (WIDTH + margin), 0)
+    for line in wrap(state_sentence(result), 52 * len(parts)):
+        drawing.label(drawing.width / 2, top, line, size=13, anchor="middle", bold=True)
+        top += 18
+    for column, part in enumerate(parts):
+        drawing.add(part, margin + column * (WIDTH + margin), top)
+    drawing.height = top + max(part.height for part in parts) + 44
+    drawing.label(margin, drawing.height - 14, _origin(result), size=10, colour="soft")
+    return drawing
+
+
+def _origin(result: CalibrationResult) -> str:
+    source = os.path.basename(str(result.input.get("file", "")))
+    parts = [f"plan {shortened(result.plan_id, 60)}", f"method {shortened(result.method, 20)}",
+             f"θ datum {result.error_map.datum_theta}" if result.artifact.angular_count else "",
+             f"input {shortened(source, 60)}" if source else "", f"selfcal {__version__}"]
+    return "  ·  ".join(part for part in parts if part)
+
+
+def error_map(result: CalibrationResult,
+              truth: Mapping[str, np.ndarray] | None = None) -> Drawing:
+    """Return the vectors of G over their length, U around their heads, a known truth beneath."""
+    emap, artifact = result.error_map, result.artifact
+    length = np.hypot(emap.gx, emap.gy)
+    U = np.stack([emap.u_gx, emap.u_gy]) * result.noise.k_xy
+    sites = thinned(artifact, MAX_ARROWS)
+    step = sites[0].step or 1
+    factor = enlargement(np.fmax(length, U.max(axis=0)), step * artifact.grid_pitch_m)
+    drawing = titled("error-map", "Error of the stage, G = indicated − true")
+    g = [np.stack([np.where(emap.valid, of[key], np.nan) for key in ("gx", "gy")])
+         for of in (vars(emap), truth) if of is not None]
+    frame = _frame(drawing, artifact, _reach(artifact, g, np.nan_to_num(U), factor))
+    scale = Scale("e", 0.0, round_end(length * UM_PER_M))
+    cells(frame, artifact, length * UM_PER_M, scale)
+    at = np.stack([artifact.x_m[sites].ravel(), artifact.y_m[sites].ravel()]) * MM_PER_M
+    entries = [("ink", "measured")]
+    found, *true = (part[:, *sites].reshape(2, -1) for part in g)
+    if true:
+        arrows(frame, at, true[0], factor, colour="truth", width=3.4, heads=False)
+        entries.append(("truth", "known truth"))
+    if _ellipses(frame, at + found * factor * MM_PER_M,
+                 U[:, *sites].reshape(2, -1) * factor * MM_PER_M):
+        entries.append(("band", f"U, k = {result.noise.k_xy:.3g}"))
+    arrows(frame, at, found, factor)
+    frame.axes(x_label="stage x in mm", y_label="stage y in mm")
+    left, top, width, height = frame.box
+    scale_bar(drawing, scale, (left + width + 16, top, 14.0, height))
+    _spots(frame, result)
+    arrow_key(frame, factor, (LEFT, top + height + 58))
+    thin = "" if step == 1 else f", every {ordinal(step)} site"
+    drawing.label(LEFT + 130, top + height + 62, f"vectors enlarged {factor:,.0f} ×{thin}"
+                  if emap.valid.any() else "not one site is known")
+    legend(drawing, entries, (LEFT, top + height + 82))
+    drawing.height = top + height + 92
+    return drawing
+
+
+def _frame(drawing: Drawing, artifact: Artifact, reach: float) -> Frame:
+    """Return the frame of a map that has room for vectors of `reach` pitches."""
+    plain = map_frame(drawing, artifact, (LEFT, TOP, SIDE))
+    extra = max(reach - 0.5, 0.0) * artifact.grid_pitch_m * MM_PER_M
+    x, y = (end[1] + extra for end in (plain.x, plain.y))
+    return replace(plain, box=(LEFT, TOP, SIDE, SIDE * y / x), x=(-x, x), y=(-y, y))
+
+
+def _reach(artifact: Artifact, fields: list[np.ndarray], U: np.ndarray, factor: float) -> float:
+    """Return how far enlarged vectors with U reach beyond the outermost sites, in pitches."""
+    most = 0.0
+    for at, half, size, *parts in zip((artifact.m, artifact.n), artifact.half, U, *fields,
+                                      strict=True):
+        for g in parts:
+            ends = (np.abs(at + g * factor / artifact.grid_pitch_m)
+                    + size * factor / artifact.grid_pitch_m)
+            most = max(most, float(np.nanmax(ends, initial=0.0)) - half)
+    return min(most + 0.2, 4.0)
+
+
+def _ellipses(frame: Frame, tips_mm: np.ndarray, u_mm: np.ndarray) -> bool:
+    """Draw U (2, P) around the heads (2, P); return whether it is large enough to be seen."""
+    known = np.isfinite(u_mm).all(axis=0) & np.isfinite(tips_mm).all(axis=0)
+    radii = (u_mm * np.array([[frame.per_x], [frame.per_y]]))[:, known]
+    if not known.any() or radii.max() < 0.7:
+        return False
+    frame.drawing.discs([frame.at(x, y) for x, y in tips_mm[:, known].T],
+                        [(a, b) for a, b in radii.T], fill="band", opacity=0.6)
+    return True
+
+
+def _spots(frame: Frame, result: CalibrationResult) -> None:
+    """Show a pointer the values of each site of a field that is not too large."""
+    emap, artifact, k = result.error_map, result.artifact, result.noise.k_xy
+    if max(artifact.shape) > MAX_SPOTS:
+        return
+    radius = 0.45 * artifact.grid_pitch_m * MM_PER_M * frame.per_x
+    for index in np.ndindex(artifact.shape):
+        x, y = (float(part[index]) * MM_PER_M for part in (artifact.x_m, artifact.y_m))
+        gx, gy, ux, uy = (significant(float(part[index]) * scale) for part, scale in (
+            (emap.gx, UM_PER_M), (emap.gy, UM_PER_M), (emap.u_gx, k * UM_PER_M),
+            (emap.u_gy, k * UM_PER_M)))
+        words = UNKNOWN if gx == UNKNOWN else f"Gx {gx} ± {ux} µm, Gy {gy} ± {uy} µm (k = {k:.3g})"
+        frame.drawing.spot(*frame.at(x, y), radius, f"x {x:.6g} mm, y {y:.6g} mm: {words}")
+
+
+def component_maps(result: CalibrationResult) -> Drawing:
+    """Return Gx and Gy at one scale, and below the expanded uncertainty of both at its own."""
+    emap, k = result.error_map, result.noise.k_xy
+    errors = np.stack([emap.gx, emap.gy]) * UM_PER_M
+    u = np.where(emap.valid, np.stack([emap.u_gx, emap.u_gy]), np.nan) * k * UM_PER_M
+    end, side, gap, left, top = round_end(errors), 158.0, 44.0, 44.0, 50.0
+    drawing = titled("components", f"Components of the error, and their U with k = {k:.3g}")
+    for names, pair, scale in ((("Gx", "Gy"), errors, Scale("d", -end, end)),
+                               (("U(Gx)", "U(Gy)"), u, range_scale("v", u))):
+        for column, (name, values) in enumerate(zip(names, pair, strict=True)):
+            frame = map_frame(drawing, result.artifact, (left + column * (side + gap), top, side))
+            cells(frame, result.artifact, values, scale)
+            frame.axes(ticks=(4, 4), x_label="mm" if name.startswith("U") else "")
+            uniform = scale.low == scale.high
+            drawing.label(frame.box[0], top - 7, name + (
+                f" = {significant(scale.high) if scale.high else UNKNOWN} µm everywhere"
+                if uniform else ""), bold=True)
+        if not uniform:
+            scale_bar(drawing, scale, (left + 2 * side + gap + 14, top, 12.0, frame.box[3]))
+        top += frame.box[3] + 56
+    drawing.height = top - 8
+    return drawing
 
 
 def angular_map(result: CalibrationResult,
@@ -205,9 +208,8 @@ def angular_map(result: CalibrationResult,
     error, u = emap.g_theta * ARCSEC_PER_RAD, emap.u_g_theta * k * ARCSEC_PER_RAD
     true = None if truth is None or truth.get("g_theta") is None else np.asarray(
         truth["g_theta"]) * ARCSEC_PER_RAD
-    drawing = Drawing("angular-map", "Error of the stage in theta: distance from the dashed "
-                      "circle, outwards is counter-clockwise.", WIDTH, CENTRE[1] + 230)
-    drawing.label(0, 16, "Error in θ in arcsec, outwards = counter-clockwise", size=13, bold=True)
+    drawing = titled("angular-map", "Error in θ in arcsec, outwards = counter-clockwise",
+                     CENTRE[1] + 230)
     curves = [np.abs(error) + np.nan_to_num(u)] + ([] if true is None else [np.abs(true)])
     known = np.concatenate(curves)
     known = known[np.isfinite(known)]
@@ -227,8 +229,8 @@ def angular_map(result: CalibrationResult,
         drawing.discs([_at(angles[i], error[i], span) for i in good], 1.8, fill="ink")
         for i in good:
             drawing.spot(*_at(angles[i], error[i], span), 7,
-                         f"line {i}, {math.degrees(angles[i]):.6g}°: {significant(error[i])} arcsec"
-                         + (f" ± {significant(u[i])}" if math.isfinite(u[i]) else ""))
+                         f"line {i}, {math.degrees(angles[i]):.6g}°: {significant(error[i])} ± "
+                         f"{significant(u[i])} arcsec (k = {k:.3g})")
     _scale(drawing, span)
     legend(drawing, entries, (90, CENTRE[1] + 220))
     return drawing

@@ -1,14 +1,61 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Drawings on paper: put on the axes of a page, in the light colours."""
+"""Drawings as pictures and on pages, in the light colours: what matplotlib is needed for."""
 
+import io
+import os
+from functools import cache
+from pathlib import Path as FilePath
+from typing import Any
+
+from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.collections import EllipseCollection
 from matplotlib.colors import to_rgba
+from matplotlib.figure import Figure
+from matplotlib.font_manager import FontProperties, findfont, get_font
 from matplotlib.patches import PathPatch
 from matplotlib.path import Path as Outline
 
+from selfcal_ros import __version__
+from selfcal_ros.errors import InputError
+from selfcal_ros.files import write_bytes
 from selfcal_ros.reporting.figures.drawing import COLOURS, Discs, Drawing, Label, Path, Point
-from selfcal_ros.reporting.maps.style import drawable
+
+DPI = 150
+"""Resolution of a PNG, in which a pixel of a drawing is a point."""
+
+POINTS_PER_INCH = 72
+
+KINDS: dict[str, dict[str, str | None]] = {
+    ".png": {"Software": f"selfcal {__version__}"},
+    ".svg": {"Creator": f"selfcal {__version__}", "Date": None},
+    ".pdf": {"Creator": f"selfcal {__version__}", "CreationDate": None}}
+"""Endings of pictures, and what is written into them: no date, so that they are repeatable."""
+
+RC: dict[Any, Any] = {"font.family": "DejaVu Sans", "text.parse_math": False,
+                      "svg.hashsalt": "selfcal", "svg.fonttype": "path",
+                      "text.color": COLOURS["ink"][0]}
+"""Settings of every picture; the fixed salt makes SVG files repeatable."""
+
+
+def save_picture(drawing: Drawing, path: str | os.PathLike) -> None:
+    """Write a drawing to `path` as PNG, SVG or PDF by its ending, atomically.
+
+    Raises
+    ------
+    InputError
+        If the name does not end in one of `KINDS`, or the file cannot be written.
+    """
+    kind = FilePath(path).suffix.lower()
+    if kind not in KINDS:
+        raise InputError(str(path), "no kind of picture by its ending",
+                         "name a file that ends in .png, .svg or .pdf")
+    with rc_context(RC):
+        page = Figure(figsize=(drawing.width / POINTS_PER_INCH, drawing.height / POINTS_PER_INCH))
+        put(drawing, page.add_axes((0, 0, 1, 1)), 1.0)
+        data = io.BytesIO()
+        page.savefig(data, format=kind.lstrip("."), dpi=DPI, metadata=KINDS[kind])
+    write_bytes(path, data.getvalue())
 
 
 def put(drawing: Drawing, axes: Axes, points: float) -> None:
@@ -71,3 +118,17 @@ def _label(item: Label, axes: Axes, points: float, order: int) -> None:
               ha={"start": "left", "middle": "center", "end": "right"}[item.anchor],
               va="baseline", rotation=90 if item.turned else 0, rotation_mode="anchor",
               zorder=order)
+
+
+def drawable(text: object, limit: int = 300) -> str:
+    """Return `text` as one line of characters that the font has, cut at `limit`."""
+    known = _characters()
+    line = "".join(c if c.isprintable() and c in known else "?" for c in str(text)[:limit + 1])
+    return line if len(line) <= limit else line[:limit - 1] + "…"
+
+
+@cache
+def _characters() -> frozenset[str]:
+    """Return the characters that the font has."""
+    font = get_font(findfont(FontProperties(family="DejaVu Sans")))
+    return frozenset(chr(code) for code, glyph in font.get_charmap().items() if glyph)

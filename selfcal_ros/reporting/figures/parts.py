@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Parts of maps: coloured cells, scale bars, and enlarged vectors with their key."""
+"""Parts of figures: panels, coloured cells, scale bars, enlarged vectors with their key."""
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -14,6 +16,7 @@ from selfcal_ros.reporting.figures.drawing import (
     Drawing,
     Frame,
     Point,
+    round_down,
     round_step,
     round_ticks,
     tick_text,
@@ -21,17 +24,29 @@ from selfcal_ros.reporting.figures.drawing import (
 from selfcal_ros.reporting.summary.format import significant
 from selfcal_ros.units import MM_PER_M, UM_PER_M
 
+WIDTH = 480.0
+"""Width of a figure in pixels: its words can still be read on a telephone."""
+
 MAX_CELLS = 101
 """Cells along a side; of larger fields every second, third, ... site is shown."""
 
 MAX_ARROWS = 21
 """Arrows along a side."""
 
-MAX_SPOTS = 31
-"""Sites along a side up to which a pointer is told their values."""
 
-Scale = tuple[str, float]
-"""Kind of a colour scale (``e``, ``v``: from 0; ``d``: to either side of 0) and its end, µm."""
+class Scale(NamedTuple):
+    """A colour scale: its ramp (``d``: to either side of 0) and the values of its ends."""
+
+    ramp: str
+    low: float
+    high: float
+
+
+def titled(name: str, title: str, height: float = 0.0) -> Drawing:
+    """Return an empty figure with its title."""
+    drawing = Drawing(name, title, WIDTH, height)
+    drawing.label(0, 16, title, size=13, bold=True)
+    return drawing
 
 
 def map_frame(drawing: Drawing, artifact: Artifact, box: tuple[float, float, float]) -> Frame:
@@ -51,12 +66,11 @@ def thinned(artifact: Artifact, most: int) -> tuple[slice, slice]:
     return slice(half_x % step, None, step), slice(half_y % step, None, step)
 
 
-def cells(frame: Frame, artifact: Artifact, values_um: np.ndarray, scale: Scale) -> None:
+def cells(frame: Frame, artifact: Artifact, values: np.ndarray, scale: Scale) -> None:
     """Colour the cell of every site; unknown sites take the colour of nothing."""
-    name = scale[0]
     sites = thinned(artifact, MAX_CELLS)
     step = sites[0].step or 1
-    level = levels(values_um[sites], scale)
+    level = levels(values[sites], scale)
     x, y = (along[sites] * MM_PER_M for along in (artifact.x_m, artifact.y_m))
     half = 0.5 * step * artifact.grid_pitch_m * MM_PER_M
     outlines: dict[int, list[tuple[Point, ...]]] = {}
@@ -68,7 +82,7 @@ def cells(frame: Frame, artifact: Artifact, values_um: np.ndarray, scale: Scale)
             outlines.setdefault(int(level[i, first]), []).append(
                 (low, (high[0], low[1]), high, (low[0], high[1])))
     for found in sorted(outlines):
-        frame.drawing.shapes(outlines[found], fill="none" if found < 0 else f"{name}{found}")
+        frame.drawing.shapes(outlines[found], fill="none" if found < 0 else f"{scale.ramp}{found}")
 
 
 def _clipped(frame: Frame, point: Point) -> Point:
@@ -83,33 +97,30 @@ def _runs(row: np.ndarray) -> list[tuple[int, int]]:
     return list(zip(starts, [*(edge - 1 for edge in edges.tolist()), len(row) - 1], strict=True))
 
 
-def levels(values_um: np.ndarray, scale: Scale) -> np.ndarray:
+def levels(values: np.ndarray, scale: Scale) -> np.ndarray:
     """Return the step of the colour scale of each value; -1 where it is not known."""
-    name, end = scale
+    top = 2 * SIDES if scale.ramp == "d" else LEVELS - 1
     with np.errstate(invalid="ignore", over="ignore"):
-        part = np.asarray(values_um) / end
-        if name == "d":
-            step = np.rint(np.clip(part, -1, 1) * SIDES) + SIDES
-        else:
-            step = np.floor(np.clip(part, 0, 1) * LEVELS)
-            step = np.minimum(step, LEVELS - 1)
-    return np.where(np.isfinite(part), step, -1).astype(int)
+        part = (np.asarray(values) - scale.low) / ((scale.high - scale.low) or np.inf)
+        part = np.clip(part, 0, 1)
+        step = np.rint(part * top) if scale.ramp == "d" else np.floor(part * LEVELS)
+    return np.where(np.isfinite(part), np.minimum(step, top), -1).astype(int)
 
 
 def scale_bar(drawing: Drawing, scale: Scale, box: tuple[float, float, float, float],
               unit: str = "µm") -> None:
     """Draw the colours of a scale from bottom to top with round numbers to the right of it."""
-    name, end = scale
     left, top, width, height = box
-    count = 2 * SIDES + 1 if name == "d" else LEVELS
+    count = 2 * SIDES + 1 if scale.ramp == "d" else LEVELS
     each = height / count
     for step in range(count):
-        drawing.box(left, top + height - (step + 1) * each, width, each, fill=f"{name}{step}")
+        drawing.box(left, top + height - (step + 1) * each, width, each,
+                    fill=f"{scale.ramp}{step}")
     drawing.box(*box, stroke="soft")
-    low = -end if name == "d" else 0.0
-    inset = each / 2 if name == "d" else 0.0  # the outer steps of d are centred on the ends
-    frame = Frame(drawing, (left, top + inset, width, height - 2 * inset), (0.0, 1.0), (low, end))
-    for value in round_ticks(low, end, 5):
+    inset = each / 2 if scale.ramp == "d" else 0.0  # its outer steps are centred on the ends
+    frame = Frame(drawing, (left, top + inset, width, height - 2 * inset), (0.0, 1.0),
+                  (scale.low, scale.high))
+    for value in round_ticks(scale.low, scale.high, 5):
         y = frame.at(0, value)[1]
         drawing.line([(left + width, y), (left + width + 3, y)], stroke="soft")
         drawing.label(left + width + 6, y + 0.35 * TICK, tick_text(value), size=TICK,
@@ -117,14 +128,27 @@ def scale_bar(drawing: Drawing, scale: Scale, box: tuple[float, float, float, fl
     drawing.label(left + width / 2, top - 7, unit, size=TICK, anchor="middle", colour="soft")
 
 
-def round_end(values_um: np.ndarray) -> float:
+def round_end(values: np.ndarray) -> float:
     """Return the end of a colour scale: a little round, not below the largest magnitude."""
-    known = np.abs(values_um[np.isfinite(values_um)])
+    known = np.abs(values[np.isfinite(values)])
     largest = float(known.max()) if known.size else 0.0
     if largest <= 0:
         return 1.0
     step = round_step(largest, 5) / 2
     return step * math.ceil(largest / step - 1e-9)
+
+
+def range_scale(ramp: str, values: np.ndarray) -> Scale:
+    """Return a scale from the smallest to the largest value, both ends rounded outwards.
+
+    Its ends are equal where the values are, to 1 %, or where none is known.
+    """
+    known = values[np.isfinite(values)]
+    low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 0.0)
+    if high - low <= 0.01 * high:
+        return Scale(ramp, high, high)
+    step = round_step(high - low, 5) / 2
+    return Scale(ramp, step * math.floor(low / step + 1e-9), step * math.ceil(high / step - 1e-9))
 
 
 def enlargement(lengths_m: np.ndarray, spacing_m: float) -> float:
@@ -136,8 +160,7 @@ def enlargement(lengths_m: np.ndarray, spacing_m: float) -> float:
     factor = 1.2 * spacing_m / typical
     if not math.isfinite(factor):
         return 1.0
-    power = 10.0 ** math.floor(math.log10(factor))
-    return next((step * power for step in (5, 2) if step * power <= factor * (1 + 1e-12)), power)
+    return round_down(factor)
 
 
 def arrows(frame: Frame, xy_mm: np.ndarray, vectors_m: np.ndarray, factor: float, *,
@@ -173,9 +196,7 @@ def arrow_key(frame: Frame, factor: float, at: Point, unit_m: float = 1 / UM_PER
               unit: str = "µm") -> None:
     """Draw an arrow of a round length at the pixel `at` and say how long it is."""
     per_unit = unit_m * factor * MM_PER_M * frame.per_x
-    wanted = 46.0 / per_unit if per_unit > 0 else 1.0
-    power = 10.0 ** math.floor(math.log10(wanted))
-    value = next((step * power for step in (5, 2) if step * power <= wanted), power)
+    value = round_down(46.0 / per_unit) if per_unit > 0 else 1.0
     end = at[0] + value * per_unit, at[1]
     frame.drawing.lines([(at, end)], width=1.4)
     frame.drawing.shapes([_head(at, end, value * per_unit, 1.4)], fill="ink")
@@ -195,3 +216,74 @@ def legend(drawing: Drawing, entries: Sequence[tuple[str, str]], at: Point, *,
 def text_width(words: str, size: float) -> float:
     """Return about how wide words are, rather too much than too little."""
     return 0.6 * size * len(words)
+
+
+def ordinal(number: int) -> str:
+    """Return ``1st``, ``2nd``, ``3rd``, ``4th``, ``11th``, ``21st``."""
+    teen = number % 100 in (11, 12, 13)
+    return f"{number}{'th' if teen else {1: 'st', 2: 'nd', 3: 'rd'}.get(number % 10, 'th')}"
+
+
+def panels(drawing: Drawing, titles: Sequence[str], reach_mm: Sequence[float]) -> list[Frame]:
+    """Return two frames a row of the field, titled, and let the drawing grow around them."""
+    side, gap, left, top = 186.0, 42.0, 46.0, 48.0
+    height = side * reach_mm[1] / reach_mm[0]
+    out = []
+    for number, title in enumerate(titles):
+        box = (left + number % 2 * (side + gap), top + number // 2 * (height + 50), side, height)
+        drawing.label(box[0], box[1] - 6, shortened(title, 26), bold=True)
+        out.append(Frame(drawing, box, (-reach_mm[0], reach_mm[0]), (-reach_mm[1], reach_mm[1])))
+    drawing.height = top + -(-len(titles) // 2) * (height + 50) - 26
+    return out
+
+
+def shortened(words: str, most: int) -> str:
+    """Return words cut at `most` characters."""
+    return words if len(words) <= most else words[:most - 1] + "…"
+
+
+@dataclass(frozen=True, eq=False)
+class Curve:
+    """Values over x: a line unless its width is 0, dots of a radius, ± `U` as bars or as a band."""
+
+    x: np.ndarray
+    y: np.ndarray
+    colour: str = "ink"
+    width: float = 1.5
+    dash: tuple[float, ...] = ()
+    dots: float = 0.0
+    U: np.ndarray | None = None
+    band: bool = False
+
+
+def chart(drawing: Drawing, box: tuple[float, float, float, float], curves: Sequence[Curve], *,
+          title: str = "", labels: tuple[str, str] = ("", ""), log: bool = False,
+          x: tuple[float, float] | None = None, y: tuple[float, float] | None = None) -> None:
+    """Draw curves over x and y, which hold all of them unless given; `log` = both logarithmic."""
+    scaled = [replace(c, x=np.log10(c.x), y=np.log10(c.y)) for c in curves] if log else curves
+    reach = [c.y + side * (0.0 if c.U is None else c.U) for c in scaled for side in (-1, 1)]
+    frame = Frame(drawing, box, x or _span([c.x for c in scaled], 0.04), y or _span(reach, 0.06),
+                  log)
+    drawing.label(box[0], box[1] - 7, title, bold=True)
+    for curve in scaled:
+        low, high = ([frame.at(*point) for point in zip(curve.x, curve.y + side * (
+            0.0 if curve.U is None else curve.U), strict=True)] for side in (-1, 1))
+        if curve.band:
+            drawing.shapes([[*high, *reversed(low)]], fill=curve.colour, opacity=0.25)
+        elif curve.U is not None:
+            drawing.lines(zip(low, high, strict=True), stroke=curve.colour)
+        places = [frame.at(*point) for point in zip(curve.x, curve.y, strict=True)]
+        if curve.width:
+            drawing.line(places, stroke=curve.colour, width=curve.width, dash=curve.dash)
+        if curve.dots:
+            drawing.discs(places, curve.dots, fill=curve.colour)
+    frame.axes(x_label=labels[0], y_label=labels[1])
+
+
+def _span(values: Sequence[np.ndarray], margin: float) -> tuple[float, float]:
+    """Return a range that holds all values, with a margin at either end."""
+    known = np.concatenate(values)
+    known = known[np.isfinite(known)]
+    low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 1.0)
+    room = margin * (high - low) or abs(low) or 1.0
+    return low - room, high + room

@@ -8,9 +8,8 @@ import numpy as np
 
 from selfcal_ros.model.result import CalibrationResult, ViewResult
 from selfcal_ros.reporting.figures.drawing import SERIES, Drawing, Frame, Point
-from selfcal_ros.reporting.figures.maps import WIDTH
-from selfcal_ros.reporting.figures.parts import legend, text_width
-from selfcal_ros.reporting.figures.residuals import panels, places_mm
+from selfcal_ros.reporting.figures.parts import WIDTH, legend, panels, text_width, titled
+from selfcal_ros.reporting.figures.residuals import places_mm
 from selfcal_ros.reporting.summary.format import printable
 from selfcal_ros.reporting.summary.sections import pose_text
 from selfcal_ros.units import MM_PER_M
@@ -22,12 +21,10 @@ def views_drawing(result: CalibrationResult) -> Drawing:
     Marks beyond the field of the stage are hollow: no view reads them.
     """
     artifact = result.artifact
-    drawing = Drawing("views", "How the plate lies on the stage in every view; hollow marks lie "
-                      "beyond the field and are not read.", WIDTH, 0)
-    drawing.label(0, 16, "How the plate lies in every view", size=13, bold=True)
+    drawing = titled("views", "How the plate lies in every view")
     reach = [(half + 2.6) * artifact.grid_pitch_m * MM_PER_M for half in artifact.half]
     titles = [f"{view.name}: {pose_text(view, artifact.grid_pitch_m)}" for view in result.views]
-    for (_, frame), view in zip(panels(drawing, titles, reach), result.views, strict=True):
+    for frame, view in zip(panels(drawing, titles, reach), result.views, strict=True):
         _plate(drawing, frame, view, result)
         frame.border()
     for line in ("shaded: field of the stage; dot in the corner: mark (h, h) of the plate",
@@ -115,10 +112,8 @@ def rejected_map(result: CalibrationResult) -> Drawing | None:
     reach = [half + 1.2 * artifact.grid_pitch_m * MM_PER_M for half in field]
     colours = {reason: f"c{i % SERIES}" for i, (reason, _) in enumerate(
         Counter(row[1] for row in found).most_common())}
-    drawing = Drawing("rejected", "Where the stage stood at grid readings that were rejected, by "
-                      "view and reason.", WIDTH, 0)
-    drawing.label(0, 16, "Rejected grid readings, where they happened", size=13, bold=True)
-    for title, frame in panels(drawing, names, reach):
+    drawing = titled("rejected", "Rejected grid readings, where they happened")
+    for title, frame in zip(names, panels(drawing, names, reach), strict=True):
         low, high = frame.at(-field[0], -field[1]), frame.at(*field)
         drawing.box(low[0], high[1], high[0] - low[0], low[1] - high[1], fill="card")
         for reason, colour in colours.items():

@@ -12,15 +12,19 @@ from scipy.special import ndtri
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.result import CalibrationResult, ViewResult
 from selfcal_ros.model.statistics import rms
-from selfcal_ros.reporting.figures.drawing import Drawing, Frame, span_of
-from selfcal_ros.reporting.figures.maps import WIDTH
+from selfcal_ros.reporting.figures.drawing import SERIES, Drawing, Frame, span_of
 from selfcal_ros.reporting.figures.parts import (
     MAX_ARROWS,
+    Curve,
     arrow_key,
     arrows,
+    chart,
     enlargement,
     legend,
+    panels,
+    shortened,
     thinned,
+    titled,
 )
 from selfcal_ros.reporting.summary.format import significant
 from selfcal_ros.units import ARCSEC_PER_RAD, MM_PER_M, UM_PER_M
@@ -107,47 +111,19 @@ def residual_maps(result: CalibrationResult, found: Sequence[ViewResiduals]) -> 
     sites = thinned(artifact, MAX_ARROWS)
     factor = enlargement(np.concatenate([np.hypot(*v.xy_m).ravel() for v in views]),
                          (sites[0].step or 1) * artifact.grid_pitch_m)
-    drawing = Drawing("residual-maps", "Residuals of the grid readings, view by view, at the "
-                      "marks; one enlargement for all.", WIDTH, 0)
-    drawing.label(0, 16, "Residuals of the grid readings by view", size=13, bold=True)
+    drawing = titled("residual-maps", "Residuals of the grid readings by view")
     reach = [max(float(np.abs(v.places_mm(artifact)[axis]).max()) for v in views)
              + 1.3 * artifact.grid_pitch_m * MM_PER_M for axis in (0, 1)]
-    frame = None
-    for title, frame in panels(drawing, [v.view.name for v in views], reach):
-        view = next(v for v in views if v.view.name == title)
+    frames = panels(drawing, [v.view.name for v in views], reach)
+    for view, frame in zip(views, frames, strict=True):
         frame.axes(ticks=(4, 4))
         at = view.places_mm(artifact)[:, *sites].reshape(2, -1)
         arrows(frame, at, view.xy_m[:, *sites].reshape(2, -1), factor, width=0.9)
-    if frame is None:
-        return None
     y = drawing.height + 18
-    arrow_key(frame, factor, (46, y))
-    drawing.label(150, y + 4, f"enlarged {factor:,.0f} ×; axes in mm", size=12)
+    arrow_key(frames[0], factor, (46, y))
+    drawing.label(150, y + 4, f"enlarged {factor:,.0f} ×; axes in mm")
     drawing.height = y + 16
     return drawing
-
-
-def panels(drawing: Drawing, titles: Sequence[str], reach_mm: Sequence[float],
-           ) -> list[tuple[str, Frame]]:
-    """Return two frames a row of the field, titled, and let the drawing grow around them."""
-    side, gap, left, top = 186.0, 42.0, 46.0, 48.0
-    height = side * reach_mm[1] / reach_mm[0]
-    out = []
-    for number, title in enumerate(titles):
-        column = number % 2
-        box = (left + column * (side + gap), top, side, height)
-        drawing.label(box[0], top - 6, shortened(title, 26), size=12, bold=True)
-        out.append((title, Frame(drawing, box, (-reach_mm[0], reach_mm[0]),
-                                 (-reach_mm[1], reach_mm[1]))))
-        if column or number == len(titles) - 1:
-            top += height + 50
-    drawing.height = top - 26
-    return out
-
-
-def shortened(words: str, most: int) -> str:
-    """Return words cut at `most` characters."""
-    return words if len(words) <= most else words[:most - 1] + "…"
 
 
 BINS = 15
@@ -176,24 +152,25 @@ def distributions(found: Sequence[ViewResiduals], kind: str) -> Drawing | None:
     if not rows:
         return None
     what = "grid" if xy else "angular"
-    drawing = Drawing(f"distributions-{kind}", f"Histogram and normal plot of the {what} "
-                      "residuals of every view.", WIDTH, 26 + 148.0 * len(rows))
-    drawing.label(0, 16, f"Distribution of the {what} residuals by view, {unit}", size=13,
-                  bold=True)
+    drawing = titled(f"distributions-{kind}", f"Distribution of the {what} residuals by view",
+                     44 + 148.0 * len(rows))
     end = 1.05 * span_of(np.concatenate([values for _, values in rows]).tolist())
     for number, (name, values) in enumerate(rows):
         top = 50.0 + 148 * number
+        last = number == len(rows) - 1
         size = rms(values)
-        drawing.label(46, top - 7, shortened(name, 24), size=12, bold=True)
+        drawing.label(46, top - 7, shortened(name, 24), bold=True)
         drawing.label(472, top - 7, f"{len(values)} residuals, rms {significant(size)} {unit}",
                       size=11, anchor="end", colour="soft")
-        _histogram(drawing, values, size, (46, top, 190, 96), end)
-        _normal_plot(drawing, values, size, (290, top, 182, 96), end)
+        _histogram(drawing, values, size, (46, top, 190, 96), end).axes(
+            ticks=(5, 3), x_label=f"residual in {unit}" if last else "")
+        _normal_plot(drawing, values, size, (290, top, 182, 96), end).axes(
+            ticks=(6, 5), x_label="normal quantile" if last else "")
     return drawing
 
 
 def _histogram(drawing: Drawing, values: np.ndarray, size: float,
-               box: tuple[float, float, float, float], end: float) -> None:
+               box: tuple[float, float, float, float], end: float) -> Frame:
     counts, edges = np.histogram(values, BINS, (-end, end))
     width = 2 * end / BINS
     peak = len(values) * width * _normal_density(0.0) / size if size > 0 else 0.0
@@ -208,7 +185,7 @@ def _histogram(drawing: Drawing, values: np.ndarray, size: float,
         curve = len(values) * width * (_normal_density(along / size) / size)
         drawing.line([frame.at(x, min(y, top)) for x, y in zip(along, curve, strict=True)],
                      width=1.3)
-    frame.axes(ticks=(5, 3))
+    return frame
 
 
 def _normal_density(x: Any) -> Any:
@@ -217,7 +194,7 @@ def _normal_density(x: Any) -> Any:
 
 
 def _normal_plot(drawing: Drawing, values: np.ndarray, size: float,
-                 box: tuple[float, float, float, float], end: float) -> None:
+                 box: tuple[float, float, float, float], end: float) -> Frame:
     quantiles = ndtri((np.arange(len(values)) + 0.5) / len(values))
     reach = max(3.2, float(np.abs(quantiles).max()) * 1.05)
     frame = Frame(drawing, box, (-reach, reach), (-end, end))
@@ -225,7 +202,7 @@ def _normal_plot(drawing: Drawing, values: np.ndarray, size: float,
                   np.linspace(-reach, reach, 41)], stroke="truth", width=1.2)
     chosen = _some(len(values))
     drawing.discs([frame.at(quantiles[i], values[i]) for i in chosen], 1.5, fill="ink")
-    frame.axes(ticks=(6, 5))
+    return frame
 
 
 def _some(count: int) -> list[int]:
@@ -243,29 +220,20 @@ def courses(found: Sequence[ViewResiduals], sigma_m: float) -> Drawing | None:
     views = [v for v in found if v.course.shape[1] > 1]
     if not views:
         return None
-    drawing = Drawing("courses", "Mean grid residuals over the time of each view, with the band "
-                      "that random noise would keep to.", WIDTH, 0)
-    drawing.label(0, 16, "Mean residuals over the time of each view, µm", size=13, bold=True)
+    drawing = titled("courses", "Mean residuals over the time of each view, µm")
     bands = [2 * sigma_m * UM_PER_M / np.sqrt(np.maximum(v.course[3], 1)) for v in views]
     end = 1.1 * max(span_of((v.course[1:3] * UM_PER_M).ravel().tolist() + band.tolist())
                     for v, band in zip(views, bands, strict=True))
     top = 50.0
     for view, band in zip(views, bands, strict=True):
-        since = view.course[0] - view.course[0, 0]
-        minutes = since[-1] > 180
-        t = since / (60 if minutes else 1)
-        frame = Frame(drawing, (52, top, 420, 84), (0.0, float(t[-1]) or 1.0), (-end, end))
-        drawing.label(52, top - 7, shortened(view.view.name, 40), size=12, bold=True)
-        if np.isfinite(band).all():
-            edge = list(zip(t, band, strict=True))
-            drawing.shapes([[*(frame.at(x, y) for x, y in edge),
-                             *(frame.at(x, -y) for x, y in reversed(edge))]],
-                           fill="band", opacity=0.25)
-        for axis, colour in ((1, "c0"), (2, "c1")):
-            drawing.line([frame.at(x, y) for x, y in
-                          zip(t, view.course[axis] * UM_PER_M, strict=True)], stroke=colour,
-                         width=1.5)
-        frame.axes(ticks=(6, 4))
+        t = view.course[0] - view.course[0, 0]
+        minutes = t[-1] > 180
+        t = t / (60 if minutes else 1)
+        expected = [Curve(t, np.zeros(len(t)), "band", 0.0, U=band, band=True)]
+        chart(drawing, (52, top, 420, 84), [
+            *(expected if np.isfinite(band).all() else []),
+            *(Curve(t, view.course[axis] * UM_PER_M, f"c{axis - 1}") for axis in (1, 2))],
+            title=shortened(view.view.name, 40), x=(0.0, float(t[-1]) or 1.0), y=(-end, end))
         drawing.label(472, top - 7, "time in min" if minutes else "time in s", size=11,
                       colour="soft", anchor="end")
         top += 84 + 46
@@ -290,25 +258,19 @@ def drift_found(result: CalibrationResult) -> Drawing | None:
     if not paths:
         return None
     names = list(dict.fromkeys(view for view, _ in paths))
-    drawing = Drawing("drift", "Drift of the plate against the microscope within each view, as "
-                      "the model found it.", WIDTH, 0)
-    drawing.label(0, 16, "Drift found in each view, µm, over the part of its time", size=13,
-                  bold=True)
+    drawing = titled("drift", "Drift found in each view, µm")
     end = 1.1 * span_of(np.concatenate(list(paths.values())).tolist())
-    frame = Frame(drawing, (58, 34, 414, 190), (0.0, 1.0), (-end, end))
-    drawing.line([frame.at(0, 0), frame.at(1, 0)], stroke="line")
-    for number, name in enumerate(names):
-        for axis, dash in (("x", ()), ("y", (5, 3))):
-            if (name, axis) in paths:
-                drawing.line([frame.at((t + 1) / 2, v) for t, v in
-                              zip(tau, paths[name, axis], strict=True)],
-                             stroke=f"c{number % 6}", width=1.8, dash=dash)
-    frame.axes(ticks=(5, 5), x_label="part of the view's time", y_label="")
+    chart(drawing, (58, 34, 414, 190), [
+        Curve(np.array([0.0, 1.0]), np.zeros(2), "line", 1.0),
+        *(Curve((tau + 1) / 2, paths[name, axis], f"c{number % SERIES}", 1.8, dash)
+          for number, name in enumerate(names) for axis, dash in (("x", ()), ("y", (5, 3)))
+          if (name, axis) in paths)],
+        x=(0.0, 1.0), y=(-end, end), labels=("part of the view's time", ""))
     y = 34 + 190 + 62.0
     for first in range(0, len(names), 3):
-        legend(drawing, [(f"c{(first + i) % 6}", shortened(name, 16)) for i, name in
+        legend(drawing, [(f"c{(first + i) % SERIES}", shortened(name, 16)) for i, name in
                          enumerate(names[first:first + 3])], (46, y))
         y += 18
-    drawing.label(46, y, "solid: along x, dashed: along y", size=12, colour="soft")
+    drawing.label(46, y, "solid: along x, dashed: along y", colour="soft")
     drawing.height = y + 10
     return drawing

@@ -19,6 +19,7 @@ from selfcal_ros.reporting.figures.drawing import (
     Label,
     Path,
     Spot,
+    round_down,
     round_step,
     round_ticks,
 )
@@ -28,9 +29,14 @@ from selfcal_ros.reporting.figures.maps import (
     angular_map,
     component_maps,
     error_map,
-    uncertainty_map,
 )
-from selfcal_ros.reporting.figures.parts import levels, text_width
+from selfcal_ros.reporting.figures.parts import (
+    Scale,
+    levels,
+    ordinal,
+    range_scale,
+    text_width,
+)
 from selfcal_ros.reporting.figures.places import rejected_in, rejected_map
 from selfcal_ros.reporting.figures.residuals import (
     courses,
@@ -94,7 +100,7 @@ def extent(item):
 @pytest.mark.parametrize("name", RESULTS)
 def test_nothing_lies_outside_of_a_figure(name):
     figures = drawn(RESULTS[name]())
-    assert len(figures) >= 4
+    assert len(figures) >= 3
     for drawing in figures:
         for item in drawing.items:
             left, right, top, bottom = extent(item)
@@ -158,26 +164,85 @@ def test_residuals_of_a_turned_view_stand_where_its_marks_lie():
 @pytest.mark.parametrize(("value", "step"), [(0.0, 0), (0.0999, 0), (0.1001, 1), (0.95, 9),
                                              (1.0, 9), (7.0, 9), (np.nan, -1)])
 def test_steps_of_a_scale_from_zero(value, step):
-    assert levels(np.array([value]), ("e", 1.0)) == [step]
+    assert levels(np.array([value]), Scale("e", 0.0, 1.0)) == [step]
+    assert levels(np.array([value + 5]), Scale("e", 5.0, 6.0)) == [step]
 
 
 @pytest.mark.parametrize(("value", "step"), [(-2.0, 0), (-1.0, 0), (-0.11, 4), (-0.09, 5),
                                              (0.09, 5), (0.11, 6), (1.0, 10), (np.nan, -1)])
 def test_steps_of_a_scale_to_both_sides(value, step):
-    assert levels(np.array([value]), ("d", 1.0)) == [step]
+    assert levels(np.array([value]), Scale("d", -1.0, 1.0)) == [step]
 
 
-def test_components_and_uncertainties_share_one_scale():
+@pytest.mark.parametrize(("values", "ends"), [
+    ([0.0231, 0.0362, np.nan], (0.0225, 0.0375)), ([3.0, 3.02], (3.02, 3.02)), ([np.nan], (0, 0)),
+    ([0.0, 1.0], (0.0, 1.0))])
+def test_a_scale_over_a_range_shows_the_variation_unless_there_is_none(values, ends):
+    scale = range_scale("v", np.array(values))
+    assert (scale.low, scale.high) == pytest.approx(ends)
+
+
+def fills(drawing, ramp):
+    return [item.fill for item in drawing.items if isinstance(item, Path)
+            and re.fullmatch(rf"{ramp}\d+", item.fill)]
+
+
+def test_components_share_one_scale_and_their_u_another_that_shows_where_it_is_large():
     result, _ = known_result(3, 0)
     gx, gy = np.zeros((2, 3, 3))
     gx[2, 0], gy[0, 2] = 1e-6, -1e-6
-    u = np.full((3, 3), 1.5e-7)
-    u[1, 1] = 1e-6
+    u = np.full((3, 3), 1.5e-8)
+    u[1, 1] = 2.5e-8
     emap = replace(result.error_map, gx=gx, gy=gy, u_gx=u, u_gy=u)
-    drawing = component_maps(replace(result, error_map=emap))
-    fills = [i.fill for i in drawing.items if isinstance(i, Path) and i.fill.startswith("d")]
-    assert fills[:8] == ["d5", "d10", "d0", "d5", "d6", "d10", "d6", "d10"]
-    assert uncertainty_map(result).width == error_map(result).width
+    result = replace(result, error_map=emap, noise=replace(result.noise, k_xy=2.28))
+    drawing = component_maps(result)
+    assert fills(drawing, "d")[:4] == ["d5", "d10", "d0", "d5"]
+    assert fills(drawing, "v")[:4] == ["v0", "v9"] * 2
+    words = [item.text for item in drawing.items if isinstance(item, Label)]
+    assert words[0].endswith("U with k = 2.28") and {"U(Gx)", "U(Gy)", "0.05"} <= set(words)
+    even = replace(result, error_map=replace(emap, u_gx=np.full((3, 3), 1e-7),
+                                             u_gy=np.full((3, 3), 1.001e-7)))
+    words = [item.text for item in component_maps(even).items if isinstance(item, Label)]
+    assert {"U(Gx) = 0.228 µm everywhere", "U(Gy) = 0.228 µm everywhere"} <= set(words)
+
+
+def test_ellipses_are_as_wide_as_u_along_x_and_as_high_as_u_along_y_with_the_k_of_the_result():
+    result, _ = known_result(7, 0, size_y=5)
+    wide, high = np.full((7, 5), 3e-7), np.full((7, 5), 1e-7)
+    result = replace(result, noise=replace(result.noise, k_xy=2.5), error_map=replace(
+        result.error_map, u_gx=wide, u_gy=high))
+    drawing = error_map(result)
+    found, = (item for item in drawing.items if isinstance(item, Discs) and item.fill == "band"
+              and len(item.radii) > 1)
+    vectors = np.array(shafts(drawing))
+    gain = (vectors[:, 1, 0] - vectors[:, 0, 0]) / result.error_map.gx.ravel()  # pixels a metre
+    np.testing.assert_allclose(found.radii, np.outer(gain, (2.5 * 3e-7, 2.5 * 1e-7)))
+    np.testing.assert_allclose(found.centres, vectors[:, 1])
+    words = [item.text for item in drawing.items if isinstance(item, Label)]
+    assert "U, k = 2.5" in words
+    told = next(item.title for item in drawing.items if isinstance(item, Spot))
+    assert "± 0.750 µm" in told and "± 0.250 µm (k = 2.5)" in told
+
+
+def test_a_map_without_one_known_site_says_so():
+    result, _ = known_result(3, 0)
+    nothing = np.full((3, 3), np.nan)
+    drawing = error_map(replace(result, error_map=replace(result.error_map, gx=nothing)))
+    assert "not one site is known" in [i.text for i in drawing.items if isinstance(i, Label)]
+    assert shafts(drawing, width=1.2) == []
+
+
+@pytest.mark.parametrize(("number", "words"), [(1, "1st"), (2, "2nd"), (3, "3rd"), (4, "4th"),
+                                               (11, "11th"), (12, "12th"), (21, "21st"),
+                                               (22, "22nd"), (23, "23rd"), (113, "113th")])
+def test_ordinals(number, words):
+    assert ordinal(number) == words
+
+
+@pytest.mark.parametrize(("value", "rounded"), [(1, 1), (1.99, 1), (2, 2), (4.9, 2), (5, 5),
+                                                (9.99, 5), (19564, 10000), (0.0021, 0.002)])
+def test_round_numbers(value, rounded):
+    assert round_down(value) == pytest.approx(rounded)
 
 
 def test_lines_lie_outside_the_circle_where_the_error_is_positive():
