@@ -15,7 +15,7 @@ from selfcal_ros.reporting.figures.drawing import Drawing
 from selfcal_ros.reporting.figures.places import views_drawing
 from selfcal_ros.reporting.figures.svg import svg_file
 from selfcal_ros.reporting.summary.numbers import truth_arrays
-from selfcal_ros.reporting.words.result import worded
+from selfcal_ros.reporting.words.findings import worded
 
 ROOT = Path(__file__).parents[1]
 FOLDER = ROOT / "docs" / "pictures"

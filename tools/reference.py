@@ -59,9 +59,10 @@ RESULT = {
     "method": "`joint` or `law`", "measurement_sense": "`microscope_moves` or `plate_moves`",
     "artifact": "the plate, as in PLAN.yaml", "run_id": "stamp of the run's first command, ns",
     "verdict": "`grade` (good, enlarged, not_qualified), `qualified` (false for not_qualified), "
-               "`sentence`, `reasons`, `enlarged_by` (each name, u_rms, u_max, unit), and "
-               "`causes`, the most likely first (each name, text, view, axis, mark, size, u, unit, "
-               "p, effect_rms, effect_max, told, remedies)",
+               "`sentence`, `reasons`, `failed` (the tests that failed, as `findings`), "
+               "`enlarged_by` (each name, u_rms, u_max, unit), and `causes`, most likely first: as "
+               "`findings`, and effect_rms, effect_max, told (whether the readings determine it "
+               "all), remedies (a list of {model}, {view} to measure again, {action})",
     "model": "`misalignment` (rigid, linear) and `terms`: name, size (null = free), estimates "
              "(view, component, value, u, unit), "
              "size_used (where the readings contradict the size), source (declared, default, "
@@ -83,6 +84,8 @@ RESULT = {
     "noise": "sigma_* of one reading (m, rad): used, from repeats, from residuals, declared; "
              "dof_*; k_*; p_* of the F-test",
     "rejected": "reason -> number of detections", "warnings": "a list of sentences",
+    "findings": "the data behind `warnings`: a list of name, text, view, axis, mark (m, n) or (k), "
+                "size, u, unit, p, details (by name, SI units)",
     "input": "file and sha256 of the bag", "solver": "how the equations were solved",
     "covariance_terms": "terms and factors (r, 2, N, N): what an exact comparison of results "
                         "needs; up to 31 × 31 sites, and not with `--model none`",
@@ -91,7 +94,8 @@ RESULT = {
                  "{time_s, dx, dy, count} over the view's time"}
 SOMETIMES = {
     "rejected_at": "where grid detections were rejected: view, reason, x, y (m)",
-    "outliers": "`--robust`: rule, and what was removed", "slips": "`--robust`: slips of the plate",
+    "outliers": "`--robust`: rule, and the readings removed",
+    "slips": "`--robust`: slips of the plate",
     "noisy_views": "`--robust`: views noisier than the others",
     "validation": "`--validate`: what was held out, and how well it was predicted",
     "budget": "`--budget`: components of the uncertainty, m and rad"}
@@ -204,7 +208,7 @@ def example() -> dict[str, Any]:
 
     from selfcal_ros.estimation.api import calibrate
     from selfcal_ros.model.artifact import Artifact
-    from selfcal_ros.reporting.words.result import worded
+    from selfcal_ros.reporting.words.findings import worded
     from selfcal_ros.simulation.truth import hu_plan, random_truth, simulate_measurements
 
     rng = np.random.default_rng(1)

@@ -32,7 +32,7 @@ for _libraries in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
 
 ROOT = Path(__file__).resolve().parents[1]
 SENTENCES = {"sentence", "text", "reasons", "warnings", "advice", "created", "file", "version",
-             "message", "rejected_text", "sha256"}
+             "message", "rejected_text", "sha256", "action"}
 """Keys whose values are words for a reader, or differ from run to run."""
 
 OPTIONS = ([], ["--model", "none"], ["--robust"], ["--validate"], ["--misalignment", "linear"],

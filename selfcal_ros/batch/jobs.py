@@ -37,7 +37,7 @@ from selfcal_ros.model.result import (
     unidentified_result,
     with_input,
 )
-from selfcal_ros.reporting.words.result import worded
+from selfcal_ros.reporting.words.findings import worded
 
 
 def run_job(job: Job) -> Record:
@@ -96,7 +96,8 @@ def solved(job: Job, source: dict[str, str],
     except NotIdentifiableError as error:
         if not isinstance(error.observability, Observability):
             raise
-        result, problem = unidentified_result(session.measurements, error.observability), error
+        result = worded(unidentified_result(session.measurements, error.observability))
+        problem = error
     return with_input(result, source, session.lost), problem
 
 

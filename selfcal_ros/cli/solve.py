@@ -138,7 +138,7 @@ def run(args: argparse.Namespace) -> int:
         with_input,
     )
     from selfcal_ros.reporting.report import check_name, write_report
-    from selfcal_ros.reporting.words.result import worded
+    from selfcal_ros.reporting.words.findings import worded
 
     check_outputs([args.bag, args.params], [file_of(args), args.report])
     if args.report:
@@ -160,7 +160,7 @@ def run(args: argparse.Namespace) -> int:
             result = _calibrated(args, measurements, options)
     except NotIdentifiableError as error:
         if (args.output or args.json) and error.observability is not None:
-            result = unidentified_result(measurements, error.observability)
+            result = worded(unidentified_result(measurements, error.observability))
             _write(args, result_to_dict(with_input(result, bag_input(args.bag), lost)))
         if findings:  # what the plan lacks is told by readings that are not there
             raise NotIdentifiableError(f"{args.bag}: {findings[0]}; correct this first (as it is: "
@@ -220,8 +220,10 @@ def _extended(args: argparse.Namespace, measurements: Any, options: Any,
         used = clean(measurements, options).measurements if args.robust else measurements
         found = validate(used, options)
         result = judged_by(result, found)
-        result = replace(result, extra={**result.extra, "validation": validation_json(found)})
-        lines += ["", "held-out readings:", *(f"  {line}" for line in validation_text(found))]
+        result = replace(result, extra={
+            **result.extra, "validation": validation_json(found, result.artifact)})
+        lines += ["", "held-out readings:", *(f"  {line}" for line in validation_text(
+            found, result.artifact))]
     if args.budget:
         from selfcal_ros.estimation.quality.budget import budgets
         from selfcal_ros.reporting.words.budget import budget_json, budget_text

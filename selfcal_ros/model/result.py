@@ -16,6 +16,8 @@ from selfcal_ros.model.error_map import ErrorMap, ThetaDatum
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.verdict import Finding, Grade, ModelResult, Provenance, Verdict
 from selfcal_ros.model.verdict_json import (
+    finding_from_dict,
+    finding_to_dict,
     model_from_dict,
     model_to_dict,
     provenance_from_dict,
@@ -28,7 +30,6 @@ from selfcal_ros.model.verdict_json import (
 SCHEMA = "selfcal.result/1"
 LARGEST = 1e3
 """Errors and uncertainties beyond it, in m or rad, are damage: sums of their squares overflow."""
-NOT_IDENTIFIED = "Not qualified: the readings do not identify the stage"
 
 
 @dataclass(frozen=True)
@@ -147,8 +148,8 @@ class Noise:
 class CalibrationResult:
     """Everything that one calibration found.
 
-    `findings` is what estimation has to tell beside the verdict, as data, until
-    `selfcal_ros.reporting.words.result.worded` makes `warnings` of it.
+    `findings` is what was left out or could not be done; `warnings` are their sentences, which
+    `selfcal_ros.reporting.words.findings.worded` adds, and those of the collection.
     """
 
     plan_id: str
@@ -223,7 +224,8 @@ def unidentified_result(measurements: Measurements, observability: Observability
         ErrorMap(artifact, grid, grid, grid, grid, circle, circle, nan, nan),
         ArtifactMap(grid, grid, circle), views, observability, Noise(nan, nan),
         measurements.all_rejected(), sense=str(measurements.sense),
-        verdict=Verdict(Grade.NOT_QUALIFIED, NOT_IDENTIFIED), run_id=measurements.run_id)
+        verdict=Verdict(Grade.NOT_QUALIFIED, (Finding("not_identified"),)),
+        run_id=measurements.run_id)
 
 
 def result_to_dict(result: CalibrationResult) -> dict[str, Any]:
@@ -232,10 +234,8 @@ def result_to_dict(result: CalibrationResult) -> dict[str, Any]:
     Raises
     ------
     ValueError
-        If it is not worded: give it to `selfcal_ros.reporting.words.result.worded` first.
+        If it is not worded: give it to `selfcal_ros.reporting.words.findings.worded` first.
     """
-    if result.findings:
-        raise ValueError(f"{len(result.findings)} findings of the result are not worded")
     emap, amap, artifact = result.error_map, result.artifact_map, result.artifact
     return {
         "schema": SCHEMA,
@@ -270,6 +270,7 @@ def result_to_dict(result: CalibrationResult) -> dict[str, Any]:
         "noise": plain(asdict(result.noise)),
         "rejected": dict(result.rejected),
         "warnings": list(result.warnings),
+        "findings": plain([finding_to_dict(found) for found in result.findings]),
         "input": dict(result.input),
         **{key: plain(value) for key, value in result.extra.items()},
     }
@@ -278,7 +279,8 @@ def result_to_dict(result: CalibrationResult) -> dict[str, Any]:
 _MAP_ARRAYS = ("gx", "gy", "u_gx", "u_gy", "g_theta", "u_g_theta")
 _KNOWN = {"schema", "run_id", "verdict", "model", "reference", "provenance", "dof",
           "coverage_factor", "plan_id", "method", "measurement_sense", "artifact", "views",
-          "error_map", "artifact_map", "observability", "noise", "rejected", "warnings", "input"}
+          "error_map", "artifact_map", "observability", "noise", "rejected", "warnings", "findings",
+          "input"}
 
 
 def plain(value: Any) -> Any:
@@ -352,7 +354,8 @@ def _parse(data: dict) -> CalibrationResult:
         {key: value for key, value in data.items() if key not in _KNOWN},
         verdict_from_dict(data.get("verdict"), identifiable=seen["identifiable"]),
         model_from_dict(data.get("model")), reference_from_dict(data.get("reference")),
-        provenance_from_dict(data.get("provenance")), _of(str, data.get("run_id", "")))
+        provenance_from_dict(data.get("provenance")), _of(str, data.get("run_id", "")),
+        tuple(map(finding_from_dict, data.get("findings", []))))
 
 
 def _view(v: dict) -> ViewResult:

@@ -8,37 +8,57 @@ from typing import Any, Literal
 
 
 @dataclass(frozen=True)
-class Finding:
-    """Something that is to be told to a person: each kind has its data as fields, SI units.
+class Remedy:
+    """What to do about a cause: solve with a `model`, measure a `view` (again), or an `action`."""
 
-    `selfcal_ros.reporting.words` makes a sentence of it.
-    """
+    kind: Literal["model", "view", "action"]
+    value: str
 
 
 @dataclass(frozen=True)
-class Cause(Finding):
-    """Something that the readings show and the model does not hold.
+class Finding:
+    """Something found in the readings, as data in SI units.
+
+    `selfcal_ros.reporting.words.findings` has the sentence of each name.
 
     Attributes
     ----------
     name : str
-        A `selfcal_ros.model.terms.TermName`, ``slip`` (of a plate within a view), ``reading`` (a
-        mark or line that is off in a view), ``rotation`` (of a view's lines against its marks),
-        ``off_sites`` (of the stage) or ``noise`` (of a view).
-    text : str
-        What, with size, uncertainty and what to do, for a person; empty before it is worded.
+        What was found: the name of a term, or another one that has its sentence.
     size, u : float
-        Its largest component and standard uncertainty, in `unit`.
+        Its largest component and standard uncertainty, in `unit`; NaN where it has none.
     unit : str
-        ``m``, ``rad`` or ``m/m`` (also for a ratio of noises).
+        ``m``, ``rad`` or ``m/m`` (also for a ratio of noises); empty without a size.
     p : float
         Probability that readings without it show as much.
-    what : Finding, optional
-        Where and of what kind; None of a cause that has its text.
     view, axis : str
         Where it is: name of the view, ``x`` or ``y``; empty where that says nothing.
     mark : tuple of int
         Mark (m, n) or line (k,) of a single reading; else empty.
+    details : dict, optional
+        What else its sentence says, by name; None in a file older than details.
+    text : str
+        Its sentence; empty before it is worded.
+    """
+
+    name: str
+    size: float = math.nan
+    u: float = math.nan
+    unit: str = ""
+    p: float = math.nan
+    view: str = ""
+    axis: str = ""
+    mark: tuple[int, ...] = ()
+    details: dict[str, Any] | None = field(default_factory=dict)
+    text: str = ""
+
+
+@dataclass(frozen=True)
+class Cause(Finding):
+    """What explains the residuals, or an enlarged uncertainty.
+
+    Attributes
+    ----------
     effect_rms, effect_max : float
         What it does to the map: of one coordinate, m, or of the angular map, rad, if `unit` is
         rad and it is in the lines; NaN where that is not known.
@@ -48,28 +68,10 @@ class Cause(Finding):
         What to do, the best first; those that name a model were tried on these readings.
     """
 
-    name: str
-    text: str
-    size: float
-    u: float
-    unit: str
-    p: float
-    what: Finding | None = None
-    view: str = ""
-    axis: str = ""
-    mark: tuple[int, ...] = ()
     effect_rms: float = math.nan
     effect_max: float = math.nan
     told: bool = True
-    remedies: tuple["Remedy", ...] = ()
-
-
-@dataclass(frozen=True)
-class Remedy:
-    """What to do about a cause: solve with a `model`, measure a `view` (again), or an `action`."""
-
-    kind: Literal["model", "view", "action"]
-    value: str
+    remedies: tuple[Remedy, ...] = ()
 
 
 class Grade(StrEnum):
@@ -105,24 +107,23 @@ class Verdict:
     ----------
     grade : Grade
         Good, good within an enlarged uncertainty, or not qualified.
-    sentence : str
-        The verdict in one sentence; empty before it is worded.
-    reasons : tuple of str
-        The tests that failed, in words.
+    failed : tuple of Finding
+        The tests that failed.
     causes : tuple of Cause
         What explains it, the most likely first.
-    findings : tuple of Finding
-        The tests that failed and the causes as data, until they are worded.
     enlarged_by : tuple of Enlargement
         What enlarged the uncertainty, the most first.
+    sentence, reasons : str, tuple of str
+        The verdict in one sentence, and one for each failed test and cause; empty before it is
+        worded.
     """
 
     grade: Grade
+    failed: tuple[Finding, ...] = ()
+    causes: tuple[Cause, ...] = ()
+    enlarged_by: tuple[Enlargement, ...] = ()
     sentence: str = ""
     reasons: tuple[str, ...] = ()
-    causes: tuple[Cause, ...] = ()
-    findings: tuple[Finding, ...] = ()
-    enlarged_by: tuple[Enlargement, ...] = ()
 
     @property
     def qualified(self) -> bool:

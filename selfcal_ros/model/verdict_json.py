@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Verdict, model and provenance in a RESULT.json; older results have none of them."""
 
+import math
 from typing import Any
 
 from selfcal_ros.model.verdict import (
     Cause,
     Enlargement,
+    Finding,
     Grade,
     ModelResult,
     Provenance,
@@ -15,58 +17,73 @@ from selfcal_ros.model.verdict import (
     Verdict,
 )
 
-NAN = float("nan")
 REFERENCES = ("artifact", "stage_x", "stage_y")
 """Kinds of a reference length."""
 
 
-def verdict_to_dict(verdict: Verdict) -> dict[str, Any]:
-    """Return the JSON form of a verdict, which is worded.
+def finding_to_dict(found: Finding) -> dict[str, Any]:
+    """Return the JSON form of a finding, or of a cause.
 
     Raises
     ------
     ValueError
-        If it is not: give the result to `selfcal_ros.reporting.words.result.worded` first.
+        If it has no text: give the result to `selfcal_ros.reporting.words.findings.worded` first.
     """
-    if verdict.findings:
-        raise ValueError(f"{len(verdict.findings)} findings of the verdict are not worded")
+    if not found.text:
+        raise ValueError(f"the finding '{found.name}' is not worded")
+    data = {**vars(found), "mark": list(found.mark)}
+    if isinstance(found, Cause):
+        data["remedies"] = [{remedy.kind: remedy.value} for remedy in found.remedies]
+    return data
+
+
+def finding_from_dict(data: dict) -> Finding:
+    """Return a finding; files of older versions have no details."""
+    return Finding(**_finding(data))
+
+
+def _finding(data: dict) -> dict[str, Any]:
+    details = data.get("details")
+    if not isinstance(details, dict | None):
+        raise ValueError(f"{details!r} are no details")
+    return {**{key: _text(data[key]) for key in ("name", "text", "unit")},
+            **{key: _text(data.get(key, "")) for key in ("view", "axis")},
+            **{key: _number(data[key]) for key in ("size", "u", "p")},
+            "mark": tuple(map(int, data.get("mark", ()))), "details": details}
+
+
+def _cause(data: dict) -> Cause:
+    return Cause(**_finding(data), effect_rms=_number(data.get("effect_rms")),
+                 effect_max=_number(data.get("effect_max")), told=bool(data.get("told", True)),
+                 remedies=tuple(Remedy(kind, _text(value)) for remedy in data.get("remedies", [])
+                                for kind, value in remedy.items()))
+
+
+def verdict_to_dict(verdict: Verdict) -> dict[str, Any]:
+    """Return the JSON form of a verdict; ValueError if it is not worded."""
     return {"qualified": verdict.qualified, "grade": str(verdict.grade),
             "sentence": verdict.sentence, "reasons": list(verdict.reasons),
-            "enlarged_by": [vars(item) for item in verdict.enlarged_by],
-            "causes": [{"name": c.name, "text": c.text, "view": c.view, "axis": c.axis,
-                        "mark": list(c.mark), "size": c.size, "u": c.u, "unit": c.unit, "p": c.p,
-                        "effect_rms": c.effect_rms, "effect_max": c.effect_max, "told": c.told,
-                        "remedies": [{r.kind: r.value} for r in c.remedies]}
-                       for c in verdict.causes]}
+            "failed": [finding_to_dict(found) for found in verdict.failed],
+            "causes": [finding_to_dict(cause) for cause in verdict.causes],
+            "enlarged_by": [vars(item) for item in verdict.enlarged_by]}
 
 
 def verdict_from_dict(data: dict | None, *, identifiable: bool) -> Verdict:
     """Return the verdict of a result; one without a verdict counts as identified or not."""
     if data is None:
         return Verdict(Grade.GOOD if identifiable else Grade.NOT_QUALIFIED,
-                       "Not judged: written before verdicts were")
+                       sentence="Not judged: written before there were verdicts")
     if not isinstance(data["qualified"], bool):
         raise ValueError(f"qualified is {data['qualified']!r}, not true or false")
     grade = Grade(data.get("grade", "good" if data["qualified"] else "not_qualified"))
     if data["qualified"] is (grade is Grade.NOT_QUALIFIED):
         raise ValueError(f"the grade '{grade}' contradicts qualified {data['qualified']}")
-    return Verdict(grade, _text(data["sentence"]),
-                   tuple(_text(reason) for reason in data["reasons"]),
-                   tuple(_cause(cause) for cause in data["causes"]),
-                   enlarged_by=tuple(
-                       Enlargement(_text(e["name"]), _number(e["u_rms"]), _number(e["u_max"]),
-                                   _text(e["unit"]))
-                       for e in data.get("enlarged_by", [])))
-
-
-def _cause(c: dict) -> Cause:
-    return Cause(_text(c["name"]), _text(c["text"]), _number(c["size"]), _number(c["u"]),
-                 _text(c["unit"]), _number(c["p"]), view=_text(c.get("view", "")),
-                 axis=_text(c.get("axis", "")), mark=tuple(map(int, c.get("mark", ()))),
-                 effect_rms=_number(c.get("effect_rms")), effect_max=_number(c.get("effect_max")),
-                 told=bool(c.get("told", True)),
-                 remedies=tuple(Remedy(kind, _text(value)) for remedy in c.get("remedies", [])
-                                for kind, value in remedy.items()))
+    return Verdict(
+        grade, tuple(map(finding_from_dict, data.get("failed", []))),
+        tuple(map(_cause, data["causes"])),
+        tuple(Enlargement(_text(e["name"]), _number(e["u_rms"]), _number(e["u_max"]),
+                          _text(e["unit"])) for e in data.get("enlarged_by", [])),
+        _text(data["sentence"]), tuple(map(_text, data["reasons"])))
 
 
 def model_to_dict(model: ModelResult) -> dict[str, Any]:
@@ -112,14 +129,13 @@ def reference_from_dict(raw: Any) -> dict[str, Any] | None:
         return None
     if not isinstance(raw, dict):
         raise ValueError(f"{raw!r} is not a reference")
-    told = raw
-    if told["kind"] not in REFERENCES:
-        raise ValueError(f"the reference {told['kind']!r} is unknown")
-    error, u = _number(told["relative_error"]), _number(told["u_relative"])
+    if raw["kind"] not in REFERENCES:
+        raise ValueError(f"the reference {raw['kind']!r} is unknown")
+    error, u = _number(raw["relative_error"]), _number(raw["u_relative"])
     if not (abs(error) < 0.1 and 0 <= u < 0.1):
         raise ValueError(f"reference: {error!r} with u {u!r} is not a relative error")
-    _text(told.get("certificate") or "")
-    return told
+    _text(raw.get("certificate") or "")
+    return raw
 
 
 def _text(value: Any) -> str:
@@ -130,7 +146,7 @@ def _text(value: Any) -> str:
 
 def _number(value: Any) -> float:
     if value is None:
-        return NAN
+        return math.nan
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise ValueError(f"{value!r} is not a number")
     return float(value)

@@ -77,7 +77,8 @@ def _extra_section(name: str, title: str, value: Any) -> Section | None:
 
 
 def _is_plain(value: Any) -> bool:
-    return value is None or isinstance(value, str | int | float)
+    return value is None or isinstance(value, str | int | float) or (  # or a mark (m, n)
+        isinstance(value, list) and len(value) in (1, 2) and all(type(i) is int for i in value))
 
 
 def _is_table(value: Any) -> bool:
@@ -101,7 +102,8 @@ def _column(key: str, values: list[Any]) -> list[str]:
     """Return the cells of a column: numbers with equal decimals, degrees of freedom as integers."""
     if key == "dof":
         return ["many" if v is None or v >= COUNTED_DOF else f"{v:.0f}" for v in values]
-    if not any(isinstance(v, float) for v in values) or any(isinstance(v, str) for v in values):
+    if not any(isinstance(v, float) for v in values) or any(
+            isinstance(v, str | list) for v in values):
         return [_cell(key, v) for v in values]
     scale = _unit(key)[2]
     numbers = [float("nan") if v is None or isinstance(v, bool) else v * scale for v in values]
@@ -127,6 +129,8 @@ def _cell(key: str, value: Any) -> str:
         return UNKNOWN
     if isinstance(value, bool):
         return "yes" if value else "no"
+    if isinstance(value, list):
+        return ", ".join(map(str, value))
     scale = _unit(key)[2]
     if isinstance(value, float) or (isinstance(value, int) and scale != 1.0):
         return significant(value * scale)

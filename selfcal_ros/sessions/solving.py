@@ -30,7 +30,7 @@ from selfcal_ros.model.view import MAX_VIEWS
 from selfcal_ros.reporting.summary.format import counted
 from selfcal_ros.reporting.summary.numbers import summary_numbers
 from selfcal_ros.reporting.summary.sections import state_sentence
-from selfcal_ros.reporting.words.result import worded
+from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.sessions.map_files import is_qualified, read_result, result_file, run_file
 from selfcal_ros.sessions.ports import Diagnosis, Level, Ports
 from selfcal_ros.sessions.runs import Run, begins_in_future, supersedes
@@ -68,7 +68,7 @@ def solve(job: Job) -> Outcome:
         result = worded(calibrate(job.measurements, job.options))
         return Outcome(job, with_warnings(result, job.notes), None)
     except NotIdentifiableError as error:
-        result = unidentified_result(job.measurements, error.observability)
+        result = worded(unidentified_result(job.measurements, error.observability))
         return Outcome(job, with_warnings(result, job.notes), error)
     except Exception as error:  # told by `take`, in the thread of the session
         return Outcome(job, None, error)

@@ -172,7 +172,7 @@ def test_results_that_cannot_be_exported(run):
 @pytest.mark.parametrize("verb", ["export", "orthogonality", "accuracy", "straightness"])
 def test_a_table_of_a_result_that_is_not_qualified_says_so_everywhere(run, verb):
     why = "the plate slipped: measure it again"
-    doubted = Verdict(Grade.NOT_QUALIFIED, f"Not qualified: {why}", (why,))
+    doubted = Verdict(Grade.NOT_QUALIFIED, sentence=f"Not qualified: {why}", reasons=(why,))
     write_json("r.json", result_to_dict(replace(result_of(MAP), verdict=doubted)))
     along = [] if verb == "export" else ["--along", "x"]
     code, out, err = run(verb, "r.json", *along, "-o", "f.cal")

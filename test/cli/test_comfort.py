@@ -221,7 +221,7 @@ def test_the_table_of_a_result(tmp_path, capsys):
     assert main(["table", str(tmp_path / "r.json"), "-o", "-", "--json"]) == 0
     assert json.loads(capsys.readouterr().out) == {"csv": text}
     doubted = replace(result, verdict=Verdict(
-        Grade.NOT_QUALIFIED, "Not qualified: the plate slipped"))
+        Grade.NOT_QUALIFIED, sentence="Not qualified: the plate slipped"))
     write_json(tmp_path / "r.json", result_to_dict(doubted))
     assert main(["table", str(tmp_path / "r.json"), "-o", str(tmp_path / "t.csv")]) == 5
     assert capsys.readouterr().err == "selfcal: Not qualified: the plate slipped\n"

@@ -22,6 +22,7 @@ from selfcal_ros.model.result import (
 from selfcal_ros.model.verdict import (
     Cause,
     Enlargement,
+    Finding,
     Grade,
     ModelResult,
     Remedy,
@@ -29,6 +30,7 @@ from selfcal_ros.model.verdict import (
     Verdict,
 )
 from selfcal_ros.model.view import View
+from selfcal_ros.reporting.words.findings import worded
 from test.support.results import known_result
 
 ARRAYS = ("gx", "gy", "u_gx", "u_gy", "g_theta", "u_g_theta")
@@ -86,7 +88,8 @@ def test_an_unidentified_plan_has_maps_of_nulls():
     view = View("a")
     measured = Measurements("p", Artifact(3, 0.01, 4), (
         ViewReadings(view, used=9, rejected={"duplicate": 2}),), rejected={"outside_every_view": 1})
-    result = unidentified_result(measured, Observability(25, 39, 14, False, ("m",), ("add tx",)))
+    result = worded(unidentified_result(
+        measured, Observability(25, 39, 14, False, ("m",), ("add tx",))))
     again = through_json(result)
     assert_same(again, result)
     assert np.isnan(again.error_map.gx).all()
@@ -159,15 +162,17 @@ def test_a_reference_is_off_by_less_than_a_tenth(error, u, is_one):
         result_from_dict(data, "r")
 
 
-CAUSE = Cause("drift", "drift along x", 5e-8, 1e-9, "m", 1e-7, view="tx", axis="x", mark=(1, -2),
+CAUSE = Cause("drift", 5e-8, 1e-9, "m", 1e-7, "tx", "x", (1, -2), {"part": "x x2"}, "drift along x",
               effect_rms=2e-9, effect_max=6e-9, told=False,
               remedies=(Remedy("model", "drift:8e-8"), Remedy("view", "tx")))
 
 
 @pytest.mark.parametrize("grade", Grade)
 def test_a_grade_with_its_causes_and_terms_comes_back(grade):
-    verdict = Verdict(grade, "So it is", ("why",), (CAUSE,), enlarged_by=(
-        Enlargement("drift", 3e-9, 9e-9), Enlargement("rotation", 1e-6, 2e-6, "rad")))
+    failed = Finding("noise_contradicted", 3e-8, unit="m", details={"stated": 1e-8}, text="noisy")
+    verdict = Verdict(grade, (failed,), (CAUSE,), (
+        Enlargement("drift", 3e-9, 9e-9), Enlargement("rotation", 1e-6, 2e-6, "rad")),
+        "So it is", ("why",))
     terms = (TermResult("plate_strain", 7e-8, (), 2e-7, "default"),
              TermResult("drift", 5e-8, (), None, "readings"))
     result = replace(known_result()[0], verdict=verdict, model=ModelResult("rigid", terms))
@@ -179,12 +184,12 @@ def test_a_grade_with_its_causes_and_terms_comes_back(grade):
 
 
 def test_a_verdict_of_before_has_the_grade_of_its_qualification():
-    data = result_to_dict(replace(known_result()[0], verdict=Verdict(Grade.GOOD, "Good")))
-    for key in ("grade", "enlarged_by"):
+    data = result_to_dict(replace(known_result()[0], verdict=Verdict(Grade.GOOD, sentence="Good")))
+    for key in ("grade", "enlarged_by", "failed"):
         del data["verdict"][key]
-    assert result_from_dict(data, "old").verdict == Verdict(Grade.GOOD, "Good")
+    assert result_from_dict(data, "old").verdict == Verdict(Grade.GOOD, sentence="Good")
     data["verdict"]["qualified"] = False
-    assert result_from_dict(data, "old").verdict == Verdict(Grade.NOT_QUALIFIED, "Good")
+    assert result_from_dict(data, "old").verdict == Verdict(Grade.NOT_QUALIFIED, sentence="Good")
     data["verdict"]["grade"] = "enlarged"
     with pytest.raises(InputError, match="the grade 'enlarged' contradicts qualified False"):
         result_from_dict(data, "old")

@@ -95,18 +95,22 @@ def test_both_kinds_of_uncertainty_are_told_with_what_each_is_for():
 
 def test_causes_come_as_a_table_with_one_unit_each():
     result, _ = known_result(3, 0)
-    causes = (Cause("drift", "drift of 80 ± 3 nm along x: solve with --model drift", 8e-8, 3e-9,
-                    "m", 1e-9, remedies=(Remedy("model", "drift"),)),
-              Cause("noise", "view 'a' is 2 times as noisy: measure it again", 2.0, 0.1, "m/m",
-                    2e-4))
-    verdict = Verdict(Grade.NOT_QUALIFIED, "Not qualified: most likely drift",
-                      ("grid readings: too much",), causes)
+    causes = (Cause("drift", 8e-8, 3e-9, "m", 1e-9, "run 2: shift x", "x", remedies=(
+        Remedy("model", "drift:8e-8"), Remedy("action", "measure there and back"))),
+              Cause("noise", 2.0, 0.1, "m/m", 2e-4, details=None,
+                    text="view 'a' is 2 times as noisy: measure it again"))
+    verdict = Verdict(Grade.NOT_QUALIFIED, causes=causes, reasons=("grid readings: too much",),
+                      sentence="Not qualified: most likely drift")
     html = report_html(replace(result, verdict=verdict))
     assert '<p class="verdict bad">Not qualified: most likely drift. Map as it is:' in html
     cells = re.findall(r"<td[^>]*>([^<]*)</td>", html)
-    at = cells.index("drift of 80 ± 3 nm along x")
-    assert cells[at:at + 6] == ["drift of 80 ± 3 nm along x", "0.0800", "0.0030", "µm", "1e-09",
-                                "solve with --model drift"]
+    at = cells.index("drift")
+    what = "a drift of 0.0800 ± 0.0030 µm along x during view &#x27;run 2: shift x&#x27;"
+    assert cells[at:at + 7] == ["drift", what, "0.0800", "0.0030", "µm", "1e-09",
+                                "solve with --model drift:8e-8, or measure there and back"]
+    assert cells[at + 7:at + 14] == [
+        "noise", "view &#x27;a&#x27; is 2 times as noisy: measure it again", "2.00", "0.10",
+        "times", "0.0002", ""]
     assert "failed: grid readings: too much" in html
 
 

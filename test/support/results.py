@@ -64,7 +64,7 @@ def with_residuals(size: int = 5, lines: int = 24, *, size_y: int = 0) -> Calibr
             for v in result.views]
     rejected = [{"view": result.views[0].name, "reason": ["low_score", "too_far_from_nominal"],
                  "x": [0.01, -0.02], "y": [0.02, 0.0]}]
-    removed = {"removed": [{"view": result.views[1].name, "kind": "grid", "mark": "1, 0"}]}
+    removed = {"removed": [{"view": result.views[1].name, "kind": "grid", "mark": [1, 0]}]}
     return replace(result, extra={"residuals": {"views": rows}, "rejected_at": rejected,
                                   "outliers": removed})
 

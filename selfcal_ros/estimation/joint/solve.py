@@ -18,7 +18,6 @@ from selfcal_ros.estimation.blas_threads import one_thread
 from selfcal_ros.estimation.datum.angular import conditions_for, misclosure_test
 from selfcal_ros.estimation.datum.covariance import FieldCovariance, angular_variance
 from selfcal_ros.estimation.datum.scale import scale_datum, scale_of
-from selfcal_ros.estimation.findings import Magnification, NoUncertainty, Unchecked
 from selfcal_ros.estimation.joint.fit import JointFit
 from selfcal_ros.estimation.joint.kept_residuals import kept_residuals
 from selfcal_ros.estimation.joint.model_fit import ModelFit, fit_model
@@ -132,7 +131,7 @@ def _solved(measurements: Measurements, options: Options, *, model: ModelFit,
     findings = (*_unchecked(problem.system, measurements.sense),
                 *_magnification(artifact_map, options))
     if not problem.direct and options.uncertainty is None:
-        findings = (NoUncertainty(), *findings)
+        findings = (Finding("no_uncertainty"), *findings)
     axes = (1.0, 0.0)
     if problem.conditions.datum is ThetaDatum.XY_AXES and closure is not None:
         axes = misclosure_test(found.misclosure, closure)
@@ -153,7 +152,7 @@ def _magnification(found: ArtifactMap, options: Options) -> tuple[Finding, ...]:
     if options.reference is not None or not (
             abs(found.magnification) > options.magnification_limit):
         return ()
-    return (Magnification(found.magnification, found.u_magnification),)
+    return (Finding("magnification", found.magnification, found.u_magnification, "m/m"),)
 
 
 def _unchecked(system: NormalEquations, sense: Sense) -> tuple[Finding, ...]:
@@ -164,7 +163,7 @@ def _unchecked(system: NormalEquations, sense: Sense) -> tuple[Finding, ...]:
         return ()
     if sense is Sense.PLATE_MOVES:  # as the map itself: G(X) = -H(-X)
         sites, lines = -sites[::-1], np.sort(-lines % max(system.angular.n_lines, 1), axis=0)
-    return (Unchecked(tuple(map(tuple, sites.tolist())), tuple(map(tuple, lines.tolist()))),)
+    return (Finding("unchecked", details={"sites": sites.tolist(), "lines": lines[:, 0].tolist()}),)
 
 
 def weights_read(problem: Problem, index: int) -> dict[str, Any]:

@@ -8,7 +8,6 @@ import numpy as np
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.blas_threads import one_thread
-from selfcal_ros.estimation.findings import DrawnUncertainty
 from selfcal_ros.estimation.joint.noise import NoiseEstimate, noise_estimate, pooled
 from selfcal_ros.estimation.joint.problem import FLOOR
 from selfcal_ros.estimation.joint.solved import Solved, noise_of
@@ -320,4 +319,4 @@ def _view_result(view: ViewReadings, index: int, found: HuSolution) -> ViewResul
 def _findings(artifact: Artifact, options: Options) -> tuple[Finding, ...]:
     if artifact.grid_size <= EXACT_SIZE or options.uncertainty is False:
         return ()
-    return (DrawnUncertainty(N_DRAWS),)
+    return (Finding("drawn_uncertainty", details={"draws": N_DRAWS}),)

@@ -13,10 +13,13 @@ from selfcal_ros.estimation.verdict.enlarge import TOLD, remaining_part, with_co
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.result import CalibrationResult, Noise
 from selfcal_ros.model.statistics import rms
-from selfcal_ros.model.verdict import Finding
 
 CELL_MEAN = 8 / 15
 """Mean square of the parabola 4 s (1 - s) over a cell: rms of an interpolation error."""
+
+
+class How:
+    """How a component was found: each kind has its data as fields, SI units."""
 
 
 class Source(Enum):
@@ -28,7 +31,7 @@ class Source(Enum):
 
 
 @dataclass(frozen=True)
-class FromReadings(Finding):
+class FromReadings(How):
     """Noise of readings by its source; None: there is none. `contradicted`: by another source."""
 
     source: Source | None
@@ -36,7 +39,7 @@ class FromReadings(Finding):
 
 
 @dataclass(frozen=True)
-class FromTerm(Finding):
+class FromTerm(How):
     """A term that was known to `given` beforehand, of which the readings leave a part.
 
     `allowed` is the size that was used instead where the readings contradict it, else None.
@@ -48,21 +51,21 @@ class FromTerm(Finding):
 
 
 @dataclass(frozen=True)
-class FromEffect(Finding):
+class FromEffect(How):
     """A cause that the readings show and no term of the model holds: its effect on the map."""
 
     cause: str
 
 
 @dataclass(frozen=True)
-class FromReference(Finding):
+class FromReference(How):
     """The relative uncertainty and kind of a reference length; None: no length sets the scale."""
 
     reference: ReferenceLength | None
 
 
 @dataclass(frozen=True)
-class FromCurvature(Finding):
+class FromCurvature(How):
     """Interpolation between ``sites`` or ``lines``, by the curvature of the map."""
 
     between: str
@@ -82,7 +85,7 @@ class Component:
         Standard uncertainty, rms over the field and at its worst site, m or rad.
     dof : float
         Degrees of freedom; infinite if known.
-    how : Finding
+    how : How
         How it was found.
     """
 
@@ -91,7 +94,7 @@ class Component:
     u_rms: float
     u_max: float
     dof: float
-    how: Finding
+    how: How
 
 
 @dataclass(frozen=True)

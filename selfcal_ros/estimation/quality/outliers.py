@@ -20,17 +20,6 @@ from selfcal_ros.errors import InputError, NotIdentifiableError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.blas_threads import one_thread
 from selfcal_ros.estimation.checks.wiring import check_wiring
-from selfcal_ros.estimation.findings import (
-    NoisyView,
-    OutliersGivenUp,
-    OutliersKept,
-    OutliersRemoved,
-    Removed,
-    SlipFound,
-    SlipsGivenUp,
-    TakenForSlip,
-    TooManyOutliers,
-)
 from selfcal_ros.estimation.joint.solve import fit_joint
 from selfcal_ros.estimation.lattice.maps import PHASES
 from selfcal_ros.estimation.options import Options
@@ -56,9 +45,41 @@ MAX_REMOVED = 0.1
 TIED = 1e-6
 """Readings whose ratios differ by less cannot be attributed: both are removed."""
 
+NAMED = 5
+"""Outliers that their finding lists, the first of them; ``extra["outliers"]`` has all."""
+
+LEFT = {"noisy_view", "too_many_outliers", "outliers_kept", "outliers_given_up", "slips_given_up"}
+"""Findings that something is wrong with the readings which could not be corrected."""
+
 MAX_SLIPS = 3
 MAX_TERMS = 3
 """Terms that are taken off the readings, one after the other, before outliers are looked for."""
+
+
+@dataclass(frozen=True)
+class Removed:
+    """A reading that was removed.
+
+    Attributes
+    ----------
+    view, kind : str
+        Name of the view; ``grid`` or ``angular``.
+    mark : tuple of int
+        (m, n), or (k,).
+    standardised : float
+        Residual over its standard deviation when it was removed.
+    leverage : float
+        Part of the reading that the fit followed.
+    residual : float
+        Length of the residual, m, or its size, rad.
+    """
+
+    view: str
+    kind: str
+    mark: tuple[int, ...]
+    standardised: float
+    leverage: float
+    residual: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,10 +108,10 @@ def robust_calibrate(measurements: Measurements,
     Returns
     -------
     CalibrationResult
-        `findings` tells what was found, ``extra["outliers"]`` lists with view and mark
-        what was removed, ``extra["slips"]`` and ``extra["noisy_views"]`` the bad views;
-        `rejected` counts the removed detections under ``outlier_among_views``. What could not
-        be mended disqualifies the result.
+        `findings` says what was found, ``extra["outliers"]`` lists the readings removed,
+        ``extra["slips"]`` and ``extra["noisy_views"]`` the bad views; `rejected` counts the
+        removed detections under ``outlier_among_views``. A fault that could not be corrected
+        disqualifies the result.
 
     Raises
     ------
@@ -106,25 +127,19 @@ def robust_calibrate(measurements: Measurements,
     check_wiring(measurements)
     cleaned = clean(measurements, options)
     result = calibrate(cleaned.measurements, options)
-    left = tuple(finding for finding in cleaned.findings if _is_left(finding))
+    left = tuple(found for found in cleaned.findings if found.name in LEFT
+                 or (found.details or {}).get("spoils"))
     verdict = result.verdict
     if left:
-        verdict = replace(verdict, grade=Grade.NOT_QUALIFIED, findings=(*verdict.findings, *left))
+        verdict = replace(verdict, grade=Grade.NOT_QUALIFIED, failed=(*verdict.failed, *left))
     return replace(result, findings=(*result.findings, *cleaned.findings), verdict=verdict,
                    extra={**result.extra, **_listed(cleaned)})
-
-
-def _is_left(finding: Finding) -> bool:
-    """Return whether something is wrong with the readings that was found, but not mended."""
-    return isinstance(finding, (NoisyView, TooManyOutliers, OutliersKept, OutliersGivenUp,
-                                SlipsGivenUp)) or (
-        isinstance(finding, SlipFound) and finding.spoils)
 
 
 def _listed(cleaned: OutlierScreening) -> dict[str, Any]:
     """Return what was found in the form of a RESULT.json: tables of plain values, SI units."""
     removed = [{
-        "view": item.view, "kind": item.kind, "mark": ", ".join(map(str, item.mark)),
+        "view": item.view, "kind": item.kind, "mark": list(item.mark),
         "standardised": item.standardised, "leverage": item.leverage,
         "residual_m": item.residual if item.kind == "grid" else None,
         "residual_rad": item.residual if item.kind == "angular" else None,
@@ -132,8 +147,7 @@ def _listed(cleaned: OutlierScreening) -> dict[str, Any]:
     outliers = {"rule": f"removed if its squared standardised residual fails an F-test at level "
                         f"{LEVEL}/n, for marks and lines together",
                 "unchecked": cleaned.unchecked, "removed": removed}
-    return {"outliers": outliers, "slips": [
-        asdict(item) | {"alternatives": "; ".join(item.alternatives)} for item in cleaned.slips],
+    return {"outliers": outliers, "slips": [asdict(item) for item in cleaned.slips],
             "noisy_views": [{"view": name, "ratio": ratio} for name, ratio in cleaned.noisy]}
 
 
@@ -182,14 +196,17 @@ def _without_slips(measurements: Measurements, options: Options, linear: Options
             if not done:
                 return at
             continue
-        at = replace(at, notes=(*at.notes, TakenForSlip(slip.view, cause)))
+        at = replace(at, notes=(*at.notes, replace(
+            cause, name="taken_for_slip", details={
+                **(cause.details or {}), "cause": cause.name, "slip_in": slip.view})))
         options = replace(options, terms=(*options.terms, ModelTerm(TermName(cause.name))))
         try:
             flattened = _flattened(at.measurements, options)
         except (NotIdentifiableError, InputError):
             return at
         at = replace(at, flattened=flattened, residuals=residuals_of(flattened, linear))
-    return replace(at, notes=(*at.notes, SlipsGivenUp(len(at.slips))))
+    return replace(at, notes=(*at.notes, Finding(
+        "slips_given_up", details={"slips": len(at.slips)})))
 
 
 def _split(at: _Screened, slip: Slip, linear: Options) -> tuple[_Screened, bool]:
@@ -202,9 +219,9 @@ def _split(at: _Screened, slip: Slip, linear: Options) -> tuple[_Screened, bool]
         residuals = residuals_of(flattened, linear)
     except NotIdentifiableError:
         return replace(at, slips=(*at.slips, slip),
-                       notes=(*at.notes, slip.found(spoils=True))), False
+                       notes=(*at.notes, slip.finding(spoils=True))), False
     return _Screened(split(at.measurements), flattened, residuals, (*at.slips, slip),
-                     (*at.notes, slip.found(spoils=False))), True
+                     (*at.notes, slip.finding(spoils=False))), True
 
 
 def robust_sigma(squares: np.ndarray, dof: int) -> float:
@@ -226,14 +243,16 @@ def _reject(measurements: Measurements, options: Options, residuals: Residuals
         if not found:
             break
         if len(gone) + len(found) > MAX_REMOVED * n_readings:
-            return {}, residuals_of(measurements, options), TooManyOutliers(MAX_REMOVED)
+            return {}, residuals_of(measurements, options), Finding(
+                "too_many_outliers", details={"limit": MAX_REMOVED})
         try:
             residuals = residuals_of(without(measurements, gone | found), options)
         except NotIdentifiableError:
-            return gone, residuals, OutliersKept()
+            return gone, residuals, Finding("outliers_kept")
         gone |= found
     else:
-        return (*_taken_back(measurements, options, gone, residuals), OutliersGivenUp(MAX_ROUNDS))
+        return (*_taken_back(measurements, options, gone, residuals),
+                Finding("outliers_given_up", details={"rounds": MAX_ROUNDS}))
     return (*_taken_back(measurements, options, gone, residuals), None)
 
 
@@ -325,8 +344,10 @@ def _agrees(residuals: Residuals, key: Key) -> bool:
 
 def _findings(removed: tuple[Removed, ...], noisy: tuple[tuple[str, float], ...],
               stopped: Finding | None) -> list[Finding]:
-    out: list[Finding] = [OutliersRemoved(removed)] if removed else []
-    out += [NoisyView(name, ratio) for name, ratio in noisy]
+    out = [Finding("outliers_removed", details={"number": len(removed), "first": [
+        {"view": item.view, "kind": item.kind, "mark": list(item.mark),
+         "standardised": item.standardised} for item in removed[:NAMED]]})] if removed else []
+    out += [Finding("noisy_view", ratio, unit="m/m", view=name) for name, ratio in noisy]
     return out + ([stopped] if stopped else [])
 
 

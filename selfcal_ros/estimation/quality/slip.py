@@ -16,7 +16,6 @@ import numpy as np
 from scipy.special import chdtri
 
 from selfcal_ros.errors import NotIdentifiableError
-from selfcal_ros.estimation.findings import SlipFound
 from selfcal_ros.estimation.joint.fit import JointFit, fit
 from selfcal_ros.estimation.joint.problem import Problem
 from selfcal_ros.estimation.joint.solve import fit_joint, prepare
@@ -31,7 +30,7 @@ from selfcal_ros.estimation.verdict.cause_sizes import cause_of
 from selfcal_ros.estimation.verdict.explanations import PlacedSlip, find_explanations
 from selfcal_ros.estimation.verdict.fault_columns import SLIP
 from selfcal_ros.model.readings import Measurements, ViewReadings
-from selfcal_ros.model.verdict import Cause
+from selfcal_ros.model.verdict import Cause, Finding
 
 AMBIGUOUS = 16.0
 """Difference of chi2 below which two places explain the readings equally well."""
@@ -77,9 +76,9 @@ class SlipPlace:
     chi2: float
 
     @property
-    def place(self) -> str:
-        """Where it slipped, in words."""
-        return f"before {self.axis} = {self.first}"
+    def place(self) -> dict[str, str | int]:
+        """View, axis and first line of marks after the slip."""
+        return {"view": self.view, "axis": self.axis, "first": self.first}
 
 
 @dataclass(frozen=True)
@@ -90,19 +89,21 @@ class Slip(SlipPlace):
     ----------
     tx_m, ty_m, phi_rad : float
         Change of offset and rotation, stage frame.
-    alternatives : tuple of str
+    alternatives : tuple of SlipPlace
         Other places that explain the readings as well: few views do not always tell where.
     """
 
     tx_m: float
     ty_m: float
     phi_rad: float
-    alternatives: tuple[str, ...] = ()
+    alternatives: tuple[SlipPlace, ...] = ()
 
-    def found(self, *, spoils: bool) -> SlipFound:
-        """Return what is told of the slip; `spoils`: its view had to stay as it was."""
-        return SlipFound(self.view, (self.place, *self.alternatives), self.tx_m, self.ty_m,
-                         self.phi_rad, spoils)
+    def finding(self, *, spoils: bool) -> Finding:
+        """Return the slip as a finding; `spoils`: its view had to stay as it was."""
+        return Finding(
+            "slip_found", float(np.hypot(self.tx_m, self.ty_m)), unit="m", view=self.view, details={
+                "places": [place.place for place in (self, *self.alternatives)], "x": self.tx_m,
+                "y": self.ty_m, "phi": self.phi_rad, "spoils": spoils})
 
 
 def find_slip(residuals: Residuals, sigma_m: float, measurements: Measurements,
@@ -158,9 +159,7 @@ def _best(found: list[SlipPlace], measurements: Measurements, options: Options) 
     # the loss counts residuals, which are smaller than the noise by the part that the fit follows
     dof_part = 1 - _followed(measurements, slip, options)
     near = losses[order[0]] + AMBIGUOUS * float(np.median(squares)) / chdtri(2, 0.5) / dof_part
-    others = tuple(f"before {fits[i][0].axis} = {fits[i][0].first}" + (
-        "" if fits[i][0].view == slip.view else f" in view '{fits[i][0].view}'")
-        for i in order[1:] if losses[i] < near)
+    others = tuple(fits[i][0] for i in order[1:] if losses[i] < near)
     tx_m, ty_m, phi_rad = size
     return Slip(slip.view, slip.index, slip.axis, slip.first, slip.chi2, tx_m, ty_m, phi_rad,
                 others)

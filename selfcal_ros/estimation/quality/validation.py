@@ -18,13 +18,6 @@ from selfcal_ros.errors import (
 )
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.blas_threads import one_thread
-from selfcal_ros.estimation.findings import (
-    NothingToPredict,
-    OwnTermsUnknown,
-    PredictionFailed,
-    RestNotIdentified,
-    RestNotSettled,
-)
 from selfcal_ros.estimation.joint.model_fit import ModelFit
 from selfcal_ros.estimation.joint.solve import solve_joint
 from selfcal_ros.estimation.joint.solved import Solved
@@ -70,8 +63,8 @@ class HeldOut:
 
     Attributes
     ----------
-    name : str
-        What was held out.
+    view, tenth : str, int
+        What was held out: a whole view, by its name, or a random tenth, by its number from 1.
     n_grid, n_angular : int
         Readings that were predicted.
     rms_m, max_m : float
@@ -87,7 +80,8 @@ class HeldOut:
         What `ratio` exceeds in one of a thousand good sets; NaN if it is not judged.
     """
 
-    name: str
+    view: str = ""
+    tenth: int = 0
     n_grid: int = 0
     n_angular: int = 0
     rms_m: float = float("nan")
@@ -142,16 +136,16 @@ def validate(measurements: Measurements, options: Options | None = None, *, seed
     out = []
     for fold in range(folds):
         chosen = [(grid == fold, lines == fold) for grid, lines in group]
-        out.append(_held_out(measurements, options, chosen, f"a random tenth ({fold + 1})"))
+        out.append(replace(_held_out(measurements, options, chosen), tenth=fold + 1))
     for index, view in enumerate(measurements.views):
         chosen = [(np.full(len(v.m), i == index), np.full(len(v.k), i == index))
                   for i, v in enumerate(measurements.views)]
-        out.append(_held_out(measurements, options, chosen, f"view '{view.view.name}'"))
+        out.append(replace(_held_out(measurements, options, chosen), view=view.view.name))
     return out
 
 
 def _held_out(measurements: Measurements, options: Options,
-              chosen: list[tuple[np.ndarray, np.ndarray]], name: str) -> HeldOut:
+              chosen: list[tuple[np.ndarray, np.ndarray]]) -> HeldOut:
     """Calibrate from the readings that are not chosen and predict the chosen ones."""
     kept, held = (replace(measurements, views=tuple(
         subset(view, grid ^ flip, lines ^ flip)
@@ -160,9 +154,9 @@ def _held_out(measurements: Measurements, options: Options,
     try:
         solved = solve_joint(kept, options)
     except (NotIdentifiableError, NoDataError):
-        return HeldOut(name, why=_rest_not_identified(kept, held))
+        return HeldOut(why=_rest_not_identified(kept, held))
     except NotSettledError:
-        return HeldOut(name, why=RestNotSettled())
+        return HeldOut(why=Finding("rest_not_converged"))
     model = solved.model
     if model is None:
         raise AssertionError("the joint solution always has its model")
@@ -187,9 +181,9 @@ def _held_out(measurements: Measurements, options: Options,
     both = both[:, np.isfinite(both).all(axis=0)]
     lines_off = lines_off[np.isfinite(lines_off)]
     if not both.size and not lines_off.size:
-        return HeldOut(name, why=NothingToPredict())
+        return HeldOut(why=Finding("nothing_to_predict"))
     ratio, limit, why = _judged(solved, model, of, known=known_at, error=error_at)
-    return HeldOut(name, both.shape[1], len(lines_off), rms(both) if both.size else NOTHING,
+    return HeldOut("", 0, both.shape[1], len(lines_off), rms(both) if both.size else NOTHING,
                    float(abs(both).max()) if both.size else NOTHING,
                    rms(lines_off) if lines_off.size else NOTHING, ratio, why, limit)
 
@@ -206,17 +200,17 @@ def _judged(solved: Solved, model: ModelFit, held: HeldReadings, *, known: np.nd
         weight = weight * (noise.sigma_xy_declared / held.grid.sigma_declared) ** 2
     square = float((weight * abs(error) ** 2)[known].sum()) / (2 * int(known.sum()))
     ratio = float(np.sqrt(square)) / max(noise.sigma_xy, 1e-300)
-    own = tuple(str(term.name) for term in model.problem.terms
-                if term.free and term.name in OF_A_VIEW)
+    own = [str(term.name) for term in model.problem.terms
+           if term.free and term.name in OF_A_VIEW]
     if own and -1 in held.rows:
-        return ratio, NOTHING, OwnTermsUnknown(own)
+        return ratio, NOTHING, Finding("own_terms_unknown", details={"terms": own})
     if not (noise.sigma_xy > ROUNDING and noise.dof_xy > 0 and model.problem.direct):
         return ratio, NOTHING, None
     return ratio, prediction_limit(model, held, known, weight).ratio(noise.dof_xy), None
 
 
-def _rest_not_identified(kept: Measurements, held: Measurements) -> RestNotIdentified:
-    """Return which view more would let a view be held out."""
+def _rest_not_identified(kept: Measurements, held: Measurements) -> Finding:
+    """Return that the rest does not identify the stage, and with which further view it would."""
     views = tuple(replace(v.view, grid=bool(len(v.m)), angular=bool(len(v.k)))
                   for v in kept.views if len(v.m) or len(v.k))
     gone = {v.view.lattice_pose(held.artifact) for v in held.views if len(v.m) or len(v.k)}
@@ -226,8 +220,11 @@ def _rest_not_identified(kept: Measurements, held: Measurements) -> RestNotIdent
     for more in candidate_views(plan.artifact, angular=any(view.angular for view in views)):
         if more.lattice_pose(plan.artifact) not in gone and identifies(
                 plan.artifact, (*plan.views, more)):
-            return RestNotIdentified(plan.artifact, more)
-    return RestNotIdentified(plan.artifact)
+            return Finding("rest_not_identified", details={"add": {
+                "rotation": more.rotation_rad, "translation_x": more.translation_m[0],
+                "translation_y": more.translation_m[1], "grid": more.grid,
+                "angular": more.angular}})
+    return Finding("rest_not_identified")
 
 
 def prediction_errors(measurements: Measurements, result: CalibrationResult, index: int,
@@ -314,10 +311,11 @@ def _misalignment(residual: np.ndarray, marks: np.ndarray) -> tuple[float, float
 
 def judged_by(result: CalibrationResult, found: list[HeldOut]) -> CalibrationResult:
     """Return a result, not worded, that predictions beyond their limits disqualify."""
-    failed = tuple(PredictionFailed(item.name, item.ratio, item.limit)
+    failed = tuple(Finding("prediction_failed", item.ratio, unit="m/m", view=item.view,
+                           details={"tenth": item.tenth, "limit": item.limit})
                    for item in found if item.exceeds)
     if not failed:
         return result
     verdict = result.verdict
     return replace(result, verdict=replace(verdict, grade=Grade.NOT_QUALIFIED,
-                                           findings=(*verdict.findings, *failed)))
+                                           failed=(*verdict.failed, *failed)))

@@ -3,43 +3,24 @@
 
 import math
 from collections.abc import Callable, Iterable
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 from scipy.special import eval_legendre
 
-from selfcal_ros.estimation.findings import (
-    ApproachCause,
-    DriftCause,
-    LineEccentricityCause,
-    MicroscopeCause,
-    NoiseCause,
-    PlateScaleCause,
-    PlateShapeCause,
-    PlateStrainCause,
-    ReadingCause,
-    SizeCause,
-    SlipCause,
-)
 from selfcal_ros.estimation.joint.model_fit import ModelFit
 from selfcal_ros.estimation.terms.sizes import SizeTest
 from selfcal_ros.estimation.verdict.explanations import Explanation
 from selfcal_ros.estimation.verdict.fault_columns import READING, SLIP
 from selfcal_ros.model.readings import Measurements
-from selfcal_ros.model.terms import TermName
-from selfcal_ros.model.verdict import Cause, Finding, TermEstimate
+from selfcal_ros.model.terms import UNITS, TermName
+from selfcal_ros.model.verdict import Cause, TermEstimate
 
 TIMES = np.linspace(-1, 1, 101)
 """Instants of a view between which the range of a drift is sought."""
 
-
-class Sized(NamedTuple):
-    """The component that stands out: value and standard uncertainty in `unit`, and what it is."""
-
-    value: float
-    u: float
-    unit: str
-    what: Finding
+Sized = tuple[float, float, dict[str, Any]]
+"""The component that stands out: its value and standard uncertainty, and fields of its cause."""
 
 
 def cause_of(found: Explanation, names: tuple[str, ...], half_width_m: float) -> Cause:
@@ -54,14 +35,12 @@ def cause_of(found: Explanation, names: tuple[str, ...], half_width_m: float) ->
     half_width_m : float
         Longer half width of the plate, m: the unit of a slip's rotation.
     """
-    sized = _SIZES[found.name](found, names, half_width_m)
-    what = sized.what
-    moved = np.zeros(1) if found.moved is None else np.abs(found.moved)
-    return Cause(
-        found.name, "", sized.value, sized.u, sized.unit, found.p, what,
-        view=getattr(what, "view", ""), axis=getattr(what, "axis", ""),
-        mark=getattr(what, "mark", ()), effect_rms=found.effect_m,
-        effect_max=float(moved.max(initial=0.0)), told=found.whole)
+    value, u, fields = _SIZES[found.name](found, names, half_width_m)
+    unit = UNITS.get(found.name, "m")
+    largest = 0.0 if found.moved is None else float(np.abs(found.moved).max(initial=0.0))
+    return Cause(**{"name": found.name, "size": value, "u": u, "unit": unit, "p": found.p,
+                    "effect_rms": found.effect_m, "effect_max": largest, "told": found.whole,
+                    **fields})
 
 
 def size_cause(test: SizeTest, estimates: Iterable[TermEstimate]) -> Cause:
@@ -75,13 +54,8 @@ def size_cause(test: SizeTest, estimates: Iterable[TermEstimate]) -> Cause:
         The term's coefficients without that size.
     """
     largest = max(estimates, key=lambda e: abs(e.value))
-    return Cause(str(test.name), "", abs(largest.value), largest.u, largest.unit, test.p,
-                 SizeCause(test.given, test.shown))
-
-
-def noise_cause(view: str, ratio: float, u: float, p: float) -> Cause:
-    """Return a view that is noisier than the others as a cause."""
-    return Cause("noise", "", ratio, u, "m/m", p, NoiseCause(view))
+    return Cause(str(test.name), abs(largest.value), largest.u, largest.unit, test.p,
+                 details={"given": test.given})
 
 
 def scatter_of_views(model: ModelFit, measurements: Measurements
@@ -118,14 +92,20 @@ def _likeliest[What](found: Explanation, options: list[tuple[What, np.ndarray]],
     return max(sized, key=lambda item: abs(item[1]) / max(item[2], 1e-300))
 
 
+def _one_column(found: Explanation) -> tuple[str, float, float]:
+    """Return component, value and u of the coefficient that stands out most."""
+    return _likeliest(found, [(column.component, row) for column, row in zip(
+        found.columns, np.eye(len(found.columns)), strict=True)])
+
+
 def _microscope(found: Explanation, *_: object) -> Sized:
-    part, value, u = _likeliest(found, list(zip(("scale", "turn", "scales", "shear"), np.eye(4),
-                                                strict=True)))
-    return Sized(value, u, "rad" if part in ("turn", "shear") else "m/m", MicroscopeCause(part))
+    part, value, u = _one_column(found)
+    return value, u, {"unit": "rad" if part in ("turn", "shear") else "m/m",
+                      "details": {"part": part}}
 
 
 def _drift(found: Explanation, names: tuple[str, ...], _: float) -> Sized:
-    options: list[tuple[DriftCause, np.ndarray]] = []
+    options: list[tuple[tuple[str, str], np.ndarray]] = []
     for view in sorted({column.view for column in found.columns}):
         for axis in "xy":
             shape = np.array([
@@ -134,37 +114,23 @@ def _drift(found: Explanation, names: tuple[str, ...], _: float) -> Sized:
                 for c in found.columns])
             path = found.values @ shape
             ends = shape[:, int(path.argmax())] - shape[:, int(path.argmin())]
-            options.append((DriftCause(axis, names[view]), ends))
-    what, value, u = _likeliest(found, options)
-    return Sized(value, u, "m", what)
+            options.append(((names[view], axis), ends))
+    (name, axis), value, u = _likeliest(found, options)
+    return value, u, {"view": name, "axis": axis}
 
 
-def _one_column(found: Explanation) -> tuple[int, float, float]:
-    """Return index, value and u of the coefficient that stands out most."""
-    return _likeliest(found, list(enumerate(np.eye(len(found.columns)))))
-
-
-def _against_first(found: Explanation) -> tuple[int, float, float]:
-    """Return index, value and u of the coefficient that stands out most against the first view's.
+def _of_plate(found: Explanation, names: tuple[str, ...], _: float) -> Sized:
+    """Size the coefficient that stands out most against the first view's.
 
     The first view has none of its own where the term is free: then it is 0 there.
     """
     weights = np.eye(len(found.columns))
     for at, column in enumerate(found.columns):
         weights[at] -= [c.view == 0 and c.component == column.component for c in found.columns]
-    return _likeliest(found, [(at, row) for at, row in enumerate(weights) if row.any()])
-
-
-def _plate_scale(found: Explanation, names: tuple[str, ...], _: float) -> Sized:
-    at, value, u = _against_first(found)
-    return Sized(value, u, "m/m", PlateScaleCause(names[found.columns[at].view], names[0]))
-
-
-def _plate_strain(found: Explanation, names: tuple[str, ...], _: float) -> Sized:
-    at, value, u = _against_first(found)
-    column = found.columns[at]
-    return Sized(value, u, "m/m", PlateStrainCause(names[column.view], names[0],
-                                                   column.component))
+    column, value, u = _likeliest(found, [(column, row) for column, row in zip(
+        found.columns, weights, strict=True) if row.any()])
+    return value, u, {"view": names[column.view],
+                      "details": {"against": names[0], "part": column.component}}
 
 
 def _line_eccentricity(found: Explanation, names: tuple[str, ...], _: float) -> Sized:
@@ -174,26 +140,19 @@ def _line_eccentricity(found: Explanation, names: tuple[str, ...], _: float) -> 
         size = float(np.hypot.reduce(found.values[mine]))
         options.append((view, np.where(mine, found.values, 0.0) / (size or 1.0)))
     view, value, u = _likeliest(found, options)
-    return Sized(value, u, "rad", LineEccentricityCause(names[view]))
-
-
-def _plate_shape(found: Explanation, names: tuple[str, ...], _: float) -> Sized:
-    at, value, u = _against_first(found)
-    return Sized(value, u, "m", PlateShapeCause(names[found.columns[at].view], names[0],
-                                                found.whole))
+    return value, u, {"view": names[view]}
 
 
 def _approach(found: Explanation, *_: object) -> Sized:
-    at, value, u = _one_column(found)
-    return Sized(value, u, "m", ApproachCause(found.columns[at].component))
+    axis, value, u = _one_column(found)
+    return value, u, {"axis": axis}
 
 
 def _reading(found: Explanation, names: tuple[str, ...], _: float) -> Sized:
     toward = found.values / np.hypot(*found.values)
-    value, u = _linear(found, toward)
     if found.mark is None:
         raise ValueError("a reading without its mark")
-    return Sized(value, u, "m", ReadingCause(names[found.columns[0].view], found.mark))
+    return *_linear(found, toward), {"view": names[found.columns[0].view], "mark": found.mark}
 
 
 def _slip(found: Explanation, names: tuple[str, ...], half_width_m: float) -> Sized:
@@ -202,13 +161,13 @@ def _slip(found: Explanation, names: tuple[str, ...], half_width_m: float) -> Si
     size = math.hypot(x, y)
     toward = np.zeros(3)
     toward[order["x"]], toward[order["y"]] = (x / size, y / size) if size else (1.0, 0.0)
-    value, u = _linear(found, toward)
-    return Sized(value, u, "m", SlipCause(names[found.columns[0].view], found.part, x, y,
-                                          phi / half_width_m))
+    return *_linear(found, toward), {
+        "view": names[found.columns[0].view],
+        "details": {"after": found.part, "x": x, "y": y, "phi": phi / half_width_m}}
 
 
 _SIZES: dict[str, Callable[..., Sized]] = {
-    TermName.MICROSCOPE: _microscope, TermName.DRIFT: _drift, TermName.PLATE_SCALE: _plate_scale,
-    TermName.PLATE_SHAPE: _plate_shape, TermName.APPROACH: _approach, SLIP: _slip,
-    READING: _reading, TermName.PLATE_STRAIN: _plate_strain,
+    TermName.MICROSCOPE: _microscope, TermName.DRIFT: _drift, TermName.PLATE_SCALE: _of_plate,
+    TermName.PLATE_SHAPE: _of_plate, TermName.APPROACH: _approach, SLIP: _slip,
+    READING: _reading, TermName.PLATE_STRAIN: _of_plate,
     TermName.LINE_ECCENTRICITY: _line_eccentricity}

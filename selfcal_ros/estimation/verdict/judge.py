@@ -7,7 +7,6 @@ looks for. What is found and bounded enlarges U; what is not disqualifies. The r
 the readings were taken.
 """
 
-from collections.abc import Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from typing import Any
@@ -19,22 +18,13 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.blas_threads import one_thread
 from selfcal_ros.estimation.checks.wiring import sign_is_shown
 from selfcal_ros.estimation.datum.angular import MISCLOSURE_LEVEL
-from selfcal_ros.estimation.findings import (
-    AxesNotMet,
-    FiniteRotation,
-    NoiseContradicted,
-    NoiseUnknown,
-    NotConverged,
-    SignNotShown,
-    VisitedOnce,
-)
 from selfcal_ros.estimation.joint.model_fit import ModelFit
 from selfcal_ros.estimation.joint.solve import fit_joint, solve_joint
 from selfcal_ros.estimation.joint.solved import Solved
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.terms.solution import free_inverse
 from selfcal_ros.estimation.verdict.enlarge import enlarged, enlargements, with_coverage
-from selfcal_ros.estimation.verdict.look import ALWAYS_SITES, Looked, look_into
+from selfcal_ros.estimation.verdict.look import ALWAYS_SITES, look_into
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.terms import TermName
@@ -58,7 +48,7 @@ the uncertainty from the residuals counts as covering it."""
 
 @one_thread()
 def judged(solved: Solved, measurements: Measurements, options: Options) -> CalibrationResult:
-    """Return the result with its verdict, not worded.
+    """Return the result with its verdict as data, without sentences.
 
     Parameters
     ----------
@@ -72,7 +62,7 @@ def judged(solved: Solved, measurements: Measurements, options: Options) -> Cali
     noises = _noise_findings(solved)
     checked = checked_by(solved, measurements, options, failed=bool(noises))
     failed = [*_rotation_findings(solved, checked), *_axes_findings(checked),
-              *([] if solved.converged else [NotConverged()]),
+              *([] if solved.converged else [Finding("not_converged")]),
               *_sign_findings(checked, measurements, options)]
     looked = look_into(checked, measurements, options, failed=bool(noises))
     own = checked is solved
@@ -82,11 +72,12 @@ def judged(solved: Solved, measurements: Measurements, options: Options) -> Cali
     reference = options.reference
     result = enlarged(solved.result, looked.effects)
     result = with_coverage(result, reference)
-    shown = [*failed, *noises, *looked.causes]
-    verdict = Verdict(_grade(result, looked, failed=bool(failed), noises=noises,
-                             own=own or not looked.causes),
-                      causes=looked.causes, findings=tuple(shown),
-                      enlarged_by=enlargements(result, looked.terms, looked.effects))
+    bounded = looked.bounded and (own or not looked.causes) and not _unexplained_noise(solved)
+    grade = (Grade.GOOD if not (failed or noises or looked.causes) else
+             Grade.ENLARGED if bounded and not failed and result.has_uncertainty else
+             Grade.NOT_QUALIFIED)
+    verdict = Verdict(grade, (*failed, *noises), looked.causes,
+                      enlargements(result, looked.terms, looked.effects))
     return replace(
         result, verdict=verdict, findings=(*result.findings, *_visits_findings(checked)),
         provenance=provenance_of(measurements, options),
@@ -95,18 +86,11 @@ def judged(solved: Solved, measurements: Measurements, options: Options) -> Cali
             "u_relative": reference.u_relative, "certificate": reference.certificate})
 
 
-def _grade(result: CalibrationResult, looked: Looked, *, failed: bool,
-           noises: Sequence[Finding], own: bool) -> Grade:
-    """Return the grade; `own`: the solution that was looked into is that of the result."""
-    if not (failed or noises or looked.causes):
-        return Grade.GOOD
-    if failed or not (looked.bounded and own and result.has_uncertainty):
-        return Grade.NOT_QUALIFIED
-    for finding in noises:
-        if not isinstance(finding, NoiseContradicted) or (
-                finding.residuals > UNEXPLAINED * finding.stated):
-            return Grade.NOT_QUALIFIED
-    return Grade.ENLARGED
+def _unexplained_noise(solved: Solved) -> bool:
+    """Return whether the noise is not known, or residuals are larger than U covers."""
+    return not np.isfinite(solved.xy.sigma) or any(
+        noise.contradicted and noise.residuals > UNEXPLAINED * noise.stated
+        for noise in (solved.xy, solved.theta))
 
 
 def checked_by(solved: Solved, measurements: Measurements, options: Options, *,
@@ -134,8 +118,8 @@ def _rotation_findings(solved: Solved, checked: Solved) -> list[Finding]:
     """Return whether finite rotations explain what a linear model leaves."""
     if checked is solved or checked.model is None or not checked.model.problem.rigid:
         return []
-    return [FiniteRotation(max(abs(view.phi) for view in checked.result.views),
-                           checked.xy.residuals)]
+    return [Finding("finite_rotation", max(abs(view.phi) for view in checked.result.views),
+                    unit="rad", details={"residuals": checked.xy.residuals})]
 
 
 def _sign_findings(solved: Solved, measurements: Measurements,
@@ -160,7 +144,7 @@ def _sign_findings(solved: Solved, measurements: Measurements,
         return []
     hidden = np.abs(equations.untold(rows)[scale[0]]).max(initial=0.0) > HIDDEN
     variance = free_inverse(equations)[scale[0], scale[0]] * model.found.xy.sigma**2
-    return [] if not hidden and 0 <= variance <= SIGN_U**2 else [SignNotShown()]
+    return [] if not hidden and 0 <= variance <= SIGN_U**2 else [Finding("sign_not_shown")]
 
 
 def _rigid_fit(measurements: Measurements, options: Options) -> ModelFit | None:
@@ -173,15 +157,16 @@ def _rigid_fit(measurements: Measurements, options: Options) -> ModelFit | None:
 
 
 def _noise_findings(solved: Solved) -> list[Finding]:
-    out: list[Finding] = [
-        NoiseContradicted(kind, noise.residuals, noise.stated, bool(np.isfinite(noise.declared)))
-        for noise, kind in ((solved.xy, "grid"), (solved.theta, "angular")) if noise.contradicted]
-    return out if np.isfinite(solved.xy.sigma) else [*out, NoiseUnknown()]
+    out = [Finding("noise_contradicted", noise.residuals, unit=unit, p=noise.p, details={
+        "stated": noise.stated, "declared": bool(np.isfinite(noise.declared))})
+        for noise, unit in ((solved.xy, "m"), (solved.theta, "rad")) if noise.contradicted]
+    return out if np.isfinite(solved.xy.sigma) else [*out, Finding("noise_unknown")]
 
 
 def _axes_findings(solved: Solved) -> list[Finding]:
     p, size_rad = solved.axes
-    return [] if p >= MISCLOSURE_LEVEL else [AxesNotMet(size_rad, p)]
+    return [] if p >= MISCLOSURE_LEVEL else [
+        Finding("axes_not_met", size_rad, unit="rad", p=p)]
 
 
 def _visits_findings(solved: Solved) -> list[Finding]:
@@ -192,7 +177,7 @@ def _visits_findings(solved: Solved) -> list[Finding]:
     held = any(term.name is TermName.DRIFT for term in problem.terms)
     visits = [view for view in problem.ground.visits if view is not None]
     once = len(visits) == len(problem.ground.visits) and not any(v.repeated for v in visits)
-    return [VisitedOnce()] if once and not held and problem.repeats_xy[1] > 0 else []
+    return [Finding("visited_once")] if once and not held and problem.repeats_xy[1] > 0 else []
 
 
 def provenance_of(measurements: Measurements, options: Options) -> Provenance:

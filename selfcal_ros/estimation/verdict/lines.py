@@ -14,7 +14,6 @@ import numpy as np
 from scipy.special import fdtrc
 
 from selfcal_ros.errors import InputError, NotIdentifiableError
-from selfcal_ros.estimation.findings import ReadingCause, RotationCause
 from selfcal_ros.estimation.joint.model_fit import ModelFit
 from selfcal_ros.estimation.joint.problem import FLOOR, Problem
 from selfcal_ros.estimation.joint.solve import solve_joint
@@ -82,8 +81,8 @@ def _largest(model: ModelFit, p: float) -> Cause:
     row, line = 3 * rows[worst], lines[worst]
     variance = (system.grid_inverse[row, row] * (found.xy.sigma / length) ** 2
                 + system.angular_inverse[line, line] * found.theta.sigma**2)
-    return Cause(ROTATION, "", float(apart[worst]), float(np.sqrt(variance)), "rad", p,
-                 RotationCause(problem.ground.names[rows[worst]]))
+    return Cause(ROTATION, float(apart[worst]), float(np.sqrt(variance)), "rad", p,
+                 problem.ground.names[rows[worst]])
 
 
 def solved_apart(measurements: Measurements, options: Options) -> Solved | None:
@@ -177,8 +176,7 @@ def line_cause(problem: Problem, measurements: Measurements, level: float) -> Ca
     if worst is None or not worst.p < level:
         return None
     view = measurements.views[problem.angular.index[worst.view]].view.name
-    return Cause(READING, "", worst.off_rad, worst.u_rad, "rad", worst.p,
-                 ReadingCause(view, (worst.k,)))
+    return Cause(READING, worst.off_rad, worst.u_rad, "rad", worst.p, view, mark=(worst.k,))
 
 
 def _suspects(problem: Problem) -> Iterator[OffLine]:

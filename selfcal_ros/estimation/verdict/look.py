@@ -19,12 +19,7 @@ from selfcal_ros.estimation.joint.solve import solve_joint
 from selfcal_ros.estimation.joint.solved import Solved
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.terms.equations import LEAST_NOISE_M
-from selfcal_ros.estimation.verdict.cause_sizes import (
-    cause_of,
-    noise_cause,
-    scatter_of_views,
-    size_cause,
-)
+from selfcal_ros.estimation.verdict.cause_sizes import cause_of, scatter_of_views, size_cause
 from selfcal_ros.estimation.verdict.enlarge import Effect, difference, effect_of_field
 from selfcal_ros.estimation.verdict.explanations import (
     FLOOR_M,
@@ -391,7 +386,7 @@ def _noisy_views(found: _Found, measurements: Measurements) -> None:
         p = float(fdtrc(dof, rest, ratio**2)) * len(views)
         if p < LEVEL and ratio > NOISY:
             u = ratio * np.sqrt((1 / dof + 1 / rest) / 2)
-            found.causes.append(noise_cause(name, ratio, u, p))
+            found.causes.append(Cause("noise", ratio, u, "m/m", p, name))
             ratios.append(sigma / used)
     if ratios and max(ratios) > 1:
         more = np.nan_to_num(np.stack([emap.u_gx, emap.u_gy])) * np.sqrt(max(ratios) ** 2 - 1)

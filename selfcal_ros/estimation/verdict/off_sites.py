@@ -11,7 +11,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from selfcal_ros.estimation.findings import OffSitesCause
 from selfcal_ros.estimation.joint.fit import fit
 from selfcal_ros.estimation.joint.model_fit import ModelFit
 from selfcal_ros.model.error_map import ErrorMap
@@ -92,8 +91,8 @@ def off_sites_cause(model: ModelFit, error_map: ErrorMap, level: float) -> Place
         return None
     worst = np.unravel_index(int(effect.argmax()), effect.shape)
     shown = bool(at_sites.xy.residuals < SHOWN * before)
-    cause = Cause(OFF_SITES, "", float(effect[worst]), float(noise[worst]), "m", p,
-                  OffSitesCause(rms(np.abs(away)), shown), effect_rms=rms(effect),
+    cause = Cause(OFF_SITES, float(effect[worst]), float(noise[worst]), "m", p,
+                  details={"away": rms(np.abs(away))}, effect_rms=rms(effect),
                   effect_max=float(effect[worst]))
     bound = _between(np.where(known, model.found.field, np.nan), _pitch_m(model), away)
     return Place(cause, np.where(known, bound, 0.0), shown)

@@ -80,7 +80,7 @@ def rejected_in(result: CalibrationResult) -> list[Place]:
     for row in _rows(removed):
         view = views.get(str(row.get("view")))
         if view is not None and row.get("kind") == "grid":
-            found += _marked(result, view, str(row.get("mark")))
+            found += _marked(result, view, row.get("mark"))
     return found
 
 
@@ -92,11 +92,10 @@ def _number(value: object) -> bool:
     return isinstance(value, int | float) and math.isfinite(value)
 
 
-def _marked(result: CalibrationResult, view: ViewResult, mark: str) -> list[Place]:
-    numbers = mark.split(", ")
-    if len(numbers) != 2 or not all(part.lstrip("-").isdigit() for part in numbers):
+def _marked(result: CalibrationResult, view: ViewResult, mark: object) -> list[Place]:
+    if not isinstance(mark, list) or len(mark) != 2 or not all(map(_number, mark)):
         return []
-    m, n = (np.array(int(part) * result.artifact.grid_pitch_m) for part in numbers)
+    m, n = (np.array(part * result.artifact.grid_pitch_m) for part in mark)
     x, y = places_mm(view, m, n)
     return [(view.name, "outlier_among_views", float(x), float(y))]
 

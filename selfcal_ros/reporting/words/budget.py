@@ -11,9 +11,9 @@ from selfcal_ros.estimation.quality.budget import (
     FromReadings,
     FromReference,
     FromTerm,
+    How,
     Source,
 )
-from selfcal_ros.model.verdict import Finding
 from selfcal_ros.units import ARCSEC_PER_RAD, UM_PER_M
 
 COUNTED_DOF = 1e5
@@ -34,7 +34,7 @@ def quantity_text(budget: Budget) -> str:
 
 
 @singledispatch
-def how_text(how: Finding) -> str:
+def how_text(how: How) -> str:
     """Return how a component was found."""
     raise TypeError(f"no words for {type(how).__name__}")
 

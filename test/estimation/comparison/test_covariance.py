@@ -22,7 +22,7 @@ from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.result import result_from_dict, result_to_dict
 from selfcal_ros.model.terms import ModelTerm, TermName
 from selfcal_ros.model.view import View
-from selfcal_ros.reporting.words.result import worded
+from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.simulation.truth import Spread, hu_plan, random_truth, simulate_measurements
 from test.support.lattice_plans import plan_of
 from test.support.map_covariance import map_covariance

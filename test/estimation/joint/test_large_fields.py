@@ -16,7 +16,6 @@ from threadpoolctl import threadpool_limits
 
 from selfcal_ros.errors import InputError, NotIdentifiableError
 from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.estimation.findings import NoUncertainty, Unchecked
 from selfcal_ros.estimation.joint import pcg
 from selfcal_ros.estimation.normal import cache, equations
 from selfcal_ros.estimation.normal.grid import GridSystem
@@ -91,8 +90,9 @@ def test_iteration_takes_fields_in_pieces(as_large):
     assert 0.9 < valid.mean() < 1 and found.extra["solver"]["iterations"] < 150
     assert np.nanmax(np.abs(found.error_map.gx - truth.g[0])) < EXACT
     assert np.isnan(found.error_map.u_gx).all()
-    assert found.findings[0] == NoUncertainty()
-    single = [len(finding.sites) for finding in found.findings if isinstance(finding, Unchecked)]
+    assert found.findings[0].name == "no_uncertainty"
+    single = [len(finding.details["sites"]) for finding in found.findings
+              if finding.name == "unchecked"]
     assert single == [found.observability.unchecked_sites] and single[0] > 0
 
 

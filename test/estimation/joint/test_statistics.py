@@ -14,7 +14,7 @@ from selfcal_ros.estimation.options import ReferenceKind, ReferenceLength
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.readings import Sense
-from selfcal_ros.reporting.words.result import worded
+from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.simulation.truth import Spread, hu_plan, random_truth, simulate_measurements
 from test.support.lattice_plans import in_datum, plan_of
 from test.support.map_covariance import map_covariance
@@ -215,7 +215,7 @@ class TestNoise:
         found = worded(calibrate(calm, BARE))
         text = " ".join(found.verdict.reasons)
         assert "grid readings: residuals show a noise of" in text
-        assert "something beside random noise" in text
+        assert "something other than random noise" in text
         assert "angular readings" not in text
         assert not found.verdict.qualified
         assert found.noise.sigma_xy == found.noise.sigma_xy_residuals

@@ -7,14 +7,18 @@ import numpy as np
 import pytest
 
 from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.estimation.findings import Unchecked
 from selfcal_ros.estimation.lattice.unchecked import rest_on_one
 from selfcal_ros.estimation.observability.plan_check import check_plan
 from selfcal_ros.model.readings import Sense
+from selfcal_ros.model.verdict import Finding
 from selfcal_ros.simulation.truth import random_truth, simulate_measurements
 from test.support.plans import plan_of
 
 SIGMA_M = 20e-9
+
+
+def unchecked(sites, lines):
+    return Finding("unchecked", details={"sites": sites, "lines": lines})
 
 
 def one_by_one(site, mark):
@@ -82,7 +86,7 @@ def test_an_error_of_a_reading_that_no_other_checks_is_in_the_map_and_said(sense
     assert np.sort(abs(moved).ravel())[-2] < 0.15e-6
     assert bad.noise.sigma_xy_residuals == pytest.approx(good.noise.sigma_xy_residuals, rel=0.01)
     assert bad.verdict.qualified
-    assert bad.findings == good.findings == (Unchecked(((2 * sign, sign),)),)
+    assert bad.findings == good.findings == (unchecked([[2 * sign, sign]], []),)
     assert good.observability.unchecked_sites == 1 and good.observability.unchecked_lines == 0
 
 
@@ -95,24 +99,24 @@ def test_an_error_of_a_line_that_no_other_checks_is_in_the_map_and_said(sense):
     good, bad = calibrate(readings), calibrate(replace(readings, views=(bad, *readings.views[1:])))
     moved = np.argmax(abs(bad.error_map.g_theta - good.error_map.g_theta))
     assert moved == (3 if sense is Sense.MICROSCOPE_MOVES else 5)
-    assert bad.findings == good.findings == (Unchecked((), ((moved,),)),)
+    assert bad.findings == good.findings == (unchecked([], [moved]),)
 
 
 @pytest.mark.parametrize(("names", "gone", "lines", "expected"), [
     ("0, 90, tx", {}, (), ()),
     # two readings are left of site (2, 1), but one of them is all that tells of mark (1, -2)
-    ("0, 90, tx", {"tx": {(1, 1), (1, -2)}, "0": {(1, -2)}}, (), (Unchecked(((2, 1),)),)),
+    ("0, 90, tx", {"tx": {(1, 1), (1, -2)}, "0": {(1, -2)}}, (), (unchecked([[2, 1]], []),)),
     # a mark that is read once tells nothing of its site, which others reach
     ("0, 90, tx, ty", {"tx": {(1, 1)}, "90": {(1, 1)}, "ty": {(1, 1)}}, (), ()),
     ("0, 90, tx, ty", ONE_LEFT, (), ()),
     ("0, 90, tx", {}, {"90": {1}, "tx": {3}, "line": {2}}.items(),
-     (Unchecked((), ((3,),)),))])
+     (unchecked([], [3]),))])
 def test_what_is_counted(names, gone, lines, expected):
     result = calibrate(measured(names, gone, lines=tuple(lines)))
     assert result.findings == expected
     seen = result.observability
-    assert seen.unchecked_sites == sum(len(one.sites) for one in expected)
-    assert seen.unchecked_lines == sum(len(one.lines) for one in expected)
+    assert seen.unchecked_sites == sum(len(one.details["sites"]) for one in expected)
+    assert seen.unchecked_lines == sum(len(one.details["lines"]) for one in expected)
 
 
 def test_a_site_that_is_not_known_is_not_counted():
@@ -128,4 +132,4 @@ def test_a_plan_tells_where_it_leaves_sites_unchecked(names, expected):
     assert check_plan(plan).observability.unchecked_sites == expected
     result = calibrate(measured(names, {}, size=7, size_y=3))
     assert result.observability.unchecked_sites == expected
-    assert all(abs(m) > 1 for found in result.findings for m, _ in found.sites)
+    assert all(abs(m) > 1 for found in result.findings for m, _ in found.details["sites"])

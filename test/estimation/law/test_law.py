@@ -8,12 +8,12 @@ import pytest
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.estimation.findings import DrawnUncertainty
 from selfcal_ros.estimation.law.solve import hu_readings, hu_views, law_for
 from selfcal_ros.estimation.options import Options, ReferenceKind, ReferenceLength
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.readings import Sense
+from selfcal_ros.model.verdict import Finding
 from selfcal_ros.simulation.truth import Spread, hu_plan, random_truth, simulate_measurements
 from test.support.recalibrations import responses, sizes_of
 
@@ -128,7 +128,8 @@ def test_exact_and_drawn_propagation_agree(monkeypatch):
         ratio = getattr(drawn.error_map, name) / getattr(exact.error_map, name)
         assert abs(np.sqrt((ratio**2).mean()) - 1) < 0.1
     assert drawn.noise.sigma_xy == pytest.approx(exact.noise.sigma_xy, rel=0.02)
-    assert drawn.findings == (DrawnUncertainty(400),) and exact.findings == ()
+    assert drawn.findings == (
+        Finding("drawn_uncertainty", details={"draws": 400}),) and exact.findings == ()
 
 
 @pytest.mark.parametrize("exact_size", [21, 3])
@@ -142,7 +143,7 @@ def test_an_uncertainty_map_that_is_not_wanted_is_not_there(monkeypatch, exact_s
     for name in ("u_gx", "u_gy", "u_g_theta"):
         assert (getattr(wanted, name) > 0).all() and np.isnan(getattr(plain, name)).all()
     found = calibrate(readings, replace(LAW, uncertainty=False))
-    assert not any(isinstance(finding, DrawnUncertainty) for finding in found.findings)
+    assert not any(finding.name == "drawn_uncertainty" for finding in found.findings)
     assert not found.has_uncertainty
 
 

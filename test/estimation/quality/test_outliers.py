@@ -25,7 +25,7 @@ from selfcal_ros.model.result import plain, result_from_dict, result_to_dict
 from selfcal_ros.model.terms import ModelTerm, TermName
 from selfcal_ros.model.verdict import Grade
 from selfcal_ros.model.view import View
-from selfcal_ros.reporting.words.result import worded
+from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.simulation.truth import hu_plan, random_truth, simulate_measurements
 from test.support.lattice_plans import plan_of
 from test.support.options import bare
@@ -76,7 +76,8 @@ def refused(result, reason):
 
 
 def removed(result):
-    return {(row["view"], row["kind"], row["mark"]) for row in result.extra["outliers"]["removed"]}
+    return {(row["view"], row["kind"], ", ".join(map(str, row["mark"])))
+            for row in result.extra["outliers"]["removed"]}
 
 
 def test_redundancies_add_up_to_the_degrees_of_freedom():
@@ -209,7 +210,7 @@ def test_the_visits_of_a_split_view_stay_with_their_marks():
     moved = replace(moved, views=(*moved.views[:3], replace(view, visits=replace(
         view.visits, dx=view.dx, dy=view.dy)), *moved.views[4:]))
     found = clean(moved, ZERO_MEAN)
-    assert [slip.place for slip in found.slips] == ["before m = 2"]
+    assert [(slip.axis, slip.first) for slip in found.slips] == [("m", 2)]
     parts = {v.view.name: v for v in found.measurements.views}
     for name in ("shift_x", "shift_x after slip"):
         part = parts[name]
@@ -222,13 +223,13 @@ def test_giving_up_is_said(monkeypatch):
     _, readings = measured(3)
     bad = with_errors(readings, 1, dx={(-4, 2): 1e-6, (0, 0): 3e-6, (3, -3): 5e-7})
     text = " ".join(worded(robust_calibrate(bad, ZERO_MEAN)).warnings)
-    assert "gave up on outliers after 1 rounds: more of them seem to be in the readings" in text
+    assert "gave up on outliers after 1 rounds: the readings seem to contain more" in text
     refused(robust_calibrate(bad, ZERO_MEAN), "gave up on outliers after 1 rounds")
     monkeypatch.setattr("selfcal_ros.estimation.quality.outliers.MAX_SLIPS", 0)
     _, readings = measured(4, more=True)
     moved = slipped(readings, 3, "m", 2, (2e-7, -1e-7, 0.0))
     result = robust_calibrate(moved, ZERO_MEAN)
-    assert "gave up on slips after 0: more of them seem to be in the readings" in " ".join(
+    assert "gave up on slips after 0: the readings seem to contain more" in " ".join(
         worded(result).warnings)
     assert result.extra["slips"] == []
     refused(result, "gave up on slips after 0")
@@ -280,7 +281,7 @@ def test_planted_outliers_are_removed_and_nothing_else(sense):
     assert error_rms(calibrate(bad, ZERO_MEAN), truth) > 1.5 * error_rms(result, truth)
     assert result.rejected[OUTLIER] == 4
     assert result.views[1].used == bad.views[1].used - 3 and result.views[1].rejected == 3
-    row = next(r for r in result.extra["outliers"]["removed"] if r["mark"] == "-4, 2")
+    row = next(r for r in result.extra["outliers"]["removed"] if r["mark"] == [-4, 2])
     assert row["standardised"] > 10 and 0 < row["leverage"] < 1
     # the fit follows the outlier by its leverage: the residual is the rest of it
     assert row["residual_m"] == pytest.approx((1 - row["leverage"]) * 1e-6, abs=1e-7)
@@ -311,7 +312,7 @@ def test_a_slipped_view_is_named_sized_and_split(index, axis, first, change):
     result = robust_calibrate(slipped_readings, ZERO_MEAN)
     (slip,) = result.extra["slips"]
     assert (slip["view"], slip["axis"], slip["first"]) == (view.view.name, axis, first)
-    assert slip["alternatives"] == ""
+    assert slip["alternatives"] == ()
     assert slip["tx_m"] == pytest.approx(change[0], abs=3e-8)
     assert slip["ty_m"] == pytest.approx(change[1], abs=3e-8)
     assert slip["phi_rad"] == pytest.approx(change[2], abs=1e-6)
@@ -329,9 +330,9 @@ def test_a_slip_whose_place_three_views_do_not_tell_is_reported_not_mended():
     result = robust_calibrate(slipped(readings, 3, "m", 2, (2e-7, -1e-7, 0.0)), ZERO_MEAN)
     (slip,) = result.extra["slips"]
     assert slip["view"] == "shift_x"
-    places = {f"before {slip['axis']} = {slip['first']}", *slip["alternatives"].split("; ")}
-    assert "before m = 2" in places and len(places) >= 2
-    assert "do not tell which; the map is spoiled by it: measure the view again" in " ".join(
+    places = [(place["axis"], place["first"]) for place in (slip, *slip["alternatives"])]
+    assert ("m", 2) in places and len(set(places)) >= 2
+    assert "do not determine which; this spoils the map: measure the view again" in " ".join(
         worded(result).warnings)
     assert [v.name for v in result.views] == [v.view.name for v in readings.views]
 
@@ -430,7 +431,7 @@ def test_a_view_whose_slip_cannot_be_placed_is_left_out_if_it_can_be_spared(monk
     truth, readings = measured(4, more=True)
     result = robust_calibrate(slipped(readings, 3, "m", 2, (2e-7, -1e-7, 0.0)), ZERO_MEAN)
     said = " ".join(worded(result).warnings)
-    assert "the readings do not tell which; the view is left out" in said
+    assert "the readings do not determine which; the view is left out" in said
     view = result.views[3]
     lost = len(readings.views[3].m) + len(readings.views[3].k)
     assert view.name == "shift_x" and view.used == 0 and view.rejected == lost

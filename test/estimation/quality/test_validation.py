@@ -19,7 +19,7 @@ from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.terms import ModelTerm, TermName
 from selfcal_ros.model.view import View
-from selfcal_ros.reporting.words.result import worded
+from selfcal_ros.reporting.words.findings import held_out_text, worded
 from selfcal_ros.reporting.words.validation import validation_json, validation_text, why_text
 from selfcal_ros.simulation.machine import Spread
 from selfcal_ros.simulation.truth import hu_plan, random_truth, simulate_measurements
@@ -41,6 +41,10 @@ def measured(*, more=True, sense=Sense.MICROSCOPE_MOVES, sigma=SIGMA_M, repeats=
                                  sigma_theta_rad=SIGMA_RAD * bool(sigma))
 
 
+def called(item):
+    return held_out_text(item.view, item.tenth)
+
+
 @pytest.fixture
 def few_draws(monkeypatch):
     """Draw the limits roughly, in tests that do not ask for them."""
@@ -49,7 +53,8 @@ def few_draws(monkeypatch):
 
 @pytest.mark.parametrize("sense", list(Sense))
 def test_exact_readings_are_predicted_exactly(sense, few_draws):
-    found = {item.name: item for item in validate(measured(sense=sense, sigma=0.0), BARE, folds=1)}
+    found = {called(item): item
+             for item in validate(measured(sense=sense, sigma=0.0), BARE, folds=1)}
     assert len(found) == 6
     for name in ("a random tenth (1)", "view 'identity'", "view 'rot90'", "view 'shift_x'",
                  "view 'both'"):
@@ -70,10 +75,10 @@ def test_noise_is_predicted_within_noise_and_leverage(repeats, few_draws):
 
 def test_a_spoiled_view_is_predicted_badly(few_draws):
     readings = measured()
-    right = {item.name: item for item in validate(readings, BARE, folds=1)}
+    right = {called(item): item for item in validate(readings, BARE, folds=1)}
     view = readings.views[4]
     swapped = replace(view, dx=view.dy, dy=view.dx)
-    wrong = {item.name: item for item in validate(
+    wrong = {called(item): item for item in validate(
         replace(readings, views=(*readings.views[:4], swapped)), BARE, folds=1)}
     for name in ("a random tenth (1)", "view 'both'"):
         assert wrong[name].rms_m > 3 * right[name].rms_m
@@ -83,7 +88,8 @@ def test_a_spoiled_view_is_predicted_badly(few_draws):
 
 def test_views_that_are_needed_cannot_be_held_out(few_draws):
     readings = measured(more=False)
-    notes = {item.name: why_text(item.why) for item in validate(readings, BARE, folds=1)}
+    notes = {called(item): why_text(item.why, ARTIFACT)
+             for item in validate(readings, BARE, folds=1)}
     assert notes["a random tenth (1)"] == ""
     for name in ("identity", "rot90", "line", "shift_x"):
         assert "does not identify the stage" in notes[f"view '{name}'"]
@@ -95,7 +101,7 @@ def test_views_that_are_needed_cannot_be_held_out(few_draws):
     plan = replace(plan, views=(*plan.views, View("more", pi / 2, (0.01, 0.0), True, True)))
     truth = random_truth(ARTIFACT, 5, rng)
     more = simulate_measurements(truth, plan, rng, sigma_m=SIGMA_M, sigma_theta_rad=SIGMA_RAD)
-    held = {item.name: item for item in validate(more, BARE, folds=1)}
+    held = {called(item): item for item in validate(more, BARE, folds=1)}
     assert held["view 'shift_x'"].why is None and held["view 'shift_x'"].n_grid > 0
 
 
@@ -109,10 +115,10 @@ def test_a_rest_that_does_not_settle_costs_its_own_line_alone(few_draws, monkeyp
         return solve(kept, options)
     monkeypatch.setattr(validation, "solve_joint", without_first)
     found = validate(readings, BARE, folds=1)
-    line = "cannot be held out: the estimate does not settle on the rest"
-    assert validation_text(found)[1] == f"view 'identity': {line}"
-    assert validation_json(found)[1]["note"] == line and not found[1].exceeds
-    assert [item.name for item in found if item.n_grid] == [
+    line = "cannot be held out: the rest does not converge"
+    assert validation_text(found, ARTIFACT)[1] == f"view 'identity': {line}"
+    assert validation_json(found, ARTIFACT)[1]["note"] == line and not found[1].exceeds
+    assert [called(item) for item in found if item.n_grid] == [
         "a random tenth (1)", "view 'rot90'", "view 'shift_x'", "view 'both'"]
 
 
@@ -133,8 +139,8 @@ def test_the_limit_is_that_of_good_readings(monkeypatch):
         SMALL.views, (1, 3, 1, 3, 2), strict=True)))
     found = [item for seed in range(8) for item in validate(
         drawn(seed, plan, missing=0.1), LINEAR, folds=3) if np.isfinite(item.limit)]
-    tenths = [item for item in found if "tenth" in item.name]
-    views = [item for item in found if "view" in item.name]
+    tenths = [item for item in found if item.tenth]
+    views = [item for item in found if item.view]
     for items in (tenths, views):
         assert len(items) >= 20
         bad = sum(item.exceeds for item in items)
@@ -147,21 +153,21 @@ def test_a_spoiled_view_exceeds_its_limit_and_disqualifies_the_result():
     readings = drawn(3, SMALL)
     right = validate(readings, LINEAR, folds=1)
     assert not any(item.exceeds for item in right)
-    assert "times the noise, within the limit of " in validation_text(right)[0]
+    assert "times the noise, within the limit of " in validation_text(right, ARTIFACT)[0]
     result = calibrate(readings, LINEAR)
     assert judged_by(result, right).verdict == result.verdict
     view = readings.views[4]
     wrong = replace(readings, views=(*readings.views[:4], replace(view, dx=view.dy, dy=view.dx)))
     found = validate(wrong, LINEAR, folds=1)
-    bad = next(item for item in found if item.name == "view 'ty'")
-    assert bad.exceeds and ", EXCEEDS the limit of " in "\n".join(validation_text(found))
+    bad = next(item for item in found if item.view == "ty")
+    assert bad.exceeds and ", EXCEEDS the limit of " in "\n".join(validation_text(found, ARTIFACT))
     judged = worded(judged_by(result, [bad]))
     assert not judged.verdict.qualified
     assert judged.verdict.reasons == (
         f"view 'ty' is predicted with {bad.ratio:.2f} times the noise, beyond the limit of "
         f"{bad.limit:.2f}",)
     assert judged.verdict.sentence == f"Not qualified: {judged.verdict.reasons[0]}"
-    assert validation_json([bad])[0]["exceeds"] is True
+    assert validation_json([bad], ARTIFACT)[0]["exceeds"] is True
 
 
 def test_terms_are_predicted_with_the_readings(few_draws):
@@ -184,13 +190,13 @@ def test_terms_are_predicted_with_the_readings(few_draws):
     tenths, whole = found[:2], found[2]
     for item in tenths:
         assert item.ratio < item.limit < 3
-    assert why_text(whole.why) == "its own drift cannot be known: not judged"
-    assert "its own drift cannot be known: not judged)" in validation_text(found)[2]
+    assert why_text(whole.why, ARTIFACT) == "its own drift cannot be known: not judged"
+    assert "its own drift cannot be known: not judged)" in validation_text(found, ARTIFACT)[2]
     for left_out in (terms[:1], terms[1:]):
         poor = validate(readings, replace(LINEAR, terms=left_out, drift_degree=1), folds=1)[0]
         assert poor.rms_m > 2 * tenths[0].rms_m
     shared = validate(readings, replace(LINEAR, terms=terms[:1]), folds=1)[1]
-    assert why_text(shared.why) == "" and np.isfinite(shared.limit)
+    assert why_text(shared.why, ARTIFACT) == "" and np.isfinite(shared.limit)
 
 
 def test_a_view_held_out_has_own_terms_within_their_sizes(few_draws, monkeypatch):
@@ -200,7 +206,7 @@ def test_a_view_held_out_has_own_terms_within_their_sizes(few_draws, monkeypatch
     spread = Spread(plate_strain=5e-6)
     found = [item for seed in range(8) for item in validate(
         drawn(seed, SMALL, spread=spread), strained, folds=1)
-        if "view" in item.name and item.n_grid]
+        if item.view and item.n_grid]
     assert len(found) >= 30 and all(item.why is None for item in found)
     assert sum(item.exceeds for item in found) <= binom.ppf(0.9995, len(found), 0.05)
     assert min(item.ratio for item in found) > 1 and np.mean([item.ratio for item in found]) > 3
@@ -224,7 +230,7 @@ def test_seeds_and_folds(few_draws):
     readings = drawn(0, SMALL)
     assert validate(readings, BARE, folds=1) == validate(readings, BARE, folds=1)
     assert validate(readings, BARE, folds=1)[0] != validate(readings, BARE, folds=1, seed=1)[0]
-    tenths = [item for item in validate(readings, BARE, folds=10) if "tenth" in item.name]
+    tenths = [item for item in validate(readings, BARE, folds=10) if item.tenth]
     assert sum(item.n_grid for item in tenths) <= sum(len(v.m) for v in readings.views)
     for folds in (0, 11):
         with pytest.raises(InputError, match="number from 1 to 10"):
@@ -233,7 +239,7 @@ def test_seeds_and_folds(few_draws):
 
 def test_text_and_json(few_draws):
     found = validate(measured(), bare(datum_theta="zero_mean"), folds=1)
-    text = validation_text(found)
+    text = validation_text(found, ARTIFACT)
     assert "marks predicted within" in text[0] and "arcsec rms" in text[0]
-    assert len(validation_json(found)) == len(text) == 6
-    assert validation_json(found)[0]["rms_m"] == found[0].rms_m
+    assert len(validation_json(found, ARTIFACT)) == len(text) == 6
+    assert validation_json(found, ARTIFACT)[0]["rms_m"] == found[0].rms_m

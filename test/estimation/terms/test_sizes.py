@@ -14,7 +14,7 @@ from selfcal_ros.model.result import result_from_dict, result_to_dict
 from selfcal_ros.model.terms import ModelTerm, parse_terms
 from selfcal_ros.model.verdict import Grade
 from selfcal_ros.reporting.words.budget import how_text
-from selfcal_ros.reporting.words.result import worded
+from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.simulation.machine import Spread, random_truth
 from selfcal_ros.simulation.truth import simulate_measurements
 from test.estimation.terms.test_terms import plan_of, settings
@@ -115,10 +115,10 @@ def test_a_calibration_with_a_contradicted_size_says_so_and_its_u_is_honest(term
     verdict, cause = result.verdict, result.verdict.causes[0]
     assert verdict.grade is Grade.ENLARGED
     assert cause.name == name and cause.p < 5e-4
-    assert cause.text.startswith(f"{name} up to ")
+    assert cause.text.startswith(f"a term '{name}' as large as ")
     assert f" {unit}, " in cause.text
     assert "times the size assumed: " in cause.text
-    assert verdict.reasons[0].startswith(f"the readings show {name} up to ")
+    assert verdict.reasons[0].startswith(f"the readings show a term '{name}' as large as ")
     assert verdict.sentence == f"Good within an enlarged U: {cause.text}"
     assert [item.name for item in verdict.enlarged_by] == [name]
     estimates = result.model.terms[0].estimates

@@ -7,15 +7,14 @@ import numpy as np
 import pytest
 
 from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.estimation.findings import VisitedOnce
 from selfcal_ros.estimation.joint.model_fit import fit_model
 from selfcal_ros.estimation.joint.solve import prepare
 from selfcal_ros.estimation.verdict.explanations import find_explanations
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.terms import parse_terms
-from selfcal_ros.model.verdict import Grade
+from selfcal_ros.model.verdict import Finding, Grade
 from selfcal_ros.model.view import Plan, View
-from selfcal_ros.reporting.words.result import worded
+from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.simulation.exposures import CellSettings
 from selfcal_ros.simulation.machine import Spread, random_truth
 from selfcal_ros.simulation.truth import simulate_measurements
@@ -79,18 +78,18 @@ def slipping(after, by_m):
 
 
 CASES = {
-    "turned": ("microscope", 2e-3, "microscope turned by ",
+    "turned": ("microscope", 2e-3, "a microscope turned counter-clockwise by ",
                {"spread": replace(CLEAN, microscope_rotation_rad=2e-3), "stop_sigma_m": 20e-6}),
-    "turned back": ("microscope", -2e-3, "microscope turned by -",
+    "turned back": ("microscope", -2e-3, "a microscope turned clockwise by ",
                     {"spread": replace(CLEAN, microscope_rotation_rad=-2e-3),
                      "stop_sigma_m": 20e-6}),
-    "scaled": ("microscope", 5e-3, "scale of the microscope off by ",
+    "scaled": ("microscope", 5e-3, "a microscope that shows lengths too short by ",
                {"spread": replace(CLEAN, microscope_scale=5e-3), "stop_sigma_m": 20e-6}),
-    "drift": ("drift", 500e-9, "along x while view '90' was measured",
+    "drift": ("drift", 500e-9, "along x during view '90'",
               {"change": steadily(500e-9)}),
     "grown": ("plate_scale", 2e-6, "in view '+x' than in view '0'",
               {"change": with_views("plate_scale", 2, 2e-6, ())}),
-    "backlash": ("approach", 50e-9, "indicated x differs by ±(",
+    "backlash": ("approach", 50e-9, "an indicated x that changes by ±(",
                  {"spread": replace(CLEAN, backlash_x_m=50e-9)}),
     "slip": ("slip", 250e-9, "of view '+x'", {"change": slipping(0.45, (200e-9, -150e-9))}),
 }
@@ -139,7 +138,8 @@ def test_a_noisy_view_is_named():
     wider = result.error_map.u_gx / judged().error_map.u_gx
     assert wider == pytest.approx(3 * SETTINGS.sigma_xy_m / result.noise.sigma_xy, rel=0.1)
     cause = verdict.causes[names.index("noise")]
-    assert cause.text.startswith("view '-x' is ") and cause.size == pytest.approx(3, rel=0.1)
+    assert " times as much noise in view '-x' as in" in cause.text
+    assert cause.view == "-x" and cause.size == pytest.approx(3, rel=0.1)
 
 
 def test_an_effect_without_consequence_disqualifies_nothing():
@@ -181,4 +181,4 @@ def test_repeats_that_are_of_one_time_are_said_to_be(consecutive, repeats, terms
                                      settings=replace(SETTINGS, consecutive=consecutive))
     result = calibrate(readings, replace(OPTIONS, terms=parse_terms(terms, "")))
     assert result.verdict.qualified
-    assert result.findings == ((VisitedOnce(),) if said else ())
+    assert result.findings == ((Finding("visited_once"),) if said else ())

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.estimation.findings import AxesNotMet, SignNotShown
 from selfcal_ros.estimation.joint.solve import solve_joint
 from selfcal_ros.estimation.law.solve import solve_law
 from selfcal_ros.estimation.options import Options
@@ -16,7 +15,7 @@ from selfcal_ros.estimation.verdict.look import are_looked_for
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.terms import ModelTerm, TermName, parse_terms
-from selfcal_ros.model.verdict import Grade
+from selfcal_ros.model.verdict import Finding, Grade
 from selfcal_ros.simulation.exposures import CellSettings
 from selfcal_ros.simulation.machine import Spread, random_truth
 from selfcal_ros.simulation.truth import hu_plan, simulate_measurements
@@ -38,7 +37,8 @@ def test_the_axis_conditions_are_tested_at_5_percent(readings, p, holds):
     solved = replace(solve_joint(readings, options), axes=(p, 3 * ARCSEC_RAD))
     verdict = judged(solved, readings, options).verdict
     assert verdict.grade is (Grade.GOOD if holds else Grade.NOT_QUALIFIED)
-    assert verdict.findings == (() if holds else (AxesNotMet(3 * ARCSEC_RAD, p),))
+    assert verdict.failed == (() if holds else (
+        Finding("axes_not_met", 3 * ARCSEC_RAD, unit="rad", p=p),))
 
 
 def test_axis_conditions_that_nobody_asked_for_hold(readings):
@@ -53,9 +53,9 @@ def test_axes_that_the_stage_does_not_keep_are_found_without_an_uncertainty_map(
     options = Options(misalignment_model="linear", datum_theta=ThetaDatum.XY_AXES, terms=terms)
     wanted, plain = (calibrate(readings, replace(options, uncertainty=uncertainty))
                      for uncertainty in (None, False))
-    assert wanted.verdict.findings == plain.verdict.findings
-    (found,) = plain.verdict.findings
-    assert isinstance(found, AxesNotMet) and found.misclosure_rad > 30 * ARCSEC_RAD
+    assert wanted.verdict.failed == plain.verdict.failed
+    (found,) = plain.verdict.failed
+    assert found.name == "axes_not_met" and found.size > 30 * ARCSEC_RAD
     assert plain.verdict.grade is wanted.verdict.grade is Grade.NOT_QUALIFIED
     for name in ("u_gx", "u_gy", "u_g_theta"):
         assert np.isnan(getattr(plain.error_map, name)).all()
@@ -90,5 +90,5 @@ def offsets_of(stop_sigma_m):
     (0.0, {"terms": parse_terms(["microscope:1e-2"], "")}, True), (0.0, {"assumed": ()}, True)])
 def test_the_sign_of_offsets_is_shown_by_their_scatter_or_declared(stop_sigma_m, how, shown):
     verdict = calibrate(offsets_of(stop_sigma_m), Options(**how)).verdict
-    assert verdict.findings == (() if shown else (SignNotShown(),))
+    assert verdict.failed == (() if shown else (Finding("sign_not_shown"),))
     assert verdict.grade is (Grade.GOOD if shown else Grade.NOT_QUALIFIED)

@@ -15,9 +15,9 @@ from selfcal_ros.estimation.verdict import lines
 from selfcal_ros.estimation.verdict.lines import rotation_cause, solved_apart
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.terms import parse_terms
-from selfcal_ros.model.verdict import Grade
+from selfcal_ros.model.verdict import Grade, Remedy
 from selfcal_ros.model.view import Plan, View
-from selfcal_ros.reporting.words.result import worded
+from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.simulation.exposures import CellSettings
 from selfcal_ros.simulation.machine import Spread, random_truth
 from selfcal_ros.simulation.truth import hu_plan, simulate_measurements
@@ -64,7 +64,9 @@ def test_a_plate_that_turns_between_marks_and_lines_is_named(index, by_rad):
     assert (cause.name, cause.unit) == ("rotation", "rad") and cause.p < 5e-4
     # the median of three views is the datum: a third one may carry noise of the same size
     assert cause.size == pytest.approx(by_rad, abs=6 * cause.u) and cause.u < 0.1 * abs(by_rad)
-    assert cause.text.startswith(f"lines of view '{name}' turned by {cause.size * 206264.8:.3f} ± ")
+    way = "counter-clockwise" if cause.size > 0 else "clockwise"
+    assert cause.text.startswith(f"lines turned {way} by {abs(cause.size) * 206264.8:.3f} ± ")
+    assert (cause.view, cause.remedies[0]) == (name, Remedy("view", name))
     assert "check whether the plate moved between marks and lines" in cause.text
 
 

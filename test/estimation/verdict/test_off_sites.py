@@ -7,15 +7,14 @@ import numpy as np
 import pytest
 
 from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.estimation.findings import SignNotShown
 from selfcal_ros.estimation.options import ReferenceLength
 from selfcal_ros.estimation.verdict import off_sites
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import GridVisits, Measurements, Sense, ViewReadings
 from selfcal_ros.model.terms import parse_terms
-from selfcal_ros.model.verdict import Grade
+from selfcal_ros.model.verdict import Finding, Grade
 from selfcal_ros.model.view import View
-from selfcal_ros.reporting.words.result import worded
+from selfcal_ros.reporting.words.findings import worded
 from test.support.options import BARE, bare
 
 N, PITCH_M, SIGMA_M = 7, 0.01, 1e-8
@@ -86,8 +85,8 @@ def test_a_stage_that_follows_plates_beside_their_places_has_a_larger_u(sense):
     cause = result.verdict.causes[0]
     assert (cause.name, cause.unit) == ("off_sites", "m") and cause.p < 5e-4
     assert cause.size == pytest.approx(wrong, rel=0.35)
-    assert cause.text.startswith("the stage standing 1.7 mm off the sites, where its error is ")
-    assert "lay the plate nearer to its place" in cause.text
+    assert cause.text.startswith("a stage that stood 1.7 mm off the sites, where its error ")
+    assert "place the plate closer to its nominal pose" in cause.text
 
 
 @pytest.mark.parametrize("sense", Sense)
@@ -106,7 +105,7 @@ def test_with_a_microscope_that_nobody_knows_the_sign_of_its_offsets_is_not_show
     """All views lie beside their places alike: a microscope of any scale shows the same."""
     verdict = calibrate(readings(follow=True)).verdict
     assert verdict.grade is Grade.NOT_QUALIFIED
-    assert verdict.findings[0] == SignNotShown() and verdict.causes[0].name == "off_sites"
+    assert verdict.failed[0] == Finding("sign_not_shown") and verdict.causes[0].name == "off_sites"
 
 
 @pytest.mark.parametrize("seed", range(5))

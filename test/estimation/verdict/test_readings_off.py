@@ -7,14 +7,13 @@ import numpy as np
 import pytest
 
 from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.estimation.findings import ReadingCause
 from selfcal_ros.estimation.joint.solve import prepare
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.quality.outliers import robust_calibrate
 from selfcal_ros.estimation.verdict.fault_columns import MOST, reading_columns
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.verdict import Grade
-from selfcal_ros.reporting.words.result import worded
+from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.simulation.truth import hu_plan, random_truth, simulate_measurements
 from test.support.options import BARE
 from test.support.results import covered
@@ -80,9 +79,8 @@ def test_a_line_that_is_off_in_one_view_is_named():
     assert cause.size == pytest.approx(-1e-3, abs=4.5 * cause.u)
     assert SIGMA_RAD < cause.u < 4 * SIGMA_RAD
     assert cause.text.startswith(f"a reading of line 5 in view 'rot90' that is off by "
-                                 f"{cause.size * 180 * 3600 / np.pi:.1f} ± ")
-    assert calibrate(misread(readings, 1, line=5, by_rad=-1e-3), BARE).verdict.causes[0].what == (
-        ReadingCause("rot90", (5,)))
+                                 f"{-cause.size * 180 * 3600 / np.pi:.1f} ± ")
+    assert (cause.view, cause.mark) == ("rot90", (5,))
 
 
 def test_the_remedy_that_is_named_mends_it():

@@ -163,10 +163,10 @@ def test_names_cannot_steer_the_terminal():
 
 def test_a_verdict_comes_before_everything_else():
     result, _ = known_result()
-    cause = Cause("drift", "drift of 51 ± 2 nm along x: solve with --model drift", 5.1e-8, 2e-9,
-                  "m", 1e-12)
-    bad = Verdict(Grade.NOT_QUALIFIED, "Not qualified: most likely drift of 51 nm",
-                  ("residuals exceed repeats",), (cause,))
+    cause = Cause("drift", 5.1e-8, 2e-9, "m", 1e-12,
+                  text="drift of 51 ± 2 nm along x: solve with --model drift")
+    bad = Verdict(Grade.NOT_QUALIFIED, causes=(cause,), reasons=("residuals exceed repeats",),
+                  sentence="Not qualified: most likely drift of 51 nm")
     text = summary_text(replace(result, verdict=bad))
     assert text.startswith("Not qualified: most likely drift of 51 nm. Map as it is: Calibrated")
     assert "Verdict: NOT QUALIFIED\n  residuals exceed repeats\n" in text

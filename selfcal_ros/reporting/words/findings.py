@@ -1,0 +1,359 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The sentence of each finding, made from its data: verdict, causes and warnings of a result.
+
+Everywhere else findings are data. Lengths are in µm, ratios in µm/m, rotations in mrad or arcsec.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+from selfcal_ros.model.result import CalibrationResult, Noise
+from selfcal_ros.model.terms import UNITS, TermName
+from selfcal_ros.model.verdict import Cause, Finding, Grade, Remedy, Verdict
+from selfcal_ros.units import (
+    ARCSEC_PER_RAD,
+    MM_PER_M,
+    MRAD_PER_RAD,
+    PPM_PER_ONE,
+    UM_PER_M,
+    URAD_PER_RAD,
+)
+
+NAMED = 5
+"""Sites and lines that are named one by one; the others are counted."""
+
+
+class Unit(NamedTuple):
+    """How a person reads a quantity: how many of the unit are one in SI, and its name."""
+
+    per_si: float
+    name: str
+
+
+UM, RATIO = Unit(UM_PER_M, "µm"), Unit(PPM_PER_ONE, "µm/m")
+MRAD, PERCENT = Unit(MRAD_PER_RAD, "mrad"), Unit(100.0, "%")
+ARCSEC, URAD = Unit(ARCSEC_PER_RAD, "arcsec"), Unit(URAD_PER_RAD, "µrad")
+
+_OF_SIZES = {TermName.MICROSCOPE: MRAD, TermName.LINE_ECCENTRICITY: URAD}
+"""Unit in which a person reads the coefficients of a term; by the SI unit for the others."""
+
+
+def plus_minus(found: Finding, unit: Unit, times: float = 1.0) -> str:
+    """Return the size of a finding without its sign, two figures of its uncertainty, and the unit.
+
+    Parameters
+    ----------
+    found : Finding
+        What was found.
+    unit : Unit
+        In which it is read.
+    times : float
+        How many times the size is told.
+    """
+    value, u = (times * unit.per_si * each for each in (abs(found.size), found.u))
+    digits = 3
+    if math.isfinite(u) and u > 0:
+        digits = min(max(1 - math.floor(math.log10(u)), 0), 9)
+    return f"{value:.{digits}f} ± {u:.{digits}f} {unit.name}"
+
+
+def _either(found: Finding, positive: str, negative: str) -> str:
+    """Return one of two directions by the sign of a size."""
+    return positive if found.size >= 0 else negative
+
+
+def _slipped(of: dict[str, Any]) -> str:
+    return (f"({of['x'] * UM_PER_M:.3g}, {of['y'] * UM_PER_M:.3g}) µm and "
+            f"{of['phi'] * URAD_PER_RAD:.3g} µrad")
+
+
+_MICROSCOPE: dict[str, Callable[[Cause], str]] = {
+    "turn": lambda c: (f"a microscope turned {_either(c, 'counter-clockwise', 'clockwise')} by "
+                       f"{plus_minus(c, MRAD)}"),
+    "scale": lambda c: (f"a microscope that shows lengths too {_either(c, 'short', 'long')} by "
+                        f"{plus_minus(c, PERCENT)}"),
+    "stretch": lambda c: (
+        f"a microscope that shows lengths along x {_either(c, 'shorter', 'longer')} than along y "
+        f"by {plus_minus(c, PERCENT, 2)}"),
+    "shear": lambda c: f"microscope axes out of square by {plus_minus(c, MRAD, 2)}"}
+
+_STRAIN: dict[str, Callable[[Cause], str]] = {
+    "scale": lambda c: _either(c, "enlarged", "shrunk"),
+    "stretch": lambda c: _either(c, "stretched along x and compressed along y",
+                                 "stretched along y and compressed along x"),
+    "shear": lambda c: f"stretched along its diagonal at {_either(c, '45', '135')}° and "
+                       "compressed along the other"}
+
+Words = Callable[[Any, dict[str, Any]], str]
+"""A finding and its details -> its sentence."""
+
+_CAUSES: dict[str, Words] = {
+    TermName.MICROSCOPE: lambda c, of: _MICROSCOPE[of["part"]](c),
+    TermName.DRIFT: lambda c, of: (
+        f"a drift of {plus_minus(c, UM)} along {c.axis} during view '{c.view}'"),
+    TermName.PLATE_SCALE: lambda c, of: (
+        f"a plate {_either(c, 'larger', 'smaller')} by {plus_minus(c, RATIO)} in view '{c.view}' "
+        f"than in view '{of['against']}'"),
+    TermName.PLATE_STRAIN: lambda c, of: (
+        f"a plate {_STRAIN[of['part']](c)} by {plus_minus(c, RATIO)} in view '{c.view}' relative "
+        f"to view '{of['against']}'"),
+    TermName.PLATE_SHAPE: lambda c, of: (
+        f"a plate bent by {plus_minus(c, UM)} at the middle of an edge in view '{c.view}' relative "
+        f"to view '{of['against']}'" + (
+            "" if c.told else ", part of which cannot be separated from the stage")),
+    TermName.LINE_ECCENTRICITY: lambda c, of: (
+        f"a circle of lines off the axis of rotation by {plus_minus(c, URAD)} of its radius in "
+        f"view '{c.view}'"),
+    TermName.APPROACH: lambda c, of: (
+        f"an indicated {c.axis} that changes by ±({plus_minus(c, UM)}) with the direction of "
+        "approach"),
+    "slip": lambda c, of: (
+        f"a plate that slipped by {_slipped(of)} after about {of['after']:.0%} of view "
+        f"'{c.view}'"),
+    "rotation": lambda c, of: (
+        f"lines turned {_either(c, 'counter-clockwise', 'clockwise')} by {plus_minus(c, ARCSEC)} "
+        f"relative to the marks in view '{c.view}'"),
+    "reading": lambda c, of: (
+        f"a reading of {f'mark {c.mark}' if len(c.mark) > 1 else f'line {c.mark[0]}'} in view "
+        f"'{c.view}' that is off by {plus_minus(c, UM if len(c.mark) > 1 else ARCSEC)}"),
+    "off_sites": lambda c, of: (
+        f"a stage that stood {of['away'] * MM_PER_M:.3g} mm off the sites, where its error differs "
+        f"by {plus_minus(c, UM)}"),
+    "noise": lambda c, of: (
+        f"{c.size:.2f} times as much noise in view '{c.view}' as in the others")}
+
+_ACTIONS = {
+    TermName.MICROSCOPE: "align the microscope, or have the stage stop next to the marks "
+                         "deliberately (check_stops)",
+    TermName.DRIFT: "visit the marks there and back",
+    TermName.PLATE_SCALE: "let the plate reach thermal equilibrium",
+    TermName.PLATE_SHAPE: "support the plate without strain",
+    TermName.PLATE_STRAIN: "support the plate without strain",
+    TermName.LINE_ECCENTRICITY: "centre the circle of lines on the axis of rotation in each view",
+    TermName.APPROACH: "approach each mark from the same side",
+    "slip": "measure the view again, or solve with --robust",
+    "rotation": "check whether the plate moved between marks and lines, and the sign of the "
+                "lines' offsets",
+    "reading": "solve with --robust, or measure it again",
+    "off_sites": "place the plate closer to its nominal pose, or send the stage to the sites",
+    "noise": "measure the view again, and look for a source of vibration"}
+"""What to do about a cause besides what was tried on the readings."""
+
+SENTENCES: dict[str, Words] = {
+    # tests that failed
+    "not_identified": lambda f, of: "the readings do not identify the stage",
+    "sign_not_shown": lambda f, of: (
+        "nothing in the readings shows the sign of the microscope's offsets, and with the opposite "
+        "sign the map would be that of a different stage: have the stage stop next to the marks "
+        "deliberately (check_stops in the plan), or declare the microscope (--microscope 0.01)"),
+    "not_converged": lambda f, of: (
+        "the estimate converged only without the assumptions about the measurement, which the "
+        "readings are far from: check the sense, the axes and the pixel size of the microscope"),
+    "finite_rotation": lambda f, of: (
+        f"the model is linear, but the plate was turned by up to {f.size * MRAD_PER_RAD:.2f} mrad: "
+        "solve jointly with finite rotations, the default, which leaves "
+        f"{of['residuals'] * UM_PER_M:.3g} µm"),
+    "noise_contradicted": lambda f, of: _noise_contradicted(f, of),
+    "noise_unknown": lambda f, of: (
+        "grid readings: neither repeats nor residuals determine the noise, so the uncertainty is "
+        "not known; read every mark twice"),
+    "axes_not_met": lambda f, of: (
+        "theta: the stage does not satisfy the axis conditions of the datum xy_axes (misclosure "
+        f"{f.size * ARCSEC_PER_RAD:.3g} arcsec, p = {f.p:.2g}); use zero_mean"),
+    "prediction_failed": lambda f, of: (
+        f"{held_out_text(f.view, of['tenth'])} is predicted with {f.size:.2f} times the noise, "
+        f"beyond the limit of {of['limit']:.2f}"),
+    # what was left out, or could not be done
+    "no_uncertainty": lambda f, of: (
+        "no uncertainty map, because of the size of the field: ask for it (--uncertainty always)"),
+    "visited_once": lambda f, of: (
+        "each mark was visited once in a view, its repeats one after the other: a drift that is "
+        "the same in all views becomes part of the map, and repeats do not show it; visit the "
+        "marks there and back, along x and along y"),
+    "unchecked": lambda f, of: _unchecked(of["sites"], of["lines"]),
+    "magnification": lambda f, of: (
+        f"the plate is {_either(f, 'larger', 'smaller')} than the encoders indicate by "
+        f"{plus_minus(f, RATIO)}, more than plate and encoders should differ: check the pitch in "
+        "the plan (grid_pitch), and the scale of the encoders"),
+    "drawn_uncertainty": lambda f, of: (
+        f"uncertainties of Hu's law from {of['draws']} draws of unit noise: "
+        f"{100 / math.sqrt(2 * of['draws']):.1f} % standard error"),
+    "outliers_removed": lambda f, of: _outliers_removed(of["number"], of["first"]),
+    "noisy_view": lambda f, of: (
+        f"view '{f.view}' is {f.size:.1f} times as noisy as the others: measure it again"),
+    "too_many_outliers": lambda f, of: (
+        f"more than {of['limit']:.0%} of the readings contradict the others: none was removed; "
+        "look for a wrong plan or a faulty view"),
+    "outliers_kept": lambda f, of: "removing more outliers would leave the stage undetermined",
+    "outliers_given_up": lambda f, of: (
+        f"gave up on outliers after {of['rounds']} rounds: the readings seem to contain more; look "
+        "for a wrong plan or a faulty view"),
+    "slip_found": lambda f, of: _slip_found(f, of),
+    "taken_for_slip": lambda f, of: (
+        f"view '{of['slip_in']}' looks as if the plate slipped, but the readings show "
+        f"{what_it_is(replace(f, name=of['cause']))}, which explains them better: no view was "
+        "split"),
+    "slips_given_up": lambda f, of: (
+        f"gave up on slips after {of['slips']}: the readings seem to contain more; measure again"),
+    # why readings held out were not predicted, or not judged
+    "rest_not_converged": lambda f, of: "cannot be held out: the rest does not converge",
+    "nothing_to_predict": lambda f, of: (
+        "nothing to predict: no held-out mark is known from the rest"),
+    "own_terms_unknown": lambda f, of: (
+        f"its own {' and '.join(of['terms'])} cannot be known: not judged")}
+
+
+def _noise_contradicted(found: Finding, of: dict[str, Any]) -> str:
+    kind, unit = ("grid", UM) if found.unit == "m" else ("angular", ARCSEC)
+    name = "the detections' own sigma" if of["declared"] else "repeats"
+    return (f"{kind} readings: residuals show a noise of {found.size * unit.per_si:.3g} "
+            f"{unit.name}, {name} {of['stated'] * unit.per_si:.3g} {unit.name}; " + (
+                "the readings contain something other than random noise"
+                if found.size > of["stated"] else
+                "repeats share what single readings do not (drift between passes), or the stated "
+                "noise is too large"))
+
+
+def held_out_text(view: str, tenth: int) -> str:
+    """Return what was held out of the readings: a random tenth by its number, else a view."""
+    return f"a random tenth ({tenth})" if tenth else f"view '{view}'"
+
+
+def _unchecked(sites: list[list[int]], lines: list[int]) -> str:
+    what = " and ".join(_counted(places, kind) for places, kind in (
+        ([tuple(site) for site in sites], "site"), (lines, "line")) if places)
+    rest, them = ("rests on a single reading", "it") if len(sites) + len(lines) == 1 else (
+        "rest on single readings", "them")
+    return (f"{what} of the map {rest} that no other checks; an error in {them} goes into the map, "
+            "and no residual shows it: measure the missing marks, or add a view")
+
+
+def _counted(places: list, kind: str) -> str:
+    if len(places) == 1:
+        return f"1 {kind} {places[0]}"
+    more = f" and {len(places) - NAMED} more" if len(places) > NAMED else ""
+    return f"{len(places)} {kind}s ({', '.join(map(str, places[:NAMED]))}{more})"
+
+
+def _outliers_removed(number: int, first: list[dict[str, Any]]) -> str:
+    named = ", ".join(
+        f"'{item['view']}' {item['kind']} "
+        f"{tuple(item['mark']) if len(item['mark']) > 1 else item['mark'][0]} "
+        f"({item['standardised']:.1f} sigma)" for item in first)
+    rest = f" and {number - len(first)} more" if number > len(first) else ""
+    return f"removed {number} outlier{'s' * (number != 1)}: {named}{rest}"
+
+
+def _slip_found(found: Finding, of: dict[str, Any]) -> str:
+    places = [f"before {place['axis']} = {place['first']}" + (
+        "" if place["view"] == found.view else f" in view '{place['view']}'")
+        for place in of["places"]]
+    spoils = "; this spoils the map: measure the view again"
+    if len(places) > 1:
+        return (f"view '{found.view}': the plate slipped by about {_slipped(of)}, "
+                f"{' or '.join(places)}; the readings do not determine which"
+                f"{spoils if of['spoils'] else '; the view is left out'}")
+    return (f"view '{found.view}': the plate slipped {places[0]} by {_slipped(of)}; treated as two "
+            f"placements{spoils if of['spoils'] else ''}")
+
+
+def remedies(cause: Cause) -> tuple[Remedy, ...]:
+    """Return the remedies of a cause: those that were tried, and the action that removes it."""
+    if any(remedy.kind == "action" for remedy in cause.remedies):
+        return cause.remedies
+    return (*cause.remedies, Remedy("action", _ACTIONS[cause.name]))
+
+
+def advice(cause: Cause) -> str:
+    """Return what to do about a cause; empty where a file says it in the cause's text alone."""
+    return "" if cause.details is None else ", or ".join(
+        f"solve with --model {remedy.value}" if remedy.kind == "model" else remedy.value
+        for remedy in remedies(cause) if remedy.kind != "view")
+
+
+def what_it_is(cause: Cause) -> str:
+    """Return what a cause is, without what to do about it.
+
+    That is the whole text of a cause of a file that lacks its data.
+    """
+    try:
+        if cause.details is None:
+            return cause.text
+        if "given" in cause.details:
+            return _larger_term(cause, cause.details["given"])
+        return _CAUSES[cause.name](cause, cause.details)
+    except (KeyError, TypeError, ValueError):
+        if not cause.text:
+            raise
+        return cause.text
+
+
+def _larger_term(cause: Cause, given: float) -> str:
+    name = TermName(cause.name)
+    unit = _OF_SIZES.get(name, RATIO if UNITS[name] == "m/m" else UM)
+    ratio = cause.size / given
+    return (f"a term '{name}' as large as {cause.size * unit.per_si:.3g} {unit.name}, "
+            f"{f'{ratio:.3g}' if ratio < 1e3 else f'{ratio:.0f}'} times the size assumed")
+
+
+def sentence_of(found: Finding) -> str:
+    """Return the sentence of a finding; of a cause with what to do about it."""
+    if found.name in SENTENCES:
+        return SENTENCES[found.name](found, found.details or {})
+    if not isinstance(found, Cause):
+        raise KeyError(f"no words for {found.name}")
+    return f"{what_it_is(found)}: {advice(found)}"
+
+
+def worded(result: CalibrationResult) -> CalibrationResult:
+    """Return a result with the texts of its findings; one that has them stays as it is.
+
+    Parameters
+    ----------
+    result : CalibrationResult
+        As `selfcal_ros.estimation.api.calibrate` gives it, with its validation if there is one.
+    """
+    findings = tuple(map(_with_text, result.findings))
+    new = (found.text for found, old in zip(findings, result.findings, strict=True)
+           if not old.text)
+    return replace(result, verdict=worded_verdict(result.verdict, result.noise),
+                   findings=findings, warnings=(*result.warnings, *new))
+
+
+def _with_text[Kind: Finding](found: Kind) -> Kind:
+    return found if found.text else replace(found, text=sentence_of(found))
+
+
+def worded_verdict(verdict: Verdict, noise: Noise) -> Verdict:
+    """Return a verdict with its sentence, its reasons and the texts of its findings.
+
+    Parameters
+    ----------
+    verdict : Verdict
+        As estimation gives it, or as a file has it.
+    noise : Noise
+        Of the same result: whether there was something to compare residuals with.
+    """
+    new = [found for found in (*verdict.failed, *verdict.causes) if not found.text]
+    if verdict.sentence and not new:
+        return verdict
+    reasons = (*verdict.reasons, *(
+        f"the readings show {what_it_is(found)}" if isinstance(found, Cause) else
+        sentence_of(found) for found in new))
+    causes = tuple(replace(_with_text(cause), remedies=remedies(cause))
+                   for cause in verdict.causes)
+    return replace(verdict, failed=tuple(map(_with_text, verdict.failed)), causes=causes,
+                   reasons=reasons, sentence=_sentence(verdict.grade, reasons, causes, noise))
+
+
+def _sentence(grade: Grade, reasons: tuple[str, ...], causes: tuple[Cause, ...],
+              noise: Noise) -> str:
+    if grade is Grade.GOOD:
+        tested = math.isfinite(noise.p_xy) or math.isfinite(noise.p_theta)
+        return ("Good: residuals and the noise of readings agree" if tested else
+                "Good: residuals show the noise; there are no repeats to compare it with")
+    if grade is Grade.ENLARGED:
+        return f"Good within an enlarged U: {causes[0].text if causes else reasons[0]}"
+    return f"Not qualified: {f'most likely {causes[0].text}' if causes else reasons[0]}"
