@@ -225,7 +225,7 @@ def _extended(args: argparse.Namespace, measurements: Any, options: Any,
         lines += ["", "held-out readings:", *(f"  {line}" for line in validation_text(
             found, result.artifact))]
     if args.budget:
-        from selfcal_ros.estimation.quality.budget import budgets
+        from selfcal_ros.estimation.verdict.budget import budgets
         from selfcal_ros.reporting.words.budget import budget_json, budget_text
 
         if not result.has_uncertainty:

@@ -8,7 +8,7 @@ import numpy as np
 
 from selfcal_ros.aerotech.verify import Verification
 from selfcal_ros.estimation.options import ReferenceLength
-from selfcal_ros.estimation.quality.budget import Budget, budgets
+from selfcal_ros.estimation.verdict.budget import Budget, budgets
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.reporting.extras import convention_section, extra_sections, provenance_section
 from selfcal_ros.reporting.figures.correction import before_and_after, tried

@@ -4,7 +4,7 @@
 from functools import singledispatch
 from typing import Any
 
-from selfcal_ros.estimation.quality.budget import (
+from selfcal_ros.estimation.verdict.budget import (
     Budget,
     FromCurvature,
     FromEffect,

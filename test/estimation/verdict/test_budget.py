@@ -9,7 +9,7 @@ from scipy.stats import t as student
 
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.options import ReferenceKind, ReferenceLength
-from selfcal_ros.estimation.quality.budget import FromReadings, Source, budgets
+from selfcal_ros.estimation.verdict.budget import FromReadings, Source, budgets
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.terms import ModelTerm, TermName
