@@ -9,6 +9,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.clock import Clock, ClockType
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.publisher import Publisher
+from rclpy.timer import Timer
 
 from selfcal_ros.collection.settings.parameter import BARE_Y, Settings
 from selfcal_ros.errors import InputError, printable
@@ -49,10 +50,9 @@ class NodeBase[S: Settings](Answering):
         except InputError:
             self.destroy_node()  # or its name stays in the graph until garbage is looked for
             raise
-        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._health = self.publisher(private(HEALTH))
-        self._beat = self.create_timer(BEAT_S, self.guarded(self.report), clock=self._steady)
+        self._beat = self.every(BEAT_S, self.report)
 
     def _take_parameters(self, kind: type[S]) -> None:
         overrides = {key: value.value for key, value in self._parameter_overrides.items()}
@@ -103,10 +103,16 @@ class NodeBase[S: Settings](Answering):
             callback(message, info["source_timestamp"] < began_ns)
         return self.subscribe(topic, WithInfo(self.guarded(call, topic.name)), **kwargs)
 
-    def every(self, seconds: float, callback: Callable[[], None]) -> Any:
-        """Call `callback` every so many seconds of a steady clock."""
-        return self.own(self.create_timer(seconds, self.guarded(callback), clock=self._steady),
-                        self.destroy_timer)
+    def every(self, seconds: float, callback: Callable[[], None]) -> Timer:
+        """Call `callback` every so many seconds of a steady clock, which no other timer has.
+
+        For each timer that is added or reset the events executor of rclpy 7.1 calls, once more,
+        every timer of the same clock that is due, and each call puts off the next by a period:
+        the health of a node that starts slowly would be told three times, and then not for 3 s.
+        """
+        timer = self.create_timer(seconds, self.guarded(callback),
+                                  clock=Clock(clock_type=ClockType.STEADY_TIME))
+        return self.own(timer, self.destroy_timer)
 
     def own(self, entity: Any, destroy: Callable[[Any], Any]) -> Any:
         """Return `entity`; a managed node notes how to take it down."""

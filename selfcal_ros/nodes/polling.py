@@ -6,7 +6,6 @@ import time
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
-from rclpy.clock import Clock, ClockType
 from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 
@@ -111,16 +110,10 @@ class PollingNode[S: ManagedSettings](ManagedNode[S]):
     """
 
     def at_need(self, seconds: float, callback: Callable[[], None]) -> Timer:
-        """Return a timer that stands until `wake`, on a clock of its own.
-
-        For each reset of a timer the events executor of rclpy 7.1 calls, once more, every timer of
-        the same clock that is due, and each call puts off the next by a period: twenty resets
-        beside the second's health would tell it twenty times, and then not for twenty seconds.
-        """
-        timer = self.create_timer(seconds, self.guarded(callback),
-                                  clock=Clock(clock_type=ClockType.STEADY_TIME))
+        """Return a timer that stands until `wake`."""
+        timer = self.every(seconds, callback)
         timer.cancel()
-        return self.own(timer, self.destroy_timer)
+        return timer
 
     @property
     def subscriptions(self) -> Iterator[Subscription]:

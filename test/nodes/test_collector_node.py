@@ -152,6 +152,19 @@ def test_timers_that_are_woken_neither_hasten_nor_put_off_the_health(graph):
     assert node._beat.time_until_next_call() <= base.BEAT_S * NS_PER_S
 
 
+@pytest.mark.usefixtures("quick_beat")
+def test_a_node_whose_timers_are_due_when_it_is_first_spun_tells_its_health_in_time(graph):
+    node = MeasurementCollector(context=graph.context)
+    node.autostart()
+    told = graph.listen(names.of_node("measurement_collector", names.HEALTH))
+    while not all(timer.is_ready() or timer.is_canceled() for timer in node.timers):
+        pass
+    graph.add(node)
+    graph.until(lambda: told, "the health")
+    graph.call(Trigger, FINISH)  # what was due before has been done
+    assert node._beat.time_until_next_call() <= base.BEAT_S * NS_PER_S
+
+
 def test_finish_without_a_command_says_what_is_missing(graph):
     graph.node(MeasurementCollector)
     answer = graph.call(Trigger, FINISH)
