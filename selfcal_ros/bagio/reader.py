@@ -27,7 +27,7 @@ LAST_FIELDS = {ENCODER_TOPIC: "position", DETECTION_TOPIC: "score", COMMAND_TOPI
 """Last field that the contract asks for; what stands behind it may be missing."""
 SUFFIXES = (".mcap", ".mcap.zstd")
 CLOCK_LIMIT_S = CollectorSettings().clock_limit
-LOOKED_AT = 200
+LOOKED_AT = 500
 """Stamps of a topic in a chunk that are held against the times of logging."""
 NEVER_NS = np.iinfo(np.int64).max
 

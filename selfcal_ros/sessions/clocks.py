@@ -61,13 +61,13 @@ class ClockWatch:
         self._live_run, self._watches = run_id, {}
         self.steps = {topic: list(mine) for topic, mine in steps.items()}
 
-    def data(self, topic: str, stamp_ns: int, now_ns: int, now_s: float) -> None:
-        """Take the stamp and the reception of a message of the cell, by both clocks."""
+    def data(self, topic: str, stamps_ns: np.ndarray, now_ns: np.ndarray,
+             steady_ns: np.ndarray) -> None:
+        """Take the stamps and the reception of messages of the cell, by both clocks; n > 0."""
         if self._live:
             watch = self._watches.setdefault(topic, StepWatch(self._limit_s))
-            self.steps.setdefault(topic, []).extend(watch.add(
-                np.array([stamp_ns]), np.array([round(now_s * NS_PER_S)])))
-        offset = stamp_ns - now_ns
+            self.steps.setdefault(topic, []).extend(watch.add(stamps_ns, steady_ns))
+        offset, now_s = int((stamps_ns - now_ns).max()), float(steady_ns[-1]) * S_PER_NS
         if self._bins and now_s - self._bins[-1][0] < BIN_S:
             when, largest = self._bins[-1]
             self._bins[-1] = (when, max(largest, offset))

@@ -25,10 +25,12 @@ from selfcal_ros.sessions.health import CellChecks, Rate, merged
 from selfcal_ros.sessions.ports import Diagnosis, Level, Ports
 from selfcal_ros.sessions.runs import RunWatch
 from selfcal_ros.topics import DETECTION_TOPIC, ENCODER_TOPIC
-from selfcal_ros.units import MS_PER_S, S_PER_NS, UM_PER_M
+from selfcal_ros.units import MS_PER_S, NS_PER_S, S_PER_NS, UM_PER_M
 
 HEARD_S = 1.0
 """Time without an encoder sample after which the encoder is not heard."""
+Age = int | np.ndarray
+"""Time since the reception of messages, ns: of the newest, or int64 array of each, newest last."""
 
 
 class CollectingSession:
@@ -74,18 +76,18 @@ class CollectingSession:
         """The time of this node, ns."""
         return self._ports.now_ns()
 
-    def take_encoder(self, block: EncoderBlock, age_ns: int = 0) -> None:
-        """Take encoder samples, the newest of which was received `age_ns` ago."""
+    def take_encoder(self, block: EncoderBlock, age_ns: Age = 0) -> None:
+        """Take encoder samples, received `age_ns` ago: each of them, or the newest."""
         if not len(block):
             return
-        self._encoder_s = self._ports.now_s() - age_ns * S_PER_NS
+        self._encoder_s = self._ports.now_s() - int(np.atleast_1d(age_ns)[-1]) * S_PER_NS
         self.collector.add_encoder_block(block.stamps_ns, block.names, block.positions,
                                          block.velocities)
         self._encoder_rate.add(block.stamps_ns)
         self._note_clock(ENCODER_TOPIC, block.stamps_ns, age_ns)
         self._dirty = True
 
-    def take_detections(self, table: np.ndarray, age_ns: int = 0) -> None:
+    def take_detections(self, table: np.ndarray, age_ns: Age = 0) -> None:
         """Take detections (`collection.inputs.DETECTION`), received as `take_encoder` says."""
         if not len(table):
             return
@@ -94,10 +96,13 @@ class CollectingSession:
         self._unseen.append(table["stamp"][table["stamp"] >= self._since_ns])
         self._dirty = True
 
-    def _note_clock(self, topic: str, stamps_ns: np.ndarray, age_ns: int) -> None:
+    def _note_clock(self, topic: str, stamps_ns: np.ndarray, age_ns: Age) -> None:
         """Hold stamps against their reception."""
-        self._clock.data(topic, int(stamps_ns.max()), self._ports.now_ns() - age_ns,
-                         self._ports.now_s() - age_ns * S_PER_NS)
+        ages = np.atleast_1d(age_ns)
+        if len(ages) != len(stamps_ns):  # of another number of messages: that of the newest
+            ages, stamps_ns = ages[-1:], stamps_ns.max(keepdims=True)
+        self._clock.data(topic, stamps_ns, self._ports.now_ns() - ages,
+                         round(self._ports.now_s() * NS_PER_S) - ages)
 
     def adopt(self, collector: Collector, journal: str,
               steps: Mapping[str, list[Step]] | None = None) -> None:

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Whether the cell's clock is this machine's; what ROS time follows, said once at each change."""
 
+import numpy as np
 import pytest
 
 from selfcal_ros.sessions.clocks import ClockWatch, RosTime
@@ -24,9 +25,9 @@ def offset_after(*delays_s: float, every_s: float, live: bool = True) -> int | N
     watch = ClockWatch(limit_s=0.05)
     watch.command(T0, T0 if live else T0 + 10**12, is_older=False)
     for number, delay in enumerate(delays_s):
-        now_s = 50.0 + number * every_s
+        steady_ns = round((50.0 + number * every_s) * 1e9)
         now_ns = T0 + round(number * every_s * 1e9)
-        watch.data("joints", now_ns - round(delay * 1e9), now_ns, now_s)
+        watch.data("joints", *np.array([[now_ns - round(delay * 1e9)], [now_ns], [steady_ns]]))
     return watch.offset_ns
 
 
@@ -52,7 +53,7 @@ def test_an_offset_is_named_beyond_its_limit_in_either_direction(offset_s, messa
     watch = ClockWatch(limit_s=0.05)
     assert watch.diagnosis().values == {} and not watch.ahead
     watch.command(T0, T0, is_older=False)
-    watch.data("joints", T0 + round(offset_s * 1e9), T0, 50.0)
+    watch.data("joints", *np.array([[T0 + round(offset_s * 1e9)], [T0], [50 * 10**9]]))
     found = watch.diagnosis()
     assert found.message.partition("detections")[0] == message
     assert found.level == (Level.WARN if message else Level.OK)

@@ -196,9 +196,9 @@ class Reception:
                             (DETECTION_TOPIC, self.session.take_detections)):
             mine = [item for item in waiting if item[0] == topic]
             if mine:
-                age_ns = now_ns - mine[-1][2]
+                ages_ns = now_ns - np.array([item[2] for item in mine])
                 for block in self._decoders[topic].many(Payloads.joined([m[1] for m in mine])):
-                    self._guarded(topic, take, block, age_ns)
+                    self._guarded(topic, take, block, ages_ns)
         error = bad_input(self._bad)
         if error is not None:
             self._refuse("decoding", error)

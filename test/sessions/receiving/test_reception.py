@@ -20,7 +20,7 @@ from selfcal_ros.collection.inputs import Command, Detection, EncoderSample, Pha
 from selfcal_ros.errors import InputError
 from selfcal_ros.sessions.collecting import CollectingSession
 from selfcal_ros.sessions.ports import Level
-from selfcal_ros.sessions.receiving import journal_keeper
+from selfcal_ros.sessions.receiving import journal_keeper, reception
 from selfcal_ros.sessions.receiving.journal_keeper import JournalKeeper, KeptTopic
 from selfcal_ros.sessions.receiving.reception import Reception
 from selfcal_ros.topics import COMMAND_TOPIC, DETECTION_TOPIC, ENCODER_TOPIC, INPUT_TOPICS
@@ -578,6 +578,32 @@ def test_a_run_stamped_a_day_ahead_hides_no_later_one_nor_does_its_journal(tmp_p
     again = collect_bag(desk_path(tmp_path), settings_of("measurement_collector")).measurements
     assert digests(again) == digests(expected)
     assert Desk(tmp_path).receive(honest, is_older=True).reception.drain()
+
+
+@pytest.mark.parametrize("by_s", [-5.0, 0.4])
+def test_a_clock_that_steps_shortly_before_the_end_is_told_live_as_of_the_journal(
+        tmp_path, monkeypatch, events, by_s):
+    """Most messages come in a single look of the collector."""
+    desk = Desk(tmp_path)
+    monkeypatch.setattr(reception.time, "time_ns", lambda: desk.hands.now_ns)
+    step_ns = events[-1].stamp_ns - 300_000_000
+    for number, event in enumerate(events):
+        stepped = isinstance(event, Detection) and event.stamp_ns > step_ns
+        data = cdr_of(replace(event, stamp_ns=event.stamp_ns + round(by_s * 1e9) * stepped))
+        if isinstance(event, Command):
+            desk.reception.command(data, False, event.stamp_ns)
+        else:
+            (desk.reception.detection if isinstance(event, Detection)
+             else desk.reception.encoder)(data, event.stamp_ns)
+        if number == len(events) // 2 or event is events[-1]:
+            desk.hands.seconds = 100.0 + (event.stamp_ns - START_NS) * 1e-9
+            desk.reception.drain()
+    desk.session.finish()
+    [live] = desk.session._stepped
+    desk.keeper.close()
+    found = collect_bag(desk_path(tmp_path), settings_of("measurement_collector"))
+    assert [live] == [line for line in found.lost if "stepped" in line]
+    assert f"stepped {'back' if by_s < 0 else 'ahead'} by {abs(by_s):g} s" in live
 
 
 @pytest.mark.parametrize("ahead_s, used", [(59.9, True), (60.1, False)])
