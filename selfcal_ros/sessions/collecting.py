@@ -67,6 +67,7 @@ class CollectingSession:
         self._noise: tuple[float, float] = (math.nan, math.nan)
         self.missed: dict[tuple[str, int], str] = {}  # views that began before this node
         self._placed: set[tuple[str, int]] = set()
+        self._gap, self._gap_stamp_ns = "", 0  # told until another command comes
         self._problem = ""
         self._state = "waiting for a MEASURE command"
         self._rejected: Counter = Counter()
@@ -105,7 +106,7 @@ class CollectingSession:
                          round(self._ports.now_s() * NS_PER_S) - ages)
 
     def adopt(self, collector: Collector, journal: str,
-              steps: Mapping[str, list[Step]] | None = None) -> None:
+              steps: Mapping[str, list[Step]] | None = None, away_s: float = 0.0) -> None:
         """Go on with a collector that has taken what a journal holds of the run.
 
         Parameters
@@ -116,14 +117,20 @@ class CollectingSession:
             Its name.
         steps : dict, optional
             Topic -> steps of clocks that the journal shows.
+        away_s : float
+            Time since the journal was written last.
         """
         self.collector, self._dirty, self._next_status = collector, True, 0.0
         last = collector.newest_command
         if last is not None:
             self._clock.adopt(last.run_id, steps or {})
-        where = "between views" if last is None or last.phase != Phase.MEASURE else (
-            f"in view '{last.placed().name}'; marks that were detected since and are missing have "
-            "to be measured again, by the cell or with redo_view")
+        where = "between views"
+        if last is not None and last.phase == Phase.MEASURE:
+            self._gap_stamp_ns, view = last.stamp_ns, last.placed().name
+            self._gap = (f"view '{view}': detections of {away_s:.1f} s without a collector are "
+                         "lost, those of complete marks included")
+            where = (f"in view '{view}'; {self._gap}; missing marks have to be measured again, by "
+                     "the cell or with redo_view")
         messages = sum(collector.received.values())
         self._ports.say(Level.OK, f"took up {journal} with {messages} messages, {where}")
 
@@ -306,7 +313,10 @@ class CollectingSession:
         state += f"; began before this node: {missed}" if missed else ""
         stored = self.collector.storage_problem
         state += f"; {stored}" if stored else ""
-        bad = missed or self._problem or self.collector.unusable or stored
+        last = self.collector.newest_command
+        gap = self._gap if last is not None and last.stamp_ns == self._gap_stamp_ns else ""
+        state += f"; {gap}" if gap else ""
+        bad = missed or self._problem or self.collector.unusable or stored or gap
         main = Diagnosis(Level.WARN if bad else Level.OK, state, {
             **received, "views": len(self._published), **self._newest(), **self._cost(),
             "detections_matched": "yes" if detections_matched else "no",

@@ -170,6 +170,7 @@ class JournalKeeper:
         self._looking: Future[Looked] | None = None
         self._claim: Claim | None = None
         self.looked_at = ""  # what is gone through
+        self.away_s = 0.0  # since that was written last
         self._left_ago_s: float | None = None  # of a run that is too old to be taken up
         self._early: list[tuple[str, bytes, int]] = []  # came while the journal is gone through
         self._goes_on: list[Path] = []  # files that were taken up and could not be gone on with
@@ -206,6 +207,7 @@ class JournalKeeper:
         self._claim, left = None, None
         try:
             known = newest(self._folder)
+            self.away_s = known[1] if known is not None else 0.0
             if known is not None and known[1] > self._max_age_s:
                 left, self._left_ago_s = known
             else:

@@ -182,7 +182,7 @@ class Reception:
         except Exception as error:  # a journal that cannot be read ends nothing
             self._refuse("journal", error)
             return
-        self.session.adopt(found.collector, self._source, found.steps)
+        self.session.adopt(found.collector, self._source, found.steps, self.journal.away_s)
         for line in found.lost:
             self._say(Level.WARN, f"{self._source}: {line}")
 

@@ -188,6 +188,31 @@ def test_a_session_that_takes_up_a_journal_goes_on_as_if_nothing_had_been(
     assert f"with {cut} messages" in line
 
 
+@pytest.mark.parametrize("away_s", [0.5, 90.0])
+def test_the_time_without_a_collector_is_told_in_the_view_that_it_tore(tmp_path, events, away_s):
+    """Where the marks that were lost had been read often enough before, nothing else tells it."""
+    commands = [event for event in events if isinstance(event, Command)]
+    cut = next(number for number, event in enumerate(events) if event is commands[2])
+    first = Desk(tmp_path).receive(events[:cut])
+    first.reception.drain()
+    first.keeper.close()
+    [file] = tmp_path.glob("journal_*/*.mcap")
+    for path in (file, file.parent / "metadata.yaml", file.parent):
+        written_ns = time.time_ns() - round(away_s * 1e9)
+        os.utime(path, ns=(written_ns, written_ns))
+    second = Desk(tmp_path)
+    second.reception.drain()
+    line = re.compile(r"view '0': detections of (\d+\.\d) s without a collector are lost, those of "
+                      "complete marks included")
+    told = second.session.diagnosis(detections_matched=True)
+    assert told.level == Level.WARN
+    assert away_s <= float(line.search(told.message)[1]) < away_s + 60
+    assert [line.search(text)[0] for text in second.hands.lines(Level.OK)] == [
+        line.search(told.message)[0]]
+    second.receive([commands[2]]).reception.drain()
+    assert not line.search(second.session.diagnosis(detections_matched=True).message)
+
+
 @pytest.mark.parametrize(("hours", "limit_s", "goes_on"), [
     (23, 86400.0, True), (25, 86400.0, False), (25, 1e6, True), (1, 60.0, False)])
 def test_a_run_that_was_left_long_ago_is_not_taken_up(tmp_path, events, hours, limit_s, goes_on):
