@@ -23,36 +23,36 @@ PAGE = ROOT / "docs/reference.md"
 HEAD = """# Reference
 
 Keys of PLAN.yaml, SIM.yaml and RESULT.json, parameters of the nodes, messages. Written by
-`make reference` from the code; a test keeps it current. SI units; names of units stand where a
-number has one.
+`make reference` from the code; a test keeps it current. SI units; the unit of each number is
+stated.
 """
 PLAN = {
-    "plan_id": "name of the plan; one plan has one plate",
+    "plan_id": "name of the plan; a plan has one plate",
     "artifact": "the plate", "views": "list of views, in their order",
-    "visit_order": "order of the marks in views that have none of their own "
-                   "(docs/identifiability.md); default: as the cell likes",
-    "model_terms": "list of TERM or TERM:SIZE that are estimated with the map; default: none",
-    "microscope": "how well the microscope is known, standard uncertainties; default: as the "
-                  "solver's parameters of these names",
+    "visit_order": "order of the marks in views without their own "
+                   "(docs/identifiability.md); default: chosen by the cell",
+    "model_terms": "list of TERM or TERM:SIZE to be estimated with the map; default: none",
+    "microscope": "standard uncertainties of the microscope; default: the solver's "
+                  "parameters of these names",
     "microscope.scale_u": "of its scale, m/m; default 0.01",
-    "microscope.rotation_u": "of its turn against the axes, rad; default 0.01",
+    "microscope.rotation_u": "of its rotation relative to the axes, rad; default 0.01",
     "microscope.shear_u": "of half the difference of its scales, and of half its error of "
                           "squareness, m/m; default 0.002",
-    "check_stops": "marks of each grid view that are seen four times more, the stage deliberately "
-                   "off them (docs/cell.md); default: none",
+    "check_stops": "marks of each grid view that are measured four more times, the stage "
+                   "deliberately off them (docs/cell.md); default: none",
     "check_stops.marks": "how many marks",
-    "check_stops.offset": "how far off the stage stops, m; at most a quarter of the pitch",
+    "check_stops.offset": "distance of the stage from the mark, m; at most a quarter of the pitch",
     "artifact.grid_size": "N, marks along x; odd, 3 to 1001",
     "artifact.grid_pitch": "distance between neighbouring marks, m",
     "artifact.angular_count": "K, angular lines; a multiple of 4, 0 without lines",
-    "artifact.grid_size_y": "marks along y where the plate is not square; default: N",
-    "views[].name": "name, each its own",
+    "artifact.grid_size_y": "marks along y if the plate is not square; default: N",
+    "views[].name": "name, unique",
     "views[].rotation_deg": "nominal turn, counter-clockwise, degrees; default 0",
     "views[].translation_pitch": "[a, b], nominal shift along stage x and y in pitches; "
                                  "default [0, 0]",
     "views[].grid": "whether grid marks are measured; needs quarter turns; default true",
     "views[].angular": "whether angular lines are measured; default: true if the plate has some",
-    "views[].repeats": "times that every mark is measured; default 1",
+    "views[].repeats": "number of times that every mark is measured; default 1",
     "views[].visit_order": "order of the grid marks in this view"}
 RESULT = {
     "schema": "`selfcal.result/1`", "plan_id": "plan that was measured",
@@ -65,7 +65,7 @@ RESULT = {
                "all), remedies (a list of {model}, {view} to measure again, {action})",
     "model": "`misalignment` (rigid, linear) and `terms`: name, size (null = free), estimates "
              "(view, component, value, u, unit), "
-             "size_used (where the readings contradict the size), source (declared, default, "
+             "size_used (if the readings contradict the size), source (declared, default, "
              "readings)",
     "reference": "kind, relative_error, u_relative, certificate of a known length; null without",
     "provenance": "created (ISO 8601, UTC), duration_s, version, first_exposure, last_exposure, "
@@ -74,30 +74,31 @@ RESULT = {
            "theta",
     "coverage_factor": "k for 95.45 % at those degrees of freedom: xy, theta",
     "views": "a list: name, rotation (rad), translation_x, translation_y (m), misalignment {phi "
-             "(rad), tx, ty (m)}, used, rejected, read {grid, angular} (weights of what was read)",
+             "(rad), tx, ty (m)}, used, rejected, read {grid, angular} (weights of the readings)",
     "error_map": "gx, gy, u_gx, u_gy: N×N lists in m, [i][j] = site m = i − h, n = j − h, null "
-                 "where not known; g_theta, u_g_theta: K numbers in rad; nonorthogonality, "
+                 "where unknown; g_theta, u_g_theta: K numbers in rad; nonorthogonality, "
                  "scale_difference, datum_theta",
     "artifact_map": "ax, ay (m), a_theta (rad) of the plate, as error_map",
     "observability": "rank, unknowns, deficiency, identifiable, modes, advice; unchecked_sites, "
-                     "unchecked_lines: how many rest on single readings, null where not counted",
+                     "unchecked_lines: number that depend on single readings, null if not counted",
     "noise": "sigma_* of one reading (m, rad): used, from repeats, from residuals, declared; "
              "dof_*; k_*; p_* of the F-test",
     "rejected": "reason -> number of detections", "warnings": "a list of sentences",
     "findings": "the data behind `warnings`: a list of name, text, view, axis, mark (m, n) or (k), "
                 "size, u, unit, p, details (by name, SI units)",
     "input": "file and sha256 of the bag", "solver": "how the equations were solved",
-    "covariance_terms": "terms and factors (r, 2, N, N): what an exact comparison of results "
-                        "needs; up to 31 × 31 sites, and not with `--model none`",
-    "angular_terms": "standard uncertainty of the angular map that each term makes, rad",
+    "covariance_terms": "terms and factors (r, 2, N, N), for the exact comparison of results; "
+                        "up to 31 × 31 sites, and not with `--model none`",
+    "angular_terms": "contribution of each term to the standard uncertainty of the angular map, "
+                     "rad",
     "residuals": "views: view, dx, dy (m, [i][j] by mark, stage axes), dtheta (rad), course "
                  "{time_s, dx, dy, count} over the view's time"}
 SOMETIMES = {
-    "rejected_at": "where grid detections were rejected: view, reason, x, y (m)",
+    "rejected_at": "positions of rejected grid detections: view, reason, x, y (m)",
     "outliers": "`--robust`: rule, and the readings removed",
     "slips": "`--robust`: slips of the plate",
     "noisy_views": "`--robust`: views noisier than the others",
-    "validation": "`--validate`: what was held out, and how well it was predicted",
+    "validation": "`--validate`: readings held out, and prediction errors",
     "budget": "`--budget`: components of the uncertainty, m and rad"}
 
 
@@ -136,10 +137,10 @@ def described(keys: list[str], words: dict[str, str], what: str) -> list[tuple[s
 
 def sim_rows() -> Iterator[tuple[str, ...]]:
     for p in spec.TOP:
-        default = "as `seed` goes on" if p.name == "noise_seed" else value(p.default)
+        default = "from `seed`" if p.name == "noise_seed" else value(p.default)
         yield f"`{p.name}`", default, bounds(vars(p)), p.unit
-    yield "`plan`", "", "a path beside the file, or a plan", ""
-    yield "`placed`", "none", "views as in a plan, where the plate lies otherwise", ""
+    yield "`plan`", "", "a path relative to the file, or a plan", ""
+    yield "`placed`", "none", "views as in a plan, with another pose of the plate", ""
     for name, section, defaults in (
             ("truth", spec.TRUTH, Spread()), ("physics", spec.PHYSICS, Spread()),
             ("noise", spec.NOISE, CellSettings()), ("cell", spec.CELL, CellSettings()),
@@ -174,7 +175,7 @@ def message_lines(path: Path) -> list[str]:
         if found:
             rows.append((f"`{found[2]}`", f"`{found[1]}`", found[3] or ""))
         elif line == "---":
-            rows.append(("—", "", "what follows is the answer"))
+            rows.append(("—", "", "(next part: answer or feedback)"))
     return [f"### {path.stem}", "", *table(("field", "type", "meaning"), rows), ""]
 
 
@@ -185,11 +186,11 @@ def text(result: dict[str, Any]) -> str:
         raise SystemExit(f"RESULT.json: {sorted(unknown ^ (set(RESULT) - set(result)))}")
     lines = [HEAD, "## PLAN.yaml", "",
              *table(("key", "meaning"), described(plan_keys(), PLAN, "PLAN.yaml")), "",
-             "## SIM.yaml", "", "What the keys mean: docs/simulate.md.", "",
+             "## SIM.yaml", "", "Meaning of the keys: docs/simulate.md.", "",
              *table(("key", "default", "allowed", "unit"), sim_rows()), "",
              "## RESULT.json", "", *table(("key", "meaning"), described(
                  list(result), RESULT, "RESULT.json")), "",
-             "Only where they were asked for, or there is something to tell:", "",
+             "Present only if requested, or if there is something to report:", "",
              *table(("key", "meaning"), [(f"`{k}`", v) for k, v in SOMETIMES.items()]), "",
              "## Parameters", ""]
     for node, parameters in NODE_PARAMETERS.items():

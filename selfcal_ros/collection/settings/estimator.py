@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the settings of the solver ask of the estimator."""
+"""From the settings of the solver to the options of the estimator."""
 
 from selfcal_ros.collection.settings.nodes import NO_TERMS, UNCERTAINTY, SolverSettings
 from selfcal_ros.errors import InputError
@@ -13,12 +13,12 @@ def solver_options(settings: SolverSettings,
                    measurements: Measurements | None = None) -> Options:
     """Return the estimator's options in a solver's settings.
 
-    Where `model_terms` is not given the terms that the plan of the `measurements` asks for hold.
+    If `model_terms` is empty, the terms in the plan of the `measurements` are used.
 
     Raises
     ------
     InputError
-        For terms that cannot be.
+        For invalid terms.
     """
     kind = settings.reference_kind
     reference = None if kind == "none" else ReferenceLength(
@@ -51,13 +51,13 @@ def _terms(given: list[str],
     if not words and measurements is not None:
         return planned, "plan"
     terms = parse_terms(given, "model_terms")
-    # how well the plan knows its microscope is no choice of a model
+    # the microscope's uncertainty in the plan is no choice of a model
     known = [term for term in planned if term.parts and term.name not in {t.name for t in terms}]
     return (*terms, *known), "options"
 
 
 def _assumed(settings: SolverSettings) -> tuple[ModelTerm, ...]:
-    """Return what is assumed where neither options nor plan name a term."""
+    """Return the terms assumed if neither options nor plan name them."""
     if [word.strip() for word in settings.model_terms] == [NO_TERMS]:
         return ()
     microscope = microscope_term(settings.scale_u, settings.rotation_u, settings.shear_u)

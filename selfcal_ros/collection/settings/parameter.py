@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A parameter of a node, and dataclasses whose fields are parameters.
 
-A field is declared once, with its type, default, unit, bounds and description; what a node declares
-to ROS, what a file may set and what the documentation lists is read from it.
+A field is declared once, with its type, default, unit, bounds and description: the source of the
+ROS declarations, of the keys allowed in a file and of the documentation.
 """
 
 from collections.abc import Mapping
@@ -82,7 +82,7 @@ class Settings:
 
     @classmethod
     def parameters(cls) -> tuple[Parameter, ...]:
-        """Return the parameters, those that all nodes have last."""
+        """Return the parameters, those shared by all nodes last."""
         own = [item for item in fields(cls) if item.name in cls.__annotations__]
         shared = [item for item in fields(cls) if item.name not in cls.__annotations__]
         defaults = cls()
