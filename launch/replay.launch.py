@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A bag replayed into live nodes: ros2 launch selfcal_ros replay.launch.py bag:=FOLDER.
 
-A plan is for a run that follows the bag; the bag's own commands are followed as they are.
+The plan is for a run after the bag; the bag's own commands are followed as they are.
 """
 
 from launch import LaunchDescription
@@ -18,7 +18,7 @@ def generate_launch_description() -> LaunchDescription:
         *arguments("cell.yaml"),
         DeclareLaunchArgument("bag", description="MCAP file or rosbag2 folder"),
         DeclareLaunchArgument("rate", default_value="1.0",
-                              description="speed; 0 = as fast as the nodes keep up"),
+                              description="speed; 0 = as fast as the nodes can follow"),
         IncludeLaunchDescription(
             PythonLaunchDescriptionSource(str(share() / "launch/calibrate.launch.py")),
             launch_arguments={**{name: LaunchConfiguration(name) for name in SHARED},

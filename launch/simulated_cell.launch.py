@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A simulated cell that runs a plan by itself, optionally recorded by bag_recorder.
 
-`ros2 bag record` beside it wants --qos-profile-overrides-path config/rosbag2/record_qos.yaml.
+`ros2 bag record` alongside needs --qos-profile-overrides-path config/rosbag2/record_qos.yaml.
 """
 
 from launch import LaunchDescription
@@ -16,7 +16,7 @@ from selfcal_ros.nodes.launching import SHARED, arguments, journal_argument, nod
 def generate_launch_description() -> LaunchDescription:
     return LaunchDescription([
         *arguments("simulated_cell.yaml"),
-        # apart from those of real runs: a simulated run must never go on with real readings
+        # separate from real runs: a simulated run must never continue with real readings
         journal_argument("selfcal_journals_simulated"),
         DeclareLaunchArgument("bag", default_value="", description="folder to record to; "
                               "empty = do not record"),

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The exceptions of the package and the exit code that each one stands for.
+"""The exceptions of the package and their exit codes.
 
-A message is one line that names the place, what is wrong, and how to correct it.
+A message is one line: where, what is wrong, and how to correct it.
 The same codes are the ``error_code`` of services and actions.
 """
 
@@ -12,7 +12,7 @@ from enum import IntEnum
 from typing import Any
 
 SHOWN = (3000, 1000)
-"""Characters of the beginning and of the end of a text that is longer."""
+"""Characters kept of the beginning and of the end of a longer text."""
 
 
 class ExitCode(IntEnum):
@@ -27,18 +27,18 @@ class ExitCode(IntEnum):
 
 
 class SelfcalError(Exception):
-    """Base of every error that the package raises on purpose."""
+    """Base of all errors of the package."""
 
     exit_code = ExitCode.INTERNAL
 
 
 class InputError(SelfcalError):
-    """Raised for a file, message, parameter or argument that cannot be used as it is.
+    """Raised for a file, message, parameter or argument that cannot be used.
 
     Parameters
     ----------
     where : str
-        File, topic, view or parameter, with line or index where there is one.
+        File, topic, view or parameter, with line or index if there is one.
     what : str
         What is wrong.
     remedy : str, optional
@@ -58,7 +58,7 @@ class NotIdentifiableError(SelfcalError):
     Parameters
     ----------
     message : str
-        One line: what is missing and which view would cure it.
+        One line: what is missing and which view would identify the stage.
     observability : object, optional
         The `selfcal_ros.model.result.Observability` found, with its unseen modes.
     """
@@ -71,19 +71,19 @@ class NotIdentifiableError(SelfcalError):
 
 
 class NotSettledError(InputError):
-    """Raised when an estimate does not settle on the readings that it was given."""
+    """Raised when an estimate does not converge on the given readings."""
 
 
 class NoDataError(InputError):
-    """Raised when the input is well formed but holds nothing to calibrate from."""
+    """Raised when the input is well formed but contains nothing to calibrate from."""
 
     exit_code = ExitCode.NO_DATA
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:
-    """Return ``did you mean 'x'?`` with the names most like `word`, at most two; "" if none is.
+    """Return ``did you mean 'x'?`` with the names most similar to `word`, at most two; or "".
 
-    The same words in another order are most like it.
+    The same words in another order count as most similar.
     """
     names = {str(name).lower(): str(name) for name in known}
     words = sorted(re.split("[-_/]+", word.lower()))
@@ -93,7 +93,7 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
 
 
 def known_are(word: str, known: Iterable[str]) -> str:
-    """Return the remedy for a name that is not known: what is like it, then all that are."""
+    """Return the remedy for an unknown name: similar names, then all known ones."""
     names = [str(name) for name in known]
     hint = did_you_mean(word, names)
     return f"{hint} known are {', '.join(names)}".strip()
@@ -105,18 +105,18 @@ def first_line(error: BaseException) -> str:
 
 
 def as_answer(error: Exception) -> tuple[ExitCode, str]:
-    """Return code and message of an answer that an error ends, whoever made the error."""
+    """Return code and message of the answer to a request that failed with an error."""
     if isinstance(error, SelfcalError):
         return error.exit_code, printable(str(error))
     return ExitCode.INTERNAL, printable(f"{type(error).__name__}: {error}")
 
 
 def printable(text: str) -> str:
-    r"""Return `text` as one line without anything that a terminal acts on.
+    r"""Return `text` as one line without control characters.
 
-    Names in bags, plans and messages are other people's: an escape sequence, a line break or a
-    change of the direction of writing in them is shown as ``\x1b``, ``\n``, ``\u202e``. Of what
-    is too long for a line there are beginning, length and end.
+    Names in bags, plans and messages come from outside: an escape sequence, a line break or a
+    change of the writing direction in them is shown as ``\x1b``, ``\n``, ``\u202e``. A text that
+    is too long is shortened to its beginning, length and end.
     """
     if len(text) > sum(SHOWN):
         text = f"{text[:SHOWN[0]]} ... ({len(text)} characters) ... {text[-SHOWN[1]:]}"

@@ -179,7 +179,7 @@ def check_outputs(inputs: Iterable[str | os.PathLike | None],
             raise InputError(str(name), "would be written over", "name another output file")
         if not target.parent.is_dir():
             raise InputError(str(name), "cannot be written (No such file or directory)",
-                             "name a folder that exists and that you may write")
+                             "name an existing, writable folder")
         taken.add(str(target))
 
 

@@ -41,7 +41,7 @@ def atomic_file(path: str | os.PathLike) -> Iterator[BinaryIO]:
                 yield file
     except OSError as error:
         raise InputError(str(target), f"cannot be written ({error.strerror or first_line(error)})",
-                         "name a folder that exists and that you may write") from error
+                         "name an existing, writable folder") from error
 
 
 @contextlib.contextmanager

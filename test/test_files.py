@@ -201,8 +201,8 @@ def test_where_nothing_can_be_written(tmp_path, target, reason):
     (tmp_path / "folder").mkdir()
     with pytest.raises(InputError) as caught:
         write_bytes(tmp_path / target, b"x")
-    assert str(caught.value) == (f"{tmp_path / target}: cannot be written ({reason}); name a "
-                                 "folder that exists and that you may write")
+    assert str(caught.value) == (f"{tmp_path / target}: cannot be written ({reason}); name an "
+                                 "existing, writable folder")
     assert names(tmp_path) == ["file", "folder"]
 
 

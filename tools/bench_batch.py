@@ -119,7 +119,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--bags", type=int, default=100)
     parser.add_argument("--plan", type=Path, default=ROOT / "config/plans/hu.yaml")
-    parser.add_argument("--workers", type=int, help="processes (default: one a core)")
+    parser.add_argument("--workers", type=int, help="processes (default: one per core)")
     parser.add_argument("--rounds", type=int, default=1, help="times that both ways are run")
     parser.add_argument("--folder", default=str(ROOT / "build" / "bench_batch"))
     parser.add_argument("-o", "--output", help="write the figures to this file")

@@ -158,8 +158,8 @@ def start(folder: str | os.PathLike, now_ns: int) -> "Journal":
         except FileExistsError:
             continue
         except OSError as error:
-            raise InputError(str(bag), f"cannot be made ({error.strerror})",
-                             "name a folder that you may write") from error
+            raise InputError(str(bag), f"cannot be created ({error.strerror})",
+                             "name a writable folder") from error
         with _said(bag):
             lock = _locked(bag)
             try:

@@ -52,8 +52,8 @@ def write_simulation(simulation: Simulation, path: str | Path, *,
             counts = _write(simulation, Path(beside, target.name), progress)
             Path(beside, target.name).rename(target)
     except OSError as error:
-        raise InputError(str(target), f"cannot be made ({error.strerror})",
-                         "name a folder that you may write") from error
+        raise InputError(str(target), f"cannot be created ({error.strerror})",
+                         "name a writable folder") from error
     return counts
 
 

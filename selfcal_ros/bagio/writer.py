@@ -158,8 +158,8 @@ class BagWriter(Closing):
             raise InputError(str(self.path), "exists already",
                              "remove it or name another folder") from error
         except OSError as error:
-            raise InputError(str(self.path), f"cannot be made ({error.strerror})",
-                             "name a folder that you may write") from error
+            raise InputError(str(self.path), f"cannot be created ({error.strerror})",
+                             "name a writable folder") from error
         self._entry = FileEntry(f"{self.path.name}_0.mcap")
         self._metadata = Metadata(files=[self._entry])
         with writing(self.path):

@@ -37,8 +37,8 @@ def opened(folder: Path) -> Iterator[None]:
             part.mkdir(parents=True, exist_ok=True)
         lock = (folder / LOCK).open("w")
     except OSError as error:
-        raise InputError(str(folder), f"cannot be made ({error.strerror})",
-                         "name a folder that you may write") from error
+        raise InputError(str(folder), f"cannot be created ({error.strerror})",
+                         "name a writable folder") from error
     with lock:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``selfcal batch``: hundreds of bags on all cores, one table, what changes over time."""
+"""``selfcal batch``: hundreds of bags on all cores, one table, changes over time."""
 
 import argparse
 import os
@@ -22,26 +22,26 @@ LOCAL = "local"
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the verb."""
     parser.add_argument("bags", metavar="DIR|BAG", nargs="+", help="MCAP files, rosbag2 folders, "
-                        "or folders that hold them at any depth")
+                        "or folders that contain them at any depth")
     parser.add_argument("-o", "--output", metavar="FOLDER", required=True,
-                        help="folder for results, table.csv, index.html and batch.json; what is "
-                        "done there already is not done again")
+                        help="folder for results, table.csv, index.html and batch.json; results "
+                        "already there are kept")
     how = parser.add_mutually_exclusive_group()
     how.add_argument("--workers", type=int, metavar="N",
-                     help="processes (default: one a core)")
+                     help="processes (default: one per core)")
     how.add_argument("--dask", metavar="ADDRESS", nargs="?", const=LOCAL,
-                     help="work in a dask.distributed cluster: its scheduler's address, which sees "
-                     "the same files, or 'local' (default) for one made for this run")
-    parser.add_argument("--redo", action="store_true", help="solve all of the bags again")
+                     help="use a dask.distributed cluster: address of its scheduler, with access "
+                     "to the same files, or 'local' (default) for one started for this run")
+    parser.add_argument("--redo", action="store_true", help="solve all bags again")
     add_json(parser, "the content of batch.json instead of a summary")
     add_options(parser)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Solve what is not done yet, write the table and the page, say what was found."""
+    """Solve the remaining bags, write the table and the page, print a summary."""
     from selfcal_ros.parallel import begin, check_workers
 
-    if not args.dask:  # first: what the workers need is loaded beside this process
+    if not args.dask:  # first: the modules of the workers load in parallel
         begin("selfcal_ros.batch.jobs", check_workers(args.workers))
     from selfcal_ros.batch.bags import find_bags
     from selfcal_ros.batch.records import Settings
@@ -49,7 +49,7 @@ def run(args: argparse.Namespace) -> int:
     from selfcal_ros.files import write_json, write_text
 
     if args.dask and args.dask != LOCAL and ":" not in args.dask:
-        raise InputError("--dask", f"'{args.dask}' is no address of a scheduler",
+        raise InputError("--dask", f"'{args.dask}' is not the address of a scheduler",
                          f"write HOST:PORT, or --dask {LOCAL} in front of a bag")
     settings = Settings(*parameters(args), args.robust, args.namespace)
     bags, folder = find_bags(args.bags), Path(args.output)
@@ -66,7 +66,7 @@ def run(args: argparse.Namespace) -> int:
         from selfcal_ros.batch.table import batch_json, csv_text, series_of, summary_lines
 
         records = [done[index] for index in sorted(done)]
-        keys = {record.get("key") for record in kept}  # copies and moved bags have one as well
+        keys = {record.get("key") for record in kept}  # copies and moved bags have one, too
         before = sum("key" in record and record["key"] in keys for record in records)
         found = series_of(records)
         lines = summary_lines(records, found, before)
@@ -81,7 +81,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _worked(args: argparse.Namespace, bags: Sequence[Path], settings: "Settings",
             places: Sequence[int]) -> dict[int, "Record"]:
-    """Return the records of the bags at `places`, and say each that gave no qualified result."""
+    """Return the records of the bags at `places`; print a line for each unqualified result."""
     from selfcal_ros.batch.store import jobs_of, work_on
     from selfcal_ros.cli.terminal.progress import late_progress
     from selfcal_ros.parallel import check_workers, outcomes
@@ -102,12 +102,12 @@ def _worked(args: argparse.Namespace, bags: Sequence[Path], settings: "Settings"
 
 
 def _load_table() -> None:
-    """Load what makes the table: with SciPy's statistics it takes longer than a bag."""
+    """Load the modules for the table: with SciPy's statistics it takes longer than a bag."""
     import selfcal_ros.batch.page  # noqa: F401
 
 
 def _failed(bag: Path, error: BaseException | None) -> dict[str, Any]:
-    """Return the record of a bag that met a fault of ours; it is not kept."""
+    """Return the record of a bag that failed with an internal error; it is not kept."""
     said = first_line(error) if error is not None else "no outcome"
     return {"bag": os.path.realpath(bag), "exit_code": int(ExitCode.INTERNAL), "qualified": None,
             "message": f"{type(error).__name__}: {said}"}
@@ -124,7 +124,7 @@ def exit_code(records: Sequence["Record"]) -> int:
     """Return 0 if every bag gave a qualified result, else the code of the worst bag.
 
     From bad to worse: not qualified (5), no usable data (4), not identified (3), bad input (2),
-    a fault of ours (1).
+    internal error (1).
     """
     return min((record["exit_code"] for record in records if record["exit_code"]),
                default=int(ExitCode.DONE))

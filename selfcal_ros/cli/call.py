@@ -14,14 +14,14 @@ REQUESTS = ("start", "confirm", "redo", "skip", "abort")
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the verb."""
     parser.add_argument("request", choices=REQUESTS, help="start: begin the plan; confirm: the "
-                        "plate lies as asked; redo: measure the view again; skip: go on without "
-                        "it; abort: give the plan up")
+                        "plate is in place; redo: measure the view again; skip: continue "
+                        "without it; abort: end the plan")
     parser.add_argument("--namespace", metavar="NS", default="", help="namespace of the cell")
     add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Ask, print the answer; exit code 2 if the request was refused."""
+    """Send the request, print the answer; exit code 2 if it was refused."""
     from selfcal_ros.cli.processes import ended_by_signals
     from selfcal_ros.cli.watching import eyes
 

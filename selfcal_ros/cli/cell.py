@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``selfcal cell check``: a short run that shows an integrator what is wrong with a cell."""
+"""``selfcal cell check``: a short run that shows an integrator the faults of a cell."""
 
 import argparse
 import json
@@ -16,23 +16,23 @@ HELP = "check a machine cell before its first calibration"
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the verb."""
     check = parser.add_subparsers(dest="cell_verb", metavar="check", required=True).add_parser(
-        "check", help="drive the cell through a short run and judge what it sends",
-        description="Measures the 3 x 3 marks in the middle of the plate, which lies straight, and "
+        "check", help="drive the cell through a short run and check its messages",
+        description="Measures the 3 x 3 marks in the middle of the plate, placed straight, and "
         "reports joints, rates, clocks, commands, rest, ids, loss, check stops, signs. Exit code 0 "
-        "if all is well, else 5.")
+        "if all checks pass, else 5.")
     check.add_argument("--plan", metavar="PLAN.yaml", required=True, help="plan with the plate")
-    check.add_argument("--params", metavar="NODES.yaml", help="ROS parameter file: that of "
-                       "measurement_collector holds")
+    check.add_argument("--params", metavar="NODES.yaml", help="ROS parameter file; the section "
+                       "of measurement_collector is used")
     check.add_argument("--namespace", metavar="NS", default="", help="namespace of the cell")
     check.add_argument("--settle", metavar="S", type=float, default=1.0,
-                       help="time to lay the plate, from PLACE to MEASURE, s (default 1)")
+                       help="time to place the plate, from PLACE to MEASURE, s (default 1)")
     check.add_argument("--patience", metavar="S", type=float, default=30.0,
                        help="longest wait for the first message, s (default 30)")
     add_json(check)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Check the cell, print what was found; exit code 5 unless all is well."""
+    """Check the cell, print the results; exit code 5 if a check fails."""
     from selfcal_ros.cli.processes import ended_by_signals, need_ros, process
     from selfcal_ros.files import read_bytes, read_yaml
     from selfcal_ros.model.view import plan_from_dict
@@ -41,7 +41,7 @@ def run(args: argparse.Namespace) -> int:
     plan_from_dict(read_yaml(args.plan), args.plan)
     for option in ("settle", "patience"):
         if not 0 <= getattr(args, option) < 1e6:
-            raise InputError(f"--{option}", f"{getattr(args, option):g} s is no time to wait",
+            raise InputError(f"--{option}", f"{getattr(args, option):g} s is not a waiting time",
                              "give 0 or more")
     words = ["--ros-args", "--log-level", "warn"]
     if args.namespace.strip("/"):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``selfcal diff``: two calibrations, or a calibration and a laser measurement, compared."""
+"""``selfcal diff``: compare two calibrations, or a calibration and a laser measurement."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from selfcal_ros.estimation.comparison.maps import LaserDifference, MapDifference
     from selfcal_ros.estimation.comparison.significance import Significance
 
-HELP = "compare two results after taking out the datum difference"
+HELP = "compare two results after removing the datum difference"
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -26,7 +26,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("b", metavar="B.json", help="another RESULT.json, or the OUT.json of "
                         "`selfcal step-diagonal`: then squareness and scale are compared")
     parser.add_argument("--keep-scale", action="store_true",
-                        help="leave magnification in: both maps have a reference length")
+                        help="keep the magnification: both maps have a reference length")
     parser.add_argument("--json", action="store_true", help="print JSON")
 
 
@@ -42,8 +42,8 @@ def run(args: argparse.Namespace) -> int:
     a = result_from_dict(first, args.a)
     if isinstance(second, dict) and "ex_x" in second:
         if args.keep_scale:
-            raise InputError("--keep-scale", f"of {args.b} squareness and scale difference are "
-                             "compared, no magnification", "leave it out")
+            raise InputError("--keep-scale", f"for {args.b} squareness and scale difference are "
+                             "compared, not the magnification", "omit it")
         rows = compare_with_laser(a, second, args.b)
         say(args, _laser_text(rows), _laser_json(rows))
         say_unless_qualified(a, f"selfcal diff: {args.a}")
@@ -53,8 +53,8 @@ def run(args: argparse.Namespace) -> int:
         for name, result in ((args.a, a), (args.b, b)):
             if result.reference is None:
                 raise InputError("--keep-scale", f"{name} has no reference length, so its "
-                                 "magnification is not known",
-                                 "leave it out, or solve with --reference")
+                                 "magnification is unknown",
+                                 "omit it, or solve with --reference")
     with busy("comparing"):
         found = compare(a, b, keep_scale=args.keep_scale, names=(args.a, args.b))
     say(args, _text(found), _json(found))
@@ -89,7 +89,7 @@ def _json(found: MapDifference) -> dict[str, Any]:
 
 def _text(found: MapDifference) -> str:
     tx, ty = found.translation_m
-    lines = ["B less A, datum difference taken out: translation "
+    lines = ["B minus A, datum difference removed: translation "
              f"({_signed(tx * UM_PER_M)}, {_signed(ty * UM_PER_M)}) µm, "
              f"rotation {_signed(found.rotation_rad * ARCSEC_PER_RAD)} arcsec, "
              f"scale {_signed(found.scale * UM_PER_M)} µm/m"
@@ -108,7 +108,7 @@ def _text(found: MapDifference) -> str:
 
 
 def _signed(value: float) -> str:
-    """Return a number with its sign; what is only rounding error is zero."""
+    """Return a number with its sign; rounding error is shown as zero."""
     return f"{round(value, 6) + 0.0:+.4g}"
 
 
@@ -116,7 +116,7 @@ def _test_text(test: Significance | None) -> list[str]:
     """Return both tests of a difference, one line each."""
     if test is None:
         return ["       no uncertainties to test against"]
-    doubt = "" if test.correlated else "; correlations between nodes not known"
+    doubt = "" if test.correlated else "; correlations between nodes unknown"
     return [f"       Mahalanobis distance^2/dof {test.chi2_ratio:.3f}, {test.dof:.0f} dof, "
             f"p = {test.p:.2g}{doubt}",
             f"       largest |z| {test.largest_z:.2f}, limit {test.z_limit:.2f}, "
@@ -126,7 +126,7 @@ def _test_text(test: Significance | None) -> list[str]:
 def _verdict_text(found: MapDifference) -> str:
     tests = {"XY": found.xy, "theta": found.theta}
     if found.significant is None:
-        return "verdict: none, as there are no uncertainties to test against"
+        return "verdict: none, no uncertainties to test against"
     differ = [name for name, test in tests.items() if test is not None and test.significant]
     if differ:
         return f"verdict: significant, the maps differ in {' and '.join(differ)}"
@@ -142,7 +142,7 @@ def _laser_json(rows: Sequence[LaserDifference]) -> dict[str, Any]:
 
 
 def _laser_text(rows: Sequence[LaserDifference]) -> str:
-    lines = ["first-order parts, map and laser:"]
+    lines = ["first-order terms, map and laser:"]
     for row in rows:
         test = "" if math.isnan(row.u) else f"  u {row.u * ARCSEC_PER_RAD:.4g}, p = {row.p:.2g}"
         lines.append(f"  {row.name.replace('_', ' ')}: {row.of_map * ARCSEC_PER_RAD:+.4g} and "

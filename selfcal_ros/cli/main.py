@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The ``selfcal`` command: finds the verbs, runs one, turns errors into exit codes.
+"""The ``selfcal`` command: find the verbs, run one, turn errors into exit codes.
 
 A verb is a module of this package with ``HELP`` (one line), ``configure(parser)`` and
 ``run(args) -> int``; ``step_diagonal.py`` is the verb ``step-diagonal``. Verb modules import
-what is slow inside ``run``.
+slow modules inside ``run``.
 """
 
 import argparse
@@ -23,7 +23,7 @@ COMPLETE = "_ARGCOMPLETE"
 
 
 def verbs(only: str | None = None) -> dict[str, ModuleType]:
-    """Return name -> module of every verb, or of `only` alone; nothing if that is no verb."""
+    """Return name -> module of every verb, or of `only` alone; empty if that is not a verb."""
     modules = {}
     for info in pkgutil.iter_modules(cli.__path__):
         name = info.name.replace("_", "-")
@@ -35,9 +35,9 @@ def verbs(only: str | None = None) -> dict[str, ModuleType]:
 
 
 def build_parser(only: str | None = None) -> argparse.ArgumentParser:
-    """Return the parser with one sub-parser a verb, or with that of `only` alone if it is a verb.
+    """Return the parser with one sub-parser per verb, or that of `only` alone if it is a verb.
 
-    A command that begins with a verb needs no other.
+    A command that begins with a verb needs no other sub-parser.
     """
     parser = Parser(
         prog="selfcal", description="Self-calibration of XY-theta stages.",
@@ -53,7 +53,7 @@ def build_parser(only: str | None = None) -> argparse.ArgumentParser:
 
 
 def _complete(parser: argparse.ArgumentParser) -> None:
-    """Answer the shell, which asks for words to complete, and end; the README says how."""
+    """Answer a shell's request for completions and end; see README."""
     import argcomplete
 
     argcomplete.autocomplete(parser)

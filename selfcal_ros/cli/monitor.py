@@ -15,13 +15,13 @@ from selfcal_ros.cli.terminal.output import add_json
 if TYPE_CHECKING:
     from selfcal_ros.cli.watching import Eyes
 
-HELP = "watch a running cell on one screen, and drive its sequencer by keys"
+HELP = "show a running cell on one screen, and operate its sequencer by keys"
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the verb."""
     parser.add_argument("--namespace", metavar="NS", default="", help="namespace of the cell")
-    add_json(parser, "one JSON object a line: pictures as they change, answers to requests")
+    add_json(parser, "one JSON object per line: pictures as they change, answers to requests")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -35,10 +35,10 @@ def run(args: argparse.Namespace) -> int:
 
 def watch(monitor: "Eyes", log: list[str], step: Callable[[], None], *,
           as_json: bool = False) -> int:
-    """Draw what the monitor sends and pass keys on; call `step` several times a second.
+    """Draw the monitor's pictures and forward keys; call `step` several times a second.
 
     Without a terminal every change of state is a line on stdout instead, and requests are read
-    as words from stdin. `as_json` prints what the monitor sends as JSON, one object a line.
+    as words from stdin. `as_json` prints the monitor's messages as JSON, one object per line.
     """
     show = _json_lines if as_json else _live if sys.stdout.isatty() else _lines
     try:
@@ -68,7 +68,7 @@ def _watched(monitor: "Eyes", log: list[str], step: Callable[[], None],
 
 @contextlib.contextmanager
 def _live(log: list[str]) -> Iterator[Callable[[Any], None]]:
-    """Draw on the whole terminal, which is given back as it was."""
+    """Draw on the whole terminal, which is restored at the end."""
     from rich.console import Console
     from rich.live import Live
     from rich.text import Text
@@ -77,7 +77,7 @@ def _live(log: list[str]) -> Iterator[Callable[[Any], None]]:
 
     newest: dict[str, Any] = {}
     console = Console()
-    drawn: list[Any] = []  # size and log of what is on the screen
+    drawn: list[Any] = []  # size and log shown on the screen
     with Live(Text("Looking for the nodes ..."), console=console, screen=True,
               auto_refresh=False) as live:
         def draw(picture: Any) -> None:
@@ -92,7 +92,7 @@ def _live(log: list[str]) -> Iterator[Callable[[Any], None]]:
 
 @contextlib.contextmanager
 def _lines(log: list[str]) -> Iterator[Callable[[Any], None]]:
-    """Print a line where something a script may wait for has changed."""
+    """Print a line for each change that a script may wait for."""
     from selfcal_ros.errors import printable
 
     said: dict[str, str] = {}
@@ -111,7 +111,7 @@ def _lines(log: list[str]) -> Iterator[Callable[[Any], None]]:
 
 
 def _state_lines(picture: Any, there: set[str], said: set[str]) -> Iterator[tuple[str, str]]:
-    """Yield what a script may wait for; `there` collects the nodes that have told anything."""
+    """Yield changes that a script may wait for; `there` collects the nodes heard so far."""
     from selfcal_ros.cli.screen import saved_as, what_now
 
     yield "now", what_now(picture)
@@ -132,7 +132,7 @@ def _state_lines(picture: Any, there: set[str], said: set[str]) -> Iterator[tupl
 
 @contextlib.contextmanager
 def _json_lines(log: list[str]) -> Iterator[Callable[[Any], None]]:
-    """Print each picture that differs from the one before, and each line of the log."""
+    """Print each picture that differs from the previous one, and each line of the log."""
     newest: list[Any] = [None]
 
     def draw(picture: Any) -> None:
@@ -146,7 +146,7 @@ def _json_lines(log: list[str]) -> Iterator[Callable[[Any], None]]:
 
 @contextlib.contextmanager
 def _keys() -> Iterator[Callable[[], list[str]]]:
-    """Yield a function that returns what was pressed, or written as words, since the last call."""
+    """Yield a function that returns the keys or words entered since the last call."""
     import select
 
     from selfcal_ros.cli.screen import KEYS
@@ -176,7 +176,7 @@ def _keys() -> Iterator[Callable[[], list[str]]]:
 
 
 def _read_keys(descriptor: int) -> str:
-    """Return what has been typed on a terminal, empty at its end; nothing is left in a buffer."""
+    """Return the characters typed on a terminal, empty at its end; nothing stays buffered."""
     try:
         return os.read(descriptor, 1024).decode(errors="replace")
     except OSError:  # hung up

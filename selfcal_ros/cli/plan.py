@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``selfcal plan``: judge a plan before anything moves, and suggest views."""
+"""``selfcal plan``: check a plan before anything moves, and suggest views."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 HELP = "check a plan of views before it is measured, or suggest views"
 
 SHOWN = 8
-"""Suggestions, unless it is said how many."""
+"""Default number of suggestions."""
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -54,15 +54,15 @@ def configure(parser: argparse.ArgumentParser) -> None:
     check.add_argument("--map", action="store_true",
                        help="also print the predicted uncertainty at every site")
     check.add_argument("--model", metavar="TERM[:SIZE][,...]", action="append", default=[],
-                       help="terms that are to be estimated with the map, beside the plan's "
-                       "model_terms; without a size they are free, and exit code 3 says that the "
-                       "plan does not tell them")
+                       help="terms to be estimated with the map, in addition to the plan's "
+                       "model_terms; without a size they are free, and exit code 3 means that "
+                       "the plan cannot separate them from the stage")
     check.add_argument("--repeats", type=int, metavar="N",
-                       help="judge the plan as if every mark were measured N times a view")
+                       help="judge the plan as if every mark were measured N times per view")
     suggest.add_argument("--views", type=int, metavar="N",
                          help="find the best plan of N views for the plan's plate")
     suggest.add_argument("--criterion", choices=("rms", "max"), default="rms",
-                         help="which XY uncertainty is to become small (default rms)")
+                         help="which XY uncertainty to minimise (default rms)")
     suggest.add_argument("--top", type=int, metavar="N",
                          help=f"number of suggestions to show (default {SHOWN})")
     suggest.add_argument("-o", "--output", metavar="PLAN.yaml",
@@ -136,7 +136,7 @@ def _repeated(plan: Plan, repeats: int | None) -> Plan:
 def _judge(plan: Plan, model: tuple[ModelTerm, ...], assumed: Assumed,
            sizes: dict[TermName, float], without: tuple[Observability, Prediction],
            ) -> tuple[Observability, Prediction | None, Sequence[TermCheck]]:
-    """Return what the plan tells with its terms, the prediction with them, and their checks.
+    """Return observability and prediction with terms, and the checks of the terms.
 
     `without`: observability and prediction without terms.
     """
@@ -189,21 +189,21 @@ def _check_text(plan: Plan, seen: Observability, predicted: Prediction | None) -
 def _check_stops_text(plan: Plan) -> str:
     marks, offset_m = _check_stops(plan)
     if not marks:
-        return ("no check stops: nothing but stop errors and turns of the plate shows scale, turn "
-                "and sign of the microscope; add check_stops: {marks: 5, offset: 20e-6}")
+        return ("no check stops: only stop errors and turns of the plate show scale, turn and sign "
+                "of the microscope; add check_stops: {marks: 5, offset: 20e-6}")
     return (f"check stops: {marks} marks of each grid view, {offset_m * UM_PER_M:g} µm off in x "
-            f"and y: {4 * marks} exposures more")
+            f"and y: {4 * marks} more exposures")
 
 
 def _unchecked_text(seen: Observability) -> list[str]:
     counts = ((seen.unchecked_sites, "sites"), (seen.unchecked_lines, "lines"))
     found = " and ".join(f"{count} {what}" for count, what in counts if count)
-    return [f"{found} rest on single readings that no other checks: a further view would check "
-            "them"] if found else []
+    return [f"{found} depend on single readings that no other reading checks: a further view would "
+            "check them"] if found else []
 
 
 def field_note(predicted: Prediction, plan: Plan) -> str:
-    """Return that a prediction is not for the plan's own field; empty if it is."""
+    """Return a note if a prediction is not for the plan's own field, else an empty string."""
     nx, ny = predicted.ux.shape
     return "" if (nx, ny) == plan.artifact.shape else (
         f"predicted for a field of {nx} x {ny} sites; XY is about 5 % larger for each doubling of "
@@ -238,7 +238,7 @@ def _suggest(args: argparse.Namespace, plan: Plan) -> int:
     from selfcal_ros.reporting.words.steps import search_text
 
     if args.top is not None and args.views is not None:
-        raise InputError("--top", "with --views one plan is found, not a list", "leave it out")
+        raise InputError("--top", "with --views one plan is found, not a list", "omit it")
     shown = SHOWN if args.top is None else args.top
     if shown < 1:
         raise InputError("--top", f"{shown} is not positive", "give 1 or more")
@@ -259,7 +259,7 @@ def _suggest(args: argparse.Namespace, plan: Plan) -> int:
         else:
             now, ranked = rank_next(plan, criterion=args.criterion, datum=datum, against=against,
                                     progress=progress)
-    # without terms and without a noise that is given the figures are gains
+    # without terms and --sigma the figures are gains
     told = against is not None or args.sigma is not None
     unit = _averaged_m(plan if args.views is None else best, assumed_of(args)) if told else None
     if args.views is not None:
@@ -276,7 +276,7 @@ def _suggest(args: argparse.Namespace, plan: Plan) -> int:
 
 
 def _in_order(plan: Plan, order: str) -> Plan:
-    """Return the plan with all grid marks visited in `order`, unless it is empty."""
+    """Return the plan with all grid marks visited in `order`, unchanged if empty."""
     from dataclasses import replace
 
     from selfcal_ros.model.orders import parse_order
@@ -289,7 +289,7 @@ def _in_order(plan: Plan, order: str) -> Plan:
 
 
 def _checked_like(plan: Plan, other: Plan) -> Plan:
-    """Return the plan with the check stops of another one in its views with grid marks."""
+    """Return the plan with the check stops of another plan in its views with grid marks."""
     from dataclasses import replace
 
     marks, offset_m = _check_stops(other)
@@ -299,13 +299,13 @@ def _checked_like(plan: Plan, other: Plan) -> Plan:
 
 
 def _check_stops(plan: Plan) -> tuple[int, float]:
-    """Return how many marks of each view are checked, and from how far off, m."""
+    """Return the number of marks checked in each view, and their distance, m."""
     return next(((view.check_marks, view.check_offset_m) for view in plan.views if view.grid),
                 (0, 0.0))
 
 
 def _against(args: argparse.Namespace, plan: Plan) -> Against | None:
-    """Return the terms that count in the uncertainty: the plan's own and those of --against."""
+    """Return the terms included in the uncertainty: the plan's own and those of --against."""
     from selfcal_ros.estimation.observability.suggest import Against
     from selfcal_ros.model.terms import ModelTerm, TermName, parse_terms
 
@@ -373,7 +373,7 @@ def _score_text(score: Score, noise_m: float | None) -> str:
 
 
 def view_to_dict(view: View, artifact: Artifact) -> dict[str, Any]:
-    """Return a view in the form of a PLAN.yaml."""
+    """Return a view in the format of PLAN.yaml."""
     a, b = view.lattice_pose(artifact).shift
     order = {"visit_order": view.visit_order} if view.visit_order else {}
     return {"name": view.name, "rotation_deg": round(math.degrees(view.rotation_rad), 9),

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``selfcal plan``: its options about the terms of the model, and what it prints of them."""
+"""``selfcal plan``: its options for the terms of the model, and their table."""
 
 from __future__ import annotations
 
@@ -24,21 +24,21 @@ STOP_ERROR = "10e-6"
 
 
 def add_term_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options that say what a plan is judged against."""
+    """Add the options for the terms against which a plan is judged."""
     parser.add_argument("--against", metavar="TERM:SIZE[,...]", action="append", default=[],
-                        help="size of a term, a standard deviation in SI units, that the plan is "
-                        "judged against; TERM is microscope, drift, plate_scale, plate_shape or "
-                        "approach")
+                        help="size of a term against which the plan is judged, a standard "
+                        "deviation in SI units; TERM is microscope, drift, plate_scale, "
+                        "plate_shape or approach")
     parser.add_argument("--drift-degree", type=int, metavar="D",
-                        help="degree of the polynomial by which a view drifts (default 3)")
+                        help="degree of the polynomial of the drift of a view (default 3)")
     parser.add_argument("--order", metavar="ORDER", default="",
-                        help="visiting order of all views, instead of the plan's")
+                        help="visiting order of all views, replaces the plan's")
     parser.add_argument("--sigma", metavar="LENGTH",
                         help="noise of one reading, m or with a unit as in 20nm (default 20 nm); "
-                        "given, uncertainties are shown in um")
+                        "if given, uncertainties are printed in um")
     parser.add_argument("--stop-error", metavar="LENGTH", default=STOP_ERROR,
-                        help="how far off a mark the stage stops, standard deviation of an axis, "
-                        "m or with a unit (default 10 um)")
+                        help="stop error of the stage relative to a mark, standard deviation per "
+                        "axis, m or with a unit (default 10 um)")
 
 
 def length_m(text: str, option: str) -> float:
@@ -62,12 +62,12 @@ def length_m(text: str, option: str) -> float:
 
 
 def assumed_of(args: argparse.Namespace) -> Assumed:
-    """Return what the options say about the measurement to come.
+    """Return the assumptions on the future measurement from the options.
 
     Raises
     ------
     InputError
-        For a length, an order or a degree that cannot be.
+        For an invalid length, order or degree.
     """
     from selfcal_ros.estimation.terms.planned import Assumed
     from selfcal_ros.model.orders import parse_order
@@ -101,7 +101,7 @@ def sizes_of(args: argparse.Namespace) -> dict[TermName, float]:
 
 
 def model_of(args: argparse.Namespace, plan: Plan) -> tuple[ModelTerm, ...]:
-    """Return the terms of the model: the plan's, and those of ``--model`` in their place."""
+    """Return the terms of the model: the plan's, replaced by those of ``--model``."""
     from selfcal_ros.model.terms import TermName, parse_terms
 
     found = {term.name: term for terms in (parse_terms(plan.model_terms, "model_terms"),
@@ -110,18 +110,18 @@ def model_of(args: argparse.Namespace, plan: Plan) -> tuple[ModelTerm, ...]:
 
 
 def terms_json(checks: Iterable[TermCheck]) -> list[dict[str, Any]]:
-    """Return the checks of terms in the form of the contract."""
+    """Return the checks of terms as JSON."""
     return [{"name": str(c.name), "told": c.told, "unseen_modes": c.unseen_modes,
              "model": c.model, "size": c.size, "unit": c.unit, "effect_rms_m": c.effect_rms_m,
              "effect_max_m": c.effect_max_m, "power": c.power} for c in checks]
 
 
 def terms_text(plan: Plan, checks: Iterable[TermCheck], assumed: Assumed) -> list[str]:
-    """Return the checks of terms as a table, with what was assumed."""
-    lines = ["terms: told from the stage or not; what a size that the model does not hold does to "
-             "the map;", "how surely it would be noticed",
-             f"  {'term':<12}{'model':<7}{'told':<17}{'size':>12}  {'map rms':>10} {'largest':>10}"
-             f" {'noticed':>9}"]
+    """Return the checks of terms as a table, with the assumptions."""
+    lines = ["terms: separable from the stage or not; effect on the map of this size outside the "
+             "model;", "probability of detection",
+             f"  {'term':<12}{'model':<7}{'separable':<17}{'size':>12}  {'map rms':>10} "
+             f"{'largest':>10} {'detected':>9}"]
     for c in checks:
         told = "yes" if c.told else f"no, {_modes(c.unseen_modes)}"
         lines.append(f"  {c.name:<12}{c.model or '-':<7}{told:<17}{size_text(c):>12}"
@@ -156,12 +156,12 @@ def _assumptions(plan: Plan, assumed: Assumed) -> list[str]:
     lines = [f"  assumed: order {', '.join(sorted({str(o) for o in orders.values()}))}; drifts of "
              f"degree {assumed.drift_degree}; {assumed.sigma_m * UM_PER_M:.6g} µm noise of "
              "one reading;",
-             f"  plates laid down to {math.degrees(MISALIGNMENT_RAD):g} deg and "
+             f"  plates placed within {math.degrees(MISALIGNMENT_RAD):g} deg and "
              f"{MISALIGNMENT_M * UM_PER_M:g} µm, stops {assumed.stop_error_m * UM_PER_M:.6g} µm "
              "off the marks, drawn with a fixed seed"]
     if cut:
         names = ", ".join(f"'{view.name}'" for view in cut)
         first = orders[cut[0].name]
-        lines.append(f"  the order {first} takes repeats by {first.passes}: it is cut off in the "
-                     f"views {names}")
+        lines.append(f"  the order {first} needs a multiple of {first.passes} repeats: it is "
+                     f"truncated in the views {names}")
     return lines

@@ -13,14 +13,14 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the verb."""
     parser.add_argument("result", metavar="RESULT.json", help="result that `selfcal solve` wrote")
     parser.add_argument("-o", "--output", metavar="FILE.png|.svg|.pdf", required=True,
-                        help="picture to write; its ending says which kind")
+                        help="picture to write; its ending sets the format")
     parser.add_argument("--truth", metavar="TRUTH.json",
                         help="known truth to compare with: gx, gy in m, g_theta in rad")
     add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Read the result, draw, say where it is."""
+    """Read the result, draw the picture, print its path."""
     from pathlib import Path
 
     from selfcal_ros.cli.report import read_truth

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Nodes as processes of a command: they end when it ends, however it ends."""
+"""Nodes as processes of a command: they end with it, however it ends."""
 
 import contextlib
 import ctypes
@@ -17,7 +17,7 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.start import missing_ros
 
 PR_SET_PDEATHSIG = 1
-"""Of prctl(2): the signal that a process gets when its parent has died, also by SIGKILL."""
+"""Option of prctl(2): the signal sent to a process when its parent dies, also by SIGKILL."""
 
 
 def need_ros(alternative: str) -> None:
@@ -32,8 +32,8 @@ def process(module: str, arguments: list[str], environment: dict, **kwargs: Any,
             ) -> Iterator[subprocess.Popen]:
     """Run a module as a process that is stopped, at worst killed, at the end of the block.
 
-    Ctrl-C reaches the process from the terminal too. It is blocked there from the start, and let
-    through by `nodes.running.run` once the imports are done and it can be handled.
+    Ctrl-C reaches the process from the terminal, too. It is blocked from the start, and unblocked
+    by `nodes.running.run` after the imports, when it can be handled.
     """
     child, before = None, signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
@@ -49,7 +49,7 @@ def process(module: str, arguments: list[str], environment: dict, **kwargs: Any,
 
 
 def _die_with_parent(parent: int) -> Callable[[], None] | None:
-    """Return what a child does before it becomes the node: ask for SIGTERM when `parent` dies."""
+    """Return a function for the child before exec: request SIGTERM when `parent` dies."""
     if not sys.platform.startswith("linux"):
         return None
     prctl = ctypes.CDLL(None, use_errno=True).prctl
@@ -62,7 +62,7 @@ def _die_with_parent(parent: int) -> Callable[[], None] | None:
 
 
 def stop(child: subprocess.Popen) -> None:
-    """End a process: asked first, killed if it does not answer within ten seconds."""
+    """End a process: terminate it, kill it if it has not ended within ten seconds."""
     for end in (child.terminate, child.kill):
         if child.poll() is None:
             end()
@@ -76,7 +76,7 @@ def stop(child: subprocess.Popen) -> None:
 
 @contextlib.contextmanager
 def ended_by_signals() -> Iterator[None]:
-    """Let SIGTERM and SIGHUP end the block as an exception would, so that it cleans up."""
+    """Let SIGTERM and SIGHUP end the block like an exception, so that it cleans up."""
     def end(number: int, _: object) -> None:
         raise SystemExit(128 + number)
     before = {number: signal.signal(number, end) for number in (signal.SIGTERM, signal.SIGHUP)}
@@ -89,9 +89,9 @@ def ended_by_signals() -> Iterator[None]:
 
 @contextlib.contextmanager
 def domain() -> Iterator[dict]:
-    """Yield an environment with a ROS domain of its own on this machine.
+    """Yield an environment with its own ROS domain on this machine.
 
-    A ROS_DOMAIN_ID that is set already is kept, so that `ros2 topic echo` can watch.
+    An existing ROS_DOMAIN_ID is kept, so that `ros2 topic echo` can be used.
     """
     environment = dict(os.environ)
     environment.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``selfcal replay``: a bag played over DDS into the live nodes, each a process of its own."""
+"""``selfcal replay``: a bag played over DDS into the live nodes, each in its own process."""
 
 import argparse
 import contextlib
@@ -23,20 +23,20 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("bag", metavar="BAG", help="MCAP file or rosbag2 folder")
     speed = parser.add_mutually_exclusive_group()
     speed.add_argument("--rate", type=float, default=1.0, metavar="R", help="speed (default: 1)")
-    speed.add_argument("--fast", action="store_true", help="as fast as the nodes keep up")
+    speed.add_argument("--fast", action="store_true", help="as fast as the nodes can follow")
     parser.add_argument("--shuffle", type=int, metavar="SEED",
                         help="deliver the messages in shuffled order")
-    parser.add_argument("-o", "--output", metavar="RESULT.json", help="where to write the result; "
-                        "- is stdout, and all else goes to stderr")
+    parser.add_argument("-o", "--output", metavar="RESULT.json", help="file for the result; "
+                        "- is stdout, and other output goes to stderr")
     add_json(parser, "RESULT.json, and the summary on stderr")
     parser.add_argument("--params", metavar="NODES.yaml", help="ROS parameter file for the nodes")
     parser.add_argument("--namespace", metavar="NAME", help="namespace of the cell's topics, "
-                        "for bags that hold several cells; / is the root")
+                        "for bags with several cells; / is the root")
     parser.add_argument("--quiet", action="store_true", help="print no summary")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Start the nodes, play, collect the result, stop the nodes."""
+    """Start the nodes, play the bag, collect the result, stop the nodes."""
     from selfcal_ros.bagio.offline import bag_input
     from selfcal_ros.cli.terminal.print_result import exit_code, show
     from selfcal_ros.errors import InputError
@@ -60,7 +60,7 @@ def run(args: argparse.Namespace) -> int:
         if code or not saved.exists():
             return code or 1
         result = result_from_dict(read_json(saved), str(saved))
-        noted = [line for line in clock if line not in result.warnings]  # by the live collector
+        noted = [line for line in clock if line not in result.warnings]
         result = with_input(result, source, [*lost, *noted])
         result = replace(result, rejected=dict(sorted((result.rejected | refused).items())))
     data = result_to_dict(result)
@@ -74,9 +74,9 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _clock_lines(args: argparse.Namespace) -> tuple[list[str], dict[str, int]]:
-    """Say which clocks stepped in the bag, and return it: played fast, no node can see it.
+    """Print and return the clock steps in the bag, which no node can detect during fast replay.
 
-    And return the messages stamped in the future, which were not played, by reason.
+    Also return the counts of messages stamped in the future, which were not played, by reason.
     """
     from selfcal_ros.bagio.offline import clock_lines
     from selfcal_ros.cli.solve import node_settings

@@ -16,7 +16,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the verb."""
     parser.add_argument("result", metavar="RESULT.json", help="result that `selfcal solve` wrote")
     parser.add_argument("-o", "--output", metavar="REPORT.html|.pdf",
-                        help="where to write (default: beside the result, ending in .html)")
+                        help="file to write (default: next to the result, ending in .html)")
     parser.add_argument("--plot", metavar="MAP.png", help="also write the map as a picture")
     parser.add_argument("--truth", metavar="TRUTH.json",
                         help="known truth to compare with: gx, gy in m, g_theta in rad")
@@ -25,7 +25,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Read the result, write the report, say where it is."""
+    """Read the result, write the report, print its path."""
     from selfcal_ros.files import check_outputs, read_json
     from selfcal_ros.model.result import result_from_dict
     from selfcal_ros.reporting.report import check_name, write_report
@@ -52,7 +52,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def read_truth(path: str) -> dict:
-    """Return the truth in a TRUTH.json; InputError says what is wrong with it."""
+    """Return the truth in a TRUTH.json; InputError if it is invalid."""
     from selfcal_ros.errors import InputError
     from selfcal_ros.files import read_json
 

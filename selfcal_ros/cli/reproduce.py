@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``selfcal reproduce``: the published simulations, run again and set beside the paper."""
+"""``selfcal reproduce``: the published simulations, rerun and compared with the paper."""
 
 import argparse
 import sys
@@ -12,10 +12,10 @@ from selfcal_ros.cli.terminal.progress import late_progress
 if TYPE_CHECKING:
     from selfcal_ros.parallel import Progress
 
-HELP = "run the published simulations of Hu or Qiao, side by side with their figures"
+HELP = "run the published simulations of Hu or Qiao next to the published figures"
 
 MANY = 1000
-"""Draws from which on processes are worth their start."""
+"""Number of draws from which several processes are faster."""
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -27,13 +27,13 @@ def configure(parser: argparse.ArgumentParser) -> None:
                         help="seed of all random numbers (default 1)")
     parser.add_argument("--workers", type=int, metavar="N",
                         help="processes; the numbers do not depend on it (default: 1, from "
-                        f"{MANY} draws on one a core)")
+                        f"{MANY} draws on one per core)")
     add_json(parser, "the numbers")
     parser.add_argument("--out", metavar="DIR", help="folder for the plots and the text")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run, print, and save what was asked for."""
+    """Run the simulation, print and save the requested output."""
     from selfcal_ros.errors import ExitCode, InputError
     from selfcal_ros.files import write_text
     from selfcal_ros.parallel import check_workers
@@ -62,8 +62,8 @@ def _make(folder: Path) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError(str(folder), f"cannot be made ({error.strerror})",
-                         "name a folder that you may write") from error
+        raise InputError(str(folder), f"cannot be created ({error.strerror})",
+                         "name a writable folder") from error
 
 
 def _hu(args: argparse.Namespace, workers: int, progress: "Progress") -> tuple:

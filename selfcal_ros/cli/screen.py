@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One terminal screen of a calibration: drawn from the picture that the monitor process sends.
+"""One terminal screen of a calibration, drawn from the picture of the monitor process.
 
-It fits whatever the size of the terminal: what there is no room for is told in words, and pictures
-of the plate and the map become coarser.
+It fits any size of the terminal: omissions are stated, and pictures of the plate and the map
+become coarser.
 """
 
 import re
@@ -18,12 +18,12 @@ KEYS = {"s": "start", "c": "confirm", "r": "redo", "k": "skip", "a": "abort"}
 SHADES = " .:-=+*#%@"
 LEVELS = {0: ("ok", "green"), 1: ("warn", "yellow"), 2: ("error", "red")}
 LEAST = (60, 18)
-"""Columns and rows below which only what is to be done now is shown."""
+"""Columns and rows below which only the current task is shown."""
 SYMBOLS = {"um": "µm"}
 BETWEEN = 3
 """Columns between the two halves of the screen."""
 PREFIX = re.compile(r"^\[(\w+)\] \[[\d.]+\] \[([^\]]+)\]: ")
-"""What a node writes before a line of its log."""
+"""Prefix of a node's log lines."""
 
 
 def screen(picture: dict[str, Any], log: list[str],
@@ -57,7 +57,7 @@ def _beside(width: int, left: Text, right: Text) -> Text:
 
 
 def what_now(picture: dict[str, Any]) -> str:
-    """Return in one sentence what the person in front of the screen has to do."""
+    """Return in one sentence what the operator has to do."""
     told = picture["health"].get("pose_sequencer")
     if told is None:
         return "pose_sequencer is not there: start it, or wait for it."
@@ -77,12 +77,12 @@ def what_now(picture: dict[str, Any]) -> str:
         return look or "Nothing: the view is being measured."
     return {"IDLE": "Press s to start the plan.", "DONE": "Done. s starts another run.",
             "ABORTED": "Aborted. s starts a new run.",
-            "FOLLOWING": "Nothing: somebody else commands; a ends that.",
+            "FOLLOWING": "Nothing: another sequencer commands; a ends that.",
             }.get(state, printable(told["message"]))
 
 
 def _sense_of(turn_deg: Any) -> str:
-    """Return which way a plate is turned, and where its first corner is then."""
+    """Return the direction of a turn, and the resulting position of the first corner."""
     quarters = round(turn_deg / 90)
     if not quarters % 4 or abs(turn_deg - 90 * quarters) > 1:
         return " counter-clockwise" if turn_deg > 0 else " clockwise" if turn_deg < 0 else ""
@@ -98,7 +98,7 @@ def saved_as(picture: dict[str, Any]) -> str:
 
 
 def _state(values: dict[str, str], command: dict[str, Any]) -> str:
-    """Return the sequencer's state; its newest command tells it earlier than its health."""
+    """Return the sequencer's state; its newest command is earlier than its health."""
     state = values.get("state", "")
     if state not in ("PLACING", "MEASURING") or command.get("plan_id") != values.get("plan_id"):
         return state
@@ -107,7 +107,7 @@ def _state(values: dict[str, str], command: dict[str, Any]) -> str:
 
 
 def _task(picture: dict[str, Any]) -> list[Text]:
-    """Return which view of which run it is, and what is to be done."""
+    """Return view, run and current task."""
     command, told = picture["command"], picture["health"].get("pose_sequencer")
     values = told["values"] if told else {}
     views = _whole(values.get("views")) or (command or {}).get("views_planned", 0)
@@ -116,7 +116,7 @@ def _task(picture: dict[str, Any]) -> list[Text]:
     if command and views:
         of = (f"view {index + 1} of {views}: {printable(name)}"
               if command["phase"] in ("PLACE", "MEASURE")
-              else f"{min(index, views)} of {views} views are over")
+              else f"{min(index, views)} of {views} views done")
     run = printable(values.get("run_id") or (command or {}).get("run_id") or "-")
     plan = printable(values.get("plan_id") or (command or {}).get("plan_id") or "-")
     return [Text.assemble((of, "bold"), (f"   plan {plan}, run {run}", "dim")),
@@ -126,13 +126,13 @@ def _task(picture: dict[str, Any]) -> list[Text]:
 
 
 def _whole(text: Any) -> int:
-    """Return the whole number in what a node has told, 0 if it is none."""
+    """Return the whole number in a text, 0 if it is none."""
     text = str(text)
     return int(text) if text.isascii() and text.isdecimal() and len(text) < 10 else 0
 
 
 def _measured(picture: dict[str, Any], width: int, rows: int) -> list[Text]:
-    """Return how far the view is and what was rejected."""
+    """Return coverage of the view and rejections."""
     view = picture["view"]
     if view is None:
         return headed("coverage", [Text("nothing measured yet")], width)
@@ -173,8 +173,8 @@ def _plate(view: dict[str, Any], width: int, room: int) -> list[Text]:
     cells, step = coarser(view["plate"], width, max(room - 1, 1), _worst_mark)
     step *= view.get("plate_step", 1)
     what = "a mark" if step == 1 else f"{step} x {step} marks"
-    unknown = ", ? not told" if any("?" in row for row in cells) else ""
-    return [Text(f"a sign: {what}; . missing{unknown}", style="dim"),
+    unknown = ", ? unknown" if any("?" in row for row in cells) else ""
+    return [Text(f"each cell: {what}; . missing{unknown}", style="dim"),
             *(Text(" ".join(row), style="green") for row in cells)]
 
 
@@ -194,7 +194,7 @@ def _found(picture: dict[str, Any], width: int, rows: int) -> list[Text]:
 
 
 def _verdict(picture: dict[str, Any]) -> list[Text]:
-    """Return what the solver says, the most important first."""
+    """Return the solver's verdict, the most important first."""
     summary = picture["summary"]
     if summary is None:
         return [Text("no view has been solved yet")]
@@ -223,7 +223,7 @@ def _map(um: list[list[float | None]], width: int, rows: int, told: dict[str, An
     most = max((value for row in cells for value in row if value is not None), default=0.0)
     signs = [["?" if value is None else SHADES[min(9, int(value / (most or 1.0) * 10))]
               for value in row] for row in cells]
-    title = f"error, '@' = {most:.3g} µm" + (f", sign {step} x {step}" if step > 1 else "")
+    title = f"error, '@' = {most:.3g} µm" + (f", cell {step} x {step}" if step > 1 else "")
     return headed(title, [Text(" ".join(row), style="magenta") for row in signs], width)
 
 
@@ -233,7 +233,7 @@ def _worst_error(cells: list[float | None]) -> float | None:
 
 
 def _health(picture: dict[str, Any]) -> list[Text]:
-    """Return the nodes with something wrong, one a line, and those that are well."""
+    """Return the nodes with a problem, one per line, and those that are well."""
     well, texts = [], []
     for node, told in picture["health"].items():
         if told is not None and not told["level"]:
@@ -247,7 +247,7 @@ def _health(picture: dict[str, Any]) -> list[Text]:
 
 
 def _said(line: str) -> Text:
-    """Return a line of the log; of what a node says, without the time."""
+    """Return a line of the log, without the time for lines of nodes."""
     told = PREFIX.match(line)
     if told is None:
         return Text(printable(line))

@@ -12,12 +12,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the verb."""
     parser.add_argument("sim", metavar="SIM.yaml", help="what to simulate (docs/simulate.md)")
     parser.add_argument("-o", "--output", metavar="BAG", required=True,
-                        help="bag folder to make; truth.json is written into it")
+                        help="bag folder to create; truth.json is written into it")
     add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Simulate and say what was written."""
+    """Simulate and print what was written."""
     from selfcal_ros.bagio.simulated import write_simulation
     from selfcal_ros.cli.terminal.progress import progress_bar
     from selfcal_ros.simulation.spec import read_simulation

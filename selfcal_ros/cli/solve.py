@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``selfcal solve``: a bag in, the calibrated error map out, without any middleware."""
+"""``selfcal solve``: a bag in, the calibrated error map out, without middleware."""
 
 import argparse
 import sys
@@ -17,8 +17,8 @@ HELP = "calibrate from a bag: MCAP file or rosbag2 folder"
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the verb."""
     parser.add_argument("bag", metavar="BAG", help="MCAP file or rosbag2 folder")
-    parser.add_argument("-o", "--output", metavar="RESULT.json", help="where to write the result; "
-                        "- is stdout, and all else goes to stderr")
+    parser.add_argument("-o", "--output", metavar="RESULT.json", help="file for the result; "
+                        "- is stdout, and other output goes to stderr")
     add_json(parser, "RESULT.json, and the summary on stderr")
     add_options(parser)
     parser.add_argument("--validate", action="store_true",
@@ -26,50 +26,51 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--budget", action="store_true",
                         help="print the uncertainty budget of the map (GUM)")
     parser.add_argument("--report", metavar="REPORT.html|.pdf", help="also write the report, "
-                        "compared with the truth where the bag holds one")
+                        "compared with the truth if the bag has one")
     parser.add_argument("--quiet", action="store_true", help="print no summary")
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options that say how a bag is collected and solved."""
+    """Add the options for collecting and solving a bag."""
     parser.add_argument("--method", choices=("joint", "law"),
                         help="joint least squares (default) or Hu's published law")
     parser.add_argument("--theta-datum", choices=("xy_axes", "zero_mean"),
-                        help="what fixes the constant of the angular map (default: zero_mean)")
+                        help="condition that fixes the constant of the angular map (default: "
+                             "zero_mean)")
     parser.add_argument("--misalignment", choices=("rigid", "linear"),
-                        help="how the plate turns: by a rotation (default), or as the papers "
-                        "write it (Hu's law knows nothing else)")
+                        help="rotation of the plate: finite (rigid, default), or linear as in the "
+                        "papers (the only one for Hu's law)")
     parser.add_argument("--uncertainty", choices=("auto", "always", "never"),
                         help="uncertainty map; auto (default): up to 201 x 201 sites")
     parser.add_argument("--sense", choices=("microscope_moves", "plate_moves"),
-                        help="who moves (default: microscope_moves)")
+                        help="what moves (default: microscope_moves)")
     parser.add_argument("--params", metavar="NODES.yaml",
-                        help="ROS parameter file, the same that the nodes take")
+                        help="ROS parameter file, the same as for the nodes")
     parser.add_argument("--reference", metavar="KIND:ERROR:U", help="known length that sets the "
                         "scale: artifact, stage_x or stage_y, its relative error and the standard "
-                        "uncertainty of that, e.g. artifact:1.2e-6:3e-7")
+                        "uncertainty of this error, e.g. artifact:1.2e-6:3e-7")
     parser.add_argument("--certificate", metavar="TEXT",
-                        help="what states the reference: number and issuer of its certificate")
+                        help="certificate of the reference: number and issuer")
     parser.add_argument("--model", metavar="TERM[:SIZE],...", action="append",
                         help="terms estimated with the map: microscope, drift, plate_scale, "
                         "plate_shape, approach, plate_strain, line_eccentricity; SIZE is a "
-                        "standard deviation known from elsewhere (SI; 0: known to be none), e.g. "
+                        "standard deviation known from elsewhere (SI; 0: exactly zero), e.g. "
                         "drift,plate_shape:30e-9; default: those of the plan; none: no terms, not "
                         "even those assumed by default (docs/estimation.md)")
     parser.add_argument("--microscope", metavar="SCALE_U[:ROTATION_U[:SHEAR_U]]",
-                        help="how well the microscope is known: standard uncertainties of its "
-                        "scale, turn (rad) and shear (default: 0.01:0.01:0.002)")
+                        help="standard uncertainties of the microscope's scale, rotation (rad) "
+                        "and shear (default: 0.01:0.01:0.002)")
     parser.add_argument("--drift-degree", type=int, metavar="D",
                         help="degree of a drift's polynomial (default: 3)")
     parser.add_argument("--namespace", metavar="NAME", help="namespace of the cell's topics, "
-                        "for bags that hold several cells; / is the root")
+                        "for bags with several cells; / is the root")
     parser.add_argument("--robust", action="store_true",
                         help="find and remove outliers among the marks, name bad views "
                         "(docs/identifiability.md)")
 
 
 def node_settings[S: Settings](params: str | None, kind: type[S], **given: Any) -> S:
-    """Return the settings of a node in a parameter file, if any; what is given wins over it."""
+    """Return the settings of a node from a parameter file, if any, and arguments, which win."""
     from selfcal_ros.collection.settings.ros_file import overrides_in
     from selfcal_ros.files import read_yaml
 
@@ -80,7 +81,7 @@ def node_settings[S: Settings](params: str | None, kind: type[S], **given: Any) 
 
 
 def parameters(args: argparse.Namespace) -> "tuple[CollectorSettings, SolverSettings]":
-    """Return the settings of the collector and of the solver; options win over the file."""
+    """Return the settings of collector and solver; options take precedence over the file."""
     from selfcal_ros.collection.settings.nodes import CollectorSettings, SolverSettings
 
     collector = node_settings(args.params, CollectorSettings, measurement_sense=args.sense)
@@ -94,12 +95,12 @@ def parameters(args: argparse.Namespace) -> "tuple[CollectorSettings, SolverSett
                          "name the length with --reference KIND:ERROR:U")
     if args.misalignment == "rigid" and solver.method == "law":
         raise InputError("--misalignment", "Hu's law is linear, not rigid",
-                         "leave it out, or use --method joint")
+                         "omit it, or use --method joint")
     return collector, solver
 
 
 def _model(args: argparse.Namespace) -> list[str] | None:
-    """Return the terms of --model and --microscope; None where neither is given."""
+    """Return the terms of --model and --microscope; None if neither is given."""
     if args.microscope is None:
         return args.model
     sizes = args.microscope.split(":")
@@ -144,7 +145,7 @@ def run(args: argparse.Namespace) -> int:
     if args.report:
         check_name(args.report)
     collector, solver = parameters(args)
-    if args.validate and solver.method == "law":  # what is validated is the joint solution
+    if args.validate and solver.method == "law":  # the joint solution is validated
         raise InputError("--validate", "Hu's law needs every reading and cannot hold any out",
                          "solve with --method joint")
     with progress_bar("reading") as bar:
@@ -152,7 +153,7 @@ def run(args: argparse.Namespace) -> int:
             args.bag, collector, namespace=args.namespace,
             progress=lambda count: bar(count, None))
     said = [*findings, *lost, *(() if findings else advice(measurements.all_rejected()))]
-    for line in dict.fromkeys(said):  # a clock that stepped is a finding, and noted in the result
+    for line in dict.fromkeys(said):  # a clock step is a finding, and noted in the result
         print(f"selfcal solve: {args.bag}: {line}", file=sys.stderr)
     options = solver_options(solver, measurements)
     try:
@@ -162,7 +163,7 @@ def run(args: argparse.Namespace) -> int:
         if (args.output or args.json) and error.observability is not None:
             result = worded(unidentified_result(measurements, error.observability))
             _write(args, result_to_dict(with_input(result, bag_input(args.bag), lost)))
-        if findings:  # what the plan lacks is told by readings that are not there
+        if findings:  # missing readings look like a deficient plan
             raise NotIdentifiableError(f"{args.bag}: {findings[0]}; correct this first (as it is: "
                                        f"{error})", error.observability) from error
         raise
@@ -179,7 +180,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _calibrated(args: argparse.Namespace, measurements: Any, options: Any) -> Any:
-    """Return the result, not worded; what is wrong with offsets or plate names the bag."""
+    """Return the result without sentences; errors of offsets or plate name the bag."""
     from selfcal_ros.estimation.api import calibrate
     from selfcal_ros.estimation.checks.placing import PlacingError
     from selfcal_ros.estimation.checks.wiring import WiringError
@@ -194,7 +195,7 @@ def _calibrated(args: argparse.Namespace, measurements: Any, options: Any) -> An
 
 
 def _write(args: argparse.Namespace, data: dict[str, Any]) -> None:
-    """Write a result where it is wanted: to a file, to stdout, or both."""
+    """Write a result to a file, to stdout, or both."""
     from selfcal_ros.files import write_json
 
     if file_of(args):
@@ -205,7 +206,7 @@ def _write(args: argparse.Namespace, data: dict[str, Any]) -> None:
 
 def _extended(args: argparse.Namespace, measurements: Any, options: Any,
               result: Any) -> tuple[Any, list[str]]:
-    """Return the result with places, and validation and budget as wanted, and what to print."""
+    """Return the result with places, validation and budget as requested, and the text."""
     from dataclasses import replace
 
     from selfcal_ros.collection.marks.places import with_places

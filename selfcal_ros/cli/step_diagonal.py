@@ -26,9 +26,9 @@ if TYPE_CHECKING:
 HELP = "identify linear, straightness and squareness errors from a laser step-diagonal measurement"
 STEP_MM = 10.0
 SHORTEST_MM = 1e-6
-"""Steps below 1 nm are not steps of a machine."""
+"""Shorter steps, below 1 nm, are refused."""
 SEED = 1
-"""Of the noise in the table of sensitivities."""
+"""Repeats for the noise in the table of sensitivities."""
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -55,7 +55,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
                         help="accept X and Y readings that are equal in every block")
     parser.add_argument("--plot", metavar="FILE", help="draw the profiles (png, svg or pdf)")
     parser.add_argument("--sensitivity", action="store_true",
-                        help="without DATA.csv: simulate what each fault of the set-up does to "
+                        help="without DATA.csv: simulate the effect of each set-up fault on "
                              "both formulations; table to stdout, JSON with -o, curves with --plot")
     parser.add_argument("--simulate", metavar="SIM.yaml",
                         help="without DATA.csv: write the readings of a simulated measurement to "
@@ -70,12 +70,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add_frame(parser, theta=False)
     add_bag_options(parser)
     parser.add_argument("-o", "--output", metavar="OUT.json",
-                        help="write the result here; otherwise it is printed")
+                        help="file for the result; default: print it")
     add_json(parser, "the result also where it is written")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Identify, write the result, and say what was found."""
+    """Identify the errors, write the result, and print a summary."""
     from selfcal_ros.files import write_json
     from selfcal_ros.laser.data import Form, Method
     from selfcal_ros.laser.identify import EQUAL_READINGS, Choice, identify, readings_are_equal
@@ -88,7 +88,7 @@ def run(args: argparse.Namespace) -> int:
     if args.simulate:
         return _simulate(args)
     if args.data is None or args.method is None:
-        raise InputError("arguments", "DATA.csv and --method are wanted",
+        raise InputError("arguments", "DATA.csv and --method are required",
                          "give both, or --sensitivity or --simulate alone")
     data, warnings, source = _measurement(args)
     choice = Choice(Method(args.method), Form(args.form), args.allow_equal)
@@ -115,17 +115,17 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _check_outputs(args: argparse.Namespace) -> None:
-    """Refuse outputs that would not be written, or not all of them."""
+    """Refuse outputs that would not be written."""
     from selfcal_ros.aerotech.write import refuse_existing
     from selfcal_ros.files import check_outputs
 
     if args.sensitivity and args.simulate:
         raise InputError("--sensitivity", "it and --simulate exclude each other",
-                         "leave one of them out")
+                         "omit one of them")
     measured = not (args.sensitivity or args.simulate)
     for option, path, there, remedy in (
             ("--truth", args.truth, args.simulate, "it belongs to --simulate"),
-            ("--plot", args.plot, not args.simulate, "leave it out with --simulate"),
+            ("--plot", args.plot, not args.simulate, "omit it with --simulate"),
             ("--cal", args.cal, measured, "it belongs to a measurement"),
             ("--save-csv", args.save_csv, measured and args.data and is_bag(args.data),
              "it belongs to a bag")):
@@ -140,10 +140,10 @@ def _check_outputs(args: argparse.Namespace) -> None:
 
 
 def _refuse_machine(args: argparse.Namespace) -> None:
-    """Refuse options of a calibration file where none is written."""
+    """Refuse options of a calibration file if none is written."""
     refuse_given(args, {"x_axis": 1, "y_axis": 2, "unit": "mm", "home_x": None, "home_y": None,
                         "reverse_x": False, "reverse_y": False, "force": False},
-                 "it belongs to a calibration file", "name one with --cal, or leave it out")
+                 "it belongs to a calibration file", "name one with --cal, or omit it")
 
 
 def _write_cal(args: argparse.Namespace, found: "StepDiagonalResult") -> None:
@@ -165,7 +165,7 @@ def _write_cal(args: argparse.Namespace, found: "StepDiagonalResult") -> None:
 
 
 def _sensitivity(args: argparse.Namespace) -> int:
-    """Simulate every fault of the set-up on the machine of the source's case study."""
+    """Simulate every set-up fault on the machine of the source's case study."""
     import numpy as np
 
     from selfcal_ros.files import write_json
@@ -174,7 +174,7 @@ def _sensitivity(args: argparse.Namespace) -> int:
 
     if args.data is not None:
         raise InputError("arguments", "--sensitivity simulates and reads no data",
-                         "leave DATA.csv out")
+                         "omit DATA.csv")
     machine, rng = case_study_machine(), np.random.default_rng(SEED)
     with busy("simulating faults"):
         rows = sensitivity(machine, rng)
@@ -197,12 +197,13 @@ def _simulate(args: argparse.Namespace) -> int:
 
     if args.data is not None:
         raise InputError("arguments", "--simulate makes data and reads none",
-                         "leave DATA.csv out")
+                         "omit DATA.csv")
     simulation = simulation_from_dict(read_yaml(args.simulate), args.simulate)
     data = simulate_step_diagonal(simulation.machine, simulation.measurement, simulation.rng)
     text = table_text(data, [
         f"simulated from {args.simulate}; mm; several rows of a block are repeats",
-        "readings are positive on every diagonal (np: rx = -l.dx); a block is a place on the axis",
+        "readings are positive on every diagonal (np: rx = -l.dx); a block is a position on the "
+        "axis",
         "ex_x, ey_y: directly measured linear errors, actual - nominal of each step"])
     if args.truth:
         write_json(args.truth, truth_of(simulation.machine))
@@ -214,7 +215,7 @@ def _simulate(args: argparse.Namespace) -> int:
 
 
 def _measurement(args: argparse.Namespace) -> tuple:
-    """Return the measurement, its warnings, and where it came from."""
+    """Return the measurement, its warnings, and its source."""
     from selfcal_ros.files import sha256_of
     from selfcal_ros.laser.table import Columns, dimension_of, read_table
 
@@ -232,7 +233,7 @@ def _measurement(args: argparse.Namespace) -> tuple:
 
 def _steps(args: argparse.Namespace, dim: int) -> tuple[float, ...]:
     if dim < 3 and args.step_z != STEP_MM:
-        raise InputError("--step-z", "the measurement has no Z", "leave it out")
+        raise InputError("--step-z", "the measurement has no Z", "omit it")
     for axis in "xyz"[:dim]:
         step = getattr(args, f"step_{axis}")
         if not SHORTEST_MM <= step < math.inf:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The part of ``selfcal step-diagonal`` that takes the measurement from a bag."""
+"""``selfcal step-diagonal`` from a bag."""
 
 import argparse
 import math
@@ -32,31 +32,31 @@ def add_bag_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--laser-unit", choices=tuple(M_PER), default="m",
                        help="unit of the distance (default m)")
     group.add_argument("--laser-sign", type=int, choices=(1, -1), default=1,
-                       help="-1 if the distance shrinks along the diagonals (default 1)")
+                       help="-1 if the distance decreases along the diagonals (default 1)")
     group.add_argument("--position-topic", metavar="TOPIC",
                        help="axis positions: JointState, PointStamped or PoseStamped, m")
     group.add_argument("--joints", metavar="LIST", default=JOINTS,
                        help="joints of X, Y[, Z] (default x,y; three names mean 3D)")
     group.add_argument("--rest-tolerance", type=float, default=REST_TOLERANCE_UM, metavar="UM",
-                       help="wandering of an axis at rest, um (default 2)")
+                       help="largest motion of an axis at rest, um (default 2)")
     group.add_argument("--min-rest", type=float, default=MIN_REST_S, metavar="S",
                        help="shortest rest, s (default 0.5)")
     group.add_argument("--settle", type=float, default=SETTLE_S, metavar="S",
-                       help="left out at both ends of a rest, s (default 0.1)")
+                       help="time ignored at both ends of a rest, s (default 0.1)")
     group.add_argument("--save-csv", metavar="FILE", help="write the blocks as a CSV table")
 
 
 def refuse_for_table(args: argparse.Namespace) -> None:
-    """Refuse options of a bag where the readings come from a table, which they would not change."""
+    """Refuse options of a bag if the readings come from a table."""
     given = {"laser_topic": None, "laser_field": "", "laser_unit": "m", "laser_sign": 1,
              "position_topic": None, "joints": JOINTS, "rest_tolerance": REST_TOLERANCE_UM,
              "min_rest": MIN_REST_S, "settle": SETTLE_S}
-    refuse_given(args, given, f"it is for a bag, and {args.data} is a table", "leave it out")
+    refuse_given(args, given, f"it is for bags, and {args.data} is a table", "omit it")
 
 
 def refuse_given(args: argparse.Namespace, defaults: dict[str, Any], why: str,
                  remedy: str) -> None:
-    """Refuse options that are not at their default, by the names of `args`, and say why."""
+    """Refuse options that differ from their defaults, with the reason."""
     for name, default in defaults.items():
         if getattr(args, name) != default:
             raise InputError(f"--{name.replace('_', '-')}", why, remedy)
@@ -83,7 +83,7 @@ def measurement_from_bag(args: argparse.Namespace,
     Raises
     ------
     InputError
-        If a topic is not named, an option is no sensible number, or the bag cannot be used.
+        If a topic is missing, an option is not a valid number, or the bag cannot be used.
     """
     from selfcal_ros.laser.bag import SeriesTopics, read_series
     from selfcal_ros.laser.table import write_table

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Nodes as processes that are looked after: restarted when they die, reported when they may not."""
+"""Supervised node processes: restarted when they die, or reported."""
 
 import contextlib
 import subprocess
@@ -11,17 +11,17 @@ from typing import Self
 from selfcal_ros.cli.processes import process
 
 MOST_RESTARTS = 5
-"""Restarts of a node within `WINDOW_S`; more is no accident."""
+"""Largest number of restarts of a node within `WINDOW_S`."""
 WINDOW_S = 60.0
 NEVER_AGAIN = (2,)
-"""Exit codes after which a restart would only repeat them: bad input."""
+"""Exit codes after which a restart would fail again: bad input."""
 ONCE = ("bag_recorder",)
-"""Nodes that cannot go on where they were: their folder exists."""
+"""Nodes that cannot be restarted: their folder exists."""
 KEPT_LINES = 200
 
 
 class Supervisor:
-    """Runs nodes and looks after them; a context manager that stops them all at its end.
+    """Context manager that runs and supervises nodes, and stops them at its end.
 
     Parameters
     ----------
@@ -59,7 +59,7 @@ class Supervisor:
         self._stack.close()
 
     def step(self) -> None:
-        """Restart what has died, or say why it is not restarted."""
+        """Restart nodes that have died, or report why not."""
         for node, child in list(self._running.items()):
             code = child.poll()
             if code is None:
@@ -68,13 +68,13 @@ class Supervisor:
             how = f"signal {-code}" if code < 0 else f"code {code}"
             recent = [when for when in self._restarts[node] if self._now_s() - when < WINDOW_S]
             if code in NEVER_AGAIN or node in ONCE:
-                self._say(f"{node} has ended with {how} and is not started again")
+                self._say(f"{node} ended with {how} and is not restarted")
             elif len(recent) >= MOST_RESTARTS:
-                self._say(f"{node} has ended with {how}, for the {len(recent) + 1}th time within "
-                          f"{WINDOW_S:.0f} s: not started again")
+                self._say(f"{node} ended with {how}, {len(recent) + 1} times within {WINDOW_S:.0f} "
+                          "s: not restarted")
             else:
                 self._restarts[node] = [*recent, self._now_s()]
-                self._say(f"{node} has ended with {how}: started again")
+                self._say(f"{node} ended with {how}: restarted")
                 self._start(node)
 
     def _start(self, node: str) -> None:
@@ -86,7 +86,7 @@ class Supervisor:
         threading.Thread(target=self._read, args=(child,), name=node, daemon=True).start()
 
     def _read(self, child: subprocess.Popen) -> None:
-        with contextlib.suppress(ValueError):  # closed while it is read
+        with contextlib.suppress(ValueError):  # closed during reading
             for line in child.stderr or ():
                 self._say(line.rstrip("\n"))
 

@@ -20,15 +20,15 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("result", metavar="RESULT.json", help="result that `selfcal solve` wrote")
     parser.add_argument("-o", "--output", metavar="FILE.csv|.npz", required=True,
                         help="table to write: a line for each site, then one for each angular "
-                        "line (csv, SI units, empty = not known), or arrays (npz); "
+                        "line (csv, SI units, empty = unknown), or arrays (npz); "
                         "- = csv to stdout")
     add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Read the result, write the table to a file and say so, or to stdout.
+    """Read the result, write the table to a file or to stdout.
 
-    A result that is not qualified ends with code 5 and the reason on stderr, as where it was made.
+    A result that is not qualified ends with code 5 and the reason on stderr, as in `solve`.
     """
     from pathlib import Path
 
@@ -39,7 +39,7 @@ def run(args: argparse.Namespace) -> int:
 
     kind = ".csv" if args.output == STDOUT else Path(args.output).suffix.lower()
     if kind not in KINDS:
-        raise InputError(args.output, "no kind of table by its ending",
+        raise InputError(args.output, "its ending is not that of a table",
                          "name a file that ends in " + " or ".join(KINDS) + ", or - for stdout")
     check_outputs([args.result], [file_of(args)])
     result = result_from_dict(read_json(args.result), args.result)
@@ -53,7 +53,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def csv_bytes(result: "CalibrationResult") -> bytes:
-    """Return the maps as CSV: nominal places of sites and lines, errors, standard uncertainties."""
+    """Return the maps as CSV: nominal positions of sites and lines, errors, uncertainties."""
     import math
 
     emap, plate = result.error_map, result.artifact

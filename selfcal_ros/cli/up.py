@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``selfcal up``: the nodes of a cell, supervised, and one screen to run a calibration."""
+"""``selfcal up``: the supervised nodes of a cell, and one screen to run a calibration."""
 
 import argparse
 import contextlib
@@ -8,7 +8,7 @@ from pathlib import Path
 
 from selfcal_ros.cli.terminal.output import add_json
 
-HELP = "bring up the nodes of a cell, supervise them, and run a calibration on one screen"
+HELP = "start and supervise the nodes of a cell, and run a calibration on one screen"
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -18,20 +18,20 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--namespace", metavar="NS", default="", help="namespace of the cell")
     parser.add_argument("--bag", metavar="FOLDER", help="record the session to this new folder")
     parser.add_argument("--results", metavar="FOLDER", default=".",
-                        help="folder for the map of each run, PLAN_RUN.json, and for those that "
-                        "save_map writes (default: the working directory)")
-    add_json(parser, "one JSON object a line: pictures as they change, answers to requests")
+                        help="folder for the map of each run, PLAN_RUN.json, and for those of "
+                        "save_map (default: the working directory)")
+    add_json(parser, "one JSON object per line: pictures as they change, answers to requests")
     parser.add_argument("--journal", metavar="FOLDER", help="folder for journals, from which a "
-                        "collector that died goes on (default: journals in that of the results; "
-                        "with --simulate journals_simulated)")
+                        "restarted collector continues (default: journals in the folder of the "
+                        "results; with --simulate journals_simulated)")
     parser.add_argument("--compensate", action="store_true",
                         help="publish corrected joint states as well")
     parser.add_argument("--simulate", action="store_true",
-                        help="run a simulated cell beside the nodes, to try it out")
+                        help="also run a simulated cell, to try it out")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Start the nodes, watch over them, show the screen; take them along at the end."""
+    """Start and supervise the nodes, show the screen, stop the nodes at the end."""
     from selfcal_ros.cli.monitor import watch
     from selfcal_ros.cli.processes import ended_by_signals, need_ros
     from selfcal_ros.cli.supervisor import Supervisor
@@ -65,11 +65,11 @@ def commands(args: argparse.Namespace) -> dict[str, list[str]]:
     def with_parameters(**values: str) -> list[str]:
         return common + [word for name, value in values.items()
                          for word in ("-p", f"{name}:={value}")]
-    # apart: a simulated run that was left must never go on with real readings
+    # separate: an interrupted simulated run must never continue with real readings
     folder = "journals_simulated" if args.simulate else "journals"
     journal = args.journal or str(Path(args.results, folder))
     of = "_simulated" if args.simulate else ""
-    # first, so that a parameter file may name another
+    # first, so that a parameter file can override it
     saved = Path(args.results, f"{Path(args.plan).stem}{of}_{{run_id}}.json")
     nodes = {"measurement_collector": with_parameters(journal=str(Path(journal).absolute())),
              "solver": ["--ros-args", "-p", f"save_path:={saved.absolute()}", *common[1:], "-p",

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The process that watches a cell, as the commands see it: pictures in, requests out."""
+"""The monitor process of a cell, as used by commands: pictures in, requests out."""
 
 import contextlib
 import json
@@ -34,7 +34,7 @@ class Eyes:
         self._queue.put(None)
 
     def ask(self, request: str) -> None:
-        """Ask the sequencer for something."""
+        """Send a request to the sequencer."""
         if self._child.stdin is None:
             return
         with contextlib.suppress(BrokenPipeError):
@@ -42,7 +42,7 @@ class Eyes:
             self._child.stdin.flush()
 
     def next(self, timeout_s: float) -> dict[str, Any] | None:
-        """Return the next message; an empty one after `timeout_s`, None when the process ended."""
+        """Return the next message; empty after `timeout_s`, None when the process has ended."""
         try:
             return self._queue.get(timeout=timeout_s)
         except queue.Empty:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the launch files share: arguments, nodes, and an end with the reason if one cannot start."""
+"""Shared by the launch files: arguments, nodes, and an end with the reason if one cannot start."""
 
 import os
 from pathlib import Path
@@ -40,12 +40,12 @@ def arguments(params: str) -> list[Any]:
         argument("plan", default_value=str(share() / "config/plans/resistant.yaml"),
                  description="PLAN.yaml with plate and views"),
         argument("use_sim_time", default_value="false", choices=["true", "false"],
-                 description="stamp by /clock, as of a simulator or `ros2 bag play --clock`"),
+                 description="take time from /clock, as of a simulator or `ros2 bag play --clock`"),
         argument("log_level", default_value="info",
                  choices=["debug", "info", "warn", "error", "fatal"],
-                 description="least level that nodes log"),
+                 description="lowest level that nodes log"),
         argument("foxglove", default_value="false", choices=["true", "false"],
-                 description="start foxglove_bridge as well, port 8765 (package foxglove_bridge)"),
+                 description="also start foxglove_bridge, port 8765 (package foxglove_bridge)"),
         OpaqueFunction(function=refuse_missing)]
 
 
@@ -54,18 +54,18 @@ def journal_argument(folder: str) -> DeclareLaunchArgument:
     home = Path(os.environ.get("ROS_HOME") or Path.home() / ".ros")
     return DeclareLaunchArgument(
         "journal", default_value=str(home / folder), description="folder for journals, from which "
-        "a collector that died goes on; none = no journal")
+        "a restarted collector continues; none = no journal")
 
 
 def refuse_missing(context: LaunchContext) -> None:
-    """End the launch if the parameter file is none: launch_ros would start the nodes without."""
+    """End the launch if the parameter file is missing, which launch_ros would ignore."""
     path = context.launch_configurations["params"]
     if not Path(path).is_file():
         raise InputError(f"params:={path}", "no such file", "check the path")
 
 
 def text(name: str) -> ParameterValue:
-    """Return a launch argument as a text, whatever YAML would take it for."""
+    """Return a launch argument as a string, however YAML would interpret it."""
     return ParameterValue(LaunchConfiguration(name), value_type=str)
 
 
@@ -81,15 +81,15 @@ def node(name: str, *parameters: Any, **kwargs: Any) -> Node:
 
 
 def foxglove() -> Node:
-    """Return the action that starts foxglove_bridge if it is wanted."""
+    """Return the action that starts foxglove_bridge if requested."""
     return Node(package="foxglove_bridge", executable="foxglove_bridge", output="screen",
                 condition=IfCondition(LaunchConfiguration("foxglove")))
 
 
 def end_if_it_cannot_start(event: Any, _context: Any) -> None:
-    """End the launch with code 1 if a node ended for bad parameters or input.
+    """End the launch with code 1 if a node ended because of bad parameters or input.
 
-    A node that ends later, or by a signal, ends alone: it can be started again beside the others.
+    A node that ends later, or by a signal, ends alone: it can be restarted without the others.
 
     Parameters
     ----------

@@ -351,7 +351,7 @@ def test_the_disk_has_it_soon_and_its_failure_is_said(tmp_path, monkeypatch):
 
 def test_what_cannot_be_a_journal(tmp_path):
     (tmp_path / "file").write_text("x")
-    with pytest.raises(InputError, match=r"cannot be made \(Not a directory\); name a folder"):
+    with pytest.raises(InputError, match=r"cannot be created \(Not a directory\); name a"):
         start(tmp_path / "file" / "in it", NOW)
     with start(tmp_path, NOW) as writer:
         with pytest.raises(InputError, match="topic /a: no definition of b/msg/C; record only"):

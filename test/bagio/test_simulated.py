@@ -48,5 +48,5 @@ def test_the_whole_bag_has_its_name(simulation, tmp_path):
 def test_a_place_where_no_folder_can_be_made_is_one_line(simulation, tmp_path):
     (tmp_path / "file").write_text("")
     place = tmp_path / "file" / "bag"
-    with pytest.raises(InputError, match=f"^{re.escape(str(place))}: cannot be made "):
+    with pytest.raises(InputError, match=f"^{re.escape(str(place))}: cannot be created "):
         write_simulation(simulation, place)

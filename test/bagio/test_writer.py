@@ -206,8 +206,8 @@ def test_closing_twice_is_closing_once(tmp_path):
 @pytest.mark.parametrize(("target", "said"), [
     ("folder", "exists already; remove it or name another folder"),
     ("file", "exists already; remove it or name another folder"),
-    ("file/bag", "cannot be made (Not a directory); name a folder that you may write"),
-    ("n" * 300, "cannot be made (File name too long); name a folder that you may write")])
+    ("file/bag", "cannot be created (Not a directory); name a writable folder"),
+    ("n" * 300, "cannot be created (File name too long); name a writable folder")])
 def test_where_no_bag_can_be_made(tmp_path, target, said):
     (tmp_path / "folder").mkdir()
     (tmp_path / "file").touch()

@@ -176,8 +176,8 @@ def test_two_batches_do_not_work_in_one_folder(shelf, tmp_path, capsys):
 
 @pytest.mark.parametrize(("options", "message"), [
     (["--workers", "0"], "--workers: 0 is not a number of workers; give 1 to 1024"),
-    (["--dask", "x.mcap"], "--dask: 'x.mcap' is no address of a scheduler; write HOST:PORT, or "
-     "--dask local in front of a bag")])
+    (["--dask", "x.mcap"], "--dask: 'x.mcap' is not the address of a scheduler; write HOST:PORT, "
+     "or --dask local in front of a bag")])
 def test_options_that_cannot_be(shelf, tmp_path, capsys, options, message):
     assert batch(shelf / "a.mcap", "-o", tmp_path / "out", *options) == 2
     assert capsys.readouterr().err == f"selfcal batch: {message}\n"

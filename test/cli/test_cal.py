@@ -230,11 +230,12 @@ def test_eval_refuses_a_length_of_an_axis_that_turns(run):
     for text in (without_comments, str):  # told by where the table rolls over, or by its comments
         code, out, err = run("eval", text("t.cal"), "--position", "3=10mm", *counts)
         assert (code, out) == (2, "")
-        one_line(err, "'3=10mm' is a length, and axis 3 turns; write 3=10.5, in its primary unit")
+        one_line(err, "'3=10mm' is a length, and axis 3 is rotary; write 3=10.5, in its primary "
+                      "unit")
     assert run("export", "r.json", "-o", "g.cal", "--theta-axis", "3")[0] == 0
     code, _, err = run("eval", "g_theta.cal", "--position", "3=10mm")
     assert code == 2
-    one_line(err, "'3=10mm' is a length, and axis 3 turns")
+    one_line(err, "'3=10mm' is a length, and axis 3 is rotary")
     assert run("eval", "f.cal", "--position", "1=10mm", "--position", "2=1")[0] == 0
 
 
@@ -266,7 +267,7 @@ def test_check_gi4(run, tmp_path):
     assert run("check", "g.cal", "--gi4", "--scanner-bits", "99")[0] == 2
     code, out, err = run("check", "g.cal", "--scanner-bits", "20")
     assert code == 2 and not out
-    one_line(err, "--scanner-bits: they are those behind a GI4; add --gi4")
+    one_line(err, "--scanner-bits: it belongs to a GI4; add --gi4")
 
 
 @pytest.mark.parametrize(("args", "want"), [
@@ -294,7 +295,7 @@ def test_eval_counts(run, tmp_path):
 
 
 @pytest.mark.parametrize(("args", "message"), [
-    ([], "--position: no position is given"),
+    ([], "--position: no position given"),
     (["--position", "2=1"], "axis 1: its position is needed"),
     (["--position", "1"], "'1' is not AXIS=VALUE"),
     (["--position", "33=1"], "'33=1' is not AXIS=VALUE"),
@@ -334,8 +335,8 @@ def test_the_example_of_the_source(run):
     (["--measured", "5um"], "the measurement is not complete"),
     (["--measured", "5", "--over", "1m", "--travel", "1m"], "'5' is not a length"),
     (["--measured", "5um", "--over", "0m", "--travel", "1m"], "not a positive length"),
-    (["--measured", "5um", "--over", "1m", "--travel", "1m", "-o", "o.cal"], "take end, middle"),
-    (["--measured", "5um", "--over", "1m", "--travel", "1m", "--home-x", "1"], "take --home"),
+    (["--measured", "5um", "--over", "1m", "--travel", "1m", "-o", "o.cal"], "give end, middle"),
+    (["--measured", "5um", "--over", "1m", "--travel", "1m", "--home-x", "1"], "use --home"),
     (["r.json", "--over", "1m"], "exclude each other")])
 def test_orthogonality_without_sense(run, args, message):
     code, _, err = run("orthogonality", *args)

@@ -212,8 +212,8 @@ def test_the_table_of_a_result(tmp_path, capsys):
     np.testing.assert_array_equal(arrays["gx"], emap.gx)
     np.testing.assert_array_equal(arrays["ay"], result.artifact_map.ay)
     assert main(["table", str(tmp_path / "r.json"), "-o", str(tmp_path / "t.txt")]) == 2
-    assert capsys.readouterr().err == (f"selfcal table: {tmp_path / 't.txt'}: no kind of table by "
-                                       "its ending; name a file that ends in .csv or .npz, "
+    assert capsys.readouterr().err == (f"selfcal table: {tmp_path / 't.txt'}: its ending is not "
+                                       "that of a table; name a file that ends in .csv or .npz, "
                                        "or - for stdout\n")
     text = (tmp_path / "t.csv").read_text()
     assert main(["table", str(tmp_path / "r.json"), "-o", "-"]) == 0

@@ -70,7 +70,7 @@ def test_maps_that_differ_and_maps_without_uncertainty_have_their_verdicts(files
     write_json(other, data)
     assert main(["diff", files[0], other]) == 0
     assert capsys.readouterr().out.splitlines()[-1] == (
-        "verdict: none, as there are no uncertainties to test against")
+        "verdict: none, no uncertainties to test against")
 
 
 def test_a_result_that_is_not_qualified_is_named(files, tmp_path, capsys):
@@ -119,7 +119,7 @@ def test_keep_scale_is_for_maps_that_have_one(files, tmp_path, capsys):
         printed = capsys.readouterr()
         assert printed.out == "" and printed.err == (
             f"selfcal diff: --keep-scale: {bare} has no reference length, so its magnification is "
-            "not known; leave it out, or solve with --reference\n")
+            "unknown; omit it, or solve with --reference\n")
     assert main(["diff", files[1], files[1], "--keep-scale"]) == 0
     assert "scale +0 µm/m" in capsys.readouterr().out
 
@@ -149,8 +149,8 @@ def test_result_against_the_laser(files, tmp_path, capsys):
         1e-6 - found["nonorthogonality"]["map"])
     assert main(["diff", files[0], str(laser), "--keep-scale"]) == 2
     assert capsys.readouterr().err == (
-        f"selfcal diff: --keep-scale: of {laser} squareness and scale difference are compared, no "
-        "magnification; leave it out\n")
+        f"selfcal diff: --keep-scale: for {laser} squareness and scale difference are compared, "
+        "not the magnification; omit it\n")
 
 
 def test_files_that_are_no_results(files, tmp_path, capsys):
@@ -174,5 +174,5 @@ def test_symbols_are_spelled_out_where_stdout_cannot_take_them(files, monkeypatc
 def test_rounding_errors_are_zero(files, capsys):
     assert main(["diff", files[0], files[0]]) == 0
     assert capsys.readouterr().out.splitlines()[0].startswith(
-        "B less A, datum difference taken out: translation (+0, +0) µm, rotation +0 arcsec, "
+        "B minus A, datum difference removed: translation (+0, +0) µm, rotation +0 arcsec, "
         "scale +0 µm/m")

@@ -58,8 +58,8 @@ def test_check_tells_what_nothing_checks(tmp_path, capsys):
     text = Path(shipped("hu")).read_text().replace("size: 11", "size: 11, grid_size_y: 5")
     (tmp_path / "long.yaml").write_text(text)
     assert main(["plan", "check", str(tmp_path / "long.yaml")]) == 0
-    assert ("\n30 sites rest on single readings that no other checks: a further view would check "
-            "them\n") in capsys.readouterr().out
+    assert ("\n30 sites depend on single readings that no other reading checks: a further view "
+            "would check them\n") in capsys.readouterr().out
 
 
 def test_check_in_words(capsys):
@@ -126,11 +126,11 @@ def test_free_terms_that_a_plan_does_not_tell_are_refused(capsys, tmp_path):
 
 def test_an_order_that_is_cut_off_is_said(capsys):
     assert main(["plan", "check", shipped("hu_repeated"), "--order", "x_back_y_back"]) == 0
-    assert ("  the order x_back_y_back takes repeats by 4: it is cut off in the views 'identity', "
-            "'rot90', 'shift_x'\n") in capsys.readouterr().out
+    assert ("  the order x_back_y_back needs a multiple of 4 repeats: it is truncated in the views "
+            "'identity', 'rot90', 'shift_x'\n") in capsys.readouterr().out
     assert main(["plan", "check", shipped("hu_repeated"), "--order", "x_back_y_back",
                  "--repeats", "8"]) == 0
-    assert "cut off" not in capsys.readouterr().out
+    assert "truncated" not in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(("arguments", "message"), [
@@ -241,7 +241,7 @@ def test_suggest_the_best_plan(capsys, tmp_path):
     (["suggest", "--views", "2"], "--views: 2 views cannot identify the stage; give 3 or more"),
     (["suggest", "--top", "0"], "--top: 0 is not positive"),
     (["suggest", "--views", "4", "--top", "2"],
-     "--top: with --views one plan is found, not a list; leave it out"),
+     "--top: with --views one plan is found, not a list; omit it"),
     (["suggest", "-o", "/no/such/folder/p.yaml"], "cannot be written"),
 ])
 def test_bad_arguments(arguments, message, capsys):

@@ -79,11 +79,11 @@ def test_summary_on_a_terminal_without_symbols(folder, monkeypatch):
     (["result.json", "-o", "a.txt"],
      "a.txt: a report is HTML or PDF; end the name in .html or .pdf"),
     (["result.json", "-o", "a.html", "--plot", "none/a.png"],
-     "none/a.png: cannot be written (No such file or directory); name a folder that exists and "
-     "that you may write"),
+     "none/a.png: cannot be written (No such file or directory); name an existing, "
+     "writable folder"),
     (["result.json", "-o", "none/a.html"],
-     "none/a.html: cannot be written (No such file or directory); name a folder that exists and "
-     "that you may write"),
+     "none/a.html: cannot be written (No such file or directory); name an existing, "
+     "writable folder"),
     (["result.json", "--truth", "list.json"],
      "list.json: not a mapping; give gx, gy (m) and g_theta (rad)"),
     (["result.json", "--truth", "result.json"], "truth gx: missing; give gx, gy (m) and g_theta "

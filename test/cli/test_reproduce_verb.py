@@ -38,7 +38,7 @@ def test_text_and_plots_and_the_same_bytes_for_the_same_seed(paper, figures, wor
     (["--draws", "0"], "--draws: 0 is not positive; give 1 or more"),
     (["--seed", "-1"], "--seed: -1 is negative"),
     (["--workers", "0", "--draws", "2"], "--workers: 0 is not a number of workers"),
-    (["--out", "/proc/nothing"], "cannot be made"),
+    (["--out", "/proc/nothing"], "cannot be created"),
 ])
 def test_bad_arguments(arguments, message, capsys):
     assert main(["reproduce", "qiao", *arguments]) == 2

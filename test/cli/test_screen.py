@@ -45,7 +45,7 @@ def shown(picture: dict, log: tuple = (), size: tuple[int, int] = (140, 40)) -> 
      "Look: no sign of life of solver."),
     (told("DONE"), "Done. s starts another run."),
     (told("ABORTED"), "Aborted. s starts a new run."),
-    (told("FOLLOWING"), "Nothing: somebody else commands; a ends that.")])
+    (told("FOLLOWING"), "Nothing: another sequencer commands; a ends that.")])
 def test_what_a_person_has_to_do(sequencer, sentence):
     assert what_now(EMPTY | {"health": {"pose_sequencer": sequencer},
                              "command": COMMAND}) == sentence
@@ -151,7 +151,7 @@ def test_all_of_a_good_view_is_on_the_screen(size):
         assert words in text
     assert "more row" not in text
     assert "…" not in text
-    signs = re.search(r"a sign: (\d+) x \d+ marks", text)
+    signs = re.search(r"each cell: (\d+) x \d+ marks", text)
     side = math.ceil(21 / int(signs[1]))
     plate = [row for row in rows if re.match(r"o( o)+( \.)?( |$)", row)]
     assert len(plate) == side
@@ -183,8 +183,8 @@ def test_a_small_terminal_says_what_is_to_be_done_and_asks_for_more_room():
 
 
 @pytest.mark.parametrize("phase, run, sentence", [
-    ("PLACE", "17", "view 2 of 4: rot90"), ("DONE", "17", "1 of 4 views are over"),
-    ("ABORT", "17", "1 of 4 views are over"), ("PLACE", "18", "views 4 of 4; an earlier run")])
+    ("PLACE", "17", "view 2 of 4: rot90"), ("DONE", "17", "1 of 4 views done"),
+    ("ABORT", "17", "1 of 4 views done"), ("PLACE", "18", "views 4 of 4; an earlier run")])
 def test_what_is_over_and_what_is_of_an_earlier_run_is_said(phase, run, sentence):
     text = shown(MEASURED | {"command": COMMAND | {"phase": phase, "run_id": run}})
     assert sentence in text

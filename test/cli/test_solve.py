@@ -256,7 +256,7 @@ def test_the_law_is_linear_and_says_so(tmp_path, capsys, bag):
                             codes=(0, 5))
     capsys.readouterr()
     assert refused(capsys, 2, bag, "--method", "law", "--misalignment", "rigid") == (
-        "--misalignment: Hu's law is linear, not rigid; leave it out, or use --method joint")
+        "--misalignment: Hu's law is linear, not rigid; omit it, or use --method joint")
 
 
 def test_the_uncertainty_map_on_request(tmp_path, bag):
@@ -316,7 +316,7 @@ def test_bad_options(capsys, bag, options):
 
 def test_an_output_that_cannot_be_written(tmp_path, capsys, bag):
     line = refused(capsys, 2, bag, "-o", str(tmp_path / "none" / "r.json"))
-    assert "cannot be written (No such file or directory); name a folder" in line
+    assert "cannot be written (No such file or directory); name an existing" in line
 
 
 def test_the_measurement_is_never_written_over(tmp_path, capsys):

@@ -149,13 +149,13 @@ def test_options_that_would_do_nothing_are_refused(capsys, extra):
     code, out, err = run(capsys, EXAMPLE, "--method", "new", *extra)
     assert (code, out) == (2, "") and err.count("\n") == 1
     assert err.startswith(f"selfcal step-diagonal: {extra[0]}: ")
-    assert err.endswith("leave it out\n")
+    assert err.endswith("omit it\n")
 
 
 def test_two_simulations_exclude_each_other(capsys):
     code, out, err = run(capsys, "--sensitivity", "--simulate", CONFIG / "case_study.yaml")
     assert (code, out, err) == (2, "", "selfcal step-diagonal: --sensitivity: it and --simulate "
-                                       "exclude each other; leave one of them out\n")
+                                       "exclude each other; omit one of them\n")
 
 
 def test_bad_tables_are_one_line_with_their_exit_code(tmp_path, capsys):
@@ -201,7 +201,7 @@ def test_the_sensitivity_table(tmp_path, capsys, monkeypatch):
 def test_data_and_method_belong_together(capsys):
     for arguments in ((EXAMPLE,), ("--method", "new")):
         code, _, err = run(capsys, *arguments)
-        assert code == 2 and "DATA.csv and --method are wanted" in err
+        assert code == 2 and "DATA.csv and --method are required" in err
     code, _, err = run(capsys, EXAMPLE, "--sensitivity")
     assert code == 2 and "reads no data" in err
 

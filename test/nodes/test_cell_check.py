@@ -221,8 +221,8 @@ def test_what_the_verb_says(tmp_path, monkeypatch, capfd, code, words, said):
 
 
 @pytest.mark.parametrize(("words", "said"), [
-    (["--settle", "-1"], "--settle: -1 s is no time to wait; give 0 or more"),
-    (["--patience", "nan"], "--patience: nan s is no time to wait; give 0 or more"),
+    (["--settle", "-1"], "--settle: -1 s is not a waiting time; give 0 or more"),
+    (["--patience", "nan"], "--patience: nan s is not a waiting time; give 0 or more"),
     (["--params", "none.yaml"], "none.yaml")])
 def test_bad_options_of_the_verb(tmp_path, capsys, words, said):
     plan = plan_file(tmp_path, small_plan())

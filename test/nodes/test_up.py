@@ -103,13 +103,13 @@ def test_a_calibration_by_words_past_the_death_of_two_nodes(start, tmp_path):
         up.until(f"now: Place the plate for view '{view.name}'")
         if index == 1:  # the sequencer comes back in the view where it was
             os.kill(pid_of(up.process.pid, "pose_sequencer"), signal.SIGKILL)
-            up.until("pose_sequencer has ended with signal 9: started again")
+            up.until("pose_sequencer ended with signal 9: restarted")
             up.until("now: Press s to start the plan.")
             up.write("start")
             assert f"in view '{view.name}', PLACE" in up.until("took up run ")
         if index == 2:
             os.kill(pid_of(up.process.pid, "solver"), signal.SIGKILL)
-            up.until("solver has ended with signal 9: started again")
+            up.until("solver ended with signal 9: restarted")
         up.write("confirm")
     up.until("now: Done. s starts another run.")
     up.until("map: Calibrated from 4 views: largest error ")
@@ -269,9 +269,9 @@ def test_a_node_that_dies_again_and_again_is_given_up(dying):
     with supervisor:
         for _ in range(MOST_RESTARTS + 3):
             supervisor.step()
-        assert supervisor.log == ["solver has ended with signal 9: started again"] * (
-            MOST_RESTARTS) + ["solver has ended with signal 9, for the 6th time within 60 s: not "
-                              "started again"]
+        assert supervisor.log == ["solver ended with signal 9: restarted"] * (
+            MOST_RESTARTS) + ["solver ended with signal 9, 6 times within 60 s: not "
+                              "restarted"]
 
 
 @pytest.mark.parametrize("seconds, kept", [(59.9, False), (60.0, True)])
@@ -282,12 +282,12 @@ def test_deaths_of_long_ago_do_not_count(dying, seconds, kept):
             supervisor.step()
         clock.now = seconds
         supervisor.step()
-        assert supervisor.log[-1].endswith(": started again") is kept
+        assert supervisor.log[-1].endswith(": restarted") is kept
 
 
 @pytest.mark.parametrize("code, node, line", [
-    (2, "solver", "solver has ended with code 2 and is not started again"),
-    (-9, "bag_recorder", "bag_recorder has ended with signal 9 and is not started again")])
+    (2, "solver", "solver ended with code 2 and is not restarted"),
+    (-9, "bag_recorder", "bag_recorder ended with signal 9 and is not restarted")])
 def test_what_would_only_fail_again_is_not_started_again(dying, code, node, line):
     supervisor, _ = dying([code], node)
     with supervisor:

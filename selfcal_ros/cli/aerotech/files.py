@@ -25,7 +25,7 @@ def add_to(group: argparse._SubParsersAction) -> None:
     check.add_argument("--scanner-bits", type=int, metavar="N",
                        help=f"bits of the scanner protocol behind --gi4 (default {SCANNER_BITS})")
     check.add_argument("--strict", action="store_true",
-                       help="refuse what is only tolerated or doubtful, too")
+                       help="also refuse tolerated and doubtful content")
     check.add_argument("--json", action="store_true", help="print the findings as JSON")
     check.set_defaults(run_sub_verb=_check)
     evaluate = group.add_parser("eval", help="print the corrections at a position as JSON, "
@@ -35,7 +35,7 @@ def add_to(group: argparse._SubParsersAction) -> None:
     add("--position", action="append", metavar="AXIS=P", help="position: primary units, or a "
         "length as in 1=10.5mm")
     add("--unit", choices=("m", "mm", "um"), help="primary unit of the linear axes, for positions "
-        "with a unit (default: as the comments of FILE.cal say, else mm)")
+        "with a unit (default: from the comments of FILE.cal, else mm)")
     add("--counts-per-unit", action="append", metavar="AXIS=C",
         help="encoder counts per primary unit")
     add("--counts-per-secondary", action="append", metavar="AXIS=C",
@@ -47,7 +47,7 @@ def add_to(group: argparse._SubParsersAction) -> None:
         help="home offset now, primary units, if it has changed")
     add("--absolute-feedback-offset", action="append", metavar="AXIS=C",
         help="absolute feedback offset now, counts, if it has changed")
-    add("--json", action="store_true", help="print JSON: as it is printed anyhow")
+    add("--json", action="store_true", help="print JSON (the default)")
     evaluate.set_defaults(run_sub_verb=_evaluate)
 
 
@@ -57,7 +57,7 @@ def _check(args: argparse.Namespace) -> int:
     from selfcal_ros.aerotech.rules import Gi4
 
     if args.scanner_bits is not None and not args.gi4:
-        raise InputError("--scanner-bits", "they are those behind a GI4", "add --gi4")
+        raise InputError("--scanner-bits", "it belongs to a GI4", "add --gi4")
     bits = SCANNER_BITS if args.scanner_bits is None else args.scanner_bits
     if not 6 <= bits <= 48:
         raise InputError("--scanner-bits", f"{bits} bits", "give 16, 18 or 20")
@@ -108,7 +108,7 @@ def _evaluate(args: argparse.Namespace) -> int:
         rotary.add(frame.theta_axis)
     positions = numbers(in_unit(args.position, unit, rotary=rotary), "--position")
     if not positions:
-        raise InputError("--position", "no position is given", "write --position 1=10.5")
+        raise InputError("--position", "no position given", "write --position 1=10.5")
     corrections = CalEvaluator(cal.tables, _setup(args)).corrections(positions)
     print(json.dumps({str(axis): float(value) for axis, value in corrections.items()}))
     return int(ExitCode.DONE)

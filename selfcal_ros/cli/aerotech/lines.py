@@ -36,8 +36,8 @@ def add_to(group: argparse._SubParsersAction) -> None:
     square.add_argument("--over", metavar="LENGTH", help="length of the square")
     square.add_argument("--travel", metavar="LENGTH", help="full travel of the reference axis")
     square.add_argument("--home", choices=tuple(_HOMES),
-                        help="home position of the reference axis (default: show all; with -o: "
-                             "must be said)")
+                        help="home position of the reference axis (default: show all; "
+                             "required with -o)")
     _common(square, _orthogonality)
     for name, what in (("accuracy", "an axis from its own position"),
                        ("straightness", "the other axis from the position of an axis")):
@@ -62,10 +62,10 @@ def _common(parser: argparse.ArgumentParser, run: object) -> None:
 
 
 def _frame(args: argparse.Namespace) -> "MachineFrame":
-    """Return the frame of the machine; refuse what would change nothing."""
+    """Return the frame of the machine; refuse options without effect."""
     if args.force and not args.output:
         raise InputError("--force", "it replaces a file, and none is named",
-                         "name one with -o, or leave it out")
+                         "name one with -o, or omit it")
     return frame_of(args)
 
 
@@ -86,14 +86,14 @@ def _orthogonality(args: argparse.Namespace) -> int:
     if None in measured:
         raise InputError("arguments", "the measurement is not complete",
                          "give --measured, --over and --travel, or a RESULT.json")
-    _refuse_frame(args, "a measured square", "take --home")
+    _refuse_frame(args, "a measured square", "use --home")
     measured_m, over_m, travel_m = (
         cal_lines.length_m(text, name) for text, name in
         zip(measured, ("--measured", "--over", "--travel"), strict=True))
     if args.output:
         if args.home is None:
-            raise InputError("--home", "it is not said where the home position lies",
-                             "take end, middle or middle-balanced")
+            raise InputError("--home", "the home position is missing",
+                             "give end, middle or middle-balanced")
         line = cal_lines.orthogonality(measured_m, over_m, travel_m, args.home)
         return _deliver(args, line, frame, (args.along, other))
     homes = [args.home] if args.home else list(_HOMES)
@@ -128,7 +128,7 @@ def _line(args: argparse.Namespace, corrected: Axis) -> int:
     frame, result = _frame(args), None
     if Path(args.source).suffix.lower() == ".csv":
         _refuse_frame(args, "measured errors, whose positions are the controller's own",
-                      "leave it out")
+                      "omit it")
         line = cal_lines.measured_line(read_text(args.source), args.source, frame.unit_m)
     else:
         result = read_result(args.source)
@@ -139,7 +139,7 @@ def _line(args: argparse.Namespace, corrected: Axis) -> int:
 
 
 def _refuse_frame(args: argparse.Namespace, what: str, remedy: str) -> None:
-    """Refuse options that place the stage frame: what a machine shows is not in that frame."""
+    """Refuse options of the stage frame: measured values are not in that frame."""
     for axis in "xy":
         if getattr(args, f"home_{axis}") is not None:
             raise InputError(f"--home-{axis}", f"it has no meaning for {what}", remedy)
@@ -150,7 +150,7 @@ def _refuse_frame(args: argparse.Namespace, what: str, remedy: str) -> None:
 
 def _deliver(args: argparse.Namespace, line: "AxisCorrection", frame: "MachineFrame",
              axes: tuple[Axis, Axis], result: "CalibrationResult | None" = None) -> int:
-    """Write the table of a line to its file, or print it; `result` is that of its map."""
+    """Write the table of a line to a file, or print it; `result` is that of its map."""
     from datetime import UTC, datetime
 
     from selfcal_ros import __version__

@@ -55,8 +55,8 @@ def _export(args: argparse.Namespace) -> int:
     if args.theta_output and frame.theta_axis is None:
         raise InputError("--theta-output", "no theta table is written", "name --theta-axis")
     if not result.observability.identifiable:
-        raise NotIdentifiableError(f"{args.result}: the plan that was measured does not identify "
-                                   "the stage; measure the views that are missing",
+        raise NotIdentifiableError(f"{args.result}: the measured plan does not identify the stage; "
+                                   "measure the missing views",
                                    result.observability)
     filled = 0
     if args.fill:
@@ -85,7 +85,7 @@ def _export(args: argparse.Namespace) -> int:
     if filled:
         print(f"selfcal cal: {filled} unknown sites filled from their neighbours", file=sys.stderr)
     if frame.theta_axis is not None and frame.theta_counts_per_unit is None:
-        print("selfcal cal: the theta table covers one turn to either side and does not roll over;"
+        print("selfcal cal: the theta table covers one turn either way and does not roll over;"
               f" --counts-per-unit {frame.theta_axis}=COUNTS makes it roll over", file=sys.stderr)
     return exit_code(result)
 

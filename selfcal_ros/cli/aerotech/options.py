@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the sub-verbs of ``selfcal cal`` have in common: axes, units, pairs AXIS=VALUE."""
+"""Shared by the sub-verbs of ``selfcal cal``: axes, units, pairs AXIS=VALUE."""
 
 import argparse
 import math
@@ -48,7 +48,7 @@ def numbers(texts: list[str] | None, option: str, *, positive: bool = False) -> 
 
 
 def in_unit(texts: list[str] | None, unit: str, *, rotary: Container[int] = ()) -> list[str]:
-    """Return options AXIS=LENGTH with the length as a number in `unit`; others as they are.
+    """Return options AXIS=LENGTH with the length as a number in `unit`; others unchanged.
 
     Raises
     ------
@@ -62,7 +62,7 @@ def in_unit(texts: list[str] | None, unit: str, *, rotary: Container[int] = ()) 
             found.append(text)
             continue
         if int(match[1]) in rotary:
-            raise InputError("--position", f"'{text}' is a length, and axis {match[1]} turns",
+            raise InputError("--position", f"'{text}' is a length, and axis {match[1]} is rotary",
                              f"write {match[1]}=10.5, in its primary unit (deg)")
         factor = Fraction(str(M_PER[match[3].replace("µ", "u")])) / Fraction(str(M_PER[unit]))
         try:
@@ -73,9 +73,9 @@ def in_unit(texts: list[str] | None, unit: str, *, rotary: Container[int] = ()) 
 
 
 def add_frame(parser: argparse.ArgumentParser, *, theta: bool, default: bool = True) -> None:
-    """Add the options that say how the controller's axes lie in the stage frame."""
+    """Add the options that relate the controller's axes to the stage frame."""
     group = parser.add_argument_group(
-        "machine", "" if default else "default: as the comments of FILE.cal say, else columns "
+        "machine", "" if default else "default: from the comments of FILE.cal, else columns "
         "are x and rows are y")
     group.add_argument("--x-axis", type=int, metavar="N", default=1 if default else None,
                        help="index of the x axis, from 1")
@@ -87,10 +87,10 @@ def add_frame(parser: argparse.ArgumentParser, *, theta: bool, default: bool = T
         if axis == "theta" and not theta:
             continue
         group.add_argument(f"--home-{axis}", type=float, metavar="P", default=None,
-                           help=f"place of the controller's zero in the stage frame, {unit} "
+                           help=f"position of the controller's zero in the stage frame, {unit} "
                                 "(default 0, the centre of the field)")
         group.add_argument(f"--reverse-{axis}", action="store_true",
-                           help=f"the encoder counts against the stage frame's {axis}")
+                           help=f"the encoder counts opposite to the stage frame's {axis}")
     if theta:
         group.add_argument("--theta-axis", type=int, metavar="N", help="index of the theta axis")
         group.add_argument("--counts-per-unit", action="append", metavar="AXIS=COUNTS",
@@ -98,7 +98,7 @@ def add_frame(parser: argparse.ArgumentParser, *, theta: bool, default: bool = T
 
 
 def frame_of(args: argparse.Namespace, base: "MachineFrame | None" = None) -> "MachineFrame":
-    """Return the frame that the options describe, upon `base` where they are silent."""
+    """Return the frame described by the options, with `base` as default."""
     from dataclasses import replace
 
     from selfcal_ros.aerotech.machine import UNITS_M, MachineFrame
@@ -137,7 +137,7 @@ def frame_of(args: argparse.Namespace, base: "MachineFrame | None" = None) -> "M
 
 
 def read_result(path: str) -> "CalibrationResult":
-    """Return the result in a RESULT.json; InputError says what is wrong with it."""
+    """Return the result in a RESULT.json; InputError if it is invalid."""
     from selfcal_ros.files import read_json
     from selfcal_ros.model.result import result_from_dict
 

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What verbs write to the terminal: progress, and a result."""
+"""Terminal output of the verbs: progress, and a result."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Text and pictures made to fit a given room of a terminal; what is left out is told."""
+"""Fit text and pictures into a terminal; omissions are stated."""
 
 from collections.abc import Callable, Sequence
 from math import ceil
@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.text import Text
 
 _CONSOLE = Console(width=500, legacy_windows=False)
-"""Knows how wide characters are; nothing is printed on it."""
+"""Used for the width of characters; nothing is printed on it."""
 
 
 def wrapped(texts: Sequence[Text], width: int) -> list[Text]:
@@ -17,7 +17,7 @@ def wrapped(texts: Sequence[Text], width: int) -> list[Text]:
 
 
 def fitted(rows: list[Text], most: int) -> list[Text]:
-    """Return at most `most` rows; the last of them says how many there was no room for."""
+    """Return at most `most` rows; the last one states how many were omitted."""
     if len(rows) <= most:
         return rows
     left = len(rows) - max(most - 1, 0)
@@ -26,7 +26,7 @@ def fitted(rows: list[Text], most: int) -> list[Text]:
 
 
 def last_fitted(texts: Sequence[Text], width: int, most: int) -> list[Text]:
-    """Return the last texts that fit as a whole into `most` rows; of a longer one its beginning."""
+    """Return the last texts that fit into `most` rows; the beginning of one that does not."""
     rows: list[Text] = []
     for text in reversed(texts):
         more = wrapped([text], width)
@@ -37,7 +37,7 @@ def last_fitted(texts: Sequence[Text], width: int, most: int) -> list[Text]:
 
 
 def headed(title: str, rows: list[Text], width: int) -> list[Text]:
-    """Return rows below a line with their title."""
+    """Return rows below a title line."""
     head = Text(f"── {title} ", style="bold", no_wrap=True)
     head.truncate(width, overflow="ellipsis")
     head.append("─" * (width - head.cell_len))
@@ -46,7 +46,7 @@ def headed(title: str, rows: list[Text], width: int) -> list[Text]:
 
 def coarser[T](cells: Sequence[Sequence[T]], width: int, height: int,
                worst: Callable[[list[T]], T]) -> tuple[list[list[T]], int]:
-    """Return cells so that they fit, a blank between two of a row, and how many a side became one.
+    """Return cells coarsened to fit, blank-separated, and the factor per side.
 
     Parameters
     ----------
@@ -55,7 +55,7 @@ def coarser[T](cells: Sequence[Sequence[T]], width: int, height: int,
     width, height : int
         Columns and rows of room, at least 1.
     worst : callable
-        Gives the cell that stands for others.
+        Returns the cell that represents a group of cells.
     """
     across = max(map(len, cells), default=0)
     step = max(1, ceil(len(cells) / height), ceil(across / ((width + 1) // 2)))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a verb gives on stdout: text for a person, or one JSON object (docs/json.md)."""
+"""Output of a verb on stdout: text, or one JSON object (docs/json.md)."""
 
 import argparse
 import json
@@ -7,7 +7,7 @@ import sys
 from typing import Any, TextIO
 
 STDOUT = "-"
-"""As the name of an output file: the result goes to stdout, all else to stderr."""
+"""Name of an output file: the result goes to stdout, everything else to stderr."""
 
 
 def add_json(parser: argparse.ArgumentParser, what: str = "one JSON object") -> None:
@@ -16,7 +16,7 @@ def add_json(parser: argparse.ArgumentParser, what: str = "one JSON object") -> 
 
 
 def say(args: argparse.Namespace, text: str, data: dict[str, Any]) -> None:
-    """Print `data` as JSON if that is wanted, else `text`."""
+    """Print `data` as JSON if requested, else `text`."""
     if args.json:
         put(data)
     else:
@@ -24,7 +24,7 @@ def say(args: argparse.Namespace, text: str, data: dict[str, Any]) -> None:
 
 
 def tell(text: str) -> None:
-    """Print text for a person; where stdout cannot take µ, ° and the like, spelled out."""
+    """Print text; if stdout cannot encode µ, ° and the like, they are spelled out."""
     from selfcal_ros.reporting.summary.format import can_print_symbols, to_ascii
 
     print(text if can_print_symbols(sys.stdout) else to_ascii(text))
@@ -46,5 +46,5 @@ def on_stdout(args: argparse.Namespace) -> bool:
 
 
 def aside(args: argparse.Namespace) -> TextIO:
-    """Return where text beside the result goes: stderr if the result is on stdout."""
+    """Return the stream for other text: stderr if the result is on stdout."""
     return sys.stderr if on_stdout(args) else sys.stdout

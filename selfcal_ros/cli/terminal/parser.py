@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The parser of the command line: a fault is one line, with what was probably meant."""
+"""Command line parser: errors are one line, with a suggestion."""
 
 import argparse
 from collections.abc import Iterable, Sequence
@@ -11,7 +11,7 @@ from selfcal_ros.errors import ExitCode, did_you_mean, printable
 class Parser(argparse.ArgumentParser):
     """An ArgumentParser whose errors are one line on stderr, exit code 2.
 
-    A verb, a choice or an option that is not known is answered with those that are like it.
+    An unknown verb, choice or option is answered with similar ones.
     Sub-parsers are of this class, too. ``leaf`` of the arguments is the innermost parser.
     """
 
@@ -21,7 +21,7 @@ class Parser(argparse.ArgumentParser):
 
     def parse_args(self, args: Sequence[str] | None = None,  # type: ignore[override]
                    namespace: argparse.Namespace | None = None) -> argparse.Namespace:
-        """Return the arguments; an option that is left over ends with a line that names it."""
+        """Return the arguments; an unknown option ends with a line that names it."""
         found, unknown = self.parse_known_args(args, namespace)
         if unknown:
             found.leaf.refuse(unknown)
@@ -50,7 +50,7 @@ class Parser(argparse.ArgumentParser):
                   printable(f"{self.prog}: {message}; see {self.prog} --help") + "\n")
 
     def _check_value(self, action: argparse.Action, value: Any) -> None:
-        """Refuse what is not among the choices, with what is like it."""
+        """Refuse a value that is not among the choices, with similar ones."""
         if action.choices is None or value in action.choices:
             return
         choices: Iterable[str] = map(str, action.choices)

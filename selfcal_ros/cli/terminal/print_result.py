@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a verb prints of a result."""
+"""Terminal output of a result."""
 
 import sys
 from typing import TYPE_CHECKING, TextIO
@@ -9,7 +9,7 @@ if TYPE_CHECKING:
 
 
 def show(result: "CalibrationResult", bag: str, output: str | None, stream: TextIO) -> None:
-    """Print the summary, against the known truth where the bag folder holds one."""
+    """Print the summary, compared with the truth if the bag folder has one."""
     from selfcal_ros.bagio.offline import read_truth
     from selfcal_ros.reporting.summary.format import can_print_symbols
     from selfcal_ros.reporting.summary.sections import summary_text
@@ -23,7 +23,7 @@ def show(result: "CalibrationResult", bag: str, output: str | None, stream: Text
 def exit_code(result: "CalibrationResult") -> int:
     """Return the exit code of a result that was computed: 0, or 5 if it is not qualified.
 
-    Why not is said in one line on stderr, whatever else is printed.
+    The reason is printed in one line on stderr in any case.
     """
     from selfcal_ros.errors import ExitCode
 
@@ -32,7 +32,7 @@ def exit_code(result: "CalibrationResult") -> int:
 
 
 def say_unless_qualified(result: "CalibrationResult", who: str) -> bool:
-    """Say on stderr what the verdict has to say, and return whether a result is not qualified."""
+    """Print the verdict on stderr, and return whether a result is not qualified."""
     from selfcal_ros.model.verdict import Grade
     from selfcal_ros.reporting.summary.format import can_print_symbols, printable, to_ascii
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A progress bar where a person watches, nothing where a script does."""
+"""A progress bar on a terminal, nothing in a script."""
 
 import contextlib
 import sys
@@ -32,7 +32,7 @@ def _nothing(done: int, total: int | None = None) -> None:
 
 @contextlib.contextmanager
 def late_progress(label: str, after_s: float = 2.0) -> Iterator[Callable[[int, int | None], None]]:
-    """Yield the function of `progress_bar`; its bar appears only once `after_s` have passed."""
+    """Yield the function of `progress_bar`; its bar appears only after `after_s`."""
     began = time.monotonic()
     draw: Callable[[int, int | None], None] | None = None
     with contextlib.ExitStack() as stack:
@@ -49,9 +49,9 @@ def late_progress(label: str, after_s: float = 2.0) -> Iterator[Callable[[int, i
 
 @contextlib.contextmanager
 def busy(label: str, after_s: float = 2.0) -> Iterator[None]:
-    """Show that the block is at work, and for how long, once `after_s` have passed.
+    """Show that the block is running, and for how long, after `after_s`.
 
-    For work that cannot tell how far it is; drawn by a thread on stderr if that is a terminal.
+    For work of unknown progress; drawn by a thread on stderr if that is a terminal.
     Nothing may be printed in the block.
     """
     if not sys.stderr.isatty():

@@ -398,7 +398,7 @@ def test_a_disk_that_is_full_from_the_beginning_is_tried_again(tmp_path, events,
 
 def test_a_folder_that_may_not_be_written_is_a_mistake_of_the_parameter(tmp_path):
     (tmp_path / "file").touch()
-    with pytest.raises(InputError, match=r"cannot be made \(Not a directory\); name a folder"):
+    with pytest.raises(InputError, match=r"cannot be created \(Not a directory\); name a"):
         Desk(tmp_path / "file")
 
 
