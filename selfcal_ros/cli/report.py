@@ -26,6 +26,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Read the result, write the report, print its path."""
+    from selfcal_ros.aerotech.report import table_chapter
     from selfcal_ros.files import check_outputs, read_json
     from selfcal_ros.model.result import result_from_dict
     from selfcal_ros.reporting.report import check_name, write_report
@@ -42,7 +43,7 @@ def run(args: argparse.Namespace) -> int:
             from selfcal_ros.reporting.figures.maps import map_picture
             from selfcal_ros.reporting.figures.paper import save_picture
             save_picture(map_picture(result, truth), args.plot)
-        write_report(result, output, truth=truth)
+        write_report(result, output, truth=truth, more=[table_chapter(result)])
     written = [str(name) for name in (output, args.plot) if name]
     text = [summary_text(result, truth=truth, ascii_only=not can_print_symbols(sys.stdout))
             ] if args.text else []

@@ -138,11 +138,11 @@ def run(args: argparse.Namespace) -> int:
         unidentified_result,
         with_input,
     )
-    from selfcal_ros.reporting.report import check_name, write_report
     from selfcal_ros.reporting.words.findings import worded
 
     check_outputs([args.bag, args.params], [file_of(args), args.report])
     if args.report:
+        from selfcal_ros.reporting.report import check_name  # loads every figure
         check_name(args.report)
     collector, solver = parameters(args)
     if args.validate and solver.method == "law":  # the joint solution is validated
@@ -172,7 +172,9 @@ def run(args: argparse.Namespace) -> int:
     result = created_now(with_input(worded(result), bag_input(args.bag), lost))
     _write(args, result_to_dict(result))
     if args.report:
-        write_report(result, args.report, truth=read_truth(args.bag))
+        from selfcal_ros.aerotech.report import table_chapter
+        from selfcal_ros.reporting.report import write_report
+        write_report(result, args.report, truth=read_truth(args.bag), more=[table_chapter(result)])
     if not args.quiet:
         show(result, args.bag, file_of(args), aside(args))
         print("\n".join(lines), end="\n" * bool(lines), file=aside(args))

@@ -1,17 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a report holds, chapter by chapter, before it becomes a page or a PDF."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from selfcal_ros.aerotech.verify import Verification
 from selfcal_ros.estimation.options import ReferenceLength
 from selfcal_ros.estimation.verdict.budget import Budget, budgets
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.reporting.extras import convention_section, extra_sections, provenance_section
-from selfcal_ros.reporting.figures.correction import before_and_after, tried
 from selfcal_ros.reporting.figures.drawing import Drawing
 from selfcal_ros.reporting.figures.maps import (
     angular_map,
@@ -58,8 +56,8 @@ class Chapter:
     alert: bool = False
 
 
-def chapters(result: CalibrationResult,
-             truth: Mapping[str, np.ndarray] | None) -> list[Chapter]:
+def chapters(result: CalibrationResult, truth: Mapping[str, np.ndarray] | None,
+             more: Sequence[Chapter] = ()) -> list[Chapter]:
     """Return the chapters of a report; those with nothing to say are left out.
 
     Parameters
@@ -68,10 +66,12 @@ def chapters(result: CalibrationResult,
         What was found.
     truth : mapping, optional
         ``gx``, ``gy`` (nx, ny) in m and ``g_theta`` (K,) in rad on the lattice of the map.
+    more : sequence of Chapter
+        Chapters of others; they follow the uncertainty.
     """
     found = [
         Chapter("Attention", sections=(sections.attention_section(result),), alert=True),
-        _causes(result), _maps(result, truth), _uncertainty(result), _correction(result),
+        _causes(result), _maps(result, truth), _uncertainty(result), *more,
         _residuals(result), _rejected(result),
         Chapter("Measurement", sections=(sections.measurement_section(result),
                                          sections.views_section(result))),
@@ -155,31 +155,6 @@ def _reference(result: CalibrationResult) -> ReferenceLength | None:
         return None
     return ReferenceLength(told["kind"], float(told["relative_error"]), float(told["u_relative"]),
                            str(told.get("certificate") or ""))
-
-
-def _correction(result: CalibrationResult) -> Chapter:
-    title = "Exported table: before and after"
-    if not result.error_map.valid.any():
-        return Chapter(title)
-    outcome = tried(result)
-    if outcome.found is None:
-        return Chapter(title, sections=(Section("", notes=(outcome.why_not,)),))
-    return Chapter(title, _figures(
-        (before_and_after(result, outcome.found), "A simulated controller that moves to the middle "
-         "of every cell, without and with the table of selfcal cal export. What remains is the "
-         "controller's linear interpolation.")), (_correction_table(outcome.found),))
-
-
-def _correction_table(found: Verification) -> Section:
-    rows = []
-    for residual in found.residuals:
-        where = {"sites": "at the nodes", "between": "between the nodes"}[residual.place]
-        numbers = [f(which) * UM_PER_M for f in (residual.rms, residual.largest)
-                   for which in ("before", "after")]
-        rows.append((where, *fixed_column(numbers, 4)))
-    header = ("error vector in µm", "rms before", "after", "largest before", "after")
-    return Section("What the table leaves", table=(header, *rows), notes=(
-        "The map counts as the truth here: to what remains belongs the U of the map itself.",))
 
 
 def _residuals(result: CalibrationResult) -> Chapter:

@@ -2,23 +2,19 @@
 """The calibration report as a PDF: words in columns, then the figures, on A4."""
 
 import io
-import os
-from collections.abc import Mapping
+from collections.abc import Sequence
 from textwrap import wrap
 from typing import Any
 
-import numpy as np
 from matplotlib import rc_context
 from matplotlib.backends.backend_pdf import PdfPages
 from matplotlib.figure import Figure as Page
 
 from selfcal_ros import __version__
-from selfcal_ros.files import write_bytes
 from selfcal_ros.model.result import CalibrationResult
-from selfcal_ros.reporting.chapters import Chapter, Figure, chapters
+from selfcal_ros.reporting.chapters import Chapter, Figure
 from selfcal_ros.reporting.figures.paper import RC, drawable, put
 from selfcal_ros.reporting.summary.format import aligned, numeric_columns
-from selfcal_ros.reporting.summary.numbers import truth_arrays
 from selfcal_ros.reporting.summary.sections import Section, state_sentence
 
 WIDTH, HEIGHT, MARGIN = 595.0, 842.0, 48.0
@@ -40,28 +36,8 @@ Line = tuple[str, bool]
 """Words of a line, and whether they are a heading."""
 
 
-def save_pdf(result: CalibrationResult, path: str | os.PathLike, *,
-             truth: Mapping[str, np.ndarray] | None = None) -> None:
-    """Write the report of a calibration to `path` as a PDF, atomically.
-
-    Raises
-    ------
-    InputError
-        If `truth` does not fit the map, or the file cannot be written.
-    """
-    write_bytes(path, report_pdf(result, truth=truth))
-
-
-def report_pdf(result: CalibrationResult, *,
-               truth: Mapping[str, np.ndarray] | None = None) -> bytes:
-    """Return the report as a PDF, the same bytes for the same result.
-
-    Raises
-    ------
-    InputError
-        If `truth` does not fit the map.
-    """
-    found = chapters(result, truth_arrays(result.error_map, truth))
+def report_pdf(result: CalibrationResult, found: Sequence[Chapter]) -> bytes:
+    """Return the report as a PDF, the same bytes for the same result."""
     title = drawable(f"Stage calibration: plan {result.plan_id}", 90)
     buffer = io.BytesIO()
     about = {"Title": title, "Creator": f"selfcal {__version__}", "CreationDate": None,

@@ -3,14 +3,14 @@
 
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from html import escape
 from pathlib import Path
 
 import numpy as np
 
 from selfcal_ros.errors import InputError
-from selfcal_ros.files import write_text
+from selfcal_ros.files import write_bytes, write_text
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.verdict import Grade
 from selfcal_ros.reporting.chapters import Chapter, Figure, chapters
@@ -22,8 +22,20 @@ from selfcal_ros.reporting.summary.sections import Section, state_sentence
 
 
 def write_report(result: CalibrationResult, path: str | os.PathLike, *,
-                 truth: Mapping[str, np.ndarray] | None = None) -> None:
+                 truth: Mapping[str, np.ndarray] | None = None,
+                 more: Sequence[Chapter] = ()) -> None:
     """Write the report of a calibration, HTML or PDF, atomically.
+
+    Parameters
+    ----------
+    result : CalibrationResult
+        The result; all its text is escaped.
+    path : path-like
+        File to write; .html or .pdf.
+    truth : mapping, optional
+        ``gx``, ``gy`` in m and ``g_theta`` in rad: adds the comparison and draws it.
+    more : sequence of Chapter
+        What others add to the chapters of every report.
 
     Raises
     ------
@@ -32,11 +44,12 @@ def write_report(result: CalibrationResult, path: str | os.PathLike, *,
         cannot be written.
     """
     check_name(path)
+    found = chapters(result, truth_arrays(result.error_map, truth), more)
     if Path(path).suffix.lower() == ".pdf":
-        from selfcal_ros.reporting.pdf import save_pdf as save  # loads matplotlib
+        from selfcal_ros.reporting.pdf import report_pdf  # loads matplotlib
+        write_bytes(path, report_pdf(result, found))
     else:
-        from selfcal_ros.reporting.report import save_report as save  # loads every figure
-    save(result, path, truth=truth)
+        write_text(path, report_html(result, found))
 
 
 def check_name(path: str | os.PathLike) -> None:
@@ -122,41 +135,13 @@ SHORT = 24
 """Characters up to which a cell of words is kept in one line."""
 
 
-def save_report(result: CalibrationResult, path: str | os.PathLike, *,
-                truth: Mapping[str, np.ndarray] | None = None) -> None:
-    """Write the report of a calibration to `path`, atomically.
-
-    Raises
-    ------
-    InputError
-        If `truth` does not fit the map, or the file cannot be written.
-    """
-    write_text(path, report_html(result, truth=truth))
-
-
-def report_html(result: CalibrationResult, *,
-                truth: Mapping[str, np.ndarray] | None = None) -> str:
-    """Return the report as one HTML document with inline figures and no outside resource.
-
-    Parameters
-    ----------
-    result : CalibrationResult
-        What was found; all its text is escaped.
-    truth : mapping, optional
-        ``gx``, ``gy`` in m and ``g_theta`` in rad: adds the comparison and draws it.
-
-    Raises
-    ------
-    InputError
-        If `truth` does not fit the map.
-    """
-    found = chapters(result, truth_arrays(result.error_map, truth))
+def report_html(result: CalibrationResult, found: Sequence[Chapter]) -> str:
+    """Return the report as one HTML document with inline figures and no outside resource."""
     good = (result.verdict.grade is Grade.GOOD and result.observability.identifiable
             and not result.warnings)
     parts = [f'<p class="verdict{"" if good else " bad"}">{_text(state_sentence(result))}</p>',
              _contents(found), *map(_chapter, found)]
-    title = _text(f"Stage calibration: plan {result.plan_id}")
-    return page(title, "\n".join(parts))
+    return page(_text(f"Stage calibration: plan {result.plan_id}"), "\n".join(parts))
 
 
 def _text(value: object) -> str:
@@ -167,7 +152,7 @@ def _anchor(title: str) -> str:
     return re.sub(r"[^a-z]+", "-", title.lower()).strip("-")
 
 
-def _contents(found: list[Chapter]) -> str:
+def _contents(found: Sequence[Chapter]) -> str:
     links = "".join(f'<a href="#{_anchor(c.title)}">{_text(c.title)}</a>' for c in found)
     return f"<nav>{links}</nav>"
 

@@ -408,7 +408,7 @@ def test_bad_paths_and_bad_plots(run, tmp_path):
                           (["export", "x.json", "-o", "g.cal"], "not a result of schema"),
                           (["export", "r.json", "-o", "no/g.cal"], "cannot be written"),
                           (["verify", "r.json", "f.cal", "--plot", "f.gif"],
-                           "the format of a plot")):
+                           "no kind of picture by its ending")):
         code, _, err = run(*args)
         assert code == 2
         one_line(err, message)

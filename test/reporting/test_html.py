@@ -7,13 +7,14 @@ import numpy as np
 import pytest
 
 from selfcal_ros import __version__
+from selfcal_ros.aerotech.report import table_chapter
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.joint.noise import coverage_factor
 from selfcal_ros.model.result import Observability, result_from_dict, result_to_dict
 from selfcal_ros.model.verdict import Cause, Grade, Remedy, Verdict
 from selfcal_ros.reporting.extras import MAX_ROWS, convention_section, extra_sections
-from selfcal_ros.reporting.report import report_html, save_report
-from test.support.results import known_result, with_residuals
+from selfcal_ros.reporting.report import write_report
+from test.support.results import html_of, known_result, with_residuals
 
 VOID = {"meta", "img", "br"}
 
@@ -49,7 +50,7 @@ def parsed(html):
 
 def test_report_is_whole_and_needs_nothing_from_outside():
     result, truth = known_result(5, 24)
-    html = report_html(result, truth=truth)
+    html = html_of(result, truth)
     page = parsed(html)
     assert page.addresses and all(a.startswith("#") for a in page.addresses)
     assert all(f'id="{a[1:]}"' in html for a in page.addresses)
@@ -60,7 +61,7 @@ def test_report_is_whole_and_needs_nothing_from_outside():
 
 
 def test_every_colour_of_a_figure_is_defined_for_light_and_dark():
-    html = report_html(with_residuals(), truth=known_result(5, 24)[1])
+    html = html_of(with_residuals(), known_result(5, 24)[1])
     used = set(re.findall(r'class="(?:[^"]* )?[fs]-(\w+)', html))
     light, dark = re.findall(r":root \{ [^}]*\}", html)[:2]
     assert len(used) > 20
@@ -71,7 +72,7 @@ def test_every_colour_of_a_figure_is_defined_for_light_and_dark():
 
 
 def test_figures_follow_what_the_result_keeps():
-    bare, rich = (parsed(report_html(r)).text for r in (known_result(5, 24)[0], with_residuals()))
+    bare, rich = (parsed(html_of(r)).text for r in (known_result(5, 24)[0], with_residuals()))
     titles = ("Residuals of the grid readings by view", "Distribution of the grid residuals",
               "Distribution of the angular residuals", "Mean residuals over the time",
               "Rejected grid readings, where they happened")
@@ -82,7 +83,7 @@ def test_figures_follow_what_the_result_keeps():
 
 def test_both_kinds_of_uncertainty_are_told_with_what_each_is_for():
     result, _ = known_result(5, 24)
-    page = parsed(report_html(result))
+    page = parsed(html_of(result))
     text = "|".join(page.text)
     for where in ("x or y, at the nodes", "x or y, anywhere", "θ, at the lines", "θ, anywhere"):
         assert text.count(where) == 1
@@ -101,7 +102,7 @@ def test_causes_come_as_a_table_with_one_unit_each():
                     text="view 'a' is 2 times as noisy: measure it again"))
     verdict = Verdict(Grade.NOT_QUALIFIED, causes=causes, reasons=("grid readings: too much",),
                       sentence="Not qualified: most likely drift")
-    html = report_html(replace(result, verdict=verdict))
+    html = html_of(replace(result, verdict=verdict))
     assert '<p class="verdict bad">Not qualified: most likely drift. Map as it is:' in html
     cells = re.findall(r"<td[^>]*>([^<]*)</td>", html)
     at = cells.index("drift")
@@ -116,12 +117,12 @@ def test_causes_come_as_a_table_with_one_unit_each():
 
 def test_the_report_of_a_large_field_stays_small():
     result, _ = known_result(101, 360)
-    assert len(report_html(result).encode()) < 2_000_000
+    assert len(html_of(result).encode()) < 2_000_000
 
 
 def test_report_says_everything():
     result, truth = known_result(5, 24)
-    text = " ".join(parsed(report_html(result, truth=truth)).text)
+    text = " ".join(parsed(html_of(result, truth)).text)
     for expected in ("Stage calibration: plan hu", "Calibrated from 4 views", "shift_x",
                      "Non-orthogonality".lower(), "scale difference", "no encoder sample",
                      "Against the known truth", "zero_mean: the angular errors add up to zero",
@@ -139,7 +140,7 @@ def test_text_from_files_is_escaped():
         extra={evil: evil, "budget": [{evil: evil}]},
         views=(replace(result.views[0], name=evil),),
         observability=Observability(1, 2, 1, False, (evil,), (evil,)))
-    page = parsed(report_html(hostile))
+    page = parsed(html_of(hostile))
     assert "script" not in page.tags
     assert evil in "".join(page.text)
 
@@ -147,11 +148,11 @@ def test_text_from_files_is_escaped():
 def test_a_deficient_plan_is_marked_and_comes_first():
     result, _ = known_result(3, 0)
     seen = Observability(1, 3, 2, False, ("scale difference",), ("add a view turned by 90 deg",))
-    html = report_html(replace(result, observability=seen))
+    html = html_of(replace(result, observability=seen))
     assert '<p class="verdict bad">Not a calibration: 2 modes' in html
     assert html.index("advice: add a view turned by 90 deg") < html.index("<h2>Map</h2>")
-    assert '<p class="verdict">Calibrated' in report_html(result)
-    assert '<p class="verdict bad">' in report_html(replace(result, warnings=("torn bag",)))
+    assert '<p class="verdict">Calibrated' in html_of(result)
+    assert '<p class="verdict bad">' in html_of(replace(result, warnings=("torn bag",)))
 
 
 def test_unknown_maps_and_plates_without_lines():
@@ -159,7 +160,7 @@ def test_unknown_maps_and_plates_without_lines():
     nothing = np.full((3, 3), np.nan)
     emap = replace(result.error_map, gx=nothing, gy=nothing, u_gx=nothing, u_gy=nothing,
                    nonorthogonality=np.nan, scale_difference=np.nan)
-    page = parsed(report_html(replace(result, error_map=emap, views=())))
+    page = parsed(html_of(replace(result, error_map=emap, views=())))
     assert page.tags.count("svg") == 2
     assert "not known" in " ".join(page.text)
     assert "θ datum" not in page.text
@@ -169,7 +170,7 @@ def test_a_site_that_is_unknown_leaves_a_table_with_a_hole():
     result, _ = known_result(5, 0)
     gx = result.error_map.gx.copy()
     gx[1, 2] = np.nan
-    html = report_html(replace(result, error_map=replace(result.error_map, gx=gx)))
+    html = html_of(replace(result, error_map=replace(result.error_map, gx=gx)))
     assert "1 sites are unknown, and a table has no holes: selfcal cal export --fill" in html
 
 
@@ -206,10 +207,10 @@ def test_conventions_follow_the_result():
 def test_report_is_repeatable_and_survives_the_json_form(tmp_path):
     result, _ = known_result(3, 8)
     again = result_from_dict(result_to_dict(result), "r.json")
-    save_report(result, tmp_path / "a.html")
-    assert (tmp_path / "a.html").read_text(encoding="utf-8") == report_html(again)
+    write_report(result, tmp_path / "a.html", more=[table_chapter(result)])
+    assert (tmp_path / "a.html").read_text(encoding="utf-8") == html_of(again)
 
 
 def test_truth_of_another_lattice_is_refused():
     with pytest.raises(InputError, match=r"^truth gx: has the shape \(3, 3\), the map"):
-        report_html(known_result(5, 0)[0], truth=known_result(3, 0)[1])
+        html_of(known_result(5, 0)[0], known_result(3, 0)[1])

@@ -4,13 +4,14 @@ from dataclasses import replace
 
 import pytest
 
+from selfcal_ros.aerotech.report import table_chapter
 from selfcal_ros.errors import InputError
 from selfcal_ros.reporting import pdf
 from selfcal_ros.reporting.chapters import Chapter
-from selfcal_ros.reporting.pdf import COLUMNS, _lines, report_pdf, save_pdf
+from selfcal_ros.reporting.pdf import COLUMNS, _lines, report_pdf
 from selfcal_ros.reporting.report import write_report
 from selfcal_ros.reporting.summary.sections import Section
-from test.support.results import known_result, with_residuals
+from test.support.results import chapters_of, known_result, with_residuals
 
 SMALL = replace(known_result(3, 0)[0], plan_id=r"$\frac{ \n 長", warnings=("$x$ \x1b[2J",))
 """A result with names of the user that neither matplotlib nor its font understands."""
@@ -18,7 +19,7 @@ SMALL = replace(known_result(3, 0)[0], plan_id=r"$\frac{ \n 長", warnings=("$x$
 
 @pytest.fixture(scope="module")
 def small():
-    return report_pdf(SMALL)
+    return report_pdf(SMALL, chapters_of(SMALL))
 
 
 def pages_of(data):
@@ -28,14 +29,15 @@ def pages_of(data):
 def test_a_pdf_has_pages_and_is_the_same_bytes_for_the_same_result(tmp_path, small):
     assert small.startswith(b"%PDF") and small.rstrip().endswith(b"%%EOF")
     assert b"/CreationDate" not in small and b"/FontFile2" in small  # TrueType
-    save_pdf(SMALL, tmp_path / "a.pdf")
+    write_report(SMALL, tmp_path / "a.pdf", more=[table_chapter(SMALL)])
     assert (tmp_path / "a.pdf").read_bytes() == small
 
 
 def test_residuals_take_pages_of_their_own(small, monkeypatch):
     """Pages are counted, not read: their letters are left as outlines, which is cheaper."""
     monkeypatch.setitem(pdf.EMBEDDED, "pdf.fonttype", 3)
-    assert pages_of(report_pdf(with_residuals())) >= max(4, pages_of(small) + 1)
+    long = with_residuals()
+    assert pages_of(report_pdf(long, chapters_of(long))) >= max(4, pages_of(small) + 1)
 
 
 def test_no_line_is_wider_than_the_page_and_no_cell_is_lost():
@@ -51,7 +53,7 @@ def test_no_line_is_wider_than_the_page_and_no_cell_is_lost():
 
 
 def test_the_ending_of_the_name_says_the_form(tmp_path, small, monkeypatch):
-    monkeypatch.setattr(pdf, "report_pdf", lambda result, truth: small)
+    monkeypatch.setattr(pdf, "report_pdf", lambda result, found: small)
     result = known_result(3, 0)[0]
     for name, start in (("a.pdf", b"%PDF"), ("a.PDF", b"%PDF"), ("a.html", b"<!DOCTYPE")):
         write_report(result, tmp_path / name)

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from selfcal_ros.aerotech.report import table_chapter
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ErrorMap
 from selfcal_ros.model.result import (
@@ -14,6 +15,9 @@ from selfcal_ros.model.result import (
     Observability,
     ViewResult,
 )
+from selfcal_ros.reporting.chapters import Chapter, chapters
+from selfcal_ros.reporting.report import report_html
+from selfcal_ros.reporting.summary.numbers import truth_arrays
 from selfcal_ros.simulation.truth import hu_plan, random_truth
 from test.support.lattice_plans import in_datum
 from test.support.maps import first_order
@@ -75,3 +79,14 @@ def covered(result: CalibrationResult, g: np.ndarray) -> float:
     off = in_datum(np.stack([emap.gx, emap.gy]) - g, emap.valid, result.artifact, scale=True)
     inside = abs(off) <= result.noise.k_xy * np.stack([emap.u_gx, emap.u_gy])
     return float(inside[:, emap.valid].mean())
+
+
+def chapters_of(result: CalibrationResult, truth: dict[str, np.ndarray] | None = None,
+                ) -> list[Chapter]:
+    """Return the chapters of the report that `selfcal report` writes."""
+    return chapters(result, truth_arrays(result.error_map, truth), [table_chapter(result)])
+
+
+def html_of(result: CalibrationResult, truth: dict[str, np.ndarray] | None = None) -> str:
+    """Return the report that `selfcal report` writes as HTML."""
+    return report_html(result, chapters_of(result, truth))

@@ -105,8 +105,9 @@ def _verify(args: argparse.Namespace) -> int:
         found = verify_tables(result.error_map, cal.tables, frame)
     say(args, _text(found), _numbers(found))
     if args.plot:
-        from selfcal_ros.reporting.cal_plots import plot_verification
-        plot_verification(found, args.plot)
+        from selfcal_ros.aerotech.report import controller_figure
+        from selfcal_ros.reporting.figures.paper import save_picture
+        save_picture(controller_figure(found), args.plot)
     if found.worse:
         raise InputError(args.file, "the tables make the machine worse",
                          "check signs, axes, unit, home position and encoder directions")

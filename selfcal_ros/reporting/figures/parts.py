@@ -224,16 +224,17 @@ def ordinal(number: int) -> str:
     return f"{number}{'th' if teen else {1: 'st', 2: 'nd', 3: 'rd'}.get(number % 10, 'th')}"
 
 
-def panels(drawing: Drawing, titles: Sequence[str], reach_mm: Sequence[float]) -> list[Frame]:
-    """Return two frames a row of the field, titled, and let the drawing grow around them."""
+def panels(drawing: Drawing, titles: Sequence[str], reach_mm: Sequence[float],
+           below: float = 50.0) -> list[Frame]:
+    """Return two titled frames of the field a row; the drawing grows, with room below each row."""
     side, gap, left, top = 186.0, 42.0, 46.0, 48.0
     height = side * reach_mm[1] / reach_mm[0]
     out = []
     for number, title in enumerate(titles):
-        box = (left + number % 2 * (side + gap), top + number // 2 * (height + 50), side, height)
+        box = (left + number % 2 * (side + gap), top + number // 2 * (height + below), side, height)
         drawing.label(box[0], box[1] - 6, shortened(title, 26), bold=True)
         out.append(Frame(drawing, box, (-reach_mm[0], reach_mm[0]), (-reach_mm[1], reach_mm[1])))
-    drawing.height = top + -(-len(titles) // 2) * (height + 50) - 26
+    drawing.height = top + -(-len(titles) // 2) * (height + below) - 26
     return out
 
 

@@ -9,8 +9,6 @@ import numpy as np
 import pytest
 
 from selfcal_ros.model.verdict import ModelResult, TermEstimate, TermResult
-from selfcal_ros.reporting.chapters import chapters
-from selfcal_ros.reporting.figures.correction import tried
 from selfcal_ros.reporting.figures.drawing import (
     COLOURS,
     Discs,
@@ -46,11 +44,11 @@ from selfcal_ros.reporting.figures.residuals import (
     residuals_in,
 )
 from selfcal_ros.reporting.figures.svg import inline_svg, svg_file
-from test.support.results import known_result, with_residuals
+from test.support.results import chapters_of, known_result, with_residuals
 
 
 def drawn(result, truth=None):
-    return [figure.drawing for chapter in chapters(result, truth) for figure in chapter.figures]
+    return [figure.drawing for chapter in chapters_of(result, truth) for figure in chapter.figures]
 
 
 def long_names(result):
@@ -317,17 +315,6 @@ def test_rejected_readings_stand_where_they_happened():
     assert "low score (1)" in words and "outlier among views (1)" in words
 
 
-def test_a_table_with_holes_or_absurd_errors_is_not_tried():
-    result, _ = known_result(5, 0)
-    far = replace(result.error_map, gx=np.full((5, 5), 6e-3))
-    assert tried(replace(result, error_map=far)) == (
-        None, "errors beyond half a pitch are none that a table corrects")
-    gx = result.error_map.gx.copy()
-    gx[0, 0] = np.nan
-    holed = tried(replace(result, error_map=replace(result.error_map, gx=gx)))
-    assert holed.why_not.startswith("1 sites are unknown")
-
-
 @pytest.mark.parametrize("extra", [
     {}, {"residuals": 5}, {"residuals": {"views": []}}, {"residuals": {"views": "abc"}},
     {"residuals": {"views": [1, 2, 3, 4]}, "rejected_at": [7]},
@@ -339,20 +326,6 @@ def test_extras_of_another_form_are_left_out(extra):
     found = residuals_in(result)
     assert residual_maps(result, found) is None and courses(found, 1e-8) is None
     assert distributions(found, "xy") is None and rejected_map(result) is None
-
-
-def test_the_table_leaves_nothing_at_the_nodes_and_the_curvature_between():
-    result, _ = known_result(5, 0)
-    x = result.artifact.x_m
-    pitch = result.artifact.grid_pitch_m
-    gx = 1e-6 * (x / pitch) ** 2
-    found = tried(replace(result, error_map=replace(
-        result.error_map, gx=gx, gy=np.zeros_like(gx)))).found
-    assert found.sites.largest("before") > 1e-6
-    assert found.sites.largest("after") < 1e-11
-    # a parabola of 1 um a squared pitch lies 1/4 um below its chords at the middle of a cell
-    shift = found.between.shift_after - found.sites.shift_after
-    assert shift == pytest.approx([0.25e-6, 0.0], rel=1e-3, abs=1e-12)
 
 
 def test_svg_of_a_figure_stands_alone_and_is_the_same_twice():

@@ -1,0 +1,78 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the report says of an exported table: the controller's error before and after."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from selfcal_ros.aerotech.export import table_theta, table_xy
+from selfcal_ros.aerotech.machine import MachineFrame
+from selfcal_ros.aerotech.report import controller_figure, table_chapter
+from selfcal_ros.aerotech.verify import verify_tables
+from selfcal_ros.reporting.figures.drawing import Discs, Label, Path
+from test.support.results import known_result
+
+
+def parabola():
+    """Return a result whose Gx is a parabola of 1 um a squared pitch."""
+    result, _ = known_result(5, 8)
+    x = result.artifact.x_m
+    gx = 1e-6 * (x / result.artifact.grid_pitch_m) ** 2
+    return replace(result, error_map=replace(result.error_map, gx=gx, gy=np.zeros_like(gx)))
+
+
+def words(drawing):
+    return [item.text for item in drawing.items if isinstance(item, Label)]
+
+
+def test_a_table_with_holes_or_absurd_errors_is_not_tried():
+    result, _ = known_result(5, 0)
+
+    def why_not(gx):
+        section, = table_chapter(replace(result, error_map=replace(result.error_map, gx=gx))
+                                 ).sections
+        return section.notes[0]
+
+    assert why_not(np.full((5, 5), 6e-3)) == ("errors beyond half a pitch are none that a table "
+                                              "corrects")
+    gx = result.error_map.gx.copy()
+    gx[0, 0] = np.nan
+    assert why_not(gx).startswith("1 sites are unknown")
+
+
+def test_the_table_leaves_nothing_at_the_nodes_and_the_curvature_between():
+    result, frame = parabola(), MachineFrame()
+    found = verify_tables(result.error_map, [table_xy(result.error_map, frame)], frame)
+    assert found.sites.largest("before") > 1e-6
+    assert found.sites.largest("after") < 1e-11
+    # a parabola of 1 um a squared pitch lies 1/4 um below its chords at the middle of a cell
+    shift = found.between.shift_after - found.sites.shift_after
+    assert shift == pytest.approx([0.25e-6, 0.0], rel=1e-3, abs=1e-12)
+
+
+def test_before_and_after_are_drawn_at_one_scale():
+    drawing, = (figure.drawing for figure in table_chapter(parabola()).figures)
+    titles = words(drawing)
+    assert [t for t in titles if t.startswith(("before", "after"))] == [
+        "before, at the nodes", "after, at the nodes", "before, between the nodes",
+        "after, between the nodes"]
+    assert [text for text in titles if text.startswith(("rms", "below"))][1] == (
+        "below 0.0001 µm everywhere")
+    assert sum(text.endswith(" µm") and not text.startswith("rms") for text in titles) == 1  # key
+    shafts = [line for item in drawing.items if isinstance(item, Path)
+              and (item.stroke, item.width) == ("ink", 0.9) for line in item.lines]
+    lengths = [abs(end[0] - start[0]) for start, end in shafts]
+    assert len(lengths) < 40 + 16 + 1  # nothing can be seen of what the table leaves at the nodes
+    assert max(lengths) > 10
+
+
+def test_the_lines_before_and_after_share_one_chart():
+    result, frame = known_result(5, 8)[0], MachineFrame(theta_axis=3)
+    found = verify_tables(result.error_map, [table_theta(result.error_map, frame)], frame)
+    drawing = controller_figure(found)
+    before, after = (item.centres for item in drawing.items if isinstance(item, Discs)
+                     and item.radii[0][0] == 2.0)
+    assert np.ptp([y for _, y in before]) > 100 > 0.1 > np.ptp([y for _, y in after])
+    legend = [text for text in words(drawing) if text.endswith("arcsec") and "rms" in text]
+    assert legend[0].startswith("before: rms") and legend[1].startswith("after: rms")
