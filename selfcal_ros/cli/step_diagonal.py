@@ -21,6 +21,8 @@ from selfcal_ros.errors import ExitCode, InputError
 from selfcal_ros.units import M_PER_MM
 
 if TYPE_CHECKING:
+    from selfcal_ros.aerotech.machine import MachineFrame
+    from selfcal_ros.aerotech.model import Table1D
     from selfcal_ros.laser.data import StepDiagonalResult
 
 HELP = "identify linear, straightness and squareness errors from a laser step-diagonal measurement"
@@ -101,8 +103,9 @@ def run(args: argparse.Namespace) -> int:
     for warning in result["warnings"]:
         print(f"selfcal step-diagonal: warning: {warning}", file=sys.stderr)
     if args.plot:
-        from selfcal_ros.reporting.laser_plots import plot_profiles
-        plot_profiles(found, args.plot)
+        from selfcal_ros.laser.plots import profiles_figure
+        from selfcal_ros.reporting.figures.paper import save_picture
+        save_picture(profiles_figure(found, data), args.plot)
     if args.cal:
         _write_cal(args, found)
     if args.output:
@@ -151,7 +154,6 @@ def _write_cal(args: argparse.Namespace, found: "StepDiagonalResult") -> None:
     from selfcal_ros import __version__
     from selfcal_ros.aerotech.export import DECIMALS
     from selfcal_ros.aerotech.write import cal_text, write_cal
-    from selfcal_ros.laser.profiles import correction_tables
 
     frame = frame_of(args)
     comments = [f"written by selfcal {__version__} from the step-diagonal measurement {args.data}",
@@ -162,6 +164,19 @@ def _write_cal(args: argparse.Namespace, found: "StepDiagonalResult") -> None:
     backup = write_cal(args.cal, text, force=args.force)
     if backup:
         print(f"selfcal step-diagonal: the old {args.cal} is {backup}", file=sys.stderr)
+
+
+def correction_tables(found: "StepDiagonalResult", frame: "MachineFrame") -> list["Table1D"]:
+    """Return the 1D tables of all corrections, in the controller's coordinates.
+
+    The machine's home is counted from the start of the first block.
+    """
+    from selfcal_ros.aerotech.lines import AxisCorrection, line_table
+    from selfcal_ros.laser.profiles import axis_corrections
+
+    lines = axis_corrections(found)
+    return [line_table(AxisCorrection(*lines[pair]), frame, along=pair[0], corrected=pair[1])
+            for pair in sorted(lines)]
 
 
 def _sensitivity(args: argparse.Namespace) -> int:
@@ -179,8 +194,9 @@ def _sensitivity(args: argparse.Namespace) -> int:
     with busy("simulating faults"):
         rows = sensitivity(machine, rng)
     if args.plot:
-        from selfcal_ros.reporting.laser_plots import plot_sensitivity
-        plot_sensitivity(rows, sweep(machine, rng), args.plot)
+        from selfcal_ros.laser.plots import sensitivity_figure
+        from selfcal_ros.reporting.figures.paper import save_picture
+        save_picture(sensitivity_figure(sweep(machine, rng)), args.plot)
     table = {"machine": "case study, 6 blocks of 10 mm x 10 mm", "rows": rows}
     if args.output:
         write_json(args.output, table)

@@ -20,9 +20,6 @@ from typing import Literal
 
 import numpy as np
 
-from selfcal_ros.aerotech.lines import AxisCorrection, line_table
-from selfcal_ros.aerotech.machine import MachineFrame
-from selfcal_ros.aerotech.model import Table1D
 from selfcal_ros.errors import InputError
 from selfcal_ros.laser.data import AXES, Method, StepDiagonalResult
 
@@ -185,8 +182,9 @@ def map_equivalent(found: StepDiagonalResult) -> MapEquivalent:
     return MapEquivalent(o, u_o, (slope(found, 1, 1) - slope(found, 0, 0)) / 2, u_r)
 
 
-def axis_corrections(found: StepDiagonalResult) -> dict[tuple[Axis, Axis], AxisCorrection]:
-    """Return (along, corrected) -> correction -E, m, of every profile of X and Y.
+def axis_corrections(found: StepDiagonalResult,
+                     ) -> dict[tuple[Axis, Axis], tuple[np.ndarray, np.ndarray]]:
+    """Return (along, corrected) -> positions and corrections -E, m, of every profile of X and Y.
 
     The datum is turned from the first X step to the line of the X axis: the correction of Y along x
     is the straightness of X alone, and that of X along y holds straightness and squareness. Linear
@@ -202,24 +200,10 @@ def axis_corrections(found: StepDiagonalResult) -> dict[tuple[Axis, Axis], AxisC
                          "x and y", "export a measurement of face diagonals")
     x, y = (positions_m(found, axis) for axis in (0, 1))
     turn = slope(found, 0, 1)
-    lines: dict[tuple[Axis, Axis], AxisCorrection] = {
-        ("x", "y"): AxisCorrection(x, turn * x - profile_m(found, 0, 1)),
-        ("y", "x"): AxisCorrection(y, -turn * y - profile_m(found, 1, 0))}
+    lines: dict[tuple[Axis, Axis], tuple[np.ndarray, np.ndarray]] = {
+        ("x", "y"): (x, turn * x - profile_m(found, 0, 1)),
+        ("y", "x"): (y, -turn * y - profile_m(found, 1, 0))}
     if found.method == Method.NEW:
-        lines[("x", "x")] = AxisCorrection(x, -profile_m(found, 0, 0))
-        lines[("y", "y")] = AxisCorrection(y, -profile_m(found, 1, 1))
+        lines["x", "x"] = x, -profile_m(found, 0, 0)
+        lines["y", "y"] = y, -profile_m(found, 1, 1)
     return lines
-
-
-def correction_tables(found: StepDiagonalResult, frame: MachineFrame) -> list[Table1D]:
-    """Return the 1D tables of all corrections, in the controller's coordinates.
-
-    Parameters
-    ----------
-    found : StepDiagonalResult
-        Result of a 2D measurement.
-    frame : MachineFrame
-        The machine's axes; its home is counted from the start of the first block.
-    """
-    return [line_table(line, frame, along=along, corrected=corrected)
-            for (along, corrected), line in sorted(axis_corrections(found).items())]

@@ -208,7 +208,7 @@ def test_data_and_method_belong_together(capsys):
 
 def test_a_picture_has_a_known_format(tmp_path, capsys):
     code, _, err = run(capsys, EXAMPLE, "--method", "new", "--plot", tmp_path / "p.gif")
-    assert code == 2 and "'gif' is not a picture format; name a file that ends in .png, .svg" in err
+    assert code == 2 and "by its ending; name a file that ends in .png, .svg or .pdf" in err
 
 
 def test_the_corrections_are_written_as_tables(tmp_path, capsys):

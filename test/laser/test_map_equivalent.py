@@ -4,11 +4,11 @@ import pytest
 
 from selfcal_ros.aerotech.evaluate import CalEvaluator
 from selfcal_ros.aerotech.machine import MachineFrame
+from selfcal_ros.cli.step_diagonal import correction_tables
 from selfcal_ros.errors import InputError
 from selfcal_ros.laser.identify import identify_ibaraki, identify_wang
 from selfcal_ros.laser.profiles import (
     axis_corrections,
-    correction_tables,
     map_equivalent,
     squareness,
     squareness_rad,
@@ -61,7 +61,7 @@ def test_a_corrected_machine_is_straight_square_and_true(frame):
 
 def test_the_correction_of_y_along_x_has_no_slope():
     line = axis_corrections(identify_ibaraki(measured(case_study_machine())))[("x", "y")]
-    assert np.polyfit(line.positions_m, line.corrections_m, 1)[0] == pytest.approx(0, abs=1e-15)
+    assert np.polyfit(*line, 1)[0] == pytest.approx(0, abs=1e-15)
 
 
 def test_the_conventional_formulation_corrects_no_linear_errors():
