@@ -13,6 +13,7 @@ DOMAIN = {"model"} | BASE
 ESTIMATION = {"estimation", "compensation"}
 MIDDLE = {"messages", "bagio", "reporting", "collection", "simulation", "parallel"}
 GUESTS = {"aerotech", "laser", "papers"}
+"""What only the verbs import, so that the core does without it."""
 MAY_IMPORT = {
     "errors": set(),
     "memory": set(),
@@ -24,8 +25,7 @@ MAY_IMPORT = {
     **{name: DOMAIN | ESTIMATION for name in ESTIMATION},
     **{name: DOMAIN | ESTIMATION | MIDDLE for name in MIDDLE},
     "parallel": {"errors"},
-    "reporting": DOMAIN | ESTIMATION | MIDDLE | GUESTS,
-    **{name: DOMAIN | ESTIMATION | MIDDLE | GUESTS for name in GUESTS},
+    **{name: DOMAIN | ESTIMATION | MIDDLE for name in GUESTS},
     "batch": DOMAIN | ESTIMATION | MIDDLE,
     "sessions": DOMAIN | ESTIMATION | MIDDLE,
     "start": set(),

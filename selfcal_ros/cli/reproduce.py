@@ -11,6 +11,7 @@ from selfcal_ros.cli.terminal.progress import late_progress
 
 if TYPE_CHECKING:
     from selfcal_ros.parallel import Progress
+    from selfcal_ros.reporting.figures.drawing import Drawing
 
 HELP = "run the published simulations of Hu or Qiao next to the published figures"
 
@@ -47,11 +48,15 @@ def run(args: argparse.Namespace) -> int:
         _make(folder)
     workers = check_workers(1 if args.workers is None and args.draws < MANY else args.workers)
     with late_progress("solving draws") as progress:
-        text, save, numbers = (_hu if args.paper == "hu" else _qiao)(args, workers, progress)
+        text, figures, numbers = (_hu if args.paper == "hu" else _qiao)(args, workers, progress)
     say(args, text, {"paper": args.paper, "draws": args.draws, "seed": args.seed, **numbers})
     if folder is not None:
+        from selfcal_ros.reporting.figures.paper import save_picture
+
         write_text(folder / f"{args.paper}.txt", text + "\n")
-        for path in save(folder):
+        for drawing in figures():
+            path = folder / f"{drawing.name}.png"
+            save_picture(drawing, path)
             print(f"wrote {path}", file=sys.stderr if args.json else sys.stdout)
     return int(ExitCode.DONE)
 
@@ -71,16 +76,16 @@ def _hu(args: argparse.Namespace, workers: int, progress: "Progress") -> tuple:
 
     found = reproduce_hu(args.draws, args.seed, workers=workers, progress=progress)
 
-    def save(folder: Path) -> list[Path]:
-        from selfcal_ros.reporting.reproduce_plots import save_hu_plots
+    def figures() -> "list[Drawing]":
+        from selfcal_ros.papers.plots import hu_figures
 
-        return save_hu_plots(found, folder)
+        return hu_figures(found)
 
     tables = [{"name": run.published.name, "sigma_um": run.published.sigma_um,
                "sigma_deg": run.published.sigma_deg, "published": run.published.table,
                "law_first": run.law.first.tolist(), "law_std": run.law.std.tolist(),
                "joint_std": run.joint.std.tolist(), "bound": run.bound} for run in found.runs]
-    return hu_text(found), save, {"noise_free_um": found.noise_free_um,
+    return hu_text(found), figures, {"noise_free_um": found.noise_free_um,
                                   "noise_free_deg": found.noise_free_deg, "tables": tables}
 
 
@@ -89,14 +94,14 @@ def _qiao(args: argparse.Namespace, workers: int, progress: "Progress") -> tuple
 
     found = reproduce_qiao(args.draws, args.seed, workers=workers, progress=progress)
 
-    def save(folder: Path) -> list[Path]:
-        from selfcal_ros.reporting.reproduce_plots import save_qiao_plots
+    def figures() -> "list[Drawing]":
+        from selfcal_ros.papers.plots import qiao_figures
 
-        return save_qiao_plots(found, folder)
+        return qiao_figures(found)
 
     programs = [{"views": program.views, "rms_um": program.rms_um,
                  "deficiency": program.deficiency} for program in found.programs]
-    return qiao_text(found), save, {
+    return qiao_text(found), figures, {
         "sizes": SIZES, "ranks": found.ranks.tolist(), "unknowns": found.unknowns.tolist(),
         "programs": programs, "rms_um": found.rms_um.tolist(),
         "rms_uniform_um": found.rms_uniform_um.tolist(), "bound_um": found.bound_um}
