@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from selfcal_ros.bagio.reader import BagReader
-from selfcal_ros.collection.clock.steps import step_lines
+from selfcal_ros.collection.clock_steps import step_lines
 from selfcal_ros.collection.collector import Collector
 from selfcal_ros.collection.expected import ViewProgress
 from selfcal_ros.collection.inputs import Reason

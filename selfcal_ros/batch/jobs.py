@@ -23,7 +23,7 @@ from selfcal_ros.batch.records import (
     is_whole,
     read_record,
 )
-from selfcal_ros.collection.marks.places import with_places
+from selfcal_ros.collection.reduce import with_places
 from selfcal_ros.collection.settings.estimator import solver_options
 from selfcal_ros.errors import ExitCode, NotIdentifiableError, SelfcalError
 from selfcal_ros.estimation.api import calibrate

@@ -71,7 +71,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def node_settings[S: Settings](params: str | None, kind: type[S], **given: Any) -> S:
     """Return the settings of a node from a parameter file, if any, and arguments, which win."""
-    from selfcal_ros.collection.settings.ros_file import overrides_in
+    from selfcal_ros.collection.settings.nodes import overrides_in
     from selfcal_ros.files import read_yaml
 
     where = params or "options"
@@ -211,7 +211,7 @@ def _extended(args: argparse.Namespace, measurements: Any, options: Any,
     """Return the result with places, validation and budget as requested, and the text."""
     from dataclasses import replace
 
-    from selfcal_ros.collection.marks.places import with_places
+    from selfcal_ros.collection.reduce import with_places
 
     lines: list[str] = []
     result = with_places(result, measurements.views)

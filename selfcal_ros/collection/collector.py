@@ -11,9 +11,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from selfcal_ros.collection.diagnosis import Finding
-from selfcal_ros.collection.evidence import EncoderFacts, Seen
+from selfcal_ros.collection.diagnosis import EncoderFacts, Finding, Seen
+from selfcal_ros.collection.encoder import NEVER, JointTrack, TrackLimits
 from selfcal_ros.collection.expected import ViewProgress, expected_marks, read_enough
+from selfcal_ros.collection.exposures import Exposures, Tracks
 from selfcal_ros.collection.inputs import (
     DETECTION,
     Command,
@@ -25,10 +26,8 @@ from selfcal_ros.collection.inputs import (
 from selfcal_ros.collection.marks.check_stops import count_stops
 from selfcal_ros.collection.marks.identify import IdentityRules
 from selfcal_ros.collection.reduce import Rules
+from selfcal_ros.collection.samples import Limits
 from selfcal_ros.collection.settings.nodes import CollectorSettings
-from selfcal_ros.collection.stage.encoder import NEVER, JointTrack, TrackLimits
-from selfcal_ros.collection.stage.exposures import Exposures, Tracks
-from selfcal_ros.collection.stage.samples import Limits
 from selfcal_ros.collection.timeline import Timeline, build_timeline, without_strays
 from selfcal_ros.collection.view_cache import ViewCache
 from selfcal_ros.errors import InputError, NoDataError

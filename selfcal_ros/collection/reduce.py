@@ -1,12 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From the detections of one view to its readings: a pure function of their set."""
+"""From the detections of one view to its readings: a pure function of their set.
+
+Rejected grid detections are kept with the position of the stage, which may point at dirt.
+"""
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
+from selfcal_ros.collection.encoder import GOOD, MOVING, REASONS
+from selfcal_ros.collection.exposures import Exposures, JointAt
 from selfcal_ros.collection.inputs import LARGEST_OFFSET, Kind, Reason, good_sigmas
 from selfcal_ros.collection.marks.check_stops import without_aside
 from selfcal_ros.collection.marks.identify import (
@@ -15,13 +21,10 @@ from selfcal_ros.collection.marks.identify import (
     identify_grid,
     wrap,
 )
-from selfcal_ros.collection.marks.places import PlaceList
-from selfcal_ros.collection.marks.repeats import Means, reduce_repeats
-from selfcal_ros.collection.marks.visits import grid_visits, repeat_motion
-from selfcal_ros.collection.stage.encoder import GOOD, MOVING, REASONS
-from selfcal_ros.collection.stage.exposures import Exposures, JointAt
+from selfcal_ros.collection.marks.repeats import Means, grid_visits, reduce_repeats, repeat_motion
 from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.model.readings import Sense, ViewReadings
+from selfcal_ros.model.readings import RejectedPlaces, Sense, ViewReadings
+from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.view import View
 
 
@@ -33,6 +36,28 @@ class Rules:
     identity: IdentityRules
     min_score: float
     outlier_limit: float
+
+
+class PlaceList:
+    """Gathers the rejected detections of a view with the indicated position at each."""
+
+    def __init__(self, before: RejectedPlaces | None = None) -> None:
+        before = before or RejectedPlaces()
+        self._reason = [np.array(before.reason, dtype=object)]
+        self._at = [np.stack([before.x, before.y])]
+
+    def add(self, reasons: np.ndarray, at_m: np.ndarray) -> None:
+        """Take rejected detections: their reasons (D,) and positions (2, D) in m."""
+        self._reason.append(reasons)
+        self._at.append(at_m)
+
+    def places(self) -> RejectedPlaces:
+        """Return the places; of more than `RejectedPlaces.MOST` an even choice."""
+        reason, at = np.concatenate(self._reason), np.concatenate(self._at, axis=1)
+        if len(reason) > RejectedPlaces.MOST:
+            chosen = np.linspace(0, len(reason) - 1, RejectedPlaces.MOST).round().astype(int)
+            reason, at = reason[chosen], at[:, chosen]
+        return RejectedPlaces(tuple(map(str, reason)), *at)
 
 
 def canonical(detections: np.ndarray) -> np.ndarray:
@@ -271,3 +296,16 @@ def _keep(d: np.ndarray, reasons: np.ndarray, rejected: Counter, *values: np.nda
 def _count(rejected: Counter, reason: Reason, mask: np.ndarray) -> None:
     if mask.any():
         rejected[str(reason)] += int(mask.sum())
+
+
+def with_places(result: CalibrationResult, views: Iterable[ViewReadings]) -> CalibrationResult:
+    """Return the result with the places of rejected detections, where there are any."""
+    places = places_json(views)
+    return replace(result, extra={**result.extra, "rejected_at": places}) if places else result
+
+
+def places_json(views: Iterable[ViewReadings]) -> list[dict[str, Any]]:
+    """Return the places for ``extra["rejected_at"]`` of a result: a row a view, m."""
+    return [{"view": view.view.name, "reason": list(view.places.reason),
+             "x": view.places.x.round(6), "y": view.places.y.round(6)}
+            for view in views if view.places.reason]

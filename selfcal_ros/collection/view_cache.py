@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from selfcal_ros.collection.exposures import Exposures
 from selfcal_ros.collection.inputs import DETECTION, Reason
 from selfcal_ros.collection.reduce import Rules, canonical, clean, reduce_view, with_low_scores
-from selfcal_ros.collection.stage.exposures import Exposures
-from selfcal_ros.collection.stage.growing import GrowingColumns, GrowingTable
+from selfcal_ros.collection.samples import GrowingColumns, GrowingTable
 from selfcal_ros.collection.timeline import Timeline
 from selfcal_ros.model.readings import ViewReadings
 

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from selfcal_ros.collection.clock.steps import Step, StepWatch
+from selfcal_ros.collection.clock_steps import Step, StepWatch
 from selfcal_ros.sessions.ports import Diagnosis, Level
 from selfcal_ros.units import NS_PER_S, S_PER_NS
 

@@ -10,16 +10,15 @@ from typing import Any
 import numpy as np
 
 from selfcal_ros.bagio.offline import FROM_THE_FUTURE
-from selfcal_ros.collection.clock.steps import Step, future_lines, step_lines
+from selfcal_ros.collection.clock_steps import Step, future_lines, step_lines
 from selfcal_ros.collection.collector import Collector
-from selfcal_ros.collection.digest import placing_digest, readings_digest, session_digest
 from selfcal_ros.collection.expected import ViewProgress
 from selfcal_ros.collection.inputs import Command, Phase, Reason, advice
 from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.messages import from_model, to_model
 from selfcal_ros.messages.to_model import EncoderBlock
-from selfcal_ros.model.readings import Measurements
+from selfcal_ros.model.readings import Measurements, placing_digest, readings_digest, session_digest
 from selfcal_ros.sessions.clocks import ClockWatch
 from selfcal_ros.sessions.health import CellChecks, Rate, merged
 from selfcal_ros.sessions.ports import Diagnosis, Level, Ports

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from selfcal_ros.collection.digest import placing_digest
 from selfcal_ros.collection.expected import expected_marks
 from selfcal_ros.collection.inputs import Command, Phase, check_command
 from selfcal_ros.collection.sequencer import ENDED, Sequencer, State
@@ -18,6 +17,7 @@ from selfcal_ros.collection.timeline import begins_run
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import read_yaml
 from selfcal_ros.messages import from_model, to_model
+from selfcal_ros.model.readings import placing_digest
 from selfcal_ros.model.view import Plan, View, plan_from_dict
 from selfcal_ros.sessions.health import Presence
 from selfcal_ros.sessions.ports import Diagnosis, Level, Ports

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from selfcal_ros.collection.digest import readings_digest, session_digest
 from selfcal_ros.collection.inputs import Phase, begun_ns, check_plate, check_view
 from selfcal_ros.collection.settings.estimator import solver_options
 from selfcal_ros.collection.settings.nodes import SolverSettings
@@ -18,7 +17,7 @@ from selfcal_ros.files import write_json
 from selfcal_ros.memory import keep_freed_memory
 from selfcal_ros.messages import from_model, to_model
 from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.model.readings import Measurements
+from selfcal_ros.model.readings import Measurements, readings_digest, session_digest
 from selfcal_ros.model.result import (
     CalibrationResult,
     created_now,

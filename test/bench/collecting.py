@@ -20,10 +20,10 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
 from selfcal_ros.collection.collector import Collector
-from selfcal_ros.collection.digest import readings_digest
 from selfcal_ros.collection.inputs import DETECTION, Command, EncoderSample, Kind, Phase
 from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.readings import readings_digest
 from selfcal_ros.model.view import View
 
 SIZE, PITCH_M = 21, 0.01

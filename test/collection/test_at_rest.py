@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from selfcal_ros.collection.encoder import JointTrack, TrackLimits
 from selfcal_ros.collection.inputs import EncoderSample, Kind, Reason
-from selfcal_ros.collection.stage.encoder import JointTrack, TrackLimits
 from test.support.collecting import collect, scene, table
 
 MS = 1_000_000

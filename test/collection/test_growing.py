@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from selfcal_ros.collection.stage.growing import GrowingColumns, GrowingTable
+from selfcal_ros.collection.samples import GrowingColumns, GrowingTable
 
 PAIR = np.dtype([("a", np.int64), ("b", float)])
 

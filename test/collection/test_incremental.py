@@ -11,14 +11,14 @@ from hypothesis import strategies as st
 
 from selfcal_ros.collection import view_cache
 from selfcal_ros.collection.collector import Collector
-from selfcal_ros.collection.digest import readings_digest, session_digest
+from selfcal_ros.collection.encoder import JointTrack, TrackLimits
+from selfcal_ros.collection.exposures import Exposures, Tracks
 from selfcal_ros.collection.inputs import DETECTION, Command, Detection, EncoderSample
 from selfcal_ros.collection.marks import identify, repeats
+from selfcal_ros.collection.samples import Limits
 from selfcal_ros.collection.settings.nodes import CollectorSettings
-from selfcal_ros.collection.stage.encoder import JointTrack, TrackLimits
-from selfcal_ros.collection.stage.exposures import Exposures, Tracks
-from selfcal_ros.collection.stage.samples import Limits
 from selfcal_ros.errors import NoDataError
+from selfcal_ros.model.readings import readings_digest, session_digest
 from selfcal_ros.simulation.spec import Faults, apply_faults
 from test.support.collecting import collect, digest, scene
 

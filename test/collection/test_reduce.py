@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from selfcal_ros.collection.inputs import Kind, Reason
-from selfcal_ros.collection.marks.places import PlaceList
+from selfcal_ros.collection.reduce import PlaceList
 from selfcal_ros.model.readings import RejectedPlaces, Sense
 from test.support.collecting import collect, scene, table
 

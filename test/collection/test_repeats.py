@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.stats import binom
 
 from selfcal_ros.collection.marks import repeats as repeats_module
-from selfcal_ros.collection.marks.repeats import reduce_repeats
+from selfcal_ros.collection.marks.repeats import distances, median, reduce_repeats, row_medians
 
 SIGMA = 2e-8
 LIMIT = 6.0
@@ -241,3 +241,23 @@ def test_outliers_are_found_in_every_part_of_the_marks(monkeypatch, part):
     pairs = spoilt | ((count[key] == 2) & np.isin(key, key[spoilt]))  # of two both go
     assert found.outlier.tolist() == pairs.tolist()
     assert found.count.sum() == (~pairs).sum()
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 4, 12, 13, 100, 101])
+@pytest.mark.parametrize("of", [1.0, 1e-9, 3e5])
+def test_medians_are_those_of_numpy_to_the_bit(count, of):
+    rng = np.random.default_rng(count)
+    table = rng.normal(of, of, (20, 3, count))
+    table[rng.random(table.shape) < 0.3] = of  # ties
+    for row in table[:, 0]:
+        before = row.copy()
+        assert median(row) == np.median(row)
+        np.testing.assert_array_equal(row, before)  # untouched unless it may be
+        assert median(row, overwrite=True) == np.median(before)
+    rest = table[:, 1:]
+    np.testing.assert_array_equal(row_medians(rest), np.median(rest, axis=-1, keepdims=True))
+
+
+def test_distances():
+    np.testing.assert_array_equal(distances(np.array([[3e-9, -5.0, 0.0], [4e-9, 12.0, 0.0]])),
+                                  [5e-9, 13.0, 0.0])

@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from selfcal_ros.collection.stage import samples as module
-from selfcal_ros.collection.stage.samples import Limits, SampleStore
+from selfcal_ros.collection import samples as module
+from selfcal_ros.collection.samples import Limits, SampleStore
 
 STAMPS = st.lists(st.integers(0, 300), max_size=30)
 

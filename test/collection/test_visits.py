@@ -8,11 +8,9 @@ from itertools import groupby
 import numpy as np
 import pytest
 
-from selfcal_ros.collection.digest import readings_digest
 from selfcal_ros.collection.inputs import Kind
-from selfcal_ros.collection.marks.repeats import reduce_repeats
-from selfcal_ros.collection.marks.visits import grid_visits
-from selfcal_ros.model.readings import Sense
+from selfcal_ros.collection.marks.repeats import grid_visits, reduce_repeats
+from selfcal_ros.model.readings import Sense, readings_digest
 from test.support.collecting import collect, digest, scene
 
 US = 1_000

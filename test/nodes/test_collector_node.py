@@ -17,9 +17,9 @@ from selfcal_msgs.msg import MarkDetection, ViewCommand
 from std_srvs.srv import Trigger
 
 from selfcal_ros.bagio.reader import BagReader
-from selfcal_ros.collection.digest import readings_digest, session_digest
 from selfcal_ros.collection.inputs import Command, Detection, Phase
 from selfcal_ros.messages import from_model, to_model
+from selfcal_ros.model.readings import readings_digest, session_digest
 from selfcal_ros.nodes import base, measurement_collector, names
 from selfcal_ros.nodes.filling import fill
 from selfcal_ros.nodes.measurement_collector import MeasurementCollector

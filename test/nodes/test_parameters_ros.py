@@ -7,8 +7,7 @@ import pytest
 import yaml
 from rclpy.parameter import Parameter as RosParameter
 
-from selfcal_ros.collection.settings.nodes import NODE_PARAMETERS
-from selfcal_ros.collection.settings.ros_file import overrides_in
+from selfcal_ros.collection.settings.nodes import NODE_PARAMETERS, overrides_in
 from selfcal_ros.errors import InputError
 from selfcal_ros.nodes.bag_player import BagPlayer
 from selfcal_ros.nodes.bag_recorder import BagRecorder

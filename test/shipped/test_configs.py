@@ -9,8 +9,7 @@ import pytest
 
 from selfcal_ros import __version__
 from selfcal_ros.cli.main import verbs
-from selfcal_ros.collection.settings.nodes import NODE_PARAMETERS, NODE_SETTINGS
-from selfcal_ros.collection.settings.ros_file import overrides_in
+from selfcal_ros.collection.settings.nodes import NODE_PARAMETERS, NODE_SETTINGS, overrides_in
 from selfcal_ros.files import read_yaml
 from selfcal_ros.model.view import plan_from_dict
 from selfcal_ros.simulation.spec import read_simulation

@@ -8,12 +8,11 @@ from typing import Any
 import numpy as np
 
 from selfcal_ros.collection.collector import Collector
-from selfcal_ros.collection.digest import readings_digest, session_digest
 from selfcal_ros.collection.expected import ViewProgress
 from selfcal_ros.collection.inputs import DETECTION, Command, Detection, EncoderSample, Kind
 from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.messages.to_model import EncoderBlock
-from selfcal_ros.model.readings import Measurements, ViewReadings
+from selfcal_ros.model.readings import Measurements, ViewReadings, readings_digest, session_digest
 from selfcal_ros.model.view import Plan
 from selfcal_ros.simulation.cell import CellSettings, Event, plan_events
 from selfcal_ros.simulation.truth import Truth, random_truth

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from selfcal_ros.collection.inputs import Reason
-from selfcal_ros.collection.marks.medians import PART, distances
+from selfcal_ros.collection.marks.repeats import PART, distances
 from selfcal_ros.collection.marks.rigid import (
     LARGEST_TURN_RAD,
     MotionEstimate,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From repeats of a mark to one mean: outliers out, repeatability pooled.
+"""From repeats of a mark to one mean, without outliers, and to the means of its visits.
 
 Rule: a repeat is an outlier if it lies further from the median of its mark's repeats than
 `limit` standard deviations of one reading. The standard deviation is robust: the median of
@@ -19,7 +19,44 @@ from functools import lru_cache
 
 import numpy as np
 
-from selfcal_ros.collection.marks.medians import PART, median, row_medians
+from selfcal_ros.model.readings import GridVisits, RepeatMotion
+
+PART = 32_768
+"""Numbers that are worked on together where marks do not depend on each other: they stay in the
+cache of a processor, and take no memory beside the readings."""
+
+
+def median(values: np.ndarray, *, overwrite: bool = False) -> float:
+    """Return the median to the bit of `numpy.median`, at a third of its cost.
+
+    Parameters
+    ----------
+    values : float array (n,)
+        At least one, none of them NaN.
+    overwrite : bool
+        Whether their order may be changed, which saves a copy.
+    """
+    half = len(values) // 2
+    part = values if overwrite else values.copy()
+    part.partition(half)
+    if len(values) % 2:
+        return float(part[half])
+    return float((part[:half].max() + part[half]) / 2)
+
+
+def row_medians(values: np.ndarray) -> np.ndarray:
+    """Return the medians (..., 1) of the rows of a table (..., r), r > 0, none of them NaN."""
+    half = values.shape[-1] // 2
+    rising = np.sort(values, axis=-1)
+    if values.shape[-1] % 2:
+        return rising[..., half:half + 1]
+    return (rising[..., half - 1:half] + rising[..., half:half + 1]) / 2
+
+
+def distances(away: np.ndarray) -> np.ndarray:
+    """Return the lengths (n,) of vectors (2, n) of ordinary size: `numpy.hypot`, faster."""
+    return np.sqrt(away[0] * away[0] + away[1] * away[1])
+
 
 MIN_PAIRS = 12
 """Pairs of repeats below which a view is too small to tell outliers."""
@@ -232,3 +269,106 @@ def _pair_scale(groups: list[np.ndarray], values: np.ndarray,
             done += apart.size
     independent = sum(len(group) * (group.shape[1] - 1) for group in groups) * len(values)
     return median(every, overwrite=True) / 0.6744897501960817, independent
+
+
+SLOW = 5
+"""Degree of the polynomial of the order of the readings that is taken out of their changes."""
+FOLLOWS = 3.0
+"""Change of the deviation over that of the stage's position up to which an outlier among repeats
+may come of the microscope's wiring: reversed offsets make 2 of it, doubled ones 1."""
+
+
+def grid_visits(means: Means, key: np.ndarray, sigma: np.ndarray, *, stamps_ns: np.ndarray,
+                deviation: np.ndarray, offset: np.ndarray, approach: np.ndarray,
+                step_m: float = np.inf) -> GridVisits | None:
+    """Return the visits behind the means of a view's grid marks; None without any.
+
+    A visit is a run of successive exposures of one mark: any other mark that was exposed in
+    between ends it, also one whose reading is an outlier, and so does a motion of the stage beyond
+    `step_m`, as from one check stop to the next. Outliers are in no visit. Deviations,
+    offsets and instants of a visit are averaged with the weights of `reduce_repeats`. The approach
+    is the one that all its exposures have in common, 0 where they differ.
+
+    Parameters
+    ----------
+    means : Means
+        What `reduce_repeats` made of the same readings.
+    key : int array (n,)
+        Number of the mark of each reading, in the order of the stamps.
+    sigma : float array (n,)
+        Declared standard uncertainties, m; 0 = not declared.
+    stamps_ns : int64 array (n,)
+        Instants of exposure.
+    deviation, offset : float array (2, n)
+        Deviation and offset as seen, stage axes, m.
+    approach : int8 array (2, n)
+        Signs of the last motions of x and y.
+    step_m : float
+        Motion of the stage along an axis that ends a visit, m.
+    """
+    kept = ~means.outlier
+    if not kept.any():
+        return None
+    moved = np.abs(np.diff(deviation - offset, prepend=(deviation - offset)[:, :1])) > step_m
+    number = np.cumsum((np.diff(key, prepend=key[:1]) != 0) | moved.any(axis=0))[kept]
+    key, stamps_ns = key[kept], stamps_ns[kept]
+    begins = np.diff(number, prepend=-1) != 0
+    first, visit = np.flatnonzero(begins), np.cumsum(begins) - 1
+    since = (stamps_ns - stamps_ns[first][visit]).astype(float)
+    found = average(visit, deviation[:, kept], sigma[kept], np.vstack([offset[:, kept], since]))
+    mark = np.searchsorted(means.key, key[first])
+    order = np.argsort(mark, kind="stable")  # the numbers of visits rise with their stamps
+    offset_x, offset_y, since = found.companions[:, order]
+    came_x, came_y = (
+        np.where(_differs(row[kept], visit, first), 0, row[kept][first]).astype(np.int8)[order]
+        for row in approach)
+    return GridVisits(
+        mark[order], found.mean[0, order], found.mean[1, order], found.count[order],
+        stamps_ns[first][order] + np.rint(since).astype(np.int64), offset_x, offset_y, came_x,
+        came_y, u=found.u[order] if len(found.u) else found.u, sigma_m=found.sigma, dof=found.dof)
+
+
+def _differs(values: np.ndarray, visit: np.ndarray, first: np.ndarray) -> np.ndarray:
+    """Return which visits hold more than one value, bool array (visits,)."""
+    return np.bincount(visit, values != values[first][visit], len(first)) > 0
+
+
+def repeat_motion(key: np.ndarray, place: np.ndarray, offset: np.ndarray,
+                  outlier: np.ndarray) -> RepeatMotion | None:
+    """Return how the offsets of the marks follow the stage; None without repeats.
+
+    Outliers are left out unless the stage stood elsewhere too: offsets of the wrong sign or scale
+    make an outlier of every stop beside a mark. What changes slowly, as a drift that the stage
+    follows, is no response of the microscope: a polynomial is taken out, then neighbours are
+    subtracted.
+
+    Parameters
+    ----------
+    key : int array (n,)
+        Number of the mark of each reading, in the order of the stamps.
+    place, offset : float array (c, n)
+        Place of the optical axis over the plate, and offset of the mark from it, m or rad.
+    outlier : bool array (n,)
+        Outliers among the repeats.
+    """
+    if outlier.any():
+        there, seen = _about_means(key, place), _about_means(key, offset)
+        follows = ((there + seen) ** 2).sum(axis=0) <= FOLLOWS**2 * (there**2).sum(axis=0)
+        keep = ~outlier | follows
+        key, place, offset = key[keep], place[:, keep], offset[:, keep]
+    free = len(key) - int(np.count_nonzero(np.bincount(key))) - SLOW
+    if free <= 0:
+        return None
+    about = np.concatenate([_about_means(key, place), _about_means(key, offset)])
+    slow = _about_means(key, np.polynomial.legendre.legvander(
+        np.linspace(-1, 1, len(key)), SLOW)[:, 1:].T)
+    change = np.diff(about - np.linalg.lstsq(slow @ slow.T, slow @ about.T)[0].T @ slow)
+    return RepeatMotion(change @ change.T / 2, 2 * free // 3)  # neighbours share a reading
+
+
+def _about_means(key: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Return values (c, n) less the mean of their mark."""
+    first, count = np.zeros(key.max() + 1, dtype=int), np.bincount(key)
+    first[key[::-1]] = np.arange(len(key))[::-1]  # of equal ones the last that is set stays
+    values = values - values[:, first[key]]  # exact where repeats are equal
+    return values - np.stack([np.bincount(key, row) for row in values])[:, key] / count[key]

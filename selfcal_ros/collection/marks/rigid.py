@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from selfcal_ros.collection.marks.medians import distances, median
+from selfcal_ros.collection.marks.repeats import distances, median
 
 LARGEST_TURN_RAD = 0.2
 """A plate turned by more than this was laid down the wrong way; it is not a misalignment."""

@@ -23,7 +23,7 @@ from selfcal_ros.bagio.journal import (
 )
 from selfcal_ros.bagio.offline import block_handlers
 from selfcal_ros.bagio.reader import BagReader
-from selfcal_ros.collection.clock.steps import Step
+from selfcal_ros.collection.clock_steps import Step
 from selfcal_ros.collection.collector import Collector
 from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.errors import InputError

@@ -6,7 +6,7 @@ An encoder at 1 kHz writes 15 GB a day, whether anything is measured or not.
 
 from collections import deque
 
-from selfcal_ros.collection.stage.encoder import LOOK_BACK_NS
+from selfcal_ros.collection.encoder import LOOK_BACK_NS
 from selfcal_ros.units import NS_PER_S
 
 REACH_NS = LOOK_BACK_NS + 10 * NS_PER_S

@@ -8,7 +8,7 @@ import pytest
 from scipy.special import stdtr
 
 from selfcal_ros.collection.inputs import Detection, Kind
-from selfcal_ros.collection.marks.visits import repeat_motion
+from selfcal_ros.collection.marks.repeats import repeat_motion
 from selfcal_ros.errors import ExitCode
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.checks.wiring import (

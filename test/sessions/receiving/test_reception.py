@@ -15,9 +15,9 @@ from selfcal_ros.bagio import journal, journal_file
 from selfcal_ros.bagio.journal import resume
 from selfcal_ros.bagio.offline import collect_bag
 from selfcal_ros.bagio.reader import BagReader
-from selfcal_ros.collection.digest import readings_digest
 from selfcal_ros.collection.inputs import Command, Detection, EncoderSample, Phase
 from selfcal_ros.errors import InputError
+from selfcal_ros.model.readings import readings_digest
 from selfcal_ros.sessions.collecting import CollectingSession
 from selfcal_ros.sessions.ports import Level
 from selfcal_ros.sessions.receiving import journal_keeper, reception

@@ -7,8 +7,8 @@ import pytest
 
 from selfcal_ros.bagio.offline import collect_bag
 from selfcal_ros.bagio.reader import BagReader
-from selfcal_ros.collection.digest import readings_digest
 from selfcal_ros.collection.inputs import Command, Detection, EncoderSample, Phase
+from selfcal_ros.model.readings import readings_digest
 from selfcal_ros.sessions.receiving.resting import REACH_NS, Resting
 from selfcal_ros.topics import ENCODER_TOPIC
 from selfcal_ros.units import S_PER_NS

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from selfcal_ros.collection.inputs import Reason
-from selfcal_ros.collection.stage.samples import Limits, Samples, SampleStore
+from selfcal_ros.collection.samples import Limits, Samples, SampleStore
 from selfcal_ros.units import NS_PER_S
 
 BEYOND_NOISE = 6.0

@@ -3,9 +3,9 @@
 
 import pytest
 
-from selfcal_ros.collection.plate_picture import plate_picture
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.view import View
+from selfcal_ros.sessions.watching import plate_picture
 
 PLATE = Artifact(7, 0.01, 0, 5)
 

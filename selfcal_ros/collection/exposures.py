@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from selfcal_ros.collection.stage.encoder import (
+from selfcal_ros.collection.encoder import (
     EVER,
     LOOK_BACK_NS,
     NEVER,
@@ -18,8 +18,7 @@ from selfcal_ros.collection.stage.encoder import (
     Series,
     filled,
 )
-from selfcal_ros.collection.stage.growing import GrowingColumns, GrowingTable
-from selfcal_ros.collection.stage.samples import NO_STAMPS
+from selfcal_ros.collection.samples import NO_STAMPS, GrowingColumns, GrowingTable
 
 MOST_SAMPLES = 300_000
 """Samples of a joint that are looked at together."""

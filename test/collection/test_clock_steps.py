@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from selfcal_ros.collection.clock.steps import Step, StepWatch, step_lines
+from selfcal_ros.collection.clock_steps import Step, StepWatch, step_lines
 from selfcal_ros.collection.inputs import Command, Phase
 from selfcal_ros.collection.timeline import build_timeline
 from selfcal_ros.model.artifact import Artifact

@@ -15,8 +15,8 @@ from selfcal_ros.collection.settings.nodes import (
     PlayerSettings,
     RecorderSettings,
     SolverSettings,
+    overrides_in,
 )
-from selfcal_ros.collection.settings.ros_file import overrides_in
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact
@@ -53,7 +53,7 @@ def test_the_bounds_are_allowed_and_beyond_is_not(node, parameter):
 
 def documented(node):
     """Return name, default, bounds and unit of each parameter as docs/reference.md has them."""
-    page = (Path(__file__).parents[3] / "docs" / "reference.md").read_text()
+    page = (Path(__file__).parents[2] / "docs" / "reference.md").read_text()
     _, _, section = page.partition("## Parameters")[2].partition(f"### {node}\n")
     for line in section.partition("\n### ")[0].splitlines():
         if line.startswith("| `"):
