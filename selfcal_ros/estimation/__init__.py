@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Estimators: from readings to maps with uncertainties; one sub-package a question."""
+"""Estimators: from readings to maps with uncertainties; one sub-package per question."""

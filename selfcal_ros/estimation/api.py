@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The one call of the estimators: readings in, calibration out."""
+"""The public call of the estimators: readings in, calibration out."""
 
 from selfcal_ros.estimation.checks.placing import check_placing
 from selfcal_ros.estimation.checks.wiring import check_wiring
@@ -34,7 +34,7 @@ def calibrate(measurements: Measurements, options: Options | None = None) -> Cal
         If the marks that were read do not identify the stage.
     InputError
         If readings contradict the plan, an option does not fit them, the offsets do not follow the
-        stage (`WiringError`), or the plate lies otherwise than planned (`PlacingError`).
+        stage (`WiringError`), or the plate is not placed as planned (`PlacingError`).
     """
     check_wiring(measurements)
     options = options or Options()

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """One BLAS thread while a solution is computed: the same bits on any number of cores.
 
-The dense blocks of the solver are small, so that threads of the linear algebra library cost more
-than they bring, and their number changes the order of sums.
+The dense blocks of the solver are small: threads of the linear algebra library cost more than
+they gain, and their number changes the order of sums.
 """
 
 from collections.abc import Iterator
@@ -29,7 +29,7 @@ def _controller() -> ThreadpoolController:
 def one_thread() -> Iterator[None]:
     """Run the block with one BLAS thread.
 
-    The number goes back when the outermost block of any thread of this process has ended.
+    The number is restored when the outermost block of any thread of this process has ended.
     """
     global _depth
     with _lock:

@@ -13,7 +13,7 @@ MISALIGNMENT_MODELS = ("linear", "rigid")
 
 
 class ReferenceKind(StrEnum):
-    """What the reference length was measured on."""
+    """Object on which the reference length was measured."""
 
     ARTIFACT = "artifact"
     STAGE_X = "stage_x"
@@ -22,7 +22,7 @@ class ReferenceKind(StrEnum):
 
 @dataclass(frozen=True)
 class ReferenceLength:
-    """A length that sets the scale, which no view can tell.
+    """A length that sets the scale, which no view determines.
 
     Attributes
     ----------
@@ -35,7 +35,7 @@ class ReferenceLength:
     u_relative : float
         Its standard uncertainty (k=1).
     certificate : str
-        What states it: number and issuer of a certificate, as text.
+        Certificate: number and issuer, as text.
 
     Raises
     ------
@@ -49,7 +49,7 @@ class ReferenceLength:
     certificate: str = ""
 
     def __post_init__(self) -> None:
-        """Refuse lengths that cannot be relative errors."""
+        """Refuse values that cannot be relative errors."""
         object.__setattr__(self, "kind", ReferenceKind(self.kind))
         if not abs(self.relative_error) < 0.1:
             raise InputError("reference length", f"{self.relative_error} is not a relative error",
@@ -68,27 +68,27 @@ class Options:
     method : str
         ``joint`` (all readings in one least squares) or ``law`` (Hu's published steps).
     datum_theta : ThetaDatum
-        What fixes the free constant of the angular map.
+        Condition that fixes the constant of the angular map.
     reference : ReferenceLength, optional
         Sets the scale; without it the map has none (Hu eq. 5).
     misalignment_model : str
         ``rigid``: finite rotations of the plate, or ``linear``, as published. Empty = rigid, or
-        linear for the law, which knows nothing else.
+        linear for the law, which has no other model.
     uncertainty : bool, optional
         Whether to compute the uncertainty map; None decides by the size of the field.
     terms : tuple of ModelTerm
-        Terms of the model that are estimated with the map.
+        Terms of the model estimated with the map.
     drift_degree : int
-        Degree of the polynomial by which views drift, where drift is a term.
+        Degree of the polynomial of the drift of a view, if drift is a term.
     causes : bool, optional
-        Whether to look for terms that the readings show and the model does not hold; None does
-        in fields of up to 41 x 41 sites, and where a test fails.
+        Whether to search for unmodelled terms in the readings; None searches
+        in fields of up to 41 x 41 sites, and if a test fails.
     terms_from : str
-        Who asks for the terms, for the provenance: ``options``, ``plan`` or empty.
+        Origin of the terms, for the provenance: ``options``, ``plan`` or empty.
     assumed : tuple of ModelTerm
-        Terms with sizes that hold where `terms` does not name them: lines of type B of the budget
-        (GUM 4.3). Empty: all of them are known to be none. Linear models assume none: they would
-        take the finite rotations that they leave out for strain.
+        Terms with sizes that apply unless `terms` names them: lines of type B of the budget
+        (GUM 4.3). Empty: all of them are known to be zero. Linear models assume none: strain would
+        absorb the finite rotations that they omit.
     magnification_limit : float
         Difference of the scales of plate and encoders, m/m, beyond which there is a warning.
 
@@ -131,14 +131,14 @@ class Options:
         return self.misalignment_model == "rigid"
 
     def model_terms(self, *, visits: bool, assumed: bool = True) -> tuple[ModelTerm, ...]:
-        """Return all terms of the model, those that are asked for before those that are assumed.
+        """Return all terms of the model, requested terms before assumed ones.
 
         Parameters
         ----------
         visits : bool
-            Whether the visits of every view are known, which a microscope needs.
+            Whether the visits of every view are known, as a microscope term requires.
         assumed : bool
-            Whether those that nobody asks for count as well.
+            Whether to include assumed terms.
         """
         named = {term.name for term in self.terms}
         more = [term for term in self.assumed if assumed and term.name not in named

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What fixes origin, rotation, scale and angular constant, and with which uncertainty."""
+"""Datum: origin, rotation, scale and angular constant, and their uncertainties."""

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The datum of the angular map: zero mean, or Hu's four axis conditions (eqs. 9, 27).
 
-The four conditions fix one free constant and test three differences. They shall not bend the
-XY map, so they act on Gtheta alone, with slopes and rotations as the readings gave them.
+The four conditions fix one free constant and test three differences. They must not bend the
+XY map, so they act on Gtheta alone, with slopes and rotations from the readings.
 """
 
 from dataclasses import dataclass
@@ -18,23 +18,22 @@ from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.readings import Sense
 
 MISCLOSURE_LEVEL = 0.05
-"""Level of the test of the three redundant axis conditions: who names this datum claims that they
-hold."""
+"""Level of the test of the three redundant axis conditions, which this datum claims to hold."""
 
 CLOSED_RAD = 1e-12
-"""Misclosure that is rounding, not a fault, rad."""
+"""Misclosure attributed to rounding, rad."""
 
 
 @dataclass(frozen=True, eq=False)
 class Conditions:
-    """Linear conditions on the angular map and the map's answer to them.
+    """Linear conditions on the angular map and the map's response to them.
 
     In the frame of the equations: with ``plate_moves`` the solved fields are H(X) = -G(-X).
 
     Attributes
     ----------
     datum : ThetaDatum
-        The convention that they hold.
+        The convention.
     rows : float array (conditions, K)
         rows @ Gtheta = slopes @ G.
     slopes : complex array (conditions, nx, ny)
@@ -42,7 +41,7 @@ class Conditions:
     gain : float array (K, conditions)
         Change of Gtheta for a unit misclosure.
     phi_gain : float array (views, conditions)
-        Change of phi of the angular views that no grid reading fixes.
+        Change of phi of the angular views without grid readings.
     """
 
     datum: ThetaDatum
@@ -57,23 +56,23 @@ _of_system: Memo[tuple[ThetaDatum, Sense, float], Conditions] = Memo()
 
 def conditions_for(system: NormalEquations, datum: ThetaDatum, sense: Sense,
                    half_width_m: float) -> Conditions:
-    """Return the conditions of a datum on what was measured.
+    """Return the conditions of a datum for the measured plan.
 
     Parameters
     ----------
     system : NormalEquations
         The measured plan.
     datum : ThetaDatum
-        The convention wanted.
+        The requested convention.
     sense : Sense
-        Who moves.
+        What moves.
     half_width_m : float
         Length of the unit of the system's positions, m.
 
     Raises
     ------
     InputError
-        For ``xy_axes`` if a half axis is not known as a whole.
+        For ``xy_axes`` if a half axis is not completely determined.
     """
     return _of_system.get(system, (datum, sense, half_width_m),
                           lambda: _conditions(system, datum, sense, half_width_m))
@@ -101,7 +100,7 @@ def _conditions(system: NormalEquations, datum: ThetaDatum, sense: Sense,
 
 
 def _require_axes(known: np.ndarray, lines: list[bool]) -> None:
-    """Raise InputError unless all four half axes and their lines are known."""
+    """Raise InputError unless all four half axes and their lines are determined."""
     hx, hy = (size // 2 for size in known.shape)
     halves = (("+x", known[hx + 1:, hy]), ("+y", known[hx, hy + 1:]), ("-x", known[:hx, hy]),
               ("-y", known[hx, :hy]))
@@ -115,7 +114,7 @@ def _require_axes(known: np.ndarray, lines: list[bool]) -> None:
 
 
 def _solve_conditions(system: NormalEquations, rows: np.ndarray, slopes: np.ndarray) -> Conditions:
-    """Return the least-squares answer of the angular equations, given phi of the grid views."""
+    """Return the least-squares response of the angular equations, given phi of the grid views."""
     angular = system.angular
     free = [v for v, i in enumerate(system.angular_index) if i not in system.grid_index]
     inverse = np.linalg.pinv(angular.schur[np.ix_(free, free)], hermitian=True)
@@ -134,20 +133,20 @@ def _solve_conditions(system: NormalEquations, rows: np.ndarray, slopes: np.ndar
 
 
 def misclosure_test(misclosure: np.ndarray, covariance: np.ndarray) -> tuple[float, float]:
-    """Return probability and size (rad) of what the redundant axis conditions contradict.
+    """Return probability and size (rad) of the misclosure of the redundant axis conditions.
 
     Parameters
     ----------
     misclosure : float array (conditions,)
-        Slopes less Gtheta at the axes, up to one common constant, rad.
+        Slopes minus Gtheta at the axes, up to one common constant, rad.
     covariance : float array (conditions, conditions)
         Its covariance, rad^2.
 
     Returns
     -------
     p, size_rad : float
-        Probability of so large a misclosure if the conditions hold; its largest contrast. The
-        probability is 1 where there is nothing to test.
+        Probability of such a misclosure if the conditions hold; its largest contrast. The
+        probability is 1 if there is nothing to test.
     """
     n = len(misclosure)
     if n < 2:

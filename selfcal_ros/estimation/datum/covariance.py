@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Covariance of the calibrated maps: exact, with the datum, without forming it as a whole.
+"""Covariance of the calibrated maps: exact, in the datum, without forming the whole matrix.
 
 For unit noise the sites have the covariance S = M^-1 + Y P Y', with M the eliminated matrix,
-Y its answer to the misalignments and P their covariance; the datum projects it (method eq. 4.8).
+Y the response to the misalignments and P their covariance; the datum projects it (method eq. 4.8).
 """
 
 from dataclasses import dataclass
@@ -15,25 +15,25 @@ from selfcal_ros.estimation.datum.scale import ScaleDatum
 from selfcal_ros.estimation.normal.equations import NormalEquations
 
 NO_NOISE_M = 1e-100
-"""Noise that stands for none: its square is still a number."""
+"""Stands for zero noise; its square is still representable."""
 
 
 @dataclass(frozen=True, eq=False)
 class TermSpread:
-    """How the coefficients of terms reach the map: part of its covariance.
+    """Effect of the terms' coefficients on the map, for its covariance.
 
     Attributes
     ----------
     fields : complex array (sites, p)
-        Map of a unit of each coefficient, in no particular datum.
+        Map for a unit of each coefficient, in no particular datum.
     parameters : float array (size, p)
-        Misalignments that belong to it.
+        The corresponding misalignments.
     covariance : float array (p, p)
         Of the coefficients, for unit noise of one grid reading.
     of_marks : float array (p,)
-        Scale of what a unit of each coefficient adds to the mean of every mark.
+        Scale of the field added to the marks' means by a unit of each coefficient.
     turned : float array (K, p)
-        Angular map of a unit of each coefficient, sign reversed, rad.
+        Angular map for a unit of each coefficient, sign reversed, rad.
     """
 
     fields: np.ndarray
@@ -53,7 +53,7 @@ class FieldCovariance:
     inverse : float array (size, size)
         Covariance of the misalignments for unit grid noise.
     scale : ScaleDatum, optional
-        What sets the scale of the map; without it the map has none.
+        Sets the scale of the map; without it the map has none.
     sigma : float
         Noise of one grid reading, m, by which the reference's uncertainty is measured.
     terms : TermSpread, optional
@@ -91,7 +91,7 @@ class FieldCovariance:
         return basis, spread, np.real(basis.conj().T @ spread)
 
     def project(self, rows: np.ndarray) -> np.ndarray:
-        """Return functionals (sites, k) as they act on a map that is not in its datum."""
+        """Return functionals (sites, k) as acting on a map that is not in its datum."""
         basis = self.system.gauge.orthonormal
         return rows - basis @ np.real(basis.conj().T @ rows)
 
@@ -131,11 +131,11 @@ class FieldCovariance:
 
     @property
     def scale_variance(self) -> float:
-        """Variance of the scale that the reference sets, at the unit of position."""
+        """Variance of the scale set by the reference, at the unit of position."""
         return 0.0 if self.scale is None else self._of_scale(self.scale)[1]
 
     def maps_of_terms(self) -> np.ndarray:
-        """Return the map of a unit of each coefficient in the datum, complex (sites, p)."""
+        """Return the map for a unit of each coefficient in the datum, complex (sites, p)."""
         maps = self.project(self.terms.fields)
         if self.scale is None:
             return maps

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The datum: what no view can tell, and the slopes of the half axes (method eqs. 3.1-3.3, 3.7)."""
+"""Modes that no view determines, and the slopes of the half axes (method eqs. 3.1-3.3, 3.7)."""
 
 import numpy as np
 
@@ -23,9 +23,9 @@ def datum_modes(artifact: Artifact, *, scale: bool) -> np.ndarray:
 
 
 def remove_modes(field_m: np.ndarray, modes: np.ndarray) -> np.ndarray:
-    """Return `field_m` (2, nx, ny) without its least-squares part in `modes`, over known sites.
+    """Return `field_m` (2, nx, ny) minus its least-squares part in `modes`, over known sites.
 
-    Sites with NaN stay NaN and do not count. With the modes of `datum_modes` the result
+    Sites with NaN stay NaN and are ignored. With the modes of `datum_modes` the result
     satisfies Hu eq. 5 (stage) or eq. 11 (plate).
     """
     known = np.isfinite(field_m).all(axis=0)
@@ -41,7 +41,7 @@ def half_axis_slopes(artifact: Artifact, g_m: np.ndarray) -> np.ndarray:
     """Return the slopes of the XY error along the half axes +X, +Y, -X, -Y, rad (Hu eq. 27).
 
     They are the angular errors at lines 0, K/4, K/2, 3K/4: ordinary least squares with
-    intercept; +Gy on x along +-X, -Gx on y along +-Y. NaN where a half axis has but one site.
+    intercept; +Gy on x along +-X, -Gx on y along +-Y. NaN if a half axis has only one site.
 
     Parameters
     ----------
@@ -67,14 +67,14 @@ def _slope(values: np.ndarray, pitch_m: float) -> np.ndarray:
 def slope_rows(z_m: np.ndarray, known: np.ndarray) -> np.ndarray:
     """Return the slopes of `half_axis_slopes` as rows over the sites, complex (4, nx, ny).
 
-    A row of zeros stands for a half axis with fewer than two known sites.
+    The row of a half axis with fewer than two known sites is zero.
 
     Parameters
     ----------
     z_m : complex array (nx, ny)
         Site positions, m.
     known : bool array (nx, ny)
-        Sites that count.
+        Sites to use.
     """
     hx, hy = (size // 2 for size in z_m.shape)
     out = np.zeros((4, *z_m.shape), dtype=complex)

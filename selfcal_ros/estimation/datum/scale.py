@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The scale of the map from a reference length: a certified plate or a laser-measured axis.
 
-No view tells the magnification: G = s z, A = -s m with offsets to match changes no reading. The
-map in its datum (no scale) becomes G + c z, with c such that the reference holds (method eq. 3.5).
+No view determines the magnification: G = s z, A = -s m with matching offsets changes no reading.
+The map in its datum (no scale) becomes G + c z, with c from the reference (method eq. 3.5).
 """
 
 from dataclasses import dataclass
@@ -16,20 +16,20 @@ from selfcal_ros.estimation.options import ReferenceKind, ReferenceLength
 
 @dataclass(frozen=True, eq=False)
 class ScaleDatum:
-    """How the scale varies with a solution: c = const + Re(rows^H G) + parameters . p + noise.
+    """Dependence of the scale on a solution: c = const + Re(rows^H G) + parameters . p + noise.
 
     Attributes
     ----------
     rows : complex array (sites,)
-        On the map in no particular datum.
+        Factors of the map in no particular datum.
     parameters : float array (3 views,)
-        On the misalignments that belong to it.
+        Factors of the corresponding misalignments.
     variance : float
-        Of what is neither, for unit noise of one grid reading.
+        Variance of the remaining part, for unit noise of one grid reading.
     u_m : float
         Standard uncertainty of the reference itself, m at the unit of position.
     of_plate : bool
-        Whether the plate sets the scale: what a term adds to its marks moves the scale as well.
+        Whether the plate sets the scale, so that terms acting on its marks change it.
     """
 
     rows: np.ndarray
@@ -41,7 +41,7 @@ class ScaleDatum:
 
 def scale_datum(system: NormalEquations, reference: ReferenceLength,
                 half_width_m: float) -> ScaleDatum:
-    """Return the scale that a reference length sets.
+    """Return the scale set by a reference length.
 
     Parameters
     ----------

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where each mark of a view lies on the stage, and which sites hang together."""
+"""Site of each mark of a view on the stage, and connected sites."""

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which sites hang together: components of the readings, and whether turns close in them.
+"""Connected components of the readings, and whether closed paths turn in them.
 
 Sites and marks are the nodes, a reading joins one mark to one site and carries the view's
 quarter turns. With misalignments known, a component leaves two numbers free (a vector that
-turns along with the readings) unless some closed path turns it: then it leaves none. Counting
-components is therefore an exact rank.
+turns along with the readings) unless a closed path turns it. Counting components therefore gives
+the exact rank.
 """
 
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ class Components:
     of_site, of_mark : int array (sites,), (marks,)
         Number of the component; -1 for a site never visited or a mark never read.
     balanced : bool array (components,)
-        No closed path turns a vector: the component leaves two numbers free.
+        Whether no closed path turns a vector: the component leaves two numbers free.
     """
 
     of_site: np.ndarray
@@ -40,7 +40,7 @@ class Components:
 
     @property
     def largest(self) -> int:
-        """The component with the most sites; the first of equals."""
+        """The component with the most sites; the first one if equal."""
         known = self.of_site[self.of_site >= 0]
         return int(np.bincount(known, minlength=len(self.balanced)).argmax())
 
@@ -56,14 +56,14 @@ def components(site: np.ndarray, mark: np.ndarray, q: np.ndarray, *, n_sites: in
     n_sites, n_marks : int
         Number of sites and marks.
     turning : int
-        A site known to lie in a component that is not balanced; -1 = none is known.
+        A site known to be in a component that is not balanced; -1 = unknown.
     """
     of_site, of_mark = np.full(n_sites, -1), np.full(n_marks, -1)
     if not len(site):
         return Components(of_site, of_mark, np.zeros(0, dtype=bool))
     first = np.empty(n_marks, dtype=int)
     first[mark[::-1]] = np.arange(len(mark))[::-1]
-    # a mark joins the site of its first reading to those of its others
+    # a mark joins the site of its first reading to its other sites
     other = np.flatnonzero(first[mark] != np.arange(len(mark)))
     start = first[mark[other]]
     turn = (q[other] - q[start]) % 4
@@ -72,7 +72,7 @@ def components(site: np.ndarray, mark: np.ndarray, q: np.ndarray, *, n_sites: in
         site[start], site[other], turn, n_sites)
     touched = np.zeros(n_sites, dtype=bool)
     touched[site] = True
-    # the copies of a site lie in all components of the cover over its own component
+    # the copies of a site are in all components of the cover over its own component
     _, one, number = np.unique(label.min(axis=0)[touched], return_index=True,
                                return_inverse=True)
     copies = label[:, np.flatnonzero(touched)[one]]
@@ -105,10 +105,10 @@ def _cover(a: np.ndarray, b: np.ndarray, turn: np.ndarray, n: int) -> np.ndarray
 
 def free_turns(site: np.ndarray, mark: np.ndarray, q: np.ndarray,
                parts: Components) -> tuple[np.ndarray, np.ndarray]:
-    """Return the quarter turns that a component's free vector takes, int (sites,), (marks,).
+    """Return the quarter turns of a component's free vector, int (sites,), (marks,).
 
-    Against the first site of the component: with v the vector there, G = i^turn v and
-    A = -i^turn v change no reading. 0 outside the components that are balanced.
+    Relative to the first site of the component: with v the vector there, G = i^turn v and
+    A = -i^turn v change no reading. 0 outside balanced components.
 
     Parameters
     ----------

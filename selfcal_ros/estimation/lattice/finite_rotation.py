@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a finite rotation of the plate adds to the linear model, by reading (method eq. 2.6).
+"""Contribution of a finite rotation of the plate beyond the linear model (method eq. 2.6).
 
-A mark lies at R(phi) R^q (m + A) + t. The linear model has R^q A + phi J R^q m + t of it; what is
-left is (R(phi) - 1 - phi J) R^q m + (R(phi) - 1) R^q A. As complex numbers, R(phi) is exp(i phi).
+A mark is at R(phi) R^q (m + A) + t. The linear model contains R^q A + phi J R^q m + t; the rest
+is (R(phi) - 1 - phi J) R^q m + (R(phi) - 1) R^q A. As complex numbers, R(phi) is exp(i phi).
 """
 
 import numpy as np
@@ -20,13 +20,13 @@ def turned_marks(view: ViewReadings, artifact: Artifact) -> np.ndarray:
 
 
 def turned_plate(view: ViewReadings, artifact: Artifact, plate: ArtifactMap) -> np.ndarray:
-    """Return R^q A of the marks read, complex (P,), stage frame, m; NaN where not known."""
+    """Return R^q A of the marks read, complex (P,), stage frame, m; NaN where unknown."""
     turn = PHASES[view.view.lattice_pose(artifact).q]
     at = view.m + artifact.half[0], view.n + artifact.half[1]
     return turn * (plate.ax[at] + 1j * plate.ay[at])
 
 
 def rotation_excess(phi_rad: float, marks: np.ndarray, plate: np.ndarray) -> np.ndarray:
-    """Return what the rotation adds to the linear model at the marks, complex (P,), m."""
+    """Return the contribution of the rotation beyond the linear model, complex (P,), m."""
     turn = np.expm1(1j * phi_rad)
     return (turn - 1j * phi_rad) * marks + turn * plate  # method eq. 2.6

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Moving a solution to its datum: rigid modes out of G and A, into the misalignments."""
+"""Move a solution to its datum: rigid modes out of G and A, into the misalignments."""
 
 from functools import cached_property
 
@@ -7,14 +7,14 @@ import numpy as np
 
 
 class Gauge:
-    """Least-squares parts of a complex field in modes, over the known sites.
+    """Least-squares components of a complex field in modes, over the known sites.
 
     Parameters
     ----------
     z : complex array (nx, ny)
         Positions in units of the longer half width.
     known : bool array (nx, ny)
-        Sites that count.
+        Sites to use.
     scale : bool
         Whether magnification belongs to the datum (stage: yes, plate: no).
     """
@@ -33,7 +33,7 @@ class Gauge:
         return (self._gram_inverse[mode] @ self._rows).reshape(self.known.shape)
 
     def remove(self, field: np.ndarray, parts: np.ndarray) -> np.ndarray:
-        """Return `field` less the modes with coefficients `parts`."""
+        """Return `field` minus the modes with coefficients `parts`."""
         shift, slope = complex(parts[0], parts[1]), complex(0.0, parts[2])
         if self.scale:
             slope += parts[3]
@@ -70,7 +70,7 @@ def _modes(z: np.ndarray, known: np.ndarray) -> np.ndarray:
 
 
 def _inverse(gram: np.ndarray) -> np.ndarray:
-    """Return the pseudo-inverse of a Gram matrix: few sites may not tell all modes apart."""
+    """Return the pseudo-inverse of a Gram matrix: few sites may not separate all modes."""
     values, vectors = np.linalg.eigh(gram)
     good = values > 1e-12 * values[-1]
     return (vectors[:, good] / values[good]) @ vectors[:, good].T

@@ -19,7 +19,7 @@ PHASES = np.array([1, 1j, -1, -1j])
 
 @dataclass(frozen=True)
 class Window:
-    """Where one view's marks and their sites lie: slices into the plate and into the field."""
+    """Marks of one view and their sites, as slices into the plate and into the field."""
 
     marks: tuple[slice, slice]
     sites: tuple[slice, slice]
@@ -27,7 +27,7 @@ class Window:
 
 
 def window(pose: LatticePose, half: tuple[int, int]) -> Window:
-    """Return the marks of a view that lie in the field, and their sites, as slices.
+    """Return the marks of a view inside the field, and their sites, as slices.
 
     Site = R^q (m, n) + (a, b); a field with half widths `half`.
     """
@@ -61,7 +61,7 @@ class LatticeViews:
     shape : tuple of int
         Marks (and sites) along x and y.
     poses : tuple of LatticePose
-        One a view.
+        One per view.
     unit : int
         Pitches in the unit of positions; 0 = the longer half width.
     """
@@ -75,7 +75,7 @@ class LatticeViews:
 
     @property
     def reach(self) -> int:
-        """Largest folded distance, in pitches, of two sites that one mark visits."""
+        """Largest folded distance, in pitches, of two sites visited by one mark."""
         out = 0
         for p in self.poses:
             for r in self.poses:
@@ -93,7 +93,7 @@ class LatticeViews:
 
     @cached_property
     def in_field(self) -> np.ndarray:
-        """Marks that lie in the field, bool (views, nx, ny)."""
+        """Marks inside the field, bool (views, nx, ny)."""
         out = np.zeros((len(self.poses), *self.shape), dtype=bool)
         for index, win in enumerate(self.windows):
             out[index][win.marks] = True
@@ -115,7 +115,7 @@ class LatticeViews:
         Parameters
         ----------
         field : complex array (..., nx, ny)
-            G, or many of them.
+            G, or several fields.
         """
         out = np.zeros((*field.shape[:-2], len(self.poses), *self.shape), dtype=complex)
         for index, (pose, win) in enumerate(zip(self.poses, self.windows, strict=True)):
@@ -156,7 +156,7 @@ class LatticeViews:
 
     @cached_property
     def _of_site(self) -> tuple[np.ndarray, np.ndarray]:
-        """Place of the mark on every site, and i^q or 0 where there is none, (views, sites)."""
+        """Index of the mark on every site, and i^q or 0 if there is none, (views, sites)."""
         n = self.shape[0] * self.shape[1]
         place = np.zeros((len(self.poses), n), dtype=int)
         phase = np.zeros(place.shape, dtype=complex)
@@ -173,7 +173,7 @@ class LatticeViews:
 
 
 def _add_turned(out: np.ndarray, part: np.ndarray, q: int) -> None:
-    """Add i^q times `part` to `out` without multiplying: only signs and parts change places."""
+    """Add i^q times `part` to `out` without multiplying: only signs and parts are exchanged."""
     if q == 0:
         out += part
     elif q == 2:
@@ -185,7 +185,7 @@ def _add_turned(out: np.ndarray, part: np.ndarray, q: int) -> None:
 
 
 def rigid_parameters(views: LatticeViews) -> np.ndarray:
-    """Return what the 7 datum modes do to the misalignments, (7, views, 3): phi, Re and Im tau.
+    """Return the misalignments of the 7 datum modes, (7, views, 3): phi, Re and Im tau.
 
     Modes: stage translation x, y, rotation, scale; plate translation x, y, rotation; unit
     length (or unit angle times the longer half width). A mode G, A with these misalignments

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Readings laid out on the lattice: the canonical form, whatever their order was."""
+"""Readings on the lattice, in a canonical form that does not depend on their order."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -55,7 +55,7 @@ def grid_data(measurements: Measurements) -> GridData:
     Raises
     ------
     InputError
-        If a mark does not exist, is off the field, comes twice, or is not a finite number.
+        If a mark does not exist, is outside the field, is duplicated, or is not a finite number.
     """
     artifact = measurements.artifact
     index = tuple(i for i, view in enumerate(measurements.views) if len(view.m))
@@ -119,7 +119,7 @@ def _grid_pose(readings: ViewReadings, artifact: Artifact) -> LatticePose:
 
 def _flat_marks(readings: ViewReadings, artifact: Artifact, pose: LatticePose, *,
                 where: str) -> np.ndarray:
-    """Return the flat index of every mark read, checked against plate and field."""
+    """Return the flat index of every mark read, checked for plate and field."""
     (hx, hy), m, n = artifact.half, np.asarray(readings.m), np.asarray(readings.n)
     if m.shape != n.shape:
         raise InputError(where, "m and n differ in length", "give one value a mark")
@@ -150,10 +150,10 @@ def _place(y: np.ndarray, weight: np.ndarray, flat: np.ndarray, *, values: np.nd
 
 
 def _declare(weight: np.ndarray, ones: list[tuple]) -> float:
-    """Turn counts into (sigma / u)^2 where uncertainties are declared; return that sigma.
+    """Convert counts to (sigma / u)^2 where uncertainties are declared; also return sigma.
 
     Sigma is the rms of u sqrt(count) over the declared marks; marks without a declaration are
-    taken as readings of that sigma.
+    treated as readings of that sigma.
     """
     if not any(len(u) for _, _, u in ones):
         return float("nan")
@@ -161,7 +161,7 @@ def _declare(weight: np.ndarray, ones: list[tuple]) -> float:
     for row, (flat, _, u) in enumerate(ones):
         if len(u):
             good = np.isfinite(u) & (u > 0)
-            # summed in the order of the lattice: no result depends on the order of readings
+            # summed in lattice order: the result does not depend on the order of readings
             square = np.zeros(weight[row].size)
             square[flat[good]] = u[good] ** 2 * weight[row].reshape(-1)[flat[good]]
             total, number = total + float(square.sum()), number + int(good.sum())

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What Hu's published law finds from the same readings."""
+"""Hu's published law, applied to the same readings."""

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Hu's law as linear maps on arrays, step by step (Hu eqs. 16-28, method eqs. 5.1-5.10).
 
-Every array carries a last axis of columns, so that the same code solves the readings (one column)
-and propagates the noise of each reading (one column a reading).
+Every array has a last axis of columns, so that the same code solves the readings (one column)
+and propagates the noise of each reading (one column per reading).
 """
 
 from collections.abc import Callable
@@ -29,10 +29,10 @@ class HuReadings:
 
 @dataclass(frozen=True, eq=False)
 class HuSolution:
-    """What the law finds, one column for each column of readings.
+    """Solution of the law, one column for each column of readings.
 
     `g`, `a` (2, N, N, C) in m; `g_theta`, `a_theta` (K, C) in rad; `phi` (4, C); `t` (4, 2, C),
-    NaN for view 2; `o`, `r` (C,); `rest_xy`, `rest_theta`: what eqs. 23, 25 and 28 leave over.
+    NaN for view 2; `o`, `r` (C,); `rest_xy`, `rest_theta`: residuals of eqs. 23, 25 and 28.
     """
 
     g: np.ndarray
@@ -48,7 +48,7 @@ class HuSolution:
 
 
 class HuLaw:
-    """The law for one artifact: factors its two least-squares problems once.
+    """The law for one artifact, with its two least-squares problems factorised once.
 
     Parameters
     ----------
@@ -103,10 +103,10 @@ class HuLaw:
         return HuSolution(g, a, g_theta, vt[0] - phi0 - g_theta, phi, t, o, r, rest_xy, rest_theta)
 
     def _left_by_phi3(self) -> np.ndarray:
-        """Return what an error of phi3 leaves over in eq. 25, of unit length.
+        """Return the residual of eq. 25 caused by an error of phi3, of unit length.
 
-        phi3 comes from the angular lines alone (eq. 17), so that its error is angular noise: it is
-        taken out of what is left over before the noise of the grid readings is read off it.
+        phi3 comes from the angular lines alone (eq. 17), so its error is angular noise: it is
+        removed from the residuals before the noise of the grid readings is estimated from them.
         """
         step = np.stack([np.broadcast_to(self.y, (*self.artifact.shape, 1)),
                          np.broadcast_to(-self.x, (*self.artifact.shape, 1))])[:, :-1]
@@ -130,7 +130,7 @@ def _columns(part: np.ndarray) -> np.ndarray:
 
 
 def _diagonals(values: tuple[float, ...], shape: tuple[int, int]) -> sparse.csr_array:
-    """Return a matrix of constant diagonals, the main one first; SciPy 1.11 has no diags_array."""
+    """Return a matrix of constant diagonals, the main one first; SciPy 1.11 lacks diags_array."""
     return sparse.dia_array((np.outer(values, np.ones(shape[1])), range(len(values))),
                             shape=shape).tocsr()
 
@@ -140,7 +140,7 @@ def _identity(size: int) -> sparse.csr_array:
 
 
 def _rows_xy(size: int) -> sparse.csr_array:
-    """Return the left sides of eqs. 23 and 25 on F as (2, N, N) flattened."""
+    """Return the left-hand sides of eqs. 23 and 25 for F as (2, N, N) flattened."""
     one = _identity(size)
     first = _diagonals((-1.0, 1.0), (size - 1, size))
     second = first[:-1, :-1] @ first
@@ -154,7 +154,7 @@ def _rows_xy(size: int) -> sparse.csr_array:
 
 
 def _first_order_rows(artifact: Artifact) -> np.ndarray:
-    """Return the six sums of eq. 7 on F, in lattice units."""
+    """Return the six sums of eq. 7 over F, in lattice units."""
     one = np.ones(artifact.shape)
     rows = np.zeros((6, 2, *artifact.shape))
     for index, weight in enumerate((one, artifact.m, artifact.n)):
@@ -175,10 +175,10 @@ def _rows_theta(count: int, datum: ThetaDatum, axis_lines: np.ndarray,
 
 def _bordered(rows: sparse.csr_array, ties: np.ndarray,
               ) -> Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
-    """Return a solver of the least squares of `rows` and the few dense rows `ties` together.
+    """Return a least-squares solver for `rows` together with the few dense rows `ties`.
 
-    The dense rows border the sparse normal matrix, so that it stays sparse. The solver takes the
-    right sides of both and returns the solution and what is left over of `rows`.
+    The dense rows border the normal matrix, so that it stays sparse. The solver takes the
+    right-hand sides of both and returns the solution and the residuals of `rows`.
     """
     unknowns = rows.shape[1]
     bordered = sparse.csc_array(sparse.bmat(
@@ -191,6 +191,6 @@ def _bordered(rows: sparse.csr_array, ties: np.ndarray,
         found = factor.solve(np.concatenate([rows.T @ right, tied]))[:unknowns]
         rest, slack = right - rows @ found, tied - ties @ found
         more = factor.solve(np.concatenate([rows.T @ rest, slack]))[:unknowns]
-        return found + more, rest - rows @ more            # one refinement: rounding level
+        return found + more, rest - rows @ more            # one refinement: to rounding
 
     return solve

@@ -27,10 +27,10 @@ from selfcal_ros.model.verdict import Finding
 from selfcal_ros.model.view import View
 
 EXACT_SIZE = 21
-"""Largest N whose noise is propagated reading by reading."""
+"""Largest N for which the noise is propagated reading by reading."""
 
 N_DRAWS = 400
-"""Unit-noise draws behind the uncertainties of a larger plate: 3.5 % standard error each."""
+"""Unit-noise draws for the uncertainties of a larger plate: standard error 3.5 % each."""
 
 _JOINT = "solve with --method joint"
 _REMEDY = "measure Hu's four views in full, or solve with --method joint"
@@ -40,14 +40,14 @@ _NAMES = ("0 deg with grid and lines", "90 deg with grid and lines", "one line, 
 
 @one_thread()
 def solve_law(measurements: Measurements, options: Options) -> Solved:
-    """Calibrate by Hu's law from exactly his four views, each of them complete.
+    """Calibrate by Hu's law from exactly Hu's four views, all complete.
 
     Parameters
     ----------
     measurements : Measurements
-        Readings; their repeats are averaged as they are, without weights, as published.
+        Readings; repeats are averaged without weights, as published.
     options : Options
-        Only `datum_theta` matters here, and whether an uncertainty map is not wanted.
+        Only `datum_theta` and `uncertainty` are used.
 
     Returns
     -------
@@ -57,7 +57,7 @@ def solve_law(measurements: Measurements, options: Options) -> Solved:
     Raises
     ------
     InputError
-        If a view is missing, surplus or incomplete, or an option is not the law's.
+        If a view is missing, surplus or incomplete, or an option does not apply to the law.
     """
     _require_plain(options)
     views = hu_views(measurements)
@@ -102,7 +102,7 @@ def _require_plain(options: Options) -> None:
 
 @lru_cache(4)
 def law_for(artifact: Artifact, datum: ThetaDatum, sense: Sense) -> HuLaw:
-    """Return the law for a plate and a sense of measurement, factorised once for each.
+    """Return the cached, factorised law for a plate and a sense of measurement.
 
     With the plate on the stage the law solves for H(X) = -G(-X): the slopes of G along +X, +Y,
     -X, -Y are those of H along -X, -Y, +X, +Y, and Htheta(-k) = -Gtheta(k).
@@ -164,7 +164,7 @@ def _require_complete(view: ViewReadings, index: int, artifact: Artifact) -> Non
 
 
 def hu_readings(artifact: Artifact, views: list[ViewReadings]) -> HuReadings:
-    """Return the deviations of Hu's four views, as `hu_views` gives them, as arrays."""
+    """Return the deviations of Hu's four views from `hu_views` as arrays."""
     v0, v1, v3 = (_grid(views[index], artifact) for index in (0, 1, 3))
     vt = np.zeros((4, artifact.angular_count, 1))
     for index, view in enumerate(views):
@@ -181,10 +181,10 @@ def _grid(view: ViewReadings, artifact: Artifact) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class _Spread:
-    """Sums over the readings of one unit of noise each, grid readings first, then angular.
+    """Effect of unit noise of every reading, for grid and for angular readings.
 
     `var_g` (2, 2, N, N), `var_theta` (2, K): the variances; `rest` (2,) and `rest_dof` (2,): the
-    expected sums of squares of what is left over, grid for XY and angular for theta, and their
+    expected sums of squared residuals, of grid readings in XY and angular ones in theta, and their
     effective degrees of freedom.
     """
 
@@ -201,7 +201,7 @@ class _Spread:
 
 
 def _propagate(law: HuLaw, views: list[ViewReadings]) -> _Spread:
-    """Send the noise of each reading through the law: exactly up to EXACT_SIZE, else by draws."""
+    """Propagate the noise of each reading: exactly up to EXACT_SIZE, else by draws."""
     exact = law.artifact.grid_size <= EXACT_SIZE
     parts = []
     for kind in range(2):
@@ -248,7 +248,7 @@ def _full_views(artifact: Artifact) -> list[ViewReadings]:
 
 
 def _quadratic_form(rest: np.ndarray, *, exact: bool) -> tuple[float, float]:
-    """Return mean and effective degrees of freedom (Satterthwaite) of the sum of squares left."""
+    """Return mean and effective degrees of freedom (Satterthwaite) of the sum of squares."""
     if exact:
         gram = rest.T @ rest
         mean, twice_squares = float(np.trace(gram)), 2 * float((gram**2).sum())
@@ -260,7 +260,7 @@ def _quadratic_form(rest: np.ndarray, *, exact: bool) -> tuple[float, float]:
 
 def _unit_noise(artifact: Artifact, views: list[ViewReadings], *, kind: int,
                 exact: bool) -> HuReadings:
-    """Return unit noise of every single reading of one kind: a column each, or random columns."""
+    """Return unit noise of all readings of one kind: one column per reading, or random columns."""
     size, lines = artifact.grid_size, artifact.angular_count
     shapes = [(2, size, size), (2, size, size), (2, size - 1, size), (4, lines)]
     weights = [_per_mean(views[index], artifact, shape)
@@ -288,7 +288,7 @@ def _per_mean(view: ViewReadings, artifact: Artifact, shape: tuple[int, ...]) ->
 
 def _noise(found: HuSolution, spread: _Spread,
            views: tuple[ViewReadings, ...]) -> tuple[NoiseEstimate, NoiseEstimate]:
-    """Estimate the noise of one reading from repeats, and from what the equations leave over."""
+    """Estimate the noise of one reading from repeats, and from the residuals."""
     rest = np.sqrt([(found.rest_xy**2).sum() / spread.rest[0],
                     (found.rest_theta**2).sum() / spread.rest[1]])
     dof = np.maximum(np.round(spread.rest_dof), 1).astype(int)
@@ -301,7 +301,7 @@ def _noise(found: HuSolution, spread: _Spread,
 
 
 def _to_stage(field: np.ndarray, theta: np.ndarray, sign: int) -> tuple[np.ndarray, np.ndarray]:
-    """Turn H(X) = -G(-X), Htheta(k) = -Gtheta(-k) back into G; sign +1 for uncertainties."""
+    """Convert H(X) = -G(-X), Htheta(k) = -Gtheta(-k) to G; sign +1 for uncertainties."""
     return sign * field[:, ::-1, ::-1], sign * np.roll(theta[::-1], 1, axis=0)
 
 

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How the sites' equations of a large field are factorised exactly and fast."""
+"""Exact and fast factorisation of the sites' equations of a large field."""

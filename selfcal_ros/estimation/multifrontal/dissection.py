@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Nested dissection of the field, and the fronts of a multifrontal factorisation.
 
-A mark joins only sites that quarter turns and small shifts carry into each other. Folded into
+A mark joins only sites related by quarter turns and small shifts. Folded into
 one eighth of the plane, (max(|i|, |j|), min(|i|, |j|)), such sites are neighbours, so straight
 cuts through the folded field separate the matrix.
 """
@@ -14,7 +14,7 @@ import numpy as np
 from selfcal_ros.estimation.multifrontal.symmetry import RealSymmetricForm
 
 LEAF = 192
-"""Sites below which a part of the field is not cut any more."""
+"""Number of sites below which a part of the field is not cut further."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,12 +26,12 @@ class Front:
     start, stop : int
         Range of the variables eliminated here, in the order of elimination.
     boundary : int array (b,)
-        Later variables that they are joined to, sorted.
+        Later variables joined to these, sorted.
     children : tuple of int
-        Fronts that are eliminated into this one.
+        Fronts eliminated into this one.
     offset : int
-        Where the front's numbers start in the storage of all: the block of its own variables,
-        then that of its boundary against them, both by columns.
+        Start of the front's values in the common storage: the block of its own variables,
+        then the block of its boundary against them, both by columns.
     """
 
     start: int
@@ -42,7 +42,7 @@ class Front:
 
     @property
     def size(self) -> int:
-        """Numbers that the front stores."""
+        """Number of values stored by the front."""
         own = self.stop - self.start
         return own * (own + len(self.boundary))
 
@@ -53,7 +53,7 @@ class Front:
                 storage[middle:self.offset + self.size].reshape(own, -1).T)
 
     def places(self, variables: np.ndarray) -> np.ndarray:
-        """Return where variables stand in this front: its own first, then its boundary."""
+        """Return the positions of variables in this front: its own first, then its boundary."""
         own = self.stop - self.start
         return np.where(variables < self.stop, variables - self.start,
                         own + np.searchsorted(self.boundary, variables))
@@ -61,20 +61,20 @@ class Front:
 
 @dataclass(frozen=True, eq=False)
 class Dissection:
-    """Order of elimination and its fronts, children before parents.
+    """Elimination order and fronts, children before parents.
 
     Attributes
     ----------
     order : int array (free,)
         Variable eliminated at each position; the copies of the cut follow in their order.
     fronts : tuple of Front
-        In the order of elimination.
+        In elimination order.
     top : tuple of int
         Fronts without a parent: only copies are left on their boundaries.
     storage : float array
         The lower triangle of the matrix, laid out for the fronts.
     rest : float array (copies, copies)
-        Its lower triangle over the copies, by columns.
+        The lower triangle over the copies, by columns.
     """
 
     order: np.ndarray
@@ -90,17 +90,17 @@ def dissect(folded: RealSymmetricForm, shape: tuple[int, int], reach: int) -> Di
     Parameters
     ----------
     folded : RealSymmetricForm
-        The matrix; its copies are not eliminated here.
+        The matrix; copies are not eliminated here.
     shape : tuple of int
         Sites along x and y.
     reach : int
-        Largest folded distance of two sites that the matrix joins.
+        Largest folded distance of two sites joined by the matrix.
     """
     hx, hy = (size // 2 for size in shape)
     i, j = abs(folded.free // shape[1] - hx), abs(folded.free % shape[1] - hy)
     far, near = np.maximum(i, j), np.minimum(i, j)
     pieces: list[tuple[np.ndarray, tuple[int, ...]]] = []
-    # neighbours in a row: the variables of a front are stored, and read, side by side
+    # consecutive: the variables of a front are contiguous in memory
     rows = np.argsort(far * (max(shape) + 1) + near, kind="stable")
     top = _cut(rows, np.stack([far, near]), max(reach, 1), pieces)
     order = np.concatenate([np.zeros(0, dtype=int), *(piece for piece, _ in pieces)])
@@ -123,7 +123,7 @@ def dissect(folded: RealSymmetricForm, shape: tuple[int, int], reach: int) -> Di
 
 
 def _fronts(pieces: list, row: np.ndarray, front: np.ndarray, *, size: int) -> tuple[Front, ...]:
-    """Return the fronts of pieces, given the rows of the matrix in each front's columns."""
+    """Return the fronts of the pieces, given the matrix rows in each front's columns."""
     stops = np.cumsum([len(piece) for piece, _ in pieces], dtype=int)
     later = row >= stops[front]
     keys = np.unique(front[later] * size + row[later])
@@ -143,7 +143,7 @@ def _fronts(pieces: list, row: np.ndarray, front: np.ndarray, *, size: int) -> t
 
 def _addresses(fronts: tuple[Front, ...], row: np.ndarray, column: np.ndarray, *,
                front: np.ndarray, size: int) -> np.ndarray:
-    """Return where the entries (row, column) of the lower triangle are stored."""
+    """Return the storage positions of entries (row, column) of the lower triangle."""
     start = np.array([one.start for one in fronts])[front]
     own = np.array([one.stop for one in fronts])[front] - start
     widths = np.array([len(one.boundary) for one in fronts])
@@ -158,7 +158,7 @@ def _addresses(fronts: tuple[Front, ...], row: np.ndarray, column: np.ndarray, *
 
 
 def _cut(sites: np.ndarray, folded: np.ndarray, reach: int, pieces: list) -> tuple[int, ...]:
-    """Append the pieces of `sites`, separators last; return the numbers of the topmost ones."""
+    """Append the pieces of `sites`, separators last; return the indices of the topmost ones."""
     if not len(sites):
         return ()
     if len(sites) > LEAF:
@@ -180,7 +180,7 @@ def _cut(sites: np.ndarray, folded: np.ndarray, reach: int, pieces: list) -> tup
 
 
 def _best_cut(at: np.ndarray, reach: int) -> int:
-    """Return where to cut: halves as equal as they can be, both of them not empty."""
+    """Return where to cut into two non-empty halves, as equal as possible."""
     counts = np.bincount(at - at.min())
     before = np.concatenate([[0], np.cumsum(counts)])
     starts = np.arange(1, len(counts) - reach)

@@ -4,8 +4,8 @@
 Each front keeps J = L^-1 and Y = F21 J', where F11 = L L'. A solution then needs matrix products
 only, and the diagonal of the inverse follows from the last front down to the first (Takahashi):
 with K = J' J and W = J' Y', Z12 = -W Z22, Z11 = K - Z12 W', with Z22 taken from the parent's Z.
-All this is real; only the cut, which is solved last, is complex, and only the real part of its
-inverse reaches a diagonal.
+All this is real except for the cut, which is solved last; only the real part of its inverse
+enters the diagonal.
 """
 
 import numpy as np
@@ -15,7 +15,7 @@ from selfcal_ros.estimation.multifrontal.dissection import dissect
 from selfcal_ros.estimation.multifrontal.symmetry import RealSymmetricForm
 
 SMALL = 64
-"""Side up to which a triangle is inverted by substitution."""
+"""Largest side of a triangle inverted by substitution."""
 
 
 class Factor:
@@ -28,7 +28,7 @@ class Factor:
     shape : tuple of int
         Sites along x and y.
     reach : int
-        Largest folded distance of two sites that the matrix joins.
+        Largest folded distance of two sites joined by the matrix.
 
     Raises
     ------
@@ -56,7 +56,7 @@ class Factor:
         return len(self.folded.free)
 
     def _close(self, updates: dict[int, np.ndarray]) -> np.ndarray:
-        """Join the copies of the cut sites and invert what remains, complex (cut, cut)."""
+        """Join the copies of the cut sites and invert the remainder, complex (cut, cut)."""
         folded, rest = self.folded, self.dissection.rest
         for number in self.dissection.top:
             places = self.dissection.fronts[number].boundary - self._n_free
@@ -90,14 +90,14 @@ class Factor:
     def products(self, right: np.ndarray) -> np.ndarray:
         """Return the inner products of right-hand sides (sites, k) with their solutions, (k, k).
 
-        With M = P^H L L^H P those of L^-1 P alone: the way back is not gone.
+        With M = P^H L L^H P these are the products of L^-1 P: no back substitution.
         """
         work, closed = self._eliminated(right)
         free = work[:self._n_free]
         return free.conj().T @ free + closed.conj().T @ (self._cut_inverse @ closed)
 
     def _eliminated(self, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return columns (sites, k) after elimination: of all variables, and of the cut sites."""
+        """Return columns (sites, k) after elimination: for all variables, and for the cut sites."""
         folded, n = self.folded, self._n_free
         turned = folded.phase.conj()[:, None] * columns
         work = np.zeros((folded.size, turned.shape[1]), dtype=complex)
@@ -151,7 +151,7 @@ class Factor:
         return out
 
     def _diagonal(self, number: int, z22: np.ndarray) -> np.ndarray:
-        """Return the diagonal of `_selected`: no front asks for the rest of one without children.
+        """Return the diagonal of `_selected` for a front without children.
 
         Z11 = J' J + (Y J)' Z22 (Y J).
         """
@@ -160,7 +160,7 @@ class Factor:
         return (lower * lower).sum(axis=0) + (carried * (z22 @ carried)).sum(axis=0)
 
     def _selected(self, number: int, z22: np.ndarray) -> np.ndarray:
-        """Return the inverse over one front, given that over its boundary."""
+        """Return the inverse over one front, given the inverse over its boundary."""
         lower, below = self._blocks[number]
         inverse, weight = lower.T @ lower, lower.T @ below.T
         own = len(inverse)
@@ -172,24 +172,24 @@ class Factor:
 
 
 def _lanes(work: np.ndarray) -> np.ndarray:
-    """Return (n, k) as (n,) if k is 1: single numbers are indexed faster than rows."""
+    """Return (n, k) as (n,) if k is 1: indexing scalars is faster than rows."""
     return work.reshape(-1) if work.shape[1] == 1 else work
 
 
 def _mirrored(lower: np.ndarray) -> np.ndarray:
-    """Return the Hermitian matrix with this lower triangle; above it are zeros."""
+    """Return the Hermitian matrix with this lower triangle; the upper one is zero."""
     out = lower + lower.conj().T
     out[np.diag_indices(len(out))] /= 2
     return out
 
 
 def _extend(blocks: tuple[np.ndarray, ...], places: np.ndarray, update: np.ndarray) -> None:
-    """Add the lower triangle of `update` at places of a symmetric matrix, given its lower blocks.
+    """Add the lower triangle of `update` to a symmetric matrix given by its lower blocks.
 
     Parameters
     ----------
     blocks : tuple of float arrays
-        (F11, F21, F22) of a front; or the whole matrix alone.
+        (F11, F21, F22) of a front; or the whole matrix.
     places : int array (b,)
         Rows and columns of the update, ascending.
     update : float array (b, b)
@@ -207,9 +207,9 @@ def _extend(blocks: tuple[np.ndarray, ...], places: np.ndarray, update: np.ndarr
 
 def _eliminate(f11: np.ndarray, f21: np.ndarray, f22: np.ndarray
                ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return L^-1, F21 L^-T and what remains for the boundary; all three are overwritten.
+    """Return L^-1, F21 L^-T and the Schur complement of the boundary; inputs are overwritten.
 
-    Of the symmetric blocks the lower triangles are read and written.
+    Only the lower triangles of symmetric blocks are read and written.
     """
     lower, info = lapack.dpotrf(f11, lower=1, overwrite_a=1)
     if info:
@@ -225,7 +225,7 @@ def _eliminate(f11: np.ndarray, f21: np.ndarray, f22: np.ndarray
 def _inverse(lower: np.ndarray) -> np.ndarray:
     """Return the inverse of a lower triangular matrix, which is overwritten.
 
-    Halves are joined by matrix products, which are faster than substitution.
+    Recursive by halves: matrix products are faster than substitution.
     """
     n = len(lower)
     if n <= SMALL:

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The eliminated normal matrix as a real matrix: the field folded into its four quadrants.
 
-With G(X) = i^k h(X), k the quadrant of X, and the like for marks, a reading whose mark and site
-lie k quarter turns apart, as the view turns them, joins h and A by the real number 1. Only a
-shift across an axis leaves a factor i^g. The few sites that such readings touch are the cut:
-each gets one real copy for every g, and copies are joined by i^g h(X) at the very end. All the
+With G(X) = i^k h(X), k the quadrant of X, and likewise for marks, a reading whose mark and site
+are as many quadrants apart as the view turns them joins h and A by the real number 1. Only a
+shift across an axis leaves a factor i^g. The few sites of such readings are the cut:
+each gets one real copy for every g, and copies are joined by i^g h(X) at the very end. The
 rest of the elimination is real (method eq. 8.1).
 """
 
@@ -23,8 +23,8 @@ class RealSymmetricForm:
     Attributes
     ----------
     rows, columns : int array (entries,)
-        Variables that an entry of R joins: the free sites, then the copies of the cut sites. R is
-        symmetric, either triangle may hold an entry; entries at one place add up.
+        Variables joined by an entry of R: the free sites, then the copies of the cut sites. R is
+        symmetric, an entry may be in either triangle; duplicate entries are summed.
     values : float array (entries,)
         The entries.
     size : int
@@ -32,13 +32,13 @@ class RealSymmetricForm:
     free, cut : int array
         Sites without and with copies.
     copy_of : int array (copies,)
-        Place of each copy's site in `cut`.
+        Index of each copy's site in `cut`.
     copy_phase : complex array (copies,)
         i^g: copy = i^g h.
     phase : complex array (sites,)
         i^k: G = i^k h.
     pins : float array (cut,)
-        What is added to the diagonal of the cut sites.
+        Values added to the diagonal of the cut sites.
     """
 
     rows: np.ndarray
@@ -62,9 +62,9 @@ def fold(views: LatticeViews, weight: np.ndarray, relative_weight: np.ndarray,
     views : LatticeViews
         Maps between sites and marks.
     weight, relative_weight : float array (views, nx, ny)
-        Weight of each reading, and its part in the mean of its mark.
+        Weight of each reading, and its share in the mean of its mark.
     pins : int array
-        Sites whose diagonal is raised by the mean weight, because nothing else holds them.
+        Sites whose diagonal is raised by the mean weight, because they are otherwise undetermined.
     """
     n_sites, read = weight[0].size, (weight > 0).reshape(len(weight), -1)
     quadrant = _quadrants(views.shape)
@@ -117,6 +117,6 @@ def _entries(variable: np.ndarray, diagonal: np.ndarray, weight: np.ndarray,
         value = -weight[i][both] * relative_weight[j][both]
         rows.append(a)
         columns.append(b)
-        # an entry and its mirror image may meet on the diagonal
+        # an entry and its mirror image may coincide on the diagonal
         values.append(np.where(a == b, 2 * value, value))
     return np.concatenate(rows), np.concatenate(columns), np.concatenate(values)

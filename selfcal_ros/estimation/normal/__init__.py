@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which equations the readings give, and what these equations determine."""
+"""Normal equations of the readings, and what they determine."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Readings of one kind, grid or angular, fitted alone: what they leave over."""
+"""Residuals of the readings of one kind, grid or angular, fitted alone."""
 
 import numpy as np
 
@@ -7,7 +7,7 @@ from selfcal_ros.estimation.normal.equations import NormalEquations
 
 
 def grid_residuals(system: NormalEquations, y: np.ndarray) -> np.ndarray:
-    """Return what the grid readings `y` (views, nx, ny) leave over when fitted alone."""
+    """Return the residuals of the grid readings `y` (views, nx, ny), fitted alone."""
     grid = system.grid
     free, d = grid.reduced(y)
     parameters = system.grid_inverse @ d
@@ -16,7 +16,7 @@ def grid_residuals(system: NormalEquations, y: np.ndarray) -> np.ndarray:
 
 
 def angular_residuals(system: NormalEquations, y: np.ndarray) -> np.ndarray:
-    """Return what the angular readings `y` (views, K) leave over when fitted alone."""
+    """Return the residuals of the angular readings `y` (views, K), fitted alone."""
     angular = system.angular
     if not angular.n_views:
         return np.zeros(y.shape)

@@ -16,16 +16,16 @@ from selfcal_ros.estimation.lattice.connectivity import Components, components
 from selfcal_ros.estimation.lattice.unchecked import rest_on_one
 
 DENSE_LINES = 512
-"""Largest K that is solved with dense matrices."""
+"""Largest K solved with dense matrices."""
 
 
 class AngularSystem:
-    """Everything about a set of angular readings that does not depend on their values.
+    """Normal equations of a set of angular readings, independent of their values.
 
     Parameters
     ----------
     turns : tuple of int
-        Total turn of each angular view in lines.
+        Total turn of each angular view, in lines.
     weight : float array (views, K)
         Weight of each reading; 0 = not read.
     """
@@ -63,13 +63,13 @@ class AngularSystem:
 
     @cached_property
     def unchecked(self) -> np.ndarray:
-        """Stage lines that rest on readings which no other checks, bool (K,)."""
+        """Stage lines that depend on unchecked readings, bool (K,)."""
         view, line = np.nonzero(self.read)
         return rest_on_one(self.site[view, line], line, n_sites=self.n_lines,
                            n_marks=self.n_lines)
 
     def centred(self, y: np.ndarray) -> np.ndarray:
-        """Return `y` (views, K, ...) less the weighted mean of each line over its views."""
+        """Return `y` (views, K, ...) minus the weighted mean of each line over its views."""
         return y - np.einsum("vk,vk...->k...", self.relative_weight, y)
 
     def scatter(self, y: np.ndarray) -> np.ndarray:

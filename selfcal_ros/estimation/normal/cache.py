@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The normal equations of measured plans, kept for further readings of the same marks."""
+"""Cache of normal equations, for further readings of the same marks."""
 
 import hashlib
 from collections import OrderedDict
@@ -16,7 +16,7 @@ from selfcal_ros.model.view import LatticePose
 
 CACHED = 16
 CACHED_READINGS = 4_000_000
-"""Limits of the cache: number of plans, and readings in all of them together."""
+"""Limits of the cache: number of plans, and of readings in all of them."""
 
 
 _cache: OrderedDict[tuple, NormalEquations] = OrderedDict()
@@ -25,12 +25,12 @@ _lock = Lock()
 
 @dataclass(frozen=True, eq=False)
 class Marks[Pose]:
-    """Which marks of one kind were read, and how often.
+    """Marks of one kind that were read, and how often.
 
     Attributes
     ----------
     poses : tuple
-        Of the views in which they were: lattice poses for the grid, turns in lines.
+        Of their views: lattice poses for the grid, turns in lines.
     weight : float array (views, ...)
         Weights of the marks on the plate.
     index : tuple of int
@@ -49,7 +49,7 @@ def system_for(grid: GridData, angular: AngularData) -> NormalEquations:
 
 
 def system_of(grid: Marks[LatticePose], angular: Marks[int]) -> NormalEquations:
-    """Return the system of marks that were read, from the cache if it is known."""
+    """Return the system of marks that were read, from the cache if present."""
     digest = hashlib.blake2b(grid.weight, digest_size=16)
     digest.update(angular.weight)
     key = (grid.weight.shape, grid.poses, grid.index, angular.weight.shape, angular.poses,
@@ -73,6 +73,6 @@ def _cached_readings() -> int:
 
 
 def clear_cache() -> None:
-    """Forget all systems."""
+    """Remove all systems."""
     with _lock:
         _cache.clear()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The normal equations of a measured plan, grid and lines together, and what they determine."""
+"""Normal equations of a measured plan, grid and lines together, and what they determine."""
 
 from functools import cached_property
 
@@ -10,24 +10,24 @@ from selfcal_ros.estimation.normal.angular import AngularSystem
 from selfcal_ros.estimation.normal.grid import GridSystem
 
 GAP = 1e-9
-"""Relative size below which an eigenvalue of a misalignment matrix is a zero; the true zeros lie
+"""Relative size below which an eigenvalue of a misalignment matrix is zero; true zeros are
 near 1e-15 and the smallest others above 1e-4."""
 
 DIRECT_SITES = 201 * 201
-"""Sites up to which the normal matrix is factorised in any case."""
+"""Largest number of sites for which the normal matrix is always factorised."""
 
 UNEVEN_SITES = 401 * 401
-"""Sites up to which it is factorised where weights differ, which slows an iteration down."""
+"""The same for unequal weights, which slow the iteration down."""
 
 MAX_DIRECT_SITES = 1001 * 1001
-"""Sites up to which it is factorised if an uncertainty is wanted: 5.6 GB."""
+"""The same if an uncertainty is requested: 5.6 GB."""
 
 CORE = 41
-"""Sites along each side of the middle part of a large field."""
+"""Sites per side of the middle part of a large field."""
 
 
 class NormalEquations:
-    """Grid and angular equations of one measured plan, joined by the views' rotations.
+    """Grid and angular equations of one measured plan, coupled by the views' rotations.
 
     Parameters
     ----------
@@ -36,7 +36,7 @@ class NormalEquations:
     grid_index, angular_index : tuple of int
         Position of their views in the measurement.
     rank_only : bool
-        Whether its rank alone will be asked for: a large field then needs no factorisation.
+        Whether only the rank is needed: a large field then needs no factorisation.
     """
 
     def __init__(self, grid: GridSystem, angular: AngularSystem, grid_index: tuple[int, ...],
@@ -49,11 +49,11 @@ class NormalEquations:
         of_view = {i: 3 * row for row, i in enumerate(grid_index)}
         of_view |= {i: 3 * len(grid_index) + row for row, i in enumerate(extra)}
         self.phi_at = np.array([of_view[i] for i in angular_index], dtype=int)
-        """Place of phi of each angular view among the misalignments."""
+        """Index of phi of each angular view among the misalignments."""
 
     @cached_property
     def direct(self) -> bool:
-        """Whether the sites are factorised; otherwise they are iterated."""
+        """Whether the sites are factorised; if not, they are iterated."""
         sites = self.grid.n_sites
         weight = self.grid.weight
         uneven = sites <= UNEVEN_SITES and weight.max() > 2 * weight[self.grid.read].min()
@@ -61,10 +61,10 @@ class NormalEquations:
 
     @cached_property
     def _core(self) -> GridSystem:
-        """Grid equations that tell the rank of the misalignments: a middle part of a large field.
+        """Grid equations for the rank of the misalignments: the middle part of a large field.
 
-        If the middle of the plate determines all misalignments up to the datum, then so does the
-        whole, since readings only add; otherwise the whole has to be factorised.
+        If the middle of the plate determines all misalignments up to the datum, so does the
+        whole, since more readings can only add; if not, the whole has to be factorised.
         """
         if self.grid.n_sites <= CORE**2 or (self.direct and not self.rank_only):
             return self.grid
@@ -74,7 +74,7 @@ class NormalEquations:
 
     @cached_property
     def rigid(self) -> np.ndarray:
-        """Datum modes in all misalignments, (7, size)."""
+        """Datum modes in terms of all misalignments, (7, size)."""
         out = np.zeros((7, self.size))
         out[:, :3 * self.grid.n_views] = self.grid.rigid
         out[[2, 6], 3 * self.grid.n_views:] = -1
@@ -100,7 +100,7 @@ class NormalEquations:
     def grid_scale(self) -> float:
         """Size of the grid's misalignment matrix before plate and sites were eliminated.
 
-        Ranks refer to it: what is left after the elimination may be nothing but rounding.
+        Ranks are relative to it: the matrix after elimination may be mere rounding.
         """
         return _trace(self.grid)
 
@@ -143,7 +143,7 @@ class NormalEquations:
 
     @cached_property
     def _held(self) -> tuple[np.ndarray, np.ndarray]:
-        """What makes the normal matrix regular, and what it adds to its inverse."""
+        """Matrix that makes the normal matrix regular, and its effect on the inverse."""
         held = self.grid_scale * (self._null @ self._null.T)
         return held, held / self.grid_scale**2
 
@@ -163,12 +163,12 @@ class NormalEquations:
 
     @cached_property
     def rank_turns(self) -> int:
-        """Rank of the angular misalignment matrix: rotations that the lines alone tell."""
+        """Rank of the angular misalignment matrix: rotations determined by the lines alone."""
         return _rank(np.linalg.eigvalsh(self.angular.schur), self.angular_scale)
 
     @cached_property
     def _null(self) -> np.ndarray:
-        """Orthonormal misalignments that no reading tells, (size, nullity)."""
+        """Orthonormal undetermined misalignments, (size, nullity)."""
         values, vectors = self._core_spectrum
         if self.angular.n_views:
             ratio = self._core_scale / self.angular_scale
@@ -177,17 +177,17 @@ class NormalEquations:
 
     @cached_property
     def nullity(self) -> int:
-        """Combinations of misalignments that no reading tells, the datum's among them."""
+        """Undetermined combinations of misalignments, including the datum's."""
         return self._null.shape[1]
 
     @cached_property
     def unseen(self) -> np.ndarray:
-        """Misalignments that no reading tells, beside the datum, (size, modes)."""
-        # without turns the rigid modes depend on each other: an orthonormal basis of their span
+        """Undetermined misalignments other than the datum, (size, modes)."""
+        # without turns the rigid modes are dependent: an orthonormal basis of their span
         datum = np.vstack([self.rigid, self._turn_of_lines]) if self.apart else self.rigid
         rigid, size, _ = np.linalg.svd(datum.T, full_matrices=False)
         rigid = rigid[:, size > 1e-9 * size[0]]
-        if rigid.shape[1] == self.nullity:  # no reading tells the datum
+        if rigid.shape[1] == self.nullity:  # no reading determines the datum
             return np.zeros((self.size, 0))
         residual = self._null - rigid @ (rigid.T @ self._null)
         u, s, _ = np.linalg.svd(residual, full_matrices=False)
@@ -197,14 +197,14 @@ class NormalEquations:
     def apart(self) -> bool:
         """Whether no angular view shares its rotation with a grid view.
 
-        Then a common rotation of the angular views and the constant of the plate's lines are one
-        datum more, which the stage's map does not feel.
+        Then a common rotation of the angular views and the constant of the plate's lines are an
+        additional datum, which does not affect the stage's map.
         """
         return bool(self.angular_index) and set(self.angular_index).isdisjoint(self.grid_index)
 
     @property
     def _turn_of_lines(self) -> np.ndarray:
-        """The common rotation of views that measure lines alone, (size,)."""
+        """The common rotation of views of lines alone, (size,)."""
         out = np.zeros(self.size)
         out[3 * self.grid.n_views:] = 1.0
         return out
@@ -226,22 +226,22 @@ class NormalEquations:
 
     @property
     def unchecked_sites(self) -> np.ndarray:
-        """Known sites that rest on readings which no other checks, bool (nx, ny)."""
+        """Known sites that depend on unchecked readings, bool (nx, ny)."""
         return self.grid.unchecked & self.known_sites
 
     @property
     def unchecked_lines(self) -> np.ndarray:
-        """Known stage lines that rest on readings which no other checks, bool (K,)."""
+        """Known stage lines that depend on unchecked readings, bool (K,)."""
         return self.angular.unchecked & self.known_lines
 
     @cached_property
     def known_views(self) -> np.ndarray:
-        """Misalignments that are determined up to the datum, bool (size,)."""
+        """Misalignments determined up to the datum, bool (size,)."""
         known = np.ones(self.size, dtype=bool)
         n, shape = 3 * self.grid.n_views, self.grid.views.shape
         nothing = np.zeros(self.grid.weight.shape)
         for column in self.unseen.T:
-            # an unseen mode may carry rigid parts: it counts as it looks in the datum
+            # an unseen mode may contain rigid parts: take it in the datum
             field = -(self.grid.response @ column[:n]).reshape(shape)
             parts = self.gauge.parts(field)
             moved = column - parts @ self.rigid[:4]
@@ -259,7 +259,7 @@ class NormalEquations:
 
     @cached_property
     def known_lines(self) -> np.ndarray:
-        """Stage lines that are determined up to one constant, bool (K,)."""
+        """Stage lines determined up to one constant, bool (K,)."""
         parts = self.angular.components
         known = parts.of_site == parts.largest if len(parts.balanced) else parts.of_site >= 0
         if self.unseen.shape[1] and known.any():
@@ -285,7 +285,7 @@ class NormalEquations:
 
 
 def core_of(grid: GridSystem) -> GridSystem:
-    """Return the readings of the marks and sites in the middle of a field, a smaller system."""
+    """Return the smaller system of the marks and sites in the middle of a field."""
     low = [(size - CORE) // 2 if size > CORE else 0 for size in grid.views.shape]
     part = tuple(slice(a, size - a) for a, size in zip(low, grid.views.shape, strict=True))
     weight = grid.weight[(slice(None), *part)]

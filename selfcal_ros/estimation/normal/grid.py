@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Normal equations of the grid readings with the plate eliminated (method eqs. 4.3-4.5).
 
-The plate's error at a mark is the weighted mean of what its readings leave, so eliminating it
-is exact and local. What remains couples the stage error G at sites that one mark visits, and
-three numbers a view (phi, Re tau, Im tau), which are eliminated last.
+The plate's error at a mark is the weighted mean of the residuals of its readings, so eliminating
+it is exact and local. The remaining equations couple the stage error G at the sites that one mark
+visits, and three numbers per view (phi, Re tau, Im tau), which are eliminated last.
 """
 
 from functools import cached_property
@@ -24,12 +24,12 @@ from selfcal_ros.model.view import LatticePose
 
 
 class GridSystem:
-    """Everything about a set of grid readings that does not depend on their values.
+    """Normal equations of a set of grid readings, independent of their values.
 
     Parameters
     ----------
     poses : tuple of LatticePose
-        One a view.
+        One per view.
     weight : float array (views, nx, ny)
         Weight of each reading; 0 = not read.
     unit : int
@@ -43,7 +43,7 @@ class GridSystem:
         total = weight.sum(axis=0)
         self.mark_read = total > 0
         self.relative_weight = weight / np.where(self.mark_read, total, 1.0)
-        """Part of each reading in the mean of its mark, (views, nx, ny) (method eq. 4.3)."""
+        """Share of each reading in the mean of its mark, (views, nx, ny) (method eq. 4.3)."""
 
     @property
     def n_views(self) -> int:
@@ -81,13 +81,13 @@ class GridSystem:
 
     @cached_property
     def unchecked(self) -> np.ndarray:
-        """Sites that rest on readings which no other checks, bool (nx, ny)."""
+        """Sites that depend on unchecked readings, bool (nx, ny)."""
         site, mark, _ = self.edges
         return rest_on_one(site, mark, n_sites=self.n_sites,
                            n_marks=self.n_sites).reshape(self.views.shape)
 
     def _find_turning_site(self) -> int:
-        """Return a site that one mark visits in two turns, which closes a path; -1 = none."""
+        """Return a site visited by one mark in two turns, which closes a path; -1 = none."""
         q = [pose.q for pose in self.views.poses]
         for i, j in combinations(range(self.n_views), 2):
             if q[i] != q[j]:
@@ -98,7 +98,7 @@ class GridSystem:
         return -1
 
     def centred(self, marks: np.ndarray) -> np.ndarray:
-        """Return `marks` (views, nx, ny) less the weighted mean of each mark over its views."""
+        """Return `marks` (views, nx, ny) minus the weighted mean of each mark over its views."""
         mean = self.relative_weight[0] * marks[0]
         for relative_weight, mark in zip(self.relative_weight[1:], marks[1:], strict=True):
             mean += relative_weight * mark
@@ -111,20 +111,20 @@ class GridSystem:
 
     @cached_property
     def pins(self) -> np.ndarray:
-        """The sites that are held: never visited, and one of each free component."""
+        """The pinned sites: those never visited, and one of each free component."""
         parts = self.components
         held = parts.first_sites[parts.balanced]
         return np.concatenate([np.flatnonzero(parts.of_site < 0), held])
 
     @cached_property
     def factor(self) -> Factor:
-        """Factorisation of the matrix over the sites, pinned where a component is free."""
+        """Factorisation of the matrix over the sites, with pins for free components."""
         folded = fold(self.views, self.weight, self.relative_weight, self.pins)
         return Factor(folded, self.views.shape, self.views.reach)
 
     @cached_property
     def shapes(self) -> np.ndarray:
-        """What phi and Re tau of a view do to its readings: i z and 1, complex (2, nx, ny)."""
+        """Effect of phi and Re tau of a view on its readings: i z and 1, complex (2, nx, ny)."""
         return np.stack([1j * self.views.z, np.ones(self.views.shape)])
 
     @cached_property
@@ -139,7 +139,7 @@ class GridSystem:
         return out.reshape(2 * self.n_views, self.n_sites)
 
     def coupled(self, fields: np.ndarray) -> np.ndarray:
-        """Return what fields (sites, ...) ask of phi, Re, Im tau of the views, (3 views, ...)."""
+        """Return the adjoint coupling of fields (sites, ...) to phi, Re, Im tau, (3 views, ...)."""
         return of_misalignments((self.columns @ fields.conj()).conj())
 
     @cached_property
@@ -160,7 +160,7 @@ class GridSystem:
 
     @cached_property
     def response(self) -> np.ndarray:
-        """M^-1 times `columns`: the sites' answer to phi, Re tau, Im tau, (sites, 3 views)."""
+        """M^-1 times `columns`: response of the sites to phi, Re tau, Im tau, (sites, 3 views)."""
         solved = self.factor.solve(np.ascontiguousarray(self.columns.T))
         return _real_columns(solved.reshape(self.n_sites, self.n_views, 2))
 
@@ -172,7 +172,7 @@ class GridSystem:
 
     @cached_property
     def rigid(self) -> np.ndarray:
-        """The datum modes in the misalignments, (7, 3 views)."""
+        """The datum modes in terms of the misalignments, (7, 3 views)."""
         return rigid_parameters(self.views).reshape(7, -1)
 
     def right_side(self, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -189,17 +189,17 @@ class GridSystem:
         return free, d - self.coupled(free)
 
     def misaligned(self, parameters: np.ndarray) -> np.ndarray:
-        """Return phi i z + tau at every mark, complex (..., views, nx, ny), of (..., 3 views)."""
+        """Return phi i z + tau at every mark, complex (..., views, nx, ny), from (..., 3 views)."""
         each = parameters.reshape(*parameters.shape[:-1], self.n_views, 3)
         phi, tau = each[..., 0], each[..., 1] + 1j * each[..., 2]
         return phi[..., None, None] * self.shapes[0] + tau[..., None, None]
 
     def free_parts_small(self, field: np.ndarray, plate: np.ndarray
                          ) -> tuple[np.ndarray, np.ndarray]:
-        """Return G and A with the marks of each free component off by zero on average.
+        """Return G and A with zero mean plate error in each free component.
 
-        No reading tells the vector of such a component in the linear model; a finite rotation
-        turns it, so that one of 0.4 mm (where the pins left it) was a residual of 2 um at 0.3 deg.
+        The linear model does not determine the vector of such a component; a finite rotation
+        turns it, so that 0.4 mm (as left by the pins) gave residuals of 2 um at 0.3 deg.
 
         Parameters
         ----------

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What follows from a system of equations alone, computed once for as long as the system lives."""
+"""Values derived from a system of equations, computed once in its lifetime."""
 
 from collections.abc import Callable
 from weakref import WeakKeyDictionary
@@ -8,16 +8,16 @@ from selfcal_ros.estimation.normal.equations import NormalEquations
 
 
 class Memo[Key, Value]:
-    """Values by system and key; the values must not hold the system.
+    """Values by system and key; the values must not reference the system.
 
-    Where two threads compute the same value at a time, one of the two equal ones is kept.
+    If two threads compute the same value at the same time, one of them is kept.
     """
 
     def __init__(self) -> None:
         self._values: WeakKeyDictionary[NormalEquations, dict[Key, Value]] = WeakKeyDictionary()
 
     def get(self, system: NormalEquations, key: Key, make: Callable[[], Value]) -> Value:
-        """Return the value of `key` for `system`, made by `make` the first time."""
+        """Return the value of `key` for `system`, computed by `make` the first time."""
         known = self._values.setdefault(system, {})
         if key not in known:
             known[key] = make()

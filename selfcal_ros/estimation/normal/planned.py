@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The normal equations of a plan before anything is measured: every mark in the field is read."""
+"""Normal equations of a plan before measurement: every mark in the field is read."""
 
 from collections.abc import Sequence
 
@@ -14,7 +14,7 @@ from selfcal_ros.model.view import View
 
 def planned_system(artifact: Artifact, views: Sequence[View], *,
                    rank_only: bool = False) -> NormalEquations:
-    """Return the system of views as planned: every mark that lies in the field, unit repeats.
+    """Return the system of the planned views: every mark in the field, unit repeats.
 
     Parameters
     ----------
@@ -23,7 +23,7 @@ def planned_system(artifact: Artifact, views: Sequence[View], *,
     views : sequence of View
         The plan.
     rank_only : bool
-        Whether its rank alone will be asked for.
+        Whether only the rank is needed.
     """
     grid_views = [(i, v) for i, v in enumerate(views) if v.grid]
     poses = tuple(view.lattice_pose(artifact) for _, view in grid_views)
