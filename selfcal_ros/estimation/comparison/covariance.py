@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Covariances of saved maps, from the weights of what was read, which a RESULT.json keeps.
+"""Covariances of saved maps, from the weights of the readings in RESULT.json.
 
-They are exact: reference length and terms of the model included. A RESULT.json of version 0.1 does
-not tell what was read: then the correlations are those of its views without a missing mark, and
-the sizes those of the map.
+They are exact, including reference length and terms of the model. A RESULT.json of version 0.1 has
+no weights: then the correlations are those of its views without a missing mark, and the
+variances those of the map.
 """
 
 from typing import Any
@@ -29,13 +29,13 @@ from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.view import View
 
 MAX_LINES = 1024
-"""Largest number of lines whose covariance is formed as a whole."""
+"""Largest number of lines for a full covariance matrix."""
 
 
 def xy_covariance(result: CalibrationResult, known: np.ndarray) -> tuple[np.ndarray, bool]:
     """Return the covariance of Gx, Gy at the known sites, m^2, and whether it is a full matrix.
 
-    (2n, 2n), or the variances (2n,) where the views do not tell the correlations.
+    (2n, 2n), or the variances (2n,) if the correlations are unknown.
     """
     emap = result.error_map
     u = np.concatenate([emap.u_gx[known], emap.u_gy[known]])
@@ -95,7 +95,7 @@ def _sized(cover: np.ndarray, u: np.ndarray) -> np.ndarray:
 
 
 def first_order_u(result: CalibrationResult) -> tuple[float, float]:
-    """Return the standard uncertainties of O and R of a map; NaN where the views do not tell."""
+    """Return the standard uncertainties of O and R of a map; NaN if unknown."""
     system = _system(result)
     if system is None:
         return float("nan"), float("nan")
@@ -113,7 +113,7 @@ def first_order_u(result: CalibrationResult) -> tuple[float, float]:
 
 
 def _powers(result: CalibrationResult, system: NormalEquations) -> tuple[float, float]:
-    """Return the variance of a reading, m^2, and that of the map's scale, behind a map's u.
+    """Return the variances of a reading, m^2, and of the map's scale, from a map's u.
 
     A map whose scale a reference length sets has u^2 = sigma^2 d + s^2 x^2, with d from the views.
     """
@@ -145,7 +145,7 @@ def _field(system: NormalEquations) -> FieldCovariance:
 
 
 def _exact_field(result: CalibrationResult, system: NormalEquations) -> FieldCovariance:
-    """Return the covariance of the map for unit noise, terms of the model apart."""
+    """Return the covariance of the map for unit noise, without terms of the model."""
     noise = result.noise
     length = result.artifact.grid_pitch_m * max(result.artifact.half)
     inverse = system.inverse(bounded_ratio(system, noise.sigma_xy, noise.sigma_theta, length)
@@ -157,13 +157,13 @@ def _exact_field(result: CalibrationResult, system: NormalEquations) -> FieldCov
 
 
 def tells_what_was_read(result: CalibrationResult) -> bool:
-    """Return whether a result keeps the weights of what was read in its views."""
+    """Return whether a result contains the weights of its readings."""
     return bool(result.views) and all(
         v.read_grid is not None and v.read_angular is not None for v in result.views)
 
 
 def _system(result: CalibrationResult) -> NormalEquations | None:
-    """Return the system behind a result; None if the stage is not identified, or not told."""
+    """Return the system behind a result; None if unknown or the stage is not identified."""
     if np.isnan(result.error_map.u_gx).all() or not result.views:
         return None
     if tells_what_was_read(result):
@@ -176,7 +176,7 @@ def _system(result: CalibrationResult) -> NormalEquations | None:
 
 
 def _read_system(result: CalibrationResult) -> NormalEquations:
-    """Return the system of the weights that a result keeps."""
+    """Return the system of the weights in a result."""
     artifact = result.artifact
     grid, lines = [], []
     for index, v in enumerate(result.views):
@@ -199,7 +199,7 @@ def _read_system(result: CalibrationResult) -> NormalEquations:
 
 
 def _is_read(kept: Any) -> bool:
-    """Tell if any weight is not zero; NaN counts, and is refused with the weights."""
+    """Return whether any weight is not zero; NaN counts, and is refused with the weights."""
     try:
         return bool(np.any(np.array(kept, dtype=float)))
     except (TypeError, ValueError):
@@ -207,12 +207,12 @@ def _is_read(kept: Any) -> bool:
 
 
 def _weights(kept: Any, field: np.ndarray, where: str) -> np.ndarray:
-    """Return weights in full: one number stands for all of the field.
+    """Return weights in full: a single number stands for the whole field.
 
     Raises
     ------
     InputError
-        If they are no weights of this field.
+        If they are not weights of this field.
     """
     try:
         weight = np.array(kept, dtype=float)
@@ -230,7 +230,7 @@ def _views(result: CalibrationResult) -> tuple[View, ...]:
     """Return the views behind a result with the kinds of marks that were read in them.
 
     The rotation of a view is known if its grid was read, or if its lines were and share their
-    rotation with a grid. Used readings without a known rotation are lines in views of their own:
+    rotation with a grid. Used readings without a known rotation are lines in separate views:
     then no grid view has lines.
     """
     lines = result.artifact.angular_count > 0

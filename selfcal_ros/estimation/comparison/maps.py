@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Two maps compared after the datum difference is taken out, with the significance of the rest."""
+"""Comparison of two maps after removing the datum difference, with significance."""
 
 from dataclasses import dataclass
 
@@ -26,7 +26,7 @@ PITCH_TOLERANCE = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class MapDifference:
-    """Map B less map A, datum difference taken out.
+    """Map B minus map A, datum difference removed.
 
     Attributes
     ----------
@@ -35,11 +35,11 @@ class MapDifference:
     d_theta : float array (K,)
         Difference of the angular maps, rad.
     translation_m, rotation_rad, scale, theta_rad : tuple, float
-        The datum difference that was taken out.
+        The removed datum difference.
     nonorthogonality, scale_difference : float
         Differences of O and R.
     xy, theta : Significance or None
-        Tests; None where there is nothing to test.
+        Tests; None if there is nothing to test.
     """
 
     dx: np.ndarray
@@ -56,7 +56,7 @@ class MapDifference:
 
     @property
     def significant(self) -> bool | None:
-        """Verdict of all tests; None where there was nothing to test against."""
+        """Verdict of all tests; None without uncertainties to test against."""
         tests = [test for test in (self.xy, self.theta) if test is not None]
         return any(test.significant for test in tests) if tests else None
 
@@ -90,9 +90,9 @@ def compare(a: CalibrationResult, b: CalibrationResult, *, keep_scale: bool = Fa
     Parameters
     ----------
     a, b : CalibrationResult
-        The calibrations; the difference is B less A.
+        The calibrations; the difference is B minus A.
     keep_scale : bool
-        Leave magnification in the difference: both maps have a scale of their own.
+        Keep magnification in the difference: both maps have their own scale.
     names : tuple of str
         For messages.
 
@@ -125,7 +125,7 @@ def compare(a: CalibrationResult, b: CalibrationResult, *, keep_scale: bool = Fa
 
 
 def require_same_lattice(a: Artifact, b: Artifact, names: tuple[str, str]) -> None:
-    """Raise InputError unless both maps stand on the same lattice."""
+    """Raise InputError unless both maps have the same lattice."""
     for what, one, other in (("sites", a.shape, b.shape),
                              ("angular lines", a.angular_count, b.angular_count)):
         if one != other:
@@ -150,7 +150,7 @@ def _theta_test(a: CalibrationResult, b: CalibrationResult,
 def _noise_dof(a: CalibrationResult, b: CalibrationResult, kind: str) -> float:
     """Return the effective degrees of freedom of the noise behind both uncertainties.
 
-    Welch and Satterthwaite; what the detections declare counts as known.
+    Welch-Satterthwaite; declared noise counts as known.
     """
     parts = []
     for result in (a, b):
@@ -164,7 +164,7 @@ def _noise_dof(a: CalibrationResult, b: CalibrationResult, kind: str) -> float:
 
 
 def _dof_of(noise: Noise, kind: str) -> float:
-    """Return the degrees of freedom of a noise; results of version 0.1 do not name them."""
+    """Return the degrees of freedom of a noise; results of version 0.1 do not contain them."""
     dof = getattr(noise, f"dof_{kind}")
     if dof > 0:
         return dof
@@ -175,10 +175,10 @@ def _dof_of(noise: Noise, kind: str) -> float:
 
 @dataclass(frozen=True)
 class LaserDifference:
-    """One first-order part of a map against the laser's: squareness as O, or scale as R.
+    """A first-order term of map and laser: squareness as O, or scale as R.
 
-    `difference` is laser less map; `u` its standard uncertainty, NaN where not known; `p` the
-    two-sided probability of so large a difference.
+    `difference` is laser minus map; `u` its standard uncertainty, NaN if unknown; `p` the
+    two-sided probability of such a difference.
     """
 
     name: str
@@ -189,7 +189,7 @@ class LaserDifference:
 
     @property
     def difference(self) -> float:
-        """Laser less map."""
+        """Laser minus map."""
         return self.of_laser - self.of_map
 
 
@@ -210,7 +210,7 @@ def compare_with_laser(result: CalibrationResult, laser: dict,
     Raises
     ------
     InputError
-        If the laser's result has no first-order parts of an error map.
+        If the laser's result has no first-order terms of an error map.
     """
     parts = laser.get("error_map_equivalent")
     if not isinstance(parts, dict) or parts.get("nonorthogonality") is None:

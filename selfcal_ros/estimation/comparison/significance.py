@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Do two maps differ by more than their uncertainties allow: two tests, one verdict.
+"""Whether two maps differ by more than their uncertainties: two tests, one verdict.
 
-With d the difference, datum taken out, and C its covariance (both projected alike):
+With d the difference without the datum, and C its covariance (both projected):
 
     Mahalanobis    d' C^+ d / rank, as F with the degrees of freedom of the noise; chi^2 if known
-    largest |z|    max |d_i| / sqrt(C_ii), against its own distribution from seeded draws of C
+    largest |z|    max |d_i| / sqrt(C_ii), its distribution from seeded draws of C
 
-The first sees a difference of any shape, the second one bad node in a large field. The verdict is
-significant if either probability is below LEVEL / 2 (Bonferroni).
+The first detects a difference of any shape, the second one bad node in a large field. The verdict
+is significant if either probability is below LEVEL / 2 (Bonferroni).
 """
 
 from dataclasses import dataclass
@@ -18,18 +18,18 @@ from scipy.special import chdtrc, fdtrc, stdtr, stdtrit
 from selfcal_ros.model.statistics import MANY_DOF
 
 LEVEL = 0.05
-"""Probability that maps of one stage differ significantly, both tests together."""
+"""Probability that maps of the same stage differ significantly, both tests together."""
 
 DRAWS = 2000
-"""Draws of the largest |z|: fifty of them lie above its limit."""
+"""Draws of the largest |z|: fifty of them exceed its limit."""
 
 NO_VARIANCE = 1e-9
-"""Relative variance of a value, or of a combination, that the datum has taken out."""
+"""Relative variance of a value or combination that the datum removes."""
 
 
 @dataclass(frozen=True)
 class Significance:
-    """Test of a difference against both uncertainties.
+    """Test of a difference with the uncertainties of both maps.
 
     Attributes
     ----------
@@ -37,20 +37,20 @@ class Significance:
         Square of the Mahalanobis distance over its degrees of freedom: 1 on average if the maps
         agree.
     dof : float
-        Its degrees of freedom: combinations of nodes that both maps tell apart from the datum.
+        Its degrees of freedom: combinations of nodes that are independent of the datum.
     p : float
-        Probability of so large a ratio if the maps agree.
+        Probability of such a ratio if the maps agree.
     correlated : bool
-        Whether the correlations between nodes are known; without them nodes count as
-        independent, and p is a rough one.
+        Whether the correlations between nodes are known; without them nodes are treated as
+        independent, and p is approximate.
     largest_z : float
         Largest difference of a node on an axis (of a line) in standard uncertainties.
     z_limit : float
-        What it exceeds with the probability LEVEL / 2 if the maps agree.
+        Limit exceeded with the probability LEVEL / 2 if the maps agree.
     p_z : float
-        Probability of so large a `largest_z` if the maps agree.
+        Probability of such a `largest_z` if the maps agree.
     noise_dof : float
-        Degrees of freedom of the noise behind both uncertainties; infinite if it is known.
+        Degrees of freedom of the noise behind both uncertainties; infinite if known.
     significant : bool
         The verdict of both tests.
     """
@@ -68,7 +68,7 @@ class Significance:
 
 def significance(values: np.ndarray, covariances: list[tuple[np.ndarray, bool]],
                  removed: np.ndarray, noise_dof: float) -> Significance | None:
-    """Test values from which the columns `removed` were taken out by least squares.
+    """Test values from which the columns `removed` were removed by least squares.
 
     Parameters
     ----------
@@ -77,14 +77,14 @@ def significance(values: np.ndarray, covariances: list[tuple[np.ndarray, bool]],
     covariances : list
         For both maps: covariance (n, n), or variances (n,), and whether it is a full matrix.
     removed : float array (n, k)
-        Columns that were fitted and taken off.
+        Columns that were fitted and subtracted.
     noise_dof : float
         Degrees of freedom of the noise.
 
     Returns
     -------
     Significance or None
-        None where there is no uncertainty to test against.
+        None without uncertainties to test against.
     """
     correlated = all(flag for _, flag in covariances)
     total = np.sum([covariance if correlated or covariance.ndim == 1 else np.diag(covariance)
@@ -123,9 +123,9 @@ def _mahalanobis(z: np.ndarray, correlation: np.ndarray) -> tuple[float, float, 
 
 def _of_largest(largest: float, n: int, root: np.ndarray | None,
                 noise_dof: float) -> tuple[float, float]:
-    """Return the probability of so large a |z| of n values, and the limit of LEVEL / 2.
+    """Return the probability of such a |z| among n values, and the limit of LEVEL / 2.
 
-    The number of values bounds it (Bonferroni); draws tell it where nodes are correlated, but not
+    The number of values bounds it (Bonferroni); draws give it for correlated nodes, except
     in the far tail, where the bound is close.
     """
     dof = min(noise_dof, MANY_DOF)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Plans that are each other's mirror image, or turned: they promise the same uncertainty."""
+"""Plans that are mirror images or rotations of each other, with the same uncertainty."""
 
 from collections.abc import Iterable
 from itertools import product
@@ -11,11 +11,11 @@ TURNS = (1, 1j, -1, -1j)
 
 
 def equivalent_key(artifact: Artifact, views: Iterable[View]) -> tuple:
-    """Return what plans have in common that turn into each other: their turns and shifts.
+    """Return a key that is the same for equivalent plans, from their turns and shifts.
 
     Turning stage and plate together renames sites and marks; so does mirroring both; turning the
-    plate in all views renames the marks. A field that is not square has half of these. The
-    uncertainty of XY is the same; that of theta need not be.
+    plate in all views renames the marks. A field that is not square has half of these symmetries.
+    The uncertainty of XY is the same; that of theta need not be.
 
     Parameters
     ----------

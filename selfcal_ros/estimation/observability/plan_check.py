@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether a plan identifies the stage, what it leaves unseen, and which view would cure it."""
+"""Whether a plan identifies the stage, its unseen modes, and the views that would remove them."""
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
@@ -29,21 +29,21 @@ from selfcal_ros.model.result import Observability
 from selfcal_ros.model.view import Plan, View
 
 SEARCH_SIZE = 9
-"""Largest field on which the view that cures is searched; it is then verified on the real one."""
+"""Largest field for the search of a curing view, which is then verified on the real field."""
 
 NARROW = 5
-"""Sites across that a smaller field keeps in any case."""
+"""Smallest number of sites across a reduced field."""
 
 PROXY_SIZE = 101
-"""Field on which the uncertainty of a larger one is predicted."""
+"""Field on which the uncertainty of a larger field is predicted."""
 
 MAX_CURES = 5
-"""Largest number of sets of views that are offered."""
+"""Largest number of sets of views proposed."""
 
 
 @dataclass(frozen=True, eq=False)
 class PlanCheck:
-    """A plan judged before anything moves.
+    """Check of a plan before anything moves.
 
     Attributes
     ----------
@@ -69,14 +69,14 @@ def check_plan(plan: Plan) -> PlanCheck:
 
 
 def with_unseen_modes(seen: Observability, system: NormalEquations, plan: Plan) -> PlanCheck:
-    """Return a deficient set of readings with its unseen modes in words and what would cure it.
+    """Return the check of a deficient set of readings: unseen modes in words, and cures.
 
     Parameters
     ----------
     seen : Observability
         Rank and deficiency.
     system : NormalEquations
-        The readings, some of them perhaps missing.
+        The readings, possibly incomplete.
     plan : Plan
         The views behind the readings.
     """
@@ -91,10 +91,10 @@ def with_unseen_modes(seen: Observability, system: NormalEquations, plan: Plan) 
 
 @one_thread()
 def predict_plan(plan: Plan, datum: ThetaDatum) -> Prediction:
-    """Return the uncertainties that a plan promises if every mark is read.
+    """Return the uncertainties predicted for a plan if every mark is read.
 
-    Fields above MAX_SITES are predicted on a smaller field, as the shape of what is returned
-    tells: the gain grows slowly, as log N, so that it is too small then.
+    Fields above MAX_SITES are predicted on a smaller field, which is the shape of the result: the
+    gain grows slowly, as log N, so the prediction is then too small.
     """
     artifact = plan.artifact
     if artifact.shape[0] * artifact.shape[1] <= MAX_SITES:
@@ -106,7 +106,7 @@ def predict_plan(plan: Plan, datum: ThetaDatum) -> Prediction:
 
 
 def unit_repeats(plan: Plan) -> int:
-    """Return the repeats of the averaged reading whose noise is the unit: the fewest."""
+    """Return the fewest repeats, those of the averaged reading whose noise is the unit."""
     return min(view.repeats for view in plan.views)
 
 
@@ -120,14 +120,14 @@ def unseen_modes(system: NormalEquations) -> tuple[UnseenMode, ...]:
 
 
 def candidate_views(artifact: Artifact, *, angular: bool) -> list[View]:
-    """Return the views that a cell can usually offer: quarter turns and one-pitch shifts.
+    """Return the usual views of a cell: quarter turns and one-pitch shifts.
 
     Parameters
     ----------
     artifact : Artifact
         The plate.
     angular : bool
-        Whether angular lines are measured as well; then a turn by one line is offered too.
+        Whether angular lines are measured as well; then a turn by one line is included.
     """
     pitch = artifact.grid_pitch_m
     names = {(0, 0): "", (1, 0): "+x", (0, 1): "+y", (-1, 0): "-x", (0, -1): "-y"}
@@ -142,9 +142,9 @@ def candidate_views(artifact: Artifact, *, angular: bool) -> list[View]:
 def find_cures(plan: Plan) -> Iterator[tuple[View, ...]]:
     """Yield the smallest sets of candidate views that make `plan` identify the stage.
 
-    Sets for the grid are searched on a field of at most SEARCH_SIZE sites a side, a view turned by
-    one line is added where the angular map needs it, and every set is verified on the plan's
-    own field: what is yielded is exact, whatever the search field was.
+    Sets for the grid are searched on a field of at most SEARCH_SIZE sites per side, a view turned
+    by one line is added if the angular map needs it, and every set is verified on the plan's
+    own field, so the result is exact.
     """
     angular = any(view.angular for view in plan.views) and plan.artifact.angular_count > 0
     candidates = candidate_views(plan.artifact, angular=angular)
@@ -170,13 +170,13 @@ def _grid_seen(plan: Plan, views: tuple[View, ...]) -> bool:
 
 
 def smaller(plan: Plan, size: int) -> Plan:
-    """Return the plan on a field of at most `size` sites a side, same turns and shifts.
+    """Return the plan on a field of at most `size` sites per side, with the same turns and shifts.
 
-    The field keeps its proportions, on which the uncertainty of a long field depends, and stays
+    The field keeps its proportions, on which the uncertainty of a long field depends, and is
     large enough for the plan's own shifts.
     """
     reach = [max(map(abs, view.lattice_pose(plan.artifact).shift)) for view in plan.views]
-    room = 2 * max(reach, default=0) + 3  # a plan that is to be found has no views yet
+    room = 2 * max(reach, default=0) + 3  # a plan to be searched has no views yet
     part = min(1.0, max(size, room) / max(plan.artifact.shape))
     nx, ny = (max(2 * round((n * part - 1) / 2) + 1, min(n, max(room, NARROW)))
               for n in plan.artifact.shape)

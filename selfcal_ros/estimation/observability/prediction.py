@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Standard uncertainties that a plan will give, before anything is measured."""
+"""Standard uncertainties predicted for a plan before measurement."""
 
 from dataclasses import dataclass
 
@@ -17,20 +17,20 @@ MAX_SITES = 151 * 151
 """Largest field whose uncertainty map is predicted in full."""
 
 BLOCK = 512
-"""Unit vectors that are solved for at a time."""
+"""Number of unit vectors solved at a time."""
 
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
     """Standard uncertainty of the maps for unit noise of one averaged reading.
 
-    Where views differ in repeats, the reading with the fewest has the unit noise.
+    If views differ in repeats, the reading with the fewest has unit noise.
 
     Attributes
     ----------
     ux, uy : float array (nx, ny)
-        Of Gx and Gy, in units of the noise of a grid reading; their shape is that of the field
-        which it is for.
+        Of Gx and Gy, in units of the noise of a grid reading; their shape is that of the
+        predicted field.
     u_theta : float array (K,)
         Of Gtheta, in units of the noise of an angular reading, misalignments of the grid
         views known; empty if no line is measured.
@@ -58,7 +58,7 @@ class Prediction:
 
 def predict(system: NormalEquations, artifact: Artifact, datum: ThetaDatum, *,
             repeats: int = 1) -> Prediction:
-    """Return the predicted uncertainties of readings that identify the stage.
+    """Return the predicted uncertainties for readings that identify the stage.
 
     Parameters
     ----------
@@ -83,8 +83,8 @@ def predict(system: NormalEquations, artifact: Artifact, datum: ThetaDatum, *,
 def theta_variance(system: NormalEquations, artifact: Artifact, datum: ThetaDatum) -> np.ndarray:
     """Return the variance of Gtheta (K,) for unit noise of one angular reading.
 
-    The rotations of the grid views count as known: the grid fixes them thousands of times better
-    than the lines do. So do the slopes behind the datum ``xy_axes``.
+    The rotations of the grid views are taken as known: the grid determines them thousands of times
+    better than the lines. So are the slopes behind the datum ``xy_axes``.
     """
     answer, inner, spread, conditions = _theta_parts(system, artifact, datum)
     rows, gain = conditions.rows, conditions.gain
@@ -111,7 +111,7 @@ def theta_matrix(system: NormalEquations, artifact: Artifact, datum: ThetaDatum,
 def _theta_parts(system: NormalEquations, artifact: Artifact, datum: ThetaDatum,
                  sense: Sense = Sense.MICROSCOPE_MOVES
                  ) -> tuple[np.ndarray, np.ndarray, np.ndarray, Conditions]:
-    """Return the lines' answer to free rotations, their covariance, and the datum's columns."""
+    """Return the lines' response to free rotations, their covariance, and the datum's columns."""
     angular = system.angular
     half_width_m = artifact.grid_pitch_m * max(artifact.half)
     conditions = conditions_for(system, ThetaDatum(datum), sense, half_width_m)

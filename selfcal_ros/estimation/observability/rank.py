@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Exact rank: what a set of views, or the marks that were read in them, can tell.
+"""Exact rank of a set of views, or of the marks that were read in them.
 
-The rank is not found by a tolerance on a large matrix. With misalignments known, it is a count
-of graph components (`lattice.connectivity`); what the misalignments add is the rank of a matrix of
-three rows a view, whose zeros and non-zeros lie ten orders of magnitude apart (method eqs. 6.1,
+The rank does not depend on a tolerance for a large matrix. With misalignments known, it is a count
+of graph components (`lattice.connectivity`); the misalignments add the rank of a matrix with
+three rows per view, whose zeros and non-zeros are ten orders of magnitude apart (method eqs. 6.1,
 6.2).
 """
 
@@ -22,22 +22,22 @@ DATUM_ROWS = 7
 """Stage translation, rotation, magnification; plate translation, rotation (Hu 5, 11)."""
 
 DETERMINED = 0.5
-"""Part of the field's sites that must be determined; below, a map is refused."""
+"""Fraction of the field's sites that must be determined for a map."""
 
 
 _measured: Memo[tuple[Artifact, tuple[View, ...]], Observability] = Memo()
 
 
 def plan_observability(plan: Plan) -> Observability:
-    """Return what the plan would tell if every mark in the field were read."""
+    """Return the observability of the plan if every mark in the field is read."""
     system = planned_system(plan.artifact, plan.views, rank_only=True)
     return full_observability(system, plan.artifact, plan.views)
 
 
 def identifies(artifact: Artifact, views: Sequence[View]) -> bool:
-    """Return whether views would tell the whole map if every mark in the field were read.
+    """Return whether views determine the whole map if every mark in the field is read.
 
-    That alone, for searches: no advice, and no matrix where a count of components says no already.
+    For searches: no advice, and no matrix if the count of components already says no.
     """
     system = planned_system(artifact, views, rank_only=True)
     parts = system.grid.components
@@ -47,7 +47,7 @@ def identifies(artifact: Artifact, views: Sequence[View]) -> bool:
 
 
 def deficiency(system: NormalEquations) -> int:
-    """Return how many numbers of the map, the plate and the misalignments no reading tells."""
+    """Return the number of undetermined parameters of map, plate and misalignments."""
     rank = system.rank_grid + DATUM_ROWS
     return 4 * system.grid.n_sites + 3 * system.grid.n_views - rank + angular_deficiency(system)
 
@@ -72,10 +72,10 @@ def full_observability(system: NormalEquations, artifact: Artifact,
 
 
 def angular_deficiency(system: NormalEquations) -> int:
-    """Return how many modes of the angular map stay unseen beside its free constant.
+    """Return the number of unseen modes of the angular map, apart from its free constant.
 
     If no angular view shares its rotation with a grid view, the constant of the plate's lines is
-    free as well: a datum of the plate, which the stage's map does not feel.
+    free as well: a datum of the plate, which does not affect the stage's map.
     """
     angular = system.angular
     if not angular.n_views:
@@ -90,11 +90,10 @@ def angular_deficiency(system: NormalEquations) -> int:
 
 def measured_observability(system: NormalEquations, artifact: Artifact,
                            views: tuple[View, ...]) -> Observability:
-    """Return what the marks that were read tell.
+    """Return the observability of the marks that were read.
 
-    If the views would identify the stage and only marks are missing, the sites that are
-    determined are enough, as long as they are at least half of the field: then rank and
-    unknowns count these alone.
+    If the views would identify the stage and only marks are missing, the determined sites
+    suffice if they are at least half of the field: rank and unknowns then count these alone.
 
     Parameters
     ----------
@@ -110,7 +109,7 @@ def measured_observability(system: NormalEquations, artifact: Artifact,
 
 
 def with_unchecked(seen: Observability, system: NormalEquations) -> Observability:
-    """Return what readings tell with the sites and lines that single readings alone tell."""
+    """Return the observability with the counts of unchecked sites and lines."""
     return seen if not seen.identifiable else replace(
         seen, unchecked_sites=int(system.unchecked_sites.sum()),
         unchecked_lines=int(system.unchecked_lines.sum()))
@@ -135,7 +134,7 @@ def _measured_observability(system: NormalEquations, artifact: Artifact,
 
 
 def _as_read(system: NormalEquations, views: tuple[View, ...]) -> tuple[View, ...]:
-    """Return the views with only those kinds of marks that were read."""
+    """Return the views with only the kinds of marks that were read."""
     return tuple(View(view.name, view.rotation_rad, view.translation_m,
                       i in system.grid_index, i in system.angular_index)
                  for i, view in enumerate(views)
@@ -143,7 +142,7 @@ def _as_read(system: NormalEquations, views: tuple[View, ...]) -> tuple[View, ..
 
 
 def advice_for(artifact: Artifact, views: Iterable[View]) -> tuple[str, ...]:
-    """Return the views that a deficient plan lacks: a quarter turn, a shift, a one-line turn."""
+    """Return advice on the missing views of a deficient plan: a quarter turn, a shift, a line."""
     views = tuple(views)
     poses = [view.lattice_pose(artifact) for view in views if view.grid]
     advice = []
@@ -160,7 +159,7 @@ def advice_for(artifact: Artifact, views: Iterable[View]) -> tuple[str, ...]:
 
 
 def _tried(artifact: Artifact, views: tuple[View, ...]) -> tuple[str, ...]:
-    """Return the first single view that cures the plan, found by trying them."""
+    """Return the first single view, by trial, that cures the plan."""
     pitch = artifact.grid_pitch_m
     for name, turn, shift in (("shifted by one pitch along Y", 0.0, (0.0, pitch)),
                               ("shifted by one pitch along X", 0.0, (pitch, 0.0)),
@@ -177,7 +176,7 @@ def _common_step(turns: list[int], lines: int) -> int:
 
 
 def refusal(observability: Observability) -> str:
-    """Return the one line that refuses a deficient measurement and names what would cure it."""
+    """Return the line that refuses a deficient measurement and names the cure."""
     modes = f"{observability.deficiency} mode" + "s" * (observability.deficiency != 1)
     return (f"the marks that were read do not identify the stage ({modes} unseen): "
             + "; ".join(observability.advice))

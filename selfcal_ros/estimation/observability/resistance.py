@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a plan makes of the terms of the model: told or not, what they do to the map, if noticed.
+"""A plan against the terms of the model: separability, effect on the map, detection.
 
-With c the columns of a term that the model does not hold, b its coefficients, F = G(c) the maps of
-its columns, and the model's own columns m (method, terms of the model), the map moves by
-    (F_c - F_m Q m'Rc) b,     Q = cov of the model's coefficients, R = what the estimate leaves,
+With c the columns of a term outside the model, b its coefficients, F = G(c) the maps of
+its columns, and the model's own columns m (method, terms of the model), the map changes by
+    (F_c - F_m Q m'Rc) b,     Q = cov of the model's coefficients, R = residual projection,
 and the residuals explain, in units of the noise, a sum of squares distributed as
     sum_k (1 + lambda_k s^2 / sigma^2) chi^2(1)     for coefficients of standard deviation s,
-with lambda_k the eigenvalues of the information on b beside the model.
+with lambda_k the eigenvalues of the information on b given the model.
 """
 
 from collections.abc import Mapping, Sequence
@@ -39,33 +39,33 @@ from selfcal_ros.model.view import Plan
 
 SIZES = {TermName.MICROSCOPE: 1e-3, TermName.DRIFT: 10e-9, TermName.PLATE_SCALE: 1e-6,
          TermName.PLATE_SHAPE: 10e-9, TermName.APPROACH: 10e-9, TermName.PLATE_STRAIN: 1e-6}
-"""Sizes against which a plan is judged: 1 mrad and 0.1 %, 10 nm, 1 um/m.
+"""Default sizes against which a plan is judged: 1 mrad and 0.1 %, 10 nm, 1 um/m.
 
-Those of the marks: lines do not move the XY map."""
+Terms of the marks only: lines do not affect the XY map."""
 
 DRAWS = 20_000
-"""Draws of the power: its standard error is at most 0.4 %."""
+"""Draws for the power, whose standard error is at most 0.4 %."""
 
 
 @dataclass(frozen=True)
 class TermCheck:
-    """What a plan makes of one term.
+    """Check of a plan against one term.
 
     Attributes
     ----------
     name : TermName
         Which.
     model : str
-        How the model holds it: ``free``, ``sized``, or empty if it does not.
+        In the model as ``free`` or ``sized``; empty if not in the model.
     unseen_modes : int
-        Modes of the stage that it hides if it is free, beside the model's other free terms.
+        Modes of the stage hidden by it if free, together with the model's other free terms.
     size : float
-        Standard deviation of its coefficients that the following are for, in `unit`.
+        Standard deviation of its coefficients for the following, in `unit`.
     effect_rms_m, effect_max_m : float
-        Standard deviation of a coordinate of the map where the model does not hold it: root mean
+        Standard deviation of a coordinate of the map if the model does not contain it: root mean
         square over the sites, and largest, m.
     power : float
-        Probability that the test for causes finds it then, 0 to 1.
+        Probability that the test for causes then detects it, 0 to 1.
     """
 
     name: TermName
@@ -78,7 +78,7 @@ class TermCheck:
 
     @property
     def told(self) -> bool:
-        """Whether the readings tell it from the stage."""
+        """Whether the readings separate it from the stage."""
         return self.unseen_modes == 0
 
     @property
@@ -88,16 +88,16 @@ class TermCheck:
 
 
 class PlannedTerms:
-    """All terms beside the grid readings of a plan that identifies the stage.
+    """All terms with the grid readings of a plan that identifies the stage.
 
-    Fields above MAX_SITES are judged on a smaller one.
+    Fields above MAX_SITES are evaluated on a smaller one.
 
     Parameters
     ----------
     plan : Plan
         The views.
     model : sequence of ModelTerm
-        Terms that are to be estimated with the map.
+        Terms to be estimated with the map.
     assumed : Assumed
         Noise, stop errors, visiting order.
     """
@@ -121,12 +121,12 @@ class PlannedTerms:
             require_terms_told(self.of_model, seen)
 
     def told(self, seen: Observability) -> Observability:
-        """Return what the plan identifies with the free terms of its model as further unknowns.
+        """Return the observability of the plan with the free terms of its model as unknowns.
 
         Parameters
         ----------
         seen : Observability
-            What it identifies without them.
+            Observability without them.
         """
         try:
             self.require_told(seen)
@@ -138,7 +138,7 @@ class PlannedTerms:
 
     @one_thread()
     def check(self, name: TermName, size: float, level: float) -> TermCheck:
-        """Return what the plan makes of a term.
+        """Return the check of the plan against a term.
 
         Parameters
         ----------
@@ -156,7 +156,7 @@ class PlannedTerms:
 
     @one_thread()
     def predicted(self, alone: Prediction) -> Prediction:
-        """Return the prediction `alone`, made without terms, with those of the model."""
+        """Return the prediction `alone` with the contribution of the model's terms added."""
         return with_part_of_terms(alone, self.of_model, self.repeats)
 
     def _others(self, name: TermName) -> list[ModelTerm]:
@@ -168,7 +168,7 @@ class PlannedTerms:
                 - _n_unseen(with_terms(self.every, others)))
 
     def _effect(self, name: TermName, size: float) -> tuple[float, float]:
-        """Return the root mean square and the largest of what the term does to the map."""
+        """Return rms and largest effect of the term on the map."""
         every, others = self.every, self._others(name)
         term, model = every.rows([name]), rows_of(every.columns, others)
         inverse = with_terms(every, others).inverse(self.assumed.sigma_m)
@@ -197,7 +197,7 @@ class PlannedTerms:
         return float(np.mean(explained / rank / noise > fdtri(rank, dof, 1 - level)))
 
     def _information(self, name: TermName, beside: TermEquations) -> tuple[np.ndarray, int]:
-        """Return the eigenvalues of the information on a term beside others, and its rank."""
+        """Return the eigenvalues of the information on a term given others, and its rank."""
         every = self.every
         term = every.rows([name])
         others = rows_of(every.columns,
@@ -218,7 +218,7 @@ def _squares(rank: int) -> tuple[np.ndarray, Mapping[str, Any]]:
 
 
 def with_part_of_terms(alone: Prediction, terms: TermEquations, repeats: int) -> Prediction:
-    """Return a prediction that was made without terms, with their part.
+    """Return a prediction with the contribution of terms added.
 
     Parameters
     ----------
@@ -237,7 +237,7 @@ def with_part_of_terms(alone: Prediction, terms: TermEquations, repeats: int) ->
 
 def check_terms(planned: PlannedTerms, sizes: Mapping[TermName, float],
                 level: float) -> tuple[TermCheck, ...]:
-    """Return what a plan makes of every term; `sizes` where they are not `SIZES`."""
+    """Return the checks against all terms; `sizes` override `SIZES`."""
     own = {term.name: term.size for term in planned.model if not term.free}
     wanted = SIZES | own | dict(sizes)
     return tuple(planned.check(name, wanted[name], level) for name in SIZES)

@@ -26,29 +26,29 @@ from selfcal_ros.model.terms import VISIT_TERMS, ModelTerm, TermName
 from selfcal_ros.model.view import Plan, View
 
 SEARCH_SIZE = 11
-"""Largest field on which plans are compared while searching; the best are then judged in full."""
+"""Largest field for the comparison of plans in a search; the best are then evaluated in full."""
 
 FULL_SIZE = 41
-"""Largest field on which every candidate is judged in full."""
+"""Largest field on which every candidate is evaluated in full."""
 
 EXHAUSTIVE = 2000
-"""Largest number of plans that are all tried; beyond it greedy choice and exchange."""
+"""Largest number of plans for which all are tried; above, greedy choice and exchange."""
 
 FEW = 200
-"""The same where every plan counts, as terms are involved that a mirror image does not share."""
+"""The same if terms are involved, which mirror images do not share."""
 
 MAX_TIES = 64
-"""Plans that are equal but for their lines that are judged with them."""
+"""Largest number of plans that differ only in their lines to be evaluated with them."""
 
 FINALISTS = 5
-"""Plans of a search on a smaller field that are judged on the plan's own field."""
+"""Plans from a search on a smaller field that are evaluated on the plan's own field."""
 
 
 @dataclass(frozen=True)
 class Score:
-    """What a plan promises, for unit noise of one reading; infinite if it is deficient.
+    """Predicted uncertainty of a plan for unit noise of one reading; infinite if deficient.
 
-    `of_terms`: the deficiency is what free terms hide of a stage that is identified without them.
+    `of_terms`: the deficiency is caused by free terms; without them the stage is identified.
     """
 
     deficiency: int
@@ -60,21 +60,21 @@ class Score:
     def key(self, criterion: str) -> tuple[float, ...]:
         """Return the order of plans: deficiency first, then the criterion, then the other.
 
-        What terms hide is not counted of a plan that is deficient without them: it comes last.
+        For a plan deficient even without terms, their effect is not counted: it comes last.
         """
         first, second = ((self.rms_xy, self.max_xy) if criterion == "rms"
                          else (self.max_xy, self.rms_xy))
-        # rounding must not decide between plans that are equal by symmetry
+        # rounding must not decide between plans equal by symmetry
         return (bool(self.deficiency and not self.of_terms), self.deficiency, round(first, 9),
                 round(second, 9), round(self.rms_theta, 9))
 
 
 @dataclass(frozen=True)
 class Against:
-    """Terms whose part in the uncertainty counts, and what is assumed of the visits.
+    """Terms included in the uncertainty, and the assumptions on the visits.
 
-    A size is what is known of a term, whether the readings tell it better or not at all; what a
-    free term hides of the stage counts as a deficiency.
+    A size is prior knowledge of a term, whether or not the readings determine it better; modes
+    of the stage hidden by a free term count as a deficiency.
     """
 
     terms: tuple[ModelTerm, ...]
@@ -82,7 +82,7 @@ class Against:
 
     @property
     def of_visits(self) -> bool:
-        """Whether when, whence and with which offset a mark is read matters."""
+        """Whether instant, approach and offset of a reading matter."""
         return any(term.name in VISIT_TERMS for term in self.terms)
 
     @property
@@ -93,14 +93,14 @@ class Against:
 
 @dataclass(frozen=True)
 class Search:
-    """How a plan was searched.
+    """How a plan was found.
 
     Attributes
     ----------
     n_plans : int or None
         The number of plans if all were tried; None after greedy choice and exchange.
     size : int or None
-        Sites a side of the smaller field on which they were compared; None for the plan's own.
+        Sites per side of the smaller field on which they were compared; None for the plan's own.
     """
 
     n_plans: int | None
@@ -109,7 +109,7 @@ class Search:
 
 @dataclass(frozen=True)
 class Suggestion:
-    """A next step and the score that the plan then has.
+    """A next step and the resulting score of the plan.
 
     Attributes
     ----------
@@ -120,9 +120,9 @@ class Suggestion:
     views : tuple of View
         All views of the plan with it.
     repeat_of : int or None
-        Index of the view that is measured more often.
+        Index of the view to be measured more often.
     order : str
-        The visiting order, if another is suggested.
+        The suggested visiting order, if another.
     """
 
     view: View | None
@@ -136,7 +136,7 @@ Progress = Callable[[int, int | None], None]
 
 
 def no_progress(done: int, total: int | None = None) -> None:
-    """Show nothing."""
+    """Do nothing."""
 
 
 @one_thread()
@@ -145,7 +145,7 @@ def score_plan(plan: Plan, datum: ThetaDatum = ThetaDatum.ZERO_MEAN, *,
     """Return the score of a plan with every mark read.
 
     The unit of noise is an averaged reading of `repeats` repeats, by default the plan's fewest.
-    The part of the terms that it is judged `against` is in the XY uncertainty.
+    The XY uncertainty includes the contribution of the terms of `against`.
     """
     system = planned_system(plan.artifact, plan.views)
     unseen = deficiency(system)
@@ -170,22 +170,22 @@ def rank_next(plan: Plan, *, criterion: str = "rms", datum: ThetaDatum = ThetaDa
               ) -> tuple[Score, list[Suggestion]]:
     """Return the plan's score and every candidate for the next step, the best first.
 
-    Candidates are the views of `candidate_views`, as many repeats more of a view of the plan, and,
-    where the order of the visits matters to the terms, other visiting orders. Fields above
-    FULL_SIZE are judged on a smaller field of SEARCH_SIZE sites a side.
+    Candidates are the views of `candidate_views`, another set of repeats of a view of the plan,
+    and, if the order of the visits matters to the terms, other visiting orders. Fields above
+    FULL_SIZE are evaluated on a smaller field of SEARCH_SIZE sites per side.
 
     Parameters
     ----------
     plan : Plan
-        What is planned so far.
+        The plan so far.
     criterion : str
-        ``rms`` or ``max``: which XY uncertainty is to become small.
+        ``rms`` or ``max``: the XY uncertainty to minimise.
     datum : ThetaDatum
         Convention of the angular map.
     against : Against, optional
-        Terms whose part in the uncertainty counts.
+        Terms included in the uncertainty.
     progress : callable
-        Called with the number of plans judged and that of all.
+        Called with the number of plans evaluated and the total.
     """
     judged = smaller(plan, SEARCH_SIZE) if max(plan.artifact.shape) > FULL_SIZE else plan
     unit = unit_repeats(plan)
@@ -255,10 +255,10 @@ def best_plan(artifact: Artifact, n_views: int, *, angular: bool, criterion: str
               progress: Progress = no_progress) -> tuple[Plan, Score, Search]:
     """Return the best plan of `n_views` views among the candidates, its score, and the search.
 
-    The first view is the one without turn: turning all views together only renames the plate. With
-    angular lines one view is the turn by one line. Up to EXHAUSTIVE plans are all tried, more are
-    searched by greedy choice and exchange of single views until no exchange helps. Of plans that
-    are each other's mirror image only one is computed; lines decide between those that are best.
+    The first view is the one without a turn: turning all views together only renames the marks.
+    With angular lines one view is the turn by one line. Up to EXHAUSTIVE plans are all tried, more
+    are searched by greedy choice and exchange of single views until no exchange helps. Of
+    mirror-image plans only one is computed; lines decide between the best.
 
     Raises
     ------
@@ -292,7 +292,7 @@ def best_plan(artifact: Artifact, n_views: int, *, angular: bool, criterion: str
 
 
 class _Searched:
-    """Keys of plans by their grid marks alone; of plans that are each other's mirror image one."""
+    """Keys of plans by their grid marks alone; one for mirror-image plans."""
 
     def __init__(self, field: Plan, pool: list[View], repeats: int, criterion: str,
                  against: Against | None, progress: Progress) -> None:
@@ -303,11 +303,11 @@ class _Searched:
 
     @property
     def one_by_one(self) -> bool:
-        """Whether every plan counts: what depends on the visits does not survive a mirror."""
+        """Whether mirror-image plans differ, as terms of the visits make them."""
         return self.against is not None and self.against.of_visits
 
     def key(self, chosen: tuple[int, ...]) -> tuple[float, ...]:
-        """Return the order of the first view of the pool with those chosen."""
+        """Return the sort key of the plan of the pool's first view with the chosen ones."""
         views = (self.pool[0], *(self.pool[i] for i in chosen))
         same = (tuple(sorted(chosen)) if self.one_by_one
                 else equivalent_key(self.field.artifact, views))
@@ -319,7 +319,7 @@ class _Searched:
 
 
 def _search(searched: _Searched, free: int) -> tuple[dict[tuple[int, ...], tuple], Search]:
-    """Return the plans that were tried with their keys, and how they were found."""
+    """Return the plans tried with their keys, and how they were found."""
     n_pool = len(searched.pool)
     n_plans = comb(n_pool + free - 1, free)
     if n_plans <= (FEW if searched.one_by_one else EXHAUSTIVE):
@@ -354,7 +354,7 @@ def _exchange(key: Callable[[tuple[int, ...]], tuple[float, ...]], n_pool: int, 
 
 
 def unused_name(name: str, views: Iterable[View]) -> str:
-    """Return `name`, numbered if a view of the plan has it already."""
+    """Return `name`, numbered if another view of the plan has it."""
     taken = {view.name for view in views}
     tail = 2
     out = name

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a deficient plan cannot see: the unseen fields of the stage, named and as maps.
+"""Unseen fields of the stage under a deficient plan, named and as maps.
 
-Two sources (method eq. 6.1). A component of sites and marks that no closed path of readings
-turns leaves a vector free, which goes along with the readings. And combinations of misalignments
-that no reading tells move whole fields.
+There are two sources (method eq. 6.1): a component of sites and marks that no closed path of
+readings turns leaves a vector free; and undetermined combinations of misalignments move whole
+fields.
 """
 
 from dataclasses import dataclass
@@ -16,12 +16,12 @@ from selfcal_ros.estimation.normal.equations import NormalEquations, pseudo_inve
 from selfcal_ros.estimation.normal.grid import GridSystem
 
 MATCH = 1e-9
-"""Relative sum of squares that a reading of a field may leave if the field is unseen."""
+"""Largest relative residual sum of squares of an unseen field."""
 
 
 @dataclass(frozen=True, eq=False)
 class UnseenMode:
-    """A family of stage errors that the readings cannot tell from plate errors.
+    """A family of stage errors that the readings cannot separate from plate errors.
 
     Attributes
     ----------
@@ -39,7 +39,7 @@ class UnseenMode:
 
 
 def is_unseen(system: NormalEquations, field: np.ndarray) -> bool:
-    """Return whether a stage error can hide behind a plate error and misalignments.
+    """Return whether a stage error can be compensated by a plate error and misalignments.
 
     Parameters
     ----------
@@ -58,7 +58,7 @@ def is_unseen(system: NormalEquations, field: np.ndarray) -> bool:
     block = np.zeros((system.size, system.size))
     block[:len(grid.block), :len(grid.block)] = grid.block
     if system.angular.n_views:
-        # the angular lines hold the rotations together as far as they were read
+        # the angular lines relate the rotations as far as they were read
         weight = system.grid_scale / system.angular_scale
         block[np.ix_(system.phi_at, system.phi_at)] += weight * system.angular.schur
     explained = right @ pseudo_inverse(*np.linalg.eigh(block), system.grid_scale) @ right
@@ -66,7 +66,7 @@ def is_unseen(system: NormalEquations, field: np.ndarray) -> bool:
 
 
 def known_families(system: NormalEquations) -> list[UnseenMode]:
-    """Return the unseen fields among those that have a name of their own."""
+    """Return the unseen fields among the named ones."""
     z = system.grid.views.z
     x, y = z.real, z.imag
     named = [
@@ -166,7 +166,7 @@ def unread_marks(grid: GridSystem) -> UnseenMode | None:
 
 
 def angular_families(system: NormalEquations) -> list[UnseenMode]:
-    """Return what the turns leave unseen of the angular map, in words."""
+    """Return the unseen modes of the angular map, in words."""
     angular = system.angular
     if not angular.n_views:
         return []
