@@ -24,7 +24,7 @@ from selfcal_ros.nodes.base import SelfcalNode
 from selfcal_ros.nodes.player import Player
 from selfcal_ros.nodes.running import run
 
-PATIENCE_S = 30.0
+PATIENCE_S = 60.0
 """Longest wait for the nodes to appear, to receive what was sent, or to answer."""
 
 

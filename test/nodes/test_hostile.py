@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Every node among hostile publishers and clients: each field at its worst, torn bytes."""
 
+import importlib
 import io
 import json
 import os
@@ -8,6 +9,7 @@ from collections import Counter
 from dataclasses import replace
 from functools import partial
 from itertools import batched, islice
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,6 +18,7 @@ from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from selfcal_msgs.action import RunCalibration
 from std_srvs.srv import Trigger
 
+from selfcal_ros import nodes as every_node
 from selfcal_ros.collection.inputs import Command, Detection, EncoderSample
 from selfcal_ros.errors import InputError, SelfcalError
 from selfcal_ros.estimation.api import calibrate
@@ -23,10 +26,14 @@ from selfcal_ros.messages import from_model
 from selfcal_ros.nodes import monitor_session, names
 from selfcal_ros.nodes.bag_player import BagPlayer
 from selfcal_ros.nodes.bag_recorder import BagRecorder
+from selfcal_ros.nodes.callbacks import Guarded
+from selfcal_ros.nodes.cell_checker import CellChecker
 from selfcal_ros.nodes.compensator import CompensatorNode
 from selfcal_ros.nodes.filling import fill
 from selfcal_ros.nodes.measurement_collector import MeasurementCollector
+from selfcal_ros.nodes.player import Player
 from selfcal_ros.nodes.pose_sequencer import PoseSequencer
+from selfcal_ros.nodes.replay_session import ReplaySession
 from selfcal_ros.nodes.solver import Solver
 from selfcal_ros.nodes.stage_simulator import StageSimulator
 from selfcal_ros.sessions.health import Refusals
@@ -101,6 +108,30 @@ def cell(graph, refused, tmp_path, monkeypatch):
     nodes[-1].close()
 
 
+@pytest.fixture
+def all_kinds(graph, cell, tmp_path):
+    """Return a node of every kind: those beside the cell in a namespace of their own."""
+    (tmp_path / "beside").mkdir()
+    bag = str(small_bag(tmp_path / "beside"))
+    graph.node(partial(StageSimulator, namespace="beside"))
+    graph.node(partial(BagPlayer, namespace="beside"), bag=bag, wait_for_subscribers=3600.0)
+    graph.node(partial(CellChecker, PLAN, namespace="beside", settle_s=0.0, patience_s=3600.0))
+    graph.add(ReplaySession(partial(Player, bag=bag, rate=1.0, seed=-1), "none.json",
+                            namespace="replay", context=graph.context))
+    nodes = [node for node in graph.nodes if node is not graph.hand]
+    assert {type(node) for node in nodes} == set(kinds())
+    return nodes
+
+
+def kinds():
+    """Yield the class of each node that the package can run as a process."""
+    for file in sorted(Path(every_node.__file__).parent.glob("*.py")):
+        if "\ndef main(" in file.read_text():
+            module = importlib.import_module(f"{every_node.__name__}.{file.stem}")
+            yield from (item for item in vars(module).values() if isinstance(item, type)
+                        and issubclass(item, Guarded) and item.__module__ == module.__name__)
+
+
 def play(graph, events) -> None:
     """Publish the messages of a run, once all nodes that are to hear them do."""
     voices = {kind: graph.publisher(topic, readers=readers)
@@ -123,16 +154,24 @@ def send(graph, topic, messages) -> None:
     graph.hand.destroy_publisher(voice)
 
 
-def everybody_is_well(graph, cell, refused, capsys) -> None:
-    """Check that each node tells its health anew, and that a good run gives its map."""
+def good_run():
+    """Return the messages of a run after the hostile messages."""
+    return [replace(event, stamp_ns=event.stamp_ns + LATER_NS) for event in events_of(PLAN)]
+
+
+def everybody_is_well(graph, cell, refused, capsys, begun=0) -> None:
+    """Check that each node tells its health anew, and that a good run gives its map.
+
+    So many messages of it have been played.
+    """
     solver = cell[2]
     assert [node.state for node in cell[:4]] == ["active"] * 4
     assert [(place, error) for place, error in refused if not isinstance(error, SelfcalError)] == []
     told = {node: graph.listen(names.of_node(node.get_name(), names.HEALTH)) for node in cell}
     graph.until(lambda: all(len(heard) > 1 for heard in told.values()), "the health of all")
     graph.call(Trigger, "pose_sequencer/abort")  # it followed the commands of others
-    events = [replace(event, stamp_ns=event.stamp_ns + LATER_NS) for event in events_of(PLAN)]
-    play(graph, events)
+    events = good_run()
+    play(graph, events[begun:])
     expected = calibrate(collected(events)[1]).error_map.gx
     graph.until(lambda: solver.session.result is not None and np.array_equal(
         solver.session.result.error_map.gx, expected), "the map of a good run")
@@ -155,22 +194,41 @@ def hostile_to(topic, fields):
             yield message
 
 
-def test_each_field_at_its_worst_ends_nothing(graph, cell, refused, good, capfd):
+def test_each_field_at_its_worst_ends_nothing(graph, cell, all_kinds, refused, good, capfd):
+    status = {key: "1" for key in ("view", "command_stamp", "views", "run_id")}
+    private = [(names.of_node(node, names.HEALTH), worst(names.HEALTH.type(
+        level=b"\1", name=node, message="as told", values=[
+            KeyValue(key=key, value=value) for key, value in status.items()])))
+        for node in monitor_session.WATCHED]
     for topic, fields in good:
         send(graph, topic, hostile_to(topic, fields))
-    for node in ("measurement_collector", "solver", "pose_sequencer"):
-        told = names.of_node(node, names.HEALTH)
-        health = names.HEALTH.type(level=b"\1", name=node, message="as told", values=[
-            KeyValue(key=key, value="1") for key in ("view", "command_stamp", "views", "run_id")])
-        send(graph, told, (message for _, message in worst(health)))
+    for topic, messages in private:
+        send(graph, topic, (message for _, message in messages))
+    strange = [(names.of_node(node, topic), [message for _, message in worst(message)])
+               for node, topic, message in (
+        ("measurement_collector", names.RECEIVED, names.RECEIVED.type(data=[1, 2, 3])),
+        ("solver", names.SOLVED, names.SOLVED.type(data="digest")))]
+    heard = set().union(*map(subscribed, all_kinds))
+    for space in ("/beside", "/replay"):
+        for topic, messages in [*((topic, hostile_to(topic, fields)) for topic, fields in good),
+                                *strange]:
+            if f"{space}/{topic.name}" in heard:
+                send(graph, replace(topic, name=f"{space}/{topic.name}"), messages)
     everybody_is_well(graph, cell, refused, capfd)
     places = {place for place, _ in refused}
     assert {names.COMMAND.name, names.MEASUREMENT.name, names.ERROR_MAP.name} <= places
     assert any("longer than 8192 bytes" in str(error) for _, error in refused)
-    spoilt = {f"/{topic.name}" for topic, _ in good} | {
-        f"/{node}/health" for node in ("measurement_collector", "solver")}
+    sent = {f"{space}/{topic.name}" for space in ("", "/beside", "/replay")
+            for topic, _ in [*good, *private, *strange]}
     only_recorded = {f"/{names.CORRECTED.name}"}  # the recorder looks into no message
-    assert {name for node in cell for name in node._heard_on} == spoilt | only_recorded
+    assert heard - only_recorded <= sent
+    assert {f"/{topic.name}" for topic, _ in [*good, *private]} <= heard
+
+
+def subscribed(node) -> set[str]:
+    """Return the full names of the topics that a node hears, as the graph has them."""
+    found = node.get_subscriber_names_and_types_by_node(node.get_name(), node.get_namespace())
+    return {name for name, _ in found}
 
 
 def test_torn_bytes_end_nothing(graph, cell, refused, good, capfd):
@@ -211,16 +269,6 @@ TEXT = ParameterValue(type=ParameterType.PARAMETER_STRING, string_value="x")
 BASES = {"parameters": [[Parameter(name=name, value=TEXT)] for name in (
     "hardware_id", "use_sim_time")], "names": [["none"]], "prefixes": [["none"]]}
 """What stands in the sequences of a request whose elements are spoilt."""
-
-
-@pytest.fixture
-def all_kinds(graph, cell, tmp_path):
-    """Return all nodes, the screen included: those beside the cell in a namespace of their own."""
-    (tmp_path / "beside").mkdir()
-    graph.node(partial(StageSimulator, namespace="beside"))
-    graph.node(partial(BagPlayer, namespace="beside"), bag=str(small_bag(tmp_path / "beside")),
-               wait_for_subscribers=3600.0)
-    return [node for node in graph.nodes if node is not graph.hand]
 
 
 @pytest.fixture
@@ -303,18 +351,25 @@ def asked_to_end(goal):
 
 def test_each_request_at_its_worst_is_answered_and_ends_nothing(
         graph, cell, all_kinds, refused, traps, capfd):
-    asked = Counter()
+    asked, called = Counter(), {*(f"{ACTION}/{part}" for part in (
+        "send_goal", "get_result", "cancel_goal"))}
+    half = len(good_run()) // 2
+    play(graph, good_run()[:half])
     for node in all_kinds:
         for service in [*node.services]:
             client = reached(graph, service.srv_type, service.service_name)
             answers = ask(graph, client, requests_of(service.srv_type, traps))
-            asked[node.get_name()] += len(answers)
+            asked[node.get_fully_qualified_name()] += len(answers)
+            called.add(service.service_name)
             graph.hand.destroy_client(client)
-    assert len(asked) == 8 and min(asked.values()) > 300, asked
+    assert len(asked) == len(all_kinds) and min(asked.values()) > 300, asked
+    there = [node.get_service_names_and_types_by_node(node.get_name(), node.get_namespace())
+             for node in all_kinds]
+    assert {name for found in there for name, _ in found} == called
     graph.call(Trigger, "pose_sequencer/abort")  # or it rejects goals
     results = results_of(graph, traps)
     assert {result.error_code for result in results} == {2}
     odd = [(place, error) for place, error in refused if not isinstance(error, SelfcalError)]
     assert {place for place, _ in odd} == RAISED_BY_RCLPY, odd
     refused.clear()
-    everybody_is_well(graph, cell, refused, capfd)
+    everybody_is_well(graph, cell, refused, capfd, half)
