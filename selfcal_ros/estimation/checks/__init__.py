@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Is the cell set up as it says? Asked before any map is made."""
+"""Checks of the cell's set-up, before any map is computed."""

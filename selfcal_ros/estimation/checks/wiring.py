@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether the microscope's offsets follow the stage as they should, before any map is made.
+"""Whether the microscope's offsets follow the stage correctly, before any map is computed.
 
-Where the stage stands off by m from one repeat of a mark to the next, the offset that the
-microscope sees is -m. With readout noise of the encoder, which is no motion, and noise of the
-detection, independent of each other and of the motion, the covariance of place and offset is
--S D', where S is the covariance of the motion and D the way the offsets are wired: the identity, or
+If the stage moves by m from one repeat of a mark to the next, the offset measured by the microscope
+is -m. With readout noise of the encoder, which is not motion, and noise of the
+detection, independent of each other and of the motion, the covariance of position and offset is
+-S D', where S is the covariance of the motion and D the wiring of the offsets: the identity, or
 one of the other seven that exchange and reverse axes. For the right one tr(S D' D) is largest, so
-neither noise can make another one win. Noise of the place draws the slope of the offset on it
-towards 0, noise of the offset the slope of the place: the scale lies between the two.
+neither noise can favour another one. Noise of the position pulls the slope of the offset on it
+towards 0, noise of the offset the slope of the position: the scale is between the two.
 Of 2,000 clean simulated measurements none was refused (test_wiring.py).
 """
 
@@ -23,39 +23,39 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.model.readings import Measurements, RepeatMotion
 
 LEVEL = 1e-6
-"""Probability, all tries together, of refusing a measurement whose offsets are wired well."""
+"""Probability, over all tests, of refusing a correctly wired measurement."""
 TOLD = 1e-3
-"""Probability below which a single offset counts as following a single axis the wrong way."""
+"""Probability below which a single offset is taken to follow a single axis wrongly."""
 SHOWN = 0.01
-"""Probability, without any motion, of what speaks for the sign of the offsets that counts."""
+"""Probability without motion below which the sign of the offsets counts as confirmed."""
 DOUBLED, HALVED = 1.5, 0.7
-"""Scales beyond which an offset is in wrong units; what is nearer to 1 is fitted."""
+"""Scales beyond which an offset is in wrong units; nearer to 1 the scale is fitted."""
 LEAST_SLOPE = 0.3
-"""Scale below which an offset is not taken to follow the stage at all."""
+"""Scale below which an offset is taken not to follow the stage."""
 LEAST_MOTION = 1e-12
-"""Standard deviation of the place, m or rad, that is rounding."""
+"""Standard deviation of the position, m or rad, attributed to rounding."""
 AXES = {"grid": ("x", "y"), "angular": ("theta",)}
 
 
 class WiringError(InputError):
-    """Raised for offsets of the other sign, on exchanged axes, or in wrong units."""
+    """Raised for offsets with the wrong sign, on exchanged axes, or in wrong units."""
 
 
 @dataclass(frozen=True)
 class OffsetResponse:
-    """How one offset follows the place of the optical axis over the plate; it should by -1.
+    """Response of one offset to the position of the optical axis over the plate; nominally -1.
 
     Attributes
     ----------
     offset, axis : str
         ``x``, ``y`` or ``theta``: the offset, and the axis that it follows.
     slope, u_slope : float
-        Regression of the offset on the place, and its standard uncertainty.
+        Regression of the offset on the position, and its standard uncertainty.
     most : float
-        Offset over place by the regression of the place on the offset: between this and the slope
-        lies what both are without noise.
+        Offset over position by the regression of the position on the offset: without noise the
+        ratio is between this and the slope.
     p : float
-        Probability of a covariance as large without any motion.
+        Probability of such a covariance without motion.
     """
 
     offset: str
@@ -73,16 +73,16 @@ class OffsetResponse:
 
 @dataclass(frozen=True)
 class WiringFault:
-    """Offsets that do not follow the stage as they should.
+    """Offsets that do not follow the stage correctly.
 
     Attributes
     ----------
     view : str
-        Name of the view that shows it; empty = all together.
+        Name of the view that shows it; empty = all views together.
     kind : str
         ``grid`` or ``angular``.
     responses : tuple of OffsetResponse
-        Those that are wrong, at least one.
+        The wrong ones, at least one.
     """
 
     view: str
@@ -97,9 +97,9 @@ def check_wiring(measurements: Measurements) -> None:
 
 
 def wiring_faults(measurements: Measurements) -> list[WiringFault]:
-    """Return how offsets are wired wrongly, as far as the repeats of marks tell it.
+    """Return the faults in the wiring of offsets shown by repeats of marks.
 
-    All views together, else the first view that shows a fault by itself.
+    From all views together, else from the first view that shows a fault by itself.
     """
     found = []
     for kind, name in (("grid", "motion"), ("angular", "motion_theta")):
@@ -115,9 +115,9 @@ def wiring_faults(measurements: Measurements) -> list[WiringFault]:
 
 
 def sign_is_shown(measurements: Measurements) -> bool:
-    """Return whether the repeats of grid marks show that offsets follow the stage as they should.
+    """Return whether the repeats of grid marks confirm the sign of the offsets.
 
-    That speaks for the sign that they have and against the other one, all views together.
+    All views together, compared with the opposite sign.
     """
     motions = [view.motion for view in measurements.views if view.motion is not None]
     if not motions:
@@ -148,7 +148,7 @@ def _wirings(n: int) -> tuple[np.ndarray, ...]:
 
 def _wrong(motion: RepeatMotion, axes: tuple[str, ...], level: float,
            ) -> tuple[OffsetResponse, ...]:
-    """Return the offsets that follow the stage wrongly; none where nothing is beyond doubt."""
+    """Return the offsets that follow the stage wrongly; none if in doubt."""
     n, least = len(axes), LEAST_MOTION**2 * motion.dof
     moved = np.diag(motion.products) > np.repeat([least, 0.0], n)
     if not moved[:n].any() or not moved[n:].any():
@@ -167,9 +167,9 @@ def _wrong(motion: RepeatMotion, axes: tuple[str, ...], level: float,
 
 
 def _wiring(motion: RepeatMotion, level: float) -> np.ndarray:
-    """Return how the offsets are wired: the right way unless another is beyond doubt.
+    """Return the wiring of the offsets: the right one unless another is beyond doubt.
 
-    Where the axes move together, exchanged and reversed offsets look alike: reversed, then.
+    If the axes move together, exchanged and reversed offsets look the same: then reversed.
     """
     n = len(motion.products) // 2
 
@@ -187,9 +187,9 @@ def _wiring(motion: RepeatMotion, level: float) -> np.ndarray:
 
 
 def _p_for(motion: RepeatMotion, wiring: np.ndarray, other: np.ndarray) -> float:
-    """Return the probability of what speaks for one wiring and against another.
+    """Return the probability of the evidence for one wiring and against another.
 
-    That is tr(C (D' - D)): negative, or 0 without any motion, where the other one holds.
+    The evidence is tr(C (D' - D)): negative, or 0 without motion, if the other one is true.
     """
     n = len(wiring)
     change = other - wiring
@@ -201,10 +201,10 @@ def _p_for(motion: RepeatMotion, wiring: np.ndarray, other: np.ndarray) -> float
 
 
 def _p_of_scale(motion: RepeatMotion, at: tuple[int, int]) -> float:
-    """Return the probability of a scale as far from 1 where it is `HALVED` to `DOUBLED`.
+    """Return the probability of a scale as far from 1 if it is within `HALVED` to `DOUBLED`.
 
-    With o the offset and p the place: o - s p goes with p if even the smallest scale is beyond s,
-    p - o / s with o if even the largest is below it.
+    With o the offset and p the position: o - s p correlates with p if even the smallest scale is
+    beyond s, p - o / s with o if even the largest is below it.
     """
     (i, j), n = at, len(motion.products) // 2
     place, offset = np.eye(2 * n)[i], np.eye(2 * n)[n + j]
@@ -216,15 +216,15 @@ def _p_of_scale(motion: RepeatMotion, at: tuple[int, int]) -> float:
 
 
 def _correlation(products: np.ndarray, a: np.ndarray, b: np.ndarray) -> float:
-    """Return the correlation of two combinations of places and offsets."""
+    """Return the correlation of two combinations of positions and offsets."""
     size2 = (a @ products @ a) * (b @ products @ b)
     return float(a @ products @ b / np.sqrt(size2)) if size2 > 0 else 0.0
 
 
 def _p_of(correlation: float, dof: int) -> float:
-    """Return the probability of a larger correlation by chance, or little more: no scipy needed.
+    """Return a close upper bound of the probability of a larger correlation, without scipy.
 
-    The density goes with (1 - r^2)^(d/2 - 1), which is integrated with a factor of r / correlation.
+    The density is proportional to (1 - r^2)^(d/2 - 1), integrated with a factor r / correlation.
     """
     d = dof - 1
     if correlation <= 0:
@@ -235,7 +235,7 @@ def _p_of(correlation: float, dof: int) -> float:
 
 
 def _response(motion: RepeatMotion, at: tuple[int, int], axes: tuple[str, ...]) -> OffsetResponse:
-    """Return how offset j follows axis i, `at` = (i, j)."""
+    """Return the response of offset j to axis i, `at` = (i, j)."""
     (i, j), n = at, len(axes)
     place, offset = motion.products[i, i], motion.products[n + j, n + j]
     cross = float(motion.products[i, n + j])
@@ -247,7 +247,7 @@ def _response(motion: RepeatMotion, at: tuple[int, int], axes: tuple[str, ...]) 
 
 
 def worded(fault: WiringFault) -> WiringError:
-    """Return a fault as the error that says in one line what is wrong and how to correct it."""
+    """Return the error for a fault: in one line, what is wrong and how to correct it."""
     responses = fault.responses
     names = " and ".join(f"offset_{response.offset}" for response in responses)
     told = ", ".join(

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which maps fit all readings best, and how large the noise is."""
+"""Joint least squares of all readings, and the noise."""

@@ -33,17 +33,17 @@ class JointFit:
     g_theta, a_theta : float array (K,)
         Angular maps, rad.
     residuals_theta : float array (views, K)
-        Angular residuals, rad; axis conditions that the stage does not keep are not in them.
+        Angular residuals, rad; without axis conditions that the stage violates.
     misclosure : float array (conditions,)
-        Slopes less Gtheta before the angular datum was applied, rad.
+        Slopes minus Gtheta before the angular datum was applied, rad.
     xy, theta : NoiseEstimate
         Noise of the grid and of the angular readings.
     inverse : float array (size, size)
         Covariance of the misalignments for unit grid noise; empty if the sites were iterated.
     solver : dict
-        How the equations were solved, and to what residual.
+        Method of solution and residual reached.
     ratio : float
-        Weight of an angular reading (times the half width) against a grid reading; 0 = none.
+        Weight of an angular reading (times the half width) relative to a grid reading; 0 = none.
     """
 
     field: np.ndarray
@@ -69,8 +69,8 @@ class JointFit:
 def fit(problem: Problem, y: np.ndarray, theta: AngularPart | None = None) -> JointFit:
     """Return the joint least-squares solution.
 
-    Each kind of readings is first fitted alone, for its noise; the two noises then weigh them
-    against each other in the views' rotations, which both see.
+    Each kind of reading is first fitted alone for its noise; the noises then determine their
+    relative weights in the views' rotations, which they share.
 
     Parameters
     ----------
@@ -79,7 +79,7 @@ def fit(problem: Problem, y: np.ndarray, theta: AngularPart | None = None) -> Jo
     y : complex array (views, nx, ny)
         Grid deviations in the plate frame, m.
     theta : AngularPart, optional
-        `angular_part` of the problem, where several grid deviations are solved with it.
+        `angular_part` of the problem, if several grid deviations are solved with it.
     """
     system, grid, angular = problem.system, problem.system.grid, problem.system.angular
     n, length = 3 * grid.n_views, problem.half_width_m
@@ -143,7 +143,7 @@ def _solve_direct(problem: Problem, y: np.ndarray, theta: AngularPart) -> FreeNe
 
 
 def angular_part(problem: Problem) -> AngularPart:
-    """Return the angular readings fitted alone: they do not depend on the grid's."""
+    """Return the angular readings fitted alone, independently of the grid."""
     angular, y = problem.system.angular, problem.angular.y
     if not angular.n_views:
         nothing = noise_estimate((float("nan"), 0), (float("nan"), 0), float("nan"))

@@ -13,21 +13,21 @@ from selfcal_ros.estimation.joint.problem import (
 )
 
 ROUGH = 1e-6
-"""Relative residual at which the noise of the grid readings is taken, to weigh the angular ones."""
+"""Relative residual at which the noise of the grid readings is estimated, for the weights."""
 
 
 def solve_iterated(problem: Problem, y: np.ndarray, theta: AngularPart) -> FreeNetworkSolution:
     """Return the solution of the joint equations by conjugate gradients.
 
-    A rough solution of the grid readings alone gives their noise; with it the angular readings
-    join, and the iteration goes on to the full accuracy.
+    An approximate solution of the grid readings alone gives their noise; then the angular readings
+    join, and the iteration continues to full accuracy.
     """
     system, grid = problem.system, problem.system.grid
     n, length = 3 * grid.n_views, problem.half_width_m
     plain = _block_inverse(problem, np.zeros((grid.n_views, grid.n_views)))
     _, d = grid.right_side(y)
     near = plain @ d
-    # misalignments are far larger than errors: off first, or rounding of them stays behind
+    # misalignments are far larger than errors: subtract first, or their rounding remains
     b, d = grid.right_side(np.where(grid.read, y - grid.misaligned(near), 0.0))
     b = b.reshape(grid.views.shape)
     kernel = GridIteration(grid, plain)
@@ -71,14 +71,14 @@ def _block_inverse(problem: Problem, of_phi: np.ndarray) -> np.ndarray:
 
 
 def _angular_on_grid(problem: Problem, theta: AngularPart) -> tuple:
-    """Return the angular equations of phi of the grid views, and what gives the other phi.
+    """Return the angular equations of phi of the grid views, and the relation to the other phi.
 
     Returns
     -------
     normal, right : arrays
         Over the grid views; phi of purely angular views eliminated.
     rest : tuple
-        Places of the other phi among the misalignments, and matrix and offset (rad) of
+        Indices of the other phi among the misalignments, and matrix and offset (rad) of
         phi = offset - matrix @ phi of the grid views.
     """
     system, schur = problem.system, problem.system.angular.schur

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Residuals that a result keeps, so that a report can show them without the bag."""
+"""Residuals stored in a result, so that a report can show them without the bag."""
 
 from typing import Any
 
@@ -11,25 +11,25 @@ from selfcal_ros.model.readings import GridVisits, Measurements
 from selfcal_ros.units import NS_PER_S
 
 KEY = "residuals"
-"""Name among the extras of a result."""
+"""Key among the extras of a result."""
 
 MAX_READINGS = 60_000
-"""Grid readings up to which residuals are kept: a plate of 121 x 121 marks in four views."""
+"""Largest number of grid readings with stored residuals: 121 x 121 marks in four views."""
 
 MAX_PARTS = 60
-"""Parts of a view's time for which the mean residual is kept."""
+"""Number of intervals of a view's time with a stored mean residual."""
 
 DECIMALS_M, DECIMALS_RAD, DECIMALS_S = 13, 12, 3
-"""Decimals that are kept: 0.1 pm, 1 prad, 1 ms."""
+"""Decimals stored: 0.1 pm, 1 prad, 1 ms."""
 
 
 def kept_residuals(measurements: Measurements, model: ModelFit) -> dict[str, Any]:
     """Return the residuals of all readings for `CalibrationResult.extra`; empty for large fields.
 
     Each view has `dx`, `dy` [i][j] (m, stage axes, mark m = i - h, n = j - h of the plate) and
-    `dtheta` [k] (rad, counter-clockwise), NaN where not read; and where the visits of its marks
+    `dtheta` [k] (rad, counter-clockwise), NaN where not read; and, if the visits of its marks
     are known, `course`: `time_s` (from the first visit of the run), mean `dx`, `dy` (m) and
-    `count` of the readings in each part of the view's time.
+    `count` of the readings in each interval of the view's time.
 
     Parameters
     ----------
@@ -82,7 +82,7 @@ def _to_stage(model: ModelFit, row: int) -> complex:
 
 
 def _course(visits: GridVisits, rest: np.ndarray, start_ns: int) -> dict[str, np.ndarray]:
-    """Return the mean residual in each part of the view's time."""
+    """Return the mean residual in each interval of the view's time."""
     order = np.argsort(visits.stamp_ns, kind="stable")
     starts = _starts(len(order))
     counts = visits.count[order]
@@ -96,7 +96,7 @@ def _course(visits: GridVisits, rest: np.ndarray, start_ns: int) -> dict[str, np
 
 
 def _starts(visits: int) -> np.ndarray:
-    """Return where each of `MAX_PARTS` parts, or of fewer visits as many, begins; never empty."""
+    """Return the starts of `MAX_PARTS` intervals, or one per visit if fewer; none is empty."""
     parts = min(visits, MAX_PARTS)
     size, longer = divmod(visits, parts)
     number = np.arange(parts)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The noise of one reading: from repeats, from residuals, and whether the two agree."""
+"""The noise of one reading, from repeats and from residuals, and their agreement."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -10,16 +10,16 @@ from scipy.special import fdtrc, stdtrit
 from selfcal_ros.model.statistics import MANY_DOF
 
 MIN_REPEAT_DOF = 30
-"""Degrees of freedom from which the scatter of repeats is trusted; below, residuals are."""
+"""Degrees of freedom from which the scatter of repeats is used; below, the residuals."""
 
 F_LEVEL = 1e-3
-"""Two-sided level of the test that repeats and residuals show the same noise."""
+"""Two-sided level of the test that repeats and residuals have the same noise."""
 
 SAME = 1.1
-"""Ratio of two noises up to which they count as the same, however surely they differ."""
+"""Ratio of two noises up to which they count as equal, however significant the difference."""
 
 COVERAGE = 0.9545
-"""Probability of an expanded uncertainty: k = 2 for many degrees of freedom."""
+"""Coverage of an expanded uncertainty: k = 2 for many degrees of freedom."""
 
 
 @dataclass(frozen=True)
@@ -29,19 +29,19 @@ class NoiseEstimate:
     Attributes
     ----------
     sigma : float
-        Standard deviation of one reading behind the uncertainties; NaN if unknown. Where repeats
-        (or the declaration) and residuals contradict each other it is the larger of the two.
+        Standard deviation of one reading behind the uncertainties; NaN if unknown. If repeats
+        (or the declaration) and residuals contradict each other it is the larger one.
     dof : float
         Its degrees of freedom; infinite if the detections declare it.
     repeats, residuals : float
-        The two estimates, NaN where there is none.
+        The two estimates, NaN if none.
     dof_repeats, dof_residuals : float
         Their degrees of freedom.
     declared : float
-        As the detections declare it, NaN if they do not.
+        As declared by the detections, NaN if not declared.
     p : float
-        Two-sided probability that residuals and repeats (or declaration) differ as they do if
-        nothing but one noise is in both; NaN if there is nothing to compare.
+        Two-sided probability of such a difference of residuals and repeats (or declaration) if
+        both have the same noise; NaN if there is nothing to compare.
     """
 
     sigma: float
@@ -55,12 +55,12 @@ class NoiseEstimate:
 
     @property
     def stated(self) -> float:
-        """What residuals are compared with: the declared noise, or that of repeats."""
+        """Noise compared with the residuals: the declared one, or that of repeats."""
         return self.declared if np.isfinite(self.declared) else self.repeats
 
     @property
     def contradicted(self) -> bool:
-        """Whether residuals and repeats (or declaration) cannot come from one noise."""
+        """Whether residuals and repeats (or declaration) contradict each other."""
         if not self.p < F_LEVEL:
             return False
         small, large = sorted((self.stated, self.residuals))
@@ -68,7 +68,7 @@ class NoiseEstimate:
 
     @property
     def k(self) -> float:
-        """Coverage factor for 95.45 % (Student's t); NaN if the noise is not known."""
+        """Coverage factor for 95.45 % (Student's t); NaN if the noise is unknown."""
         return coverage_factor(self.dof) if self.dof > 0 else float("nan")
 
 
@@ -88,17 +88,17 @@ def pooled(parts: Iterable[tuple[float, float]]) -> tuple[float, float]:
 
 def noise_estimate(repeats: tuple[float, float], residuals: tuple[float, float], declared: float, *,
           floor: float = 0.0) -> NoiseEstimate:
-    """Return the noise level to use: declared, else repeats, else residuals.
+    """Return the noise to use: declared, else repeats, else residuals.
 
-    Where a test contradicts that choice, the larger is used. Repeats that are identical to the
-    last bit tell the resolution of the sensor, not the noise, and do not count.
+    If a test contradicts this choice, the larger one is used. Repeats that are identical to the
+    last bit show the resolution of the sensor, not the noise, and are ignored.
 
     Parameters
     ----------
     repeats, residuals : tuple
         (sigma, degrees of freedom) of each; dof 0 = none.
     declared : float
-        As the detections declare it; NaN = not declared.
+        As declared by the detections; NaN = not declared.
     floor : float
         Noise at the level of rounding, which is not tested.
     """
@@ -120,7 +120,7 @@ def noise_estimate(repeats: tuple[float, float], residuals: tuple[float, float],
 
 
 def _same_noise(base: tuple[float, float], residuals: tuple[float, float], floor: float) -> float:
-    """Return the two-sided probability that both are estimates of one noise (F-test)."""
+    """Return the two-sided probability that both are estimates of the same noise (F-test)."""
     if not (base[1] > 0 and residuals[1] > 0) or not max(base[0], residuals[0]) > floor:
         return float("nan")
     ratio = np.square(min(residuals[0] / max(base[0], np.finfo(float).tiny), 1e100))

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Large fields: conjugate gradients with a cosine-transform preconditioner (method eq. 8.2).
 
-The plate and the misalignments are eliminated exactly in every product; what is iterated is the
-stage map alone. The fields that a quarter turn maps to themselves meet only differences over a
-shift, a Laplacian with free edges; all others meet a turn as well, a Laplacian plus a constant.
+The plate and the misalignments are eliminated exactly in every product; only the stage map is
+iterated. Fields that a quarter turn maps to themselves are subject to differences over a shift
+only, a Laplacian with free edges; all others to a turn as well, a Laplacian plus a constant.
 Both are diagonal under the DCT-II, in whose basis a quarter turn is a transposition with signs.
 """
 
@@ -19,10 +19,10 @@ from selfcal_ros.estimation.lattice.maps import PHASES
 from selfcal_ros.estimation.normal.grid import GridSystem
 
 TOLERANCE = 1e-12
-"""Residual of the normal equations at which the iteration ends, relative to the right side."""
+"""Residual of the normal equations at which the iteration ends, relative to the right-hand side."""
 
 DENSE_DCT = 600
-"""Largest side whose cosine transform may be a matrix product."""
+"""Largest side for a cosine transform by matrix product."""
 
 MAX_ITERATIONS = 2000
 
@@ -40,7 +40,7 @@ class Iterated:
     iterations : int
         Steps taken.
     relative_residual : float
-        True residual b - N G, computed afresh at the end, over |b|.
+        True residual b - N G, recomputed at the end, over |b|.
     """
 
     field: np.ndarray
@@ -57,7 +57,7 @@ class GridIteration:
     grid : GridSystem
         The readings.
     inverse : float array (3 views, 3 views)
-        Pseudo-inverse of the misalignments' block, with what the angular readings add to it.
+        Pseudo-inverse of the misalignments' block, including the angular readings.
     """
 
     def __init__(self, grid: GridSystem, inverse: np.ndarray) -> None:
@@ -88,7 +88,7 @@ class GridIteration:
         return out
 
     def remove_rigid(self, field: np.ndarray) -> None:
-        """Take the rigid modes, which no reading tells and rounding would feed, off a field."""
+        """Remove the rigid modes, undetermined and fed by rounding, from a field."""
         rows, columns = field.sum(axis=1), field.sum(axis=0)
         mean = rows.sum() / field.size
         turn = (self._x @ rows - 1j * (self._y @ columns)) / (
@@ -120,8 +120,8 @@ class GridIteration:
     def _transform(self, field: np.ndarray, transform: Callable) -> np.ndarray:
         """Return the DCT-II of a field or its inverse, in single precision.
 
-        Lengths with large prime factors are slow in a fast transform; up to `DENSE_DCT` a matrix
-        product is faster for them.
+        A fast transform is slow for lengths with large prime factors; up to `DENSE_DCT` a matrix
+        product is faster.
         """
         if self._cosines is None or self._pool is None:
             return transform(field, type=2, norm="ortho", workers=-1)
@@ -143,9 +143,9 @@ class GridIteration:
         Parameters
         ----------
         b : complex array (nx, ny)
-            Right side of the sites.
+            Right-hand side of the sites.
         d : float array (3 views,)
-            Right side of the misalignments.
+            Right-hand side of the misalignments.
         start : complex array (nx, ny), optional
             Field to start from.
         tolerance : float
@@ -154,7 +154,7 @@ class GridIteration:
         Raises
         ------
         InputError
-            If the residual does not fall to `tolerance`: weights differ by many orders.
+            If the residual does not reach `tolerance`: weights differ by many orders of magnitude.
         """
         right = b - self.spread(self.inverse @ d)
         self.remove_rigid(right)
@@ -186,7 +186,7 @@ class GridIteration:
 
 
 def preconditioner_symbols(grid: GridSystem) -> tuple[np.ndarray, np.ndarray]:
-    """Return the diagonals that act on hat + T hat (turning fields) and on hat (all), (N, N).
+    """Return the diagonals for hat + T hat (turning fields) and for hat (all), (N, N).
 
     T is a quarter turn in the DCT basis; (hat + T hat) / 2 where kx + ky is odd is the part of a
     field that quarter turns map to itself.
@@ -214,10 +214,10 @@ def preconditioner_symbols(grid: GridSystem) -> tuple[np.ndarray, np.ndarray]:
 
 
 def missing_mark_correction(grid: GridSystem) -> np.ndarray:
-    """Return what the inverse of the matrix has on its diagonal beyond that of a full plate.
+    """Return the excess of the inverse's diagonal over that of a full plate.
 
-    A site that has lost readings is looser than the transform, which knows full plates alone,
-    takes it for; this keeps the number of steps from growing with the marks that are missing.
+    The transform assumes full plates; sites that lack readings are less constrained. This
+    correction keeps the number of steps from growing with the number of missing marks.
     """
     views = grid.views
     full = GridSystem(views.poses, views.in_field * grid.mean_weight, views.unit)

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The part of a map's covariance that terms of the model make, as a RESULT.json keeps it.
+"""Contribution of the model's terms to a map's covariance, as stored in RESULT.json.
 
 With L (r, 2, nx, ny), cov(G) = sigma^2 (S + sum_r L_r L_r'), where S follows from the weights of
-what was read. So a saved map can be compared as exactly as the calibration behind it. Each factor
-belongs to a term with a size, being what the map would gain if that term were known, or to the
-free terms together.
+the readings, so a saved map can be compared as exactly as the calibration itself. Each factor
+belongs to a term with a size, and is the variance that the map would lose if that term were known,
+or to the free terms together.
 """
 
 from typing import Any
@@ -18,28 +18,28 @@ from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.result import CalibrationResult
 
 KEY = "covariance_terms"
-"""Where a result keeps the factors."""
+"""Key of the factors in a result."""
 
 MAX_SITES = 31 * 31
-"""Largest field whose covariance is formed as a whole."""
+"""Largest field for a full covariance matrix."""
 
 NEGLIGIBLE = 1e-3
 """Length of a factor, in units of the noise, that changes no uncertainty by a thousandth."""
 
 ROUNDING = 1e-12
-"""Relative size of a variance that is none."""
+"""Relative size below which a variance is zero."""
 
 FREE = ""
-"""Name under which the factors of all free terms are kept."""
+"""Name of the factors of all free terms."""
 
 ANGULAR_KEY = "angular_terms"
-"""Where a result keeps the standard uncertainty of the angular map that each term makes, rad."""
+"""Key of each term's contribution to the standard uncertainty of the angular map, rad."""
 
 DIGITS = 7
-"""Digits of a factor that are kept."""
+"""Digits of a factor stored."""
 
 LEAST = 1e-12
-"""Entry of a factor below which nothing is kept, in units of the noise."""
+"""Entries of a factor below this are dropped, in units of the noise."""
 
 
 def saved_terms(cover: FieldCovariance, columns: TermColumns, sense: Sense) -> dict[str, Any]:
@@ -52,7 +52,7 @@ def saved_terms(cover: FieldCovariance, columns: TermColumns, sense: Sense) -> d
     columns : TermColumns
         The terms.
     sense : Sense
-        Who moved: the factors are in the stage frame.
+        What moved: the factors are in the stage frame.
     """
     shape = cover.system.grid.views.shape
     if cover.system.grid.n_sites > MAX_SITES:
@@ -75,7 +75,7 @@ def saved_terms(cover: FieldCovariance, columns: TermColumns, sense: Sense) -> d
 def rounded(values: np.ndarray) -> np.ndarray:
     """Return values rounded to `DIGITS` digits, none smaller than `LEAST`.
 
-    As quotients by a power of ten that is exact, so that they print with no more digits.
+    As quotients of an exact power of ten, so that they print with no more digits.
     """
     size = np.abs(values)
     digits = DIGITS - 1 - np.floor(np.log10(np.maximum(size, LEAST)))
@@ -86,7 +86,7 @@ def rounded(values: np.ndarray) -> np.ndarray:
 def _roots(covariance: np.ndarray, columns: TermColumns) -> list[tuple[str, np.ndarray]]:
     """Return roots (p, k) of parts of a covariance: of each term with a size, of the free ones.
 
-    A part is what is known better of all coefficients if that term, and those before it, are
+    A part is the reduction of the covariance if that term, and those before it, are
     known: the parts add up to the covariance.
     """
     rest, out = covariance.copy(), []
@@ -110,7 +110,7 @@ def factors_of(result: CalibrationResult) -> np.ndarray:
     Raises
     ------
     InputError
-        If they are not those of the result's lattice.
+        If they do not match the result's lattice.
     """
     shape = (2, *result.artifact.shape)
     if KEY not in result.extra:
@@ -129,7 +129,7 @@ def factors_of(result: CalibrationResult) -> np.ndarray:
 
 def angular_terms(cover: FieldCovariance, columns: TermColumns, sigma_m: float,
                   known: np.ndarray) -> dict[str, Any]:
-    """Return what each term of the lines makes of the angular map, for `extra`: rad, (K,).
+    """Return the contribution of each term of the lines to the angular map, for `extra`: rad, (K,).
 
     Parameters
     ----------
@@ -138,7 +138,7 @@ def angular_terms(cover: FieldCovariance, columns: TermColumns, sigma_m: float,
     sigma_m : float
         Noise of one grid reading, m.
     known : bool array (K,)
-        Lines of the map, whose mean is its datum.
+        Lines of the map; their mean is the datum.
     """
     out = {}
     for name in dict.fromkeys(columns.columns[at].term for at in columns.lines.at):
@@ -151,7 +151,7 @@ def angular_terms(cover: FieldCovariance, columns: TermColumns, sigma_m: float,
 
 
 def variance_of_terms(result: CalibrationResult) -> dict[str, np.ndarray]:
-    """Return the variance of the map that each term with a size makes, (2, nx, ny), m^2."""
+    """Return the variance of the map from each term with a size, (2, nx, ny), m^2."""
     factors = factors_of(result)
     names = np.array(result.extra[KEY]["terms"] if len(factors) else [], dtype=str)
     return {str(name): (factors[names == name] ** 2).sum(axis=0) * result.noise.sigma_xy**2

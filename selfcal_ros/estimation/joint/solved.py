@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A solution before it is judged: the result, and what the judgement needs to know."""
+"""A solution before the verdict: the result, and the inputs of the verdict."""
 
 from dataclasses import dataclass
 
@@ -10,7 +10,7 @@ from selfcal_ros.model.result import CalibrationResult, Noise
 
 @dataclass(frozen=True, eq=False)
 class Solved:
-    """A solution that no test has judged yet.
+    """A solution before any test.
 
     Attributes
     ----------
@@ -21,10 +21,10 @@ class Solved:
     model : ModelFit, optional
         The joint fit; None for Hu's law.
     axes : tuple of float
-        Probability and size (rad) of the misclosure of the axis conditions; 1 and 0 where they
-        were not asked for.
+        Probability and size (rad) of the misclosure of the axis conditions; 1 and 0 if not
+        used.
     converged : bool
-        Whether the estimate converged with what is assumed of the measurement.
+        Whether the estimate converged with the assumed terms.
     """
 
     result: CalibrationResult

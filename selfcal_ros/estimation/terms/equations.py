@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The equations of the terms' coefficients: what is told of them, and with which covariance."""
+"""Equations of the terms' coefficients: what is determined, and the covariance."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -13,25 +13,25 @@ from selfcal_ros.estimation.terms.projection import ProjectedColumns
 from selfcal_ros.model.terms import TermName
 
 UNTOLD = 1e-9
-"""Relative size below which an eigenvalue of the scaled equations is a zero."""
+"""Relative size below which an eigenvalue of the scaled equations is zero."""
 
 LEAST_NOISE_M = 1e-12
-"""Noise against which sizes are weighed at least, m: less is rounding."""
+"""Smallest noise against which sizes are weighted, m: less is rounding."""
 
 OVER_NOISE = 100.0
-"""Power of the offsets over that of their noise from which they tell a microscope: what is not told
-by offsets that differ would be told by their own noise, which is in the readings as well."""
+"""Ratio of the variance of the offsets to that of their noise from which they determine a
+microscope: below, they would be dominated by their own noise, which is in the readings as well."""
 
 MOVES_THE_MAP = 1e-5
-"""Root mean square that an untold combination of columns must give the map, in units of its own,
-to count as an unseen mode: rounding gives 1e-9, the smallest true ones 1e-2."""
+"""Relative rms of the map above which an undetermined combination of columns is an unseen mode:
+rounding gives 1e-9, the smallest true ones 1e-2."""
 
 
 @dataclass(frozen=True, eq=False)
 class TermEquations:
     """Normal equations of the coefficients with map, plate and misalignments eliminated.
 
-    All is for unit noise of one grid reading; p coefficients.
+    For unit noise of one grid reading; p coefficients.
 
     Attributes
     ----------
@@ -40,11 +40,11 @@ class TermEquations:
     columns : TermColumns
         The terms.
     projected : ProjectedColumns
-        What the estimate makes of them.
+        Their effect on the estimate.
     noise_m : float
-        Noise of one grid reading, m: that of the offsets a microscope sees; 0 if not known.
+        Noise of one grid reading, m, which is that of the microscope's offsets; 0 if unknown.
     line_weight : float
-        Weight of a reading of a line with weight 1, rad^-2 m^2: that against a grid reading.
+        Weight of a line reading with weight 1 relative to a grid reading, rad^-2 m^2.
     """
 
     system: NormalEquations
@@ -60,14 +60,14 @@ class TermEquations:
 
     @cached_property
     def information(self) -> np.ndarray:
-        """What the readings tell, sizes apart, (p, p): c' W r + within."""
+        """Information from the readings, without sizes, (p, p): c' W r + within."""
         return self.projected.gram + self.columns.within.gram
 
     @cached_property
     def norm(self) -> np.ndarray:
-        """Root of the weighted square of every column before anything is taken off, (p,).
+        """Root of the weighted square of every column before elimination, (p,).
 
-        Against it is judged what is told: what is left may be nothing but rounding.
+        The reference for what is determined: the remainder may be mere rounding.
         """
         grid = self.columns.shapes.squares(self.system.grid.weight)
         lines = self.columns.lines
@@ -77,13 +77,13 @@ class TermEquations:
 
     @property
     def free(self) -> np.ndarray:
-        """Which coefficients the readings alone are to tell, bool (p,)."""
+        """Coefficients to be determined by the readings alone, bool (p,)."""
         return np.isinf(self.columns.size)
 
     def untold(self, rows: np.ndarray) -> np.ndarray:
-        """Return combinations of the coefficients `rows` that no reading tells, (p, k).
+        """Return undetermined combinations of the coefficients `rows`, (p, k).
 
-        Orthonormal in scaled coefficients (times `norm`); others count as known.
+        Orthonormal in scaled coefficients (times `norm`); others are taken as known.
         """
         scale = self.norm[rows]
         scaled = self.information[np.ix_(rows, rows)] / np.outer(scale, scale)
@@ -94,10 +94,10 @@ class TermEquations:
         return out
 
     def limit(self, rows: np.ndarray) -> float:
-        """Return the eigenvalue of the scaled equations of `rows` up to which nothing is told."""
+        """Return the eigenvalue of the scaled equations of `rows` that counts as zero."""
         seen = self._norm_of_microscope[rows]
         least = float(seen.min()) if len(seen) else np.inf
-        # each column holds the noise of one coordinate of every mean
+        # each column contains the noise of one coordinate of every mean
         return max(UNTOLD, OVER_NOISE * self._power / least**2)
 
     @cached_property
@@ -111,7 +111,7 @@ class TermEquations:
 
     @cached_property
     def maps(self) -> np.ndarray:
-        """Map of a unit of each coefficient in the datum, complex (sites, p); 0 where unknown."""
+        """Map for a unit of each coefficient in the datum, complex (sites, p); 0 where unknown."""
         known = self.system.known_sites.ravel()[:, None]
         fields = np.where(known, self.projected.fields, 0.0)
         basis = self.system.gauge.orthonormal
@@ -119,13 +119,13 @@ class TermEquations:
 
     @cached_property
     def turned(self) -> np.ndarray:
-        """Angular map of a unit of each coefficient in the datum, sign reversed, (K, p)."""
+        """Angular map for a unit of each coefficient in the datum, sign reversed, (K, p)."""
         known = self.system.known_lines
         turned = self.projected.turned
         return turned - turned[known].mean(axis=0) if known.any() else turned
 
     def unseen(self, rows: np.ndarray) -> np.ndarray:
-        """Return untold combinations of `rows` that move the map, scaled, (p, modes)."""
+        """Return undetermined combinations of `rows` that change the map, scaled, (p, modes)."""
         untold = self.untold(rows)
         if not untold.shape[1]:
             return untold
@@ -144,9 +144,9 @@ class TermEquations:
         return self.columns.rows(names)
 
     def prior(self, sigma_m: float) -> np.ndarray:
-        """Return the information that each size gives, for unit noise, (p,); 0 of free ones.
+        """Return the information from each size, for unit noise, (p,); 0 of free ones.
 
-        Noise below `LEAST_NOISE_M` counts as that: what views have in common, no reading tells
+        Noise is at least `LEAST_NOISE_M`: the part common to all views cannot be separated
         from the plate, and without the sizes the equations are singular.
         """
         sized = ~self.free
@@ -156,20 +156,20 @@ class TermEquations:
     def inverse(self, sigma_m: float) -> np.ndarray:
         """Return the covariance of the coefficients for unit noise, (p, p).
 
-        Untold combinations of free coefficients, which do not move the map, have none.
+        It is 0 for undetermined combinations of free coefficients, which do not change the map.
 
         Parameters
         ----------
         sigma_m : float
-            Noise of one grid reading, m, against which sizes are weighed.
+            Noise of one grid reading, m, against which sizes are weighted.
         """
         # a sized coefficient in units of its size, a free one in those of its column
         scale = np.where(self.free, 1 / self.norm, self.columns.size)
         matrix = self.information * np.outer(scale, scale)
         matrix[np.diag_indices(len(scale))] += self.prior(sigma_m) * scale**2
         hold = self.untold(self.free)
-        # sized coefficients may be told far better than free ones, in these units; the diagonal of
-        # a free one that nothing tells is rounding
+        # sized coefficients may be determined far better than free ones in these units; the
+        # diagonal of an undetermined free one is rounding
         diagonal = np.maximum(np.diag(matrix), np.finfo(float).tiny)
         own = np.sqrt(np.where(self.free & (diagonal <= UNTOLD), 1.0, diagonal))
         null = np.linalg.qr(own[:, None] * hold)[0]
@@ -180,5 +180,5 @@ class TermEquations:
         return told @ found @ told * np.outer(scale, scale)
 
     def rank(self) -> int:
-        """Return how many combinations of all coefficients the readings tell."""
+        """Return the number of combinations of all coefficients determined by the readings."""
         return self.n - self.untold(np.ones(self.n, dtype=bool)).shape[1]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether the readings tell the free terms from the stage, and what to do if they do not."""
+"""Whether the readings separate the free terms from the stage, and the remedy if not."""
 
 from dataclasses import replace
 
@@ -18,13 +18,13 @@ CURES = {
     TermName.LINE_ECCENTRICITY: "centre the circle of lines better",
     TermName.APPROACH: "visit the marks from both sides, e.g. visit_order: x_back_y_back",
 }
-"""What makes a term visible, for a person."""
+"""Remedies that make a term separable, in words."""
 
 
 def unseen_by_term(equations: TermEquations) -> dict[TermName, int]:
-    """Return for each free term that alone cannot be told from the stage how many modes it hides.
+    """Return, for each free term that is not separable from the stage, the modes that it hides.
 
-    Terms that only together cannot be told are all named, with what they hide together.
+    Terms that are not separable only in combination are all named, with the modes hidden together.
     """
     free = {column.term for column in equations.columns.columns if column.size == float("inf")}
     out = {}
@@ -47,7 +47,7 @@ def require_terms_told(equations: TermEquations, seen: Observability) -> None:
     equations : TermEquations
         The terms.
     seen : Observability
-        What the readings tell without terms.
+        Observability without terms.
     """
     modes = equations.unseen(equations.free).shape[1]
     if not modes:

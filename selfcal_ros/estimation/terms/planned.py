@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the terms of a plan stand on before anything is measured: visits as they are planned.
+"""Inputs of a plan's terms before measurement: the planned visits.
 
-Visits follow each other in equal steps of time, each from where the one before it was. How far the
-microscope sees a mark off its centre is not known yet: misalignments and stop errors are drawn,
-always the same for the same plan.
+Visits are equally spaced in time, each approached from the previous one. The microscope's offsets
+are not known yet: misalignments and stop errors are drawn, always the same for the same plan.
 """
 
 import math
@@ -35,25 +34,25 @@ from selfcal_ros.model.view import View
 from selfcal_ros.model.visit_order import VisitSequence, approach_signs, visit_sequence
 
 MISALIGNMENT_RAD = math.radians(0.3)
-"""Standard deviation of the turn by which a person lays the plate down."""
+"""Standard deviation of the rotation of a plate placed by hand."""
 
 MISALIGNMENT_M = 30e-6
-"""Standard deviation of its place along each axis."""
+"""Standard deviation of its position along each axis."""
 
 SEED = 1
-"""Of the misalignments, stop errors and random visiting orders that a plan assumes."""
+"""Seed of the misalignments, stop errors and random visiting orders assumed for a plan."""
 
 
 @dataclass(frozen=True)
 class Assumed:
-    """What a plan assumes of the measurement that is to come.
+    """Assumptions of a plan on the future measurement.
 
     Attributes
     ----------
     sigma_m : float
         Noise of one grid reading, m.
     stop_error_m : float
-        Standard deviation of where the stage stops about a mark, each axis, m.
+        Standard deviation of the stop error of the stage at a mark, per axis, m.
     drift_degree : int
         Degree of a drift's polynomial.
     order : str
@@ -68,7 +67,7 @@ class Assumed:
 
 def planned_ground(artifact: Artifact, views: Sequence[View], system: NormalEquations,
                    assumed: Assumed) -> Ground:
-    """Return the ground of views as they are planned.
+    """Return the inputs for the planned views.
 
     Parameters
     ----------
@@ -98,8 +97,8 @@ def _visits(artifact: Artifact, view: View, assumed: Assumed,
     stops = assumed.stop_error_m * (rng.normal(size=n) + 1j * rng.normal(size=n))
     (hx, hy), phase = artifact.half, PHASES[-view.lattice_pose(artifact).q % 4]
     mark = (found.m + hx) * artifact.shape[1] + found.n + hy
-    # which way the stage carries the plate changes nothing: its motion and its part of a reading
-    # both change their sign
+    # the sense of measurement does not matter: the stage's motion and its part of a reading
+    # both change sign
     return ViewVisits(mark, found.count.astype(float), np.zeros(n, dtype=complex),
                       _view_time(found), 1j * turn * sites + complex(x, y) - stops - aside,
                       approach_signs((sites + aside).real).astype(float),
@@ -115,9 +114,9 @@ def _view_time(found: VisitSequence) -> np.ndarray:
 
 def planned_equations(system: NormalEquations, ground: Ground, terms: Iterable[ModelTerm],
                       assumed: Assumed) -> TermEquations:
-    """Return the equations of terms beside the grid readings of a plan.
+    """Return the equations of terms with the grid readings of a plan.
 
-    Rotations are those that the grid tells, as in `predict`: lines add little to them.
+    Rotations are those from the grid, as in `predict`: lines add little to them.
     """
     columns = term_columns(ground, terms, assumed.drift_degree)
     reduced = reduce_columns(system.grid, columns.shapes)
@@ -130,12 +129,12 @@ def planned_equations(system: NormalEquations, ground: Ground, terms: Iterable[M
 
 
 def with_terms(every: TermEquations, terms: Iterable[ModelTerm]) -> TermEquations:
-    """Return the equations of some of the terms that `every` holds with sizes of their own.
+    """Return the equations of some of the terms of `every`, with their own sizes.
 
     Parameters
     ----------
     every : TermEquations
-        Sized terms: a plate's columns are there for all views.
+        Sized terms: columns of the plate exist for all views.
     terms : iterable of ModelTerm
         Free ones have no columns of the plate in the first view, as in `term_columns`.
     """
@@ -154,7 +153,7 @@ def with_terms(every: TermEquations, terms: Iterable[ModelTerm]) -> TermEquation
 
 
 def rows_of(columns: TermColumns, terms: Iterable[ModelTerm]) -> np.ndarray:
-    """Return which columns the terms have, bool (p,)."""
+    """Return the columns of the terms, bool (p,)."""
     free: dict[str, bool] = {term.name: term.free for term in terms}
     return np.array([column.term in free and not (free[column.term] and _first(column))
                      for column in columns.columns], dtype=bool)

@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Columns through the estimate of map, plate and misalignments: what they do to it, and leave.
+"""Columns projected by the estimate of map, plate and misalignments: effects and residuals.
 
 The estimate without terms is linear: y -> (G, misalignments) with residuals (1 - P) y. A term's
-column c has the map F = G(c) and the residuals r = (1 - P) c. With these the terms join by
+column c has the map F = G(c) and the residuals r = (1 - P) c. The terms then follow by
 partitioned regression (Frisch and Waugh):
     (r'W c + within + sigma^2/size^2) b = c'W e + within,
     G = G(y) - F b,     cov G = S + F cov(b) F'
 With the marks, then the sites (matrix M, right-hand side s), then the misalignments (right-hand
 side d, covariance C) eliminated, r'W c = c'W c - mean' W mean - s' M^-1 s - d' C d. Up to the last
-all is linear over the complex numbers and done for the shapes of the columns.
+step everything is linear over the complex numbers and done for the shapes of the columns.
 """
 
 from collections.abc import Callable
@@ -25,7 +25,7 @@ from selfcal_ros.estimation.terms.shapes import LineColumns, Shapes
 
 @dataclass(frozen=True, eq=False)
 class ReducedColumns:
-    """Columns with the sites eliminated: what does not depend on the angular readings.
+    """Columns with the sites eliminated, independent of the angular readings.
 
     Attributes
     ----------
@@ -36,9 +36,9 @@ class ReducedColumns:
     sites : complex array (sites, q)
         Right-hand side s of every shape.
     inner : complex array (q, q)
-        Weighted inner products of what marks and sites leave of the shapes.
+        Weighted inner products of the shapes' residuals after marks and sites.
     asked : complex array (2 views, q)
-        What the shapes ask of rotation and offset of every view, sites eliminated.
+        Coupling of the shapes to rotation and offset of every view, sites eliminated.
     """
 
     grid: GridSystem
@@ -59,7 +59,7 @@ class ReducedColumns:
 
     @cached_property
     def gram(self) -> np.ndarray:
-        """Weighted inner products of what marks and sites leave of the columns, (p, p)."""
+        """Weighted inner products of the columns' residuals after marks and sites, (p, p)."""
         return self.shapes.products(self.inner)
 
 
@@ -73,7 +73,7 @@ def reduce_columns(grid: GridSystem, shapes: Shapes) -> ReducedColumns:
 
 def reduce_anew(grid: GridSystem, shapes: Shapes, before: ReducedColumns,
                 rows: np.ndarray) -> ReducedColumns:
-    """Return columns with the sites eliminated, of which only `rows` have changed.
+    """Return columns with the sites eliminated, if only `rows` have changed.
 
     Parameters
     ----------
@@ -82,9 +82,9 @@ def reduce_anew(grid: GridSystem, shapes: Shapes, before: ReducedColumns,
     shapes : Shapes
         The columns.
     before : ReducedColumns
-        Of the columns before.
+        The previous columns.
     rows : bool array (p,)
-        Which ones are to be set up anew, with all others of the same shapes.
+        Columns to recompute, with all others of the same shapes.
     """
     changed = np.unique(shapes.of_column[rows])
     sites, fresh, asked = _marks_eliminated(grid, shapes)
@@ -98,7 +98,7 @@ def reduce_anew(grid: GridSystem, shapes: Shapes, before: ReducedColumns,
 
 def _marks_eliminated(grid: GridSystem, shapes: Shapes
                       ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return s (sites, q), inner products (q, q) and what is asked of views (2 views, q)."""
+    """Return s (sites, q), inner products (q, q) and the coupling to the views (2 views, q)."""
     n, marks = grid.n_views, grid.n_sites
     weight, part = (array.reshape(n, marks) for array in (grid.weight, grid.relative_weight))
     to_views = grid.shapes.reshape(2, marks).conj()
@@ -114,7 +114,7 @@ def _marks_eliminated(grid: GridSystem, shapes: Shapes
         here = np.zeros((len(rows), *shapes.lattice), dtype=complex)
         grid.views.add_scattered(here, v, weighted.reshape(here.shape))
         sites[rows] += here
-    # less the mean of each mark, which all views share
+    # minus the mean of each mark, which all views share
     inner -= (means * weight.sum(axis=0)).conj() @ means.T
     asked -= (to_views * weight[:, None]) @ means.T
     for v in range(n):
@@ -124,19 +124,19 @@ def _marks_eliminated(grid: GridSystem, shapes: Shapes
 
 
 def _coupled(grid: GridSystem, sites: np.ndarray) -> np.ndarray:
-    """Return what M^-1 s asks of rotation and offset of every view, complex (2 views, k)."""
+    """Return the coupling of M^-1 s to rotation and offset of every view, complex (2 views, k)."""
     answers = grid.response.reshape(grid.n_sites, grid.n_views, 3)[:, :, :2]
     return answers.reshape(grid.n_sites, -1).conj().T @ sites
 
 
 @dataclass(frozen=True, eq=False)
 class ProjectedColumns:
-    """What the estimate makes of each column, in no particular datum.
+    """Effect of each column on the estimate, in no particular datum.
 
     Attributes
     ----------
     make_fields : callable
-        Returns `fields`: few ask for them.
+        Returns `fields`, which are rarely needed.
     parameters : float array (size, p)
         Misalignments, as in `NormalEquations`.
     gram : float array (p, p)
@@ -158,18 +158,18 @@ class ProjectedColumns:
 
 @dataclass(frozen=True, eq=False)
 class ReducedLines:
-    """Columns of lines with the lines of stage and plate eliminated, in the units of the grid.
+    """Columns of lines with the lines of stage and plate eliminated, in grid units.
 
     Attributes
     ----------
     at : int array (q,)
-        Which columns they are.
+        Indices of the columns.
     free : float array (K, q)
-        What the stage's lines alone make of them, rad.
+        Their effect on the stage's lines alone, rad.
     right : float array (views, q)
         Right-hand side of the misalignments.
     gram : float array (q, q)
-        Weighted inner products of what is left.
+        Weighted inner products of the residuals.
     half_width_m : float
         Unit of the misalignments, m.
     """
@@ -183,7 +183,7 @@ class ReducedLines:
 
 def reduce_lines(angular: AngularSystem, lines: LineColumns, ratio: float,
                  half_width_m: float) -> ReducedLines:
-    """Return columns of lines, of which one reading weighs `ratio` times `half_width_m` squared."""
+    """Return columns of lines; a reading has the weight `ratio` times `half_width_m` squared."""
     if not len(lines.at):
         return ReducedLines(lines.at, np.zeros((angular.n_lines, 0)),
                             np.zeros((angular.n_views, 0)), np.zeros((0, 0)), half_width_m)
@@ -199,14 +199,14 @@ def reduce_lines(angular: AngularSystem, lines: LineColumns, ratio: float,
 
 def project(system: NormalEquations, reduced: ReducedColumns, inverse: np.ndarray,
             lines: ReducedLines) -> ProjectedColumns:
-    """Return what the joint estimate makes of the columns.
+    """Return the effect of the columns on the joint estimate.
 
     Parameters
     ----------
     system : NormalEquations
         The measured plan.
     reduced : ReducedColumns
-        The columns with their sites eliminated.
+        The columns with the sites eliminated.
     inverse : float array (size, size)
         Covariance of the misalignments for unit noise of one grid reading.
     lines : ReducedLines

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What columns are at the marks, kept as the complex shapes of which they are 1 or i times one.
+"""Columns at the marks, stored as complex shapes; a column is 1 or i times a shape.
 
-Most terms come in pairs, the same along x and along y, and most live in one view: a drift of
-degree 3 in five views has 30 columns of 5 x 441 numbers each, and 15 shapes of 441. All that the
-equations need is linear over the complex numbers until misalignments join, so it is worked out for
-the shapes; what is asked of the columns is read off:
+Most terms come in pairs, the same along x and along y, and most belong to one view: a drift of
+degree 3 in five views has 30 columns of 5 x 441 numbers each, and 15 shapes of 441. Up to the
+misalignments the equations are linear over the complex numbers and computed for the shapes; the
+products of the columns follow:
 
     Re(conj(u c) v d) = Re(conj(u) v <c, d>),     u, v in {1, i}
 """
@@ -27,13 +27,13 @@ class Shapes:
     lattice : tuple of int
         Marks along x and y.
     rows : tuple of int array
-        Which shapes each view has, (k,); all others are 0 in it.
+        Indices of the shapes of each view, (k,); all others are 0 in it.
     values : tuple of complex array
-        Those shapes, (k, marks), plate frame; 0 where not read.
+        Their values, (k, marks), plate frame; 0 where not read.
     of_column : int array (p,)
         The shape of each column.
     unit : complex array (p,)
-        1 or i: the column is that times its shape.
+        1 or i, the factor of the shape.
     """
 
     n: int
@@ -45,7 +45,7 @@ class Shapes:
 
     @cached_property
     def grid(self) -> np.ndarray:
-        """The columns in full, complex (p, views, nx, ny)."""
+        """The expanded columns, complex (p, views, nx, ny)."""
         out = np.zeros((len(self.unit), len(self.rows), *self.lattice), dtype=complex)
         for view, (rows, values) in enumerate(zip(self.rows, self.values, strict=True)):
             at = np.full(self.n, -1)
@@ -56,7 +56,7 @@ class Shapes:
         return out
 
     def of_columns(self, each: np.ndarray) -> np.ndarray:
-        """Return what is linear in the shapes, complex (..., q), for the columns, (..., p)."""
+        """Return values linear in the shapes, complex (..., q), for the columns, (..., p)."""
         return each[..., self.of_column] * self.unit
 
     def products(self, inner: np.ndarray) -> np.ndarray:
@@ -85,7 +85,7 @@ class Shapes:
     def combined(self, coefficients: np.ndarray, only: np.ndarray | None = None) -> np.ndarray:
         """Return the sum of coefficients (p,) times columns, complex (views, nx, ny).
 
-        `only`, bool (p,), says which columns count.
+        `only`, bool (p,), selects columns.
         """
         here = slice(None) if only is None else only
         each: np.ndarray = np.zeros(self.n, dtype=complex)
@@ -111,7 +111,7 @@ class Shapes:
 
     def replaced(self, shapes: Sequence[int], means: Sequence[Mapping[int, np.ndarray]]
                  ) -> "Shapes":
-        """Return the columns with other values of some shapes, in the views that they have."""
+        """Return the columns with new values of some shapes, in their views."""
         values = list(self.values)
         for view, rows in enumerate(self.rows):
             at = [(np.flatnonzero(rows == shape), mean[view])
@@ -125,7 +125,7 @@ class Shapes:
 
 @dataclass(frozen=True, eq=False)
 class LineColumns:
-    """Columns that are in the readings of lines: which ones, int (q,), and values (q, views, K)."""
+    """Columns of the readings of lines: indices, int (q,), and values (q, views, K)."""
 
     at: np.ndarray
     values: np.ndarray
@@ -140,7 +140,7 @@ NO_LINES = LineColumns(np.zeros(0, dtype=int), np.zeros((0, 0, 0)))
 
 def shapes_of(means: Sequence[Mapping[int, np.ndarray]], of_column: Sequence[int],
               unit: Sequence[complex], weight: np.ndarray) -> Shapes:
-    """Return shapes given by their values in the views that they have.
+    """Return shapes given by their values in their views.
 
     Parameters
     ----------
@@ -149,7 +149,7 @@ def shapes_of(means: Sequence[Mapping[int, np.ndarray]], of_column: Sequence[int
     of_column, unit : sequences (p,)
         Shape of each column, and 1 or i.
     weight : float array (views, nx, ny)
-        Of the readings; its shape is that of the lattice.
+        Weights of the readings, in the shape of the lattice.
     """
     rows, values = [], []
     for view in range(len(weight)):
@@ -162,7 +162,7 @@ def shapes_of(means: Sequence[Mapping[int, np.ndarray]], of_column: Sequence[int
 
 
 def shapes_in_full(columns: np.ndarray) -> Shapes:
-    """Return columns that are given in all views, complex (p, views, nx, ny)."""
+    """Return columns given in all views, complex (p, views, nx, ny)."""
     p, views = columns.shape[:2]
     every = np.arange(p)
     return Shapes(p, columns.shape[2:], (every,) * views,

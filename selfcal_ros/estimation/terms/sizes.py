@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether the readings agree with the sizes of terms that were given as known beforehand.
+"""Whether the readings agree with the given sizes of terms.
 
-The coefficients of a term, as they would be without their size, have b ~ N(0, C + size^2 1), with
-C their covariance (method eq. 7.9). Where that is contradicted, the readings show a size of their
-own: that at which b' (C + size^2 1)^-1 b is as large as its rank (Paule and Mandel 1982), and at
-most that at which it is as small as chance would rarely make it.
+The coefficients of a term, estimated without their size, have b ~ N(0, C + size^2 1), with
+C their covariance (method eq. 7.9). If this is contradicted, the readings give another size:
+that at which b' (C + size^2 1)^-1 b equals its rank (Paule and Mandel 1982), and at most that at
+which it is improbably small.
 """
 
 from collections.abc import Sequence
@@ -21,31 +21,31 @@ SIZE_LEVEL = 5e-4
 """Level of the test of each size."""
 
 BISECTIONS = 60
-"""Steps, on a logarithmic scale, in which a size is found to rounding."""
+"""Steps, on a logarithmic scale, to find a size to rounding."""
 
 TAIL = (1 - 0.9545) / 2
-"""Probability with which a statistic as small contradicts a size as too large."""
+"""Probability of a small statistic below which a size is too large."""
 
 
 @dataclass(frozen=True)
 class SizeTest:
-    """The size of a term against what the readings tell of its coefficients.
+    """The size of a term compared with the readings.
 
     Attributes
     ----------
     name : TermName
         The term.
     given : float
-        Its size, SI unit of the term; the largest of those of a microscope.
+        Its size, SI unit of the term; the largest one of a microscope.
     shown, allowed : float
-        The size that the readings show, and the largest that they allow (of two limits with a
-        coverage of 95.45 %); that given where they do not contradict it.
+        The size shown by the readings, and the largest that they allow (the upper one of two limits
+        with a coverage of 95.45 %); the given size if they do not contradict it.
     statistic : float
         b' (C + size^2 1)^-1 b; `rank` on average.
     rank : int
-        Combinations of the coefficients that the readings tell.
+        Number of combinations of the coefficients determined by the readings.
     p : float
-        Probability of as much or more if the size is right.
+        Probability of as large a value if the size is right.
     """
 
     name: TermName
@@ -58,20 +58,20 @@ class SizeTest:
 
     @property
     def contradicted(self) -> bool:
-        """Whether the readings rule the size out as too small."""
+        """Whether the readings rule out the size as too small."""
         return self.p < SIZE_LEVEL
 
 
 def size_test(equations: TermEquations, right: np.ndarray, term: ModelTerm,
               noise: tuple[float, float]) -> SizeTest:
-    """Return the test of one size, the other terms held by theirs or free.
+    """Return the test of one size, the other terms with their sizes or free.
 
     Parameters
     ----------
     equations : TermEquations
         The columns of all terms.
     right : float array (p,)
-        Inner products c' W y of all columns with the readings, no coefficient taken off.
+        Inner products c' W y of all columns with the readings, without coefficients subtracted.
     term : ModelTerm
         With a size.
     noise : tuple of float
@@ -107,10 +107,10 @@ def size_test(equations: TermEquations, right: np.ndarray, term: ModelTerm,
 
 def _told(equations: TermEquations, right: np.ndarray, rows: np.ndarray, sigma_m: float
           ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return what the readings tell of coefficients that count as free.
+    """Return the estimates of coefficients taken as free.
 
-    Their told combinations, scaled by the columns' norms, (r,), the variances of these by the
-    noise, (r,), and their covariance where the largest size is 1, (r, r).
+    The determined combinations, scaled by the columns' norms, (r,), their variances from the
+    noise, (r,), and their covariance for a largest size of 1, (r, r).
     """
     rest = ~rows
     prior = np.where(rest, np.sqrt(equations.prior(sigma_m)), 0.0)
@@ -132,9 +132,9 @@ def _told(equations: TermEquations, right: np.ndarray, rows: np.ndarray, sigma_m
 
 def size_tests(equations: TermEquations, right: np.ndarray, terms: Sequence[ModelTerm],
                noise: tuple[float, float]) -> tuple[SizeTest, ...]:
-    """Return the tests of all sizes, those that the readings contradict first, the worst first.
+    """Return the tests of all sizes, contradicted ones first, the worst first.
 
-    Each is judged beside those before it with the sizes that the readings allow, so that one term
+    Each is tested with the preceding terms at the sizes that the readings allow, so that one term
     does not make others appear too small.
 
     Parameters

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Coefficients of the terms from the residuals of an estimate, and the noise that is left."""
+"""Coefficients of the terms from the residuals of an estimate, and the remaining noise."""
 
 from dataclasses import dataclass
 
@@ -10,7 +10,7 @@ from selfcal_ros.estimation.terms.equations import TermEquations
 
 @dataclass(frozen=True, eq=False)
 class Sums:
-    """Weighted sums of squares of what is left, m^2, with their degrees of freedom.
+    """Weighted sums of squared residuals, m^2, with their degrees of freedom.
 
     `between`: residuals of the marks' means; `within`: visits about the mean of their mark.
     """
@@ -33,7 +33,7 @@ class Sums:
 
 @dataclass(frozen=True, eq=False)
 class Score:
-    """What columns can explain of the residuals of an estimate that does not hold them.
+    """Part of the residuals of an estimate that missing columns can explain.
 
     Attributes
     ----------
@@ -55,20 +55,20 @@ class Score:
 
 def score(equations: TermEquations, residuals: tuple[np.ndarray, np.ndarray],
           squares: tuple[float, float], *, coefficients: np.ndarray | None = None) -> Score:
-    """Return the right-hand side of the coefficients that are still to come.
+    """Return the right-hand side of the remaining coefficients.
 
     Parameters
     ----------
     equations : TermEquations
         The columns.
     residuals : tuple of array
-        Residuals of the estimate from deviations less `coefficients` columns: of the marks, plate
+        Residuals of the estimate from deviations minus `coefficients` columns: of the marks, plate
         frame, m, complex (views, nx, ny), and of the lines, rad, (views, K).
     squares : tuple of float
         Weighted squares of all residuals, angular ones included, m^2, and their degrees of
         freedom without terms.
     coefficients : float array (p,), optional
-        What has been taken off already.
+        Coefficients already subtracted.
     """
     columns, weight = equations.columns, equations.system.grid.weight
     shapes = columns.shapes
@@ -83,9 +83,9 @@ def score(equations: TermEquations, residuals: tuple[np.ndarray, np.ndarray],
 
 
 def residual_sums(equations: TermEquations, found: Score) -> Sums:
-    """Return what all the columns leave, were their coefficients free.
+    """Return the residuals of all columns with free coefficients.
 
-    The noise is taken from this fit: a size that is too small would leave part of its term in.
+    The noise comes from this fit: a size that is too small would leave part of its term.
     """
     inverse = free_inverse(equations)
     more = inverse @ found.total
@@ -97,7 +97,7 @@ def residual_sums(equations: TermEquations, found: Score) -> Sums:
 
 
 def free_inverse(equations: TermEquations) -> np.ndarray:
-    """Return the pseudo-inverse of the information: covariance were all coefficients free."""
+    """Return the pseudo-inverse of the information: covariance of free coefficients."""
     everything = np.ones(equations.n, dtype=bool)
     untold = equations.untold(everything)
     scaled = equations.information / np.outer(equations.norm, equations.norm)
@@ -107,16 +107,16 @@ def free_inverse(equations: TermEquations) -> np.ndarray:
 
 def next_coefficients(equations: TermEquations, found: Score, coefficients: np.ndarray,
                       sigma_m: float) -> np.ndarray:
-    """Return the coefficients that the score asks for, (p,), sizes as prior knowledge.
+    """Return the coefficients from the score, (p,), with sizes as prior knowledge.
 
     Parameters
     ----------
     equations : TermEquations
         The columns.
     found : Score
-        At `coefficients`.
+        Score at `coefficients`.
     coefficients : float array (p,)
-        Where the estimate stands.
+        Present coefficients of the estimate.
     sigma_m : float
         Noise of one grid reading, m.
     """

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The visits of each grid view in the frame of the equations: when, with which offset, from where.
+"""Visits of each grid view in the frame of the equations: instant, offset, approach.
 
-A mean over the visits of a mark serves the map as well as the visits themselves. What the visits
-of one mark leave about their mean tells terms that differ between them, and the noise.
+For the map, the mean over the visits of a mark is as good as the visits themselves. The scatter of
+the visits of one mark about their mean determines terms that differ between them, and the noise.
 """
 
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ from selfcal_ros.estimation.lattice.readings import GridData
 from selfcal_ros.model.readings import GridVisits, Measurements, Sense, ViewReadings
 
 FARTHEST_M = 1e6
-"""Deviation or offset that no visit has."""
+"""Largest valid deviation or offset of a visit."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,9 +34,9 @@ class ViewVisits:
     time : float array
         Instant in the view's time, -1 at its first visit and +1 at its last.
     offset : complex array
-        Offset that the microscope saw, stage axes, m.
+        Offset measured by the microscope, stage axes, m.
     approach_x, approach_y : float array
-        Sign of the last motion of each stage axis; 0 = not known.
+        Sign of the last motion of each stage axis; 0 = unknown.
     phase : complex
         i^-q: from the stage frame to the plate frame.
     """
@@ -68,11 +68,11 @@ class ViewVisits:
 
     @cached_property
     def repeated(self) -> bool:
-        """Whether a mark was visited more than once; else its visit is its mean."""
+        """Whether a mark was visited more than once; if not, its visit is its mean."""
         return bool(len(self.mark)) and int(np.bincount(self.mark).max()) > 1
 
     def about_means(self, values: np.ndarray, n_marks: int) -> np.ndarray:
-        """Return complex values (k, V) less the mean of their mark."""
+        """Return complex values (k, V) minus the mean of their mark."""
         if not self.repeated:
             return np.zeros_like(values, dtype=complex)
         return values - self.means(values, n_marks)[:, self.mark]
@@ -84,7 +84,7 @@ def approach_sign(sense: Sense) -> int:
 
 
 def visits_of(measurements: Measurements, grid: GridData) -> tuple[ViewVisits | None, ...]:
-    """Return the visits of every grid view, in the order of `grid`; None where not known."""
+    """Return the visits of every grid view, in the order of `grid`; None if unknown."""
     return tuple(_visits_of(measurements.views[i], grid, row)
                  for row, i in enumerate(grid.index))
 
@@ -106,7 +106,7 @@ def _visits_of(view: ViewReadings, grid: GridData, row: int) -> ViewVisits | Non
 
 
 def check_visits(measurements: Measurements) -> None:
-    """Raise InputError for visits that cannot be: of no mark, or without a finite number."""
+    """Raise InputError for invalid visits: of no mark, or not finite."""
     for view in measurements.views:
         if view.visits is not None and len(view.visits.mark):
             _check(view.visits, view)
@@ -131,7 +131,7 @@ def _check(visits: GridVisits, view: ViewReadings) -> None:
 
 
 def _own_weights(visits: GridVisits, mark: np.ndarray, n_marks: int) -> np.ndarray:
-    """Return 1/u^2 where all visits of a mark declare it, else the repeats: as for its mean."""
+    """Return 1/u^2 if all visits of a mark declare u, else the repeats: as for its mean."""
     count = visits.count.astype(float)
     if not len(visits.u):
         return count
@@ -141,7 +141,7 @@ def _own_weights(visits: GridVisits, mark: np.ndarray, n_marks: int) -> np.ndarr
 
 
 def view_time(stamps_ns: np.ndarray) -> np.ndarray:
-    """Return instants in the view's time: -1 at the first, +1 at the last; 0 if there is one."""
+    """Return instants in the view's time: -1 at the first, +1 at the last; 0 if only one."""
     first, last = int(stamps_ns.min()), int(stamps_ns.max())
     if first == last:
         return np.zeros(len(stamps_ns))
@@ -149,11 +149,11 @@ def view_time(stamps_ns: np.ndarray) -> np.ndarray:
 
 
 def between_visits(measurements: Measurements, least_dof: int) -> tuple[float, int] | None:
-    """Return the noise of one reading as the visits of each mark show it, m, and its dof.
+    """Return the noise of one reading from the visits of each mark, m, and its dof.
 
-    Repeats of one visit share whatever is slow, visits do not: where both are there, the visits
-    tell the noise of a mean. None where no visit has repeats, or fewer than `least_dof` degrees of
-    freedom are between visits: then all repeats count alike.
+    Repeats of one visit share slow effects, visits do not: with both, the scatter between visits
+    is the noise of a mean. None if no visit has repeats, or with fewer than `least_dof` degrees of
+    freedom between visits: then all repeats count equally.
     """
     total, dof, repeated = 0.0, 0, False
     for view in measurements.views:
