@@ -9,10 +9,11 @@ from selfcal_ros.collection.settings.estimator import solver_options
 from selfcal_ros.collection.settings.nodes import CollectorSettings, SolverSettings
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.files import write_text
+from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.result import CalibrationResult, with_input
 from selfcal_ros.reporting.chapters import chapters
 from selfcal_ros.reporting.figures.drawing import Drawing
-from selfcal_ros.reporting.figures.places import views_drawing
+from selfcal_ros.reporting.figures.places import plan_figure
 from selfcal_ros.reporting.figures.svg import svg_file
 from selfcal_ros.reporting.summary.numbers import truth_arrays
 from selfcal_ros.reporting.words.findings import worded
@@ -24,22 +25,23 @@ FIGURES = ("error-map", "residual-maps")
 """Figures of the report of the demo's bag that the documents show."""
 
 
-def calibrated() -> CalibrationResult:
-    """Return the calibration of the demo's bag."""
+def calibrated() -> tuple[CalibrationResult, Measurements]:
+    """Return the calibration of the demo's bag, and the readings in it."""
     measurements, _, lost, _ = collect_bag(
         BAG, CollectorSettings.checked({}, "pictures"))
     options = solver_options(SolverSettings.checked({}, "pictures"), measurements)
     result = with_input(worded(calibrate(measurements, options)), bag_input(BAG), lost)
-    return result
+    return result, measurements
 
 
 def pictures() -> dict[str, str]:
     """Return name -> content of every picture."""
-    result = calibrated()
+    result, measurements = calibrated()
     found = {figure.drawing.name: figure.drawing for chapter in
              chapters(result, truth_arrays(result.error_map, read_truth(BAG)))
              for figure in chapter.figures}
-    drawings: list[Drawing] = [*(found[name] for name in FIGURES), views_drawing(result)]
+    drawings: list[Drawing] = [*(found[name] for name in FIGURES), plan_figure(
+        measurements.artifact, [view.view for view in measurements.views])]
     return {f"{drawing.name}.svg": svg_file(drawing) for drawing in drawings}
 
 

@@ -16,7 +16,7 @@ from selfcal_ros.reporting.figures.maps import (
     component_maps,
     error_map,
 )
-from selfcal_ros.reporting.figures.places import rejected_map
+from selfcal_ros.reporting.figures.places import plan_figure, rejected_map, views_in
 from selfcal_ros.reporting.figures.residuals import (
     courses,
     distributions,
@@ -73,8 +73,10 @@ def chapters(result: CalibrationResult, truth: Mapping[str, np.ndarray] | None,
         Chapter("Attention", sections=(sections.attention_section(result),), alert=True),
         _causes(result), _maps(result, truth), _uncertainty(result), *more,
         _residuals(result), _rejected(result),
-        Chapter("Measurement", sections=(sections.measurement_section(result),
-                                         sections.views_section(result))),
+        Chapter("Measurement", _figures(
+            (plan_figure(result.artifact, views_in(result)) if result.views else None,
+             "The plate as the plan lays it; the arrow leads the corner from where it is without a "
+             "turn.")), (sections.measurement_section(result), sections.views_section(result))),
         Chapter("Details", sections=tuple(extra_sections(result.extra))),
         Chapter("How to read the numbers", sections=(convention_section(result),
                                                      provenance_section(result)))]

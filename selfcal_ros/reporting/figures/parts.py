@@ -192,6 +192,13 @@ def _head(start: Point, end: Point, length: float, width: float) -> tuple[Point,
             (back[0] + uy * side, back[1] - ux * side))
 
 
+def curved_arrow(drawing: Drawing, way: Sequence[Point], *, colour: str) -> None:
+    """Draw a line through points with a head at its end."""
+    back = next((point for point in reversed(way) if math.dist(point, way[-1]) >= 9), way[0])
+    drawing.line(way, stroke=colour, width=1.4)
+    drawing.shapes([_head(back, way[-1], math.dist(back, way[-1]), 3.0)], fill=colour)
+
+
 def arrow_key(frame: Frame, factor: float, at: Point, unit_m: float = 1 / UM_PER_M,
               unit: str = "µm") -> None:
     """Draw an arrow of a round length at the pixel `at` and say how long it is."""

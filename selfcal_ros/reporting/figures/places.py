@@ -3,55 +3,93 @@
 
 import math
 from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
+from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.result import CalibrationResult, ViewResult
+from selfcal_ros.model.view import View
+from selfcal_ros.model.visit_order import check_marks
 from selfcal_ros.reporting.figures.drawing import SERIES, Drawing, Frame, Point
-from selfcal_ros.reporting.figures.parts import WIDTH, legend, panels, text_width, titled
+from selfcal_ros.reporting.figures.parts import (
+    MAX_ARROWS,
+    WIDTH,
+    curved_arrow,
+    legend,
+    panels,
+    text_width,
+    thinned,
+    titled,
+)
 from selfcal_ros.reporting.figures.residuals import places_mm
 from selfcal_ros.reporting.summary.format import printable
 from selfcal_ros.reporting.summary.sections import pose_text
-from selfcal_ros.units import MM_PER_M
+from selfcal_ros.units import MM_PER_M, UM_PER_M
 
 
-def views_drawing(result: CalibrationResult) -> Drawing:
-    """Return the plate in every view: its outline, its marks, and the corner that tells its turn.
+def plan_figure(artifact: Artifact, views: Sequence[View]) -> Drawing:
+    """Return the plate in every view: its marks, its corner and the sense of its turn, check stops.
 
     Marks beyond the field of the stage are hollow: no view reads them.
     """
-    artifact = result.artifact
     drawing = titled("views", "How the plate lies in every view")
     reach = [(half + 2.6) * artifact.grid_pitch_m * MM_PER_M for half in artifact.half]
-    titles = [f"{view.name}: {pose_text(view, artifact.grid_pitch_m)}" for view in result.views]
-    for frame, view in zip(panels(drawing, titles, reach), result.views, strict=True):
-        _plate(drawing, frame, view, result)
+    titles = [f"{view.name}: {pose_text(view.rotation_rad, view.translation_m, artifact)}"
+              for view in views]
+    for frame, view in zip(panels(drawing, titles, reach), views, strict=True):
+        _plate(frame, view, artifact)
         frame.border()
-    for line in ("shaded: field of the stage; dot in the corner: mark (h, h) of the plate",
-                 "small dots: only angular lines are read; hollow: beyond the field, not read"):
+    said = ["shaded: field; dot: corner (h, h) of the plate; arrow: its turn",
+            "small dots: only lines are read; hollow: off the field, not read"]
+    if aside := {view.check_offset_m for view in views if view.check_marks}:
+        said.append("crosses: check stops, seen again with the stage "
+                    f"{' or '.join(f'{each * UM_PER_M:.6g}' for each in sorted(aside))} µm off")
+    for line in said:
         drawing.height += 18
         drawing.label(46, drawing.height - 12, line, size=11.5, colour="soft")
     return drawing
 
 
-def _plate(drawing: Drawing, frame: Frame, view: ViewResult, result: CalibrationResult) -> None:
-    artifact = result.artifact
-    pitch, (hx, hy) = artifact.grid_pitch_m, artifact.half
-    field = [(half + 0.3) * pitch * MM_PER_M for half in (hx, hy)]
+def views_in(result: CalibrationResult) -> list[View]:
+    """Return the views of a result, as far as it knows them: grids are read after quarter turns."""
+    return [View(view.name, view.rotation, (view.translation_x, view.translation_y),
+                 abs(math.remainder(view.rotation, math.pi / 2)) < 1e-6)
+            for view in result.views]
+
+
+def _plate(frame: Frame, view: View, artifact: Artifact) -> None:
+    drawing, pitch = frame.drawing, artifact.grid_pitch_m
+    half = np.array(artifact.half)[:, None]
+    field = ((half[:, 0] + 0.3) * pitch * MM_PER_M).tolist()
     low, high = frame.at(-field[0], -field[1]), frame.at(*field)
     drawing.box(low[0], high[1], high[0] - low[0], low[1] - high[1], fill="e2")
-    corners = np.array([[1, 1, -1, -1, 1], [1, -1, -1, 1, 1]]) * (
-        np.array([[hx], [hy]]) + 0.6) * pitch
-    drawing.line(_at(frame, places_mm(view, *corners)), stroke="truth", width=1.6)
-    place = places_mm(view, artifact.x_m, artifact.y_m)
-    quarter = math.degrees(view.rotation) / 90
-    if abs(quarter - round(quarter)) > 1e-6:  # angular lines alone: no grid mark is read
-        drawing.discs(_at(frame, place.reshape(2, -1)), 1.0, fill="soft")
-    else:
+    corners = np.array([[1, 1, -1, -1, 1], [1, -1, -1, 1, 1]]) * (half + 0.6) * pitch
+    drawing.line(_at(frame, _places_mm(view, *corners)), stroke="truth", width=1.6)
+    sites = thinned(artifact, MAX_ARROWS)
+    place = _places_mm(view, artifact.x_m[sites], artifact.y_m[sites])
+    if view.grid:
         on = (np.abs(place[0]) < field[0]) & (np.abs(place[1]) < field[1])
         drawing.discs(_at(frame, place[:, on]), 1.4, fill="ink")
         drawing.discs(_at(frame, place[:, ~on]), 1.6, stroke="bad")
-    drawing.discs(_at(frame, place[:, -1:, -1]), 3.6, fill="truth")
+    else:
+        drawing.discs(_at(frame, place.reshape(2, -1)), 1.0, fill="soft")
+    if view.check_marks:
+        there = view.lattice_pose(artifact).marks_in_field(artifact)[1]
+        for x, y in _at(frame, there[:, check_marks(there, view.check_marks)] * pitch * MM_PER_M):
+            drawing.lines([[(x - 6, y), (x + 6, y)], [(x, y - 6), (x, y + 6)]], stroke="c0",
+                          width=1.6)
+    drawing.discs(_at(frame, _places_mm(view, *(half * pitch))), 3.6, fill="truth")
+    if view.rotation_rad:
+        inside = 0.72 * half * pitch
+        arc = np.hstack([_places_mm(replace(view, rotation_rad=float(angle)), *inside)
+                         for angle in np.linspace(0.0, view.rotation_rad, 61)])
+        curved_arrow(drawing, _at(frame, arc), colour="truth")
+
+
+def _places_mm(view: View, x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
+    return places_mm(view.rotation_rad, view.translation_m, x_m, y_m)
 
 
 def _at(frame: Frame, places: np.ndarray) -> list[Point]:
@@ -96,7 +134,7 @@ def _marked(result: CalibrationResult, view: ViewResult, mark: object) -> list[P
     if not isinstance(mark, list) or len(mark) != 2 or not all(map(_number, mark)):
         return []
     m, n = (np.array(part * result.artifact.grid_pitch_m) for part in mark)
-    x, y = places_mm(view, m, n)
+    x, y = places_mm(view.rotation, (view.translation_x, view.translation_y), m, n)
     return [(view.name, "outlier_among_views", float(x), float(y))]
 
 

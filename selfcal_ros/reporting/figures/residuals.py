@@ -54,14 +54,16 @@ class ViewResiduals:
 
     def places_mm(self, artifact: Artifact) -> np.ndarray:
         """Return where each mark lies on the stage nominally, mm, (2, nx, ny)."""
-        return places_mm(self.view, artifact.x_m, artifact.y_m)
+        at = self.view.translation_x, self.view.translation_y
+        return places_mm(self.view.rotation, at, artifact.x_m, artifact.y_m)
 
 
-def places_mm(view: ViewResult, x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
-    """Return where places of the plate lie on the stage nominally, mm, (2, ...)."""
-    c, s = math.cos(view.rotation), math.sin(view.rotation)
-    return np.stack([c * x_m - s * y_m + view.translation_x,
-                     s * x_m + c * y_m + view.translation_y]) * MM_PER_M
+def places_mm(rotation_rad: float, translation_m: tuple[float, float], x_m: np.ndarray,
+              y_m: np.ndarray) -> np.ndarray:
+    """Return where places of a plate so laid are on the stage nominally, mm, (2, ...)."""
+    c, s = math.cos(rotation_rad), math.sin(rotation_rad)
+    return np.stack([c * x_m - s * y_m + translation_m[0],
+                     s * x_m + c * y_m + translation_m[1]]) * MM_PER_M
 
 
 def residuals_in(result: CalibrationResult) -> list[ViewResiduals]:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ErrorMap
 from selfcal_ros.model.result import CalibrationResult, Noise, ViewResult
 from selfcal_ros.model.verdict import Grade
@@ -131,8 +132,10 @@ def views_done(result: CalibrationResult) -> int:
 
 def views_section(result: CalibrationResult) -> Section:
     """Return the table of views: nominal pose, misalignment, detections."""
-    pitch, views = result.artifact.grid_pitch_m, result.views
-    columns = [[printable(v.name) for v in views], [pose_text(v, pitch) for v in views],
+    artifact, views = result.artifact, result.views
+    columns = [[printable(v.name) for v in views],
+               [pose_text(v.rotation, (v.translation_x, v.translation_y), artifact)
+                for v in views],
                fixed_column([v.phi / RAD_PER_MRAD for v in views]),
                fixed_column([v.tx * UM_PER_M for v in views]),
                fixed_column([v.ty * UM_PER_M for v in views]),
@@ -142,11 +145,11 @@ def views_section(result: CalibrationResult) -> Section:
                    table=(header, *zip(*columns, strict=True)) if views else ())
 
 
-def pose_text(view: ViewResult, pitch_m: float) -> str:
-    """Return the nominal pose as ``90° (+1, 0)``: turn and translation in pitches."""
-    steps = [f"{value / pitch_m:+.6g}" for value in (view.translation_x, view.translation_y)]
+def pose_text(rotation_rad: float, translation_m: tuple[float, float], artifact: Artifact) -> str:
+    """Return a nominal pose as ``90° (+1, 0)``: turn and translation in pitches."""
+    steps = [f"{value / artifact.grid_pitch_m:+.6g}" for value in translation_m]
     x, y = (step if float(step) else "0" for step in steps)
-    return f"{math.degrees(view.rotation):.6g}° ({x}, {y})"
+    return f"{math.degrees(rotation_rad):.6g}° ({x}, {y})"
 
 
 def place_text(emap: ErrorMap, site: tuple[int, int] | None) -> str:

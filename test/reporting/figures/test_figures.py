@@ -8,7 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.verdict import ModelResult, TermEstimate, TermResult
+from selfcal_ros.model.view import View
 from selfcal_ros.reporting.figures.drawing import (
     COLOURS,
     Discs,
@@ -35,7 +37,7 @@ from selfcal_ros.reporting.figures.parts import (
     range_scale,
     text_width,
 )
-from selfcal_ros.reporting.figures.places import rejected_in, rejected_map
+from selfcal_ros.reporting.figures.places import plan_figure, rejected_in, rejected_map
 from selfcal_ros.reporting.figures.residuals import (
     courses,
     distributions,
@@ -301,6 +303,58 @@ def test_courses_need_times_and_show_a_rise_upwards():
     rise = next(i.lines[0] for i in drawing.items if isinstance(i, Path) and i.stroke == "c0")
     assert len(rise) == 5 and rise[-1][1] < rise[0][1] - 20
     assert courses(found[1:], 1e-8) is None
+
+
+def turned(rotation_deg, shift=(0.0, 0.0), **more):
+    """Return the figure of one view of a plate of 5 x 9 marks, and the middle of its panel."""
+    view = View("v", math.radians(rotation_deg), shift, **more)
+    drawing = plan_figure(Artifact(5, 0.01, 24, 9), [view])
+    frame = next(item.lines[0] for item in drawing.items if isinstance(item, Path)
+                 and item.stroke == "soft" and len(item.lines[0]) == 5)
+    return drawing, np.mean(frame[:4], axis=0)
+
+
+def heads(drawing):
+    return [np.array(item.lines[0]) for item in drawing.items
+            if isinstance(item, Path) and item.fill == "truth"]
+
+
+@pytest.mark.parametrize(("rotation", "corner", "sense"), [
+    (90, (-1, -1), "left"), (-90, (1, 1), "right"), (180, (-1, 1), "left")])
+def test_the_arrow_leads_the_corner_of_a_turned_plate_the_way_it_is_turned(rotation, corner, sense):
+    """Pixels grow downwards: (-1, -1) is top left, where a quarter turn to the left leads it."""
+    drawing, middle = turned(rotation)
+    dot, = (item.centres[0] for item in drawing.items if isinstance(item, Discs)
+            and item.fill == "truth")
+    assert tuple(np.sign(dot - middle)) == corner
+    way, = (np.array(item.lines[0]) - middle for item in drawing.items if isinstance(item, Path)
+            and item.stroke == "truth" and len(item.lines[0]) == 61)
+    assert way[0][0] > 0 > way[0][1]  # begins at the top right, where the corner is without a turn
+    assert np.sign(way[-1]).tolist() == list(corner)
+    across = way[:-1, 0] * way[1:, 1] - way[:-1, 1] * way[1:, 0]  # < 0: counter-clockwise
+    assert (across < 0).all() if sense == "left" else (across > 0).all()
+    head, = heads(drawing)
+    np.testing.assert_allclose(head[0] - middle, way[-1])
+
+
+def test_a_plate_that_is_not_turned_has_no_arrow_and_marks_off_the_field_are_hollow():
+    drawing, middle = turned(0, (0.01, 0.0))
+    assert heads(drawing) == []
+    hollow, = (item for item in drawing.items if isinstance(item, Discs) and item.stroke == "bad")
+    assert len(hollow.centres) == 9 and all(x > middle[0] for x, _ in hollow.centres)
+
+
+def test_check_stops_are_crosses_at_the_marks_that_are_visited_again():
+    drawing, middle = turned(0, check_marks=5, check_offset_m=2e-5)
+    crosses = [np.mean(np.concatenate(item.lines), axis=0) - middle for item in drawing.items
+               if isinstance(item, Path) and item.stroke == "c0"]
+    pitch = next(abs(a[0] - b[0]) for item in drawing.items if isinstance(item, Discs)
+                 and item.fill == "ink" for a, b in [(item.centres[0], item.centres[9])])
+    sites = {tuple(np.rint(cross / pitch).astype(int).tolist()) for cross in crosses}
+    assert sites == {(0, 0), (1, -2), (-1, -2), (-1, 2), (1, 2)}
+    words = [item.text for item in drawing.items if isinstance(item, Label)]
+    assert words[-1] == "crosses: check stops, seen again with the stage 20 µm off"
+    assert not any("crosses" in item.text for item in turned(0)[0].items if isinstance(item, Label))
 
 
 def test_rejected_readings_stand_where_they_happened():

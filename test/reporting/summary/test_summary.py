@@ -213,9 +213,7 @@ def test_a_view_that_was_not_measured_shows_dashes():
 
 
 def test_pose_is_in_degrees_and_pitches():
-    view = replace(known_result()[0].views[0], rotation=-np.pi / 2, translation_x=-0.02,
-                   translation_y=0.01)
-    assert pose_text(view, 0.01) == "-90° (-2, +1)"
+    assert pose_text(-np.pi / 2, (-0.02, 0.01), Artifact(5, 0.01)) == "-90° (-2, +1)"
 
 
 def test_plate_without_angular_lines_has_no_theta():
