@@ -11,7 +11,7 @@ from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.blas_threads import one_thread
 from selfcal_ros.estimation.law.equations import HuReadings
 from selfcal_ros.estimation.law.solve import hu_readings, hu_views, law_for
-from selfcal_ros.estimation.normal.planned import planned_system
+from selfcal_ros.estimation.normal.systems import planned_system
 from selfcal_ros.estimation.observability.prediction import predict
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact

@@ -10,7 +10,7 @@ import numpy as np
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.blas_threads import one_thread
 from selfcal_ros.estimation.datum.modes import datum_modes
-from selfcal_ros.estimation.normal.planned import planned_system
+from selfcal_ros.estimation.normal.systems import planned_system
 from selfcal_ros.estimation.observability.prediction import predict
 from selfcal_ros.estimation.observability.rank import plan_observability
 from selfcal_ros.estimation.options import Options

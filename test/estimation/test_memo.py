@@ -4,8 +4,7 @@
 import gc
 import weakref
 
-from selfcal_ros.estimation.normal.memo import Memo
-from selfcal_ros.estimation.normal.planned import planned_system
+from selfcal_ros.estimation.normal.systems import Memo, planned_system
 from selfcal_ros.model.artifact import Artifact
 from test.support.lattice_plans import plan_of
 

@@ -5,8 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from selfcal_ros.estimation.datum.covariance import FieldCovariance
-from selfcal_ros.estimation.datum.scale import scale_datum
+from selfcal_ros.estimation.datum.covariance import FieldCovariance, scale_datum
 from selfcal_ros.estimation.joint.solve import fit_joint
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact

@@ -12,15 +12,13 @@ import numpy as np
 from scipy.optimize import nnls
 
 from selfcal_ros.errors import InputError
-from selfcal_ros.estimation.datum.covariance import FieldCovariance
-from selfcal_ros.estimation.datum.scale import scale_datum
+from selfcal_ros.estimation.datum.covariance import FieldCovariance, scale_datum
 from selfcal_ros.estimation.joint.problem import bounded_ratio
-from selfcal_ros.estimation.joint.saved_terms import KEY, MAX_SITES, factors_of
+from selfcal_ros.estimation.joint.solved import KEY, MAX_SITES, factors_of
 from selfcal_ros.estimation.law.solve import law_covariance
-from selfcal_ros.estimation.normal.cache import Marks, system_of
 from selfcal_ros.estimation.normal.equations import NormalEquations
 from selfcal_ros.estimation.normal.grid import GridSystem
-from selfcal_ros.estimation.normal.planned import planned_system
+from selfcal_ros.estimation.normal.systems import Marks, planned_system, system_of
 from selfcal_ros.estimation.observability.prediction import theta_matrix
 from selfcal_ros.estimation.observability.rank import deficiency
 from selfcal_ros.estimation.options import ReferenceLength

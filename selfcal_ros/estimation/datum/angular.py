@@ -13,7 +13,7 @@ from scipy.special import chdtrc
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.datum.modes import slope_rows
 from selfcal_ros.estimation.normal.equations import NormalEquations
-from selfcal_ros.estimation.normal.memo import Memo
+from selfcal_ros.estimation.normal.systems import Memo
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.readings import Sense
 

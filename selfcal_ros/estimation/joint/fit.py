@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from selfcal_ros.estimation.datum.scale import scale_of
+from selfcal_ros.estimation.datum.covariance import scale_of
 from selfcal_ros.estimation.joint.noise import NoiseEstimate, noise_estimate
 from selfcal_ros.estimation.joint.problem import (
     FLOOR,

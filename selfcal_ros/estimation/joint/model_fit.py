@@ -20,7 +20,13 @@ from selfcal_ros.estimation.joint.fit import JointFit, angular_part, fit
 from selfcal_ros.estimation.joint.problem import ROUNDING, Problem, grid_dof, sigma_of
 from selfcal_ros.estimation.lattice.gauge import Gauge
 from selfcal_ros.estimation.terms.columns import TermColumns, made_anew, term_columns
-from selfcal_ros.estimation.terms.equations import TermEquations
+from selfcal_ros.estimation.terms.equations import (
+    Sums,
+    TermEquations,
+    next_coefficients,
+    residual_sums,
+    score,
+)
 from selfcal_ros.estimation.terms.ground import without_noise
 from selfcal_ros.estimation.terms.projection import (
     ReducedColumns,
@@ -30,7 +36,6 @@ from selfcal_ros.estimation.terms.projection import (
     reduce_lines,
 )
 from selfcal_ros.estimation.terms.sizes import SizeTest, size_tests
-from selfcal_ros.estimation.terms.solution import Sums, next_coefficients, residual_sums, score
 from selfcal_ros.model.terms import OF_PLATE, ModelTerm, TermName
 
 MAX_STEPS = 100

@@ -16,18 +16,26 @@ from selfcal_ros.errors import (
 )
 from selfcal_ros.estimation.blas_threads import one_thread
 from selfcal_ros.estimation.datum.angular import conditions_for, misclosure_test
-from selfcal_ros.estimation.datum.covariance import FieldCovariance, angular_variance
-from selfcal_ros.estimation.datum.scale import scale_datum, scale_of
+from selfcal_ros.estimation.datum.covariance import (
+    FieldCovariance,
+    angular_variance,
+    scale_datum,
+    scale_of,
+)
 from selfcal_ros.estimation.joint.fit import JointFit
-from selfcal_ros.estimation.joint.kept_residuals import kept_residuals
 from selfcal_ros.estimation.joint.model_fit import ModelFit, fit_model
 from selfcal_ros.estimation.joint.problem import Problem, repeats_of, turned
-from selfcal_ros.estimation.joint.saved_terms import angular_terms, saved_terms
-from selfcal_ros.estimation.joint.solved import Solved, noise_of
+from selfcal_ros.estimation.joint.solved import (
+    Solved,
+    angular_terms,
+    kept_residuals,
+    noise_of,
+    saved_terms,
+)
 from selfcal_ros.estimation.lattice.maps import PHASES
 from selfcal_ros.estimation.lattice.readings import angular_data, grid_data
-from selfcal_ros.estimation.normal.cache import system_for
 from selfcal_ros.estimation.normal.equations import MAX_DIRECT_SITES, NormalEquations
+from selfcal_ros.estimation.normal.systems import system_for
 from selfcal_ros.estimation.observability.plan_check import with_unseen_modes
 from selfcal_ros.estimation.observability.rank import identifies, measured_observability, refusal
 from selfcal_ros.estimation.options import Options, ReferenceKind, ReferenceLength
@@ -218,7 +226,7 @@ def _error_map(measurements: Measurements, options: Options, *, model: ModelFit,
                ) -> tuple[ErrorMap, np.ndarray | None, dict[str, Any]]:
     """Return the map in the stage frame, the covariance of the angular misclosure, factors.
 
-    The factors are those of `selfcal_ros.estimation.joint.saved_terms`.
+    The factors are those of `selfcal_ros.estimation.joint.solved`.
     """
     problem, found = model.problem, model.found
     system, length = problem.system, problem.half_width_m

@@ -1,11 +1,27 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A solution before the verdict: the result, and the inputs of the verdict."""
+"""A solution before it is judged, and the parts of a fit that RESULT.json keeps.
+
+Residuals, so that a report can show them without the bag; and the part of the map's covariance
+that terms of the model make. With factors L (r, 2, nx, ny), cov(G) = sigma^2 (S + sum_r L_r L_r'),
+where S follows from the weights of the readings, so that saved maps are compared exactly. Each
+factor belongs to a term with a size, being what the map would gain if that term were known, or to
+the free terms together.
+"""
 
 from dataclasses import dataclass
+from typing import Any
 
+import numpy as np
+
+from selfcal_ros.errors import InputError
+from selfcal_ros.estimation.datum.covariance import FieldCovariance
 from selfcal_ros.estimation.joint.model_fit import ModelFit
 from selfcal_ros.estimation.joint.noise import NoiseEstimate
+from selfcal_ros.estimation.lattice.maps import PHASES
+from selfcal_ros.estimation.terms.columns import TermColumns
+from selfcal_ros.model.readings import GridVisits, Measurements, Sense
 from selfcal_ros.model.result import CalibrationResult, Noise
+from selfcal_ros.units import NS_PER_S
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,3 +57,237 @@ def noise_of(xy: NoiseEstimate, theta: NoiseEstimate) -> Noise:
         xy.sigma, theta.sigma, xy.repeats, theta.repeats, xy.residuals, theta.residuals,
         xy.dof_repeats, theta.dof_repeats, xy.dof_residuals, theta.dof_residuals, xy.declared,
         theta.declared, xy.dof, theta.dof, xy.k, theta.k, xy.p, theta.p)
+
+
+RESIDUALS = "residuals"
+"""Key among the extras of a result."""
+
+MAX_READINGS = 60_000
+"""Largest number of grid readings with stored residuals: 121 x 121 marks in four views."""
+
+MAX_PARTS = 60
+"""Number of intervals of a view's time with a stored mean residual."""
+
+DECIMALS_M, DECIMALS_RAD, DECIMALS_S = 13, 12, 3
+"""Decimals stored: 0.1 pm, 1 prad, 1 ms."""
+
+
+def kept_residuals(measurements: Measurements, model: ModelFit) -> dict[str, Any]:
+    """Return the residuals of all readings for `CalibrationResult.extra`; empty for large fields.
+
+    Each view has `dx`, `dy` [i][j] (m, stage axes, mark m = i - h, n = j - h of the plate) and
+    `dtheta` [k] (rad, counter-clockwise), NaN where not read; and, if the visits of its marks
+    are known, `course`: `time_s` (from the first visit of the run), mean `dx`, `dy` (m) and
+    `count` of the readings in each interval of the view's time.
+
+    Parameters
+    ----------
+    measurements : Measurements
+        The readings.
+    model : ModelFit
+        The solution, with its residuals in the plate frame.
+    """
+    problem, found = model.problem, model.found
+    if problem.system.grid.n_readings > MAX_READINGS:
+        return {}
+    starts = [int(v.visits.stamp_ns.min()) for v in measurements.views
+              if v.visits is not None and len(v.visits.stamp_ns)]
+    views = []
+    for index, view in enumerate(measurements.views):
+        entry: dict[str, Any] = {"view": view.view.name}
+        if index in problem.grid.index:
+            row = problem.grid.index.index(index)
+            read = problem.grid.weight[row] > 0
+            rest = np.where(read, found.residuals[row], np.nan) * _to_stage(model, row)
+            entry |= {"dx": np.round(rest.real, DECIMALS_M), "dy": np.round(rest.imag, DECIMALS_M)}
+            if starts and view.visits is not None and len(view.visits.mark):
+                entry["course"] = _course(view.visits, _at_visits(model, row), min(starts))
+        if index in problem.angular.index:
+            row = problem.angular.index.index(index)
+            rest = np.where(problem.angular.weight[row] > 0, found.residuals_theta[row], np.nan)
+            entry["dtheta"] = np.round(rest, DECIMALS_RAD)
+        views.append(entry)
+    return {RESIDUALS: {"views": views}}
+
+
+def _at_visits(model: ModelFit, row: int) -> np.ndarray:
+    """Return the residual of every visit of a grid view, complex (V,), stage axes, m."""
+    problem = model.problem
+    visits = problem.ground.visits[row] if problem.ground else None
+    if visits is None:
+        return np.zeros(0, dtype=complex)
+    values = visits.y
+    if model.equations is not None:
+        values = values - model.equations.columns.at_visits(model.coefficients)[row]
+    rest = model.found.residuals[row].reshape(-1)
+    residual = visits.about_means(values[None], rest.size)[0] + rest[visits.mark]
+    return residual * _to_stage(model, row)
+
+
+def _to_stage(model: ModelFit, row: int) -> complex:
+    """Return the factor from the frame of a grid view's readings to the stage frame."""
+    problem = model.problem
+    return complex(PHASES[problem.grid.poses[row].q] / problem.frames[row])
+
+
+def _course(visits: GridVisits, rest: np.ndarray, start_ns: int) -> dict[str, np.ndarray]:
+    """Return the mean residual in each interval of the view's time."""
+    order = np.argsort(visits.stamp_ns, kind="stable")
+    starts = _starts(len(order))
+    counts = visits.count[order]
+    count = np.add.reduceat(counts, starts)
+    since_s = (visits.stamp_ns - start_ns) / NS_PER_S
+    columns = {name: np.add.reduceat(values[order] * counts, starts) / count
+               for name, values in (("time_s", since_s), ("dx", rest.real), ("dy", rest.imag))}
+    return {"time_s": np.round(columns["time_s"], DECIMALS_S),
+            "dx": np.round(columns["dx"], DECIMALS_M), "dy": np.round(columns["dy"], DECIMALS_M),
+            "count": count}
+
+
+def _starts(visits: int) -> np.ndarray:
+    """Return the starts of `MAX_PARTS` intervals, or one per visit if fewer; none is empty."""
+    parts = min(visits, MAX_PARTS)
+    size, longer = divmod(visits, parts)
+    number = np.arange(parts)
+    return number * size + np.minimum(number, longer)
+
+
+KEY = "covariance_terms"
+"""Key of the factors in a result."""
+
+MAX_SITES = 31 * 31
+"""Largest field for a full covariance matrix."""
+
+NEGLIGIBLE = 1e-3
+"""Length of a factor, in units of the noise, that changes no uncertainty by a thousandth."""
+
+ROUNDING = 1e-12
+"""Relative size below which a variance is zero."""
+
+FREE = ""
+"""Name of the factors of all free terms."""
+
+ANGULAR_KEY = "angular_terms"
+"""Key of each term's contribution to the standard uncertainty of the angular map, rad."""
+
+DIGITS = 7
+"""Digits of a factor stored."""
+
+LEAST = 1e-12
+"""Entries of a factor below this are dropped, in units of the noise."""
+
+
+def saved_terms(cover: FieldCovariance, columns: TermColumns, sense: Sense) -> dict[str, Any]:
+    """Return the factors for `CalibrationResult.extra`; empty without terms, or for large fields.
+
+    Parameters
+    ----------
+    cover : FieldCovariance
+        Of the map, in the frame of the equations, terms included.
+    columns : TermColumns
+        The terms.
+    sense : Sense
+        What moved: the factors are in the stage frame.
+    """
+    shape = cover.system.grid.views.shape
+    if cover.system.grid.n_sites > MAX_SITES:
+        return {}
+    maps = cover.maps_of_terms().reshape(*shape, -1)
+    maps = np.where(cover.system.known_sites[..., None], maps, 0.0)
+    if sense is Sense.PLATE_MOVES:
+        maps = maps[::-1, ::-1]
+    both = np.concatenate([maps.real.reshape(-1, maps.shape[2]),
+                           maps.imag.reshape(-1, maps.shape[2])])
+    factors, names = [], []
+    for name, root in _roots(cover.terms.covariance, columns):
+        left, size, _ = np.linalg.svd(both @ root, full_matrices=False)
+        kept = size > NEGLIGIBLE
+        factors += list((left[:, kept] * size[kept]).T.reshape(-1, 2, *shape))
+        names += [name] * int(kept.sum())
+    return {KEY: {"terms": names, "factors": rounded(np.array(factors)).tolist()}}
+
+
+def rounded(values: np.ndarray) -> np.ndarray:
+    """Return values rounded to `DIGITS` digits, none smaller than `LEAST`.
+
+    As quotients of an exact power of ten, so that they print with no more digits.
+    """
+    size = np.abs(values)
+    digits = DIGITS - 1 - np.floor(np.log10(np.maximum(size, LEAST)))
+    power = 10.0 ** np.maximum(digits, 0.0)
+    return np.where(size < LEAST, 0.0, np.round(values * power) / power)
+
+
+def _roots(covariance: np.ndarray, columns: TermColumns) -> list[tuple[str, np.ndarray]]:
+    """Return roots (p, k) of parts of a covariance: of each term with a size, of the free ones.
+
+    A part is the reduction of the covariance if that term, and those before it, are
+    known: the parts add up to the covariance.
+    """
+    rest, out = covariance.copy(), []
+    sized = dict.fromkeys(c.term for c in columns.columns if np.isfinite(c.size))
+    for name in sized:
+        at = columns.rows([name])
+        values, vectors = np.linalg.eigh(rest[np.ix_(at, at)])
+        told = values > ROUNDING * max(values[-1], 0.0)
+        root = rest[:, at] @ (vectors[:, told] / np.sqrt(values[told]))
+        rest = rest - root @ root.T
+        out.append((str(name), root))
+    own = np.sqrt(np.maximum(np.diag(covariance), np.finfo(float).tiny))
+    values, vectors = np.linalg.eigh(rest / np.outer(own, own))
+    out.append((FREE, own[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))))
+    return out
+
+
+def factors_of(result: CalibrationResult) -> np.ndarray:
+    """Return the factors L of a result, (r, 2, nx, ny), for unit noise; r = 0 without terms.
+
+    Raises
+    ------
+    InputError
+        If they do not match the result's lattice.
+    """
+    shape = (2, *result.artifact.shape)
+    if KEY not in result.extra:
+        return np.zeros((0, *shape))
+    try:
+        kept = result.extra[KEY]
+        factors = np.array(kept["factors"], dtype=float).reshape(-1, *shape)
+        good = np.isfinite(factors).all() and len(factors) == len(kept["terms"])
+    except (TypeError, ValueError, KeyError):
+        good = False
+    if not good:
+        raise InputError(KEY, "no factors of this lattice",
+                         "write the result again with `selfcal solve`")
+    return factors
+
+
+def angular_terms(cover: FieldCovariance, columns: TermColumns, sigma_m: float,
+                  known: np.ndarray) -> dict[str, Any]:
+    """Return the contribution of each term of the lines to the angular map, for `extra`: rad, (K,).
+
+    Parameters
+    ----------
+    cover, columns : FieldCovariance, TermColumns
+        As in `saved_terms`.
+    sigma_m : float
+        Noise of one grid reading, m.
+    known : bool array (K,)
+        Lines of the map; their mean is the datum.
+    """
+    out = {}
+    for name in dict.fromkeys(columns.columns[at].term for at in columns.lines.at):
+        rows = columns.rows([name])
+        moved = cover.terms.turned[:, rows]
+        moved = moved - moved[known].mean(axis=0)
+        power = np.einsum("kp,pq,kq->k", moved, cover.terms.covariance[np.ix_(rows, rows)], moved)
+        out[str(name)] = rounded(np.sqrt(np.maximum(power, 0.0)) * sigma_m)
+    return {ANGULAR_KEY: out} if out else {}
+
+
+def variance_of_terms(result: CalibrationResult) -> dict[str, np.ndarray]:
+    """Return the variance of the map from each term with a size, (2, nx, ny), m^2."""
+    factors = factors_of(result)
+    names = np.array(result.extra[KEY]["terms"] if len(factors) else [], dtype=str)
+    return {str(name): (factors[names == name] ** 2).sum(axis=0) * result.noise.sigma_xy**2
+            for name in dict.fromkeys(names.tolist()) if name != FREE}

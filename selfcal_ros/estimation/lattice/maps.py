@@ -4,6 +4,8 @@
 Vectors are complex numbers, z = x + iy, so that a quarter turn is a multiplication by i. In the
 plate frame the model (method eq. 2.4, Hu 12-15) reads, for view v with q quarter turns,
     y_v(m) = i^-q G(X_v(m)) + A(m) + phi_v i z(m) + tau_v,     y_v = i^-q V_v,  tau_v = i^-q t_v.
+A finite rotation adds (R(phi) - 1 - phi J) R^q m + (R(phi) - 1) R^q A to it (method eq. 2.6), with
+R(phi) = exp(i phi).
 """
 
 from dataclasses import dataclass
@@ -11,6 +13,9 @@ from functools import cached_property
 
 import numpy as np
 
+from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.readings import ViewReadings
+from selfcal_ros.model.result import ArtifactMap
 from selfcal_ros.model.view import LatticePose
 
 PHASES = np.array([1, 1j, -1, -1j])
@@ -199,3 +204,22 @@ def rigid_parameters(views: LatticeViews) -> np.ndarray:
         out[:, v, 0] = (0, 0, -1, 0, 0, 0, -1)
         out[:, v, 1], out[:, v, 2] = np.real(taus), np.imag(taus)
     return out
+
+
+def turned_marks(view: ViewReadings, artifact: Artifact) -> np.ndarray:
+    """Return R^q m of the marks read, from the plate's centre, complex (P,), stage frame, m."""
+    turn = PHASES[view.view.lattice_pose(artifact).q]
+    return turn * (view.m + 1j * view.n) * artifact.grid_pitch_m
+
+
+def turned_plate(view: ViewReadings, artifact: Artifact, plate: ArtifactMap) -> np.ndarray:
+    """Return R^q A of the marks read, complex (P,), stage frame, m; NaN where unknown."""
+    turn = PHASES[view.view.lattice_pose(artifact).q]
+    at = view.m + artifact.half[0], view.n + artifact.half[1]
+    return turn * (plate.ax[at] + 1j * plate.ay[at])
+
+
+def rotation_excess(phi_rad: float, marks: np.ndarray, plate: np.ndarray) -> np.ndarray:
+    """Return the contribution of the rotation beyond the linear model, complex (P,), m."""
+    turn = np.expm1(1j * phi_rad)
+    return (turn - 1j * phi_rad) * marks + turn * plate  # method eq. 2.6

@@ -11,8 +11,7 @@ enters the diagonal.
 import numpy as np
 from scipy.linalg import blas, lapack
 
-from selfcal_ros.estimation.multifrontal.dissection import dissect
-from selfcal_ros.estimation.multifrontal.symmetry import RealSymmetricForm
+from selfcal_ros.estimation.multifrontal.dissection import RealSymmetricForm, dissect
 
 SMALL = 64
 """Largest side of a triangle inverted by substitution."""

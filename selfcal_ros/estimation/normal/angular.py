@@ -12,8 +12,7 @@ from scipy.linalg import lapack
 from scipy.sparse import coo_matrix, csc_matrix
 from scipy.sparse.linalg import splu
 
-from selfcal_ros.estimation.lattice.connectivity import Components, components
-from selfcal_ros.estimation.lattice.unchecked import rest_on_one
+from selfcal_ros.estimation.lattice.connectivity import Components, components, rest_on_one
 
 DENSE_LINES = 512
 """Largest K solved with dense matrices."""

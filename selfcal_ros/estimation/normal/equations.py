@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Normal equations of a measured plan, grid and lines together, and what they determine."""
+"""The normal equations of a measured plan, grid and lines together, and what they determine."""
 
 from functools import cached_property
 
@@ -311,3 +311,22 @@ def pseudo_inverse(values: np.ndarray, vectors: np.ndarray, scale: float) -> np.
     """Return the pseudo-inverse of a matrix of size `scale`, given its eigenvalues and vectors."""
     good = values > GAP * scale
     return (vectors[:, good] / values[good]) @ vectors[:, good].T
+
+
+def grid_residuals(system: NormalEquations, y: np.ndarray) -> np.ndarray:
+    """Return the residuals of the grid readings `y` (views, nx, ny), fitted alone."""
+    grid = system.grid
+    free, d = grid.reduced(y)
+    parameters = system.grid_inverse @ d
+    field = (free - grid.response @ parameters).reshape(grid.views.shape)
+    return grid.plate(y, field, parameters)[1]
+
+
+def angular_residuals(system: NormalEquations, y: np.ndarray) -> np.ndarray:
+    """Return the residuals of the angular readings `y` (views, K), fitted alone."""
+    angular = system.angular
+    if not angular.n_views:
+        return np.zeros(y.shape)
+    free, d = angular.reduced(y)
+    phi = system.angular_inverse @ d
+    return angular.plate(y, free - angular.response @ phi, phi)[1]

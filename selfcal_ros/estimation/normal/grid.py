@@ -15,11 +15,11 @@ from selfcal_ros.estimation.lattice.connectivity import (
     Components,
     components,
     free_turns,
+    rest_on_one,
 )
 from selfcal_ros.estimation.lattice.maps import PHASES, LatticeViews, rigid_parameters
-from selfcal_ros.estimation.lattice.unchecked import rest_on_one
+from selfcal_ros.estimation.multifrontal.dissection import fold
 from selfcal_ros.estimation.multifrontal.factor import Factor
-from selfcal_ros.estimation.multifrontal.symmetry import fold
 from selfcal_ros.model.view import LatticePose
 
 

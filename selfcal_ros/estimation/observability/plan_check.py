@@ -8,7 +8,7 @@ from math import pi
 
 from selfcal_ros.estimation.blas_threads import one_thread
 from selfcal_ros.estimation.normal.equations import NormalEquations
-from selfcal_ros.estimation.normal.planned import planned_system
+from selfcal_ros.estimation.normal.systems import planned_system
 from selfcal_ros.estimation.observability.prediction import MAX_SITES, Prediction, predict
 from selfcal_ros.estimation.observability.rank import (
     full_observability,

@@ -12,8 +12,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 from selfcal_ros.estimation.normal.equations import NormalEquations
-from selfcal_ros.estimation.normal.memo import Memo
-from selfcal_ros.estimation.normal.planned import planned_system
+from selfcal_ros.estimation.normal.systems import Memo, planned_system
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.result import Observability
 from selfcal_ros.model.view import Plan, View

@@ -19,7 +19,7 @@ from scipy.special import fdtri
 
 from selfcal_ros.errors import NotIdentifiableError
 from selfcal_ros.estimation.blas_threads import one_thread
-from selfcal_ros.estimation.normal.planned import planned_system
+from selfcal_ros.estimation.normal.systems import planned_system
 from selfcal_ros.estimation.observability.plan_check import PROXY_SIZE, smaller, unit_repeats
 from selfcal_ros.estimation.observability.prediction import MAX_SITES, Prediction
 from selfcal_ros.estimation.terms.equations import TermEquations

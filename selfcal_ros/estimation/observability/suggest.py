@@ -8,7 +8,7 @@ from math import comb, inf
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.blas_threads import one_thread
-from selfcal_ros.estimation.normal.planned import planned_system
+from selfcal_ros.estimation.normal.systems import planned_system
 from selfcal_ros.estimation.observability.equivalent import equivalent_key
 from selfcal_ros.estimation.observability.plan_check import (
     candidate_views,

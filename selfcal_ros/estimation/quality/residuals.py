@@ -23,9 +23,12 @@ from selfcal_ros.estimation.joint.noise import pooled
 from selfcal_ros.estimation.joint.problem import Problem
 from selfcal_ros.estimation.joint.solve import prepare
 from selfcal_ros.estimation.lattice.maps import PHASES
-from selfcal_ros.estimation.normal.alone import angular_residuals, grid_residuals
-from selfcal_ros.estimation.normal.equations import NormalEquations
-from selfcal_ros.estimation.normal.memo import Memo
+from selfcal_ros.estimation.normal.equations import (
+    NormalEquations,
+    angular_residuals,
+    grid_residuals,
+)
+from selfcal_ros.estimation.normal.systems import Memo
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.verdict.explanations import LEVEL
 from selfcal_ros.model.readings import Measurements

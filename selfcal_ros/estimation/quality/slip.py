@@ -20,7 +20,7 @@ from selfcal_ros.estimation.joint.fit import JointFit, fit
 from selfcal_ros.estimation.joint.problem import Problem
 from selfcal_ros.estimation.joint.solve import fit_joint, prepare
 from selfcal_ros.estimation.lattice.maps import PHASES
-from selfcal_ros.estimation.normal.alone import grid_residuals
+from selfcal_ros.estimation.normal.equations import grid_residuals
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.quality.residuals import Residuals
 from selfcal_ros.estimation.terms.columns import Column, TermColumns, WithinMarks

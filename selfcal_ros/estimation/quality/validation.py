@@ -21,7 +21,7 @@ from selfcal_ros.estimation.blas_threads import one_thread
 from selfcal_ros.estimation.joint.model_fit import ModelFit
 from selfcal_ros.estimation.joint.solve import solve_joint
 from selfcal_ros.estimation.joint.solved import Solved
-from selfcal_ros.estimation.lattice.finite_rotation import (
+from selfcal_ros.estimation.lattice.maps import (
     rotation_excess,
     turned_marks,
     turned_plate,

@@ -7,7 +7,7 @@ from enum import Enum
 import numpy as np
 
 from selfcal_ros.estimation.joint.noise import F_LEVEL, coverage_factor
-from selfcal_ros.estimation.joint.saved_terms import ANGULAR_KEY, variance_of_terms
+from selfcal_ros.estimation.joint.solved import ANGULAR_KEY, variance_of_terms
 from selfcal_ros.estimation.options import ReferenceLength
 from selfcal_ros.estimation.verdict.enlarge import TOLD, remaining_part, with_coverage
 from selfcal_ros.model.artifact import Artifact

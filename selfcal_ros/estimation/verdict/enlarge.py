@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from selfcal_ros.estimation.joint.noise import coverage_factor
-from selfcal_ros.estimation.joint.saved_terms import (
+from selfcal_ros.estimation.joint.solved import (
     ANGULAR_KEY,
     KEY,
     rounded,

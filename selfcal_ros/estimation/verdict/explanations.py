@@ -19,9 +19,8 @@ from scipy.special import fdtrc
 from selfcal_ros.estimation.joint.model_fit import ModelFit, equations_of, squares
 from selfcal_ros.estimation.lattice.maps import PHASES
 from selfcal_ros.estimation.terms.columns import Column, TermColumns, joined, term_columns
-from selfcal_ros.estimation.terms.equations import TermEquations
+from selfcal_ros.estimation.terms.equations import Score, TermEquations, score
 from selfcal_ros.estimation.terms.ground import Ground, without_noise
-from selfcal_ros.estimation.terms.solution import Score, score
 from selfcal_ros.estimation.verdict.fault_columns import (
     READING,
     SLIP,

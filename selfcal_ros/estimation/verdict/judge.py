@@ -22,7 +22,7 @@ from selfcal_ros.estimation.joint.model_fit import ModelFit
 from selfcal_ros.estimation.joint.solve import fit_joint, solve_joint
 from selfcal_ros.estimation.joint.solved import Solved
 from selfcal_ros.estimation.options import Options
-from selfcal_ros.estimation.terms.solution import free_inverse
+from selfcal_ros.estimation.terms.equations import free_inverse
 from selfcal_ros.estimation.verdict.enlarge import enlarged, enlargements, with_coverage
 from selfcal_ros.estimation.verdict.look import ALWAYS_SITES, look_into
 from selfcal_ros.model.readings import Measurements

@@ -18,7 +18,7 @@ from selfcal_ros.estimation.joint.model_fit import ModelFit
 from selfcal_ros.estimation.joint.problem import FLOOR, Problem
 from selfcal_ros.estimation.joint.solve import solve_joint
 from selfcal_ros.estimation.joint.solved import Solved
-from selfcal_ros.estimation.normal.alone import angular_residuals, grid_residuals
+from selfcal_ros.estimation.normal.equations import angular_residuals, grid_residuals
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.verdict.enlarge import Effect
 from selfcal_ros.estimation.verdict.fault_columns import MOST, READING

@@ -10,7 +10,7 @@ from scipy.stats import chi2
 from selfcal_ros.estimation.datum.angular import conditions_for, misclosure_test
 from selfcal_ros.estimation.joint.fit import fit
 from selfcal_ros.estimation.joint.solve import prepare
-from selfcal_ros.estimation.normal.planned import planned_system
+from selfcal_ros.estimation.normal.systems import planned_system
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ThetaDatum

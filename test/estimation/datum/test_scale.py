@@ -4,8 +4,8 @@
 import numpy as np
 import pytest
 
-from selfcal_ros.estimation.datum.scale import scale_datum, scale_of
-from selfcal_ros.estimation.normal.planned import planned_system
+from selfcal_ros.estimation.datum.covariance import scale_datum, scale_of
+from selfcal_ros.estimation.normal.systems import planned_system
 from selfcal_ros.estimation.options import ReferenceKind, ReferenceLength
 from selfcal_ros.model.artifact import Artifact
 from test.support.lattice_plans import plan_of

@@ -17,9 +17,9 @@ from threadpoolctl import threadpool_limits
 from selfcal_ros.errors import InputError, NotIdentifiableError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.joint import pcg
-from selfcal_ros.estimation.normal import cache, equations
+from selfcal_ros.estimation.normal import equations, systems
 from selfcal_ros.estimation.normal.grid import GridSystem
-from selfcal_ros.estimation.normal.planned import planned_system
+from selfcal_ros.estimation.normal.systems import planned_system
 from selfcal_ros.estimation.quality.outliers import robust_calibrate
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.simulation.truth import hu_plan, random_truth, simulate_measurements
@@ -52,10 +52,10 @@ def as_large(monkeypatch):
     def lower():
         monkeypatch.setattr(equations, "DIRECT_SITES", 0)
         monkeypatch.setattr(equations, "CORE", 9)
-        cache.clear_cache()
+        systems.clear_cache()
 
     yield lower
-    cache.clear_cache()
+    systems.clear_cache()
 
 
 def same(a, b, tolerance):
@@ -113,7 +113,7 @@ def test_uneven_weights_are_factorised_or_iterated_to_the_truth(as_large, monkey
     factorised = calibrate(readings, BARE)
     assert factorised.extra["solver"]["method"] == "multifrontal"
     monkeypatch.setattr(equations, "UNEVEN_SITES", 0)
-    cache.clear_cache()
+    systems.clear_cache()
     iterated = calibrate(readings, BARE)
     assert iterated.extra["solver"]["method"] == "conjugate gradients"
     for found in (factorised.error_map, iterated.error_map):
@@ -159,9 +159,9 @@ def test_the_core_of_a_large_field_tells_its_rank_alone(as_large):
 
 SCRIPT = """
 import hashlib, numpy as np
-from selfcal_ros.estimation.normal import cache, equations
+from selfcal_ros.estimation.normal import systems, equations
 from selfcal_ros.estimation.normal.grid import GridSystem
-from selfcal_ros.estimation.normal.planned import planned_system
+from selfcal_ros.estimation.normal.systems import planned_system
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact
@@ -171,7 +171,7 @@ data = simulate_measurements(random_truth(plan.artifact, 4, rng), plan, rng, sig
                              sigma_theta_rad=1e-7)
 for limit in (equations.DIRECT_SITES, 0):
     equations.DIRECT_SITES = equations.MAX_DIRECT_SITES = limit
-    cache.clear_cache()
+    systems.clear_cache()
     found = calibrate(data, Options(uncertainty=None if limit else False)).error_map
     parts = (found.gx, found.gy, found.g_theta, found.u_gx)
     print(hashlib.sha256(b"".join(part.tobytes() for part in parts)).hexdigest())
@@ -184,7 +184,7 @@ def test_the_number_of_threads_changes_no_bit(monkeypatch, capsys):
         monkeypatch.setattr(equations, name, getattr(equations, name))
     with threadpool_limits(1):
         exec(SCRIPT, {})
-    cache.clear_cache()
+    systems.clear_cache()
     alone = capsys.readouterr().out
     several = subprocess.run([sys.executable, "-c", SCRIPT], text=True, capture_output=True,
                              check=True, cwd=ROOT,

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from selfcal_ros.estimation.joint.saved_terms import KEY, saved_terms
+from selfcal_ros.estimation.joint.solved import KEY, saved_terms
 from selfcal_ros.estimation.terms.columns import Column, TermColumns, WithinMarks
 from selfcal_ros.model.readings import Sense
 

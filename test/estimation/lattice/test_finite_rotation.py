@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from selfcal_ros.estimation.lattice.finite_rotation import (
+from selfcal_ros.estimation.lattice.maps import (
     rotation_excess,
     turned_marks,
     turned_plate,

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.estimation.lattice.unchecked import rest_on_one
+from selfcal_ros.estimation.lattice.connectivity import rest_on_one
 from selfcal_ros.estimation.observability.plan_check import check_plan
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.verdict import Finding

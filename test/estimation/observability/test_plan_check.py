@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from selfcal_ros.errors import NotIdentifiableError
 from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.estimation.normal.planned import planned_system
+from selfcal_ros.estimation.normal.systems import planned_system
 from selfcal_ros.estimation.observability import plan_check, rank
 from selfcal_ros.estimation.observability.plan_check import (
     candidate_views,

@@ -9,7 +9,7 @@ import pytest
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.estimation.normal.planned import planned_system
+from selfcal_ros.estimation.normal.systems import planned_system
 from selfcal_ros.estimation.observability import suggest
 from selfcal_ros.estimation.observability.plan_check import (
     candidate_views,

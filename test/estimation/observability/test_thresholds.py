@@ -8,7 +8,7 @@ import pytest
 
 from selfcal_ros.errors import NotIdentifiableError
 from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.estimation.normal.planned import planned_system
+from selfcal_ros.estimation.normal.systems import planned_system
 from selfcal_ros.estimation.observability.prediction import predict, theta_variance
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact

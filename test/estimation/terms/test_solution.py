@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from selfcal_ros.estimation.terms.solution import Score, Sums, residual_sums
+from selfcal_ros.estimation.terms.equations import Score, Sums, residual_sums
 
 
 @pytest.mark.parametrize("p", [1, 3])

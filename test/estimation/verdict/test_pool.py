@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from selfcal_ros.estimation.terms.solution import Score, Sums
+from selfcal_ros.estimation.terms.equations import Score, Sums
 from selfcal_ros.estimation.verdict.explanations import Group, Pool, select_explanations
 
 LENGTHS = np.array([2.0, 0.5, 4.0])

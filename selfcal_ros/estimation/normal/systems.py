@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cache of normal equations, for further readings of the same marks."""
+"""Normal equations of plans, planned or measured, and what is computed once for each of them."""
 
 import hashlib
 from collections import OrderedDict
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from threading import Lock
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -12,7 +14,8 @@ from selfcal_ros.estimation.lattice.readings import AngularData, GridData
 from selfcal_ros.estimation.normal.angular import AngularSystem
 from selfcal_ros.estimation.normal.equations import NormalEquations
 from selfcal_ros.estimation.normal.grid import GridSystem
-from selfcal_ros.model.view import LatticePose
+from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.view import LatticePose, View
 
 CACHED = 16
 CACHED_READINGS = 4_000_000
@@ -76,3 +79,47 @@ def clear_cache() -> None:
     """Remove all systems."""
     with _lock:
         _cache.clear()
+
+
+def planned_system(artifact: Artifact, views: Sequence[View], *,
+                   rank_only: bool = False) -> NormalEquations:
+    """Return the system of the planned views: every mark in the field, unit repeats.
+
+    Parameters
+    ----------
+    artifact : Artifact
+        The plate.
+    views : sequence of View
+        The plan.
+    rank_only : bool
+        Whether only the rank is needed.
+    """
+    grid_views = [(i, v) for i, v in enumerate(views) if v.grid]
+    poses = tuple(view.lattice_pose(artifact) for _, view in grid_views)
+    angular = [(i, v) for i, v in enumerate(views) if v.angular and artifact.angular_count]
+    turns = tuple(v.lattice_pose(artifact).s for _, v in angular)
+    empty = np.zeros((len(poses), *artifact.shape))
+    field = GridSystem(poses, empty).views.in_field
+    repeats = np.array([v.repeats for _, v in grid_views], dtype=float)
+    lines = np.array([v.repeats for _, v in angular], dtype=float)
+    return NormalEquations(
+        GridSystem(poses, field * repeats[:, None, None]),
+        AngularSystem(turns, np.ones((len(turns), artifact.angular_count)) * lines[:, None]),
+        tuple(i for i, _ in grid_views), tuple(i for i, _ in angular), rank_only=rank_only)
+
+
+class Memo[Key, Value]:
+    """Values by system and key; the values must not reference the system.
+
+    If two threads compute the same value at the same time, one of them is kept.
+    """
+
+    def __init__(self) -> None:
+        self._values: WeakKeyDictionary[NormalEquations, dict[Key, Value]] = WeakKeyDictionary()
+
+    def get(self, system: NormalEquations, key: Key, make: Callable[[], Value]) -> Value:
+        """Return the value of `key` for `system`, computed by `make` the first time."""
+        known = self._values.setdefault(system, {})
+        if key not in known:
+            known[key] = make()
+        return known[key]
