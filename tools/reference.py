@@ -86,6 +86,10 @@ RESULT = {
     "rejected": "reason -> number of detections", "warnings": "a list of sentences",
     "findings": "the data behind `warnings`: a list of name, text, view, axis, mark (m, n) or (k), "
                 "size, u, unit, p, details (by name, SI units)",
+    "budget": "a line for each component of the uncertainty: quantity (xy in m, theta in rad), "
+              "component, type (A, B), value, u, unit (of the input quantity), effect_rms, "
+              "effect_max (on the map, k = 1), dof (null = many), source (readings, declared, "
+              "default), details, text",
     "input": "file and sha256 of the bag", "solver": "how the equations were solved",
     "covariance_terms": "terms and factors (r, 2, N, N), for the exact comparison of results; "
                         "up to 31 × 31 sites, and not with `--model none`",
@@ -98,8 +102,7 @@ SOMETIMES = {
     "outliers": "`--robust`: rule, and the readings removed",
     "slips": "`--robust`: slips of the plate",
     "noisy_views": "`--robust`: views noisier than the others",
-    "validation": "`--validate`: readings held out, and prediction errors",
-    "budget": "`--budget`: components of the uncertainty, m and rad"}
+    "validation": "`--validate`: readings held out, and prediction errors"}
 
 
 def table(head: tuple[str, ...], rows: Iterator[tuple[str, ...]] | list) -> list[str]:

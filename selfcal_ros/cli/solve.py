@@ -168,7 +168,7 @@ def run(args: argparse.Namespace) -> int:
                                        f"{error})", error.observability) from error
         raise
     with busy("validating"):
-        result, lines = _extended(args, measurements, options, result)
+        result, lines = _validated(args, measurements, options, result)
     result = created_now(with_input(worded(result), bag_input(args.bag), lost))
     _write(args, result_to_dict(result))
     if args.report:
@@ -177,6 +177,7 @@ def run(args: argparse.Namespace) -> int:
         write_report(result, args.report, truth=read_truth(args.bag), more=[table_chapter(result)])
     if not args.quiet:
         show(result, args.bag, file_of(args), aside(args))
+        lines += _budget(result) if args.budget else []
         print("\n".join(lines), end="\n" * bool(lines), file=aside(args))
     return exit_code(result)
 
@@ -206,9 +207,9 @@ def _write(args: argparse.Namespace, data: dict[str, Any]) -> None:
         put(data)
 
 
-def _extended(args: argparse.Namespace, measurements: Any, options: Any,
-              result: Any) -> tuple[Any, list[str]]:
-    """Return the result with places, validation and budget as requested, and the text."""
+def _validated(args: argparse.Namespace, measurements: Any, options: Any,
+               result: Any) -> tuple[Any, list[str]]:
+    """Return the result with places, validated if requested, and the text to print."""
     from dataclasses import replace
 
     from selfcal_ros.collection.reduce import with_places
@@ -227,14 +228,14 @@ def _extended(args: argparse.Namespace, measurements: Any, options: Any,
             **result.extra, "validation": validation_json(found, result.artifact)})
         lines += ["", "held-out readings:", *(f"  {line}" for line in validation_text(
             found, result.artifact))]
-    if args.budget:
-        from selfcal_ros.estimation.verdict.budget import budgets
-        from selfcal_ros.reporting.words.budget import budget_json, budget_text
-
-        if not result.has_uncertainty:
-            return result, [*lines, "", "no budget: the uncertainty map was not computed "
-                            "(--uncertainty always)"]
-        rows = budgets(result, options.reference)
-        result = replace(result, extra={**result.extra, "budget": budget_json(rows)})
-        lines += ["", *budget_text(rows)]
     return result, lines
+
+
+def _budget(result: Any) -> list[str]:
+    """Return the budget as it is printed."""
+    from selfcal_ros.estimation.verdict.budget import budgets
+    from selfcal_ros.reporting.words.budget import budget_text
+
+    if not result.has_uncertainty:
+        return ["", "no budget: the uncertainty map was not computed (--uncertainty always)"]
+    return ["", *budget_text(budgets(result))]

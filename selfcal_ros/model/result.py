@@ -14,10 +14,12 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ErrorMap, ThetaDatum
 from selfcal_ros.model.readings import Measurements
-from selfcal_ros.model.verdict import Finding, Grade, ModelResult, Provenance, Verdict
+from selfcal_ros.model.verdict import BudgetLine, Finding, Grade, ModelResult, Provenance, Verdict
 from selfcal_ros.model.verdict_json import (
+    budget_from_dict,
     finding_from_dict,
     finding_to_dict,
+    line_to_dict,
     model_from_dict,
     model_to_dict,
     provenance_from_dict,
@@ -170,6 +172,7 @@ class CalibrationResult:
     provenance: Provenance = Provenance()
     run_id: str = ""
     findings: tuple[Finding, ...] = ()
+    budget: tuple[BudgetLine, ...] = ()
 
     @property
     def artifact(self) -> Artifact:
@@ -181,17 +184,6 @@ class CalibrationResult:
         """Whether the uncertainty of the XY map was computed."""
         emap = self.error_map
         return bool((np.isfinite(emap.u_gx) & np.isfinite(emap.u_gy)).any())
-
-
-def _budget(rows: Any) -> None:
-    """Raise ValueError if these are no rows of a budget."""
-    for row in _of(list, rows):
-        for key, value in _of(dict, row).items():
-            if key == "dof" or str(key).startswith("u_"):
-                _number(value)
-            else:
-                _of(str, value)
-        _of(str, row["quantity"])
 
 
 def with_input(result: CalibrationResult, source: dict[str, str],
@@ -271,6 +263,7 @@ def result_to_dict(result: CalibrationResult) -> dict[str, Any]:
         "rejected": dict(result.rejected),
         "warnings": list(result.warnings),
         "findings": plain([finding_to_dict(found) for found in result.findings]),
+        "budget": plain([line_to_dict(line) for line in result.budget]),
         "input": dict(result.input),
         **{key: plain(value) for key, value in result.extra.items()},
     }
@@ -280,7 +273,7 @@ _MAP_ARRAYS = ("gx", "gy", "u_gx", "u_gy", "g_theta", "u_g_theta")
 _KNOWN = {"schema", "run_id", "verdict", "model", "reference", "provenance", "dof",
           "coverage_factor", "plan_id", "method", "measurement_sense", "artifact", "views",
           "error_map", "artifact_map", "observability", "noise", "rejected", "warnings", "findings",
-          "input"}
+          "budget", "input"}
 
 
 def plain(value: Any) -> Any:
@@ -323,7 +316,6 @@ def _parse(data: dict) -> CalibrationResult:
     artifact = Artifact(raw["grid_size"], float(raw["grid_pitch"]), raw["angular_count"],
                         raw.get("grid_size_y", 0))
     emap, amap = data["error_map"], data["artifact_map"]
-    _budget(data.get("budget", []))
     shapes: dict[str, tuple[int, ...]] = dict.fromkeys(_MAP_ARRAYS[:4], artifact.shape)
     shapes |= dict.fromkeys(_MAP_ARRAYS[4:], (artifact.angular_count,))
     error_map = ErrorMap(
@@ -355,7 +347,8 @@ def _parse(data: dict) -> CalibrationResult:
         verdict_from_dict(data.get("verdict"), identifiable=seen["identifiable"]),
         model_from_dict(data.get("model")), reference_from_dict(data.get("reference")),
         provenance_from_dict(data.get("provenance")), _of(str, data.get("run_id", "")),
-        tuple(map(finding_from_dict, data.get("findings", []))))
+        tuple(map(finding_from_dict, data.get("findings", []))),
+        budget_from_dict(data.get("budget", [])))
 
 
 def _view(v: dict) -> ViewResult:

@@ -5,6 +5,7 @@ import math
 from typing import Any
 
 from selfcal_ros.model.verdict import (
+    BudgetLine,
     Cause,
     Enlargement,
     Finding,
@@ -84,6 +85,32 @@ def verdict_from_dict(data: dict | None, *, identifiable: bool) -> Verdict:
         tuple(Enlargement(_text(e["name"]), _number(e["u_rms"]), _number(e["u_max"]),
                           _text(e["unit"])) for e in data.get("enlarged_by", [])),
         _text(data["sentence"]), tuple(map(_text, data["reasons"])))
+
+
+def line_to_dict(line: BudgetLine) -> dict[str, Any]:
+    """Return the JSON form of a line of the budget."""
+    data = dict(vars(line))
+    return {"quantity": data.pop("quantity"), "component": data.pop("component"),
+            "type": data.pop("kind"), **data}
+
+
+def budget_from_dict(rows: Any) -> tuple[BudgetLine, ...]:
+    """Return the lines of a budget; none of those of files that have other columns."""
+    if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
+        raise ValueError(f"{rows!r} is not a list of lines of a budget")
+    return tuple(_line(row) for row in rows if "effect_rms" in row)
+
+
+def _line(row: dict) -> BudgetLine:
+    dof = row["dof"]
+    if not isinstance(row["details"], dict):
+        raise ValueError(f"{row['details']!r} are no details")
+    quantity, component, kind, unit, source, text = (
+        _text(row[key]) for key in ("quantity", "component", "type", "unit", "source", "text"))
+    value, u, effect_rms, effect_max = (
+        _number(row[key]) for key in ("value", "u", "effect_rms", "effect_max"))
+    return BudgetLine(quantity, component, kind, value, u, unit, effect_rms, effect_max,
+                      math.inf if dof is None else _number(dof), source, row["details"], text)
 
 
 def model_to_dict(model: ModelResult) -> dict[str, Any]:

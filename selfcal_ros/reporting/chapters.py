@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from selfcal_ros.estimation.options import ReferenceLength
 from selfcal_ros.estimation.verdict.budget import Budget, budgets
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.reporting.extras import convention_section, extra_sections, provenance_section
@@ -25,10 +24,10 @@ from selfcal_ros.reporting.figures.residuals import (
     residuals_in,
 )
 from selfcal_ros.reporting.summary import sections
-from selfcal_ros.reporting.summary.format import fixed_column, printable
+from selfcal_ros.reporting.summary.format import aligned_numbers, fixed_column, printable
 from selfcal_ros.reporting.summary.sections import Section
 from selfcal_ros.reporting.words.budget import dof_text
-from selfcal_ros.reporting.words.findings import advice, what_it_is
+from selfcal_ros.reporting.words.findings import advice, line_text, what_it_is
 from selfcal_ros.units import ARCSEC_PER_RAD, PPM_PER_ONE, RAD_PER_MRAD, UM_PER_M
 
 AT_NODES = ("At the nodes: how well the map itself is known. Take it to compare two calibrations, "
@@ -130,33 +129,37 @@ def _maps(result: CalibrationResult, truth: Mapping[str, np.ndarray] | None) -> 
 
 def _uncertainty(result: CalibrationResult) -> Chapter:
     """Return both kinds of U, each with what it is for."""
-    emap = result.error_map
-    if not (np.isfinite(emap.u_gx) & np.isfinite(emap.u_gy)).any():
-        return Chapter("Uncertainty")
-    rows = []
-    for budget in budgets(result, _reference(result)):
+    rows, tables = [], []
+    for budget in budgets(result):
         unit, scale = ("µm", UM_PER_M) if budget.unit == "m" else ("arcsec", ARCSEC_PER_RAD)
         numbers = [budget.u_rms, budget.u_max, budget.U_rms, budget.U_max]
         rows.append((_where(budget), *fixed_column([value * scale for value in numbers]), unit,
                      f"{budget.k:.2f}", dof_text(budget.dof)))
+        if budget.anywhere:
+            tables.append(_budget_table(budget, unit, scale))
+    if not rows:
+        return Chapter("Uncertainty")
     header = ("known", "u rms", "u largest", "U rms", "U largest", "unit", "k", "dof")
     return Chapter("Uncertainty", sections=(Section(
-        "Two kinds of U, for 95.45 %", table=(header, *rows), notes=(AT_NODES, ANYWHERE)),))
+        "Two kinds of U, for 95.45 %", table=(header, *rows), notes=(AT_NODES, ANYWHERE)), *tables))
+
+
+def _budget_table(budget: Budget, unit: str, scale: float) -> Section:
+    """Return the lines of a budget."""
+    effects = [aligned_numbers([getattr(line, name) * scale for line in budget.lines])
+               for name in ("effect_rms", "effect_max")]
+    rows = [(line.component, line.kind, *effect, unit, dof_text(line.dof), line.source,
+             printable(line.text or line_text(line)))
+            for line, *effect in zip(budget.lines, *effects, strict=True)]
+    header = ("component", "type", "u rms", "u largest", "unit", "dof", "source", "from")
+    name = "x or y" if budget.quantity == "xy" else "θ"
+    return Section(f"Uncertainty budget (GUM): {name}", table=(header, *rows))
 
 
 def _where(budget: Budget) -> str:
     if budget.quantity == "xy":
         return "x or y, anywhere" if budget.anywhere else "x or y, at the nodes"
     return "θ, anywhere" if budget.anywhere else "θ, at the lines"
-
-
-def _reference(result: CalibrationResult) -> ReferenceLength | None:
-    """Return the reference length that a result names; None without one."""
-    told = result.reference
-    if not told:
-        return None
-    return ReferenceLength(told["kind"], float(told["relative_error"]), float(told["u_relative"]),
-                           str(told.get("certificate") or ""))
 
 
 def _residuals(result: CalibrationResult) -> Chapter:

@@ -15,13 +15,11 @@ from selfcal_ros.reporting.summary.format import (
     significant,
 )
 from selfcal_ros.reporting.summary.sections import Section
-from selfcal_ros.reporting.words.budget import COUNTED_DOF
 from selfcal_ros.units import ARCSEC_PER_RAD, UM_PER_M
 
 MAX_ROWS = 200
 """Longest table of a report; the rest is in the result file."""
-TITLES = {"budget": "Uncertainty budget (GUM)",
-          "outliers": "Marks removed or weighted down", "validation": "Held-out validation",
+TITLES = {"outliers": "Marks removed or weighted down", "validation": "Held-out validation",
           "reference": "Reference length"}
 """Known extras, in the order in which they are reported; others follow by name."""
 DRAWN = {"residuals", "rejected_at"}
@@ -45,20 +43,9 @@ def extra_sections(extra: Mapping[str, Any]) -> list[Section]:
     """
     names = [*(n for n in TITLES if n in extra), *sorted(n for n in extra if n not in TITLES)]
     names = [name for name in names if name not in DRAWN]
-    found = [part for name in names for part in _parts(name, extra[name])]
-    sections = [_extra_section(*part) for part in found]
+    sections = [_extra_section(name, TITLES.get(name, _words(name).capitalize()), extra[name])
+                for name in names]
     return [section for section in sections if section is not None]
-
-
-def _parts(name: str, value: Any) -> list[tuple[str, str, Any]]:
-    """Return (name, title, value); a table over several quantities becomes one of each."""
-    title = TITLES.get(name, _words(name).capitalize())
-    if not _is_table(value) or not all(isinstance(row.get("quantity"), str) for row in value):
-        return [(name, title, value)]
-    quantities = dict.fromkeys(row["quantity"] for row in value)
-    return [(name, f"{title}: {quantity}", [
-        {key: item for key, item in row.items() if key != "quantity"} for row in value
-        if row["quantity"] == quantity]) for quantity in quantities]
 
 
 def _extra_section(name: str, title: str, value: Any) -> Section | None:
@@ -99,9 +86,7 @@ def _table(rows: Sequence[Mapping[str, Any]]) -> tuple[tuple, tuple]:
 
 
 def _column(key: str, values: list[Any]) -> list[str]:
-    """Return the cells of a column: numbers with equal decimals, degrees of freedom as integers."""
-    if key == "dof":
-        return ["many" if v is None or v >= COUNTED_DOF else f"{v:.0f}" for v in values]
+    """Return the cells of a column: numbers with equal decimals."""
     if not any(isinstance(v, float) for v in values) or any(
             isinstance(v, str | list) for v in values):
         return [_cell(key, v) for v in values]

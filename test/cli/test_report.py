@@ -132,8 +132,9 @@ def test_no_damage_to_a_result_file_ends_in_a_traceback(folder):
 
 
 REFERENCE = {"kind": "artifact", "relative_error": 1e-6, "u_relative": 1e-7, "certificate": "C 1"}
-ROW = {"quantity": "XY", "component": "combined", "type": "", "u_rms_m": 1e-9, "u_max_m": 2e-9,
-       "u_rms_rad": None, "u_max_rad": None, "dof": 12.0, "note": ""}
+ROW = {"quantity": "xy", "component": "reading noise", "type": "A", "value": 0.0, "u": 2e-8,
+       "unit": "m", "effect_rms": 1e-9, "effect_max": 2e-9, "dof": None, "source": "readings",
+       "details": {}, "text": "scatter of repeats"}
 
 
 @pytest.mark.parametrize(("key", "value", "said"), [
@@ -144,11 +145,12 @@ ROW = {"quantity": "XY", "component": "combined", "type": "", "u_rms_m": 1e-9, "
     ("reference", REFERENCE | {"certificate": 3}, "3 is not text"),
     ("reference", {}, "the key 'kind' is missing"),
     ("reference", [], "[] is not a reference"),
-    ("budget", [{}], "the key 'quantity' is missing"),
-    ("budget", [ROW | {"quantity": 3}], "3 is not of type str"),
+    ("budget", [{"effect_rms": 1e-9}], "the key 'dof' is missing"),
+    ("budget", [ROW | {"quantity": 3}], "3 is not text"),
+    ("budget", [ROW | {"details": 3}], "3 are no details"),
     ("budget", [ROW | {"dof": "many"}], "'many' is not a number"),
-    ("budget", [ROW | {"u_rms_m": [1]}], "[1] is not a number"),
-    ("budget", [3], "3 is not of type dict"), ("budget", "x", "'x' is not of type list")])
+    ("budget", [ROW | {"effect_max": [1]}], "[1] is not a number"),
+    ("budget", [3], "[3] is not a list of lines"), ("budget", "x", "'x' is not a list of lines")])
 def test_an_unusable_reference_or_budget_is_one_line(folder, monkeypatch, capsys, key, value, said):
     monkeypatch.chdir(folder)
     whole = json.loads(Path("result.json").read_text())

@@ -58,7 +58,7 @@ def assert_same(a, b):
 def test_a_result_survives_its_json_to_the_last_bit(lines, size_y):
     result, _ = known_result(11, lines, size_y=size_y)
     result = replace(result, warnings=("a", "b"), sense="plate_moves", method="law",
-                     extra={"budget": [{"quantity": "x", "u_k1_m": 2.5e-9, "dof": 7}]})
+                     extra={"more": [{"quantity": "x", "u_k1_m": 2.5e-9, "dof": 7}]})
     assert_same(through_json(result), result)
 
 

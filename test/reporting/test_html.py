@@ -137,7 +137,7 @@ def test_text_from_files_is_escaped():
     hostile = replace(
         result, plan_id=evil, warnings=(evil,), rejected={evil: 1},
         input={"file": evil, evil: evil}, method=evil, sense=evil,
-        extra={evil: evil, "budget": [{evil: evil}]},
+        extra={evil: evil, "outliers": [{evil: evil}]},
         views=(replace(result.views[0], name=evil),),
         observability=Observability(1, 2, 1, False, (evil,), (evil,)))
     page = parsed(html_of(hostile))
@@ -174,15 +174,14 @@ def test_a_site_that_is_unknown_leaves_a_table_with_a_hole():
     assert "1 sites are unknown, and a table has no holes: selfcal cal export --fill" in html
 
 
-def test_budget_and_residuals_are_tabulated_with_units():
-    budget = [{"component": "reading noise", "u_xy_m": 1.7e-8, "dof": 220.4},
-              {"component": "reference", "u_xy_m": 1.23e-6, "active": True}]
+def test_rows_and_numbers_are_tabulated_with_units():
+    rows = [{"view": "a", "rms_m": 1.7e-8, "mark": [1, -2]},
+            {"view": "b", "rms_m": 1.23e-6, "exceeds": True}]
     sections = extra_sections({"left_over": {"largest_rad": 1e-6, "n": 968, "map": [[1.0]]},
-                               "budget": budget})
-    assert [s.title for s in sections] == ["Uncertainty budget (GUM)", "Left over"]
-    assert sections[0].table == (("component", "u xy in µm", "dof", "active"),
-                                 ("reading noise", "0.017", "220", "–"),
-                                 ("reference", "1.230", "many", "yes"))
+                               "validation": rows})
+    assert [s.title for s in sections] == ["Held-out validation", "Left over"]
+    assert sections[0].table == (("view", "rms in µm", "mark", "exceeds"),
+                                 ("a", "0.017", "1, -2", "–"), ("b", "1.230", "–", "yes"))
     assert sections[1].facts == (("largest in arcsec", "0.206"), ("n", "968"))
 
 

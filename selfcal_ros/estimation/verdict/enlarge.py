@@ -18,7 +18,6 @@ from selfcal_ros.estimation.joint.solved import (
     rounded,
     variance_of_terms,
 )
-from selfcal_ros.estimation.options import ReferenceLength
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.statistics import rms
@@ -106,12 +105,15 @@ def remaining_part(term: TermResult) -> float:
     return rms(np.array([estimate.u for estimate in term.estimates])) / term.solved_with
 
 
-def known_beforehand(result: CalibrationResult, reference: ReferenceLength | None) -> np.ndarray:
-    """Return the variance of the map that no reading told, (2, nx, ny), m^2."""
-    artifact = result.artifact
-    found = np.zeros((2, *artifact.shape))
-    if reference is not None:
-        found += (reference.u_relative * np.stack([artifact.x_m, artifact.y_m])) ** 2
+def variance_of_reference(result: CalibrationResult) -> np.ndarray:
+    """Return the variance of the map that the reference length makes, (2, nx, ny), m^2."""
+    u = 0.0 if result.reference is None else float(result.reference["u_relative"])
+    return (u * np.stack([result.artifact.x_m, result.artifact.y_m])) ** 2
+
+
+def known_beforehand(result: CalibrationResult) -> np.ndarray:
+    """Return the variance of the map that no reading determined, (2, nx, ny), m^2."""
+    found = variance_of_reference(result)
     terms = {term.name: term for term in result.model.terms}
     for name, variance in variance_of_terms(result).items():
         if name not in terms or remaining_part(terms[name]) >= TOLD:  # else an effect
@@ -119,22 +121,16 @@ def known_beforehand(result: CalibrationResult, reference: ReferenceLength | Non
     return found
 
 
-def with_coverage(result: CalibrationResult,
-                  reference: ReferenceLength | None) -> CalibrationResult:
+def with_coverage(result: CalibrationResult) -> CalibrationResult:
     """Return the result with degrees of freedom and k of the XY map's uncertainty.
 
-    Parameters
-    ----------
-    result : CalibrationResult
-        With its uncertainty map; without one k is that of the noise.
-    reference : ReferenceLength, optional
-        What set the scale.
+    Without an uncertainty map k is that of the noise. The reference length is that of the result.
     """
     noise, emap = result.noise, result.error_map
     dof = noise.dof_xy
     power = np.stack([emap.u_gx, emap.u_gy]) ** 2
     at = np.isfinite(power)
-    known = known_beforehand(result, reference)
+    known = known_beforehand(result)
     if not (at.any() and dof > 0 and known[at].any()):
         return replace(result, noise=replace(noise, dof_map_xy=dof, dof_map_theta=noise.dof_theta))
     whole = float(power[at].mean())

@@ -23,6 +23,7 @@ from selfcal_ros.estimation.joint.solve import fit_joint, solve_joint
 from selfcal_ros.estimation.joint.solved import Solved
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.terms.equations import free_inverse
+from selfcal_ros.estimation.verdict.budget import budget_lines
 from selfcal_ros.estimation.verdict.enlarge import enlarged, enlargements, with_coverage
 from selfcal_ros.estimation.verdict.look import ALWAYS_SITES, look_into
 from selfcal_ros.model.readings import Measurements
@@ -70,20 +71,20 @@ def judged(solved: Solved, measurements: Measurements, options: Options) -> Cali
         solved = looked.solved
         noises = _noise_findings(solved)
     reference = options.reference
-    result = enlarged(solved.result, looked.effects)
-    result = with_coverage(result, reference)
+    result = replace(solved.result, reference=None if reference is None else {
+        "kind": str(reference.kind), "relative_error": reference.relative_error,
+        "u_relative": reference.u_relative, "certificate": reference.certificate})
+    result = with_coverage(enlarged(result, looked.effects))
     bounded = looked.bounded and (own or not looked.causes) and not _unexplained_noise(solved)
     grade = (Grade.GOOD if not (failed or noises or looked.causes) else
              Grade.ENLARGED if bounded and not failed and result.has_uncertainty else
              Grade.NOT_QUALIFIED)
     verdict = Verdict(grade, (*failed, *noises), looked.causes,
                       enlargements(result, looked.terms, looked.effects))
-    return replace(
+    result = replace(
         result, verdict=verdict, findings=(*result.findings, *_visits_findings(checked)),
-        provenance=provenance_of(measurements, options),
-        reference=None if reference is None else {
-            "kind": str(reference.kind), "relative_error": reference.relative_error,
-            "u_relative": reference.u_relative, "certificate": reference.certificate})
+        provenance=provenance_of(measurements, options))
+    return replace(result, budget=tuple(budget_lines(result)))
 
 
 def _unexplained_noise(solved: Solved) -> bool:

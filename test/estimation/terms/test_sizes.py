@@ -13,8 +13,7 @@ from selfcal_ros.estimation.verdict.budget import budgets
 from selfcal_ros.model.result import result_from_dict, result_to_dict
 from selfcal_ros.model.terms import ModelTerm, parse_terms
 from selfcal_ros.model.verdict import Grade
-from selfcal_ros.reporting.words.budget import how_text
-from selfcal_ros.reporting.words.findings import worded
+from selfcal_ros.reporting.words.findings import line_text, worded
 from selfcal_ros.simulation.machine import Spread, random_truth
 from selfcal_ros.simulation.truth import simulate_measurements
 from test.estimation.terms.test_terms import plan_of, settings
@@ -135,9 +134,9 @@ def test_a_size_that_is_too_small_is_kept_beside_the_one_that_was_used():
     assert term.size == 1e-8 and 1e-6 < term.size_used < 1e-4
     back = result_from_dict(result_to_dict(worded(result)), "r.json")
     assert back.model == result.model
-    line = next(c for c in budgets(result)[0].components if c.label == "term plate_scale")
-    said = how_text(line.how)
-    assert said.startswith("given as 1e-08, which the readings contradict; they allow ")
+    line = next(c for c in budgets(result)[0].lines if c.component == "term plate_scale")
+    assert line_text(line).startswith("size 1e-08, which the readings contradict; of ")
+    assert (line.source, line.details["allowed"]) == ("readings", term.size_used)
     right = calibrate(readings, options("plate_scale:5e-6"))
     assert right.model.terms[0].size_used is None
     assert right.verdict.grade is Grade.GOOD

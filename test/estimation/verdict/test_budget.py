@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The uncertainty budget: each component on its own, the sum, k, and the printed table."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -8,12 +9,14 @@ import pytest
 from scipy.stats import t as student
 
 from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.estimation.options import ReferenceKind, ReferenceLength
-from selfcal_ros.estimation.verdict.budget import FromReadings, Source, budgets
+from selfcal_ros.estimation.options import Options
+from selfcal_ros.estimation.verdict.budget import budget_lines, budgets
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Measurements
-from selfcal_ros.model.terms import ModelTerm, TermName
-from selfcal_ros.reporting.words.budget import budget_json, budget_text, how_text, quantity_text
+from selfcal_ros.model.result import result_from_dict, result_to_dict
+from selfcal_ros.model.terms import ModelTerm, TermName, parse_terms
+from selfcal_ros.reporting.words.budget import budget_text, quantity_text
+from selfcal_ros.reporting.words.findings import line_text, worded
 from selfcal_ros.simulation.truth import Spread, hu_plan, random_truth, simulate_measurements
 from test.support.lattice_plans import plan_of
 from test.support.options import BARE, bare
@@ -33,7 +36,16 @@ def calibrated(repeats=5, *, extra_m=0.0, angular=True, g_m=0.0):
 
 
 def parts_of(budget):
-    return {part.label: part for part in budget.components}
+    return {line.component: line for line in budget.lines}
+
+
+def drawn_up(result, **changed):
+    """Return the budgets of a result of which something is changed."""
+    return budgets(replace(result, budget=(), **changed))
+
+
+def by(noise, *, contradicted=False):
+    return {"by": noise, "contradicted": contradicted}
 
 
 def test_reading_noise_is_that_of_the_map():
@@ -41,10 +53,10 @@ def test_reading_noise_is_that_of_the_map():
     xy, _, theta, _ = budgets(result)
     part = parts_of(xy)["reading noise"]
     u = np.stack([result.error_map.u_gx, result.error_map.u_gy])
-    assert part.u_rms == pytest.approx(np.sqrt((u**2).mean()))
-    assert part.u_max == pytest.approx(u.max())
-    assert part.dof == result.noise.dof_xy_repeats and part.how == FromReadings(Source.REPEATS)
-    assert parts_of(theta)["reading noise"].u_rms == pytest.approx(
+    assert part.effect_rms == pytest.approx(np.sqrt((u**2).mean()))
+    assert part.effect_max == pytest.approx(u.max())
+    assert part.dof == result.noise.dof_xy_repeats and part.details == by("repeats")
+    assert parts_of(theta)["reading noise"].effect_rms == pytest.approx(
         np.sqrt((result.error_map.u_g_theta**2).mean()))
 
 
@@ -53,21 +65,21 @@ def test_noise_beyond_the_repeats_is_in_the_noise_once():
     result = calibrated(extra_m=3e-8)
     part = parts_of(budgets(result)[0])["reading noise"]
     u = np.stack([result.error_map.u_gx, result.error_map.u_gy])
-    assert part.u_rms == pytest.approx(np.sqrt((u**2).mean()))
+    assert part.effect_rms == pytest.approx(np.sqrt((u**2).mean()))
     assert part.dof == result.noise.dof_xy_residuals
-    assert part.how == FromReadings(Source.RESIDUALS, True)
-    assert how_text(part.how) == ("residuals of the fit, the larger of two that contradict each "
+    assert part.details == by("residuals", contradicted=True)
+    assert line_text(part) == ("residuals of the fit, the larger of two that contradict each "
                                   "other (see the verdict)")
     # an error of 30 nm a mean beside 20 nm / sqrt(5)
     quiet = parts_of(budgets(calibrated())[0])["reading noise"]
-    assert part.u_rms == pytest.approx(quiet.u_rms * np.hypot(3e-8 * np.sqrt(5), 2e-8) / 2e-8,
-                                       rel=0.15)
-    assert quiet.how == FromReadings(Source.REPEATS)
+    more = np.hypot(3e-8 * np.sqrt(5), 2e-8) / 2e-8
+    assert part.effect_rms == pytest.approx(quiet.effect_rms * more, rel=0.15)
+    assert quiet.details == by("repeats")
 
 
 def test_without_repeats_the_residuals_speak():
     parts = parts_of(budgets(calibrated(1))[0])
-    assert parts["reading noise"].how == FromReadings(Source.RESIDUALS)
+    assert parts["reading noise"].details == by("residuals")
 
 
 def test_nodes_and_field_are_told_apart():
@@ -78,9 +90,9 @@ def test_nodes_and_field_are_told_apart():
     assert quantity_text(of_lines) == "theta at the lines of the map"
     assert quantity_text(at_any_angle) == "theta at any angle, map interpolated between its lines"
     assert "interpolation" not in parts_of(at_nodes) | parts_of(of_lines)
-    assert parts_of(in_field)["interpolation"].u_rms > 5 * at_nodes.u_rms
+    assert parts_of(in_field)["interpolation"].effect_rms > 5 * at_nodes.u_rms
     assert in_field.u_rms == pytest.approx(np.hypot(
-        at_nodes.u_rms, parts_of(in_field)["interpolation"].u_rms))
+        at_nodes.u_rms, parts_of(in_field)["interpolation"].effect_rms))
 
 
 def test_a_term_with_a_size_has_a_line_and_the_lines_add_up():
@@ -97,25 +109,25 @@ def test_a_term_with_a_size_has_a_line_and_the_lines_add_up():
     emap = result.error_map
     total = np.mean(np.stack([emap.u_gx, emap.u_gy]) ** 2)
     line = parts["term plate_shape"]
-    assert total == pytest.approx(sum(part.u_rms**2 for part in parts.values()), rel=1e-4)
+    assert total == pytest.approx(sum(part.effect_rms**2 for part in parts.values()), rel=1e-4)
     own = np.stack([alone.error_map.u_gx, alone.error_map.u_gy]) / alone.noise.sigma_xy
     noise = np.sqrt(np.mean(own**2)) * result.noise.sigma_xy
-    assert parts["reading noise"].u_rms == pytest.approx(noise, rel=1e-3)
-    assert line.u_rms > 0.2 * noise
-    assert how_text(line.how).startswith("known to 1e-07 beforehand; the readings leave ")
+    assert parts["reading noise"].effect_rms == pytest.approx(noise, rel=1e-3)
+    assert line.effect_rms > 0.2 * noise
+    assert line_text(line).startswith("size 1e-07, of which the readings leave ")
     loose = parts_of(budgets(calibrate(readings, replace(plain, terms=(
         ModelTerm(TermName.PLATE_SHAPE, 1e-9),))))[0])["term plate_shape"]
-    assert (loose.kind, loose.dof) == ("B", np.inf) and loose.u_rms < line.u_rms
+    assert (loose.kind, loose.dof) == ("B", np.inf) and loose.effect_rms < line.effect_rms
 
 
 def test_reference_length_grows_with_the_distance_from_the_centre():
     result = calibrated()
-    assert parts_of(budgets(result)[0])["reference length"].u_rms == 0.0
-    reference = ReferenceLength(ReferenceKind.ARTIFACT, 0.0, 1e-6)
-    part = parts_of(budgets(result, reference)[0])["reference length"]
-    assert part.u_max == pytest.approx(1e-6 * 0.04)
-    assert part.u_rms == pytest.approx(1e-6 * np.sqrt((ARTIFACT.x_m**2).mean()))
-    assert part.kind == "B" and "artifact" in how_text(part.how)
+    assert parts_of(budgets(result)[0])["reference length"].effect_rms == 0.0
+    reference = {"kind": "artifact", "relative_error": 0.0, "u_relative": 1e-6, "certificate": ""}
+    part = parts_of(drawn_up(result, reference=reference)[0])["reference length"]
+    assert part.effect_max == pytest.approx(1e-6 * 0.04)
+    assert part.effect_rms == pytest.approx(1e-6 * np.sqrt((ARTIFACT.x_m**2).mean()))
+    assert part.kind == "B" and "artifact" in line_text(part)
 
 
 def test_the_reference_is_not_counted_twice():
@@ -124,10 +136,10 @@ def test_the_reference_is_not_counted_twice():
     own = 3e-7 * np.stack([ARTIFACT.x_m, ARTIFACT.y_m])
     emap = result.error_map
     with_scale = replace(emap, u_gx=np.hypot(emap.u_gx, own[0]), u_gy=np.hypot(emap.u_gy, own[1]))
-    reference = ReferenceLength(ReferenceKind.ARTIFACT, 0.0, 3e-7)
-    found = parts_of(budgets(replace(result, error_map=with_scale), reference)[0])
-    assert found["reading noise"].u_rms == pytest.approx(noise.u_rms)
-    assert found["reading noise"].u_max == pytest.approx(noise.u_max)
+    reference = {"kind": "artifact", "relative_error": 0.0, "u_relative": 3e-7, "certificate": ""}
+    found = parts_of(drawn_up(result, error_map=with_scale, reference=reference)[0])
+    assert found["reading noise"].effect_rms == pytest.approx(noise.effect_rms)
+    assert found["reading noise"].effect_max == pytest.approx(noise.effect_max)
 
 
 def test_interpolation_error_of_a_parabola_is_the_exact_one():
@@ -135,45 +147,78 @@ def test_interpolation_error_of_a_parabola_is_the_exact_one():
     x = ARTIFACT.x_m
     nothing = np.zeros(ARTIFACT.shape)
     curved = replace(result.error_map, gx=1e-3 * x**2, gy=nothing, u_gx=nothing, u_gy=nothing)
-    part = parts_of(budgets(replace(result, error_map=curved))[1])["interpolation"]
+    part = parts_of(drawn_up(result, error_map=curved)[1])["interpolation"]
     middle = 1e-3 * 0.01**2 / 4  # linear interpolation of a x^2 over a pitch, at its middle
-    assert part.u_max == pytest.approx(middle)
-    assert part.u_rms == pytest.approx(np.sqrt(8 / 15 / 2) * middle)
+    assert part.effect_max == pytest.approx(middle)
+    assert part.effect_rms == pytest.approx(np.sqrt(8 / 15 / 2) * middle)
 
 
 def test_noise_is_no_interpolation_error():
     parts = parts_of(budgets(calibrated())[1])
-    assert parts["interpolation"].u_rms < parts["reading noise"].u_rms
+    assert parts["interpolation"].effect_rms < parts["reading noise"].effect_rms
 
 
 def test_sum_degrees_of_freedom_and_coverage_factor():
     _, budget = budgets(calibrated(2, angular=False, extra_m=3e-8, g_m=1e-7))
-    rms = [part.u_rms for part in budget.components]
+    rms = [part.effect_rms for part in budget.lines]
     assert budget.u_rms == pytest.approx(np.sqrt(np.sum(np.square(rms))))
-    expected = budget.u_rms**4 / sum(p.u_rms**4 / p.dof for p in budget.components)
+    expected = budget.u_rms**4 / sum(p.effect_rms**4 / p.dof for p in budget.lines)
     assert budget.dof == pytest.approx(expected)
     assert budget.k == pytest.approx(student.isf(0.02275, budget.dof)) and budget.k > 2.0
     assert budget.U_rms == pytest.approx(budget.k * budget.u_rms)
     assert budget.unit == "m"
 
 
-def test_table_and_json():
-    found = budgets(calibrated())
-    text = "\n".join(budget_text(found))
+def test_the_table_names_all_lines_and_their_sum():
+    text = "\n".join(budget_text(budgets(calibrated())))
     for label in ("reading noise", "reference length", "interpolation",
-                  "combined", "expanded, k = 2."):
+                  "combined", "expanded, k = 2.", "scatter of repeats",
+                  "curvature of the map; assumes that it is smooth between lines"):
         assert label in text
-    rows = budget_json(found)
-    assert {row["component"] for row in rows} >= {"reading noise", "combined", "expanded"}
-    first = rows[0]
-    assert first["u_rms_m"] == found[0].components[0].u_rms and first["u_rms_rad"] is None
-    assert rows[-1]["u_rms_rad"] == found[-1].U_rms
+
+
+def test_a_result_has_its_budget_also_in_a_file():
+    result = worded(calibrated())
+    assert [(line.quantity, line.component, line.kind, line.source) for line in result.budget] == [
+        ("xy", "reading noise", "A", "readings"), ("xy", "reference length", "B", "default"),
+        ("xy", "interpolation", "B", "readings"), ("theta", "reading noise", "A", "readings"),
+        ("theta", "interpolation", "B", "readings")]
+    rows = json.loads(json.dumps(result_to_dict(result)))["budget"]
+    noise = result.noise
+    assert rows[0] == {
+        "quantity": "xy", "component": "reading noise", "type": "A", "value": 0.0,
+        "u": noise.sigma_xy, "unit": "m", "effect_rms": result.budget[0].effect_rms,
+        "effect_max": result.budget[0].effect_max, "dof": noise.dof_xy, "source": "readings",
+        "details": {"by": "repeats", "contradicted": False}, "text": "scatter of repeats"}
+    assert rows[1]["dof"] is None and rows[3]["u"] == noise.sigma_theta
+    again = result_from_dict(result_to_dict(result), "r.json")
+    assert again.budget == result.budget and budgets(again) == budgets(result)
+    old = replace(again, budget=())
+    assert [b.lines for b in budgets(old)] == [b.lines for b in budgets(calibrated())]
+    bare = replace(result, error_map=replace(result.error_map, u_gx=result.error_map.gx * np.nan))
+    assert list(budget_lines(bare)) == [] and drawn_up(bare) == []
+
+
+@pytest.mark.parametrize(("given", "source"), [
+    (None, "default"), ("plate_strain:1e-9", "declared")])
+def test_a_line_says_what_its_size_rests_on(given, source):
+    rng = np.random.default_rng(1)
+    plan = hu_plan(ARTIFACT, 2)
+    readings = simulate_measurements(random_truth(ARTIFACT, 4, rng),
+                                     plan, rng, sigma_m=2e-8, sigma_theta_rad=2e-5)
+    result = calibrate(readings, Options(terms=parse_terms([given], "") if given else ()))
+    line = parts_of(budgets(result)[0])["term plate_strain"]
+    (term,) = (term for term in result.model.terms if term.name == "plate_strain")
+    assert (line.kind, line.source, line.unit, line.dof) == ("B", source, "m/m", np.inf)
+    assert line.details["given"] == term.size and line.details["remaining"] > 0.5
+    largest = max(term.estimates, key=lambda estimate: abs(estimate.value))
+    assert (line.value, line.u) == (largest.value, largest.u)
 
 
 def test_a_map_without_noise_has_no_noise_component():
     result = calibrated()
     silent = replace(result, noise=replace(result.noise, sigma_xy=0.0))
-    assert parts_of(budgets(silent)[0])["reading noise"].how == FromReadings(None)
+    assert parts_of(drawn_up(silent)[0])["reading noise"].details == {}
 
 
 def test_noise_that_the_detections_declare_is_told_as_such():
@@ -188,6 +233,6 @@ def test_noise_that_the_detections_declare_is_told_as_such():
         parts = parts_of(budgets(result)[0])
         noise = parts["reading noise"]
         assert (noise.kind, noise.dof) == ("B", np.inf)
-        assert noise.how == FromReadings(Source.DECLARED, True)
+        assert noise.details == by("declared", contradicted=True)
         u = np.stack([result.error_map.u_gx, result.error_map.u_gy])
-        assert noise.u_rms == pytest.approx(np.sqrt((u**2).mean()))
+        assert noise.effect_rms == pytest.approx(np.sqrt((u**2).mean()))
