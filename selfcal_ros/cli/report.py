@@ -20,6 +20,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--plot", metavar="MAP.png", help="also write the map as a picture")
     parser.add_argument("--truth", metavar="TRUTH.json",
                         help="known truth to compare with: gx, gy in m, g_theta in rad")
+    for name, what in (("stage", "name of the stage"), ("serial-number", "its serial number"),
+                       ("operator", "who calibrated it")):
+        parser.add_argument(f"--{name}", metavar="TEXT", default="",
+                            help=f"{what}, for the head of the report")
     add_json(parser)
     parser.add_argument("--text", action="store_true", help="also print the summary")
 
@@ -29,6 +33,7 @@ def run(args: argparse.Namespace) -> int:
     from selfcal_ros.aerotech.report import table_chapter
     from selfcal_ros.files import check_outputs, read_json
     from selfcal_ros.model.result import result_from_dict
+    from selfcal_ros.reporting.extras import ABOUT
     from selfcal_ros.reporting.report import check_name, write_report
     from selfcal_ros.reporting.summary.format import can_print_symbols
     from selfcal_ros.reporting.summary.sections import summary_text
@@ -43,7 +48,8 @@ def run(args: argparse.Namespace) -> int:
             from selfcal_ros.reporting.figures.maps import map_picture
             from selfcal_ros.reporting.figures.paper import save_picture
             save_picture(map_picture(result, truth), args.plot)
-        write_report(result, output, truth=truth, more=[table_chapter(result)])
+        write_report(result, output, truth=truth, more=[table_chapter(result)],
+                     about={name: getattr(args, name) for name in ABOUT})
     written = [str(name) for name in (output, args.plot) if name]
     text = [summary_text(result, truth=truth, ascii_only=not can_print_symbols(sys.stdout))
             ] if args.text else []

@@ -122,6 +122,23 @@ def _cell(key: str, value: Any) -> str:
     return printable(value)
 
 
+ABOUT = ("stage", "serial_number", "operator")
+"""What a report begins with, and no reading tells."""
+
+
+def heading(result: CalibrationResult, about: Mapping[str, str]) -> Section:
+    """Return what was calibrated, by whom and when; `about` before what the result knows."""
+    made = result.provenance
+    known = {**made.extra, **{key: value for key, value in about.items() if value}}
+    first, last = (str(known.get(key, "")).replace("T", " ")[:16] for key in
+                   ("first_exposure", "last_exposure"))
+    measured = f"{first} to {last.removeprefix(first[:11])} UTC"
+    return Section("Calibration", (
+        *((_words(key), printable(known.get(key) or UNKNOWN)) for key in ABOUT),
+        ("measured", measured if first else UNKNOWN),
+        ("evaluated", f"{made.created[:16].replace('T', ' ')} UTC" if made.created else UNKNOWN)))
+
+
 def convention_section(result: CalibrationResult) -> Section:
     """Return what the numbers mean: signs, datum, sense of measurement, coverage."""
     facts = [

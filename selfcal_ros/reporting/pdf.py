@@ -36,7 +36,7 @@ Line = tuple[str, bool]
 """Words of a line, and whether they are a heading."""
 
 
-def report_pdf(result: CalibrationResult, found: Sequence[Chapter]) -> bytes:
+def report_pdf(result: CalibrationResult, found: Sequence[Chapter], head: Section) -> bytes:
     """Return the report as a PDF, the same bytes for the same result."""
     title = drawable(f"Stage calibration: plan {result.plan_id}", 90)
     buffer = io.BytesIO()
@@ -44,6 +44,7 @@ def report_pdf(result: CalibrationResult, found: Sequence[Chapter]) -> bytes:
              "Producer": None}
     with rc_context({**RC, **EMBEDDED}), PdfPages(buffer, metadata=about) as pages:
         writer = _Writer(pages, title)
+        writer.lines([(line, False) for line in [*_section_lines(head), ""]])
         writer.sentence(drawable(state_sentence(result), 600))
         for chapter in found:
             writer.lines(_lines(chapter))

@@ -14,6 +14,7 @@ from selfcal_ros.files import write_bytes, write_text
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.verdict import Grade
 from selfcal_ros.reporting.chapters import Chapter, Figure, chapters
+from selfcal_ros.reporting.extras import heading
 from selfcal_ros.reporting.figures.svg import css as figures_css
 from selfcal_ros.reporting.figures.svg import inline_svg
 from selfcal_ros.reporting.summary.format import numeric_columns, printable
@@ -23,7 +24,7 @@ from selfcal_ros.reporting.summary.sections import Section, state_sentence
 
 def write_report(result: CalibrationResult, path: str | os.PathLike, *,
                  truth: Mapping[str, np.ndarray] | None = None,
-                 more: Sequence[Chapter] = ()) -> None:
+                 more: Sequence[Chapter] = (), about: Mapping[str, str] | None = None) -> None:
     """Write the report of a calibration, HTML or PDF, atomically.
 
     Parameters
@@ -36,6 +37,8 @@ def write_report(result: CalibrationResult, path: str | os.PathLike, *,
         ``gx``, ``gy`` in m and ``g_theta`` in rad: adds the comparison and draws it.
     more : sequence of Chapter
         What others add to the chapters of every report.
+    about : mapping, optional
+        The ``stage``, its ``serial_number`` and the ``operator``.
 
     Raises
     ------
@@ -47,9 +50,9 @@ def write_report(result: CalibrationResult, path: str | os.PathLike, *,
     found = chapters(result, truth_arrays(result.error_map, truth), more)
     if Path(path).suffix.lower() == ".pdf":
         from selfcal_ros.reporting.pdf import report_pdf  # loads matplotlib
-        write_bytes(path, report_pdf(result, found))
+        write_bytes(path, report_pdf(result, found, heading(result, about or {})))
     else:
-        write_text(path, report_html(result, found))
+        write_text(path, report_html(result, found, heading(result, about or {})))
 
 
 def check_name(path: str | os.PathLike) -> None:
@@ -135,11 +138,12 @@ SHORT = 24
 """Characters up to which a cell of words is kept in one line."""
 
 
-def report_html(result: CalibrationResult, found: Sequence[Chapter]) -> str:
+def report_html(result: CalibrationResult, found: Sequence[Chapter], head: Section) -> str:
     """Return the report as one HTML document with inline figures and no outside resource."""
     good = (result.verdict.grade is Grade.GOOD and result.observability.identifiable
             and not result.warnings)
-    parts = [f'<p class="verdict{"" if good else " bad"}">{_text(state_sentence(result))}</p>',
+    parts = [_section(head, titled=False),
+             f'<p class="verdict{"" if good else " bad"}">{_text(state_sentence(result))}</p>',
              _contents(found), *map(_chapter, found)]
     return page(_text(f"Stage calibration: plan {result.plan_id}"), "\n".join(parts))
 

@@ -11,9 +11,9 @@ from selfcal_ros.aerotech.report import table_chapter
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.joint.noise import coverage_factor
 from selfcal_ros.model.result import Observability, result_from_dict, result_to_dict
-from selfcal_ros.model.verdict import Cause, Grade, Remedy, Verdict
-from selfcal_ros.reporting.extras import MAX_ROWS, convention_section, extra_sections
-from selfcal_ros.reporting.report import write_report
+from selfcal_ros.model.verdict import Cause, Grade, Provenance, Remedy, Verdict
+from selfcal_ros.reporting.extras import MAX_ROWS, convention_section, extra_sections, heading
+from selfcal_ros.reporting.report import report_html, write_report
 from test.support.results import html_of, known_result, with_residuals
 
 VOID = {"meta", "img", "br"}
@@ -194,6 +194,26 @@ def test_extras_of_other_forms_are_left_to_the_file():
     assert nested[0].table == (("view", "rms in µm"), ("a", "0.0200"))
     long = extra_sections({"outliers": [{"m": i} for i in range(MAX_ROWS + 5)]})[0]
     assert len(long.table) == MAX_ROWS + 1 and long.notes == ("5 more rows are in the result file",)
+
+
+def test_a_report_begins_with_stage_serial_number_operator_and_dates():
+    result, _ = known_result(3, 8)
+    times = {"first_exposure": "2026-11-21T15:28:54.617+00:00",
+             "last_exposure": "2026-11-21T16:29:26.532+00:00", "stage": "bag's"}
+    made = Provenance("2026-11-23T08:51:45+00:00", 3.0, "0.1.0", times)
+    result = replace(result, provenance=made)
+    found = heading(result, {"stage": "XY <1>", "operator": "N. N.", "serial_number": ""})
+    assert found.facts == (
+        ("stage", "XY <1>"), ("serial number", "–"), ("operator", "N. N."),
+        ("measured", "2026-11-21 15:28 to 16:29 UTC"), ("evaluated", "2026-11-23 08:51 UTC"))
+    assert dict(heading(result, {}).facts)["stage"] == "bag's"
+    html = report_html(result, [], found)
+    assert html.index("XY &lt;1&gt;") < html.index("N. N.") < html.index('class="verdict')
+    late = replace(made, extra={**times, "last_exposure": "2026-11-22T00:10:00.000+00:00"})
+    assert dict(heading(replace(result, provenance=late), {}).facts)["measured"] == (
+        "2026-11-21 15:28 to 2026-11-22 00:10 UTC")
+    bare = heading(replace(result, provenance=Provenance()), {})
+    assert {value for _, value in bare.facts} == {"–"}
 
 
 def test_conventions_follow_the_result():

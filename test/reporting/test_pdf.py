@@ -8,6 +8,7 @@ from selfcal_ros.aerotech.report import table_chapter
 from selfcal_ros.errors import InputError
 from selfcal_ros.reporting import pdf
 from selfcal_ros.reporting.chapters import Chapter
+from selfcal_ros.reporting.extras import heading
 from selfcal_ros.reporting.pdf import COLUMNS, _lines, report_pdf
 from selfcal_ros.reporting.report import write_report
 from selfcal_ros.reporting.summary.sections import Section
@@ -19,7 +20,7 @@ SMALL = replace(known_result(3, 0)[0], plan_id=r"$\frac{ \n 長", warnings=("$x$
 
 @pytest.fixture(scope="module")
 def small():
-    return report_pdf(SMALL, chapters_of(SMALL))
+    return report_pdf(SMALL, chapters_of(SMALL), heading(SMALL, {}))
 
 
 def pages_of(data):
@@ -37,7 +38,8 @@ def test_residuals_take_pages_of_their_own(small, monkeypatch):
     """Pages are counted, not read: their letters are left as outlines, which is cheaper."""
     monkeypatch.setitem(pdf.EMBEDDED, "pdf.fonttype", 3)
     long = with_residuals()
-    assert pages_of(report_pdf(long, chapters_of(long))) >= max(4, pages_of(small) + 1)
+    data = report_pdf(long, chapters_of(long), heading(long, {}))
+    assert pages_of(data) >= max(4, pages_of(small) + 1)
 
 
 def test_no_line_is_wider_than_the_page_and_no_cell_is_lost():
@@ -53,7 +55,7 @@ def test_no_line_is_wider_than_the_page_and_no_cell_is_lost():
 
 
 def test_the_ending_of_the_name_says_the_form(tmp_path, small, monkeypatch):
-    monkeypatch.setattr(pdf, "report_pdf", lambda result, found: small)
+    monkeypatch.setattr(pdf, "report_pdf", lambda result, found, head: small)
     result = known_result(3, 0)[0]
     for name, start in (("a.pdf", b"%PDF"), ("a.PDF", b"%PDF"), ("a.html", b"<!DOCTYPE")):
         write_report(result, tmp_path / name)

@@ -16,6 +16,7 @@ from selfcal_ros.model.result import (
     ViewResult,
 )
 from selfcal_ros.reporting.chapters import Chapter, chapters
+from selfcal_ros.reporting.extras import heading
 from selfcal_ros.reporting.report import report_html
 from selfcal_ros.reporting.summary.numbers import truth_arrays
 from selfcal_ros.simulation.truth import hu_plan, random_truth
@@ -89,4 +90,4 @@ def chapters_of(result: CalibrationResult, truth: dict[str, np.ndarray] | None =
 
 def html_of(result: CalibrationResult, truth: dict[str, np.ndarray] | None = None) -> str:
     """Return the report that `selfcal report` writes as HTML."""
-    return report_html(result, chapters_of(result, truth))
+    return report_html(result, chapters_of(result, truth), heading(result, {}))
