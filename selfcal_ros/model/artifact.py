@@ -11,7 +11,7 @@ from selfcal_ros.errors import InputError
 MAX_GRID_SIZE = 1001
 MAX_ANGULAR_COUNT = 1_000_000
 PITCH_RANGE_M = (1e-7, 1.0)
-"""Distances between marks that a plate can have."""
+"""Valid distances between marks."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class Artifact:
     grid_size_y: int = 0
 
     def __post_init__(self) -> None:
-        """Refuse sizes that have no centre mark and counts that have no quarter turn."""
+        """Refuse sizes without a centre mark and counts without a quarter turn."""
         for name, size in (("grid_size", self.grid_size), ("grid_size_y", self.shape[1])):
             if not 3 <= size <= MAX_GRID_SIZE or size % 2 == 0:
                 raise InputError(f"artifact {name}", f"{size} is not an odd number from 3 to "

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The calibrated error map of the stage, with its datum and its uncertainty."""
+"""The calibrated error map of the stage, with datum and uncertainty."""
 
 from dataclasses import dataclass, field
 from enum import StrEnum
@@ -10,7 +10,7 @@ from selfcal_ros.model.artifact import Artifact
 
 
 class ThetaDatum(StrEnum):
-    """What fixes the free constant of the angular map (method eqs. 3.6, 3.7)."""
+    """Condition that fixes the constant of the angular map (method eqs. 3.6, 3.7)."""
 
     XY_AXES = "xy_axes"
     ZERO_MEAN = "zero_mean"
@@ -20,7 +20,7 @@ class ThetaDatum(StrEnum):
 class ErrorMap:
     """Stage error G = indicated - true at the sites, stage frame.
 
-    Its datum: no translation, rotation or magnification (Hu eq. 5), except where a reference
+    Datum: no translation, rotation or magnification (Hu eq. 5), unless a reference
     length sets the scale; theta by `datum_theta`.
 
     Attributes
@@ -28,11 +28,11 @@ class ErrorMap:
     artifact : Artifact
         Lattice of the sites.
     gx, gy : float array (nx, ny)
-        Error at site m = i - hx, n = j - hy, m; NaN where not known.
+        Error at site m = i - hx, n = j - hy, m; NaN where unknown.
     u_gx, u_gy : float array (nx, ny)
         Standard uncertainties (k=1), m.
     g_theta, u_g_theta : float array (K,)
-        Angular error at line k and its standard uncertainty, rad; NaN where not known.
+        Angular error at line k and its standard uncertainty, rad; NaN where unknown.
     nonorthogonality, scale_difference : float
         O and R of Hu eq. 6: Gx = O y + R x + Fx, Gy = O x - R y + Fy.
     datum_theta : ThetaDatum

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Names of visiting orders: in which order the grid marks of a view are measured."""
+"""Names of visiting orders, in which the grid marks of a view are measured."""
 
 from dataclasses import dataclass
 
@@ -7,16 +7,16 @@ from selfcal_ros.errors import InputError
 
 ORDERS = ("raster", "serpentine", "there_and_back", "x_then_y", "x_back_y_back", "random")
 """raster: line by line along x, each line along y from its first mark to its last. serpentine:
-the same, every other line backwards. there_and_back: a raster pass, then exactly the same
+the same, every other line backwards. there_and_back: a raster pass, then the same pass
 backwards. x_then_y: a raster pass, then one that goes line by line along y. x_back_y_back: line by
 line along x, back, along y, back. random: every mark once in each pass, in any order."""
 PASSES = {"there_and_back": 2, "x_then_y": 2, "x_back_y_back": 4}
-"""Passes after which an order begins again; one where it is not named."""
+"""Number of passes after which an order repeats; default one."""
 PLATE_SUFFIX = "@plate"
-"""Lines are those of the plate's marks, the same marks in the same order in every view. Without
-it they are those of the stage's sites, the same sites in the same order in every view."""
+"""Suffix for lines of the plate's marks: the same marks in the same order in every view. Without
+it lines are those of the stage's sites: the same sites in the same order in every view."""
 DEFAULT_ORDER = "serpentine"
-"""What a cell does that is not told otherwise."""
+"""Order of a cell if none is specified."""
 
 
 @dataclass(frozen=True)
@@ -28,16 +28,16 @@ class VisitOrder:
 
     @property
     def passes(self) -> int:
-        """Passes after which it begins again: a view takes as many repeats, or a multiple."""
+        """Passes after which it repeats: a view has as many repeats, or a multiple."""
         return PASSES.get(self.name, 1)
 
     def __str__(self) -> str:
-        """Return the text that names the order."""
+        """Return the name of the order."""
         return self.name + PLATE_SUFFIX * self.of_plate
 
 
 def parse_order(text: str, where: str = "visit_order") -> VisitOrder:
-    """Return the order that a text such as ``there_and_back@plate`` names.
+    """Return the order named by a text such as ``there_and_back@plate``.
 
     Raises
     ------

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Readings: what was measured of the marks, view by view, and digests of them."""
+"""Readings of the marks, view by view, and their digests."""
 
 import hashlib
 from collections.abc import Iterable
@@ -15,7 +15,7 @@ from selfcal_ros.model.view import View
 
 
 class Sense(StrEnum):
-    """Who moves: the microscope over a resting plate, or the plate under the microscope.
+    """What moves: the microscope over a resting plate, or the plate under the microscope.
 
     With ``plate_moves`` the mark at X is measured with the stage at p = -X, so that the
     stage's part of a deviation is -G(-X), and -Gtheta(-k) (method eq. 1.6).
@@ -31,10 +31,10 @@ def _empty(kind: type) -> Any:
 
 @dataclass(frozen=True, eq=False)
 class GridVisits:
-    """Visits of grid marks in one view: readings of a mark between which no other mark was read.
+    """Visits of grid marks in one view: successive readings of a mark, no other mark in between.
 
-    What a mean over all repeats of a mark hides, and terms of the model need: when, with which
-    offset, and from where each visit was measured. Sorted by (mark, stamp), each visit once.
+    Information lost by averaging all repeats of a mark, but needed by terms of the model: instant,
+    offset, and approach of each visit. Sorted by (mark, stamp), each visit once.
 
     Attributes
     ----------
@@ -47,9 +47,9 @@ class GridVisits:
     stamp_ns : int64 array (V,)
         Mean instant of exposure.
     offset_x, offset_y : float array (V,)
-        Mean offset that the microscope saw, stage axes, m.
+        Mean offset measured by the microscope, stage axes, m.
     approach_x, approach_y : int8 array (V,)
-        Sign of the last motion of each stage axis before the exposure; 0 = not known.
+        Sign of the last motion of each stage axis before the exposure; 0 = unknown.
     u : float array (V,) or (0,)
         Declared standard uncertainty of each mean, m; as `ViewReadings.u`.
     sigma_m : float
@@ -72,7 +72,7 @@ class GridVisits:
     dof: int = 0
 
     def of_marks(self, keep: np.ndarray) -> "GridVisits":
-        """Return the visits of the marks where `keep` (P,) is true, numbered among these."""
+        """Return the visits of the marks where `keep` (P,) is true, renumbered."""
         stay = keep[self.mark]
         columns = {name: getattr(self, name)[stay] for name in (
             "dx", "dy", "count", "stamp_ns", "offset_x", "offset_y", "approach_x", "approach_y")}
@@ -82,12 +82,12 @@ class GridVisits:
 
 @dataclass(frozen=True, eq=False)
 class RepeatMotion:
-    """How the offsets of the marks of one view follow the stage, from one repeat to the next.
+    """Changes of offset and stage position between repeats of the marks of one view.
 
     Attributes
     ----------
     products : float array (2c, 2c)
-        Sums of products of the c coordinates of the axis' place over the plate (reading less
+        Sums of products of the c coordinates of the optical axis over the plate (reading minus
         offset), then of the c offsets, each about the mean of its mark and without slow changes;
         m^2 or rad^2.
     dof : int
@@ -100,14 +100,14 @@ class RepeatMotion:
 
 @dataclass(frozen=True, eq=False)
 class RejectedPlaces:
-    """Where the stage stood at detections of grid marks that were rejected, at most MOST of a view.
+    """Stage positions at rejected detections of grid marks, at most MOST per view.
 
     Attributes
     ----------
     reason : tuple of str
-        Why, one a detection.
+        Reason for each detection.
     x, y : float array (R,)
-        Indicated position at the exposure, m; NaN where the encoder does not tell it.
+        Indicated position at the exposure, m; NaN where unknown.
     """
 
     MOST: ClassVar[int] = 500
@@ -134,8 +134,8 @@ class ViewReadings:
     count : int array (P,)
         Repeats behind each mean.
     u : float array (P,) or (0,)
-        Standard uncertainty of each mean as the detections declare it, m; empty = not known,
-        and NaN for a single mark whose detections declared none.
+        Standard uncertainty of each mean as declared by the detections, m; empty = unknown,
+        and NaN for a single mark without declaration.
     k, dtheta, count_theta, u_theta : arrays (Q,)
         The same for angular lines, rad.
     sigma_xy, sigma_theta : float
@@ -145,15 +145,15 @@ class ViewReadings:
     used : int
         Detections behind the means.
     rejected : dict
-        Reason -> number of detections that were rejected.
+        Reason -> number of rejected detections.
     visits : GridVisits, optional
-        The visits behind the means of the grid marks; None where they are not known.
+        The visits behind the means of the grid marks; None if unknown.
     places : RejectedPlaces
-        Where grid detections were rejected; empty where that is not known.
+        Positions of rejected grid detections; empty if unknown.
     outliers, outliers_theta : int array (P,) or (0,), (Q,) or (0,)
-        Further repeats of each mark and line that are outliers; empty where that is not known.
+        Outliers among the repeats of each mark and line, additional to the count; empty if unknown.
     motion, motion_theta : RepeatMotion, optional
-        How offsets follow the stage, x and y and the angle; None without repeats.
+        Response of the offsets to the stage, in x and y and in angle; None without repeats.
     """
 
     view: View
@@ -198,9 +198,9 @@ class Measurements:
     rejected : dict
         Reason -> number of detections that belong to no view.
     run_id : str
-        Run of the plan: the stamp of its first command, ns, as text; empty if not told.
+        Run of the plan: the stamp of its first command, ns, as text; empty if unknown.
     model_terms : tuple of str
-        Terms that the plan wants estimated with the map, see `selfcal_ros.model.terms`.
+        Terms of the plan to be estimated with the map, see `selfcal_ros.model.terms`.
     """
 
     plan_id: str
@@ -212,7 +212,7 @@ class Measurements:
     model_terms: tuple[str, ...] = ()
 
     def all_rejected(self) -> dict[str, int]:
-        """Return reason -> count over all views and outside of them, sorted by reason."""
+        """Return reason -> count over all views and outside them, sorted by reason."""
         total: dict[str, int] = {}
         for rejected in (self.rejected, *(view.rejected for view in self.views)):
             for reason, count in rejected.items():
@@ -279,14 +279,14 @@ _VISITS = (("mark", "i8"), ("dx", "f8"), ("dy", "f8"), ("count", "i8"), ("stamp_
 
 
 def readings_digest(readings: ViewReadings, rejected: dict[str, int]) -> str:
-    """Return the SHA-256 of one view's readings, visits, and the rejections outside of views."""
+    """Return the SHA-256 of one view's readings, visits, and the rejections outside views."""
     if readings not in _KNOWN:
         _KNOWN[readings] = _digest(readings)
     return hashlib.sha256(repr((_KNOWN[readings], sorted(rejected.items()))).encode()).hexdigest()
 
 
 _KNOWN: WeakKeyDictionary[ViewReadings, str] = WeakKeyDictionary()
-"""Digests of readings that are still in use: those of a view that is over are asked for again."""
+"""Digests of readings still in use: those of a finished view are requested repeatedly."""
 
 
 def _digest(readings: ViewReadings) -> str:
@@ -299,7 +299,7 @@ def _digest(readings: ViewReadings) -> str:
     for motion in (readings.motion, readings.motion_theta):
         if motion:
             digest.update(motion.products.tobytes() + repr(motion.dof).encode())
-    # what was read, not how it was to be measured
+    # the readings, not the settings of the measurement
     view = replace(readings.view, visit_order="", check_marks=0, check_offset_m=0.0)
     digest.update(repr((view, readings.sigma_xy, readings.sigma_theta, readings.dof_xy,
                         readings.dof_theta, readings.used, readings.rejected)).encode())
@@ -307,7 +307,7 @@ def _digest(readings: ViewReadings) -> str:
 
 
 def placing_digest(artifact: Artifact, view: View) -> str:
-    """Return a short digest of a plate and of how a view lays and reads it, names left out."""
+    """Return a short digest of a plate and of the pose and marks of a view, without names."""
     numbers = (*artifact.shape, artifact.grid_pitch_m, artifact.angular_count, view.rotation_rad,
                *view.translation_m, view.grid, view.angular, view.repeats,
                view.check_marks, view.check_offset_m)

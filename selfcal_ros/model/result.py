@@ -31,17 +31,17 @@ from selfcal_ros.model.verdict_json import (
 
 SCHEMA = "selfcal.result/1"
 LARGEST = 1e3
-"""Errors and uncertainties beyond it, in m or rad, are damage: sums of their squares overflow."""
+"""Larger errors and uncertainties, in m or rad, are invalid: sums of their squares overflow."""
 
 
 @dataclass(frozen=True)
 class ViewResult:
-    """One view as it was found: nominal pose, misalignment, detections used and rejected.
+    """Result of one view: nominal pose, misalignment, detections used and rejected.
 
     Lengths in m, angles in rad, stage frame. `phi` is the rotation about the plate centre,
-    `tx`, `ty` the offset; NaN where the view was not measured. `read_grid` and `read_angular` are
-    the weights of what was read: one number where all marks in the field (all lines) have it,
-    else a number a mark, [i][j], and a line; 0 = not read, None = not told.
+    `tx`, `ty` the offset; NaN if the view was not measured. `read_grid` and `read_angular` are
+    the weights of the readings: one number if it is the same for all marks in the field (all
+    lines), else a number per mark, [i][j], and per line; 0 = not read, None = unknown.
     """
 
     name: str
@@ -61,8 +61,8 @@ class ViewResult:
 class ArtifactMap:
     """Plate error A = true - nominal, plate frame: ax, ay (nx, ny) in m, a_theta (K,) in rad.
 
-    `magnification` is the least-squares scale of A, with its standard uncertainty: the plate
-    against the encoders, whose own scale the datum takes out of the map.
+    `magnification` is the least-squares scale of A, with its standard uncertainty: that of the
+    plate relative to the encoders, whose own scale the datum removes from the map.
     """
 
     ax: np.ndarray
@@ -74,7 +74,7 @@ class ArtifactMap:
 
 @dataclass(frozen=True)
 class Observability:
-    """What the marks that were read can tell.
+    """Observability from the marks that were read.
 
     Attributes
     ----------
@@ -89,8 +89,8 @@ class Observability:
     advice : tuple of str
         Views or marks that would cure a deficiency.
     unchecked_sites, unchecked_lines : int, optional
-        Sites and lines of the map that rest on single readings, which no other reading checks;
-        None where it was not counted.
+        Number of sites and lines of the map that depend on single readings, which no other reading
+        checks; None if not counted.
     """
 
     rank: int
@@ -110,10 +110,10 @@ class Noise:
     `sigma_xy`, `sigma_theta` are the values behind the uncertainties; `*_repeats` come from the
     scatter of repeats, `*_residuals` from the residuals of the fit, `*_declared` from the
     detections; `dof_*` are their degrees of freedom, `dof_xy`, `dof_theta` those of the values
-    used (NaN: not known; infinite: declared). `dof_map_*` are those of the map's uncertainty at its
-    nodes, which holds more than noise (Welch-Satterthwaite), and `k_*` the coverage factors for
-    95.45 % that belong to them. `p_*` is the probability that residuals contradict repeats, or the
-    declaration, as they do by chance.
+    used (NaN: unknown; infinite: declared). `dof_map_*` are those of the map's uncertainty at its
+    nodes, which contains more than noise (Welch-Satterthwaite), and `k_*` the corresponding
+    coverage factors for 95.45 %. `p_*` is the probability of such a difference of residuals and
+    repeats, or declaration, by chance.
     """
 
     sigma_xy: float
@@ -140,7 +140,7 @@ class Noise:
     def dof_of(self, kind: str) -> float:
         """Return the degrees of freedom of the map's uncertainty, ``xy`` or ``theta``.
 
-        Older results name those of the noise alone.
+        Older results have those of the noise alone.
         """
         found = float(getattr(self, f"dof_map_{kind}"))
         return found if found > 0 else float(getattr(self, f"dof_{kind}"))
@@ -148,10 +148,10 @@ class Noise:
 
 @dataclass(frozen=True, eq=False)
 class CalibrationResult:
-    """Everything that one calibration found.
+    """The result of a calibration.
 
-    `findings` is what was left out or could not be done; `warnings` are their sentences, which
-    `selfcal_ros.reporting.words.findings.worded` adds, and those of the collection.
+    `findings` are the data of warnings; `warnings` are their sentences, added by
+    `selfcal_ros.reporting.words.findings.worded`, and those of the collection.
     """
 
     plan_id: str
@@ -188,7 +188,7 @@ class CalibrationResult:
 
 def with_input(result: CalibrationResult, source: dict[str, str],
                lost: list[str]) -> CalibrationResult:
-    """Return `result` with the file it came from, and what was lost of it as warnings."""
+    """Return `result` with its input file, and losses in the file as warnings."""
     return replace(with_warnings(result, lost), input=source)
 
 
@@ -198,14 +198,14 @@ def with_warnings(result: CalibrationResult, lines: Iterable[str]) -> Calibratio
 
 
 def created_now(result: CalibrationResult) -> CalibrationResult:
-    """Return `result` with the present time as that of its creation, UTC."""
+    """Return `result` with the present time as its time of creation, UTC."""
     now = datetime.now(UTC).isoformat(timespec="seconds")
     return replace(result, provenance=replace(result.provenance, created=now))
 
 
 def unidentified_result(measurements: Measurements, observability: Observability
                         ) -> CalibrationResult:
-    """Return the result of a plan that does not identify the stage: all maps unknown."""
+    """Return the result of a plan that does not identify the stage, with unknown maps."""
     artifact = measurements.artifact
     grid, circle = np.full(artifact.shape, np.nan), np.full(artifact.angular_count, np.nan)
     nan = float("nan")
@@ -226,7 +226,7 @@ def result_to_dict(result: CalibrationResult) -> dict[str, Any]:
     Raises
     ------
     ValueError
-        If it is not worded: give it to `selfcal_ros.reporting.words.findings.worded` first.
+        If it has no sentences: call `selfcal_ros.reporting.words.findings.worded` first.
     """
     emap, amap, artifact = result.error_map, result.artifact_map, result.artifact
     return {
@@ -278,7 +278,7 @@ _KNOWN = {"schema", "run_id", "verdict", "model", "reference", "provenance", "do
 
 def plain(value: Any) -> Any:
     """Return `value` as JSON types: arrays as lists, NaN and infinities as None."""
-    if isinstance(value, np.generic):  # first: a float64 is a float
+    if isinstance(value, np.generic):  # first, as a float64 is a float
         return plain(value.item())
     if isinstance(value, float):
         return value if math.isfinite(value) else None
@@ -293,12 +293,12 @@ def plain(value: Any) -> Any:
 
 
 def result_from_dict(data: object, where: str) -> CalibrationResult:
-    """Return the result in the JSON form `data`, which came from the file `where`.
+    """Return the result from its JSON form `data`, read from the file `where`.
 
     Raises
     ------
     InputError
-        If the schema is another one, or a key is missing or has the wrong shape.
+        If the schema differs, or a key is missing or has the wrong shape.
     """
     if not isinstance(data, dict) or data.get("schema") != SCHEMA:
         raise InputError(where, f"not a result of schema {SCHEMA}",

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Statistics of arrays in which NaN stands for what is not known."""
+"""Statistics of arrays in which NaN means unknown."""
 
 import numpy as np
 
 MANY_DOF = 1e9
-"""Degrees of freedom that stand for infinitely many, where the tail of F or t takes no infinity."""
+"""Finite substitute for infinite degrees of freedom in the tails of F and t."""
 
 
 def rms(values: np.ndarray) -> float:

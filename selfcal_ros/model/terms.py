@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Terms of the measurement model beside stage, plate and misalignments: what they are called."""
+"""Terms of the measurement model in addition to stage, plate and misalignments."""
 
 import math
 from collections.abc import Iterable
@@ -9,25 +9,25 @@ from enum import StrEnum
 from selfcal_ros.errors import InputError, known_are
 
 MAX_DRIFT_DEGREE = 9
-"""Largest degree of the polynomial by which a view may drift."""
+"""Largest degree of the polynomial of a view's drift."""
 
 DRIFT_DEGREE = 3
-"""Degree of that polynomial if nothing else is said."""
+"""Default degree of this polynomial."""
 
 SMALLEST, LARGEST = 1e-18, 1.0
-"""Sizes of terms that are written down: nothing is known better, and no more is left open."""
+"""Valid sizes of terms in texts."""
 
 
 class TermName(StrEnum):
     """Names of the terms, as in ``--model``, ``model_terms`` and RESULT.json.
 
     MICROSCOPE: a 2x2 matrix E shared by all views, mark = indicated + (1 + E) offset.
-    DRIFT: the plate moves against the stage while a view is measured, a polynomial of time.
+    DRIFT: the plate moves relative to the stage during a view, a polynomial of time.
     PLATE_SCALE: the plate is larger by a factor 1 + b in a view (temperature).
     PLATE_SHAPE: the plate is bent in a view, quadratic in position (clamping, gravity).
     APPROACH: the indicated position depends on the direction from which an axis arrived.
     PLATE_STRAIN: the plate is strained linearly in a view (clamping): scale, stretch and shear.
-    LINE_ECCENTRICITY: the circle of lines lies off the axis of rotation by its own amount in each
+    LINE_ECCENTRICITY: the circle of lines is eccentric to the axis of rotation, differently in each
     view, as a fraction of its radius.
     """
 
@@ -41,7 +41,7 @@ class TermName(StrEnum):
 
 
 VISIT_TERMS = frozenset({TermName.MICROSCOPE, TermName.DRIFT, TermName.APPROACH})
-"""Terms that need to know when, with which offset or from where a mark was read."""
+"""Terms that need instant, offset or approach of each reading."""
 
 UNITS: dict[str, str] = {
     TermName.MICROSCOPE: "m/m", TermName.DRIFT: "m", TermName.PLATE_SCALE: "m/m",
@@ -51,12 +51,12 @@ UNITS: dict[str, str] = {
 the edge of the view's time, for a shape at the middle of the plate's edge."""
 
 OF_PLATE = (TermName.PLATE_SCALE, TermName.PLATE_SHAPE, TermName.PLATE_STRAIN)
-"""Terms of the plate itself, which differ from view to view and turn with it."""
+"""Terms of the plate itself, which differ between views and turn with it."""
 
 
 @dataclass(frozen=True)
 class ModelTerm:
-    """A term that is estimated together with the map.
+    """A term estimated together with the map.
 
     Attributes
     ----------
@@ -64,9 +64,9 @@ class ModelTerm:
         Which.
     size : float
         Standard deviation of its coefficients as known from elsewhere, in `UNITS`; infinite if
-        the readings alone are to determine them, 0 if they are known to be none.
+        the readings alone determine them, 0 if they are known to be zero.
     parts : tuple of float
-        Of a microscope: standard deviations of scale, turn and shear, where they differ;
+        For a microscope: standard deviations of scale, turn and shear, if they differ;
         `size` is then the largest.
 
     Raises
@@ -80,7 +80,7 @@ class ModelTerm:
     parts: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
-        """Take a name that is given as plain text, too."""
+        """Accept a name as plain text, too."""
         if self.name not in list(TermName):
             raise InputError("ModelTerm", f"the term '{self.name}' is unknown",
                              known_are(self.name, TermName))
@@ -90,7 +90,7 @@ class ModelTerm:
 
     @property
     def free(self) -> bool:
-        """Whether the readings alone are to determine it."""
+        """Whether the readings alone determine it."""
         return math.isinf(self.size)
 
     def size_of(self, component: str) -> float:
@@ -104,20 +104,20 @@ class ModelTerm:
         return ModelTerm(self.name, self.size * factor, tuple(factor * p for p in self.parts))
 
     def __str__(self) -> str:
-        """Return the term as it is written in an option."""
+        """Return the term as written in an option."""
         sizes = self.parts or (() if self.free else (self.size,))
         return ":".join([str(self.name), *(f"{size:g}" for size in sizes)])
 
 
 def microscope_term(scale_u: float = 0.01, rotation_u: float = 0.01,
                     shear_u: float = 0.002) -> ModelTerm:
-    """Return the microscope as it is known before anything is read.
+    """Return the microscope's term from prior standard uncertainties.
 
     Parameters
     ----------
     scale_u, rotation_u, shear_u : float
-        Standard uncertainty of its scale (m/m), of its turn against the axes (rad), and of the
-        difference of its scales and its squareness (half of either).
+        Standard uncertainty of its scale (m/m), of its rotation relative to the axes (rad), and of
+        half the difference of its scales and half its squareness error.
     """
     return ModelTerm(TermName.MICROSCOPE, parts=(scale_u, rotation_u, shear_u))
 
@@ -126,29 +126,28 @@ DEFAULT_TERMS = (
     microscope_term(),
     ModelTerm(TermName.PLATE_STRAIN, 7e-8),
     ModelTerm(TermName.LINE_ECCENTRICITY, 2e-6))
-"""What is assumed of every measurement where nothing else is declared (GUM type B): nobody knows
-pixels better than 1 % and a camera's turn better than 10 mrad unless he says so; a plate of fused
-silica is strained by clamping by 5e-8 and by 0.1 K as much again; the circle of lines is laid to
-0.1 um at a radius of 50 mm."""
+"""Assumptions for every measurement unless declared (GUM type B): the pixel size is known to 1 %
+and the rotation of the camera to 10 mrad; a plate of fused silica is strained by 5e-8 by clamping
+and by as much again by 0.1 K; the circle of lines is centred to 0.1 um at a radius of 50 mm."""
 
 
 def parse_terms(texts: Iterable[str], where: str) -> tuple[ModelTerm, ...]:
     """Return the terms written as ``TERM`` or ``TERM:SIZE``, in the order of `TermName`.
 
-    A microscope may have three sizes, ``microscope:SCALE:TURN:SHEAR``. A size of 0 says that the
-    term is known to be none.
+    A microscope may have three sizes, ``microscope:SCALE:TURN:SHEAR``. A size of 0 means that the
+    term is known to be zero.
 
     Parameters
     ----------
     texts : iterable of str
-        Each one term, or several separated by commas; empty ones are passed over.
+        Each one term, or several separated by commas; empty ones are ignored.
     where : str
         Option, parameter or file, for messages.
 
     Raises
     ------
     InputError
-        For an unknown term, one given twice, or a size that is none.
+        For an unknown or duplicate term, or an invalid size.
     """
     found: dict[TermName, ModelTerm] = {}
     for text in (part.strip() for item in texts for part in item.split(",")):

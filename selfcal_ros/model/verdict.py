@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether a result can be relied on, why not, and what was estimated beside the map."""
+"""Verdict on a result with its reasons, and the estimates of terms."""
 
 import math
 from dataclasses import dataclass, field
@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 @dataclass(frozen=True)
 class Remedy:
-    """What to do about a cause: solve with a `model`, measure a `view` (again), or an `action`."""
+    """Remedy for a cause: solve with a `model`, measure a `view` (again), or an `action`."""
 
     kind: Literal["model", "view", "action"]
     value: str
@@ -24,21 +24,21 @@ class Finding:
     Attributes
     ----------
     name : str
-        What was found: the name of a term, or another one that has its sentence.
+        Name of a term, or another name with a sentence.
     size, u : float
-        Its largest component and standard uncertainty, in `unit`; NaN where it has none.
+        Its largest component and standard uncertainty, in `unit`; NaN if none.
     unit : str
         ``m``, ``rad`` or ``m/m`` (also for a ratio of noises); empty without a size.
     p : float
-        Probability that readings without it show as much.
+        Probability of as much without it.
     view, axis : str
-        Where it is: name of the view, ``x`` or ``y``; empty where that says nothing.
+        Location: name of the view, ``x`` or ``y``; empty if not applicable.
     mark : tuple of int
         Mark (m, n) or line (k,) of a single reading; else empty.
     details : dict, optional
-        What else its sentence says, by name; None in a file older than details.
+        Further data of its sentence, by name; None in files of older versions.
     text : str
-        Its sentence; empty before it is worded.
+        Its sentence; empty before wording.
     """
 
     name: str
@@ -55,17 +55,17 @@ class Finding:
 
 @dataclass(frozen=True)
 class Cause(Finding):
-    """What explains the residuals, or an enlarged uncertainty.
+    """Explanation of the residuals, or of an enlarged uncertainty.
 
     Attributes
     ----------
     effect_rms, effect_max : float
-        What it does to the map: of one coordinate, m, or of the angular map, rad, if `unit` is
-        rad and it is in the lines; NaN where that is not known.
+        Effect on the map: of one coordinate, m, or of the angular map, rad, if `unit` is
+        rad and it is in the lines; NaN if unknown.
     told : bool
         Whether the readings determine all of it.
     remedies : tuple of Remedy
-        What to do, the best first; those that name a model were tried on these readings.
+        Remedies, the best first; those that name a model were tried on these readings.
     """
 
     effect_rms: float = math.nan
@@ -75,9 +75,9 @@ class Cause(Finding):
 
 
 class Grade(StrEnum):
-    """What a result is worth.
+    """Grade of a result.
 
-    GOOD: within its U. ENLARGED: within a U that was enlarged by what the readings show.
+    GOOD: within its U. ENLARGED: within a U that was enlarged for effects in the readings.
     NOT_QUALIFIED: the readings contradict the model by more than any U given here covers.
     """
 
@@ -88,9 +88,9 @@ class Grade(StrEnum):
 
 @dataclass(frozen=True)
 class Enlargement:
-    """What enlarged the uncertainty: its name, rms and largest part of u, and their unit.
+    """Cause that enlarged the uncertainty: name, rms and largest contribution to u, unit.
 
-    `unit` is ``m`` for the XY map, ``rad`` for what only the angular map has.
+    `unit` is ``m`` for the XY map, ``rad`` for causes of the angular map only.
     """
 
     name: str
@@ -110,12 +110,12 @@ class Verdict:
     failed : tuple of Finding
         The tests that failed.
     causes : tuple of Cause
-        What explains it, the most likely first.
+        Explanations, the most likely first.
     enlarged_by : tuple of Enlargement
-        What enlarged the uncertainty, the most first.
+        Causes that enlarged the uncertainty, the largest first.
     sentence, reasons : str, tuple of str
-        The verdict in one sentence, and one for each failed test and cause; empty before it is
-        worded.
+        The verdict in one sentence, and one for each failed test and cause; empty before
+        wording.
     """
 
     grade: Grade
@@ -127,7 +127,7 @@ class Verdict:
 
     @property
     def qualified(self) -> bool:
-        """Whether the stage is identified and U covers what the readings show."""
+        """Whether the stage is identified and U covers the effects in the readings."""
         return self.grade is not Grade.NOT_QUALIFIED
 
 
@@ -176,8 +176,8 @@ class BudgetLine:
 class TermEstimate:
     """One coefficient of a term: SI unit, standard uncertainty (k=1).
 
-    `view` is empty where all views share the coefficient; `value` and `u` are NaN where the
-    readings do not tell it.
+    `view` is empty if all views share the coefficient; `value` and `u` are NaN if
+    undetermined.
     """
 
     view: str
@@ -189,10 +189,10 @@ class TermEstimate:
 
 @dataclass(frozen=True)
 class TermResult:
-    """A term of the model with what was found.
+    """A term of the model with its estimates.
 
-    `size` is as it was given, None where the term was free; `size_used` the larger one of the
-    solution where the readings contradict that, else None. `source` says who put it in:
+    `size` is the given one, None if the term was free; `size_used` the larger one of the
+    solution if the readings contradict it, else None. `source` is the origin of the term:
     ``declared``, ``default``, or ``readings``, which show it.
     """
 
@@ -204,7 +204,7 @@ class TermResult:
 
     @property
     def solved_with(self) -> float:
-        """The size of the solution; infinite where the term was free."""
+        """The size of the solution; infinite if the term was free."""
         return self.size_used or self.size or math.inf
 
 
@@ -218,18 +218,18 @@ class ModelResult:
 
 @dataclass(frozen=True)
 class Provenance:
-    """Where and when a result comes from.
+    """Origin and time of a result.
 
     Attributes
     ----------
     created : str
-        When it was computed, ISO 8601; empty if not known.
+        Time of computation, ISO 8601; empty if unknown.
     duration_s : float
-        From the first to the last command or reading; NaN if not known.
+        From the first to the last command or reading; NaN if unknown.
     version : str
-        Of this package.
+        Version of this package.
     extra : dict
-        What else is known: recorded, visit_order, source.
+        Further keys: recorded, visit_order, source.
     """
 
     created: str = ""

@@ -28,7 +28,7 @@ def finding_to_dict(found: Finding) -> dict[str, Any]:
     Raises
     ------
     ValueError
-        If it has no text: give the result to `selfcal_ros.reporting.words.findings.worded` first.
+        If it has no text: call `selfcal_ros.reporting.words.findings.worded` on the result first.
     """
     if not found.text:
         raise ValueError(f"the finding '{found.name}' is not worded")
@@ -61,7 +61,7 @@ def _cause(data: dict) -> Cause:
 
 
 def verdict_to_dict(verdict: Verdict) -> dict[str, Any]:
-    """Return the JSON form of a verdict; ValueError if it is not worded."""
+    """Return the JSON form of a verdict; ValueError if it has no sentences."""
     return {"qualified": verdict.qualified, "grade": str(verdict.grade),
             "sentence": verdict.sentence, "reasons": list(verdict.reasons),
             "failed": [finding_to_dict(found) for found in verdict.failed],
@@ -70,7 +70,7 @@ def verdict_to_dict(verdict: Verdict) -> dict[str, Any]:
 
 
 def verdict_from_dict(data: dict | None, *, identifiable: bool) -> Verdict:
-    """Return the verdict of a result; one without a verdict counts as identified or not."""
+    """Return the verdict of a result; without one, whether it is identified decides."""
     if data is None:
         return Verdict(Grade.GOOD if identifiable else Grade.NOT_QUALIFIED,
                        sentence="Not judged: written before there were verdicts")
@@ -136,13 +136,13 @@ def model_from_dict(data: dict | None) -> ModelResult:
 
 
 def provenance_to_dict(provenance: Provenance) -> dict[str, Any]:
-    """Return the JSON form of where a result comes from."""
+    """Return the JSON form of a provenance."""
     return {"created": provenance.created, "duration_s": provenance.duration_s,
             "version": provenance.version, **provenance.extra}
 
 
 def provenance_from_dict(data: dict | None) -> Provenance:
-    """Return where a result comes from, as far as it says."""
+    """Return the provenance of a result, as far as known."""
     if data is None:
         return Provenance()
     known = ("created", "duration_s", "version")
@@ -151,7 +151,7 @@ def provenance_from_dict(data: dict | None) -> Provenance:
 
 
 def reference_from_dict(raw: Any) -> dict[str, Any] | None:
-    """Return the reference length of a result as it is; ValueError if it is none."""
+    """Return the reference length of a result; ValueError if invalid."""
     if raw is None:
         return None
     if not isinstance(raw, dict):

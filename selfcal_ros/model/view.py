@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Views: how the plate lies on the stage, and plans: which views are measured."""
+"""Views: poses of the plate on the stage; plans: the views to be measured."""
 
 import math
 from contextlib import suppress
@@ -45,7 +45,7 @@ class LatticePose:
 
     @property
     def q(self) -> int:
-        """Quarter turns of a pose in which grid marks lie on sites.
+        """Quarter turns of a pose in which grid marks are on sites.
 
         Raises
         ------
@@ -80,7 +80,7 @@ class LatticePose:
         return self.turn_lines
 
     def site_of(self, m: np.ndarray, n: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the site (i, j) on which mark (m, n) lies: R^q (m, n) + (a, b).
+        """Return the site (i, j) of mark (m, n): R^q (m, n) + (a, b).
 
         Raises
         ------
@@ -91,14 +91,14 @@ class LatticePose:
         return x + self.a, y + self.b
 
     def marks_in_field(self, artifact: Artifact) -> tuple[np.ndarray, np.ndarray]:
-        """Return marks and their sites, int arrays (2, V), that lie in the field of the stage."""
+        """Return the marks inside the field of the stage and their sites, int arrays (2, V)."""
         marks = np.stack([artifact.m.ravel(), artifact.n.ravel()])
         sites = np.stack(self.site_of(*marks))
         inside = (np.abs(sites) <= np.array(artifact.half)[:, None]).all(axis=0)
         return marks[:, inside], sites[:, inside]
 
     def n_in_field(self, artifact: Artifact) -> int:
-        """Return how many marks lie in the field of the stage."""
+        """Return the number of marks inside the field of the stage."""
         plate = artifact.half[::-1] if self.q % 2 else artifact.half
         return math.prod(max(0, min(h, s + p) - max(-h, s - p) + 1) for h, s, p in zip(
             artifact.half, self.shift, plate, strict=True))
@@ -117,16 +117,16 @@ class View:
     translation_m : tuple of float
         Nominal position of the plate's centre, m.
     grid, angular : bool
-        Which marks are measured.
+        Kinds of marks that are measured.
     repeats : int
-        Times that every mark is measured.
+        Number of times that every mark is measured.
     visit_order : str
-        Order in which the grid marks are visited, see `selfcal_ros.model.orders`; empty = as
-        the cell likes.
+        Order in which the grid marks are visited, see `selfcal_ros.model.orders`; empty =
+        chosen by the cell.
     check_marks : int
-        Grid marks that are seen four times more, the stage at +x, -x, +y and -y of the mark.
+        Grid marks that are measured four more times, the stage at +x, -x, +y and -y of the mark.
     check_offset_m : float
-        How far from the mark the stage stops for these, m.
+        Distance of these stops from the mark, m.
     """
 
     name: str
@@ -140,7 +140,7 @@ class View:
     check_offset_m: float = 0.0
 
     def require_check_stops(self, artifact: Artifact) -> None:
-        """Raise InputError for check stops that no cell can do at the marks in this view.
+        """Raise InputError for check stops that are impossible at the marks of this view.
 
         At more than a quarter of the pitch a microscope need not see the mark, and a mark without
         an id is not identified.
@@ -166,7 +166,7 @@ class View:
         Raises
         ------
         InputError
-            If the pose lies off the lattice, or grid marks are wanted at a turn that is
+            If the pose is off the lattice, or grid marks are requested at a turn that is
             not a whole quarter.
         """
         where = f"view '{self.name}'"
@@ -212,9 +212,9 @@ class Plan:
     artifact : Artifact
         The plate.
     views : tuple of View
-        What is measured.
+        Views to be measured.
     model_terms : tuple of str
-        Terms that are to be estimated with the map, see `selfcal_ros.model.terms`.
+        Terms to be estimated with the map, see `selfcal_ros.model.terms`.
     """
 
     plan_id: str
@@ -231,10 +231,10 @@ def plan_from_dict(data: object, where: str) -> Plan:
     data : object
         Parsed YAML: ``plan_id``, ``artifact {grid_size, grid_pitch, angular_count}`` (m),
         ``views [{name, rotation_deg, translation_pitch, grid, angular, repeats, visit_order}]``,
-        ``visit_order``, which holds for views that have none of their own, ``model_terms``,
+        ``visit_order``, for views without their own, ``model_terms``,
         a list of ``TERM`` or ``TERM:SIZE``, ``check_stops {marks, offset}`` (m) of all views
-        with grid marks, and ``microscope {scale_u, rotation_u, shear_u}``, how well the
-        microscope is known.
+        with grid marks, and ``microscope {scale_u, rotation_u, shear_u}``, standard uncertainties
+        of the microscope.
     where : str
         File name, for messages.
 
@@ -274,7 +274,7 @@ def plan_from_dict(data: object, where: str) -> Plan:
 
 
 def _with_microscope(terms: tuple[str, ...], raw: dict, where: str) -> tuple[str, ...]:
-    """Return the terms with the microscope as the plan knows it, written as one of them."""
+    """Return the terms, including the microscope's from the plan."""
     if not raw:
         return terms
     fields = _fields(raw, where, {}, {
@@ -294,11 +294,11 @@ def _terms(texts: list, where: str) -> tuple[str, ...]:
 
 
 def _checks(data: dict, where: str) -> tuple[int, float]:
-    """Return how many marks are checked, and from how far off, m; (0, 0) if none are."""
+    """Return the number of marks checked and their distance, m; (0, 0) if none."""
     if not data:
         return 0, 0.0
-    if isinstance(data.get("offset"), str):  # YAML takes 20e-6, without a point, for a text
-        with suppress(ValueError):  # refused below as what it is
+    if isinstance(data.get("offset"), str):  # YAML reads 20e-6, without a point, as a string
+        with suppress(ValueError):  # refused below
             data = data | {"offset": float(data["offset"])}
     raw = _fields(data, where, {"marks": int, "offset": float})
     return raw["marks"], raw["offset"]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Visiting orders worked out: which grid mark of a view is visited when, and from which side."""
+"""Sequence of the visits of a view's grid marks, and the direction of approach."""
 
 from dataclasses import dataclass
 
@@ -10,30 +10,30 @@ from selfcal_ros.model.orders import DEFAULT_ORDER, VisitOrder, parse_order
 from selfcal_ros.model.view import View
 
 SIDES = ((1, 0), (-1, 0), (0, 1), (0, -1))
-"""Where the stage stands from the mark in check stops, along its x and y, in their order."""
+"""Directions of the stage from the mark in check stops, along x and y, in their order."""
 
 
 @dataclass(frozen=True, eq=False)
 class VisitSequence:
     """The visits of the grid marks of one view in their order.
 
-    A visit is one or more exposures of a mark between which no other mark is exposed: where one
-    pass ends on the mark on which the next begins, that is one visit.
+    A visit is one or more successive exposures of a mark: if one pass ends on the mark on which the
+    next begins, that is one visit.
 
     Attributes
     ----------
     m, n : int array (V,)
         The mark visited, plate frame.
     i, j : int array (V,)
-        The site on which it lies, stage frame.
+        Its site, stage frame.
     count : int array (V,)
         Exposures of the visit.
     pass_number : int array (V,)
         Pass over the plate in which the visit begins, from 0; each side of check stops is one.
     time : float array (V,)
-        Mean number of its exposures, counted from 0 over the whole view.
+        Mean index of its exposures, counted from 0 over the whole view.
     aside_m : float array (2, V)
-        How far from the mark the stage stops along its x and y: check stops; else 0.
+        Distance of the stage from the mark along x and y at check stops; else 0.
     """
 
     m: np.ndarray
@@ -57,27 +57,27 @@ def visit_sequence(artifact: Artifact, view: View, *, order: str = "", consecuti
     Parameters
     ----------
     artifact, view
-        The plate, how it lies, and how often every mark is measured.
+        The plate, its pose, and the repeats.
     order : str
         See `selfcal_ros.model.orders`; empty = that of the view, or else `DEFAULT_ORDER`.
     consecutive : bool
-        One pass in which all repeats of a mark are exposed one after another. Otherwise every
-        repeat is a pass of its own; the passes of the order follow each other in turn, and
-        repeats that are no multiple of their number leave the last turn incomplete.
+        One pass in which all repeats of a mark are exposed consecutively. If false, every
+        repeat is a pass; the passes of the order follow each other cyclically, and the last
+        cycle is incomplete if the repeats are not a multiple of their number.
     rng : numpy.random.Generator, optional
-        Source of the order ``random``, which cannot do without.
+        Required by the order ``random``.
 
     Returns
     -------
     VisitSequence
-        Only marks whose sites lie in the field; no visit where no grid marks are measured.
+        Only marks whose sites are in the field; no visits in views without grid marks.
 
     Raises
     ------
     InputError
-        For an order that is not known, or a view off the lattice.
+        For an unknown order, or a view off the lattice.
     ValueError
-        For a random order without a source of chance.
+        For a random order without `rng`.
     """
     chosen = parse_order(order or view.visit_order or DEFAULT_ORDER)
     if not view.grid:
@@ -97,7 +97,7 @@ def _passes(order: VisitOrder, places: np.ndarray, n_passes: int,
             raise ValueError("a random visiting order needs a source of chance")
         return np.stack([rng.permutation(places.shape[1]) for _ in range(n_passes)])
     x, y = places
-    # line by line along x: the lines themselves run along y
+    # line by line along x: each line runs along y
     along_x, along_y = np.lexsort((y, x)), np.lexsort((x, y))
     cycle = {"raster": (along_x,),
              "serpentine": (np.lexsort((np.where((x - x.min()) % 2, -y, y), x)),),
@@ -111,9 +111,9 @@ def _visits(marks: np.ndarray, sites: np.ndarray, passes: np.ndarray, *, togethe
             view: View) -> VisitSequence:
     """Return the visits of passes (P, n) in which each mark is exposed `together` times.
 
-    Check stops come half way, one exposure each. All marks are seen from +x, then all in the same
-    order from -x, +y and -y: each stop of a mark is reached from the same side, so that backlash
-    does not look like a scale of the microscope.
+    Check stops come half way, one exposure each. All marks are measured from +x, then all in the
+    same order from -x, +y and -y: each stop of a mark is reached from the same side, so that
+    backlash does not look like a scale of the microscope.
     """
     half = (len(passes) + 1) // 2
     stops = SIDES if view.check_marks else ()
@@ -131,10 +131,10 @@ def _visits(marks: np.ndarray, sites: np.ndarray, passes: np.ndarray, *, togethe
 
 
 def check_marks(sites: np.ndarray, number: int) -> np.ndarray:
-    """Return which of the sites (2, V) are checked by a cell that has no choice of its own.
+    """Return the sites among (2, V) that are checked by default.
 
-    The one in the middle of them and others evenly around it half way out, the first towards
-    (+x, +y), counter-clockwise; where a site is taken already, the nearest that is free.
+    The one in the middle and others evenly around it half way out, the first towards
+    (+x, +y), counter-clockwise; if a site is already taken, the nearest free one.
     """
     number = min(number, sites.shape[1])
     middle = (sites.min(axis=1) + sites.max(axis=1)) / 2
@@ -144,26 +144,26 @@ def check_marks(sites: np.ndarray, number: int) -> np.ndarray:
         [np.zeros((2, 1)), out])
     chosen: list[int] = []
     for target in targets.T:
-        away = np.round(np.hypot(*(sites - target[:, None])), 6)  # of equal ones the first
+        away = np.round(np.hypot(*(sites - target[:, None])), 6)  # the first of equals
         away[chosen] = np.inf
         chosen.append(int(np.argmin(away)))
     return np.array(chosen)
 
 
 def approach_signs(position: np.ndarray, threshold: float = 0.0) -> np.ndarray:
-    """Return from which side each position of an axis was reached.
+    """Return the direction from which each position of an axis was reached.
 
     Parameters
     ----------
     position : float array (V,)
-        Where the axis stops, visit by visit.
+        Positions of the stops, visit by visit.
     threshold : float
         Largest difference that does not count as a motion, in the unit of the positions.
 
     Returns
     -------
     int8 array (V,)
-        Sign of the last motion before each stop; 0 as long as the axis has not moved.
+        Sign of the last motion before each stop; 0 until the axis has moved.
     """
     step = np.diff(position, prepend=position[:1])
     moved = np.abs(step) > threshold
