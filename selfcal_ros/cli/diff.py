@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
     from selfcal_ros.estimation.comparison.maps import LaserDifference, MapDifference
     from selfcal_ros.estimation.comparison.significance import Significance
+    from selfcal_ros.model.result import CalibrationResult
 
 HELP = "compare two results after removing the datum difference"
 
@@ -45,7 +46,8 @@ def run(args: argparse.Namespace) -> int:
             raise InputError("--keep-scale", f"for {args.b} squareness and scale difference are "
                              "compared, not the magnification", "omit it")
         rows = compare_with_laser(a, second, args.b)
-        say(args, _laser_text(rows), _laser_json(rows))
+        say(args, "\n".join([_laser_text(rows), *_grades_text([a])]),
+            {**_laser_json(rows), **_grades([a])})
         say_unless_qualified(a, f"selfcal diff: {args.a}")
         return int(ExitCode.DONE)
     b = result_from_dict(second, args.b)
@@ -57,7 +59,7 @@ def run(args: argparse.Namespace) -> int:
                                  "omit it, or solve with --reference")
     with busy("comparing"):
         found = compare(a, b, keep_scale=args.keep_scale, names=(args.a, args.b))
-    say(args, _text(found), _json(found))
+    say(args, _text(found, _grades_text([a, b])), {**_json(found), **_grades([a, b])})
     datums = [result.error_map.datum_theta for result in (a, b)]
     if datums[0] != datums[1] and not args.json and found.theta is not None:
         print(f"       theta datums differ: {datums[0]} and {datums[1]}; xy_axes also ties four "
@@ -65,6 +67,24 @@ def run(args: argparse.Namespace) -> int:
     for name, result in ((args.a, a), (args.b, b)):
         say_unless_qualified(result, f"selfcal diff: {name}")
     return int(ExitCode.DONE)
+
+
+def _grades(results: Sequence[CalibrationResult]) -> dict[str, Any]:
+    """Return grade and enlargements of the results A and B."""
+    from selfcal_ros.model.result import plain
+
+    named = dict(zip("ab", (result.verdict for result in results), strict=False))
+    return plain({"grade": {name: str(verdict.grade) for name, verdict in named.items()},
+                  "enlarged_by": {name: [vars(item) for item in verdict.enlarged_by]
+                                  for name, verdict in named.items()}})
+
+
+def _grades_text(results: Sequence[CalibrationResult]) -> list[str]:
+    from selfcal_ros.reporting.summary.sections import enlargement_texts
+
+    return [f"{name}      grade: " + "; ".join([
+        str(result.verdict.grade).replace("_", " "), *enlargement_texts(result.verdict)])
+            for name, result in zip("AB", results, strict=False)]
 
 
 def _json(found: MapDifference) -> dict[str, Any]:
@@ -87,7 +107,7 @@ def _json(found: MapDifference) -> dict[str, Any]:
         "dx": found.dx, "dy": found.dy, "d_theta": found.d_theta})
 
 
-def _text(found: MapDifference) -> str:
+def _text(found: MapDifference, grades: Sequence[str]) -> str:
     tx, ty = found.translation_m
     lines = ["B minus A, datum difference removed: translation "
              f"({_signed(tx * UM_PER_M)}, {_signed(ty * UM_PER_M)}) µm, "
@@ -104,7 +124,7 @@ def _text(found: MapDifference) -> str:
         lines += [f"theta  rms {found.rms_theta_rad * ARCSEC_PER_RAD:.4f} arcsec   "
                   f"largest {found.max_theta_rad * ARCSEC_PER_RAD:.4f} arcsec",
                   *_test_text(found.theta)]
-    return "\n".join([*lines, _verdict_text(found)])
+    return "\n".join([*lines, *grades, _verdict_text(found)])
 
 
 def _signed(value: float) -> str:

@@ -14,7 +14,8 @@ from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.files import read_json, write_json
 from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.model.result import plain, result_to_dict
+from selfcal_ros.model.result import plain, result_from_dict, result_to_dict
+from selfcal_ros.model.verdict import Enlargement, Grade, Verdict
 from selfcal_ros.simulation.truth import hu_plan, random_truth, simulate_measurements
 
 
@@ -55,6 +56,27 @@ def test_two_results_as_text_and_as_json(files, capsys):
     assert f"Mahalanobis distance^2/dof {test['chi2_ratio']:.3f}, {test['dof']:.0f} dof" in text
     assert text.splitlines()[-1] == ("verdict: not significant, the maps agree within their "
                                      "uncertainties")
+
+
+def test_the_grades_of_both_and_what_enlarged_them_are_shown(files, capsys):
+    enlarged = result_from_dict(read_json(files[1]), "b")
+    verdict = Verdict(Grade.ENLARGED, enlarged_by=(
+        Enlargement("drift", 3e-9, 9e-9),
+        Enlargement("reading", np.radians(1 / 3600), np.radians(2 / 3600), "rad")),
+        sentence="Good within an enlarged U: a drift")
+    write_json(files[1], result_to_dict(replace(enlarged, verdict=verdict)))
+    assert main(["diff", *files]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[-3] == "A      grade: good"
+    assert lines[-2] == (
+        "B      grade: enlarged; U enlarged by drift: u 0.00300 µm rms, 0.00900 µm largest; "
+        "U enlarged by reading: u 1.00 arcsec rms, 2.00 arcsec largest")
+    assert main(["diff", *files, "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["grade"] == {"a": "good", "b": "enlarged"}
+    assert found["enlarged_by"]["a"] == []
+    assert found["enlarged_by"]["b"][0] == {"name": "drift", "u_rms": 3e-9, "u_max": 9e-9,
+                                            "unit": "m"}
 
 
 def test_maps_that_differ_and_maps_without_uncertainty_have_their_verdicts(files, tmp_path,
@@ -144,7 +166,7 @@ def test_result_against_the_laser(files, tmp_path, capsys):
     assert "nonorthogonality: " in capsys.readouterr().out
     assert main(["diff", files[0], str(laser), "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
-    assert found["nonorthogonality"]["laser"] == 1e-6
+    assert found["nonorthogonality"]["laser"] == 1e-6 and found["grade"] == {"a": "good"}
     assert found["nonorthogonality"]["difference"] == pytest.approx(
         1e-6 - found["nonorthogonality"]["map"])
     assert main(["diff", files[0], str(laser), "--keep-scale"]) == 2

@@ -10,7 +10,7 @@ import numpy as np
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ErrorMap
 from selfcal_ros.model.result import CalibrationResult, Noise, ViewResult
-from selfcal_ros.model.verdict import Grade
+from selfcal_ros.model.verdict import Grade, Verdict
 from selfcal_ros.reporting.summary.format import (
     UNKNOWN,
     aligned,
@@ -59,10 +59,14 @@ def verdict_section(result: CalibrationResult) -> Section:
     notes = [printable(reason) for reason in verdict.reasons]
     notes += [f"likely cause: {printable(cause.text)} (p = {cause.p:.1g})"
               for cause in verdict.causes]
-    notes += [f"U enlarged by {printable(item.name)}: u {unit(item.u_rms)} rms, "
-              f"{unit(item.u_max)} largest" for item, unit in (
-                  (item, arcsec if item.unit == "rad" else um) for item in verdict.enlarged_by)]
-    return Section(_TITLES[verdict.grade], notes=tuple(notes))
+    return Section(_TITLES[verdict.grade], notes=(*notes, *enlargement_texts(verdict)))
+
+
+def enlargement_texts(verdict: Verdict) -> list[str]:
+    """Return a line for each cause of an enlarged uncertainty."""
+    return [f"U enlarged by {printable(item.name)}: u {unit(item.u_rms)} rms, "
+            f"{unit(item.u_max)} largest" for item, unit in (
+                (item, arcsec if item.unit == "rad" else um) for item in verdict.enlarged_by)]
 
 
 _TITLES = {Grade.GOOD: "Verdict", Grade.ENLARGED: "Verdict: GOOD WITHIN AN ENLARGED U",
