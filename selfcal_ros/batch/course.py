@@ -3,9 +3,9 @@
 
 Both tests are of ranks, so that a single wild value decides nothing: Mann and Kendall's test of a
 trend with Theil and Sen's slope, and Pettitt's test of a change (Appl. Statist. 28 (1979) 126),
-whose probability is that of random orders of the same values; where it is, the step of least
-moduli says. They hold for values that are
-independent of each other where nothing goes on.
+whose probability is that of random orders of the same values; the change point minimises the sum
+of absolute residuals. They hold for values that are independent of each other where nothing goes
+on.
 """
 
 from collections.abc import Mapping, Sequence

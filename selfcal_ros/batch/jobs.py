@@ -6,15 +6,15 @@ that a batch that was interrupted, moved or made larger does only what is new.
 """
 
 import hashlib
+import math
 import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from selfcal_ros.bagio.offline import bag_input, collect_bag
-from selfcal_ros.batch.bags import stat_of
-from selfcal_ros.batch.quantities import quantities
-from selfcal_ros.batch.records import (
+from selfcal_ros.batch.folder import (
+    PER,
     RECORDS,
     RESULTS,
     SCHEMA,
@@ -22,6 +22,7 @@ from selfcal_ros.batch.records import (
     Record,
     is_whole,
     read_record,
+    stat_of,
 )
 from selfcal_ros.collection.reduce import with_places
 from selfcal_ros.collection.settings.estimator import solver_options
@@ -37,7 +38,9 @@ from selfcal_ros.model.result import (
     unidentified_result,
     with_input,
 )
+from selfcal_ros.reporting.summary.numbers import summary_numbers
 from selfcal_ros.reporting.words.findings import worded
+from selfcal_ros.units import ARCSEC_PER_RAD, PPM_PER_ONE, UM_PER_M
 
 
 def run_job(job: Job) -> Record:
@@ -114,3 +117,30 @@ def _with_result(result: CalibrationResult) -> Record:
         "plate": [*artifact.shape, artifact.grid_pitch_m, artifact.angular_count],
         "first_exposure": result.provenance.extra.get("first_exposure"),
         "quantities": quantities(result)}
+
+
+def quantities(result: CalibrationResult) -> dict[str, float | None]:
+    """Return name -> value; the unit is the end of the name, None = not known.
+
+    Terms of the model that all views share are there by their components, in SI units.
+    """
+    emap, noise, numbers = result.error_map, result.noise, summary_numbers(result)
+    used = sum(view.used for view in result.views)
+    rejected = sum(result.rejected.values())
+    found = {
+        "nonorthogonality_arcsec": emap.nonorthogonality * ARCSEC_PER_RAD,
+        "scale_difference_ppm": emap.scale_difference * PPM_PER_ONE,
+        "max_error_um": numbers.max_error_um,
+        "rms_error_um": numbers.rms_error_um,
+        "rms_uncertainty_um": numbers.rms_uncertainty_um,
+        "max_theta_error_arcsec": numbers.max_theta_error_arcsec,
+        "rms_theta_uncertainty_arcsec": numbers.rms_theta_uncertainty_arcsec,
+        "sigma_xy_um": noise.sigma_xy * UM_PER_M,
+        "sigma_theta_arcsec": noise.sigma_theta * ARCSEC_PER_RAD,
+        "rejected_percent": 100 * rejected / (used + rejected) if used + rejected else math.nan}
+    for term in result.model.terms:
+        for estimate in term.estimates:
+            if not estimate.view:
+                unit = estimate.unit.replace("/", PER)
+                found[f"{term.name}_{estimate.component}_{unit}".replace(" ", "_")] = estimate.value
+    return {name: value if math.isfinite(value) else None for name, value in found.items()}

@@ -13,7 +13,7 @@ from selfcal_ros.cli.terminal.output import add_json, say
 from selfcal_ros.errors import ExitCode, InputError, SelfcalError, first_line, printable
 
 if TYPE_CHECKING:
-    from selfcal_ros.batch.records import Record, Settings
+    from selfcal_ros.batch.folder import Job, Record, Settings
 
 HELP = "calibrate from many bags on all cores: one table, trends and changes over time"
 LOCAL = "local"
@@ -43,9 +43,7 @@ def run(args: argparse.Namespace) -> int:
 
     if not args.dask:  # first: the modules of the workers load in parallel
         begin("selfcal_ros.batch.jobs", check_workers(args.workers))
-    from selfcal_ros.batch.bags import find_bags
-    from selfcal_ros.batch.records import Settings
-    from selfcal_ros.batch.store import done_and_to_do, kept_records, opened
+    from selfcal_ros.batch.folder import Settings, done_and_to_do, find_bags, kept_records, opened
     from selfcal_ros.files import write_json, write_text
 
     if args.dask and args.dask != LOCAL and ":" not in args.dask:
@@ -62,8 +60,13 @@ def run(args: argparse.Namespace) -> int:
         for record in (done[index] for index in sorted(done)):
             _say(record)
         done |= _worked(args, bags, settings, places)
-        from selfcal_ros.batch.page import page_html
-        from selfcal_ros.batch.table import batch_json, csv_text, series_of, summary_lines
+        from selfcal_ros.batch.table import (
+            batch_json,
+            csv_text,
+            page_html,
+            series_of,
+            summary_lines,
+        )
 
         records = [done[index] for index in sorted(done)]
         keys = {record.get("key") for record in kept}  # copies and moved bags have one, too
@@ -82,15 +85,16 @@ def run(args: argparse.Namespace) -> int:
 def _worked(args: argparse.Namespace, bags: Sequence[Path], settings: "Settings",
             places: Sequence[int]) -> dict[int, "Record"]:
     """Return the records of the bags at `places`; print a line for each unqualified result."""
-    from selfcal_ros.batch.store import jobs_of, work_on
+    from selfcal_ros.batch.folder import Job
     from selfcal_ros.cli.terminal.progress import late_progress
     from selfcal_ros.parallel import check_workers, outcomes
 
     found: dict[int, Record] = {}
     workers = check_workers(args.workers)
-    jobs = jobs_of(Path(args.output).absolute(), bags, settings, places, redo=args.redo)
+    folder = Path(args.output).absolute()
+    jobs = [Job(bags[place], folder, settings, args.redo) for place in places]
     with late_progress("solving bags") as progress:
-        for outcome in outcomes(work_on, jobs, workers=workers, dask=args.dask or "",
+        for outcome in outcomes(_work_on, jobs, workers=workers, dask=args.dask or "",
                                 meanwhile=_load_table):
             place = places[outcome.index]
             if isinstance(outcome.error, SelfcalError):  # the folder cannot be written
@@ -101,9 +105,15 @@ def _worked(args: argparse.Namespace, bags: Sequence[Path], settings: "Settings"
     return found
 
 
+def _work_on(job: "Job") -> "Record":
+    from selfcal_ros.batch.jobs import run_job  # slow to load, and loaded in a worker already
+
+    return run_job(job)
+
+
 def _load_table() -> None:
     """Load the modules for the table: with SciPy's statistics it takes longer than a bag."""
-    import selfcal_ros.batch.page  # noqa: F401
+    import selfcal_ros.batch.table  # noqa: F401
 
 
 def _failed(bag: Path, error: BaseException | None) -> dict[str, Any]:

@@ -20,9 +20,9 @@ from selfcal_ros.nodes.publishers import kept_names, offered
 from selfcal_ros.nodes.running import run
 from selfcal_ros.sessions.collecting import CollectingSession
 from selfcal_ros.sessions.health import merged
+from selfcal_ros.sessions.journal_keeper import JournalKeeper, KeptTopic
 from selfcal_ros.sessions.ports import Diagnosis
-from selfcal_ros.sessions.receiving.journal_keeper import JournalKeeper, KeptTopic
-from selfcal_ros.sessions.receiving.reception import Reception
+from selfcal_ros.sessions.reception import Reception
 
 TICK_S = 0.1
 """Time between two looks at what has come."""

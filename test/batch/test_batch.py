@@ -16,12 +16,15 @@ import numpy as np
 import pytest
 
 from selfcal_ros.batch import jobs
-from selfcal_ros.batch.bags import find_bags
-from selfcal_ros.batch.page import page_html
-from selfcal_ros.batch.quantities import described
-from selfcal_ros.batch.records import RECORDS, RESULTS
-from selfcal_ros.batch.store import opened
-from selfcal_ros.batch.table import batch_json, csv_text, series_of, summary_lines
+from selfcal_ros.batch.folder import RECORDS, RESULTS, find_bags, opened
+from selfcal_ros.batch.table import (
+    batch_json,
+    csv_text,
+    described,
+    page_html,
+    series_of,
+    summary_lines,
+)
 from selfcal_ros.cli.main import main
 from selfcal_ros.errors import InputError, NoDataError
 from test.support.bags import Foreign

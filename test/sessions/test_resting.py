@@ -9,10 +9,10 @@ from selfcal_ros.bagio.offline import collect_bag
 from selfcal_ros.bagio.reader import BagReader
 from selfcal_ros.collection.inputs import Command, Detection, EncoderSample, Phase
 from selfcal_ros.model.readings import readings_digest
-from selfcal_ros.sessions.receiving.resting import REACH_NS, Resting
+from selfcal_ros.sessions.reception import REACH_NS, Resting
 from selfcal_ros.topics import ENCODER_TOPIC
 from selfcal_ros.units import S_PER_NS
-from test.sessions.receiving.test_reception import Desk, desk_path
+from test.sessions.test_reception import Desk, desk_path
 from test.support.ports import START_NS, settings_of
 from test.support.sessions import cdr_of, events_of, small_plan
 

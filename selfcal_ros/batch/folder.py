@@ -1,0 +1,211 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The folder of a batch: bags, settings, jobs, records; what is done already, what is to do.
+
+Nothing here needs the estimator: the command that hands out the jobs starts without it.
+"""
+
+import contextlib
+import fcntl
+import hashlib
+import json
+import os
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, NoReturn
+
+from selfcal_ros import __version__
+from selfcal_ros.collection.settings.nodes import CollectorSettings, SolverSettings
+from selfcal_ros.errors import InputError, NoDataError
+from selfcal_ros.files import read_json
+from selfcal_ros.outputs import sweep
+
+STORAGE = ".mcap"
+METADATA = "metadata.yaml"
+
+
+def find_bags(paths: Iterable[str]) -> list[Path]:
+    """Return the bags among `paths` and below them, each once, in the order of their names.
+
+    A file is a bag, and so is a folder with a metadata.yaml; below any other folder every bag
+    counts, loose .mcap files included, but nothing in folders whose name begins with a dot.
+
+    Raises
+    ------
+    InputError
+        If a path does not exist.
+    NoDataError
+        If there is no bag.
+    """
+    found: dict[str, Path] = {}
+    for name in paths:
+        path = Path(name)
+        if not path.exists():
+            raise InputError(name, "no such file or folder", "check the path")
+        for bag in sorted(_below(path)) if path.is_dir() else [path]:
+            found.setdefault(os.path.realpath(bag), bag)
+    if not found:
+        raise NoDataError(", ".join(paths), "no bag in it", "give MCAP files, rosbag2 folders or "
+                          "folders that hold them")
+    return list(found.values())
+
+
+def _below(top: Path) -> list[Path]:
+    bags = []
+    for folder, folders, files in top.walk(on_error=_refuse):
+        if METADATA in files:
+            bags.append(folder)
+            folders.clear()
+        else:
+            folders[:] = [name for name in folders if not name.startswith(".")]
+            bags += [folder / name for name in files
+                     if not name.startswith(".") and Path(name).suffix == STORAGE]
+    return bags
+
+
+def _refuse(error: OSError) -> NoReturn:
+    raise InputError(str(error.filename), f"cannot be read ({error.strerror})",
+                     "name a folder that you may read") from error
+
+
+def stat_of(bag: Path) -> list[list]:
+    """Return name, size and time of change (ns) of the files of a bag: equal if it is as it was."""
+    found = []
+    for file in sorted(_entries(bag)) if bag.is_dir() else [bag]:
+        try:
+            if file.is_file():
+                found.append([file.name, file.stat().st_size, file.stat().st_mtime_ns])
+        except OSError:  # it has just vanished: reading it tells
+            continue
+    return found
+
+
+def _entries(folder: Path) -> list[Path]:
+    try:
+        return list(folder.iterdir())
+    except OSError as error:
+        _refuse(error)
+
+
+SCHEMA = "selfcal.batch/1"
+RECORDS, RESULTS = "records", "results"
+PER = "_per_"
+"""Stands for the stroke of a unit in the name of a quantity."""
+NO_INFLUENCE = ("save_path", "result_folder", "autostart", "status_period", "frame_id")
+"""Parameters that decide nothing about a result."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How every bag of a batch is solved.
+
+    Attributes
+    ----------
+    collector, solver : CollectorSettings, SolverSettings
+        Those of the nodes.
+    robust : bool
+        Whether outliers are looked for.
+    namespace : str or None
+        Of the cell's topics, see `selfcal_ros.bagio.offline.collect_bag`.
+    """
+
+    collector: CollectorSettings
+    solver: SolverSettings
+    robust: bool = False
+    namespace: str | None = None
+
+    def digest(self) -> str:
+        """Return a digest of all that decides a result beside the bag."""
+        values = asdict(self) | {"schema": SCHEMA, "version": __version__}
+        for node in ("collector", "solver"):
+            values[node] = {k: v for k, v in values[node].items() if k not in NO_INFLUENCE}
+        return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
+
+
+@dataclass(frozen=True)
+class Job:
+    """A bag to be solved into the folder of a batch; `redo`: also where it was solved before."""
+
+    bag: Path
+    folder: Path
+    settings: Settings
+    redo: bool = False
+
+
+Record = dict[str, Any]
+"""What is kept of a bag: JSON, schema `SCHEMA`, see docs/batch.md."""
+
+
+def read_record(path: Path) -> Record | None:
+    """Return the record in a file; None if there is none, or none that can be used."""
+    try:
+        record = read_json(path)
+    except InputError:
+        return None
+    good = isinstance(record, dict) and record.get("schema") == SCHEMA and all(
+        isinstance(record.get(name), kind) for name, kind in (
+            ("bag", str), ("settings", str), ("files", list), ("exit_code", int),
+            ("message", str)))
+    return record if good else None
+
+
+def is_whole(folder: Path, record: Record) -> bool:
+    """Return whether the result that a record names is there."""
+    return "result" not in record or (folder / str(record["result"])).is_file()
+
+
+LOCK = ".lock"
+
+
+@contextlib.contextmanager
+def opened(folder: Path) -> Iterator[None]:
+    """Make the folder of a batch, and hold it against other batches while the block runs.
+
+    Raises
+    ------
+    InputError
+        If it cannot be made, or another batch works in it.
+    """
+    try:
+        for part in (folder / RECORDS, folder / RESULTS):
+            part.mkdir(parents=True, exist_ok=True)
+        lock = (folder / LOCK).open("w")
+    except OSError as error:
+        raise InputError(str(folder), f"cannot be created ({error.strerror})",
+                         "name a writable folder") from error
+    with lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            raise InputError(str(folder), "another batch works in this folder",
+                             "wait for its end or name another folder") from error
+        for part in (folder / RECORDS, folder / RESULTS):
+            sweep(part)
+        yield
+
+
+def kept_records(folder: Path, settings: Settings) -> list[Record]:
+    """Return the records of these settings that are in the folder."""
+    digest = settings.digest()
+    found = (read_record(path) for path in sorted((folder / RECORDS).glob("*.json")))
+    return [record for record in found if record is not None and record["settings"] == digest
+            and is_whole(folder, record)]
+
+
+def done_and_to_do(kept: Sequence[Record], bags: Sequence[Path],
+                   ) -> tuple[dict[int, Record], list[int]]:
+    """Return the records of bags that are done, by their place in `bags`, and the others' places.
+
+    A bag is done if it has a record and its files are as they were. The largest of the others come
+    first, so that no core ends long after the others.
+    """
+    known = {record["bag"]: record for record in kept}
+    done, sizes = {}, {}
+    for index, bag in enumerate(bags):
+        files = stat_of(bag)
+        record = known.get(os.path.realpath(bag))
+        if record is not None and record["files"] == files:
+            done[index] = record
+        else:
+            sizes[index] = sum(size for _, size, _ in files)
+    return done, sorted(sizes, key=lambda index: -sizes[index])
