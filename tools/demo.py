@@ -30,7 +30,7 @@ def demo() -> int:
     """Replay, plot, report; what takes long to import is imported here, where Ctrl-C is caught."""
     from selfcal_ros.bagio.offline import read_truth
     from selfcal_ros.cli.main import main as selfcal
-    from selfcal_ros.cli.terminal.output import tell
+    from selfcal_ros.cli.terminal import tell
     from selfcal_ros.files import read_json
     from selfcal_ros.model.result import result_from_dict
     from selfcal_ros.reporting.figures.maps import map_picture

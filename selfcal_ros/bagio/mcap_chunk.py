@@ -48,6 +48,11 @@ MAX_PERIOD = 64
 FIRST_LOOK = 64
 STRETCH = 1 << 20
 """Bytes of a file without chunks in which messages are found at once."""
+END = struct.Struct("<BQQQI8s")
+"""The footer and what closes the file."""
+FOOTER_SIZE = 20
+MAGIC = b"\x89MCAP0\r\n"
+"""First and last bytes of a file."""
 
 
 @dataclass(frozen=True)
@@ -257,13 +262,6 @@ def gathered(records: list[McapRecord]) -> list[Block | McapRecord]:
             messages = []
         items.append(record)
     return [*items, block_of(messages)] if messages else items
-
-
-END = struct.Struct("<BQQQI8s")
-"""The footer and what closes the file."""
-FOOTER_SIZE = 20
-MAGIC = b"\x89MCAP0\r\n"
-"""First and last bytes of a file."""
 
 
 @dataclass

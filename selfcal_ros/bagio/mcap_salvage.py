@@ -41,6 +41,26 @@ BLOCK = 1 << 16
 ZSTD_HEAD = 18
 """Longest head of a zstd frame."""
 MEMORY = Path("/proc/meminfo")
+HEAD = struct.Struct("<BQ")
+"""Opcode and length of a record."""
+PARSERS = {Opcode.SCHEMA: Schema.read, Opcode.CHANNEL: Channel.read, Opcode.CHUNK: Chunk.read,
+           Opcode.STATISTICS: Statistics.read}
+CHUNK_FRONT = 49
+"""Bytes of a chunk record before its records, without the name of the compression."""
+FOOTER_CONTENT = 28
+"""Bytes from the place of the summary in the footer to the end of a file."""
+MESSAGE_FRONT = 22
+"""Bytes of a message before its payload."""
+CHUNK_LOOKS = (rb"\x06(?s:.{36})(?:\x04\0\0\0zstd|\x03\0\0\0lz4|\0\0\0\0)"
+               rb"|\x0f\x04\0\0\0\0\0\0\0(?s:.{4})[\x01-\x0e]")
+"""The start of a chunk, or the end of the data section with another record behind it."""
+SLICE = 4096
+"""Bytes that are decompressed at once where the end is missing."""
+MESSAGE_LOOKS = rb"\x05(?s:.{5})\0\0\0"
+CHUNKS = re.compile(b"(?=" + CHUNK_LOOKS + b")")
+MESSAGES = re.compile(b"(?=" + CHUNK_LOOKS + b"|" + MESSAGE_LOOKS + b")")
+"""The same in a file without chunks, where messages stand by themselves. Looking ahead only, so
+that what looks alike does not hide a true one that it overlaps."""
 
 
 class TooLargeError(ValueError):
@@ -172,28 +192,6 @@ def _copy(file: BinaryIO, plain: BinaryIO) -> None:
     while block := stream.read(BLOCK):
         refuse_beyond(limit, plain.tell() + len(block))
         plain.write(block)
-
-
-HEAD = struct.Struct("<BQ")
-"""Opcode and length of a record."""
-PARSERS = {Opcode.SCHEMA: Schema.read, Opcode.CHANNEL: Channel.read, Opcode.CHUNK: Chunk.read,
-           Opcode.STATISTICS: Statistics.read}
-CHUNK_FRONT = 49
-"""Bytes of a chunk record before its records, without the name of the compression."""
-FOOTER_CONTENT = 28
-"""Bytes from the place of the summary in the footer to the end of a file."""
-MESSAGE_FRONT = 22
-"""Bytes of a message before its payload."""
-CHUNK_LOOKS = (rb"\x06(?s:.{36})(?:\x04\0\0\0zstd|\x03\0\0\0lz4|\0\0\0\0)"
-               rb"|\x0f\x04\0\0\0\0\0\0\0(?s:.{4})[\x01-\x0e]")
-"""The start of a chunk, or the end of the data section with another record behind it."""
-SLICE = 4096
-"""Bytes that are decompressed at once where the end is missing."""
-MESSAGE_LOOKS = rb"\x05(?s:.{5})\0\0\0"
-CHUNKS = re.compile(b"(?=" + CHUNK_LOOKS + b")")
-MESSAGES = re.compile(b"(?=" + CHUNK_LOOKS + b"|" + MESSAGE_LOOKS + b")")
-"""The same in a file without chunks, where messages stand by themselves. Looking ahead only, so
-that what looks alike does not hide a true one that it overlaps."""
 
 
 def parsed(opcode: int, body: bytes) -> tuple[McapRecord | None, int]:

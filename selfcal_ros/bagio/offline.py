@@ -29,6 +29,8 @@ FROM_THE_FUTURE = {ENCODER_TOPIC: ("encoder", Reason.ENCODER_FUTURE),
 """How messages that are stamped in the future of their reception are counted."""
 MAX_SAID = 3
 """Lines of what was lost that an error repeats."""
+TRUTH_FILE = "truth.json"
+TOPICS = list(INPUT_TOPICS)
 
 
 class BagSession(NamedTuple):
@@ -179,16 +181,10 @@ def bag_input(path: str | Path) -> dict[str, str]:
     return {"file": Path(path).name, "sha256": digest.hexdigest()}
 
 
-TRUTH_FILE = "truth.json"
-
-
 def read_truth(bag: str | Path) -> dict | None:
     """Return the truth that lies in a bag folder, or None."""
     path = Path(bag) / TRUTH_FILE
     return read_json(path) if path.is_file() else None
-
-
-TOPICS = list(INPUT_TOPICS)
 
 
 class Playlist:

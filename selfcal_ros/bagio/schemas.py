@@ -27,6 +27,10 @@ would take 0.1 s of CPU in every command and node that reads or writes a bag."""
 
 KEPT = 64
 """Schemas whose typestores are kept; a folder of foreign bags has a handful."""
+NUMBERS = {"bool": "u1", "byte": "u1", "char": "u1", "uint8": "u1", "int8": "i1", "int16": "i2",
+           "uint16": "u2", "int32": "i4", "uint32": "u4", "int64": "i8", "uint64": "u8",
+           "float32": "f4", "float64": "f8"}
+"""Numpy codes of the basic types."""
 
 
 def _message_folder() -> Path:
@@ -140,12 +144,6 @@ def shorter_stores(name: str, last: str) -> tuple[Typestore, ...]:
     common = {known: typestore().fielddefs[known] for known in COMMON}
     return tuple(_store({**common, name: (constants, fields[:count])})
                  for count in range(len(names) - 1, names.index(last), -1))
-
-
-NUMBERS = {"bool": "u1", "byte": "u1", "char": "u1", "uint8": "u1", "int8": "i1", "int16": "i2",
-           "uint16": "u2", "int32": "i4", "uint32": "u4", "int64": "i8", "uint64": "u8",
-           "float32": "f4", "float64": "f8"}
-"""Numpy codes of the basic types."""
 
 
 def fields_of(store: Typestore, name: str) -> tuple[Field, ...] | None:

@@ -21,6 +21,8 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.files import write_text
 from selfcal_ros.messages.from_model import Fields
 
+CHUNK_SIZE = 256 * 1024
+
 
 @contextmanager
 def writing(path: Path, what: str = "cannot be written") -> Iterator[None]:
@@ -122,9 +124,6 @@ class Metadata:
                        "duration": file.about()["duration"], "message_count": file.count}
                       for file in self.files],
             "custom_data": None, "ros_distro": "jazzy"}
-
-
-CHUNK_SIZE = 256 * 1024
 
 
 @dataclass

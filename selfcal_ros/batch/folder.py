@@ -22,6 +22,15 @@ from selfcal_ros.outputs import sweep
 
 STORAGE = ".mcap"
 METADATA = "metadata.yaml"
+SCHEMA = "selfcal.batch/1"
+RECORDS, RESULTS = "records", "results"
+PER = "_per_"
+"""Stands for the stroke of a unit in the name of a quantity."""
+NO_INFLUENCE = ("save_path", "result_folder", "autostart", "status_period", "frame_id")
+"""Parameters that decide nothing about a result."""
+Record = dict[str, Any]
+"""What is kept of a bag: JSON, schema `SCHEMA`, see docs/batch.md."""
+LOCK = ".lock"
 
 
 def find_bags(paths: Iterable[str]) -> list[Path]:
@@ -87,14 +96,6 @@ def _entries(folder: Path) -> list[Path]:
         _refuse(error)
 
 
-SCHEMA = "selfcal.batch/1"
-RECORDS, RESULTS = "records", "results"
-PER = "_per_"
-"""Stands for the stroke of a unit in the name of a quantity."""
-NO_INFLUENCE = ("save_path", "result_folder", "autostart", "status_period", "frame_id")
-"""Parameters that decide nothing about a result."""
-
-
 @dataclass(frozen=True)
 class Settings:
     """How every bag of a batch is solved.
@@ -132,10 +133,6 @@ class Job:
     redo: bool = False
 
 
-Record = dict[str, Any]
-"""What is kept of a bag: JSON, schema `SCHEMA`, see docs/batch.md."""
-
-
 def read_record(path: Path) -> Record | None:
     """Return the record in a file; None if there is none, or none that can be used."""
     try:
@@ -152,9 +149,6 @@ def read_record(path: Path) -> Record | None:
 def is_whole(folder: Path, record: Record) -> bool:
     """Return whether the result that a record names is there."""
     return "result" not in record or (folder / str(record["result"])).is_file()
-
-
-LOCK = ".lock"
 
 
 @contextlib.contextmanager

@@ -19,6 +19,15 @@ from selfcal_ros.reporting.report import page
 S_PER_DAY = 86400.0
 BASE = ("bag", "first_exposure", "exit_code", "qualified", "message", "plan_id", "run_id",
         "sha256", "result", "grade")
+WIDTH, HEIGHT, LEFT, EDGE = 560, 150, 64, 14
+STYLE = """
+figure { max-width: 36rem; } svg { width: 100%; height: auto; }
+svg text { fill: var(--soft); font-size: 11px; }
+.frame { stroke: var(--line); fill: none; } .value { fill: var(--good); }
+.value.bad { fill: var(--bad); } .course { stroke: var(--ink); fill: none; stroke-width: 1.5; }
+.change { stroke: var(--bad); stroke-dasharray: 4 3; }
+td.text { text-align: left; min-width: 14rem; } td.bad { color: var(--bad); }
+"""
 
 
 @dataclass(frozen=True)
@@ -152,17 +161,6 @@ def summary_lines(records: Sequence[Record], found: Sequence[Series],
         nothing = few if len(series.records) < FEWEST else "no quantity has a trend or a change"
         lines += [f"  {line}" for line in said or [nothing]]
     return lines
-
-
-WIDTH, HEIGHT, LEFT, EDGE = 560, 150, 64, 14
-STYLE = """
-figure { max-width: 36rem; } svg { width: 100%; height: auto; }
-svg text { fill: var(--soft); font-size: 11px; }
-.frame { stroke: var(--line); fill: none; } .value { fill: var(--good); }
-.value.bad { fill: var(--bad); } .course { stroke: var(--ink); fill: none; stroke-width: 1.5; }
-.change { stroke: var(--bad); stroke-dasharray: 4 3; }
-td.text { text-align: left; min-width: 14rem; } td.bad { color: var(--bad); }
-"""
 
 
 def page_html(records: Sequence[Record], found: Sequence[Series], lines: Sequence[str]) -> str:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from selfcal_ros.cli.solve import add_options, parameters
-from selfcal_ros.cli.terminal.output import add_json, say
+from selfcal_ros.cli.terminal import add_json, say
 from selfcal_ros.errors import ExitCode, InputError, SelfcalError, first_line, printable
 
 if TYPE_CHECKING:
@@ -86,7 +86,7 @@ def _worked(args: argparse.Namespace, bags: Sequence[Path], settings: "Settings"
             places: Sequence[int]) -> dict[int, "Record"]:
     """Return the records of the bags at `places`; print a line for each unqualified result."""
     from selfcal_ros.batch.folder import Job
-    from selfcal_ros.cli.terminal.progress import late_progress
+    from selfcal_ros.cli.terminal import late_progress
     from selfcal_ros.parallel import check_workers, outcomes
 
     found: dict[int, Record] = {}

@@ -1,20 +1,287 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``selfcal cal``: calibration files of Aerotech controllers."""
+"""``selfcal cal``: read, check, evaluate, write and verify files of Aerotech controllers."""
 
 import argparse
+import json
+import math
+import os
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from selfcal_ros.cli.aerotech import files, lines, maps
+from selfcal_ros.cli.cal_lines import (
+    add_frame,
+    add_line_tables,
+    frame_of,
+    in_unit,
+    numbers,
+    pairs,
+    read_result,
+)
+from selfcal_ros.cli.terminal import add_json, busy, say
+from selfcal_ros.errors import ExitCode, InputError, NotIdentifiableError
+from selfcal_ros.units import M_PER_UM, RAD_PER_ARCSEC
+
+if TYPE_CHECKING:
+    from selfcal_ros.aerotech.evaluate import MachineSetup
+    from selfcal_ros.aerotech.model import Table1D, Table2D
+    from selfcal_ros.aerotech.verify import Verification
 
 HELP = "read, check, evaluate, write and verify calibration files of Aerotech controllers"
+SCANNER_BITS = 16
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the sub-verbs."""
     group = parser.add_subparsers(dest="sub_verb", metavar="WHAT", required=True)
-    for module in (files, maps, lines):
-        module.add_to(group)
+    for add in (add_files, add_maps, add_line_tables):
+        add(group)
 
 
 def run(args: argparse.Namespace) -> int:
     """Run the sub-verb."""
     return args.run_sub_verb(args)
+
+
+def add_files(group: argparse._SubParsersAction) -> None:
+    """Add the sub-verbs."""
+    check = group.add_parser("check", help="check a file against every rule of the format")
+    check.add_argument("file", metavar="FILE.cal")
+    check.add_argument("--gi4", action="store_true",
+                       help="check galvo tables against the restrictions of the GI4 too")
+    check.add_argument("--scanner-bits", type=int, metavar="N",
+                       help=f"bits of the scanner protocol behind --gi4 (default {SCANNER_BITS})")
+    check.add_argument("--strict", action="store_true",
+                       help="also refuse tolerated and doubtful content")
+    check.add_argument("--json", action="store_true", help="print the findings as JSON")
+    check.set_defaults(run_sub_verb=_check)
+    evaluate = group.add_parser("eval", help="print the corrections at a position as JSON, "
+                                             "in primary units by axis")
+    evaluate.add_argument("file", metavar="FILE.cal")
+    add = evaluate.add_argument
+    add("--position", action="append", metavar="AXIS=P", help="position: primary units, or a "
+        "length as in 1=10.5mm")
+    add("--unit", choices=("m", "mm", "um"), help="primary unit of the linear axes, for positions "
+        "with a unit (default: from the comments of FILE.cal, else mm)")
+    add("--counts-per-unit", action="append", metavar="AXIS=C",
+        help="encoder counts per primary unit")
+    add("--counts-per-secondary", action="append", metavar="AXIS=C",
+        help="encoder counts per secondary unit")
+    add("--temperature", type=float, metavar="T", help="temperature of the scales, degC")
+    add("--home-direction", action="append", metavar="AXIS=CW|CCW",
+        help="home direction now, if it has changed since the table was made")
+    add("--home-offset", action="append", metavar="AXIS=P",
+        help="home offset now, primary units, if it has changed")
+    add("--absolute-feedback-offset", action="append", metavar="AXIS=C",
+        help="absolute feedback offset now, counts, if it has changed")
+    add("--json", action="store_true", help="print JSON (the default)")
+    evaluate.set_defaults(run_sub_verb=_evaluate)
+
+
+def _check(args: argparse.Namespace) -> int:
+    from selfcal_ros.aerotech.model import Severity
+    from selfcal_ros.aerotech.read import read_cal, refuse_errors
+    from selfcal_ros.aerotech.rules import Gi4
+
+    if args.scanner_bits is not None and not args.gi4:
+        raise InputError("--scanner-bits", "it belongs to a GI4", "add --gi4")
+    bits = SCANNER_BITS if args.scanner_bits is None else args.scanner_bits
+    if not 6 <= bits <= 48:
+        raise InputError("--scanner-bits", f"{bits} bits", "give 16, 18 or 20")
+    cal = read_cal(args.file, gi4=Gi4(bits) if args.gi4 else None)
+    counts = {severity: len(cal.of(severity)) for severity in Severity}
+    if args.json:
+        print(json.dumps({
+            "file": args.file, "tables": [_described(table) for table in cal.tables],
+            **{f"{severity}s" if severity is not Severity.TOLERATED else "tolerated": number
+               for severity, number in counts.items()},
+            "findings": [{"line": f.line, "severity": f.severity, "what": f.what, "mend": f.remedy}
+                         for f in cal.findings]}, indent=1))
+    else:
+        for finding in cal.findings:
+            print(finding.text(args.file))
+        for table in cal.tables:
+            print(f"{args.file}:{table.line}: {_described(table)['text']}")
+        print(f"{args.file}: {len(cal.tables)} tables, {counts[Severity.ERROR]} errors, "
+              f"{counts[Severity.WARNING]} warnings, {counts[Severity.TOLERATED]} tolerated")
+    refuse_errors(cal)
+    if args.strict and cal.findings:
+        first = cal.findings[0]
+        raise InputError(f"{args.file}:{first.line}", first.what, first.remedy)
+    return int(ExitCode.DONE)
+
+
+def _described(table: "Table1D | Table2D") -> dict:
+    shape = " x ".join(map(str, table.values.shape[:2]))
+    outputs = ", ".join(map(str, table.outputs))
+    inputs = " and ".join(map(str, table.inputs))
+    return {"line": table.line, "kind": table.kind, "inputs": list(table.inputs),
+            "outputs": list(table.outputs), "shape": list(table.values.shape),
+            "text": f"{table.kind} table, {shape} entries, corrects axis {outputs} from the "
+                    f"position of axis {inputs}"}
+
+
+def _evaluate(args: argparse.Namespace) -> int:
+    from selfcal_ros.aerotech.evaluate import CalEvaluator
+    from selfcal_ros.aerotech.machine import frame_from_comments
+    from selfcal_ros.aerotech.read import load_cal
+
+    cal = load_cal(args.file)
+    frame = frame_from_comments(cal.comments)
+    unit = args.unit or (frame.unit if frame else "mm")
+    rotary = {axis for table in cal.tables if getattr(table, "rollover", None)
+              for axis in table.inputs}
+    if frame is not None and frame.theta_axis is not None:
+        rotary.add(frame.theta_axis)
+    positions = numbers(in_unit(args.position, unit, rotary=rotary), "--position")
+    if not positions:
+        raise InputError("--position", "no position given", "write --position 1=10.5")
+    corrections = CalEvaluator(cal.tables, _setup(args)).corrections(positions)
+    print(json.dumps({str(axis): float(value) for axis, value in corrections.items()}))
+    return int(ExitCode.DONE)
+
+
+def _setup(args: argparse.Namespace) -> "MachineSetup":
+    from selfcal_ros.aerotech.evaluate import AxisSetup, MachineSetup
+
+    if args.temperature is not None and not math.isfinite(args.temperature):
+        raise InputError("--temperature", f"{args.temperature} is not a temperature", "give degC")
+    directions = pairs(args.home_direction, "--home-direction")
+    for axis, word in directions.items():
+        if word not in ("CW", "CCW"):
+            raise InputError("--home-direction", f"'{word}' is not a home direction",
+                             f"write {axis}=CW or {axis}=CCW")
+    found: dict[str, dict[int, Any]] = {
+        "counts_per_unit": numbers(args.counts_per_unit, "--counts-per-unit", positive=True),
+        "counts_per_secondary": numbers(args.counts_per_secondary, "--counts-per-secondary",
+                                        positive=True),
+        "home_direction": directions,
+        "home_offset": numbers(args.home_offset, "--home-offset"),
+        "absolute_feedback_offset": numbers(args.absolute_feedback_offset,
+                                            "--absolute-feedback-offset"),
+    }
+    axes: set[int] = set().union(*found.values())
+    return MachineSetup({axis: AxisSetup(**{name: values.get(axis)
+                                            for name, values in found.items()})
+                         for axis in axes}, args.temperature)
+
+
+def add_maps(group: argparse._SubParsersAction) -> None:
+    """Add the sub-verbs."""
+    export = group.add_parser("export", help="write the tables of an error map")
+    export.add_argument("result", metavar="RESULT.json")
+    export.add_argument("-o", "--output", metavar="FILE.cal", required=True,
+                        help="2D table for x and y")
+    export.add_argument("--theta-output", metavar="FILE.cal",
+                        help="1D table for theta, which cannot share a file with a 2D table "
+                             "(default: FILE_theta.cal)")
+    export.add_argument("--fill", action="store_true",
+                        help="set unknown sites to the mean of their neighbours")
+    export.add_argument("--force", action="store_true",
+                        help="replace existing files; the old ones are kept with their date")
+    add_json(export)
+    add_frame(export, theta=True)
+    export.set_defaults(run_sub_verb=_export)
+    verify = group.add_parser("verify", help="print the residual of a simulated controller before "
+                                             "and after a file is loaded, um")
+    verify.add_argument("result", metavar="RESULT.json")
+    verify.add_argument("file", metavar="FILE.cal")
+    verify.add_argument("--plot", metavar="F.png", help="draw it (png, svg or pdf)")
+    verify.add_argument("--json", action="store_true", help="print as JSON, m and rad")
+    add_frame(verify, theta=True, default=False)
+    verify.set_defaults(run_sub_verb=_verify)
+
+
+def _export(args: argparse.Namespace) -> int:
+    from dataclasses import replace
+
+    from selfcal_ros.aerotech import export
+    from selfcal_ros.aerotech.write import cal_text, refuse_existing, write_cal
+    from selfcal_ros.cli.terminal import exit_code
+    from selfcal_ros.files import check_outputs
+
+    result, frame = read_result(args.result), frame_of(args)
+    if args.theta_output and frame.theta_axis is None:
+        raise InputError("--theta-output", "no theta table is written", "name --theta-axis")
+    if not result.observability.identifiable:
+        raise NotIdentifiableError(f"{args.result}: the measured plan does not identify the stage; "
+                                   "measure the missing views",
+                                   result.observability)
+    filled = 0
+    if args.fill:
+        error_map, filled = export.fill_unknown(result.error_map)
+        result = replace(result, error_map=error_map)
+    comments = export.provenance(result, frame, filled=filled)
+    texts = {args.output: cal_text([export.table_xy(result.error_map, frame)],
+                                   comments=comments, decimals=export.DECIMALS)}
+    if frame.theta_axis is not None:
+        target = Path(args.output)
+        beside = args.theta_output or str(target.with_name(f"{target.stem}_theta{target.suffix}"))
+        if os.path.realpath(beside) == os.path.realpath(target):
+            raise InputError(beside, "a 1D and a 2D table cannot share a file", "name another file")
+        table = export.table_theta(result.error_map, frame)
+        texts[beside] = cal_text([table], comments=comments,
+                                 decimals=export.theta_decimals(result.error_map))
+    check_outputs([args.result], texts)
+    refuse_existing(list(texts), force=args.force)
+    lines, files = [], []
+    for path, text in texts.items():
+        backup = write_cal(path, text, force=args.force)
+        kind = "1D table for theta" if path != args.output else "2D table for x and y"
+        lines.append(f"{path}: {kind}" + (f"; the old file is {backup}" if backup else ""))
+        files.append({"file": path, "kind": kind, "old_file": backup and str(backup)})
+    say(args, "\n".join(lines), {"files": files, "filled": filled})
+    if filled:
+        print(f"selfcal cal: {filled} unknown sites filled from their neighbours", file=sys.stderr)
+    if frame.theta_axis is not None and frame.theta_counts_per_unit is None:
+        print("selfcal cal: the theta table covers one turn either way and does not roll over;"
+              f" --counts-per-unit {frame.theta_axis}=COUNTS makes it roll over", file=sys.stderr)
+    return exit_code(result)
+
+
+def _verify(args: argparse.Namespace) -> int:
+    from selfcal_ros.aerotech.machine import MachineFrame, frame_from_comments
+    from selfcal_ros.aerotech.model import Table2D
+    from selfcal_ros.aerotech.read import load_cal
+    from selfcal_ros.aerotech.verify import verify_tables
+
+    result, cal = read_result(args.result), load_cal(args.file)
+    base = frame_from_comments(cal.comments)
+    if base is None and isinstance(cal.tables[0], Table2D):
+        base = MachineFrame(cal.tables[0].column_axis, cal.tables[0].row_axis)
+    frame = frame_of(args, base)
+    with busy("simulating the controller"):
+        found = verify_tables(result.error_map, cal.tables, frame)
+    say(args, _text(found), _numbers(found))
+    if args.plot:
+        from selfcal_ros.aerotech.report import controller_figure
+        from selfcal_ros.reporting.figures.paper import save_picture
+        save_picture(controller_figure(found), args.plot)
+    if found.worse:
+        raise InputError(args.file, "the tables make the machine worse",
+                         "check signs, axes, unit, home position and encoder directions")
+    return int(ExitCode.DONE)
+
+
+def _numbers(found: "Verification") -> dict:
+    from selfcal_ros.model.result import plain
+
+    return plain({r.place: {"points": r.position.shape[1],
+                            "before": {"rms": r.rms("before"), "max": r.largest("before")},
+                            "after": {"rms": r.rms("after"), "max": r.largest("after")},
+                            "shift_after": r.shift_after} for r in found.residuals})
+
+
+def _text(found: "Verification") -> str:
+    """Return the residuals as a small table: µm, and arcsec for angular lines."""
+    lines = ["residual true - commanded, without its constant shift         before          after"]
+    names = {"sites": "sites", "between": "cell centres (cubic stage)", "lines": "angular lines"}
+    for r in found.residuals:
+        unit, scale = ("arcsec", RAD_PER_ARCSEC) if r.place == "lines" else ("µm", M_PER_UM)
+        for what, value in (("rms", r.rms), ("max", r.largest)):
+            name = f"{r.position.shape[1]} {names[r.place]}, {what}, {unit}"
+            lines.append(f"{name:<48}{value('before') / scale:>16.6f}"
+                         f"{value('after') / scale:>15.6f}")
+        shift = ", ".join(f"{s / scale:.6f}" for s in r.shift_after)
+        lines.append(f"  constant shift after: {shift} {unit} (the controller is zero at home)")
+    return "\n".join(lines)

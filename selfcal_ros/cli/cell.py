@@ -7,7 +7,7 @@ import os
 import subprocess
 from pathlib import Path
 
-from selfcal_ros.cli.terminal.output import add_json, put, tell
+from selfcal_ros.cli.terminal import add_json, put, tell
 from selfcal_ros.errors import ExitCode, InputError
 
 HELP = "check a machine cell before its first calibration"

@@ -7,8 +7,7 @@ import argparse
 import math
 from typing import TYPE_CHECKING, Any
 
-from selfcal_ros.cli.terminal.output import say
-from selfcal_ros.cli.terminal.progress import busy
+from selfcal_ros.cli.terminal import busy, say
 from selfcal_ros.units import ARCSEC_PER_RAD, UM_PER_M, URAD_PER_RAD
 
 if TYPE_CHECKING:
@@ -33,7 +32,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Compare and print."""
-    from selfcal_ros.cli.terminal.print_result import say_unless_qualified
+    from selfcal_ros.cli.terminal import say_unless_qualified
     from selfcal_ros.errors import ExitCode, InputError
     from selfcal_ros.estimation.comparison.maps import compare, compare_with_laser
     from selfcal_ros.files import read_json

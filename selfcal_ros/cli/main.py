@@ -15,7 +15,7 @@ import sys
 from types import ModuleType
 
 from selfcal_ros import __version__, cli
-from selfcal_ros.cli.terminal.parser import Parser
+from selfcal_ros.cli.terminal import Parser
 from selfcal_ros.errors import ExitCode, InputError, SelfcalError
 
 COMPLETE = "_ARGCOMPLETE"

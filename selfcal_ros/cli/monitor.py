@@ -10,10 +10,10 @@ import sys
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any
 
-from selfcal_ros.cli.terminal.output import add_json
+from selfcal_ros.cli.terminal import add_json
 
 if TYPE_CHECKING:
-    from selfcal_ros.cli.watching import Eyes
+    from selfcal_ros.cli.processes import Eyes
 
 HELP = "show a running cell on one screen, and operate its sequencer by keys"
 
@@ -26,8 +26,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Show the screen until q, Ctrl-C or the end of the input."""
-    from selfcal_ros.cli.processes import ended_by_signals
-    from selfcal_ros.cli.watching import eyes
+    from selfcal_ros.cli.processes import ended_by_signals, eyes
 
     with ended_by_signals(), eyes(args.namespace) as monitor:
         return watch(monitor, [], lambda: None, as_json=args.json)

@@ -16,8 +16,7 @@ from selfcal_ros.cli.plan_terms import (
     terms_json,
     terms_text,
 )
-from selfcal_ros.cli.terminal.output import tell
-from selfcal_ros.cli.terminal.progress import busy, late_progress
+from selfcal_ros.cli.terminal import busy, late_progress, tell
 from selfcal_ros.units import UM_PER_M
 
 if TYPE_CHECKING:

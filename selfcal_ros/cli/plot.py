@@ -3,8 +3,7 @@
 
 import argparse
 
-from selfcal_ros.cli.terminal.output import add_json, say
-from selfcal_ros.cli.terminal.progress import busy
+from selfcal_ros.cli.terminal import add_json, busy, say
 
 HELP = "draw the maps of a result: png, svg or pdf"
 

@@ -10,7 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from selfcal_ros.cli.processes import domain, ended_by_signals, need_ros, process
-from selfcal_ros.cli.terminal.output import add_json, aside, file_of, on_stdout, put
+from selfcal_ros.cli.terminal import add_json, aside, file_of, on_stdout, put
 
 HELP = "play a bag into the live nodes and take the map from them"
 AS_RECORDED = -1
@@ -38,7 +38,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Start the nodes, play the bag, collect the result, stop the nodes."""
     from selfcal_ros.bagio.offline import bag_input
-    from selfcal_ros.cli.terminal.print_result import exit_code, show
+    from selfcal_ros.cli.terminal import exit_code, show
     from selfcal_ros.errors import InputError
     from selfcal_ros.files import check_outputs, read_json, write_json
     from selfcal_ros.model.result import result_from_dict, result_to_dict, with_input
@@ -90,7 +90,7 @@ def _clock_lines(args: argparse.Namespace) -> tuple[list[str], dict[str, int]]:
 
 
 def _play(args: argparse.Namespace, saved: Path, environment: dict) -> tuple[int, list[str]]:
-    from selfcal_ros.cli.terminal.progress import progress_bar
+    from selfcal_ros.cli.terminal import progress_bar
 
     rest = ["--ros-args", "--params-file", args.params] if args.params else []
     quiet = ["--ros-args", "--log-level", "warn"]

@@ -6,8 +6,7 @@ import os
 import sys
 from pathlib import Path
 
-from selfcal_ros.cli.terminal.output import add_json, say
-from selfcal_ros.cli.terminal.progress import busy
+from selfcal_ros.cli.terminal import add_json, busy, say
 
 HELP = "write a calibration report: one self-contained HTML or PDF file"
 

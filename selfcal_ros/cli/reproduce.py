@@ -6,8 +6,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from selfcal_ros.cli.terminal.output import add_json, say
-from selfcal_ros.cli.terminal.progress import late_progress
+from selfcal_ros.cli.terminal import add_json, late_progress, say
 
 if TYPE_CHECKING:
     from selfcal_ros.parallel import Progress

@@ -3,7 +3,7 @@
 
 import argparse
 
-from selfcal_ros.cli.terminal.output import add_json, say
+from selfcal_ros.cli.terminal import add_json, say
 
 HELP = "write a bag of a simulated cell, with its known truth"
 
@@ -19,7 +19,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Simulate and print what was written."""
     from selfcal_ros.bagio.simulated import write_simulation
-    from selfcal_ros.cli.terminal.progress import progress_bar
+    from selfcal_ros.cli.terminal import progress_bar
     from selfcal_ros.simulation.spec import read_simulation
 
     simulation = read_simulation(args.sim)

@@ -5,7 +5,7 @@ import argparse
 import sys
 from typing import TYPE_CHECKING, Any
 
-from selfcal_ros.cli.terminal.output import add_json, aside, file_of, on_stdout, put
+from selfcal_ros.cli.terminal import add_json, aside, file_of, on_stdout, put
 from selfcal_ros.errors import InputError
 
 if TYPE_CHECKING:
@@ -126,8 +126,7 @@ def _reference(text: str | None) -> dict[str, Any]:
 def run(args: argparse.Namespace) -> int:
     """Collect, calibrate, print the summary and write the result."""
     from selfcal_ros.bagio.offline import bag_input, collect_bag, read_truth
-    from selfcal_ros.cli.terminal.print_result import exit_code, show
-    from selfcal_ros.cli.terminal.progress import busy, progress_bar
+    from selfcal_ros.cli.terminal import busy, exit_code, progress_bar, show
     from selfcal_ros.collection.inputs import advice
     from selfcal_ros.collection.settings.estimator import solver_options
     from selfcal_ros.errors import NotIdentifiableError

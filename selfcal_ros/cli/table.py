@@ -4,7 +4,7 @@
 import argparse
 from typing import TYPE_CHECKING
 
-from selfcal_ros.cli.terminal.output import STDOUT, add_json, file_of, say
+from selfcal_ros.cli.terminal import STDOUT, add_json, file_of, say
 
 if TYPE_CHECKING:
     from selfcal_ros.model.result import CalibrationResult
@@ -32,7 +32,7 @@ def run(args: argparse.Namespace) -> int:
     """
     from pathlib import Path
 
-    from selfcal_ros.cli.terminal.print_result import exit_code
+    from selfcal_ros.cli.terminal import exit_code
     from selfcal_ros.errors import InputError
     from selfcal_ros.files import check_outputs, read_json, write_bytes
     from selfcal_ros.model.result import result_from_dict

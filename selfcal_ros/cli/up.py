@@ -6,7 +6,7 @@ import contextlib
 import os
 from pathlib import Path
 
-from selfcal_ros.cli.terminal.output import add_json
+from selfcal_ros.cli.terminal import add_json
 
 HELP = "start and supervise the nodes of a cell, and run a calibration on one screen"
 
@@ -33,9 +33,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Start and supervise the nodes, show the screen, stop the nodes at the end."""
     from selfcal_ros.cli.monitor import watch
-    from selfcal_ros.cli.processes import ended_by_signals, need_ros
-    from selfcal_ros.cli.supervisor import Supervisor
-    from selfcal_ros.cli.watching import eyes
+    from selfcal_ros.cli.processes import Supervisor, ended_by_signals, eyes, need_ros
     from selfcal_ros.errors import InputError
     from selfcal_ros.files import read_bytes, read_yaml
     from selfcal_ros.model.view import plan_from_dict

@@ -20,6 +20,8 @@ SLEW = 2000
 """A clock that is kept by another runs away from it by at most one part in so many."""
 REMEDY = ("let clocks slew, not step, while a run is measured (chrony, ptp4l: no step after the "
           "start)")
+Span = tuple[np.ndarray, np.ndarray]
+"""Lowest and highest of offset, stamp and reception, each (3, n)."""
 
 
 @dataclass(frozen=True)
@@ -126,10 +128,6 @@ class StepWatch:
             offset_ns = max(offset_ns, known - max(received_ns - when, 0) // SLEW)
         self._nearest = offset_ns, received_ns
         return self._nearest
-
-
-Span = tuple[np.ndarray, np.ndarray]
-"""Lowest and highest of offset, stamp and reception, each (3, n)."""
 
 
 def _parted(before: Span, after: Span, limit_ns: int) -> np.ndarray:

@@ -33,6 +33,8 @@ PLACED = (Reason.NOT_AT_MARK, Reason.TOO_FAR, Reason.MOVING, Reason.CONTRADICTIO
 """Reasons behind which the stage may stand where no mark is."""
 
 Span = tuple[int, int] | None
+LOOKED_AT = 2000
+"""Detections whose stage positions are looked at, the last of them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -212,10 +214,6 @@ def _said(scale: float, *, swapped: bool, signs: tuple[int, int], sense: Sense) 
         what.append(f"{axis} is indicated with the wrong sign")
         remedy.append(f"turn the sign of {axis}")
     return f"{' and '.join(what)}; {', and '.join(remedy)}"
-
-
-LOOKED_AT = 2000
-"""Detections whose stage positions are looked at, the last of them."""
 
 
 @dataclass(frozen=True)

@@ -26,6 +26,10 @@ COLUMNS = {"position": "f8", "reason": "i1", "moving": "?", "first": "i8", "last
 """What is known of a joint at each instant, and between which stamps its samples decide it."""
 APPROACH = {"motion": "i1", "approach": "i1"}
 """The last motion of a linear joint as samples tell it, and the sign with `AS_BEFORE` filled in."""
+NEW = 9
+"""Direction of approach of an instant that has not been looked up yet."""
+N_LINEAR = 2
+"""Joints whose direction of approach is known: the first ones."""
 
 
 @dataclass(frozen=True)
@@ -236,12 +240,6 @@ class Exposures:
             changed |= found != old
             joint["approach"][start:] = found
         return self._stamps.rows[start:][changed & known]
-
-
-NEW = 9
-"""Direction of approach of an instant that has not been looked up yet."""
-N_LINEAR = 2
-"""Joints whose direction of approach is known: the first ones."""
 
 
 def _differ(before: list[np.ndarray], after: list[np.ndarray]) -> np.ndarray:

@@ -38,6 +38,10 @@ MAX_AHEAD_NS = 60 * NS_PER_S
 what is stamped later by a clock that is right."""
 MAX_EXPOSURES = 5_000_000
 """Exposures of one view that the simulated cell holds: 240 MB."""
+DETECTION = np.dtype([
+    ("stamp", "i8"), ("kind", "u1"), ("has_id", "?"), ("m", "i8"), ("n", "i8"), ("k", "i8"),
+    ("ox", "f8"), ("oy", "f8"), ("ot", "f8"), ("sigma", "f8"), ("score", "f8")])
+"""Many detections as a table: fields as in `Detection`, offsets as ox, oy, ot."""
 
 
 class Kind(IntEnum):
@@ -81,12 +85,6 @@ class Detection:
     offset_theta: float
     sigma: float
     score: float
-
-
-DETECTION = np.dtype([
-    ("stamp", "i8"), ("kind", "u1"), ("has_id", "?"), ("m", "i8"), ("n", "i8"), ("k", "i8"),
-    ("ox", "f8"), ("oy", "f8"), ("ot", "f8"), ("sigma", "f8"), ("score", "f8")])
-"""Many detections as a table: fields as in `Detection`, offsets as ox, oy, ot."""
 
 
 @dataclass(frozen=True, slots=True)

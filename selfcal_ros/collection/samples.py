@@ -16,6 +16,12 @@ from pathlib import Path
 
 import numpy as np
 
+NO_STAMPS = np.zeros(0, dtype=np.int64)
+LARGE_TEMPORARY = Path("/var/tmp")
+"""Where large temporary files belong: /tmp may lie in memory."""
+Samples = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""Stamps (int64, ns), positions and speeds (float; NaN = not told)."""
+
 
 class GrowingTable:
     """Rows of a structured type."""
@@ -77,14 +83,6 @@ class GrowingColumns:
         """Add rows with the same values in front of the rows `at` (rising); unnamed ones are 0."""
         for name, column in self._columns.items():
             column.insert(at, np.full(len(at), values.get(name, 0), dtype=column.rows.dtype))
-
-
-NO_STAMPS = np.zeros(0, dtype=np.int64)
-LARGE_TEMPORARY = Path("/var/tmp")
-"""Where large temporary files belong: /tmp may lie in memory."""
-
-Samples = tuple[np.ndarray, np.ndarray, np.ndarray]
-"""Stamps (int64, ns), positions and speeds (float; NaN = not told)."""
 
 
 @dataclass(frozen=True)

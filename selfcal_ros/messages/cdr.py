@@ -22,6 +22,17 @@ SEQUENCE = -1
 TEXT = "text"
 WORD = 8
 EVERY_BIT = (1 << 8 * WORD) - 1
+MAX_LENGTH = 1 << 13
+"""Bytes of the longest message that is decoded: 140 joints with names of 30 letters, positions,
+velocities and efforts."""
+MAX_KNOWN = 16
+"""Layouts of one length that are kept for the next messages."""
+MAX_LENGTHS, MAX_KNOWN_BYTES = 256, 1 << 17
+"""Lengths of which layouts are kept, and bytes of all messages that have one."""
+FREE_TRIES, WORTH = 16, 32
+"""Layouts that may be new in one call, and messages that allow one more."""
+TRY_BYTES = 512
+"""A layout of more bytes counts as several: it takes 1 ms a kB."""
 
 
 @dataclass(frozen=True)
@@ -187,19 +198,6 @@ class _Walk:
         start = self._pass(size if count is None else size * count)
         if name is not None:
             self.values[name] = (self.order + code, start, count)
-
-
-MAX_LENGTH = 1 << 13
-"""Bytes of the longest message that is decoded: 140 joints with names of 30 letters, positions,
-velocities and efforts."""
-MAX_KNOWN = 16
-"""Layouts of one length that are kept for the next messages."""
-MAX_LENGTHS, MAX_KNOWN_BYTES = 256, 1 << 17
-"""Lengths of which layouts are kept, and bytes of all messages that have one."""
-FREE_TRIES, WORTH = 16, 32
-"""Layouts that may be new in one call, and messages that allow one more."""
-TRY_BYTES = 512
-"""A layout of more bytes counts as several: it takes 1 ms a kB."""
 
 
 @dataclass(frozen=True)

@@ -37,6 +37,24 @@ from selfcal_ros.units import NS_PER_S
 
 MOST_NOTES = 20
 """Lines on the session that are taken."""
+_VISITS = (("mark", "mark", np.int64), ("dx", "dx", float), ("dy", "dy", float),
+           ("count", "count", np.int64), ("stamp", "stamp_ns", np.int64),
+           ("offset_x", "offset_x", float), ("offset_y", "offset_y", float),
+           ("approach_x", "approach_x", np.int8), ("approach_y", "approach_y", np.int8))
+TIME = (Field("sec", "i4"), Field("nanosec", "u4"))
+HEADER = (Field("stamp", TIME), Field("frame_id", TEXT))
+JOINT_STATE = (
+    Field("header", HEADER), Field("name", TEXT, SEQUENCE), Field("position", "f8", SEQUENCE),
+    Field("velocity", "f8", SEQUENCE), Field("effort", "f8", SEQUENCE))
+"""Fields of sensor_msgs/msg/JointState."""
+MARK_DETECTION = (
+    Field("header", HEADER), Field("kind", "u1"), Field("has_id", "u1"), Field("m", "i4"),
+    Field("n", "i4"), Field("k", "u4"), Field("offset_x", "f8"), Field("offset_y", "f8"),
+    Field("offset_theta", "f8"), Field("sigma", "f8"), Field("score", "f4"))
+"""Fields of selfcal_msgs/msg/MarkDetection."""
+STAMP_END = 12
+"""Bytes of the encapsulation, and of the stamp behind it."""
+_OFFSETS = {"ox": "offset_x", "oy": "offset_y", "ot": "offset_theta"}
 
 
 def stamp_ns(message: Any) -> int:
@@ -165,12 +183,6 @@ def _motion_of(message: Any, name: str, size: int) -> RepeatMotion | None:
     return RepeatMotion(products.reshape(size, size), int(getattr(message, f"dof_{name}")))
 
 
-_VISITS = (("mark", "mark", np.int64), ("dx", "dx", float), ("dy", "dy", float),
-           ("count", "count", np.int64), ("stamp", "stamp_ns", np.int64),
-           ("offset_x", "offset_x", float), ("offset_y", "offset_y", float),
-           ("approach_x", "approach_x", np.int8), ("approach_y", "approach_y", np.int8))
-
-
 def _visits_of(message: Any) -> GridVisits | None:
     """Return the visits in a ViewMeasurement; None if it has none."""
     if not len(getattr(message, "visit_mark", ())):
@@ -235,22 +247,6 @@ def error_map(message: Any) -> ErrorMap:
                     nonorthogonality=float(message.nonorthogonality),
                     scale_difference=float(message.scale_difference),
                     datum_theta=ThetaDatum(message.datum_theta))
-
-
-TIME = (Field("sec", "i4"), Field("nanosec", "u4"))
-HEADER = (Field("stamp", TIME), Field("frame_id", TEXT))
-JOINT_STATE = (
-    Field("header", HEADER), Field("name", TEXT, SEQUENCE), Field("position", "f8", SEQUENCE),
-    Field("velocity", "f8", SEQUENCE), Field("effort", "f8", SEQUENCE))
-"""Fields of sensor_msgs/msg/JointState."""
-MARK_DETECTION = (
-    Field("header", HEADER), Field("kind", "u1"), Field("has_id", "u1"), Field("m", "i4"),
-    Field("n", "i4"), Field("k", "u4"), Field("offset_x", "f8"), Field("offset_y", "f8"),
-    Field("offset_theta", "f8"), Field("sigma", "f8"), Field("score", "f4"))
-"""Fields of selfcal_msgs/msg/MarkDetection."""
-STAMP_END = 12
-"""Bytes of the encapsulation, and of the stamp behind it."""
-_OFFSETS = {"ox": "offset_x", "oy": "offset_y", "ot": "offset_theta"}
 
 
 @dataclass(frozen=True)

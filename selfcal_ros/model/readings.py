@@ -13,6 +13,15 @@ import numpy as np
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.view import View
 
+OUTLIER = "outlier_among_views"
+Key = tuple[int, str, tuple[int, ...]]
+"""A reading: position of its view, ``grid`` or ``angular``, and (m, n) or (k,)."""
+_ARRAYS = (("m", "i8"), ("n", "i8"), ("dx", "f8"), ("dy", "f8"), ("count", "i8"), ("u", "f8"),
+           ("k", "i8"), ("dtheta", "f8"), ("count_theta", "i8"), ("u_theta", "f8"))
+_VISITS = (("mark", "i8"), ("dx", "f8"), ("dy", "f8"), ("count", "i8"), ("stamp_ns", "i8"),
+           ("offset_x", "f8"), ("offset_y", "f8"), ("approach_x", "i1"), ("approach_y", "i1"),
+           ("u", "f8"))
+
 
 class Sense(StrEnum):
     """What moves: the microscope over a resting plate, or the plate under the microscope.
@@ -220,12 +229,6 @@ class Measurements:
         return dict(sorted(total.items()))
 
 
-OUTLIER = "outlier_among_views"
-
-Key = tuple[int, str, tuple[int, ...]]
-"""A reading: position of its view, ``grid`` or ``angular``, and (m, n) or (k,)."""
-
-
 def subset(view: ViewReadings, grid: np.ndarray, lines: np.ndarray) -> ViewReadings:
     """Return the readings of a view where the masks over its marks and lines are true."""
     return replace(
@@ -269,13 +272,6 @@ def _thinned(view: ViewReadings, marks: set[tuple[int, ...]], lines: set[int], *
 def _rejecting(view: ViewReadings, lost: int) -> ViewReadings:
     rejected = {**view.rejected, OUTLIER: view.rejected.get(OUTLIER, 0) + lost}
     return replace(view, rejected=rejected, used=view.used - lost)
-
-
-_ARRAYS = (("m", "i8"), ("n", "i8"), ("dx", "f8"), ("dy", "f8"), ("count", "i8"), ("u", "f8"),
-           ("k", "i8"), ("dtheta", "f8"), ("count_theta", "i8"), ("u_theta", "f8"))
-_VISITS = (("mark", "i8"), ("dx", "f8"), ("dy", "f8"), ("count", "i8"), ("stamp_ns", "i8"),
-           ("offset_x", "f8"), ("offset_y", "f8"), ("approach_x", "i1"), ("approach_y", "i1"),
-           ("u", "f8"))
 
 
 def readings_digest(readings: ViewReadings, rejected: dict[str, int]) -> str:

@@ -22,6 +22,8 @@ LEAST_STEPS, MOST_STEPS = 40, 20_000
 """Intervals between stamps that tell a jitter, and that are kept to tell it."""
 MORE = 1.25
 """Marks over those of the last time from which it is looked at again how the plate lies."""
+NAMED = 6
+"""Missing marks and lines that a line names; the rest is counted."""
 
 
 def merged(main: Diagnosis, others: Iterable[Diagnosis]) -> Diagnosis:
@@ -252,10 +254,6 @@ class CellChecks:
         """Return what is wrong, ERROR where something is."""
         wrong = [line for line in (*self._miswired.values(), self._misplaced) if line]
         return Diagnosis(Level.ERROR if wrong else Level.OK, "; ".join(wrong))
-
-
-NAMED = 6
-"""Missing marks and lines that a line names; the rest is counted."""
 
 
 class StallWatch:

@@ -28,6 +28,15 @@ from selfcal_ros.sessions.ports import Diagnosis, Level
 from selfcal_ros.topics import COMMAND_TOPIC, DETECTION_TOPIC, ENCODER_TOPIC, INPUT_TOPICS
 from selfcal_ros.units import NS_PER_S, S_PER_NS
 
+REACH_NS = LOOK_BACK_NS + 10 * NS_PER_S
+"""How long before and behind a command or a detection, by reception, every sample is kept: that far
+back from an exposure the direction of approach is looked for, and messages take their time."""
+APART_NS, BURST = 60 * NS_PER_S, 50
+"""Time between the samples that are kept at rest, and how many of them follow one another: they
+show that the encoder was there, how often it told its position, and steps of its clock."""
+Sample = tuple[bytes, int]
+"""Bytes, and the instant of reception, ns."""
+
 
 class Reception:
     """Holds what has been received until `drain`.
@@ -223,17 +232,6 @@ class Reception:
         for sample in self._resting.end():
             self.journal.write(ENCODER_TOPIC, *sample)
         self.journal.close()
-
-
-REACH_NS = LOOK_BACK_NS + 10 * NS_PER_S
-"""How long before and behind a command or a detection, by reception, every sample is kept: that far
-back from an exposure the direction of approach is looked for, and messages take their time."""
-APART_NS, BURST = 60 * NS_PER_S, 50
-"""Time between the samples that are kept at rest, and how many of them follow one another: they
-show that the encoder was there, how often it told its position, and steps of its clock."""
-
-Sample = tuple[bytes, int]
-"""Bytes, and the instant of reception, ns."""
 
 
 class Resting:

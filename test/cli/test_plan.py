@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 import yaml
 
+from selfcal_ros.cli import terminal
 from selfcal_ros.cli.main import main
 from selfcal_ros.cli.plan import field_note
 from selfcal_ros.cli.plan_terms import length_m
-from selfcal_ros.cli.terminal import progress
 from selfcal_ros.estimation.observability.plan_check import predict_plan
 from selfcal_ros.files import read_yaml
 from selfcal_ros.model.error_map import ThetaDatum
@@ -269,9 +269,9 @@ def test_progress_shows_only_what_takes_long(monkeypatch):
         drawn.append(label)
         yield lambda *at: drawn.append(at)
 
-    monkeypatch.setattr(progress.time, "monotonic", lambda: clock[0])
-    monkeypatch.setattr(progress, "progress_bar", bar)
-    with progress.late_progress("plans") as advance:
+    monkeypatch.setattr(terminal.time, "monotonic", lambda: clock[0])
+    monkeypatch.setattr(terminal, "progress_bar", bar)
+    with terminal.late_progress("plans") as advance:
         advance(1, 9)
         clock[0] = 101.9
         advance(2, 9)

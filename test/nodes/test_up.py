@@ -17,11 +17,11 @@ from types import SimpleNamespace
 
 import pytest
 
-from selfcal_ros.cli import supervisor as supervising
+from selfcal_ros.cli import processes as supervising
 from selfcal_ros.cli import up as up_verb
 from selfcal_ros.cli.main import build_parser
 from selfcal_ros.cli.main import main as selfcal
-from selfcal_ros.cli.supervisor import MOST_RESTARTS, Supervisor
+from selfcal_ros.cli.processes import MOST_RESTARTS, Supervisor
 from selfcal_ros.files import read_json
 from selfcal_ros.nodes import monitor_session
 from test.support.sessions import plan_file, small_plan

@@ -24,6 +24,17 @@ from selfcal_ros.model.readings import GridVisits, RepeatMotion
 PART = 32_768
 """Numbers that are worked on together where marks do not depend on each other: they stay in the
 cache of a processor, and take no memory beside the readings."""
+MIN_PAIRS = 12
+"""Pairs of repeats below which a view is too small to tell outliers."""
+ALL_PAIRS = 33
+"""Repeats of a mark up to which all their pairs are looked at; of more, 16 for each repeat."""
+STEPS = 3
+"""Steps of a sensor by which repeats may differ that otherwise agree to the bit."""
+SLOW = 5
+"""Degree of the polynomial of the order of the readings that is taken out of their changes."""
+FOLLOWS = 3.0
+"""Change of the deviation over that of the stage's position up to which an outlier among repeats
+may come of the microscope's wiring: reversed offsets make 2 of it, doubled ones 1."""
 
 
 def median(values: np.ndarray, *, overwrite: bool = False) -> float:
@@ -56,14 +67,6 @@ def row_medians(values: np.ndarray) -> np.ndarray:
 def distances(away: np.ndarray) -> np.ndarray:
     """Return the lengths (n,) of vectors (2, n) of ordinary size: `numpy.hypot`, faster."""
     return np.sqrt(away[0] * away[0] + away[1] * away[1])
-
-
-MIN_PAIRS = 12
-"""Pairs of repeats below which a view is too small to tell outliers."""
-ALL_PAIRS = 33
-"""Repeats of a mark up to which all their pairs are looked at; of more, 16 for each repeat."""
-STEPS = 3
-"""Steps of a sensor by which repeats may differ that otherwise agree to the bit."""
 
 
 @dataclass(frozen=True)
@@ -269,13 +272,6 @@ def _pair_scale(groups: list[np.ndarray], values: np.ndarray,
             done += apart.size
     independent = sum(len(group) * (group.shape[1] - 1) for group in groups) * len(values)
     return median(every, overwrite=True) / 0.6744897501960817, independent
-
-
-SLOW = 5
-"""Degree of the polynomial of the order of the readings that is taken out of their changes."""
-FOLLOWS = 3.0
-"""Change of the deviation over that of the stage's position up to which an outlier among repeats
-may come of the microscope's wiring: reversed offsets make 2 of it, doubled ones 1."""
 
 
 def grid_visits(means: Means, key: np.ndarray, sigma: np.ndarray, *, stamps_ns: np.ndarray,

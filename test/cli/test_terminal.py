@@ -7,7 +7,7 @@ import threading
 
 import pytest
 
-from selfcal_ros.cli.terminal.progress import busy, late_progress
+from selfcal_ros.cli.terminal import busy, late_progress
 
 
 class Terminal(io.StringIO):

@@ -1,2 +1,0 @@
-# SPDX-License-Identifier: Apache-2.0
-"""The sub-verbs of ``selfcal cal``: files of Aerotech controllers."""
