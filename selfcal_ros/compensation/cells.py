@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Piecewise polynomials on a uniform grid, evaluated fast: bilinear cells and bicubic splines.
 
-Every cell keeps its own coefficients side by side in memory, so that one evaluation is one
-gather of a row and a short Horner scheme; positions go through in blocks that stay in cache.
+The coefficients of every cell are contiguous in memory, so one evaluation is one
+gather of a row and a short Horner scheme; positions are processed in blocks that fit in cache.
 """
 
 import math
@@ -12,14 +12,14 @@ from functools import cached_property
 import numpy as np
 
 BLOCK = 16384
-"""Bilinear positions handled at once: their coefficients fill the second-level cache."""
+"""Bilinear positions per block: their coefficients fill the second-level cache."""
 SMALL = 1 << 20
-"""Bytes of coefficients that stay in cache."""
+"""Bytes of coefficients that fit in cache."""
 MAX_ITERATIONS = 60
 REST = 4 * float(np.finfo(float).eps)
-"""Step, in pitches, at which a fixed point has come to rest."""
+"""Step, in pitches, below which a fixed point has converged."""
 SNAP = 1e-9
-"""Distance to a node, in pitches, below which a position counts as lying on it."""
+"""Distance to a node, in pitches, below which a position is taken to be on it."""
 
 
 def cubic_pieces(values: np.ndarray, *, periodic: bool = False) -> np.ndarray:
@@ -46,9 +46,9 @@ def _slopes(values: np.ndarray) -> np.ndarray:
         slope[end] = inward * (4 * f1 - 5 * f0 + f2) / 2
     before, own = [0.0, *[1.0] * (n - 2), 2.0], [1.0, *[4.0] * (n - 2), 1.0]
     after = [2.0, *[1.0] * (n - 2), 0.0]
-    if n == 3:  # both ends are one condition: the parabola has no third derivative
+    if n == 3:  # both ends give the same condition: the parabola has no third derivative
         before[2], slope[2] = 0.0, (values[0] - 4 * values[1] + 3 * values[2]) / 2
-    for i in range(1, n):  # each row less the one before it
+    for i in range(1, n):  # each row minus the previous one
         part = 1 / (own[i] - before[i] * after[i - 1])
         after[i] *= part
         slope[i] = (slope[i] - before[i] * slope[i - 1]) * part
@@ -66,7 +66,7 @@ def _slopes_of_circle(values: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class Cells:
-    """Two fields on a uniform grid as one polynomial a cell.
+    """Two fields on a uniform grid as one polynomial per cell.
 
     Attributes
     ----------
@@ -79,7 +79,7 @@ class Cells:
     nodes : float array (2, nx, ny)
         Values at the nodes.
     by_power : float array (coefficients, cells) or None
-        The coefficients the other way round, for a grid so small that all of them stay in cache.
+        The transposed coefficients, for a grid so small that all of them fit in cache.
     """
 
     shape: tuple[int, int]
@@ -90,7 +90,7 @@ class Cells:
 
     @property
     def block(self) -> int:
-        """Positions handled at once, so that their coefficients stay in cache."""
+        """Positions per block, so that their coefficients fit in cache."""
         return BLOCK * 8 // self.coefficients[0].size
 
     @cached_property
@@ -102,7 +102,7 @@ class Cells:
     def steepest(self) -> float:
         """Return the largest |df/du| + |df/dv| of either field at 5 x 5 points of every cell.
 
-        Unknown nodes do not count.
+        Unknown nodes are ignored.
         """
         powers = np.arange(self.degree + 1)
         places = np.linspace(0, 1, 5)[:, None]
@@ -133,14 +133,14 @@ class Cells:
                       ) -> tuple[np.ndarray, np.ndarray]:
         """Return the (a, b) with (a, b) + scale * fields(a, b) = (s, t), by fixed point.
 
-        The solution nearly always lies in the cell of (s, t) itself, so each cell's polynomial
-        is fetched once. Where it does not, or (s, t) lies outside of the grid, both are NaN.
+        The solution is nearly always in the cell of (s, t) itself, so each cell's polynomial
+        is fetched once. If it is not, or (s, t) is outside the grid, both are NaN.
         """
         (i, j), (u, v) = self._locate(s, t)
         us, vt = u, v
         rows = self._rows(i, j, often=True)
-        # Each step shrinks what is left by the slope of the fields (two directions, and as much
-        # again for what a spline does between its nodes).
+        # Each step reduces the error by the slope of the fields (two directions, and twice for
+        # the spline between its nodes).
         shrink = min(1.0, 4 * scale * self.largest_step)
         for _ in range(MAX_ITERATIONS):
             first, second = self._polynomials(rows, u, v)
@@ -154,7 +154,7 @@ class Cells:
         return np.where(stayed, i + u, np.nan), np.where(stayed, j + v, np.nan)
 
     def solve_point(self, s: float, t: float, scale: float) -> tuple[float, float]:
-        """Return `solve_in_cell` of one finite position, to the bit, without NumPy's 200 us."""
+        """Return `solve_in_cell` of one finite position, bit for bit, without NumPy's 200 us."""
         nx, ny = self.shape
         i, j = min(max(int(s), 0), nx - 2), min(max(int(t), 0), ny - 2)
         us, vt = u, v = s - i, t - j
@@ -174,7 +174,7 @@ class Cells:
 
     def solve(self, s: np.ndarray, t: np.ndarray, scale: float,
               ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the same as `solve_in_cell`, wherever the solution lies."""
+        """Return the same as `solve_in_cell`, with the solution in any cell."""
         a, b = s, t
         for _ in range(MAX_ITERATIONS):
             first, second = self.at(a, b)
@@ -191,7 +191,7 @@ class Cells:
         nx, ny = self.shape
         s, t = np.clip(s, 0, nx - 1), np.clip(t, 0, ny - 1)
         with np.errstate(invalid="ignore"):
-            # A NaN position turns into some integer; u stays NaN and so does the result.
+            # A NaN position becomes some integer; u stays NaN and so does the result.
             i = np.clip(s.astype(np.int64), 0, nx - 2)
             j = np.clip(t.astype(np.int64), 0, ny - 2)
         return (i, j), (s - i, t - j)
@@ -211,14 +211,14 @@ class Cells:
 
 
 def _largest(step: np.ndarray) -> float:
-    """Return the largest amount in `step`; NaN (unknown nodes, NaN positions) does not count."""
+    """Return the largest magnitude in `step`, ignoring NaN (unknown nodes, NaN positions)."""
     size = np.abs(step)
     largest = size.max(initial=0.0)
     return size.max(initial=0.0, where=~np.isnan(size)) if np.isnan(largest) else largest
 
 
 def _horner(rows: np.ndarray, u: np.ndarray, v: np.ndarray, side: int) -> np.ndarray:
-    """Sum of rows[p * side + q] u^p v^q, in place where it can be."""
+    """Return the sum of rows[p * side + q] u^p v^q, in place if possible."""
     out = np.zeros(0)
     for p in reversed(range(side)):
         inner = rows[p * side + side - 1] * v
@@ -235,7 +235,7 @@ def _horner(rows: np.ndarray, u: np.ndarray, v: np.ndarray, side: int) -> np.nda
 
 
 def _horner_point(rows: list[list[float]], u: float, v: float, side: int) -> float:
-    """Return what `_horner` does, by the same operations on floats."""
+    """Return the same as `_horner`, by the same operations on floats."""
     out = 0.0
     for p in reversed(range(side)):
         inner = rows[p][-1] * v
@@ -248,7 +248,7 @@ def _horner_point(rows: list[list[float]], u: float, v: float, side: int) -> flo
 
 def _known_corners(field: np.ndarray, cell: tuple[np.ndarray, np.ndarray],
                    inside: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
-    """Bilinear value that leaves out corners of zero weight, (P,)."""
+    """Return bilinear values that ignore corners of zero weight, (P,)."""
     (i, j), (u, v) = cell, inside
     u, v = (np.where(abs(w - np.round(w)) < SNAP, np.round(w), w) for w in (u, v))
     out = np.zeros(len(u))

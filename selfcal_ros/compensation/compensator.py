@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The compensator: a calibrated error map put to use (method eqs. 1.4, 1.5).
+"""The compensator: use of a calibrated error map (method eqs. 1.4, 1.5).
 
-The error map holds G = indicated - true at the true position of the marks, hence
+The error map contains G = indicated - true at the true position of the marks, hence
 
     indicated to command for a true position p:   p + G(p)                  (direct)
     true position of an indicated position q:     the p with p + G(p) = q   (fixed point)
@@ -28,38 +28,38 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.model.error_map import ErrorMap
 
 MAX_SLOPE = 0.25
-"""Largest slope between neighbours that the inverse accepts: the fixed point converges fast."""
+"""Largest slope between neighbours accepted by the inverse: the fixed point converges fast."""
 
 GENTLE = 0.005
-"""Slope between neighbours below which no spline through them comes near twice MAX_SLOPE."""
+"""Slope between neighbours below which no spline through them gets near twice MAX_SLOPE."""
 
 _Field = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 
 class Compensator:
-    """Evaluate an error map and its inverse at any position of the stage frame.
+    """Evaluate an error map and its inverse at any position in the stage frame.
 
     Parameters
     ----------
     error_map : ErrorMap
         Stage error G at the sites, and Gtheta at the angular lines.
     method : {"bilinear", "bicubic"}
-        Interpolation between the sites. ``bilinear`` is what the controller does with an
+        Interpolation between the sites. ``bilinear`` is that of the controller with an
         exported table. ``bicubic`` is the interpolating cubic spline (periodic for theta); it
-        refuses a map with unknown sites, because each of them would spoil the whole field.
+        refuses a map with unknown sites, because each of them would affect the whole field.
     outside : {"clamp", "refuse"}
-        Beyond the calibrated field: take the error of the nearest point of its edge, or raise.
+        Outside the calibrated field: use the error of the nearest point of its edge, or raise.
 
     Raises
     ------
     InputError
-        For an unknown word, a bicubic map with unknown sites, or a map so steep that it cannot
-        be inverted.
+        For an unknown option, a bicubic map with unknown sites, or a map too steep to be
+        inverted.
 
     Notes
     -----
-    Unknown sites (NaN) under ``bilinear``: the value is NaN wherever an unknown site would
-    have a weight, so that known sites themselves stay known. NaN positions give NaN.
+    Unknown sites (NaN) with ``bilinear``: the value is NaN wherever an unknown site has
+    weight, so that known sites themselves stay known. NaN positions give NaN.
     All methods take scalars or arrays that broadcast and return float arrays of that shape.
     """
 
@@ -91,11 +91,11 @@ class Compensator:
 
     @property
     def has_theta(self) -> bool:
-        """Whether the map knows anything about theta."""
+        """Whether the map has theta."""
         return self.error_map.artifact.angular_count > 0
 
     def inside(self, x_m: ArrayLike, y_m: ArrayLike) -> np.ndarray:
-        """Return whether positions lie in the calibrated field, edge included, bool array."""
+        """Return whether positions are in the calibrated field, edge included, bool array."""
         half = np.array(self.error_map.artifact.half) * self._pitch + SNAP * self._pitch
         return (np.abs(x_m) <= half[0]) & (np.abs(y_m) <= half[1])
 
@@ -105,7 +105,7 @@ class Compensator:
         Raises
         ------
         InputError
-            With ``outside="refuse"``, if a position lies outside of the field.
+            With ``outside="refuse"``, if a position is outside the field.
         """
         self._refuse_outside(x_m, y_m)
         return self._blocks(lambda x, y: self._at(self._cells, x, y), (x_m, y_m),
@@ -117,18 +117,18 @@ class Compensator:
         Raises
         ------
         InputError
-            With ``outside="refuse"``, if a position lies outside of the field.
+            With ``outside="refuse"``, if a position is outside the field.
         """
         gx, gy = self.error(x_m, y_m)
         return np.asarray(x_m) + gx, np.asarray(y_m) + gy
 
     def correct(self, x_m: ArrayLike, y_m: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
-        """Return the true position behind the indicated position `x_m`, `y_m`.
+        """Return the true position for the indicated position `x_m`, `y_m`.
 
         Raises
         ------
         InputError
-            With ``outside="refuse"``, if a true position lies outside of the field.
+            With ``outside="refuse"``, if a true position is outside the field.
         """
         x, y = np.broadcast_arrays(np.asarray(x_m, dtype=float), np.asarray(y_m, dtype=float))
         out = self._blocks(self._invert(self._cells.solve_in_cell), (x, y), self._cells.block)
@@ -151,7 +151,7 @@ class Compensator:
         """
         (hx, hy), pitch = self.error_map.artifact.half, self._pitch
         a, b = self._cells.solve_point(x_m / pitch + hx, y_m / pitch + hy, 1 / pitch)
-        if math.isnan(a):  # the solution lies in another cell, outside, or nowhere
+        if math.isnan(a):  # the solution is in another cell, outside, or does not exist
             x, y = self.correct(x_m, y_m)
             return float(x), float(y)
         return (a - hx) * pitch, (b - hy) * pitch
@@ -160,14 +160,14 @@ class Compensator:
         """Return standard uncertainties of G, m, at true positions `x_m`, `y_m`.
 
         The uncertainties of the sites, interpolated bilinearly: an upper bound for the bilinear
-        value whatever the correlation of the sites. The bicubic value of sites that err alike and
-        independently keeps within it to 1 %, but for the outermost cells, where it may exceed it
-        by 37 %. What the stage does between its sites is not in it.
+        value whatever the correlation of the sites. The bicubic value for sites with equal and
+        independent errors stays within it to 1 %, except in the outermost cells, where it may
+        exceed it by 37 %. The stage error between its sites is not included.
 
         Raises
         ------
         InputError
-            With ``outside="refuse"``, if a position lies outside of the field.
+            With ``outside="refuse"``, if a position is outside the field.
         """
         self._refuse_outside(x_m, y_m)
         return self._blocks(lambda x, y: self._at(self._u_cells, x, y), (x_m, y_m),
@@ -195,7 +195,7 @@ class Compensator:
         return np.asarray(theta_rad) + self.error_theta(theta_rad)
 
     def correct_theta(self, theta_rad: ArrayLike) -> np.ndarray:
-        """Return the true angle behind the indicated angle `theta_rad`.
+        """Return the true angle for the indicated angle `theta_rad`.
 
         Raises
         ------
@@ -230,7 +230,7 @@ class Compensator:
         return true
 
     def uncertainty_theta(self, theta_rad: ArrayLike) -> np.ndarray:
-        """Return the standard uncertainty of Gtheta, rad, as `uncertainty` does.
+        """Return the standard uncertainty of Gtheta, rad, like `uncertainty`.
 
         Raises
         ------
@@ -268,7 +268,7 @@ class Compensator:
     def _refuse_outside(self, x_m: ArrayLike, y_m: ArrayLike) -> None:
         if self.outside == "clamp":
             return
-        # An unknown position (NaN) lies neither inside nor outside: it gives NaN.
+        # An unknown position (NaN) is neither inside nor outside: it gives NaN.
         off = ~(self.inside(x_m, y_m) | np.isnan(x_m) | np.isnan(y_m))
         if np.any(off):
             x, y = np.broadcast_arrays(x_m, y_m)
@@ -307,13 +307,13 @@ class _Circle:
         below = np.floor(s)
         u = s - below
         with np.errstate(invalid="ignore"):
-            # A position that is not finite turns into some integer; u is NaN and so is the result.
+            # A position that is not finite becomes some integer; u is NaN and so is the result.
             i = below.astype(np.int64) % self._count
         if self._pieces is not None:
             c = self._pieces[:, i]
             return ((c[3] * u + c[2]) * u + c[1]) * u + c[0]
         low, high = self._closed[i], self._closed[i + 1]
-        # A line of zero weight does not count, so that a known line stays known.
+        # A line of zero weight is ignored, so that a known line stays known.
         return np.where(u == 0, low, low + u * (high - low))
 
     def at_point(self, angle_rad: float) -> float:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How a map is put to use: between its nodes, and outside of its field."""
+"""Interpolation of a map between its nodes, and treatment outside its field."""
 
 from typing import Literal
 

@@ -1,17 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Least squares over all diagonals of the exact geometry of the new formulation, 2D and 3D.
+"""Least squares over all diagonals with the exact geometry of the new formulation, 2D and 3D.
 
 Model: R[k, j, i] = s[k, j] w_k . d[j, i]. Assumptions, those of the source:
 
 1. the linear errors E_j(j) are known;
 2. the laser of diagonal k lies along the machine's own diagonal D_k = sum of its steps, so that
    w_k . D_k = |D_k| (eq. 3 for the whole run); any w_k with this property is D_k/|D_k| plus a
-   vector t_k square to D_k: the mirror's tilt, unknown, D - 1 numbers a diagonal (eq. 4);
-3. the mirror turns in no block (no angular errors of the machine);
+   vector t_k perpendicular to D_k: the mirror's tilt, unknown, D - 1 numbers per diagonal (eq. 4);
+3. the mirror rotates in no block (no angular errors of the machine);
 4. datum: the first X step has no transverse error; in 3D the first Y step has no Z error.
 
-2D: 2n - 1 errors and one tilt a diagonal from 2n readings a diagonal: one diagonal suffices, two
-leave 2n - 1 redundant readings. 3D: 6n - 3 errors and 8 tilts from 12n readings.
+2D: 2n - 1 errors and one tilt per diagonal from 2n readings per diagonal: one diagonal suffices,
+two leave 2n - 1 redundant readings. 3D: 6n - 3 errors and 8 tilts from 12n readings.
 """
 
 from dataclasses import dataclass
@@ -24,7 +24,7 @@ from selfcal_ros.laser.data import StepDiagonal, step_vectors
 
 MAX_ITERATIONS = 30
 CONVERGED = 1e-12
-"""Largest last correction, relative to the largest step."""
+"""Convergence: largest last correction, relative to the largest step."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +34,7 @@ class Adjusted:
     Attributes
     ----------
     errors_m : float array (D, n, D)
-        All errors, the linear ones as given.
+        All errors; the linear ones are the given ones.
     tilt : float array (K, D-1)
         Components of t_k along the rows of `Geometry.sideways`.
     by_readings, by_linear : float arrays (D*n*D, K*D*n) and (D*n*D, D*n)
@@ -61,7 +61,7 @@ class Geometry:
 
     @cached_property
     def free(self) -> np.ndarray:
-        """Which errors are unknown, bool (D, n, D): all but the linear ones and the datum."""
+        """Unknown errors, bool (D, n, D): all but the linear ones and the datum."""
         free = np.ones((self.dim, self.n, self.dim), dtype=bool)
         for j in range(self.dim):
             free[j, :, j] = False
@@ -70,7 +70,7 @@ class Geometry:
 
     @cached_property
     def sideways(self) -> np.ndarray:
-        """Unit vectors square to the nominal diagonals, (K, D-1, D); 2D: counter-clockwise."""
+        """Unit vectors normal to the nominal diagonals, (K, D-1, D); 2D: counter-clockwise."""
         out = []
         for signs in self.signs:
             along = signs * self.steps / np.linalg.norm(self.steps)
@@ -131,8 +131,8 @@ def adjust(data: StepDiagonal) -> Adjusted:
     NotIdentifiableError
         If the diagonals do not determine the errors.
     InputError
-        If the least squares does not converge, which says that readings and steps are not of
-        one machine.
+        If the least squares does not converge: readings and steps do not belong to the same
+        machine.
     """
     geometry = Geometry(data)
     linear = data.linear_mean_m

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Laser distances and axis positions from a bag, for the step-diagonal measurement.
 
-Messages are decoded by the definitions that the bag brings along. A message with a header counts
-at its stamp, one without at the time of its logging. Samples are sorted by time, whatever their
-order in the file; a time that comes twice keeps the first.
+Messages are decoded by the definitions in the bag. A message with a header is used at its stamp,
+one without at its log time. Samples are sorted by time, whatever their order in the file; of
+duplicate times the first is kept.
 """
 
 from collections.abc import Callable, Sequence
@@ -22,16 +22,16 @@ from selfcal_ros.messages.to_model import stamp_ns
 
 FIELDS = {"std_msgs/msg/Float64": "data", "std_msgs/msg/Float32": "data",
           "sensor_msgs/msg/Range": "range"}
-"""Where the distance stands in a message, unless a field is named."""
+"""Default field of the distance by type."""
 POINTS = {"geometry_msgs/msg/PointStamped": "point", "geometry_msgs/msg/PoseStamped":
           "pose.position", "geometry_msgs/msg/Point": ""}
-"""Where x, y, z stand in a message that is no JointState."""
+"""Fields of x, y, z by type, other than JointState."""
 JOINT_STATE = "sensor_msgs/msg/JointState"
 
 
 @dataclass(frozen=True)
 class SeriesTopics:
-    """Where laser and positions are recorded.
+    """Topics and fields of laser and positions.
 
     Attributes
     ----------
@@ -40,8 +40,8 @@ class SeriesTopics:
     joints : tuple of str
         Names of the axes in a JointState, in the order of the steps.
     laser_field : str
-        Field of the distance (``a.b`` goes deeper), or the joint's name in a JointState; empty =
-        that of the type.
+        Field of the distance (``a.b`` for nested ones), or the joint's name in a JointState; empty
+        = default of the type.
     laser_unit_m, position_unit_m : float
         Metres in a unit of the values.
     """
@@ -55,14 +55,14 @@ class SeriesTopics:
 
 
 def read_series(path: Path, topics: SeriesTopics) -> tuple[Series, list[str]]:
-    """Return the recording in a bag, and what has to be said about it.
+    """Return the recording in a bag, and notes about it.
 
     Raises
     ------
     InputError
         If the bag cannot be read, a type has no such field, or a joint is missing.
     NoDataError
-        If a topic is not in the bag or empty.
+        If a topic is missing or empty.
     """
     reader = BagReader(Path(path))
     wanted = {topics.laser: _laser_value(topics), topics.position: _position_value(topics)}

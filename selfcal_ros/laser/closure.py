@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the redundancy of a step-diagonal measurement says: closures and their uncertainties."""
+"""Redundancy of a step-diagonal measurement: closures and their uncertainties."""
 
 import numpy as np
 
@@ -16,15 +16,15 @@ from selfcal_ros.model.statistics import rms
 from selfcal_ros.units import MM_PER_M
 
 LENGTH_TOLERANCE = 1e-3
-"""Largest relative disagreement of diagonals and linear errors that a set-up can explain: laser
-or mirror off by about 30 mrad."""
+"""Largest relative disagreement of diagonals and linear errors from the set-up: laser
+or mirror misaligned by about 30 mrad."""
 
 
 def propagated(data: StepDiagonal, by_readings: np.ndarray,
                by_linear: np.ndarray) -> np.ndarray | None:
     """Return the covariance of values with these derivatives; None if readings have no repeats.
 
-    Linear errors without repeats count as exact.
+    Linear errors without repeats are taken as exact.
     """
     noise, linear = reading_noise(data), linear_noise(data)
     if not noise.dof:
@@ -36,12 +36,12 @@ def propagated(data: StepDiagonal, by_readings: np.ndarray,
 
 
 def is_complete(data: StepDiagonal) -> bool:
-    """Return whether all diagonals and the linear errors are there."""
+    """Return whether all diagonals and the linear errors are present."""
     return data.linear_m is not None and set(data.diagonals) == set(DIAGONALS[data.dim])
 
 
 def length_closure(data: StepDiagonal) -> tuple[float, float | None] | None:
-    """Return the rms of the diagonals less what the linear errors make of it, m, and its u.
+    """Return the rms of measured minus computed diagonals, m, and its u.
 
     Parallelogram law: the squares of all diagonals sum to those of the sides, whatever the
     squareness. None if a diagonal or the linear errors are missing; u None without repeats.
@@ -59,7 +59,7 @@ def length_closure(data: StepDiagonal) -> tuple[float, float | None] | None:
 
 def between_diagonals(data: StepDiagonal,
                       alone: list[Adjusted]) -> tuple[np.ndarray, np.ndarray | None]:
-    """Return the errors from pp alone less those from np alone, and their uncertainties.
+    """Return the errors from pp alone minus those from np alone, and their uncertainties.
 
     Parameters
     ----------
@@ -78,13 +78,13 @@ def between_diagonals(data: StepDiagonal,
 
 
 def check_lengths(data: StepDiagonal) -> None:
-    """Refuse linear errors that cannot belong to the diagonals, block by block.
+    """Refuse linear errors that do not fit the diagonals, block by block.
 
     Raises
     ------
     InputError
         If they are missing, or diagonals and sides of a block disagree by more than
-        `LENGTH_TOLERANCE`; the message says so where micrometres in place of millimetres
+        `LENGTH_TOLERANCE`; the message says if micrometres instead of millimetres
         explain it.
     """
     linear = data.linear_mean_m

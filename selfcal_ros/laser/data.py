@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a step-diagonal measurement is: steps, diagonals, readings, and the identified errors.
+"""Data of a step-diagonal measurement: steps, diagonals, readings, and the identified errors.
 
 Vectors of a block: axis j moves by d[j, i] = step_j e_j + E[j, i] in block i. On diagonal k the
-axis runs with the sign s[k, j], so that its reading is R[k, j, i] = s[k, j] w_k . d[j, i], with
+axis runs with the sign s[k, j], so its reading is R[k, j, i] = s[k, j] w_k . d[j, i], with
 w = n/(l . n) for the laser direction l and the mirror's normal n (method eq. 9.1). Nominal
 readings are positive on every diagonal: in np, R_x = -l_np . dx.
 
-A block is named by its place on the axis, not by the time of its measurement: where an axis
+A block is identified by its position on the axis, not by time: if an axis
 runs backwards (X in np), its first step in time is that of the last block.
 """
 
@@ -27,7 +27,7 @@ MAX_BLOCKS = 500
 
 
 class Method(StrEnum):
-    """Which formulation turns readings into errors."""
+    """Formulation that computes errors from readings."""
 
     CONVENTIONAL = "conventional"
     NEW = "new"
@@ -62,7 +62,7 @@ class StepDiagonal:
     diagonals : tuple of str (K,)
         Names of the measured diagonals, from `DIAGONALS`.
     samples_m : float array (repeats, K, D, n)
-        Reading of axis j on diagonal k in block i; NaN where a block was repeated less often.
+        Reading of axis j on diagonal k in block i; NaN for missing repeats of a block.
     linear_m : float array (repeats, D, n) or None
         Directly measured linear errors E_j(j), actual - nominal; NaN where not repeated.
 
@@ -78,7 +78,7 @@ class StepDiagonal:
     linear_m: np.ndarray | None = None
 
     def __post_init__(self) -> None:
-        """Refuse steps that are not lengths and arrays that do not belong together."""
+        """Refuse steps that are not lengths and arrays of inconsistent shapes."""
         for axis, step in zip(AXES, self.steps_m, strict=False):
             if not (np.isfinite(step) and step > 0):
                 raise InputError(f"step {axis}", f"{step * MM_PER_M:g} mm is not a length",
@@ -162,18 +162,18 @@ class StepDiagonal:
 
 @dataclass(frozen=True, eq=False)
 class Closure:
-    """What a redundant measurement says about itself, m.
+    """Consistency of a redundant measurement, m.
 
     Attributes
     ----------
     lengths_m, u_lengths_m : float or None
-        rms of the measured diagonals minus what the linear errors make of it: zero for any
-        squareness (parallelogram law); a misaligned laser or linear errors that are not those
-        of the measurement show here. None without linear errors or with a missing diagonal.
+        rms of the measured diagonals minus the value from the linear errors: zero for any
+        squareness (parallelogram law); shows a misaligned laser or linear errors of another
+        state. None without linear errors or with a missing diagonal.
     between_m, u_between_m : float array (D, n, D) or None
-        2D, new formulation: errors found from pp alone minus those from np alone.
+        2D, new formulation: errors from pp alone minus those from np alone.
     residual_rms_m : float or None
-        rms residual of the least squares; None where nothing is redundant.
+        rms residual of the least squares; None without redundancy.
     """
 
     lengths_m: float | None = None
@@ -185,7 +185,7 @@ class Closure:
 
 @dataclass(frozen=True, eq=False)
 class StepDiagonalResult:
-    """Errors of every block, turned so that the first X step has no transverse error.
+    """Errors of every block, rotated so that the first X step has no transverse error.
 
     Attributes
     ----------
@@ -195,12 +195,12 @@ class StepDiagonalResult:
         E[j, i, c]: error in direction c of the i-th step of axis j, actual - nominal, m. In 3D
         the first Y step has no Z error either.
     covariance : float array (D*n*D, D*n*D) or None
-        Of the errors in C order, m^2; None where nothing is known of the noise.
+        Covariance of the errors in C order, m^2; None if the noise is unknown.
     method, form : str
-        How they were found.
+        Formulation and form.
     mirror_rad : dict
         Diagonal -> angles between mirror normal and diagonal (2D: one, counter-clockwise),
-        where the form finds them.
+        if the form determines them.
     closure : Closure
         Redundancy.
     """
@@ -225,7 +225,7 @@ class StepDiagonalResult:
 
     @property
     def u_errors_m(self) -> np.ndarray | None:
-        """Standard uncertainties of the errors, (D, n, D), m; None where not known."""
+        """Standard uncertainties of the errors, (D, n, D), m; None if unknown."""
         if self.covariance is None:
             return None
         variance = np.maximum(np.diag(self.covariance), 0.0)
@@ -238,10 +238,10 @@ def step_vectors(steps_m: Sequence[float] | np.ndarray, errors_m: np.ndarray) ->
 
 
 def turn_to_first_step(vectors_m: np.ndarray) -> np.ndarray:
-    """Return displacement vectors turned so that the first X step lies along X.
+    """Return displacement vectors rotated so that the first X step is along X.
 
-    In 3D the first Y step then lies in the XY plane. What is measured along diagonals whose
-    direction is unknown cannot tell a turn of the whole machine: this is the datum.
+    In 3D the first Y step is then in the XY plane. Measurements along diagonals of unknown
+    direction do not determine a rotation of the whole machine: this is the datum.
 
     Parameters
     ----------
@@ -259,7 +259,7 @@ def turn_to_first_step(vectors_m: np.ndarray) -> np.ndarray:
 
 
 NEAR = 1.25
-"""Largest ratio of a reading to its nominal value, either way."""
+"""Largest ratio of a reading to its nominal value, or the inverse."""
 LINEAR_SHARE = 0.05
 """Largest linear error as a share of the step."""
 _UNITS = {1e-3: "metres", 1e3: "micrometres", 1e6: "nanometres", 1 / 25.4: "inches"}
@@ -270,20 +270,20 @@ def _is_near(ratio: float) -> bool:
 
 
 def check_reading(value_m: float, nominal_m: float, where: str) -> None:
-    """Refuse a reading that no machine with these steps can give.
+    """Refuse a reading that is impossible with these steps.
 
     Parameters
     ----------
     value_m, nominal_m : float
-        Reading, and what it is without any error.
+        Reading, and its value without any error.
     where : str
         File, line and column.
 
     Raises
     ------
     InputError
-        If it is not finite, negative, zero, or far from nominal; a unit that explains the ratio is
-        named.
+        If it is not finite, negative, zero, or far from nominal; the message names a unit that
+        explains the ratio.
     """
     if not math.isfinite(value_m):
         raise InputError(where, "not a finite number",
@@ -302,7 +302,7 @@ def check_reading(value_m: float, nominal_m: float, where: str) -> None:
 
 
 def check_linear(value_m: float, step_m: float, where: str) -> None:
-    """Refuse a linear error that is not small beside its step.
+    """Refuse a linear error that is not small compared with its step.
 
     Raises
     ------

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Both formulations of the step-diagonal measurement, and one entry to them.
+"""Both formulations of the step-diagonal measurement, and their common entry point.
 
-The conventional one (Wang; eqs. 1 and 2 of the source) takes the nominal laser directions: it is
-valid only if the laser lies along the nominal diagonals and the mirror stands square to it.
+The conventional one (Wang; eqs. 1 and 2 of the source) uses the nominal laser directions: it is
+valid only if the laser is along the nominal diagonals and the mirror perpendicular to it.
 *Erratum*: eq. 1 is printed with its rows for R_y,pp and R_y,np exchanged. The new one (Ibaraki,
-Goto, Matsubara) takes measured linear errors and leaves laser and mirror unknown.
+Goto, Matsubara) uses measured linear errors and treats laser and mirror as unknown.
 """
 
 from collections.abc import Callable, Collection
@@ -35,7 +35,7 @@ from selfcal_ros.laser.published_equations import Erratum, solve_diagonal
 from selfcal_ros.model.statistics import rms
 
 EQUAL_RELATIVE = 1e-12
-"""Readings closer than this are the same number."""
+"""Readings closer than this are equal."""
 
 
 def laser_directions(data: StepDiagonal) -> np.ndarray:
@@ -52,8 +52,8 @@ EQUAL_READINGS = ("the readings of all axes are equal in every block: either the
 def readings_are_equal(data: StepDiagonal) -> bool:
     """Return whether all axes read the same in each of two or more blocks, with equal steps.
 
-    A mirror adjusted parallel to the other diagonal does that, and the step diagonal then tells
-    only diagonal lengths (source, "Misalignment of mirror directions"); so do axes with the same
+    This happens with a mirror parallel to the other diagonal, when the measurement gives
+    only diagonal lengths (source, "Misalignment of mirror directions"), and with axes of the same
     linear errors (source, Table 1 b).
     """
     r = data.readings_m
@@ -62,9 +62,9 @@ def readings_are_equal(data: StepDiagonal) -> bool:
 
 
 def block_gain(data: StepDiagonal) -> np.ndarray:
-    """Return what takes the readings of an axis in a block to its step, (D, n, D, K).
+    """Return the matrix from the readings of an axis in a block to its step, (D, n, D, K).
 
-    Eq. 1 splits into one small system for each axis: 2D two readings for two components, 3D
+    Eq. 1 separates into one small system per axis: 2D two readings for two components, 3D
     four for three, by least squares weighted by the repeats.
     """
     directions = data.signs[:, :, None] * laser_directions(data)[:, None, :]
@@ -75,7 +75,7 @@ def block_gain(data: StepDiagonal) -> np.ndarray:
 
 def solve_blocks(data: StepDiagonal, readings_m: np.ndarray, gain: np.ndarray,
                  errata: Collection[Erratum] = ()) -> np.ndarray:
-    """Return the errors (D, n, D) that solve eq. 1 block by block, turned to the first X step."""
+    """Return the errors (D, n, D) from eq. 1 block by block, rotated to the first X step."""
     if Erratum.EQ1_ROWS in errata:
         readings_m = readings_m.copy()
         readings_m[:, 1] = readings_m[::-1, 1]
@@ -85,19 +85,19 @@ def solve_blocks(data: StepDiagonal, readings_m: np.ndarray, gain: np.ndarray,
 
 @one_thread()
 def identify_wang(data: StepDiagonal, *, errata: Collection[Erratum] = ()) -> StepDiagonalResult:
-    """Identify all errors from the readings alone, trusting the nominal laser directions.
+    """Identify all errors from the readings alone, assuming the nominal laser directions.
 
     Parameters
     ----------
     data : StepDiagonal
         All diagonals; linear errors are not used.
     errata : collection of Erratum
-        Errors of the printed equations to put back, for comparison.
+        Errors of the printed equations to restore, for comparison.
 
     Returns
     -------
     StepDiagonalResult
-        ``closure`` has the least squares' residual in 3D; in 2D nothing is redundant.
+        ``closure`` has the least squares' residual in 3D; in 2D there is no redundancy.
 
     Raises
     ------
@@ -131,8 +131,8 @@ def jacobian(function: Callable[[np.ndarray], np.ndarray], x: np.ndarray,
              step_m: float = 1e-7) -> np.ndarray:
     """Return d function / d x by central differences, (outputs, inputs) in C order.
 
-    The formulations are linear but for terms of (error / step)^2, so that the differences are
-    exact to far below what an uncertainty needs.
+    The formulations are linear except for terms of (error / step)^2, so the differences are
+    far more accurate than an uncertainty needs.
     """
     columns = []
     for index in range(x.size):
@@ -153,10 +153,10 @@ def identify_ibaraki(data: StepDiagonal, *, form: Form = Form.EXACT,
     data : StepDiagonal
         At least one diagonal in 2D, with linear errors.
     form : Form
-        ``exact`` is right for any constant mirror tilt; the other forms follow the paper's
+        ``exact`` is valid for any constant mirror tilt; the other forms follow the paper's
         equations, 2D only, and take the mean of the diagonals.
     errata : collection of Erratum
-        Errors of the printed equations to put back; not with ``exact``, which does not use them.
+        Errors of the printed equations to restore; not with ``exact``, which does not use them.
 
     Raises
     ------
@@ -201,7 +201,7 @@ def _paper(data: StepDiagonal, form: Form, errata: Collection[Erratum],
 
 @dataclass(frozen=True)
 class Choice:
-    """How a measurement is to be identified.
+    """Options of the identification.
 
     Attributes
     ----------
@@ -225,7 +225,7 @@ def identify(data: StepDiagonal, choice: Choice) -> StepDiagonalResult:
     Raises
     ------
     InputError
-        If the measurement lacks what the formulation needs, or holds only diagonal lengths.
+        If the measurement lacks data for the formulation, or gives only diagonal lengths.
     NotIdentifiableError
         If the diagonals do not determine the errors.
     """

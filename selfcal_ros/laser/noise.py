@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The noise of readings, from their repeats.
 
-A reading of a step is the difference of two laser distances. If the distances are what is noisy,
-neighbouring readings in time share one distance and their correlation is -1/2; if every reading
-is taken anew it is 0. The repeats tell which: the correlation is estimated and used, because
+A reading of a step is the difference of two laser distances. If the distances are noisy,
+neighbouring readings in time share one distance and their correlation is -1/2; for independent
+readings it is 0. The correlation is estimated from the repeats and used, because
 profiles and squareness are sums of readings.
 """
 
@@ -24,7 +24,7 @@ class ReadingNoise:
     sigma_m : float
         Standard deviation, pooled over blocks; NaN without repeats.
     correlation : float
-        Of readings that follow each other in time, -0.5 to 0.
+        Correlation of successive readings, -0.5 to 0.
     dof : int
         Degrees of freedom of sigma.
     """
@@ -35,7 +35,7 @@ class ReadingNoise:
 
 
 def time_order(signs: np.ndarray, n_blocks: int) -> np.ndarray:
-    """Return the flat index j*n + i of the readings of one diagonal in their order of time.
+    """Return the flat index j*n + i of the readings of one diagonal in order of time.
 
     Parameters
     ----------
@@ -70,8 +70,8 @@ def _pooled(runs: np.ndarray) -> ReadingNoise:
     if dof == 0:
         return ReadingNoise(float("nan"))
     variance = float(np.nansum(runs**2)) / dof
-    # Neighbours in time can be paired only where every repeat is a complete run; a series may
-    # have fewer of them than another.
+    # Neighbours in time can be paired only if every repeat is a complete run; the series may
+    # have different numbers of repeats.
     complete = np.isfinite(runs).all(axis=2)
     if variance == 0 or np.any(np.isfinite(runs).any(axis=2) & ~complete) or runs.shape[2] < 2:
         return ReadingNoise(float(np.sqrt(variance)), 0.0, dof)
@@ -80,12 +80,12 @@ def _pooled(runs: np.ndarray) -> ReadingNoise:
 
 
 def _likeliest(runs: np.ndarray, dof: int) -> tuple[float, float]:
-    """Return the correlation of neighbours and the variance of greatest likelihood.
+    """Return the maximum-likelihood correlation of neighbours and variance.
 
     `runs` are deviations from the mean of their series, with `dof` degrees of freedom at each time.
     The covariance is variance * (1 + correlation on both neighbouring diagonals); the sine
     transform (DST-I) diagonalises it, with eigenvalues 1 + 2 correlation cos(pi k / (N + 1)). Sums
-    of many readings hang on the smallest of these, which the lag-1 moment alone estimates badly.
+    of many readings depend on the smallest of these, which the lag-1 moment estimates badly.
     """
     size = runs.shape[2]
     power = np.sum(dst(runs, type=1, norm="ortho") ** 2, axis=(0, 1)) / dof

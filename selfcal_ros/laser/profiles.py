@@ -6,12 +6,13 @@ Definitions
 Profile P[j, c]: error in direction c at the end of every block of axis j, from 0 at the start,
 over the nominal positions 0, step, ..., n step. Straightness: peak to valley of a transverse
 profile about its line. Squareness of axes j < c: (slope of P[c, j] over axis c + slope of P[j, c]
-over axis j) times the range of axis c; it is the lean of axis c towards +j against a perfect
-square on axis j, so positive means an angle of less than 90 deg. No turn of the machine changes it.
+over axis j) times the range of axis c; it is the inclination of axis c towards +j relative to a
+perfect square on axis j, so positive means an angle below 90 deg. It does not depend on the
+orientation of the machine.
 The line is the least-squares line (default) or the line through both ends.
 
-An error here is E = actual - nominal; an error map's is G = indicated - true = -E. Positions count
-from the start of the first block.
+An error here is E = actual - nominal; that of an error map is G = indicated - true = -E. Positions
+are relative to the start of the first block.
 """
 
 from dataclasses import dataclass
@@ -33,7 +34,7 @@ class ReferenceLine(StrEnum):
 
 @dataclass(frozen=True)
 class Value:
-    """A quantity with its standard uncertainty (k=1), in the same unit; None if not known."""
+    """A quantity with its standard uncertainty (k=1), in the same unit; None if unknown."""
 
     value: float
     u: float | None = None
@@ -50,7 +51,7 @@ def profile_m(found: StepDiagonalResult, axis: int, direction: int) -> np.ndarra
 
 
 def u_profile_m(found: StepDiagonalResult, axis: int, direction: int) -> np.ndarray | None:
-    """Return the standard uncertainty of the profile, (n+1,), m; None if not known."""
+    """Return the standard uncertainty of the profile, (n+1,), m; None if unknown."""
     if found.covariance is None:
         return None
     rows = _accumulate(found.n_blocks)
@@ -63,7 +64,7 @@ def straightness(found: StepDiagonalResult, axis: int, direction: int,
     """Return the straightness of `axis` in `direction`, m.
 
     Its uncertainty is that of the distance between the two extreme points; as a peak-to-valley
-    value it is biased upwards where the noise is not small against it.
+    value it is biased upwards unless the noise is much smaller.
     """
     rows = _accumulate(found.n_blocks) - np.outer(np.arange(found.n_blocks + 1),
                                                   _slope_row(found.n_blocks, line))
@@ -85,7 +86,7 @@ def slope(found: StepDiagonalResult, axis: int, direction: int,
 
 def u_slope(found: StepDiagonalResult, axis: int, direction: int,
             line: ReferenceLine = ReferenceLine.LEAST_SQUARES) -> float | None:
-    """Return the standard uncertainty of `slope`; None if not known."""
+    """Return the standard uncertainty of `slope`; None if unknown."""
     if found.covariance is None:
         return None
     row = _slope_row(found.n_blocks, line) / found.steps_m[axis]
@@ -112,7 +113,7 @@ def squareness(found: StepDiagonalResult, first: int = 0, second: int = 1,
 
 def squareness_rad(found: StepDiagonalResult, first: int = 0, second: int = 1,
                    line: ReferenceLine = ReferenceLine.LEAST_SQUARES) -> float:
-    """Return the squareness as an angle, rad: 90 deg less the angle between the axes."""
+    """Return the squareness as an angle, rad: 90 deg minus the angle between the axes."""
     return slope(found, second, first, line) + slope(found, first, second, line)
 
 
@@ -127,12 +128,12 @@ def name_of(axis: int, direction: int) -> str:
 
 
 def _accumulate(n: int) -> np.ndarray:
-    """Return the rows that sum block errors to profile points, (n+1, n)."""
+    """Return the matrix from block errors to profile points, (n+1, n)."""
     return np.tri(n + 1, n, -1)
 
 
 def _slope_row(n: int, line: ReferenceLine) -> np.ndarray:
-    """Return the row that takes block errors to the slope of their profile, per block."""
+    """Return the row from block errors to the slope of their profile, per block."""
     if line is ReferenceLine.END_POINTS:
         return np.full(n, 1.0 / n)
     centred = np.arange(n + 1) - n / 2
@@ -152,15 +153,15 @@ Axis = Literal["x", "y"]
 
 @dataclass(frozen=True)
 class MapEquivalent:
-    """First-order parts of an error map (Hu eq. 6) as the laser sees them.
+    """First-order terms of an error map (Hu eq. 6) from the laser.
 
     Attributes
     ----------
     nonorthogonality, u_nonorthogonality : float, float or None
         O and its standard uncertainty: Gx = O y, Gy = O x, so that the squareness is -2 O.
     scale_difference, u_scale_difference : float or None
-        R: Gx = R x, Gy = -R y, half the difference of the slopes of -Ey(y) and -Ex(x); None where
-        the linear errors are not measured but guessed from the diagonals.
+        R: Gx = R x, Gy = -R y, half the difference of the slopes of -Ey(y) and -Ex(x); None if
+        the linear errors are not measured but derived from the diagonals.
     """
 
     nonorthogonality: float
@@ -170,7 +171,7 @@ class MapEquivalent:
 
 
 def map_equivalent(found: StepDiagonalResult) -> MapEquivalent:
-    """Return O and R of an error map that has this squareness and these linear errors."""
+    """Return O and R of an error map with this squareness and these linear errors."""
     u = squareness(found).u
     span = found.steps_m[1] * found.n_blocks
     o = -squareness_rad(found) / 2
@@ -186,14 +187,14 @@ def axis_corrections(found: StepDiagonalResult,
                      ) -> dict[tuple[Axis, Axis], tuple[np.ndarray, np.ndarray]]:
     """Return (along, corrected) -> positions and corrections -E, m, of every profile of X and Y.
 
-    The datum is turned from the first X step to the line of the X axis: the correction of Y along x
-    is the straightness of X alone, and that of X along y holds straightness and squareness. Linear
-    errors are corrected only where they were measured (new formulation).
+    The datum is rotated from the first X step to the line of the X axis: the correction of Y along
+    x is the straightness of X alone, and that of X along y contains straightness and squareness.
+    Linear errors are corrected only if they were measured (new formulation).
 
     Raises
     ------
     InputError
-        For a 3D measurement, whose Z axis the tables of the package do not know.
+        For a 3D measurement: the tables of the package have no Z axis.
     """
     if found.dim != 2:
         raise InputError("calibration table", "body diagonals measure three axes, the tables hold "

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The new formulation as the source writes it: eqs. 3 to 6, one diagonal at a time, 2D.
+"""The new formulation as published: eqs. 3 to 6, one diagonal at a time, 2D.
 
 Here u = a + Ex(x), q = b + Ey(y) are the measured step lengths of a block, v = Ey(x) and
-p = Ex(y) the transverse errors. The np diagonal is the pp diagonal of the machine seen in a
-mirror (X reversed): v and p change their signs, nothing else does.
+p = Ex(y) the transverse errors. The np diagonal is the pp diagonal of the mirror image of the
+machine (X reversed): only v and p change sign.
 """
 
 from collections.abc import Collection
@@ -16,12 +16,12 @@ from selfcal_ros.laser.data import Form, StepDiagonal
 
 
 class Erratum(StrEnum):
-    """Errors of the printed equations, which can be put back to see what they do."""
+    """Errors of the printed equations, which can be restored to see their effect."""
 
     EQ1_ROWS = "eq1"
     """The rows for R_y,pp and R_y,np are exchanged."""
     EQ4_SIGN = "eq4"
-    """A minus sign that the geometry of its figure does not have."""
+    """A minus sign that contradicts the geometry of its figure."""
     EQ6_LENGTH = "eq6"
     """Sine and cosine exchanged: the result is a length of about b."""
 
@@ -46,9 +46,9 @@ def eq4(u_first: float, half_r_less_delta: float, alpha_2: float,
     half_r_less_delta : float
         R/2 - delta(1), which is R_x of the first block.
     alpha_2 : float
-        Angle of the mirror to the Y axis; pi/4 where a = b.
+        Angle of the mirror to the Y axis; pi/4 if a = b.
     errata : collection of Erratum
-        `Erratum.EQ4_SIGN` puts the printed minus sign back.
+        `Erratum.EQ4_SIGN` restores the printed minus sign.
     """
     sign = -1.0 if Erratum.EQ4_SIGN in errata else 1.0
     return float(sign * u_first * np.cos(alpha_2) / half_r_less_delta)
@@ -57,7 +57,7 @@ def eq4(u_first: float, half_r_less_delta: float, alpha_2: float,
 def eq5_printed(delta: np.ndarray, sin_alpha: float, alpha_2: float) -> np.ndarray:
     """Return Ey(x) of every block from the change of delta = R/2 - R_x (eq. 5, as printed).
 
-    It takes Ex(x) and the half diagonal to be the same in every block.
+    It assumes the same Ex(x) and half diagonal in every block.
     """
     return -(sin_alpha / np.sin(alpha_2)) * (delta - delta[0])
 
@@ -78,7 +78,7 @@ def eq6(p_0: np.ndarray, v: np.ndarray, u: np.ndarray, q: np.ndarray, *,
 
 def solve_diagonal(data: StepDiagonal, readings_m: np.ndarray, linear_m: np.ndarray, *,
                    form: Form, errata: Collection[Erratum] = ()) -> np.ndarray:
-    """Return the errors (K, D, n, D) that eqs. 3 to 6 give for every diagonal on its own.
+    """Return the errors (K, D, n, D) from eqs. 3 to 6 for every diagonal separately.
 
     Parameters
     ----------
@@ -89,15 +89,15 @@ def solve_diagonal(data: StepDiagonal, readings_m: np.ndarray, linear_m: np.ndar
     linear_m : float array (2, n)
         Ex(x) and Ey(y).
     form : Form
-        ``printed`` takes eq. 5 as printed, ``stepwise`` its exact form.
+        ``printed`` uses eq. 5 as printed, ``stepwise`` its exact form.
     errata : collection of Erratum
-        Errors of the printed equations to put back.
+        Errors of the printed equations to restore.
     """
     if data.dim != 2:
         raise InputError(f"form {form}", "the source gives its equations in 2D only",
                          "use the exact form for body diagonals")
     u, q = linear_m + np.array(data.steps_m)[:, None]
-    # The source takes pi/4 "without loss of generality", which holds for a = b.
+    # The source sets pi/4 "without loss of generality", which is valid for a = b.
     alpha_2 = float(np.arctan2(data.steps_m[1], data.steps_m[0]))
     errors = np.zeros((len(data.diagonals), 2, data.n_blocks, 2))
     for k, (r_x, r_y) in enumerate(readings_m):

@@ -48,7 +48,7 @@ def outcome(found: StepDiagonalResult, data: StepDiagonal, *,
     line : ReferenceLine
         Reference line of straightness and squareness.
     warnings : sequence of str
-        What a reader has to know.
+        Warnings for the reader.
     """
     kinds = [(j, c) for j in range(found.dim) for c in range(found.dim)]
     out: dict[str, Any] = {"schema": SCHEMA, "method": str(found.method)}
@@ -94,7 +94,7 @@ def _value(prefix: str, value: Value) -> dict[str, float | None]:
 
 
 def geometry(found: StepDiagonalResult, line: ReferenceLine) -> dict[str, Any]:
-    """Return squareness and straightness, mm: in 3D one name a pair beside the short names."""
+    """Return squareness and straightness, mm: in 3D one name per pair, and the short names."""
     out: dict[str, Any] = _value("squareness", squareness(found, line=line))
     out["squareness_rad"] = squareness_rad(found, line=line)
     for axis in range(2):
@@ -124,7 +124,7 @@ def _closure(found: StepDiagonalResult) -> dict[str, Any]:
 
 
 CLOSURE_SHARE = 2e-6
-"""Closure of the lengths, relative to the diagonal, that a set-up off by 2 mrad can cause."""
+"""Closure of the lengths, relative to the diagonal, for a misalignment of 2 mrad."""
 
 
 def _advice(found: StepDiagonalResult) -> list[str]:
@@ -142,7 +142,7 @@ def _advice(found: StepDiagonalResult) -> list[str]:
 
 
 def summary(result: dict[str, Any]) -> str:
-    """Return what a person wants to read first, in micrometres."""
+    """Return the main results as text, in micrometres."""
     def in_um(value_mm: float, u_mm: float | None) -> str:
         u = "" if u_mm is None else f" (u = {u_mm * UM_PER_MM:.4f})"
         return f"{value_mm * UM_PER_MM:+.4f} µm{u}"

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The measurement as a CSV table, mm: one row a block and repeat.
+"""The measurement as a CSV table, mm: one row per block and repeat.
 
 Columns: ``block``; ``rx_pp, ry_pp, rx_np, ry_np`` (3D: ``rx_ppp, ry_ppp, rz_ppp, rx_npp, ...``);
 and, for the new formulation, the linear errors ``ex_x, ey_y`` (3D: ``ez_z``). Several repeats are
-several rows of the same block. Lines that start with ``#`` are comments. The cells of a diagonal,
-or of a linear error, stay empty in the rows beyond its own repeats.
+several rows of the same block. Lines that start with ``#`` are comments. The cells of a diagonal
+or linear error are empty in the rows beyond its own repeats.
 """
 
 import csv
@@ -34,16 +34,16 @@ BLOCK = "block"
 
 @dataclass(frozen=True)
 class Columns:
-    """Which columns a table must have.
+    """Required columns of a table.
 
     Attributes
     ----------
     steps_m : tuple of float
-        Nominal steps; their number says 2D or 3D.
+        Nominal steps, two for 2D, three for 3D.
     diagonals : tuple of str
         Diagonals to read.
     linear : bool
-        Whether the linear errors are wanted.
+        Whether the linear errors are required.
     """
 
     steps_m: tuple[float, ...]
@@ -58,7 +58,7 @@ class Columns:
 
     @property
     def errors(self) -> list[str]:
-        """Names of the columns of linear errors, if wanted."""
+        """Names of the columns of linear errors, if required."""
         return [name_of(j, j) for j in range(len(self.steps_m))] if self.linear else []
 
 
@@ -68,7 +68,7 @@ def read_table(path: str | os.PathLike, columns: Columns) -> tuple[StepDiagonal,
     Raises
     ------
     InputError
-        For a missing column or block, a cell that is no number, a value that cannot be mm.
+        For a missing column or block, a cell that is not a number, a value that cannot be in mm.
     NoDataError
         If the table has no rows.
     """
@@ -156,7 +156,7 @@ def _block(text: str, where: str) -> int:
 
 def _number(text: str, where: str) -> float:
     try:
-        # float() also takes 1_000 and digits of other scripts, which no table means.
+        # float() also accepts 1_000 and digits of other scripts
         number = float(text if text.isascii() and "_" not in text else "other")
     except ValueError as error:
         raise InputError(where, f"'{text}' is not a number" if text else "the cell is empty",
@@ -191,7 +191,7 @@ def _values(named: dict[str, str], columns: Columns, where: str) -> tuple[np.nda
 
 def _refuse_unread(rows: list[tuple[np.ndarray, np.ndarray]], columns: Columns,
                    where: str) -> None:
-    """Refuse a block in which a diagonal was read in no row."""
+    """Refuse a block without readings of a diagonal."""
     read = np.isfinite([readings for readings, _ in rows]).any(axis=0).ravel()
     if not read.all():
         raise InputError(f"{where}: {columns.readings[int(np.argmin(read))]}", "the cell is empty",
@@ -240,7 +240,7 @@ def table_text(data: StepDiagonal, comments: Sequence[str] = ()) -> str:
 
 
 def _row(of_block: np.ndarray, repeat: int) -> list[float]:
-    """Return the values of one repeat, NaN where there are not so many."""
+    """Return the values of one repeat, NaN where missing."""
     if repeat < len(of_block):
         return of_block[repeat].ravel().tolist()
     return [math.nan] * of_block[0].size

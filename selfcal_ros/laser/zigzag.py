@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From a recorded zig-zag to blocks: laser distance and axis positions over time in, readings out.
+"""From a recorded zig-zag to blocks: laser distances and axis positions to readings.
 
 The axes rest between their moves. Each rest gives a position and a mean laser distance; two rests
 that differ by one step of one axis make a reading. A chain of single-axis moves that run X, Y(, Z),
-X, Y(, Z), ... without changing its senses is one run along a diagonal; a chain of moves of one axis
-alone, with the laser along that axis, is a direct measurement of its linear error. Anything else
-(the way back to the start, a move of two axes) separates runs. Blocks are numbered by the place of
+X, Y(, Z), ... with constant directions is one run along a diagonal; a chain of moves of one axis
+alone, with the laser along that axis, is a direct measurement of its linear error. Any other move
+(the return to the start, a move of two axes) separates runs. Blocks are numbered by the position of
 a move on its axis.
 """
 
@@ -20,29 +20,29 @@ from selfcal_ros.laser.data import AXES, DIAGONALS, MAX_BLOCKS, StepDiagonal, ch
 from selfcal_ros.units import NS_PER_S
 
 OUTLIER = 10.0
-"""Laser samples of a rest farther than this from its median are left out, in median distances: for
+"""Laser samples of a rest farther than this from its median are ignored, in median distances: for
 Gaussian noise 6.7 standard deviations."""
 
 
 @dataclass(frozen=True)
 class CutRule:
-    """How a recording is cut.
+    """Rules for cutting a recording.
 
     Attributes
     ----------
     steps_m : tuple of float (D,)
         Nominal steps.
     rest_tolerance_m : float
-        Largest wandering of a position at rest, peak to valley.
+        Largest motion at rest, peak to valley.
     min_rest_s : float
         Shortest rest that counts.
     settle_s : float
-        Beginning and end of a rest whose laser distances are left out: within the tolerance
-        the axis may still creep there, or already move.
+        Beginning and end of a rest whose laser distances are ignored: within the tolerance
+        the axis may still creep, or already move.
     step_tolerance : float
         Largest deviation of a move from its nominal step, relative to the step.
     laser_sign : int
-        -1 if the distance shrinks while the machine moves along the beam's diagonal.
+        -1 if the distance decreases while the machine moves along the diagonal.
     """
 
     steps_m: tuple[float, ...]
@@ -75,7 +75,7 @@ class Series:
 
 @dataclass(frozen=True, eq=False)
 class Rest:
-    """Axes at rest: mean position (D,) and mean laser distance, m; laser samples left out."""
+    """Axes at rest: mean position (D,) and mean laser distance, m; number of ignored samples."""
 
     position_m: np.ndarray
     laser_m: float
@@ -85,7 +85,7 @@ class Rest:
 
 @dataclass(frozen=True, eq=False)
 class Move:
-    """A move of one axis by one step: its sense, its place on the axis, its laser reading."""
+    """A move of one axis by one step: direction, position on the axis, laser reading."""
 
     axis: int
     sense: int
@@ -95,16 +95,16 @@ class Move:
 
 @dataclass(frozen=True, eq=False)
 class Cut:
-    """What a recording holds.
+    """Content of a recording.
 
     Attributes
     ----------
     data : StepDiagonal
-        Readings of all diagonals that were run; linear errors if all axes were measured alone.
+        Readings of all measured diagonals; linear errors if all axes were measured alone.
     runs : dict
         Name of a diagonal or axis -> number of complete runs.
     notes : tuple of str
-        What was left out, and why.
+        What was ignored, and why.
     """
 
     data: StepDiagonal
@@ -118,10 +118,10 @@ def cut_zigzag(series: Series, rule: CutRule) -> Cut:
     Raises
     ------
     NoDataError
-        If it holds no complete run along a diagonal.
+        If it contains no complete run along a diagonal.
     InputError
         If stamps do not ascend, a value is not finite, runs have different numbers of blocks, or a
-        reading cannot be what it says.
+        reading is impossible.
     """
     _check(series, rule)
     rests = find_rests(series, rule)
@@ -184,8 +184,8 @@ def _check(series: Series, rule: CutRule) -> None:
 def find_rests(series: Series, rule: CutRule) -> list[Rest]:
     """Return the rests of a recording in their order, each with its mean laser distance.
 
-    A rest is a stretch of samples that stay within the tolerance, as long as it can be. Rests
-    without a laser sample after settling do not count.
+    A rest is a longest interval of samples within the tolerance. Rests
+    without a laser sample after settling are ignored.
     """
     stamps, positions = series.position_ns, series.position_m
     rests, start, end = [], 0, 1
@@ -201,7 +201,7 @@ def find_rests(series: Series, rule: CutRule) -> list[Rest]:
         elif end == len(stamps):
             break
         else:
-            # No rest holds both the sample at `end` and the last one that lies too far from it.
+            # No rest contains both the sample at `end` and the last one too far from it.
             far = np.abs(positions[start:end] - positions[end]).max(axis=1) > rule.rest_tolerance_m
             start += int(np.flatnonzero(far)[-1]) + 1
             end += 1
@@ -209,7 +209,7 @@ def find_rests(series: Series, rule: CutRule) -> list[Rest]:
 
 
 def _end_of_rest(positions: np.ndarray, known: tuple[int, int], tolerance_m: float) -> int:
-    """Return the end of the stretch from known[0] that stays within the tolerance."""
+    """Return the end of the interval from known[0] within the tolerance."""
     start, end = known
     low, high = positions[start:end].min(axis=0), positions[start:end].max(axis=0)
     while end < len(positions):
@@ -222,9 +222,9 @@ def _end_of_rest(positions: np.ndarray, known: tuple[int, int], tolerance_m: flo
 
 def _mean_laser(series: Series, between_ns: tuple[int, int],
                 rule: CutRule) -> tuple[float, int] | None:
-    """Return the mean distance of a rest without its ends, and the number of samples left out.
+    """Return the mean distance of a rest without its ends, and the number of ignored samples.
 
-    A single sample beside the others (a beam that was cut, a digit that was lost) would move the
+    A single outlier (an interrupted beam, a lost digit) would move the
     mean by far more than the noise of the laser. None without samples.
     """
     settle_ns = round(rule.settle_s * NS_PER_S)
@@ -234,23 +234,23 @@ def _mean_laser(series: Series, between_ns: tuple[int, int],
     if not len(distances):
         return None
     away = np.abs(distances - np.median(distances))
-    # Half of the samples lie within the median of `away`. If they are all equal, the laser's
-    # resolution hides its noise, and the wandering of the axes is all that is known.
+    # Half of the samples are within the median of `away`. If they are all equal, the laser's
+    # resolution hides its noise, and only the motion of the axes is known.
     usual = float(np.median(away)) or rule.rest_tolerance_m / OUTLIER
     kept = away <= OUTLIER * usual
     return rule.laser_sign * float(distances[kept].mean()), int((~kept).sum())
 
 
 def _moves(rests: Sequence[Rest], rule: CutRule) -> list[Move | None]:
-    """Return the move between each two rests; None where it is not one step of one axis."""
+    """Return the move between successive rests; None if it is not one step of one axis."""
     steps = np.array(rule.steps_m)
     out: list[Move | None] = []
     for before, after in pairwise(rests):
         change = after.position_m - before.position_m
         moved = np.abs(change) > rule.step_tolerance * steps
         if not moved.any():
-            # A rest torn in two by a twitch of an axis: the reading spans it only if it is
-            # joined, and joining would hide the twitch. The run ends here.
+            # A rest interrupted by a twitch of an axis: joining its parts would hide the
+            # twitch. The run ends here.
             out.append(None)
             continue
         axis = int(np.argmax(moved))
@@ -264,7 +264,7 @@ def _moves(rests: Sequence[Rest], rule: CutRule) -> list[Move | None]:
 def _chains(moves: Sequence[Move | None]) -> list[list[Move]]:
     """Return the longest chains of moves that follow one pattern.
 
-    A chain goes on while each axis keeps its sense and the order of the axes repeats.
+    A chain continues while each axis keeps its direction and the order of the axes repeats.
     """
     chains: list[list[Move]] = [[]]
     for move in moves:
@@ -293,7 +293,7 @@ def _continues(chain: list[Move], move: Move) -> bool:
 def _name_of_run(chain: list[Move], dim: int) -> str | None:
     """Return the diagonal or axis of a chain of moves, or None."""
     if len({move.axis for move in chain}) == 1:
-        # One move alone is no run: it may be half a block.
+        # A single move is not a run: it may be half a block.
         return AXES[chain[0].axis] if len(chain) > 1 and chain[0].sense > 0 else None
     order = [move.axis for move in chain]
     if len(chain) % dim or order != list(range(dim)) * (len(chain) // dim):
@@ -307,7 +307,7 @@ def _blocks_of(chain: list[Move], name: str, dim: int) -> int:
 
 
 def _origin(named: dict[str, list[list[Move]]]) -> dict[int, float]:
-    """Return the lowest place of a move on every axis, m."""
+    """Return the lowest position of a move on every axis, m."""
     origin: dict[int, float] = {}
     for move in (move for each in named.values() for chain in each for move in chain):
         origin[move.axis] = min(origin.get(move.axis, np.inf), move.low_m)
@@ -316,7 +316,7 @@ def _origin(named: dict[str, list[list[Move]]]) -> dict[int, float]:
 
 def _readings(chain: list[Move], name: str, origin: dict[int, float],
               rule: CutRule) -> np.ndarray:
-    """Return the readings of a run, (D, n), or (n,) for a run of one axis; by place."""
+    """Return the readings of a run, (D, n), or (n,) for a run of one axis; by position."""
     dim, steps = len(rule.steps_m), np.array(rule.steps_m)
     alone = len(name) == 1
     n = _blocks_of(chain, name, dim)

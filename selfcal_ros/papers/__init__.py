@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The published simulations, run again with seeds and compared with the printed figures."""
+"""The published simulations, rerun with seeds and compared with the printed figures."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Hu's published simulation, run again with seeds, by his law and by joint least squares."""
+"""Hu's published simulation, rerun with seeds, by Hu's law and by joint least squares."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -34,7 +34,7 @@ AS_PUBLISHED = Spread(encoder="xy_axes", rotation="linear")
 
 @dataclass(frozen=True)
 class Published:
-    """One published table and the figures that belong to it; um and deg.
+    """One published table and its figures; um and deg.
 
     `table` rows are x, y, theta; columns max, min, std. The signs of the minima were lost in
     print.
@@ -80,7 +80,7 @@ class Errors:
 
 @dataclass(frozen=True, eq=False)
 class HuRun:
-    """All draws at one noise: by the law and by joint least squares, and the bound."""
+    """All draws at one noise: by the law and by joint least squares, with the bound."""
 
     published: Published
     law: Errors
@@ -90,7 +90,7 @@ class HuRun:
 
 @dataclass(frozen=True, eq=False)
 class HuReproduction:
-    """The whole simulation: the truth that was drawn, the noise-free error, both tables."""
+    """The whole simulation: the truth, the noise-free error, both tables."""
 
     truth: Truth
     noise_free_um: float
@@ -101,7 +101,7 @@ class HuReproduction:
 @one_thread()
 def reproduce_hu(n_draws: int, seed: int, *, workers: int = 1,
                  progress: Progress = silent) -> HuReproduction:
-    """Run Hu's simulation: one truth, `n_draws` draws of noise at each of his two levels.
+    """Run Hu's simulation: one truth, `n_draws` draws of noise at each of the two levels.
 
     The draws are solved by `workers` processes, with the same results for any number of them.
     """
@@ -155,7 +155,7 @@ def _joint_maps(draws: list[Measurements]) -> list[ErrorMap]:
 
 
 def hu_text(found: HuReproduction) -> str:
-    """Return Tables 1 and 2 and the series of Figures 6 to 9, side by side with the paper."""
+    """Return Tables 1 and 2 and the series of Figures 6 to 9, next to the paper's."""
     n = len(found.runs[0].law.xy)
     lines = ["Hu, Zhu, Liu: self-calibration of XY-theta stages, section 4",
              "N = 11, 10 mm, K = 24; law = the published steps, joint = least squares of all "

@@ -76,7 +76,7 @@ def _reach(artifact: Artifact) -> list[float]:
 
 
 def _vectors(frame: Frame, artifact: Artifact, fields: Sequence[Field]) -> None:
-    """Draw fields over each other at one enlargement, with its key below."""
+    """Draw fields over each other at the same enlargement, with a key below."""
     at = np.stack([artifact.x_m.ravel(), artifact.y_m.ravel()]) * MM_PER_M
     factor = enlargement(np.concatenate([np.hypot(*field).ravel() for field, _, _ in fields]),
                          artifact.grid_pitch_m)
@@ -92,7 +92,7 @@ def _level(n: int, value: float, colour: str, dash: tuple[float, ...]) -> Curve:
 
 
 def _draws(run: HuRun, name: str, columns: tuple[int, ...]) -> Drawing:
-    """Return the standard deviations of the errors draw by draw, beside what was published."""
+    """Return the standard deviations of the errors draw by draw, with the published ones."""
     published = run.published
     n = min(published.n_draws[published.figures.index(name)], len(run.law.xy))
     drawing = titled(f"hu_{name.lower().replace(' ', '_')}", f"Hu, {name}: std of the error, noise "

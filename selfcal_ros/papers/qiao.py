@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Qiao's published tables and simulations, run again with seeds."""
+"""Qiao's published tables and simulations, rerun with seeds."""
 
 from dataclasses import dataclass
 from functools import partial
@@ -96,7 +96,7 @@ PROGRAMS = (("initial", "90 deg", "shift +x"), ("initial", "180 deg", "shift +x"
 
 @dataclass(frozen=True, eq=False)
 class Program:
-    """One program of Figure 3: truth, noise-free answer (2, N, N) in um, unseen modes."""
+    """One program of Figure 3: truth, noise-free estimate (2, N, N) in um, unseen modes."""
 
     views: tuple[str, ...]
     truth_um: np.ndarray
@@ -105,7 +105,7 @@ class Program:
 
     @property
     def rms_um(self) -> float:
-        """Root mean square of the answer's error, um."""
+        """Root mean square of the estimate's error, um."""
         return rms(self.found_um - self.truth_um)
 
 
@@ -171,7 +171,7 @@ def _errors_um(truth: Truth, readings: Measurements) -> np.ndarray:
 
 
 def _with_uniform_noise(readings: Measurements, rng: np.random.Generator) -> Measurements:
-    """Add noise that is uniform within +-SIGMA_M."""
+    """Add uniform noise within +-SIGMA_M."""
     def shaken(view: ViewReadings) -> ViewReadings:
         dx, dy = rng.uniform(-SIGMA_M, SIGMA_M, (2, len(view.dx)))
         return ViewReadings(view.view, view.m, view.n, view.dx + dx, view.dy + dy, view.count)
@@ -181,7 +181,7 @@ def _with_uniform_noise(readings: Measurements, rng: np.random.Generator) -> Mea
 
 
 def _program(truth: Truth, views: tuple[str, ...]) -> Program:
-    """Solve without noise: by the estimator, or by the generalised inverse where it refuses."""
+    """Solve without noise: by the estimator, or by the generalised inverse if it refuses."""
     plan = plan_of(views)
     seen = plan_observability(plan)
     if seen.identifiable:
@@ -231,7 +231,7 @@ def _observe(truth: Truth, plan: Plan) -> np.ndarray:
 
 
 def qiao_text(found: QiaoReproduction) -> str:
-    """Return the rank tables, both programs and the noise run, side by side with the paper."""
+    """Return the rank tables, both programs and the noise run, next to the paper's."""
     lines = ["Qiao et al.: position self-calibration by least squares, tables 1-4",
              f"{'positions':44}{'printed rank':>14}  " + "".join(f"{f'n = {n}':>10}" for n in SIZES)
              + "   unknowns"]

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A machine cell with known truth: the messages that it publishes while it measures a view.
+"""A machine cell with known truth: its messages during the measurement of a view.
 
 The stage moves from mark to mark, dwells, and the microscope exposes in the middle of the dwell.
-Where it stops and what is seen there is worked out in `exposures`.
+The stops and the measured offsets are computed in `exposures`.
 """
 
 from collections.abc import Iterator
@@ -31,8 +31,8 @@ def view_events(truth: Truth, plan: Plan, index: int, *, settings: CellSettings,
                 rng: np.random.Generator, start_ns: int) -> Iterator[EncoderSample | Detection]:
     """Yield encoder samples and detections of view `index` in the order of their stamps.
 
-    Every mark is visited `repeats` times, grid first. The first stamp is `start_ns`; for a period
-    the stage rests, and comes to the first grid mark from minus.
+    Every mark is visited `repeats` times, grid first. The first stamp is `start_ns`; the stage
+    rests for a period, and approaches the first grid mark in + direction.
     """
     stops, offsets, marks = _exposures(truth, index, plan.views[index], settings, rng)
     period_ns, step_ns = settings.period_ns, round(NS_PER_S / settings.encoder_rate_hz)
@@ -71,7 +71,7 @@ def _exposures(truth: Truth, index: int, view: View, settings: CellSettings,
                ) -> tuple[np.ndarray, np.ndarray, list[tuple | None]]:
     """Return stops (E + 1, 3), the first before any exposure, offsets (E, 3) and marks.
 
-    A mark is (kind, m, n, k), None where the plate has none.
+    A mark is (kind, m, n, k), None if the plate has none there.
     """
     stops, offsets = [np.zeros((0, 3))], [np.zeros((0, 3))]
     marks: list[tuple | None] = []

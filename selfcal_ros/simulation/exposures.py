@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How a simulated cell measures: its settings, and every exposure of a view."""
+"""Settings of a simulated cell, and every exposure of a view."""
 
 from dataclasses import dataclass
 
@@ -15,50 +15,50 @@ from selfcal_ros.simulation.machine import Truth
 from selfcal_ros.units import NS_PER_S
 
 DWELL = 0.6
-"""Part of an exposure period in which the stage rests."""
+"""Fraction of an exposure period in which the stage rests."""
 
 
 @dataclass(frozen=True)
 class CellSettings:
-    """How the cell measures: SI units, rates in Hz, periods in s; all sizes standard deviations.
+    """Settings of the cell: SI units, rates in Hz, periods in s; all sizes standard deviations.
 
     Attributes
     ----------
     sense : Sense
-        Who moves.
+        What moves.
     sigma_xy_m, sigma_theta_rad : float
         White noise of one exposure.
     noise_ratio : float
-        That of y over that of x, which is `sigma_xy_m`.
+        Noise of y over that of x, which is `sigma_xy_m`.
     encoder_rate_hz, exposure_period_s : float
         Encoder samples, and the time from one exposure to the next.
     with_ids, declare_sigma : bool
         Whether detections name their marks, and state their noise.
     servo_sigma_m, servo_sigma_rad : float
-        How far the stage stands off where it stopped, exposure by exposure: motion, which the
-        encoders tell.
+        Scatter of the stage about its stop position, exposure by exposure: motion, which the
+        encoders indicate.
     encoder_sigma_m, encoder_sigma_rad : float
-        Noise of what the encoders tell, exposure by exposure: no motion.
+        Noise of the encoder readings, exposure by exposure, without motion.
     visit_order : str
-        Order of the marks where a view does not ask for one (`selfcal_ros.model.orders`).
+        Order of the marks if a view does not specify one (`selfcal_ros.model.orders`).
     consecutive : bool
-        All repeats of a mark one after another, in one pass; otherwise one pass a repeat.
+        All repeats of a mark consecutively, in one pass; if false, one pass per repeat.
     stop_sigma_m, stop_sigma_rad : float
-        How far from its target the stage stops, visit by visit.
+        Stop error relative to the target, visit by visit.
     follow_mark : bool
-        Whether the target is the mark as it is seen, not the nominal place of the view.
+        Whether the target is the actual position of the mark, not the nominal one.
     visit_xy_m : float
-        Noise that all exposures of a visit share.
+        Noise shared by all exposures of a visit.
     flicker_xy_m, flicker_theta_rad : float
         Noise with a spectrum of 1/f over the exposures of a view.
     resolution_xy_m, resolution_theta_rad : float
-        Step of the offsets that the microscope tells; 0 = none.
+        Step of the published offsets; 0 = none.
 
     Raises
     ------
     InputError
-        For a dwell too short for encoder samples on both sides of the exposure, or an order that
-        is not known.
+        For a dwell too short for encoder samples on both sides of the exposure, or an unknown
+        order.
     """
 
     sense: Sense = Sense.MICROSCOPE_MOVES
@@ -85,7 +85,7 @@ class CellSettings:
     resolution_theta_rad: float = 0.0
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be measured so."""
+        """Refuse impossible settings."""
         if DWELL * self.exposure_period_s * self.encoder_rate_hz < 2.5:
             raise InputError("simulated cell", f"{self.encoder_rate_hz:g} Hz gives fewer than "
                              f"2.5 encoder samples in a dwell of "
@@ -101,7 +101,7 @@ class CellSettings:
 
     @property
     def dwell_ns(self) -> int:
-        """Time at rest in each period, ns; the exposure lies in its middle."""
+        """Time at rest in each period, ns; the exposure is in its middle."""
         return round(DWELL * self.period_ns)
 
     @property
@@ -111,7 +111,7 @@ class CellSettings:
 
 
 NO_MOTION_M = 1e-6
-"""Largest change of an axis from one stop to the next that leaves its play where it is."""
+"""Largest change of an axis between stops that does not take up its backlash."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,19 +123,19 @@ class GridExposures:
     visits : VisitSequence
         The visits, V of them.
     visit : int array (E,)
-        Number of the visit of each exposure.
+        Index of the visit of each exposure.
     position : float array (2, E)
         Indicated position of the stage, m.
     offset : float array (2, E)
-        Offset that the microscope tells, m.
+        Offset published by the microscope, m.
     mark : int array (2, V)
-        m and n of the mark that lies there: the one visited where the plate lies as commanded.
+        m and n of the mark found there: the visited one if the plate is placed as commanded.
     there : bool array (V,)
-        Whether a mark lies there at all.
+        Whether there is a mark.
     approach : int8 array (2, V)
         Sign of the last motion of each stage axis before the visit.
     site : float array (2, V)
-        Nominal place of the mark in the stage frame, m.
+        Nominal position of the mark in the stage frame, m.
     """
 
     visits: VisitSequence
@@ -155,9 +155,9 @@ class AngularExposures:
     Attributes
     ----------
     k, line : int arrays
-        The line that the view expects, and the one that lies there.
+        The line that the view expects, and the one found there.
     position, offset : float arrays
-        Indicated angle, and the offset told, rad.
+        Indicated angle, and the published offset, rad.
     """
 
     k: np.ndarray
@@ -168,10 +168,10 @@ class AngularExposures:
 
 def grid_exposures(truth: Truth, index: int, view: View, *, settings: CellSettings,
                    rng: np.random.Generator) -> GridExposures:
-    """Return the exposures of the grid marks of view number `index`.
+    """Return the exposures of the grid marks of view `index`.
 
-    The plate drifts from the first of them to the last. Before the first the stage comes from
-    minus, in x and in y (`lead_in`).
+    The plate drifts from the first of them to the last. The first one is approached in
+    + direction, in x and in y (`lead_in`).
     """
     visits = visit_sequence(truth.artifact, view, order=view.visit_order or settings.visit_order,
                             consecutive=settings.consecutive, rng=rng)
@@ -185,7 +185,7 @@ def grid_exposures(truth: Truth, index: int, view: View, *, settings: CellSettin
     moved = physics.drift(truth, index, tau)
     sign = -1 if settings.sense is Sense.PLATE_MOVES else 1
     stop = sign * site
-    if settings.follow_mark:  # the stage goes on until the mark is under the microscope
+    if settings.follow_mark:  # the stage continues until the mark is under the microscope
         centre = sign * (place + moved[:, np.cumsum(visits.count) - visits.count])
         stop = centre + physics.stage_error(truth, centre, index)
     stop = stop + _normal(rng, settings.stop_sigma_m, stop.shape) + visits.aside_m
@@ -208,16 +208,16 @@ def grid_exposures(truth: Truth, index: int, view: View, *, settings: CellSettin
 
 def _settling(truth: Truth, came: np.ndarray, visit: np.ndarray, period_s: float,
               ) -> np.ndarray | float:
-    """Return what the axes are short of at each exposure, (2, E), m.
+    """Return the settling error of the axes at each exposure, (2, E), m.
 
     Parameters
     ----------
     truth
-        What is true.
+        The truth.
     came : float array (2, V + 1)
-        Stops of the stage, the first that before the first visit.
+        Stops of the stage, beginning with the one before the first visit.
     visit : int array (E,)
-        Number of the visit of each exposure.
+        Index of the visit of each exposure.
     period_s : float
         Time from one exposure to the next.
     """
@@ -230,13 +230,13 @@ def _settling(truth: Truth, came: np.ndarray, visit: np.ndarray, period_s: float
 
 
 def lead_in(truth: Truth, first: np.ndarray) -> np.ndarray:
-    """Return from where an axis sets out for the first grid mark of a view, m."""
+    """Return the position of an axis before the first grid mark of a view, m."""
     return first - truth.artifact.grid_pitch_m / 2
 
 
 def angular_exposures(truth: Truth, index: int, view: View, *, settings: CellSettings,
                       rng: np.random.Generator) -> AngularExposures:
-    """Return the exposures of the angular lines of view number `index`, line by line."""
+    """Return the exposures of the angular lines of view `index`, line by line."""
     direction, nominal, there = physics.line_directions(truth, index, view)
     line = np.arange(len(nominal))
     k = (np.repeat(line, view.repeats) if settings.consecutive
@@ -258,13 +258,13 @@ def angular_exposures(truth: Truth, index: int, view: View, *, settings: CellSet
 
 
 def quantised(told: np.ndarray, step: float) -> np.ndarray:
-    """Return the nearest whole multiples of `step`; as they are if it is 0."""
+    """Return the nearest multiples of `step`; unchanged if it is 0."""
     return np.rint(told / step) * step if step else told
 
 
 def flicker_noise(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
     """Return noise of variance 1 along the last axis whose spectrum falls as 1/f."""
-    length = 2 * max(shape[-1], 2)  # twice as long: what is used does not close on itself
+    length = 2 * max(shape[-1], 2)  # twice as long: the part used is not periodic
     k = np.arange(1, length // 2)
     spectrum = np.zeros((*shape[:-1], length // 2 + 1), dtype=complex)
     parts = rng.normal(0, 1, (2, *shape[:-1], len(k)))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is true of a machine, of a plate, and of each view in which the plate lies on it."""
+"""Truth of a machine, of a plate, and of each view of the plate on it."""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -16,14 +16,14 @@ ENCODERS = ("independent", "xy_axes")
 ROTATIONS = ("finite", "linear")
 AXES = {"xy": (1, 0, 0, 1), "-x-y": (-1, 0, 0, -1), "-xy": (-1, 0, 0, 1), "x-y": (1, 0, 0, -1),
         "yx": (0, 1, 1, 0), "-y-x": (0, -1, -1, 0), "y-x": (0, 1, -1, 0), "-yx": (0, -1, 1, 0)}
-"""What is told as the offset's x and y of its true x and y: rows of a matrix, one after another."""
+"""Published x and y of an offset from its true x and y: rows of a matrix, consecutively."""
 DRIFT_POWERS = (1, 2, 3)
 """Powers of time behind the columns of `Truth.drift_m`: linear, quadratic, cubic."""
 
 
 @dataclass(frozen=True)
 class Spread:
-    """What a random truth is drawn from; Hu's simulation by default. SI units.
+    """Parameters of a random truth; Hu's simulation by default. SI units.
 
     Attributes
     ----------
@@ -32,50 +32,50 @@ class Spread:
     phi_rad, t_m : float
         Standard deviations of each view's misalignment.
     correlation_pitches : float
-        Length over which the stage error, and that of the rotary encoder in lines, stays alike:
-        its correlation falls with the distance d as exp(-d^2 / 2 L^2). 0: that of each site and
-        line is its own, and bilinear in between.
+        Correlation length L of the stage error, and of that of the rotary encoder in lines:
+        exp(-d^2 / 2 L^2) at the distance d. 0: independent errors at sites and lines, bilinear
+        in between.
     encoder : str
-        ``independent``: the rotary encoder owes nothing to the axes, only its mean is 0.
-        ``xy_axes``: it is true to the slopes of the half axes (Hu eq. 9).
+        ``independent``: the rotary encoder is independent of the axes, only its mean is 0.
+        ``xy_axes``: it agrees with the slopes of the half axes (Hu eq. 9).
     rotation : str
-        ``finite``, as a plate turns; ``linear``, as the papers write it.
+        ``finite``: true rotations; ``linear``: linearised, as in the papers.
     microscope_scale, microscope_stretch, microscope_rotation_rad, microscope_shear : float
-        The microscope itself: a true length over the seen one, less 1; the same for x more and
-        for y less; its turn against the stage, counter-clockwise; the symmetric shear.
+        The microscope: true over measured length, minus 1; the same, positive for x and negative
+        for y; its rotation relative to the stage, counter-clockwise; the symmetric shear.
     microscope_axes, microscope_pixels, line_factor : str, float, float
-        What is told of an offset: which axes with which signs (`AXES`), how many times its
-        length; how many times the true offset is told of a line (-1: the other sign).
+        Published offset: axes and signs (`AXES`), factor of its length; factor of the true offset
+        of a line (-1: wrong sign).
     microscope_distortion, microscope_field_m : float
-        Part by which the seen offset is too long at this distance from the axis; it grows with
-        the square of the distance.
+        Relative amount by which the measured offset is too long at this distance from the axis;
+        grows with the square of the distance.
     optical_tilt_x_rad, optical_tilt_y_rad : float
-        Direction of the optical axis against the normal of the stage: a mark that lies higher
-        is seen moved by this times its height.
+        Direction of the optical axis relative to the normal of the stage: a mark appears shifted
+        by this times its height.
     backlash_x_m, backlash_y_m : float
-        What the indicated position has too much after a motion towards plus, and too little
-        after one towards minus.
+        Indicated - true position after a motion in + direction; the negative after one in -
+        direction.
     backlash_growth_m : float
-        By how much both have grown at the last grid exposure of a view, in proportion to time.
+        Growth of both up to the last grid exposure of a view, proportional to time.
     settling_m, settling_time_s : float
-        What an axis is short of its indicated position at the first exposure after it has moved,
-        and the time in which that falls to 1/e while it rests.
+        Distance by which an axis is short of its indicated position at the first exposure after a
+        motion, and the time in which this falls to 1/e at rest.
     stage_bend_m : float
-        Standard deviation by which the stage error differs in each view: coefficients of u^2, uv
+        Standard deviation of the change of the stage error in each view: coefficients of u^2, uv
         and v^2, where u and v are the indicated position over half the size of the field.
     plate_scale, plate_shape_m, plate_strain : float
-        Standard deviations by which the plate grows (relative), bends at mid-edge and is strained
-        (symmetric matrix, relative) in each view after the first.
+        Standard deviations of growth (relative), bending at mid-edge and strain (symmetric matrix,
+        relative) of the plate in each view after the first.
     plate_tilt_rad, plate_bow_m : float
         Standard deviation of the tilt of the plate about stage x and y in each view; height of the
-        plate's centre above its edges' middles.
+        plate's centre above the middles of its edges.
     line_eccentricity_rad : float
-        Standard deviation, along x and y, of the place of the circle of lines off the turning
-        axis in each view, over its radius.
+        Standard deviation, along x and y, of the eccentricity of the circle of lines in each view,
+        over its radius.
     phi_common_rad, t_common_m : float
-        Standard deviations of a misalignment that all views share: a plate laid against pins.
+        Standard deviations of a misalignment shared by all views: a plate placed against pins.
     pitch_error : float
-        True pitch of the plate over the declared one, less 1.
+        True pitch of the plate over the declared one, minus 1.
     drift_linear_m, drift_quadratic_m, drift_cubic_m, drift_walk_m : float
         Standard deviations of the drift in each view, in x and in y, at its last grid exposure.
     """
@@ -122,14 +122,14 @@ class Spread:
 
     @property
     def microscope(self) -> np.ndarray:
-        """The matrix E: true offset = (1 + E) seen offset, (2, 2)."""
+        """The matrix E: true offset = (1 + E) measured offset, (2, 2)."""
         scale, stretch = self.microscope_scale, self.microscope_stretch
         turn, shear = self.microscope_rotation_rad, self.microscope_shear
         return np.array([[scale + stretch, shear - turn], [shear + turn, scale - stretch]])
 
     @property
     def wiring(self) -> np.ndarray:
-        """The matrix that makes the offset told of the offset seen, (2, 2)."""
+        """The matrix from the measured to the published offset, (2, 2)."""
         return self.microscope_pixels * np.reshape(AXES[self.microscope_axes], (2, 2)).astype(float)
 
 
@@ -139,12 +139,12 @@ def _zeros(*shape: int) -> Any:
 
 @dataclass(frozen=True, eq=False)
 class Waves:
-    """Waves that add up to a smooth error: of a stage along x and y, or of an encoder.
+    """Waves whose sum is a smooth error, of a stage along x and y, or of an encoder.
 
     Attributes
     ----------
     number : float array (n, d)
-        Angle that each wave turns by over the unit of each coordinate.
+        Phase of each wave per unit of each coordinate.
     size : complex array (n, components)
         Amplitude and phase of each, m or rad.
     """
@@ -153,7 +153,7 @@ class Waves:
     size: np.ndarray
 
     def at(self, place: np.ndarray) -> np.ndarray:
-        """Return the sum of the waves at places (d, E), (components, E)."""
+        """Return the sum of the waves at positions (d, E), (components, E)."""
         parts = np.array_split(place, 1 + place.shape[1] // MOST_PLACES, axis=1)
         return np.concatenate([np.real(self.size.T @ np.exp(1j * (self.number @ part)))
                                for part in parts], axis=1)
@@ -161,14 +161,14 @@ class Waves:
 
 NO_WAVES = Waves(np.zeros((0, 2)), np.zeros((0, 2), dtype=complex))
 N_WAVES = 300
-"""Waves of random direction that a smooth stage error is made of."""
+"""Number of waves of random direction in a smooth stage error."""
 MOST_PLACES = 4096
-"""Places at which waves are added up at once, 20 MB."""
+"""Positions at which waves are summed at once, 20 MB."""
 
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """Stage error, plate error, the misalignment of each view, and what else is true.
+    """Stage error, plate error, the misalignment of each view, and further effects.
 
     Attributes
     ----------
@@ -176,58 +176,58 @@ class Truth:
         The lattice.
     g, a : float array (2, nx, ny)
         Stage error at the sites (stage frame) and plate error of the marks (plate frame), m.
-        Between sites the stage error less `waves` is bilinear.
+        Between sites the stage error minus `waves` is bilinear.
     g_theta, a_theta : float array (K,)
-        The same for the angular lines, rad; between lines the stage error less `waves_theta` is
+        The same for the angular lines, rad; between lines the stage error minus `waves_theta` is
         linear.
     phi_rad : float array (views,)
         Rotation of each view, counter-clockwise, about the plate's centre.
     t_m : float array (views, 2)
         Offset of each view, stage frame.
     linear : bool
-        Whether the plate turns as the papers write it: phi J R^q m, and the plate's error not
-        at all; otherwise by a rotation.
+        Whether the rotation is linearised, as in the papers: phi J R^q m, without the plate's
+        error; if false, a finite rotation.
     microscope : float array (2, 2)
-        E: true offset = (1 + E) seen offset, stage axes.
+        E: true offset = (1 + E) measured offset, stage axes.
     wiring : float array (2, 2)
-        Told offset = wiring times seen offset.
+        Published offset = wiring times measured offset.
     line_factor : float
-        Told offset of a line = this times the true one.
+        Published offset of a line = this times the true one.
     distortion : float
-        Relative length that the seen offset has too much, over the square of its length, 1/m^2.
+        Relative excess length of the measured offset, over the square of its length, 1/m^2.
     optical_tilt_rad : float array (2,)
-        What a mark is seen moved by along stage x and y, over its height.
+        Apparent shift of a mark along stage x and y, over its height.
     backlash_m : float array (2,)
-        Indicated - true position of each axis after a motion towards plus, beside g.
+        Indicated - true position of each axis after a motion in + direction, in addition to g.
     backlash_growth_m : float
-        What is added to both until the last grid exposure of a view.
+        Growth of both up to the last grid exposure of a view.
     settling_m, settling_time_s : float
-        Indicated - true position of an axis at the first exposure after its motion towards plus,
-        beside g and backlash, and the time in which it falls to 1/e.
+        Indicated - true position of an axis at the first exposure after a motion in + direction,
+        in addition to g and backlash, and the time in which it falls to 1/e.
     stage_bend_m : float array (views, 2, 3) or (0, 2, 3)
-        What is added to g in a view: as `plate_shape_m`, of the indicated position.
+        Addition to g in a view: as `plate_shape_m`, as a function of the indicated position.
     plate_scale : float array (views,) or (0,)
         Relative growth of the plate.
     plate_shape_m : float array (views, 2, 3) or (0, 2, 3)
         Displacement of the marks along plate x and y: coefficients of u^2, uv and v^2, where u and
-        v are the nominal place over half the size of the field.
+        v are the nominal position over half the size of the field.
     plate_strain : float array (views, 2, 2) or (0, 2, 2)
-        Displacement of the marks over their nominal place, plate axes.
+        Displacement of the marks over their nominal position, plate axes.
     plate_tilt_rad : float array (views, 2) or (0, 2)
         Rotation vector of the plate along stage x and y, about its centre.
     plate_bow_m : float
         Height of the plate's centre above the middles of its edges.
     line_eccentricity_rad : float array (views, 2) or (0, 2)
-        Centre of the circle of lines from the turning axis, stage axes, over its radius.
+        Centre of the circle of lines relative to the rotation axis, stage axes, over its radius.
     placed : tuple of View or None
-        How the plate lies where that is not as commanded, view by view.
+        Actual poses that differ from the commanded ones, view by view.
     drift_m : float array (views, 2, 3) or (0, 2, 3)
         Motion of the plate at the last grid exposure, stage x and y, that grew with the first,
         second and third power of time.
     walk_m : float array (views, 2, steps + 1) or (0, 2, 1)
         Motion of the plate at equal steps of time from the first grid exposure to the last.
     waves, waves_theta : Waves
-        What the stage error has between sites (places in pitches), and between lines (in lines).
+        Waves of the stage error between sites (positions in pitches), and between lines (in lines).
     """
 
     artifact: Artifact
@@ -262,13 +262,13 @@ class Truth:
 
     @property
     def by_visit(self) -> bool:
-        """Whether visits of a mark differ by more than noise, or are not read as they lie."""
+        """Whether visits of a mark differ by more than noise."""
         return bool(self.placed) or any(np.any(values) for values in (
             self.microscope, self.wiring - np.eye(2), self.line_factor - 1, self.distortion,
             self.backlash_m, self.backlash_growth_m, self.settling_m, self.drift_m, self.walk_m))
 
     def placed_as(self, index: int, commanded: View) -> View:
-        """Return how the plate lies in view `index`."""
+        """Return the pose of the plate in view `index`."""
         return (self.placed[index] if index < len(self.placed) else None) or commanded
 
 
@@ -286,10 +286,10 @@ def random_truth(artifact: Artifact, n_views: int, rng: np.random.Generator,
     rng : numpy.random.Generator
         Source of the draw.
     spread : Spread, optional
-        What is drawn, before the datum is removed.
+        Parameters of the draw, before the datum is removed.
     placing : numpy.random.Generator, optional
-        Source of what differs from view to view, and so from one measurement to the next: how the
-        plate lies, its temperature, its strain, drifts. Without it `rng` goes on.
+        Source of the values that differ between views, and so between measurements: pose of the
+        plate, temperature, strain, drifts. Default `rng`.
     """
     spread = spread or Spread()
     drawn_g, waves = _stage(artifact, spread, rng)
@@ -318,11 +318,11 @@ def random_truth(artifact: Artifact, n_views: int, rng: np.random.Generator,
 
 def _stage(artifact: Artifact, spread: Spread,
            rng: np.random.Generator) -> tuple[np.ndarray, Waves]:
-    """Return the stage error at the sites, (2, nx, ny), m, and the waves that it consists of."""
+    """Return the stage error at the sites, (2, nx, ny), m, and its waves."""
     length = spread.correlation_pitches
     if not length:
         return rng.normal(0, spread.g_m, (2, *artifact.shape)), NO_WAVES
-    # directions and lengths whose spectrum is that of exp(-d^2 / 2 L^2)
+    # directions and lengths with the spectrum of exp(-d^2 / 2 L^2)
     number = rng.normal(0, 1 / length, (N_WAVES, 2))
     waves = Waves(number, _amplitudes(rng, np.full(N_WAVES, spread.g_m / np.sqrt(N_WAVES)), 2))
     sites = np.stack([artifact.m.ravel(), artifact.n.ravel()])
@@ -354,14 +354,14 @@ def _encoder(artifact: Artifact, g: np.ndarray, drawn: np.ndarray, encoder: str)
         return drawn
     if encoder == "independent":
         return drawn - drawn.mean()
-    slopes = half_axis_slopes(artifact, g)  # a half axis of one site has none
+    slopes = half_axis_slopes(artifact, g)  # a half axis of one site has no slope
     quarter = drawn[:: artifact.angular_count // 4]
     quarter[:] = np.where(np.isfinite(slopes), slopes, quarter)
     return drawn
 
 
 def _of_views(spread: Spread, n_views: int, rng: np.random.Generator) -> dict[str, Any]:
-    """Return what is drawn for each view; nothing of what has no size."""
+    """Return the values drawn for each view; none for effects without a size."""
     drawn: dict[str, Any] = {}
     if spread.plate_scale:
         drawn["plate_scale"] = rng.normal(0, spread.plate_scale, n_views)
@@ -371,7 +371,7 @@ def _of_views(spread: Spread, n_views: int, rng: np.random.Generator) -> dict[st
         xx, xy, yy = rng.normal(0, spread.plate_strain, (3, n_views))
         drawn["plate_strain"] = np.stack([xx, xy, xy, yy], axis=1).reshape(-1, 2, 2)
     for values in drawn.values():
-        values[:1] = 0  # the plate is what it is in the first view
+        values[:1] = 0  # the plate is defined by the first view
     sizes = np.array([spread.drift_linear_m, spread.drift_quadratic_m, spread.drift_cubic_m])
     if sizes.any():
         drawn["drift_m"] = rng.normal(0, 1, (n_views, 2, 3)) * sizes

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where things are: marks on the plate, the plate on the stage, the stage under its encoders.
+"""Positions of marks on the plate, the plate on the stage, the stage under its encoders.
 
-Everything is told as a place in the stage frame. The estimator's equations are not used here: it
-must find what these places give.
+Everything is a position in the stage frame. The estimator's equations are not used here: it must
+recover the truth from these positions.
 """
 
 import numpy as np
@@ -20,12 +20,12 @@ def rotate(q: int, vector: np.ndarray) -> np.ndarray:
 
 
 def plate_displacement(truth: Truth, index: int, m: np.ndarray, n: np.ndarray) -> np.ndarray:
-    """Return true minus nominal place of marks on the plate, as it is in a view, (2, V), m.
+    """Return true minus nominal position of marks on the plate in a view, (2, V), m.
 
     Parameters
     ----------
     truth, index
-        What is true, and the number of the view.
+        The truth, and the index of the view.
     m, n : int array (V,)
         The marks.
     """
@@ -43,14 +43,14 @@ def plate_displacement(truth: Truth, index: int, m: np.ndarray, n: np.ndarray) -
 
 def marks_below(truth: Truth, index: int, view: View, marks: tuple[np.ndarray, np.ndarray],
                 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return which marks lie where `marks` would, had the plate been laid down as commanded.
+    """Return the marks found where `marks` would be if the plate were placed as commanded.
 
     Returns
     -------
     m, n : int arrays (V,)
-        The marks that lie there.
+        The marks found there.
     there : bool array (V,)
-        Whether the plate has a mark there at all; `m` and `n` are 0 where it has none.
+        Whether the plate has a mark there; `m` and `n` are 0 if not.
     """
     artifact = truth.artifact
     lies = truth.placed_as(index, view).lattice_pose(artifact)
@@ -63,16 +63,16 @@ def marks_below(truth: Truth, index: int, view: View, marks: tuple[np.ndarray, n
 
 def mark_places(truth: Truth, index: int, view: View,
                 marks: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Return where marks lie in the stage frame when a view begins, and where nominally.
+    """Return true and nominal positions of marks in the stage frame at the beginning of a view.
 
-    The plate is turned about its centre, by the view's quarter turns, by its misalignment and by
-    its tilt, and its centre is put down at the view's translation plus the offset. Where the
-    optical axis is not normal to the stage a mark is seen moved by its height.
+    The plate is rotated about its centre, by the view's quarter turns, by its misalignment and by
+    its tilt, and its centre is placed at the view's translation plus the offset. If the
+    optical axis is not normal to the stage a mark appears shifted according to its height.
 
     Returns
     -------
     place, site : float arrays (2, V)
-        True and nominal place, m.
+        True and nominal position, m.
     """
     m, n = marks
     pose, pitch = view.lattice_pose(truth.artifact), truth.artifact.grid_pitch_m
@@ -82,7 +82,7 @@ def mark_places(truth: Truth, index: int, view: View,
     phi = truth.phi_rad[index]
     if truth.linear:
         away = phi * rotate(1, arm) + error
-    else:  # R(phi) (arm + error) - arm, without the loss of digits
+    else:  # R(phi) (arm + error) - arm, without cancellation
         away = (np.sin(phi) * rotate(1, arm + error) - 2 * np.sin(phi / 2) ** 2 * (arm + error)
                 + error)
     height = _bow(truth, m, n)
@@ -94,16 +94,16 @@ def mark_places(truth: Truth, index: int, view: View,
 
 
 def _bow(truth: Truth, m: np.ndarray, n: np.ndarray) -> np.ndarray:
-    """Return the height of marks on the plate, (V,), m; the plate is a part of a sphere."""
+    """Return the height of marks on the plate, (V,), m; the plate is part of a sphere."""
     hx, hy = truth.artifact.half
     return truth.plate_bow_m * (1 - (m / hx) ** 2 - (n / hy) ** 2)
 
 
 def _tilted(tilt: np.ndarray, arm: np.ndarray, height: np.ndarray,
             ) -> tuple[np.ndarray, np.ndarray]:
-    """Return how far points (2, V) at heights (V,) move along stage x, y, and upwards.
+    """Return the displacement of points (2, V) at heights (V,) along stage x, y, and upwards.
 
-    They turn about the horizontal axis `tilt` (2,) by its length (Rodrigues).
+    They rotate about the horizontal axis `tilt` (2,) by its length (Rodrigues).
     """
     angle = np.hypot(*tilt)
     if not angle:
@@ -116,7 +116,7 @@ def _tilted(tilt: np.ndarray, arm: np.ndarray, height: np.ndarray,
 
 
 def drift(truth: Truth, index: int, tau: np.ndarray) -> np.ndarray:
-    """Return how far the plate has moved at times `tau` (E,), 0..1 of a view, (2, E), m."""
+    """Return the displacement of the plate at times `tau` (E,), 0..1 of a view, (2, E), m."""
     moved = np.zeros((2, len(tau)))
     if len(truth.drift_m):
         moved += truth.drift_m[index] @ np.stack([tau**power for power in DRIFT_POWERS])
@@ -129,7 +129,7 @@ def drift(truth: Truth, index: int, tau: np.ndarray) -> np.ndarray:
 def stage_error(truth: Truth, position: np.ndarray, index: int = 0) -> np.ndarray:
     """Return indicated minus true position at indicated positions (2, E) in a view, m.
 
-    Bilinear between the sites, waves, and what the stage bends by in that view.
+    Bilinear between the sites, plus waves and the bending of the stage in that view.
     """
     artifact = truth.artifact
     (hx, hy), (nx, ny) = artifact.half, artifact.shape
@@ -147,7 +147,7 @@ def stage_error(truth: Truth, position: np.ndarray, index: int = 0) -> np.ndarra
 
 
 def stage_bending(truth: Truth, position: np.ndarray, index: int) -> np.ndarray | float:
-    """Return what is added to the stage error at indicated positions (2, E) in a view, m."""
+    """Return the bending of the stage at indicated positions (2, E) in a view, m."""
     if not len(truth.stage_bend_m):
         return 0.0
     u, v = position / (truth.artifact.grid_pitch_m * np.array(truth.artifact.half)[:, None])
@@ -157,7 +157,7 @@ def stage_bending(truth: Truth, position: np.ndarray, index: int) -> np.ndarray 
 def encoder_error(truth: Truth, position: np.ndarray) -> np.ndarray:
     """Return indicated minus true angle at indicated angles (E,), rad.
 
-    Linear between lines, and waves.
+    Linear between lines, plus waves.
     """
     count, g = truth.artifact.angular_count, truth.g_theta
     place = position * (count / (2 * np.pi))
@@ -170,15 +170,15 @@ def encoder_error(truth: Truth, position: np.ndarray) -> np.ndarray:
 
 
 def true_offset(sense: Sense, place: np.ndarray, stage: np.ndarray) -> np.ndarray:
-    """Return the place of a mark from the optical axis.
+    """Return the position of a mark relative to the optical axis.
 
     Parameters
     ----------
     sense : Sense
-        With ``microscope_moves`` the axis is where the stage is. With ``plate_moves`` it is at the
-        origin, and the stage carries the plate along.
+        With ``microscope_moves`` the axis is at the stage position. With ``plate_moves`` it is at
+        the origin, and the stage carries the plate.
     place : float array
-        Place of the mark, in the frame of the stage that rests at 0, m or rad.
+        Position of the mark with the stage at 0, m or rad.
     stage : float array
         True position of the stage, of the same shape.
     """
@@ -186,7 +186,7 @@ def true_offset(sense: Sense, place: np.ndarray, stage: np.ndarray) -> np.ndarra
 
 
 def seen_offset(truth: Truth, offset: np.ndarray) -> np.ndarray:
-    """Return what is told of true offsets (2, E): (1 + E)^-1 offset, distorted, then wired."""
+    """Return published offsets from true ones (2, E): (1 + E)^-1 offset, distorted, then wired."""
     if truth.microscope.any():
         offset = np.linalg.solve(np.eye(2) + truth.microscope, offset)
     if truth.distortion:
@@ -198,8 +198,8 @@ def line_directions(truth: Truth, index: int, view: View,
                     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the true and the nominal direction in the stage frame of every line expected, rad.
 
-    The nominal direction is within one turn, 0 included. The true one is as seen from the turning
-    axis, off which the circle of lines may lie. With them goes the number of the line that lies
+    The nominal direction is within one turn, 0 included. The true one is relative to the rotation
+    axis, to which the circle of lines may be eccentric. Also returns the index of the line found
     there; all (K,).
     """
     count = truth.artifact.angular_count

@@ -28,32 +28,32 @@ from selfcal_ros.simulation.machine import (
 from selfcal_ros.units import M_PER_UM, NS_PER_S, RAD_PER_MRAD
 
 PARTS = ("lost", "outliers", "low_score", "not_finite", "unknown_mark", "duplicated")
-"""Faults that meet a part of the detections, one at most each; in the order of the draw."""
+"""Faults of single detections, at most one per detection; in the order of the draw."""
 
 
 @dataclass(frozen=True)
 class Faults:
-    """What goes wrong: parts of the detections (0..1), times in s.
+    """Faults: fractions of the detections (0..1), times in s.
 
     Attributes
     ----------
     lost, duplicated, outliers : float
-        Parts of the detections that never arrive, arrive twice, or lie off by 1 to 20 um
+        Fractions of the detections that never arrive, arrive twice, or are off by 1 to 20 um
         (angular: by 1 to 20 mrad).
     low_score, not_finite, unknown_mark : float
-        Parts with a score of 0.1, a NaN offset, or an id off the plate.
+        Fractions with a score of 0.1, a NaN offset, or an id off the plate.
     delay_s : float
         Delay of arrival, drawn from an exponential distribution with a fifth of this as its mean;
         messages overtake each other.
     clock_step_s : float
-        In the middle of the recording the cell's clock steps back by this much; 0 = never.
+        Step back of the cell's clock in the middle of the recording; 0 = none.
     encoder_gap_s : float
-        Length of a hole in the encoder stream, at a third of the recording; 0 = none.
+        Length of a gap in the encoder stream, at a third of the recording; 0 = none.
 
     Raises
     ------
     InputError
-        If the parts add up to more than 1.
+        If the fractions add up to more than 1.
     """
 
     lost: float = 0.0
@@ -67,7 +67,7 @@ class Faults:
     encoder_gap_s: float = 0.0
 
     def __post_init__(self) -> None:
-        """Refuse parts that cannot all be: a detection has one fault at most."""
+        """Refuse impossible fractions: a detection has one fault at most."""
         total = sum(getattr(self, name) for name in PARTS)
         if total > 1 + 1e-9:
             raise InputError("faults", f"the parts of the detections add up to {total:g}",
@@ -83,9 +83,9 @@ def apply_faults(events: Sequence[Event], faults: Faults, rng: np.random.Generat
     events : sequence
         Messages in the order of their stamps.
     faults : Faults
-        What goes wrong.
+        The faults.
     rng : numpy.random.Generator
-        Source of chance.
+        Source of the draw.
     """
     ledger: Counter = Counter()
     first, last = events[0].stamp_ns, events[-1].stamp_ns
@@ -143,7 +143,7 @@ def _one_fault(event: Detection, name: str, rng: np.random.Generator) -> list[Ev
 
 
 Bounds = dict[str, Any]
-"""Unit, limits and choices of a key, as `Parameter` takes them."""
+"""Unit, limits and choices of a key, as in `Parameter`."""
 
 Section = dict[str, tuple[str, Bounds]]
 """Key -> field of the dataclass, and its bounds; type and default are the field's."""
@@ -153,7 +153,7 @@ LENGTH: Bounds = {"unit": "m", "low": 0.0, "high": 1e-3}
 ANGLE: Bounds = {"unit": "rad", "low": 0.0, "high": 0.1}
 TIME: Bounds = {"unit": "s", "low": 0.0, "high": 3600.0}
 LAST_START_S = 2.1e9
-"""Stamps are 32 bit seconds; this leaves room for the longest recording."""
+"""Largest start time: stamps are 32 bit seconds, with room for the longest recording."""
 
 RATIO: Bounds = {"unit": "m/m", "low": 0.0, "high": 0.1}
 SIGNED_RATIO = RATIO | {"low": -0.1}
@@ -222,8 +222,8 @@ TOP = (
 class Simulation:
     """A parsed SIM.yaml: plan, seeds, spread of the truth, cell, faults, start time.
 
-    `noise_seed` is None where `seed` is that of everything; `placed` says how the plate lies in
-    views in which that is not as the plan commands.
+    `noise_seed` is None if `seed` determines everything; `placed` has the actual poses in
+    views that are not placed as the plan commands.
     """
 
     plan: Plan
@@ -237,7 +237,7 @@ class Simulation:
     placed: tuple[View | None, ...] = ()
 
     def run(self) -> tuple[Truth, list[tuple[int, Event]], dict[str, int]]:
-        """Return the truth, the messages with their times of arrival, and the ledger of faults."""
+        """Return the truth, the messages with their times of arrival, and the counts of faults."""
         machine = rng = np.random.default_rng(self.seed)
         if self.noise_seed is not None:
             rng = np.random.default_rng(self.noise_seed)
@@ -253,16 +253,16 @@ class Simulation:
 def read_simulation(path: str | Path) -> Simulation:
     """Return the simulation in a SIM.yaml.
 
-    Keys: ``plan`` (a path beside the file, or a plan inline), ``seed``, ``noise_seed``, ``truth``,
-    ``physics`` (fields of `Spread`), ``placed``, ``noise``, ``cell`` (fields of `CellSettings`),
-    ``faults`` (fields of `Faults`), ``start_time`` (s), ``compression``; see docs/simulate.md. SI
-    units.
+    Keys: ``plan`` (a path relative to the file, or an inline plan), ``seed``, ``noise_seed``,
+    ``truth``, ``physics`` (fields of `Spread`), ``placed``, ``noise``, ``cell`` (fields of
+    `CellSettings`), ``faults`` (fields of `Faults`), ``start_time`` (s), ``compression``; see
+    docs/simulate.md. SI units.
 
     Raises
     ------
     InputError
-        For an unknown key, a value of the wrong type or out of bounds, or faults that together
-        meet more than all detections.
+        For an unknown key, a value of the wrong type or out of bounds, or faults of more than
+        all detections together.
     """
     where = str(path)
     data = _mapping(read_yaml(path), where, (
@@ -290,12 +290,12 @@ def read_simulation(path: str | Path) -> Simulation:
 
 
 def settings_of(values: Mapping[str, Any]) -> CellSettings:
-    """Return how a cell measures, by the keys of sections ``noise`` and ``cell`` in one mapping."""
+    """Return the settings of a cell from the keys of ``noise`` and ``cell`` in one mapping."""
     return CellSettings(**_fields_of(values, NOISE | CELL, CellSettings()))
 
 
 def spread_of(values: Mapping[str, Any]) -> Spread:
-    """Return what a truth is drawn from, by the keys of ``truth`` and ``physics``."""
+    """Return the parameters of a truth from the keys of ``truth`` and ``physics``."""
     return Spread(**_fields_of(values, TRUTH | PHYSICS, Spread()))
 
 
@@ -313,7 +313,7 @@ def _plan(plan: Any, path: Path) -> Plan:
 
 
 def _placed(views: Any, plan: Plan, where: str) -> tuple[View | None, ...]:
-    """Return how the plate lies in the views that are named; empty if in none."""
+    """Return the actual poses of the named views; empty if none."""
     if not views:
         return ()
     plate = plan.artifact

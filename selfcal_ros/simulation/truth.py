@@ -26,22 +26,22 @@ __all__ = ["Spread", "Truth", "angular_deviation", "grid_deviation", "hu_plan", 
 
 FIRST_STAMP_NS = 1_700_000_000_000_000_000
 BETWEEN_VIEWS_NS = 60_000_000_000
-"""Time that it takes to place the plate anew."""
+"""Time to place the plate again."""
 
 
 def grid_deviation(truth: Truth, index: int, view: View, *,
                    sense: Sense = Sense.MICROSCOPE_MOVES) -> np.ndarray:
     """Return the deviation of every mark in a view, (2, nx, ny), m; NaN off the field.
 
-    As read by a stage that stops at the nominal place, at the beginning of the view, without
-    noise, through a perfect microscope.
+    For a stage that stops at the nominal position, at the beginning of the view, without
+    noise, with a perfect microscope.
     """
     artifact = truth.artifact
     place, site = physics.mark_places(truth, index, view, physics.all_marks(artifact))
     node = np.rint(site / artifact.grid_pitch_m).astype(int)
     inside = (np.abs(node) <= np.array(artifact.half)[:, None]).all(axis=0)
     sign = -1 if sense is Sense.PLATE_MOVES else 1
-    # what the stage is off by at the site, as `physics.stage_error` has it at a node
+    # stage error at the site, as `physics.stage_error` at a node
     i, j = sign * node
     out = np.full_like(site, np.nan)
     hx, hy = artifact.half
@@ -69,19 +69,19 @@ def simulate_measurements(truth: Truth, plan: Plan, rng: np.random.Generator, *,
     Parameters
     ----------
     truth, plan, rng
-        What is measured, how, and the source of noise.
+        Truth, plan, and the source of noise.
     sigma_m, sigma_theta_rad : float
         Standard deviation of one reading; each mark is the mean of the view's repeats.
     sense : Sense
-        Who moves.
+        What moves.
     missing : float
         Fraction of marks lost, independently in each view.
     linear : bool, optional
-        Plates that turn as the papers write it, or by a rotation; as the truth says without it.
+        Whether rotations are linearised, as in the papers; default as in the truth.
     visits : bool
-        Whether every visit of a mark is told. It is where visits differ by more than white noise.
+        Whether to include the visits of marks; always if visits differ by more than white noise.
     settings : CellSettings, optional
-        How the cell measures; in place of `sigma_m`, `sigma_theta_rad` and `sense`.
+        Settings of the cell; replaces `sigma_m`, `sigma_theta_rad` and `sense`.
     """
     truth = truth if linear is None else replace(truth, linear=linear)
     if visits or settings or truth.by_visit:
@@ -133,7 +133,7 @@ def _repeatability(sigma: float, repeats: int) -> float:
 
 
 def hu_plan(artifact: Artifact, repeats: int = 1, plan_id: str = "hu") -> Plan:
-    """Return Hu's four views: as it is, 90 deg, one line (angular only), one pitch along +X."""
+    """Return Hu's four views: identity, 90 deg, one line (angular only), one pitch along +X."""
     line = 2 * np.pi / artifact.angular_count if artifact.angular_count else 0.0
     angular = artifact.angular_count > 0
     views = [View("identity", 0.0, (0.0, 0.0), True, angular, repeats),
@@ -145,24 +145,24 @@ def hu_plan(artifact: Artifact, repeats: int = 1, plan_id: str = "hu") -> Plan:
 
 def measured_view(truth: Truth, item: tuple[int, View], rng: np.random.Generator, *,
                   settings: CellSettings, missing: float, start_ns: int) -> ViewReadings:
-    """Return the readings of a view, with its visits, as the collector would from its messages.
+    """Return the readings of a view, with its visits, as from the collector.
 
     Marks are those that the view expects, as for detections without ids.
 
     Parameters
     ----------
     truth : Truth
-        What is measured.
+        The truth.
     item : tuple
-        Number of the view, and the view.
+        Index of the view, and the view.
     rng : numpy.random.Generator
         Source of noise.
     settings : CellSettings
-        How it is measured.
+        Settings of the cell.
     missing : float
         Fraction of marks lost.
     start_ns : int
-        When the view begins.
+        Beginning of the view.
     """
     index, view = item
     readings = ViewReadings(view)
@@ -182,7 +182,7 @@ def _lost(rng: np.random.Generator, missing: float, shape: tuple[int, ...] | int
 
 
 def _read(sense: Sense, found: GridExposures | AngularExposures) -> np.ndarray:
-    """Return where marks lie by what encoder and microscope say."""
+    """Return the positions of marks as read by encoder and microscope."""
     if sense is Sense.PLATE_MOVES:
         return found.offset - found.position
     return found.position + found.offset
@@ -194,7 +194,7 @@ def _grid(readings: ViewReadings, truth: Truth, found: GridExposures, *, setting
     kept = ~lost[visits.m + hx, visits.n + hy] & found.there
     key = (visits.m + hx) * (2 * hy + 1) + visits.n + hy
     marks, mark = np.unique(key[kept], return_inverse=True)
-    number = np.cumsum(kept) - 1  # of a visit among those kept
+    number = np.cumsum(kept) - 1  # index of a visit among those kept
     here = kept[found.visit]
     visit = number[found.visit[here]]
     deviation = (_read(settings.sense, found) - found.site[:, found.visit])[:, here]
@@ -208,7 +208,7 @@ def _grid(readings: ViewReadings, truth: Truth, found: GridExposures, *, setting
     offset, _, _ = _means(found.offset[:, here], visit, count)
     motion = repeat_motion(of_mark, (_read(settings.sense, found) - found.offset)[:, here],
                            found.offset[:, here], np.zeros(len(of_mark), dtype=bool))
-    # the stage leaves for the first mark one period after the view begins
+    # the stage moves to the first mark one period after the view begins
     first = start_ns + settings.period_ns + settings.exposure_ns
     stamp = first + np.rint(visits.time[kept] * settings.period_ns).astype(np.int64)
     order = np.lexsort((stamp, mark))
@@ -239,7 +239,7 @@ def _angular(readings: ViewReadings, truth: Truth, found: AngularExposures, *, s
 
 def _means(values: np.ndarray, group: np.ndarray, count: np.ndarray, fitted: int = 0,
            ) -> tuple[np.ndarray, float, int]:
-    """Return means (c, groups), the pooled standard deviation of one value, its freedom.
+    """Return means (c, groups), the pooled standard deviation of one value, and its dof.
 
     Parameters
     ----------
@@ -248,9 +248,9 @@ def _means(values: np.ndarray, group: np.ndarray, count: np.ndarray, fitted: int
     group : int array (n,)
         Group of each value.
     count : int array (groups,)
-        Values in each group.
+        Number of values in each group.
     fitted : int
-        Numbers that were fitted to the values before.
+        Number of parameters fitted to the values before.
     """
     mean = np.stack([np.bincount(group, row, len(count)) / count for row in values])
     dof = len(values) * int((count - 1).sum()) - fitted

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A laser measurement along diagonals in steps, with known truth."""
+"""A simulated step-diagonal laser measurement with known truth."""

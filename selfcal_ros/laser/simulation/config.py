@@ -23,12 +23,12 @@ from selfcal_ros.units import M_PER_MM, M_PER_NM, M_PER_UM, ONE_PER_PPM, RAD_PER
 
 MAX_REPEATS = 1000
 LARGEST = 1e9
-"""No length, angle or ratio of a set-up is larger, in the units of the file."""
+"""Largest length, angle or ratio of a set-up, in the units of the file."""
 
 
 @dataclass(frozen=True, eq=False)
 class LaserSimulation:
-    """What a file describes: machine, measurement, and the generator after drawing the machine."""
+    """Content of a file: machine, measurement, and the generator after drawing the machine."""
 
     machine: StepMachine
     measurement: Measurement
@@ -52,7 +52,7 @@ def simulation_from_dict(data: object, where: str) -> LaserSimulation:
     Raises
     ------
     InputError
-        For an unknown key, a missing one, or a value of another kind.
+        For an unknown or missing key, or a wrong type.
     """
     top = _mapping(data, where, ("seed", "machine", "setups", "noise"))
     seed = top.get("seed", 0)
@@ -179,7 +179,7 @@ def _count(value: object, where: str, most: int) -> int:
 
 
 def truth_of(machine: StepMachine) -> dict[str, Any]:
-    """Return what a perfect identification of a machine gives, mm, in the datum of the results."""
+    """Return the result of a perfect identification of a machine, mm, in the datum of results."""
     truth = StepDiagonalResult(machine.steps_m, machine.truth_m(), None, "", "", {}, Closure())
     errors = {name_of(j, c): (truth.errors_m[j, :, c] / M_PER_MM).tolist()
               for j in range(machine.dim) for c in range(machine.dim)}

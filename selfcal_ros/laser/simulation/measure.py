@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A step-diagonal measurement of a machine with known errors and a misaligned set-up.
 
-The geometry is traced, not taken from the formulas of `selfcal_ros.laser`: a beam along a line
-fixed in space meets the plane of the mirror that rides on the machine.
+The geometry is traced, independently of the formulas of `selfcal_ros.laser`: a beam along a line
+fixed in space hits the plane of the mirror carried by the machine.
 """
 
 from collections.abc import Mapping
@@ -23,7 +23,7 @@ _Z = np.array([0.0, 0.0, 1.0])
 
 @dataclass(frozen=True, eq=False)
 class StepMachine:
-    """A machine whose every step is known.
+    """A machine with known steps.
 
     Attributes
     ----------
@@ -34,7 +34,7 @@ class StepMachine:
     turns_rad : float array (D, n, 3) or None
         Rotation vector by which the mirror's carrier turns in that step, rad.
     stacked : bool
-        Whether Y rides on X (and Z on both), so that their steps turn with it.
+        Whether Y is mounted on X (and Z on both), so that their steps turn with it.
     """
 
     steps_m: tuple[float, ...]
@@ -53,25 +53,25 @@ class StepMachine:
         return self.errors_m.shape[1]
 
     def truth_m(self) -> np.ndarray:
-        """Return the errors turned so that the first X step has no transverse error, m."""
+        """Return the errors rotated so that the first X step has no transverse error, m."""
         turned = turn_to_first_step(step_vectors(self.steps_m, self.errors_m))
         return turned - np.diag(self.steps_m)[:, None, :]
 
 
 @dataclass(frozen=True)
 class SetUp:
-    """How laser and mirror stand for one diagonal.
+    """Alignment of laser and mirror for one diagonal.
 
     Attributes
     ----------
     laser_rad, mirror_rad : tuple of float
-        Angles of the laser off its reference direction and of the mirror's normal off the
+        Angles of the laser from its reference direction and of the mirror's normal from the
         laser: counter-clockwise in XY, and in 3D a second one upwards.
     to_machine : bool
-        Whether the laser's reference is the machine's own diagonal, as it is where the spot is kept
-        on a quad-detector; otherwise the nominal one.
+        Whether the laser's reference is the machine's own diagonal, as with the spot kept
+        on a quad-detector; if false, the nominal one.
     abbe_m : tuple of float
-        Where the beam meets the mirror at the start, seen from the functional point, m.
+        Point where the beam hits the mirror at the start, relative to the functional point, m.
     scale : float
         Relative error of the laser's unit of length.
     """
@@ -92,11 +92,11 @@ class LaserNoise:
     distance_m : float
         Standard deviation of one laser distance; a reading is the difference of two.
     reading_m : float
-        Standard deviation added to every reading anew.
+        Standard deviation added to every reading independently.
     linear_m : float
         Standard deviation of one distance of the direct measurement of the linear errors.
     repeats : int
-        Times that everything is measured.
+        Number of times that everything is measured.
     """
 
     distance_m: float = 0.0
@@ -107,7 +107,7 @@ class LaserNoise:
 
 @dataclass(frozen=True)
 class Measurement:
-    """What is simulated: set-up of every diagonal (a missing one is perfect) and noise."""
+    """Simulated measurement: set-up of every diagonal (default: perfect) and noise."""
 
     setups: Mapping[str, SetUp] = field(default_factory=dict)
     noise: LaserNoise = field(default_factory=LaserNoise)
@@ -115,7 +115,7 @@ class Measurement:
 
 def simulate_step_diagonal(machine: StepMachine, measurement: Measurement,
                            rng: np.random.Generator) -> StepDiagonal:
-    """Return the readings and linear errors that the measurement gives.
+    """Return the readings and linear errors of the measurement.
 
     Parameters
     ----------
@@ -199,7 +199,7 @@ def _tilted(direction: np.ndarray, sideways: tuple[np.ndarray, np.ndarray],
 
 
 def rotation(vector_rad: np.ndarray) -> np.ndarray:
-    """Return the matrix (3, 3) that turns by a rotation vector (Rodrigues)."""
+    """Return the rotation matrix (3, 3) of a rotation vector (Rodrigues)."""
     angle = np.linalg.norm(vector_rad)
     if angle == 0:
         return np.eye(3)
@@ -219,7 +219,7 @@ def case_study_machine() -> StepMachine:
     """Return a machine with the source's measured errors: 6 blocks of 10 mm x 10 mm.
 
     Over 60 mm: linear errors +1.14 um (X), +0.69 um (Y); straightness 0.05 um (X), 0.11 um (Y)
-    about least-squares lines; squareness -1.22 um. The shapes of the profiles are made up.
+    about least-squares lines; squareness -1.22 um. The shapes of the profiles are invented.
     """
     n, step = 6, 0.010
     errors = np.zeros((2, n, 2))
@@ -235,7 +235,7 @@ def case_study_machine() -> StepMachine:
         shape *= peak_to_valley / np.ptp(shape)
         errors[j, :, 1 - j] = np.diff(shape)
     errors[0, :, 1] -= errors[0, 0, 1]
-    # Slopes over the range: of Y along x by the datum; of X along y to make up the squareness.
+    # Slopes over the range: of Y along x by the datum; of X along y for the squareness.
     along_x = np.concatenate([[0.0], np.cumsum(errors[0, :, 1])])
     errors[1, :, 0] += (-1.22e-6 - np.polyfit(t, along_x, 1)[0]) / n
     return StepMachine((step, step), errors)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How far each fault of the set-up leads both formulations astray."""
+"""Effect of set-up faults on both formulations."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -26,12 +26,12 @@ SWEEP = tuple(10.0 ** np.arange(-5, -1.9, 0.5))
 
 @dataclass(frozen=True)
 class Fault:
-    """One thing that can be wrong, as a function of its size.
+    """A fault, as a function of its size.
 
     Attributes
     ----------
     name : str
-        What it is.
+        Name of the fault.
     size : float
         Size in the table.
     unit : str
@@ -39,7 +39,7 @@ class Fault:
     apply : callable
         (machine, size) -> the machine and the measurement with the fault.
     random : bool
-        Whether it is drawn, so that the table shows an rms of draws.
+        Whether it is random, so that the table shows the rms of draws.
     """
 
     name: str
@@ -121,7 +121,7 @@ FAULTS = (
 
 
 def effect(machine: StepMachine, data: StepDiagonal, method: Method) -> Effect:
-    """Return how far one identification is from the truth of the machine."""
+    """Return the errors of one identification relative to the truth."""
     found = identify(data, Choice(method, allow_equal=True))
     truth = StepDiagonalResult(machine.steps_m, machine.truth_m(), None, "", "", {}, Closure())
     wrong = np.abs(found.errors_m - truth.errors_m)
@@ -134,7 +134,7 @@ def effect(machine: StepMachine, data: StepDiagonal, method: Method) -> Effect:
 
 def effect_of(fault: Fault, size: float, machine: StepMachine, *, method: Method,
               rng: np.random.Generator) -> Effect:
-    """Return the effect of a fault of a given size; of a random one the rms over draws."""
+    """Return the effect of a fault of a given size; for a random one the rms over draws."""
     broken, measurement = fault.apply(machine, size)
     draws = [effect(broken, simulate_step_diagonal(broken, measurement, rng), method)
              for _ in range(NOISE_DRAWS if fault.random else 1)]
@@ -144,7 +144,7 @@ def effect_of(fault: Fault, size: float, machine: StepMachine, *, method: Method
 
 
 def sensitivity(machine: StepMachine, rng: np.random.Generator) -> list[dict]:
-    """Return one row for each fault: its size and the effects on both formulations, m."""
+    """Return one row per fault: its size and the effects on both formulations, m."""
     return [{"fault": fault.name, "size": fault.size, "unit": fault.unit,
              **{method: vars(found) for method, found in
                 _both(fault, fault.size, machine, rng).items()}} for fault in FAULTS]
@@ -170,7 +170,7 @@ def _columns(effects: list[dict[str, Effect]]) -> dict[str, list[dict]]:
 
 
 def sensitivity_text(rows: list[dict]) -> str:
-    """Return the table of effects in micrometres, for a person."""
+    """Return the table of effects in micrometres as text."""
     width = max(len(row["fault"]) for row in rows)
     head = f"{'fault':{width}s} {'size':>14s}"
     columns = ("linear_m", "transverse_m", "squareness_m", "straightness_m")
