@@ -14,20 +14,14 @@ import numpy as np
 from selfcal_ros.batch.course import FEWEST, Course, Finding, courses
 from selfcal_ros.batch.folder import PER, SCHEMA, Record
 from selfcal_ros.errors import printable
+from selfcal_ros.reporting.figures.drawing import TICK, Drawing, Frame
+from selfcal_ros.reporting.figures.svg import inline_svg
 from selfcal_ros.reporting.report import page
 
 S_PER_DAY = 86400.0
 BASE = ("bag", "first_exposure", "exit_code", "qualified", "message", "plan_id", "run_id",
         "sha256", "result", "grade")
-WIDTH, HEIGHT, LEFT, EDGE = 560, 150, 64, 14
-STYLE = """
-figure { max-width: 36rem; } svg { width: 100%; height: auto; }
-svg text { fill: var(--soft); font-size: 11px; }
-.frame { stroke: var(--line); fill: none; } .value { fill: var(--good); }
-.value.bad { fill: var(--bad); } .course { stroke: var(--ink); fill: none; stroke-width: 1.5; }
-.change { stroke: var(--bad); stroke-dasharray: 4 3; }
-td.text { text-align: left; min-width: 14rem; } td.bad { color: var(--bad); }
-"""
+STYLE = "td.text { text-align: left; min-width: 14rem; } td.bad { color: var(--bad); }\n"
 
 
 @dataclass(frozen=True)
@@ -209,56 +203,37 @@ def _number(value: Any) -> str:
 def _figure(series: Series, name: str, course: Course) -> str:
     """Return values over time with what is named: a line, or a step where it changed."""
     text, unit = described(name)
+    caption = f"{text}{', ' * bool(unit)}{unit}"
+    days = series.days
     values = np.array([record["quantities"].get(name) for record in series.records], dtype=float)
     known = np.isfinite(values)
-    ends = low, high = float(values[known].min()), float(values[known].max())
+    low, high = float(values[known].min()), float(values[known].max())
     margin = (high - low) * 0.08 or abs(high) * 0.01 or 1.0
-    low, high = low - margin, high + margin
-    span = float(series.days[-1]) or 1.0
-    bottom = HEIGHT - 2 * EDGE
-
-    def place(day: float, value: float) -> tuple[float, float]:
-        return (LEFT + (WIDTH - LEFT - EDGE) * day / span,
-                EDGE + (bottom - EDGE) * (high - value) / (high - low))
-
-    marks = [f'<rect class="frame" x="{LEFT}" y="{EDGE}" width="{WIDTH - LEFT - EDGE}" '
-             f'height="{bottom - EDGE}"/>',
-             *(f'<text x="{LEFT - 6}" y="{place(0.0, value)[1] + 4:.1f}" text-anchor="end">'
-               f"{value:.4g}</text>" for value in sorted({ends[0], ends[1]})),
-             f'<text x="{LEFT}" y="{HEIGHT - 1}">{series.date(0)[:10]}</text>',
-             f'<text x="{WIDTH - EDGE}" y="{HEIGHT - 1}" text-anchor="end">'
-             f"{series.date(-1)[:10]}</text>"]
-    for day, value, record in zip(series.days[known], values[known],
-                                  np.array(series.records, dtype=object)[known], strict=True):
-        x, y = place(day, value)
-        kind = "value" if record["exit_code"] == 0 else "value bad"
-        marks.append(f'<circle class="{kind}" cx="{x:.1f}" cy="{y:.1f}" r="3"><title>'
-                     f"{_text(record['bag'])}: {value:.6g} {_text(unit)}</title></circle>")
-    marks += _named(series, course, values, place)
-    caption = _text(f"{text}{', ' * bool(unit)}{unit}")
-    return (f'<figure><svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{caption}">'
-            + "".join(marks) + f"</svg><figcaption>{caption}</figcaption></figure>")
-
-
-def _named(series: Series, course: Course, values: np.ndarray, place: Any) -> list[str]:
-    days = series.days
+    drawing = Drawing(name, caption, 560, 150)
+    frame = Frame(drawing, (64, 14, 482, 108), (0.0, float(days[-1]) or 1.0),
+                  (low - margin, high + margin))
+    frame.border()
+    for value in sorted({low, high}):
+        drawing.label(58, frame.at(0.0, value)[1] + 4, f"{value:.4g}", size=TICK, anchor="end",
+                      colour="soft")
+    for number, (x, anchor) in enumerate(((64.0, "start"), (546.0, "end"))):
+        drawing.label(x, 142, series.date(-number)[:10], size=TICK, anchor=anchor, colour="soft")
+    for day, value, record in zip(days, values, series.records, strict=True):
+        if np.isfinite(value):
+            drawing.discs([frame.at(day, value)], 3.0,
+                          fill="bad" if record["exit_code"] else "good")
+            drawing.spot(*frame.at(day, value), 6, f"{record['bag']}: {value:.6g} {unit}")
     if course.finding is Finding.TREND:
         slope = course.slope_per_day[0]
         offset = float(np.nanmedian(values - slope * days))
-        ends = [place(day, offset + slope * day) for day in (days[0], days[-1])]
-        return [_line("course", *ends)]
-    if course.finding is Finding.CHANGE:
+        drawing.line([frame.at(day, offset + slope * day) for day in (days[0], days[-1])],
+                     width=1.5)
+    elif course.finding is Finding.CHANGE:
         middle = (days[course.last_before] + days[course.change]) / 2
-        x = place(middle, 0.0)[0]
-        return [_line("change", (x, EDGE), (x, HEIGHT - 2 * EDGE)),
-                _line("course", place(days[0], course.before), place(middle, course.before)),
-                _line("course", place(middle, course.after), place(days[-1], course.after))]
-    return []
-
-
-def _line(kind: str, start: tuple[float, float], end: tuple[float, float]) -> str:
-    return (f'<line class="{kind}" x1="{start[0]:.1f}" y1="{start[1]:.1f}" x2="{end[0]:.1f}" '
-            f'y2="{end[1]:.1f}"/>')
+        drawing.line([frame.at(middle, end) for end in frame.y], stroke="bad", dash=(4, 3))
+        for ends, mean in (((days[0], middle), course.before), ((middle, days[-1]), course.after)):
+            drawing.line([frame.at(day, mean) for day in ends], width=1.5)
+    return (f"<figure>{inline_svg(drawing)}<figcaption>{_text(caption)}</figcaption></figure>")
 
 
 def described(name: str) -> tuple[str, str]:
