@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files: digests, and JSON and YAML whose errors name file and place."""
+"""Files: digests, and JSON and YAML with errors that name file and line."""
 
 import contextlib
 import csv
@@ -23,28 +23,28 @@ from selfcal_ros.outputs import atomic_file
 
 MAX_YAML_BYTES = 4 << 20
 MAX_YAML_NODES = 50_000
-"""Values in a YAML file, each alias counted as often as what it stands for; a plan of 1,000 views
+"""Largest number of values in a YAML file, aliases expanded; a plan of 1,000 views
 has 17,000, which take 0.2 s."""
 MAX_JSON_VALUES = 1_000_000
-"""Values in a JSON file that is read for somebody who waits for an answer: they take 0.8 s."""
+"""Largest number of values in a JSON file read for a request: they take 0.8 s."""
 EXPLAINED = 1 << 16
-"""Characters of a faulty document that is read a second time, for a better message."""
+"""Characters of a faulty document that are read again for a better message."""
 WHOLE_LIMIT = 1 << 63
-"""Whole numbers in files must fit into 64 bits: everything that is one here does."""
+"""Whole numbers in files must fit into 64 bits."""
 
 
 class _Strict(Composer, SafeConstructor, Resolver):
-    """Makes values of YAML's events: floats are those of YAML 1.2 and rcl: 5e-4, 1.0e3, -.5.
+    """Construct values from YAML events; floats as in YAML 1.2 and rcl: 5e-4, 1.0e3, -.5.
 
-    It refuses a key that is given twice, a whole number beyond 64 bits, and a document of more
-    than `MAX_YAML_NODES` values, or whose aliases would grow to more.
+    Refuses a duplicate key, a whole number beyond 64 bits, and a document of more
+    than `MAX_YAML_NODES` values, aliases expanded.
     """
 
     _n_nodes = 0
     peek_event: Any
 
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
-        """Compose a node and those below it, as long as there are not too many."""
+        """Compose a node and those below it, up to the limit of their number."""
         self._n_nodes += 1
         if self._n_nodes > MAX_YAML_NODES:
             raise yaml.composer.ComposerError(None, None, f"more than {MAX_YAML_NODES} values",
@@ -52,7 +52,7 @@ class _Strict(Composer, SafeConstructor, Resolver):
         return super().compose_node(parent, index)
 
     def get_single_node(self) -> yaml.Node | None:
-        """Compose the document, and see how large its aliases make it."""
+        """Compose the document, and check its size with aliases expanded."""
         node = super().get_single_node()
         if node is not None and _yaml_size(node, {}) > MAX_YAML_NODES:
             raise yaml.composer.ComposerError(None, None, "its aliases stand for more than "
@@ -60,7 +60,7 @@ class _Strict(Composer, SafeConstructor, Resolver):
         return node
 
     def construct_object(self, node: yaml.Node, deep: bool = False) -> Any:
-        """Return the value of a node whose text is one of its tag: `!!int ''` is none."""
+        """Return the value of a node whose text is valid for its tag: `!!int ''` is not."""
         try:
             return super().construct_object(node, deep)
         except (LookupError, AttributeError) as error:
@@ -69,7 +69,7 @@ class _Strict(Composer, SafeConstructor, Resolver):
                 node.start_mark) from error
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict:
-        """Return the mapping of a node without a key that is given twice."""
+        """Return the mapping of a node; refuse duplicate keys."""
         seen = set()
         for key, _ in node.value:
             if isinstance(key, yaml.ScalarNode) and key.tag != "tag:yaml.org,2002:merge":
@@ -88,15 +88,15 @@ class _Strict(Composer, SafeConstructor, Resolver):
 
 
 class YamlLoader(_Strict, yaml.SafeLoader):
-    """Reads YAML by itself; its messages are those that a user gets."""
+    """Pure Python loader, with the messages for the user."""
 
 
 LOADERS: list[type[yaml.SafeLoader] | type[yaml.CSafeLoader]] = [YamlLoader]
-"""The ways to read a document: the first is the fastest, the last has the best messages."""
+"""Loaders: the first is the fastest, the last has the best messages."""
 
 if yaml.__with_libyaml__:
     class FastYamlLoader(_Strict, yaml.CSafeLoader):
-        """Reads YAML by libyaml, which gives events; Python makes values of them.
+        """Loader with libyaml's events; values are constructed in Python.
 
         Parameters
         ----------
@@ -112,9 +112,9 @@ if yaml.__with_libyaml__:
 
 
 def _yaml_size(node: yaml.Node, known: dict[int, int]) -> int:
-    """Return the number of values below a node; a node that holds itself has no end."""
+    """Return the number of values below a node; infinite for a node that contains itself."""
     if id(node) not in known:
-        known[id(node)] = MAX_YAML_NODES + 1  # until it is known
+        known[id(node)] = MAX_YAML_NODES + 1  # until known
         children = [item for pair in node.value for item in pair] if isinstance(
             node, yaml.MappingNode) else node.value if isinstance(node, yaml.SequenceNode) else ()
         known[id(node)] = 1 + sum(_yaml_size(child, known) for child in children)
@@ -122,7 +122,7 @@ def _yaml_size(node: yaml.Node, known: dict[int, int]) -> int:
 
 
 def _whole(value: int | str) -> int:
-    """Return a whole number; ValueError, without its digits, for one beyond 64 bits."""
+    """Return a whole number; ValueError, without its digits, beyond 64 bits."""
     if isinstance(value, str) and len(value) < 25:
         value = int(value)
     if isinstance(value, str) or not -WHOLE_LIMIT <= value < WHOLE_LIMIT:
@@ -131,18 +131,18 @@ def _whole(value: int | str) -> int:
 
 
 class YamlDumper(yaml.SafeDumper):
-    """Writes what `read_yaml` reads: a text that looks like such a float is quoted."""
+    """Dumper for `read_yaml`: a string that looks like such a float is quoted."""
 
 
 FLOATS = re.compile(r"^[-+]?(?:(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)[eE][-+]?[0-9]+|\.[0-9]+)$")
-"""What YAML 1.1 takes for text, because a dot or the sign of the exponent is missing."""
+"""Floats that YAML 1.1 reads as strings, lacking a dot or the sign of the exponent."""
 
 for _class in (*LOADERS, YamlDumper):
     _class.add_implicit_resolver("tag:yaml.org,2002:float", FLOATS, list("-+.0123456789"))
 
 
 def sync_folder(folder: Path) -> None:
-    """Wait until the names in a folder are on the disk."""
+    """Synchronise a folder's entries to the disk."""
     fd = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(fd)
@@ -156,13 +156,13 @@ def _reason(error: Exception) -> str:
 
 def check_outputs(inputs: Iterable[str | os.PathLike | None],
                   outputs: Iterable[str | os.PathLike | None]) -> None:
-    """Refuse outputs that cannot all be written, before the first of them is.
+    """Refuse outputs that cannot all be written, before writing the first.
 
     Raises
     ------
     InputError
-        If an output is one of the files that are read (or in a folder that is), two outputs are
-        one file, or an output is a folder or has none to lie in.
+        If an output is an input file (or in an input folder), two outputs are
+        the same file, or an output is a folder or has no folder.
     """
     taken = {os.path.realpath(name) for name in inputs if name}
     taken |= {os.path.realpath(file) for folder in map(Path, list(taken)) if folder.is_dir()
@@ -172,7 +172,7 @@ def check_outputs(inputs: Iterable[str | os.PathLike | None],
             continue
         target = Path(os.path.realpath(name))
         if target.exists() and not target.is_file() and not target.is_dir():
-            continue  # a pipe or /dev/null takes any number of outputs
+            continue  # a pipe or /dev/null accepts any number of outputs
         if target.is_dir():
             raise InputError(str(name), "it is a folder", "name a file")
         if str(target) in taken:
@@ -191,7 +191,7 @@ def write_bytes(path: str | os.PathLike, data: bytes) -> None:
 
 def write_text(path: str | os.PathLike, text: str) -> None:
     """Write `text` as UTF-8 to `path` atomically."""
-    write_bytes(path, text.encode(errors="backslashreplace"))  # names of files may be no UTF-8
+    write_bytes(path, text.encode(errors="backslashreplace"))  # file names may not be UTF-8
 
 
 def write_json(path: str | os.PathLike, value: Any) -> None:
@@ -205,9 +205,9 @@ def write_yaml(path: str | os.PathLike, value: Any) -> None:
 
 
 def read_bytes(path: str | os.PathLike, limit: int | None = None) -> bytes:
-    """Return the content of `path`; with a `limit` that of a regular file of at most so many bytes.
+    """Return the content of `path`; with `limit`, of a regular file of at most that many bytes.
 
-    With a limit nothing is waited for: no pipe, no device, no file that the kernel makes up.
+    With a limit nothing can block: no pipe, no device, no file of the kernel.
 
     Raises
     ------
@@ -228,10 +228,10 @@ def read_bytes(path: str | os.PathLike, limit: int | None = None) -> bytes:
 
 
 def _regular(path: str | os.PathLike, limit: int) -> bytes:
-    """Return the content of a regular file: as many bytes as it has when it is opened."""
+    """Return the content of a regular file, up to its size when opened."""
     if stat.S_ISDIR(os.stat(path).st_mode):
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
-    if stat.S_ISREG(os.stat(path).st_mode):  # to open a device may do something
+    if stat.S_ISREG(os.stat(path).st_mode):  # opening a device may have side effects
         with open(path, "rb", opener=lambda name, flags: os.open(
                 name, flags | os.O_NONBLOCK)) as file:
             found = os.fstat(file.fileno())
@@ -253,7 +253,7 @@ def read_text(path: str | os.PathLike, limit: int | None = None) -> str:
 
 
 def csv_cells(line: str, where: str) -> list[str]:
-    """Return the cells of a line of a table; InputError if it cannot be one."""
+    """Return the cells of a line of a table; InputError if invalid."""
     try:
         return [cell.strip() for cell in next(csv.reader([line]))]
     except csv.Error as error:
@@ -263,7 +263,7 @@ def csv_cells(line: str, where: str) -> list[str]:
 def read_json(path: str | os.PathLike, limit: int | None = None) -> Any:
     """Return the JSON value in `path`; InputError names line and column of a fault.
 
-    `limit` as for `read_bytes`; with one there may be `MAX_JSON_VALUES` values.
+    `limit` as for `read_bytes`; with it, at most `MAX_JSON_VALUES` values.
     """
     text = read_text(path, limit)
     if limit is not None and text.count(",") >= MAX_JSON_VALUES:
@@ -281,7 +281,7 @@ def read_json(path: str | os.PathLike, limit: int | None = None) -> Any:
 def read_yaml(path: str | os.PathLike) -> Any:
     """Return the YAML value in `path`; InputError names line and column of a fault.
 
-    Floats are read as YAML 1.2 and ROS parameter files have them (`YamlLoader`). The file is a
+    Floats as in YAML 1.2 and ROS parameter files (`YamlLoader`). The file is a
     regular one of at most `MAX_YAML_BYTES`.
     """
     text = read_text(path, MAX_YAML_BYTES)
@@ -297,7 +297,7 @@ def read_yaml(path: str | os.PathLike) -> Any:
         raise InputError(place, f"not YAML ({error.problem})", "correct the line") from error
     except yaml.YAMLError as error:
         raise InputError(str(path), "not YAML", "give a YAML text file") from error
-    except (ValueError, RecursionError) as error:  # the 40th of a month, brackets too deep
+    except (ValueError, RecursionError) as error:  # an invalid date, brackets too deep
         raise InputError(str(path), f"not usable YAML ({first_line(error)})",
                          "correct the value") from error
 

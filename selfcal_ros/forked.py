@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Imported last where workers are forked: what is loaded stays out of collections of garbage.
+"""Imported last before workers are forked: exempts loaded objects from garbage collection.
 
-The first full collection of every worker would go through it, and so copy the memory it is in:
+The first full collection of every worker would touch them, and so copy their memory:
 0.05 s each.
 """
 

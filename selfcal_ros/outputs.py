@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files that are written whole or not at all."""
+"""Atomic file output."""
 
 import contextlib
 import fcntl
@@ -16,15 +16,15 @@ from typing import BinaryIO
 from selfcal_ros.errors import InputError, first_line
 
 TEMPORARY = re.compile(r"\.selfcal\.[0-9a-f]{16}")
-"""Names of files and folders that are not whole yet; their writer holds a lock on them."""
+"""Names of unfinished files and folders, locked by their writer."""
 
 
 @contextlib.contextmanager
 def atomic_file(path: str | os.PathLike) -> Iterator[BinaryIO]:
     """Yield a binary file that becomes `path` only if the block ends without an error.
 
-    A file that exists keeps its permissions, a link stays a link, and what is no file (a pipe,
-    /dev/null) is written into as it is.
+    An existing file keeps its permissions, a link stays a link, and a target that is not a file
+    (a pipe, /dev/null) is written directly.
 
     Raises
     ------
@@ -46,7 +46,7 @@ def atomic_file(path: str | os.PathLike) -> Iterator[BinaryIO]:
 
 @contextlib.contextmanager
 def _replacement(target: Path) -> Iterator[BinaryIO]:
-    """Yield a temporary file beside `target` that takes its place in one step, or vanishes."""
+    """Yield a temporary file next to `target` that replaces it atomically, or is removed."""
     temporary, fd = _temporary(target.parent)
     try:
         with os.fdopen(fd, "wb") as file:
@@ -72,7 +72,7 @@ def temporary_folder(parent: Path) -> Iterator[Path]:
 
 
 def _temporary(parent: Path, *, folder: bool = False) -> tuple[Path, int]:
-    """Make a temporary file or folder; return it and the descriptor that holds its lock."""
+    """Create a temporary file or folder; return it and the descriptor of its lock."""
     sweep(parent)
     while True:
         path = parent / f".selfcal.{secrets.token_hex(8)}"
@@ -81,14 +81,14 @@ def _temporary(parent: Path, *, folder: bool = False) -> tuple[Path, int]:
         fd = os.open(path, os.O_RDONLY if folder else os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o600)
         with contextlib.suppress(OSError):  # a file system without locks
             fcntl.flock(fd, fcntl.LOCK_EX)
-        if path.exists():  # it was not swept before it was locked
+        if path.exists():  # it was not removed before it was locked
             return path, fd
         os.close(fd)
 
 
 @cache
 def sweep(folder: Path) -> None:
-    """Remove what killed processes left unfinished in a folder; looked for once a process."""
+    """Remove unfinished files of killed processes in a folder; once per process."""
     with contextlib.suppress(OSError):
         for path in list(folder.iterdir()):
             if TEMPORARY.fullmatch(path.name) and (path.is_file() or path.is_dir()):
@@ -97,7 +97,7 @@ def sweep(folder: Path) -> None:
 
 
 def _remove_abandoned(path: Path) -> None:
-    """Remove a temporary file or folder; OSError if its writer lives, which holds the lock."""
+    """Remove a temporary file or folder; OSError if its writer still holds the lock."""
     fd = os.open(path, os.O_RDONLY | os.O_NOFOLLOW)
     try:
         fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -110,7 +110,7 @@ def _remove_abandoned(path: Path) -> None:
 
 
 def _mode(target: Path) -> int:
-    """Return the permissions of a file that exists, or those that a new one gets."""
+    """Return the permissions of an existing file, or those of a new one."""
     if target.is_file():
         return stat.S_IMODE(target.stat().st_mode)
     umask = os.umask(0)

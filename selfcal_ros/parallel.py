@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """One function over many items on all cores: a pool of processes, or dask.distributed.
 
-Outcomes come as they are ready. An item whose worker dies (out of memory, a signal) costs that
-item alone. Every worker has one BLAS thread, and ends with the process that started it.
+Outcomes are yielded as they are ready. If a worker dies (out of memory, a signal), only its item
+is lost. Every worker has one BLAS thread, and ends with the process that started it.
 """
 
 import contextlib
@@ -23,25 +23,25 @@ from threadpoolctl import threadpool_limits
 from selfcal_ros.errors import InputError
 
 AHEAD = 2
-"""Items in the hands of the pool, a worker: enough that none waits for work."""
+"""Items submitted per worker: enough that none waits for work."""
 BLAS_THREADS = "OPENBLAS_NUM_THREADS"
-"""Environment variable: threads that OpenBLAS starts as it is loaded."""
+"""Environment variable: threads started by OpenBLAS when loaded."""
 FORKED = "selfcal_ros.forked"
 LOCAL = "local"
-"""Instead of a scheduler's address: a dask cluster in this machine, made for the run."""
+"""Instead of a scheduler's address: a local dask cluster started for the run."""
 
 
 Progress = Callable[[int, int], None]
-"""Called with how many items are done, and of how many."""
+"""Called with the number of items done, and the total."""
 
 
 def silent(done: int, total: int) -> None:
-    """Show no progress."""
+    """Do nothing."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came of an item: its place in the order of the items, and a value or an error."""
+    """Outcome of an item: its index, and a value or an error."""
 
     index: int
     value: Any = None
@@ -49,17 +49,17 @@ class Outcome:
 
 
 class WorkerDied(Exception):
-    """Says that the process in which an item was worked on ended without an answer."""
+    """Raised if the process of an item ended without an answer."""
 
 
 def cores() -> int:
-    """Return the number of cores that this process may use."""
+    """Return the number of cores available to this process."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (
         os.cpu_count() or 1)
 
 
 def check_workers(number: int | None, option: str = "--workers") -> int:
-    """Return the number of workers wanted, all cores if None; InputError if it is none."""
+    """Return the requested number of workers, all cores if None; InputError if invalid."""
     if number is None:
         return cores()
     if not 1 <= number <= 1024:
@@ -68,24 +68,25 @@ def check_workers(number: int | None, option: str = "--workers") -> int:
 
 
 def begin(module: str, workers: int) -> None:
-    """Begin to import what workers will need, while this process imports what it needs itself.
+    """Begin importing the workers' modules, while this process imports its own.
 
     Parameters
     ----------
     module : str
-        Full name of the module of the function that they will be given.
+        Full name of the module of the workers' function.
     workers : int
-        With one there is nothing to begin: it is this process.
+        With one worker, this process, there is nothing to begin.
     """
     if workers > 1 and _method() == "forkserver":
         _start_server(module)
 
 
 def _start_server(module: str) -> None:
-    """Start the process that forks workers, unless it runs: with Ctrl-C blocked in it and in them.
+    """Start the process that forks workers, if necessary, with Ctrl-C blocked in it and in them.
 
-    Ctrl-C reaches all processes of a terminal, also while they import; it is for the parent. BLAS
-    has one thread in all of them from the start: others would spin for 0.03 s in each library.
+    Ctrl-C reaches all processes of a terminal, also during imports; only the parent handles it.
+    BLAS has one thread in all of them from the start: others would spin for 0.03 s in each
+    library.
     """
     multiprocessing.get_context("forkserver").set_forkserver_preload([module, __name__, FORKED])
     resource_tracker.ensure_running()  # which lets the signal through
@@ -104,26 +105,26 @@ def _start_server(module: str) -> None:
 
 def outcomes(function: Callable[[Any], Any], items: Sequence[Any], *, workers: int = 1,
              dask: str = "", meanwhile: Callable[[], None] | None = None) -> Iterator[Outcome]:
-    """Yield what `function` makes of each item, as it becomes ready.
+    """Yield the outcome of `function` for each item, as it becomes ready.
 
     Parameters
     ----------
     function : callable
-        Of one item; of a module, so that workers can import it.
+        Takes one item; from a module, so that workers can import it.
     items : sequence
-        What it is called with.
+        Its arguments.
     workers : int
-        Processes; 1 = in this process, one after the other.
+        Processes; 1 = in this process, sequentially.
     dask : str
         Address of a dask scheduler, or `LOCAL`; empty = processes of the standard library.
     meanwhile : callable, optional
-        Called once, in a thread of its own while other processes start and work: what this one
-        has to load. It has returned when the last outcome has come.
+        Called once in a separate thread while other processes start and work, to load modules
+        here. It has returned when the last outcome is yielded.
 
     Raises
     ------
     InputError
-        If dask is wanted and not there, or its scheduler does not answer.
+        If dask is requested and not installed, or its scheduler does not answer.
     """
     if dask:
         yield from _with_dask(function, items, workers, dask)
@@ -136,9 +137,9 @@ def outcomes(function: Callable[[Any], Any], items: Sequence[Any], *, workers: i
 
 def mapped(function: Callable[[Any], Any], items: Sequence[Any], *, workers: int = 1,
            progress: Progress = silent) -> list[Any]:
-    """Return `function` of each item, in their order; the first error met is raised.
+    """Return `function` of each item, in their order; the first error is raised.
 
-    `progress` is called with how many are done, and of how many.
+    `progress` is called with the number of items done, and the total.
     """
     found: list[Any] = [None] * len(items)
     for done, outcome in enumerate(outcomes(function, items, workers=workers), 1):
@@ -152,9 +153,9 @@ def mapped(function: Callable[[Any], Any], items: Sequence[Any], *, workers: int
 def mapped_in_parts(function: Callable[[list[Any]], list[Any]], items: Sequence[Any], *,
                     workers: int = 1, size: int = 20,
                     progress: Progress = silent) -> list[Any]:
-    """Return what `function` makes of lists of items, joined in their order.
+    """Return the results of `function` for lists of items, joined in their order.
 
-    For items too small to be worth a way to a worker and back, one by one.
+    For items too small to be sent to a worker individually.
     """
     parts = [list(items[start:start + size]) for start in range(0, len(items), size)]
     found = mapped(function, parts, workers=workers,
@@ -171,12 +172,12 @@ def _tried(function: Callable[[Any], Any], items: Sequence[Any], index: int) -> 
 
 @contextlib.contextmanager
 def _beside(function: Callable[[], None] | None) -> Iterator[None]:
-    """Run `function`, if there is one, in a thread while the block runs; both end together.
+    """Run `function`, if any, in a thread while the block runs; both end together.
 
-    This process waits for the one that forks workers, which is still importing, and works later.
-    Where the block is given up, by Ctrl-C or by who takes the outcomes, the function is not waited
-    for: the thread ends with the process. (To raise an exception in it would leave the locks of
-    its imports taken.)
+    This process waits for the one that forks workers, which is still importing.
+    If the block is aborted, by Ctrl-C or by the consumer of the outcomes, the function is not
+    waited for: the thread ends with the process. (An exception raised in it would leave the locks
+    of its imports taken.)
     """
     if function is None:
         yield
@@ -193,7 +194,7 @@ def _beside(function: Callable[[], None] | None) -> Iterator[None]:
 
 def _with_processes(function: Callable[[Any], Any], items: Sequence[Any],
                     workers: int) -> Iterator[Outcome]:
-    """Yield outcomes of a pool; where it breaks, each item in its hands is tried by itself."""
+    """Yield outcomes of a pool; if it breaks, each of its items is retried separately."""
     waiting = list(reversed(range(len(items))))
     while waiting:
         suspects: list[int] = []
@@ -220,7 +221,7 @@ def _with_processes(function: Callable[[Any], Any], items: Sequence[Any],
 
 
 def _alone(function: Callable[[Any], Any], items: Sequence[Any], index: int) -> Outcome:
-    """Return the outcome of an item in a process of its own."""
+    """Return the outcome of an item in a separate process."""
     with _pool(1, function) as pool:
         future = pool.submit(function, items[index])
         wait([future])
@@ -241,9 +242,9 @@ def _method() -> str:
 
 @contextlib.contextmanager
 def _pool(workers: int, function: Callable[[Any], Any]) -> Iterator[ProcessPoolExecutor]:
-    """Yield a pool whose processes are gone when the block ends, however it ends.
+    """Yield a pool whose processes have ended when the block ends, however it ends.
 
-    What `function` needs is imported once, where the workers are forked.
+    The modules of `function` are imported once, before the workers are forked.
     """
     context = multiprocessing.get_context(_method())
     if _method() == "forkserver":
@@ -266,9 +267,9 @@ def _pool(workers: int, function: Callable[[Any], Any]) -> Iterator[ProcessPoolE
 def _end_server() -> None:
     """End the process that forks workers; the next pool starts another.
 
-    It may still import. Then it would fork those that it was asked for when this process has ended,
-    and they would fail, with a traceback. It has ended when this returns, and is left for
-    `multiprocessing` to find so: a pool that took it for alive would be refused by it.
+    It may still be importing: then it would fork the requested workers after this process has
+    ended, and they would fail with a traceback. It has ended when this returns, and
+    `multiprocessing` is left to detect this: a pool that assumed it alive would be refused.
     """
     pid = getattr(getattr(forkserver, "_forkserver", None), "_forkserver_pid", None)
     if pid is not None:
@@ -278,14 +279,14 @@ def _end_server() -> None:
 
 
 def begin_worker() -> None:
-    """Prepare a worker: one BLAS thread, Ctrl-C left to its parent, no life without that."""
+    """Prepare a worker: one BLAS thread, Ctrl-C left to its parent, end with the parent."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
     threadpool_limits(limits=1, user_api="blas")
 
 
 def _end_with_parent() -> None:
-    """End this process at once when the one that wanted it has ended, however that came."""
+    """End this process at once when its parent has ended, for any reason."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Entry points of all commands. An interrupt while modules are imported waits until they are.
+"""Entry points of all commands. An interrupt during imports waits until they are done.
 
-Python would end in the middle of an import with a traceback. Blocked, Ctrl-C is kept by the
-system until `cli.main.main` or `nodes.running.run` let it through to where it is handled.
+Otherwise Python would end in the middle of an import with a traceback. Blocked, Ctrl-C is kept by
+the system until `cli.main.main` or `nodes.running.run` unblock it.
 """
 
 import importlib.util
@@ -11,7 +11,7 @@ import sys
 from functools import partial
 
 BUILD = "colcon build --base-paths src/selfcal_ros src/selfcal_ros/msg_defs"
-"""What builds the messages too: colcon looks for no package below a package."""
+"""Command that builds the messages as well: colcon does not search inside a package."""
 
 
 NEEDED = {
@@ -19,11 +19,11 @@ NEEDED = {
     "selfcal_msgs": f"run `make setup`, or in the workspace `{BUILD}` and "
                     "source install/setup.bash",
     "threadpoolctl": "`sudo apt install python3-threadpoolctl`, or with pip"}
-"""Modules of a node that neither pip nor rosdep brings without more, and what brings them."""
+"""Modules of a node that neither pip nor rosdep installs by default, and how to install them."""
 
 
 def missing_ros() -> str:
-    """Return which module of a node is not in this environment, and the remedy; "" if none."""
+    """Return the module of a node missing in this environment, and the remedy; "" if none."""
     for name, remedy in NEEDED.items():
         if importlib.util.find_spec(name) is None:
             return f"there is no {name} in this environment; {remedy}"
@@ -31,7 +31,7 @@ def missing_ros() -> str:
 
 
 def begin_node() -> None:
-    """Block interrupts while a node is imported; end the process if it cannot be."""
+    """Block interrupts while a node is imported; end the process if the import fails."""
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     missing = missing_ros()
     if missing:

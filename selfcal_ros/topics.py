@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The names and types of all topics and their quality of service, declared once.
+"""Names, types and quality of service of all topics, declared once.
 
-Names are relative: a namespace goes in front.
+Names are relative: a namespace is put in front.
 """
 
 ENCODER_TOPIC = "stage/joint_states"
@@ -19,13 +19,13 @@ INPUT_TOPICS = {
     DETECTION_TOPIC: "selfcal_msgs/msg/MarkDetection",
     COMMAND_TOPIC: "selfcal_msgs/msg/ViewCommand",
 }
-"""Type of each topic that readings are made of."""
+"""Type of each input topic."""
 
 INFINITE = {"sec": 9223372036, "nsec": 854775807}
 
 
 def qos_profile(*, reliable: bool, transient_local: bool, depth: int) -> dict:
-    """Return one offered QoS profile as rosbag2 (Jazzy) writes it."""
+    """Return an offered QoS profile in the format of rosbag2 (Jazzy)."""
     return {"history": "keep_last", "depth": depth,
             "reliability": "reliable" if reliable else "best_effort",
             "durability": "transient_local" if transient_local else "volatile",

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Factors between SI units and those in which people and files write, declared once.
+"""Factors between SI units and the units of texts and files, declared once.
 
 ``A_PER_B`` is how many A are one B: a length in m times `MM_PER_M` is in mm.
 """
@@ -20,4 +20,4 @@ S_PER_NS, MS_PER_S, S_PER_H = 1e-9, 1e3, 3600.0
 BYTES_PER_MB = 1e6
 
 M_PER = {"m": 1.0, "mm": M_PER_MM, "um": M_PER_UM, "nm": M_PER_NM}
-"""Length of each unit by the name that options and files use."""
+"""Length of each unit by its name in options and files."""

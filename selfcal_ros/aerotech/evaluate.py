@@ -3,7 +3,7 @@
 
 Positions and corrections are in primary units and follow the sign of the encoder. Each table
 adds its own correction. A table's reference positions are n * distance - offset (NEGPOS: with
-the other sign), shifted by what has changed since the table was made: home offset, home
+opposite sign), shifted by changes since the table was made: home offset, home
 direction, absolute feedback offset.
 """
 
@@ -21,7 +21,7 @@ from selfcal_ros.errors import InputError
 
 @dataclass(frozen=True)
 class AxisSetup:
-    """What the controller knows about an axis.
+    """Settings of the controller for an axis.
 
     Attributes
     ----------
@@ -30,11 +30,11 @@ class AxisSetup:
     counts_per_secondary : float or None
         Encoder counts per secondary unit.
     home_direction : str or None
-        "CW" or "CCW" as set now; None: as it was when the table was made.
+        Present "CW" or "CCW"; None: unchanged since the table was made.
     home_offset : float or None
-        HomeOffset now, primary units: home = marker + home offset. None: unchanged.
+        Present HomeOffset, primary units: home = marker + home offset. None: unchanged.
     absolute_feedback_offset : float or None
-        PrimaryAbsoluteFeedbackOffset now, counts, added to the position. None: unchanged.
+        Present PrimaryAbsoluteFeedbackOffset, counts, added to the position. None: unchanged.
     """
 
     counts_per_unit: float | None = None
@@ -52,7 +52,7 @@ class MachineSetup:
     temperature_c: float | None = None
 
     def per_count(self, axis: int, where: str) -> float:
-        """Return primary units per count of an axis; InputError if it is not known."""
+        """Return primary units per count of an axis; InputError if unknown."""
         counts = self.of(axis).counts_per_unit
         if counts is None:
             raise InputError(f"axis {axis}", f"{where} is in counts, whose size is not known",
@@ -60,7 +60,7 @@ class MachineSetup:
         return 1.0 / counts
 
     def unit(self, axis: int, unit: Unit, where: str) -> float:
-        """Return primary units per one of `unit` on an axis; InputError if it is not known."""
+        """Return primary units per `unit` of an axis; InputError if unknown."""
         if unit.word is UnitWord.PRIMARY:
             return 1.0 / unit.divisor
         per_count = self.per_count(axis, where)
@@ -101,9 +101,9 @@ class AxisSamples:
     rollover: float | None = None
 
     def locate(self, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the entry below each position and the part of the way to the next, clamped."""
+        """Return the entry below each position and the fraction to the next, clamped."""
         with np.errstate(invalid="ignore"):
-            # A NaN position turns into some integer; its part stays NaN.
+            # A NaN position becomes some integer; its fraction stays NaN.
             if self.rollover is not None:
                 position = self.first + np.mod(position - self.first, self.rollover)
             way = np.clip((position - self.first) / self.step, 0, self.count - 1)
@@ -111,7 +111,7 @@ class AxisSamples:
         return entry, way - entry
 
     def covers_zero(self) -> bool:
-        """Return whether position 0 lies between the first and the last entry."""
+        """Return whether position 0 is between the first and the last entry."""
         zero = 0.0 if self.rollover is None else self.first + np.mod(-self.first, self.rollover)
         edge = EDGE * self.step
         return self.first - edge <= zero <= self.first + (self.count - 1) * self.step + edge
@@ -192,7 +192,7 @@ def bound_1d(table: Table1D, setup: MachineSetup) -> BoundTable1D:
 
 
 def _home_shift(table: Table1D, setup: MachineSetup) -> float:
-    """Return how far a fixed point of the stage has moved in coordinates counted from home."""
+    """Return the shift of a fixed point of the stage in coordinates relative to home."""
     if table.home_direction is None:
         return 0.0
     now = setup.of(table.reference)
@@ -213,7 +213,7 @@ def _feedback_shift(axis_then: tuple[int, float | None], setup: MachineSetup, pl
 
 
 def _expansion(table: Table1D, setup: MachineSetup) -> float:
-    """Return alpha * (T - MATERIALTEMP): the scale has grown and indicates too little."""
+    """Return alpha * (T - MATERIALTEMP), by which the expanded scale indicates too little."""
     if (table.expand_coeff is None or table.material_temp is None
             or setup.temperature_c is None):
         return 0.0
@@ -221,7 +221,7 @@ def _expansion(table: Table1D, setup: MachineSetup) -> float:
 
 
 def bound_2d(table: Table2D, setup: MachineSetup) -> BoundTable2D:
-    """Return a 2D or galvo table in primary units, biased if position (0, 0) lies inside."""
+    """Return a 2D or galvo table in primary units, biased if position (0, 0) is inside."""
     place = f"the table of line {table.line}" if table.line else "the table"
     tracks, values = [], np.moveaxis(table.values, 2, 0)
     for dim, (end, axis) in enumerate((("row", table.row_axis), ("col", table.column_axis))):
@@ -259,12 +259,12 @@ class CalEvaluator:
     tables : sequence of Table
         Loaded tables, of one or several files.
     setup : MachineSetup, optional
-        What the controller knows about its axes.
+        Settings of the controller for its axes.
 
     Raises
     ------
     InputError
-        If a table uses counts or secondary units whose size `setup` does not tell.
+        If a table uses counts or secondary units of unknown size.
     """
 
     def __init__(self, tables: Sequence[Table], setup: MachineSetup | None = None) -> None:

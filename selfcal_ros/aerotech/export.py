@@ -25,24 +25,24 @@ from selfcal_ros.units import ARCSEC_PER_DEG, M_PER_UM, RAD_PER_ARCSEC, UM_PER_M
 DECIMALS = 5
 """Digits of a correction in um: rounding stays below 0.005 nm."""
 MAX_THETA_ROUNDING_M = 0.01e-9
-"""What rounding of an angular correction may move a point on the field's edge."""
+"""Largest motion of a point on the field's edge by rounding of an angular correction."""
 PRIMARY = Unit(UnitWord.PRIMARY)
 
 
 def micrometres(unit_m: float) -> Unit:
-    """Return the correction unit that means micrometres for a primary unit of `unit_m` m."""
+    """Return the correction unit for micrometres with a primary unit of `unit_m` m."""
     return Unit(UnitWord.PRIMARY, tidy(unit_m / M_PER_UM))
 
 
 def tidy(value: float) -> float:
-    """Return `value` without the last digits that a change of unit has spoiled."""
+    """Return `value` without rounding errors from a change of unit."""
     return float(f"{value:.14g}") + 0.0
 
 
 def table_xy(error_map: ErrorMap, frame: MachineFrame) -> Table2D:
     """Return the 2D table that corrects x and y.
 
-    A reversed encoder gives a negative sample distance and corrections of the other sign, so
+    A reversed encoder gives a negative sample distance and corrections of opposite sign, so
     that the table follows the sign of the encoder.
 
     Raises
@@ -66,7 +66,7 @@ def table_xy(error_map: ErrorMap, frame: MachineFrame) -> Table2D:
 
 
 def theta_decimals(error_map: ErrorMap) -> int:
-    """Return the digits of an angular correction in arcsec that the field's size asks for."""
+    """Return the digits of an angular correction in arcsec required by the field's size."""
     artifact = error_map.artifact
     radius = np.hypot(*artifact.half) * artifact.grid_pitch_m
     digits = int(np.ceil(np.log10(0.5 * RAD_PER_ARCSEC * radius / MAX_THETA_ROUNDING_M)))
@@ -76,8 +76,8 @@ def theta_decimals(error_map: ErrorMap) -> int:
 def table_theta(error_map: ErrorMap, frame: MachineFrame) -> Table1D:
     """Return the 1D table that corrects theta.
 
-    With the counts per degree known it covers one turn and rolls over; without them the
-    format cannot say where it rolls over, and the table covers a turn to either side.
+    With known counts per degree it covers one turn and rolls over; without them the
+    format cannot express the roll-over, and the table covers a turn in either direction.
 
     Raises
     ------
@@ -151,16 +151,16 @@ def _neighbours(shift: tuple[int, int], shape: tuple[int, int]) -> tuple[tuple, 
 
 def provenance(result: CalibrationResult, frame: MachineFrame, *, filled: int = 0,
                now: datetime | None = None) -> list[str]:
-    """Return comments that say where a table comes from and how it is meant.
+    """Return comments with the origin and conventions of a table.
 
     Parameters
     ----------
     result : CalibrationResult
-        What the calibration found.
+        The calibration.
     frame : MachineFrame
-        Axes of the machine; `selfcal cal verify` reads them back.
+        Axes of the machine, for `selfcal cal verify`.
     filled : int
-        Sites that were unknown and have been filled.
+        Number of unknown sites that were filled.
     now : datetime, optional
         Date of the export, UTC.
     """
@@ -193,7 +193,7 @@ def _uncertainty_line(result: CalibrationResult) -> str:
 
 
 def verdict_lines(result: CalibrationResult) -> list[str]:
-    """Return the verdict, and why it is none where it is none."""
+    """Return the verdict, with the reasons if not qualified."""
     verdict, when = result.verdict, result.provenance.extra.get("last_exposure", "")
     lines = [f"measured until {when}"] if when else []
     if verdict.grade is Grade.GOOD:

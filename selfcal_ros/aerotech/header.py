@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Start lines of a table: positional arguments, keywords, and what their arguments are.
+"""Start lines of a table: positional arguments, keywords and their arguments.
 
 Source: Aerotech, Axis Calibration, the tables "File Format Settings".
 """
@@ -12,9 +12,9 @@ from typing import Any
 from selfcal_ros.aerotech.model import Findings, Kind, Unit, UnitWord
 
 LIMIT = 1e15
-"""Numbers beyond this are not lengths, angles or counts of a machine."""
+"""Largest valid length, angle or count."""
 SMALLEST = 1e-15
-"""The same for distances and divisors that must not be zero."""
+"""Smallest valid distance or divisor."""
 OLD_UNITS = {"METRIC": "PRIMARY"}
 """Words of older controllers."""
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d{1,4})?", re.ASCII)
@@ -41,7 +41,7 @@ def number(text: str) -> float:
     Raises
     ------
     ArgumentFault
-        If it is no plain decimal number, or beyond `LIMIT`.
+        If it is not a plain decimal number, or beyond `LIMIT`.
     """
     if len(text) > 400 or not _NUMBER.fullmatch(text):
         remedy = "use a point as decimal mark" if "," in text else "write a plain decimal number"
@@ -53,7 +53,7 @@ def number(text: str) -> float:
 
 
 def integer(text: str) -> int:
-    """Return the whole number in `text`; ArgumentFault if it is none or absurdly large."""
+    """Return the whole number in `text`; ArgumentFault if invalid or too large."""
     if not _INTEGER.fullmatch(text):
         raise ArgumentFault(f"{short(text)} is not a whole number",
                             "write it with at most 9 digits")
@@ -61,7 +61,7 @@ def integer(text: str) -> int:
 
 
 def unit(text: str) -> Unit:
-    """Return the unit in `text`, such as PRIMARY/1000; ArgumentFault says what is wrong."""
+    """Return the unit in `text`, such as PRIMARY/1000; ArgumentFault if invalid."""
     word, slash, divisor = text.partition("/")
     try:
         name = UnitWord(OLD_UNITS.get(word.upper(), word.upper()))
@@ -97,7 +97,7 @@ def serial(text: str) -> str:
 
 @dataclass(frozen=True)
 class Keyword:
-    """A keyword: the field of the table that it sets, and its argument's reader (None: a flag)."""
+    """A keyword: its field in the table, and the reader of its argument (None: a flag)."""
 
     field: str
     read: Callable[[str], Any] | None
@@ -137,7 +137,7 @@ KEYWORDS: dict[Kind, dict[str, Keyword]] = {
 }
 ALIASES = {f"PRIMARYABSOLUTEFEEDBACKOFFSET{end}": f"ABSOLUTEFEEDBACKOFFSET{end}"
            for end in ("", "ROW", "COL")}
-"""Other names that the maker's own parameter pages use."""
+"""Other names, from the manufacturer's parameter pages."""
 ALL_KEYWORDS = set().union(*KEYWORDS.values())
 POSITIONAL: dict[Kind, tuple[str, ...]] = {
     Kind.ONE_D: ("axis_index",),
@@ -155,7 +155,7 @@ _POSITION = re.compile(r"[+\-.\d]")
 
 @dataclass
 class Header:
-    """What the start lines of one table say."""
+    """Content of the start lines of one table."""
 
     kind: Kind
     line: int

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """1D tables for accuracy, orthogonality and straightness.
 
-An error is actual - commanded here, as an interferometer or a dial indicator shows it; the
-correction is opposite to it (Aerotech, 1D Axis Calibration). From an error map, whose
+An error is actual - commanded here, as shown by an interferometer or a dial indicator; the
+correction is its opposite (Aerotech, 1D Axis Calibration). For an error map, whose
 G = indicated - true already is the opposite, the correction is +G.
 """
 
@@ -23,7 +23,7 @@ from selfcal_ros.model.error_map import ErrorMap
 from selfcal_ros.units import M_PER_NM, M_PER_UM
 
 UNIFORM = 1e-6
-"""Largest departure of measured positions from equal distances, in distances."""
+"""Largest deviation of measured positions from equal distances, in distances."""
 _LENGTH = re.compile(r"([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*(m|mm|um|µm|μm|nm)",
                      re.ASCII)
 _LENGTH_UNITS_M = {**UNITS_M, "µm": M_PER_UM, "μm": M_PER_UM, "nm": M_PER_NM}
@@ -54,13 +54,13 @@ def orthogonality(measured_m: float, over_m: float, travel_m: float,
     Parameters
     ----------
     measured_m : float
-        Error that the indicator shows, m, with its sign.
+        Error shown by the indicator, m, with its sign.
     over_m : float
         Length of the square over which it was measured, m.
     travel_m : float
         Full travel of the reference axis, m.
     home : {"end", "middle", "middle-balanced"}
-        Where its home position lies; balanced means opposite corrections at both ends.
+        Its home position; balanced means opposite corrections at both ends.
 
     Raises
     ------
@@ -92,7 +92,7 @@ def measured_line(text: str, where: str, unit_m: float) -> AxisCorrection:
     Raises
     ------
     InputError
-        For another header, a value that is no number, or positions that are not equidistant.
+        For another header, a value that is not a number, or positions that are not equidistant.
     """
     lines = enumerate(text.splitlines(), 1)
     rows = [(number, csv_cells(line, f"{where}:{number}")) for number, line in lines
@@ -145,12 +145,12 @@ def map_line(error_map: ErrorMap, along: Literal["x", "y"],
 def map_orthogonality(error_map: ErrorMap, along: Literal["x", "y"]) -> AxisCorrection:
     """Return the two-point correction for the non-orthogonality O of an error map.
 
-    Gx = O y and Gy = O x (Hu 6) are, but for a rotation, an error 2 O x of y alone.
+    Gx = O y and Gy = O x (Hu 6) are, apart from a rotation, an error 2 O x of y alone.
 
     Raises
     ------
     InputError
-        If O is not known.
+        If O is unknown.
     """
     if not np.isfinite(error_map.nonorthogonality):
         raise InputError("error map", "its non-orthogonality is not known",
@@ -162,7 +162,7 @@ def map_orthogonality(error_map: ErrorMap, along: Literal["x", "y"]) -> AxisCorr
 
 
 def without_slope(line: AxisCorrection) -> AxisCorrection:
-    """Return `line` without its least-squares straight line: what straightness means."""
+    """Return `line` without its least-squares straight line, as for straightness."""
     x, c = line.positions_m - line.positions_m.mean(), line.corrections_m
     return AxisCorrection(line.positions_m, c - c.mean() - x * (x @ c) / (x @ x))
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where the controller's axes lie in the stage frame, and a controller to try tables on."""
+"""The controller's axes in the stage frame, and a simulated controller to test tables."""
 
 import math
 import re
@@ -30,9 +30,9 @@ class MachineFrame:
     unit : str
         Primary unit of x and y: m, mm or um.
     home_x_m, home_y_m, home_theta_rad : float
-        Place of the controller's zero in the stage frame.
+        Position of the controller's zero in the stage frame.
     reverse_x, reverse_y, reverse_theta : bool
-        Whether the encoder counts against the direction of the stage frame.
+        Whether the encoder counts opposite to the stage frame.
     theta_counts_per_unit : float or None
         Encoder counts per degree.
     """
@@ -85,7 +85,7 @@ class MachineFrame:
         return -1.0 if self.reverse_theta else 1.0
 
     def setup(self) -> MachineSetup:
-        """Return what the controller knows about these axes."""
+        """Return the controller's settings for these axes."""
         if self.theta_axis is None or self.theta_counts_per_unit is None:
             return MachineSetup()
         return MachineSetup({self.theta_axis: AxisSetup(self.theta_counts_per_unit)})
@@ -146,18 +146,18 @@ def frame_from_comments(comments: Sequence[str]) -> MachineFrame | None:
 class SimulatedController:
     """A controller with tables loaded that drives a stage with a known error.
 
-    The command is a position in the stage frame. The controller looks the correction up at the
-    commanded position, adds it, and drives until the encoder shows the sum; where the stage
-    then truly is follows from its error G = indicated - true.
+    The command is a position in the stage frame. The controller looks up the correction at the
+    commanded position, adds it, and drives until the encoder shows the sum; the true
+    position of the stage follows from its error G = indicated - true.
 
     Parameters
     ----------
     stage : Compensator
-        The stage's error between its sites too.
+        The stage's error, including between its sites.
     frame : MachineFrame
-        How the axes are wired.
+        Wiring of the axes.
     tables : CalEvaluator or None
-        What is loaded; None: nothing.
+        Loaded tables; None: nothing.
     """
 
     def __init__(self, stage: Compensator, frame: MachineFrame,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Calibration files of Aerotech controllers as values: tables, units, findings, lines of text."""
+"""Data model of Aerotech calibration files: tables, units, findings, lines of text."""
 
 import codecs
 import re
@@ -10,7 +10,7 @@ import numpy as np
 
 
 class Kind(StrEnum):
-    """Kind of a table; a file holds tables of one kind only."""
+    """Kind of a table; a file contains tables of one kind only."""
 
     ONE_D = "1D"
     TWO_D = "2D"
@@ -23,7 +23,7 @@ class Kind(StrEnum):
 
 
 class Severity(StrEnum):
-    """How bad a finding is."""
+    """Severity of a finding."""
 
     ERROR = "error"
     WARNING = "warning"
@@ -32,15 +32,15 @@ class Severity(StrEnum):
 
 @dataclass(frozen=True, order=True)
 class Finding:
-    """One remark about a file: where, what and how to correct it.
+    """A finding in a file: line, problem and remedy.
 
     Attributes
     ----------
     line : int
         Line of the file, from 1; 0 means the whole file.
     severity : Severity
-        ERROR: the file must not be loaded. WARNING: legal, but probably not what was meant.
-        TOLERATED: not the strict form, yet its meaning is plain.
+        ERROR: the file must not be loaded. WARNING: legal, but probably not intended.
+        TOLERATED: not the strict form, but unambiguous.
     what, remedy : str
         What is wrong, and what to do about it.
     """
@@ -235,14 +235,14 @@ Table = Table1D | Table2D
 
 @dataclass(frozen=True, eq=False)
 class CalFile:
-    """What a calibration file says, and what is to be said about it.
+    """Content of a calibration file, with findings.
 
     Attributes
     ----------
     where : str
         File name, for messages.
     tables : tuple of Table
-        Tables that could be understood, in their order.
+        Tables that could be read, in their order.
     findings : tuple of Finding
         Sorted by line.
     comments : tuple of str
@@ -260,7 +260,7 @@ class CalFile:
 
 
 def same_table(a: Table, b: Table) -> bool:
-    """Return whether two tables say the same, wherever they stand in their files."""
+    """Return whether two tables are equal, apart from their position in files."""
     if type(a) is not type(b) or a.values.shape != b.values.shape:
         return False
     names = [f.name for f in fields(a) if f.name not in ("values", "line", "lines")]
@@ -273,7 +273,7 @@ _MARKS = re.compile("[;'\"]")
 
 
 class TooManyFindings(Exception):
-    """Raised to stop reading a file that is not worth reading on."""
+    """Raised to stop reading an unusable file."""
 
 
 class Findings:
@@ -284,19 +284,19 @@ class Findings:
         self._tolerated: dict[tuple[str, str], list[int]] = {}
 
     def error(self, line: int, what: str, remedy: str) -> None:
-        """Note that the file must not be loaded."""
+        """Record an error: the file must not be loaded."""
         self._add(Finding(line, Severity.ERROR, what, remedy))
 
     def warning(self, line: int, what: str, remedy: str) -> None:
-        """Note something legal that was probably not meant."""
+        """Record legal content that was probably not intended."""
         self._add(Finding(line, Severity.WARNING, what, remedy))
 
     def tolerated(self, line: int, what: str, remedy: str) -> None:
-        """Note a departure from the strict form whose meaning is plain."""
+        """Record an unambiguous deviation from the strict form."""
         self._tolerated.setdefault((what, remedy), []).append(line)
 
     def stop(self, line: int, what: str, remedy: str) -> None:
-        """Note an error after which reading on makes no sense."""
+        """Record an error and stop reading."""
         self._listed.append(Finding(line, Severity.ERROR, what, remedy))
         raise TooManyFindings
 
@@ -319,7 +319,7 @@ def decode(data: bytes, findings: Findings) -> tuple[list[str], set[int]]:
     """Return the lines of a file without line ends, and the numbers of those not in UTF-8.
 
     A byte order mark and CRLF are tolerated, UTF-16 is an error. Lines that are not UTF-8 are
-    read as Windows-1252; whether that is tolerable depends on what they say.
+    read as Windows-1252; whether this is tolerated depends on their content.
     """
     if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         findings.error(1, "the file is UTF-16", "save it as UTF-8")
@@ -363,13 +363,13 @@ def strip_comment(line: str) -> tuple[str, str, str]:
     """Return the line before its comment, the comment's mark (or "") and the comment.
 
     A semicolon starts a comment, and so does an apostrophe (older controllers), unless it
-    stands inside a quoted string.
+    is inside a quoted string.
     """
     quoted = False
     for match in _MARKS.finditer(line):
         at = match.start()
         if match.group() == '"':
-            # A quote that is never closed does not hide the rest of the line.
+            # An unclosed quote does not hide the rest of the line.
             quoted = not quoted and line.find('"', at + 1) >= 0
         elif not quoted:
             return line[:at], line[at], line[at + 1:]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Read calibration files: everything met in the wild, with a finding for whatever is odd."""
+"""Read calibration files tolerantly, with a finding for each deviation."""
 
 import contextlib
 import os
@@ -32,7 +32,7 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.files import read_bytes
 
 MAX_TABLES = 1000
-"""Tables after which a file is not read on."""
+"""Number of tables after which reading stops."""
 _NUMERIC = re.compile(r"[0-9eE+\-. \t]*")
 _NUMBER_FIRST = re.compile(r"[+\-.]?\d")
 _TOKEN = re.compile(r":([A-Za-z0-9_]*)")
@@ -53,7 +53,7 @@ class _Open:
 
 
 class _Reader:
-    """The state of reading: tables so far, and the one that is open."""
+    """The state of reading: tables so far, and the open one."""
 
     def __init__(self) -> None:
         self.findings = Findings()
@@ -65,7 +65,7 @@ class _Reader:
         self.open: _Open | None = None
 
     def read(self, lines: list[str], odd: set[int]) -> None:
-        """Take all lines; those in `odd` are not UTF-8."""
+        """Process all lines; those in `odd` are not UTF-8."""
         index = 0
         while index < len(lines):
             end = index
@@ -90,7 +90,7 @@ class _Reader:
         self.open.counts.extend(counts[said].tolist())
 
     def _line(self, number_: int, line: str, *, odd: bool) -> None:
-        """Take one line that is not just numbers."""
+        """Process a line that is not just numbers."""
         text, mark, comment = strip_comment(line)
         text = text.strip(" \t")
         if mark and not self.first_start:
@@ -269,14 +269,14 @@ def _table_2d(header: Header, values: np.ndarray | None, layout: tuple[list[int]
 
 def _rows_are_whole(columns: int, outputs: int, layout: tuple[list[int], list[int]],
                     findings: Findings) -> bool:
-    """Return whether the lines make up whole rows; a finding says which line does not."""
+    """Return whether the lines form whole rows; a finding names a line that does not."""
     width = columns * outputs
     want = f"a row has {columns} columns of {outputs} values = {width}"
     lines, on_lines = layout[0], np.array(layout[1])
     ends = np.cumsum(on_lines)
     if np.all(on_lines == width):
         return True
-    # Rows may be wrapped, or several may share a line; but no line may straddle two rows.
+    # Rows may be wrapped, or share a line; but a line may not straddle two rows.
     begins = ends - on_lines
     straddles = (begins // width != (ends - 1) // width) & ((begins % width != 0)
                                                             | (ends % width != 0))
@@ -295,7 +295,7 @@ def _rows_are_whole(columns: int, outputs: int, layout: tuple[list[int], list[in
 
 
 def parse_cal(data: bytes, where: str, *, gi4: Gi4 | None = None) -> CalFile:
-    """Return what the bytes of a calibration file say, with all findings.
+    """Return the content of a calibration file from its bytes, with all findings.
 
     Parameters
     ----------
@@ -304,7 +304,7 @@ def parse_cal(data: bytes, where: str, *, gi4: Gi4 | None = None) -> CalFile:
     where : str
         Its name, for messages.
     gi4 : Gi4, optional
-        Check galvo tables against the restrictions of this drive too.
+        Also check galvo tables against the restrictions of this drive.
     """
     reader = _Reader()
     with contextlib.suppress(TooManyFindings):
@@ -316,7 +316,7 @@ def parse_cal(data: bytes, where: str, *, gi4: Gi4 | None = None) -> CalFile:
 
 
 def read_cal(path: str | os.PathLike, *, gi4: Gi4 | None = None) -> CalFile:
-    """Return what a calibration file says, with all findings; InputError if it is missing."""
+    """Return the content of a calibration file, with all findings; InputError if missing."""
     return parse_cal(read_bytes(path), str(path), gi4=gi4)
 
 

@@ -17,12 +17,12 @@ MAX_2D_TABLES = 10
 MAX_GALVO_POINTS = 138_000
 GI4_SIDE = 65
 EDGE = 1e-9
-"""Part of a sample distance within which a position counts as lying on the table's edge."""
+"""Fraction of a sample distance within which a position is taken to be on the table's edge."""
 
 
 @dataclass(frozen=True)
 class Gi4:
-    """Restrictions of the GI4 galvo drive: a protocol of so many bits."""
+    """Restrictions of the GI4 galvo drive, by the bits of its protocol."""
 
     bits: int = 16
 
@@ -33,7 +33,7 @@ class Gi4:
 
 
 def check_tables(tables: Sequence[Table], findings: Findings, *, gi4: Gi4 | None = None) -> None:
-    """Add a finding for every rule that the tables of one file break."""
+    """Add a finding for every rule broken by the tables of one file."""
     for table in tables:
         check_table(table, findings, gi4=gi4)
         if table.kind is not tables[0].kind:
@@ -42,7 +42,7 @@ def check_tables(tables: Sequence[Table], findings: Findings, *, gi4: Gi4 | None
 
 
 def check_table(table: Table, findings: Findings, *, gi4: Gi4 | None = None) -> None:
-    """Add a finding for every rule that one table breaks."""
+    """Add a finding for every rule broken by one table."""
     if not np.all(np.abs(table.values) <= LIMIT):
         findings.error(table.line, "values that are not finite, or too large",
                        f"stay within +-{LIMIT:g}")
@@ -108,7 +108,7 @@ def _table_1d(table: Table1D, findings: Findings) -> None:
 
 
 def _span(distance: float, offset: float, count: int) -> tuple[float, float]:
-    """Return the least and the greatest position, rounded so that 0 may lie on an edge."""
+    """Return the smallest and largest position, rounded so that 0 may be on an edge."""
     ends = [-offset, (count - 1) * distance - offset]
     ends = [0.0 if abs(end) < EDGE * abs(distance) else end for end in ends]
     return min(ends), max(ends)
@@ -180,13 +180,13 @@ def _gi4(table: Table2D, findings: Findings, gi4: Gi4) -> None:
 
 
 def mixed_kinds(line: int, kinds: tuple[Kind, Kind], findings: Findings) -> None:
-    """Note a table of another kind than the first one of its file."""
+    """Record a table of another kind than the first one of its file."""
     findings.error(line, f"a {kinds[0]} table in a file of {kinds[1]} tables",
                    "put each kind into a file of its own")
 
 
 def check_counts(tables: Sequence[Table], findings: Findings) -> None:
-    """Add a finding for every limit on the number of tables that a file exceeds."""
+    """Add a finding for every exceeded limit on the number of tables."""
     limits = {Kind.ONE_D: MAX_1D_TABLES, Kind.TWO_D: MAX_2D_TABLES}
     for kind, limit in limits.items():
         same = [table for table in tables if table.kind is kind]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What loaded tables leave of the stage's error: residuals of a simulated controller."""
+"""Residuals of a simulated controller with loaded tables."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -19,18 +19,18 @@ class Residual:
     """Residuals true - commanded before and after, without their common shift.
 
     The zero bias of the controller, and the home position itself, move all positions by one
-    constant; the calibration does not know such a constant either (datum), so it is taken out.
+    constant; the calibration does not determine this constant (datum), so it is removed.
 
     Attributes
     ----------
     place : str
-        Where: "sites", "between", "lines".
+        "sites", "between" or "lines".
     position : float array (axes, P)
         Commanded positions, m or rad.
     before, after : float array (axes, P)
         Residuals without their mean, m or rad.
     shift_before, shift_after : float array (axes,)
-        The means that were taken out.
+        The means that were removed.
     """
 
     place: str
@@ -51,7 +51,7 @@ class Residual:
 
 @dataclass(frozen=True, eq=False)
 class Verification:
-    """Residuals at the sites, between them, and at the angular lines; None where not asked."""
+    """Residuals at the sites, between them, and at the angular lines; None if not requested."""
 
     frame: MachineFrame
     sites: Residual | None = None
@@ -60,7 +60,7 @@ class Verification:
 
     @property
     def residuals(self) -> list[Residual]:
-        """Return the residuals that there are."""
+        """Return the available residuals."""
         return [r for r in (self.sites, self.between, self.lines) if r is not None]
 
     @property
@@ -72,16 +72,16 @@ class Verification:
 
 def verify_tables(error_map: ErrorMap, tables: Sequence[Table],
                   frame: MachineFrame) -> Verification:
-    """Return what `tables` leave of the error of a stage with this error map.
+    """Return the residuals of a stage with this error map and `tables`.
 
-    At the sites the map is the truth. Between them the truth is not known: the cubic spline
-    through the sites stands for it at the centres of the cells, so that what is left there is
+    At the sites the map is the truth. Between them the truth is unknown: it is substituted by the
+    cubic spline through the sites at the centres of the cells, so that the residual there is
     the error of the controller's linear interpolation.
 
     Raises
     ------
     InputError
-        If a table corrects or needs an axis that is not one of the frame.
+        If a table corrects or needs an axis outside the frame.
     """
     stage: set[int | None] = {frame.x_axis, frame.y_axis}
     xy = [table for table in tables if stage & set(table.outputs)]
@@ -137,7 +137,7 @@ def _at_lines(error_map: ErrorMap, frame: MachineFrame, evaluator: CalEvaluator)
 
 def _residual(place: str, position: np.ndarray, reached: list[np.ndarray]) -> Residual:
     residuals = [true - position for true in reached]
-    # A known site next to an unknown one cannot be inverted to the last digit: leave it out.
+    # A known site next to an unknown one cannot be inverted exactly: omit it.
     known = np.isfinite(residuals).all(axis=(0, 1))
     if not known.any():
         raise InputError("error map", "no site can be verified", "measure more sites")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Write calibration files in the strict form, never over a file that is not meant to go."""
+"""Write calibration files in the strict form, never silently over an existing file."""
 
 import os
 from collections.abc import Sequence
@@ -18,7 +18,7 @@ from selfcal_ros.files import read_bytes, write_bytes
 
 
 def decimal(value: float) -> str:
-    """Return the shortest decimal number that reads back as `value`, without an exponent."""
+    """Return the shortest decimal number that reads back as `value`, without exponent."""
     text = repr(float(value))
     return np.format_float_positional(value, trim="-") if "e" in text else text.removesuffix(".0")
 
@@ -34,13 +34,13 @@ def cal_text(tables: Sequence[Table], *, comments: Sequence[str] = (),
     comments : sequence of str
         Lines for the head of the file.
     decimals : int, optional
-        Digits after the point of the corrections; without it so many that every value reads
+        Digits after the point of the corrections; default: as many as needed to read every value
         back exactly.
 
     Raises
     ------
     InputError
-        If the tables break a rule of the format, or hold what it cannot say.
+        If the tables break a rule of the format, or cannot be expressed in it.
     """
     findings = Findings()
     check_tables(tables, findings)
@@ -63,10 +63,10 @@ def cal_text(tables: Sequence[Table], *, comments: Sequence[str] = (),
 
 
 def _refuse_what_reads_differently(text: str, tables: Sequence[Table], *, exact: bool) -> None:
-    """Raise InputError if a file does not give back the tables it was written from.
+    """Raise InputError if a file does not reproduce the tables it was written from.
 
-    The fields of a table are whatever its maker put there: a quote in a serial number, an offset
-    that is no number, keywords that a galvo table must not have.
+    The fields of a table may be invalid: a quote in a serial number, an offset
+    that is not a number, keywords that a galvo table must not have.
     """
     back = refuse_errors(parse_cal(text.encode(), "calibration file")).tables
     for number, (table, read) in enumerate(zip(tables, back, strict=True), 1):
@@ -113,7 +113,7 @@ def _argument(value: float | int | str | Unit) -> str:
 
 
 def refuse_existing(paths: Sequence[str | os.PathLike], *, force: bool) -> None:
-    """Raise InputError if one of `paths` exists, unless `force` allows to replace it."""
+    """Raise InputError if one of `paths` exists, unless `force` allows replacing it."""
     for path in paths:
         if Path(path).is_dir():
             raise InputError(str(path), "it is a folder", "name a file")
