@@ -53,10 +53,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
                         help="certificate of the reference: number and issuer")
     parser.add_argument("--model", metavar="TERM[:SIZE],...", action="append",
                         help="terms estimated with the map: microscope, drift, plate_scale, "
-                        "plate_shape, approach, plate_strain, line_eccentricity; SIZE is a "
-                        "standard deviation known from elsewhere (SI; 0: exactly zero), e.g. "
-                        "drift,plate_shape:30e-9; default: those of the plan; none: no terms, not "
-                        "even those assumed by default (docs/estimation.md)")
+                        "plate_shape, approach, plate_strain, line_eccentricity, rotation; "
+                        "SIZE is a standard deviation known from elsewhere (SI; 0: exactly zero), "
+                        "e.g. drift,plate_shape:30e-9; default: those of the plan; none: no "
+                        "terms, not even those assumed by default (docs/estimation.md)")
     parser.add_argument("--microscope", metavar="SCALE_U[:ROTATION_U[:SHEAR_U]]",
                         help="standard uncertainties of the microscope's scale, rotation (rad) "
                         "and shear (default: 0.01:0.01:0.002)")

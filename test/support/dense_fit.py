@@ -13,7 +13,7 @@ import numpy as np
 from scipy.special import eval_legendre
 
 from selfcal_ros.model.readings import Measurements, Sense
-from selfcal_ros.model.terms import ModelTerm, TermName
+from selfcal_ros.model.terms import OF_LINES, ModelTerm, TermName
 
 STEP = 1e-5
 """Of the differences, rad, m and m/m: what they leave out and what they round are then 1e-11."""
@@ -74,6 +74,9 @@ class DenseFit:
                         for axis in "xy"]
             elif term.name is TermName.LINE_ECCENTRICITY:
                 mine = [(v, part) for v in lines[int(term.free):] for part in ("cos", "sin")]
+            elif term.name is TermName.ROTATION:
+                both = [v for v in lines if v in grid]
+                mine = [(v, "turn") for v in both[int(term.free):] if len(both) > 1]
             else:
                 mine = [(v, part) for v in grid[int(term.free):] for part in MARKS[term.name]]
             for v, part in mine:
@@ -144,9 +147,9 @@ class DenseFit:
         strained, added = np.zeros((2, len(self.keys), len(self.z)), dtype=complex)
         turned = np.zeros((len(self.keys), len(self.k)))
         for row, (term, v, part) in enumerate(self.keys):
-            if term == TermName.LINE_ECCENTRICITY:
-                wave = {"cos": np.cos, "sin": np.sin}[part](2 * np.pi * self.k / self.K)
-                turned[row] = wave * (self.line_view == v)
+            if term in OF_LINES:
+                wave = {"cos": np.cos, "sin": np.sin, "turn": np.ones_like}[part]
+                turned[row] = wave(2 * np.pi * self.k / self.K) * (self.line_view == v)
             elif term in MARKS:
                 strained[row] = self._of_plate(part, term) * (self.view == v)
             else:

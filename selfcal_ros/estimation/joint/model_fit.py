@@ -9,7 +9,7 @@ solves the same factored equations (Gauss-Newton).
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -36,7 +36,7 @@ from selfcal_ros.estimation.terms.projection import (
     reduce_lines,
 )
 from selfcal_ros.estimation.terms.sizes import SizeTest, size_tests
-from selfcal_ros.model.terms import OF_PLATE, ModelTerm, TermName
+from selfcal_ros.model.terms import OF_PLATE, SHARED, ModelTerm, TermName
 
 MAX_STEPS = 100
 
@@ -55,8 +55,8 @@ LATE, OF_NOISE_LATE = 20, 0.1
 laid millimetres beside their places make the offsets, and their rounding, as large."""
 
 LINEAR = 1e-3
-"""Relative change of the misalignments' covariance from which the terms' equations are set up
-anew."""
+"""Relative change of the misalignments' covariance, or of the weight of lines that have terms of
+their own, from which the terms' equations are set up anew."""
 
 OFFSET_STEPS = 10
 """Most steps in which the offsets that a microscope saw are freed from noise anew."""
@@ -127,7 +127,9 @@ def fit_model(problem: Problem,
     """Return the joint least-squares solution of the whole model.
 
     A term's size that the readings rule out would bend the map with nothing to show it: the fit is
-    repeated with the largest size that they allow.
+    repeated with the largest size that they allow. A term that all views share comes first if it
+    explains all by itself: marks that turn against lines as a microscope of another scale turns
+    them are no plates that moved between both.
 
     Parameters
     ----------
@@ -142,17 +144,29 @@ def fit_model(problem: Problem,
         If the rotations do not settle, or a term needs what the readings do not tell.
     """
     model = _settled(problem, check)
-    sizes = _size_tests(model)
-    allowed = {test.name: test.allowed for test in sizes if test.contradicted}
-    if not allowed:
+    sizes = _size_tests(model, problem.terms)
+    if not any(test.contradicted for test in sizes):
         return replace(model, sizes=sizes)
-    terms = tuple(term.scaled(allowed[term.name] / term.size) if term.name in allowed else term
-                  for term in problem.terms)
-    return replace(_settled(replace(problem, terms=terms), check), sizes=sizes)
+    for term in problem.terms:
+        alone = _size_tests(model, [term] if term.name in SHARED else [])
+        if any(test.contradicted for test in alone):
+            simpler = _settled(_raised(problem, alone), check)
+            rest = _size_tests(simpler, [other for other in problem.terms if other is not term])
+            if not any(test.contradicted for test in rest):
+                return replace(simpler, sizes=(*alone, *rest))
+    return replace(_settled(_raised(problem, sizes), check), sizes=sizes)
 
 
-def _size_tests(model: ModelFit) -> tuple[SizeTest, ...]:
-    """Return the tests of all sizes; none without a noise to test them by."""
+def _raised(problem: Problem, sizes: Sequence[SizeTest]) -> Problem:
+    """Return the problem with the sizes that the readings allow where they contradict them."""
+    allowed = {test.name: test.allowed for test in sizes if test.contradicted}
+    return replace(problem, terms=tuple(
+        term.scaled(allowed[term.name] / term.size) if term.name in allowed else term
+        for term in problem.terms))
+
+
+def _size_tests(model: ModelFit, terms: Sequence[ModelTerm]) -> tuple[SizeTest, ...]:
+    """Return the tests of the sizes of terms; none without a noise to test them by."""
     equations = model.equations
     if equations is None or equations.free.all():
         return ()
@@ -160,7 +174,7 @@ def _size_tests(model: ModelFit) -> tuple[SizeTest, ...]:
                    coefficients=model.coefficients)
     right = scored.total + equations.information @ model.coefficients
     noise = model.found.xy
-    return size_tests(equations, right, model.problem.terms, (noise.sigma, noise.dof))
+    return size_tests(equations, right, terms, (noise.sigma, noise.dof))
 
 
 def _settled(problem: Problem, check: Callable[[TermEquations], None]) -> ModelFit:
@@ -226,7 +240,7 @@ class _State:
 
     def _linearise(self, columns: TermColumns, reduced: ReducedColumns) -> None:
         """Set up the equations of the terms about the present solution."""
-        self.weights, self.reduced = self.found.inverse, reduced
+        self.weights, self.ratio, self.reduced = self.found.inverse, self.found.ratio, reduced
         self.equations = equations_of(self.problem, self.found, columns, reduced)
 
     def _refresh(self, equations: TermEquations, reduced: ReducedColumns) -> None:
@@ -236,7 +250,7 @@ class _State:
             columns = self._freed_of_noise(self.microscope, columns)
             reduced = reduce_anew(self.problem.system.grid, columns.shapes, reduced,
                                   columns.rows([TermName.MICROSCOPE]))
-        elif not self._stale():
+        elif not self._stale(equations):
             return
         self._linearise(columns, reduced)
 
@@ -253,9 +267,12 @@ class _State:
             self.offset_steps = self.steps
         return columns
 
-    def _stale(self) -> bool:
+    def _stale(self, equations: TermEquations) -> bool:
         """Return whether the angular readings now weigh otherwise than in the equations."""
         now, then = self.found.inverse, self.weights
+        if len(equations.columns.lines.at) and (
+                abs(self.found.ratio - self.ratio) > LINEAR * self.ratio):
+            return True
         return bool(len(now) and np.abs(now - then).max() > LINEAR * np.abs(then).max())
 
     def step(self) -> float:
@@ -286,6 +303,9 @@ class _State:
                     and change <= part * sigma * np.sqrt(spread.min()))
 
     def finished(self) -> ModelFit:
+        equations, reduced = self.equations, self.reduced
+        if equations is not None and reduced is not None and self._stale(equations):
+            self._linearise(equations.columns, reduced)
         self.sums = self._sums()
         return ModelFit(self.problem, self.found, self.equations, self.coefficients, self.sums,
                         self.y, self.reduced)

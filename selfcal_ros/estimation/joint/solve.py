@@ -51,7 +51,7 @@ from selfcal_ros.model.result import (
     Observability,
     ViewResult,
 )
-from selfcal_ros.model.terms import VISIT_TERMS, TermName
+from selfcal_ros.model.terms import OF_LINES, VISIT_TERMS, TermName
 from selfcal_ros.model.verdict import Finding, ModelResult, TermEstimate, TermResult
 from selfcal_ros.model.view import Plan
 
@@ -123,7 +123,8 @@ def prepare(measurements: Measurements, options: Options) -> tuple[Problem, Obse
     terms = tuple(
         term for term in options.model_terms(
             visits=all(v is not None for v in ground.visits), assumed=direct and rigid)
-        if angular.index or term.name is not TermName.LINE_ECCENTRICITY)
+        if term.name not in OF_LINES or (
+            ground.with_lines if term.name is TermName.ROTATION else angular.index))
     problem = Problem(
         system, grid, angular, *repeats_of(measurements), half_width_m, conditions, direct,
         ground, options.reference, rigid, terms, options.drift_degree)

@@ -27,7 +27,7 @@ from selfcal_ros.estimation.terms.shapes import shapes_in_full
 from selfcal_ros.estimation.terms.visits import ViewVisits
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.statistics import MANY_DOF
-from selfcal_ros.model.terms import OF_PLATE, TermName
+from selfcal_ros.model.terms import OF_LINES, OF_PLATE, TermName
 
 LEVEL = 1e-3
 """Probability that a good set of readings exceeds its limit."""
@@ -85,7 +85,7 @@ def held_readings(model: ModelFit, kept: Measurements, held: Measurements) -> He
         made = term_columns(ground, problem.terms, problem.drift_degree)
         at = {(c.term, c.view, c.component): k for k, c in enumerate(equations.columns.columns)}
         for column, block in zip(made.columns, made.grid, strict=True):
-            if column.term == TermName.LINE_ECCENTRICITY:
+            if column.term in OF_LINES:
                 continue  # its views are those with lines, and no mark has a part of it
             shared = column.view == -1
             row = -1 if shared else rows[column.view]

@@ -254,7 +254,7 @@ def likelier_term(measurements: Measurements, options: Options, slip: Slip) -> C
     found = find_explanations(model, slips=True, readings=False, placed=placed)
     if not found or found[0].name == SLIP:
         return None
-    return cause_of(found[0], ground.names, problem.half_width_m)
+    return cause_of(found[0], ground)
 
 
 def slip_at_line(ground: Ground, row: int, slip: Slip, phase: complex) -> TermColumns:

@@ -11,6 +11,7 @@ width and s the signs of approach (reality of machines; docs/method.md, terms of
     plate_shape  V has a quadratic form of z/H, 6 a view
     approach     V has +-(h_x s_x + i h_y s_y)  2, shared; minus where the plate moves
     line_eccentricity  Vtheta has c cos theta_k + s sin theta_k, 2 a view, rad
+    rotation     Vtheta has r, 1 a view of marks and lines, rad
 """
 
 from collections.abc import Iterable, Sequence
@@ -23,7 +24,7 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.terms.ground import Ground
 from selfcal_ros.estimation.terms.shapes import NO_LINES, LineColumns, Shapes, shapes_of
 from selfcal_ros.estimation.terms.visits import ViewVisits
-from selfcal_ros.model.terms import UNITS, VISIT_TERMS, ModelTerm, TermName
+from selfcal_ros.model.terms import OF_LINES, UNITS, VISIT_TERMS, ModelTerm, TermName
 
 Seen = list[list[np.ndarray | None]]
 
@@ -185,7 +186,7 @@ def term_columns(ground: Ground, terms: Iterable[ModelTerm], degree: int) -> Ter
     for term in terms:
         if term.name in VISIT_TERMS:
             _require_visits(ground, term.name)
-        if term.name is TermName.LINE_ECCENTRICITY:
+        if term.name in OF_LINES:
             _line_columns(made, ground, term)
         elif term.name not in VISIT_TERMS:
             _plate_columns(made, ground, term)
@@ -346,13 +347,16 @@ def _plate_forms(ground: Ground, name: TermName) -> np.ndarray:
 
 
 def _line_columns(made: Made, ground: Ground, term: ModelTerm) -> None:
-    """Add the columns of the circle of lines, which no grid reading has."""
-    views = len(ground.line_names)
+    """Add the columns of a term of the lines, which no grid reading has."""
+    count = len(ground.line_names)
     angle = 2 * np.pi / max(ground.n_lines, 1) * np.arange(ground.n_lines)
+    views, waves = tuple(range(count)), {"cos": np.cos(angle), "sin": np.sin(angle)}
+    if term.name is TermName.ROTATION:
+        views, waves = ground.with_lines, {"turn": np.ones_like(angle)}
     nothing: list[np.ndarray | None] = [None] * len(ground.names)
-    for view in range(1 if term.free else 0, views):
-        for component, wave in (("cos", np.cos(angle)), ("sin", np.sin(angle))):
-            values = np.zeros((views, ground.n_lines))
+    for view in views[int(term.free):]:
+        for component, wave in waves.items():
+            values = np.zeros((count, ground.n_lines))
             values[view] = wave
             made.lines.append((len(made.columns), values))
             made.column(Column(term.name, view, component, term.size), made.add({}, nothing), 1)
@@ -388,13 +392,9 @@ def _within_anew(ground: Ground, at: Seen, shapes: Shapes, *, before: WithinMark
         weighted = np.conj(moved) * visits.weight
         inner[np.ix_(mine, here)] += weighted @ np.array([at[k][view] for k in here]).T
         against[mine] += (weighted @ visits.y).conj()
-    gram, right = before.gram.copy(), before.right.copy()
-    own = np.isin(shapes.of_column, changed)
+    gram, right, own = before.gram.copy(), before.right.copy(), np.isin(shapes.of_column, changed)
     gram[own], right[own] = shapes.products(inner)[own], shapes.against(against)[own]
     gram[:, own] = gram[own].T
-    gram[np.ix_(own, own)] = _symmetric(gram[np.ix_(own, own)])
+    square = gram[np.ix_(own, own)]
+    gram[np.ix_(own, own)] = (square + square.T) / 2
     return WithinMarks(gram, right, before.total, before.dof)
-
-
-def _symmetric(square: np.ndarray) -> np.ndarray:
-    return (square + square.T) / 2

@@ -10,7 +10,7 @@ from selfcal_ros.estimation.lattice.maps import LatticeViews
 from selfcal_ros.estimation.lattice.readings import GridData
 from selfcal_ros.estimation.terms.visits import ViewVisits, approach_sign, visits_of
 from selfcal_ros.model.readings import Measurements
-from selfcal_ros.model.terms import TermName
+from selfcal_ros.model.terms import OF_LINES
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,6 +35,9 @@ class Ground:
         Names of the views in which lines were read.
     n_lines : int
         Lines of the plate, K.
+    with_lines : tuple of int
+        Which of these views are views of marks as well, if there are two or more: their marks and
+        lines share rotations.
     """
 
     z: np.ndarray
@@ -45,20 +48,23 @@ class Ground:
     indicated: int = 1
     line_names: tuple[str, ...] = ()
     n_lines: int = 0
+    with_lines: tuple[int, ...] = ()
 
     def name_of(self, term: str, view: int) -> str:
         """Return the name of the view of a column; empty where all views share it (-1)."""
-        names = self.line_names if term == TermName.LINE_ECCENTRICITY else self.names
+        names = self.line_names if term in OF_LINES else self.names
         return (*names, "")[view]
 
 
 def ground_of(measurements: Measurements, grid: GridData, half_width_m: float) -> Ground:
     """Return the ground of a measurement whose grid readings are `grid`."""
-    lines = tuple(v.view.name for v in measurements.views if len(v.k))
+    lines = [v for v in measurements.views if len(v.k)]
+    shared = tuple(row for row, view in enumerate(lines) if len(view.m))
     z = LatticeViews(grid.y.shape[1:], grid.poses).z
     names = tuple(measurements.views[i].view.name for i in grid.index)
     return Ground(z, half_width_m, grid.weight, visits_of(measurements, grid), names,
-                  approach_sign(measurements.sense), lines, measurements.artifact.angular_count)
+                  approach_sign(measurements.sense), tuple(view.view.name for view in lines),
+                  measurements.artifact.angular_count, shared if len(shared) > 1 else ())
 
 
 def without_noise(ground: Ground, residuals: np.ndarray,

@@ -46,6 +46,9 @@ class SizeTest:
         Number of combinations of the coefficients determined by the readings.
     p : float
         Probability of as large a value if the size is right.
+    evidence : float
+        Logarithm of how much likelier the readings are with the size that they show (ratio of
+        marginal likelihoods); 0 if they do not contradict the given one.
     """
 
     name: TermName
@@ -55,6 +58,7 @@ class SizeTest:
     statistic: float
     rank: int
     p: float
+    evidence: float = 0.0
 
     @property
     def contradicted(self) -> bool:
@@ -81,8 +85,11 @@ def size_test(equations: TermEquations, right: np.ndarray, term: ModelTerm,
     values, variance, of_size = _told(equations, right, equations.rows([term.name]), sigma)
     rank = len(values)
 
+    def spread(size: float) -> np.ndarray:
+        return np.diag(variance) + size**2 * of_size
+
     def statistic(size: float) -> float:
-        return float(values @ np.linalg.solve(np.diag(variance) + size**2 * of_size, values))
+        return float(values @ np.linalg.solve(spread(size), values))
 
     if not rank:
         return SizeTest(term.name, term.size, term.size, term.size, 0.0, 0, 1.0)
@@ -101,8 +108,10 @@ def size_test(equations: TermEquations, right: np.ndarray, term: ModelTerm,
             low, high = (middle, high) if statistic(middle) > level else (low, middle)
         return high
 
-    least = float(chdtri(rank, 1 - TAIL))
-    return replace(test, shown=size_at(rank), allowed=size_at(least))
+    shown, allowed = size_at(rank), size_at(float(chdtri(rank, 1 - TAIL)))
+    wider = np.linalg.slogdet(spread(shown))[1] - np.linalg.slogdet(spread(term.size))[1]
+    return replace(test, shown=shown, allowed=allowed,
+                   evidence=float(found - statistic(shown) - wider) / 2)
 
 
 def _told(equations: TermEquations, right: np.ndarray, rows: np.ndarray, sigma_m: float
@@ -132,7 +141,7 @@ def _told(equations: TermEquations, right: np.ndarray, rows: np.ndarray, sigma_m
 
 def size_tests(equations: TermEquations, right: np.ndarray, terms: Sequence[ModelTerm],
                noise: tuple[float, float]) -> tuple[SizeTest, ...]:
-    """Return the tests of all sizes, contradicted ones first, the worst first.
+    """Return the tests of all sizes, contradicted ones first, in the order of their evidence.
 
     Each is tested with the preceding terms at the sizes that the readings allow, so that one term
     does not make others appear too small.
@@ -153,7 +162,7 @@ def size_tests(equations: TermEquations, right: np.ndarray, terms: Sequence[Mode
         failed = [test for test in tests if test.contradicted]
         if not failed:
             return (*found, *tests)
-        worst = max(failed, key=lambda test: test.statistic - test.rank)
+        worst = max(failed, key=lambda test: test.evidence)
         found.append(worst)
         sized = [term for term in sized if term.name != worst.name]
         equations = replace(equations, columns=equations.columns.scaled(

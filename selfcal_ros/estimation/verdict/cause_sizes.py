@@ -3,17 +3,19 @@
 
 import math
 from collections.abc import Callable, Iterable
+from itertools import compress
 from typing import Any
 
 import numpy as np
 from scipy.special import eval_legendre
 
-from selfcal_ros.estimation.joint.model_fit import ModelFit
+from selfcal_ros.estimation.joint.model_fit import ModelFit, equations_of
+from selfcal_ros.estimation.terms.ground import Ground
 from selfcal_ros.estimation.terms.sizes import SizeTest
 from selfcal_ros.estimation.verdict.explanations import Explanation
 from selfcal_ros.estimation.verdict.fault_columns import READING, SLIP
 from selfcal_ros.model.readings import Measurements
-from selfcal_ros.model.terms import UNITS, TermName
+from selfcal_ros.model.terms import OF_LINES, UNITS, TermName
 from selfcal_ros.model.verdict import Cause, TermEstimate
 
 TIMES = np.linspace(-1, 1, 101)
@@ -23,24 +25,35 @@ Sized = tuple[float, float, dict[str, Any]]
 """The component that stands out: its value and standard uncertainty, and fields of its cause."""
 
 
-def cause_of(found: Explanation, names: tuple[str, ...], half_width_m: float) -> Cause:
-    """Return an explanation as a cause.
+def cause_of(found: Explanation, ground: Ground) -> Cause:
+    """Return what explains the residuals of a fit, or what the fit holds, as a cause.
 
     Parameters
     ----------
     found : Explanation
-        What explains the residuals.
-    names : tuple of str
-        Names of its views: of the grid, or of the lines.
-    half_width_m : float
-        Longer half width of the plate, m: the unit of a slip's rotation.
+        What it is.
+    ground : Ground
+        Of the fit: names of the views, unit of a slip's rotation.
     """
-    value, u, fields = _SIZES[found.name](found, names, half_width_m)
+    names = ground.line_names if found.name in OF_LINES else ground.names
+    value, u, fields = _SIZES[found.name](found, names, ground.half_width_m)
     unit = UNITS.get(found.name, "m")
     largest = 0.0 if found.moved is None else float(np.abs(found.moved).max(initial=0.0))
     return Cause(**{"name": found.name, "size": value, "u": u, "unit": unit, "p": found.p,
                     "effect_rms": found.effect_m, "effect_max": largest, "told": found.whole,
                     **fields})
+
+
+def held_by(model: ModelFit, name: str, p: float = 1.0, *, whole: bool = True) -> Explanation:
+    """Return a term as the fit that holds it finds it: within the size that it has."""
+    if model.equations is None:
+        raise ValueError(f"the fit does not hold {name}")
+    equations = equations_of(model.problem, model.found, model.equations.columns, model.reduced)
+    rows = equations.rows([name])
+    covariance = model.covariance[np.ix_(rows, rows)] * model.found.xy.sigma**2
+    columns = tuple(compress(equations.columns.columns, rows))
+    found = Explanation(str(name), columns, model.coefficients[rows], covariance, p, whole, 0.0)
+    return found.doing(equations, np.where(rows, model.coefficients, 0.0))
 
 
 def size_cause(test: SizeTest, estimates: Iterable[TermEstimate]) -> Cause:
@@ -143,6 +156,19 @@ def _line_eccentricity(found: Explanation, names: tuple[str, ...], _: float) -> 
     return value, u, {"view": names[view]}
 
 
+def _rotation(found: Explanation, names: tuple[str, ...], _: float) -> Sized:
+    """Size the view that stands out of each other one: a turn that all share is the datum's."""
+    n, unit = len(found.values), np.eye(len(found.values))
+    apart = []
+    for at in range(n):
+        pairs = [_linear(found, unit[at] - unit[other]) for other in range(n) if other != at]
+        apart.append(min((abs(value) / max(u, 1e-300) for value, u in pairs), default=0.0))
+    at = int(np.argmax(apart))
+    value, u = _linear(found, unit[at] - (1 - unit[at]) / max(n - 1, 1))
+    u = max(u, abs(value) / max(apart[at], 1e-300))  # as uncertain as against the nearest
+    return value, u, {"view": names[found.columns[at].view]}
+
+
 def _approach(found: Explanation, *_: object) -> Sized:
     axis, value, u = _one_column(found)
     return value, u, {"axis": axis}
@@ -170,4 +196,4 @@ _SIZES: dict[str, Callable[..., Sized]] = {
     TermName.MICROSCOPE: _microscope, TermName.DRIFT: _drift, TermName.PLATE_SCALE: _of_plate,
     TermName.PLATE_SHAPE: _of_plate, TermName.APPROACH: _approach, SLIP: _slip,
     READING: _reading, TermName.PLATE_STRAIN: _of_plate,
-    TermName.LINE_ECCENTRICITY: _line_eccentricity}
+    TermName.LINE_ECCENTRICITY: _line_eccentricity, TermName.ROTATION: _rotation}

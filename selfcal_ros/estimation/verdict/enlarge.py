@@ -46,11 +46,21 @@ class Effect:
     theta: np.ndarray
 
 
-def effect_of_field(name: str, field: np.ndarray, sense: str, n_lines: int) -> Effect:
-    """Return the effect of a complex field (nx, ny) in the frame of the equations, m."""
+def effect_of_field(name: str, field: np.ndarray, sense: str, theta: np.ndarray) -> Effect:
+    """Return the effect of what is moved, in the frame of the equations.
+
+    Parameters
+    ----------
+    name : str
+        Of the cause.
+    field, theta : complex array (nx, ny), float array (K,)
+        On the maps, m and rad.
+    sense : str
+        Who moved.
+    """
     if sense == Sense.PLATE_MOVES:
-        field = -field[::-1, ::-1]
-    return Effect(name, np.stack([field.real, field.imag]), np.zeros(n_lines))
+        field, theta = -field[::-1, ::-1], -np.roll(theta[::-1], 1)
+    return Effect(name, np.stack([field.real, field.imag]), theta)
 
 
 def difference(name: str, one: CalibrationResult, other: CalibrationResult) -> Effect:

@@ -12,6 +12,7 @@ import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import compress
 
 import numpy as np
 from scipy.special import fdtrc
@@ -27,7 +28,7 @@ from selfcal_ros.estimation.verdict.fault_columns import (
     reading_columns,
     slip_columns,
 )
-from selfcal_ros.model.terms import VISIT_TERMS, ModelTerm, TermName
+from selfcal_ros.model.terms import SHARED, VISIT_TERMS, ModelTerm, TermName
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,9 +174,6 @@ LEVEL = 5e-4
 
 MAX_CAUSES = 4
 
-SHARED = (TermName.MICROSCOPE, TermName.APPROACH)
-"""Terms whose coefficients all views share."""
-
 FLOOR_M = 1e-13
 """Noise that is rounding, against which nothing is tested."""
 
@@ -196,14 +194,15 @@ class Explanation:
         Probability of explaining as much by chance.
     whole : bool
         Whether the readings tell all of its coefficients.
-    effect_m : float
-        Root mean square of what it does to a coordinate of the map, as far as it is told.
+    effect_m, effect_rad : float
+        Root mean square of what it does to a coordinate of the map and to the angular map, as far
+        as it is told.
     part : float
         Part of the view's visits before a slip; NaN for what is none.
     mark : tuple of int, optional
         Mark (m, n) of a single reading; None for what is none.
-    moved : complex array (sites,), optional
-        What it does to the map, in the frame of the equations, m, in the datum.
+    moved, turned : complex array (sites,), float array (K,), optional
+        What it does to the maps, in the frame of the equations, m and rad, in the datum.
     rank : int
         Which it is: explanations of one rank explain the same equally well.
     """
@@ -219,6 +218,18 @@ class Explanation:
     mark: tuple[int, int] | None = None
     moved: np.ndarray | None = None
     rank: int = 0
+    effect_rad: float = 0.0
+    turned: np.ndarray | None = None
+
+    def doing(self, equations: TermEquations, coefficients: np.ndarray) -> "Explanation":
+        """Return it with what `coefficients` (p,) of `equations` do to the maps."""
+        system = equations.system
+        moved = equations.maps @ coefficients
+        turned = np.where(system.known_lines, -(equations.turned @ coefficients), 0.0)
+        known, lines = (max(int(at.sum()), 1) for at in (system.known_sites, system.known_lines))
+        return replace(self, moved=moved, turned=turned,
+                       effect_m=float(np.sqrt((abs(moved) ** 2).sum() / (2 * known))),
+                       effect_rad=float(np.sqrt((turned**2).sum() / lines)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -266,7 +277,9 @@ def find_explanations(model: ModelFit, *, slips: bool, readings: bool = True,
     columns = term_columns(ground, (*problem.terms, *more), problem.drift_degree)
     groups = list(_groups(columns, [term.name for term in more]))
     if slips:
-        columns, groups = _with_slips(ground, columns, groups)
+        steps, places = slip_columns(ground)
+        columns, groups = _with(ground, (columns, groups), steps, [
+            Group(SLIP, rows, *at, len(places)) for at, rows in places.items()])
     if readings:
         columns, groups = _with_readings(model, ground, columns, groups)
     if placed is not None:
@@ -308,20 +321,13 @@ def _with(ground: Ground, before: tuple[TermColumns, list[Group]], columns: Term
           for g in groups)]
 
 
-def _with_slips(ground: Ground, columns: TermColumns,
-                groups: list[Group]) -> tuple[TermColumns, list[Group]]:
-    steps, places = slip_columns(ground)
-    return _with(ground, (columns, groups), steps, [
-        Group(SLIP, rows, view, part, len(places)) for (view, part), rows in places.items()])
-
-
 def _with_readings(model: ModelFit, ground: Ground, columns: TermColumns,
                    groups: list[Group]) -> tuple[TermColumns, list[Group]]:
     phases = PHASES[[-pose.q % 4 for pose in model.problem.grid.poses]]
     single, suspects = reading_columns(ground, model.found.residuals, phases)
-    tried = int(np.count_nonzero(ground.weight))
     return _with(ground, (columns, groups), single, [
-        Group(READING, s.rows, s.view, places=tried, mark=s.mark) for s in suspects])
+        Group(READING, s.rows, s.view, places=int(np.count_nonzero(ground.weight)), mark=s.mark)
+        for s in suspects])
 
 
 def select_explanations(pool: Pool, groups: list[Group], taken: np.ndarray) -> list[Explanation]:
@@ -336,7 +342,7 @@ def select_explanations(pool: Pool, groups: list[Group], taken: np.ndarray) -> l
         good = [(test, group) for test, group in tests if test is not None and test[0] < LEVEL]
         if not good:
             break
-        (_, _), best = max(good, key=lambda item: item[0][1])
+        best = max(good, key=lambda item: item[0][1])[1]
         as_good = [(test, group) for test, group in good
                    if group is best or _replaces(pool, taken, group, best)]
         # of each term the likeliest part; what all views share is simpler than what each has
@@ -356,7 +362,7 @@ def select_explanations(pool: Pool, groups: list[Group], taken: np.ndarray) -> l
 
 def _replaces(pool: Pool, taken: np.ndarray, group: Group, best: Group) -> bool:
     """Return whether a term explains the residuals so well that `best` adds nothing to it."""
-    if {SLIP, READING} & {group.name, best.name}:
+    if {SLIP, READING, TermName.ROTATION} & {group.name, best.name}:
         return False
     before, after = pool.each([taken | group.rows, taken | group.rows | best.rows])
     more = _test(pool, before, after, best)
@@ -382,17 +388,11 @@ def _test(pool: Pool, before: Beside, after: Beside,
 
 
 def _explanation(pool: Pool, taken: np.ndarray, group: Group, p: float) -> Explanation:
-    rows = taken | group.rows
-    beside = pool.beside(rows)
+    beside = pool.beside(taken | group.rows)
     variance, _ = pool.noise(beside)
-    values = beside.values
-    system = pool.equations.system
-    moved = pool.equations.maps[:, group.rows] @ values[group.rows]
-    known = max(int(system.known_sites.sum()), 1)
-    effect = float(np.sqrt((abs(moved) ** 2).sum() / (2 * known)))
-    columns = tuple(column for column, here in zip(
-        pool.equations.columns.columns, group.rows, strict=True) if here)
-    return Explanation(group.name, columns, values[group.rows],
+    own = np.where(group.rows, beside.values, 0.0)
+    columns = tuple(compress(pool.equations.columns.columns, group.rows))
+    return Explanation(group.name, columns, own[group.rows],
                        variance * beside.inverse[np.ix_(group.rows, group.rows)], p,
-                       pool.beside(group.rows).rank == int(group.rows.sum()), effect, group.part,
-                       group.mark, moved)
+                       pool.beside(group.rows).rank == int(group.rows.sum()), 0.0, group.part,
+                       group.mark).doing(pool.equations, own)

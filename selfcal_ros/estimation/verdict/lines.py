@@ -1,11 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What angular lines show: rotations that are not those of the marks, a reading that is off.
+"""What angular lines show: a reading that is off, sought among the lines alone; wrong offsets."""
 
-A view's rotation is one number for both (method eq. 2.2, 2.3). If the plate moved between them, or
-offsets of lines have the other sign, both fit well alone, and not together. A single reading that
-the others contradict is sought among the lines alone.
-"""
-
+import math
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import NamedTuple
@@ -13,134 +9,44 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import fdtrc
 
-from selfcal_ros.errors import InputError, NotIdentifiableError
 from selfcal_ros.estimation.joint.model_fit import ModelFit
 from selfcal_ros.estimation.joint.problem import FLOOR, Problem
-from selfcal_ros.estimation.joint.solve import solve_joint
-from selfcal_ros.estimation.joint.solved import Solved
-from selfcal_ros.estimation.normal.equations import angular_residuals, grid_residuals
-from selfcal_ros.estimation.options import Options
+from selfcal_ros.estimation.normal.equations import angular_residuals
+from selfcal_ros.estimation.verdict.cause_sizes import cause_of, held_by
 from selfcal_ros.estimation.verdict.enlarge import Effect
 from selfcal_ros.estimation.verdict.fault_columns import MOST, READING
 from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.model.readings import Measurements, ViewReadings
+from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.result import CalibrationResult
-from selfcal_ros.model.statistics import MANY_DOF, rms
+from selfcal_ros.model.terms import TermName
 from selfcal_ros.model.verdict import Cause
 
-ROTATION = "rotation"
 
+def turned_too_far(model: ModelFit, result: CalibrationResult,
+                   measurements: Measurements) -> Cause | None:
+    """Return lines that turn against marks by as much as the plates are turned, as a cause.
 
-def rotation_cause(model: ModelFit, level: float) -> Cause | None:
-    """Return the view in which marks and lines turn differently, None where they agree.
-
-    What both together leave more than each alone, in units of their noises, is tested (F) for as
-    many rotations as both tell.
-
-    Parameters
-    ----------
-    model : ModelFit
-        The joint fit.
-    level : float
-        Level of the test.
+    That is no plate that moved: offsets of lines have the other sign, or those of marks are in
+    wrong units. None where they do not, or where the model has them turn alike.
     """
-    system, found = model.problem.system, model.found
-    both = set(system.grid_index) & set(system.angular_index)
-    dof = system.rank_schur + system.rank_turns - (system.size - system.nullity)
-    noise = np.array([found.xy.sigma, found.theta.sigma])
-    if len(both) < 2 or dof < 1 or not (noise > FLOOR).all():  # rounding is not tested
+    if TermName.ROTATION not in [term.name for term in model.problem.terms]:
         return None
-    alone = _squares(model, grid_residuals(system, model.y),
-                     angular_residuals(system, model.problem.angular.y))
-    more = (_squares(model, found.residuals, found.residuals_theta) - alone) / noise**2
-    known = min(found.xy.dof, found.theta.dof, MANY_DOF)
-    p = float(fdtrc(dof, known, max(float(more.sum()), 0.0) / dof))
-    return _largest(model, p) if p < level else None
-
-
-def _squares(model: ModelFit, grid: np.ndarray, lines: np.ndarray) -> np.ndarray:
-    """Return the weighted squares of residuals, m^2 and rad^2, (2,)."""
-    system = model.problem.system
-    return np.array([float((system.grid.weight * abs(grid) ** 2).sum()),
-                     float((system.angular.weight * lines**2).sum())])
-
-
-def _largest(model: ModelFit, p: float) -> Cause:
-    """Return the view whose lines are turned most against its marks, as a cause."""
-    problem, found = model.problem, model.found
-    system, length = problem.system, problem.half_width_m
-    pairs = [(system.grid_index.index(i), row) for row, i in enumerate(system.angular_index)
-             if i in system.grid_index]
-    rows = np.array([row for row, _ in pairs])
-    lines = np.array([row for _, row in pairs])
-    of_marks = (system.grid_inverse @ system.grid.reduced(model.y)[1])[3 * rows] / length
-    of_lines = (system.angular_inverse @ system.angular.reduced(problem.angular.y)[1])[lines]
-    apart = of_lines - of_marks
-    apart = apart - np.median(apart)  # a turn that all views share is the datum's
-    worst = int(np.argmax(abs(apart)))
-    row, line = 3 * rows[worst], lines[worst]
-    variance = (system.grid_inverse[row, row] * (found.xy.sigma / length) ** 2
-                + system.angular_inverse[line, line] * found.theta.sigma**2)
-    return Cause(ROTATION, float(apart[worst]), float(np.sqrt(variance)), "rad", p,
-                 problem.ground.names[rows[worst]])
-
-
-def solved_apart(measurements: Measurements, options: Options) -> Solved | None:
-    """Return the solution in which marks and lines of a view have rotations of their own.
-
-    None where there is none: where lines tell rotations of the marks, or a model does not settle.
-    """
-    views: list[ViewReadings] = []
-    for view in measurements.views:
-        if not (len(view.m) and len(view.k)):
-            views.append(view)
-            continue
-        lines = replace(view.view, name=f"{view.view.name} lines", grid=False)
-        views += [
-            replace(view, view=replace(view.view, angular=False), k=view.k[:0],
-                    dtheta=view.dtheta[:0], count_theta=view.count_theta[:0],
-                    u_theta=view.u_theta[:0], sigma_theta=float("nan"), dof_theta=0),
-            ViewReadings(lines, k=view.k, dtheta=view.dtheta, count_theta=view.count_theta,
-                         u_theta=view.u_theta, sigma_theta=view.sigma_theta,
-                         dof_theta=view.dof_theta)]
-    try:
-        return solve_joint(replace(measurements, views=tuple(views)), options)
-    except (NotIdentifiableError, InputError):
-        return None
-
-
-def bends(together: CalibrationResult, apart: CalibrationResult, part: float) -> bool:
-    """Return whether common rotations move a map by more than a part of its uncertainty (rms).
-
-    Also where the uncertainty is not known.
-
-    Parameters
-    ----------
-    together, apart : CalibrationResult
-        With rotations that marks and lines share, and with rotations of their own.
-    part : float
-        The part.
-    """
-    one, other = together.error_map, apart.error_map
-    if not together.has_uncertainty:
-        return True
-    turned = one.g_theta - other.g_theta
-    known = np.isfinite(turned)
-    turned = turned - turned[known].mean() if known.any() else turned
-    moved = np.stack([one.gx - other.gx, one.gy - other.gy])
-    return bool(rms(moved) > part * rms(np.stack([one.u_gx, one.u_gy]))
-                or rms(turned) > part * rms(one.u_g_theta))
-
-
-def turns_apart(result: CalibrationResult, measurements: Measurements) -> float:
-    """Return by how much the views of marks and lines are turned against one another, rad.
-
-    Lines whose offsets have the other sign turn by twice that, and their map is bounded by nothing.
-    """
+    held = held_by(model, TermName.ROTATION)
+    first = len(model.problem.ground.with_lines) - len(held.values)  # has none where it is free
+    values, covariance = np.pad(held.values, (first, 0)), np.pad(held.covariance, (first, 0))
+    apart, variance = abs(values[:, None] - values), np.diag(covariance)
+    spread = variance[:, None] + variance - 2 * covariance
+    of_u = apart / np.sqrt(np.maximum(spread, np.finfo(float).tiny))
     phi = [view.phi for view, readings in zip(result.views, measurements.views, strict=True)
            if len(readings.m) and len(readings.k)]
-    return float(np.ptp(phi))
+    if not apart[of_u > SURE].max(initial=0.0) > np.ptp(phi) / 2:
+        return None
+    p = math.erfc(float(of_u.max()) / math.sqrt(2))
+    return replace(cause_of(held, model.problem.ground), p=p)
 
+
+SURE = 3.0
+"""Size over its standard uncertainty from which a rotation is that of its view."""
 
 CHECKED = 1e-6
 """Smallest part of a reading that its residual must hold: what others check of it."""

@@ -13,14 +13,25 @@ import numpy as np
 from scipy.special import fdtrc
 
 from selfcal_ros.errors import InputError, NotIdentifiableError
-from selfcal_ros.estimation.joint.model_fit import ModelFit, equations_of
+from selfcal_ros.estimation.joint.model_fit import ModelFit
 from selfcal_ros.estimation.joint.noise import pooled
 from selfcal_ros.estimation.joint.solve import solve_joint
 from selfcal_ros.estimation.joint.solved import Solved
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.terms.equations import LEAST_NOISE_M
-from selfcal_ros.estimation.verdict.cause_sizes import cause_of, scatter_of_views, size_cause
-from selfcal_ros.estimation.verdict.enlarge import Effect, difference, effect_of_field
+from selfcal_ros.estimation.terms.sizes import SizeTest
+from selfcal_ros.estimation.verdict.cause_sizes import (
+    cause_of,
+    held_by,
+    scatter_of_views,
+    size_cause,
+)
+from selfcal_ros.estimation.verdict.enlarge import (
+    Effect,
+    difference,
+    effect_of_field,
+    enlargements,
+)
 from selfcal_ros.estimation.verdict.explanations import (
     FLOOR_M,
     LEVEL,
@@ -28,14 +39,7 @@ from selfcal_ros.estimation.verdict.explanations import (
     find_explanations,
 )
 from selfcal_ros.estimation.verdict.fault_columns import READING
-from selfcal_ros.estimation.verdict.lines import (
-    bends,
-    effect_of_line,
-    line_cause,
-    rotation_cause,
-    solved_apart,
-    turns_apart,
-)
+from selfcal_ros.estimation.verdict.lines import SURE, effect_of_line, line_cause, turned_too_far
 from selfcal_ros.estimation.verdict.off_sites import off_sites_cause
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.statistics import rms
@@ -61,7 +65,7 @@ MAX_JOINED = 4
 START: dict[str, float] = {
     TermName.MICROSCOPE: 1e-6, TermName.DRIFT: 1e-12, TermName.PLATE_SCALE: 1e-10,
     TermName.PLATE_SHAPE: 1e-12, TermName.APPROACH: 1e-12, TermName.PLATE_STRAIN: 1e-10,
-    TermName.LINE_ECCENTRICITY: 1e-9}
+    TermName.LINE_ECCENTRICITY: 1e-9, TermName.ROTATION: 1e-10}
 """Size with which a term joins: so small that the readings contradict it."""
 
 PLAUSIBLE = {TermName.MICROSCOPE: 0.1}
@@ -129,21 +133,27 @@ def look_into(solved: Solved, measurements: Measurements, options: Options, *,
     if are_looked_for(n_sites, options, failed=failed) and solved.xy.sigma > LEAST_NOISE_M:
         _search(found, measurements, options, failed=failed)
     solved, tests = found.solved, _model(found.solved).sizes
-    names = [str(test.name) for test in tests
-             if test.contradicted and test.name not in found.joined]
-    terms = {term.name: term for term in solved.result.model.terms}
-    raised = [size_cause(test, terms[test.name].estimates) for test in tests if test.name in names]
+    raised = {str(test.name): _raised_cause(solved, test) for test in tests
+              if test.contradicted and test.name not in found.joined}
+    names = [name for name, cause in raised.items() if cause is not None]
     plausible = all(test.allowed <= PLAUSIBLE.get(test.name, np.inf) for test in tests)
-    causes = [*raised, *found.causes]
+    alike = TermName.ROTATION in raised and _as_a_microscope(found, measurements, options)
+    causes = [*(cause for cause in raised.values() if cause is not None), *found.causes]
+    if (turned := turned_too_far(_model(solved), solved.result, measurements)) is not None:
+        found.bounded = False
+        if TermName.ROTATION not in [cause.name for cause in causes]:
+            causes.append(turned)
     if place is not None:
         causes = [place.cause, *causes] if place.shown else [*causes, place.cause]
-        found.effects.append(effect_of_field(place.cause.name, place.moved, measurements.sense,
-                                             measurements.artifact.angular_count))
+        found.effects.append(effect_of_field(
+            place.cause.name, place.moved, measurements.sense,
+            np.zeros(measurements.artifact.angular_count)))
     looked = Looked(_from_readings(solved, found.joined), tuple(causes), tuple(found.effects),
                     (*names, *found.joined), found.bounded and plausible)
     if not advise or not causes:
         return looked
-    model = _tried(looked, measurements, options) if looked.terms and plausible else None
+    tried = looked.terms and plausible and not alike
+    model = _tried(looked, measurements, options) if tried else None
     return replace(looked, causes=tuple(_advised(cause, model, looked.terms) for cause in causes))
 
 
@@ -226,8 +236,7 @@ def are_looked_for(sites: int, options: Options, *, failed: bool) -> bool:
 def _search(found: _Found, measurements: Measurements, options: Options, *, failed: bool) -> None:
     """Let terms join while the readings show any; then bound what is left."""
     left: list[Explanation] = []
-    alone = _turned_alone(found.solved, measurements, options, failed=failed)
-    for _ in range(0 if alone else MAX_JOINED + 1):
+    for _ in range(MAX_JOINED + 1):
         left = _explanations(found.solved, failed=failed)
         first = [item for item in left if item.rank == 0 and item.name in START]
         if not first or not _join(found, first, measurements, options):
@@ -235,7 +244,6 @@ def _search(found: _Found, measurements: Measurements, options: Options, *, fail
         failed = False
     for item in left:
         _bound(found, item, measurements)
-    _rotation(found, measurements, options)
     if (line := line_cause(_model(found.solved).problem, measurements, LEVEL)) is not None:
         found.causes.append(line)
         found.effects.append(effect_of_line(line, measurements.artifact))
@@ -268,7 +276,8 @@ def _counts(found: Explanation, solved: Solved) -> bool:
     u = np.concatenate([emap.u_gx[emap.valid], emap.u_gy[emap.valid]])
     if not np.isfinite(u).any():
         return True
-    return found.effect_m > MATTERS * rms(u)
+    return (found.effect_m > MATTERS * rms(u)
+            or found.effect_rad > MATTERS * rms(emap.u_g_theta))
 
 
 def solved_with(measurements: Measurements, options: Options,
@@ -286,6 +295,7 @@ def _join(found: _Found, first: list[Explanation], measurements: Measurements,
 
     Return whether it did.
     """
+    ground = _model(found.solved).problem.ground
     names = [*found.joined, first[0].name]
     solved = solved_with(measurements, options, [ModelTerm(TermName(n), START[n]) for n in names])
     if solved is None or not any(test.name == first[0].name and test.contradicted
@@ -297,77 +307,65 @@ def _join(found: _Found, first: list[Explanation], measurements: Measurements,
         twin = solved_with(measurements, options, starts)
         if twin is not None:
             found.effects.append(difference(other.name, twin.result, solved.result))
-    found.causes += [_cause(found.solved, item) for item in first]
+    found.causes += [cause_of(item, ground) for item in first]
     found.solved, found.joined = solved, names
-    found.causes[-len(first)] = _fitted_cause(solved, first[0])
+    found.causes[-len(first)] = cause_of(held_by(
+        _model(solved), first[0].name, first[0].p, whole=first[0].whole), ground)
     return True
 
 
-def _cause(solved: Solved, item: Explanation) -> Cause:
-    ground = _model(solved).problem.ground
-    names = ground.line_names if item.name == TermName.LINE_ECCENTRICITY else ground.names
-    return cause_of(item, names, _model(solved).problem.half_width_m)
+def _raised_cause(solved: Solved, test: SizeTest) -> Cause | None:
+    """Return a size that the readings contradict as a cause; None where it is of no account."""
+    term = next(term for term in solved.result.model.terms if term.name == test.name)
+    parts = enlargements(solved.result, [term.name], [])
+    u = rms(np.stack([solved.result.error_map.u_gx, solved.result.error_map.u_gy]))
+    of = {"m": u, "rad": rms(solved.result.error_map.u_g_theta)}
+    # what no reading tells of it is in the uncertainty, as far as that is known
+    little = bool(parts) and all(part.u_rms < MATTERS * of[part.unit] for part in parts)
+    held = held_by(_model(solved), term.name, test.p,
+                   whole=little or test.rank == len(term.estimates))
+    if not _counts(held, solved):
+        return None
+    if test.name is TermName.ROTATION and abs(
+            (cause := cause_of(held, _model(solved).problem.ground)).size) > SURE * cause.u:
+        return cause  # else the readings do not tell which view it is
+    return size_cause(test, term.estimates)
 
 
-def _fitted_cause(solved: Solved, item: Explanation) -> Cause:
-    """Return the cause as the solution that holds it finds it: within the size that it has."""
-    model = _model(solved)
-    if model.equations is None:
-        raise ValueError(f"the solution does not hold {item.name}")
-    equations = equations_of(model.problem, model.found, model.equations.columns, model.reduced)
-    rows = equations.rows([item.name])
-    values = np.where(rows, model.coefficients, 0.0)
-    moved = equations.maps @ values
-    known = max(int(model.problem.system.known_sites.sum()), 1)
-    covariance = model.covariance[np.ix_(rows, rows)] * model.found.xy.sigma**2
-    columns = tuple(c for c, here in zip(equations.columns.columns, rows, strict=True) if here)
-    return _cause(solved, replace(
-        item, columns=columns, values=model.coefficients[rows], covariance=covariance,
-        effect_m=float(np.sqrt((abs(moved) ** 2).sum() / (2 * known))), moved=moved))
+def _as_a_microscope(found: _Found, measurements: Measurements, options: Options) -> bool:
+    """Return whether a microscope of another scale explains as well that lines turn.
+
+    It is a cause then, and enlarges the uncertainty by what it would do, unless that is little.
+    """
+    known = next((term for term in options.model_terms(visits=True)
+                  if term.name is TermName.MICROSCOPE and not term.free), None)
+    if known is None:
+        return False
+    wider = known.scaled(max(PLAUSIBLE[TermName.MICROSCOPE] / known.size, 1.0))
+    twin = solved_with(measurements, options, [wider])
+    if twin is None or any(test.contradicted for test in _model(twin).sizes):
+        return False
+    held = held_by(_model(twin), known.name)
+    effect = difference(str(known.name), twin.result, found.solved.result)
+    if not _counts(replace(held, effect_m=rms(effect.xy), effect_rad=rms(effect.theta)),
+                   found.solved):
+        return False
+    found.causes.append(cause_of(held, _model(twin).problem.ground))
+    found.effects.append(effect)
+    return True
 
 
 def _bound(found: _Found, item: Explanation, measurements: Measurements) -> None:
     """Take up what did not join: its effect on the map is known as far as the readings tell."""
     model = _model(found.solved)
-    cause = _cause(found.solved, item)
+    cause = cause_of(item, model.problem.ground)
     if cause.name in [known.name for known in found.causes] and cause.name in START:
         return
     found.causes.append(cause)
     found.bounded &= item.whole
-    if item.moved is not None:
+    if item.moved is not None and item.turned is not None:
         field = item.moved.reshape(model.problem.system.grid.views.shape)
-        found.effects.append(effect_of_field(item.name, field, measurements.sense,
-                                             measurements.artifact.angular_count))
-
-
-def _turned_alone(solved: Solved, measurements: Measurements, options: Options, *,
-                  failed: bool) -> bool:
-    """Return whether lines turned against marks are all there is: they bend what marks leave."""
-    if rotation_cause(_model(solved), LEVEL) is None:
-        return False
-    apart = solved_apart(measurements, options)
-    return apart is None or not _explanations(
-        apart, failed=failed or bends(solved.result, apart.result, MATTERS))
-
-
-def _rotation(found: _Found, measurements: Measurements, options: Options) -> None:
-    """Take up rotations that marks and lines of a view do not share.
-
-    What spoils the marks turns them as well: a rotation is the cause where nothing else is.
-    """
-    turned = rotation_cause(_model(found.solved), LEVEL)
-    if turned is None:
-        return
-    terms = [ModelTerm(TermName(name), START[name]) for name in found.joined]
-    apart = solved_apart(measurements, replace(options, terms=_merged(options.terms, terms)))
-    if apart is None:
-        found.causes.append(turned)
-        found.bounded = False
-        return
-    if bends(found.solved.result, apart.result, MATTERS):
-        found.causes.append(turned)
-        found.effects.append(difference(turned.name, found.solved.result, apart.result))
-        found.bounded &= abs(turned.size) < turns_apart(found.solved.result, measurements) / 2
+        found.effects.append(effect_of_field(item.name, field, measurements.sense, item.turned))
 
 
 def _noisy_views(found: _Found, measurements: Measurements) -> None:

@@ -37,7 +37,7 @@ UM, RATIO = Unit(UM_PER_M, "µm"), Unit(PPM_PER_ONE, "µm/m")
 MRAD, PERCENT = Unit(MRAD_PER_RAD, "mrad"), Unit(100.0, "%")
 ARCSEC, URAD = Unit(ARCSEC_PER_RAD, "arcsec"), Unit(URAD_PER_RAD, "µrad")
 
-_OF_SIZES = {TermName.MICROSCOPE: MRAD, TermName.LINE_ECCENTRICITY: URAD}
+_OF_SIZES = {TermName.MICROSCOPE: MRAD, TermName.LINE_ECCENTRICITY: URAD, TermName.ROTATION: URAD}
 """Unit in which a person reads the coefficients of a term; by the SI unit for the others."""
 
 
@@ -113,7 +113,7 @@ _CAUSES: dict[str, Words] = {
     "slip": lambda c, of: (
         f"a plate that slipped by {_slipped(of)} after about {of['after']:.0%} of view "
         f"'{c.view}'"),
-    "rotation": lambda c, of: (
+    TermName.ROTATION: lambda c, of: (
         f"lines turned {_either(c, 'counter-clockwise', 'clockwise')} by {plus_minus(c, ARCSEC)} "
         f"relative to the marks in view '{c.view}'"),
     "reading": lambda c, of: (
@@ -135,8 +135,8 @@ _ACTIONS = {
     TermName.LINE_ECCENTRICITY: "centre the circle of lines on the axis of rotation in each view",
     TermName.APPROACH: "approach each mark from the same side",
     "slip": "measure the view again, or solve with --robust",
-    "rotation": "check whether the plate moved between marks and lines, and the sign of the "
-                "lines' offsets",
+    TermName.ROTATION: "check whether the plate moved between marks and lines, and the sign of "
+                       "the lines' offsets",
     "reading": "solve with --robust, or measure it again",
     "off_sites": "place the plate closer to its nominal pose, or send the stage to the sites",
     "noise": "measure the view again, and look for a source of vibration"}

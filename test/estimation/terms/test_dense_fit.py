@@ -25,8 +25,8 @@ MODELS = {
     "none": "",
     "assumed": ",".join(map(str, DEFAULT_TERMS)),
     "sized": "microscope:0.01:0.02:0.001,drift:5e-8,plate_scale:3e-7,plate_shape:2e-8,"
-             "approach:3e-8,plate_strain:2e-7,line_eccentricity:3e-6",
-    "free": "microscope,drift,plate_scale,approach",
+             "approach:3e-8,plate_strain:2e-7,line_eccentricity:3e-6,rotation:1e-6",
+    "free": "microscope,drift,plate_scale,approach,rotation",
     "mixed": "microscope:0:0.01:0.002,drift,plate_scale:1e-7,approach,line_eccentricity:2e-6"}
 MACHINE = Spread(
     microscope_rotation_rad=4e-3, microscope_scale=-5e-3,

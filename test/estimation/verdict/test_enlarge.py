@@ -44,9 +44,11 @@ def effects_of(result):
 
 
 def test_a_field_of_a_moved_plate_is_that_of_the_opposite_place_with_the_other_sign():
-    ahead = effect_of_field("slip", FIELD, Sense.MICROSCOPE_MOVES, 8)
-    back = effect_of_field("slip", FIELD, Sense.PLATE_MOVES, 8)
-    assert not ahead.theta.any() and ahead.theta.shape == (8,)
+    lines = np.arange(8.0)
+    ahead = effect_of_field("slip", FIELD, Sense.MICROSCOPE_MOVES, lines)
+    back = effect_of_field("slip", FIELD, Sense.PLATE_MOVES, lines)
+    np.testing.assert_array_equal(ahead.theta, lines)
+    np.testing.assert_array_equal(back.theta, [0, -7, -6, -5, -4, -3, -2, -1])
     np.testing.assert_array_equal(ahead.xy, [FIELD.real, FIELD.imag])
     assert back.xy[0, 0, 0] == -FIELD[4, 2].real and back.xy[1, 4, 0] == -FIELD[0, 2].imag
     np.testing.assert_array_equal(back.xy, [-FIELD.real[::-1, ::-1], -FIELD.imag[::-1, ::-1]])

@@ -121,7 +121,8 @@ def test_at_most_four_causes_are_named_the_likeliest_first():
     names = ["a", "b", "c", "d", "e", "f"]
     equations = SimpleNamespace(
         information=np.eye(6), norm=np.ones(6), limit=lambda rows: 1e-9, maps=np.zeros((4, 6)),
-        projected=SimpleNamespace(gram=np.eye(6)), system=SimpleNamespace(known_sites=np.ones(4)),
+        turned=np.zeros((3, 6)), projected=SimpleNamespace(gram=np.eye(6)),
+        system=SimpleNamespace(known_sites=np.ones(4), known_lines=np.ones(3)),
         columns=SimpleNamespace(columns=tuple(names)))
     parts = np.arange(1.0, 7.0) * 1e-6
     many = Pool(equations, Score(parts, np.zeros(6), Sums(

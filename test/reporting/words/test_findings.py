@@ -6,6 +6,7 @@ import json
 import math
 import re
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -30,6 +31,7 @@ from test.support.sources import PACKAGE
 
 ARCSEC_RAD = math.pi / 648_000
 NAMES = ("0", "90", "+x")
+GROUND = SimpleNamespace(names=NAMES, line_names=NAMES, half_width_m=0.05)
 MICROSCOPE = ("scale", "turn", "stretch", "shear")
 ALIGN = "align the microscope, or have the stage stop next to the marks deliberately (check_stops)"
 CLAMP = "support the plate without strain"
@@ -107,7 +109,7 @@ def strained(part, size):
      "a reading of mark (-2, 5) in view '+x' that is off by 0.500 ± 0.010 µm: solve with --robust, "
      "or measure it again", 5e-7, 1e-8, "m")])
 def test_a_cause_in_words(found, text, size, u, unit):
-    cause = cause_of(found, NAMES, 0.05)
+    cause = cause_of(found, GROUND)
     assert (cause.name, sentence_of(cause), cause.unit, cause.p) == (found.name, text, unit, 1e-6)
     assert (cause.size, cause.u) == pytest.approx((size, u), rel=1e-12)
 
@@ -253,7 +255,7 @@ def test_every_finding_of_the_package_has_its_words_and_no_words_are_left_over()
 def test_a_remedy_that_was_tried_comes_first_and_a_view_is_for_programs():
     found = explanation("drift", [(1, "x P1")], [1e-8], 1e-9)
     tried = (Remedy("model", "drift:2e-08"), Remedy("view", "90"))
-    cause = replace(cause_of(found, NAMES, 0.05), remedies=tried)
+    cause = replace(cause_of(found, GROUND), remedies=tried)
     assert sentence_of(cause) == (
         "a drift of 0.0200 ± 0.0020 µm along x during view '90': solve with --model drift:2e-08, "
         "or visit the marks there and back")
@@ -270,7 +272,8 @@ def saved_and_read(result):
 def test_a_view_with_a_colon_in_its_name_cuts_no_sentence_of_a_saved_result():
     """Whatever a view is called: what a cause is, and what to do, come from the data."""
     found = explanation("plate_scale", [(1, ""), (2, "")], [1e-7, 2e-6], 1e-7)
-    cause = replace(cause_of(found, ("0: first", "90", ODD), 0.05), remedies=(
+    cause = replace(cause_of(found, SimpleNamespace(
+        names=("0: first", "90", ODD), half_width_m=0.05)), remedies=(
         Remedy("model", "plate_scale:3e-06"), Remedy("view", ODD)))
     what = (f"a plate larger by 2.00 ± 0.10 µm/m in view '{ODD}' than in view '0: first'")
     noisy = Finding("noisy_view", 2.26, unit="m/m", view=ODD)
