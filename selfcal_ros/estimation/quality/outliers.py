@@ -196,9 +196,10 @@ def _without_slips(measurements: Measurements, options: Options, linear: Options
             if not done:
                 return at
             continue
-        at = replace(at, notes=(*at.notes, replace(
-            cause, name="taken_for_slip", details={
-                **(cause.details or {}), "cause": cause.name, "slip_in": slip.view})))
+        at = replace(at, notes=(*at.notes, Finding(
+            "taken_for_slip", cause.size, cause.u, cause.unit, cause.p, cause.view, cause.axis,
+            cause.mark, {**(cause.details or {}), "cause": cause.name, "told": cause.told,
+                         "slip_in": slip.view})))
         options = replace(options, terms=(*options.terms, ModelTerm(TermName(cause.name))))
         try:
             flattened = _flattened(at.measurements, options)

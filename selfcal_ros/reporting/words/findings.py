@@ -194,8 +194,8 @@ SENTENCES: dict[str, Words] = {
     "slip_found": lambda f, of: _slip_found(f, of),
     "taken_for_slip": lambda f, of: (
         f"view '{of['slip_in']}' looks as if the plate slipped, but the readings show "
-        f"{what_it_is(replace(f, name=of['cause']))}, which explains them better: no view was "
-        "split"),
+        + what_it_is(Cause(**{**vars(f), "name": of["cause"], "told": of.get("told", True)}))
+        + ", which explains them better: no view was split"),
     "slips_given_up": lambda f, of: (
         f"gave up on slips after {of['slips']}: the readings seem to contain more; measure again"),
     # why readings held out were not predicted, or not judged
