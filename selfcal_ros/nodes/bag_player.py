@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""bag_player: replays a bag onto the graph."""
+"""bag_player: plays a bag into the ROS graph."""
 
 import sys
 import time
@@ -15,11 +15,11 @@ from selfcal_ros.nodes.running import run
 from selfcal_ros.sessions.ports import Diagnosis, Level
 
 STALLED_S = 2.0
-"""Time after which a listener that takes nothing more is a warning."""
+"""Time after which a listener that takes no further messages is a warning."""
 
 
 class BagPlayer(SelfcalNode[PlayerSettings]):
-    """Plays one bag, says what it sent, and ends."""
+    """Play one bag, report the messages sent, and end."""
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__(PlayerSettings, **kwargs)
@@ -35,7 +35,7 @@ class BagPlayer(SelfcalNode[PlayerSettings]):
         self.every(0.002, self._step)
 
     def diagnosis(self) -> Diagnosis:
-        """Return how far it is, and for whom it waits."""
+        """Return the progress, and the node it waits for."""
         level, line = Level.OK, "playing"
         if not self._started:
             level, line = Level.WARN, f"waiting for {self.player.listener}"

@@ -18,7 +18,7 @@ from selfcal_ros.sessions.ports import Diagnosis, Level
 
 
 class BagRecorder(SelfcalNode[RecorderSettings]):
-    """Records what arrives, as it arrives; what was recorded survives a crash."""
+    """Record messages as received; the bag survives a crash."""
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__(RecorderSettings, **kwargs)
@@ -46,7 +46,7 @@ class BagRecorder(SelfcalNode[RecorderSettings]):
             self._fail(error)
 
     def _fail(self, error: InputError) -> None:
-        """Record no more: after a write that was cut off, what follows could not be read."""
+        """Stop recording: after an incomplete write, later messages could not be read."""
         self._failed, self._unrecorded = str(error), self._unrecorded + 1
         self.say(Level.ERROR, f"recording has ended: {error}; what was recorded is readable, "
                  "start anew in another folder")
@@ -59,7 +59,7 @@ class BagRecorder(SelfcalNode[RecorderSettings]):
                 self._fail(error)
 
     def diagnosis(self) -> Diagnosis:
-        """Return what was recorded, or why nothing is any more."""
+        """Return the number of recorded messages, or why recording has ended."""
         if self._failed:
             return Diagnosis(Level.ERROR, f"recording has ended: {self._failed}",
                              self._writer.counts | {"unrecorded": self._unrecorded})

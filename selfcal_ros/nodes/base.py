@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What all nodes share: checked parameters, ports for the session, guarded callbacks, health."""
+"""Base of all nodes: checked parameters, ports for the session, guarded callbacks, health."""
 
 import time
 from collections.abc import Callable
@@ -23,17 +23,17 @@ from selfcal_ros.sessions.clocks import RosTime
 from selfcal_ros.sessions.health import Losses, Refusals, merged
 from selfcal_ros.sessions.ports import Diagnosis, Level, Ports
 
-BEAT_S = 1.0  # from one telling of the health to the next
+BEAT_S = 1.0  # between two health messages
 
 
 class NodeBase[S: Settings](Answering):
-    """A node of rclpy with parameters from the package's one table, and health once a second.
+    """A node of rclpy with parameters from the package's table, and health once a second.
 
-    Work and health follow a steady clock: a simulated or stepped ROS time does not stop them.
+    Work and health use a steady clock: a simulated or stepped ROS time does not stop them.
     """
 
     def prepare(self, kind: type[S]) -> None:
-        """Check the parameters and begin to tell the health.
+        """Check the parameters and start publishing health.
 
         Raises
         ------
@@ -48,7 +48,7 @@ class NodeBase[S: Settings](Answering):
         try:
             self._take_parameters(kind)
         except InputError:
-            self.destroy_node()  # or its name stays in the graph until garbage is looked for
+            self.destroy_node()  # otherwise its name stays in the graph until garbage collection
             raise
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._health = self.publisher(private(HEALTH))
@@ -57,7 +57,7 @@ class NodeBase[S: Settings](Answering):
     def _take_parameters(self, kind: type[S]) -> None:
         overrides = {key: value.value for key, value in self._parameter_overrides.items()}
         self.settings = kind.checked(overrides, f"parameters of {kind.NODE}")
-        for parameter in kind.parameters():  # the checked value: 2 is a good 2.0 here
+        for parameter in kind.parameters():  # the checked value: 2 is accepted as 2.0
             self.declare_parameter(parameter.name, getattr(self.settings, parameter.name),
                                    descriptor(parameter), ignore_override=True)
         for key in (key for key, value in overrides.items() if value is True):
@@ -70,19 +70,19 @@ class NodeBase[S: Settings](Answering):
                         self.destroy_publisher)
 
     def output(self, topic: Topic) -> Callable[[dict[str, Any]], None]:
-        """Return what publishes the fields of a message on `topic`."""
+        """Return a function that publishes the fields of a message on `topic`."""
         publisher = self.publisher(topic)
         return lambda fields: publisher.publish(fill(topic.type(), fields))
 
     def subscribe(self, topic: Topic, callback: Callable[..., None], **kwargs: Any) -> Any:
-        """Subscribe `callback` to `topic`; what it raises is counted and does not end the node."""
+        """Subscribe `callback` to `topic`; its exceptions are counted and do not end the node."""
         name = self.resolve_topic_name(topic.name)
         guarded = callback if hasattr(callback, "__signature__") else self.guarded(
             callback, topic.name)
         self._heard_on[name] = topic
 
         def lost(event: Any) -> None:
-            if topic.qos.depth > 1:  # else only the newest is wanted: the others are no loss
+            if topic.qos.depth > 1:  # otherwise only the newest is used: the others are not lost
                 self.losses.add(topic.name, event.total_count_change)
         events = SubscriptionEventCallbacks(message_lost=lost)
         return self.own(self.create_subscription(
@@ -91,9 +91,9 @@ class NodeBase[S: Settings](Answering):
 
     def subscribe_with_age(self, topic: Topic, callback: Callable[[Any, bool], None],
                            **kwargs: Any) -> Any:
-        """Subscribe `callback`; its second argument says if the message is older than this call.
+        """Subscribe `callback`; its second argument is whether the message is older than this call.
 
-        Only a latched message can be: it was published before this node listened.
+        Only a latched message, published before the subscription, can be.
         """
         began_ns = time.time_ns()
 
@@ -104,29 +104,29 @@ class NodeBase[S: Settings](Answering):
         return self.subscribe(topic, WithInfo(self.guarded(call, topic.name)), **kwargs)
 
     def every(self, seconds: float, callback: Callable[[], None]) -> Timer:
-        """Call `callback` every so many seconds of a steady clock, which no other timer has.
+        """Call `callback` periodically, in seconds of a steady clock used by no other timer.
 
-        For each timer that is added or reset the events executor of rclpy 7.1 calls, once more,
-        every timer of the same clock that is due, and each call puts off the next by a period:
-        the health of a node that starts slowly would be told three times, and then not for 3 s.
+        For each timer that is added or reset the events executor of rclpy 7.1 calls again
+        every due timer of the same clock, and each call delays the next by a period:
+        the health of a node that starts slowly would be published three times, then not for 3 s.
         """
         timer = self.create_timer(seconds, self.guarded(callback),
                                   clock=Clock(clock_type=ClockType.STEADY_TIME))
         return self.own(timer, self.destroy_timer)
 
     def own(self, entity: Any, destroy: Callable[[Any], Any]) -> Any:
-        """Return `entity`; a managed node notes how to take it down."""
+        """Return `entity`; a managed node registers it for destruction."""
         return entity
 
     def ports(self, publish: Callable[[str, dict[str, Any]], None]) -> Ports:
-        """Return what a session needs of this node; `publish` takes its outputs."""
+        """Return the ports of this node for a session; `publish` takes its outputs."""
         return Ports(publish, self.say, time.monotonic,
                      lambda: self.get_clock().now().nanoseconds)
 
     def say(self, level: Level, line: str) -> None:
         """Write one line to the log."""
         logger, line = self.get_logger(), printable(line)
-        if level == Level.OK:  # a line each: rclpy tells call sites apart by their place
+        if level == Level.OK:  # a line each: rclpy distinguishes call sites by their location
             logger.info(line)
         elif level == Level.WARN:
             logger.warning(line)
@@ -134,11 +134,11 @@ class NodeBase[S: Settings](Answering):
             logger.error(line)
 
     def diagnosis(self) -> Diagnosis:
-        """Return what this node has to say of itself."""
+        """Return the diagnosis of this node."""
         return Diagnosis(Level.OK, "running")
 
     def report(self) -> None:
-        """Tell the health of this node."""
+        """Publish the health of this node."""
         graph = [mismatched(self, self._heard_on), others_publishing(self, self.alone_on)]
         clock = self._ros_time.look(simulated=self.get_parameter("use_sim_time").value,
                                     now_ns=self.get_clock().now().nanoseconds)
@@ -146,7 +146,7 @@ class NodeBase[S: Settings](Answering):
             self.refusals.diagnosis(), self.losses.diagnosis(), clock, *graph]))
 
     def diagnose(self, diagnosis: Diagnosis) -> None:
-        """Publish one diagnostic status of this node, for everybody and for its companions."""
+        """Publish a diagnostic status of this node, on /diagnostics and on its health topic."""
         stage = self.settings.hardware_id or self.get_namespace().strip("/") or "stage"
         status = status_of(diagnosis, self.get_fully_qualified_name().lstrip("/"), stage)
         array_message = DiagnosticArray(status=[status])
@@ -156,7 +156,7 @@ class NodeBase[S: Settings](Answering):
 
 
 class SelfcalNode[S: Settings](NodeBase[S]):
-    """A node that works from its construction on.
+    """A node that is active from its construction.
 
     Parameters
     ----------

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The action run_calibration: a whole plan, and the map saved at its end."""
+"""The action run_calibration: a whole plan, with the map saved at its end."""
 
 import time
 from typing import Any
@@ -19,14 +19,14 @@ from selfcal_ros.sessions.sequencing import SequencingSession, load_plan
 
 
 class CalibrationAction:
-    """Serves run_calibration for a sequencer: one goal at a time.
+    """Serve run_calibration for a sequencer: one goal at a time.
 
     Parameters
     ----------
     node : ManagedNode
-        The sequencer's node, in activation.
+        The sequencer's node, during activation.
     session : SequencingSession
-        What runs the plan.
+        Runs the plan.
     """
 
     def __init__(self, node: ManagedNode[SequencerSettings], session: SequencingSession) -> None:
@@ -44,7 +44,7 @@ class CalibrationAction:
             ActionServer.destroy)
 
     def tick(self) -> None:
-        """Give feedback; see to a cancelled goal and to a solver that does not answer."""
+        """Give feedback; handle a cancelled goal and a solver that does not answer."""
         if self._goal is None:
             return
         if self._goal.is_cancel_requested and not self._session.ended:
@@ -104,7 +104,7 @@ class CalibrationAction:
         goal.succeed() if answer.success else goal.abort()
 
     async def _save(self, path: str) -> Any:
-        """Return the solver's answer; NoDataError if there is none in time."""
+        """Return the solver's answer; NoDataError after a time-out."""
         if not self._saver.service_is_ready():
             raise NoDataError("run_calibration", "no solver is running", "start one, then save_map")
         patience = self._node.settings.save_timeout

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Callbacks as rclpy calls them: guarded, so that none of them ends a node."""
+"""Guarded callbacks of rclpy: none of them ends a node."""
 
 import inspect
 from collections.abc import Callable, Iterator
@@ -17,16 +17,16 @@ from selfcal_ros.errors import as_answer
 from selfcal_ros.sessions.health import Refusals
 
 TASKS = ("execute", "_execute_goal", "_send_result_response")
-"""Methods of events and actions of rclpy that an executor runs as tasks."""
+"""Methods of events and actions of rclpy run as tasks by an executor."""
 
 
 class WithInfo:
-    """A callback that takes a message and its info, whatever parameters it shows itself.
+    """A callback that takes a message and its info, whatever its own signature.
 
     Parameters
     ----------
     call : callable
-        Takes what arrives.
+        Takes the message and its info.
     """
 
     __signature__ = inspect.signature(lambda message, info: None)
@@ -40,7 +40,7 @@ class WithInfo:
 
 
 class Guarded(Node):
-    """A node that no callback ends: what one raises is counted in `refusals` and logged.
+    """A node that no callback ends: exceptions are counted in `refusals` and logged.
 
     The node's own callbacks are guarded where they are registered. The services of rclpy
     (parameters, lifecycle, types), its subscription to ``/clock`` and its tasks of actions and
@@ -50,7 +50,7 @@ class Guarded(Node):
     refusals: Refusals
 
     def guarded(self, callback: Callable[..., Any], place: str = "") -> Callable[..., Any]:
-        """Return `callback` with whatever it raises counted and logged instead of raised."""
+        """Return `callback` with exceptions counted and logged instead of raised."""
         place = place or getattr(callback, "__name__", "callback").strip("_")
         if inspect.iscoroutinefunction(callback):
             @wraps(callback)
@@ -73,7 +73,7 @@ class Guarded(Node):
 
     @property
     def services(self) -> Iterator[Service]:
-        """The services, each answering with a failure where its callback raises."""
+        """The services, answering with a failure if their callback raises."""
         for service in super().services:
             if not hasattr(service.callback, "__wrapped__"):
                 self._guard(service)
@@ -81,7 +81,7 @@ class Guarded(Node):
 
     @property
     def subscriptions(self) -> Iterator[Subscription]:
-        """The subscriptions, those of rclpy guarded."""
+        """The subscriptions, with those of rclpy guarded."""
         for item in super().subscriptions:
             if not any(hasattr(item.callback, name) for name in ("__wrapped__", "__signature__")):
                 item.callback = self.guarded(item.callback, item.topic)
@@ -112,7 +112,7 @@ class Guarded(Node):
 
 
 def failed(request: Any, response: Any, error: Exception) -> Any:
-    """Return `response` with `error` as the reason where its type has a field for one."""
+    """Return `response` with `error` as the reason, if its type has a field for it."""
     result = SetParametersResult(successful=False, reason=as_answer(error)[1])
     if isinstance(response, SetParameters.Response):
         response.results += [result] * (len(request.parameters) - len(response.results))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The node of `selfcal cell check`: plays sequencer and collector for one short run.
+"""The node of `selfcal cell check`: acts as sequencer and collector for one short run.
 
 Run as a process: ``python -m selfcal_ros.nodes.cell_checker PLAN.yaml SETTLE_S PATIENCE_S``. It
 takes the parameters of measurement_collector, and writes a line of JSON to stdout for each
@@ -27,7 +27,7 @@ from selfcal_ros.sessions.sequencing import load_plan
 
 
 class CellChecker(SelfcalNode[CollectorSettings]):
-    """Commands a cell as a sequencer does and judges what it sends."""
+    """Command a cell like a sequencer and check its messages."""
 
     def __init__(self, plan: Plan, *, settle_s: float, patience_s: float, **kwargs: Any) -> None:
         super().__init__(CollectorSettings, **kwargs)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""compensator: true positions from indicated ones, by the calibrated error map."""
+"""compensator: true positions from indicated ones with the calibrated error map."""
 
 import sys
 from typing import Any
@@ -14,7 +14,7 @@ from selfcal_ros.sessions.ports import Diagnosis
 
 
 class CompensatorNode(ManagedNode[CompensatorSettings]):
-    """Publishes stage/corrected_joint_states: each sample with the stage's error taken off."""
+    """Publish stage/corrected_joint_states: each sample without the stage's error."""
 
     session = WhileConfigured[CompensatingSession]()
     _input = WhileConfigured[ByTheClock]()
@@ -24,13 +24,13 @@ class CompensatorNode(ManagedNode[CompensatorSettings]):
         super().__init__(CompensatorSettings, **kwargs)
 
     def configure(self) -> None:
-        """Make the session, with the map of a file if one is named."""
+        """Create the session, with the map of a file if named."""
         self.session = CompensatingSession(self.settings, self.ports(lambda *_: None))
         self._corrected = self.publisher(names.CORRECTED)
         self.alone_on += [names.CORRECTED.name]
 
     def activate(self) -> None:
-        """Listen to the maps and to the encoder."""
+        """Subscribe to the maps and to the encoder."""
         self.subscribe(names.SUMMARY, self.session.take_summary)
         self.subscribe(names.ERROR_MAP, self.session.take_map)
         self._input = ByTheClock(names.ENCODER.name, self.session.receive,
@@ -38,13 +38,13 @@ class CompensatorNode(ManagedNode[CompensatorSettings]):
         self._encoder = self.subscribe(names.ENCODER_NEWEST, self._input, raw=True)
 
     def _on_samples(self) -> None:
-        """Correct what has come: the first sample of it calls, the others are taken here."""
+        """Correct waiting samples: called for the first one, which takes the others."""
         with self._encoder.handle:
             missing = self._input.empty(self._encoder, names.ENCODER_NEWEST.qos.depth)
         self.session.correct_waiting(missing.lost, self._corrected.publish)
 
     def diagnose_session(self) -> Diagnosis:
-        """Return what the session says."""
+        """Return the diagnosis of the session."""
         return self.session.diagnosis()
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What ROS tells of a parameter: description, unit, bounds, choices."""
+"""ROS descriptors of parameters: description, unit, bounds, choices."""
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 
@@ -7,7 +7,7 @@ from selfcal_ros.collection.settings.parameter import Parameter
 
 
 def descriptor(parameter: Parameter) -> ParameterDescriptor:
-    """Return the descriptor of a parameter; nobody changes one while the node runs."""
+    """Return the descriptor of a parameter, read-only while the node runs."""
     unit = f" [{parameter.unit}]" if parameter.unit else ""
     told = ParameterDescriptor(description=parameter.description + unit, read_only=True)
     if parameter.choices:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The subscription to the encoder, as its publishers offer it at the moment."""
+"""The subscription to the encoder, matching the present offers of its publishers."""
 
 from collections.abc import Callable
 from typing import Any
@@ -11,9 +11,9 @@ from selfcal_ros.nodes.base import NodeBase
 
 
 class EncoderInput:
-    """Hears the encoder reliably if all its publishers are reliable, else with best effort.
+    """Subscribe reliably if all publishers of the encoder are reliable, else with best effort.
 
-    It is looked at ten times a second: a driver may come late, or come back with another offer.
+    Checked ten times a second: a driver may appear late, or return with another offer.
     """
 
     def __init__(self, node: NodeBase, callback: Callable[[Any], None], **kwargs: Any) -> None:
@@ -38,7 +38,7 @@ class EncoderInput:
         self._subscription = self._node.subscribe(topic, self._callback, **self._kwargs)
 
     def close(self) -> None:
-        """Hear the encoder no longer."""
+        """End the subscription."""
         if self._subscription is not None:
             self._node.destroy_subscription(self._subscription)
         self._subscription = None

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Messages of rclpy from plain nested dicts, and back to what sessions understand."""
+"""Messages of rclpy from plain nested dicts, and back to the types of sessions."""
 
 import array
 from typing import Any
@@ -20,7 +20,7 @@ def fill(message: Any, fields: dict[str, Any]) -> Any:
             current = getattr(message, name)
             if isinstance(current, array.array):
                 code = current.typecode
-                fits = np.can_cast(value.dtype, code)  # otherwise `array` looks at each number
+                fits = np.can_cast(value.dtype, code)  # otherwise `array` checks each number
                 value = array.array(code, value.astype(code).tobytes() if fits else value.tolist())
             setattr(message, name, value)
         else:
@@ -29,7 +29,7 @@ def fill(message: Any, fields: dict[str, Any]) -> Any:
 
 
 def status_of(diagnosis: Diagnosis, name: str, hardware_id: str) -> DiagnosticStatus:
-    """Return the status message of a diagnosis; what a terminal would obey is made visible."""
+    """Return the status message of a diagnosis; control characters are made visible."""
     return DiagnosticStatus(
         level=bytes([diagnosis.level]), name=name, message=printable(diagnosis.message),
         hardware_id=printable(hardware_id),

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Managed nodes: configured, activated and taken down in steps, by themselves or by a manager."""
+"""Managed nodes: configured, activated and cleaned up in steps, by themselves or by a manager."""
 
 import traceback
 from collections.abc import Callable
@@ -17,16 +17,16 @@ from selfcal_ros.sessions.ports import Diagnosis, Level
 
 
 class WhileConfigured[T]:
-    """An attribute of a managed node that exists from its configuring to its taking down.
+    """An attribute of a managed node that exists only while it is configured.
 
-    Read at another time it raises SelfcalError: no code of a node has to ask if there is one.
+    Read at another time it raises SelfcalError, so that nodes need not check for it.
     """
 
     def __set_name__(self, owner: type, name: str) -> None:
         self._name = name
 
     def __get__(self, node: "ManagedNode", owner: type) -> T:
-        """Return what `configure` or `activate` has set."""
+        """Return the value set by `configure` or `activate`."""
         try:
             return node.held[self._name]
         except KeyError:
@@ -34,21 +34,21 @@ class WhileConfigured[T]:
                                f"{node.state}; configure the node first") from None
 
     def __set__(self, node: "ManagedNode", value: T) -> None:
-        """Hold `value` until the node is taken down."""
+        """Keep `value` until the node is cleaned up."""
         node.held[self._name] = value
 
 
 def stop(worker: Executor) -> None:
-    """Let a worker go; what still runs in it is not waited for."""
+    """Release a worker without waiting for its present task."""
     worker.shutdown(wait=False, cancel_futures=True)
 
 
 class ManagedNode[S: ManagedSettings](NodeBase[S], LifecycleNode):
-    """A lifecycle node whose errors in transitions are told, and which leaves nothing behind.
+    """A lifecycle node that reports errors in transitions and leaves nothing behind.
 
-    `configure` makes the session and what it publishes on, `activate` what it hears, answers and
-    does by the clock. Deactivated, it keeps its session and its latched messages; cleaned up,
-    nothing. An error in a transition is logged, told in the health at level ERROR, and leads
+    `configure` creates session and publishers, `activate` subscriptions, services and timers.
+    Deactivated, it keeps its session and its latched messages; cleaned up,
+    nothing. An error in a transition is logged, in the health at level ERROR, and leads
     through the state of error processing to ``unconfigured``.
 
     Parameters
@@ -70,17 +70,17 @@ class ManagedNode[S: ManagedSettings](NodeBase[S], LifecycleNode):
         change.callback = partial(self._change_state, change.callback)
 
     def configure(self) -> None:
-        """Make the session and the publishers."""
+        """Create the session and the publishers."""
 
     def activate(self) -> None:
-        """Make subscriptions, services and timers."""
+        """Create subscriptions, services and timers."""
 
     def diagnose_session(self) -> Diagnosis:
-        """Return what the session has to say; asked in the state ``active`` only."""
+        """Return the diagnosis of the session; called in the state ``active`` only."""
         return Diagnosis(Level.OK, "running")
 
     def autostart(self) -> None:
-        """Configure and activate, if the parameter ``autostart`` says so; raise what fails."""
+        """Configure and activate if the parameter ``autostart`` is set; raise on failure."""
         if self.settings.autostart:
             for step in (self.trigger_configure, self.trigger_activate):
                 step()
@@ -93,15 +93,15 @@ class ManagedNode[S: ManagedSettings](NodeBase[S], LifecycleNode):
         return "finalized" if self._is_gone else self._state_machine.current_state[1]
 
     def own(self, entity: Any, destroy: Callable[[Any], Any]) -> Any:
-        """Return `entity`, to be destroyed when the step that makes it is undone."""
+        """Return `entity`, to be destroyed when the step that created it is undone."""
         if self._making:
             self._made[self._making].append(partial(destroy, entity))
         return entity
 
     def guarded(self, callback: Callable[..., Any], place: str = "") -> Callable[..., Any]:
-        """Return a guarded callback that does nothing once the step that made it is undone.
+        """Return a guarded callback that does nothing once the step that created it is undone.
 
-        An executor may still call what was due when it was taken down.
+        An executor may still call callbacks that were due when they were removed.
         """
         inner, step = super().guarded(callback, place), self._making
         if not step:
@@ -110,7 +110,7 @@ class ManagedNode[S: ManagedSettings](NodeBase[S], LifecycleNode):
         return wraps(callback)(lambda *args: inner(*args) if self._made[step] is mine else None)
 
     def diagnosis(self) -> Diagnosis:
-        """Return the state of the node where it is not active, else what the session says."""
+        """Return the state of the node if not active, else the diagnosis of the session."""
         if self.state == "active":
             return self.diagnose_session()
         if self.problem is not None:
@@ -118,45 +118,45 @@ class ManagedNode[S: ManagedSettings](NodeBase[S], LifecycleNode):
         return Diagnosis(Level.WARN, f"{self.state}: a managed node that waits to be activated")
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Make what `configure` makes."""
+        """Run `configure`."""
         return self._make("configure", self.configure)
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Make what `activate` makes."""
+        """Run `activate`."""
         return self._make("activate", self.activate)
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Take down what `activate` made."""
+        """Undo `activate`."""
         return self._unmake("activate")
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Take down everything."""
+        """Undo everything."""
         return self._unmake("activate", "configure")
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Take down everything."""
+        """Undo everything."""
         return self._unmake("activate", "configure")
 
     def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Take down everything; the node can be configured anew."""
+        """Undo everything; the node can be configured again."""
         return self._unmake("activate", "configure")
 
     def destroy_node(self) -> None:
-        """Take everything down, the name in the graph included.
+        """Undo everything, and remove the name from the graph.
 
-        rclpy 7.1 leaves the state machine, which holds on to the node: until Python collects
-        its garbage, the name would stay in the graph, without any topic.
+        rclpy 7.1 leaves the state machine, which references the node: until garbage
+        collection the name would stay in the graph, without any topic.
         """
         self._unmake("activate", "configure")
         super().destroy_node()
-        self._is_gone = True  # a state machine that is asked after its end ends the process
+        self._is_gone = True  # a state machine used after its end ends the process
         self._state_machine.destroy_when_not_in_use()
 
     def _make(self, step: str, make: Callable[[], None]) -> TransitionCallbackReturn:
         self.problem, self._making = None, step
         try:
             make()
-        except Exception as error:  # rclpy would swallow it without a word
+        except Exception as error:  # rclpy would ignore it silently
             return self._fail(step, error)
         finally:
             self._making = ""
@@ -167,7 +167,7 @@ class ManagedNode[S: ManagedSettings](NodeBase[S], LifecycleNode):
             for step in steps:
                 while self._made[step]:
                     self._made[step].pop()()
-                self._made[step] = []  # what it made is called no more
+                self._made[step] = []  # its callbacks are no longer called
             if "configure" in steps:
                 self._heard_on.clear()
                 self.alone_on.clear()
@@ -187,7 +187,7 @@ class ManagedNode[S: ManagedSettings](NodeBase[S], LifecycleNode):
         return TransitionCallbackReturn.ERROR
 
     def _change_state(self, change: Callable[[Any, Any], Any], request: Any, response: Any) -> Any:
-        """Answer a transition that does not exist in this state with False; rclpy would raise."""
+        """Answer an invalid transition with False; rclpy would raise."""
         try:
             response = change(request, response)
         except RCLError as error:

@@ -30,7 +30,7 @@ def map_markers(error_map: ErrorMap, stamp_ns: int, frame_id: str) -> MarkerArra
         marker(0, Marker.LINE_LIST, "error", scale={"x": wide / 20}, points=_points(shape.ends)),
         marker(1, Marker.CUBE_LIST, "uncertainty",
                scale={"x": 0.9 * wide, "y": 0.9 * wide, "z": wide / 100},
-               points=_points(shape.sites - (0.0, 0.0, wide / 20)),  # beneath the vectors
+               points=_points(shape.sites - (0.0, 0.0, wide / 20)),  # below the vectors
                colors=[_colour(rgb) for rgb in shape.colours.tolist()]),
         marker(2, Marker.TEXT_VIEW_FACING, "legend", scale={"z": wide / 3}, text=shape.legend,
                pose={"position": dict(zip("xyz", shape.legend_at, strict=True)),

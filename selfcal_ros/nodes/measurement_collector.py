@@ -25,22 +25,22 @@ from selfcal_ros.sessions.ports import Diagnosis
 from selfcal_ros.sessions.reception import Reception
 
 TICK_S = 0.1
-"""Time between two looks at what has come."""
+"""Period of processing received messages."""
 BUSY_S, MANY, BUSY_LOOKS = 0.01, 200, 50
-"""The same for so many looks after one that found so many messages, or more: who plays a bag waits
-to be told that they have come."""
+"""The same for this many periods after one with this many messages or more: a bag player waits
+for the counts."""
 SOON_S, SOON_TICKS = 0.002, 50
-"""The same while the last exposure of a view waits for the samples behind it, and how often."""
+"""The same while the last exposure of a view waits for the following samples, and how often."""
 
 NO_JOURNAL = "none"
-"""As the parameter `journal`: what can be said in a launch file, where nothing is no value."""
+"""Value of the parameter `journal` for none; a launch file cannot pass an empty value."""
 
 
 class MeasurementCollector(PollingNode[CollectorSettings]):
-    """Feeds a `CollectingSession`; publishes ViewStatus and ViewMeasurement.
+    """Feed a `CollectingSession`; publish ViewStatus and ViewMeasurement.
 
-    A tick takes the messages that have come as bytes, writes them to the journal, decodes them
-    together, and gives them to the session. A detection that may complete a view makes one at once.
+    A tick takes the received messages as bytes, writes them to the journal, decodes them
+    together, and passes them to the session. A detection that may complete a view triggers a tick.
     """
 
     session = WhileConfigured[CollectingSession]()
@@ -54,7 +54,7 @@ class MeasurementCollector(PollingNode[CollectorSettings]):
         super().__init__(CollectorSettings, **kwargs)
 
     def configure(self) -> None:
-        """Make the session, the journal and the publishers."""
+        """Create the session, the journal and the publishers."""
         keep_freed_memory()
         ports = self.ports(self._publish)
         self.session = CollectingSession(self.settings, ports)
@@ -79,15 +79,15 @@ class MeasurementCollector(PollingNode[CollectorSettings]):
         return KeptTopic(own, offered(topic), heard)
 
     def _journal_folder(self) -> str:
-        """Return the folder of this cell's journals: one of its own for each namespace."""
+        """Return the folder of this cell's journals, one per namespace."""
         folder = self.settings.journal
         if folder == NO_JOURNAL:
             return ""
         return folder and str(Path(folder, self.get_namespace().strip("/")))
 
     def activate(self) -> None:
-        """Listen to the cell and to the commands."""
-        # undone last: what the subscriptions still held goes to the journal and to the session
+        """Subscribe to the cell and to the commands."""
+        # undone last: remaining messages of the subscriptions go to the journal and the session
         self.own(None, lambda _: self.guarded(self._drain)())
         inputs = self._inputs
         self._detections = self.subscribe(names.DETECTIONS, inputs[names.DETECTIONS.name], raw=True)
@@ -113,7 +113,7 @@ class MeasurementCollector(PollingNode[CollectorSettings]):
             self.session.tick()
 
     def _on_detection(self) -> None:
-        """Look at once where a view may be complete, and then until it is, or was not."""
+        """Process at once if a view may be complete, and repeatedly until this is decided."""
         if self._reception.may_end:
             self._looks = 0
             wake(self._soon)
@@ -125,7 +125,7 @@ class MeasurementCollector(PollingNode[CollectorSettings]):
             self._soon.cancel()
 
     def _drain(self) -> int:
-        """Take what has come and tell the counts, so that a player can keep pace; count it."""
+        """Process received messages and publish the counts, so that a player can keep pace."""
         self.poll()
         count = self._reception.n_waiting
         if self._reception.drain():
@@ -143,7 +143,7 @@ class MeasurementCollector(PollingNode[CollectorSettings]):
         return self.session.finish()
 
     def diagnose_session(self) -> Diagnosis:
-        """Return what the session says."""
+        """Return the diagnosis of the session."""
         return merged(self.session.diagnosis(
             detections_matched=self._detections.get_publisher_count() > 0),
             [self._reception.diagnosis()])

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The eyes and hands of `selfcal up`, `monitor` and `call` on the graph.
+"""The ROS side of `selfcal up`, `monitor` and `call`.
 
 Run as a process: ``python -m selfcal_ros.nodes.monitor_session NAMESPACE``. It writes a line of
 JSON to stdout when something has changed, ``{"picture": ...}``, and takes requests from stdin, one
-word a line: start, confirm, redo, skip, abort. Each is answered by a line
-``{"answer": TEXT, "success": true|false}``. What it hears and cannot use it says in a line
+word per line: start, confirm, redo, skip, abort. Each is answered by a line
+``{"answer": TEXT, "success": true|false}``. Unusable messages are reported in a line
 ``{"said": TEXT}``. It ends when stdin does.
 """
 
@@ -40,7 +40,7 @@ PATIENCE_S = 10.0
 
 
 class MonitorSession(Guarded):
-    """Shows what the topics of a cell say, and asks its sequencer for what a person wants."""
+    """Publish the state of a cell from its topics, and send requests to its sequencer."""
 
     def __init__(self, namespace: str, **kwargs: Any) -> None:
         super().__init__(f"monitor_{os.getpid()}", namespace=namespace, **kwargs)
@@ -85,7 +85,7 @@ class MonitorSession(Guarded):
             self._write(text)
 
     def _serve(self) -> None:
-        """Send what was asked for, and pass on what was answered or is overdue."""
+        """Send requests, and forward answers and time-outs."""
         while self._words:
             word = self._words.pop(0)
             if not word:

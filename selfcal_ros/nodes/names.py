@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Every topic with its type and QoS; its name is declared in `topics`."""
+"""Every topic with its message type and QoS; names are declared in `topics`."""
 
 from dataclasses import dataclass
 
@@ -36,15 +36,15 @@ def _qos(depth: int, *, reliable: bool = True, latched: bool = False) -> QoSProf
         durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE)
 
 
-# 1 kHz of encoder: a hiccup of a second must not overwrite a sample
+# encoder at 1 kHz: a pause of a second must not overwrite a sample
 ENCODER = Topic(topics.ENCODER_TOPIC, JointState, _qos(5000))
 ENCODER_BEST_EFFORT = Topic(topics.ENCODER_TOPIC, JointState, _qos(5000, reliable=False))
-# of what came earlier, and was displaced, nobody wants the corrected position
+# corrected positions of earlier, displaced samples are useless
 ENCODER_NEWEST = Topic(topics.ENCODER_TOPIC, JointState, _qos(100, reliable=False))
 DETECTIONS = Topic(topics.DETECTION_TOPIC, MarkDetection, _qos(5000))
 COMMAND = Topic(topics.COMMAND_TOPIC, ViewCommand, _qos(256, latched=True))
 NEWEST_COMMAND = Topic(topics.COMMAND_TOPIC, ViewCommand, _qos(1, latched=True))
-"""As a sequencer offers it: a cell that joins late acts on the first command that it hears."""
+"""Offered by a sequencer: a late cell acts on the first command that it receives."""
 STATUS = Topic(topics.STATUS_TOPIC, ViewStatus, _qos(64, latched=True))
 STATUS_AS_IT_COMES = Topic(topics.STATUS_TOPIC, ViewStatus, _qos(64))
 MEASUREMENT = Topic(topics.MEASUREMENT_TOPIC, ViewMeasurement, _qos(64, latched=True))
@@ -56,18 +56,18 @@ CORRECTED = Topic(topics.CORRECTED_TOPIC, JointState, _qos(100, reliable=False))
 # below the node's own name (~/)
 HEALTH = Topic("health", DiagnosticStatus, _qos(1, latched=True))
 RECEIVED = Topic("received", UInt64MultiArray, _qos(1, latched=True))
-"""The collector's counts of encoder samples, detections and commands, for the pace of a player."""
+"""The collector's counts of encoder samples, detections and commands, for a player's pace."""
 SOLVED = Topic("solved", String, _qos(1, latched=True))
-"""The solver's fingerprint of the readings behind what it publishes."""
+"""The solver's fingerprint of the readings behind its results."""
 
 
 def of_node(node: str, topic: Topic) -> Topic:
-    """Return the topic below a node's own name as others in its namespace see it."""
+    """Return the topic below a node's name as seen by others in its namespace."""
     return Topic(f"{node}/{topic.name}", topic.type, topic.qos)
 
 
 def private(topic: Topic) -> Topic:
-    """Return the topic as the node itself names it."""
+    """Return the topic as named by the node itself."""
     return Topic(f"~/{topic.name}", topic.type, topic.qos)
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Playing a bag onto the graph: at its own pace, or as fast as the subscribers keep up."""
+"""Play a bag into the graph at its own pace, or as fast as the subscribers can follow."""
 
 import math
 import time
@@ -21,17 +21,17 @@ from selfcal_ros.units import S_PER_NS
 
 KINDS = {ENCODER_TOPIC: "encoder", DETECTION_TOPIC: "detection", COMMAND_TOPIC: "command"}
 WINDOW = 1500
-"""Messages that may be under way to the collector; well below the depth of its queues."""
+"""Largest number of messages on the way to the collector, well below its queue depth."""
 BURST, SLICE_S = 100, 0.02
-"""Messages between two looks at the time and at how far the subscribers are; longest step."""
+"""Messages between checks of the time and of the subscribers' progress; longest step."""
 UNHEARD_RATE = 4000
-"""Messages a second while no collector tells how far it is."""
+"""Messages per second while no collector reports its progress."""
 
 
 class Player:
-    """Publishes the input topics of a bag from the timers of a node.
+    """Publish the input topics of a bag from the timers of a node.
 
-    Messages go out as the bytes that the bag has, or are re-encoded where its types have other
+    Messages are sent as the bytes in the bag, or re-encoded if its types have other
     trailing fields than this package's. `seed` shuffles the order of arrival, not the stamps;
     `namespace` is that of the cell in the bag, None = the only one; `listener` is the node that
     sets the pace.
@@ -54,8 +54,8 @@ class Player:
         self.heard: dict[str, int] | None = None
         self._at = 0
         self._began: float | None = None
-        self._published_s = 0.0  # when a message went out last, or none was due
-        self._before = 0  # messages that the listener had received before the first of these
+        self._published_s = 0.0  # last time that a message was sent, or none was due
+        self._before = 0  # messages received by the listener before the first of these
         received = names.of_node(self.listener, names.RECEIVED)
         self._tells = partial(node.count_publishers, received.name)
         node.subscribe(received, self._on_received)
@@ -76,10 +76,10 @@ class Player:
         return self._at
 
     def unheard(self) -> list[str]:
-        """Return the topics that have messages to play but that `listener` does not hear yet.
+        """Return the topics with messages to play that `listener` has not subscribed to yet.
 
-        Other subscribers (ros2 topic echo, foxglove_bridge) do not count, and a collector that
-        hears with best effort, because another publisher offers no more, would lose messages.
+        Other subscribers (ros2 topic echo, foxglove_bridge) do not count; a collector that
+        subscribes with best effort, because another publisher offers no more, would lose messages.
         """
         if self.heard is None and self._tells():
             return list(self.playlist.counts)
@@ -89,7 +89,7 @@ class Player:
                 for topic, found in hears.items() if ReliabilityPolicy.RELIABLE not in found]
 
     def _hears(self, publisher: Publisher) -> list[ReliabilityPolicy]:
-        """Return how `listener` hears a publisher: as each of its subscriptions there asks for."""
+        """Return the reliabilities requested by the subscriptions of `listener` to a publisher."""
         if not publisher.get_subscription_count():
             return []
         readers = self.node.get_subscriptions_info_by_topic(publisher.topic_name)
@@ -97,7 +97,7 @@ class Player:
                 == f"{reader.node_namespace.rstrip('/')}/{reader.node_name}"]
 
     def step(self) -> None:
-        """Publish what is due now."""
+        """Publish the messages due now."""
         now = time.monotonic()
         if self._began is None:
             self._began, self._before = now, sum((self.heard or {}).values())
@@ -113,12 +113,12 @@ class Player:
 
     @property
     def stalled_s(self) -> float:
-        """Seconds for which messages have been due and the listener had not taken those before."""
+        """Seconds for which messages have been due while the listener took no previous ones."""
         started = self._began is not None and not self.done
         return time.monotonic() - self._published_s if started else 0.0
 
     def _publish(self, count: int, due_ns: float) -> bool:
-        """Publish up to so many messages that were logged by then; tell if more may be due."""
+        """Publish up to this many messages logged by then; return whether more may be due."""
         for _ in range(min(count, self.total - self._at)):
             if self._next is None:
                 raise InputError(self._bag, f"{self.total} messages when it was opened, "
@@ -133,7 +133,7 @@ class Player:
         return True
 
     def _room(self, played_s: float) -> int:
-        """Return how many messages the subscribers can take, `played_s` after the first one."""
+        """Return the number of messages that subscribers can take, `played_s` after the first."""
         if self.heard is None:
             return int(WINDOW + UNHEARD_RATE * played_s / 2) - self._at
         return WINDOW - self._at + sum(self.heard.values()) - self._before

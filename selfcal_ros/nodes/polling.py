@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Subscriptions that a node empties by the clock: a third of the cost of a callback a message."""
+"""Subscriptions polled by a node: a third of the cost of one callback per message."""
 
 import inspect
 import time
@@ -13,36 +13,36 @@ from selfcal_ros.collection.settings.parameter import ManagedSettings
 from selfcal_ros.nodes.managed import ManagedNode
 
 MOST = 2000
-"""Messages of a subscription that are taken at once; the others wait for the next time."""
+"""Largest number of messages taken per poll; the others wait."""
 
 
 def wake(timer: Timer) -> None:
-    """Let a timer run that stands; one that runs is left alone."""
+    """Start a timer unless it is running."""
     if timer.is_canceled():
         timer.reset()
 
 
 class Missing(NamedTuple):
-    """Messages that did not come: lost on the way, or published while nobody listened."""
+    """Missing messages: lost in transport, or published while not subscribed."""
 
     lost: int
     unheard: int
 
 
 class ByTheClock:
-    """Takes the bytes of messages and the instants of their reception, ns; marks a subscription.
+    """Take the bytes of messages and the instants of their reception, ns, from a subscription.
 
-    It outlives its subscription: what was published between two of them is known by the numbers
-    that a publisher gives. Of several publishers the numbers interleave and tell nothing.
+    It outlives its subscription: messages published between two subscriptions are known from the
+    sequence numbers of a publisher. The numbers of several publishers interleave and are useless.
 
     Parameters
     ----------
     topic : str
-        Name under which losses are counted.
+        Name for the counts of losses.
     take : callable (data, received_ns)
         Takes a message.
     wake : callable, optional
-        Called when a message has come; without it executors leave the subscription alone.
+        Called when a message has arrived; without it executors ignore the subscription.
     """
 
     __signature__ = inspect.signature(lambda message, info: None)  # rclpy counts them
@@ -50,7 +50,7 @@ class ByTheClock:
     def __init__(self, topic: str, take: Callable[[bytes, int], None],
                  wake: Callable[[], None] | None = None) -> None:
         self.topic, self.take, self.wake = topic, take, wake
-        self._numbers: list[int | None] = []  # of what was taken since the last look for gaps
+        self._numbers: list[int | None] = []  # of messages taken since the last check for gaps
         self._last: int | None = None
         self._before: int | None = None  # the last number of the subscription before this one
         self._n_publishers = 0
@@ -63,7 +63,7 @@ class ByTheClock:
             self.wake()
 
     def empty(self, subscription: Subscription, most: int) -> Missing:
-        """Take what waits, up to `most`; return how many numbers of publication were left out."""
+        """Take waiting messages, up to `most`; return the number of skipped sequence numbers."""
         is_empty = False
         for _ in range(most):
             taken = subscription.handle.take_message(subscription.msg_type, True)
@@ -79,10 +79,10 @@ class ByTheClock:
         self.take(data, info["received_timestamp"] or time.time_ns())
 
     def _missing(self, numbers: list[int | None], n_publishers: int, is_empty: bool) -> Missing:
-        """Return what the numbers leave out, if they are of one publisher.
+        """Return the gaps in the sequence numbers, if they are of one publisher.
 
-        That is so if there was one at this look and at the last: what a second one sent that is
-        gone has been taken by then, unless the queue was not emptied.
+        This is the case if there was one publisher now and at the previous check: messages of a
+        second one that is gone have been taken by then, unless the queue was not emptied.
         """
         most = max(n_publishers, self._n_publishers)
         self._n_publishers = n_publishers if is_empty else most
@@ -98,39 +98,39 @@ class ByTheClock:
         return Missing(lost, unheard)
 
     def pause(self) -> None:
-        """Take note that its subscription ends."""
+        """Record the end of the subscription."""
         self._before = self._before if self._last is None else self._last
         self._last, self._n_publishers = None, 0
 
 
 class PollingNode[S: ManagedSettings](ManagedNode[S]):
-    """A managed node whose subscriptions with `ByTheClock` are left to `poll` by executors.
+    """A managed node whose subscriptions with `ByTheClock` are handled by `poll`, not by executors.
 
-    Those that wake the node are looked after by both.
+    Those that wake the node are handled by both.
     """
 
     def at_need(self, seconds: float, callback: Callable[[], None]) -> Timer:
-        """Return a timer that stands until `wake`."""
+        """Return a timer that is stopped until `wake`."""
         timer = self.every(seconds, callback)
         timer.cancel()
         return timer
 
     @property
     def subscriptions(self) -> Iterator[Subscription]:
-        """The subscriptions that an executor looks after."""
+        """The subscriptions handled by an executor."""
         return (item for item in super().subscriptions
                 if not isinstance(item.callback, ByTheClock) or item.callback.wake)
 
     def poll(self) -> None:
-        """Take what has come on those subscriptions, and count what was lost on the way."""
+        """Take the messages of these subscriptions, and count losses in transport."""
         for item in [*super().subscriptions]:
             if isinstance(item.callback, ByTheClock):
                 self._empty(item, item.callback, MOST)
 
     def destroy_subscription(self, subscription: Subscription) -> bool:
-        """Destroy a subscription; what waits on one that is polled is taken first.
+        """Destroy a subscription; waiting messages of a polled one are taken first.
 
-        Its publishers have it acknowledged: nobody would send it again.
+        They have been acknowledged to their publishers and would not be sent again.
         """
         callback = subscription.callback
         if isinstance(callback, ByTheClock) and subscription in [*super().subscriptions]:
@@ -140,9 +140,9 @@ class PollingNode[S: ManagedSettings](ManagedNode[S]):
         return super().destroy_subscription(subscription)
 
     def _empty(self, item: Subscription, callback: ByTheClock, most: int) -> None:
-        """Take what waits on a subscription.
+        """Take the waiting messages of a subscription.
 
-        The middleware tells nothing of messages that were overwritten before they were taken.
+        The middleware does not report messages that were overwritten before they were taken.
         """
         with item.handle:
             missing = callback.empty(item, most)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""pose_sequencer: leads through the views of a plan."""
+"""pose_sequencer: commands the views of a plan."""
 
 import sys
 from functools import partial
@@ -21,7 +21,7 @@ TICK_S = 0.05
 
 
 class PoseSequencer(ManagedNode[SequencerSettings]):
-    """Publishes PLACE and MEASURE for each view; services and an action drive it."""
+    """Publish PLACE and MEASURE for each view, driven by services and an action."""
 
     session = WhileConfigured[SequencingSession]()
     _action = WhileConfigured[CalibrationAction]()
@@ -30,13 +30,13 @@ class PoseSequencer(ManagedNode[SequencerSettings]):
         super().__init__(SequencerSettings, **kwargs)
 
     def configure(self) -> None:
-        """Make the session, with its plan, and the publisher of commands."""
+        """Create the session, with its plan, and the publisher of commands."""
         command = self.output(names.NEWEST_COMMAND)
         self.session = SequencingSession(
             self.settings, self.ports(lambda _, fields: command(fields)))
 
     def activate(self) -> None:
-        """Listen to the companions, offer services and the action."""
+        """Subscribe to the companions, offer services and the action."""
         session = self.session
         self.subscribe_with_age(names.COMMAND, self._on_command)
         self.subscribe(names.STATUS_AS_IT_COMES, session.take_status)
@@ -55,12 +55,12 @@ class PoseSequencer(ManagedNode[SequencerSettings]):
         self.every(TICK_S, self._on_timer)
 
     def _on_command(self, message: Any, is_older: bool) -> None:
-        """Take a command, but not the last words of a sequencer that has been taken down."""
+        """Take a command, except the last one of a sequencer that has been shut down."""
         if not is_older or self.count_publishers(names.COMMAND.name) > 1:
             self.session.take_command(message)
 
     def _on_health(self, node: str, status: Any, is_older: bool) -> None:
-        """Take what a companion says of itself now: a run is taken up where the collector is."""
+        """Take the present health of a companion: a run is resumed where the collector is."""
         if not is_older:
             self.session.presence.take(node, diagnosis_of(status))
 
@@ -69,7 +69,7 @@ class PoseSequencer(ManagedNode[SequencerSettings]):
         self._action.tick()
 
     def diagnose_session(self) -> Diagnosis:
-        """Return what the session says."""
+        """Return the diagnosis of the session."""
         return self.session.diagnosis()
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Who else publishes: offers that do not match, and second publishers where one is right."""
+"""Other publishers: incompatible offers, and duplicates where only one is allowed."""
 
 from collections.abc import Iterable, Mapping
 from typing import Any
@@ -42,9 +42,9 @@ def others_publishing(node: Node, topics: Iterable[str]) -> Diagnosis:
 
 
 def kept_names(node: Node, topic: Topic) -> tuple[str, str]:
-    """Return under which name a bag keeps `topic`, and where it is heard if it is remapped.
+    """Return the name of `topic` in a bag, and the name that it is remapped to, if any.
 
-    Who reads a bag knows the names of the contract, behind a namespace.
+    Readers of a bag expect the names of the contract, after a namespace.
     """
     own, heard = f"{node.get_namespace().rstrip('/')}/{topic.name}", node.resolve_topic_name(
         topic.name)
@@ -52,7 +52,7 @@ def kept_names(node: Node, topic: Topic) -> tuple[str, str]:
 
 
 def offered(topic: Topic) -> dict:
-    """Return the quality of service of a topic as rosbag2 writes it down."""
+    """Return the quality of service of a topic in the format of rosbag2."""
     return qos_profile(reliable=topic.qos.reliability == ReliabilityPolicy.RELIABLE,
                        transient_local=topic.qos.durability == DurabilityPolicy.TRANSIENT_LOCAL,
                        depth=topic.qos.depth)

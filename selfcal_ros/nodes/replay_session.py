@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The heart of `selfcal replay`: plays a bag into live nodes and sees it through to the map.
+"""The node of `selfcal replay`: plays a bag into live nodes up to the saved map.
 
-Run as a process beside measurement_collector and solver:
+Run as a process alongside measurement_collector and solver:
 ``python -m selfcal_ros.nodes.replay_session BAG RATE SEED RESULT.json NAMESPACE`` (of the
 cell in the bag; empty = the only one). Progress goes to stdout, one line ``progress DONE TOTAL``
-a step, for the command line to draw.
+per step, for the command line.
 """
 
 import sys
@@ -25,11 +25,11 @@ from selfcal_ros.nodes.player import Player
 from selfcal_ros.nodes.running import run
 
 PATIENCE_S = 60.0
-"""Longest wait for the nodes to appear, to receive what was sent, or to answer."""
+"""Longest wait for the nodes to appear, to receive the messages, or to answer."""
 
 
 class ReplaySession(SelfcalNode[PlayerSettings]):
-    """Waits for subscribers, plays, checks that nothing was lost, has the map saved."""
+    """Wait for subscribers, play, check for losses, have the map saved."""
 
     def __init__(self, player: Callable[[SelfcalNode], Player], output: str,
                  **kwargs: Any) -> None:
@@ -53,7 +53,7 @@ class ReplaySession(SelfcalNode[PlayerSettings]):
             self._act()
         except SelfcalError as error:
             self._end(str(error), error.exit_code)
-        except Exception as error:  # the command waits for an end
+        except Exception as error:  # the command waits for the end
             self._end(f"{type(error).__name__}: {error}", ExitCode.INTERNAL)
 
     def _go(self, act: Callable[[], None]) -> None:

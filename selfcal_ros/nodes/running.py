@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One way to run a node as a process, and to stop it."""
+"""Run a node as a process, and stop it."""
 
 import gc
 import re
@@ -18,16 +18,16 @@ from selfcal_ros.nodes.callbacks import Guarded
 from selfcal_ros.nodes.stopping import complete_on_signal, ignore_signals
 
 SPIN_SECONDS = 86400.0
-"""An infinite time-out overflows in the executor of the wheels; a day is long enough to loop."""
+"""An infinite time-out overflows in the executor of the wheels; loop with a day instead."""
 
 _raised: list[Executor] = []
-"""Executors that raised an error: they left a callback with the future, which calls into them."""
+"""Executors that raised an error, kept alive: the future still has a callback into them."""
 
 
 def spin(node: Guarded, until: Future) -> None:
     """Spin a node with the events executor until `until` is done or the context is shut down.
 
-    What the executor raises in spite of `Guarded` is counted as a refusal.
+    Errors raised by the executor in spite of `Guarded` are counted as refusals.
     """
     executor = EventsExecutor()
     executor.add_node(node)
@@ -54,9 +54,9 @@ def _init(argv: list[str] | None) -> None:
 
 
 def _keep_what_is_loaded() -> None:
-    """Leave what is there out of later collections: going through it stops a node for 50 ms.
+    """Exempt present objects from garbage collection, which would stop a node for 50 ms.
 
-    There is no garbage in it: to look for some first would find nothing.
+    They contain no garbage, so none is collected first.
     """
     gc.freeze()
 
@@ -65,7 +65,7 @@ def run(make_node: Callable[[], Guarded], argv: list[str] | None = None) -> int:
     """Run one node as a process; SIGINT and SIGTERM end it cleanly. Return the exit code.
 
     A signal completes the future that the executor spins on, between two callbacks, so that no
-    callback is torn and what a node has to finish in `close` is finished.
+    callback is interrupted and `close` can finish its work.
     """
     stop = Future()
     complete_on_signal(stop)

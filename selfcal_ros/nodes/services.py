@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How services answer: success or the error in the response, at once or once it is known."""
+"""Answers of services: success or the error, at once or later."""
 
 import inspect
 from collections.abc import Callable
@@ -11,9 +11,9 @@ from selfcal_ros.nodes.callbacks import Guarded
 
 def answered(response: Any, answer: Callable[[], str],
              refuse: Callable[[str, Exception], None]) -> Any:
-    """Return `response` with what `answer` returns as its message, or with the error it raises.
+    """Return `response` with the result of `answer` as its message, or with its error.
 
-    An error that is none of ours is given to `refuse` as well.
+    A foreign error is passed to `refuse` as well.
     """
     try:
         response.message = printable(answer())
@@ -29,19 +29,19 @@ def answered(response: Any, answer: Callable[[], str],
 
 
 class Later:
-    """Stands for a response that is not known yet."""
+    """Placeholder for a response that is not known yet."""
 
     def __init__(self) -> None:
         self._response: Any = None
         self._send: Callable[[Any], None] | None = None
 
     def give(self, response: Any) -> None:
-        """Take the response; it is sent as soon as it may be."""
+        """Take the response; it is sent as soon as possible."""
         self._response = response
         self._meet()
 
     def ask(self, send: Callable[[Any], None]) -> None:
-        """Take the way to whoever asked."""
+        """Take the function that sends the response."""
         self._send = send
         self._meet()
 
@@ -53,8 +53,8 @@ class Later:
 def answering_later(service: Any) -> Any:
     """Return a service of rclpy whose callback may return a `Later`.
 
-    The executors of rclpy 7.1 hand what a callback returns to `send_response` of the service, with
-    the header of the request.
+    The executors of rclpy 7.1 pass the return value of a callback to `send_response` of the
+    service, with the header of the request.
     """
     send = service.send_response
 
@@ -68,9 +68,9 @@ def answering_later(service: Any) -> Any:
 
 
 class Answering(Guarded):
-    """A node whose services answer with success and message, whatever happens.
+    """A node whose services always answer with success and message.
 
-    `own` notes how to take a service down.
+    `own` registers a service for destruction.
     """
 
     own: Callable[[Any, Callable[[Any], Any]], Any]
@@ -78,7 +78,7 @@ class Answering(Guarded):
     def service(self, kind: type, name: str, answer: Callable[..., str]) -> Any:
         """Offer a service whose response is filled from `answer` (request), or from its error.
 
-        `answer` may take the response as well, for fields beside success and message.
+        `answer` may take the response as well, for fields other than success and message.
         """
         parameters = inspect.signature(answer).parameters.values()
         arguments = sum(parameter.default is parameter.empty for parameter in parameters)
@@ -90,10 +90,10 @@ class Answering(Guarded):
 
     def service_later(self, kind: type, name: str, answer: Callable[[Any, Any], str],
                       when: Callable[[Callable[[], None]], None]) -> Any:
-        """Offer a service that answers as `service` does, but not before its time.
+        """Offer a service that answers like `service`, possibly later.
 
-        `when` takes what gives the answer, and calls it once, at once or later, in the thread of
-        the executor.
+        `when` takes the function that gives the answer, and calls it once, at once or later, in the
+        thread of the executor.
         """
         def call(request: Any, response: Any) -> Later:
             later = Later()

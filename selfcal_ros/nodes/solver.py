@@ -17,18 +17,18 @@ from selfcal_ros.sessions.ports import Diagnosis
 from selfcal_ros.sessions.solving import Outcome, SolvingSession, solve, warm_up
 
 READY_FOR = 21
-"""Marks along each side of the plate for which the worker makes memory ready."""
+"""Marks per side of the plate for which the worker prepares memory."""
 
 SWEEP_S = 0.5
-"""Time between two looks for what no event has brought forward, as a solution that was ready while
+"""Period of checks for work without an event, such as a solution that was ready while
 the node was not active. A solution itself wakes the executor."""
 
 
 class Solver(ManagedNode[SolverSettings]):
-    """Solves whenever a view's readings arrive; publishes ErrorMap and CalibrationSummary.
+    """Solve whenever a view's readings arrive; publish ErrorMap and CalibrationSummary.
 
-    Solving runs in a thread beside the executor; what arrives meanwhile is solved next, together.
-    What is asked of the newest readings waits for their solution, not the executor.
+    Solving runs in a separate thread; readings that arrive meanwhile are solved next, together.
+    Requests for the newest readings wait for their solution without blocking the executor.
     """
 
     session = WhileConfigured[SolvingSession]()
@@ -36,12 +36,12 @@ class Solver(ManagedNode[SolverSettings]):
     _running = WhileConfigured[Future[Outcome] | None]()
 
     def __init__(self, **kwargs: Any) -> None:
-        self._begun = 0  # jobs, that which runs included
+        self._begun = 0  # jobs, including the running one
         self._waiting: list[tuple[int, Callable[[], None]]] = []  # for a job, by its number
         super().__init__(SolverSettings, **kwargs)
 
     def configure(self) -> None:
-        """Make the session, the worker and the publishers."""
+        """Create the session, the worker and the publishers."""
         self.session = SolvingSession(self.settings, self.ports(self._publish))
         self._worker = self.own(ThreadPoolExecutor(1, thread_name_prefix="solver"), stop)
         self._running = None
@@ -54,7 +54,7 @@ class Solver(ManagedNode[SolverSettings]):
         self.alone_on += [names.ERROR_MAP.name, names.MEASUREMENT.name]
 
     def activate(self) -> None:
-        """Listen to the collector and to the commands."""
+        """Subscribe to the collector and to the commands."""
         self.subscribe(names.MEASUREMENT, self._on_measurement)
         self.subscribe(names.COMMAND, self._on_command)
         self.every(SWEEP_S, self._advance)
@@ -77,7 +77,7 @@ class Solver(ManagedNode[SolverSettings]):
         self._begin()
 
     def _begin(self) -> None:
-        """Solve what is new; while the worker is busy, it waits."""
+        """Solve new readings; while the worker is busy, they wait."""
         job = self.session.next_job() if self._running is None else None
         if job is not None:
             self._begun += 1
@@ -85,13 +85,13 @@ class Solver(ManagedNode[SolverSettings]):
             self._running.add_done_callback(self._wake)
 
     def _wake(self, _: Future[Outcome]) -> None:
-        """Have the executor take a solution at once; called in the worker's thread."""
+        """Wake the executor for a solution; called in the worker's thread."""
         executor = self.executor
         if executor is not None:
             executor.create_task(self.guarded(self._advance))
 
     def _advance(self) -> None:
-        """Take a solution that is ready, go on with what is new, and with what has waited."""
+        """Take a finished solution, continue with new readings and waiting requests."""
         if self.state != "active":
             return
         try:
@@ -104,7 +104,7 @@ class Solver(ManagedNode[SolverSettings]):
                 self._go_on()
 
     def _take(self, running: Future[Outcome]) -> None:
-        """Take what was solved."""
+        """Take a solution."""
         outcome, self._running = running.result(), None
         try:
             self.session.take(outcome)
@@ -112,7 +112,7 @@ class Solver(ManagedNode[SolverSettings]):
             self._solved.publish(names.SOLVED.type(data=self.session.digest()))
 
     def _once_solved(self, then: Callable[[], None]) -> None:
-        """Call `then` once the readings that have come so far are solved."""
+        """Call `then` once the readings received so far are solved."""
         self._waiting.append((self._begun + self.session.stale, then))
         self.guarded(self._advance)()
 
@@ -129,7 +129,7 @@ class Solver(ManagedNode[SolverSettings]):
         return message
 
     def diagnose_session(self) -> Diagnosis:
-        """Return what the session says."""
+        """Return the diagnosis of the session."""
         return self.session.diagnosis()
 
 

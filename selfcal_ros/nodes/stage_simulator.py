@@ -31,14 +31,14 @@ from selfcal_ros.simulation.machine import Truth, random_truth
 from selfcal_ros.simulation.spec import settings_of, spread_of
 
 LEAD_NS = 20_000_000
-"""Time between a MEASURE command, or its arrival if that is later, and the first encoder sample
-of its view: nothing is stamped at a time that has passed."""
+"""Time between a MEASURE command, or its arrival if later, and the first encoder sample
+of its view: no message is stamped in the past."""
 PATIENCE_NS = 1_000_000_000
-"""Time after the last exposure from which a status holds all of them."""
+"""Time after the last exposure from which a status includes all of them."""
 
 
 class StageSimulator(SelfcalNode[SimulatorSettings]):
-    """Publishes encoder samples at a set rate and detections while a view is measured."""
+    """Publish encoder samples at a set rate, and detections while a view is measured."""
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__(SimulatorSettings, **kwargs)
@@ -52,7 +52,7 @@ class StageSimulator(SelfcalNode[SimulatorSettings]):
         self._idle_stamp = 0
         self._command: Command | None = None  # the view that is being measured
         self._acted: set[int] = set()  # stamps of commands
-        self._free_ns = 0  # stamp from which it has nothing to do
+        self._free_ns = 0  # stamp from which it is idle
         self._encoder = self.publisher(names.ENCODER)
         self._detection = self.publisher(names.DETECTIONS)
         self.subscribe(names.COMMAND, self._on_command)
@@ -61,20 +61,20 @@ class StageSimulator(SelfcalNode[SimulatorSettings]):
         self._sent = {"encoder_sent": 0, "detection_sent": 0}
 
     def diagnosis(self) -> Diagnosis:
-        """Return what it does and how much it has sent."""
+        """Return its activity and the number of messages sent."""
         return Diagnosis(Level.OK, "at home" if self._next is None else "measuring", self._sent)
 
     def _on_command(self, message: Any) -> None:
         command = to_model.command(message)
         if command.stamp_ns in self._acted:
-            return  # latched anew by a sequencer that was restarted
+            return  # latched again by a restarted sequencer
         self._acted.add(command.stamp_ns)
         self._next, self._events, self._command = None, iter(()), None
         if command.phase == Phase.MEASURE:
             self._measure(command)
 
     def _on_status(self, message: Any) -> None:
-        """See the marks again that are missing once all have been seen."""
+        """Measure missing marks again after all have been measured."""
         command = self._command
         if (command is None or self._next is not None or message.complete
                 or message.view_index != command.view_index
@@ -88,7 +88,7 @@ class StageSimulator(SelfcalNode[SimulatorSettings]):
         elif missing:
             self._measure(replace(command, view=replace(view, check_marks=0, check_offset_m=0.0)))
             self._events = (event for event in self._events if not isinstance(event, Detection)
-                            or not event.has_id  # nobody knows which it is: all of them, then
+                            or not event.has_id  # unknown which one: all of them
                             or (event.k if event.kind else (event.m, event.n)) in missing)
 
     def _measure(self, command: Command) -> None:
@@ -109,7 +109,7 @@ class StageSimulator(SelfcalNode[SimulatorSettings]):
         self._next = next(self._events, None)
 
     def _plan_with(self, command: Command) -> Plan:
-        """Return the plan with the commanded view in its place; commands describe themselves."""
+        """Return the plan with the commanded view inserted; commands describe themselves."""
         known = self._plan.views if self._plan else ()
         count = max(len(known), command.view_index + 1)
         views = [known[i] if i < len(known) else View(f"view {i}") for i in range(count)]

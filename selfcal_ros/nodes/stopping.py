@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How SIGINT and SIGTERM end a node, once or again and again."""
+"""SIGINT and SIGTERM end a node, once or repeatedly."""
 
 import ctypes
 import faulthandler
@@ -12,15 +12,15 @@ from rclpy.task import Future
 
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 ENDS_S = 60.0
-"""Time after a stop signal at which a node that has not ended is ended; it says where it hung."""
+"""Time after a stop signal at which a hanging node is ended, with stack traces."""
 
 
 def complete_on_signal(stop: Future) -> None:
-    """Complete `stop` on the first of the stop signals, in a thread of its own.
+    """Complete `stop` on the first of the stop signals, in a separate thread.
 
     Python calls signal handlers in the main thread between two lines of Python: while that thread
-    waits in the executor none is called, and in the midst of a future's methods one would wait
-    for their lock for ever. The wake-up descriptor is written to at once, whatever runs.
+    waits in the executor none is called, and inside a future's methods one would wait
+    for their lock forever. The wake-up descriptor is always written to at once.
     """
     reader, writer = socket.socketpair()
     writer.setblocking(False)
@@ -30,11 +30,11 @@ def complete_on_signal(stop: Future) -> None:
 
     def wait() -> None:
         reader.recv(1)
-        try:  # a thread of C, whatever hangs
+        try:  # a C thread, independent of Python
             faulthandler.dump_traceback_later(ENDS_S, exit=True)
-        finally:  # also where there is no stderr to say it on
+        finally:  # also without stderr
             stop.set_result(None)
-        while True:  # the descriptor stays open, or later signals would find a broken pipe
+        while True:  # keep the descriptor open: later signals would otherwise find a broken pipe
             reader.recv(4096)
 
     threading.Thread(target=wait, name="stop signals", daemon=True).start()
@@ -42,9 +42,9 @@ def complete_on_signal(stop: Future) -> None:
 
 
 def ignore_signals() -> None:
-    """Let no repeated signal (a launcher passes Ctrl-C on) disturb the exit.
+    """Ignore repeated signals (a launcher forwards Ctrl-C) during the exit.
 
-    First for the system alone, then in Python's own table: a signal that a thread still handles
+    First in the system, then in Python's own table: a signal still being handled by a thread
     while the table changes would be reported as a race.
     """
     for number in STOP_SIGNALS:
