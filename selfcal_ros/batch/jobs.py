@@ -34,10 +34,12 @@ from selfcal_ros.model.result import (
     CalibrationResult,
     Observability,
     created_now,
+    plain,
     result_to_dict,
     unidentified_result,
     with_input,
 )
+from selfcal_ros.model.verdict_json import finding_to_dict
 from selfcal_ros.reporting.summary.numbers import summary_numbers
 from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.units import ARCSEC_PER_RAD, PPM_PER_ONE, UM_PER_M
@@ -113,6 +115,7 @@ def _with_result(result: CalibrationResult) -> Record:
     return {
         "exit_code": int(ExitCode.DONE if good else ExitCode.NOT_QUALIFIED), "qualified": good,
         "grade": str(result.verdict.grade),
+        "causes": plain([finding_to_dict(cause) for cause in result.verdict.causes]),
         "message": result.verdict.sentence, "plan_id": result.plan_id, "run_id": result.run_id,
         "plate": [*artifact.shape, artifact.grid_pitch_m, artifact.angular_count],
         "first_exposure": result.provenance.extra.get("first_exposure"),

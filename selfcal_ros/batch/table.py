@@ -104,10 +104,12 @@ def csv_text(records: Sequence[Record]) -> str:
     names = dict.fromkeys(name for record in ordered for name in record.get("quantities", {}))
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
-    writer.writerow([*BASE, *names])
+    writer.writerow([*BASE, "cause", "cause_view", *names])
     for record in ordered:
-        found = record.get("quantities", {})
+        found, causes = record.get("quantities", {}), record.get("causes", [])
+        likeliest = causes[0] if causes else {"name": "", "view": ""}
         writer.writerow([_field(record.get(name)) for name in BASE]
+                        + [likeliest["name"], likeliest["view"]]
                         + [_field(found.get(name)) for name in names])
     return out.getvalue()
 

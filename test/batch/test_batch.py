@@ -294,7 +294,11 @@ def test_plans_and_plates_are_not_mixed():
 
 def test_the_table_has_a_line_a_bag_in_the_order_of_time():
     failed = {"bag": '/bags/bad, or "worse"', "exit_code": 2, "qualified": None, "message": "no"}
-    rows = list(csv.DictReader(io.StringIO(csv_text([failed, *records()[::-1]]))))
+    known = records()
+    known[1] |= {"causes": [{"name": "drift", "view": "run 2: shift x"}, {"name": "slip"}]}
+    rows = list(csv.DictReader(io.StringIO(csv_text([failed, *known[::-1]]))))
+    assert [(row["cause"], row["cause_view"]) for row in rows[:3]] == [
+        ("", ""), ("drift", "run 2: shift x"), ("", "")]
     assert [row["bag"] for row in rows] == [f"/bags/{day:02}" for day in range(30)] + [
         failed["bag"]]
     assert (rows[0]["qualified"], rows[0]["sigma_xy_um"], rows[30]["qualified"]) == ("true", "", "")

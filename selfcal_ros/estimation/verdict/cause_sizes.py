@@ -68,7 +68,7 @@ def size_cause(test: SizeTest, estimates: Iterable[TermEstimate]) -> Cause:
     """
     largest = max(estimates, key=lambda e: abs(e.value))
     return Cause(str(test.name), abs(largest.value), largest.u, largest.unit, test.p,
-                 details={"given": test.given})
+                 largest.view, details={"given": test.given})
 
 
 def scatter_of_views(model: ModelFit, measurements: Measurements

@@ -295,7 +295,8 @@ def _larger_term(cause: Cause, given: float) -> str:
     name = TermName(cause.name)
     unit = _OF_SIZES.get(name, RATIO if UNITS[name] == "m/m" else UM)
     ratio = cause.size / given
-    return (f"a term '{name}' as large as {cause.size * unit.per_si:.3g} {unit.name}, "
+    where = f" in view '{cause.view}'" if cause.view else ""
+    return (f"a term '{name}' as large as {cause.size * unit.per_si:.3g} {unit.name}{where}, "
             f"{f'{ratio:.3g}' if ratio < 1e3 else f'{ratio:.0f}'} times the size assumed")
 
 

@@ -115,13 +115,15 @@ def test_a_calibration_with_a_contradicted_size_says_so_and_its_u_is_honest(term
     assert verdict.grade is Grade.ENLARGED
     assert cause.name == name and cause.p < 5e-4
     assert cause.text.startswith(f"a term '{name}' as large as ")
-    assert f" {unit}, " in cause.text
+    where = f" in view '{cause.view}'" if cause.view else ""
+    assert f" {unit}{where}, " in cause.text
     assert "times the size assumed: " in cause.text
     assert verdict.reasons[0].startswith(f"the readings show a term '{name}' as large as ")
     assert verdict.sentence == f"Good within an enlarged U: {cause.text}"
     assert [item.name for item in verdict.enlarged_by] == [name]
     estimates = result.model.terms[0].estimates
     assert cause.size == max(abs(e.value) for e in estimates) > 100 * float(given)
+    assert cause.view == max(estimates, key=lambda e: abs(e.value)).view
     error = np.stack([result.error_map.gx, result.error_map.gy]) - truth.g
     u = np.stack([result.error_map.u_gx, result.error_map.u_gy])
     assert np.sqrt(np.mean((error / u) ** 2)) < 1.5

@@ -131,7 +131,9 @@ CAUSES = [
      "place the plate closer to its nominal pose, or send the stage to the sites"),
     *((replace(TURN, details={"given": given}),
        f"a term 'microscope' as large as 2 mrad, {times} times the size assumed: {ALIGN}")
-      for given, times in ((1e-6, "2000"), (8e-4, "2.5")))]
+      for given, times in ((1e-6, "2000"), (8e-4, "2.5"))),
+    (Cause("plate_strain", 2e-6, 1e-7, "m/m", 1e-6, "90", details={"given": 1e-6}),
+     f"a term 'plate_strain' as large as 2 µm/m in view '90', 2 times the size assumed: {CLAMP}")]
 
 
 def noise(size, stated, unit, *, declared):
