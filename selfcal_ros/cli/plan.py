@@ -234,7 +234,7 @@ def _suggest(args: argparse.Namespace, plan: Plan) -> int:
     from selfcal_ros.estimation.observability.suggest import best_plan, rank_next
     from selfcal_ros.files import check_outputs
     from selfcal_ros.model.error_map import ThetaDatum
-    from selfcal_ros.reporting.words.steps import search_text
+    from selfcal_ros.reporting.words.tables import search_text
 
     if args.top is not None and args.views is not None:
         raise InputError("--top", "with --views one plan is found, not a list", "omit it")
@@ -317,7 +317,7 @@ def _against(args: argparse.Namespace, plan: Plan) -> Against | None:
 def _show_ranked(args: argparse.Namespace, plan: Plan, now: tuple[Score, float | None],
                  ranked: Sequence[Suggestion]) -> None:
     """Print the next steps; `now`: score of the plan and the noise of an averaged reading, m."""
-    from selfcal_ros.reporting.words.steps import step_text
+    from selfcal_ros.reporting.words.tables import step_text
 
     unit = now[1]
     if args.json:

@@ -218,7 +218,7 @@ def _validated(args: argparse.Namespace, measurements: Any, options: Any,
     if args.validate:
         from selfcal_ros.estimation.quality.outliers import clean
         from selfcal_ros.estimation.quality.validation import judged_by, validate
-        from selfcal_ros.reporting.words.validation import validation_json, validation_text
+        from selfcal_ros.reporting.words.tables import validation_json, validation_text
 
         used = clean(measurements, options).measurements if args.robust else measurements
         found = validate(used, options)
@@ -233,7 +233,7 @@ def _validated(args: argparse.Namespace, measurements: Any, options: Any,
 def _budget(result: Any) -> list[str]:
     """Return the budget as it is printed."""
     from selfcal_ros.estimation.verdict.budget import budgets
-    from selfcal_ros.reporting.words.budget import budget_text
+    from selfcal_ros.reporting.words.tables import budget_text
 
     if not result.has_uncertainty:
         return ["", "no budget: the uncertainty map was not computed (--uncertainty always)"]

@@ -26,8 +26,8 @@ from selfcal_ros.reporting.figures.residuals import (
 from selfcal_ros.reporting.summary import sections
 from selfcal_ros.reporting.summary.format import aligned_numbers, fixed_column, printable
 from selfcal_ros.reporting.summary.sections import Section
-from selfcal_ros.reporting.words.budget import dof_text
 from selfcal_ros.reporting.words.findings import advice, line_text, what_it_is
+from selfcal_ros.reporting.words.tables import dof_text
 from selfcal_ros.units import ARCSEC_PER_RAD, PPM_PER_ONE, RAD_PER_MRAD, UM_PER_M
 
 AT_NODES = ("At the nodes: how well the map itself is known. Take it to compare two calibrations, "

@@ -30,7 +30,7 @@ from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.orders import ORDERS
 from selfcal_ros.model.terms import parse_terms
 from selfcal_ros.model.view import View
-from selfcal_ros.reporting.words.steps import search_text, step_text
+from selfcal_ros.reporting.words.tables import search_text, step_text
 from selfcal_ros.simulation.truth import hu_plan, random_truth, simulate_measurements
 from test.support.dense_terms import Dense
 from test.support.options import BARE, bare

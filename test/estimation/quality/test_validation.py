@@ -20,7 +20,7 @@ from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.terms import ModelTerm, TermName
 from selfcal_ros.model.view import View
 from selfcal_ros.reporting.words.findings import held_out_text, worded
-from selfcal_ros.reporting.words.validation import validation_json, validation_text, why_text
+from selfcal_ros.reporting.words.tables import validation_json, validation_text, why_text
 from selfcal_ros.simulation.machine import Spread
 from selfcal_ros.simulation.truth import hu_plan, random_truth, simulate_measurements
 from test.support.lattice_plans import plan_of
