@@ -166,9 +166,9 @@ def _residuals(result: CalibrationResult) -> Chapter:
     found = residuals_in(result)
     pairs = (
         (residual_maps(result, found), "What the fit leaves at each mark. Random directions are "
-         "noise; neighbours that point alike are something that the model does not hold."),
+         "noise; neighbours that point the same way are an effect outside the model."),
         (distributions(found, "xy"), "Bars against the normal curve of the same rms, and the same "
-         "residuals against normal quantiles: dots beside the line at the ends are outliers."),
+         "residuals against normal quantiles: dots off the line at its ends are outliers."),
         (distributions(found, "theta"), "The same of the angular lines."),
         (courses(found, result.noise.sigma_xy), "Means over a sixtieth of the view's time each. A "
          "course that leaves the band is a drift."))

@@ -3,8 +3,7 @@
 
 import math
 import os
-from collections.abc import Mapping
-from dataclasses import replace
+from collections.abc import Iterable, Mapping
 from textwrap import wrap
 
 import numpy as np
@@ -96,28 +95,32 @@ def _origin(result: CalibrationResult) -> str:
 def error_map(result: CalibrationResult,
               truth: Mapping[str, np.ndarray] | None = None) -> Drawing:
     """Return the vectors of G over their length, U around their heads, a known truth beneath."""
-    emap, artifact = result.error_map, result.artifact
-    length = np.hypot(emap.gx, emap.gy)
-    U = np.stack([emap.u_gx, emap.u_gy]) * result.noise.k_xy
+    emap, artifact, k = result.error_map, result.artifact, result.noise.k_xy
     sites = thinned(artifact, MAX_ARROWS)
     step = sites[0].step or 1
+    length = np.hypot(emap.gx, emap.gy)
+    U = np.stack([emap.u_gx, emap.u_gy]) * k
     factor = enlargement(np.fmax(length, U.max(axis=0)), step * artifact.grid_pitch_m)
+
+    def shown(parts: Iterable[np.ndarray], scale: float = 1.0) -> np.ndarray:
+        return np.stack([part[sites].ravel() for part in parts]) * scale
+
+    at = shown((artifact.x_m, artifact.y_m), MM_PER_M)
+    around = shown(U, factor * MM_PER_M)
+    fields = [shown(np.where(emap.valid, g[key], np.nan) for key in ("gx", "gy"))
+              for g in (vars(emap), truth) if g is not None]
+    tips = [at + field * factor * MM_PER_M for field in fields]
     drawing = titled("error-map", "Error of the stage, G = indicated − true")
-    g = [np.stack([np.where(emap.valid, of[key], np.nan) for key in ("gx", "gy")])
-         for of in (vars(emap), truth) if of is not None]
-    frame = _frame(drawing, artifact, _reach(artifact, g, np.nan_to_num(U), factor))
+    frame = _frame(drawing, artifact, [np.abs(tip) + np.nan_to_num(around) for tip in tips])
     scale = Scale("e", 0.0, round_end(length * UM_PER_M))
     cells(frame, artifact, length * UM_PER_M, scale)
-    at = np.stack([artifact.x_m[sites].ravel(), artifact.y_m[sites].ravel()]) * MM_PER_M
     entries = [("ink", "measured")]
-    found, *true = (part[:, *sites].reshape(2, -1) for part in g)
-    if true:
-        arrows(frame, at, true[0], factor, colour="truth", width=3.4, heads=False)
+    if truth is not None:
+        arrows(frame, at, fields[1], factor, colour="truth", width=3.4, heads=False)
         entries.append(("truth", "known truth"))
-    if _ellipses(frame, at + found * factor * MM_PER_M,
-                 U[:, *sites].reshape(2, -1) * factor * MM_PER_M):
-        entries.append(("band", f"U, k = {result.noise.k_xy:.3g}"))
-    arrows(frame, at, found, factor)
+    if _ellipses(frame, tips[0], around):
+        entries.append(("band", f"U, k = {k:.3g}"))
+    arrows(frame, at, fields[0], factor)
     frame.axes(x_label="stage x in mm", y_label="stage y in mm")
     left, top, width, height = frame.box
     scale_bar(drawing, scale, (left + width + 16, top, 14.0, height))
@@ -131,34 +134,23 @@ def error_map(result: CalibrationResult,
     return drawing
 
 
-def _frame(drawing: Drawing, artifact: Artifact, reach: float) -> Frame:
-    """Return the frame of a map that has room for vectors of `reach` pitches."""
-    plain = map_frame(drawing, artifact, (LEFT, TOP, SIDE))
-    extra = max(reach - 0.5, 0.0) * artifact.grid_pitch_m * MM_PER_M
-    x, y = (end[1] + extra for end in (plain.x, plain.y))
-    return replace(plain, box=(LEFT, TOP, SIDE, SIDE * y / x), x=(-x, x), y=(-y, y))
-
-
-def _reach(artifact: Artifact, fields: list[np.ndarray], U: np.ndarray, factor: float) -> float:
-    """Return how far enlarged vectors with U reach beyond the outermost sites, in pitches."""
-    most = 0.0
-    for at, half, size, *parts in zip((artifact.m, artifact.n), artifact.half, U, *fields,
-                                      strict=True):
-        for g in parts:
-            ends = (np.abs(at + g * factor / artifact.grid_pitch_m)
-                    + size * factor / artifact.grid_pitch_m)
-            most = max(most, float(np.nanmax(ends, initial=0.0)) - half)
-    return min(most + 0.2, 4.0)
+def _frame(drawing: Drawing, artifact: Artifact, ends_mm: list[np.ndarray]) -> Frame:
+    """Return the frame of a map that also holds places (2, P), up to four pitches off the field."""
+    pitch = artifact.grid_pitch_m * MM_PER_M
+    x, y = (min(max((half + 0.5) * pitch, float(np.nanmax(ends, initial=0.0)) + 0.2 * pitch),
+                (half + 4) * pitch)
+            for half, ends in zip(artifact.half, np.concatenate(ends_mm, axis=1), strict=True))
+    return Frame(drawing, (LEFT, TOP, SIDE, SIDE * y / x), (-x, x), (-y, y))
 
 
 def _ellipses(frame: Frame, tips_mm: np.ndarray, u_mm: np.ndarray) -> bool:
     """Draw U (2, P) around the heads (2, P); return whether it is large enough to be seen."""
-    known = np.isfinite(u_mm).all(axis=0) & np.isfinite(tips_mm).all(axis=0)
+    known = np.isfinite(u_mm + tips_mm).all(axis=0)
     radii = (u_mm * np.array([[frame.per_x], [frame.per_y]]))[:, known]
-    if not known.any() or radii.max() < 0.7:
+    if radii.max(initial=0.0) < 0.7:
         return False
-    frame.drawing.discs([frame.at(x, y) for x, y in tips_mm[:, known].T],
-                        [(a, b) for a, b in radii.T], fill="band", opacity=0.6)
+    frame.drawing.discs([frame.at(x, y) for x, y in tips_mm[:, known].T], list(map(tuple, radii.T)),
+                        fill="band", opacity=0.6)
     return True
 
 
@@ -266,21 +258,20 @@ def _scale(drawing: Drawing, span: float) -> None:
         drawing.label(x, y + 4, words, size=TICK, anchor="middle")
 
 
-def _next(count: int) -> list[tuple[int, int]]:
-    return [(i, (i + 1) % count) for i in range(count)]
+def _between(known: np.ndarray) -> list[tuple[int, int]]:
+    """Return the neighbours around the circle that are both known."""
+    count = len(known)
+    return [(i, (i + 1) % count) for i in range(count) if known[i] and known[(i + 1) % count]]
 
 
 def _curve(drawing: Drawing, angles: np.ndarray, values: np.ndarray, span: float, *,
            colour: str, width: float) -> None:
-    drawing.lines([(_at(angles[i], values[i], span), _at(angles[j], values[j], span))
-                   for i, j in _next(len(angles)) if np.isfinite(values[[i, j]]).all()],
-                  stroke=colour, width=width)
+    drawing.lines([[_at(angles[k], values[k], span) for k in pair]
+                   for pair in _between(np.isfinite(values))], stroke=colour, width=width)
 
 
 def _band(drawing: Drawing, angles: np.ndarray, error: np.ndarray, u: np.ndarray,
           span: float) -> None:
-    known = np.isfinite(error) & np.isfinite(u)
-    drawing.shapes([(_at(angles[i], error[i] + u[i], span), _at(angles[j], error[j] + u[j], span),
-                     _at(angles[j], error[j] - u[j], span), _at(angles[i], error[i] - u[i], span))
-                    for i, j in _next(len(angles)) if known[i] and known[j]],
-                   fill="band", opacity=0.6)
+    drawing.shapes([[_at(angles[k], error[k] + side * u[k], span)
+                     for k, side in ((i, 1), (j, 1), (j, -1), (i, -1))]
+                    for i, j in _between(np.isfinite(error + u))], fill="band", opacity=0.6)

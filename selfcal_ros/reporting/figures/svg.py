@@ -82,23 +82,9 @@ def _shape(tag: str, d: str, look: str, more: str = "", title: str = "") -> str:
 
 
 def _d(lines: Iterable[tuple[Point, ...]], *, closed: bool) -> str:
-    """Return path data; a step along one axis takes its short form."""
-    parts = []
-    for line in lines:
-        x, y = _n(line[0][0]), _n(line[0][1])
-        parts.append(f"M{x} {y}")
-        for point in line[1:]:
-            new_x, new_y = _n(point[0]), _n(point[1])
-            if new_y == y and new_x != x:
-                parts.append(f"H{new_x}")
-            elif new_x == x and new_y != y:
-                parts.append(f"V{new_y}")
-            elif (new_x, new_y) != (x, y):
-                parts.append(f"L{new_x} {new_y}")
-            x, y = new_x, new_y
-        if closed:
-            parts.append("Z")
-    return "".join(parts)
+    """Return path data."""
+    return "".join("M" + "L".join(f"{_n(x)} {_n(y)}" for x, y in line) + "Z" * closed
+                   for line in lines)
 
 
 def _label(label: Label) -> str:

@@ -45,7 +45,8 @@ def test_the_picture_holds_the_figures_of_the_report_beside_each_other():
     count = sum(isinstance(item, Path) for item in figures[0].items)
     np.testing.assert_allclose(moves[:count], np.broadcast_to(moves[0], (count, 2)))
     np.testing.assert_allclose(moves[count:], np.broadcast_to(moves[-1], (len(moves) - count, 2)))
-    assert moves[-1][0] - moves[0][0] >= figures[0].width and moves[0][1] == moves[-1][1]
+    assert moves[-1][0] - moves[0][0] >= figures[0].width and moves[0][1] == pytest.approx(
+        moves[-1][1])
     for kind in (Discs, Label):
         assert min(at[0] for item in found.items if isinstance(item, kind)
                    for at in (item.centres if kind is Discs else [item.at])) >= moves[0][0]
