@@ -232,7 +232,7 @@ def _validated(args: argparse.Namespace, measurements: Any, options: Any,
 
 def _budget(result: Any) -> list[str]:
     """Return the budget as it is printed."""
-    from selfcal_ros.estimation.verdict.budget import budgets
+    from selfcal_ros.estimation.verdict.uncertainty import budgets
     from selfcal_ros.reporting.words.tables import budget_text
 
     if not result.has_uncertainty:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from selfcal_ros.estimation.verdict.budget import Budget, budgets
+from selfcal_ros.estimation.verdict.uncertainty import Budget, budgets
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.reporting.extras import convention_section, extra_sections, provenance_section
 from selfcal_ros.reporting.figures.drawing import Drawing

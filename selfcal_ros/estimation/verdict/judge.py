@@ -23,9 +23,13 @@ from selfcal_ros.estimation.joint.solve import fit_joint, solve_joint
 from selfcal_ros.estimation.joint.solved import Solved
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.terms.equations import free_inverse
-from selfcal_ros.estimation.verdict.budget import budget_lines
-from selfcal_ros.estimation.verdict.enlarge import enlarged, enlargements, with_coverage
 from selfcal_ros.estimation.verdict.look import ALWAYS_SITES, look_into
+from selfcal_ros.estimation.verdict.uncertainty import (
+    budget_lines,
+    enlarged,
+    enlargements,
+    with_coverage,
+)
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.terms import TermName

@@ -20,17 +20,15 @@ from selfcal_ros.estimation.joint.solved import Solved
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.terms.equations import LEAST_NOISE_M
 from selfcal_ros.estimation.terms.sizes import SizeTest
-from selfcal_ros.estimation.verdict.cause_sizes import (
+from selfcal_ros.estimation.verdict.causes import (
+    SURE,
     cause_of,
+    effect_of_line,
     held_by,
+    line_cause,
     scatter_of_views,
     size_cause,
-)
-from selfcal_ros.estimation.verdict.enlarge import (
-    Effect,
-    difference,
-    effect_of_field,
-    enlargements,
+    turned_too_far,
 )
 from selfcal_ros.estimation.verdict.explanations import (
     FLOOR_M,
@@ -39,8 +37,13 @@ from selfcal_ros.estimation.verdict.explanations import (
     find_explanations,
 )
 from selfcal_ros.estimation.verdict.fault_columns import READING
-from selfcal_ros.estimation.verdict.lines import SURE, effect_of_line, line_cause, turned_too_far
 from selfcal_ros.estimation.verdict.off_sites import off_sites_cause
+from selfcal_ros.estimation.verdict.uncertainty import (
+    Effect,
+    difference,
+    effect_of_field,
+    enlargements,
+)
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.statistics import rms
 from selfcal_ros.model.terms import ModelTerm, TermName

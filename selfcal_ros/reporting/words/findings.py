@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, NamedTuple
 
-from selfcal_ros.estimation.verdict.budget import INTERPOLATION
+from selfcal_ros.estimation.verdict.uncertainty import INTERPOLATION
 from selfcal_ros.model.result import CalibrationResult, Noise
 from selfcal_ros.model.terms import UNITS, TermName
 from selfcal_ros.model.verdict import BudgetLine, Cause, Finding, Grade, Remedy, Verdict

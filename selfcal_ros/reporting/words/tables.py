@@ -8,7 +8,7 @@ import numpy as np
 from selfcal_ros.estimation.observability.plan_check import describe_view
 from selfcal_ros.estimation.observability.suggest import Search, Suggestion
 from selfcal_ros.estimation.quality.validation import HeldOut
-from selfcal_ros.estimation.verdict.budget import Budget
+from selfcal_ros.estimation.verdict.uncertainty import Budget
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.verdict import Finding
 from selfcal_ros.model.view import Plan, View

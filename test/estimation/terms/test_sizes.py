@@ -9,7 +9,7 @@ import pytest
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.joint.model_fit import fit_model
 from selfcal_ros.estimation.joint.solve import prepare
-from selfcal_ros.estimation.verdict.budget import budgets
+from selfcal_ros.estimation.verdict.uncertainty import budgets
 from selfcal_ros.model.result import result_from_dict, result_to_dict
 from selfcal_ros.model.terms import ModelTerm, parse_terms
 from selfcal_ros.model.verdict import Grade

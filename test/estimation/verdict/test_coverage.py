@@ -13,7 +13,7 @@ from selfcal_ros.aerotech.export import provenance
 from selfcal_ros.aerotech.machine import MachineFrame
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.options import ReferenceLength
-from selfcal_ros.estimation.verdict.budget import budgets
+from selfcal_ros.estimation.verdict.uncertainty import budgets
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.result import result_from_dict, result_to_dict
 from selfcal_ros.model.terms import parse_terms

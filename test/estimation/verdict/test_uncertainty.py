@@ -9,7 +9,7 @@ import pytest
 
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.comparison.covariance import xy_covariance
-from selfcal_ros.estimation.verdict.enlarge import (
+from selfcal_ros.estimation.verdict.uncertainty import (
     Effect,
     difference,
     effect_of_field,

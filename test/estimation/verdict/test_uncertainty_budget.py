@@ -10,7 +10,7 @@ from scipy.stats import t as student
 
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.options import Options
-from selfcal_ros.estimation.verdict.budget import budget_lines, budgets
+from selfcal_ros.estimation.verdict.uncertainty import budget_lines, budgets
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.result import result_from_dict, result_to_dict
