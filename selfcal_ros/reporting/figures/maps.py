@@ -183,9 +183,11 @@ def component_maps(result: CalibrationResult) -> Drawing:
             cells(frame, result.artifact, values, scale)
             frame.axes(ticks=(4, 4), x_label="mm" if name.startswith("U") else "")
             uniform = scale.low == scale.high
-            drawing.label(frame.box[0], top - 7, name + (
-                f" = {significant(scale.high) if scale.high else UNKNOWN} µm everywhere"
-                if uniform else ""), bold=True)
+            drawing.label(frame.box[0], top - 7, name, bold=True)
+            if uniform:
+                drawing.label(frame.box[0] + side / 2, top + frame.box[3] / 2 + 4,
+                              f"{significant(scale.high)} µm everywhere"
+                              if np.isfinite(values).any() else "not known", anchor="middle")
         if not uniform:
             scale_bar(drawing, scale, (left + 2 * side + gap + 14, top, 12.0, frame.box[3]))
         top += frame.box[3] + 56

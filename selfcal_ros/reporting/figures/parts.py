@@ -98,11 +98,14 @@ def _runs(row: np.ndarray) -> list[tuple[int, int]]:
 
 
 def levels(values: np.ndarray, scale: Scale) -> np.ndarray:
-    """Return the step of the colour scale of each value; -1 where it is not known."""
+    """Return the step of the colour scale of each value; -1 where it is not known.
+
+    Of a scale with equal ends it is the middle one.
+    """
     top = 2 * SIDES if scale.ramp == "d" else LEVELS - 1
     with np.errstate(invalid="ignore", over="ignore"):
-        part = (np.asarray(values) - scale.low) / ((scale.high - scale.low) or np.inf)
-        part = np.clip(part, 0, 1)
+        offset, span = np.asarray(values) - scale.low, scale.high - scale.low
+        part = np.clip(offset / span if span else 0.4 + 0 * offset, 0, 1)
         step = np.rint(part * top) if scale.ramp == "d" else np.floor(part * LEVELS)
     return np.where(np.isfinite(part), np.minimum(step, top), -1).astype(int)
 
