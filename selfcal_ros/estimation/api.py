@@ -1,14 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """The public call of the estimators: readings in, calibration out."""
 
+import numpy as np
+
 from selfcal_ros.estimation.checks.placing import check_placing
 from selfcal_ros.estimation.checks.wiring import check_wiring
 from selfcal_ros.estimation.joint.solve import solve_joint
 from selfcal_ros.estimation.law.solve import solve_law
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.verdict.judge import judged
-from selfcal_ros.model.readings import Measurements
+from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.readings import GridVisits, Measurements, ViewReadings
 from selfcal_ros.model.result import CalibrationResult
+from selfcal_ros.model.view import View
+from selfcal_ros.units import NS_PER_S
 
 
 def calibrate(measurements: Measurements, options: Options | None = None) -> CalibrationResult:
@@ -43,3 +48,29 @@ def calibrate(measurements: Measurements, options: Options | None = None) -> Cal
     if not result.verdict.qualified:
         check_placing(measurements)
     return result
+
+
+def pure_noise(marks: int) -> Measurements:
+    """Return readings of noise, with visits, in four views: to call `calibrate` before there are any.
+
+    Parameters
+    ----------
+    marks : int
+        Marks along each side of the plate, odd.
+    """
+    plate, rng = Artifact(marks, 0.01, 8), np.random.default_rng(1)
+    lines, views = np.arange(plate.angular_count), []
+    for number, view in enumerate((
+            View("identity"), View("rot90", np.pi / 2), View("line", np.pi / 4, grid=False),
+            View("shift_x", 0.0, (plate.grid_pitch_m, 0.0)))):
+        on_field = view.grid & (plate.m + bool(view.translation_m[0]) <= plate.half[0])
+        m, n = plate.m[on_field], plate.n[on_field]
+        dx, dy, offset_x, offset_y = rng.normal(0.0, 2e-8, (4, len(m)))
+        once, mark = np.ones(len(m), dtype=int), np.arange(len(m))
+        visits = GridVisits(mark, dx, dy, once, (1000 * number + mark) * NS_PER_S, offset_x,
+                            offset_y, once, once)
+        views.append(ViewReadings(
+            view, m, n, dx, dy, once, k=lines, dtheta=rng.normal(0.0, 1e-6, len(lines)),
+            count_theta=np.ones(len(lines), dtype=int), used=len(m) + len(lines),
+            visits=visits if view.grid else None))
+    return Measurements("noise", plate, tuple(views))

@@ -6,17 +6,14 @@ from dataclasses import dataclass, field
 from functools import cache
 from typing import Any
 
-import numpy as np
-
 from selfcal_ros.collection.inputs import Phase, begun_ns, check_plate, check_view
 from selfcal_ros.collection.settings.estimator import solver_options
 from selfcal_ros.collection.settings.nodes import SolverSettings
 from selfcal_ros.errors import InputError, NoDataError, NotIdentifiableError, SelfcalError
-from selfcal_ros.estimation.api import Options, calibrate
+from selfcal_ros.estimation.api import Options, calibrate, pure_noise
 from selfcal_ros.files import write_json
 from selfcal_ros.memory import keep_freed_memory
 from selfcal_ros.messages import from_model, to_model
-from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Measurements, readings_digest, session_digest
 from selfcal_ros.model.result import (
     CalibrationResult,
@@ -33,7 +30,6 @@ from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.sessions.clocks import Run, begins_in_future, supersedes
 from selfcal_ros.sessions.map_files import is_qualified, read_result, result_file, run_file
 from selfcal_ros.sessions.ports import Diagnosis, Level, Ports
-from selfcal_ros.simulation.truth import hu_plan, random_truth, simulate_measurements
 from selfcal_ros.topics import COMMAND_TOPIC, MEASUREMENT_TOPIC
 
 ECHO_LENGTH = 128
@@ -75,7 +71,7 @@ def solve(job: Job) -> Outcome:
 
 @cache
 def warm_up(marks: int = 5) -> None:
-    """Solve a simulated plan, so that all that solving needs is there; once in a process.
+    """Solve noise, so that all that solving needs is there; once in a process.
 
     Otherwise the first solution of a session would wait for it. To be called before there are other
     threads: threadpoolctl, when it first looks for libraries, waits for the interpreter while the
@@ -88,10 +84,7 @@ def warm_up(marks: int = 5) -> None:
         Marks along each side of the plate, for which memory is made ready.
     """
     keep_freed_memory()
-    plan = hu_plan(Artifact(marks, 0.01, 8))
-    rng = np.random.default_rng(1)
-    calibrate(simulate_measurements(random_truth(plan.artifact, len(plan.views), rng), plan, rng,
-                                    sigma_m=2e-8, sigma_theta_rad=1e-6, visits=True))
+    calibrate(pure_noise(marks))
 
 
 @dataclass
