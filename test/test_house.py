@@ -2,36 +2,17 @@
 """The rules of the house: layers, where libraries may be imported, and room per file."""
 
 import ast
+import re
 from pathlib import Path
 
 import pytest
 
-from test.support.sources import PACKAGE, SOURCES, source
+from test.support.sources import PACKAGE, ROOT, SOURCES, source
 
-BASE = {"errors", "files", "memory", "outputs", "topics", "units"}
-DOMAIN = {"model"} | BASE
-ESTIMATION = {"estimation", "compensation"}
-MIDDLE = {"messages", "bagio", "reporting", "collection", "simulation", "parallel"}
-GUESTS = {"aerotech", "laser", "papers"}
-"""What only the verbs import, so that the core does without it."""
-MAY_IMPORT = {
-    "errors": set(),
-    "memory": set(),
-    "topics": set(),
-    "units": set(),
-    "outputs": {"errors"},
-    "files": {"errors", "outputs"},
-    "model": BASE,
-    **{name: DOMAIN | ESTIMATION for name in ESTIMATION},
-    **{name: DOMAIN | ESTIMATION | MIDDLE for name in MIDDLE},
-    "parallel": {"errors"},
-    **{name: DOMAIN | ESTIMATION | MIDDLE for name in GUESTS},
-    "batch": DOMAIN | ESTIMATION | MIDDLE,
-    "sessions": DOMAIN | ESTIMATION | MIDDLE,
-    "start": set(),
-    "nodes": DOMAIN | ESTIMATION | MIDDLE | {"sessions", "start"},
-    "cli": DOMAIN | ESTIMATION | MIDDLE | GUESTS | {"batch", "start"},
-}
+BASE = {"errors": set(), "memory": set(), "topics": set(), "units": set(), "start": set(),
+        "outputs": {"errors"}, "files": {"errors", "outputs"}}
+"""Modules that any package may import (`start`: the edges), and what they import."""
+ROW = re.compile(r"\| `(\w+)` \|[^|]*\|([^|]*)\|")
 ONLY_IN = {
     "rclpy": "nodes", "mcap": "bagio", "rosbags": "bagio", "matplotlib": "reporting",
     "selfcal_msgs": "nodes", "sensor_msgs": "nodes", "diagnostic_msgs": "nodes",
@@ -52,19 +33,41 @@ def imports(path: Path) -> set[str]:
     return found
 
 
+def documented() -> dict[str, set[str]]:
+    """Return package -> packages that it imports, from the top to the bottom of the table."""
+    page = (ROOT / "docs/architecture.md").read_text()
+    section = page.partition("## Layers")[2].partition("Inside `estimation`")[0]
+    return {name: set(re.findall(r"`(\w+)`", cell)) for name, cell in ROW.findall(section)}
+
+
 def layer_of(path: Path) -> str:
     return path.relative_to(PACKAGE).parts[0].removesuffix(".py")
 
 
+def test_the_table_names_every_package():
+    alone = {"__init__", "__main__", "forked"}  # import nothing but `start`
+    assert {layer_of(path) for path in SOURCES} - alone == {*documented(), *BASE}
+
+
+@pytest.mark.parametrize("layer", [*documented(), *BASE])
+def test_packages_import_what_the_table_states(layer):
+    table = documented()
+    found = {name.split(".")[1] for path in SOURCES if layer_of(path) == layer
+             for name in imports(path) if name.startswith("selfcal_ros.")} & {*table, *BASE}
+    if layer in BASE:
+        assert found - {layer} == BASE[layer]
+    else:
+        places = list(table)
+        assert found - {layer, "model", *BASE} == table[layer]
+        assert all(places.index(layer) < places.index(other) for other in table[layer])
+        assert "start" not in found or layer in ("cli", "nodes")
+
+
 @pytest.mark.parametrize("path", SOURCES, ids=lambda p: str(p.relative_to(PACKAGE)))
-def test_imports_follow_the_layers(path):
-    layer = layer_of(path)
+def test_libraries_are_imported_in_one_place_each(path):
     for name in imports(path):
-        first, *rest = name.split(".")
-        if first == "selfcal_ros" and rest and layer in MAY_IMPORT:
-            allowed = MAY_IMPORT[layer] | {layer}
-            assert rest[0] in allowed or rest[0] in ("__version__", "cli"), f"{layer} -> {name}"
-        assert layer == ONLY_IN.get(first, layer), f"{name} belongs in {ONLY_IN.get(first)}/"
+        first = name.partition(".")[0]
+        assert layer_of(path) == ONLY_IN.get(first, layer_of(path)), f"{name} belongs elsewhere"
 
 
 @pytest.mark.parametrize("path", SOURCES, ids=lambda p: str(p.relative_to(PACKAGE)))

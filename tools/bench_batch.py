@@ -28,10 +28,10 @@ from pathlib import Path
 
 import numpy as np
 
-from selfcal_ros.bagio.simulated import write_simulation
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import write_json, write_yaml
 from selfcal_ros.parallel import check_workers, mapped
+from selfcal_ros.simulation.bag import write_simulation
 from selfcal_ros.simulation.spec import read_simulation
 
 ROOT = Path(__file__).parents[1]

@@ -13,13 +13,13 @@ from pathlib import Path
 import yaml
 
 from selfcal_ros.bagio.offline import TRUTH_FILE, bag_input, collect_bag
-from selfcal_ros.bagio.simulated import write_simulation
 from selfcal_ros.cli.replay import domain, process
 from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.errors import NotIdentifiableError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.files import write_text
 from selfcal_ros.reporting.summary.numbers import summary_numbers
+from selfcal_ros.simulation.bag import write_simulation
 from selfcal_ros.simulation.spec import read_simulation
 from selfcal_ros.units import PPM_PER_ONE, URAD_PER_RAD
 

@@ -18,8 +18,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Simulate and print what was written."""
-    from selfcal_ros.bagio.simulated import write_simulation
     from selfcal_ros.cli.terminal import progress_bar
+    from selfcal_ros.simulation.bag import write_simulation
     from selfcal_ros.simulation.spec import read_simulation
 
     simulation = read_simulation(args.sim)

@@ -51,7 +51,7 @@ def calibrate(measurements: Measurements, options: Options | None = None) -> Cal
 
 
 def pure_noise(marks: int) -> Measurements:
-    """Return readings of noise, with visits, in four views: to call `calibrate` before there are any.
+    """Return readings of noise in four views, to call `calibrate` with before there are others.
 
     Parameters
     ----------

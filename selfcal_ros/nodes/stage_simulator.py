@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from selfcal_ros.bagio.simulated import event_fields, write_truth
 from selfcal_ros.collection.inputs import (
     Command,
     Detection,
@@ -26,6 +25,7 @@ from selfcal_ros.nodes.filling import fill
 from selfcal_ros.nodes.running import run
 from selfcal_ros.sessions.ports import Diagnosis, Level
 from selfcal_ros.sessions.sequencing import load_plan
+from selfcal_ros.simulation.bag import event_fields, write_truth
 from selfcal_ros.simulation.cell import JOINTS, Event, view_events
 from selfcal_ros.simulation.machine import Truth, random_truth
 from selfcal_ros.simulation.spec import settings_of, spread_of

@@ -12,11 +12,11 @@ from rosbags.rosbag2 import Reader
 
 from selfcal_ros.bagio.reader import INPUT_TOPICS, BagReader
 from selfcal_ros.bagio.schemas import hash_of, typestore
-from selfcal_ros.bagio.simulated import QOS, event_fields
 from selfcal_ros.bagio.writer import BagWriter
 from selfcal_ros.collection.inputs import Detection, EncoderSample
 from selfcal_ros.errors import InputError
 from selfcal_ros.messages import from_model
+from selfcal_ros.simulation.bag import QOS, event_fields
 from selfcal_ros.topics import qos_profile
 from test.support.sessions import events_of, small_plan
 

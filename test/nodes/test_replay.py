@@ -14,7 +14,6 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from selfcal_ros.bagio.offline import Playlist, bag_input
-from selfcal_ros.bagio.simulated import event_fields
 from selfcal_ros.bagio.writer import BagWriter
 from selfcal_ros.cli import replay as replay_verb
 from selfcal_ros.cli.main import main as selfcal
@@ -28,6 +27,7 @@ from selfcal_ros.nodes.player import Player
 from selfcal_ros.nodes.pose_sequencer import PoseSequencer
 from selfcal_ros.nodes.replay_session import ReplaySession
 from selfcal_ros.nodes.solver import Solver
+from selfcal_ros.simulation.bag import event_fields
 from test.support.bags import Foreign
 from test.support.sessions import events_of, small_bag, small_plan, stepped_bag
 

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from selfcal_ros.bagio.offline import collect_bag
-from selfcal_ros.bagio.simulated import event_fields
 from selfcal_ros.bagio.writer import BagWriter
 from selfcal_ros.collection.inputs import Command, Detection, EncoderSample, Phase
 from selfcal_ros.estimation.api import calibrate
@@ -18,6 +17,7 @@ from selfcal_ros.sessions.collecting import CollectingSession
 from selfcal_ros.sessions.journal_keeper import take_up
 from selfcal_ros.sessions.ports import Level
 from selfcal_ros.sessions.solving import SolvingSession, solve
+from selfcal_ros.simulation.bag import event_fields
 from selfcal_ros.simulation.cell import CellSettings, plan_events
 from selfcal_ros.simulation.truth import random_truth
 from selfcal_ros.topics import INPUT_TOPICS

@@ -7,12 +7,12 @@ import numpy as np
 import yaml
 
 from selfcal_ros.bagio.schemas import build, typestore
-from selfcal_ros.bagio.simulated import event_fields, write_simulation
 from selfcal_ros.bagio.writer import BagWriter
 from selfcal_ros.collection.collector import Collector
 from selfcal_ros.collection.expected import ViewProgress
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.view import Plan
+from selfcal_ros.simulation.bag import event_fields, write_simulation
 from selfcal_ros.simulation.cell import CellSettings, Event, plan_events
 from selfcal_ros.simulation.spec import Faults, apply_faults, read_simulation
 from selfcal_ros.simulation.truth import random_truth

@@ -7,8 +7,8 @@ import pytest
 import yaml
 
 from selfcal_ros.bagio.offline import read_truth
-from selfcal_ros.bagio.simulated import write_simulation
 from selfcal_ros.errors import InputError
+from selfcal_ros.simulation.bag import write_simulation
 from selfcal_ros.simulation.spec import read_simulation
 from test.support.sessions import plan_file, small_plan
 
