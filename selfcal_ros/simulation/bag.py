@@ -102,5 +102,3 @@ def write_truth(path: Path, truth: Truth, **more: object) -> None:
         "placed": [None if view is None else {
             "rotation": view.rotation_rad, "translation": view.translation_m}
             for view in truth.placed], **more}))
-
-

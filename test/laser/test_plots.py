@@ -42,7 +42,7 @@ def test_curves_stand_over_powers_of_ten():
     effect = dict.fromkeys(("linear_m", "transverse_m", "squareness_m"), 1e-9)
     nothing = dict.fromkeys(effect, 0.0)
     curves = [{"fault": "mirror off", "size": [1e-4, 1e-3, 1e-2],
-               "conventional": [nothing, effect, {key: 1e-6 for key in effect}],
+               "conventional": [nothing, effect, dict.fromkeys(effect, 1e-6)],
                "new": [nothing] * 3}]
     drawing = sensitivity_figure(curves)
     low, middle, high = next(item.lines[0] for item in drawing.items if isinstance(item, Line)
