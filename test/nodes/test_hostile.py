@@ -195,7 +195,7 @@ def hostile_to(topic, fields):
 
 
 def test_each_field_at_its_worst_ends_nothing(graph, cell, all_kinds, refused, good, capfd):
-    status = {key: "1" for key in ("view", "command_stamp", "views", "run_id")}
+    status = dict.fromkeys(("view", "command_stamp", "views", "run_id"), "1")
     private = [(names.of_node(node, names.HEALTH), worst(names.HEALTH.type(
         level=b"\1", name=node, message="as told", values=[
             KeyValue(key=key, value=value) for key, value in status.items()])))
