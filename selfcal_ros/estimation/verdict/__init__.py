@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Do the readings agree with the model that the uncertainties assume, and if not, why not."""
+"""Whether the readings agree with the model behind the uncertainties, and the causes if not."""

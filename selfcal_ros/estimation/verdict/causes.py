@@ -25,19 +25,25 @@ from selfcal_ros.model.terms import OF_LINES, UNITS, TermName
 from selfcal_ros.model.verdict import Cause, TermEstimate
 
 TIMES = np.linspace(-1, 1, 101)
-"""Instants of a view between which the range of a drift is sought."""
+"""Instants of a view at which the range of a drift is evaluated."""
+
+SURE = 3.0
+"""Ratio of a rotation to its standard uncertainty above which the readings determine its view."""
+
+CHECKED = 1e-6
+"""Smallest share of a reading's error in its own residual: the part that other readings check."""
 
 Sized = tuple[float, float, dict[str, Any]]
-"""The component that stands out: its value and standard uncertainty, and fields of its cause."""
+"""Value and u of the most significant component, and further fields of the cause."""
 
 
 def cause_of(found: Explanation, ground: Ground) -> Cause:
-    """Return what explains the residuals of a fit, or what the fit holds, as a cause.
+    """Return an explanation of the residuals, or a term of the model, as a cause.
 
     Parameters
     ----------
     found : Explanation
-        What it is.
+        The explanation.
     ground : Ground
         Of the fit: names of the views, unit of a slip's rotation.
     """
@@ -50,27 +56,27 @@ def cause_of(found: Explanation, ground: Ground) -> Cause:
                     **fields})
 
 
-def held_by(model: ModelFit, name: str, p: float = 1.0, *, whole: bool = True) -> Explanation:
-    """Return a term as the fit that holds it finds it: within the size that it has."""
+def fitted_term(model: ModelFit, name: str, p: float = 1.0, *, whole: bool = True) -> Explanation:
+    """Return a term of the model with its fitted coefficients and its effect."""
     if model.equations is None:
-        raise ValueError(f"the fit does not hold {name}")
+        raise ValueError(f"the model does not have the term {name}")
     equations = equations_of(model.problem, model.found, model.equations.columns, model.reduced)
     rows = equations.rows([name])
     covariance = model.covariance[np.ix_(rows, rows)] * model.found.xy.sigma**2
     columns = tuple(compress(equations.columns.columns, rows))
     found = Explanation(str(name), columns, model.coefficients[rows], covariance, p, whole, 0.0)
-    return found.doing(equations, np.where(rows, model.coefficients, 0.0))
+    return found.with_effect(equations, np.where(rows, model.coefficients, 0.0))
 
 
 def size_cause(test: SizeTest, estimates: Iterable[TermEstimate]) -> Cause:
-    """Return the size of a term that the readings contradict as a cause.
+    """Return a size of a term that the readings contradict as a cause.
 
     Parameters
     ----------
     test : SizeTest
-        That failed.
+        The failed test.
     estimates : iterable of TermEstimate
-        The term's coefficients without that size.
+        Coefficients of the term, fitted without that size.
     """
     largest = max(estimates, key=lambda e: abs(e.value))
     return Cause(str(test.name), abs(largest.value), largest.u, largest.unit, test.p,
@@ -79,9 +85,9 @@ def size_cause(test: SizeTest, estimates: Iterable[TermEstimate]) -> Cause:
 
 def scatter_of_views(model: ModelFit, measurements: Measurements
                      ) -> list[tuple[str, float, float]]:
-    """Return (name, noise of one reading, degrees of freedom) of each grid view's repeats.
+    """Return (name, noise of one reading, degrees of freedom) from the repeats of each grid view.
 
-    Of its visits, less what the terms explain of them, where marks were visited again.
+    If marks were visited again, from the visits after subtraction of the fitted terms.
     """
     held, out = model.equations, []
     known = [] if held is None else held.columns.at_visits(model.coefficients)
@@ -106,13 +112,13 @@ def _linear(found: Explanation, weights: np.ndarray) -> tuple[float, float]:
 
 def _likeliest[What](found: Explanation, options: list[tuple[What, np.ndarray]],
                      ) -> tuple[What, float, float]:
-    """Return key, value and u of the combination that stands out most."""
+    """Return key, value and u of the most significant combination."""
     sized = [(what, *_linear(found, weights)) for what, weights in options]
     return max(sized, key=lambda item: abs(item[1]) / max(item[2], 1e-300))
 
 
 def _one_column(found: Explanation) -> tuple[str, float, float]:
-    """Return component, value and u of the coefficient that stands out most."""
+    """Return component, value and u of the most significant coefficient."""
     return _likeliest(found, [(column.component, row) for column, row in zip(
         found.columns, np.eye(len(found.columns)), strict=True)])
 
@@ -139,9 +145,9 @@ def _drift(found: Explanation, names: tuple[str, ...], _: float) -> Sized:
 
 
 def _of_plate(found: Explanation, names: tuple[str, ...], _: float) -> Sized:
-    """Size the coefficient that stands out most against the first view's.
+    """Size the coefficient that differs most significantly from that of the first view.
 
-    The first view has none of its own where the term is free: then it is 0 there.
+    If the term is free, the first view has no coefficients of its own: they are 0.
     """
     weights = np.eye(len(found.columns))
     for at, column in enumerate(found.columns):
@@ -163,7 +169,7 @@ def _line_eccentricity(found: Explanation, names: tuple[str, ...], _: float) -> 
 
 
 def _rotation(found: Explanation, names: tuple[str, ...], _: float) -> Sized:
-    """Size the view that stands out of each other one: a turn that all share is the datum's."""
+    """Size the view that differs most from all others: a common rotation belongs to the datum."""
     n, unit = len(found.values), np.eye(len(found.values))
     apart = []
     for at in range(n):
@@ -171,7 +177,7 @@ def _rotation(found: Explanation, names: tuple[str, ...], _: float) -> Sized:
         apart.append(min((abs(value) / max(u, 1e-300) for value, u in pairs), default=0.0))
     at = int(np.argmax(apart))
     value, u = _linear(found, unit[at] - (1 - unit[at]) / max(n - 1, 1))
-    u = max(u, abs(value) / max(apart[at], 1e-300))  # as uncertain as against the nearest
+    u = max(u, abs(value) / max(apart[at], 1e-300))  # that of the difference from the nearest
     return value, u, {"view": names[found.columns[at].view]}
 
 
@@ -207,15 +213,15 @@ _SIZES: dict[str, Callable[..., Sized]] = {
 
 def turned_too_far(model: ModelFit, result: CalibrationResult,
                    measurements: Measurements) -> Cause | None:
-    """Return lines that turn against marks by as much as the plates are turned, as a cause.
+    """Return a cause if lines rotate relative to marks by as much as the plate is rotated.
 
-    That is no plate that moved: offsets of lines have the other sign, or those of marks are in
-    wrong units. None where they do not, or where the model has them turn alike.
+    A plate that moved does not explain that: the offsets of lines have the wrong sign, or those of
+    marks the wrong unit. None otherwise, or if the model has no such rotation.
     """
     if TermName.ROTATION not in [term.name for term in model.problem.terms]:
         return None
-    held = held_by(model, TermName.ROTATION)
-    first = len(model.problem.ground.with_lines) - len(held.values)  # has none where it is free
+    held = fitted_term(model, TermName.ROTATION)
+    first = len(model.problem.ground.with_lines) - len(held.values)  # fewer if the term is free
     values, covariance = np.pad(held.values, (first, 0)), np.pad(held.covariance, (first, 0))
     apart, variance = abs(values[:, None] - values), np.diag(covariance)
     spread = variance[:, None] + variance - 2 * covariance
@@ -228,15 +234,8 @@ def turned_too_far(model: ModelFit, result: CalibrationResult,
     return replace(cause_of(held, model.problem.ground), p=p)
 
 
-SURE = 3.0
-"""Size over its standard uncertainty from which a rotation is that of its view."""
-
-CHECKED = 1e-6
-"""Smallest part of a reading that its residual must hold: what others check of it."""
-
-
 class OffLine(NamedTuple):
-    """A line's reading: row of its view, line, by what it is off with u, rad, and probability."""
+    """A faulty reading of a line: row of its view, line, error and its u, rad, and probability."""
 
     view: int
     k: int
@@ -246,18 +245,18 @@ class OffLine(NamedTuple):
 
 
 def line_cause(problem: Problem, measurements: Measurements, level: float) -> Cause | None:
-    """Return the reading of a line that contradicts the others most, None if none does.
+    """Return the reading of a line that contradicts the others most; None if none does.
 
-    Lines are fitted alone. By how much a reading is off is its residual over the part 1 - h of it
-    that the fit does not follow; what it takes off the sum of squares is tested against what is
-    left (F-test; the level holds for all lines together).
+    Lines are fitted without marks. The error of a reading is its residual over 1 - h, the part that
+    the fit does not follow; the reduction of the sum of squares is tested against the remainder
+    (F-test; the level is that of all lines together).
 
     Parameters
     ----------
     problem : Problem
         Plan and readings.
     measurements : Measurements
-        The same, for the names of the views.
+        Readings, for the names of the views.
     level : float
         Level of the test.
     """
@@ -269,7 +268,7 @@ def line_cause(problem: Problem, measurements: Measurements, level: float) -> Ca
 
 
 def _suspects(problem: Problem) -> Iterator[OffLine]:
-    """Yield the lines with the largest residuals, each tested."""
+    """Yield the readings of lines with the largest residuals, each tested."""
     system, angular = problem.system, problem.system.angular
     dof = angular.n_readings - system.rank_angular
     if dof < 2:
@@ -293,7 +292,7 @@ def _suspects(problem: Problem) -> Iterator[OffLine]:
 
 
 def effect_of_line(cause: Cause, artifact: Artifact) -> Effect:
-    """Return the effect of a reading of a line that is off: at most what it is off by."""
+    """Return the effect of a faulty reading of a line: its error at most."""
     theta = np.zeros(artifact.angular_count)
     theta[:] = abs(cause.size) / np.sqrt(max(len(theta), 1))
     return Effect(cause.name, np.zeros((2, *artifact.shape)), theta)

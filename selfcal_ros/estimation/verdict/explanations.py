@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """What explains the residuals: terms, slips, single readings (method eqs. 7.7, 7.8).
 
-A term that the model does not hold is scored by the sum of squares that its columns explain, for
-the number of their combinations that the readings determine (F-test against what is then left).
-The likeliest (Bayesian information criterion) joins first, and the others are judged together with
-it, so that one cause does not appear under many names. Terms that explain the same equally well
-are both given: the readings do not determine which it is.
+A term that the model does not hold is tested by the sum of squares that its columns explain, with
+as many degrees of freedom as the readings determine of them (F-test against the remainder). The
+best one (Bayesian information criterion) is accepted first, and the others are tested together with
+it, so that one cause does not appear under many names. Of terms that explain the same equally well
+all are returned: the readings do not determine which of them it is.
 """
 
 import math
@@ -32,21 +32,21 @@ from selfcal_ros.model.terms import SHARED, VISIT_TERMS, ModelTerm, TermName
 
 
 @dataclass(frozen=True, eq=False)
-class Beside:
-    """What columns explain together.
+class Explained:
+    """Joint fit of a set of columns to the residuals.
 
     Attributes
     ----------
     rows, at : bool array (p,), int array (k,)
-        Which columns they are, k of p, and the same as numbers.
+        The columns: as a mask, k of p, and as indices.
     own_inverse, rank : float array (k, k), int
         Pseudo-inverse of their information, and its rank.
     own_values : float array (k,)
         Their estimated coefficients.
     explained : float
-        The sum of squares that they explain, m^2.
+        Sum of squares that they explain, m^2.
     between, dof_between : float
-        Squares of the marks' means beside them, m^2, and their degrees of freedom.
+        Remaining squares of the means of the marks, m^2, and their degrees of freedom.
     """
 
     rows: np.ndarray
@@ -60,33 +60,33 @@ class Beside:
 
     @property
     def inverse(self) -> np.ndarray:
-        """The pseudo-inverse among all columns, (p, p)."""
+        """The pseudo-inverse for all columns, (p, p), 0 for the others."""
         out = np.zeros((len(self.rows),) * 2)
         out[self.at[:, None], self.at] = self.own_inverse
         return out
 
     @property
     def values(self) -> np.ndarray:
-        """The estimates among all columns, (p,)."""
+        """The coefficients of all columns, (p,), 0 for the others."""
         out = np.zeros(len(self.rows))
         out[self.at] = self.own_values
         return out
 
 
 @dataclass(frozen=True, eq=False)
-class Pool:
-    """All candidate columns at once, and the residuals that they are to explain.
+class Candidates:
+    """All columns that may explain the residuals, with those of the model.
 
     Attributes
     ----------
     equations : TermEquations
-        All columns.
+        Equations of all columns.
     right : Score
-        What they can explain.
+        Right-hand sides and sums of squares of the residuals.
     prior : float array (p,)
-        Information on each coefficient of the model that its size gives; 0 of all others.
+        Information on each coefficient of the model from its size; 0 for all others.
     taken : float array (p,)
-        Coefficients that the model has.
+        Estimated coefficients of the model; 0 for all others.
     """
 
     equations: TermEquations
@@ -94,30 +94,30 @@ class Pool:
     prior: np.ndarray
     taken: np.ndarray
 
-    def beside(self, rows: np.ndarray) -> Beside:
-        """Return what the columns of `rows`, bool (p,), explain together."""
-        return self.each([rows])[0]
+    def explain(self, rows: np.ndarray) -> Explained:
+        """Fit the columns of `rows`, bool (p,), together."""
+        return self.explain_each([rows])[0]
 
-    def each(self, many: Sequence[np.ndarray]) -> list[Beside]:
-        """Return what each of many sets of columns, bool (p,), explains by itself.
+    def explain_each(self, many: Sequence[np.ndarray]) -> list[Explained]:
+        """Fit each of many sets of columns, bool (p,), by itself.
 
-        Sets of one size are worked out together: for few columns a call costs more than its work.
+        Sets of equal size are computed together: for few columns a call costs more than its work.
         """
         places = [rows.nonzero()[0] for rows in many]
-        found: dict[int, Beside] = {}
+        found: dict[int, Explained] = {}
         for size in {len(at) for at in places}:
             mine = [number for number, at in enumerate(places) if len(at) == size]
             limits = np.array([self.equations.limit(many[number] & (self.prior == 0))
                                for number in mine])
             blocks = self._of_one_size(np.array([places[number] for number in mine]), limits)
             for number, block in zip(mine, blocks, strict=True):
-                found[number] = Beside(many[number], places[number], *block)
+                found[number] = Explained(many[number], places[number], *block)
         return [found[number] for number in range(len(many))]
 
     def _of_one_size(self, at: np.ndarray, limits: np.ndarray) -> Iterator[tuple]:
-        """Yield what `Beside` has of the columns `at`, int (n, k), less the columns themselves.
+        """Yield the fields of `Explained` from `own_inverse` on, for the columns `at`, int (n, k).
 
-        Their eigenvalues up to `limits`, (n,), count as 0.
+        Eigenvalues up to `limits`, (n,), count as 0.
         """
         sums, square = self.right.sums, (at[:, :, None], at[:, None, :])
         values, vectors = np.linalg.eigh(self._scaled[square])
@@ -135,7 +135,7 @@ class Pool:
 
     @cached_property
     def _scaled(self) -> np.ndarray:
-        """The information of columns of unit length, (p, p)."""
+        """Information on the coefficients of columns scaled to unit length, (p, p)."""
         information = self.equations.information + np.diag(self.prior)
         return information / np.outer(self._norm, self._norm)
 
@@ -149,62 +149,61 @@ class Pool:
 
     @cached_property
     def everything(self) -> tuple[float, float]:
-        """Squares of all residuals, m^2, and their degrees of freedom, without any column."""
+        """Sum of squares of all residuals, m^2, and its degrees of freedom, without any column."""
         sums = self.right.sums
         return (sums.total, sums.dof) if sums.dof_within >= 1 else (sums.between,
                                                                    sums.dof_between)
 
-    def noise(self, beside: Beside) -> tuple[float, float]:
-        """Return the variance of one reading that columns leave, m^2, and its dof.
+    def noise(self, fitted: Explained) -> tuple[float, float]:
+        """Return the remaining variance of one reading, m^2, and its degrees of freedom.
 
-        Visits of one mark agree better than marks do where a cause is not held: the larger counts.
-        NaN and 0 where the columns take all degrees of freedom.
+        If a cause is missing, visits of one mark agree better than marks do: the larger variance
+        counts. NaN and 0 if the columns use up all degrees of freedom.
         """
-        sums, between, dof = self.right.sums, beside.between, beside.dof_between
-        both = sums.dof - beside.rank
+        sums, between, dof = self.right.sums, fitted.between, fitted.dof_between
+        both = sums.dof - fitted.rank
         if sums.dof_within >= 1 and both > 0:
-            total = (sums.total - beside.explained) / both
+            total = (sums.total - fitted.explained) / both
             if dof <= 0 or between / dof <= total:
                 return max(total, 0.0), both
         return (max(between, 0.0) / dof, dof) if dof > 0 else (float("nan"), 0.0)
 
 
 LEVEL = 5e-4
-"""Level of the test of each term, for all its parts that are tried together."""
+"""Level of the test of each term, all parts of it that are tried together."""
 
 MAX_CAUSES = 4
 
 FLOOR_M = 1e-13
-"""Noise that is rounding, against which nothing is tested."""
+"""Noise up to which residuals are rounding errors and are not tested."""
 
 
 @dataclass(frozen=True, eq=False)
 class Explanation:
-    """A term that explains part of the residuals.
+    """A term, slip or single reading that explains part of the residuals.
 
     Attributes
     ----------
     name : str
         Name of the term, ``slip`` or ``reading``.
     columns : tuple of Column
-        Its coefficients.
+        Columns of its coefficients.
     values, covariance : float array (p,), (p, p)
-        Their estimates and covariance, SI units.
+        Estimates of the coefficients and their covariance, SI units.
     p : float
         Probability of explaining as much by chance.
     whole : bool
-        Whether the readings tell all of its coefficients.
+        Whether the readings determine all coefficients.
     effect_m, effect_rad : float
-        Root mean square of what it does to a coordinate of the map and to the angular map, as far
-        as it is told.
+        Effect on a coordinate of the map and on the angular map, rms, as far as determined.
     part : float
-        Part of the view's visits before a slip; NaN for what is none.
+        Part of the view's visits before a slip; otherwise NaN.
     mark : tuple of int, optional
-        Mark (m, n) of a single reading; None for what is none.
+        Mark (m, n) of a single reading; otherwise None.
     moved, turned : complex array (sites,), float array (K,), optional
-        What it does to the maps, in the frame of the equations, m and rad, in the datum.
+        Effect on the maps in their datum, in the frame of the equations, m and rad.
     rank : int
-        Which it is: explanations of one rank explain the same equally well.
+        Place among the explanations; those of equal rank explain the same equally well.
     """
 
     name: str
@@ -221,8 +220,8 @@ class Explanation:
     effect_rad: float = 0.0
     turned: np.ndarray | None = None
 
-    def doing(self, equations: TermEquations, coefficients: np.ndarray) -> "Explanation":
-        """Return it with what `coefficients` (p,) of `equations` do to the maps."""
+    def with_effect(self, equations: TermEquations, coefficients: np.ndarray) -> "Explanation":
+        """Return the explanation with the effect of `coefficients` (p,) on the maps."""
         system = equations.system
         moved = equations.maps @ coefficients
         turned = np.where(system.known_lines, -(equations.turned @ coefficients), 0.0)
@@ -234,7 +233,7 @@ class Explanation:
 
 @dataclass(frozen=True, eq=False)
 class Group:
-    """Columns that stand or fall together: a term, or a slip or reading of `places` tried."""
+    """Columns that are tested together: a term, or one slip or reading of `places` tried."""
 
     name: str
     rows: np.ndarray
@@ -246,7 +245,7 @@ class Group:
 
 @dataclass(frozen=True, eq=False)
 class PlacedSlip:
-    """A slip at a place that was found in another way: its columns, grid view, places tried."""
+    """Columns of a slip at a place known beforehand, its grid view, and number of places tried."""
 
     columns: TermColumns
     view: int
@@ -255,14 +254,14 @@ class PlacedSlip:
 
 def find_explanations(model: ModelFit, *, slips: bool, readings: bool = True,
                       placed: PlacedSlip | None = None) -> list[Explanation]:
-    """Return what explains the residuals of a fit significantly, the likeliest first.
+    """Return the significant explanations of the residuals of a fit, the most likely first.
 
     Parameters
     ----------
     model : ModelFit
-        The fit; its own terms are not looked for again.
+        The fit; its own terms are not tested again.
     slips, readings : bool
-        Whether slips of the plate within a view, single readings that are off, are looked for.
+        Whether slips of the plate within a view, or single faulty readings, are tested.
     placed : PlacedSlip, optional
         A slip that competes with the others.
     """
@@ -292,11 +291,12 @@ def find_explanations(model: ModelFit, *, slips: bool, readings: bool = True,
     right = score(equations, model.found.both_residuals, squares(problem, model.found),
                   coefficients=taken)
     prior = np.where(columns.rows(own), equations.prior(model.found.xy.sigma), 0.0)
-    return select_explanations(Pool(equations, right, prior, taken), groups, columns.rows(own))
+    return select_explanations(Candidates(equations, right, prior, taken), groups,
+                               columns.rows(own))
 
 
 def _groups(columns: TermColumns, names: Iterable[TermName]) -> Iterator[Group]:
-    """Yield the columns of each term as a whole, and those of each view, steady drift apart."""
+    """Yield the columns of each term, those of each of its views, and those of a linear drift."""
     of_view = np.array([c.view for c in columns.columns], dtype=int)
     steady = np.array([c.component.endswith("P1") for c in columns.columns], dtype=bool)
     for name in names:
@@ -312,7 +312,7 @@ def _groups(columns: TermColumns, names: Iterable[TermName]) -> Iterator[Group]:
 
 def _with(ground: Ground, before: tuple[TermColumns, list[Group]], columns: TermColumns,
           groups: list[Group]) -> tuple[TermColumns, list[Group]]:
-    """Return columns and groups with more of both behind them."""
+    """Return columns and groups with further ones appended."""
     n_before, n_after = len(before[0].columns), len(columns.columns)
     return joined(ground, before[0], columns), [
         *(replace(g, rows=np.concatenate([g.rows, np.zeros(n_after, dtype=bool)]))
@@ -330,22 +330,23 @@ def _with_readings(model: ModelFit, ground: Ground, columns: TermColumns,
         for s in suspects])
 
 
-def select_explanations(pool: Pool, groups: list[Group], taken: np.ndarray) -> list[Explanation]:
-    """Return the explanations, each judged beside `taken` and those before it."""
+def select_explanations(pool: Candidates, groups: list[Group],
+                        taken: np.ndarray) -> list[Explanation]:
+    """Return the explanations, each tested together with `taken` and those before it."""
     found: list[Explanation] = []
     rank = 0
     while groups and len(found) < MAX_CAUSES:
-        before = pool.beside(taken)
-        beside = pool.each([taken | group.rows for group in groups])
+        before = pool.explain(taken)
+        fitted = pool.explain_each([taken | group.rows for group in groups])
         tests = [(_test(pool, before, after, group), group)
-                 for after, group in zip(beside, groups, strict=True)]
+                 for after, group in zip(fitted, groups, strict=True)]
         good = [(test, group) for test, group in tests if test is not None and test[0] < LEVEL]
         if not good:
             break
         best = max(good, key=lambda item: item[0][1])[1]
         as_good = [(test, group) for test, group in good
                    if group is best or _replaces(pool, taken, group, best)]
-        # of each term the likeliest part; what all views share is simpler than what each has
+        # the best part of each term; what all views share is simpler than what each view has
         as_good.sort(key=lambda item: (item[1].name not in SHARED, -item[0][1]))
         names: list[str] = []
         for (p, _), group in as_good:
@@ -360,39 +361,39 @@ def select_explanations(pool: Pool, groups: list[Group], taken: np.ndarray) -> l
     return found
 
 
-def _replaces(pool: Pool, taken: np.ndarray, group: Group, best: Group) -> bool:
-    """Return whether a term explains the residuals so well that `best` adds nothing to it."""
+def _replaces(pool: Candidates, taken: np.ndarray, group: Group, best: Group) -> bool:
+    """Return whether `best` explains nothing beyond what `group` explains."""
     if {SLIP, READING, TermName.ROTATION} & {group.name, best.name}:
         return False
-    before, after = pool.each([taken | group.rows, taken | group.rows | best.rows])
+    before, after = pool.explain_each([taken | group.rows, taken | group.rows | best.rows])
     more = _test(pool, before, after, best)
     return more is None or more[0] >= LEVEL
 
 
-def _test(pool: Pool, before: Beside, after: Beside,
+def _test(pool: Candidates, before: Explained, after: Explained,
           group: Group) -> tuple[float, float] | None:
-    """Return probability and evidence of a group beside others; None if nothing tells it.
+    """Return probability and evidence of a group; None if the readings do not determine it.
 
-    `before` is without the group, `after` with it.
+    `before` is the fit without the group, `after` the one with it.
     """
     gained, more = max(after.explained - before.explained, 0.0), after.rank - before.rank
     variance, dof = pool.noise(after)
     if more <= 0 or not variance > FLOOR_M**2:  # NaN where nothing is left to test against
         return None
     p = float(fdtrc(more, dof, gained / more / variance))
-    # all readings together, so that explanations compare: by what each leaves of the same squares
+    # of all readings together, so that explanations are compared by the same squares
     whole, n = pool.everything
     rest = max(whole - after.explained, FLOOR_M**2)
     evidence = n * math.log1p(gained / rest) - more * math.log(n)
     return min(p * group.places, 1.0), evidence - 2 * math.log(group.places)
 
 
-def _explanation(pool: Pool, taken: np.ndarray, group: Group, p: float) -> Explanation:
-    beside = pool.beside(taken | group.rows)
-    variance, _ = pool.noise(beside)
-    own = np.where(group.rows, beside.values, 0.0)
+def _explanation(pool: Candidates, taken: np.ndarray, group: Group, p: float) -> Explanation:
+    fitted = pool.explain(taken | group.rows)
+    variance, _ = pool.noise(fitted)
+    own = np.where(group.rows, fitted.values, 0.0)
     columns = tuple(compress(pool.equations.columns.columns, group.rows))
     return Explanation(group.name, columns, own[group.rows],
-                       variance * beside.inverse[np.ix_(group.rows, group.rows)], p,
-                       pool.beside(group.rows).rank == int(group.rows.sum()), 0.0, group.part,
-                       group.mark).doing(pool.equations, own)
+                       variance * fitted.inverse[np.ix_(group.rows, group.rows)], p,
+                       pool.explain(group.rows).rank == int(group.rows.sum()), 0.0, group.part,
+                       group.mark).with_effect(pool.equations, own)

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Columns of what is no term: single grid readings that are off, and plates that slip in a view.
+"""Columns of faults: single grid readings that are off, and plates that slip within a view.
 
-A reading is a mark misread, or moved, in one view; a slip a second misalignment from an instant on.
+A faulty reading is of a mark misread, or moved, in one view; a slip is a second misalignment from
+an instant on.
 """
 
 from typing import NamedTuple
@@ -22,11 +23,11 @@ from selfcal_ros.estimation.terms.visits import ViewVisits
 READING = "reading"
 
 MOST = 6
-"""Readings that are tried: those with the largest residuals."""
+"""Number of readings that are tested: those with the largest residuals."""
 
 
 class Suspect(NamedTuple):
-    """A reading that may be off: its grid view, its mark (m, n), and which columns are its own."""
+    """A reading that may be faulty: its grid view, its mark (m, n), and a mask of its columns."""
 
     view: int
     mark: tuple[int, int]
@@ -35,14 +36,14 @@ class Suspect(NamedTuple):
 
 def reading_columns(ground: Ground, residuals: np.ndarray,
                     phases: np.ndarray) -> tuple[TermColumns, list[Suspect]]:
-    """Return the columns of the readings with the largest residuals, and which they are.
+    """Return the columns of the readings with the largest residuals, and these readings.
 
-    Two a reading: by what it is off along x and along y, stage axes, m.
+    Two for each reading: its errors along x and y, stage axes, m.
 
     Parameters
     ----------
     ground : Ground
-        What the columns stand on.
+        Inputs of the columns.
     residuals : complex array (views, nx, ny)
         Residuals of the means of the marks, plate frame, m.
     phases : complex array (views,)
@@ -71,14 +72,14 @@ def reading_columns(ground: Ground, residuals: np.ndarray,
 SLIP = "slip"
 
 PLACES = 12
-"""Instants in each view at which a slip is tried."""
+"""Number of instants in each view at which a slip is tested."""
 
 
 def slip_columns(ground: Ground) -> tuple[TermColumns, dict[tuple[int, float], np.ndarray]]:
-    """Return the columns of slips, and which of them belong to each view and instant.
+    """Return the columns of slips, and a mask of those of each view and instant.
 
-    Three a slip: offset along x and y (stage axes, m), and rotation (m at the half width). Views
-    whose visits are not known have none. An instant is a part of the view's visits, 0..1.
+    Three for each slip: offset along x and y (stage axes, m), and rotation (m at the half width).
+    Views whose visits are unknown have none. An instant is a part of the view's visits, 0..1.
     """
     columns: list[Column] = []
     shapes: list[tuple[np.ndarray, tuple[complex, ...]]] = []
@@ -100,6 +101,6 @@ def slip_columns(ground: Ground) -> tuple[TermColumns, dict[tuple[int, float], n
 
 
 def _after(visits: ViewVisits, part: float) -> np.ndarray:
-    """Return which visits come after a part of them, in the order of their instants, bool (V,)."""
+    """Return a mask of the visits after the first `part` of them in time, bool (V,)."""
     rank = np.argsort(np.argsort(visits.time, kind="stable"), kind="stable")
     return rank >= round(part * len(rank))

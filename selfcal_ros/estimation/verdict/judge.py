@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The verdict on a solution: its grade, the tests that failed and what explains them.
+"""The verdict on a solution: its grade, the tests that failed, and their causes.
 
-Tests: residuals against the scatter of repeats, or the declared noise, in either direction (F);
-the axis conditions where they are the datum; and all that `selfcal_ros.estimation.verdict.look`
-looks for. What is found and bounded enlarges U; what is not disqualifies. The result also says when
-the readings were taken.
+Residuals are compared with the scatter of repeats, or with the declared noise, in either direction
+(F-test); the axis conditions are tested where they are the datum; and
+`selfcal_ros.estimation.verdict.search` searches for causes. A cause whose effect is bounded
+enlarges U; one that is not disqualifies the result. The result also states when the readings were
+taken.
 """
 
 from dataclasses import replace
@@ -23,7 +24,7 @@ from selfcal_ros.estimation.joint.solve import fit_joint, solve_joint
 from selfcal_ros.estimation.joint.solved import Solved
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.terms.equations import free_inverse
-from selfcal_ros.estimation.verdict.look import ALWAYS_SITES, look_into
+from selfcal_ros.estimation.verdict.search import ALWAYS_SITES, search_causes
 from selfcal_ros.estimation.verdict.uncertainty import (
     budget_lines,
     enlarged,
@@ -37,18 +38,19 @@ from selfcal_ros.model.verdict import Finding, Grade, Provenance, Verdict
 from selfcal_ros.units import NS_PER_S
 
 MUCH_MORE = 1.1
-"""Ratio of what a linear model leaves to what finite rotations leave from which it is named."""
+"""Ratio of the residuals of a linear model to those with finite rotations above which the linear
+model is a finding."""
 
 SIGN_U = 0.3
 """Standard uncertainty of the microscope's scale, by the joint fit alone, up to which the readings
 show the sign of the offsets."""
 
 HIDDEN = 1e-3
-"""Part of the scale in a combination that no reading shows from which it is not known."""
+"""Share of the scale in a combination that no reading shows above which it is unknown."""
 
 UNEXPLAINED = 1.5
-"""Ratio of the noise of residuals to that of repeats, with no cause left to explain it, up to which
-the uncertainty from the residuals counts as covering it."""
+"""Ratio of the noise of residuals to that of repeats, without a cause that explains it, up to which
+the uncertainty from the residuals is taken to cover it."""
 
 
 @one_thread()
@@ -58,33 +60,31 @@ def judged(solved: Solved, measurements: Measurements, options: Options) -> Cali
     Parameters
     ----------
     solved : Solved
-        What is to be judged.
-    measurements : Measurements
-        The readings behind it.
-    options : Options
-        How it was calibrated.
+        The solution.
+    measurements, options : Measurements, Options
+        Its readings, and how they were solved.
     """
     noises = _noise_findings(solved)
     checked = checked_by(solved, measurements, options, failed=bool(noises))
     failed = [*_rotation_findings(solved, checked), *_axes_findings(checked),
               *([] if solved.converged else [Finding("not_converged")]),
               *_sign_findings(checked, measurements, options)]
-    looked = look_into(checked, measurements, options, failed=bool(noises))
+    searched = search_causes(checked, measurements, options, failed=bool(noises))
     own = checked is solved
     if own:
-        solved = looked.solved
+        solved = searched.solved
         noises = _noise_findings(solved)
     reference = options.reference
     result = replace(solved.result, reference=None if reference is None else {
         "kind": str(reference.kind), "relative_error": reference.relative_error,
         "u_relative": reference.u_relative, "certificate": reference.certificate})
-    result = with_coverage(enlarged(result, looked.effects))
-    bounded = looked.bounded and (own or not looked.causes) and not _unexplained_noise(solved)
-    grade = (Grade.GOOD if not (failed or noises or looked.causes) else
+    result = with_coverage(enlarged(result, searched.effects))
+    bounded = searched.bounded and (own or not searched.causes) and not _unexplained_noise(solved)
+    grade = (Grade.GOOD if not (failed or noises or searched.causes) else
              Grade.ENLARGED if bounded and not failed and result.has_uncertainty else
              Grade.NOT_QUALIFIED)
-    verdict = Verdict(grade, (*failed, *noises), looked.causes,
-                      enlargements(result, looked.terms, looked.effects))
+    verdict = Verdict(grade, (*failed, *noises), searched.causes,
+                      enlargements(result, searched.terms, searched.effects))
     result = replace(
         result, verdict=verdict, findings=(*result.findings, *_visits_findings(checked)),
         provenance=provenance_of(measurements, options))
@@ -100,10 +100,10 @@ def _unexplained_noise(solved: Solved) -> bool:
 
 def checked_by(solved: Solved, measurements: Measurements, options: Options, *,
                failed: bool) -> Solved:
-    """Return the solution that is looked through for causes: joint, and rigid if that fits better.
+    """Return the solution in which causes are searched for: joint, and rigid if that fits better.
 
-    Hu's law has no residuals of the whole, and a linear model takes rotations for something else.
-    `solved` itself where nobody asked, or where no other can be had.
+    Hu's law has no residuals of all readings, and a linear model mistakes rotations for other
+    effects. `solved` itself if no search is wanted, or there is no other solution.
     """
     nx, ny = measurements.artifact.shape
     wanted = failed or (solved.model is None and nx * ny <= ALWAYS_SITES)
@@ -120,7 +120,7 @@ def checked_by(solved: Solved, measurements: Measurements, options: Options, *,
 
 
 def _rotation_findings(solved: Solved, checked: Solved) -> list[Finding]:
-    """Return whether finite rotations explain what a linear model leaves."""
+    """Return a finding if finite rotations explain the residuals of a linear model."""
     if checked is solved or checked.model is None or not checked.model.problem.rigid:
         return []
     return [Finding("finite_rotation", max(abs(view.phi) for view in checked.result.views),
@@ -129,10 +129,10 @@ def _rotation_findings(solved: Solved, checked: Solved) -> list[Finding]:
 
 def _sign_findings(solved: Solved, measurements: Measurements,
                    options: Options) -> list[Finding]:
-    """Return whether the sign of the offsets is a matter of belief: no reading would change.
+    """Return a finding if nothing shows the sign of the offsets.
 
     Repeats show it, or the joint fit does (through rotations that lines share, and their squares),
-    or somebody has declared the microscope.
+    or the microscope was declared.
     """
     declared = not options.assumed or any(
         term.name is TermName.MICROSCOPE and not term.free for term in options.terms)
@@ -153,7 +153,7 @@ def _sign_findings(solved: Solved, measurements: Measurements,
 
 
 def _rigid_fit(measurements: Measurements, options: Options) -> ModelFit | None:
-    """Return the fit with finite rotations in place of a linear model, which has no microscope."""
+    """Return the fit with finite rotations: a linear model has no microscope."""
     try:
         return fit_joint(measurements, replace(options, method="joint",
                                                misalignment_model="rigid"))
@@ -175,7 +175,7 @@ def _axes_findings(solved: Solved) -> list[Finding]:
 
 
 def _visits_findings(solved: Solved) -> list[Finding]:
-    """Return whether repeats are there, and none of them at another time."""
+    """Return a finding if all repeats of each mark belong to one visit."""
     if solved.model is None:
         return []
     problem = solved.model.problem
@@ -186,11 +186,10 @@ def _visits_findings(solved: Solved) -> list[Finding]:
 
 
 def provenance_of(measurements: Measurements, options: Options) -> Provenance:
-    """Return what the readings tell of their origin: first and last exposure, visiting order.
+    """Return the origin of the readings: first and last exposure, visiting order.
 
-    Where terms were estimated, who asked for them: ``options`` or ``plan``.
-
-    The time of creation is left open: the same readings give the same result.
+    `model_terms_from` says who requested terms: ``options`` or ``plan``. The time of creation is
+    left empty, so that the same readings give the same result.
     """
     stamps = [stamp for view in measurements.views
               if view.visits is not None and len(view.visits.stamp_ns)
@@ -208,7 +207,7 @@ def provenance_of(measurements: Measurements, options: Options) -> Provenance:
 
 
 def _iso(stamp_ns: int) -> str:
-    """Return a stamp as ISO 8601 in UTC; unchanged where it is not a date."""
+    """Return a stamp as ISO 8601 in UTC; as nanoseconds if it is not a date."""
     try:
         return datetime.fromtimestamp(stamp_ns / NS_PER_S, UTC).isoformat(timespec="milliseconds")
     except (OverflowError, ValueError, OSError):

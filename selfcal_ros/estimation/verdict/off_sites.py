@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether the stage stood so far off the sites that the map is that of other places.
+"""Whether the stage stood so far off the sites that the map describes other positions.
 
-A reading has the stage error of the place where the stage stood and counts for the mark's site
-(method eq. 7.10). Where all views lie beside their places alike, residuals show nothing of
-it; but deviation and offset of a visit, and the map, tell how far off the stage stood.
+A reading contains the stage error where the stage stood, but counts for the site of the mark
+(method eq. 7.10). If all views are displaced alike, residuals do not show it; but deviation and
+offset of a visit, with the map, give the distance of the stage from the site.
 """
 
 import math
@@ -20,35 +20,35 @@ from selfcal_ros.model.verdict import Cause
 OFF_SITES = "off_sites"
 
 ROUNDING_M = 1e-15
-"""Noise that stands for none."""
+"""Noise that replaces a noise of 0."""
 
 SMALL = 0.02
-"""Change of the readings, in standard uncertainties of the map (rms), that is not looked into."""
+"""Change of the readings, in standard uncertainties of the map (rms), that is ignored."""
 
 LEAST_U_M = 1e-10
-"""Standard uncertainty of the map that is reckoned with at least: what finite rotations leave of a
-stage that is turned against its datum is as much."""
+"""Smallest standard uncertainty of the map in these tests: finite rotations of a stage that is
+rotated relative to its datum leave as much."""
 
 SHOWN = 0.9
-"""Ratio of residuals without the change to residuals from which these show it as well."""
+"""Ratio of residuals without the change to those with it below which residuals show it as well."""
 
 RMS_MATTERS = 0.5
-"""Effect on the map, in standard uncertainties (rms), from which it is named."""
+"""Effect on the map, in standard uncertainties (rms), above which it is a cause."""
 
 NODE_MATTERS = 2.0
-"""Effect on a coordinate of a node, in its standard uncertainty, from which it is named."""
+"""Effect on a coordinate of a node, in its standard uncertainty, above which it is a cause."""
 
 
 @dataclass(frozen=True, eq=False)
-class Place:
-    """Places of the stage as a cause, and what they do to the map.
+class OffSites:
+    """A stage off the sites as a cause, and its effect on the map.
 
     Attributes
     ----------
     cause : Cause
         The cause.
     moved : complex array (nx, ny)
-        Bound of the effect on the map along x and along y, frame of the equations, m.
+        Bound of the effect on the map along x and y, frame of the equations, m.
     shown : bool
         Whether residuals show it as well.
     """
@@ -58,17 +58,17 @@ class Place:
     shown: bool
 
 
-def off_sites_cause(model: ModelFit, error_map: ErrorMap, level: float) -> Place | None:
-    """Return what the places of the stage do to the map as a cause, None where that is little.
+def off_sites_cause(model: ModelFit, error_map: ErrorMap, level: float) -> OffSites | None:
+    """Return the effect of a stage off the sites as a cause; None if it is small.
 
     Parameters
     ----------
     model : ModelFit
-        The fit; views whose visits are not known count as measured at the sites.
+        The fit; views whose visits are unknown count as measured at the sites.
     error_map : ErrorMap
         Its map.
     level : float
-        Level at which the noise of the map alone does not seem to do as much.
+        Level of the test against the noise of the map.
     """
     u = np.maximum(_uncertainty(model, error_map), LEAST_U_M)
     known = model.problem.system.known_sites
@@ -77,7 +77,7 @@ def off_sites_cause(model: ModelFit, error_map: ErrorMap, level: float) -> Place
     if not rms(_parts(changed)) > SMALL * rms(u):
         return None
     before, at_sites = model.found.xy.residuals, fit(model.problem, model.y - changed)
-    if at_sites.xy.residuals < before:  # the places are behind the noise as well
+    if at_sites.xy.residuals < before:  # displacements cause part of the noise
         u = u * (at_sites.xy.residuals / before)
     moved = _parts(model.found.field - at_sites.field)
     ratio = np.where(known, np.abs(moved) / u, np.nan)
@@ -95,13 +95,13 @@ def off_sites_cause(model: ModelFit, error_map: ErrorMap, level: float) -> Place
                   details={"away": rms(np.abs(away))}, effect_rms=rms(effect),
                   effect_max=float(effect[worst]))
     bound = _between(np.where(known, model.found.field, np.nan), _pitch_m(model), away)
-    return Place(cause, np.where(known, bound, 0.0), shown)
+    return OffSites(cause, np.where(known, bound, 0.0), shown)
 
 
 def _between(field: np.ndarray, pitch_m: float, away: np.ndarray) -> np.ndarray:
-    """Return by how much the error may differ at that distance from the sites, complex (nx, ny).
+    """Return the largest change of the error at that distance from the sites, complex (nx, ny).
 
-    A stage that is rough from site to site has another slope on either side: the steeper counts.
+    The slopes on the two sides of a site may differ: the steeper one counts.
     """
     total = np.zeros((2, *field.shape))
     for axis, distance in ((0, rms(away.real)), (1, rms(away.imag))):
@@ -126,7 +126,7 @@ def _pitch_m(model: ModelFit) -> float:
 def _uncertainty(model: ModelFit, error_map: ErrorMap) -> np.ndarray:
     """Return the standard uncertainty in the frame of the equations, (2, nx, ny), m.
 
-    Where nobody asked for it that of a reading, which a map of three views comes near to.
+    If it was not computed, that of a mean reading, which a map from three views comes close to.
     """
     u, grid = np.stack([error_map.u_gx, error_map.u_gy]), model.problem.system.grid
     if not np.isfinite(u).any():
@@ -135,16 +135,16 @@ def _uncertainty(model: ModelFit, error_map: ErrorMap) -> np.ndarray:
 
 
 def _slopes(field: np.ndarray, pitch_m: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the slopes of a field along x and y, 0 where a neighbour is not known.
+    """Return the slopes of a field along x and y, 0 where a neighbour is unknown.
 
-    Central inside, one-sided at the border.
+    Central differences inside, one-sided ones at the border.
     """
     along_x, along_y = np.gradient(field, pitch_m)
     return np.nan_to_num(along_x), np.nan_to_num(along_y)
 
 
 def _noise(u: np.ndarray, pitch_m: float, away_m: tuple[float, float]) -> np.ndarray:
-    """Return what noise of the nodes does to slopes times distances, (2, nx, ny), m."""
+    """Return the noise of slopes times distances, (2, nx, ny), m."""
     total = np.zeros_like(u)
     for axis, away in zip((1, 2), away_m, strict=True):
         square = np.moveaxis(u**2, axis, 0)
@@ -156,10 +156,10 @@ def _noise(u: np.ndarray, pitch_m: float, away_m: tuple[float, float]) -> np.nda
 
 
 def _at_visits(model: ModelFit, field: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return how far the stage stood off the sites, and what that changes of the readings.
+    """Return the distances of the stage from the sites, and their effect on the readings.
 
-    Complex: the visits' distances in the stage frame, and means at the marks in the plate frame,
-    (views, nx, ny), m.
+    Complex, m: distances of all visits, stage frame, and effects on the means of the marks, plate
+    frame, (views, nx, ny).
     """
     grid = model.problem.system.grid
     along_x, along_y = (slope.reshape(-1) for slope in _slopes(field, _pitch_m(model)))
@@ -169,7 +169,7 @@ def _at_visits(model: ModelFit, field: np.ndarray) -> tuple[np.ndarray, np.ndarr
         if visits is None:
             continue
         site = grid.views.site_index[view].reshape(-1)[visits.mark]
-        # the deviation as it was read: without the turn of the frame
+        # the deviation as it was read, without the rotation of the frame
         turn = model.problem.turn_rad[view]
         mark = grid.views.z.reshape(-1)[visits.mark] * model.problem.half_width_m
         read = visits.y / visits.phase + mark * -np.expm1(-1j * turn) / visits.phase

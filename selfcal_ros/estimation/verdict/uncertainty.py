@@ -2,8 +2,8 @@
 """The uncertainty of a map: enlarged by effects that the readings show, coverage factor, budget.
 
 An effect e of known size is added in quadrature at every node, u'^2 = u^2 + e^2, so that k u'
-covers a map that holds it. As L = e / sigma it is a further factor of the map's covariance, so
-that maps are compared and budgets drawn up with it.
+covers a map that contains it. L = e / sigma is a further factor of the map's covariance, which
+comparisons of maps and budgets use. The budget lists labelled components as the GUM asks for.
 """
 
 from collections.abc import Iterable, Iterator
@@ -25,21 +25,21 @@ from selfcal_ros.model.statistics import rms
 from selfcal_ros.model.verdict import BudgetLine, Enlargement, TermResult
 
 TOLD = 0.5
-"""Part of a term's size that readings leave, below which it is they that tell the term."""
+"""Share of a term's size left by the readings below which they determine the term (type A)."""
 
 
 @dataclass(frozen=True, eq=False)
 class Effect:
-    """What a cause does to the maps, stage frame.
+    """Effect of a cause on the maps, stage frame.
 
     Attributes
     ----------
     name : str
-        Of the cause.
+        Name of the cause.
     xy : float array (2, nx, ny)
-        On Gx and Gy, m.
+        Effect on Gx and Gy, m.
     theta : float array (K,)
-        On Gtheta, rad.
+        Effect on Gtheta, rad.
     """
 
     name: str
@@ -48,16 +48,16 @@ class Effect:
 
 
 def effect_of_field(name: str, field: np.ndarray, sense: str, theta: np.ndarray) -> Effect:
-    """Return the effect of what is moved, in the frame of the equations.
+    """Return an effect that is given in the frame of the equations.
 
     Parameters
     ----------
     name : str
-        Of the cause.
+        Name of the cause.
     field, theta : complex array (nx, ny), float array (K,)
-        On the maps, m and rad.
+        Effect on the maps, m and rad.
     sense : str
-        Who moved.
+        Sense of the measurement.
     """
     if sense == Sense.PLATE_MOVES:
         field, theta = -field[::-1, ::-1], -np.roll(theta[::-1], 1)
@@ -65,7 +65,7 @@ def effect_of_field(name: str, field: np.ndarray, sense: str, theta: np.ndarray)
 
 
 def difference(name: str, one: CalibrationResult, other: CalibrationResult) -> Effect:
-    """Return by how much two maps of the same readings differ; 0 where one is not known."""
+    """Return the difference of two maps of the same readings; 0 where one is unknown."""
     a, b = one.error_map, other.error_map
     theta = a.g_theta - b.g_theta
     if np.isfinite(theta).any():
@@ -93,9 +93,9 @@ def enlarged(result: CalibrationResult, effects: Iterable[Effect]) -> Calibratio
 
 def enlargements(result: CalibrationResult, names: Iterable[str],
                  effects: Iterable[Effect]) -> tuple[Enlargement, ...]:
-    """Return what terms, by name, and effects add to the uncertainty, the most first.
+    """Return the contributions of terms, by name, and effects to u, the largest first.
 
-    Of the XY map, or of the angular map (rad) where that is all they change.
+    To u of the XY map, or of the angular map (rad) if only that changes.
     """
     variance = variance_of_terms(result)
     found = [Enlargement(name, float(np.sqrt(power.mean())), float(np.sqrt(power.max())))
@@ -112,22 +112,22 @@ def enlargements(result: CalibrationResult, names: Iterable[str],
 
 
 def remaining_part(term: TermResult) -> float:
-    """Return the part of a term's size that the readings leave: rms u over the size."""
+    """Return the share of a term's size that the readings leave: rms u over the size."""
     return rms(np.array([estimate.u for estimate in term.estimates])) / term.solved_with
 
 
 def variance_of_reference(result: CalibrationResult) -> np.ndarray:
-    """Return the variance of the map that the reference length makes, (2, nx, ny), m^2."""
+    """Return the contribution of the reference length to the variance, (2, nx, ny), m^2."""
     u = 0.0 if result.reference is None else float(result.reference["u_relative"])
     return (u * np.stack([result.artifact.x_m, result.artifact.y_m])) ** 2
 
 
 def known_beforehand(result: CalibrationResult) -> np.ndarray:
-    """Return the variance of the map that no reading determined, (2, nx, ny), m^2."""
+    """Return the variance of the map that does not come from readings, (2, nx, ny), m^2."""
     found = variance_of_reference(result)
     terms = {term.name: term for term in result.model.terms}
     for name, variance in variance_of_terms(result).items():
-        if name not in terms or remaining_part(terms[name]) >= TOLD:  # else an effect
+        if name not in terms or remaining_part(terms[name]) >= TOLD:  # otherwise an effect
             found += variance
     return found
 
@@ -135,7 +135,7 @@ def known_beforehand(result: CalibrationResult) -> np.ndarray:
 def with_coverage(result: CalibrationResult) -> CalibrationResult:
     """Return the result with degrees of freedom and k of the XY map's uncertainty.
 
-    Without an uncertainty map k is that of the noise. The reference length is that of the result.
+    Without an uncertainty map k is that of the noise.
     """
     noise, emap = result.noise, result.error_map
     dof = noise.dof_xy
@@ -155,12 +155,12 @@ CELL_MEAN = 8 / 15
 """Mean square of the parabola 4 s (1 - s) over a cell: rms of an interpolation error."""
 
 INTERPOLATION = "interpolation"
-"""The component of a map that is used between its nodes or lines."""
+"""The component that only a map used between its nodes or lines has."""
 
 
 @dataclass(frozen=True)
 class Budget:
-    """Lines of one quantity and what they add up to.
+    """Budget of one quantity: its lines and their sum.
 
     `quantity` is ``xy`` (one coordinate) or ``theta``, `anywhere` whether the map is interpolated
     between its nodes or lines; `unit` is ``m`` or ``rad``; `u_rms`, `u_max` the combined standard
@@ -207,8 +207,8 @@ class Budget:
 def budgets(result: CalibrationResult) -> list[Budget]:
     """Return the budgets of the XY map (one coordinate) and, if there is one, of the angular map.
 
-    Two of each: at the nodes of the map, where it was calibrated, and anywhere between them, where
-    the interpolation errs as well. None without an uncertainty map.
+    Two of each: at the nodes of the map, and anywhere between them, where interpolation adds its
+    error. None without an uncertainty map.
     """
     lines, found = result.budget or tuple(budget_lines(result)), []
     for quantity, dof in (("xy", _map_dof(result)), ("theta", _dof(result.noise, "theta"))):
@@ -225,17 +225,14 @@ def budgets(result: CalibrationResult) -> list[Budget]:
 def budget_lines(result: CalibrationResult) -> Iterator[BudgetLine]:
     """Yield the lines of the budget: noise, terms, reference, interpolation of each map.
 
-    Parameters
-    ----------
-    result : CalibrationResult
-        With its reference length, if it has one; one without an uncertainty map has no lines.
+    A result without an uncertainty map has none.
     """
     emap, noise = result.error_map, result.noise
     if not result.has_uncertainty:
         return
     power = np.stack([emap.u_gx, emap.u_gy]) ** 2
     of_terms, of_reference = variance_of_terms(result), variance_of_reference(result)
-    # the map's uncertainty holds the reference's and the terms', which have lines of their own
+    # the uncertainty of the map includes those of reference and terms, which have their own lines
     power = power - sum(of_terms.values()) - of_reference
     yield _noise_line("xy", np.sqrt(np.maximum(power, 0.0)), noise)
     for name, variance in of_terms.items():
@@ -253,7 +250,7 @@ def budget_lines(result: CalibrationResult) -> Iterator[BudgetLine]:
 
 
 def _map_dof(result: CalibrationResult) -> float:
-    """Return the degrees of freedom of the XY map's uncertainty; older results do not name them."""
+    """Return the degrees of freedom of the XY map's uncertainty; older results do not have them."""
     named = result.noise.dof_map_xy
     if not named > 0:
         noise = replace(result.noise, dof_xy=_dof(result.noise, "xy"))
@@ -266,13 +263,13 @@ def _dof(noise: Noise, kind: str) -> float:
     dof = getattr(noise, f"dof_{kind}")
     if dof > 0:
         return dof
-    sigma = getattr(noise, f"sigma_{kind}")  # results of version 0.1 do not name them
+    sigma = getattr(noise, f"sigma_{kind}")  # results of version 0.1 do not have them
     return next((getattr(noise, f"dof_{kind}_{way}") or np.inf for way in ("repeats", "residuals")
                  if getattr(noise, f"sigma_{kind}_{way}") == sigma), np.inf)
 
 
 def _noise_line(kind: str, u: np.ndarray, noise: Noise) -> BudgetLine:
-    """Return the noise of readings as it reaches the map."""
+    """Return the contribution of the noise of readings to a map."""
     sigma, repeats, residuals, p = (getattr(noise, name) for name in (
         f"sigma_{kind}", f"sigma_{kind}_repeats", f"sigma_{kind}_residuals", f"p_{kind}"))
     unit = "m" if kind == "xy" else "rad"
@@ -287,9 +284,9 @@ def _noise_line(kind: str, u: np.ndarray, noise: Noise) -> BudgetLine:
 
 
 def _term_line(quantity: str, name: str, u: np.ndarray, result: CalibrationResult) -> BudgetLine:
-    """Return what a term with a size, or an effect of a cause, makes of a map's uncertainty.
+    """Return the contribution of a term with a size, or of a cause, to a map's uncertainty.
 
-    A term is of type A if the readings tell it, of type B if its size does.
+    A term is of type A if the readings determine it, otherwise of type B.
     """
     effect = rms(u), float(u.max(initial=0.0))
     term = next((term for term in result.model.terms if term.name == name), None)
@@ -321,15 +318,14 @@ def _reference_line(u: np.ndarray, reference: dict[str, Any] | None) -> BudgetLi
 def _interpolation_xy(result: CalibrationResult) -> BudgetLine:
     """Estimate the error of linear interpolation from the map's own curvature.
 
-    A site less the mean of its neighbours errs as interpolation over two pitches does at the
-    middle, four times as much as over one pitch, if the error is smooth. The part that noise
-    explains is taken off.
+    A site minus the mean of its neighbours is the error of interpolation over two pitches, four
+    times that over one pitch if the error is smooth. The part that noise explains is subtracted.
     """
     emap = result.error_map
     squares = [_curvature(field, u, axis) for field, u in ((emap.gx, emap.u_gx),
                                                            (emap.gy, emap.u_gy))
                for axis in (0, 1)]
-    # each coordinate errs by what both directions contribute
+    # both directions contribute to the error of each coordinate
     return _interpolation("xy", sum(value for value, _ in squares) / 2,
                           max(largest for _, largest in squares))
 
@@ -348,7 +344,7 @@ def _interpolation(quantity: str, square: float, largest: float) -> BudgetLine:
 
 
 def _curvature(field: np.ndarray, u: np.ndarray, axis: int) -> tuple[float, float]:
-    """Return mean and largest square of a site less the mean of its neighbours, noise taken off."""
+    """Return mean and largest square of a site minus the mean of its neighbours, less noise."""
     values, power = np.moveaxis(field, axis, 0), np.moveaxis(u, axis, 0) ** 2
     square = (values[1:-1] - (values[:-2] + values[2:]) / 2) ** 2
     square = square - (power[1:-1] + (power[:-2] + power[2:]) / 4)

@@ -11,7 +11,7 @@ from selfcal_ros.estimation.joint.solve import solve_joint
 from selfcal_ros.estimation.law.solve import solve_law
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.verdict.judge import judged
-from selfcal_ros.estimation.verdict.look import are_looked_for
+from selfcal_ros.estimation.verdict.search import is_searched
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.terms import ModelTerm, TermName, parse_terms
@@ -68,9 +68,9 @@ def test_axes_that_the_stage_does_not_keep_are_found_without_an_uncertainty_map(
     (203, True, True, False), (41, False, True, False), (1, False, False, False)])
 def test_causes_are_looked_for_unasked_up_to_41_and_at_all_up_to_201_marks_a_side(
         side, asked, failed, wanted):
-    assert are_looked_for(side**2, Options(causes=asked), failed=failed) is wanted
+    assert is_searched(side**2, Options(causes=asked), failed=failed) is wanted
     if side > 1:  # and no other number of sites lies between
-        beyond = are_looked_for(side**2 + 1, Options(causes=asked), failed=failed)
+        beyond = is_searched(side**2 + 1, Options(causes=asked), failed=failed)
         assert beyond is (wanted and (side, asked, failed) not in (
             (41, None, False), (201, True, False), (201, None, True)))
 

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the readings show besides the model: looked for, bounded, and added to the uncertainty.
+"""Search for effects that the model does not hold; their bounds are added to the uncertainty.
 
-A term that they show joins the model with the largest size that they allow (method eq. 7.9), until
-they show no more. What is no term (a slip, a reading, a rotation of lines against marks, places of
-the stage) has an effect on the map, which enlarges its uncertainty.
+A term that the readings show joins the model with the largest size that they allow (method
+eq. 7.9), until they show no more. A cause that is no term (a slip, a single reading, a stage off
+the sites) has an effect on the map, which enlarges its uncertainty.
 """
 
 from collections.abc import Collection, Iterable
@@ -24,7 +24,7 @@ from selfcal_ros.estimation.verdict.causes import (
     SURE,
     cause_of,
     effect_of_line,
-    held_by,
+    fitted_term,
     line_cause,
     scatter_of_views,
     size_cause,
@@ -50,47 +50,47 @@ from selfcal_ros.model.terms import ModelTerm, TermName
 from selfcal_ros.model.verdict import Cause, Remedy, TermResult
 
 ALWAYS_SITES = 41 * 41
-"""Field up to which causes are looked for in any case; beyond, where another test fails."""
+"""Field up to which causes are always searched for; in a larger one only if a test fails."""
 
 MAX_SITES = 201 * 201
-"""Field up to which they are looked for at all."""
+"""Largest field in which causes are searched for at all."""
 
 NOISY = 1.5
-"""Ratio of the noise of a view to that of the others from which it matters."""
+"""Ratio of a view's noise to that of the others above which it is a cause."""
 
 MATTERS = 0.1
-"""Effect of a cause on the map, in standard uncertainties (rms), below which it is of no account
-where the readings determine all of it."""
+"""Effect on the map, in standard uncertainties (rms), below which a cause that the readings
+determine fully is ignored."""
 
 MAX_JOINED = 4
-"""Most terms that join the model because the readings show them."""
+"""Largest number of terms that join the model because the readings show them."""
 
 START: dict[str, float] = {
     TermName.MICROSCOPE: 1e-6, TermName.DRIFT: 1e-12, TermName.PLATE_SCALE: 1e-10,
     TermName.PLATE_SHAPE: 1e-12, TermName.APPROACH: 1e-12, TermName.PLATE_STRAIN: 1e-10,
     TermName.LINE_ECCENTRICITY: 1e-9, TermName.ROTATION: 1e-10}
-"""Size with which a term joins: so small that the readings contradict it."""
+"""Initial size of a term that joins: so small that the readings contradict it."""
 
 PLAUSIBLE = {TermName.MICROSCOPE: 0.1}
-"""Largest size that a term may have: beyond it is no term, but a fault."""
+"""Largest plausible size of a term: a larger one is a fault."""
 
 
 @dataclass(frozen=True, eq=False)
-class Looked:
-    """What was found.
+class SearchResult:
+    """Causes that were found, and the solution that allows for them.
 
     Attributes
     ----------
     solved : Solved
         The solution with the terms that the readings show.
     causes : tuple of Cause
-        The likeliest first.
+        The most likely first.
     effects : tuple of Effect
-        What enlarges the uncertainty beyond that of the solution.
+        Effects that enlarge the uncertainty beyond that of the solution.
     terms : tuple of str
         Terms whose size was enlarged, or that joined.
     bounded : bool
-        Whether solution and effects cover all that was found.
+        Whether solution and effects cover all causes.
     """
 
     solved: Solved
@@ -101,8 +101,8 @@ class Looked:
 
 
 @dataclass
-class _Found:
-    """What is being found: see `Looked`."""
+class _Search:
+    """State of a search: see `SearchResult`."""
 
     solved: Solved
     causes: list[Cause] = field(default_factory=list)
@@ -111,29 +111,29 @@ class _Found:
     bounded: bool = True
 
 
-def look_into(solved: Solved, measurements: Measurements, options: Options, *,
-              failed: bool, advise: bool = True) -> Looked:
-    """Return what the readings show besides the model.
+def search_causes(solved: Solved, measurements: Measurements, options: Options, *,
+              failed: bool, advise: bool = True) -> SearchResult:
+    """Search for effects that the model does not hold.
 
     Parameters
     ----------
     solved : Solved
-        A solution; one without a joint fit is not looked into.
+        A solution; without a joint fit there is no search.
     measurements, options : Measurements, Options
-        The readings behind it and how they were solved.
+        Its readings, and how they were solved.
     failed : bool
         Whether another test failed.
     advise : bool
         Whether remedies are tried.
     """
     if options.causes is False or solved.model is None or not solved.model.problem.direct:
-        return Looked(solved)
+        return SearchResult(solved)
     sizes = [test for test in solved.model.sizes if test.contradicted]
     place = off_sites_cause(solved.model, solved.result.error_map, LEVEL)
     failed = failed or bool(sizes or place)
-    found = _Found(solved)
+    found = _Search(solved)
     n_sites = solved.model.problem.system.grid.n_sites
-    if are_looked_for(n_sites, options, failed=failed) and solved.xy.sigma > LEAST_NOISE_M:
+    if is_searched(n_sites, options, failed=failed) and solved.xy.sigma > LEAST_NOISE_M:
         _search(found, measurements, options, failed=failed)
     solved, tests = found.solved, _model(found.solved).sizes
     raised = {str(test.name): _raised_cause(solved, test) for test in tests
@@ -151,17 +151,17 @@ def look_into(solved: Solved, measurements: Measurements, options: Options, *,
         found.effects.append(effect_of_field(
             place.cause.name, place.moved, measurements.sense,
             np.zeros(measurements.artifact.angular_count)))
-    looked = Looked(_from_readings(solved, found.joined), tuple(causes), tuple(found.effects),
-                    (*names, *found.joined), found.bounded and plausible)
+    out = SearchResult(_from_readings(solved, found.joined), tuple(causes), tuple(found.effects),
+                       (*names, *found.joined), found.bounded and plausible)
     if not advise or not causes:
-        return looked
-    tried = looked.terms and plausible and not alike
-    model = _tried(looked, measurements, options) if tried else None
-    return replace(looked, causes=tuple(_advised(cause, model, looked.terms) for cause in causes))
+        return out
+    tried = out.terms and plausible and not alike
+    model = _best_model(out, measurements, options) if tried else None
+    return replace(out, causes=tuple(_advised(cause, model, out.terms) for cause in causes))
 
 
 def _advised(cause: Cause, model: str | None, terms: Collection[str]) -> Cause:
-    """Return a cause with what to do about it: a model that was tried, a view to measure again."""
+    """Return a cause with its remedies: a model that was tried, a view to measure again."""
     remedies = []
     if model is not None and cause.name in terms:
         remedies.append(Remedy("model", model))
@@ -170,23 +170,24 @@ def _advised(cause: Cause, model: str | None, terms: Collection[str]) -> Cause:
     return replace(cause, remedies=tuple(remedies))
 
 
-def _tried(looked: Looked, measurements: Measurements, options: Options) -> str | None:
-    """Return the model with which these readings give a good map; None if none does.
+def _best_model(searched: SearchResult, measurements: Measurements,
+                options: Options) -> str | None:
+    """Return the model with which these readings give a good map; None if there is none.
 
-    With the terms free, or with the sizes that the readings allow: of those that nothing
-    contradicts the one with the smaller uncertainty.
+    Its terms are free, or have the sizes that the readings allow: of the two models, if nothing
+    contradicts them, the one with the smaller uncertainty.
     """
-    used = {term.name: term for term in _model(looked.solved).problem.terms}
+    used = {term.name: term for term in _model(searched.solved).problem.terms}
     best, least = None, np.inf
     for free in (True, False):
         terms = [ModelTerm(TermName(name)) if free else _rounded_up(used[TermName(name)])
-                 for name in looked.terms]
+                 for name in searched.terms]
         solved = solved_with(measurements, options, terms)
         if solved is None or solved.xy.contradicted or solved.theta.contradicted:
             continue
         emap = solved.result.error_map
         u = rms(np.stack([emap.u_gx, emap.u_gy])) + rms(np.nan_to_num(emap.u_g_theta))
-        again = look_into(solved, measurements, replace(
+        again = search_causes(solved, measurements, replace(
             options, terms=_merged(options.terms, terms)), failed=False, advise=False)
         if not again.causes and u < least:
             best, least = ",".join(map(str, _merged(options.terms, terms))), u
@@ -194,19 +195,19 @@ def _tried(looked: Looked, measurements: Measurements, options: Options) -> str 
 
 
 def _rounded_up(term: ModelTerm) -> ModelTerm:
-    """Return a term with its size to two figures, not smaller."""
+    """Return a term with its size rounded up to two figures."""
     power = 10.0 ** (np.floor(np.log10(term.size)) - 1)
     return ModelTerm(term.name, float(f"{np.ceil(term.size / power) * power:.1e}"))
 
 
 def _merged(terms: Iterable[ModelTerm], more: Collection[ModelTerm]) -> tuple[ModelTerm, ...]:
-    """Return terms and further ones, which replace those of their names."""
+    """Return `terms` with `more`, which replace those of the same name."""
     named = {term.name for term in more}
     return (*(term for term in terms if term.name not in named), *more)
 
 
 def _from_readings(solved: Solved, joined: Iterable[str]) -> Solved:
-    """Return a solution whose terms say which of them the readings put in."""
+    """Return a solution in which joined terms have the source ``readings``."""
     joined = set(joined)
 
     def of(term: TermResult) -> TermResult:
@@ -219,15 +220,15 @@ def _from_readings(solved: Solved, joined: Iterable[str]) -> Solved:
     return replace(solved, result=replace(result, model=model))
 
 
-def are_looked_for(sites: int, options: Options, *, failed: bool) -> bool:
-    """Return whether causes are looked for in a field of so many sites, unasked only in small ones.
+def is_searched(sites: int, options: Options, *, failed: bool) -> bool:
+    """Return whether causes are searched for in a field of that many sites.
 
     Parameters
     ----------
     sites : int
-        Sites of the field.
+        Number of sites.
     options : Options
-        Whether somebody asked.
+        `causes` forces or forbids the search.
     failed : bool
         Whether another test failed.
     """
@@ -236,8 +237,8 @@ def are_looked_for(sites: int, options: Options, *, failed: bool) -> bool:
     return failed or sites <= ALWAYS_SITES or bool(options.causes)
 
 
-def _search(found: _Found, measurements: Measurements, options: Options, *, failed: bool) -> None:
-    """Let terms join while the readings show any; then bound what is left."""
+def _search(found: _Search, measurements: Measurements, options: Options, *, failed: bool) -> None:
+    """Let terms join while the readings show any; then bound the effects of all other causes."""
     left: list[Explanation] = []
     for _ in range(MAX_JOINED + 1):
         left = _explanations(found.solved, failed=failed)
@@ -256,12 +257,12 @@ def _search(found: _Found, measurements: Measurements, options: Options, *, fail
 
 def _model(solved: Solved) -> ModelFit:
     if solved.model is None:
-        raise ValueError("a joint solution has its fit")
+        raise ValueError("the solution has no joint fit")
     return solved.model
 
 
 def _explanations(solved: Solved, *, failed: bool) -> list[Explanation]:
-    """Return what explains the residuals of a solution, the likeliest first."""
+    """Return explanations of the residuals of a solution, the most likely first."""
     model = _model(solved)
     found = [item for item in find_explanations(model, slips=False)
              if failed or _counts(item, solved)]
@@ -272,7 +273,7 @@ def _explanations(solved: Solved, *, failed: bool) -> list[Explanation]:
 
 
 def _counts(found: Explanation, solved: Solved) -> bool:
-    """Return whether an explanation is worth a word: by what it does to the map."""
+    """Return whether an explanation matters for the map."""
     if not found.whole or found.name == READING:  # one node may be far off, and the rest not
         return True
     emap = solved.result.error_map
@@ -292,11 +293,11 @@ def solved_with(measurements: Measurements, options: Options,
         return None
 
 
-def _join(found: _Found, first: list[Explanation], measurements: Measurements,
+def _join(found: _Search, first: list[Explanation], measurements: Measurements,
           options: Options) -> bool:
-    """Let the first of explanations that are equally good join; the others bound the map as well.
+    """Let the first of equally good explanations join, and the others enlarge the uncertainty.
 
-    Return whether it did.
+    Return whether it joined.
     """
     ground = _model(found.solved).problem.ground
     names = [*found.joined, first[0].name]
@@ -312,33 +313,33 @@ def _join(found: _Found, first: list[Explanation], measurements: Measurements,
             found.effects.append(difference(other.name, twin.result, solved.result))
     found.causes += [cause_of(item, ground) for item in first]
     found.solved, found.joined = solved, names
-    found.causes[-len(first)] = cause_of(held_by(
+    found.causes[-len(first)] = cause_of(fitted_term(
         _model(solved), first[0].name, first[0].p, whole=first[0].whole), ground)
     return True
 
 
 def _raised_cause(solved: Solved, test: SizeTest) -> Cause | None:
-    """Return a size that the readings contradict as a cause; None where it is of no account."""
+    """Return a contradicted size of a term as a cause; None if it does not matter."""
     term = next(term for term in solved.result.model.terms if term.name == test.name)
     parts = enlargements(solved.result, [term.name], [])
     u = rms(np.stack([solved.result.error_map.u_gx, solved.result.error_map.u_gy]))
     of = {"m": u, "rad": rms(solved.result.error_map.u_g_theta)}
-    # what no reading tells of it is in the uncertainty, as far as that is known
+    # the part that no reading determines is in the uncertainty, as far as that is known
     little = bool(parts) and all(part.u_rms < MATTERS * of[part.unit] for part in parts)
-    held = held_by(_model(solved), term.name, test.p,
+    held = fitted_term(_model(solved), term.name, test.p,
                    whole=little or test.rank == len(term.estimates))
     if not _counts(held, solved):
         return None
     if test.name is TermName.ROTATION and abs(
             (cause := cause_of(held, _model(solved).problem.ground)).size) > SURE * cause.u:
-        return cause  # else the readings do not tell which view it is
+        return cause  # otherwise the readings do not determine which view it is
     return size_cause(test, term.estimates)
 
 
-def _as_a_microscope(found: _Found, measurements: Measurements, options: Options) -> bool:
-    """Return whether a microscope of another scale explains as well that lines turn.
+def _as_a_microscope(found: _Search, measurements: Measurements, options: Options) -> bool:
+    """Return whether a microscope of another scale explains the rotation of lines equally well.
 
-    It is a cause then, and enlarges the uncertainty by what it would do, unless that is little.
+    If so it is a cause as well, and its effect enlarges the uncertainty, unless that is small.
     """
     known = next((term for term in options.model_terms(visits=True)
                   if term.name is TermName.MICROSCOPE and not term.free), None)
@@ -348,7 +349,7 @@ def _as_a_microscope(found: _Found, measurements: Measurements, options: Options
     twin = solved_with(measurements, options, [wider])
     if twin is None or any(test.contradicted for test in _model(twin).sizes):
         return False
-    held = held_by(_model(twin), known.name)
+    held = fitted_term(_model(twin), known.name)
     effect = difference(str(known.name), twin.result, found.solved.result)
     if not _counts(replace(held, effect_m=rms(effect.xy), effect_rad=rms(effect.theta)),
                    found.solved):
@@ -358,8 +359,8 @@ def _as_a_microscope(found: _Found, measurements: Measurements, options: Options
     return True
 
 
-def _bound(found: _Found, item: Explanation, measurements: Measurements) -> None:
-    """Take up what did not join: its effect on the map is known as far as the readings tell."""
+def _bound(found: _Search, item: Explanation, measurements: Measurements) -> None:
+    """Add a cause that did not join, with its effect on the map as far as that is determined."""
     model = _model(found.solved)
     cause = cause_of(item, model.problem.ground)
     if cause.name in [known.name for known in found.causes] and cause.name in START:
@@ -371,10 +372,10 @@ def _bound(found: _Found, item: Explanation, measurements: Measurements) -> None
         found.effects.append(effect_of_field(item.name, field, measurements.sense, item.turned))
 
 
-def _noisy_views(found: _Found, measurements: Measurements) -> None:
-    """Take up the views whose visits scatter more than those of the others.
+def _noisy_views(found: _Search, measurements: Measurements) -> None:
+    """Add the views whose visits scatter more than those of the others.
 
-    Where a view is noisier than the uncertainty assumes, a node may rest on it alone.
+    A node may depend on one view alone: a view noisier than assumed enlarges the uncertainty.
     """
     views = scatter_of_views(_model(found.solved), measurements)
     emap, used = found.solved.result.error_map, found.solved.xy.sigma

@@ -7,7 +7,11 @@ import numpy as np
 import pytest
 
 from selfcal_ros.estimation.terms.equations import Score, Sums
-from selfcal_ros.estimation.verdict.explanations import Group, Pool, select_explanations
+from selfcal_ros.estimation.verdict.explanations import (
+    Candidates,
+    Group,
+    select_explanations,
+)
 
 LENGTHS = np.array([2.0, 0.5, 4.0])
 """Of three columns that all marks' means tell alone, in weighted readings."""
@@ -15,12 +19,13 @@ FOUND = np.array([6.0, -8.0, 0.0])
 """What each takes off the readings, times its length: squares of 6, 8 and 0."""
 
 
-def pool(sums: Sums) -> Pool:
+def pool(sums: Sums) -> Candidates:
     """Return the columns, with `sums` of squares left before any of them is held."""
     gram = np.diag(LENGTHS**2)
     equations = SimpleNamespace(information=gram, norm=LENGTHS, limit=lambda rows: 1e-9,
                                 projected=SimpleNamespace(gram=gram))
-    return Pool(equations, Score(FOUND * LENGTHS, np.zeros(3), sums), np.zeros(3), np.zeros(3))
+    return Candidates(equations, Score(FOUND * LENGTHS, np.zeros(3), sums), np.zeros(3),
+                      np.zeros(3))
 
 
 def rows(*numbers: int) -> np.ndarray:
@@ -30,13 +35,13 @@ def rows(*numbers: int) -> np.ndarray:
 def noise(sums: Sums, taken: np.ndarray) -> tuple[float, float]:
     """Return variance and degrees of freedom of what the columns `taken` leave."""
     left = pool(sums)
-    return left.noise(left.beside(taken))
+    return left.noise(left.explain(taken))
 
 
 @pytest.mark.parametrize(("taken", "squares"), [((), 0), ((0,), 36), ((1,), 64), ((0, 1), 100),
                                                 ((0, 1, 2), 100)])
 def test_columns_explain_the_squares_of_their_parts(taken, squares):
-    found = pool(Sums(164.0, 10, 0.0, 0)).beside(rows(*taken))
+    found = pool(Sums(164.0, 10, 0.0, 0)).explain(rows(*taken))
     assert (found.explained, found.rank) == (pytest.approx(squares), len(taken))
     assert found.values == pytest.approx([3.0, -16.0, 0.0] * rows(*taken))
     assert found.inverse == pytest.approx(np.diag(rows(*taken) / LENGTHS**2))
@@ -76,7 +81,7 @@ def test_sets_of_all_sizes_are_each_as_a_dense_solution_has_them():
     equations = SimpleNamespace(
         information=readings.T @ readings, norm=np.sqrt((readings**2).sum(axis=0)),
         limit=lambda rows: 1e-9, projected=SimpleNamespace(gram=marks.T @ marks))
-    pools = Pool(equations, Score(marks.T @ left[:8], readings[8:].T @ left[8:], Sums(
+    pools = Candidates(equations, Score(marks.T @ left[:8], readings[8:].T @ left[8:], Sums(
         float(left[:8] @ left[:8]), 8, float(left[8:] @ left[8:]), 4)), np.zeros(6), np.zeros(6))
     sets = [(), (3,), (0, 1), (1, 3, 4), (5,), (0, 2, 5), (0, 2), (0, 1, 2, 3, 4, 5), (1, 5)]
     many = [np.isin(np.arange(6), chosen) for chosen in sets]
@@ -107,13 +112,14 @@ def test_terms_of_the_model_stay_within_what_their_sizes_allow():
     equations = SimpleNamespace(
         information=columns.T @ columns, norm=np.sqrt((columns**2).sum(axis=0)),
         limit=lambda rows: 1e-9, projected=SimpleNamespace(gram=columns.T @ columns))
-    pool = Pool(equations, Score(columns.T @ left, np.zeros(4), Sums(
+    pool = Candidates(equations, Score(columns.T @ left, np.zeros(4), Sums(
         float(left @ left), 30, float("nan"), 0)), prior, taken)
-    both = pool.beside(np.array([True, True, True, False]))
+    both = pool.explain(np.array([True, True, True, False]))
     whole = np.linalg.lstsq(np.vstack([columns[:, :3], rows[:, :3]]),
                             np.concatenate([y, np.zeros(2)]), rcond=None)[0]
     assert both.own_values + taken[:3] == pytest.approx(whole)
-    assert pool.beside(np.array([True, True, False, False])).explained == pytest.approx(0, abs=1e-9)
+    alone = pool.explain(np.array([True, True, False, False]))
+    assert alone.explained == pytest.approx(0, abs=1e-9)
 
 
 def test_at_most_four_causes_are_named_the_likeliest_first():
@@ -125,7 +131,7 @@ def test_at_most_four_causes_are_named_the_likeliest_first():
         system=SimpleNamespace(known_sites=np.ones(4), known_lines=np.ones(3)),
         columns=SimpleNamespace(columns=tuple(names)))
     parts = np.arange(1.0, 7.0) * 1e-6
-    many = Pool(equations, Score(parts, np.zeros(6), Sums(
+    many = Candidates(equations, Score(parts, np.zeros(6), Sums(
         float(parts @ parts) + 1e-14, 100, float("nan"), 0)), np.zeros(6), np.zeros(6))
     groups = [Group(name, np.arange(6) == number) for number, name in enumerate(names)]
     found = select_explanations(many, groups, np.zeros(6, dtype=bool))
