@@ -85,7 +85,7 @@ def test_sets_of_all_sizes_are_each_as_a_dense_solution_has_them():
         float(left[:8] @ left[:8]), 8, float(left[8:] @ left[8:]), 4)), np.zeros(6), np.zeros(6))
     sets = [(), (3,), (0, 1), (1, 3, 4), (5,), (0, 2, 5), (0, 2), (0, 1, 2, 3, 4, 5), (1, 5)]
     many = [np.isin(np.arange(6), chosen) for chosen in sets]
-    for chosen, found in zip(sets, pools.each(many), strict=True):
+    for chosen, found in zip(sets, pools.explain_each(many), strict=True):
         used = readings[:, list(chosen)]
         values = np.linalg.pinv(used) @ left
         rank = np.linalg.matrix_rank(used) if chosen else 0
