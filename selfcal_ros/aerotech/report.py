@@ -20,7 +20,7 @@ from selfcal_ros.reporting.figures.parts import (
     panels,
     titled,
 )
-from selfcal_ros.reporting.summary.format import fixed_column, significant
+from selfcal_ros.reporting.summary.format import counted, fixed_column, significant
 from selfcal_ros.reporting.summary.sections import Section
 from selfcal_ros.units import ARCSEC_PER_RAD, MM_PER_M, UM_PER_M
 
@@ -43,12 +43,12 @@ def table_chapter(result: CalibrationResult) -> Chapter:
     if unknown == emap.valid.size:
         return Chapter(TITLE)
     if unknown:
-        return _untried(f"{unknown} sites are unknown, and a table has no holes: "
-                        "selfcal cal export --fill takes their neighbours")
+        return _untried(f"{counted(unknown, 'unknown site')}, but a table has no gaps: "
+                        "selfcal cal export --fill fills them from their neighbours")
     if emap.valid.size > MAX_SITES:
         return _untried(f"not tried beyond {MAX_SITES} sites: see selfcal cal verify")
     if max(np.abs(emap.gx).max(), np.abs(emap.gy).max()) > 0.5 * result.artifact.grid_pitch_m:
-        return _untried("errors beyond half a pitch are none that a table corrects")
+        return _untried("a table cannot correct errors beyond half a pitch")
     frame = MachineFrame()
     found = verify_tables(emap, [table_xy(emap, frame)], frame)
     rows = [(PLACES[residual.place], *fixed_column([
@@ -56,12 +56,11 @@ def table_chapter(result: CalibrationResult) -> Chapter:
         for which in BEFORE_AND_AFTER], 4)) for residual in found.residuals]
     header = ("error vector in µm", "rms before", "after", "largest before", "after")
     return Chapter(TITLE, (Figure(
-        controller_figure(found), "A simulated controller that moves to the nodes and to the "
+        controller_figure(found), "A simulated controller moving to the nodes and to the "
         "middle of every cell, without and with the table of selfcal cal export. What remains "
         "between the nodes is the controller's linear interpolation."),), (Section(
             "What the table leaves", table=(header, *rows), notes=(
-                "The map counts as the truth here: to what remains belongs the U of the map "
-                "itself.",)),))
+                "The map is taken as the truth here: its own U adds to what remains.",)),))
 
 
 def _untried(why: str) -> Chapter:

@@ -76,7 +76,7 @@ def _hu(args: argparse.Namespace, workers: int, progress: "Progress") -> tuple:
     found = reproduce_hu(args.draws, args.seed, workers=workers, progress=progress)
 
     def figures() -> "list[Drawing]":
-        from selfcal_ros.papers.plots import hu_figures
+        from selfcal_ros.papers.figures import hu_figures
 
         return hu_figures(found)
 
@@ -94,7 +94,7 @@ def _qiao(args: argparse.Namespace, workers: int, progress: "Progress") -> tuple
     found = reproduce_qiao(args.draws, args.seed, workers=workers, progress=progress)
 
     def figures() -> "list[Drawing]":
-        from selfcal_ros.papers.plots import qiao_figures
+        from selfcal_ros.papers.figures import qiao_figures
 
         return qiao_figures(found)
 

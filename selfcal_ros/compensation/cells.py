@@ -8,8 +8,12 @@ gather of a row and a short Horner scheme; positions are processed in blocks tha
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Literal
 
 import numpy as np
+
+Interpolation = Literal["bilinear", "bicubic"]
+Outside = Literal["clamp", "refuse"]
 
 BLOCK = 16384
 """Bilinear positions per block: their coefficients fill the second-level cache."""

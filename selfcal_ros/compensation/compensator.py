@@ -19,11 +19,12 @@ from selfcal_ros.compensation.cells import (
     REST,
     SNAP,
     Cells,
+    Interpolation,
+    Outside,
     bicubic_cells,
     bilinear_cells,
     cubic_pieces,
 )
-from selfcal_ros.compensation.options import Interpolation, Outside
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.error_map import ErrorMap
 

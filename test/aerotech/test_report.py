@@ -34,11 +34,10 @@ def test_a_table_with_holes_or_absurd_errors_is_not_tried():
                                  ).sections
         return section.notes[0]
 
-    assert why_not(np.full((5, 5), 6e-3)) == ("errors beyond half a pitch are none that a table "
-                                              "corrects")
+    assert why_not(np.full((5, 5), 6e-3)) == "a table cannot correct errors beyond half a pitch"
     gx = result.error_map.gx.copy()
     gx[0, 0] = np.nan
-    assert why_not(gx).startswith("1 sites are unknown")
+    assert why_not(gx).startswith("1 unknown site, but")
 
 
 def test_the_table_leaves_nothing_at_the_nodes_and_the_curvature_between():

@@ -171,7 +171,7 @@ def test_a_site_that_is_unknown_leaves_a_table_with_a_hole():
     gx = result.error_map.gx.copy()
     gx[1, 2] = np.nan
     html = html_of(replace(result, error_map=replace(result.error_map, gx=gx)))
-    assert "1 sites are unknown, and a table has no holes: selfcal cal export --fill" in html
+    assert "1 unknown site, but a table has no gaps: selfcal cal export --fill" in html
 
 
 def test_rows_and_numbers_are_tabulated_with_units():

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, get_args
 
 from selfcal_ros.collection.settings.parameter import ManagedSettings, Parameter, Settings, declared
-from selfcal_ros.compensation.options import Interpolation, Outside
+from selfcal_ros.compensation.cells import Interpolation, Outside
 from selfcal_ros.errors import InputError, known_are
 from selfcal_ros.estimation.options import ReferenceKind
 from selfcal_ros.model.error_map import ThetaDatum

@@ -101,9 +101,9 @@ Place = tuple[str, str, float, float]
 
 
 def rejected_in(result: CalibrationResult) -> list[Place]:
-    """Return the rejected readings of known place: detections, and marks that `--robust` removed.
+    """Return rejected detections of known position, and marks that `--robust` removed.
 
-    What a file holds in another form is left out.
+    Malformed entries are left out.
     """
     found: list[Place] = []
     for row in _rows(result.extra.get("rejected_at")):

@@ -67,9 +67,9 @@ def places_mm(rotation_rad: float, translation_m: tuple[float, float], x_m: np.n
 
 
 def residuals_in(result: CalibrationResult) -> list[ViewResiduals]:
-    """Return the residuals that a result keeps, view by view; empty if it keeps none.
+    """Return the residuals in a result, view by view; empty if there are none.
 
-    A part of another form, in a file that something else has written, counts as not kept.
+    A malformed part counts as absent.
     """
     kept = result.extra.get("residuals")
     rows = kept.get("views") if isinstance(kept, dict) else None
