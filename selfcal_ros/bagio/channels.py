@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How the messages of one channel of a bag are decoded: many at once, or one by one.
+"""Decoding of the messages of one channel of a bag: many at once, or one by one.
 
-What the columns cannot take is decoded by rosbags, message by message; so is what it refuses, and
-a refusal is counted. Both give the same.
+Messages that the columns cannot decode are decoded by rosbags, one by one; failures are
+counted. Both give the same.
 """
 
 from collections import Counter
@@ -29,14 +29,14 @@ from selfcal_ros.topics import DETECTION_TOPIC, ENCODER_TOPIC, INPUT_TOPICS
 Input = EncoderBlock | np.ndarray | object
 """Encoder samples, a table of detections, or a command as rosbags has it."""
 PADDING = 3
-"""Bytes behind the last field that belong to it where lengths tell the definition."""
+"""Bytes after the last field that belong to it where lengths identify the definition."""
 ENOUGH, MAX_BYTES = 2000, 4 << 20
-"""Messages and bytes that are waited for before they are decoded at once."""
+"""Messages and bytes collected before they are decoded together."""
 
 
 @dataclass
 class ChannelDecoder:
-    """Decodes the messages of one channel.
+    """Decode the messages of one channel.
 
     Attributes
     ----------
@@ -45,11 +45,11 @@ class ChannelDecoder:
     name : str
         Its type.
     stores : sequence of rosbags typestores
-        Definitions of the type, the first that fits counts.
+        Definitions of the type; the first that fits is used.
     bad : Counter
-        Messages that could not be decoded, by topic and what to say of them.
+        Messages that could not be decoded, by topic and problem.
     told : bool
-        Whether the bag tells the definition.
+        Whether the bag contains the definition.
     """
 
     role: str
@@ -59,10 +59,10 @@ class ChannelDecoder:
     told: bool
 
     def __post_init__(self) -> None:
-        """Find out which messages can be taken as columns, and which as they are."""
+        """Determine which messages can be decoded as columns, and which passed unchanged."""
         fields = [fields_of(store, self.name) for store in self.stores]
         self._fields = fields[0] if len(fields) == 1 else None
-        # without a definition the length tells it, where a type has grown
+        # without a definition the length identifies it, if a type has grown
         self._any_tail = self.told or not self.name.startswith(OWN)
         self._own = same_layout(self.stores[0], self.name) if self.told else False
         self._why = "" if self.told else (
@@ -75,9 +75,9 @@ class ChannelDecoder:
             self._columns = DetectionColumns(self._fields, tail)
 
     def one(self, data: bytes) -> Any:
-        """Return a message as rosbags has it; None if it cannot be decoded, which is counted.
+        """Return a message decoded by rosbags; None if it cannot be decoded, which is counted.
 
-        One that is too long is not looked at.
+        A message that is too long is not decoded.
         """
         if len(data) > MAX_LENGTH:
             self.bad[self.role, f": they are longer than {MAX_LENGTH} bytes"] += 1
@@ -96,7 +96,7 @@ class ChannelDecoder:
         return None
 
     def _without_tail(self, data: bytes) -> bytes | None:
-        """Return a message without what stands behind its fields; None if nothing does.
+        """Return a message without trailing bytes; None if there are none.
 
         ``rclpy.serialization.serialize_message`` leaves some bytes there.
         """
@@ -106,7 +106,7 @@ class ChannelDecoder:
         return None if layout is None or layout.end == len(data) else data[:layout.end]
 
     def many(self, messages: Payloads) -> Iterator[Input]:
-        """Yield what the messages hold; what cannot be decoded is counted."""
+        """Yield the decoded messages; failures are counted."""
         rest = np.arange(len(messages))
         if self._columns is not None:
             blocks, rest = self._columns.decode(messages)
@@ -119,7 +119,7 @@ class ChannelDecoder:
     def own_bytes(self, messages: Payloads, index: np.ndarray) -> Iterator[tuple[int, bytes]]:
         """Yield the CDR bytes of the messages in the type known here, with their `index`.
 
-        What cannot be decoded is left out and counted.
+        Failures are omitted and counted.
         """
         rest = np.ones(len(messages), dtype=bool)
         if self._columns is not None and self._own:
@@ -139,14 +139,14 @@ class ChannelDecoder:
 
 @dataclass
 class Waiting:
-    """Messages of a channel that wait until it is worth to decode them."""
+    """Messages of a channel waiting to be decoded together."""
 
     decoder: ChannelDecoder
     _data: list[bytes] = field(default_factory=list)
     _size: int = 0
 
     def add(self, messages: Payloads) -> Iterator[Input]:
-        """Take messages and yield what is worth it by now."""
+        """Take messages and yield batches that are large enough."""
         if len(messages) >= ENOUGH:
             yield from self.decoder.many(messages)
             return
@@ -156,13 +156,13 @@ class Waiting:
             yield from self.rest()
 
     def rest(self) -> Iterator[Input]:
-        """Yield what waits."""
+        """Yield the waiting messages."""
         data, self._data, self._size = self._data, [], 0
         yield from self.decoder.many(Payloads.joined(data))
 
 
 def _block(role: str, message: Any) -> Input:
-    """Return a message decoded by itself as a block of one; a command as it is."""
+    """Return a single decoded message as a block of one; a command unchanged."""
     if role == ENCODER_TOPIC:
         sample = encoder_sample(message)
         velocities = np.array([sample.velocities], dtype=float) if sample.velocities else None

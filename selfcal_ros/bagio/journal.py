@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The journal: what a collector received, on the disk before it acts on it.
+"""The journal: messages received by a collector, on disk before they are used.
 
-A journal is a bag folder that grows. Killed at any instant, it holds every message that was
-flushed; `resume` gives the file an end and goes on in a new one of the same bag.
+A journal is a growing bag folder. If the writer is killed, it contains every message that was
+flushed; `resume` completes the file and continues in a new one of the same bag.
 """
 
 import fcntl
@@ -36,20 +36,20 @@ from selfcal_ros.topics import COMMAND_TOPIC
 from selfcal_ros.units import NS_PER_S, S_PER_NS
 
 SYNC_PERIOD_S = 0.5
-"""Time between two synchronisations with the disk, where there is something to synchronise."""
+"""Period of synchronisation with the disk, if there is anything to synchronise."""
 OVER = (Phase.DONE, Phase.ABORT)
 
 
 def resume(folder: str | os.PathLike) -> "Journal | None":
-    """Return the journal of the plan that is running, ready to go on; None if there is none.
+    """Return the journal of the running plan, ready to continue; None if there is none.
 
-    That is the journal in `folder` that was written last, unless its last command, by stamp, is
-    DONE or ABORT or lies in the future. Read it first (`BagReader(path).columns()`), then write.
+    It is the journal in `folder` that was written last, unless its last command, by stamp, is
+    DONE or ABORT or is in the future. Read it first (`BagReader(path).columns()`), then write.
 
     Parameters
     ----------
     folder : path
-        Where journals lie, each a bag folder; need not exist.
+        Folder of the journals, each a bag folder; need not exist.
 
     Raises
     ------
@@ -61,7 +61,7 @@ def resume(folder: str | os.PathLike) -> "Journal | None":
 
 
 class Claim:
-    """The newest journal of a folder, locked: nobody else writes it. It is gone through once."""
+    """The newest journal of a folder, locked against other writers. It is read once."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -69,7 +69,7 @@ class Claim:
             self._lock = _locked(path)
 
     def resume(self) -> "Journal | None":
-        """Return the journal as `resume` does: all of it is read, a GB in some seconds."""
+        """Return the journal like `resume`: all of it is read, some seconds per GB."""
         with _said(self.path):
             try:
                 metadata, commands = _taken_up(self.path)
@@ -82,12 +82,12 @@ class Claim:
         return None
 
     def close(self) -> None:
-        """Let go of a journal that is not resumed."""
+        """Release a journal that is not resumed."""
         os.close(self._lock)
 
 
 def claim(folder: str | os.PathLike) -> Claim | None:
-    """Return the newest journal in `folder` before it is gone through; None without one.
+    """Return the newest journal in `folder` before it is read; None if there is none.
 
     Raises
     ------
@@ -99,16 +99,16 @@ def claim(folder: str | os.PathLike) -> Claim | None:
 
 
 def unfinished(folder: str | os.PathLike, journal: Path | None = None) -> list[Path]:
-    """Return the files of the journal that `resume` would take up, in their order; [] = none.
+    """Return the files of the journal that `resume` would continue, in their order; [] = none.
 
-    Nothing is written: where there is no room, what the journal holds can be used all the same.
+    Nothing is written: the journal can be used even on a full disk.
 
     Parameters
     ----------
     folder : path
-        Where journals lie, each a bag folder; need not exist.
+        Folder of the journals, each a bag folder; need not exist.
     journal : Path, optional
-        The one to look at; None = the newest.
+        The journal; None = the newest.
 
     Raises
     ------
@@ -143,12 +143,12 @@ def newest(folder: str | os.PathLike) -> tuple[Path, float] | None:
 
 
 def start(folder: str | os.PathLike, now_ns: int) -> "Journal":
-    """Begin a new journal in `folder`, which is made if need be; its name tells the time.
+    """Start a new journal in `folder`, created if necessary, named by the time.
 
     Raises
     ------
     InputError
-        If it cannot be made.
+        If it cannot be created.
     """
     name = time.strftime("journal_%Y%m%dT%H%M%SZ", time.gmtime(now_ns // NS_PER_S))
     for suffix in ("", *(f"_{number}" for number in range(2, 1000))):
@@ -173,7 +173,7 @@ def start(folder: str | os.PathLike, now_ns: int) -> "Journal":
 
 
 class Journal(Closing):
-    """Writes raw messages to a bag folder; made by `start` or `resume`, to be closed.
+    """Write raw messages to a bag folder; created by `start` or `resume`, must be closed.
 
     Parameters
     ----------
@@ -182,12 +182,12 @@ class Journal(Closing):
     lock : int
         The open lock on it, which the journal closes.
     metadata : Metadata
-        Files and topics that are there already.
+        Existing files and topics.
 
     Attributes
     ----------
     earlier : list of Path
-        Files that were there already, in their order.
+        Existing files, in their order.
     """
 
     def __init__(self, path: Path, lock: int, metadata: Metadata) -> None:
@@ -206,17 +206,17 @@ class Journal(Closing):
             self._declare(topic, known)
         metadata.write(path)
         self._stop = threading.Event()
-        self._unsynced_s: float | None = None  # since when there is something to synchronise
-        self._syncing_s: float | None = None  # the same of what is being synchronised
+        self._unsynced_s: float | None = None  # time since which there is something to synchronise
+        self._syncing_s: float | None = None  # the same for the synchronisation in progress
         self._syncer = threading.Thread(target=self._sync_on, name="journal", daemon=True)
         self._syncer.start()
 
     def add_topic(self, topic: str, typename: str, qos: Sequence[dict] = (),
                   heard_on: str = "") -> None:
-        """Declare a topic, with its namespace, before its first message; again does nothing.
+        """Declare a topic, with its namespace, before its first message; repeated calls do nothing.
 
-        A topic of the contract is found by its name: one that was remapped is declared with its
-        own name all the same, and as `heard_on` the other one.
+        A topic of the contract is identified by its name: a remapped one is declared with its
+        original name, and the other one as `heard_on`.
 
         Raises
         ------
@@ -225,7 +225,7 @@ class Journal(Closing):
         """
         if topic in self._channels:
             return
-        definition_of(topic, typename)  # refuses a type that is not known
+        definition_of(topic, typename)  # refuses an unknown type
         known = self._metadata.topics.setdefault(
             topic, Topic(typename, list(qos), heard_on=heard_on))
         self._declare(topic, known)
@@ -248,15 +248,15 @@ class Journal(Closing):
         self._waiting.append((topic, data, log_time_ns))
 
     def flush(self) -> None:
-        """Hand what was taken to the system, all at once; the disk has it within a second.
+        """Write the messages taken, all at once; they are on the disk within a second.
 
-        Call it before acting on what was taken.
+        Call it before using them.
 
         Raises
         ------
         InputError
-            If the disk is full or fails: what was taken since the last flush is not in the
-            journal and counts in `n_lost`.
+            If the disk is full or fails: the messages since the last flush are not in the
+            journal and are counted in `n_lost`.
         """
         waiting, self._waiting = self._waiting, []
         with _said(self.path):
@@ -286,14 +286,14 @@ class Journal(Closing):
             self._metadata.topics[topic].count += len(logged)
 
     def _sync_on(self) -> None:
-        """Synchronise with the disk, in a thread of its own: it may take its time."""
+        """Synchronise with the disk, in a separate thread, as it may be slow."""
         while not self._stop.wait(SYNC_PERIOD_S):
             if self._unsynced_s is not None:
                 since, n_appended = self._unsynced_s, self._n_appended
                 self._syncing_s, self._unsynced_s = since, None
                 try:
                     self._file.sync()
-                except OSError as error:  # the system may have dropped it: a later sync tells not
+                except OSError as error:  # it may be dropped, and later syncs do not report it
                     self._failed, self._unsynced_s = error, since
                     self._n_unsynced += n_appended - self._n_synced
                 self._n_synced = n_appended
@@ -306,12 +306,12 @@ class Journal(Closing):
 
     @property
     def lag_s(self) -> float:
-        """Age of the oldest message that was flushed and is not on the disk, s; 0 = none is."""
+        """Age of the oldest flushed message that is not on the disk, s; 0 = none."""
         since = [when for when in (self._syncing_s, self._unsynced_s) if when is not None]
         return time.monotonic() - min(since) if since else 0.0
 
     def close(self) -> None:
-        """Give the file its end and write metadata.yaml; again does nothing."""
+        """Complete the file and write metadata.yaml; repeated calls do nothing."""
         if self._stop.is_set():
             return
         self._stop.set()
@@ -328,12 +328,12 @@ class Journal(Closing):
 
 
 def _said(path: Path) -> AbstractContextManager[None]:
-    """Turn a full disk or a vanished folder into the package's own error."""
+    """Convert a full disk or a missing folder to an InputError."""
     return writing(path, "the journal cannot be written")
 
 
 def _taken_up(bag: Path) -> tuple[Metadata, list[tuple[int, Phase]]]:
-    """Finish the files that are there; return what they hold, and their commands by stamp."""
+    """Complete the existing files; return their metadata, and their commands by stamp."""
     metadata = Metadata()
     commands: list[tuple[int, Phase]] = []
     for file in sorted(bag.glob("*.mcap"), key=_number):
@@ -351,13 +351,13 @@ def _taken_up(bag: Path) -> tuple[Metadata, list[tuple[int, Phase]]]:
 
 
 def _is_over(commands: list[tuple[int, Phase]]) -> bool:
-    """Return whether the last command, by stamp, ends a run, or would hide every later one."""
+    """Return whether the last command, by stamp, ends a run, or would hide every later run."""
     latest_ns = time.time_ns() + MAX_AHEAD_NS
     return bool(commands) and (commands[-1][1] in OVER or commands[-1][0] > latest_ns)
 
 
 def _locked(path: Path) -> int:
-    """Return an open lock on a folder; the system opens it when the process ends."""
+    """Return a lock on a folder; the system releases it when the process ends."""
     lock = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
     try:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -369,7 +369,7 @@ def _locked(path: Path) -> int:
 
 
 def _newest(folder: Path) -> tuple[int, Path | None]:
-    """Return when a file of a bag folder in `folder` was written last, ns, and that bag folder."""
+    """Return the last time of writing, ns, of a bag folder in `folder`, and that bag folder."""
     found: list[tuple[int, Path]] = []
     with suppress(FileNotFoundError, NotADirectoryError):
         for bag in folder.iterdir():
@@ -385,7 +385,7 @@ def _number(file: Path) -> tuple[int, str]:
 
 
 def _commands(content: Content, where: str) -> list[tuple[int, Phase]]:
-    """Return stamps and phases of the commands that were kept; what is damaged is left out."""
+    """Return stamps and phases of the commands; damaged ones are omitted."""
     found: list[tuple[int, Phase]] = []
     bad: Counter = Counter()
     for number, data in content.kept:

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One file of a journal: MCAP records one behind the other, so that any front part can be read.
+"""One file of a journal: consecutive MCAP records, so that any front part can be read.
 
-Messages stand by themselves, without chunks: what has been handed to the system is there, whatever
-becomes of the process. A file that was closed has a summary; `finish_file` gives one to a file
-whose writer was killed.
+Messages are stored without chunks: data passed to the system survive the process. A closed file
+has a summary; `finish_file` adds one to a file whose writer was killed.
 """
 
 import os
@@ -29,22 +28,22 @@ MESSAGE = struct.Struct("<BQHIQQ")
 
 @dataclass
 class Content:
-    """What a file holds: its messages in numbers, what it declares, and where its records end.
+    """Content of a file: counts of messages, declarations, and the end of its records.
 
     Attributes
     ----------
     entry : FileEntry
-        Name, number of messages, first and last time of logging.
+        Name, number of messages, first and last log time.
     counts : dict
         Channel -> number of messages.
     schemas, channels : dict
         By their numbers.
     kept : list of (int, bytes)
-        Channel and payload of the messages that were asked for.
+        Channel and payload of the requested messages.
     end : int
-        Behind the last whole record.
+        End of the last complete record.
     damaged : bool
-        Whether something else follows there than a record that was not finished, or an end.
+        Whether it is followed by something other than an unfinished record or the end.
     """
 
     entry: FileEntry
@@ -63,7 +62,7 @@ class Content:
             self.channels[record.id] = record
 
     def add(self, channel: int, log_times_ns: list[int]) -> None:
-        """Count messages by their times of logging, at least one."""
+        """Count messages by their log times, at least one."""
         entry, first, last = self.entry, min(log_times_ns), max(log_times_ns)
         entry.first_ns = first if entry.first_ns is None else min(entry.first_ns, first)
         entry.last_ns = max(entry.last_ns, last)
@@ -86,12 +85,12 @@ def records(*items: McapRecord) -> bytes:
 
 
 def front() -> bytes:
-    """Return how a file begins."""
+    """Return the beginning of a file."""
     return MAGIC + records(Header(profile="ros2", library="selfcal_ros journal"))
 
 
 def ending(content: Content) -> bytes:
-    """Return how a file ends: what it declares once more, its numbers, and checksums."""
+    """Return the end of a file: repeated declarations, statistics, and checksums."""
     entry = content.entry
     summary = records(*content.schemas.values(), *content.channels.values(), Statistics(
         attachment_count=0, channel_count=len(content.channels),
@@ -107,12 +106,12 @@ def ending(content: Content) -> bytes:
 
 
 class JournalFile:
-    """Appends records to a new file; what a failed write has begun is taken back."""
+    """Append records to a new file; a failed write is undone."""
 
     def __init__(self, path: Path) -> None:
         self.content = Content(FileEntry(path.name), end=0)
-        self._torn = False  # whether something stands behind the last whole record
-        part = path.with_suffix(".part")  # so that no file of a journal is ever empty
+        self._torn = False  # whether there is data after the last complete record
+        part = path.with_suffix(".part")  # so that a file of a journal is never empty
         self._fd = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_APPEND
                            | os.O_CLOEXEC, 0o666)
         try:
@@ -126,9 +125,9 @@ class JournalFile:
         sync_folder(path.parent)
 
     def append(self, data: bytes) -> None:
-        """Hand whole records to the system; after an OSError the file is as it was before.
+        """Write complete records; after an OSError the file is unchanged.
 
-        Where what was begun cannot be taken back, nothing is appended until it can be.
+        If a failed write cannot be undone, nothing is appended until it can.
         """
         self._take_back()
         rest = memoryview(data)
@@ -148,7 +147,7 @@ class JournalFile:
             self._torn = False
 
     def sync(self) -> None:
-        """Wait until what was appended is on the disk."""
+        """Wait until the appended data is on the disk."""
         os.fsync(self._fd)
 
     def close(self) -> None:
@@ -161,7 +160,7 @@ class JournalFile:
 
 
 def finish_file(path: Path, keep: str) -> Content:
-    """Return what a file holds; one whose writer was killed gets its end, if nothing is damaged.
+    """Return the content of a file; complete it if its writer was killed and nothing is damaged.
 
     Parameters
     ----------
@@ -184,13 +183,13 @@ def finish_file(path: Path, keep: str) -> Content:
 
 
 def scan_file(path: Path, keep: str) -> Content:
-    """Return what `finish_file` does, and write nothing."""
+    """Return the same as `finish_file`, without writing."""
     with path.open("rb") as file:
         return _scan(file, path.name, keep)
 
 
 def _scan(file: BinaryIO, name: str, keep: str) -> Content:
-    """Go through the records of a file up to the first that is not whole."""
+    """Read the records of a file up to the first incomplete one."""
     content = Content(FileEntry(name))
     size = file.seek(0, 2)
     file.seek(0)
@@ -208,7 +207,7 @@ def _scan(file: BinaryIO, name: str, keep: str) -> Content:
             if end > size or opcode == Opcode.DATA_END:
                 return content
             body = file.read(length)
-            if opcode == Opcode.MESSAGE and length >= MESSAGE_FRONT:  # longer than a stretch
+            if opcode == Opcode.MESSAGE and length >= MESSAGE_FRONT:  # longer than a block
                 block, _ = message_block(HEAD.pack(opcode, length) + body, 0)
             elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
                 record, _ = parsed(opcode, body)
@@ -229,7 +228,7 @@ def _next_head(file: BinaryIO, at: int) -> tuple[int, int] | None:
 
 
 def _count(content: Content, block: Block, keep: str) -> None:
-    """Count the messages of a block, and keep those that are asked for."""
+    """Count the messages of a block, and keep the requested ones."""
     for number in block.channels():
         part = block[block.fronts["channel"] == number]
         content.add(number, part.fronts["log_time"].tolist())

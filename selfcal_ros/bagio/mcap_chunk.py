@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The messages of a chunk found all at once, and which chunks can be skipped.
+"""Find all messages of a chunk at once, and the chunks that can be skipped.
 
-The same is done with a stretch of a file without chunks.
+The same is done with a block of a file without chunks.
 
-Records tell their lengths, so that each must be passed to find the next. Where lengths come again
-and again, those of samples of an encoder or of the samples and detections of each visit, the next
-messages are looked for at these distances by numpy. Chunks without any topic that is wanted are
-skipped by the indexes in the summary, which is believed only if its checksum is right.
+Records contain their lengths, so each must be read to find the next. If lengths repeat, as those
+of encoder samples or of the samples and detections of each visit, numpy tests for the next
+messages at these distances. Chunks without any required topic are
+skipped by the indexes in the summary, which is used only if its checksum is correct.
 """
 
 import io
@@ -42,14 +42,14 @@ FRONT_TYPE = np.dtype({
 HEAD_TYPE = np.dtype({"names": ["opcode", "length"], "formats": ["u1", "<u8"],
                       "offsets": [0, 1], "itemsize": HEAD.size})
 PATIENCE, MAX_PATIENCE = 3, 1024
-"""Messages after which lengths that come again are looked for; grows where there are none."""
+"""Messages after which repeating lengths are searched for; grows if there are none."""
 MAX_PERIOD = 64
-"""Messages after which lengths may come again, to be found."""
+"""Longest period of repeating lengths, in messages."""
 FIRST_LOOK = 64
 STRETCH = 1 << 20
-"""Bytes of a file without chunks in which messages are found at once."""
+"""Block of a file without chunks in which messages are found at once, bytes."""
 END = struct.Struct("<BQQQI8s")
-"""The footer and what closes the file."""
+"""The footer and the closing magic."""
 FOOTER_SIZE = 20
 MAGIC = b"\x89MCAP0\r\n"
 """First and last bytes of a file."""
@@ -57,7 +57,7 @@ MAGIC = b"\x89MCAP0\r\n"
 
 @dataclass(frozen=True)
 class Block:
-    """Messages that stand in one buffer, in their order.
+    """Messages in one buffer, in their order.
 
     Attributes
     ----------
@@ -87,7 +87,7 @@ class Block:
         return Block(self.fronts[which], self.payloads[which])
 
     def compressed(self) -> np.ndarray:
-        """Return which messages begin as a zstd frame does, int64 (k,)."""
+        """Return the messages that begin like a zstd frame, int64 (k,)."""
         payloads = self.payloads
         long = np.flatnonzero(payloads.length >= len(ZSTD))
         if not len(long):
@@ -97,7 +97,7 @@ class Block:
         return long[first == int.from_bytes(ZSTD, "little")]
 
     def messages(self) -> Iterator[Message]:
-        """Yield each message by itself."""
+        """Yield each message separately."""
         columns = (self.fronts[name].tolist() for name in ("channel", "sequence", "log_time",
                                                            "publish_time"))
         for channel, sequence, log_time, publish_time, data in zip(*columns, self.payloads,
@@ -116,7 +116,7 @@ def block_of(messages: list[Message]) -> Block:
 
 
 def message_block(data: bytes, at: int) -> tuple[Block, int]:
-    """Return the messages that stand in a row from `at` on, and where they end."""
+    """Return the consecutive messages from `at` on, and their end."""
     places = _Places(data)
     end = places.find(at)
     start = np.concatenate([*places.parts, np.array(places.single, dtype=np.int64)])
@@ -129,7 +129,7 @@ def message_block(data: bytes, at: int) -> tuple[Block, int]:
 
 
 def stretch(file: BinaryIO, at: int, size: int) -> tuple[Block | None, int]:
-    """Return messages that stand by themselves from `at` on and where they end, or None.
+    """Return the messages outside chunks from `at` on and their end, or None.
 
     Nothing is read from byte `size` on.
     """
@@ -142,7 +142,7 @@ def stretch(file: BinaryIO, at: int, size: int) -> tuple[Block | None, int]:
 
 
 class _Places:
-    """Finds where message records begin: `parts` of runs, then those in `single`."""
+    """Find the beginnings of message records: `parts` of runs, then those in `single`."""
 
     def __init__(self, data: bytes) -> None:
         self.data = data
@@ -150,7 +150,7 @@ class _Places:
         self.single: list[int] = []
 
     def find(self, at: int) -> int:
-        """Pass the messages from `at` on; return where something else begins."""
+        """Skip the messages from `at` on; return the beginning of the next other record."""
         data, size, single = self.data, len(self.data), self.single
         waited, patience = 0, PATIENCE
         while at + FRONT <= size:
@@ -169,7 +169,7 @@ class _Places:
         return at
 
     def _run(self, at: int, sizes: np.ndarray) -> int:
-        """Take messages whose sizes come again and again from `at` on; return how many."""
+        """Take messages with repeating sizes from `at` on; return their number."""
         stride, offsets = int(sizes.sum()), np.cumsum(sizes) - sizes
         possible = (len(self.data) - at) // stride
         found, look = 0, max(FIRST_LOOK // len(sizes), 1)
@@ -195,7 +195,7 @@ class _Places:
 
 
 def _period(sizes: np.ndarray) -> np.ndarray:
-    """Return the sizes that come again in all of `sizes`, at least twice; empty if none do."""
+    """Return the period of `sizes`, repeated at least twice; empty if there is none."""
     for period in range(1, min(len(sizes) // 2, MAX_PERIOD) + 1):
         if (sizes[period:] == sizes[:-period]).all():
             return sizes[-period:]
@@ -203,7 +203,7 @@ def _period(sizes: np.ndarray) -> np.ndarray:
 
 
 def chunk_items(chunk: Chunk) -> list[Block | Schema | Channel]:
-    """Return what a chunk holds, in its order, messages that stand together as one block.
+    """Return the content of a chunk in its order, consecutive messages as one block.
 
     Raises
     ------
@@ -221,7 +221,7 @@ def chunk_items(chunk: Chunk) -> list[Block | Schema | Channel]:
         raise CRCValidationError(chunk.uncompressed_crc, zlib.crc32(data), chunk)
     try:
         return _items(data)
-    except Exception:  # a form that only the library's own reader takes, or does not
+    except Exception:  # left to the library's reader
         chunk.data, chunk.compression = data, ""
         return [item for item in gathered(breakup_chunk(chunk))
                 if isinstance(item, Block | Schema | Channel)]
@@ -250,7 +250,7 @@ def _items(data: bytes) -> list[Block | Schema | Channel]:
 
 
 def gathered(records: list[McapRecord]) -> list[Block | McapRecord]:
-    """Return records with messages that stand together as one block."""
+    """Return records with consecutive messages as one block."""
     items: list[Block | McapRecord] = []
     messages: list[Message] = []
     for record in records:
@@ -266,7 +266,7 @@ def gathered(records: list[McapRecord]) -> list[Block | McapRecord]:
 
 @dataclass
 class Summary:
-    """What a summary tells: declarations by number, and the indexes of the chunks."""
+    """Content of a summary: declarations by number, and the indexes of the chunks."""
 
     schemas: dict[int, Schema] = field(default_factory=dict)
     channels: dict[int, Channel] = field(default_factory=dict)
@@ -274,14 +274,14 @@ class Summary:
 
     @property
     def complete(self) -> bool:
-        """Whether everything that is used in the chunks is declared here."""
+        """Whether everything used in the chunks is declared here."""
         used = {number for chunk in self.chunks for number in chunk.message_index_offsets}
         declared = {0, *self.schemas}
         return used <= self.channels.keys() and all(
             channel.schema_id in declared for channel in self.channels.values())
 
     def needless(self, wanted: Callable[[str], bool]) -> dict[int, int]:
-        """Return place -> end of the chunks that hold messages, but of no topic wanted."""
+        """Return start -> end of the chunks with messages, but of no required topic."""
         return {chunk.chunk_start_offset: chunk.chunk_start_offset + chunk.chunk_length
                 for chunk in self.chunks if chunk.message_index_offsets
                 and not any(wanted(self.channels[number].topic)
@@ -289,7 +289,7 @@ class Summary:
 
 
 def read_summary(file: BinaryIO) -> Summary:
-    """Return the summary of a file; an empty one if it is damaged or does not tell everything.
+    """Return the summary of a file; an empty one if damaged or incomplete.
 
     Parameters
     ----------
@@ -304,7 +304,7 @@ def read_summary(file: BinaryIO) -> Summary:
 
 
 def _content(file: BinaryIO) -> bytes:
-    """Return the summary; ValueError if there is none that proves to be whole."""
+    """Return the summary; ValueError unless its checksum is correct."""
     size = file.seek(0, 2)
     file.seek(size - END.size)
     tail = file.read(END.size)

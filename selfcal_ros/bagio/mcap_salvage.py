@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What can be read of an MCAP file that is compressed, cut off or damaged.
+"""Reading of a compressed, truncated or damaged MCAP file.
 
-A few kilobytes can decompress to gigabytes. What is more than `FREE` must not be more than the
-file declares, than `RATIO` times the compressed bytes, or than a quarter of the memory that is
-left; of a file, than half of the free disk space.
+A few kilobytes can decompress to gigabytes. Above `FREE`, the size must not exceed the declared
+size, `RATIO` times the compressed bytes, or a quarter of the available memory; for a file, half of
+the free disk space.
 
-A chunk is found again by its own form: its length must agree with the lengths inside it. So the
-summary, which a recorder that died never wrote, is not needed.
+A chunk is found by its structure: its length must agree with the lengths inside it. So the
+summary, which is missing if a recorder died, is not needed.
 """
 
 import io
@@ -32,14 +32,14 @@ from selfcal_ros.errors import InputError, first_line
 from selfcal_ros.units import BYTES_PER_MB
 
 FREE = 64 << 20
-"""Bytes that are always allowed."""
+"""Size that is always allowed, bytes."""
 RATIO = 200
-"""How often larger than its compressed form something may be; recordings reach 3 to 30."""
+"""Largest ratio of decompressed to compressed size; recordings reach 3 to 30."""
 ZSTD = b"\x28\xb5\x2f\xfd"
 """First bytes of a file of a bag with compression_mode FILE, or of a message with MESSAGE."""
 BLOCK = 1 << 16
 ZSTD_HEAD = 18
-"""Longest head of a zstd frame."""
+"""Longest header of a zstd frame."""
 MEMORY = Path("/proc/meminfo")
 HEAD = struct.Struct("<BQ")
 """Opcode and length of a record."""
@@ -48,27 +48,27 @@ PARSERS = {Opcode.SCHEMA: Schema.read, Opcode.CHANNEL: Channel.read, Opcode.CHUN
 CHUNK_FRONT = 49
 """Bytes of a chunk record before its records, without the name of the compression."""
 FOOTER_CONTENT = 28
-"""Bytes from the place of the summary in the footer to the end of a file."""
+"""Bytes from the footer's offset of the summary to the end of a file."""
 MESSAGE_FRONT = 22
 """Bytes of a message before its payload."""
 CHUNK_LOOKS = (rb"\x06(?s:.{36})(?:\x04\0\0\0zstd|\x03\0\0\0lz4|\0\0\0\0)"
                rb"|\x0f\x04\0\0\0\0\0\0\0(?s:.{4})[\x01-\x0e]")
-"""The start of a chunk, or the end of the data section with another record behind it."""
+"""The start of a chunk, or the end of the data section followed by another record."""
 SLICE = 4096
-"""Bytes that are decompressed at once where the end is missing."""
+"""Bytes decompressed at once if the end is missing."""
 MESSAGE_LOOKS = rb"\x05(?s:.{5})\0\0\0"
 CHUNKS = re.compile(b"(?=" + CHUNK_LOOKS + b")")
 MESSAGES = re.compile(b"(?=" + CHUNK_LOOKS + b"|" + MESSAGE_LOOKS + b")")
-"""The same in a file without chunks, where messages stand by themselves. Looking ahead only, so
-that what looks alike does not hide a true one that it overlaps."""
+"""The same in a file without chunks, also for messages. A look-ahead, so that a false match does
+not hide an overlapping true one."""
 
 
 class TooLargeError(ValueError):
-    """Raised instead of decompressing something that is larger than it may be."""
+    """Raised instead of decompressing to more than the limit."""
 
 
 def memory_left() -> int:
-    """Return the bytes of memory that can still be had, as far as the system tells."""
+    """Return the available memory in bytes, as far as the system reports it."""
     try:
         for line in MEMORY.read_text().splitlines():
             if line.startswith("MemAvailable:"):
@@ -79,7 +79,7 @@ def memory_left() -> int:
 
 
 def limit_of(compressed: int, declared: int | None = None) -> int:
-    """Return how many bytes `compressed` bytes may become; `declared`: what the file says."""
+    """Return the limit for decompressing `compressed` bytes; `declared`: size in the file."""
     large = min(RATIO * compressed, memory_left() // 4)
     return max(FREE, large if declared is None else min(large, declared))
 
@@ -99,16 +99,16 @@ def refuse_beyond(limit: int, size: int) -> None:
 
 
 def zstd_chunk(data: bytes, declared: int) -> bytes:
-    """Return the content of a zstd frame, `declared` bytes as the file says.
+    """Return the content of a zstd frame of `declared` bytes.
 
     Raises
     ------
     TooLargeError
-        If it would be larger than is allowed; nothing has been allocated.
+        If it would exceed the limit; nothing has been allocated.
     zstandard.ZstdError
         If the frame is damaged.
     """
-    with suppress(zstandard.ZstdError):  # the head is damaged: what follows says how
+    with suppress(zstandard.ZstdError):  # the header is damaged: decompression raises
         inside = zstandard.frame_content_size(data)
         if not inside:
             return b""
@@ -117,18 +117,18 @@ def zstd_chunk(data: bytes, declared: int) -> bytes:
 
 
 def lz4_chunk(data: bytes, declared: int) -> bytes:
-    """Return the content of an LZ4 frame, `declared` bytes as the file says.
+    """Return the content of an LZ4 frame of `declared` bytes.
 
     Raises
     ------
     TooLargeError
-        If it would be larger than is allowed.
+        If it would exceed the limit.
     RuntimeError
         If the frame is damaged.
     """
     check_size(lz4.frame.get_frame_info(data)["content_size"], len(data), declared)
     decoder, out, size = lz4.frame.LZ4FrameDecompressor(), [], 0
-    for start in range(0, len(data), BLOCK):  # a block becomes at most 255 times as large
+    for start in range(0, len(data), BLOCK):  # a block expands by at most 255
         out.append(decoder.decompress(data[start:start + BLOCK]))
         size += len(out[-1])
         check_size(size, len(data), declared)
@@ -138,7 +138,7 @@ def lz4_chunk(data: bytes, declared: int) -> bytes:
 
 
 def zstd_message(data: bytes) -> bytes:
-    """Return the payload of a message that was compressed by itself; raises as `zstd_chunk`."""
+    """Return the payload of a compressed message; raises like `zstd_chunk`."""
     inside = zstandard.frame_content_size(data)
     if inside >= 0:
         check_size(inside, len(data))
@@ -152,7 +152,7 @@ def zstd_message(data: bytes) -> bytes:
 
 @contextmanager
 def plain_file(path: Path, lost: list[str]) -> Iterator[BinaryIO]:
-    """Yield a file for reading, decompressed beforehand if it was compressed as a whole.
+    """Yield a file for reading, decompressed first if it was compressed as a whole.
 
     Raises
     ------
@@ -195,12 +195,12 @@ def _copy(file: BinaryIO, plain: BinaryIO) -> None:
 
 
 def parsed(opcode: int, body: bytes) -> tuple[McapRecord | None, int]:
-    """Return a record (None for a kind that is not needed) and how many bytes it takes of `body`.
+    """Return a record (None if not needed) and the number of bytes it takes of `body`.
 
     Raises
     ------
     Exception
-        Of any kind, if the body is no such record.
+        Of any kind, if the body is not such a record.
     """
     stream = ReadDataStream(io.BytesIO(body))
     if opcode == Opcode.MESSAGE:
@@ -216,7 +216,7 @@ def parsed(opcode: int, body: bytes) -> tuple[McapRecord | None, int]:
 def chunk_length(data: bytes | mmap, at: int) -> int:
     """Return the length of the chunk whose content begins at `at`, from the lengths inside it.
 
-    More than there is where `data` ends before them.
+    More than available if `data` ends before them.
     """
     name_length = int.from_bytes(data[at + 28:at + 32], "little")
     inside = int.from_bytes(data[at + 32 + name_length:at + 40 + name_length], "little")
@@ -224,7 +224,7 @@ def chunk_length(data: bytes | mmap, at: int) -> int:
 
 
 def declarations(data: mmap) -> Iterator[Schema | Channel]:
-    """Yield the schemas and channels that the summary repeats; nothing if there is no summary."""
+    """Yield the schemas and channels repeated in the summary; nothing without a summary."""
     at = struct.unpack_from("<Q", data, len(data) - FOOTER_CONTENT)[0] if len(
         data) >= FOOTER_CONTENT else 0
     while 0 < at <= len(data) - HEAD.size:
@@ -241,7 +241,7 @@ def declarations(data: mmap) -> Iterator[Schema | Channel]:
 
 
 def next_record(data: mmap, start: int, channels: Collection[int] | None) -> int:
-    """Return where the next chunk or the end of the data section begins, or the size of the file.
+    """Return the start of the next chunk or end of the data section, or the size of the file.
 
     Parameters
     ----------
@@ -250,7 +250,7 @@ def next_record(data: mmap, start: int, channels: Collection[int] | None) -> int
     start : int
         First byte that may belong to it.
     channels : collection of int or None
-        Known channels of a file without chunks, whose messages are looked for as well.
+        Known channels of a file without chunks, whose messages are searched for as well.
     """
     pattern = CHUNKS if channels is None else MESSAGES
     for match in pattern.finditer(data, start + 1):
@@ -272,9 +272,9 @@ def next_record(data: mmap, start: int, channels: Collection[int] | None) -> int
 
 
 def front_of_chunk(data: bytes) -> Iterator[McapRecord]:
-    """Yield the complete records in the front part of a chunk that was cut off.
+    """Yield the complete records in the front part of a truncated chunk.
 
-    A chunk that is all there but whose checksum does not agree gives nothing.
+    A complete chunk with a wrong checksum gives nothing.
     """
     if len(data) < CHUNK_FRONT or data[0] != Opcode.CHUNK:
         return
@@ -293,7 +293,7 @@ def front_of_chunk(data: bytes) -> Iterator[McapRecord]:
             return
         try:
             record, _ = parsed(opcode, body[at:at + length])
-        except Exception:  # a chunk that is damaged, not only cut: its rest cannot be trusted
+        except Exception:  # a damaged chunk, not only truncated: the rest cannot be trusted
             return
         if record is not None:
             yield record
@@ -301,9 +301,9 @@ def front_of_chunk(data: bytes) -> Iterator[McapRecord]:
 
 
 def _decompressed_front(compression: str, data: bytes, declared: int) -> bytes:
-    """Return what can be decompressed of a stream whose end is missing.
+    """Return the decompressible part of a truncated stream.
 
-    Nothing of one that is larger than is allowed.
+    Nothing if it exceeds the limit.
     """
     out = bytearray()
     limit = limit_of(len(data), declared)
@@ -321,5 +321,5 @@ def _decompressed_front(compression: str, data: bytes, declared: int) -> bytes:
             if len(out) > limit:
                 return b""
     except (zstandard.ZstdError, RuntimeError, EOFError):
-        pass  # the cut: what came out so far is good
+        pass  # the truncation: the output so far is good
     return bytes(out)

@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""MCAP as a stream of messages that survives a truncated or damaged file.
+"""MCAP as a stream of messages, tolerant of truncated or damaged files.
 
-The mcap library reads the records beside the messages. This module goes from one to the next, so
-that what a recorder that died leaves behind, or what is damaged in the middle, costs no more than
-itself. Messages come in blocks, as many as stand together. Files and messages that rosbag2
-compressed are decompressed on the way. Of a file that is still written, what it held when it was
-opened is read.
+The mcap library reads the records other than messages. This module goes from record to record, so
+that after truncation or damage only the affected part is lost. Consecutive messages are
+yielded in blocks. Files and messages compressed by rosbag2 are decompressed. A file that is
+still being written is read up to its size when opened.
 """
 
 import struct
@@ -46,14 +45,14 @@ from selfcal_ros.messages.cdr import Payloads
 
 CHECKED = (Opcode.HEADER, Opcode.CHUNK, Opcode.MESSAGE_INDEX, Opcode.MESSAGE, Opcode.SCHEMA,
            Opcode.CHANNEL)
-"""Records whose declared length is validated before they are skipped: it may be too large."""
+"""Records whose declared length is validated before skipping, as it may be too large."""
 INDEX = struct.Struct("<HI")
 """Channel and bytes of the entries of a message index."""
 INDEX_ENTRY = 16
 SQLITE = b"SQLite format 3"
 CONVERT = ("convert it with `ros2 bag convert -i BAG -o OPTIONS.yaml`, where OPTIONS.yaml says "
            "output_bags: [{uri: NEW, storage_id: mcap, all_topics: true}]")
-"""What to do with a bag of another storage."""
+"""Remedy for a bag with another storage."""
 
 
 class _Cut(Exception):
@@ -71,9 +70,9 @@ class McapStream:
     schemas, channels : dict
         Filled while the messages are read.
     lost : list of str
-        What could not be read, one line each.
+        Parts that could not be read, one line each.
     wanted : callable or None
-        Whether a topic is needed; chunks that hold only others are passed. None = all are.
+        Whether a topic is needed; chunks with only other topics are skipped. None = all.
     """
 
     path: Path
@@ -82,7 +81,7 @@ class McapStream:
     lost: list[str] = field(default_factory=list)
     wanted: Callable[[str], bool] | None = None
     _needless: dict[int, int] = field(default_factory=dict)
-    _size: int = 0  # bytes of the file when it was opened
+    _size: int = 0  # size of the file when opened
     _n_read: int = 0
     _n_written: int = 0
     _chunked: bool = False
@@ -90,21 +89,21 @@ class McapStream:
     _too_large: Counter = field(default_factory=Counter)
 
     def messages(self) -> Iterator[tuple[Channel, Message]]:
-        """Yield channel and message of every message that can be read; raises as `blocks`."""
+        """Yield channel and message of every readable message; raises like `blocks`."""
         for block in self.blocks():
             for message in block.messages():
                 yield self.channels[message.channel_id], message
 
     def blocks(self) -> Iterator[Block]:
-        """Yield all messages that can be read, those of declared channels, in blocks.
+        """Yield all readable messages of declared channels in blocks.
 
-        What is declared between two blocks stands in `schemas` and `channels` when the second one
-        comes.
+        Declarations between two blocks are in `schemas` and `channels` when the second one
+        is yielded.
 
         Raises
         ------
         InputError
-            If the file is empty, no MCAP file, or cannot be read.
+            If the file is empty, not an MCAP file, or cannot be read.
         """
         try:
             with plain_file(self.path, self.lost) as file:
@@ -126,7 +125,7 @@ class McapStream:
                              "the file are lost")
 
     def _refusal(self, head: bytes) -> InputError:
-        """Return what to say of a file that is no MCAP file, by its first bytes."""
+        """Return the problem of a file that is not MCAP, by its first bytes."""
         if not head:
             return InputError(str(self.path), "the file is empty", "record the bag anew")
         if head.startswith(SQLITE):
@@ -135,7 +134,7 @@ class McapStream:
                           "give an .mcap file or a rosbag2 folder")
 
     def _look_ahead(self, file: BinaryIO) -> None:
-        """Find out which chunks can be passed; what they declare stands in the summary, too."""
+        """Determine the chunks that can be skipped; their declarations are also in the summary."""
         if self.wanted is None:
             return
         summary = read_summary(file)
@@ -144,7 +143,7 @@ class McapStream:
             self.schemas, self.channels = summary.schemas, summary.channels
 
     def _records(self, file: BinaryIO) -> Iterator[Block]:
-        """Go from record to record; what begins before `sure` has certainly been read."""
+        """Go from record to record; records that begin before `sure` have been read."""
         size = self._size
         at = sure = clean = len(MAGIC)
         data_ended = passed = False
@@ -175,7 +174,7 @@ class McapStream:
             if opcode == Opcode.FOOTER:
                 return
             data_ended = data_ended or opcode == Opcode.DATA_END
-            if opcode in CHECKED:  # only the record behind a message shows that its length is right
+            if opcode in CHECKED:  # only the record after a message confirms its length
                 sure, clean = at if opcode == Opcode.MESSAGE else end, end
             if passed and opcode == Opcode.MESSAGE_INDEX:
                 self._n_read += (end - at - HEAD.size - INDEX.size) // INDEX_ENTRY
@@ -226,9 +225,9 @@ class McapStream:
         return block[~np.isin(block.fronts["channel"], missing)]
 
     def _decompressed(self, block: Block) -> Block:
-        """Return the messages with the payloads decompressed that rosbag2 compressed one by one.
+        """Return the messages with payloads compressed by rosbag2 decompressed.
 
-        A payload that cannot be decompressed stays as it is: it will not decode either.
+        A payload that cannot be decompressed is unchanged: decoding it will fail, too.
         """
         packed = [number for number in block.compressed().tolist()
                   if self.channels[int(block.fronts["channel"][number])].message_encoding == "cdr"]
@@ -255,19 +254,19 @@ class McapStream:
                 "killed: every message that was written is read"))
 
     def _grown(self, file: BinaryIO) -> str:
-        """Return what to say of a file that has grown since it was opened; "" if it has not."""
+        """Return a note if a file has grown since it was opened, else ""."""
         if file.seek(0, 2) == self._size:
             return ""
         return (f"the file is still being written: the messages in its first {self._size} bytes "
                 "are read")
 
     def _found(self, file: BinaryIO, start: int) -> int:
-        """Return where reading can go on behind `start`."""
+        """Return where reading can continue after `start`."""
         with mmap(file.fileno(), self._size, access=ACCESS_READ) as data:
             return next_record(data, start, None if self._chunked else self.channels)
 
     def _declare(self, file: BinaryIO) -> None:
-        """Take from the summary what was declared in the part that is lost."""
+        """Take declarations of the lost part from the summary."""
         with mmap(file.fileno(), self._size, access=ACCESS_READ) as data:
             for record in declarations(data):
                 if isinstance(record, Schema):
@@ -277,7 +276,7 @@ class McapStream:
 
     def _salvage(self, file: BinaryIO, start: int,
                  error: Exception) -> Iterator[Block]:
-        """Yield what is readable of the record at `start`, and say what is not."""
+        """Yield the readable part of the record at `start`, and report the rest."""
         stop, size = self._found(file, start), self._size
         file.seek(start)
         count = 0
@@ -301,7 +300,7 @@ class McapStream:
 
 
 def _is_chunk(file: BinaryIO, at: int, end: int | None) -> bool:
-    """Return whether a chunk of the length that the index tells stands at `at`."""
+    """Return whether there is a chunk of the indexed length at `at`."""
     if end is None:
         return False
     file.seek(at)
@@ -309,13 +308,13 @@ def _is_chunk(file: BinaryIO, at: int, end: int | None) -> bool:
 
 
 def _record(file: BinaryIO, at: int, size: int) -> tuple[int, McapRecord | None, int]:
-    """Return opcode, content (None where it does not matter) and end of the record at `at`."""
+    """Return opcode, content (None if not needed) and end of the record at `at`."""
     file.seek(at)
     head = file.read(HEAD.size)
     if len(head) < HEAD.size:
         raise _Cut
     opcode, length = HEAD.unpack(head)
-    if not (0 < opcode <= max(Opcode) or opcode >= 0x80):  # the range that private records have
+    if not (0 < opcode <= max(Opcode) or opcode >= 0x80):  # the range of private records
         raise ValueError(f"no record has the opcode {opcode}")
     if at + HEAD.size + length > size:
         raise _Cut

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A bag straight into the collector without middleware, or in the order in which it is played."""
+"""A bag into the collector without middleware, and in the order of replay."""
 
 import hashlib
 from array import array
@@ -26,26 +26,26 @@ from selfcal_ros.topics import COMMAND_TOPIC, DETECTION_TOPIC, ENCODER_TOPIC, IN
 FROM_THE_FUTURE = {ENCODER_TOPIC: ("encoder", Reason.ENCODER_FUTURE),
                    DETECTION_TOPIC: ("detection", Reason.FUTURE),
                    COMMAND_TOPIC: ("command", Reason.COMMAND_FUTURE)}
-"""How messages that are stamped in the future of their reception are counted."""
+"""Reasons of messages stamped ahead of their reception."""
 MAX_SAID = 3
-"""Lines of what was lost that an error repeats."""
+"""Number of lines on losses repeated in an error."""
 TRUTH_FILE = "truth.json"
 TOPICS = list(INPUT_TOPICS)
 
 
 class BagSession(NamedTuple):
-    """What a bag gives.
+    """Content of a bag.
 
     Attributes
     ----------
     measurements : Measurements
         The readings.
     views : dict
-        view_index -> how far the view came.
+        view_index -> progress of the view.
     lost : list of str
-        What could not be read, and clocks that stepped, one line each.
+        Unreadable parts, and clock steps, one line each.
     findings : list of str
-        Clocks that stepped, and why most detections of the bag, or of views, were rejected, one
+        Clock steps, and why most detections of the bag, or of views, were rejected, one
         line each.
     """
 
@@ -57,7 +57,7 @@ class BagSession(NamedTuple):
 
 def collect_bag(path: str | Path, settings: CollectorSettings, *, namespace: str | None = None,
                 progress: Callable[[int], None] = lambda count: None) -> BagSession:
-    """Return the readings in a bag, how far each view came, and what is wrong with it.
+    """Return the readings in a bag, the progress of each view, and its problems.
 
     Parameters
     ----------
@@ -68,12 +68,12 @@ def collect_bag(path: str | Path, settings: CollectorSettings, *, namespace: str
     namespace : str or None
         Namespace of the cell's topics; empty = the root, None = the only one.
     progress : callable
-        Called now and then with the number of messages read.
+        Called periodically with the number of messages read.
 
     Raises
     ------
     InputError
-        If the path is no bag of this contract.
+        If the path is not a bag of this contract.
     NoDataError
         If it has no commands or no detections, or no detection became a reading.
     """
@@ -107,7 +107,7 @@ def collect_bag(path: str | Path, settings: CollectorSettings, *, namespace: str
 
 def _fed(reader: BagReader, settings: CollectorSettings, roles: Collection[str],
          progress: Callable[[int], None] = lambda count: None) -> tuple[BagReader, Collector]:
-    """Return what has read a bag, and a collector that has taken these topics of it."""
+    """Return the reader of a bag, and a collector that has taken these topics from it."""
     collector = Collector(settings)
     take = block_handlers(collector, reader.lost)
     for topic, item in reader.columns():
@@ -124,16 +124,16 @@ def _fed(reader: BagReader, settings: CollectorSettings, roles: Collection[str],
 
 def clock_lines(path: str | Path, settings: CollectorSettings,
                 namespace: str | None = None) -> tuple[list[str], dict[str, int]]:
-    """Return a line for each step of a clock, and refused messages by reason, as `collect_bag`."""
+    """Return a line for each clock step, and refused messages by reason, like `collect_bag`."""
     reader = BagReader(Path(path), namespace, settings.clock_limit)
     reader, collector = _fed(reader, settings, [COMMAND_TOPIC])
     return step_lines(reader.steps, collector.timeline), collector.unusable
 
 
 def topics_like(topic: str, topics: dict[str, str]) -> str:
-    """Return which of a bag's topics (name -> type) were probably meant, by type, then by name.
+    """Return the topics of a bag (name -> type) that were probably intended, by type, then name.
 
-    The text ends so that another remedy can follow; it is empty if there is no such topic.
+    The text can be followed by another remedy; it is empty if there is no such topic.
     """
     others = {name: kind for name, kind in topics.items()
               if not any(f"/{name}".endswith(f"/{role}") for role in INPUT_TOPICS)}
@@ -146,9 +146,9 @@ def topics_like(topic: str, topics: dict[str, str]) -> str:
 
 def input_handlers(collector: Collector,
                    complaints: list[str]) -> dict[str, Callable[[Any], None]]:
-    """Return topic -> handler that converts a message and gives it to the collector.
+    """Return topic -> handler that converts a message and passes it to the collector.
 
-    A command that cannot be used is not fatal: it is counted, and said in `complaints`.
+    An unusable command is not fatal: it is counted, and reported in `complaints`.
     """
     def take_command(message: Any) -> None:
         try:
@@ -164,7 +164,7 @@ def input_handlers(collector: Collector,
 
 def block_handlers(collector: Collector,
                  complaints: list[str]) -> dict[str, Callable[[Any], None]]:
-    """Return topic -> handler that gives the collector what `BagReader.columns` yields of it."""
+    """Return topic -> handler that passes the output of `BagReader.columns` to the collector."""
     def take_encoder(block: EncoderBlock) -> None:
         collector.add_encoder_block(block.stamps_ns, block.names, block.positions,
                                     block.velocities)
@@ -182,15 +182,15 @@ def bag_input(path: str | Path) -> dict[str, str]:
 
 
 def read_truth(bag: str | Path) -> dict | None:
-    """Return the truth that lies in a bag folder, or None."""
+    """Return the truth in a bag folder, or None."""
     path = Path(bag) / TRUTH_FILE
     return read_json(path) if path.is_file() else None
 
 
 class Playlist:
-    """The input topics of a bag as CDR bytes, by time of logging or shuffled.
+    """The input topics of a bag as CDR bytes, by log time or shuffled.
 
-    A bag that lies in the order of its times, as recorders write it, is read again while it is
+    A bag in the order of its log times, as written by recorders, is read again while it is
     played; any other one is kept in memory.
 
     Parameters
@@ -198,7 +198,7 @@ class Playlist:
     bag : Path
         MCAP file or rosbag2 folder.
     namespace : str or None
-        Of the cell in the bag, None = the only one.
+        Namespace of the cell in the bag, None = the only one.
     seed : int
         Shuffles the order of arrival, not the times; negative = as recorded.
 
@@ -207,7 +207,7 @@ class Playlist:
     lost : list of str
         What could not be read, one line each.
     counts : dict
-        Topic -> number of messages, topics with none left out.
+        Topic -> number of messages, without topics that have none.
     """
 
     def __init__(self, bag: Path, namespace: str | None = None, seed: int = -1) -> None:
@@ -239,7 +239,7 @@ class Playlist:
         return len(self._times)
 
     def __iter__(self) -> Iterator[tuple[str, int, bytes]]:
-        """Yield topic, time of logging in ns, and CDR bytes."""
+        """Yield topic, log time in ns, and CDR bytes."""
         messages = self._reader().cdr_messages()
         if self._order is None:
             yield from messages
@@ -251,7 +251,7 @@ class Playlist:
 
 
 def _times_and_topics(reader: BagReader) -> tuple[array, array]:
-    """Return the time of logging of each message, and the number of its topic."""
+    """Return the log time of each message, and the index of its topic."""
     times, topics = array("Q"), array("B")
     for topic, stamp, _ in reader.cdr_messages():
         times.append(stamp)

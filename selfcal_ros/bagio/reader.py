@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Bags of any origin: an MCAP file or a rosbag2 folder, read for the topics of this package."""
+"""Bags of any origin: topics of this package from an MCAP file or a rosbag2 folder."""
 
 import re
 from collections import Counter
@@ -24,41 +24,41 @@ from selfcal_ros.topics import COMMAND_TOPIC, DETECTION_TOPIC, ENCODER_TOPIC, IN
 from selfcal_ros.units import NS_PER_S
 
 LAST_FIELDS = {ENCODER_TOPIC: "position", DETECTION_TOPIC: "score", COMMAND_TOPIC: "angular_count"}
-"""Last field that the contract asks for; what stands behind it may be missing."""
+"""Last field required by the contract; later ones may be missing."""
 SUFFIXES = (".mcap", ".mcap.zstd")
 CLOCK_LIMIT_S = CollectorSettings().clock_limit
 LOOKED_AT = 500
-"""Stamps of a topic in a chunk that are held against the times of logging."""
+"""Number of stamps of a topic per chunk that are compared with the log times."""
 NEVER_NS = np.iinfo(np.int64).max
 
 
 @dataclass
 class BagReader:
-    """Reads one bag.
+    """Read one bag.
 
     Parameters
     ----------
     path : Path
         MCAP file or rosbag2 folder, with or without metadata.yaml.
     namespace : str or None
-        Namespace of the topics, for bags that hold several cells; empty = the root, None = the
+        Namespace of the topics, for bags with several cells; empty = the root, None = the
         only one.
     clock_limit_s : float
-        Steps of clocks that are larger are noted.
+        Larger clock steps are recorded.
     leave_ahead : bool
-        Leave out what is stamped in the future of its logging (not by `stamped_messages`).
+        Omit messages stamped ahead of their log time (not in `stamped_messages`).
 
     Attributes
     ----------
     lost : list of str
-        What could not be read, one line each, after reading.
+        Unreadable parts, one line each, after reading.
     steps : dict
-        Topic -> steps of the clock that stamps it, after reading (not by `stamped_messages`).
+        Topic -> steps of the clock that stamps it, after reading (not with `stamped_messages`).
     ahead : Counter
-        Topic -> messages stamped in the future of their logging, after reading, left out or not
-        (not by `stamped_messages`).
+        Topic -> number of messages stamped ahead of their log time, after reading, omitted or not
+        (not with `stamped_messages`).
     cells : set of str
-        Namespaces of the input topics that were met, without slashes.
+        Namespaces of the input topics found, without slashes.
     topics : dict of str
         All topics of the bag and their types, after reading.
     """
@@ -75,7 +75,7 @@ class BagReader:
     _n_commands: int = 0
 
     def __post_init__(self) -> None:
-        """Find the MCAP files, refuse what is no bag."""
+        """Find the MCAP files; refuse anything that is not a bag."""
         self.path = Path(self.path)
         try:
             self.path.stat()
@@ -121,15 +121,15 @@ class BagReader:
 
     @property
     def mixes_clocks(self) -> bool:
-        """Whether messages are stamped in the future of their logging, and commands are not.
+        """Whether messages are stamped ahead of their log time, and some commands are not.
 
-        A live collector refuses such messages, or they would hide what is stamped later by a clock
-        that is right. Where all commands are like that, the times of logging tell nothing.
+        A live collector refuses such messages, as they would hide later ones stamped by a correct
+        clock. If all commands are like that, the log times are useless.
         """
         return bool(self.ahead.total()) and self._n_commands > self.ahead[COMMAND_TOPIC]
 
     def future_lines(self) -> list[str]:
-        """Return a line, after reading, if messages were stamped in the future of their logging."""
+        """Return a line, after reading, if messages were stamped ahead of their log time."""
         if self.leave_ahead or not self.ahead:
             return future_lines(self.ahead)
         return [f"{COMMAND_TOPIC}: stamped more than {MAX_AHEAD_NS // NS_PER_S} s ahead of its "
@@ -139,7 +139,7 @@ class BagReader:
     def messages(self) -> Iterator[tuple[str, object]]:
         """Yield (topic, decoded message) of the three input topics, names without namespace.
 
-        Raises as `stamped_messages`.
+        Raises like `stamped_messages`.
         """
         for topic, _, message in self.stamped_messages():
             yield topic, message
@@ -168,10 +168,10 @@ class BagReader:
         self._say(bad)
 
     def cdr_messages(self) -> Iterator[tuple[str, int, bytes]]:
-        """Yield (topic, time of logging in ns, CDR bytes) of the three input topics.
+        """Yield (topic, log time in ns, CDR bytes) of the three input topics.
 
-        The bytes are of the types known here, whatever fields the bag's have. What cannot be
-        decoded is left out as in `messages`, so that both say the same. Raises as they do.
+        The bytes are of the types known here, whatever the fields in the bag. Undecodable
+        messages are omitted as in `messages`, so that both agree. Raises the same errors.
         """
         bad: Counter = Counter()
         for block, parts in self._blocks(bad):
@@ -183,7 +183,7 @@ class BagReader:
         self._say(bad)
 
     def columns(self) -> Iterator[tuple[str, Input]]:
-        """Yield topic, and what many messages of it hold; a command by itself.
+        """Yield topic and a block of decoded messages; commands singly.
 
         The order of messages is not kept. Raises as `stamped_messages`.
         """
@@ -208,7 +208,7 @@ class BagReader:
                 yield stream, stream.channels[message.channel_id], message
 
     def _streams(self) -> Iterator[tuple[McapStream, Block]]:
-        """Yield the blocks of all files; one that cannot be read costs itself if another can."""
+        """Yield the blocks of all files; an unreadable file is skipped if another is readable."""
         refused: list[InputError] = []
         for file in self.files:
             stream = self._stream(file)
@@ -246,7 +246,7 @@ class BagReader:
             yield block, parts
 
     def _in_time(self, role: str, block: Block, index: np.ndarray) -> np.ndarray:
-        """Count what is stamped in the future of its logging; return indices of what is read."""
+        """Count messages stamped ahead of their log time; return the indices to be read."""
         self._n_commands += len(index) * (role == COMMAND_TOPIC)
         if role == ENCODER_TOPIC and not _ahead(block, index[::_stride(index)]).any():
             return index
@@ -267,7 +267,7 @@ class BagReader:
 
     def _decoder(self, stream: McapStream, channel: Channel,
                  bad: Counter) -> ChannelDecoder | None:
-        """Return how a channel is decoded, None for a topic that is not ours."""
+        """Return the decoder of a channel, None for another topic."""
         role = self._role(channel.topic)
         if role is None:
             return None
@@ -306,21 +306,21 @@ class BagReader:
 
 
 def _stride(index: np.ndarray) -> int:
-    """Return at every how many of the messages of a topic in a chunk it is looked."""
+    """Return the step of the messages of a topic in a chunk that are examined."""
     return max(1, len(index) // LOOKED_AT)
 
 
 def _ahead(block: Block, index: np.ndarray) -> np.ndarray:
-    """Return which messages are stamped in the future of their logging."""
+    """Return which messages are stamped ahead of their log time."""
     stamps, there = first_stamps_ns(block.payloads[index])
     ahead = np.zeros(len(index), dtype=bool)
     logged = np.minimum(block.fronts["log_time"][index[there]], NEVER_NS).astype(np.int64)
-    ahead[there] = (stamps - logged > MAX_AHEAD_NS) & (logged > 0)  # 0: not known
+    ahead[there] = (stamps - logged > MAX_AHEAD_NS) & (logged > 0)  # 0: unknown
     return ahead
 
 
 def _roles(topic: str) -> list[str]:
-    """Return the input topics that a topic may be, behind a namespace."""
+    """Return the input topics matching a topic after its namespace."""
     return [role for role in INPUT_TOPICS if topic == role or topic.endswith("/" + role)]
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Message definitions without ROS, the contract's own and those of a bag, and messages of them."""
+"""Message definitions without ROS, of the contract and of a bag, and their messages."""
 
 from functools import cache, lru_cache
 from pathlib import Path
@@ -22,11 +22,11 @@ COMMON = {
     "sensor_msgs/msg/JointState": "std_msgs/Header header\nstring[] name\nfloat64[] position\n"
                                   "float64[] velocity\nfloat64[] effort\n",
 }
-"""The common types that the contract needs, as ROS 2 Jazzy has them. To load all 180 of rosbags
+"""The common types required by the contract, as in ROS 2 Jazzy. Loading all 180 of rosbags
 would take 0.1 s of CPU in every command and node that reads or writes a bag."""
 
 KEPT = 64
-"""Schemas whose typestores are kept; a folder of foreign bags has a handful."""
+"""Number of schemas with cached typestores; a folder of foreign bags has a handful."""
 NUMBERS = {"bool": "u1", "byte": "u1", "char": "u1", "uint8": "u1", "int8": "i1", "int16": "i2",
            "uint16": "u2", "int32": "i4", "uint32": "u4", "int64": "i8", "uint64": "u8",
            "float32": "f4", "float64": "f8"}
@@ -34,14 +34,14 @@ NUMBERS = {"bool": "u1", "byte": "u1", "char": "u1", "uint8": "u1", "int8": "i1"
 
 
 def _message_folder() -> Path:
-    """Return the folder of the .msg files: installed beside the code, or in the source tree."""
+    """Return the folder of the .msg files: installed with the code, or in the source tree."""
     source = Path(__file__).parents[2] / "msg_defs" / "msg"
     return source if source.is_dir() else Path(__file__).parents[1] / "msg_text"
 
 
 @cache
 def typestore() -> Typestore:
-    """Return this package's messages, and the common types that the contract needs."""
+    """Return this package's messages, and the common types required by the contract."""
     types: dict = {}
     for name, text in COMMON.items():
         types.update(get_types_from_msg(text, name))
@@ -64,17 +64,17 @@ def _jazzy() -> Typestore:
 
 
 def store_with(typename: str) -> Typestore:
-    """Return `typestore`, or that of all types of ROS 2 Jazzy for a type that it does not know."""
+    """Return `typestore`, or that of all types of ROS 2 Jazzy for another type."""
     return typestore() if typename in typestore().fielddefs else _jazzy()
 
 
 def hash_of(typename: str) -> str:
-    """Return the hash of a type known here, by which ROS 2 tells definitions apart (REP-2011)."""
+    """Return the hash of a known type, by which ROS 2 distinguishes definitions (REP-2011)."""
     return store_with(typename).hash_rihs01(typename)
 
 
 def definition_of(topic: str, typename: str) -> str:
-    """Return the definition of a type known here, as a ros2msg schema.
+    """Return the definition of a known type as a ros2msg schema.
 
     Raises
     ------
@@ -89,7 +89,7 @@ def definition_of(topic: str, typename: str) -> str:
 
 
 def store_of_schema(name: str, encoding: str, text: str, where: str) -> Typestore:
-    """Return a typestore that decodes messages as the bag's own schema describes them.
+    """Return a typestore for decoding by the bag's own schema.
 
     Parameters
     ----------
@@ -98,14 +98,14 @@ def store_of_schema(name: str, encoding: str, text: str, where: str) -> Typestor
     encoding : str
         ``ros2msg`` or ``ros2idl``.
     text : str
-        The schema; empty = the bag has none, and the type as known here is used.
+        The schema; empty = the bag has none, and the known type is used.
     where : str
         Bag and topic, for messages.
 
     Raises
     ------
     InputError
-        If the schema cannot be parsed, or is missing and the type not known.
+        If the schema cannot be parsed, or is missing and the type is unknown.
     """
     if not text.strip():
         store = store_with(name)
@@ -122,7 +122,7 @@ def store_of_schema(name: str, encoding: str, text: str, where: str) -> Typestor
 
 @lru_cache(maxsize=KEPT)
 def _store_of_text(name: str, encoding: str, text: str) -> Typestore:
-    """Return a typestore of a schema; bags have the same ones, and rosbags writes code for each."""
+    """Return the cached typestore of a schema: rosbags generates code for each."""
     types = get_types_from_idl(text) if encoding == "ros2idl" else get_types_from_msg(text, name)
     for known in ("std_msgs/msg/Header", "builtin_interfaces/msg/Time"):
         types.setdefault(known, typestore().fielddefs[known])
@@ -131,11 +131,11 @@ def _store_of_text(name: str, encoding: str, text: str) -> Typestore:
 
 @cache
 def shorter_stores(name: str, last: str) -> tuple[Typestore, ...]:
-    """Return typestores of a type without one, two, ... of the fields that stand behind `last`.
+    """Return typestores of a type without one, two, ... of the fields after `last`.
 
     A message recorded without its definition is of one of these, longest first: the contract's
     fields, and as many of those that this package added at the end as its publisher knew. A type
-    of others has one length only.
+    of another package has one length only.
     """
     if not name.startswith(OWN):
         return ()
@@ -147,7 +147,7 @@ def shorter_stores(name: str, last: str) -> tuple[Typestore, ...]:
 
 
 def fields_of(store: Typestore, name: str) -> tuple[Field, ...] | None:
-    """Return the fields of a type for `messages.cdr`; None if it holds others."""
+    """Return the fields of a type for `messages.cdr`; None if unsupported."""
     try:
         return tuple(_field(store, field, kind) for field, kind in store.fielddefs[name][1])
     except KeyError:
@@ -155,7 +155,7 @@ def fields_of(store: Typestore, name: str) -> tuple[Field, ...] | None:
 
 
 def _field(store: Typestore, name: str, kind: Any) -> Field:
-    """Return one field; KeyError for a basic type without a numpy code, or a type unknown."""
+    """Return one field; KeyError for a basic type without a numpy code, or an unknown type."""
     node, inner = kind
     count = None
     if node == Nodetype.SEQUENCE:
@@ -169,16 +169,16 @@ def _field(store: Typestore, name: str, kind: Any) -> Field:
 
 
 def same_layout(store: Typestore, name: str) -> bool:
-    """Return whether a type has the fields of the one known here and no others, in their order."""
+    """Return whether a type has exactly the fields of the known one, in their order."""
     wanted = typestore().fielddefs[name][1]
     return store.fielddefs[name][1] == wanted and all(
         same_layout(store, inner) for _, (_, inner) in wanted if isinstance(inner, str))
 
 
 def own_message(message: Any, name: str) -> object:
-    """Return a message of the type known here with every field that `message` has as well.
+    """Return a message of the known type with the fields of `message`.
 
-    Fields that it does not have are 0 or empty.
+    Missing fields are 0 or empty.
     """
     values: dict[str, Any] = {}
     for field, (kind, inner) in typestore().fielddefs[name][1]:
@@ -191,10 +191,10 @@ def own_message(message: Any, name: str) -> object:
 
 
 def other_field(store: Typestore, name: str, last: str) -> str:
-    """Return how a type differs from the one known here, or ''.
+    """Return the difference of a type from the known one, or ''.
 
-    Every field up to `last` must be there, and what is there must have the same type. Fields that
-    are not known here, and bounds on the length of a text or an array, are free.
+    Every field up to `last` must be present, and common fields must have the same type. Unknown
+    fields, and bounds on the length of a string or array, are ignored.
     """
     found, required = dict(store.fielddefs[name][1]), True
     for field, wanted in typestore().fielddefs[name][1]:
@@ -212,7 +212,7 @@ def other_field(store: Typestore, name: str, last: str) -> str:
 
 
 def _free_of_bounds(kind: Any) -> Any:
-    """Return a field's type with the largest length of texts and sequences left out."""
+    """Return a field's type without bounds of strings and sequences."""
     node, inner = kind
     if node == Nodetype.BASE:
         return node, inner[0]
@@ -227,7 +227,7 @@ def build(store: Typestore, typename: str, fields: Fields) -> object:
     Raises
     ------
     KeyError
-        If a field of the type is not given.
+        If a field of the type is missing.
     """
     values: dict[str, Any] = {}
     for name, (kind, argument) in store.fielddefs[typename][1]:

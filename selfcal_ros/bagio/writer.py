@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Bag folders as rosbag2 (Jazzy) writes them: MCAP with profile ros2, and metadata.yaml.
+"""Bag folders like those of rosbag2 (Jazzy): MCAP with profile ros2, and metadata.yaml.
 
-A crash keeps what was flushed: chunks go to the disk as they fill, at the latest at every
-`flush`, and metadata.yaml, which only sums up, is written last.
+Flushed messages survive a crash: chunks are written when full, at the latest at every
+`flush`, and metadata.yaml, a mere summary, is written last.
 """
 
 from abc import ABC, abstractmethod
@@ -26,7 +26,7 @@ CHUNK_SIZE = 256 * 1024
 
 @contextmanager
 def writing(path: Path, what: str = "cannot be written") -> Iterator[None]:
-    """Turn a full disk or a vanished folder into the package's own error."""
+    """Convert a full disk or a missing folder to an InputError."""
     try:
         yield
     except OSError as error:
@@ -35,11 +35,11 @@ def writing(path: Path, what: str = "cannot be written") -> Iterator[None]:
 
 
 class Closing(ABC):
-    """What is closed at the end of a ``with``, also after an error: what was measured is kept."""
+    """Context manager closed at the end, also after an error, so that measurements are kept."""
 
     @abstractmethod
     def close(self) -> None:
-        """Finish what was written."""
+        """Complete the output."""
 
     def __enter__(self) -> Self:
         """Return the writer."""
@@ -53,7 +53,7 @@ class Closing(ABC):
 
 @dataclass
 class Topic:
-    """One topic of a bag: its type, the QoS offered, and how many messages it has.
+    """One topic of a bag: type, offered QoS, and number of messages.
 
     `heard_on` is the name that it was remapped to; empty = its own.
     """
@@ -64,7 +64,7 @@ class Topic:
     heard_on: str = ""
 
     def channel_metadata(self) -> dict[str, str]:
-        """Return the metadata of its channel as rosbag2 writes it, and where it was heard."""
+        """Return the metadata of its channel in rosbag2's format, with `heard_on`."""
         about = {"offered_qos_profiles": yaml.safe_dump(self.qos, sort_keys=False)
                  if self.qos else "", "topic_type_hash": hash_of(self.type)}
         return about | ({"heard_on": self.heard_on} if self.heard_on else {})
@@ -72,7 +72,7 @@ class Topic:
 
 @dataclass
 class FileEntry:
-    """One file of a bag: its messages, and when the first and the last were logged, ns."""
+    """One file of a bag: number of messages, first and last log time, ns."""
 
     name: str
     count: int = 0
@@ -86,7 +86,7 @@ class FileEntry:
         self.last_ns = max(self.last_ns, log_time_ns)
 
     def about(self) -> dict[str, Any]:
-        """Return start, duration and count as metadata.yaml has them."""
+        """Return start, duration and count in the format of metadata.yaml."""
         start = self.first_ns or 0
         return {"duration": {"nanoseconds": max(self.last_ns - start, 0)},
                 "starting_time": {"nanoseconds_since_epoch": start},
@@ -95,7 +95,7 @@ class FileEntry:
 
 @dataclass
 class Metadata:
-    """What metadata.yaml says of a bag."""
+    """Content of metadata.yaml."""
 
     topics: dict[str, Topic] = field(default_factory=dict)
     files: list[FileEntry] = field(default_factory=list)
@@ -128,7 +128,7 @@ class Metadata:
 
 @dataclass
 class BagWriter(Closing):
-    """Writes one bag folder; use as a context manager.
+    """Write one bag folder; use as a context manager.
 
     Parameters
     ----------
@@ -140,7 +140,7 @@ class BagWriter(Closing):
     Raises
     ------
     InputError
-        If the folder exists or cannot be made; from every method, if it cannot be written.
+        If the folder exists or cannot be created; from every method, if writing fails.
     """
 
     path: Path
@@ -168,16 +168,16 @@ class BagWriter(Closing):
             self._mcap.start(profile="ros2", library="selfcal_ros")
 
     def add_topic(self, topic: str, typename: str, qos: list[dict], heard_on: str = "") -> None:
-        """Declare a topic of a type known here, before its first message.
+        """Declare a topic of a known type, before its first message.
 
         Parameters
         ----------
         topic, typename : str
             Its name in the bag and its type.
         qos : list of dict
-            What is offered.
+            Offered profiles.
         heard_on : str, optional
-            Its name in the graph, where that is another one.
+            Its name in the graph, if different.
 
         Raises
         ------
@@ -212,7 +212,7 @@ class BagWriter(Closing):
         return {name: topic.count for name, topic in self._metadata.topics.items()}
 
     def flush(self) -> None:
-        """Write everything so far to the disk."""
+        """Write all messages so far to the disk."""
         with writing(self.path):
             self._mcap.flush()
 

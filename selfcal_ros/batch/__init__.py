@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Many bags at once: solved on all cores, kept by what they hold, compared over time."""
+"""Many bags at once: solved on all cores, stored by content, compared over time."""

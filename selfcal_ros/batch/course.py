@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How a quantity goes over time: a trend, a change, or neither.
+"""Course of a quantity over time: a trend, a change, or neither.
 
-Both tests are of ranks, so that a single wild value decides nothing: Mann and Kendall's test of a
+Both are rank tests, so a single outlier is not decisive: Mann and Kendall's test of a
 trend with Theil and Sen's slope, and Pettitt's test of a change (Appl. Statist. 28 (1979) 126),
-whose probability is that of random orders of the same values; the change point minimises the sum
-of absolute residuals. They hold for values that are independent of each other where nothing goes
-on.
+with probabilities from random orders of the same values; the change point minimises the sum
+of absolute residuals. They assume independent values under the null hypothesis.
 """
 
 from collections.abc import Mapping, Sequence
@@ -16,17 +15,16 @@ import numpy as np
 from scipy import stats
 
 FEWEST = 8
-"""Values below which no order is unlikely enough to say anything."""
+"""Smallest number of values for a test."""
 LEVEL = 0.05
-"""Part of the batches in which nothing goes on and yet something is named, all quantities
-together."""
+"""Fraction of stable batches with a false alarm, all quantities together."""
 ORDERS = 9999
-"""Random orders behind the probability of a change."""
+"""Number of random orders for the probability of a change."""
 SEED = 20240229
 
 
 class Finding(StrEnum):
-    """What is named."""
+    """Kinds of findings."""
 
     NONE = "none"
     TREND = "trend"
@@ -35,26 +33,26 @@ class Finding(StrEnum):
 
 @dataclass(frozen=True)
 class Course:
-    """What the values of a quantity do in the order of their times.
+    """Course of the values of a quantity over time.
 
     Attributes
     ----------
     n : int
-        Values.
+        Number of values.
     slope_per_day : tuple of float
-        Theil and Sen's slope, and the limits between which it lies with 95 %.
+        Theil and Sen's slope, and its 95 % limits.
     p_trend, p_change : float
-        Probability of as much, or more, if nothing goes on.
+        Probability of as much, or more, of stable values.
     last_before, change : int
-        Numbers of the last known value before the most likely change, and of the first after it;
-        both 0 where there is none.
+        Indices of the last known value before the most likely change, and of the first after it;
+        both 0 if there is none.
     before, after : float
         Medians on both sides of it.
     adjusted_p : float
-        That of what is named (else the smaller), as it counts among all tests of a series
+        Probability of the finding (else the smaller one), corrected for all tests of a series
         (Benjamini, Hochberg).
     finding : Finding
-        What is significant; of two the one that leaves less.
+        The significant finding; of two the one with smaller residuals.
     """
 
     n: int
@@ -73,7 +71,7 @@ def course_of(days: np.ndarray, values: np.ndarray, rng: np.random.Generator, *,
               orders: int = ORDERS) -> Course:
     """Return the course of `values` (n,) at the times `days` (n,), which rise.
 
-    Nothing is judged yet: `courses` does, among all quantities.
+    Without a decision, which `courses` makes for all quantities together.
     """
     nothing = Course(len(values), (0.0, 0.0, 0.0), 1.0, 1.0, 0, float(values[0]),
                      float(values[0]))
@@ -100,9 +98,9 @@ def pettitt(values: np.ndarray, rng: np.random.Generator, *,
 
 
 def step_of(values: np.ndarray) -> int:
-    """Return the number of the first value after the step that fits best, in least moduli.
+    """Return the index of the first value after the best step in the sense of least moduli.
 
-    Where Pettitt's statistic is largest is no good place: it is drawn to the middle.
+    The maximum of Pettitt's statistic is biased towards the middle.
     """
     moduli = [np.abs(values[:t] - np.median(values[:t])).sum()
               + np.abs(values[t:] - np.median(values[t:])).sum() for t in range(1, len(values))]
@@ -117,16 +115,16 @@ def _imbalance(ranks: np.ndarray) -> np.ndarray:
 
 def courses(days: np.ndarray, table: Mapping[str, np.ndarray], *, seed: int = SEED,
             orders: int = ORDERS) -> dict[str, Course]:
-    """Return the course of every quantity, judged together.
+    """Return the course of every quantity, with a common decision.
 
     Parameters
     ----------
     days : float array (n,)
         Times, rising, in days.
     table : mapping
-        Quantity -> values (n,), NaN where not known.
+        Quantity -> values (n,), NaN if unknown.
     seed, orders : int
-        Of the random orders.
+        Seed and number of the random orders.
     """
     rng, found = np.random.default_rng(seed), {}
     for name, values in table.items():
@@ -144,7 +142,7 @@ def courses(days: np.ndarray, table: Mapping[str, np.ndarray], *, seed: int = SE
 
 
 def _adjusted(p: Sequence[float]) -> np.ndarray:
-    """Return the probabilities of all tests of a batch as they count together, (n, 2)."""
+    """Return the probabilities of all tests of a batch, corrected together, (n, 2)."""
     return stats.false_discovery_control(p).reshape(-1, 2) if p else np.zeros((0, 2))
 
 
@@ -160,7 +158,7 @@ def _judged(course: Course, adjusted: np.ndarray, days: np.ndarray,
 
 
 def _of_both(course: Course, days: np.ndarray, values: np.ndarray) -> Finding:
-    """Return which of a line and a step leaves less (BIC of Laplace errors, 2 and 3 unknowns)."""
+    """Return the better of a line and a step (BIC of Laplace errors, 2 and 3 unknowns)."""
     known = np.isfinite(values)
     t, x, n = days[known], values[known], int(known.sum())
     line = x - course.slope_per_day[0] * t

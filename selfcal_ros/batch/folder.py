@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The folder of a batch: bags, settings, jobs, records; what is done already, what is to do.
+"""The folder of a batch: bags, settings, jobs, records; what is done and what remains.
 
-Nothing here needs the estimator: the command that hands out the jobs starts without it.
+Independent of the estimator: the command that distributes the jobs starts without it.
 """
 
 import contextlib
@@ -25,19 +25,19 @@ METADATA = "metadata.yaml"
 SCHEMA = "selfcal.batch/1"
 RECORDS, RESULTS = "records", "results"
 PER = "_per_"
-"""Stands for the stroke of a unit in the name of a quantity."""
+"""Replacement of the slash of a unit in the name of a quantity."""
 NO_INFLUENCE = ("save_path", "result_folder", "autostart", "status_period", "frame_id")
-"""Parameters that decide nothing about a result."""
+"""Parameters without effect on a result."""
 Record = dict[str, Any]
-"""What is kept of a bag: JSON, schema `SCHEMA`, see docs/batch.md."""
+"""Record of a bag: JSON, schema `SCHEMA`, see docs/batch.md."""
 LOCK = ".lock"
 
 
 def find_bags(paths: Iterable[str]) -> list[Path]:
     """Return the bags among `paths` and below them, each once, in the order of their names.
 
-    A file is a bag, and so is a folder with a metadata.yaml; below any other folder every bag
-    counts, loose .mcap files included, but nothing in folders whose name begins with a dot.
+    A file is a bag, and so is a folder with a metadata.yaml; any other folder is searched for
+    bags, including single .mcap files, except in folders whose name begins with a dot.
 
     Raises
     ------
@@ -78,13 +78,13 @@ def _refuse(error: OSError) -> NoReturn:
 
 
 def stat_of(bag: Path) -> list[list]:
-    """Return name, size and time of change (ns) of the files of a bag: equal if it is as it was."""
+    """Return name, size and time of change (ns) of the files of a bag, equal if unchanged."""
     found = []
     for file in sorted(_entries(bag)) if bag.is_dir() else [bag]:
         try:
             if file.is_file():
                 found.append([file.name, file.stat().st_size, file.stat().st_mtime_ns])
-        except OSError:  # it has just vanished: reading it tells
+        except OSError:  # it has just disappeared: reading it will fail
             continue
     return found
 
@@ -98,16 +98,16 @@ def _entries(folder: Path) -> list[Path]:
 
 @dataclass(frozen=True)
 class Settings:
-    """How every bag of a batch is solved.
+    """Settings for every bag of a batch.
 
     Attributes
     ----------
     collector, solver : CollectorSettings, SolverSettings
-        Those of the nodes.
+        Settings of the nodes.
     robust : bool
-        Whether outliers are looked for.
+        Whether to search for outliers.
     namespace : str or None
-        Of the cell's topics, see `selfcal_ros.bagio.offline.collect_bag`.
+        Namespace of the cell's topics, see `selfcal_ros.bagio.offline.collect_bag`.
     """
 
     collector: CollectorSettings
@@ -116,7 +116,7 @@ class Settings:
     namespace: str | None = None
 
     def digest(self) -> str:
-        """Return a digest of all that decides a result beside the bag."""
+        """Return a digest of everything that affects a result, other than the bag."""
         values = asdict(self) | {"schema": SCHEMA, "version": __version__}
         for node in ("collector", "solver"):
             values[node] = {k: v for k, v in values[node].items() if k not in NO_INFLUENCE}
@@ -125,7 +125,7 @@ class Settings:
 
 @dataclass(frozen=True)
 class Job:
-    """A bag to be solved into the folder of a batch; `redo`: also where it was solved before."""
+    """A bag to be solved into the folder of a batch; `redo`: even if solved before."""
 
     bag: Path
     folder: Path
@@ -134,7 +134,7 @@ class Job:
 
 
 def read_record(path: Path) -> Record | None:
-    """Return the record in a file; None if there is none, or none that can be used."""
+    """Return the record in a file; None if missing or unusable."""
     try:
         record = read_json(path)
     except InputError:
@@ -147,18 +147,18 @@ def read_record(path: Path) -> Record | None:
 
 
 def is_whole(folder: Path, record: Record) -> bool:
-    """Return whether the result that a record names is there."""
+    """Return whether the result of a record exists."""
     return "result" not in record or (folder / str(record["result"])).is_file()
 
 
 @contextlib.contextmanager
 def opened(folder: Path) -> Iterator[None]:
-    """Make the folder of a batch, and hold it against other batches while the block runs.
+    """Create the folder of a batch, and lock it against other batches during the block.
 
     Raises
     ------
     InputError
-        If it cannot be made, or another batch works in it.
+        If it cannot be created, or another batch is using it.
     """
     try:
         for part in (folder / RECORDS, folder / RESULTS):
@@ -179,7 +179,7 @@ def opened(folder: Path) -> Iterator[None]:
 
 
 def kept_records(folder: Path, settings: Settings) -> list[Record]:
-    """Return the records of these settings that are in the folder."""
+    """Return the records of these settings in the folder."""
     digest = settings.digest()
     found = (read_record(path) for path in sorted((folder / RECORDS).glob("*.json")))
     return [record for record in found if record is not None and record["settings"] == digest
@@ -188,10 +188,10 @@ def kept_records(folder: Path, settings: Settings) -> list[Record]:
 
 def done_and_to_do(kept: Sequence[Record], bags: Sequence[Path],
                    ) -> tuple[dict[int, Record], list[int]]:
-    """Return the records of bags that are done, by their place in `bags`, and the others' places.
+    """Return the records of finished bags, by their index in `bags`, and the other indices.
 
-    A bag is done if it has a record and its files are as they were. The largest of the others come
-    first, so that no core ends long after the others.
+    A bag is finished if it has a record and its files are unchanged. The largest of the others come
+    first, so that all cores finish at about the same time.
     """
     known = {record["bag"]: record for record in kept}
     done, sizes = {}, {}

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One bag of a batch: solved, and kept under what it holds and how it was solved.
+"""One bag of a batch: solved, and stored by its content and settings.
 
-The key of a record is a digest of the bag's content and of everything that decides the result, so
-that a batch that was interrupted, moved or made larger does only what is new.
+The key of a record is a digest of the bag's content and of everything that affects the result, so
+that a batch that was interrupted, moved or enlarged does only new work.
 """
 
 import hashlib
@@ -46,10 +46,10 @@ from selfcal_ros.units import ARCSEC_PER_RAD, PPM_PER_ONE, UM_PER_M
 
 
 def run_job(job: Job) -> Record:
-    """Return the record of a bag: the one that is there if it may be, or that of a new solution.
+    """Return the record of a bag: the existing one if allowed, or that of a new solution.
 
-    A bag that cannot be used has a record too, with the exit code and the line of `selfcal
-    solve`. Only where its content cannot even be read nothing is kept.
+    An unusable bag has a record, too, with the exit code and the line of `selfcal
+    solve`. Nothing is stored if its content cannot be read at all.
 
     Raises
     ------
@@ -67,7 +67,7 @@ def run_job(job: Job) -> Record:
     path = job.folder / RECORDS / f"{key}.json"
     kept = None if job.redo else read_record(path)
     if kept is not None and is_whole(job.folder, kept):
-        if not Path(kept["bag"]).exists():  # it was moved here
+        if not Path(kept["bag"]).exists():  # it was moved
             write_json(path, kept | record)
         return kept | record
     record |= {"key": key, "sha256": source["sha256"]}
@@ -86,7 +86,7 @@ def run_job(job: Job) -> Record:
 
 def solved(job: Job, source: dict[str, str],
            ) -> tuple[CalibrationResult, NotIdentifiableError | None]:
-    """Return the result in a bag, as `selfcal solve` gives it, and why it has no map if so."""
+    """Return the result of a bag, as from `selfcal solve`, and the reason if it has no map."""
     settings = job.settings
     session = collect_bag(job.bag, settings.collector, namespace=settings.namespace)
     options = solver_options(settings.solver, session.measurements)
@@ -123,9 +123,9 @@ def _with_result(result: CalibrationResult) -> Record:
 
 
 def quantities(result: CalibrationResult) -> dict[str, float | None]:
-    """Return name -> value; the unit is the end of the name, None = not known.
+    """Return name -> value; the unit is the end of the name, None = unknown.
 
-    Terms of the model that all views share are there by their components, in SI units.
+    Terms of the model shared by all views are included by their components, in SI units.
     """
     emap, noise, numbers = result.error_map, result.noise, summary_numbers(result)
     used = sum(view.used for view in result.views)

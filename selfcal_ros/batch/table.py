@@ -26,14 +26,14 @@ STYLE = "td.text { text-align: left; min-width: 14rem; } td.bad { color: var(--b
 
 @dataclass(frozen=True)
 class Series:
-    """Bags of one plan and plate with known times, and what their quantities do over time.
+    """Bags of one plan and plate with known times, and the courses of their quantities.
 
     Attributes
     ----------
     plan_id : str
         The plan.
     records : tuple of dict
-        The bags that have a map, in the order of their first exposure; copies count once.
+        The bags with a map, in the order of their first exposure; copies count once.
     days : float array (n,)
         Their times since the first, in days.
     courses : dict
@@ -50,7 +50,7 @@ class Series:
         return str(self.records[index]["first_exposure"])[:16].replace("T", " ")
 
     def sentences(self) -> list[str]:
-        """Return what is named, one line each."""
+        """Return the findings, one line each."""
         return [self._sentence(name, course) for name, course in self.courses.items()
                 if course.finding is not Finding.NONE]
 
@@ -67,7 +67,7 @@ class Series:
 
 
 def in_time(records: Sequence[Record]) -> list[Record]:
-    """Return the records in the order of their first exposure, those without one at the end."""
+    """Return the records in the order of their first exposure; those without one last."""
     return sorted(records, key=lambda r: (r.get("first_exposure") is None,
                                           str(r.get("first_exposure")), r["bag"]))
 
@@ -99,7 +99,7 @@ def _time_s(record: Record) -> float | None:
 
 
 def csv_text(records: Sequence[Record]) -> str:
-    """Return the table as CSV: one line a bag, an empty field where a value is not known."""
+    """Return the table as CSV: one line per bag, unknown values are empty."""
     ordered = in_time(records)
     names = dict.fromkeys(name for record in ordered for name in record.get("quantities", {}))
     out = io.StringIO()
@@ -144,7 +144,7 @@ def _course_json(series: Series, course: Course) -> dict:
 
 def summary_lines(records: Sequence[Record], found: Sequence[Series],
                   done_before: int) -> list[str]:
-    """Return what a batch gave, in lines."""
+    """Return a summary of a batch, in lines."""
     good = sum(record["exit_code"] == 0 for record in records)
     maps = good + sum(record["exit_code"] == 5 for record in records)
     lines = [f"{len(records)} bags: {maps} calibrated, {good} of them qualified, "
@@ -160,7 +160,7 @@ def summary_lines(records: Sequence[Record], found: Sequence[Series],
 
 
 def page_html(records: Sequence[Record], found: Sequence[Series], lines: Sequence[str]) -> str:
-    """Return the page; `lines` are `table.summary_lines`, all text is escaped."""
+    """Return the page; `lines` are those of `summary_lines`; all text is escaped."""
     good = bool(records) and all(record["exit_code"] == 0 for record in records)
     head, *said = lines
     parts = [f'<p class="verdict{"" if good else " bad"}">{_text(head)}</p>',
@@ -203,7 +203,7 @@ def _number(value: Any) -> str:
 
 
 def _figure(series: Series, name: str, course: Course) -> str:
-    """Return values over time with what is named: a line, or a step where it changed."""
+    """Return a plot of values over time with the finding: a line, or a step at the change."""
     text, unit = described(name)
     caption = f"{text}{', ' * bool(unit)}{unit}"
     days = series.days

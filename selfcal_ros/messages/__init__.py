@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Between messages and the model, and the names of topics, without any middleware."""
+"""Conversion between messages and the model, without middleware."""

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Many CDR messages of one type at once: bytes in, numpy columns out.
 
-In CDR the place of a field depends on the lengths of the texts and sequences before it. Messages
-that agree in these have one layout, which is a numpy structure over their bytes: one message is
-walked, all others of its layout are views. What has no layout, or one that few others share, is
-left to the caller. Used for bags and by live nodes alike.
+In CDR the offset of a field depends on the lengths of preceding strings and sequences. Messages
+that agree in these share a layout, a numpy structure over their bytes: one message is
+parsed, all others of its layout are views. Messages without a layout, or with a rare one, are
+left to the caller. Used for bags and by live nodes.
 """
 
 import struct
@@ -15,10 +15,10 @@ from functools import cached_property
 import numpy as np
 
 HEAD = 4
-"""Bytes of the encapsulation in front of a message; alignment counts from behind it."""
+"""Bytes of the encapsulation before a message; alignment is relative to its end."""
 LITTLE, BIG = b"\0\1", b"\0\0"
 SEQUENCE = -1
-"""Count of a field whose number of elements stands in the message."""
+"""Count of a field whose number of elements is in the message."""
 TEXT = "text"
 WORD = 8
 EVERY_BIT = (1 << 8 * WORD) - 1
@@ -26,13 +26,13 @@ MAX_LENGTH = 1 << 13
 """Bytes of the longest message that is decoded: 140 joints with names of 30 letters, positions,
 velocities and efforts."""
 MAX_KNOWN = 16
-"""Layouts of one length that are kept for the next messages."""
+"""Cached layouts per message length."""
 MAX_LENGTHS, MAX_KNOWN_BYTES = 256, 1 << 17
-"""Lengths of which layouts are kept, and bytes of all messages that have one."""
+"""Number of lengths with cached layouts, and total bytes of their examples."""
 FREE_TRIES, WORTH = 16, 32
-"""Layouts that may be new in one call, and messages that allow one more."""
+"""New layouts allowed per call, and messages that allow one more."""
 TRY_BYTES = 512
-"""A layout of more bytes counts as several: it takes 1 ms a kB."""
+"""A layout of more bytes counts as several: 1 ms per kB."""
 
 
 @dataclass(frozen=True)
@@ -56,23 +56,23 @@ class Field:
 
 @dataclass(frozen=True)
 class Layout:
-    """Where the fields of all messages lie that agree with one of them in form.
+    """Offsets of the fields of all messages of the same form.
 
     Attributes
     ----------
     length : int
         Bytes of such a message.
     end : int
-        Bytes that its fields take; what stands behind is not looked at.
+        Bytes taken by its fields; trailing bytes are ignored.
     values : dict
         Name -> (numpy code, offset, None or number of elements); fields of inner messages as
-        ``header.stamp.sec``, those within sequences of messages left out.
+        ``header.stamp.sec``, except those within sequences of messages.
     texts : dict
-        Name -> the texts, which are the same in all these messages.
+        Name -> the strings, the same in all these messages.
     fixed : bytes
         Mask of the bytes that decide the layout: 255 where all messages must agree.
     example : bytes
-        The message that was walked.
+        The parsed message.
     """
 
     length: int
@@ -84,7 +84,7 @@ class Layout:
 
     @cached_property
     def _words(self) -> list[tuple[str, int, np.uint64, np.uint64]]:
-        """Return name, offset, mask and value of each word that decides the layout."""
+        """Return name, offset, mask and value of each word that determines the layout."""
         words = []
         for at in range(0, self.length, WORD):
             place = min(at, self.length - WORD)
@@ -96,7 +96,7 @@ class Layout:
 
     @cached_property
     def dtype(self) -> np.dtype:
-        """The messages as a numpy structure: the values, and the words that decide."""
+        """The messages as a numpy structure: the values, and the determining words."""
         fields = [(name, code if count is None else (code, (count,)), at)
                   for name, (code, at, count) in self.values.items()]
         fields += [(name, "<u8", at) for name, at, _, _ in self._words]
@@ -114,7 +114,7 @@ class Layout:
 
 
 def layout_of(fields: Sequence[Field], data: bytes) -> Layout | None:
-    """Return the layout of one message; None if it is damaged or cannot have one.
+    """Return the layout of one message; None if damaged or unsupported.
 
     Parameters
     ----------
@@ -134,7 +134,7 @@ def layout_of(fields: Sequence[Field], data: bytes) -> Layout | None:
 
 
 class _Walk:
-    """Goes through one message field by field; raises ValueError where it is damaged."""
+    """Parse one message field by field; raises ValueError if damaged."""
 
     def __init__(self, data: bytes) -> None:
         self.data, self.order = data, "<" if data[:2] == LITTLE else ">"
@@ -145,7 +145,7 @@ class _Walk:
         self._fix(0, 2)
 
     def fields(self, fields: Sequence[Field], prefix: str | None) -> None:
-        """Pass the fields of a message; `prefix` is None within a sequence of messages."""
+        """Skip the fields of a message; `prefix` is None within a sequence of messages."""
         for field in fields:
             name = None if prefix is None else prefix + field.name
             count = self._length() if field.count == SEQUENCE else field.count
@@ -165,7 +165,7 @@ class _Walk:
         self.fixed[start:stop] = b"\xff" * (stop - start)
 
     def _pass(self, size: int) -> int:
-        """Go on by `size` bytes and return where they begin."""
+        """Advance by `size` bytes and return their start."""
         start = self.at
         self.at += size
         if self.at > len(self.data):
@@ -209,7 +209,7 @@ class Payloads:
     data : bytes
         The buffer.
     start, length : int64 array (n,)
-        Where each message lies, encapsulation included.
+        Position of each message, encapsulation included.
     """
 
     data: bytes
@@ -218,7 +218,7 @@ class Payloads:
 
     @classmethod
     def joined(cls, messages: Sequence[bytes]) -> "Payloads":
-        """Return the messages one behind the other."""
+        """Return the messages concatenated."""
         length = np.fromiter(map(len, messages), np.int64, len(messages))
         return cls(b"".join(messages), np.cumsum(length) - length, length)
 
@@ -243,9 +243,9 @@ class Columns:
     Attributes
     ----------
     index : int64 array (n,)
-        Which of the messages they are.
+        Indices of the messages.
     layout : Layout
-        Their layout, with the texts that are common to all.
+        Their layout, with the common strings.
     """
 
     index: np.ndarray
@@ -275,14 +275,14 @@ class Columns:
 
 
 class ColumnDecoder:
-    """Decodes messages of one type; it remembers the layouts that it has met.
+    """Decode messages of one type, with a cache of layouts.
 
     Parameters
     ----------
     fields : sequence of Field
         The type.
     tail : int or None
-        Bytes that may stand behind the last field; None = any number.
+        Allowed bytes after the last field; None = any number.
     """
 
     def __init__(self, fields: Sequence[Field], tail: int | None = None) -> None:
@@ -292,13 +292,13 @@ class ColumnDecoder:
     def decode(self, messages: Payloads) -> tuple[list[Columns], np.ndarray]:
         """Return the messages by layout, and the indices of those that remain, int64 (r,).
 
-        What remains is damaged, or of a layout that is not worth it: it has to be decoded one by
+        The remaining ones are damaged, or of a rare layout, and have to be decoded one by
         one.
         """
         groups: list[Columns] = []
         rest: list[np.ndarray] = [np.zeros(0, dtype=np.int64)]
         tries = FREE_TRIES + len(messages) // WORTH
-        # the lengths that most messages have come first, so that what is odd costs them nothing
+        # frequent lengths first, so that odd messages do not slow them down
         for index in sorted(_by_length(messages.length), key=len, reverse=True):
             tries, undecoded = self._decode_length(messages, index, groups, tries)
             rest.append(undecoded)
@@ -306,7 +306,7 @@ class ColumnDecoder:
 
     def _decode_length(self, messages: Payloads, index: np.ndarray, groups: list[Columns],
                        tries: int) -> tuple[int, np.ndarray]:
-        """Decode messages of one length; return what is left of `tries`, and what remains."""
+        """Decode messages of one length; return the remaining `tries` and messages."""
         length = int(messages.length[index[0]])
         if not HEAD + WORD <= length <= min(len(messages.data), MAX_LENGTH):
             return tries, index
@@ -351,7 +351,7 @@ def _take(layout: Layout, index: np.ndarray, rows: np.ndarray,
     """Add the messages of a layout to `groups` and return the others."""
     table = rows.view(layout.dtype)
     good = layout.matches(table)
-    if len(index) and good.all():  # as they are, without a copy
+    if len(index) and good.all():  # without a copy
         groups.append(Columns(index, layout, table))
     elif good.any():
         groups.append(Columns(index[good], layout, table[good]))

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """From the model to the fields of messages, as plain nested dicts.
 
-`bagio.schemas.build` makes messages of rosbags from them, nodes fill those of rclpy.
+`bagio.schemas.build` creates messages of rosbags from them, nodes those of rclpy.
 """
 
 from collections.abc import Iterable
@@ -21,7 +21,7 @@ Fields = dict[str, Any]
 
 VISIT_COLUMNS = ("mark", "dx", "dy", "count", "u", "offset_x", "offset_y", "approach_x",
                  "approach_y")
-"""Columns of `GridVisits` that have the name of their field in ViewMeasurement, less visit_."""
+"""Columns of `GridVisits` named like their field in ViewMeasurement without visit_."""
 
 
 def header(stamp_ns: int, frame_id: str) -> Fields:
@@ -108,7 +108,7 @@ def view_measurement(progress: ViewProgress, measurements: Measurements, stamp_n
 
 
 def _visits(visits: GridVisits | None) -> Fields:
-    """Return the fields of the visits of a view; empty where they are not known."""
+    """Return the fields of the visits of a view; empty if unknown."""
     fields = {f"visit_{name}": getattr(visits, name) if visits else []
               for name in VISIT_COLUMNS}
     return {**fields, "visit_stamp": visits.stamp_ns if visits else [],
@@ -117,7 +117,7 @@ def _visits(visits: GridVisits | None) -> Fields:
 
 
 def _motion(name: str, motion: RepeatMotion | None) -> Fields:
-    """Return the fields of sums over repeats; empty where they are not known."""
+    """Return the fields of sums over repeats; empty if unknown."""
     return {name: motion.products.ravel() if motion else [],
             f"dof_{name}": motion.dof if motion else 0}
 
@@ -143,7 +143,7 @@ def error_map(result: CalibrationResult, stamp_ns: int, frame_id: str) -> Fields
 
 
 def grade_number(result: CalibrationResult) -> int:
-    """Return the grade of a result as ErrorMap and CalibrationSummary have it."""
+    """Return the grade of a result for ErrorMap and CalibrationSummary."""
     if not result.observability.identifiable:
         return 0
     return {Grade.NOT_QUALIFIED: 0, Grade.ENLARGED: 1, Grade.GOOD: 2}[result.verdict.grade]

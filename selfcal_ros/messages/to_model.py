@@ -36,7 +36,7 @@ from selfcal_ros.topics import COMMAND_TOPIC, ERROR_MAP_TOPIC, MEASUREMENT_TOPIC
 from selfcal_ros.units import NS_PER_S
 
 MOST_NOTES = 20
-"""Lines on the session that are taken."""
+"""Largest number of lines on the session."""
 _VISITS = (("mark", "mark", np.int64), ("dx", "dx", float), ("dy", "dy", float),
            ("count", "count", np.int64), ("stamp", "stamp_ns", np.int64),
            ("offset_x", "offset_x", float), ("offset_y", "offset_y", float),
@@ -53,7 +53,7 @@ MARK_DETECTION = (
     Field("offset_theta", "f8"), Field("sigma", "f8"), Field("score", "f4"))
 """Fields of selfcal_msgs/msg/MarkDetection."""
 STAMP_END = 12
-"""Bytes of the encapsulation, and of the stamp behind it."""
+"""Bytes of the encapsulation, and of the stamp after it."""
 _OFFSETS = {"ox": "offset_x", "oy": "offset_y", "ot": "offset_theta"}
 
 
@@ -87,7 +87,7 @@ def command(message: Any) -> Command:
     Raises
     ------
     InputError
-        For an unknown phase, a plate that cannot be, or a stamp before 1970.
+        For an unknown phase, an invalid plate, or a stamp before 1970.
     """
     if stamp_ns(message) < 0:
         raise InputError(COMMAND_TOPIC, "the stamp lies before 1970", "set the clock")
@@ -107,7 +107,7 @@ def command(message: Any) -> Command:
 
 
 def terms_of(message: Any) -> tuple[str, ...]:
-    """Return the terms that a ViewCommand or ViewMeasurement wants estimated; none in old bags."""
+    """Return the terms of a ViewCommand or ViewMeasurement; none in old bags."""
     return tuple(map(str, getattr(message, "model_terms", ())))
 
 
@@ -117,13 +117,13 @@ def notes_of(message: Any) -> tuple[str, ...]:
 
 
 def artifact_of(message: Any) -> Artifact:
-    """Return the plate that a ViewCommand, ViewMeasurement or ErrorMap describes."""
+    """Return the plate of a ViewCommand, ViewMeasurement or ErrorMap."""
     return Artifact(int(message.grid_size), float(message.grid_pitch),
                     int(message.angular_count), int(getattr(message, "grid_size_y", 0)))
 
 
 def view_of(message: Any, *, repeats: int, grid: bool, angular: bool) -> View:
-    """Return the view that a ViewCommand or ViewMeasurement describes."""
+    """Return the view of a ViewCommand or ViewMeasurement."""
     return View(str(message.view_name), float(message.rotation),
                 (float(message.translation_x), float(message.translation_y)), grid, angular,
                 repeats, _order_of(message), int(getattr(message, "check_marks", 0)),
@@ -131,7 +131,7 @@ def view_of(message: Any, *, repeats: int, grid: bool, angular: bool) -> View:
 
 
 def _order_of(message: Any) -> str:
-    """Return the visiting order of a message; empty, as the cell likes, where it is not known."""
+    """Return the visiting order of a message; empty (chosen by the cell) if unknown."""
     try:
         text = str(getattr(message, "visit_order", ""))
         return str(parse_order(text)) if text else ""
@@ -172,7 +172,7 @@ def view_readings(message: Any) -> ViewReadings:
 
 
 def _motion_of(message: Any, name: str, size: int) -> RepeatMotion | None:
-    """Return the sums over repeats in a ViewMeasurement; None where it has none."""
+    """Return the sums over repeats in a ViewMeasurement; None if it has none."""
     products = np.array(getattr(message, name, ()), dtype=float)
     if not len(products):
         return None
@@ -210,7 +210,7 @@ def counts(message: Any, prefix: str) -> dict[str, int]:
 
 
 def sense_of(message: Any) -> Sense:
-    """Return the sense of measurement behind a ViewMeasurement; InputError for a word unknown."""
+    """Return the sense of measurement of a ViewMeasurement; InputError if unknown."""
     try:
         return Sense(message.measurement_sense or Sense.MICROSCOPE_MOVES)
     except ValueError as error:
@@ -225,7 +225,7 @@ def error_map(message: Any) -> ErrorMap:
     Raises
     ------
     InputError
-        If an array does not have one value a site or a line, or the datum is not known.
+        If an array does not have one value per site or line, or the datum is unknown.
     """
     artifact = artifact_of(message)
     sites, lines = math.prod(artifact.shape), artifact.angular_count
@@ -258,11 +258,11 @@ class EncoderBlock:
     stamps_ns : int64 array (n,)
         Stamps of the headers.
     names : tuple of str
-        Joints, as the messages name them.
+        Joints, as named in the messages.
     positions : float array (n, j)
         Indicated positions, m or rad; j differs from the number of names in malformed messages.
     velocities : float array (n, i) or None
-        m/s or rad/s; None where the messages tell none.
+        m/s or rad/s; None if not in the messages.
     """
 
     stamps_ns: np.ndarray
@@ -276,7 +276,7 @@ class EncoderBlock:
 
 
 class EncoderColumns:
-    """Decodes sensor_msgs/JointState; parameters as `ColumnDecoder`."""
+    """Decode sensor_msgs/JointState; parameters as for `ColumnDecoder`."""
 
     def __init__(self, fields: Sequence[Field] = JOINT_STATE, tail: int | None = None) -> None:
         self._decoder = ColumnDecoder(fields, tail)
@@ -288,29 +288,29 @@ class EncoderColumns:
 
 
 class PositionEditor:
-    """Reads and replaces the positions of sensor_msgs/JointState one by one, within their bytes.
+    """Read and replace the positions of sensor_msgs/JointState one by one, within their bytes.
 
-    A message of a layout that is known takes 2 us, where the columns of one take 90.
+    A message of a known layout takes 2 us, compared with 90 as columns of one.
     """
 
     def __init__(self) -> None:
         self._known: deque[_Positions] = deque(maxlen=MAX_KNOWN)
 
     def read(self, data: bytes) -> tuple[tuple[str, ...], tuple[float, ...]] | None:
-        """Return names and positions; None for a message that is damaged or too long."""
+        """Return names and positions; None if the message is damaged or too long."""
         if not self._find(data):
             return None
         found = self._known[0]
         return found.names, found.form.unpack_from(data, found.at)
 
     def replaced(self, data: bytes, positions: Sequence[float]) -> bytes:
-        """Return the message that was read last with other positions."""
+        """Return the last message read with other positions."""
         found = self._known[0]
         end = found.at + found.form.size
         return data[:found.at] + found.form.pack(*positions) + data[end:]
 
     def _find(self, data: bytes) -> bool:
-        """Bring the layout of a message to the front; tell if it has one."""
+        """Move the layout of a message to the front; return whether it has one."""
         for number, known in enumerate(self._known):
             if len(data) == known.length and int.from_bytes(data) & known.mask == known.value:
                 self._known.rotate(-number)
@@ -327,7 +327,7 @@ class PositionEditor:
 
 
 class _Positions(NamedTuple):
-    """Where the positions lie in messages of one layout, and the bits that tell the layout."""
+    """Offsets of the positions in messages of one layout, and the bits that identify it."""
 
     length: int
     mask: int
@@ -338,13 +338,13 @@ class _Positions(NamedTuple):
 
 
 class DetectionColumns:
-    """Decodes selfcal_msgs/MarkDetection; parameters as `ColumnDecoder`."""
+    """Decode selfcal_msgs/MarkDetection; parameters as for `ColumnDecoder`."""
 
     def __init__(self, fields: Sequence[Field] = MARK_DETECTION, tail: int | None = None) -> None:
         self._decoder = ColumnDecoder(fields, tail)
 
     def decode(self, messages: Payloads) -> tuple[list[np.ndarray], np.ndarray]:
-        """Return tables of `collection.inputs.DETECTION`, and the indices of what remains."""
+        """Return tables of `collection.inputs.DETECTION`, and the indices of the remainder."""
         groups, rest = self._decoder.decode(messages)
         return [_detection_table(group) for group in groups], rest
 
@@ -356,7 +356,7 @@ def stamps_ns(group: Columns) -> np.ndarray:
 
 
 def first_stamps_ns(messages: Payloads) -> tuple[np.ndarray, np.ndarray]:
-    """Return the stamps of messages that begin with a header, and which are long enough for one.
+    """Return the stamps of messages that begin with a header, if long enough for one.
 
     Returns
     -------

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A simulation written as a bag, with its truth beside it."""
+"""A simulation written as a bag, with its truth."""
 
 from collections.abc import Callable
 from dataclasses import asdict
@@ -36,12 +36,12 @@ def write_simulation(simulation: Simulation, path: str | Path, *,
                      ) -> dict[str, int]:
     """Simulate, write the bag folder `path` with `truth.json` in it, return messages by topic.
 
-    It is written beside and gets its name when it is whole.
+    It is written under another name and renamed when complete.
 
     Raises
     ------
     InputError
-        If the folder exists, or cannot be made or written.
+        If the folder exists, or cannot be created or written.
     """
     target = Path(path)
     if target.exists():
@@ -88,8 +88,8 @@ def write_truth(path: Path, truth: Truth, **more: object) -> None:
 
     gx, gy, ax, ay (m), g_theta, a_theta (rad); of each view phi (rad), t, drift, drift_walk,
     plate_shape, stage_bend (m), plate_scale, plate_strain, plate_tilt and line_eccentricity (rad),
-    empty where there is none; rotation, microscope, backlash (m); placed, how the plate lies in
-    views where that is not as commanded.
+    empty if none; rotation, microscope, backlash (m); placed, the actual poses of
+    views that are not placed as commanded.
     """
     write_json(path, plain({
         "gx": truth.g[0], "gy": truth.g[1], "g_theta": truth.g_theta, "ax": truth.a[0],
