@@ -63,7 +63,7 @@ def entry(name: str, made: str) -> dict:
     try:
         result = calibrate(measurements)
         numbers, emap = summary_numbers(result), result.error_map
-        expected |= {"identifiable": True, "max_error_um": round(numbers.max_error_um, 4),
+        expected |= {"identifiable": True, "max_error_um": round(numbers["max_error_um"], 4),
                      "nonorthogonality_urad": round(emap.nonorthogonality * URAD_PER_RAD, 4),
                      "scale_difference_ppm": round(emap.scale_difference * PPM_PER_ONE, 4)}
     except NotIdentifiableError as error:

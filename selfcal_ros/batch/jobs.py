@@ -127,17 +127,13 @@ def quantities(result: CalibrationResult) -> dict[str, float | None]:
 
     Terms of the model shared by all views are included by their components, in SI units.
     """
-    emap, noise, numbers = result.error_map, result.noise, summary_numbers(result)
+    emap, noise = result.error_map, result.noise
     used = sum(view.used for view in result.views)
     rejected = sum(result.rejected.values())
     found = {
         "nonorthogonality_arcsec": emap.nonorthogonality * ARCSEC_PER_RAD,
         "scale_difference_ppm": emap.scale_difference * PPM_PER_ONE,
-        "max_error_um": numbers.max_error_um,
-        "rms_error_um": numbers.rms_error_um,
-        "rms_uncertainty_um": numbers.rms_uncertainty_um,
-        "max_theta_error_arcsec": numbers.max_theta_error_arcsec,
-        "rms_theta_uncertainty_arcsec": numbers.rms_theta_uncertainty_arcsec,
+        **summary_numbers(result),
         "sigma_xy_um": noise.sigma_xy * UM_PER_M,
         "sigma_theta_arcsec": noise.sigma_theta * ARCSEC_PER_RAD,
         "rejected_percent": 100 * rejected / (used + rejected) if used + rejected else math.nan}

@@ -268,18 +268,15 @@ class SolvingSession:
         if shown.problem is None:
             self._ports.publish("map", from_model.error_map(
                 result, shown.stamp_ns, frame_id) | verdict)
-        numbers = summary_numbers(result)
         seen = result.observability
         to_come = self._planned_views(run) - shown.views_done
         advice = [f"{counted(to_come, 'view')} to come"] if self._unfinished() else seen.advice
-        fields = {name: getattr(numbers, name) for name in (
-            "max_error_um", "rms_error_um", "rms_uncertainty_um", "max_theta_error_arcsec",
-            "rms_theta_uncertainty_arcsec")}
         self._ports.publish("summary", {
             "header": from_model.header(shown.stamp_ns, frame_id),
             "state": short(self._state()), "views_done": shown.views_done,
             "views_planned": self._planned_views(run),
-            "identifiable": seen.identifiable, "rank_deficiency": seen.deficiency, **fields,
+            "identifiable": seen.identifiable, "rank_deficiency": seen.deficiency,
+            **summary_numbers(result),
             "advice": [*advice, *result.warnings], "causes": [
                 cause.text for cause in result.verdict.causes], **verdict})
         if shown.problem is None:  # last: pictures take their time

@@ -19,7 +19,6 @@ from scipy.special import fdtrc
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.joint.fit import JointFit, fit
-from selfcal_ros.estimation.joint.noise import pooled
 from selfcal_ros.estimation.joint.problem import Problem
 from selfcal_ros.estimation.joint.solve import prepare
 from selfcal_ros.estimation.lattice.maps import PHASES
@@ -30,7 +29,7 @@ from selfcal_ros.estimation.normal.equations import (
 )
 from selfcal_ros.estimation.normal.systems import Memo
 from selfcal_ros.estimation.options import Options
-from selfcal_ros.estimation.verdict.explanations import LEVEL
+from selfcal_ros.estimation.verdict.causes import noisier_views
 from selfcal_ros.model.readings import Measurements
 
 EXACT_SITES = 31 * 31
@@ -245,11 +244,8 @@ def angular_redundancy(system: NormalEquations) -> np.ndarray:
     return _redundancy(angular.weight, variance + spread)
 
 
-NOISY_REPEATS = 1.5
-"""Ratio of the noise of a view's repeats to that of the others from which it is named."""
-
 NOISY_RESIDUALS = 3.0
-"""The same for the noise that residuals show, which is known far less well."""
+"""Ratio of a view's noise to that of the others, by residuals, above which it is noisy."""
 
 MIN_VIEW_DOF = 5.0
 """Degrees of freedom of a view's own noise below which it is not judged: chance does as much."""
@@ -270,17 +266,9 @@ def noisy_views(residuals: Residuals, measurements: Measurements
 
 def by_repeats(measurements: Measurements) -> dict[str, float]:
     """Return the views whose repeats scatter more than those of the others (F-test)."""
-    views = [(v.view.name, v.sigma_xy, v.dof_xy) for v in measurements.views
-             if len(v.m) and v.dof_xy > 0 and np.isfinite(v.sigma_xy)]
-    out = {}
-    for index, (name, sigma, dof) in enumerate(views):
-        others, rest = pooled((s, d) for i, (_, s, d) in enumerate(views) if i != index)
-        if not rest or not others > ROUNDING:
-            continue
-        p = float(fdtrc(dof, rest, (sigma / others) ** 2)) * len(views)
-        if p < LEVEL and sigma > NOISY_REPEATS * others:
-            out[name] = float(sigma / others)
-    return out
+    return {cause.view: cause.size for cause in noisier_views([
+        (v.view.name, v.sigma_xy, v.dof_xy) for v in measurements.views
+        if len(v.m) and v.dof_xy > 0 and np.isfinite(v.sigma_xy)])}
 
 
 def _by_residuals(residuals: Residuals, measurements: Measurements) -> dict[str, float]:

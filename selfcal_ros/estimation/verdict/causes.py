@@ -2,7 +2,7 @@
 """Causes: explanations with their largest component and its place; faults of angular lines."""
 
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from itertools import compress
 from typing import Any, NamedTuple
@@ -11,11 +11,12 @@ import numpy as np
 from scipy.special import eval_legendre, fdtrc
 
 from selfcal_ros.estimation.joint.model_fit import ModelFit, equations_of
+from selfcal_ros.estimation.joint.noise import pooled
 from selfcal_ros.estimation.joint.problem import FLOOR, Problem
 from selfcal_ros.estimation.normal.equations import angular_residuals
 from selfcal_ros.estimation.terms.ground import Ground
 from selfcal_ros.estimation.terms.sizes import SizeTest
-from selfcal_ros.estimation.verdict.explanations import Explanation
+from selfcal_ros.estimation.verdict.explanations import FLOOR_M, LEVEL, Explanation
 from selfcal_ros.estimation.verdict.fault_columns import MOST, READING, SLIP
 from selfcal_ros.estimation.verdict.uncertainty import Effect
 from selfcal_ros.model.artifact import Artifact
@@ -26,6 +27,9 @@ from selfcal_ros.model.verdict import Cause, TermEstimate
 
 TIMES = np.linspace(-1, 1, 101)
 """Instants of a view at which the range of a drift is evaluated."""
+
+NOISY = 1.5
+"""Ratio of a view's noise to that of the others above which it is a cause."""
 
 SURE = 3.0
 """Ratio of a rotation to its standard uncertainty above which the readings determine its view."""
@@ -102,6 +106,27 @@ def scatter_of_views(model: ModelFit, measurements: Measurements
         if dof > 0 and np.isfinite(sigma):
             out.append((view.view.name, sigma, dof))
     return out
+
+
+def noisier_views(views: Sequence[tuple[str, float, float]]) -> list[Cause]:
+    """Return the views whose noise exceeds that of the others (F-test), as causes.
+
+    Parameters
+    ----------
+    views : sequence of (str, float, float)
+        Name, noise of one reading, m, and degrees of freedom of each view.
+    """
+    found = []
+    for index, (name, sigma, dof) in enumerate(views):
+        others, rest = pooled((s, d) for i, (_, s, d) in enumerate(views) if i != index)
+        if not rest or not others > FLOOR_M:
+            continue
+        ratio = sigma / others
+        p = float(fdtrc(dof, rest, ratio**2)) * len(views)
+        if p < LEVEL and ratio > NOISY:
+            u = float(ratio * np.sqrt((1 / dof + 1 / rest) / 2))
+            found.append(Cause("noise", float(ratio), u, "m/m", p, name))
+    return found
 
 
 def _linear(found: Explanation, weights: np.ndarray) -> tuple[float, float]:

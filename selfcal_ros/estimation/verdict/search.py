@@ -10,11 +10,9 @@ from collections.abc import Collection, Iterable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.special import fdtrc
 
 from selfcal_ros.errors import InputError, NotIdentifiableError
 from selfcal_ros.estimation.joint.model_fit import ModelFit
-from selfcal_ros.estimation.joint.noise import pooled
 from selfcal_ros.estimation.joint.solve import solve_joint
 from selfcal_ros.estimation.joint.solved import Solved
 from selfcal_ros.estimation.options import Options
@@ -26,12 +24,12 @@ from selfcal_ros.estimation.verdict.causes import (
     effect_of_line,
     fitted_term,
     line_cause,
+    noisier_views,
     scatter_of_views,
     size_cause,
     turned_too_far,
 )
 from selfcal_ros.estimation.verdict.explanations import (
-    FLOOR_M,
     LEVEL,
     Explanation,
     find_explanations,
@@ -54,9 +52,6 @@ ALWAYS_SITES = 41 * 41
 
 MAX_SITES = 201 * 201
 """Largest field in which causes are searched for at all."""
-
-NOISY = 1.5
-"""Ratio of a view's noise to that of the others above which it is a cause."""
 
 MATTERS = 0.1
 """Effect on the map, in standard uncertainties (rms), below which a cause that the readings
@@ -378,19 +373,9 @@ def _noisy_views(found: _Search, measurements: Measurements) -> None:
     A node may depend on one view alone: a view noisier than assumed enlarges the uncertainty.
     """
     views = scatter_of_views(_model(found.solved), measurements)
-    emap, used = found.solved.result.error_map, found.solved.xy.sigma
-    ratios = []
-    for index, (name, sigma, dof) in enumerate(views):
-        others, rest = pooled((s, d) for i, (_, s, d) in enumerate(views) if i != index)
-        if not rest or not others > FLOOR_M:
-            continue
-        ratio = sigma / others
-        p = float(fdtrc(dof, rest, ratio**2)) * len(views)
-        if p < LEVEL and ratio > NOISY:
-            u = ratio * np.sqrt((1 / dof + 1 / rest) / 2)
-            found.causes.append(Cause("noise", ratio, u, "m/m", p, name))
-            ratios.append(sigma / used)
-    if ratios and max(ratios) > 1:
-        more = np.nan_to_num(np.stack([emap.u_gx, emap.u_gy])) * np.sqrt(max(ratios) ** 2 - 1)
+    emap, noisy = found.solved.result.error_map, noisier_views(views)
+    largest = max((sigma for name, sigma, _ in views if name in [c.view for c in noisy]), default=0)
+    if (ratio := largest / found.solved.xy.sigma) > 1:
+        more = np.nan_to_num(np.stack([emap.u_gx, emap.u_gy])) * np.sqrt(ratio**2 - 1)
         found.effects.append(Effect("noise", more, np.zeros(len(emap.g_theta))))
-    found.causes.sort(key=lambda cause: cause.p)
+    found.causes += sorted(noisy, key=lambda cause: cause.p)

@@ -17,21 +17,6 @@ NAN = float("nan")
 
 
 @dataclass(frozen=True)
-class SummaryNumbers:
-    """The numbers of ``selfcal_msgs/CalibrationSummary``, by the names of its fields.
-
-    Lengths in um, angles in arcsec, NaN where not known. `max_error_um` is the longest error
-    vector |G|, `rms_error_um` and `rms_uncertainty_um` (k=1) are per axis.
-    """
-
-    max_error_um: float
-    rms_error_um: float
-    rms_uncertainty_um: float
-    max_theta_error_arcsec: float
-    rms_theta_uncertainty_arcsec: float
-
-
-@dataclass(frozen=True)
 class MapFigures:
     """What a person asks of an error map, SI units, NaN where not known.
 
@@ -98,12 +83,18 @@ def largest(values: np.ndarray) -> tuple[float, tuple[int, ...] | None]:
     return float(sizes.flat[flat]), tuple(int(i) for i in np.unravel_index(flat, sizes.shape))
 
 
-def summary_numbers(result: CalibrationResult) -> SummaryNumbers:
-    """Return the numbers of a CalibrationSummary message."""
+def summary_numbers(result: CalibrationResult) -> dict[str, float]:
+    """Return the numbers of a CalibrationSummary message by the names of its fields.
+
+    Lengths in um, angles in arcsec, NaN where unknown. ``max_error_um`` is the longest error vector
+    |G|, ``rms_error_um`` and ``rms_uncertainty_um`` (k=1) are per axis.
+    """
     figures = map_figures(result.error_map)
-    return SummaryNumbers(figures.max_error_m * UM_PER_M, figures.rms_error_m * UM_PER_M,
-                          figures.rms_u_m * UM_PER_M, figures.max_theta_rad * ARCSEC_PER_RAD,
-                          figures.rms_u_theta_rad * ARCSEC_PER_RAD)
+    return {"max_error_um": figures.max_error_m * UM_PER_M,
+            "rms_error_um": figures.rms_error_m * UM_PER_M,
+            "rms_uncertainty_um": figures.rms_u_m * UM_PER_M,
+            "max_theta_error_arcsec": figures.max_theta_rad * ARCSEC_PER_RAD,
+            "rms_theta_uncertainty_arcsec": figures.rms_u_theta_rad * ARCSEC_PER_RAD}
 
 
 def map_figures(emap: ErrorMap) -> MapFigures:
