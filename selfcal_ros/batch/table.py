@@ -241,4 +241,4 @@ def _figure(series: Series, name: str, course: Course) -> str:
 def described(name: str) -> tuple[str, str]:
     """Return a quantity's name as words, and its unit."""
     text, _, unit = name.replace(f"m{PER}m", "m/m").rpartition("_")
-    return text.replace("_", " "), {"percent": "%", "um": "µm"}.get(unit, unit)
+    return text.replace("_", " "), {"percent": "%", "um": "µm", "ppm": "µm/m"}.get(unit, unit)

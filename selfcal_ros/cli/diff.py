@@ -163,8 +163,9 @@ def _laser_json(rows: Sequence[LaserDifference]) -> dict[str, Any]:
 def _laser_text(rows: Sequence[LaserDifference]) -> str:
     lines = ["first-order terms, map and laser:"]
     for row in rows:
-        test = "" if math.isnan(row.u) else f"  u {row.u * ARCSEC_PER_RAD:.4g}, p = {row.p:.2g}"
-        lines.append(f"  {row.name.replace('_', ' ')}: {row.of_map * ARCSEC_PER_RAD:+.4g} and "
-                     f"{row.of_laser * ARCSEC_PER_RAD:+.4g} arcsec, difference "
-                     f"{row.difference * ARCSEC_PER_RAD:+.4g}{test}")
+        unit = "µrad" if row.name == "nonorthogonality" else "µm/m"
+        test = "" if math.isnan(row.u) else f"  u {row.u * UM_PER_M:.4g}, p = {row.p:.2g}"
+        lines.append(f"  {row.name.replace('_', ' ')}: {row.of_map * UM_PER_M:+.4g} and "
+                     f"{row.of_laser * UM_PER_M:+.4g} {unit}, difference "
+                     f"{row.difference * UM_PER_M:+.4g}{test}")
     return "\n".join(lines)

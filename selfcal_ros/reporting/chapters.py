@@ -26,9 +26,9 @@ from selfcal_ros.reporting.figures.residuals import (
 from selfcal_ros.reporting.summary import sections
 from selfcal_ros.reporting.summary.format import aligned_numbers, fixed_column, printable
 from selfcal_ros.reporting.summary.sections import Section
-from selfcal_ros.reporting.words.findings import advice, line_text, what_it_is
+from selfcal_ros.reporting.words.findings import advice, line_text, unit_of, what_it_is
 from selfcal_ros.reporting.words.tables import dof_text
-from selfcal_ros.units import ARCSEC_PER_RAD, PPM_PER_ONE, RAD_PER_MRAD, UM_PER_M
+from selfcal_ros.units import ARCSEC_PER_RAD, UM_PER_M
 
 AT_NODES = ("At the nodes: how well the map itself is known. Take it to compare two calibrations, "
             "and for positions that are nodes.")
@@ -92,12 +92,9 @@ def _figures(*pairs: tuple[Drawing | None, str]) -> tuple[Figure, ...]:
 def _causes(result: CalibrationResult) -> Chapter:
     """Return why the verdict is what it is: failed tests, causes with sizes, terms."""
     verdict = result.verdict
-    units = {"m": ("µm", UM_PER_M), "rad": ("mrad", 1 / RAD_PER_MRAD),
-             "m/m": ("µm/m", PPM_PER_ONE)}
     rows = []
     for cause in verdict.causes:
-        ratio = cause.name == "noise"
-        unit, scale = ("times", 1.0) if ratio else units.get(cause.unit, (cause.unit, 1.0))
+        scale, unit = (1.0, "times") if cause.name == "noise" else unit_of(cause.name, cause.unit)
         rows.append((cause.name.replace("_", " "), printable(what_it_is(cause)), *fixed_column(
             [cause.size * scale, cause.u * scale], 3), unit, f"{cause.p:.1g}",
             printable(advice(cause))))

@@ -3,6 +3,7 @@
 
 import io
 import json
+import re
 import sys
 from dataclasses import replace
 
@@ -160,10 +161,12 @@ def test_another_lattice_is_bad_input(files, tmp_path, capsys):
 def test_result_against_the_laser(files, tmp_path, capsys):
     laser = tmp_path / "laser.json"
     write_json(laser, {"ex_x": [], "error_map_equivalent": {
-        "nonorthogonality": 1e-6, "u_nonorthogonality": 1e-7, "scale_difference": None,
-        "u_scale_difference": None}})
+        "nonorthogonality": 1e-6, "u_nonorthogonality": 1e-7, "scale_difference": -2e-6,
+        "u_scale_difference": 1e-7}})
     assert main(["diff", files[0], str(laser)]) == 0
-    assert "nonorthogonality: " in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert re.search(r"nonorthogonality: \S+ and \+1 µrad, difference ", out)
+    assert re.search(r"scale difference: \S+ and -2 µm/m, difference ", out)
     assert main(["diff", files[0], str(laser), "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert found["nonorthogonality"]["laser"] == 1e-6 and found["grade"] == {"a": "good"}

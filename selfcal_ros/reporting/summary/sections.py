@@ -29,6 +29,7 @@ from selfcal_ros.reporting.summary.numbers import (
     map_figures,
     truth_figures,
 )
+from selfcal_ros.reporting.words.findings import unit_of
 from selfcal_ros.units import ARCSEC_PER_RAD, MM_PER_M, RAD_PER_MRAD, UM_PER_M
 
 
@@ -83,7 +84,7 @@ def terms_section(result: CalibrationResult) -> Section:
         if term.size_used is not None:
             how += f", contradicted: {term.size_used:.2g} used"
         for item in term.estimates:
-            scale, unit = (UM_PER_M, "µm") if item.unit == "m" else (UM_PER_M, "µm/m")
+            scale, unit = unit_of(term.name, item.unit)
             value, u = item.value * scale, item.u * scale
             decimals = decimals_for([u], 2)  # two figures of u, and the value to the same place
             rows.append((f"{term.name} ({how})", item.view or "all", item.component,

@@ -41,6 +41,16 @@ _OF_SIZES = {TermName.MICROSCOPE: MRAD, TermName.LINE_ECCENTRICITY: URAD, TermNa
 """Unit in which a person reads the coefficients of a term; by the SI unit for the others."""
 
 
+def unit_of(name: str, si: str) -> Unit:
+    """Return the unit of the estimates of a term, or of the size of a cause: the same everywhere.
+
+    Small angles of axes and lines are in µrad, rotations of plate and microscope in mrad.
+    """
+    if name in (TermName.LINE_ECCENTRICITY, TermName.ROTATION):
+        return URAD
+    return {"m": UM, "rad": MRAD, "m/m": RATIO}.get(si, Unit(1.0, si))
+
+
 def plus_minus(found: Finding, unit: Unit, times: float = 1.0) -> str:
     """Return the size of a finding without its sign, two figures of its uncertainty, and the unit.
 

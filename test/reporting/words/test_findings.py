@@ -22,6 +22,7 @@ from selfcal_ros.reporting.words.findings import (
     advice,
     remedies,
     sentence_of,
+    unit_of,
     what_it_is,
     worded,
     worded_verdict,
@@ -352,3 +353,10 @@ def test_a_result_is_worded_once_and_only_then_written():
     assert written["findings"][1]["details"] == {"slips": 3}
     assert [item["text"] for item in written["findings"]] == list(found.warnings[1:])
     assert np.array_equal(found.error_map.gx, bare.error_map.gx)
+
+
+@pytest.mark.parametrize(("name", "si", "unit"), [
+    ("drift", "m", "µm"), ("microscope", "m/m", "µm/m"), ("microscope", "rad", "mrad"),
+    ("line_eccentricity", "rad", "µrad"), ("plate_strain", "m/m", "µm/m")])
+def test_estimates_and_causes_have_one_unit_each(name, si, unit):
+    assert unit_of(name, si).name == unit
