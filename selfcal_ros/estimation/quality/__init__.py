@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether readings can be believed: outliers, slips, held-out readings."""
+"""Checks of the readings: outliers, slips of the plate, noisy views, held-out readings."""

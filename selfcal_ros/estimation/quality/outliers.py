@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Calibration that finds, removes and lists readings that contradict the others.
+"""Robust calibration: find, remove and list readings that contradict the others.
 
-The rule. Suspects are sought with the noise as the median of the standardised squares over that of
-chi^2, which outliers do not spoil: the largest first, at most one for each mark and site in a
-round, then the fit is repeated; readings that contradict each other so that the largest is not
-unique all go. At the end each is put back, and stays if it fits the others after all: an F-test of
-what it adds to the sum of squares, at the level that one of n good readings passes with
-probability LEVEL, all kinds together. Before that a slipped view is split, if no term of the model
-explains the readings better.
+The noise is estimated robustly, from the median of the standardised squares. In each round the
+largest outliers are removed, at most one for each mark and site, and the fit is repeated; if
+readings contradict each other so that the largest is not unique, all of them are removed. At the
+end each removed reading is restored if it agrees with the others after all (F-test of its
+contribution to the sum of squares, at a level that n good readings, marks and lines together, fail
+with probability LEVEL). Before that a view in which the plate slipped is split, unless a term of
+the model explains the readings better.
 """
 
 from dataclasses import asdict, dataclass, replace
@@ -36,24 +36,24 @@ LEVEL = 0.01
 
 MAX_ROUNDS = 60
 NEAR_LARGEST = 0.5
-"""Part of the largest ratio that a reading needs to go in the same round: an outlier makes its
-neighbours look bad."""
+"""Share of the largest ratio above which a reading is removed in the same round: an outlier
+increases the residuals of its neighbours."""
 
 MAX_REMOVED = 0.1
-"""Largest part of the readings that is removed; beyond, the fault is not in single readings."""
+"""Largest share of the readings that is removed; if it is more, the fault is another one."""
 
 TIED = 1e-6
-"""Readings whose ratios differ by less cannot be attributed: both are removed."""
+"""Relative difference of ratios up to which both readings are removed."""
 
 NAMED = 5
-"""Outliers that their finding lists, the first of them; ``extra["outliers"]`` has all."""
+"""Number of outliers listed in their finding; ``extra["outliers"]`` has all."""
 
 LEFT = {"noisy_view", "too_many_outliers", "outliers_kept", "outliers_given_up", "slips_given_up"}
-"""Findings that something is wrong with the readings which could not be corrected."""
+"""Findings of faults that could not be corrected."""
 
 MAX_SLIPS = 3
 MAX_TERMS = 3
-"""Terms that are taken off the readings, one after the other, before outliers are looked for."""
+"""Largest number of terms subtracted from the readings before the search for outliers."""
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,7 @@ class Removed:
 
 @dataclass(frozen=True, eq=False)
 class OutlierScreening:
-    """A measurement without its outliers, and what was found."""
+    """A measurement without its outliers, and the findings."""
 
     measurements: Measurements
     removed: tuple[Removed, ...]
@@ -108,7 +108,7 @@ def robust_calibrate(measurements: Measurements,
     Returns
     -------
     CalibrationResult
-        `findings` says what was found, ``extra["outliers"]`` lists the readings removed,
+        `findings` has what was found, ``extra["outliers"]`` lists the readings removed,
         ``extra["slips"]`` and ``extra["noisy_views"]`` the bad views; `rejected` counts the
         removed detections under ``outlier_among_views``. A fault that could not be corrected
         disqualifies the result.
@@ -137,7 +137,7 @@ def robust_calibrate(measurements: Measurements,
 
 
 def _listed(cleaned: OutlierScreening) -> dict[str, Any]:
-    """Return what was found in the form of a RESULT.json: tables of plain values, SI units."""
+    """Return the tables of outliers, slips and noisy views for RESULT.json, SI units."""
     removed = [{
         "view": item.view, "kind": item.kind, "mark": list(item.mark),
         "standardised": item.standardised, "leverage": item.leverage,
@@ -153,10 +153,9 @@ def _listed(cleaned: OutlierScreening) -> dict[str, Any]:
 
 @one_thread()
 def clean(measurements: Measurements, options: Options) -> OutlierScreening:
-    """Return the measurement split at slips and without outliers, and what was found."""
+    """Return the measurement split at slips and without outliers, and the findings."""
     # a pure datum: the redundant axis conditions of xy_axes would show in the angular residuals
-    linear = replace(options, misalignment_model="linear", reference=None, terms=(),
-                     assumed=(),
+    linear = replace(options, misalignment_model="linear", reference=None, terms=(), assumed=(),
                      datum_theta=ThetaDatum.ZERO_MEAN)
     screened = _without_slips(measurements, options, linear)
     gone, residuals, stopped = _reject(screened.flattened, linear, screened.residuals)
@@ -170,7 +169,7 @@ def clean(measurements: Measurements, options: Options) -> OutlierScreening:
 
 @dataclass(frozen=True, eq=False)
 class _Screened:
-    """Readings split at slips, the same without what the model holds, and what was found."""
+    """Readings split at slips, the same minus terms of the model, and the findings."""
 
     measurements: Measurements
     flattened: Measurements
@@ -180,7 +179,7 @@ class _Screened:
 
 
 def _without_slips(measurements: Measurements, options: Options, linear: Options) -> _Screened:
-    """Return the readings split at slips, and less what explains them better than a slip."""
+    """Return the readings split at slips, minus terms that explain them better than a slip."""
     flattened = _flattened(measurements, options)
     at = _Screened(measurements, flattened, residuals_of(flattened, linear))
     for _ in range(MAX_SLIPS + MAX_TERMS + 1):
@@ -211,7 +210,7 @@ def _without_slips(measurements: Measurements, options: Options, linear: Options
 
 
 def _split(at: _Screened, slip: Slip, linear: Options) -> tuple[_Screened, bool]:
-    """Return the readings split at a slip, or without its view, and whether that could be done."""
+    """Return the readings split at a slip, or without its view, and whether that was possible."""
     def split(readings: Measurements) -> Measurements:
         return left_out(readings, slip.index) if slip.alternatives else split_view(readings, slip)
 
@@ -226,7 +225,7 @@ def _split(at: _Screened, slip: Slip, linear: Options) -> tuple[_Screened, bool]
 
 
 def robust_sigma(squares: np.ndarray, dof: int) -> float:
-    """Return the noise whose chi^2 has the median of the standardised squares; NaN if none."""
+    """Return the noise from the median of standardised squares; NaN if there are none."""
     known = squares[np.isfinite(squares)]
     if not len(known):
         return float("nan")
@@ -236,7 +235,7 @@ def robust_sigma(squares: np.ndarray, dof: int) -> float:
 
 def _reject(measurements: Measurements, options: Options, residuals: Residuals
             ) -> tuple[dict[Key, Removed], Residuals, Finding | None]:
-    """Remove outliers round by round; return them, the last residuals, why it stopped early."""
+    """Remove outliers round by round; return them, the last residuals, and why it stopped early."""
     gone: dict[Key, Removed] = {}
     n_readings = sum(len(view.m) + len(view.k) for view in measurements.views)
     for _ in range(MAX_ROUNDS):
@@ -252,19 +251,19 @@ def _reject(measurements: Measurements, options: Options, residuals: Residuals
             return gone, residuals, Finding("outliers_kept")
         gone |= found
     else:
-        return (*_taken_back(measurements, options, gone, residuals),
+        return (*_restored(measurements, options, gone, residuals),
                 Finding("outliers_given_up", details={"rounds": MAX_ROUNDS}))
-    return (*_taken_back(measurements, options, gone, residuals), None)
+    return (*_restored(measurements, options, gone, residuals), None)
 
 
 def _worst(residuals: Residuals, measurements: Measurements) -> dict[Key, Removed]:
-    """Return the outliers of one round: the largest first, one for each mark and site."""
+    """Return the outliers of one round: the largest, one for each mark and site."""
     found: dict[Key, Removed] = {}
     grid, problem = residuals.problem.system.grid, residuals.problem
     sigma = robust_sigma(residuals.squares, 2)
     ratio = _ratio(residuals.squares, sigma)
     taken: dict[tuple[str, int], float] = {}
-    # in the order of ratios rounded, so that ties have the order of the readings
+    # by rounded ratios, so that equal ones keep the order of the readings
     order = np.argsort(-np.round(ratio.ravel(), 6), kind="stable")
     floor = max(chdtri(2, _level(residuals)), NEAR_LARGEST * float(ratio.max()))
     for at in order[:int((ratio > floor).sum())]:
@@ -285,7 +284,7 @@ def _worst(residuals: Residuals, measurements: Measurements) -> dict[Key, Remove
 
 
 def _worst_theta(residuals: Residuals, measurements: Measurements) -> dict[Key, Removed]:
-    """Return the largest angular outlier of a round, if there is one."""
+    """Return the largest outlier of the lines in a round, if there is one."""
     squares = residuals.squares_theta
     if not np.isfinite(squares).any():
         return {}
@@ -305,16 +304,16 @@ def _ratio(squares: np.ndarray, sigma: float) -> np.ndarray:
 
 
 def _level(residuals: Residuals) -> float:
-    """Return the level of the test of one reading: LEVEL over all that can be checked."""
+    """Return the level of the test of one reading: LEVEL over the number of checked readings."""
     return LEVEL / max(np.isfinite(residuals.squares).sum()
                        + np.isfinite(residuals.squares_theta).sum(), 1)
 
 
-def _taken_back(measurements: Measurements, options: Options, gone: dict[Key, Removed],
+def _restored(measurements: Measurements, options: Options, gone: dict[Key, Removed],
                 residuals: Residuals) -> tuple[dict[Key, Removed], Residuals]:
-    """Restore, one by one, what is not an outlier among the good readings.
+    """Restore readings, one by one, that agree with the good ones.
 
-    Readings that went together because each was the other's only check come back together.
+    Readings that were removed together, each the only check of the other, are restored together.
     """
     for key in sorted(gone, key=lambda k: gone[k].standardised):
         if key not in gone:
@@ -331,7 +330,7 @@ def _taken_back(measurements: Measurements, options: Options, gone: dict[Key, Re
 
 
 def _agrees(residuals: Residuals, key: Key) -> bool:
-    """Return whether a reading can be checked against the others and agrees with them."""
+    """Return whether a reading can be checked against the others, and agrees with them."""
     index, kind, mark = key
     at: tuple[int, ...]
     if kind == "grid":
@@ -353,7 +352,7 @@ def _findings(removed: tuple[Removed, ...], noisy: tuple[tuple[str, float], ...]
 
 
 def _flattened(measurements: Measurements, options: Options) -> Measurements:
-    """Return the readings less what finite rotations and terms add to the linear model."""
+    """Return the readings minus the effects of finite rotations and terms."""
     if options.misalignment_model == "linear" and not options.terms:
         return measurements
     model = fit_joint(measurements, options)

@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How well readings that were held out should be predicted: the distribution of the error.
+"""Distribution of the prediction error of readings that were held out of a fit.
 
-A prediction errs by the noise of the reading, by what the fit is off, and in a view that was held
-out as a whole by its own terms within their sizes. Their sum of squares over the noise is a
-weighted sum of chi^2; seeded draws of unit noise through the same fit give its mean
-and variance, and with these a scaled chi^2 (Satterthwaite), or F, as the noise is estimated.
+The error comes from the noise of the reading, from the error of the fit, and in a view that was
+held out as a whole from its own terms within their sizes. Its sum of squares over the noise is a
+weighted sum of chi^2; seeded draws of unit noise through the same fit give mean and variance, and
+with these a scaled chi^2 (Satterthwaite), or F, as the noise is estimated.
 
-Microscope and direction of approach are shared by all views; drift, plate and circle of lines have
-coefficients of one view each, which are estimated only if some of its readings were fitted. Of a
-view that was held out as a whole they are known within their sizes.
+Microscope and direction of approach are shared by all views. Drift, plate and circle of lines have
+coefficients for each view, which are estimated only if some of its readings were fitted; for a view
+that was held out as a whole they are known within their sizes.
 """
 
 from dataclasses import dataclass, replace
@@ -33,19 +33,19 @@ LEVEL = 1e-3
 """Probability that a good set of readings exceeds its limit."""
 
 DRAWS = 200
-"""Draws in a small field: a tenth of uncertainty of the degrees of freedom."""
+"""Number of draws in a small field: 10 % uncertainty of the degrees of freedom."""
 
 READINGS_DRAWN = 2_000_000
-"""Readings that are drawn at most, all draws together: larger fields vary less."""
+"""Largest number of readings in all draws together: larger fields vary less."""
 
 MIN_DRAWS = 16
 
 TOGETHER = 20_000
-"""Readings that are worked on at once: a few draws of a small field, one of a large one."""
+"""Number of readings computed at once: several draws of a small field, one of a large one."""
 
 
 OF_A_VIEW = (TermName.DRIFT, *OF_PLATE)
-"""Terms of the marks of which each view has its own."""
+"""Terms of marks with separate coefficients for each view."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,12 +57,12 @@ class HeldReadings:
     grid : GridData
         The readings; `index` are positions in the whole measurement.
     columns : complex array (p, views, nx, ny)
-        What a unit of each fitted coefficient does to them, plate frame.
+        Effect of a unit of each fitted coefficient on them, plate frame.
     rows : tuple of int
-        Row of each of their views in the fit; -1 where it has none.
+        Row of each of their views in the fit; -1 if it was not fitted.
     own : complex array (q, views, nx, ny)
-        What one standard deviation of each coefficient with a size that only views without a row
-        have does to them, plate frame, m.
+        Effect on them of one standard deviation of each coefficient with a size that belongs to a
+        view that was not fitted, plate frame, m.
     """
 
     grid: GridData
@@ -97,7 +97,7 @@ def held_readings(model: ModelFit, kept: Measurements, held: Measurements) -> He
 
 
 def _in_time_of(ground: Ground, grid: GridData, kept: Measurements, held: Measurements) -> Ground:
-    """Return the ground with the visits in the time of the views that were fitted, -1 to 1."""
+    """Return the inputs with times of visits relative to those of the fitted views, -1 to 1."""
     visits: list[ViewVisits | None] = []
     for index, view in zip(grid.index, ground.visits, strict=True):
         fitted, own = kept.views[index].visits, held.views[index].visits
@@ -112,14 +112,14 @@ def _in_time_of(ground: Ground, grid: GridData, kept: Measurements, held: Measur
 
 def of_terms(model: ModelFit, held: HeldReadings, index: int,
              view_marks: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
-    """Return what the terms make of the held readings of one view, complex (P,), stage frame.
+    """Return the effect of the terms on the held readings of a view, complex (P,), stage frame.
 
     Parameters
     ----------
     model : ModelFit
         The fit.
     held : HeldReadings
-        What was held out.
+        Readings that were held out.
     index : int
         Position of the view in the measurement.
     view_marks : tuple of int array (P,)
@@ -133,14 +133,14 @@ def of_terms(model: ModelFit, held: HeldReadings, index: int,
 
 
 def of_line_terms(model: ModelFit, index: int, k: np.ndarray) -> np.ndarray:
-    """Return what the terms make of the lines `k` of one view, (Q,), rad.
+    """Return the effect of the terms on the lines `k` of one view, (Q,), rad.
 
     Parameters
     ----------
     model : ModelFit
         The fit.
     index : int
-        Position of the view in the measurement; 0 is returned where none of its lines was fitted.
+        Position of the view in the measurement; the effect is 0 if none of its lines was fitted.
     k : int array (Q,)
         The lines.
     """
@@ -156,14 +156,14 @@ def of_line_terms(model: ModelFit, index: int, k: np.ndarray) -> np.ndarray:
 class PredictionLimit:
     """Distribution of the mean square of scaled prediction errors for unit noise.
 
-    `mean` and `dof`: of the scaled chi^2 that has its mean and variance.
+    `mean` and `dof` are those of the scaled chi^2 with the same mean and variance.
     """
 
     mean: float
     dof: float
 
     def ratio(self, noise_dof: float) -> float:
-        """Return the ratio of error to noise that is exceeded with the probability LEVEL."""
+        """Return the ratio of error to noise that is exceeded with probability LEVEL."""
         dof = min(noise_dof, MANY_DOF)
         return float(np.sqrt(self.mean * fdtri(self.dof, dof, 1 - LEVEL)))
 
@@ -179,7 +179,7 @@ def prediction_limit(model: ModelFit, held: HeldReadings, known: np.ndarray,
     held : HeldReadings
         The readings that are predicted.
     known : bool array (views, nx, ny)
-        Which of them can be.
+        Which of them can be predicted.
     weight : float array (views, nx, ny)
         Their weights.
     """
@@ -191,8 +191,8 @@ def prediction_limit(model: ModelFit, held: HeldReadings, known: np.ndarray,
     own = noise_of(rng, (n, *weight.shape), weight)
     own_terms = rng.standard_normal((len(held.own), n)) / max(model.found.xy.sigma, LEAST_NOISE_M)
     views = LatticeViews(grid.views.shape, held.grid.poses)
-    placings = [None if fitted >= 0 else Placing(views.z, known[row])
-                for row, fitted in enumerate(held.rows)]
+    unknown = [None if fitted >= 0 else ViewMisalignment(views.z, known[row])
+               for row, fitted in enumerate(held.rows)]
     squares = np.zeros(n)
     step = max(TOGETHER // grid.weight.size, 1)
     for draws in (slice(first, first + step) for first in range(0, n, step)):
@@ -207,9 +207,9 @@ def prediction_limit(model: ModelFit, held: HeldReadings, known: np.ndarray,
             error = error - _of_terms(coefficients[:, draws], held.columns)
         if len(held.own):
             error = error + _of_terms(own_terms[:, draws], held.own)
-        for row, (fitted, placing) in enumerate(zip(held.rows, placings, strict=True)):
-            error[:, row] -= (misaligned[:, fitted] if placing is None else
-                              np.array([placing.of(one) for one in error[:, row]]))
+        for row, (fitted, misalignment) in enumerate(zip(held.rows, unknown, strict=True)):
+            error[:, row] -= (misaligned[:, fitted] if misalignment is None else
+                              np.array([misalignment.of(one) for one in error[:, row]]))
         each = np.ascontiguousarray((weight * abs(error) ** 2)[:, known])
         squares[draws] = each.sum(axis=1) / (2 * known.sum())
     mean = float(squares.mean())
@@ -217,12 +217,12 @@ def prediction_limit(model: ModelFit, held: HeldReadings, known: np.ndarray,
 
 
 def _of_terms(coefficients: np.ndarray, columns: np.ndarray) -> np.ndarray:
-    """Return what coefficients (p, k) do to the readings, complex (k, views, nx, ny)."""
+    """Return the effect of coefficients (p, k) on the readings, complex (k, views, nx, ny)."""
     return np.array([np.tensordot(one, columns, axes=1) for one in coefficients.T])
 
 
 def noise_of(rng: np.random.Generator, shape: tuple[int, ...], weight: np.ndarray) -> np.ndarray:
-    """Return noise of variance 1 / weight on each axis, complex `shape`; none where weight is 0."""
+    """Return noise of variance 1 / weight on each axis, complex `shape`; 0 where weight is 0."""
     root = np.sqrt(np.where(weight > 0, weight, 1.0))
     both = rng.standard_normal((2, *shape)) / root * (weight > 0)
     return both[0] + 1j * both[1]
@@ -230,7 +230,7 @@ def noise_of(rng: np.random.Generator, shape: tuple[int, ...], weight: np.ndarra
 
 def _fitted(model: ModelFit, noise: np.ndarray, rng: np.random.Generator
             ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return maps (sites, k), misalignments (3 views, k), coefficients (p, k) of unit noise."""
+    """Fit k draws of unit noise: maps (sites, k), misalignments (3 views, k), terms (p, k)."""
     problem = model.problem
     grid, n = problem.system.grid, 3 * problem.system.grid.n_views
     found = model.found
@@ -250,7 +250,7 @@ def _fitted(model: ModelFit, noise: np.ndarray, rng: np.random.Generator
     values, vectors = np.linalg.eigh(now.columns.within.gram)
     within = vectors * np.sqrt(np.maximum(values, 0.0))
     right += within @ rng.standard_normal((now.n, len(noise)))
-    # a term with a size is not zero: what is drawn is its estimate less what it is
+    # a term with a size is not 0: its estimate minus its value is drawn
     prior = np.where(now.free, 0.0, found.xy.sigma / now.columns.size)
     right -= prior[:, None] * rng.standard_normal((now.n, len(noise)))
     coefficients = now.inverse(found.xy.sigma) @ right
@@ -258,13 +258,13 @@ def _fitted(model: ModelFit, noise: np.ndarray, rng: np.random.Generator
             parameters - now.projected.parameters[:n] @ coefficients, coefficients)
 
 
-class Placing:
-    """The misalignment that fits the known errors of one view best, plate frame.
+class ViewMisalignment:
+    """Least-squares misalignment of one view from its known errors, plate frame.
 
     Parameters
     ----------
     z : complex array (nx, ny)
-        Places of the marks.
+        Positions of the marks.
     known : bool array (nx, ny)
         Marks whose error is known.
     """

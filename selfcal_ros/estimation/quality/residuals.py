@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Residuals with their leverage, the part of a reading that the fit follows; noisy views.
+"""Residuals with their leverage, the share of a reading that the fit follows; noisy views.
 
-The leverage h of a reading is the part of it that the fit follows; its residual has the standard
+The leverage h of a reading is the share of it that the fit follows; its residual has the standard
 deviation sigma sqrt((1 - h) / weight). For a grid reading of weight w in a mark of total weight W,
 h = w (1/W + var(x - mean x)), with x the part of the model other than the plate's error. Its two
 coordinates share a 2 x 2 matrix h + (a, b; b, -a): `skew` is a + ib, which rotations make.
 
-Grid and angular readings are fitted apart here, so that each kind is judged by itself and the sums
-of squares have exactly known distributions. Views noisier than the others are found by their own
-repeats and by their residuals.
+Grid and angular readings are fitted separately here, so that the sums of squares of each kind have
+exactly known distributions. Views noisier than the others are found by their own repeats and by
+their residuals.
 """
 
 from dataclasses import dataclass, replace
@@ -33,22 +33,22 @@ from selfcal_ros.estimation.verdict.causes import noisier_views
 from selfcal_ros.model.readings import Measurements
 
 EXACT_SITES = 31 * 31
-"""Largest field whose leverages are computed exactly; beyond, from seeded draws."""
+"""Largest field whose leverages are computed exactly; in larger ones from seeded draws."""
 
 EXACT_LINES = 2048
-"""Largest number of lines whose leverages are computed exactly; beyond, all have their mean."""
+"""Largest number of lines whose leverages are computed exactly; otherwise all have their mean."""
 
 N_DRAWS = 64
 """Draws of unit noise for a larger field: 9 % standard error of a residual's variance."""
 
 VIEW_DRAWS = 16
-"""Draws of unit noise in each view, to unmix the noises of views."""
+"""Draws of unit noise in each view, to separate the noises of the views."""
 
 ROUNDING = 1e-13
-"""Noise below this, m or rad, is rounding, against which nothing is an outlier."""
+"""Noise, m or rad, up to which residuals are rounding errors."""
 
 CHECKED = 0.05
-"""Smallest 1 - h of a reading that can be checked against the others."""
+"""Smallest 1 - h of a reading that the others can check."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,11 +60,11 @@ class Residuals:
     problem : Problem
         The plan and its readings.
     found : JointFit
-        The joint solution.
+        Joint fit of the readings.
     redundancy, redundancy_theta : float array (views, nx, ny), (views, K)
         1 - h; 0 where not read.
     skew : complex array (views, nx, ny)
-        By how much h differs between the coordinates.
+        Difference of h between the coordinates, see above.
     """
 
     problem: Problem
@@ -77,7 +77,7 @@ class Residuals:
     def squares(self) -> np.ndarray:
         """Residual' (1 - h)^-1 residual weight, m^2, (views, nx, ny): 2 sigma^2 on average.
 
-        What the sum of squares loses without the reading. NaN where it cannot be checked.
+        Reduction of the sum of squares without the reading; NaN where it cannot be checked.
         """
         residual, skew = self.found.residuals, abs(self.skew)
         good = self.redundancy - skew > CHECKED
@@ -93,9 +93,9 @@ class Residuals:
                        self.redundancy_theta)
 
     def p_outlier(self, kind: str, at: tuple[int, ...]) -> float:
-        """Return the probability that a good reading fits the others as badly; NaN if not known.
+        """Return the probability that a good reading fits the others as badly; NaN if unknown.
 
-        F-test of what the reading adds to the sum of squares against what is left without it.
+        F-test of the reading's contribution to the sum of squares against the remainder.
         """
         if kind == "grid":
             system, squares, weight, residual, columns = (
@@ -185,11 +185,15 @@ def drawn_redundancy(system: NormalEquations) -> np.ndarray:
 
 
 def view_noise(residuals: Residuals) -> np.ndarray:
-    """Return noise of each grid view and of the others, m, and dof of its own, (views, 3).
+    """Return the noise of each grid view and of the others, m, and its degrees of freedom.
 
-    The residuals of one view hold the noise of all: their sums of squares are unmixed with what
-    seeded unit noise of each view leaves in each (Helmert's variance components, two at a time).
-    Twice the inverse of that mixing is the covariance of two variances that are 1.
+    The residuals of one view contain the noise of all. Their sums of squares are separated with
+    those that seeded unit noise of each view leaves in each (Helmert's variance components, two at
+    a time). Twice the inverse of that mixing is the covariance of two variances that are 1.
+
+    Returns
+    -------
+    float array (views, 3)
     """
     system, grid = residuals.problem.system, residuals.problem.system.grid
     mixing = _mixings.get(system, None, lambda: _mixing(system))
@@ -208,7 +212,7 @@ _mixings: Memo[None, np.ndarray] = Memo()
 
 
 def _mixing(system: NormalEquations) -> np.ndarray:
-    """Return what unit noise of each view leaves as sum of squares in each, (views, views)."""
+    """Return the sum of squares that unit noise of each view leaves in each, (views, views)."""
     grid, rng = system.grid, np.random.default_rng(0)
     root = np.sqrt(np.where(grid.read, grid.weight, 1.0))
     mixing = np.zeros((grid.n_views, grid.n_views))
@@ -223,7 +227,7 @@ def _mixing(system: NormalEquations) -> np.ndarray:
 
 
 def angular_redundancy(system: NormalEquations) -> np.ndarray:
-    """Return 1 - h of every angular reading, (views, K), rotations from the lines alone."""
+    """Return 1 - h of every angular reading, (views, K), with rotations from the lines alone."""
     angular = system.angular
     if not angular.n_views:
         return np.zeros(angular.weight.shape)
@@ -248,15 +252,15 @@ NOISY_RESIDUALS = 3.0
 """Ratio of a view's noise to that of the others, by residuals, above which it is noisy."""
 
 MIN_VIEW_DOF = 5.0
-"""Degrees of freedom of a view's own noise below which it is not judged: chance does as much."""
+"""Smallest degrees of freedom of a view's own noise for the test by residuals."""
 
 MAX_RATIO = 20.0
-"""Largest ratio of noises that residuals can tell: a noisy view hides the noise of the others."""
+"""Largest ratio of noises that residuals can show: a noisy view hides the noise of the others."""
 
 
 def noisy_views(residuals: Residuals, measurements: Measurements
                 ) -> tuple[tuple[str, float], ...]:
-    """Return the views whose noise stands out, with its ratio to that of the others."""
+    """Return the noisy views, each with the ratio of its noise to that of the others."""
     found = by_repeats(measurements)
     for name, ratio in _by_residuals(residuals, measurements).items():
         found[name] = max(ratio, found.get(name, 0.0))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A plate that slipped between two readings of a view: found, sized, and split in two placements.
+"""Slips of the plate within a view: find and size them, split the view into two placements.
 
 A view is read line by line. If the plate slips on the way, the rest of the view has another
 misalignment. For each view and each line the gain of a second misalignment is tested: the sum of
@@ -33,22 +33,22 @@ from selfcal_ros.model.readings import Measurements, ViewReadings
 from selfcal_ros.model.verdict import Cause, Finding
 
 AMBIGUOUS = 16.0
-"""Difference of chi2 below which two places explain the readings equally well."""
+"""Difference of chi^2 up to which two places explain the readings equally well."""
 
 TRIED = 12
-"""Places that are tried in full."""
+"""Number of places at which the view is split on trial."""
 
 TINY_M2 = 1e-30
-"""Square of a noise that is rounding."""
+"""Square of a noise that is rounding error."""
 
 SLIP_LEVEL = 1e-9
 """Level of the test of each place where the plate may have slipped."""
 
 MAX_PLACES = 20
-"""Places tested along each axis of a view."""
+"""Largest number of places tested along each axis of a view."""
 
 CLIP = 4.0
-"""Residuals count at most as this many standard deviations: one outlier is not a slip."""
+"""Standard deviations to which residuals are clipped: one outlier is not a slip."""
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,7 @@ class Slip(SlipPlace):
     tx_m, ty_m, phi_rad : float
         Change of offset and rotation, stage frame.
     alternatives : tuple of SlipPlace
-        Other places that explain the readings as well: few views do not always tell where.
+        Other places that explain the readings equally well: few views do not always determine it.
     """
 
     tx_m: float
@@ -99,7 +99,7 @@ class Slip(SlipPlace):
     alternatives: tuple[SlipPlace, ...] = ()
 
     def finding(self, *, spoils: bool) -> Finding:
-        """Return the slip as a finding; `spoils`: its view had to stay as it was."""
+        """Return the slip as a finding; `spoils` if the view had to be kept unsplit."""
         return Finding(
             "slip_found", float(np.hypot(self.tx_m, self.ty_m)), unit="m", view=self.view, details={
                 "places": [place.place for place in (self, *self.alternatives)], "x": self.tx_m,
@@ -108,9 +108,9 @@ class Slip(SlipPlace):
 
 def find_slip(residuals: Residuals, sigma_m: float, measurements: Measurements,
               options: Options) -> Slip | None:
-    """Return the slip that explains the residuals best, None if no place passes the test.
+    """Return the slip that explains the residuals best; None if no place passes the test.
 
-    The places that explain most are tried in full: the one whose split leaves least is the slip.
+    The view is split on trial at the places that explain most; the best split is the slip.
 
     Parameters
     ----------
@@ -172,7 +172,7 @@ def _followed(measurements: Measurements, slip: SlipPlace, options: Options) -> 
 
 
 def _size(slip: SlipPlace, fitted: JointFit, problem: Problem) -> tuple[float, float, float]:
-    """Return offset and rotation of the second placement less those of the first."""
+    """Return offset and rotation of the second placement minus those of the first."""
     row = problem.grid.index.index(slip.index)
     before, after = fitted.parameters[:3 * problem.system.grid.n_views].reshape(-1, 3)[row:row + 2]
     phi, re, im = after - before
@@ -181,7 +181,7 @@ def _size(slip: SlipPlace, fitted: JointFit, problem: Problem) -> tuple[float, f
 
 
 def _places(read: np.ndarray, axis: int) -> np.ndarray:
-    """Return the lines before which a slip is tested: at least one line read on either side."""
+    """Return the lines before which a slip is tested: at least one line was read on either side."""
     lines = np.flatnonzero(read.any(axis=1 - axis))
     inner = lines[1:]
     if len(inner) <= MAX_PLACES:
@@ -213,7 +213,7 @@ def _explained(residuals: Residuals, clipped: np.ndarray, v: int, axis: int,
 def split_view(measurements: Measurements, slip: SlipPlace) -> Measurements:
     """Return the measurement with the view as two placements, before and after the slip.
 
-    Its angular lines become a placement of their own: when they were read is not known.
+    Its angular lines become a third placement: the time of their reading is unknown.
     """
     view = measurements.views[slip.index]
     after = getattr(view, slip.axis) >= slip.first
@@ -263,13 +263,13 @@ def slip_at_line(ground: Ground, row: int, slip: Slip, phase: complex) -> TermCo
     Parameters
     ----------
     ground : Ground
-        What the columns stand on.
+        Inputs of the columns.
     row : int
         The grid view.
     slip : Slip
-        Where.
+        The slip.
     phase : complex
-        From the stage frame to the plate frame in that view.
+        Factor from the stage frame to the plate frame in that view.
     """
     half = ((ground.z.shape[0] - 1) // 2, (ground.z.shape[1] - 1) // 2)
     axis = "mn".index(slip.axis)

@@ -2,8 +2,8 @@
 """Held-out validation: how well a calibration predicts readings that it has not seen.
 
 Small residuals prove nothing; a prediction can fail. A tenth of the readings, or a whole view, is
-left out, the rest is calibrated, and the readings left out are predicted. To a whole view its three
-misalignments are fitted first, as no calibration can know them.
+held out, the rest is calibrated, and the readings held out are predicted. The three misalignments
+of a whole view are fitted to its readings first, as no calibration can know them.
 """
 
 from dataclasses import dataclass, replace
@@ -54,7 +54,7 @@ MAX_FOLDS = 10
 NOTHING = float("nan")
 
 RIGID_STEPS = 8
-"""Steps to a finite rotation of a view held out; each gains a factor of its size."""
+"""Iterations for the finite rotation of a held-out view; each gains a factor of its size."""
 
 
 @dataclass(frozen=True)
@@ -64,20 +64,19 @@ class HeldOut:
     Attributes
     ----------
     view, tenth : str, int
-        What was held out: a whole view, by its name, or a random tenth, by its number from 1.
+        The set: a whole view, by its name, or a random tenth, by its number from 1.
     n_grid, n_angular : int
-        Readings that were predicted.
+        Numbers of predicted readings.
     rms_m, max_m : float
         Error of a coordinate, m; NaN if no grid reading was predicted.
     rms_rad : float
         Error of an angular reading, rad; NaN if none was predicted.
     ratio : float
-        rms over the noise of one reading; the noise alone gives 1, the map's own uncertainty
-        adds to it.
+        rms over the noise of one reading: 1 by noise alone, more with the map's uncertainty.
     why : Finding, optional
-        Why nothing could be predicted, or why it is not judged; None otherwise.
+        Why nothing could be predicted, or why there is no limit; otherwise None.
     limit : float
-        What `ratio` exceeds in one of a thousand good sets; NaN if it is not judged.
+        Ratio that one of a thousand good sets exceeds; NaN if there is none.
     """
 
     view: str = ""
@@ -93,7 +92,7 @@ class HeldOut:
 
     @property
     def exceeds(self) -> bool:
-        """Whether the prediction is worse than noise and the map's uncertainty allow."""
+        """Whether the error is larger than noise and the map's uncertainty explain."""
         return self.ratio > self.limit
 
 
@@ -109,7 +108,7 @@ def validate(measurements: Measurements, options: Options | None = None, *, seed
     options : Options, optional
         As for `calibrate`; uncertainties are not computed, the method is ``joint``.
     seed : int
-        Of the random tenths.
+        Seed of the random tenths.
     folds : int
         Number of random tenths, 1 to 10; they do not overlap.
 
@@ -146,7 +145,7 @@ def validate(measurements: Measurements, options: Options | None = None, *, seed
 
 def _held_out(measurements: Measurements, options: Options,
               chosen: list[tuple[np.ndarray, np.ndarray]]) -> HeldOut:
-    """Calibrate from the readings that are not chosen and predict the chosen ones."""
+    """Calibrate without the chosen readings, and predict them."""
     kept, held = (replace(measurements, views=tuple(
         subset(view, grid ^ flip, lines ^ flip)
         for view, (grid, lines) in zip(measurements.views, chosen, strict=True)))
@@ -190,7 +189,7 @@ def _held_out(measurements: Measurements, options: Options,
 
 def _judged(solved: Solved, model: ModelFit, held: HeldReadings, *, known: np.ndarray,
             error: np.ndarray) -> tuple[float, float, Finding | None]:
-    """Return error over noise, its limit, and why there is none."""
+    """Return error over noise, its limit, and why there is no limit."""
     noise = solved.result.noise
     if not known.any():
         return NOTHING, NOTHING, None
@@ -210,7 +209,7 @@ def _judged(solved: Solved, model: ModelFit, held: HeldReadings, *, known: np.nd
 
 
 def _rest_not_identified(kept: Measurements, held: Measurements) -> Finding:
-    """Return that the rest does not identify the stage, and with which further view it would."""
+    """Return the finding that the rest does not identify the stage, with a view to be added."""
     views = tuple(replace(v.view, grid=bool(len(v.m)), angular=bool(len(v.k)))
                   for v in kept.views if len(v.m) or len(v.k))
     gone = {v.view.lattice_pose(held.artifact) for v in held.views if len(v.m) or len(v.k)}
@@ -230,19 +229,19 @@ def _rest_not_identified(kept: Measurements, held: Measurements) -> Finding:
 def prediction_errors(measurements: Measurements, result: CalibrationResult, index: int,
                       view: ViewReadings, *, rigid: bool = False
                       ) -> tuple[np.ndarray, np.ndarray]:
-    """Return reading less prediction of the readings `view`, (2, P) in m and (Q,) in rad.
+    """Return the prediction errors of the readings `view`, (2, P) in m and (Q,) in rad.
 
     Parameters
     ----------
     measurements : Measurements
         For the plate and the sense.
     result : CalibrationResult
-        Calibration that has not seen these readings.
+        Calibration without these readings.
     index : int
         Position of the view in the calibration, for its misalignment; a misalignment that is
         not known there is fitted to the readings.
     view : ViewReadings
-        What is to be predicted.
+        Readings that are predicted.
     rigid : bool
         Whether the calibration took finite rotations of the plate.
     """
@@ -265,7 +264,7 @@ def prediction_errors(measurements: Measurements, result: CalibrationResult, ind
 
 def _grid_errors(measurements: Measurements, result: CalibrationResult,
                  view: ViewReadings) -> np.ndarray:
-    """Return the readings less stage and plate error, complex (P,); NaN where one is unknown."""
+    """Return the readings minus stage and plate error, complex (P,); NaN where one is unknown."""
     if not len(view.m):
         return np.zeros(0, dtype=complex)
     artifact, emap = measurements.artifact, result.error_map
@@ -278,7 +277,7 @@ def _grid_errors(measurements: Measurements, result: CalibrationResult,
 
 def _aligned(residual: np.ndarray, measurements: Measurements, result: CalibrationResult,
              view: ViewReadings, *, known: tuple[float, float, float], rigid: bool) -> np.ndarray:
-    """Return `residual` less the misalignment, known or fitted to `residual` itself, (2, P)."""
+    """Return `residual` minus the misalignment, known or fitted to `residual` itself, (2, P)."""
     if not residual.size:
         return np.zeros((2, 0))
     artifact = measurements.artifact
@@ -297,7 +296,7 @@ def _aligned(residual: np.ndarray, measurements: Measurements, result: Calibrati
 
 
 def _misalignment(residual: np.ndarray, marks: np.ndarray) -> tuple[float, float, float]:
-    """Return (phi, tx, ty) fitted to `residual`, NaN if fewer than three marks are known."""
+    """Fit (phi, tx, ty) to `residual`; NaN if fewer than three marks are known."""
     good = np.isfinite(residual)
     if good.sum() < 3:
         return (float("nan"),) * 3
@@ -310,7 +309,7 @@ def _misalignment(residual: np.ndarray, marks: np.ndarray) -> tuple[float, float
 
 
 def judged_by(result: CalibrationResult, found: list[HeldOut]) -> CalibrationResult:
-    """Return a result, not worded, that predictions beyond their limits disqualify."""
+    """Return the result, disqualified if a prediction error exceeds its limit."""
     failed = tuple(Finding("prediction_failed", item.ratio, unit="m/m", view=item.view,
                            details={"tenth": item.tenth, "limit": item.limit})
                    for item in found if item.exceeds)
