@@ -86,8 +86,6 @@ class Path:
         Lengths of dashes and gaps; empty = solid.
     opacity : float
         Of the fill.
-    title : str
-        What is shown where a pointer rests on it.
     """
 
     lines: tuple[tuple[Point, ...], ...]
@@ -96,7 +94,6 @@ class Path:
     width: float = 1.0
     dash: tuple[float, ...] = ()
     opacity: float = 1.0
-    title: str = ""
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import groupby
 from typing import NamedTuple
 
 import numpy as np
@@ -75,7 +76,9 @@ def cells(frame: Frame, artifact: Artifact, values: np.ndarray, scale: Scale) ->
     half = 0.5 * step * artifact.grid_pitch_m * MM_PER_M
     outlines: dict[int, list[tuple[Point, ...]]] = {}
     for i in range(level.shape[0]):
-        for first, last in _runs(level[i]):
+        for _, run in groupby(range(level.shape[1]), level[i].__getitem__):
+            alike = list(run)
+            first, last = alike[0], alike[-1]
             low, high = frame.at(x[i, first] - half, y[i, first] - half), frame.at(
                 x[i, last] + half, y[i, last] + half)
             low, high = _clipped(frame, low), _clipped(frame, high)
@@ -88,13 +91,6 @@ def cells(frame: Frame, artifact: Artifact, values: np.ndarray, scale: Scale) ->
 def _clipped(frame: Frame, point: Point) -> Point:
     left, top, width, height = frame.box
     return (min(max(point[0], left), left + width), min(max(point[1], top), top + height))
-
-
-def _runs(row: np.ndarray) -> list[tuple[int, int]]:
-    """Return first and last index of each run of equal values."""
-    edges = np.flatnonzero(np.diff(row)) + 1
-    starts = [0, *edges.tolist()]
-    return list(zip(starts, [*(edge - 1 for edge in edges.tolist()), len(row) - 1], strict=True))
 
 
 def levels(values: np.ndarray, scale: Scale) -> np.ndarray:
@@ -202,15 +198,14 @@ def curved_arrow(drawing: Drawing, way: Sequence[Point], *, colour: str) -> None
     drawing.shapes([_head(back, way[-1], math.dist(back, way[-1]), 3.0)], fill=colour)
 
 
-def arrow_key(frame: Frame, factor: float, at: Point, unit_m: float = 1 / UM_PER_M,
-              unit: str = "µm") -> None:
+def arrow_key(frame: Frame, factor: float, at: Point) -> None:
     """Draw an arrow of a round length at the pixel `at` and say how long it is."""
-    per_unit = unit_m * factor * MM_PER_M * frame.per_x
+    per_unit = factor * MM_PER_M / UM_PER_M * frame.per_x
     value = round_down(46.0 / per_unit) if per_unit > 0 else 1.0
     end = at[0] + value * per_unit, at[1]
     frame.drawing.lines([(at, end)], width=1.4)
     frame.drawing.shapes([_head(at, end, value * per_unit, 1.4)], fill="ink")
-    frame.drawing.label(end[0] + 6, at[1] + 4, f"{significant(value, 1)} {unit}", size=TICK + 1)
+    frame.drawing.label(end[0] + 6, at[1] + 4, f"{significant(value, 1)} µm", size=TICK + 1)
 
 
 def legend(drawing: Drawing, entries: Sequence[tuple[str, str]], at: Point, *,

@@ -39,8 +39,7 @@ def inline_svg(drawing: Drawing) -> str:
 def svg_file(drawing: Drawing) -> str:
     """Return a drawing as a file that follows the reader's setting of light or dark."""
     style = "".join((variables_css("svg"), FIGURE_CSS, classes_css()))
-    sheet = _shape("path", _d([((0, 0), (drawing.width, 0), (drawing.width, drawing.height),
-                                (0, drawing.height))], closed=True), "f-paper")
+    sheet = f'<rect class="f-paper" width="{_n(drawing.width)}" height="{_n(drawing.height)}"/>'
     return _svg(drawing, f"<style>{style}</style>{sheet}\n",
                 f' xmlns="http://www.w3.org/2000/svg" width="{_n(drawing.width)}" '
                 f'height="{_n(drawing.height)}"') + "\n"
@@ -66,7 +65,7 @@ def _item(item: Item) -> str:
         return "".join(f'<ellipse class="{look}" cx="{_n(x)}" cy="{_n(y)}" rx="{_n(rx)}" '
                        f'ry="{_n(ry)}"{more}/>'
                        for (x, y), (rx, ry) in zip(item.centres, item.radii, strict=True))
-    return _shape("path", _d(item.lines, closed=bool(item.fill)), look, more, item.title)
+    return f'<path class="{look}" d="{_d(item.lines, closed=bool(item.fill))}"{more}/>'
 
 
 def _look(item: Path | Discs) -> str:
@@ -74,11 +73,6 @@ def _look(item: Path | Discs) -> str:
     if isinstance(item, Path) and item.dash:
         more += f' stroke-dasharray="{" ".join(map(_n, item.dash))}"'
     return more + (f' fill-opacity="{_n(item.opacity)}"' if item.opacity != 1 else "")
-
-
-def _shape(tag: str, d: str, look: str, more: str = "", title: str = "") -> str:
-    start = f'<{tag} class="{look}" d="{d}"{more}'
-    return f"{start}><title>{escape(printable(title))}</title></{tag}>" if title else start + "/>"
 
 
 def _d(lines: Iterable[tuple[Point, ...]], *, closed: bool) -> str:
