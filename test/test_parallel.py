@@ -201,7 +201,7 @@ def test_what_is_loaded_meanwhile_is_loaded_once_beside_the_workers(workers, tol
     first, loaded = threading.Event(), []
     values = []
     for outcome in outcomes(abs, [-1, -2, -3, -4, -5], workers=workers,
-                            meanwhile=lambda: loaded.append(first.wait(60.0))):
+                            meanwhile=lambda: loaded.append(first.wait(300))):
         first.set()  # what is loaded has waited for this outcome, and the outcome not for it
         values.append(outcome.value)
     assert sorted(values) == [1, 2, 3, 4, 5]
@@ -212,7 +212,7 @@ def test_a_consumer_that_stops_does_not_wait_for_what_is_loaded_meanwhile():
     """It stops by Ctrl-C: imports that take a second are nothing to wait for."""
     stopped, loaded = threading.Event(), []
     running = outcomes(abs, [-1, -2, -3], workers=2,
-                       meanwhile=lambda: loaded.append(stopped.wait(60.0)))
+                       meanwhile=lambda: loaded.append(stopped.wait(300)))
     next(running)
     running.close()
     assert loaded == []

@@ -30,7 +30,7 @@ from selfcal_ros.sessions import cell_check
 from test.support.sessions import plan_file, small_plan
 
 SECOND = 10**9
-STEP_NS = 20_000_000
+STEP_NS = 40_000_000
 CHECKS = ["joints", "encoder rate", "encoder clock", "abort", "detection clock", "rest", "ids",
           "marks", "check stops", "signs", "revisits", "old commands"]
 
@@ -47,6 +47,9 @@ class FaultyCell(StageSimulator):
         now = self.get_clock().now().nanoseconds
         if now:
             super()._on_timer()
+        elif not (self._encoder.get_subscription_count()
+                  and self._detection.get_subscription_count()):
+            return  # time begins when somebody listens
         second, nanosecond = divmod(now + STEP_NS if now else time.time_ns(), SECOND)
         self._clock_voice.publish(Clock(clock=Time(sec=second, nanosec=nanosecond)))
 

@@ -20,6 +20,7 @@ from selfcal_ros.nodes.compensator import CompensatorNode
 from selfcal_ros.nodes.filling import fill
 from selfcal_ros.sessions.compensating import KEEPS_UP
 from test.support.maps import random_map, result_of
+from test.support.waiting import PATIENCE_S
 
 MAP = random_map(Artifact(5, 0.01, 8), 3)
 BENCH = Path(__file__).parents[1] / "bench" / "compensate.py"
@@ -169,7 +170,7 @@ def test_a_malformed_map_does_not_end_the_node(graph):
 
 def test_the_bench_takes_corrected_samples(ros_environment):
     done = subprocess.run([sys.executable, BENCH, "--worker", "selfcal", "100", "--seconds", "0.2"],
-                          capture_output=True, text=True, check=True, timeout=60)
+                          capture_output=True, text=True, check=True, timeout=PATIENCE_S)
     row = json.loads(done.stdout)
     assert (row["benchmark"], row["method"], row["n"]) == ("compensate 100 Hz", "selfcal", 20)
     assert row["corrected"] > 0

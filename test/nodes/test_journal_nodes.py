@@ -106,6 +106,6 @@ def test_a_second_collector_on_one_journal_is_refused(cell):
     cell.graph.until(lambda: any(cell.folder.glob("journal_*/metadata.yaml")), "the journal")
     cell.inside.clear()
     cell.start("measurement_collector", journal=cell.folder)
-    _, err = cell.running["measurement_collector"].communicate(timeout=120)
+    _, err = cell.running["measurement_collector"].communicate(timeout=300)
     [line] = [text for text in err.splitlines() if text.startswith("selfcal: ")]
     assert line.endswith("another process writes this journal; end it or name another folder")

@@ -118,7 +118,7 @@ def test_what_solving_needs_is_loaded_before_there_is_another_thread_then_its_me
 def test_a_solution_that_was_ready_while_the_node_was_not_active_is_taken_later(
         graph, monkeypatch):
     gate, plain = threading.Event(), solver_module.solve
-    monkeypatch.setattr(solver_module, "solve", lambda job: gate.wait(60) and plain(job))
+    monkeypatch.setattr(solver_module, "solve", lambda job: gate.wait(300) and plain(job))
     monkeypatch.setattr(solver_module, "SWEEP_S", 0.02)
     node = graph.node(Solver)
     summaries = graph.listen(names.SUMMARY)
@@ -138,7 +138,7 @@ def test_save_map_waits_for_the_readings_that_came_before_while_the_node_works_o
 
     def wait_and_solve(job):
         jobs.append(job)
-        assert gate.wait(60)
+        assert gate.wait(300)
         return plain(job)
     monkeypatch.setattr(solver_module, "solve", wait_and_solve)
     node = graph.node(Solver, result_folder=str(tmp_path))
@@ -168,7 +168,7 @@ def test_save_map_waits_for_the_readings_that_came_before_while_the_node_works_o
 
 def test_a_save_that_waited_is_told_what_the_readings_contradict(graph, tmp_path, monkeypatch):
     gate, plain = threading.Event(), solver_module.solve
-    monkeypatch.setattr(solver_module, "solve", lambda job: gate.wait(60) and plain(job))
+    monkeypatch.setattr(solver_module, "solve", lambda job: gate.wait(300) and plain(job))
     node = graph.node(Solver, result_folder=str(tmp_path))
     publisher, (messages, _) = graph.publisher(names.MEASUREMENT), measured()
     publisher.publish(messages[0])

@@ -18,7 +18,7 @@ from selfcal_ros.nodes.names import Topic
 from selfcal_ros.simulation.bag import event_fields
 from selfcal_ros.simulation.cell import Event
 
-PATIENCE_S = 60.0
+PATIENCE_S = 300.0
 
 
 class Graph:
