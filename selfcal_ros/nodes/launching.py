@@ -5,7 +5,7 @@ import os
 from pathlib import Path
 from typing import Any
 
-from ament_index_python.packages import get_package_share_directory
+from ament_index_python.packages import get_package_share_directory, get_packages_with_prefixes
 from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch.conditions import IfCondition
 from launch.launch_context import LaunchContext
@@ -58,10 +58,16 @@ def journal_argument(folder: str) -> DeclareLaunchArgument:
 
 
 def refuse_missing(context: LaunchContext) -> None:
-    """End the launch if the parameter file is missing, which launch_ros would ignore."""
-    path = context.launch_configurations["params"]
-    if not Path(path).is_file():
-        raise InputError(f"params:={path}", "no such file", "check the path")
+    """End the launch before a node starts if the parameter file or foxglove_bridge is missing.
+
+    launch_ros ignores the one, and of the other leaves the nodes running that it had started.
+    """
+    given = context.launch_configurations
+    if not Path(given["params"]).is_file():
+        raise InputError(f"params:={given['params']}", "no such file", "check the path")
+    if given["foxglove"] == "true" and "foxglove_bridge" not in get_packages_with_prefixes():
+        raise InputError("foxglove:=true", "there is no package foxglove_bridge",
+                         "sudo apt install ros-jazzy-foxglove-bridge")
 
 
 def text(name: str) -> ParameterValue:

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The launch files, run by the real launch and launch_testing; skipped where they are not."""
 
+import contextlib
 import os
 import subprocess
 import sys
@@ -9,6 +10,8 @@ from pathlib import Path
 
 import pytest
 import yaml
+
+from test.support.waiting import wait_until
 
 ROOT = Path(__file__).parents[2]
 NEEDED = ("rclpy", "selfcal_msgs", "launch", "launch_ros", "launch_testing")
@@ -36,6 +39,16 @@ def run(monkeypatch, tmp_path):
                                   text=True, timeout=400, cwd=ROOT,
                                   env=os.environ | dict(environment))
         yield call
+        home = f"ROS_HOME={tmp_path / 'ros_home'}".encode()
+        wait_until(lambda: not [path for path in Path("/proc").glob("[0-9]*/environ")
+                                if holds(path, home)], "the end of all that was launched")
+
+
+def holds(path: Path, what: bytes) -> bool:
+    """Return whether the environment of another process holds an entry."""
+    with contextlib.suppress(OSError):  # it has just ended
+        return path.parent.name != str(os.getpid()) and what in path.read_bytes().split(b"\0")
+    return False
 
 
 LAUNCH = """
@@ -99,7 +112,9 @@ def test_foxglove_bridge_is_started_where_it_is_wanted(run, tmp_path):
     if "foxglove_bridge" in get_packages_with_prefixes():
         pytest.skip("foxglove_bridge is installed: the launch would not end")
     done = launched(run, "calibrate.launch.py", "foxglove:=true", "journal:=none")
-    assert "package 'foxglove_bridge' not found" in done.stdout + done.stderr
+    said = done.stdout + done.stderr
+    assert "foxglove:=true: there is no package foxglove_bridge; sudo apt install ros-j" in said
+    assert "process started" not in said
     assert done.returncode == 1
 
 
