@@ -61,6 +61,23 @@ def late(seed, spread):
         ((at + draw.uniform(0, spread), at), event) for at, event in enumerate(EVENTS))]
 
 
+def test_commands_of_a_run_with_another_plate_that_come_after_its_detections():
+    """What lay in the first view lies in the first view again, of another plate."""
+    cell = scene("0", repeats=1)
+    begin = cell.commands[0].stamp_ns
+    place, measure = (replace(command, run_id=str(begin)) for command in cell.commands[:2])
+    wide = replace(cell.plan.artifact, grid_pitch_m=1.5 * cell.plan.artifact.grid_pitch_m)
+    later = [replace(command, stamp_ns=command.stamp_ns + 1, run_id=str(begin + 1), artifact=wide)
+             for command in (place, measure)]
+    events = [place, measure, *(e for e in cell.events if not isinstance(e, Command)), *later]
+    collector = fresh()
+    for event in events:
+        if event is later[0]:
+            before = digest_of(collector)
+        add(collector, event)
+    assert digest_of(collector) == digest(events) != before
+
+
 @settings(max_examples=8)
 @given(seed=st.integers(0, 2**32), spread=st.sampled_from([0, 5, 200, 10**6]),
        asked=st.sets(st.integers(0, len(EVENTS)), max_size=8))

@@ -120,6 +120,12 @@ def test_without_a_plan_nothing_starts():
         Sequencer().start()
 
 
+def test_commands_that_describe_a_view_carry_the_terms_of_the_plan():
+    sequencer = Sequencer(replace(PLAN, model_terms=("drift:1e-8",)))
+    commands = [*sequencer.start(), *sequencer.confirm(), *sequencer.abort()]
+    assert [command.model_terms for command in commands] == [("drift:1e-8",)] * 2 + [()]
+
+
 def test_commands_wait_for_the_caller_to_stamp_them():
     (command,) = Sequencer(PLAN).start()
     assert command.stamp_ns == 0
