@@ -6,7 +6,7 @@ counted. Both give the same.
 """
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -16,18 +16,21 @@ from rosbags.typesys.store import Typestore
 
 from selfcal_ros.bagio.schemas import OWN, fields_of, own_message, same_layout, typestore
 from selfcal_ros.collection.inputs import DETECTION
-from selfcal_ros.messages.cdr import LITTLE, MAX_LENGTH, Payloads, layout_of
+from selfcal_ros.messages.cdr import LITTLE, MAX_LENGTH, ColumnDecoder, Columns, Payloads, layout_of
 from selfcal_ros.messages.to_model import (
-    DetectionColumns,
     EncoderBlock,
-    EncoderColumns,
     detection,
+    detection_table,
+    encoder_block,
     encoder_sample,
 )
 from selfcal_ros.topics import DETECTION_TOPIC, ENCODER_TOPIC, INPUT_TOPICS
 
 Input = EncoderBlock | np.ndarray | object
 """Encoder samples, a table of detections, or a command as rosbags has it."""
+BLOCKS: dict[str, Callable[[Columns], Input]] = {ENCODER_TOPIC: encoder_block,
+                                                 DETECTION_TOPIC: detection_table}
+"""What many messages of a topic become at once."""
 PADDING = 3
 """Bytes after the last field that belong to it where lengths identify the definition."""
 ENOUGH, MAX_BYTES = 2000, 4 << 20
@@ -67,12 +70,8 @@ class ChannelDecoder:
         self._own = same_layout(self.stores[0], self.name) if self.told else False
         self._why = "" if self.told else (
             f": the bag holds no definition of {self.name}, and they do not fit the one known here")
-        self._columns: EncoderColumns | DetectionColumns | None = None
-        tail = None if self._any_tail else PADDING
-        if self._fields is not None and self.role == ENCODER_TOPIC:
-            self._columns = EncoderColumns(self._fields, tail)
-        elif self._fields is not None and self.role == DETECTION_TOPIC:
-            self._columns = DetectionColumns(self._fields, tail)
+        self._columns = ColumnDecoder(self._fields, None if self._any_tail else PADDING) if (
+            self._fields is not None and self.role in BLOCKS) else None
 
     def one(self, data: bytes) -> Any:
         """Return a message decoded by rosbags; None if it cannot be decoded, which is counted.
@@ -109,8 +108,8 @@ class ChannelDecoder:
         """Yield the decoded messages; failures are counted."""
         rest = np.arange(len(messages))
         if self._columns is not None:
-            blocks, rest = self._columns.decode(messages)
-            yield from blocks
+            groups, rest = self._columns.decode(messages)
+            yield from map(BLOCKS[self.role], groups)
         for data in messages[rest]:
             message = self.one(data)
             if message is not None:

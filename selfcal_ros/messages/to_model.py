@@ -21,7 +21,6 @@ from selfcal_ros.messages.cdr import (
     MAX_LENGTH,
     SEQUENCE,
     TEXT,
-    ColumnDecoder,
     Columns,
     Field,
     Payloads,
@@ -47,11 +46,6 @@ JOINT_STATE = (
     Field("header", HEADER), Field("name", TEXT, SEQUENCE), Field("position", "f8", SEQUENCE),
     Field("velocity", "f8", SEQUENCE), Field("effort", "f8", SEQUENCE))
 """Fields of sensor_msgs/msg/JointState."""
-MARK_DETECTION = (
-    Field("header", HEADER), Field("kind", "u1"), Field("has_id", "u1"), Field("m", "i4"),
-    Field("n", "i4"), Field("k", "u4"), Field("offset_x", "f8"), Field("offset_y", "f8"),
-    Field("offset_theta", "f8"), Field("sigma", "f8"), Field("score", "f4"))
-"""Fields of selfcal_msgs/msg/MarkDetection."""
 STAMP_END = 12
 """Bytes of the encapsulation, and of the stamp after it."""
 _OFFSETS = {"ox": "offset_x", "oy": "offset_y", "ot": "offset_theta"}
@@ -275,18 +269,6 @@ class EncoderBlock:
         return len(self.stamps_ns)
 
 
-class EncoderColumns:
-    """Decode sensor_msgs/JointState; parameters as for `ColumnDecoder`."""
-
-    def __init__(self, fields: Sequence[Field] = JOINT_STATE, tail: int | None = None) -> None:
-        self._decoder = ColumnDecoder(fields, tail)
-
-    def decode(self, messages: Payloads) -> tuple[list[EncoderBlock], np.ndarray]:
-        """Return blocks of samples, and the indices of the messages that remain."""
-        groups, rest = self._decoder.decode(messages)
-        return [_encoder_block(group) for group in groups], rest
-
-
 class PositionEditor:
     """Read and replace the positions of sensor_msgs/JointState one by one, within their bytes.
 
@@ -337,18 +319,6 @@ class _Positions(NamedTuple):
     at: int
 
 
-class DetectionColumns:
-    """Decode selfcal_msgs/MarkDetection; parameters as for `ColumnDecoder`."""
-
-    def __init__(self, fields: Sequence[Field] = MARK_DETECTION, tail: int | None = None) -> None:
-        self._decoder = ColumnDecoder(fields, tail)
-
-    def decode(self, messages: Payloads) -> tuple[list[np.ndarray], np.ndarray]:
-        """Return tables of `collection.inputs.DETECTION`, and the indices of the remainder."""
-        groups, rest = self._decoder.decode(messages)
-        return [_detection_table(group) for group in groups], rest
-
-
 def stamps_ns(group: Columns) -> np.ndarray:
     """Return the stamps in the headers of messages, integer ns."""
     seconds = group["header.stamp.sec"].astype(np.int64)
@@ -376,13 +346,15 @@ def first_stamps_ns(messages: Payloads) -> tuple[np.ndarray, np.ndarray]:
     return second * NS_PER_S + np.where(is_little, little["nanosec"], big["nanosec"]), there
 
 
-def _encoder_block(group: Columns) -> EncoderBlock:
+def encoder_block(group: Columns) -> EncoderBlock:
+    """Return the samples in messages of sensor_msgs/JointState."""
     velocities = group["velocity"] if "velocity" in group else np.zeros((len(group), 0))
     return EncoderBlock(stamps_ns(group), group.layout.texts["name"], group["position"],
                         velocities if velocities.shape[1] else None)
 
 
-def _detection_table(group: Columns) -> np.ndarray:
+def detection_table(group: Columns) -> np.ndarray:
+    """Return messages of selfcal_msgs/MarkDetection as a table of `collection.inputs.DETECTION`."""
     table = np.empty(len(group), dtype=DETECTION)
     table["stamp"] = stamps_ns(group)
     table["has_id"] = group["has_id"] != 0

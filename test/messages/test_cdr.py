@@ -12,10 +12,9 @@ from selfcal_ros.messages import cdr, to_model
 from selfcal_ros.messages.cdr import ColumnDecoder, Payloads, layout_of
 from selfcal_ros.messages.to_model import (
     JOINT_STATE,
-    MARK_DETECTION,
-    DetectionColumns,
-    EncoderColumns,
     PositionEditor,
+    detection_table,
+    encoder_block,
 )
 
 STORE = typestore()
@@ -46,6 +45,12 @@ def as_cdr(message, little=True, tail=b"", name=JOINTS, store=STORE):
     return bytes(store.serialize_cdr(message, name, little_endian=little)) + tail
 
 
+def blocks_of(data, fields=JOINT_STATE, tail=None):
+    """Return the encoder samples of messages in blocks, and the indices of what remains."""
+    groups, rest = ColumnDecoder(fields, tail).decode(Payloads.joined(data))
+    return [encoder_block(group) for group in groups], rest
+
+
 def samples(blocks):
     """Return the samples of blocks as tuples, in the order of their stamps."""
     return sorted((stamp, block.names, tuple(position),
@@ -56,7 +61,6 @@ def samples(blocks):
 
 def test_the_fields_are_those_of_the_definitions():
     assert fields_of(STORE, JOINTS) == JOINT_STATE
-    assert fields_of(STORE, MARK) == MARK_DETECTION
 
 
 texts = st.text(st.characters(blacklist_categories=["Cs"], blacklist_characters="\0"), max_size=9)
@@ -74,7 +78,7 @@ def test_any_mixture_of_layouts_gives_what_rosbags_gives(drawn):
         message = joint_state(stamp, names, position, velocity, effort, frame)
         data.append(as_cdr(message, little, tail))
         expected.append((stamp, tuple(names), tuple(position), tuple(velocity)))
-    blocks, rest = EncoderColumns().decode(Payloads.joined(data))
+    blocks, rest = blocks_of(data)
     left = {number * 1_500_000_001 for number in rest.tolist()}
     assert samples(blocks) == [item for item in expected if item[0] not in left]
     assert len(left) <= max(0, len(data) - cdr.FREE_TRIES)
@@ -84,7 +88,8 @@ def test_detections_of_both_byte_orders():
     rng = np.random.default_rng(1)
     marks = [mark(1_700_000_000_999_999_999 + 10**9 * i, rng) for i in range(50)]
     data = [as_cdr(m, little=bool(i % 3), name=MARK) for i, m in enumerate(marks)]
-    tables, rest = DetectionColumns().decode(Payloads.joined(data))
+    groups, rest = ColumnDecoder(fields_of(STORE, MARK)).decode(Payloads.joined(data))
+    tables = [detection_table(group) for group in groups]
     assert len(tables) == 2 and not len(rest)
     rows = sorted(row for table in tables for row in table.tolist())
     assert rows == [(1_700_000_000_999_999_999 + 10**9 * i, m.kind, m.has_id, m.m, m.n, m.k,
@@ -95,7 +100,7 @@ def test_detections_of_both_byte_orders():
 def test_a_stamp_before_1970_is_negative():
     message = joint_state(0)
     message.header.stamp = STORE.types["builtin_interfaces/msg/Time"](-2, 5)
-    [block], _ = EncoderColumns().decode(Payloads.joined([as_cdr(message)]))
+    [block], _ = blocks_of([as_cdr(message)])
     assert block.stamps_ns.tolist() == [-1_999_999_995]
 
 
@@ -114,7 +119,7 @@ def test_fields_before_between_and_behind_the_known_ones():
             name=["x", "y"], velocity=np.array([0.5, i]), b=True, position=np.array([i, -1.0]),
             two=parts[:2], one=parts[0])
         data.append(as_cdr(message, i < 4, name="pkg/msg/Odd", store=store))
-    blocks, rest = EncoderColumns(fields_of(store, "pkg/msg/Odd")).decode(Payloads.joined(data))
+    blocks, rest = blocks_of(data, fields_of(store, "pkg/msg/Odd"))
     assert not len(rest) and len(blocks) == 4
     assert samples(blocks) == [(i, ("x", "y"), (i, -1.0), (0.5, i)) for i in range(6)]
 
@@ -135,7 +140,7 @@ def test_padding_may_hold_anything():
     assert inside - {2, 3}, "this message has padding"
     for at in inside:
         other[at] = 0xA5
-    blocks, _ = EncoderColumns().decode(Payloads.joined([bytes(data), bytes(other)]))
+    blocks, _ = blocks_of([bytes(data), bytes(other)])
     assert [len(block) for block in blocks] == [2]
 
 
@@ -143,7 +148,7 @@ def test_padding_may_hold_anything():
 def test_no_part_of_a_message_is_taken_for_a_whole_one(little):
     whole = as_cdr(joint_state(5, velocities=[1.0, 2.0, 3.0]), little)
     cut = [whole[:size] for size in range(len(whole))]
-    blocks, rest = EncoderColumns().decode(Payloads.joined([*cut, whole, whole]))
+    blocks, rest = blocks_of([*cut, whole, whole])
     assert [len(block) for block in blocks] == [2]
     assert rest.tolist() == list(range(len(cut)))
 
@@ -163,16 +168,16 @@ def test_damaged_messages_are_left_to_rosbags_which_refuses_them(spoil):
     assert bad != good
     with pytest.raises(Exception, match=r"deserialize|Invalid|Missing"):
         STORE.deserialize_cdr(bad, JOINTS)
-    blocks, rest = EncoderColumns().decode(Payloads.joined([good, bad, good]))
+    blocks, rest = blocks_of([good, bad, good])
     assert [len(block) for block in blocks] == [2] and rest.tolist() == [1]
-    blocks, rest = EncoderColumns().decode(Payloads.joined([bad, good, good]))
+    blocks, rest = blocks_of([bad, good, good])
     assert [len(block) for block in blocks] == [2] and rest.tolist() == [0]
 
 
 def test_how_much_may_stand_behind_the_last_field():
     data = [as_cdr(joint_state(i), tail=bytes(i)) for i in range(12)]
-    assert EncoderColumns().decode(Payloads.joined(data))[1].tolist() == []
-    assert EncoderColumns(tail=3).decode(Payloads.joined(data))[1].tolist() == list(range(4, 12))
+    assert blocks_of(data)[1].tolist() == []
+    assert blocks_of(data, tail=3)[1].tolist() == list(range(4, 12))
 
 
 def test_layouts_that_few_share_are_not_tried_without_end(monkeypatch):
@@ -180,7 +185,7 @@ def test_layouts_that_few_share_are_not_tried_without_end(monkeypatch):
     monkeypatch.setattr(cdr, "layout_of",
                         lambda fields, data: tried.append(1) or layout_of(fields, data))
     data = [as_cdr(joint_state(i, frame=f"{i:05d}")) for i in range(640)]
-    blocks, rest = EncoderColumns().decode(Payloads.joined(data))
+    blocks, rest = blocks_of(data)
     assert len(tried) == len(blocks) == cdr.FREE_TRIES + 640 // cdr.WORTH
     assert len(rest) == 640 - len(blocks)
     assert samples(blocks) == [(i, ("x", "y", "theta"), (1.0, -2.0, 3.0), ())
@@ -188,13 +193,14 @@ def test_layouts_that_few_share_are_not_tried_without_end(monkeypatch):
 
 
 def test_known_layouts_are_not_walked_again(monkeypatch):
-    decoder = EncoderColumns()
+    decoder = ColumnDecoder(JOINT_STATE)
     data = [as_cdr(joint_state(i, names=("x", "y", "theta")[i % 3:][:1], positions=[i]))
             for i in range(30)]
-    blocks, _ = decoder.decode(Payloads.joined(data))
-    assert sorted(len(block) for block in blocks) == [10, 10, 10]
+    groups, _ = decoder.decode(Payloads.joined(data))
+    assert sorted(len(group) for group in groups) == [10, 10, 10]
     monkeypatch.setattr(cdr, "layout_of", None)
-    assert samples(decoder.decode(Payloads.joined(data))[0]) == samples(blocks)
+    assert samples(map(encoder_block, decoder.decode(Payloads.joined(data))[0])) == samples(
+        map(encoder_block, groups))
 
 
 def test_the_memory_of_layouts_is_bounded():
@@ -238,7 +244,7 @@ def test_a_field_that_is_not_there():
 
 
 def test_nothing_gives_nothing():
-    blocks, rest = EncoderColumns().decode(Payloads.joined([]))
+    blocks, rest = blocks_of([])
     assert blocks == [] and len(rest) == 0
 
 
