@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from mcap.records import Channel, Message
+from mcap.records import Channel
 
 from selfcal_ros.bagio.channels import ChannelDecoder, Input, Waiting
 from selfcal_ros.bagio.mcap_chunk import Block
@@ -46,17 +46,16 @@ class BagReader:
     clock_limit_s : float
         Larger clock steps are recorded.
     leave_ahead : bool
-        Omit messages stamped ahead of their log time (not in `stamped_messages`).
+        Omit messages stamped ahead of their log time.
 
     Attributes
     ----------
     lost : list of str
         Unreadable parts, one line each, after reading.
     steps : dict
-        Topic -> steps of the clock that stamps it, after reading (not with `stamped_messages`).
+        Topic -> steps of the clock that stamps it, after reading.
     ahead : Counter
-        Topic -> number of messages stamped ahead of their log time, after reading, omitted or not
-        (not with `stamped_messages`).
+        Topic -> number of messages stamped ahead of their log time, after reading, omitted or not.
     cells : set of str
         Namespaces of the input topics found, without slashes.
     topics : dict of str
@@ -136,42 +135,17 @@ class BagReader:
                 "logging: a live collector refuses that; set the clock that stamps, or the "
                 "recorder's"]
 
-    def messages(self) -> Iterator[tuple[str, object]]:
-        """Yield (topic, decoded message) of the three input topics, names without namespace.
+    def cdr_messages(self) -> Iterator[tuple[str, int, bytes]]:
+        """Yield (topic, log time in ns, CDR bytes) of the three input topics.
 
-        Raises like `stamped_messages`.
-        """
-        for topic, _, message in self.stamped_messages():
-            yield topic, message
-
-    def stamped_messages(self) -> Iterator[tuple[str, int, object]]:
-        """Yield (topic, time of logging in ns, decoded message) of the three input topics.
+        The bytes are of the types known here, whatever the fields in the bag. Undecodable
+        messages are omitted and counted.
 
         Raises
         ------
         InputError
             If a topic has another type, encoding or message version than the contract's, or the
             bag holds several namespaces.
-        """
-        bad: Counter = Counter()
-        decoders: dict[tuple[Path, int], ChannelDecoder | None] = {}
-        for stream, channel, message in self._all():
-            key = (stream.path, channel.id)
-            if key not in decoders:
-                decoders[key] = self._decoder(stream, channel, bad)
-            decoder = decoders[key]
-            if decoder is None:
-                continue
-            decoded = decoder.one(message.data)
-            if decoded is not None:
-                yield decoder.role, message.log_time, decoded
-        self._say(bad)
-
-    def cdr_messages(self) -> Iterator[tuple[str, int, bytes]]:
-        """Yield (topic, log time in ns, CDR bytes) of the three input topics.
-
-        The bytes are of the types known here, whatever the fields in the bag. Undecodable
-        messages are omitted as in `messages`, so that both agree. Raises the same errors.
         """
         bad: Counter = Counter()
         for block, parts in self._blocks(bad):
@@ -185,7 +159,7 @@ class BagReader:
     def columns(self) -> Iterator[tuple[str, Input]]:
         """Yield topic and a block of decoded messages; commands singly.
 
-        The order of messages is not kept. Raises as `stamped_messages`.
+        The order of messages is not kept. Raises as `cdr_messages`.
         """
         bad: Counter = Counter()
         waiting: dict[int, Waiting] = {}
@@ -201,11 +175,6 @@ class BagReader:
 
     def _stream(self, file: Path) -> McapStream:
         return McapStream(file, lost=self.lost, wanted=lambda topic: bool(_roles(topic)))
-
-    def _all(self) -> Iterator[tuple[McapStream, Channel, Message]]:
-        for stream, block in self._streams():
-            for message in block.messages():
-                yield stream, stream.channels[message.channel_id], message
 
     def _streams(self) -> Iterator[tuple[McapStream, Block]]:
         """Yield the blocks of all files; an unreadable file is skipped if another is readable."""

@@ -19,7 +19,7 @@ from selfcal_ros.messages.to_model import detection, encoder_sample
 from selfcal_ros.topics import COMMAND_TOPIC, DETECTION_TOPIC, ENCODER_TOPIC
 from test.support import bags
 from test.support.bags import COMPRESSIONS, Foreign
-from test.support.sessions import events_of, small_plan
+from test.support.sessions import decoded, events_of, small_plan
 
 EXTRA = "float64 temperature\nstring operator\n"
 
@@ -29,11 +29,20 @@ def events():
     return events_of(small_plan("0", repeats=1))
 
 
+def contract_fields(command):
+    """Return the fields of a command that every version of the message has."""
+    return [getattr(command, name) for name in (
+        "phase", "plan_id", "view_index", "view_name", "rotation", "translation_x",
+        "translation_y", "grid", "angular", "repeats", "grid_size", "grid_pitch", "angular_count")]
+
+
 def one_by_one(path):
     """Return all inputs of a bag as sorted texts, and what was lost."""
     reader = BagReader(path)
-    turn = {ENCODER_TOPIC: encoder_sample, DETECTION_TOPIC: detection, COMMAND_TOPIC: lambda m: m}
-    return sorted(repr(turn[topic](message)) for topic, message in reader.messages()), reader.lost
+    turn = {ENCODER_TOPIC: encoder_sample, DETECTION_TOPIC: detection,
+            COMMAND_TOPIC: contract_fields}
+    found = sorted(repr(turn[topic](message)) for topic, _, message in decoded(reader))
+    return found, reader.lost
 
 
 def by_columns(path):
@@ -47,7 +56,7 @@ def by_columns(path):
         elif topic == DETECTION_TOPIC:
             out += [Detection(*row) for row in item.tolist()]
         else:
-            out.append(item)
+            out.append(contract_fields(item))
     return sorted(map(repr, out)), reader.lost
 
 

@@ -13,7 +13,7 @@ from selfcal_ros.bagio.reader import BagReader
 from selfcal_ros.cli.main import main
 from selfcal_ros.errors import InputError
 from test.support.bags import COMPRESSIONS, NO_SUMMARY, Foreign
-from test.support.sessions import events_of, small_plan
+from test.support.sessions import decoded, events_of, small_plan
 
 SOURCE = Path(__file__).parents[2] / "bags" / "hu_exact" / "hu_exact_0.mcap"
 DATA = SOURCE.read_bytes()
@@ -23,7 +23,7 @@ with SOURCE.open("rb") as _stream:
 
 def read(path):
     reader = BagReader(path)
-    return sum(1 for _ in reader.messages()), reader.lost
+    return sum(1 for _ in decoded(reader)), reader.lost
 
 
 def test_a_later_cut_never_reads_less_and_every_loss_is_said(tmp_path):
@@ -90,7 +90,7 @@ def damaged(folder, data):
     path = folder / "damaged.mcap"
     path.write_bytes(data)
     reader = BagReader(path)
-    return [(topic, stamp) for topic, stamp, _ in reader.stamped_messages()], reader.lost
+    return [(topic, stamp) for topic, stamp, _ in decoded(reader)], reader.lost
 
 
 @pytest.mark.parametrize("compression", COMPRESSIONS)
@@ -204,7 +204,7 @@ def test_what_is_no_bag_is_refused(tmp_path):
             read(file)
 
 
-@pytest.mark.parametrize("how", ["messages", "columns", "cdr_messages"])
+@pytest.mark.parametrize("how", ["columns", "cdr_messages"])
 @pytest.mark.parametrize("place", [0, 1])
 def test_a_file_of_a_bag_that_is_no_mcap_file_costs_itself(tmp_path, how, place):
     (tmp_path / f"b_{place}.mcap").write_bytes(bytes(5000))

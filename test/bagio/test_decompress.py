@@ -28,7 +28,7 @@ from selfcal_ros.bagio.mcap_salvage import (
 from selfcal_ros.bagio.reader import BagReader
 from selfcal_ros.errors import InputError
 from test.support.bags import COMPRESSIONS, Foreign
-from test.support.sessions import events_of, small_plan
+from test.support.sessions import decoded, events_of, small_plan
 
 BIG = 3 * FREE
 SMALL_FREE = 4 << 20
@@ -140,7 +140,7 @@ def test_a_bomb_in_a_bag_costs_itself_and_one_line(tmp_path, events, tight, name
     path = tmp_path / "bomb.mcap"
     path.write_bytes(data[:at] + bomb_chunk(name, 5 * tight) + data[at:])
     reader = BagReader(path)
-    assert sum(1 for _ in reader.messages()) == len(events)
+    assert sum(1 for _ in decoded(reader)) == len(events)
     [line] = reader.lost
     assert line.startswith("the chunk that ends at byte ")
     limit = {"zstd": 4, "lz4": 17}[name]  # LZ4 squeezes zeros 243 times, zstd without end
@@ -158,7 +158,7 @@ def test_a_bomb_that_is_cut_off_gives_nothing(tmp_path, events, tight, name, pac
     path = tmp_path / "cut.mcap"
     path.write_bytes(data[:at] + bomb_chunk(name, 5 * tight)[:-7])
     reader = BagReader(path)
-    assert sum(1 for _ in reader.messages()) == len(events)
+    assert sum(1 for _ in decoded(reader)) == len(events)
     assert "0 messages of the last chunk could be saved" in reader.lost[0]
 
 
@@ -170,7 +170,7 @@ def test_a_compressed_message_that_is_a_bomb_is_counted(tmp_path, events, tight)
             return topic, zstandard.compress(bytes(5 * tight) if bomb else data)
 
     path = Bombs().write(tmp_path / "x.mcap", events)
-    for read in (BagReader.messages, BagReader.columns, BagReader.cdr_messages):
+    for read in (BagReader.columns, BagReader.cdr_messages):
         reader = BagReader(path)
         assert {topic for topic, *_ in read(reader)} == {"stage/joint_states",
                                                          "stage/mark_detections"}
@@ -185,7 +185,7 @@ def test_a_file_that_is_a_bomb_is_refused(tmp_path, tight, told):
     path.write_bytes(zstandard.ZstdCompressor(write_content_size=told).compress(bytes(5 * tight)))
     with pytest.raises(InputError, match=r"x\.mcap\.zstd: it would decompress to \d+ MB, more than "
                        r"the 4 MB that .* allow; if it is a bag, decompress it with zstd -d$"):
-        list(BagReader(path).messages())
+        list(decoded(BagReader(path)))
 
 
 LIMITED = """
@@ -219,4 +219,4 @@ def test_a_bag_of_sqlite_is_told_how_to_become_mcap(tmp_path, place):
     path = file if place == "file" else file.parent
     with pytest.raises(InputError, match=r"a bag with sqlite3 storage; convert it with `ros2 bag "
                        r"convert -i BAG -o OPTIONS\.yaml`"):
-        list(BagReader(path).messages())
+        list(decoded(BagReader(path)))

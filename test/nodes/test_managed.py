@@ -21,7 +21,7 @@ from selfcal_ros.nodes.compensator import CompensatorNode
 from selfcal_ros.nodes.measurement_collector import MeasurementCollector
 from selfcal_ros.nodes.pose_sequencer import PoseSequencer
 from selfcal_ros.nodes.solver import Solver
-from test.support.sessions import plan_file, small_plan
+from test.support.sessions import decoded, plan_file, small_plan
 
 MANAGED = {"measurement_collector": MeasurementCollector, "pose_sequencer": PoseSequencer,
            "solver": Solver, "compensator": CompensatorNode}
@@ -254,4 +254,4 @@ def test_what_has_come_is_in_the_journal_when_a_collector_is_taken_down(graph, t
     graph.remove(node)  # before it looked
     assert received["detection"] == 7
     (journal,) = tmp_path.glob("journal_*")
-    assert [topic for topic, _ in BagReader(journal).messages()] == [names.DETECTIONS.name] * 7
+    assert [topic for topic, *_ in decoded(BagReader(journal))] == [names.DETECTIONS.name] * 7

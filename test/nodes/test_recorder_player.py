@@ -22,18 +22,18 @@ from selfcal_ros.nodes.bag_player import BagPlayer
 from selfcal_ros.nodes.bag_recorder import BagRecorder
 from selfcal_ros.nodes.measurement_collector import MeasurementCollector
 from selfcal_ros.sessions.ports import Level
-from test.support.sessions import small_bag
+from test.support.sessions import decoded, small_bag
 
 
 def stamps(bag: Path) -> list[tuple[str, int]]:
     """Return topic and header stamp of every message of a bag, in the order of the file."""
     return [(topic, m.header.stamp.sec * 10**9 + m.header.stamp.nanosec)
-            for topic, _, m in BagReader(bag).stamped_messages()]
+            for topic, _, m in decoded(BagReader(bag))]
 
 
 def content(bag: Path) -> Counter:
     return Counter((topic, repr(message)) for topic, _, message in
-                   BagReader(bag).stamped_messages())
+                   decoded(BagReader(bag)))
 
 
 def digests(bag: Path) -> list[str]:
@@ -101,8 +101,8 @@ def test_shuffled_messages_arrive_in_another_order_with_their_own_stamps(played,
 def test_a_bag_is_played_at_its_own_pace_times_the_rate(played, bag):
     recorded, _ = played(rate=20.0)
     assert content(recorded) == content(bag)
-    arrivals = [stamp for _, stamp, _ in BagReader(recorded).stamped_messages()]
-    original = [stamp for _, stamp, _ in BagReader(bag).stamped_messages()]
+    arrivals = [stamp for _, stamp, _ in decoded(BagReader(recorded))]
+    original = [stamp for _, stamp, _ in decoded(BagReader(bag))]
     assert max(arrivals) - min(arrivals) >= (max(original) - min(original)) / 20 * 0.9
 
 
@@ -238,7 +238,7 @@ def test_what_was_flushed_survives_a_crash(graph, tmp_path):
     graph.until(lambda: recorder._writer.counts["/stage/mark_detections"] == 1, "the message")
     recorder._flush()
     reader = BagReader(tmp_path / "bag")
-    assert [message.m for _, _, message in reader.stamped_messages()] == [3]
+    assert [message.m for _, _, message in decoded(reader)] == [3]
     assert reader.lost
     recorder.close()
 
@@ -273,7 +273,7 @@ def test_a_remapped_topic_is_recorded_under_the_name_of_the_contract(graph, tmp_
     marks.publish(names.DETECTIONS.type(m=3))
     graph.until(lambda: sum(recorder._writer.counts.values()) == 1, "the detection")
     recorder.close()
-    [(topic, message)] = BagReader(tmp_path / "bag").messages()
+    [(topic, _, message)] = decoded(BagReader(tmp_path / "bag"))
     assert (topic, message.m) == (names.DETECTIONS.name, 3)
     with (tmp_path / "bag" / "bag_0.mcap").open("rb") as stream:
         assert {channel.metadata["heard_on"] for channel in make_reader(

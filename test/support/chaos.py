@@ -38,7 +38,7 @@ from test.support.forked import Forks
 from test.support.independent_cell import IndependentCell, largest_deviation
 from test.support.killed import Cell
 from test.support.ros import Graph
-from test.support.sessions import collected, events_of, plan_file, small_plan
+from test.support.sessions import collected, decoded, events_of, plan_file, small_plan
 
 HARMLESS = Faults(duplicated=0.05, delay_s=0.05)
 HARMFUL = Faults(lost=0.05, duplicated=0.05, outliers=0.03, low_score=0.02, not_finite=0.02,
@@ -308,7 +308,7 @@ def clock_ahead(seed: int, environment: dict, folder: Path, *, kills: int = 3,
         line = one.judge()
         cell.end("measurement_collector")
         for journal in folder.glob(f"{cell.namespace}/journal_*"):
-            stamps = [message.header.stamp.sec for _, message in BagReader(journal).messages()]
+            stamps = [message.header.stamp.sec for *_, message in decoded(BagReader(journal))]
             if max(stamps, default=0) * NS_PER_S >= one.measured[0].stamp_ns + ahead_ns:
                 one.faults.append(f"{journal.name} has messages of the run that was ahead")
         return line, one.faults

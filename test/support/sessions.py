@@ -1,11 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """A small calibration with known truth, as events, as readings and as a bag; no middleware."""
 
+from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import yaml
 
+from selfcal_ros.bagio.channels import ChannelDecoder
+from selfcal_ros.bagio.reader import BagReader
 from selfcal_ros.bagio.schemas import build, typestore
 from selfcal_ros.bagio.writer import BagWriter
 from selfcal_ros.collection.collector import Collector
@@ -50,6 +55,14 @@ def cdr_of(event: Event) -> bytes:
     topic, fields = event_fields(event, "stage")
     name = INPUT_TOPICS[topic]
     return bytes(typestore().serialize_cdr(build(typestore(), name, fields), name)) + TAIL
+
+
+def decoded(reader: BagReader) -> Iterator[tuple[str, int, Any]]:
+    """Yield topic, time of logging in ns and message of every input message of a bag."""
+    decoders = {topic: ChannelDecoder(topic, name, (typestore(),), Counter(), told=True)
+                for topic, name in INPUT_TOPICS.items()}
+    for topic, logged_ns, data in reader.cdr_messages():
+        yield topic, logged_ns, decoders[topic].one(data)
 
 
 def plan_file(folder: Path, plan: Plan) -> str:
