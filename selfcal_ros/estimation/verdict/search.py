@@ -22,6 +22,7 @@ from selfcal_ros.estimation.verdict.causes import (
     SURE,
     cause_of,
     effect_of_line,
+    far_from_sizes,
     fitted_term,
     line_cause,
     noisier_views,
@@ -137,6 +138,11 @@ def search_causes(solved: Solved, measurements: Measurements, options: Options, 
     plausible = all(test.allowed <= PLAUSIBLE.get(test.name, np.inf) for test in tests)
     alike = TermName.ROTATION in raised and _as_a_microscope(found, measurements, options)
     causes = [*(cause for cause in raised.values() if cause is not None), *found.causes]
+    far = [cause for cause in far_from_sizes(_model(solved))
+           if cause.name not in (*raised, *found.joined)]
+    if far:
+        found.bounded = False
+        causes.extend(far)
     if (turned := turned_too_far(_model(solved), solved.result, measurements)) is not None:
         found.bounded = False
         if TermName.ROTATION not in [cause.name for cause in causes]:
