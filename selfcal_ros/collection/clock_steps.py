@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Clocks that step in the midst of a run, seen where stamps and reception part.
+"""Detection of clock steps during a run, from the difference of stamps and reception.
 
-Readings follow stamps alone and never the order of arrival; what is found here changes no number.
-It names the clock where stamps are no longer those of one clock, which stamps alone cannot tell.
+Readings depend on stamps alone and never on the order of arrival; this changes no number.
+It names a clock that has stepped, which stamps alone cannot show.
 """
 
 from collections.abc import Collection, Iterable, Mapping
@@ -15,9 +15,9 @@ from selfcal_ros.collection.timeline import Timeline
 from selfcal_ros.units import NS_PER_S, S_PER_NS
 
 GROUP, BESIDE = 5, 3
-"""Messages that are looked at as one, and such groups on either side of a step."""
+"""Messages per group, and groups compared on either side of a step."""
 SLEW = 2000
-"""A clock that is kept by another runs away from it by at most one part in so many."""
+"""Largest drift of a disciplined clock: one part in this many."""
 REMEDY = ("let clocks slew, not step, while a run is measured (chrony, ptp4l: no step after the "
           "start)")
 Span = tuple[np.ndarray, np.ndarray]
@@ -26,14 +26,14 @@ Span = tuple[np.ndarray, np.ndarray]
 
 @dataclass(frozen=True)
 class Step:
-    """A clock that has stepped.
+    """A step of a clock.
 
     Attributes
     ----------
     before_ns : int
-        A stamp of before the step, at most a few messages old.
+        A stamp before the step, at most a few messages old.
     by_ns : int
-        How much later (+) or earlier (-) things are stamped since.
+        Change of the stamps, later (+) or earlier (-).
     """
 
     before_ns: int
@@ -41,29 +41,29 @@ class Step:
 
 
 class StepWatch:
-    """Finds the steps of the clock that stamps a stream of messages.
+    """Find the steps of the clock that stamps a stream of messages.
 
-    A step parts the stamps from the instants of reception at once and for good: what lies before
-    and behind it do not overlap. Late, bundled or lost messages do not look like that: where a
-    delay ends, and what waited was lost, stamps come nearer to their reception again, but no nearer
-    than they were before. Where the clock of reception steps as well, only a step back can be told
+    A step changes the difference of stamps and reception at once and permanently: the values before
+    and after do not overlap. Late, bundled or lost messages look different: when a delay ends, and
+    delayed messages were lost, stamps get closer to their reception again, but no closer
+    than before. If the clock of reception steps as well, only a step back can be distinguished
     from a pause.
 
     Parameters
     ----------
     limit_s : float
-        Smaller steps are no matter.
+        Smaller steps are ignored.
     """
 
     def __init__(self, limit_s: float) -> None:
         self._limit_ns = round(limit_s * NS_PER_S)
-        self._rest = np.zeros((2, 0), dtype=np.int64)  # less than a group
+        self._rest = np.zeros((2, 0), dtype=np.int64)  # an incomplete group
         self._groups = np.zeros((6, 0), dtype=np.int64)
-        self._nearest: tuple[int, int] | None = None  # largest offset, and when
-        self._quiet = 0  # groups in which a step that has been told is still seen
+        self._nearest: tuple[int, int] | None = None  # largest offset, and its time
+        self._quiet = 0  # groups still affected by a reported step
 
     def add(self, stamps_ns: np.ndarray, received_ns: np.ndarray) -> list[Step]:
-        """Take messages in the order of reception; return the steps that they show.
+        """Take messages in the order of reception; return the steps found.
 
         Parameters
         ----------
@@ -85,7 +85,7 @@ class StepWatch:
         return found
 
     def _look(self) -> list[Step]:
-        """Return the steps within a group that has its neighbours on both sides."""
+        """Return the steps within a group with neighbours on both sides."""
         count = self._groups.shape[1] - 2 * BESIDE
         if count <= 0:
             return []
@@ -104,7 +104,7 @@ class StepWatch:
             nearest, when = self._nearest_so_far(before[1][:, number])
             ahead = offset[number] > nearest + self._limit_ns // 2
             if size[number] < 0 or (size[number] and ahead):
-                # of the groups that see it, the one in the midst has the step within it
+                # of the groups affected, the middle one contains the step
                 last = min(number + BESIDE, count)
                 best = number + int(np.abs(size[number:last]).argmax())
                 out.append(Step(int(before[1][1, best]), int(size[best])))
@@ -113,14 +113,14 @@ class StepWatch:
         return out
 
     def _nearest_so_far(self, before: np.ndarray) -> tuple[int, int]:
-        """Return how near to their reception stamps have come, and the reception of the last.
+        """Return the smallest difference of stamps and reception so far, and the last reception.
 
-        Of a clock that stepped since, as if it always had been where it is.
+        Corrected for steps since then.
 
         Parameters
         ----------
         before : int array (3,)
-            Highest offset, stamp and reception of the messages that come next, ns.
+            Highest offset, stamp and reception of the next messages, ns.
         """
         offset_ns, _, received_ns = before.tolist()
         if self._nearest is not None:
@@ -131,9 +131,9 @@ class StepWatch:
 
 
 def _parted(before: Span, after: Span, limit_ns: int) -> np.ndarray:
-    """Return by how much the clock has stepped between two spans of messages; 0 where it has not.
+    """Return the step of the clock between two spans of messages; 0 if none.
 
-    The middles of the spans are compared, and the step must exceed the scatter of both.
+    The centres of the spans are compared, and the step must exceed the scatter of both.
     """
     (low, high), (next_low, next_high) = before, after
     scatter = np.maximum(high[0] - low[0], next_high[0] - next_low[0])
@@ -142,7 +142,7 @@ def _parted(before: Span, after: Span, limit_ns: int) -> np.ndarray:
     clear = np.abs(by) > np.maximum(limit_ns, 2 * scatter)
     ahead = clear & (by > 0) & (stamps > limit_ns) & (stamps > received + limit_ns)
     back = clear & (by < 0) & (next_low[1] < high[1] - limit_ns // 2)
-    # both clocks went back, in messages that otherwise come in their order
+    # both clocks went back, with the messages otherwise in order
     length = np.maximum(high[2] - low[2], next_high[2] - next_low[2])
     together = (~clear) & (stamps < -limit_ns) & (received < -limit_ns) & (
         np.minimum(-stamps, -received) > 2 * length)
@@ -150,12 +150,12 @@ def _parted(before: Span, after: Span, limit_ns: int) -> np.ndarray:
 
 
 def step_lines(steps: Mapping[str, Iterable[Step]], timeline: Timeline) -> list[str]:
-    """Return one line for each step: whose clock, by how much, where, and what it does.
+    """Return one line for each step: clock, amount, location, consequence.
 
     Parameters
     ----------
     steps : dict
-        Topic -> its steps. Steps of two topics by the same amount are one.
+        Topic -> its steps. Equal steps of two topics are one.
     timeline : Timeline
         Commands of the session.
     """
@@ -172,7 +172,7 @@ def step_lines(steps: Mapping[str, Iterable[Step]], timeline: Timeline) -> list[
 
 
 def future_lines(topics: Collection[str]) -> list[str]:
-    """Return a line for topics of which messages were refused as stamped in the future, if any."""
+    """Return a line for topics with messages refused as stamped in the future, if any."""
     return [f"{', '.join(sorted(topics))}: what was stamped more than {MAX_AHEAD_NS // NS_PER_S} s "
             "ahead of its reception was not used; set the clock that stamps it"] if topics else []
 

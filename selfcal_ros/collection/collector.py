@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The collector: takes messages in any order, gives the readings of every view.
+"""The collector: takes messages in any order, returns the readings of every view.
 
-What it gives is a function of the set of messages alone, so that live nodes, a replay and
-``selfcal solve`` cannot differ. Nothing is thrown away before it has been counted.
+The result is a function of the set of messages alone, so that live nodes, a replay and
+``selfcal solve`` cannot differ. Nothing is discarded without being counted.
 """
 
 import math
@@ -36,29 +36,29 @@ from selfcal_ros.topics import COMMAND_TOPIC
 from selfcal_ros.units import NS_PER_S
 
 MOST_NAMES = 20
-"""Names of foreign joints that are remembered."""
+"""Largest number of unknown joint names remembered."""
 SETTLE_EVERY, SPARE = 100_000, 8
-"""Samples, or as many times `SPARE` detections, after which exposures are looked up, whether or
-not anybody asks for readings: the samples beside them should still be in memory."""
+"""Number of samples, or `SPARE` times as many detections, after which exposures are looked up even
+if no readings are requested, while the samples around them are in memory."""
 
 
 class Collector:
-    """Collects encoder samples, detections and commands and reduces them to readings.
+    """Collect encoder samples, detections and commands and reduce them to readings.
 
-    Only what is new costs: where the stage was at an exposure is looked up once, and a view is
-    reduced again only if something of it has changed.
+    Incremental: the stage position at an exposure is looked up once, and a view is
+    reduced again only if it has changed.
 
     Parameters
     ----------
     settings : CollectorSettings
-        What measurement_collector is set to.
+        Values of measurement_collector's parameters.
     store : Limits, optional
-        How many encoder samples are kept in memory.
+        Limits on the encoder samples kept in memory.
 
     Raises
     ------
     InputError
-        If two joints have one name.
+        If two joints have the same name.
     """
 
     def __init__(self, settings: CollectorSettings, store: Limits | None = None) -> None:
@@ -81,18 +81,18 @@ class Collector:
         self._exposures = Exposures(self.tracks,
                                     approach_threshold_m=settings.approach_threshold)
         self._views = ViewCache(self._rules)
-        self._single: list[tuple] = []  # detections that were added one by one
+        self._single: list[tuple] = []  # detections added one by one
         self._unsettled = 0
         self._commands: dict[Command, None] = {}
         self._rejected_input: Counter = Counter()
         self._timeline: Timeline | None = None
         self._newest: Command | None = None
-        self._foreign: dict[str, None] = {}  # joint names that are not ours
+        self._foreign: dict[str, None] = {}  # unknown joint names
         self._seen: Seen | None = None
         self.received = {"encoder": 0, "detection": 0, "command": 0}
 
     def add_encoder(self, sample: EncoderSample) -> None:
-        """Take one encoder message; one that cannot be used is counted under its reason."""
+        """Take one encoder message; an unusable one is counted under its reason."""
         self.received["encoder"] += 1
         velocities = sample.velocities or (math.nan,) * len(sample.positions)
         if not len(sample.names) == len(sample.positions) == len(velocities):
@@ -116,18 +116,18 @@ class Collector:
 
     def add_encoder_block(self, stamps_ns: np.ndarray, names: Sequence[str], positions: np.ndarray,
                           velocities: np.ndarray | None = None) -> None:
-        """Take many encoder messages of the same joints, as `add_encoder` takes each.
+        """Take many encoder messages of the same joints, like `add_encoder` for each.
 
         Parameters
         ----------
         stamps_ns : int64 array (n,)
             Stamps.
         names : sequence of str
-            Joints, as the messages name them.
+            Joints, as named in the messages.
         positions : float array (n, j)
             Indicated positions, m or rad.
         velocities : float array (n, i), optional
-            m/s or rad/s; None or without columns where they are not told.
+            m/s or rad/s; None or without columns if unknown.
         """
         count = len(stamps_ns)
         self.received["encoder"] += count
@@ -173,7 +173,7 @@ class Collector:
         self._grow(len(table) // SPARE)
 
     def _grow(self, count: int) -> None:
-        """Look up exposures now and then, while the samples beside them are in memory."""
+        """Look up exposures periodically, while the samples around them are in memory."""
         self._unsettled += count
         if self._unsettled >= SETTLE_EVERY:
             self._settle()
@@ -186,7 +186,7 @@ class Collector:
         self._unsettled = 0
 
     def add_command(self, command: Command) -> None:
-        """Take one view command; one that cannot be followed raises InputError."""
+        """Take one view command; an unusable one raises InputError."""
         check_command(command)
         self.received["command"] += 1
         if command not in self._commands:
@@ -194,17 +194,17 @@ class Collector:
             self._timeline = self._newest = None
 
     def refuse(self, kind: str, reason: Reason, count: int = 1) -> None:
-        """Count messages that are not used: encoder, detection or command."""
+        """Count unused messages: encoder, detection or command."""
         self.received[kind] += count
         self._rejected_input[reason] += count
 
     def knows(self, command: Command) -> bool:
-        """Return whether a command has come before."""
+        """Return whether a command has been received before."""
         return command in self._commands
 
     @property
     def newest_command(self) -> Command | None:
-        """The command with the latest stamp, of equal ones that which came last; no stray."""
+        """The command with the latest stamp, the last received of equal ones; no stray."""
         if self._newest is None and self._commands:
             kept = set(without_strays(self._commands))
             self._newest = max((c for c in reversed(self._commands) if c in kept),
@@ -213,17 +213,17 @@ class Collector:
 
     @property
     def encoder_until_ns(self) -> int:
-        """Stamp up to which samples of all joints that have any have come, as far as is known."""
+        """Stamp up to which all joints with samples have been received, as far as known."""
         return min((track.store.newest_ns for track in self.tracks if len(track)), default=NEVER)
 
     @property
     def storage_problem(self) -> str:
-        """Why more encoder samples are in memory than should be; empty if all is well."""
+        """Why more encoder samples are in memory than intended; empty if all is well."""
         return next((track.store.problem for track in self.tracks if track.store.problem), "")
 
     @property
     def unusable(self) -> dict[str, int]:
-        """Messages that are not usable as encoder samples or commands, by reason."""
+        """Messages unusable as encoder samples or commands, by reason."""
         return {str(reason): count for reason, count in sorted(self._rejected_input.items())}
 
     @property
@@ -234,7 +234,7 @@ class Collector:
         return self._timeline
 
     def collect(self) -> tuple[Measurements, dict[int, ViewProgress]]:
-        """Return the readings of all views so far, and how far each view has come.
+        """Return the readings of all views so far, and the progress of each view.
 
         Raises
         ------
@@ -260,9 +260,9 @@ class Collector:
 
     def findings(self, measurements: Measurements,
                  progress: dict[int, ViewProgress]) -> dict[int | None, Finding]:
-        """Return what spoilt most detections of the session (key None), else of single views.
+        """Return why most detections of the session (key None), or of single views, were rejected.
 
-        `measurements` and `progress` are what `collect` returned last.
+        `measurements` and `progress` are the last result of `collect`.
         """
         if self._seen is None:
             return {}
@@ -270,7 +270,7 @@ class Collector:
                                    measurements.rejected)
 
     def _facts(self) -> EncoderFacts:
-        """Return what came of the encoder."""
+        """Return a summary of the encoder messages."""
         tracks = {axis: getattr(self.tracks, axis) for axis in self._joints.values()}
         spans = [span for span in (track.store.span() for track in self.tracks) if span]
         return EncoderFacts(
@@ -282,7 +282,7 @@ class Collector:
 
 def view_progress(timeline: Timeline, index: int, readings: ViewReadings,
                   min_repeats: int = 0) -> ViewProgress:
-    """Return how far a view has come."""
+    """Return the progress of a view."""
     artifact, view = timeline.planned_view(index)
     grid, angular = expected_marks(artifact, view)
     done, done_theta = read_enough(view, readings, min_repeats)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Why most detections were rejected, in one line that says what to correct.
+"""Why most detections were rejected, in one line with the correction.
 
-A wrong parameter or a wrong clock spoils nearly all detections at once, and each is rejected for a
-reason of its own that does not name it. Here all rejections of a session are judged together.
+A wrong parameter or a wrong clock affects nearly all detections at once, but each is rejected for
+a reason that does not name it. Here all rejections of a session are evaluated together.
 """
 
 from collections.abc import Callable, Iterable, Mapping
@@ -21,25 +21,25 @@ from selfcal_ros.model.view import View
 from selfcal_ros.units import NS_PER_S
 
 MOST = 0.5
-"""Part of the detections beyond which one reason of rejection is a matter of its own."""
+"""Fraction of the detections above which one reason of rejection is diagnosed."""
 AT_LEAST = 5
-"""Detections below which nothing is said."""
+"""Smallest number of detections for a diagnosis."""
 SCALES = {1.0: "", 1e3: "1000 times what the marks ask for: they are in mm",
           1e-3: "a thousandth of what the marks ask for: they are in km, or their unit is unknown",
           1e6: "a million times what the marks ask for: they are in µm"}
-"""Indicated position over true position -> what it means."""
+"""Indicated position over true position -> meaning."""
 PLACED = (Reason.NOT_AT_MARK, Reason.TOO_FAR, Reason.MOVING, Reason.CONTRADICTION,
           Reason.NOT_IN_VIEW, Reason.AMBIGUOUS, Reason.OUTLIER, Reason.ROTATION)
-"""Reasons behind which the stage may stand where no mark is."""
+"""Reasons possibly caused by a stage away from all marks."""
 
 Span = tuple[int, int] | None
 LOOKED_AT = 2000
-"""Detections whose stage positions are looked at, the last of them."""
+"""Number of the last detections whose stage positions are examined."""
 
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """What is known of the detections of a view, or of a session.
+    """Facts on the detections of a view, or of a session.
 
     Attributes
     ----------
@@ -52,16 +52,16 @@ class Evidence:
     detections_ns, encoder_ns, commands_ns : tuple of int or None
         First and last stamp of each.
     encoder_step_s, max_gap_s : float
-        Usual time between encoder samples (NaN = not known), and the largest that is allowed.
+        Usual time between encoder samples (NaN = unknown), and the largest allowed.
     stage_m, site_m : float array (2, n)
         Indicated positions at grid detections with ids, and the nominal sites of their marks.
     pitch_m, limit_m : float
-        Distance between marks, and from a mark's site at which the stage still stands at it.
+        Distance between marks, and largest distance of the stage from a mark's site.
     sense : Sense
         Sense of measurement.
     lies : str
-        How the plate lies, and what to do, where the ids of the marks tell that it lies otherwise
-        than planned.
+        Actual pose of the plate, and remedy, if the ids of the marks show another pose than
+        planned.
     """
 
     rejected: Mapping[str, int]
@@ -83,7 +83,7 @@ class Evidence:
 
 @dataclass(frozen=True)
 class Finding:
-    """One reason for which most detections were rejected: counts, cause and what to do."""
+    """A reason for which most detections were rejected: counts, cause and remedy."""
 
     reason: str
     count: int
@@ -97,9 +97,9 @@ class Finding:
 
 
 def main_reason(rejected: Mapping[str, int], used: int) -> tuple[str, int, int] | None:
-    """Return the reason of most rejections, its count, and the detections that count; or None.
+    """Return the reason of most rejections, its count, and the total considered; or None.
 
-    Detections of other runs and plans, redone views, and duplicates are as they should be.
+    Detections of other runs and plans, redone views, and duplicates are not faults.
     """
     bad = {reason: count for reason, count in rejected.items() if reason in REMEDY}
     total = used + sum(bad.values())
@@ -110,7 +110,7 @@ def main_reason(rejected: Mapping[str, int], used: int) -> tuple[str, int, int] 
 
 
 def diagnose(evidence: Evidence) -> Finding | None:
-    """Return what spoilt most of the detections; None where no reason stands out."""
+    """Return why most of the detections were rejected; None if no reason dominates."""
     found = main_reason(evidence.rejected, evidence.used)
     if found is None:
         return None
@@ -170,7 +170,7 @@ def _seconds(offset_s: float) -> str:
 
 
 def _stage(e: Evidence) -> str | None:
-    """Return why the stage does not stand where the marks are, None if it does or cannot tell."""
+    """Return why the stage is away from the marks; None if it is not or unknown."""
     where = e.stage_m * (-1 if e.sense is Sense.PLATE_MOVES else 1)
     if where.shape[1] < AT_LEAST or (np.ptp(e.site_m, axis=1) < e.pitch_m).any():
         return None
@@ -191,13 +191,13 @@ def _stage(e: Evidence) -> str | None:
 
 
 def _away(where: np.ndarray, e: Evidence) -> float:
-    """Return the median distance from the sites, of marks that are not at the centre."""
+    """Return the median distance from the sites, for marks away from the centre."""
     outer = np.hypot(*e.site_m) > e.pitch_m / 4
     return float(np.median(np.hypot(*(where - e.site_m))[outer]))
 
 
 def _said(scale: float, *, swapped: bool, signs: tuple[int, int], sense: Sense) -> str:
-    """Return what is wrong and what to set, for a combination that fits."""
+    """Return the fault and the remedy for a combination that fits."""
     what, remedy = [], []
     if SCALES[scale]:
         what.append(f"the indicated positions are {SCALES[scale]}")
@@ -218,7 +218,7 @@ def _said(scale: float, *, swapped: bool, signs: tuple[int, int], sense: Sense) 
 
 @dataclass(frozen=True)
 class EncoderFacts:
-    """What came of the encoder.
+    """Summary of the encoder messages.
 
     Attributes
     ----------
@@ -227,11 +227,11 @@ class EncoderFacts:
     sampled : dict
         Axis -> whether it has samples.
     foreign : tuple of str
-        Other joint names that came.
+        Other joint names received.
     span_ns : tuple of int or None
         First and last stamp.
     step_s, max_gap_s : float
-        Usual time between samples of x, NaN if not known, and the largest allowed.
+        Usual time between samples of x, NaN if unknown, and the largest allowed.
     """
 
     names: Mapping[str, str]
@@ -255,7 +255,7 @@ class Seen:
     exposures : Exposures
         The stage at their instants.
     encoder : callable
-        Returns what came of the encoder, `EncoderFacts`: asked only where something is amiss.
+        Returns the `EncoderFacts`; called only if there is a fault.
     commands_ns : tuple of int
         First and last stamp of the commands.
     artifact : Artifact
@@ -277,7 +277,7 @@ class Seen:
 
     def findings(self, views: Mapping[int, ViewReadings], loose: Mapping[str, int],
                  ) -> dict[int | None, Finding]:
-        """Return what spoilt most detections of the session (key None), else of single views.
+        """Return why most detections of the session (key None), or of single views, were rejected.
 
         Parameters
         ----------
@@ -309,7 +309,7 @@ class Seen:
         missing = tuple(encoder.names[axis] for axis, kind in kinds.items()
                         if not encoder.sampled[axis] and (table["kind"] == kind).any())
         stage, site = self._stage_and_sites(rows[-LOOKED_AT:], views)
-        # where all views are spoilt the sense may be wrong: it looks like half a turn
+        # if all views are affected the sense may be wrong: it looks like half a turn
         lies = "" if whole else self._lies(rows[-LOOKED_AT:], views)
         return diagnose(Evidence(
             rejected, used, missing, encoder.foreign, _span(table["stamp"]), encoder.span_ns,
@@ -317,7 +317,7 @@ class Seen:
             self.artifact.grid_pitch_m, self.rules.stage_limit_m(self.artifact), self.sense, lies))
 
     def _lies(self, rows: np.ndarray, views: Mapping[int, ViewReadings]) -> str:
-        """Return how the plate of a view lies, if its marks are where another pose has them."""
+        """Return the actual pose of a view's plate, if its marks match another pose."""
         ((_, readings),) = views.items()
         table, view = self.table[rows], readings.view
         if not _on_lattice(self.artifact, view):

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Stage position at the instant of exposure, from the encoder samples of one joint.
 
-What is said of an exposure depends on the samples beside it alone: on the `DEPTH` stamps on either
-side, on what contradicts itself within half a gap, and, for the direction of approach, on the time
-since the exposure before. So an exposure is settled once these have come.
+The result for an exposure depends only on nearby samples: on the `DEPTH` stamps on either
+side, on contradictions within half a gap, and, for the direction of approach, on the time
+since the previous exposure. So it is final once these samples have been received.
 """
 
 from collections.abc import Callable
@@ -18,27 +18,27 @@ from selfcal_ros.units import NS_PER_S
 BEYOND_NOISE = 6.0
 """Standard deviations by which two samples must differ to show that a joint has moved."""
 NEAR = 16
-"""Samples on either side of an exposure that tell the noise of a joint at rest there."""
+"""Samples on either side of an exposure for the noise of a joint at rest."""
 DEPTH = 2 * NEAR + 4
-"""Stamps on either side of an exposure on which it depends: where one side has too few samples
-for the noise, the other gives as many more."""
+"""Stamps on either side of an exposure on which its result depends: if one side has too few samples
+for the noise, more are taken from the other."""
 MOST_NOISE_M = 1e-4
-"""Size of what passes for noise, m, from which on it is none: the samples beside the exposure are
-too few, most of them of a stage that moves."""
+"""Largest plausible noise, m: above, the samples around the exposure are too few, and most of
+them are of a moving stage."""
 LOOK_BACK_NS = 60_000_000_000
-"""Time before an exposure in which a motion is looked for."""
+"""Time before an exposure in which a motion is searched for."""
 NEVER, EVER = np.iinfo(np.int64).min, np.iinfo(np.int64).max
 GOOD, NO_ENCODER, MOVING, CONTRADICTION = range(4)
-"""What the encoder says of an exposure, in codes: they take an eighth of the memory of reasons."""
+"""Codes of the result for an exposure, with an eighth of the memory of reasons."""
 REASONS = np.array([None, Reason.NO_ENCODER, Reason.MOVING, Reason.CONTRADICTION], dtype=object)
-"""The reasons behind the codes; None where the position is good."""
+"""The reasons for the codes; None if the position is good."""
 AS_BEFORE = 2
-"""Direction of approach of an exposure before which there was no motion: that of the last one."""
+"""Code for a direction of approach as at the previous exposure: no motion in between."""
 
 
 @dataclass(frozen=True)
 class TrackLimits:
-    """When a position can be trusted: gap in ns, speed per s, agreement of equal stamps."""
+    """Limits for valid positions: gap in ns, speed per s, agreement of equal stamps."""
 
     max_gap_ns: int
     max_speed: float
@@ -47,7 +47,7 @@ class TrackLimits:
 
 
 class JointTrack:
-    """Samples of one joint, in whatever order they arrive; queries depend on the set alone."""
+    """Samples of one joint, in any order of arrival; queries depend on the set alone."""
 
     def __init__(self, limits: TrackLimits, store: Limits | None = None) -> None:
         self.limits = limits
@@ -58,11 +58,11 @@ class JointTrack:
         return len(self.store)
 
     def add(self, stamp_ns: int, position: float, speed: float) -> None:
-        """Add one sample; `speed` is NaN where the encoder does not tell it."""
+        """Add one sample; `speed` is NaN if unknown."""
         self.store.add(stamp_ns, position, speed)
 
     def between(self, start_ns: int, end_ns: int) -> "Series":
-        """Return the samples that decide about exposures from `start_ns` to `end_ns`."""
+        """Return the samples relevant to exposures from `start_ns` to `end_ns`."""
         half_gap = self.limits.max_gap_ns // 2
         return Series(self.limits, self.store.near(max(start_ns, NEVER + half_gap) - half_gap,
                                                    min(end_ns, EVER - half_gap) + half_gap,
@@ -77,12 +77,12 @@ class JointTrack:
         return float(np.median(np.diff(t)) / NS_PER_S) if len(t) > 1 else float("nan")
 
     def query(self, stamps_ns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return `Series.query` of all samples, with reasons in place of their codes."""
+        """Return `Series.query` of all samples, with reasons instead of codes."""
         positions, codes = self._all().query(stamps_ns)
         return positions, REASONS[codes]
 
     def moving(self, stamps_ns: np.ndarray) -> np.ndarray:
-        """Return `Reason.MOVING` where the joint is known to move, else None, by all samples."""
+        """Return `Reason.MOVING` where the joint is known to move, else None, from all samples."""
         series = self._all()
         return REASONS[np.where(series.moving(stamps_ns, series.query(stamps_ns)[1]), MOVING, GOOD)]
 
@@ -99,7 +99,7 @@ class JointTrack:
 
 
 def filled(approach: np.ndarray) -> np.ndarray:
-    """Return directions of approach with those that are as before; unknown before the first."""
+    """Return directions of approach with `AS_BEFORE` replaced; unknown before the first."""
     told = np.where(approach == AS_BEFORE, 0, np.arange(len(approach)))
     out = approach[np.maximum.accumulate(told)] if len(approach) else approach
     return np.where(out == AS_BEFORE, 0, out).astype(np.int8)
@@ -111,14 +111,14 @@ class Series:
     def __init__(self, limits: TrackLimits, samples: Samples) -> None:
         self.limits = limits
         stamps, positions, speeds = samples
-        if (stamps[1:] > stamps[:-1]).all():  # as a rule: nothing to hold against each other
+        if (stamps[1:] > stamps[:-1]).all():  # usual case: nothing to compare
             self.t, self.p, self.speed, self.v = stamps, positions, speeds, np.abs(speeds)
             self.bad = np.zeros(len(stamps), dtype=bool)
             return
         order = np.lexsort((positions, stamps))
         stamps, positions, speeds = stamps[order], positions[order], speeds[order]
         first = np.flatnonzero(np.diff(stamps, prepend=NEVER))
-        # from the first of each stamp to all of it: on a circle the last may lie nearer
+        # from the first of each stamp to all of them: on a circle the last may be nearer
         beside = np.repeat(positions[first], np.diff(first, append=len(stamps)))
         spread = np.abs(self._difference(positions - beside))
         self.t, self.p = stamps[first], positions[first]
@@ -132,14 +132,14 @@ class Series:
 
     def decided_by(self, stamps_ns: np.ndarray, since_ns: np.ndarray | None = None,
                    ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the first and last stamps on which what is said of each exposure depends.
+        """Return the first and last stamps on which the result for each exposure depends.
 
         Parameters
         ----------
         stamps_ns : int64 array (Q,)
             Instants of exposure.
         since_ns : int64 array (Q,), optional
-            Instants from which on a motion before each is looked for.
+            Instants from which a motion before each is searched for.
         """
         half_gap = self.limits.max_gap_ns // 2
         low = np.searchsorted(self.t, stamps_ns, "left") - DEPTH
@@ -168,9 +168,9 @@ class Series:
         Returns
         -------
         positions : float array (Q,)
-            m or rad; NaN where there is none.
+            m or rad; NaN if none.
         codes : int8 array (Q,)
-            `GOOD`, or why not: `NO_ENCODER`, `MOVING`, `CONTRADICTION`.
+            `GOOD`, `NO_ENCODER`, `MOVING` or `CONTRADICTION`.
         """
         codes = np.zeros(len(stamps_ns), dtype=np.int8)
         if not len(self) or not len(stamps_ns):
@@ -190,14 +190,14 @@ class Series:
     def moving(self, stamps_ns: np.ndarray, codes: np.ndarray) -> np.ndarray:
         """Return where this joint is known to move, bool array (Q,); `codes` are those of `query`.
 
-        For joints that a reading does not need: one that has no samples near, or whose samples
-        contradict each other, tells nothing; and displacements within noise are not motion.
+        For joints that a reading does not need: without nearby samples, or with contradictory ones,
+        motion is unknown; and displacements within noise are not motion.
         """
         fast = codes == MOVING
         if fast.any():
             t, p, v = self.t, self.p, self.v
             before, after, exact, _ = self._around(stamps_ns)
-            # at a sample: the longer way to one of its neighbours
+            # at a sample: the larger distance to one of its neighbours
             left = np.where(exact, np.maximum(before - 1, 0), before)
             right = np.where(exact, np.minimum(after + 1, len(t) - 1), after)
             way = np.fmax(np.abs(self._difference(p[right] - p[after])),
@@ -216,16 +216,16 @@ class Series:
         """Return the sign of the last motion before each exposure, int8 array (Q,).
 
         A motion is a displacement beyond `threshold`, m, and beyond the noise at rest. It is
-        looked for from the exposure back to the one before; where there is none, the sign is
-        `AS_BEFORE`. It is 0, not known, after a gap in the samples, where the last exposure is
-        more than `LOOK_BACK_NS` ago, and where too few samples are of a stage at rest.
+        searched for from the exposure back to the previous one; if there is none, the sign is
+        `AS_BEFORE`. It is 0, unknown, after a gap in the samples, if the last exposure is
+        more than `LOOK_BACK_NS` ago, and if too few samples are of a stage at rest.
 
         Parameters
         ----------
         stamps_ns : int64 array (Q,)
             Instants of exposure, rising, each once.
         positions : float array (Q,)
-            Positions there, as `query` returns them.
+            Positions there, from `query`.
         threshold : float
             Smallest displacement that counts as a motion, m.
         """
@@ -239,12 +239,12 @@ class Series:
         away = np.abs(p[sample] - positions[owner])
         moved = (away > threshold) & (stamps_ns[owner] - t[sample] <= LOOK_BACK_NS)
         limit = np.full(len(stamps_ns), threshold)
-        doubtful = np.unique(owner[moved])  # the noise is looked at where it can matter
+        doubtful = np.unique(owner[moved])  # the noise is computed only where it matters
         limit[doubtful] = np.fmax(threshold, BEYOND_NOISE * np.sqrt(2) * self._noise_near(
             stamps_ns[doubtful]))
         moved &= away > limit[owner]
         last = np.full(len(stamps_ns), -1)
-        last[owner[moved]] = sample[moved]  # of samples with one owner the last stays
+        last[owner[moved]] = sample[moved]  # the last sample of each owner
         broken = np.diff(t, prepend=t[0]) > self.limits.max_gap_ns
         broken[0] = True
         resumed = np.full(len(stamps_ns), -1)
@@ -258,7 +258,7 @@ class Series:
         return out
 
     def _noise_near(self, stamps_ns: np.ndarray) -> np.ndarray:
-        """Return the standard deviation of one position beside each exposure, robustly, (Q,).
+        """Return the robust standard deviation of one position around each exposure, (Q,).
 
         From each sample's distance to the line through its neighbours, whose variance is 1.5 times
         as large: motion at a steady speed adds nothing to it.
@@ -270,7 +270,7 @@ class Series:
         return self._median_near(off, (self.t, self.p), stamps_ns) / np.sqrt(1.5)
 
     def _speed_noise_near(self, stamps_ns: np.ndarray) -> np.ndarray:
-        """Return the standard deviation of one told speed beside each exposure, robustly, (Q,).
+        """Return the robust standard deviation of one reported speed around each exposure, (Q,).
 
         From the second differences: a steady speed and a steady acceleration add nothing to it.
         """
@@ -280,9 +280,9 @@ class Series:
 
     def _median_near(self, off: Callable[..., np.ndarray], columns: tuple[np.ndarray, ...],
                      stamps_ns: np.ndarray) -> np.ndarray:
-        """Return the standard deviation about 0 of values near each exposure, most are noise.
+        """Return the robust standard deviation about 0 of values near each exposure.
 
-        `off` makes of columns (..., n) of samples the values (..., n - 2), which are not negative:
+        `off` converts columns (..., n) of samples to non-negative values (..., n - 2),
         one for each sample but the first and the last.
         """
         if len(self) < 3:
@@ -291,16 +291,16 @@ class Series:
         start = np.clip(np.searchsorted(self.t, stamps_ns, "left") - 1 - NEAR, 0,
                         len(self) - 2 - width)
         windows = np.lib.stride_tricks.sliding_window_view
-        if len(start) * width < len(self):  # as a rule: few exposures, far from each other
+        if len(start) * width < len(self):  # usual case: few exposures, far apart
             near = off(*(windows(column, width + 2)[start] for column in columns))
         else:
             near = windows(off(*columns), width)[start]
         return np.median(near, axis=1) / 0.6744897501960817
 
     def _around(self, stamps_ns: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Return the samples before and after each instant, where they are one, where too far.
+        """Return the samples before and after each instant, whether identical, whether too far.
 
-        They are one where the instant is that sample's stamp.
+        They are identical if the instant is that sample's stamp.
         """
         t = self.t
         after = np.searchsorted(t, stamps_ns, "left")
@@ -315,12 +315,12 @@ class Series:
 
     def _motion(self, before: np.ndarray, after: np.ndarray, exact: np.ndarray,
                 ) -> tuple[np.ndarray, np.ndarray]:
-        """Return which exposures saw the stage moving, and which saw it jump to and fro."""
+        """Return for which exposures the stage moves, and for which it jumps back and forth."""
         v = self.v
         move_left, fast_left, near_left = self._step_to(before)
         middle, fast, _ = self._step_to(after)
         move_right, fast_right, near_right = self._step_to(after + 1)
-        # between two samples: their step; at a sample: the calmer of the two beside it
+        # between two samples: their step; at a sample: the smaller of the adjacent steps
         calm = (near_left & ~fast_left) | (near_right & ~fast_right)
         both = ~calm & (near_left | near_right)
         moving = np.where(exact, both, fast)
@@ -334,9 +334,9 @@ class Series:
         return moving, reversing
 
     def _step_to(self, number: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the step from the sample before to each one, whether it is fast, whether near.
+        """Return the step from the previous sample to each, whether it is fast, whether near.
 
-        There is no step, 0 and neither, to the first sample and to the one behind the last.
+        There is no step (0, False, False) to the first sample and beyond the last.
         """
         inside = (number > 0) & (number < len(self.t))
         to = np.clip(number, 0, len(self.t) - 1)
@@ -349,7 +349,7 @@ class Series:
 
     def _contradicted(self, stamps_ns: np.ndarray, before: np.ndarray,
                       after: np.ndarray) -> np.ndarray:
-        """Return which exposures lie beside, or within half a gap of, a contradicted stamp."""
+        """Return the exposures next to, or within half a gap of, a contradictory stamp."""
         t, bad = self.t, self.bad
         if not bad.any():
             return np.zeros(len(stamps_ns), dtype=bool)
@@ -368,7 +368,7 @@ class Series:
 
 
 def _fastest(speeds: np.ndarray, first: np.ndarray) -> np.ndarray:
-    """Return of the speeds of each stamp, which begin at `first`, that of the largest size."""
+    """Return the speed of largest magnitude of each stamp, whose speeds begin at `first`."""
     if not len(first):
         return speeds
     most, least = np.fmax.reduceat(speeds, first), np.fmin.reduceat(speeds, first)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which marks a view asks for, which are missing, and how far a view has come."""
+"""Expected and missing marks of a view, and its progress."""
 
 from dataclasses import dataclass
 
@@ -11,12 +11,12 @@ from selfcal_ros.model.readings import ViewReadings
 from selfcal_ros.model.view import View
 
 NAMED_AT_MOST = 200
-"""Missing grid marks, and lines, that are named."""
+"""Largest number of missing grid marks, and lines, named."""
 
 
 @dataclass(frozen=True)
 class Missing:
-    """Grid marks (m, n) and lines k that were not read as often as asked, the first of them."""
+    """The first grid marks (m, n) and lines k not read as often as required."""
 
     m: tuple[int, ...] = ()
     n: tuple[int, ...] = ()
@@ -26,8 +26,8 @@ class Missing:
 def mark_range(artifact: Artifact, view: View) -> tuple[tuple[int, int], tuple[int, int]]:
     """Return the smallest and largest m, and n, of the grid marks in the field in a view.
 
-    The field is the lattice of the stage; the range is empty (largest below smallest) where the
-    view asks for no grid marks or all lie outside.
+    The field is the lattice of the stage; the range is empty (largest below smallest) if the
+    view has no grid marks or all are outside.
     """
     pose = view.lattice_pose(artifact)
     if not view.grid or pose.quarter_turns is None:
@@ -40,7 +40,7 @@ def mark_range(artifact: Artifact, view: View) -> tuple[tuple[int, int], tuple[i
 
 
 def expected_marks(artifact: Artifact, view: View) -> tuple[int, int]:
-    """Return how many grid marks and angular lines are to be read in a view."""
+    """Return the numbers of grid marks and angular lines to be read in a view."""
     (m_low, m_high), (n_low, n_high) = mark_range(artifact, view)
     grid = max(m_high - m_low + 1, 0) * max(n_high - n_low + 1, 0)
     return grid, artifact.angular_count if view.angular else 0
@@ -50,8 +50,8 @@ def read_enough(view: View, readings: ViewReadings,
                 min_repeats: int = 0) -> tuple[np.ndarray, np.ndarray]:
     """Return which marks, and which lines, of the readings were read often enough, bool arrays.
 
-    As often as the plan asks; with `min_repeats` also where so many readings are left of as many
-    repeats, the others being outliers.
+    As often as the plan asks; with `min_repeats`, this many good readings suffice once the mark was
+    read as often as the plan asks, outliers included.
     """
     found = []
     for count, tries in _tried(view, readings):
@@ -63,7 +63,7 @@ def read_enough(view: View, readings: ViewReadings,
 
 
 def _tried(view: View, readings: ViewReadings) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return readings and repeats, outliers included, of marks (but check stops) and of lines."""
+    """Return readings and repeats, outliers included, of marks (without check stops) and lines."""
     return [(count, count + outliers if len(outliers) else count) for count, outliers in (
         (count_stops(view, readings)[0], readings.outliers),
         (readings.count_theta, readings.outliers_theta))]
@@ -71,7 +71,7 @@ def _tried(view: View, readings: ViewReadings) -> list[tuple[np.ndarray, np.ndar
 
 def missing_marks(artifact: Artifact, view: View, readings: ViewReadings,
                   min_repeats: int = 0) -> Missing:
-    """Return the first marks, in the order of (m, n) and of k, that were not read often enough."""
+    """Return the first marks, in the order of (m, n) and of k, not read often enough."""
     (m_low, _), (n_low, n_high) = mark_range(artifact, view)
     grid, angular = expected_marks(artifact, view)
     width = max(n_high - n_low + 1, 1)
@@ -91,7 +91,7 @@ def first_missing(done: np.ndarray, total: int) -> np.ndarray:
 
 @dataclass(frozen=True)
 class ViewProgress:
-    """How far a view has come; the fields of selfcal_msgs/ViewStatus."""
+    """Progress of a view; the fields of selfcal_msgs/ViewStatus."""
 
     view_index: int
     view: View
@@ -107,19 +107,19 @@ class ViewProgress:
 
     @property
     def check_expected(self) -> int:
-        """Grid marks that are to be seen from all four sides as well."""
+        """Grid marks to be measured from all four sides as well."""
         return self.view.check_marks if self.view.grid else 0
 
     @property
     def missing(self) -> Missing:
-        """Marks that have not been read as often as the plan asks, at most 200 of each kind."""
+        """Marks not read as often as the plan asks, at most 200 of each kind."""
         if self.artifact is None:
             return Missing()
         return missing_marks(self.artifact, self.view, self.readings, self.min_repeats)
 
     @property
     def needed(self) -> int:
-        """Number of detections without which the view cannot be complete."""
+        """Smallest number of detections needed to complete the view."""
         repeats, have = self.view.repeats, 0
         for count, tries in _tried(self.view, self.readings):
             more = repeats - count
@@ -138,7 +138,7 @@ class ViewProgress:
 
     @property
     def coverage(self) -> float:
-        """Part of the expected marks and checks that are complete, 0..1."""
+        """Fraction of the expected marks and checks that are complete, 0..1."""
         expected = self.grid_expected + self.angular_expected + self.check_expected
         done = self.grid_done + self.angular_done + self.check_done
         return done / expected if expected else 1.0

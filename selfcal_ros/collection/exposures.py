@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where the stage was at each exposure, whether it rested, and from where it had come.
+"""Position of the stage at each exposure, whether it was at rest, and direction of approach.
 
-Each instant of exposure is looked up once the samples beside it have come, and again only if a
-sample or an exposure comes that could change what was found: late ones cost, new ones do not.
+Each instant of exposure is looked up once the samples around it have been received, and again only
+if a later sample or exposure could change the result.
 """
 
 from collections.abc import Iterator
@@ -21,15 +21,15 @@ from selfcal_ros.collection.encoder import (
 from selfcal_ros.collection.samples import NO_STAMPS, GrowingColumns, GrowingTable
 
 MOST_SAMPLES = 300_000
-"""Samples of a joint that are looked at together."""
+"""Largest number of samples of a joint processed together."""
 COLUMNS = {"position": "f8", "reason": "i1", "moving": "?", "first": "i8", "last": "i8"}
-"""What is known of a joint at each instant, and between which stamps its samples decide it."""
+"""Columns of a joint for each instant: result, and the range of stamps that determines it."""
 APPROACH = {"motion": "i1", "approach": "i1"}
-"""The last motion of a linear joint as samples tell it, and the sign with `AS_BEFORE` filled in."""
+"""Columns of a linear joint: the last motion from samples, and with `AS_BEFORE` replaced."""
 NEW = 9
 """Direction of approach of an instant that has not been looked up yet."""
 N_LINEAR = 2
-"""Joints whose direction of approach is known: the first ones."""
+"""Number of joints with a direction of approach, the first ones."""
 
 
 @dataclass(frozen=True)
@@ -52,9 +52,9 @@ class JointAt:
     Attributes
     ----------
     position : float array
-        Indicated position, m or rad; NaN where there is none.
+        Indicated position, m or rad; NaN if none.
     code : int8 array
-        Why the position cannot be used, see `encoder.REASONS`.
+        Why the position is unusable, see `encoder.REASONS`.
     moving : bool array
         Where the joint is known to move, for readings that do not need it.
     """
@@ -96,7 +96,7 @@ class Exposures:
         return len(self._stamps)
 
     def at(self, stamps_ns: np.ndarray) -> StageAt:
-        """Return the stage at some of the instants, in the order that is asked for."""
+        """Return the stage at some of the instants, in the given order."""
         index = self._index(stamps_ns)
         x, y, theta = (JointAt(joint["position"][index], joint["reason"][index],
                                joint["moving"][index]) for joint in self._joints)
@@ -104,7 +104,7 @@ class Exposures:
                                               for joint in self._joints[:2]]))
 
     def _index(self, stamps_ns: np.ndarray) -> np.ndarray | slice:
-        """Return where some of the instants stand; of neighbours as a slice, which copies none."""
+        """Return the indices of some instants; consecutive ones as a slice, to avoid copies."""
         known = self._stamps.rows
         if len(stamps_ns):
             first = int(np.searchsorted(known, stamps_ns[0]))
@@ -114,17 +114,17 @@ class Exposures:
         return np.searchsorted(known, stamps_ns)
 
     def update(self, stamps_ns: np.ndarray) -> np.ndarray:
-        """Take further instants of exposure and what came of the encoder since the last time.
+        """Take further instants of exposure, and the encoder samples since the last call.
 
         Parameters
         ----------
         stamps_ns : int64 array (n,)
-            Instants in any order, known ones among them or not.
+            Instants in any order, including known ones or not.
 
         Returns
         -------
         int64 array (c,)
-            Instants, known before, of which something else is known now.
+            Known instants whose result has changed.
         """
         due = self._due_to_samples()
         if not (stamps_ns[1:] > stamps_ns[:-1]).all():
@@ -139,10 +139,10 @@ class Exposures:
         return self._fill(due, changed)
 
     def _due_to_samples(self) -> np.ndarray:
-        """Return which instants may depend on samples that came since the last time."""
+        """Return which instants may depend on samples since the last call."""
         due = np.zeros(len(self), dtype=bool)
         for joint, track in zip(self._joints, self._tracks, strict=True):
-            new = track.store.new_stamps()  # one without samples waits for its own
+            new = track.store.new_stamps()  # a joint without samples waits for its own
             first, last = joint["first"], joint["last"]
             if len(new) and len(due):
                 near = np.flatnonzero((last >= new[0]) & (first <= new[-1]))
@@ -151,7 +151,7 @@ class Exposures:
         return due
 
     def _insert(self, stamps_ns: np.ndarray, due: np.ndarray) -> np.ndarray:
-        """Add the instants that are new; return `due` with them and with those behind them."""
+        """Add new instants; return `due` with them and the following ones."""
         known = self._stamps.rows
         at = np.searchsorted(known, stamps_ns)
         fresh = np.ones(len(stamps_ns), dtype=bool)
@@ -159,11 +159,11 @@ class Exposures:
         fresh[inside] = known[at[inside]] != stamps_ns[inside]
         at, stamps_ns = at[fresh], stamps_ns[fresh]
         behind = at[at < len(known)]
-        due[behind] = True  # the time since the exposure before is another one
+        due[behind] = True  # the time since the previous exposure has changed
         self._stamps.insert(at, stamps_ns)
         for joint in self._joints:
             joint.insert(at, {"first": NEVER, "last": EVER, "approach": NEW})
-        if not len(behind):  # as a rule, and faster
+        if not len(behind):  # usual case, faster
             return np.append(due, np.ones(len(at), dtype=bool))
         return np.insert(due, at, True)
 
@@ -173,10 +173,10 @@ class Exposures:
                 for name in ("position", "reason", "moving")]
 
     def _groups(self, due: np.ndarray) -> list[np.ndarray]:
-        """Return the instants that are due in groups with few enough samples each, (n,) each.
+        """Return the due instants in groups with a limited number of samples, (n,) each.
 
-        Where halves have as many samples beside them as the whole, as in a session that came
-        shuffled from end to end, a group stays whole.
+        If halves need as many samples as the whole, as in a completely shuffled session, a group
+        is not split.
         """
         groups, waiting = [], [(due, np.inf)] if len(due) else []
         while waiting:
@@ -191,7 +191,7 @@ class Exposures:
         return groups
 
     def _since(self, index: np.ndarray) -> np.ndarray:
-        """Return from when on a motion before each instant is looked for."""
+        """Return the beginning of the search for a motion before each instant."""
         stamps = self._stamps.rows
         earliest = np.maximum(stamps[index], NEVER + LOOK_BACK_NS) - LOOK_BACK_NS
         before = np.where(index > 0, stamps[np.maximum(index - 1, 0)], NEVER)
@@ -201,7 +201,7 @@ class Exposures:
         return int(self._since(group[:1])[0]), int(self._stamps.rows[group[-1]])
 
     def _look_up(self, group: np.ndarray) -> None:
-        """Look up a group of instants, all that lie between its ends."""
+        """Look up a group of instants, all between its ends."""
         start, end = self._window(group)
         index = np.arange(group[0], group[-1] + 1)
         here = slice(group[0], group[-1] + 1)
@@ -221,16 +221,16 @@ class Exposures:
         stamps, first = self._stamps.rows, index[0]
         if first == 0:
             return series.approach(stamps[index], position, threshold=self._threshold_m)
-        # behind the exposure before, whose own samples may not all be here
+        # after the previous exposure, whose own samples may be incomplete here
         both = np.concatenate([stamps[first - 1:first], stamps[index]])
         return series.approach(both, np.concatenate([[np.nan], position]),
                                threshold=self._threshold_m)[1:]
 
     def _fill(self, due: np.ndarray, changed: np.ndarray) -> np.ndarray:
-        """Work out the directions of approach; return the stamps of what has changed."""
+        """Compute the directions of approach; return the stamps of changes."""
         if not due.any():
             return NO_STAMPS
-        start = int(due.argmax())  # what is before the first that was looked up stays as it is
+        start = int(due.argmax())  # nothing changes before the first one looked up
         changed, known = changed[start:], np.zeros(0, dtype=bool)
         for joint in self._joints[:N_LINEAR]:
             old = joint["approach"][start:]
@@ -243,6 +243,6 @@ class Exposures:
 
 
 def _differ(before: list[np.ndarray], after: list[np.ndarray]) -> np.ndarray:
-    """Return at which instants something else is told; NaN is equal to NaN."""
+    """Return the instants with a changed result; NaN equals NaN."""
     return np.array([(a != b) & ((a == a) | (b == b))
                      for a, b in zip(before, after, strict=True)]).any(axis=0)

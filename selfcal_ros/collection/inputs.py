@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The inputs of a calibration, free of any middleware, and why one is rejected.
+"""The inputs of a calibration, without middleware, and the reasons of rejection.
 
-What a message may claim is checked here, before anything is allocated for it. Stamps are integer
+The content of messages is validated here, before memory is allocated for it. Stamps are integer
 nanoseconds.
 """
 
@@ -20,24 +20,24 @@ from selfcal_ros.topics import MEASUREMENT_TOPIC
 from selfcal_ros.units import NS_PER_S
 
 MAX_REPEATS = 1_000_000
-"""Repeats of a mark in a view."""
+"""Largest number of repeats of a mark in a view."""
 SITES_A_MARK = 1000
-"""Sites of the plate for each mark that was read, above which a plate cannot be calibrated."""
+"""Number of sites per mark read above which a plate cannot be calibrated."""
 LARGEST, LARGEST_OFFSET = 1e3, 100.0
-"""Deviation or uncertainty, and offset of a single detection, m or rad, beyond which nobody has
-measured anything: with the 10 m that the stage may be off, deviations stay below the former."""
+"""Largest valid deviation or uncertainty, and offset of a single detection, m or rad: with a
+stage off by up to 10 m, deviations stay below the former."""
 SMALLEST_SIGMA = 1e-12
-"""Standard uncertainty of a detection, m or rad, that nobody reaches; 0 = not known."""
+"""Smallest valid standard uncertainty of a detection, m or rad; 0 = unknown."""
 SMALLEST_U = SMALLEST_SIGMA / math.sqrt(MAX_REPEATS)
-"""The same of a mean."""
+"""The same for a mean."""
 SIGMA_SPAN = 1e4
-"""How far below the median of its view a declared sigma may lie: a reading of more weight would
-decide by itself, and the readings no longer tell the map."""
+"""Smallest ratio of a declared sigma to the median of its view: a reading of larger weight would
+dominate the map."""
 MAX_AHEAD_NS = 60 * NS_PER_S
-"""How far a stamp may lie ahead of the clock of the node that gets it: beyond that it would hide
-what is stamped later by a clock that is right."""
+"""Largest lead of a stamp over the clock of the receiving node: beyond, it would hide
+later messages stamped by a correct clock."""
 MAX_EXPOSURES = 5_000_000
-"""Exposures of one view that the simulated cell holds: 240 MB."""
+"""Largest number of exposures of a view in the simulated cell: 240 MB."""
 DETECTION = np.dtype([
     ("stamp", "i8"), ("kind", "u1"), ("has_id", "?"), ("m", "i8"), ("n", "i8"), ("k", "i8"),
     ("ox", "f8"), ("oy", "f8"), ("ot", "f8"), ("sigma", "f8"), ("score", "f8")])
@@ -45,14 +45,14 @@ DETECTION = np.dtype([
 
 
 class Kind(IntEnum):
-    """What was detected; values of selfcal_msgs/MarkDetection."""
+    """Kind of a detection; values of selfcal_msgs/MarkDetection."""
 
     GRID = 0
     ANGULAR = 1
 
 
 class Phase(IntEnum):
-    """What a command asks for; values of selfcal_msgs/ViewCommand."""
+    """Phase of a command; values of selfcal_msgs/ViewCommand."""
 
     PLACE = 0
     MEASURE = 1
@@ -72,7 +72,7 @@ class EncoderSample:
 
 @dataclass(frozen=True, slots=True)
 class Detection:
-    """One mark seen; fields as in selfcal_msgs/MarkDetection (m, rad, stage axes)."""
+    """One detected mark; fields as in selfcal_msgs/MarkDetection (m, rad, stage axes)."""
 
     stamp_ns: int
     kind: int
@@ -91,7 +91,7 @@ class Detection:
 class Command:
     """One view command. `artifact` and `view` are None for DONE and ABORT.
 
-    `model_terms` are those that the plan wants estimated with the map, as it writes them.
+    `model_terms` are the terms of the plan to be estimated with the map, as text.
     """
 
     stamp_ns: int
@@ -105,7 +105,7 @@ class Command:
     model_terms: tuple[str, ...] = ()
 
     def placed(self) -> View:
-        """Return the view that a PLACE or MEASURE names.
+        """Return the view of a PLACE or MEASURE.
 
         Raises
         ------
@@ -117,7 +117,7 @@ class Command:
         return self.view
 
     def plate(self) -> Artifact:
-        """Return the plate that a PLACE or MEASURE names.
+        """Return the plate of a PLACE or MEASURE.
 
         Raises
         ------
@@ -130,14 +130,14 @@ class Command:
 
 
 def begun_ns(run_id: str) -> int | None:
-    """Return when a run began, by its name; None where the name is no stamp."""
+    """Return the beginning of a run from its name; None if the name is not a stamp."""
     return int(run_id) if run_id.isascii() and run_id.isdecimal() and len(run_id) <= 20 else None
 
 
 def check_command(command: Command) -> None:
-    """Raise InputError for a command that no cell can follow.
+    """Raise InputError for an impossible command.
 
-    It has a pose off the lattice, asks for no marks, or a number in it cannot be meant.
+    It has a pose off the lattice, asks for no marks, or contains an absurd number.
     """
     where = f"view command {command.view_index}"
     if not 0 <= command.view_index <= MAX_VIEWS or not 0 <= command.views_planned <= MAX_VIEWS:
@@ -159,7 +159,7 @@ def check_command(command: Command) -> None:
 
 
 def check_view(readings: ViewReadings, artifact: Artifact, view_index: int) -> None:
-    """Raise InputError for readings of a view that cannot be, or of marks that are not there."""
+    """Raise InputError for invalid readings of a view, or of marks that do not exist."""
     where = f"{MEASUREMENT_TOPIC} of '{readings.view.name}'"
     if not 0 <= view_index <= MAX_VIEWS:
         raise InputError(where, f"a plan has at most {MAX_VIEWS} views", "correct the view_index")
@@ -181,9 +181,9 @@ def check_view(readings: ViewReadings, artifact: Artifact, view_index: int) -> N
 
 
 def good_sigmas(sigma: np.ndarray) -> np.ndarray:
-    """Return which of the sigmas of a view's detections of one kind can be used, bool array (n,).
+    """Return which sigmas of a view's detections of one kind are usable, bool array (n,).
 
-    A collector takes no others, so that a solver can use what it gives.
+    A collector accepts no others, so that a solver can use its output.
     """
     known = (sigma >= SMALLEST_SIGMA) & (sigma <= LARGEST)
     least = np.median(sigma[known]) / SIGMA_SPAN if known.any() else 0.0
@@ -192,7 +192,7 @@ def good_sigmas(sigma: np.ndarray) -> np.ndarray:
 
 def _check_values(where: str, table: ViewReadings | GridVisits, told: Iterable[str],
                   perhaps: Iterable[str]) -> None:
-    """Raise InputError for values that are enormous, or NaN where they have to be told."""
+    """Raise InputError for values that are too large, or NaN where required."""
     for name in (*told, *perhaps):
         size = np.abs(getattr(table, name))
         if np.any(size > LARGEST) or (name in told and np.isnan(size).any()):
@@ -202,7 +202,7 @@ def _check_values(where: str, table: ViewReadings | GridVisits, told: Iterable[s
 
 
 def check_plate(artifact: Artifact, views: Iterable[ViewReadings]) -> None:
-    """Raise InputError for a plate that is enormous beside the marks that were read of it."""
+    """Raise InputError for a plate that is too large for the marks read."""
     marks, sites = sum(len(view.m) for view in views), math.prod(artifact.shape)
     if sites > SITES_A_MARK * (1 + marks):
         raise InputError(MEASUREMENT_TOPIC, f"{marks} readings of a plate with {sites} marks",
@@ -210,11 +210,11 @@ def check_plate(artifact: Artifact, views: Iterable[ViewReadings]) -> None:
 
 
 def check_simulated(command: Command) -> None:
-    """Raise InputError for a view that no cell can follow, or too large for a simulated one."""
+    """Raise InputError for an impossible view, or one too large for a simulated cell."""
     check_command(command)
     view, artifact = command.view, command.artifact
     if view is None or artifact is None:
-        return  # DONE or ABORT: nothing is simulated
+        return  # DONE or ABORT: nothing to simulate
     exposures = max(math.prod(artifact.shape), artifact.angular_count) * view.repeats
     if exposures > MAX_EXPOSURES:
         raise InputError(f"view command {command.view_index}", f"{exposures} exposures are beyond "
@@ -263,7 +263,7 @@ ADVICE = {
     Reason.FUTURE: "they were stamped more than a minute ahead of the collector's clock; set the "
                    "clock that stamps them",
 }
-"""What to do about a reason of which a single detection is worth a line."""
+"""Remedies for reasons reported even for a single detection."""
 
 REMEDY = {
     Reason.NO_ENCODER: "the encoder has a gap around the exposures; let it send without gaps, or "
@@ -297,10 +297,10 @@ REMEDY = {
     Reason.OUTLIER: "repeats of a mark contradict each other; check that each id is of one mark, "
                     "or raise outlier_limit",
 }
-"""What to do when most detections are rejected for a reason; reasons not listed are not faults."""
+"""Remedies if most detections are rejected for a reason; reasons not listed are not faults."""
 
 
 def advice(rejected: Mapping[str, int]) -> list[str]:
-    """Return one line for each reason in `rejected` that has an advice, with its count."""
+    """Return one line for each reason in `rejected` with advice, with its count."""
     return [f"{count} detection{'s' * (count != 1)} rejected as {reason}: {text}"
             for reason, text in ADVICE.items() if (count := rejected.get(reason))]

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """From the detections of one view to its readings: a pure function of their set.
 
-Rejected grid detections are kept with the position of the stage, which may point at dirt.
+Rejected grid detections are kept with the position of the stage, which may indicate dirt.
 """
 
 from collections import Counter
@@ -30,7 +30,7 @@ from selfcal_ros.model.view import View
 
 @dataclass(frozen=True)
 class Rules:
-    """Everything that decides how detections become readings."""
+    """All settings for the conversion of detections to readings."""
 
     sense: Sense
     identity: IdentityRules
@@ -39,7 +39,7 @@ class Rules:
 
 
 class PlaceList:
-    """Gathers the rejected detections of a view with the indicated position at each."""
+    """Collects the rejected detections of a view with the indicated positions."""
 
     def __init__(self, before: RejectedPlaces | None = None) -> None:
         before = before or RejectedPlaces()
@@ -52,7 +52,7 @@ class PlaceList:
         self._at.append(at_m)
 
     def places(self) -> RejectedPlaces:
-        """Return the places; of more than `RejectedPlaces.MOST` an even choice."""
+        """Return the positions; if more than `RejectedPlaces.MOST`, an even selection."""
         reason, at = np.concatenate(self._reason), np.concatenate(self._at, axis=1)
         if len(reason) > RejectedPlaces.MOST:
             chosen = np.linspace(0, len(reason) - 1, RejectedPlaces.MOST).round().astype(int)
@@ -61,9 +61,9 @@ class PlaceList:
 
 
 def canonical(detections: np.ndarray) -> np.ndarray:
-    """Return the detections with one form for all that mean the same, structured array (n,).
+    """Return the detections in canonical form, structured array (n,).
 
-    What a kind does not use is 0, and so are ids that are not told; -0.0 and 0.0 are one number.
+    Fields that a kind does not use are 0, and so are missing ids; -0.0 becomes 0.0.
     """
     d = detections.copy()
     grid, angular = d["kind"] == Kind.GRID, d["kind"] == Kind.ANGULAR
@@ -78,16 +78,16 @@ def canonical(detections: np.ndarray) -> np.ndarray:
 
 def clean(detections: np.ndarray, rules: Rules, *, scored: bool,
           ) -> tuple[np.ndarray, Counter]:
-    """Return the usable detections in canonical order, each once, and the reasons of the rest.
+    """Return usable detections in canonical order, each once, and reasons of rejection.
 
     Parameters
     ----------
     detections : structured array of `DETECTION`
-        In any order, as `canonical` returns them.
+        In any order, from `canonical`.
     rules : Rules
         Limits.
     scored : bool
-        Whether scores are reported at all (any detection of the session has one above 0).
+        Whether scores are reported (any detection of the session has one above 0).
     """
     rejected: Counter = Counter()
     known = (detections["kind"] == Kind.GRID) | (detections["kind"] == Kind.ANGULAR)
@@ -118,7 +118,7 @@ def clean(detections: np.ndarray, rules: Rules, *, scored: bool,
 
 def with_low_scores(readings: ViewReadings, detections: np.ndarray, *, exposures: Exposures,
                     rules: Rules) -> ViewReadings:
-    """Return `readings` with the places of grid detections that went for their score."""
+    """Return `readings` with the positions of grid detections rejected for a low score."""
     low = detections[(detections["kind"] == Kind.GRID) & (detections["score"] < rules.min_score)]
     if not len(low):
         return readings
@@ -129,9 +129,9 @@ def with_low_scores(readings: ViewReadings, detections: np.ndarray, *, exposures
 
 
 def _canonical(d: np.ndarray) -> np.ndarray:
-    """Return the detections in the order of all their fields, each once: `numpy.unique`, faster."""
+    """Return the detections sorted by all fields, without duplicates: a faster `numpy.unique`."""
     step = np.diff(d["stamp"])
-    if (step > 0).all():  # as they come
+    if (step > 0).all():  # in order of arrival
         return d
     d = d[np.argsort(d["stamp"], kind="stable")]
     same = d["stamp"][1:] == d["stamp"][:-1]
@@ -146,7 +146,7 @@ def reduce_view(artifact: Artifact, view: View, detections: np.ndarray, *,
                 exposures: Exposures, rules: Rules) -> ViewReadings:
     """Return the readings of one view from its cleaned detections (see `clean`).
 
-    `exposures` hold the stage at the instants of at least these detections.
+    `exposures` contain the stage at the instants of at least these detections.
     """
     rejected: Counter = Counter()
     grid = _where(detections["kind"] == Kind.GRID, detections)
@@ -162,8 +162,8 @@ def reduce_view(artifact: Artifact, view: View, detections: np.ndarray, *,
 class _GridMarks:
     """Grid detections whose marks are known: arrays (n,) and (2, n) in their order.
 
-    `position` is where the stage stood, `approach` from where it had come; `phi_rad` is the view's
-    rotation if the marks tell it.
+    `position` is that of the stage, `approach` its direction of approach; `phi_rad` is the view's
+    rotation if known from the marks.
     """
 
     detections: np.ndarray
@@ -177,7 +177,7 @@ class _GridMarks:
 
 def _grid_marks(artifact: Artifact, view: View, d: np.ndarray, *, exposures: Exposures,
                 rules: Rules, rejected: Counter, places: PlaceList) -> _GridMarks:
-    """Find the marks of grid detections; what has none is counted, and where the stage stood."""
+    """Identify the marks of grid detections; count the others, with the stage positions."""
     stage = exposures.at(d["stamp"])
     position = np.stack([stage.x.position, stage.y.position])
     why = _reasons((stage.x, stage.y), (stage.theta,))
@@ -229,7 +229,7 @@ def _reduce_angular(artifact: Artifact, view: View, d: np.ndarray, exposures: Ex
                     rules: Rules, rejected: Counter, phi: float | None) -> dict:
     stage = exposures.at(d["stamp"])
     why = _reasons((stage.theta,), (stage.x, stage.y))
-    # beyond half a turn an offset cannot be a valid observation, though it may wrap to a small one
+    # an offset beyond half a turn is invalid, though it may wrap to a small one
     why[(why == None) & (np.abs(d["ot"]) > np.pi)] = Reason.TOO_FAR  # noqa: E711
     d, (theta,) = _keep(d, why, rejected, stage.theta.position)
     found = identify_angular(artifact, view, _reading(rules.sense, theta, d["ot"]), ids=d["k"],
@@ -239,7 +239,7 @@ def _reduce_angular(artifact: Artifact, view: View, d: np.ndarray, exposures: Ex
     means = reduce_repeats(k, v[None], d["sigma"], limit=rules.outlier_limit,
                            extent=4 * np.pi, residual=rest[None])
     _count(rejected, Reason.OUTLIER, means.outlier)
-    place = wrap(v - d["ot"])  # of the axis from the line, so that no turn is in it
+    place = wrap(v - d["ot"])  # of the axis relative to the line, without full turns
     motion = repeat_motion(k, place[None], d["ot"][None], means.outlier)
     return {"k": means.key.astype(np.int64), "dtheta": means.mean[0], "count_theta": means.count,
             "u_theta": means.u, "sigma_theta": means.sigma, "dof_theta": means.dof,
@@ -247,7 +247,7 @@ def _reduce_angular(artifact: Artifact, view: View, d: np.ndarray, exposures: Ex
 
 
 def _outliers_of(means: Means, key: np.ndarray) -> np.ndarray:
-    """Return how many outliers each mark has that has a mean, int array."""
+    """Return the number of outliers of each mark with a mean, int array."""
     marks = np.append(means.key, -1)
     place = np.searchsorted(means.key, key[means.outlier])
     place = place[marks[place] == key[means.outlier]]
@@ -256,14 +256,14 @@ def _outliers_of(means: Means, key: np.ndarray) -> np.ndarray:
 
 def _reading(sense: Sense, position: np.ndarray,
              offset: np.ndarray | float) -> np.ndarray:
-    """Return where the mark lies: over a moved microscope, or on a moved plate (method 1)."""
+    """Return the position of the mark, for a moving microscope or a moving plate (method 1)."""
     return offset - position if sense is Sense.PLATE_MOVES else position + offset
 
 
 def _reasons(needed: Sequence[JointAt], others: Sequence[JointAt]) -> np.ndarray:
-    """Return the first reason of each detection, None where there is none: each counts once.
+    """Return the first reason of each detection, or None: each counts once.
 
-    Of the `needed` joints the position must be known, the others must not move.
+    The position of `needed` joints must be known, the others must not move.
     """
     codes = needed[0].code
     for joint in needed[1:]:
@@ -274,7 +274,7 @@ def _reasons(needed: Sequence[JointAt], others: Sequence[JointAt]) -> np.ndarray
 
 
 def _where(good: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """Return some of the rows; all of them as they are, without a copy."""
+    """Return some of the rows; all of them without a copy."""
     return rows if good.all() else rows[good]
 
 
@@ -282,7 +282,7 @@ def _keep(d: np.ndarray, reasons: np.ndarray, rejected: Counter, *values: np.nda
           places: PlaceList | None = None) -> tuple[np.ndarray, list[np.ndarray]]:
     """Return detections and values (n,) or (k, n) without the rejected ones, which are counted.
 
-    Where the stage stood at these, the first of the values, goes to `places`.
+    Their stage positions, the first of the values, go to `places`.
     """
     good = reasons == None  # noqa: E711
     if good.all():
@@ -299,13 +299,13 @@ def _count(rejected: Counter, reason: Reason, mask: np.ndarray) -> None:
 
 
 def with_places(result: CalibrationResult, views: Iterable[ViewReadings]) -> CalibrationResult:
-    """Return the result with the places of rejected detections, where there are any."""
+    """Return the result with the positions of rejected detections, if any."""
     places = places_json(views)
     return replace(result, extra={**result.extra, "rejected_at": places}) if places else result
 
 
 def places_json(views: Iterable[ViewReadings]) -> list[dict[str, Any]]:
-    """Return the places for ``extra["rejected_at"]`` of a result: a row a view, m."""
+    """Return the positions for ``extra["rejected_at"]`` of a result: one row per view, m."""
     return [{"view": view.view.name, "reason": list(view.places.reason),
              "x": view.places.x.round(6), "y": view.places.y.round(6)}
             for view in views if view.places.reason]

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Encoder samples of one joint for a whole shift: in any order, all of them, in bounded memory.
+"""All encoder samples of one joint for a whole shift, in any order, in bounded memory.
 
-Samples stand in blocks of rising stamps. The newest blocks are in memory; older ones go to a
-temporary file without a name, from where a message that comes very late can still have its
-neighbours. The answer is always that of the whole set, in whatever order it came.
+Samples are stored in blocks of rising stamps. The newest blocks are in memory; older ones go to an
+unnamed temporary file, from which a very late message can still get its
+neighbours. The result is always that of the whole set, in any order of arrival.
 """
 
 import io
@@ -18,18 +18,18 @@ import numpy as np
 
 NO_STAMPS = np.zeros(0, dtype=np.int64)
 LARGE_TEMPORARY = Path("/var/tmp")
-"""Where large temporary files belong: /tmp may lie in memory."""
+"""Folder for large temporary files: /tmp may be in memory."""
 Samples = tuple[np.ndarray, np.ndarray, np.ndarray]
-"""Stamps (int64, ns), positions and speeds (float; NaN = not told)."""
+"""Stamps (int64, ns), positions and speeds (float; NaN = unknown)."""
 
 
 class GrowingTable:
-    """Rows of a structured type."""
+    """Growing rows of a structured type."""
 
     def __init__(self, dtype: np.dtype) -> None:
         self._room = np.zeros(64, dtype=dtype)
-        self._count = 0  # of the rows in the room
-        self._waiting: list[np.ndarray] = []  # for a look at the rows, which makes room for them
+        self._count = 0  # of the rows in the buffer
+        self._waiting: list[np.ndarray] = []  # pending until rows are accessed
 
     def __len__(self) -> int:
         """Return the number of rows."""
@@ -37,7 +37,7 @@ class GrowingTable:
 
     @property
     def rows(self) -> np.ndarray:
-        """The rows, as a view that may be written to; valid until rows are added."""
+        """The rows, as a writable view; valid until rows are added."""
         total = len(self)
         if total > len(self._room):
             room = np.empty(max(total, 2 * len(self._room)), dtype=self._room.dtype)
@@ -45,17 +45,17 @@ class GrowingTable:
             self._room = room
         self._waiting.reverse()
         while self._waiting:
-            rows = self._waiting.pop()  # and its memory is free
+            rows = self._waiting.pop()  # and its memory is freed
             self._room[self._count:self._count + len(rows)] = rows
             self._count += len(rows)
         return self._room[:self._count]
 
     def append(self, rows: np.ndarray) -> None:
-        """Add rows at the end; they are the table's from now on, not to be written to."""
+        """Append rows; they are owned by the table afterwards and must not be written to."""
         self._waiting.append(rows)
 
     def insert(self, at: np.ndarray, rows: np.ndarray) -> None:
-        """Add rows in front of the rows `at` (rising), as `numpy.insert` does."""
+        """Insert rows before the rows `at` (rising), like `numpy.insert`."""
         if not len(rows) or at[0] == len(self):
             self.append(rows)
             return
@@ -64,7 +64,7 @@ class GrowingTable:
 
 
 class GrowingColumns:
-    """Columns that grow together, each by itself in memory: to look at one costs no other.
+    """Columns that grow together, each separate in memory.
 
     Parameters
     ----------
@@ -76,18 +76,18 @@ class GrowingColumns:
         self._columns = {name: GrowingTable(np.dtype(kind)) for name, kind in kinds.items()}
 
     def __getitem__(self, name: str) -> np.ndarray:
-        """Return a column, as a view that may be written to; valid until rows are added."""
+        """Return a column, as a writable view; valid until rows are added."""
         return self._columns[name].rows
 
     def insert(self, at: np.ndarray, values: Mapping[str, float]) -> None:
-        """Add rows with the same values in front of the rows `at` (rising); unnamed ones are 0."""
+        """Insert rows with the same values before the rows `at` (rising); unnamed columns are 0."""
         for name, column in self._columns.items():
             column.insert(at, np.full(len(at), values.get(name, 0), dtype=column.rows.dtype))
 
 
 @dataclass(frozen=True)
 class Limits:
-    """Samples of a block, and blocks that are kept in memory."""
+    """Samples per block, and blocks kept in memory."""
 
     block: int = 65_536
     in_memory: int = 6
@@ -95,7 +95,7 @@ class Limits:
 
 @dataclass(frozen=True)
 class _Block:
-    """Samples with rising stamps, in memory or at a place in the file; `speeds` may be none."""
+    """Samples with rising stamps, in memory or in the file; `speeds` may be None."""
 
     first_ns: int
     last_ns: int
@@ -111,9 +111,9 @@ class SampleStore:
     Attributes
     ----------
     newest_ns : int
-        Largest stamp of the samples that came in blocks.
+        Largest stamp of the samples added in blocks.
     problem : str
-        Why blocks stay in memory that should not; empty while the file can be written.
+        Why blocks stay in memory beyond the limit; empty while the file can be written.
     """
 
     def __init__(self, limits: Limits | None = None) -> None:
@@ -126,7 +126,7 @@ class SampleStore:
         self._unseen: list[np.ndarray] = []
         self._count, self._end = 0, 0
         self._file: io.FileIO | None = None
-        self._read: tuple[_Block, tuple[np.ndarray, ...]] | None = None  # the block read last
+        self._read: tuple[_Block, tuple[np.ndarray, ...]] | None = None  # the last block read
         self.newest_ns, self.problem = int(np.iinfo(np.int64).min), ""
 
     def __len__(self) -> int:
@@ -134,7 +134,7 @@ class SampleStore:
         return self._count + len(self._single[0])
 
     def add(self, stamp_ns: int, position: float, speed: float) -> None:
-        """Add one sample; `speed` is NaN where the encoder does not tell it."""
+        """Add one sample; `speed` is NaN if unknown."""
         stamps, positions, speeds = self._single
         stamps.append(stamp_ns)
         positions.append(position)
@@ -142,7 +142,7 @@ class SampleStore:
 
     def add_block(self, stamps_ns: np.ndarray, positions: np.ndarray,
                   speeds: np.ndarray | None = None) -> None:
-        """Add samples in any order; `speeds` None or NaN where they are not told."""
+        """Add samples in any order; `speeds` None or NaN if unknown."""
         self._flush()
         self._append(np.asarray(stamps_ns), np.asarray(positions), speeds)
 
@@ -153,20 +153,20 @@ class SampleStore:
             self._append(stamps, positions, speeds)
 
     def _empty(self) -> Samples:
-        """Return the columns of a block that has no samples yet, and no pages before it has."""
+        """Return the columns of an empty block, without memory pages until it is filled."""
         size = self._limits.block
         return np.empty(size, dtype=np.int64), np.empty(size), np.empty(size)
 
     def _append(self, stamps: np.ndarray, positions: np.ndarray,
                 speeds: np.ndarray | None) -> None:
-        """Fill the open block, closing it whenever it is full."""
+        """Fill the open block, and close it when full."""
         start = 0
         while start < len(stamps):
             taken = min(self._limits.block - self._filled, len(stamps) - start)
             here, part = (slice(at, at + taken) for at in (self._filled, start))
             t = self._filling[0][here]
             t[:] = stamps[part]
-            np.add(positions[part], 0.0, out=self._filling[1][here])  # -0.0 and 0.0 sort alike
+            np.add(positions[part], 0.0, out=self._filling[1][here])  # -0.0 and 0.0 sort as equal
             self._filling[2][here] = np.nan if speeds is None else speeds[part]
             self._rising &= bool(t[0] >= self._last_ns and (t[1:] >= t[:-1]).all())
             self._last_ns = max(self._last_ns, int(t[-1]))
@@ -183,7 +183,7 @@ class SampleStore:
         filled = tuple(column[:self._filled] for column in self._filling)
         if not self._rising:
             order = np.argsort(filled[0], kind="stable")
-            self._filling = self._empty()  # what was returned before stays as it is
+            self._filling = self._empty()  # arrays returned before are unchanged
             for column, old in zip(self._filling, filled, strict=True):
                 column[:self._filled] = old[order]
             self._rising, self._last_ns = True, int(self._filling[0][self._filled - 1])
@@ -226,7 +226,7 @@ class SampleStore:
         self._end += sum(column.nbytes for column in block.columns)
 
     def _columns(self, block: _Block) -> tuple[np.ndarray, ...]:
-        """Return the columns of a block, read back if it is not in memory."""
+        """Return the columns of a block, read back if not in memory."""
         if block.columns:
             return block.columns
         if self._read is None or self._read[0] is not block:
@@ -247,7 +247,7 @@ class SampleStore:
                      for at, kind in enumerate(kinds))
 
     def new_stamps(self) -> np.ndarray:
-        """Return the stamps that were added since the last call, rising."""
+        """Return the stamps added since the last call, rising."""
         self._flush()
         unseen, self._unseen = self._unseen, []
         stamps = np.concatenate([NO_STAMPS, *unseen])
@@ -262,7 +262,7 @@ class SampleStore:
         return (min(e[0] for e in ends), max(e[1] for e in ends)) if ends else None
 
     def count_between(self, start_ns: int, end_ns: int) -> int:
-        """Return about how many samples lie between two stamps; never fewer than there are."""
+        """Return an upper estimate of the number of samples between two stamps."""
         self._flush()
         stamps = self._open()[0]
         inside = int(np.searchsorted(stamps, end_ns, "right") - np.searchsorted(stamps, start_ns))
@@ -275,9 +275,9 @@ class SampleStore:
     def near(self, start_ns: int, end_ns: int, beside: int) -> Samples:
         """Return the samples from `start_ns` to `end_ns`, and their neighbours, in any order.
 
-        Of each side at least the `beside` nearest stamps are there with all of their samples, or
-        as many as exist. Samples that came in the order of their stamps are returned in it. What
-        is returned may be the store's own: it is not to be written to.
+        On each side at least the `beside` nearest stamps are included with all of their samples,
+        or as many as exist. Samples received in the order of their stamps keep it. The result
+        may be owned by the store and must not be written to.
         """
         self._flush()
         open_samples = self._open()
@@ -304,13 +304,13 @@ def _joined(parts: list[Samples]) -> Samples:
 
 
 def _with_speeds(columns: tuple[np.ndarray, ...]) -> Samples:
-    """Return samples from their columns; speeds that were not told are NaN."""
+    """Return samples from their columns; unknown speeds are NaN."""
     stamps, positions, *speeds = columns
     return stamps, positions, speeds[0] if speeds else np.full(len(stamps), np.nan)
 
 
 def _nth(parts: list[Samples], edge: int, sign: int, n: int) -> float:
-    """Return sign times the n-th stamp before or behind an edge, infinity if there are fewer."""
+    """Return sign times the n-th stamp before or after an edge, infinity if there are fewer."""
     beyond = [t[:np.searchsorted(t, edge)] if sign < 0 else t[np.searchsorted(t, edge, "right"):]
               for t, _, _ in parts]
     stamps = np.unique(sign * np.concatenate([NO_STAMPS, *beyond]))
@@ -328,7 +328,7 @@ def _cut(columns: tuple[np.ndarray, ...], start_ns: int, end_ns: int, beside: in
 
 
 def _reach(stamps: np.ndarray, n: int) -> int:
-    """Return how many of the samples to take from the front to have n whole stamps."""
+    """Return the number of samples from the front that contain n complete stamps."""
     take = 2 * n
     while take < len(stamps):
         change = np.flatnonzero(stamps[1:take] != stamps[:take - 1])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The sequencer's state machine: which command comes next, without ROS and without a clock."""
+"""The sequencer's state machine: the next command, without ROS and clock."""
 
 from dataclasses import dataclass
 from enum import StrEnum
@@ -10,7 +10,7 @@ from selfcal_ros.model.view import Plan
 
 
 class State(StrEnum):
-    """What the sequencer is doing."""
+    """State of the sequencer."""
 
     IDLE = "idle"
     PLACING = "waiting for the plate to be placed"
@@ -25,9 +25,9 @@ ENDED = (State.IDLE, State.DONE, State.ABORTED)
 
 @dataclass
 class Sequencer:
-    """Leads through a plan: PLACE, wait for confirmation, MEASURE, wait for completion, DONE.
+    """Steps through a plan: PLACE, wait for confirmation, MEASURE, wait for completion, DONE.
 
-    Every method that moves on returns the commands to publish, with stamp 0: the caller stamps
+    Every transition returns the commands to publish, with stamp 0: the caller stamps
     them. Requests that do not fit the state raise InputError and change nothing.
 
     Attributes
@@ -35,7 +35,7 @@ class Sequencer:
     plan : Plan or None
         Plan to run.
     state : State
-        Where it is.
+        Present state.
     index : int
         Current view.
     skipped : list of str
@@ -60,7 +60,7 @@ class Sequencer:
         return self._place()
 
     def resume(self, index: int, phase: Phase) -> Command:
-        """Take up a run at the view and the command (PLACE or MEASURE) that it had reached."""
+        """Resume a run at the view and the command (PLACE or MEASURE) that it had reached."""
         if self.state not in ENDED:
             raise InputError("pose_sequencer", f"cannot resume while {self.state}",
                              "abort the plan first")
@@ -76,26 +76,26 @@ class Sequencer:
         return self.plan
 
     def confirm(self) -> list[Command]:
-        """Take the plate as placed: measure."""
+        """Measure: the plate is placed."""
         self._need(State.PLACING, "confirm_view")
         self.state = State.MEASURING
         return [self._command(Phase.MEASURE)]
 
     def status(self, plan_id: str, view_index: int, complete: bool) -> list[Command]:
-        """Move on when the current view is complete; anything else is ignored."""
+        """Continue when the current view is complete; other statuses are ignored."""
         current = (self.state is State.MEASURING and self.plan is not None
                    and plan_id == self.plan.plan_id and view_index == self.index)
         return self._advance() if current and complete else []
 
     def redo(self) -> list[Command]:
-        """Place the current view again; what was read of it is superseded."""
+        """Place the current view again, superseding its readings."""
         if self.state not in (State.PLACING, State.MEASURING):
             raise InputError("pose_sequencer", f"nothing to redo while {self.state}",
                              "start a plan first")
         return self._place()
 
     def skip(self) -> list[Command]:
-        """Leave the current view as it is and go on with the next."""
+        """Keep the current view as it is and continue with the next."""
         if self.state not in (State.PLACING, State.MEASURING):
             raise InputError("pose_sequencer", f"nothing to skip while {self.state}",
                              "start a plan first")
@@ -103,10 +103,10 @@ class Sequencer:
         return self._advance()
 
     def abort(self) -> list[Command]:
-        """Give the plan up; what was measured stays with the collector.
+        """Abort the plan; the collector keeps the measurements.
 
-        While following somebody else's commands there is no plan of its own to abort: it only
-        stops following, and can be started again.
+        While following another sequencer's commands it only stops following, and can be
+        started again.
         """
         if self.state is State.FOLLOWING:
             self.state = State.IDLE
@@ -118,7 +118,7 @@ class Sequencer:
         return [self._command(Phase.ABORT)]
 
     def foreign_command(self) -> None:
-        """Yield to a command that somebody else published: recorded commands win."""
+        """Follow another publisher's command: recorded commands take precedence."""
         self.state = State.FOLLOWING
 
     def _need(self, state: State, request: str) -> None:

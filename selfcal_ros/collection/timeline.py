@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which view an instant belongs to: by the stamps of the commands, never by arrival.
+"""Assignment of instants to views by the stamps of the commands, never by arrival.
 
-A plan may be measured again and again: each run counts for itself, and readings of different runs
-are never mixed. Commands name their run (`run_id`). Where they do not, a run begins with a command
-of view 0 that follows DONE or ABORT, or that places the plate anew once a later view has been
+A plan may be measured repeatedly: readings of different runs
+are never mixed. Commands name their run (`run_id`). If they do not, a run begins with a command
+of view 0 that follows DONE or ABORT, or that places the plate again after a later view has been
 measured; it is then named by the stamp of its first command.
 
-A run that names itself and whose first command is there goes on until it ends or another one
-begins: a command in between that belongs to no run which has begun is a stray and changes nothing.
+A run that names itself and whose first command was received lasts until it ends or another one
+begins: a command in between that belongs to no run that has begun is a stray and changes nothing.
 """
 
 from collections.abc import Iterable
@@ -25,7 +25,7 @@ NO_END = np.iinfo(np.int64).max
 
 @dataclass(frozen=True)
 class Interval:
-    """A span of time [start, end) in ns, and the view or the reason of rejection behind it."""
+    """A span of time [start, end) in ns, with its view or reason of rejection."""
 
     start_ns: int
     end_ns: int
@@ -35,7 +35,7 @@ class Interval:
 
 @dataclass(frozen=True)
 class Timeline:
-    """The commands in the order of their stamps, cut into intervals.
+    """The commands in the order of their stamps, divided into intervals.
 
     Attributes
     ----------
@@ -48,18 +48,18 @@ class Timeline:
     intervals : tuple of Interval
         All time from the first command on, without gaps.
     views_planned : int
-        Views in the plan, or as many as were seen.
+        Views in the plan, or number of views seen.
     finished : bool
         Whether the last command is DONE or ABORT.
     last_stamp_ns : int
         Stamp of the last command.
     run_id : str
         Run of the last MEASURE; views of other runs are not used. Empty before the first MEASURE,
-        and while its first command may not have come.
+        and while its first command may be missing.
     model_terms : tuple of str
-        Terms that the plan wants estimated, as the last MEASURE tells them.
+        Terms of the plan to be estimated, from the last MEASURE.
     strays : tuple of Command
-        Commands that were left out, see `without_strays`.
+        Ignored commands, see `without_strays`.
     """
 
     plan_id: str = ""
@@ -84,7 +84,7 @@ class Timeline:
         Raises
         ------
         KeyError
-            If no MEASURE of the view is there.
+            If there is no MEASURE of the view.
         """
         view = self.views[view_index]
         if self.artifact is None:
@@ -92,7 +92,7 @@ class Timeline:
         return self.artifact, view
 
     def of_view(self, view_index: int) -> list[Interval]:
-        """Return the intervals in which readings of a view count."""
+        """Return the intervals in which readings of a view are used."""
         return [i for i in self.intervals if i.view_index == view_index]
 
 
@@ -103,10 +103,10 @@ def begins_run(command: Command) -> bool:
 
 
 def without_strays(commands: Iterable[Command]) -> list[Command]:
-    """Return the commands by their stamps, each once, without those that nobody meant.
+    """Return the commands by their stamps, without duplicates and strays.
 
-    Within a run that names itself and whose first command is there, until its DONE or ABORT, these
-    are the commands of runs that have not begun: forged ones, or what is left of a recording.
+    Strays are commands of runs that have not begun, within a run that names itself and whose
+    first command was received, until its DONE or ABORT: forged, or left over from a recording.
     """
     kept: list[Command] = []
     begun: set[tuple[str, str]] = set()
@@ -128,8 +128,8 @@ def build_timeline(commands: Iterable[Command]) -> Timeline:
     """Return the timeline of a set of commands.
 
     A detection belongs to view i from the stamp of (MEASURE, i) to that of the next command.
-    A second PLACE of a view starts it anew: what was read before it is superseded. So does a
-    MEASURE in another pose: what was read in the former pose cannot be read in this one.
+    A second PLACE of a view restarts it and supersedes its earlier readings. So does a
+    MEASURE in another pose.
 
     Raises
     ------
@@ -147,7 +147,7 @@ def build_timeline(commands: Iterable[Command]) -> Timeline:
     newest = ordered[measures[-1]]
     plan_id, artifact = newest.plan_id, newest.artifact
     runs = _runs(ordered, plan_id)
-    run_id = str(runs[measures[-1]])  # of its own plan, so there is one
+    run_id = str(runs[measures[-1]])  # of its own plan, so it exists
     mine = [c for c, run in zip(ordered, runs, strict=True) if run == run_id]
     views: dict[int, View] = {}
     for command in mine:
@@ -166,9 +166,9 @@ def build_timeline(commands: Iterable[Command]) -> Timeline:
 
 
 def _begin_is_known(first: Command, runs: list[str | None]) -> bool:
-    """Return whether the first command of a run that is there is the first there was.
+    """Return whether the first command received of a run is its actual first one.
 
-    Commands that do not name their run may arrive in any order: an earlier one may still come.
+    Commands that do not name their run may arrive in any order: an earlier one may follow.
     """
     return bool(first.run_id or (first.phase == Phase.PLACE and first.view_index == 0)
                 or len(set(runs) - {None}) > 1)
@@ -209,8 +209,8 @@ def _unused(ordered: list[Command]) -> list[Interval]:
 
 
 def _intervals(ordered: list[Command], runs: list[str | None], run_id: str) -> list[Interval]:
-    began: dict[int, int] = {}  # view_index -> stamp from which its MEASUREs count
-    placed: dict[int, int] = {}  # view_index -> stamp of a PLACE that no MEASURE has followed yet
+    began: dict[int, int] = {}  # view_index -> stamp from which its MEASUREs are used
+    placed: dict[int, int] = {}  # view_index -> stamp of a PLACE not yet followed by a MEASURE
     poses: dict[int, tuple] = {}
     for command, run in zip(ordered, runs, strict=True):
         view = command.view_index

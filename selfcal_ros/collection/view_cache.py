@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""All detections of a session, the view of each, and readings that are made anew if need be."""
+"""All detections of a session, their views, and readings recomputed if necessary."""
 
 from collections import Counter
 from dataclasses import replace
@@ -15,18 +15,18 @@ from selfcal_ros.model.readings import ViewReadings
 
 NO_STAMPS = np.zeros(0, dtype=np.int64)
 TOGETHER = 65_536
-"""Detections that are assigned to views together: what is made of them stays in the cache."""
+"""Number of detections assigned to views together, to fit in cache."""
 PLACE = {"interval": "i4", "view": "i4"}
 """Interval of the timeline and view of a detection; -1 = before the first, in no view."""
 
 
 class ViewCache:
-    """Detections as they come, and the readings made of them: each view when it has changed."""
+    """Detections, and the readings from them, recomputed for each view that has changed."""
 
     def __init__(self, rules: Rules) -> None:
         self._rules = rules
         self._table, self._place = GrowingTable(DETECTION), GrowingColumns(PLACE)
-        self._looked_up = 0  # detections whose stamps were handed out
+        self._looked_up = 0  # detections with stamps already returned
         self._scored = False
         self._timeline: Timeline | None = None
         self._changed = [NO_STAMPS]
@@ -46,7 +46,7 @@ class ViewCache:
         """Take detections."""
         self._table.append(canonical(table))
         scored = bool((np.isfinite(table["score"]) & (table["score"] > 0)).any())
-        if scored and not self._scored:  # low scores count from now on
+        if scored and not self._scored:  # low scores are rejected from now on
             self._scored = True
             self._readings = {}
 
@@ -57,13 +57,13 @@ class ViewCache:
         return new
 
     def changed_at(self, stamps_ns: np.ndarray) -> None:
-        """Take note that something else is known of the stage at these instants."""
+        """Mark instants at which the stage's data has changed."""
         if len(stamps_ns):
             self._changed.append(stamps_ns)
 
     def readings(self, timeline: Timeline, exposures: Exposures,
                  ) -> tuple[dict[int, ViewReadings], Counter]:
-        """Return the readings of every view, and reason -> detections that belong to none."""
+        """Return the readings of every view, and reason -> detections that belong to no view."""
         for index in self._assign(timeline):
             self._readings.pop(index, None)
         for index, view in timeline.views.items():
@@ -119,12 +119,12 @@ class ViewCache:
 
 
 def _different(views: np.ndarray) -> set[int]:
-    """Return the different numbers of views, -1 among them."""
+    """Return the distinct view indices, including -1."""
     return set((np.flatnonzero(np.bincount(views + 1)) - 1).tolist())
 
 
 def _as_slice(rows: np.ndarray) -> np.ndarray | slice:
-    """Return rising indices of rows one behind the other as a slice, which copies nothing."""
+    """Return consecutive rising indices as a slice, to avoid copies."""
     if len(rows) and rows[-1] - rows[0] == len(rows) - 1:
         return slice(int(rows[0]), int(rows[-1]) + 1)
     return rows

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What each node decides, without ROS: when to publish, wait, redo, solve, accept and warn."""
+"""Logic of the nodes, without ROS: when to publish, wait, redo, solve, accept and warn."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The session of `selfcal cell check`: a short run that shows what is wrong with a cell."""
+"""The session of `selfcal cell check`: a short run that shows the faults of a cell."""
 
 from collections.abc import Callable, Generator, Mapping
 from dataclasses import dataclass
@@ -20,27 +20,27 @@ from selfcal_ros.sessions.ports import Ports
 from selfcal_ros.units import MS_PER_S, S_PER_NS
 
 PLAN_ID, MARKS, REPEATS, OFFSET_M = "cell_check", 3, 2, 20e-6
-"""Of the run: marks a side in the middle of the plate, repeats, offset of the check stops."""
+"""Settings of the run: marks per side in the middle of the plate, repeats, check offset."""
 LISTEN_S, WATCH_S, STATUS_S, STALL_S = 2.0, 2.0, 0.5, 5.0
-"""Time for the encoder alone, for what should not come, from one status to the next, and without a
-detection until an incomplete view is over."""
+"""Times: for the encoder alone, for messages that should not come, between statuses, and without a
+detection until an incomplete view ends."""
 FOLLOWS = 0.9
-"""Part of the square of an offset that has to go with the stage for its slope to be known."""
+"""Fraction of the variance of an offset that must follow the stage for a valid slope."""
 REVISIT_S = 10.0
-"""Time in which a cell revisits a mark that is named as missing."""
+"""Time within which a cell must revisit a missing mark."""
 OLDEST_S = 10.0
-"""Age of a detection at which its stamp is no instant of exposure any more."""
+"""Largest age of a detection for a valid stamp of exposure."""
 MISTAKEN = (Reason.UNKNOWN_MARK, Reason.TOO_FAR, Reason.AMBIGUOUS, Reason.NOT_IN_VIEW,
             Reason.ROTATION, Reason.NOT_AT_MARK)
-"""Reasons that an id, or the lack of it, can have."""
+"""Reasons of rejection related to ids."""
 
 type Steps[T] = Generator[None, None, T]
-"""What a script yields between two looks, and returns in the end."""
+"""Type of a script: yields between checks, and returns a value at the end."""
 
 
 @dataclass(frozen=True)
 class CheckItem:
-    """One thing that was checked: its name, whether it is well, the figure, what to do."""
+    """One check: name, whether it passed, figure, remedy."""
 
     name: str
     passed: bool
@@ -49,7 +49,7 @@ class CheckItem:
 
 
 def checked_view(plan: Plan) -> tuple[Artifact, View]:
-    """Return the middle of a plan's plate, and the view that asks for it: straight, checked."""
+    """Return the middle of a plan's plate, and its view: straight, with check stops."""
     plate = Artifact(MARKS, plan.artifact.grid_pitch_m, plan.artifact.angular_count)
     marks = next((view for view in plan.views if view.check_marks), View(""))
     offset = marks.check_offset_m or min(OFFSET_M, plate.grid_pitch_m / 4)
@@ -59,12 +59,12 @@ def checked_view(plan: Plan) -> tuple[Artifact, View]:
 
 
 class CellCheck:
-    """Commands a short run as a sequencer does, and judges what comes as a collector does.
+    """Command a short run like a sequencer, and evaluate messages like a collector.
 
     Parameters
     ----------
     plan : Plan
-        Its plate, and whether it has angular lines.
+        Provides the plate, and whether it has angular lines.
     settings : CollectorSettings
         Sense, names of joints and limits.
     ports : Ports
@@ -85,7 +85,7 @@ class CellCheck:
         self._seen: list[tuple[float, int, bool]] = []  # received, s; age, ns; whether with an id
         self._joints: set[str] = set()
         self._command = Command(0, Phase.ABORT, PLAN_ID)
-        self._pause_s = WATCH_S  # after which a detection that was under way has come
+        self._pause_s = WATCH_S  # after which a detection in transit has arrived
         self._script = self._run()
 
     def take_encoder(self, message: Any) -> None:
@@ -103,7 +103,7 @@ class CellCheck:
         self._collector.add_detection(found)
 
     def tick(self) -> None:
-        """Do what is due."""
+        """Perform due work."""
         if not self.done:
             self.done = next(self._script, self) is self
 
@@ -130,7 +130,7 @@ class CellCheck:
         yield from self._old(aborted, measured)
 
     def _aborted(self) -> Steps[Command | None]:
-        """Begin a view and abort it; return its MEASURE, None if nothing came."""
+        """Begin a view and abort it; return its MEASURE, None without detections."""
         command = yield from self._place_and_measure()
         first = len(self._seen)
         if not (yield from self._until(lambda: len(self._seen) >= first + 3, self._patience_s)):
@@ -151,7 +151,7 @@ class CellCheck:
         return command
 
     def _measured(self) -> Steps[Command]:
-        """Measure the view until it is complete or nothing comes any more; return its MEASURE."""
+        """Measure the view until it is complete or detections stop; return its MEASURE."""
         self._collector, self._seen = Collector(self._settings), []
         command = yield from self._place_and_measure()
         self._collector.add_command(command)
@@ -161,13 +161,13 @@ class CellCheck:
             last = self._seen[-1][0] if self._seen else begin + self._patience_s
             return (self._collected()[1].complete or self._ports.now_s() - last
                     > max(STALL_S, 2 * self._longest_pause_s()))
-        while not over():  # without a status: nothing is to be revisited yet
+        while not over():  # without a status: nothing to revisit yet
             yield from self._wait(STATUS_S)
         self._pause_s = self._longest_pause_s()
         return command
 
     def _revisited(self) -> Steps[bool]:
-        """Name a mark as missing until it comes; return whether it did."""
+        """Report a mark as missing until it is detected; return whether it was."""
         progress = self._collected()[1]
         if not len(progress.readings.m):
             return False
@@ -181,7 +181,7 @@ class CellCheck:
         return len(self._seen) > before
 
     def _old(self, *commands: Command) -> Steps[None]:
-        """Send commands again that the cell has acted on already."""
+        """Send commands again that the cell has already executed."""
         count = 0
         for command in commands:
             before = len(self._seen)
@@ -200,7 +200,7 @@ class CellCheck:
         return self._send(Phase.MEASURE)
 
     def _send(self, phase: Phase) -> Command:
-        """Send a command of a run of its own, stamped now."""
+        """Send a command of its own run, stamped now."""
         stamp = max(self._ports.now_ns(), self._command.stamp_ns + 1)
         begins = phase is Phase.PLACE or not self._command.run_id
         run_id = str(stamp) if begins else self._command.run_id
@@ -231,7 +231,7 @@ class CellCheck:
         return True
 
     def _longest_pause_s(self) -> float:
-        """Return after which time a detection under way has come: twice the longest between two."""
+        """Return the time in which a detection in transit arrives: twice the longest interval."""
         received = [at for at, _, _ in self._seen]
         return max(WATCH_S, 2 * float(np.diff(received).max())) if len(received) > 1 else WATCH_S
 
@@ -318,7 +318,7 @@ class CellCheck:
 
 
 def _slope(motion: RepeatMotion | None, axis: int) -> float | None:
-    """Return how an offset follows its axis; None where that is mostly noise."""
+    """Return the response of an offset to its axis; None if mostly noise."""
     if motion is None:
         return None
     n = len(motion.products) // 2

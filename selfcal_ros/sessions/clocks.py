@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What stamps tell: offsets of clocks, what ROS time follows, and which run is the newer one."""
+"""Clocks: offsets, source of ROS time, and order of runs."""
 
 from collections import deque
 from collections.abc import Callable, Mapping
@@ -20,18 +20,18 @@ BIN_S = 0.1
 
 
 class ClockWatch:
-    """Compares the stamps of the cell with the instants at which its messages arrive.
+    """Compare the stamps of the cell with the reception of its messages.
 
     A message arrives after its stamp, by an unknown delay; the smallest delay of the last seconds
-    is the offset of the cell's clock, to within the transport. Nothing is said while recorded
-    messages are played: the commands then have stamps of the past as well.
+    is the offset of the cell's clock, to within the transport delay. There is no report while
+    recorded messages are played: the commands then have stamps of the past as well.
 
-    Steps are looked for by a steady clock: those of this machine's own clock are found as well.
+    Steps are detected with a steady clock, including those of this machine's own clock.
 
     Parameters
     ----------
     limit_s : float
-        Largest offset, and largest step, that is no matter.
+        Largest offset, and largest step, that is ignored.
 
     Attributes
     ----------
@@ -47,9 +47,9 @@ class ClockWatch:
         self.steps: dict[str, list[Step]] = {}
 
     def command(self, stamp_ns: int, now_ns: int, *, is_older: bool, run_id: str = "") -> None:
-        """Learn from a command whether the session is live; a latched one tells nothing.
+        """Determine from a command whether the session is live; a latched one is ignored.
 
-        A run that was live remains so: when a clock has stepped, its stamps look like recorded
+        A live run remains live: after a clock step its stamps look like recorded
         ones.
         """
         if is_older:
@@ -60,13 +60,13 @@ class ClockWatch:
             self._live_run, self._watches, self.steps = run_id, {}, {}
 
     def adopt(self, run_id: str, steps: Mapping[str, list[Step]]) -> None:
-        """Go on with a run in which clocks have stepped before."""
+        """Continue a run in which clocks have stepped before."""
         self._live_run, self._watches = run_id, {}
         self.steps = {topic: list(mine) for topic, mine in steps.items()}
 
     def data(self, topic: str, stamps_ns: np.ndarray, now_ns: np.ndarray,
              steady_ns: np.ndarray) -> None:
-        """Take the stamps and the reception of messages of the cell, by both clocks; n > 0."""
+        """Take the stamps and the reception, by both clocks, of messages of the cell; n > 0."""
         if self._live:
             watch = self._watches.setdefault(topic, StepWatch(self._limit_s))
             self.steps.setdefault(topic, []).extend(watch.add(stamps_ns, steady_ns))
@@ -81,16 +81,16 @@ class ClockWatch:
 
     @property
     def offset_ns(self) -> int | None:
-        """How much the cell's clock is ahead, ns; None while nothing live is heard."""
+        """Lead of the cell's clock, ns; None without live messages."""
         return max(offset for _, offset in self._bins) if self._live and self._bins else None
 
     @property
     def ahead(self) -> bool:
-        """Whether stamps come from the future, by more than the limit."""
+        """Whether stamps are in the future by more than the limit."""
         return self.offset_ns is not None and self.offset_ns > self._limit_ns
 
     def diagnosis(self) -> Diagnosis:
-        """Return WARN with the offset where it is beyond the limit."""
+        """Return WARN with the offset if beyond the limit."""
         offset = self.offset_ns
         if offset is None:
             return Diagnosis(Level.OK, "")
@@ -104,12 +104,12 @@ class ClockWatch:
 
 
 class RosTime:
-    """Says what ROS time follows; work and health go by a steady clock whatever it does.
+    """Report the source of ROS time; work and health always use a steady clock.
 
     Parameters
     ----------
     say : callable (level, line)
-        Writes to the log: one line when what ROS time does changes.
+        Writes to the log: one line for each change.
     """
 
     NOTHING = ("use_sim_time is set and nothing is heard on /clock: what this node stamps is "
@@ -120,7 +120,7 @@ class RosTime:
         self._last_ns, self._state = 0, "system"
 
     def look(self, *, simulated: bool, now_ns: int) -> Diagnosis:
-        """Return what ROS time does, now that it is `now_ns`; called once a second."""
+        """Return the state of ROS time at `now_ns`; called once a second."""
         if not simulated:
             return Diagnosis(Level.OK, "")
         moves, self._last_ns = now_ns != self._last_ns, now_ns
@@ -144,7 +144,7 @@ class RosTime:
 class Run:
     """One run of a plan; `run_id` is the stamp of its first command, ns, as text.
 
-    `run_id` is empty where a publisher or a recording does not tell it.
+    `run_id` is empty if a publisher or a recording does not provide it.
     """
 
     plan_id: str = ""
@@ -152,35 +152,35 @@ class Run:
 
 
 def supersedes(new: Run, current: Run) -> bool:
-    """Return whether what belongs to `new` takes the place of what belongs to `current`.
+    """Return whether messages of run `new` replace those of `current`.
 
-    The later run does. Where one of them does not tell its beginning, the one that came last.
+    The later run wins; if the beginning of one is unknown, the one received last.
     """
     begun, before = begun_ns(new.run_id), begun_ns(current.run_id)
     return begun is None or before is None or begun > before
 
 
 def is_future(stamp_ns: int, now_ns: int) -> bool:
-    """Return whether a stamp lies further ahead of a node's clock than is believed.
+    """Return whether a stamp is implausibly far ahead of a node's clock.
 
-    A clock that stands at 0 is that of a /clock which nobody publishes: it tells nothing.
+    A clock at 0 is a /clock without publisher and is ignored.
     """
     return now_ns > 0 and stamp_ns > now_ns + MAX_AHEAD_NS
 
 
 def begins_in_future(run: Run, now_ns: int) -> bool:
-    """Return whether a run has a beginning that a node's clock has not come near."""
+    """Return whether a run begins far ahead of a node's clock."""
     return is_future(begun_ns(run.run_id) or 0, now_ns)
 
 
 class RunWatch:
-    """Finds what keeps a run from being shown: its stamps, a clock that was set back, strays."""
+    """Find why a run is not shown: its stamps, a clock that was set back, strays."""
 
     def __init__(self) -> None:
         self._hidden: Command | None = None
 
     def command(self, command: Command, newest: Command | None, now_ns: int) -> None:
-        """Take a command as it comes; one of long ago, as a recorded one, hides nothing."""
+        """Take a command on reception; an old one, such as a recorded one, hides nothing."""
         if newest is None or _run_of(command) == _run_of(newest):
             self._hidden = None
         elif begins_run(command) and abs(command.stamp_ns - now_ns) <= MAX_AHEAD_NS and (
@@ -189,7 +189,7 @@ class RunWatch:
 
     def lines(self, newest: Command | None, strays: tuple[Command, ...],
               now_ns: int) -> list[str]:
-        """Return what is wrong and the way out, one line each."""
+        """Return problems with remedies, one line each."""
         found = []
         if newest is not None and is_future(newest.stamp_ns, now_ns):
             found.append(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The session of measurement_collector: what is published of the readings, and when."""
+"""The session of measurement_collector: publication of the readings."""
 
 import math
 import statistics
@@ -26,13 +26,13 @@ from selfcal_ros.topics import DETECTION_TOPIC, ENCODER_TOPIC
 from selfcal_ros.units import MS_PER_S, NS_PER_S, S_PER_NS, UM_PER_M
 
 HEARD_S = 1.0
-"""Time without an encoder sample after which the encoder is not heard."""
+"""Time without an encoder sample after which the encoder counts as silent."""
 Age = int | np.ndarray
 """Time since the reception of messages, ns: of the newest, or int64 array of each, newest last."""
 
 
 class CollectingSession:
-    """Feeds a `Collector`; publishes ``status``, and ``measurement`` when a view completes.
+    """Feed a `Collector`; publish ``status``, and ``measurement`` when a view completes.
 
     Parameters
     ----------
@@ -46,7 +46,7 @@ class CollectingSession:
         self.settings, self._ports = settings, ports
         self.collector = Collector(settings)
         self._dirty, self._next_status, self._rested = False, 0.0, 0.0
-        self._needed = 0  # readings without which the open view is not complete
+        self._needed = 0  # readings needed to complete the open view
         self._unseen: list[np.ndarray] = []  # its detections since the last status, by their stamps
         self._since_ns = 0  # its beginning
         self._costs: deque[tuple[float, float]] = deque(maxlen=1000)  # time, and CPU time
@@ -57,7 +57,7 @@ class CollectingSession:
         self._findings: list[str] = []
         self._stepped: list[str] = []
         self._checks = CellChecks(ports.say)
-        self._noted: list[str] = []  # what the readings of a view that were sent last say of clocks
+        self._noted: list[str] = []  # notes on clocks in the readings sent last
         self._clock = ClockWatch(settings.clock_limit)
         self._runs, self._run_lines = RunWatch(), list[str]()
         self._encoder_rate = Rate(ports.now_s)
@@ -65,7 +65,7 @@ class CollectingSession:
         self._noise: tuple[float, float] = (math.nan, math.nan)
         self.missed: dict[tuple[str, int], str] = {}  # views that began before this node
         self._placed: set[tuple[str, int]] = set()
-        self._gap, self._gap_stamp_ns = "", 0  # told until another command comes
+        self._gap, self._gap_stamp_ns = "", 0  # reported until the next command
         self._problem = ""
         self._state = "waiting for a MEASURE command"
         self._rejected: Counter = Counter()
@@ -87,7 +87,7 @@ class CollectingSession:
         self._dirty = True
 
     def take_detections(self, table: np.ndarray, age_ns: Age = 0) -> None:
-        """Take detections (`collection.inputs.DETECTION`), received as `take_encoder` says."""
+        """Take detections (`collection.inputs.DETECTION`), received as in `take_encoder`."""
         if not len(table):
             return
         self.collector.add_detection_block(table)
@@ -96,25 +96,25 @@ class CollectingSession:
         self._dirty = True
 
     def _note_clock(self, topic: str, stamps_ns: np.ndarray, age_ns: Age) -> None:
-        """Hold stamps against their reception."""
+        """Compare stamps with their reception."""
         ages = np.atleast_1d(age_ns)
-        if len(ages) != len(stamps_ns):  # of another number of messages: that of the newest
+        if len(ages) != len(stamps_ns):  # for another number of messages: that of the newest
             ages, stamps_ns = ages[-1:], stamps_ns.max(keepdims=True)
         self._clock.data(topic, stamps_ns, self._ports.now_ns() - ages,
                          round(self._ports.now_s() * NS_PER_S) - ages)
 
     def adopt(self, collector: Collector, journal: str,
               steps: Mapping[str, list[Step]] | None = None, away_s: float = 0.0) -> None:
-        """Go on with a collector that has taken what a journal holds of the run.
+        """Continue with a collector that has taken the run from a journal.
 
         Parameters
         ----------
         collector : Collector
-            Has what the journal holds.
+            Has the content of the journal.
         journal : str
             Its name.
         steps : dict, optional
-            Topic -> steps of clocks that the journal shows.
+            Topic -> clock steps in the journal.
         away_s : float
             Time since the journal was written last.
         """
@@ -151,7 +151,7 @@ class CollectingSession:
             self._dirty = True
 
     def _note_missed(self, command: Command, *, is_older: bool) -> None:
-        """Say which views began before this node: their detections up to now are not here."""
+        """Report views that began before this node: their earlier detections are missing."""
         view = (command.plan_id, command.view_index)
         if command.phase == Phase.PLACE and not is_older:
             self._placed.add(view)
@@ -164,7 +164,7 @@ class CollectingSession:
                 "detected until now is missing here; redo_view measures it again")
 
     def tick(self) -> None:
-        """Publish how far the views are, if something has come and it is time for it."""
+        """Publish the progress of the views, if there are new messages and it is due."""
         now, worked = self._ports.now_s(), self._ports.cpu_s()
         early = now < self._next_status
         if not self._dirty or (early and not (now >= self._rested and self._may_complete())):
@@ -175,7 +175,7 @@ class CollectingSession:
         except NoDataError:
             self._rejected = Counter(self.collector.unusable)
             return
-        except InputError as error:  # holds for this run: say it once
+        except InputError as error:  # valid for this run: report once
             if self._problem != str(error):
                 self._problem = str(error)
                 self._ports.say(Level.ERROR, f"{error}; then start a new run")
@@ -185,18 +185,18 @@ class CollectingSession:
         self._describe(measurements, progress)
         spent = self._ports.now_s() - now
         self._costs.append((spent, self._ports.cpu_s() - worked))
-        if early and self._needed:  # in vain: some of what came was no reading
+        if early and self._needed:  # in vain: some detections were not readings
             self._rested = now + 5 * spent
         self._next_status = now + max(self.settings.status_period, 5 * spent)
 
     def expects_end(self, more: int = 0) -> bool:
-        """Return whether the detections that came and `more` may complete the view."""
+        """Return whether the detections received and `more` may complete the view."""
         return 0 < self._needed <= sum(map(len, self._unseen)) + more
 
     def _may_complete(self) -> bool:
-        """Return whether enough has come, samples behind it included, to complete the view.
+        """Return whether enough has been received, including later samples, to complete the view.
 
-        A detection whose stamp lies in the future waits for its samples; it holds up no other.
+        A detection stamped in the future waits for its samples without delaying others.
         """
         until_ns = self.collector.encoder_until_ns
         return self.expects_end() and self._needed <= sum(
@@ -224,7 +224,7 @@ class CollectingSession:
             key = readings_digest(view.readings, measurements.rejected)
             closed = view.end_ns <= timeline.last_stamp_ns
             ready = final or closed or view.complete
-            # empty: unless a collector before this one may have sent its readings
+            # empty, unless a previous collector may have sent its readings
             worth = view.readings.used or view.readings.rejected or index in self._published or (
                 (final or closed) and (timeline.plan_id, index) not in self.missed)
             is_new = self._published.get(index) != key or self._noted != self._stepped
@@ -232,17 +232,17 @@ class CollectingSession:
                 self._published[index], self._noted = key, self._stepped
                 self._ports.publish("measurement", from_model.view_measurement(
                     view, measurements, stamp, frame_id, self._stepped))
-            # after the readings: what is called complete can be solved
+            # after the readings: a complete view can be solved
             if current or index == max(progress) or final:
                 fields = from_model.view_status(view, timeline.plan_id, stamp, frame_id,
                                                  run_id=timeline.run_id)
-                fields["complete"] &= not self._clock.ahead  # its detections may be of another view
+                fields["complete"] &= not self._clock.ahead  # may be of another view
                 self._ports.publish("status", fields)
             if closed or final:
                 self._advise(index, view)
 
     def _warn(self, measurements: Measurements, progress: dict[int, ViewProgress]) -> None:
-        """Say once for each view and reason that most of its detections were rejected."""
+        """Report once per view and reason that most of its detections were rejected."""
         self._findings = []
         for index, finding in self.collector.findings(measurements, progress).items():
             where = f"view '{progress[index].view.name}': " if index is not None else ""
@@ -252,7 +252,7 @@ class CollectingSession:
                 self._ports.say(Level.WARN, self._findings[-1])
 
     def _advise(self, index: int, view: ViewProgress) -> None:
-        """Say once for each view that is over what would correct its rejections."""
+        """Report once per finished view the remedies for its rejections."""
         rejected = {reason: count for reason, count in view.readings.rejected.items()
                     if not {(index, reason), (None, reason)} & self._warned}
         lines = advice(rejected) if index not in self._advised else []
@@ -261,7 +261,7 @@ class CollectingSession:
             self._advised.add(index)
 
     def _tell_steps(self) -> None:
-        """Say once that a clock has stepped or is ahead; the health says it until the run ends."""
+        """Log once that a clock has stepped or is ahead; in the health until the run ends."""
         refused = self.collector.unusable
         lines = [*step_lines(self._clock.steps, self.collector.timeline), *future_lines(
             [topic for topic, (_, reason) in FROM_THE_FUTURE.items() if refused.get(reason)])]
@@ -271,22 +271,22 @@ class CollectingSession:
         self._stepped = lines
 
     def _tell_runs(self) -> None:
-        """Say once what keeps a run from being shown; the health says it as long as it holds."""
+        """Log once why a run is not shown; in the health while it applies."""
         lines = self._runs.lines(self.collector.newest_command, self.collector.timeline.strays,
                                  self.now_ns)
         for line in lines:
-            # amounts of time change
+            # durations change
             if line.partition(":")[2] not in [told.partition(":")[2] for told in self._run_lines]:
                 self._ports.say(Level.WARN, line)
         self._run_lines = lines
 
     def _describe(self, measurements: Measurements, progress: dict[int, ViewProgress]) -> None:
-        """Keep for the diagnostics how far the view is and what was rejected so far."""
+        """Keep progress and rejections of the view for the diagnostics."""
         self._rejected = Counter(measurements.rejected)
         for view in progress.values():
             self._rejected.update(view.readings.rejected)
         index = self.collector.timeline.intervals[-1].view_index
-        for number in sorted(progress):  # of the last view that tells it
+        for number in sorted(progress):  # of the last view with one
             told = progress[number].readings
             xy, theta = (new if math.isfinite(new) else old for new, old in zip(
                 (told.sigma_xy, told.sigma_theta), self._noise, strict=True))
@@ -298,7 +298,7 @@ class CollectingSession:
             "marks read")
 
     def diagnosis(self, *, detections_matched: bool) -> Diagnosis:
-        """Return what the node says of itself.
+        """Return the diagnosis of the node.
 
         Parameters
         ----------
@@ -328,14 +328,14 @@ class CollectingSession:
             self._encoder(), self._repeatability()])
 
     def _cost(self) -> dict[str, str]:
-        """Return what the last statuses cost, waiting for a processor included, or without."""
+        """Return the time of the last statuses, with and without waiting for a processor."""
         costs, worked = zip(*(self._costs or [(0.0, 0.0)]), strict=True)
         return {"status_ms": f"{MS_PER_S * statistics.median(costs):.1f}",
                 "status_ms_max": f"{MS_PER_S * max(costs):.1f}",
                 "status_cpu_ms_max": f"{MS_PER_S * max(worked):.1f}"}
 
     def _newest(self) -> dict[str, Any]:
-        """Return where the run is: what a sequencer that was restarted takes up."""
+        """Return the state of the run, from which a restarted sequencer resumes."""
         command = self.collector.newest_command
         if command is None:
             return {}

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The session of compensator: which map is used, and what is done with a sample."""
+"""The session of compensator: selection of the map, and correction of samples."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -21,18 +21,18 @@ from selfcal_ros.sessions.ports import Diagnosis, Level, Ports
 from selfcal_ros.units import MS_PER_S, S_PER_NS
 
 KEEPS_UP = 20
-"""Samples that are corrected one after another where so many wait: a millisecond of work. Where
-more wait, the newest alone is corrected."""
+"""Largest number of waiting samples that are all corrected: a millisecond of work. If
+more wait, only the newest is corrected."""
 FARTHEST = 1e12
-"""Position, m or rad, beyond which a sample is none of a stage."""
+"""Largest valid position of a stage, m or rad."""
 
 
 class CompensatingSession:
-    """Corrects samples by the newest map that may be used; counts what it cannot correct.
+    """Correct samples by the newest usable map; count samples that cannot be corrected.
 
-    With ``require_qualified`` a map counts once the summary of the same run and stamp says that
-    it is qualified and that all planned views are behind it. A map takes over between two
-    samples, as a whole.
+    With ``require_qualified`` a map is used once the summary of the same run and stamp says that
+    it is qualified and based on all planned views. Maps change between two
+    samples, atomically.
 
     Parameters
     ----------
@@ -48,9 +48,9 @@ class CompensatingSession:
         self.counts = {"corrected": 0, "without_map": 0, "refused": 0, "skipped": 0}
         self._waiting: list[tuple[bytes, int]] = []
         self._editor = PositionEditor()
-        self._ages_s: list[float] = []  # of what was corrected since the last diagnosis
+        self._ages_s: list[float] = []  # of samples corrected since the last diagnosis
         self._skipped = 0  # since then
-        self._map: Any = None  # newest message of each, until they are judged together
+        self._map: Any = None  # newest message of each, until evaluated together
         self._summary: Any = None
         self._waits = ""
         self._used, self._since_s, self._map_ns = "", 0.0, 0
@@ -65,12 +65,12 @@ class CompensatingSession:
         self._use(result.error_map, f"{Path(path).resolve()}, plan {result.plan_id}", 0)
 
     def take_map(self, message: Any) -> None:
-        """Take a selfcal_msgs/ErrorMap: use it, now or once its summary says that it is good."""
+        """Take a selfcal_msgs/ErrorMap: use it, now or once its summary confirms it."""
         self._map = message
         self._judge()
 
     def take_summary(self, message: Any) -> None:
-        """Take the selfcal_msgs/CalibrationSummary that belongs to a map."""
+        """Take the selfcal_msgs/CalibrationSummary of a map."""
         self._summary = message
         self._judge()
 
@@ -87,7 +87,7 @@ class CompensatingSession:
                       to_model.stamp_ns(message))
 
     def _doubt(self) -> str:
-        """Return why the newest map must not be used; "" if it may."""
+        """Return why the newest map must not be used, or ""."""
         message, summary = self._map, self._summary
         if not message.qualified:
             return f"{_source(message)} is not qualified"
@@ -112,12 +112,12 @@ class CompensatingSession:
         self._waiting.append((data, received_ns))
 
     def correct_waiting(self, lost: int, publish: Callable[[bytes], None]) -> None:
-        """Correct what waits, in the order of its arrival, or the newest alone where much waits.
+        """Correct waiting samples in the order of arrival, or only the newest if many wait.
 
         Parameters
         ----------
         lost : int
-            Samples that newer ones have displaced in the queue, or that did not come.
+            Number of samples displaced in the queue by newer ones, or missing.
         publish : callable (data)
             Takes each corrected sample.
         """
@@ -137,7 +137,7 @@ class CompensatingSession:
                 self._ages_s.append((self._ports.wall_ns() - received_ns) * S_PER_NS)
 
     def correct(self, names: Sequence[str], positions: Sequence[float]) -> list[float] | None:
-        """Return the positions of all joints, stage joints corrected; None if it cannot be told.
+        """Return the positions of all joints, stage joints corrected; None if unknown.
 
         Parameters
         ----------
@@ -151,7 +151,7 @@ class CompensatingSession:
             return None
         corrected = self._corrected(names, positions)
         if corrected is None or not all(map(math.isfinite, corrected.values())):
-            # Outside of the field with outside=refuse, beside an unknown site or line, or no
+            # Outside the field with outside=refuse, next to an unknown site or line, or no
             # position at all.
             self.counts["refused"] += 1
             return None
@@ -166,7 +166,7 @@ class CompensatingSession:
         place = {name: index for index, name in enumerate(names)}
         joints = (self._settings.joint_x, self._settings.joint_y, self._settings.joint_theta)
         x, y, theta = map(place.get, joints)
-        if not all(abs(positions[index]) <= FARTHEST  # NaN neither
+        if not all(abs(positions[index]) <= FARTHEST  # nor NaN
                    for index in (x, y, theta) if index is not None):
             return None
         corrected: dict[int, float] = {}
@@ -183,7 +183,7 @@ class CompensatingSession:
         return corrected
 
     def diagnosis(self) -> Diagnosis:
-        """Return what the node says of itself, and of its pace since it was asked last."""
+        """Return the diagnosis of the node, and of its timing since the last call."""
         return merged(self._state(), [self._pace()])
 
     def _pace(self) -> Diagnosis:
@@ -215,5 +215,5 @@ class CompensatingSession:
 
 
 def _source(message: Any) -> str:
-    """Return plan and run of a map, for people."""
+    """Return plan and run of a map as text."""
     return f"plan {message.plan_id}" + (f", run {message.run_id}" if message.run_id else "")

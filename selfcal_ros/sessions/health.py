@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a node says of itself once a second, put together from its parts."""
+"""Health of a node, published once a second, from its parts."""
 
 from collections import Counter, deque
 from collections.abc import Callable, Iterable
@@ -15,19 +15,19 @@ from selfcal_ros.sessions.ports import Diagnosis, Level
 from selfcal_ros.units import NS_PER_S
 
 FIRST_LINES = 5
-"""Refusals of one kind that are logged line by line; then only the 10th, 100th, ..."""
+"""Refusals of one kind that are all logged; then only the 10th, 100th, ..."""
 MEMORY_S = 10.0
 """Time for which a refusal or a loss keeps the state at WARN."""
 LEAST_STEPS, MOST_STEPS = 40, 20_000
-"""Intervals between stamps that tell a jitter, and that are kept to tell it."""
+"""Smallest number of intervals for a jitter, and number kept for it."""
 MORE = 1.25
-"""Marks over those of the last time from which it is looked at again how the plate lies."""
+"""Ratio of marks to those at the last check at which the pose is checked again."""
 NAMED = 6
-"""Missing marks and lines that a line names; the rest is counted."""
+"""Missing marks and lines named in a line; the rest is counted."""
 
 
 def merged(main: Diagnosis, others: Iterable[Diagnosis]) -> Diagnosis:
-    """Return one diagnosis: the worst level, what is wrong first, all values."""
+    """Return one combined diagnosis: the worst level, problems first, all values."""
     others = list(others)
     wrong = [item.message for item in others if item.level > Level.OK and item.message]
     values = dict(main.values)
@@ -38,7 +38,7 @@ def merged(main: Diagnosis, others: Iterable[Diagnosis]) -> Diagnosis:
 
 
 class Tally:
-    """Counts what goes wrong, by place; the newest line of each place is told for some time.
+    """Count faults by place; the newest line of each place is reported for some time.
 
     Parameters
     ----------
@@ -49,7 +49,7 @@ class Tally:
     """
 
     word = ""
-    """Stands before a place in the diagnostics."""
+    """Prefix of a place in the diagnostics."""
 
     def __init__(self, say: Callable[[Level, str], None], now_s: Callable[[], float]) -> None:
         self._say, self._now_s = say, now_s
@@ -60,19 +60,19 @@ class Tally:
         return place in self._last and self._now_s() - self._last[place][0] < MEMORY_S
 
     def diagnosis(self) -> Diagnosis:
-        """Return WARN and the newest lines for some time after something went wrong."""
+        """Return WARN and the newest lines for some time after a fault."""
         recent = [line for place, (_, line) in self._last.items() if self._is_recent(place)]
         return Diagnosis(Level.WARN if recent else Level.OK, "; ".join(recent),
                          {f"{self.word} {place}": n for place, n in sorted(self.counts.items())})
 
 
 class Refusals(Tally):
-    """What callbacks could not use, and why; said without flooding the log."""
+    """Messages that callbacks could not use, with reasons, without flooding the log."""
 
     word = "refused"
 
     def add(self, place: str, error: Exception) -> None:
-        """Count an error of the callback at `place`; one not of this package shows its type."""
+        """Count an error of the callback at `place`; a foreign one shows its type."""
         line = str(error) if isinstance(error, SelfcalError) else (
             f"{place}: cannot be used ({type(error).__name__}: {printable(first_line(error))})")
         self.counts[place] += 1
@@ -83,10 +83,10 @@ class Refusals(Tally):
 
 
 class Losses(Tally):
-    """Messages that were published and did not come.
+    """Published messages that were not received.
 
-    The middleware's events and the numbers of publication tell of the same losses, the one before
-    the other or not at all: the larger sum of the two counts.
+    The middleware's events and the sequence numbers report the same losses, at different times or
+    not at all: the larger of the two counts is used.
     """
 
     word = "lost"
@@ -96,7 +96,7 @@ class Losses(Tally):
         self._told: dict[str, Counter] = {}
 
     def add(self, topic: str, number: int, told_by: str = "events") -> None:
-        """Count `number` messages of `topic` as lost, unless the other source told of them."""
+        """Count `number` messages of `topic` as lost, unless reported by the other source."""
         told = self._told.setdefault(topic, Counter())
         told[told_by] += number
         total = max(told.values())
@@ -106,7 +106,7 @@ class Losses(Tally):
                        "or the network is too slow for them", f"{topic}: {total} messages lost")
 
     def add_unheard(self, topic: str, number: int) -> None:
-        """Count messages that were published while this node had no subscription."""
+        """Count messages published while this node had no subscription."""
         line = f"{topic}: {number} messages were published while this node did not listen"
         place = f"{topic}, not listening"
         self._tell(place, self.counts[place] + number, line, line)
@@ -119,14 +119,14 @@ class Losses(Tally):
 
 
 class Presence:
-    """Which other nodes are alive, by the health that each of them tells once a second.
+    """Other nodes that are alive, by the health that each publishes once a second.
 
     Parameters
     ----------
     now_s : callable
         Monotonic seconds.
     patience_s : float
-        A node that has told nothing for longer is not there.
+        A node silent for longer is absent.
     """
 
     def __init__(self, now_s: Callable[[], float], patience_s: float) -> None:
@@ -134,23 +134,24 @@ class Presence:
         self._heard: dict[str, tuple[float, Diagnosis]] = {}
 
     def take(self, node: str, diagnosis: Diagnosis) -> None:
-        """Take what a node says of itself."""
+        """Take the health of a node."""
         self._heard[node] = (self._now_s(), diagnosis)
 
     def of(self, node: str) -> Diagnosis | None:
-        """Return what `node` said last; None if that was too long ago."""
+        """Return the last health of `node`; None if too old."""
         when, diagnosis = self._heard.get(node, (float("-inf"), None))
         return diagnosis if self._now_s() - when <= self._patience_s else None
 
     def silent(self) -> list[str]:
-        """Return the nodes that have told something, but not lately, by name."""
+        """Return the names of nodes heard before, but not recently."""
         return sorted(node for node in self._heard if self.of(node) is None)
 
 
 class Rate:
     """Rate, longest gap and jitter of a stream over the last seconds.
 
-    A gap lies behind the newest stamp of these seconds: one stamp of the future hides none later.
+    A gap is relative to the newest stamp of these seconds: a stamp in the future hides no later
+    gap.
 
     Parameters
     ----------
@@ -164,7 +165,7 @@ class Rate:
         self._now_s = now_s
         self._bins: deque[tuple[float, int, int]] = deque()  # begin, messages, newest stamp
         self.longest_gap_ns = 0
-        self._steps: list[np.ndarray] = []  # between stamps, since the jitter was asked
+        self._steps: list[np.ndarray] = []  # between stamps, since the last query of the jitter
         self._n_steps = 0
 
     def add(self, stamps_ns: np.ndarray) -> None:
@@ -198,9 +199,9 @@ class Rate:
         return gap
 
     def take_jitter_s(self) -> float:
-        """Return half of the range that holds 95 % of the intervals since the last call, s.
+        """Return half of the range of 95 % of the intervals since the last call, s.
 
-        A single gap is no jitter. NaN of fewer than `LEAST_STEPS` intervals.
+        A single gap is not jitter. NaN for fewer than `LEAST_STEPS` intervals.
         """
         steps = np.concatenate([np.zeros(0), *self._steps])
         self._steps, self._n_steps = [], 0
@@ -211,7 +212,7 @@ class Rate:
 
 
 class CellChecks:
-    """Looks at the readings so far; logs each fault once, and keeps it for the diagnosis.
+    """Check the readings so far; log each fault once, and keep it for the diagnosis.
 
     Parameters
     ----------
@@ -221,9 +222,9 @@ class CellChecks:
 
     def __init__(self, say: Callable[[Level, str], None]) -> None:
         self._say = say
-        self._miswired: dict[str, str] = {}  # view and kind of marks -> what is wrong with offsets
+        self._miswired: dict[str, str] = {}  # view and kind of marks -> fault of the offsets
         self._misplaced = ""
-        self._marks = 0  # that were read when it was looked at how the plate lies
+        self._marks = 0  # marks read at the last check of the pose
 
     def take(self, measurements: Measurements) -> None:
         """Check the readings of all views so far."""
@@ -235,10 +236,10 @@ class CellChecks:
         self._check_placing(measurements)
 
     def _check_placing(self, measurements: Measurements) -> None:
-        """Look how the plate lies when there are more marks.
+        """Check the pose of the plate when there are more marks.
 
-        And whenever there are others as long as it lies wrongly, so that a view that is measured
-        again ends it.
+        While it is wrong, also whenever the marks have changed, so that a repeated view ends the
+        fault.
         """
         marks = sum(len(view.m) for view in measurements.views)
         if marks == self._marks or (not self._misplaced
@@ -251,13 +252,13 @@ class CellChecks:
         self._misplaced = line
 
     def diagnosis(self) -> Diagnosis:
-        """Return what is wrong, ERROR where something is."""
+        """Return the faults, ERROR if any."""
         wrong = [line for line in (*self._miswired.values(), self._misplaced) if line]
         return Diagnosis(Level.ERROR if wrong else Level.OK, "; ".join(wrong))
 
 
 class StallWatch:
-    """Notices that no detection of the current view has come for a while.
+    """Detect a pause of the detections of the current view.
 
     Parameters
     ----------
@@ -272,7 +273,7 @@ class StallWatch:
         self.restart()
 
     def restart(self) -> None:
-        """Begin anew: a command has been sent."""
+        """Restart: a command has been sent."""
         self._since, self._longest_s = self._now_s(), 0.0
         self._seen: int | None = None
 
@@ -291,7 +292,7 @@ class StallWatch:
 
 
 def missing_marks(status: Any) -> str:
-    """Return the missing marks, lines and check stops of a ViewStatus in words, "" if none."""
+    """Return the missing marks, lines and check stops of a ViewStatus as text, "" if none."""
     marks = [f"({m}, {n})" for m, n in zip(status.missing_m, status.missing_n, strict=False)]
     grid = status.grid_expected - status.grid_done
     lines = [str(k) for k in status.missing_k]

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The journal of a collector: opened or taken up, kept in spite of a full disk, told in the health.
+"""The journal of a collector: started or resumed, tolerant of a full disk, with health.
 
-A journal that cannot be written ends nothing: what is not in it is counted and said.
+Failure to write a journal stops nothing: missing messages are counted and reported.
 """
 
 import errno
@@ -32,17 +32,17 @@ from selfcal_ros.topics import INPUT_TOPICS
 from selfcal_ros.units import S_PER_H
 
 RETRY_S = 10.0
-"""Time after which a journal that could not be opened is tried again, and without failure a failure
+"""Time after which opening a journal is retried, and time without failure after which a failure
 is over."""
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS)
-"""Errors that a disk may get over; others are those of the parameter."""
+"""Errors of the disk that may pass; others are due to the parameter."""
 
 
 @dataclass(frozen=True)
 class TakenUp:
-    """What a journal that is taken up gave: a collector that has it, and what was lost of it.
+    """Content of a resumed journal: a collector with its messages, and losses.
 
-    `steps` are those of clocks, by topic.
+    `steps` are clock steps, by topic.
     """
 
     collector: Collector
@@ -51,12 +51,12 @@ class TakenUp:
 
 
 def take_up(files: list[Path], settings: CollectorSettings) -> TakenUp:
-    """Return a collector with what the files of a journal hold; a file that cannot be read is lost.
+    """Return a collector with the messages of a journal's files; unreadable files are lost.
 
     Parameters
     ----------
     files : list of Path
-        Its MCAP files.
+        The MCAP files.
     settings : CollectorSettings
         Values of the collector's parameters.
 
@@ -87,9 +87,9 @@ def take_up(files: list[Path], settings: CollectorSettings) -> TakenUp:
 
 
 class KeptTopic(NamedTuple):
-    """A topic of the contract in a journal: its name with the namespace, the QoS offered.
+    """A topic of the contract in a journal: its name with the namespace, and offered QoS.
 
-    `heard_on` is its name in the graph, where it is remapped.
+    `heard_on` is its name in the graph, if remapped.
     """
 
     name: str
@@ -99,18 +99,18 @@ class KeptTopic(NamedTuple):
 
 @dataclass(frozen=True)
 class Looked:
-    """What going through the newest journal gave.
+    """Result of reading the newest journal.
 
     Attributes
     ----------
     journal : Journal or None
-        The journal of the run that is not over, to be gone on with.
+        The journal of an unfinished run, to be continued.
     files : list of Path
         Files of such a run: of the journal, or of one that cannot be written or is too old.
     error : InputError or None
         Why it cannot be written.
     problem : InputError or None
-        Why it cannot be read either.
+        Why it cannot even be read.
     """
 
     journal: Journal | None = None
@@ -120,16 +120,16 @@ class Looked:
 
 
 def look_through(found: Claim | None, folder: str, left: Path | None = None) -> Looked:
-    """Go through the newest journal of `folder`, which takes its time.
+    """Read the newest journal of `folder`, which may take long.
 
     Parameters
     ----------
     found : Claim or None
-        That journal, to go on with it where its run is not over; None only looks.
+        That journal, to be continued if its run is not over; None = only read.
     folder : str
-        Where journals lie.
+        Folder of the journals.
     left : Path, optional
-        The journal that is only looked at, where it is no longer the newest.
+        The journal to be only read, if it is no longer the newest.
     """
     error = None
     try:
@@ -145,16 +145,16 @@ def look_through(found: Claim | None, folder: str, left: Path | None = None) -> 
 
 
 class JournalKeeper:
-    """Keeps a journal in a folder; a `Journal` may come, fail and come back.
+    """Keep a journal in a folder, tolerating failures of the `Journal`.
 
-    Until the newest journal has been gone through, what is to be written is held.
+    Messages are held in memory until the newest journal has been read.
 
     Parameters
     ----------
     folder : str
-        Where journals lie; empty = keep none.
+        Folder of the journals; empty = none.
     topics : dict
-        Topic of the contract -> what is kept of it.
+        Topic of the contract -> its declaration in the journal.
     settings : CollectorSettings
         Values of the collector's parameters.
     ports : Ports
@@ -169,32 +169,32 @@ class JournalKeeper:
         self._journal: Journal | None = None
         self._looking: Future[Looked] | None = None
         self._claim: Claim | None = None
-        self.looked_at = ""  # what is gone through
-        self.away_s = 0.0  # since that was written last
-        self._left_ago_s: float | None = None  # of a run that is too old to be taken up
-        self._early: list[tuple[str, bytes, int]] = []  # came while the journal is gone through
-        self._goes_on: list[Path] = []  # files that were taken up and could not be gone on with
+        self.looked_at = ""  # being read
+        self.away_s = 0.0  # since that was last written
+        self._left_ago_s: float | None = None  # of a run too old to be resumed
+        self._early: list[tuple[str, bytes, int]] = []  # received while the journal is read
+        self._goes_on: list[Path] = []  # files that were read but could not be continued
         self._unwritten = 0  # while there was no journal
         self._n_taken = 0  # since the last flush
         self._problem, self._tried_s, self._failed_s = "", 0.0, 0.0
 
     @property
     def path(self) -> Path | None:
-        """The bag folder that is written, None without one."""
+        """The bag folder being written, or None."""
         return self._journal.path if self._journal else None
 
     @property
     def is_wanted(self) -> bool:
-        """Whether a journal is to be kept, be it that it cannot be written just now."""
+        """Whether a journal is requested, even if it cannot be written now."""
         return bool(self._folder)
 
     @property
     def lost(self) -> int:
-        """Messages that are not in the journal and should be."""
+        """Messages missing in the journal."""
         return self._unwritten + (self._journal.n_lost if self._journal else 0)
 
     def open(self, worker: Executor) -> None:
-        """Begin a journal, or have `worker` go through the one of a run that may not be over.
+        """Start a journal, or have `worker` read that of a run that may be unfinished.
 
         Raises
         ------
@@ -225,11 +225,11 @@ class JournalKeeper:
 
     @property
     def holds(self) -> bool:
-        """Whether what comes is held until it is known if a run is to be gone on with."""
+        """Whether messages are held until it is known if a run is to be resumed."""
         return self._looking is not None and self._left_ago_s is None
 
     def earlier(self) -> list[Path]:
-        """Return once the files of the run that is not over, as soon as they are known; else []."""
+        """Return once the files of the unfinished run, as soon as they are known; else []."""
         if self._looking is None or not self._looking.done():
             return []
         looking, self._looking = self._looking, None
@@ -242,7 +242,7 @@ class JournalKeeper:
                 self.write(*item)
 
     def _take_up(self, looked: Looked) -> list[Path]:
-        """Go on with what was found, or begin a journal; return the files of the run."""
+        """Continue the journal found, or start one; return the files of the run."""
         self._tell_problem(looked)
         try:
             if looked.error is not None:
@@ -256,7 +256,7 @@ class JournalKeeper:
         return looked.files
 
     def _tell_left(self, looked: Looked) -> list[Path]:
-        """Say that a run was left too long ago to be taken up; return none of its files."""
+        """Report that a run is too old to be resumed; return none of its files."""
         self._tell_problem(looked)
         for file in looked.files[:1]:
             self._ports.say(Level.WARN, f"{file.parent}: its run was left "
@@ -269,7 +269,7 @@ class JournalKeeper:
             self._ports.say(Level.WARN, f"{looked.problem}; the run is not taken up")
 
     def _open(self, journal: Journal | None) -> None:
-        """Go on with a journal, or begin one."""
+        """Continue a journal, or start one."""
         journal = journal or start(self._folder, self._ports.now_ns())
         with ExitStack() as undo:
             undo.callback(_given_up, journal)
@@ -290,7 +290,7 @@ class JournalKeeper:
             self._unwritten += 1
 
     def flush(self) -> None:
-        """Hand what was taken to the system; a failure is said once, and when it is over."""
+        """Write the messages taken; a failure is reported once, and when it is over."""
         taken, self._n_taken = self._n_taken, 0
         try:
             if self._journal is None:
@@ -300,18 +300,18 @@ class JournalKeeper:
             self._journal.flush()
             if taken and self.lost == lost:
                 self._is_written()
-        except InputError as error:  # whatever it is: what was taken is to be used
+        except InputError as error:  # in any case the messages taken are used
             self._fail(error)
 
     def _try_again(self) -> None:
         if (self._folder and not self.holds
                 and self._ports.now_s() >= self._tried_s + RETRY_S):
             self._tried_s = self._ports.now_s()
-            # into an older journal only what follows it: the session has what that one holds
+            # an older journal gets only later messages: the session has its content
             self._open(resume(self._folder) if self._goes_on else None)
 
     def _is_written(self) -> None:
-        """Say that a failure is over, once nothing has failed for some time."""
+        """Report that a failure is over, after some time without one."""
         if self._problem and self._ports.now_s() >= self._failed_s + RETRY_S:
             self._problem = ""
             self._ports.say(Level.WARN, f"{self.path}: the journal is written again; "
@@ -324,12 +324,12 @@ class JournalKeeper:
         self._problem = str(error)
 
     def close(self) -> None:
-        """Give the journal its end; one that is still gone through first gets what has come."""
+        """Close the journal; one still being read first gets the held messages."""
         if self._looking is not None:
             try:
                 self._looking.result()
                 self.earlier()
-            except CancelledError:  # it was not begun
+            except CancelledError:  # it was not started
                 self._unwritten += len(self._early)
                 if self._claim is not None:
                     self._claim.close()
@@ -342,7 +342,7 @@ class JournalKeeper:
             self._unwritten += journal.n_lost
 
     def diagnosis(self) -> Diagnosis:
-        """Return where the journal is, how far the disk lags, and what is not in it."""
+        """Return path, lag of the disk, and missing messages of the journal."""
         if not self._folder:
             return Diagnosis(Level.OK, "")
         lag_s = self._journal.lag_s if self._journal else 0.0
@@ -362,7 +362,7 @@ def _given_up(journal: Journal) -> None:
 
 
 def bad_input(bad: Counter) -> InputError | None:
-    """Return an error that tells what could not be decoded and empties the count of it."""
+    """Return an error with the undecodable messages, and reset their count."""
     if not bad:
         return None
     line = "; ".join(f"{count} messages on {topic}{why}" for (topic, why), count in bad.items())

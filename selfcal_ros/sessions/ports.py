@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a session needs of the node around it, and what it says of itself."""
+"""Interface between a session and its node, and diagnoses."""
 
 import time
 from collections.abc import Callable
@@ -8,7 +8,7 @@ from enum import IntEnum
 from typing import Any
 
 DIGITS = 20
-"""Of a whole number that does not fit an int64 any more."""
+"""Smallest whole number that does not fit into an int64."""
 
 
 class Level(IntEnum):
@@ -28,7 +28,7 @@ class Diagnosis:
     values: dict[str, Any] = field(default_factory=dict)
 
     def number(self, key: str) -> int | None:
-        """Return a value that is a whole number from 0 on and fits an int64; else None."""
+        """Return a value that is a non-negative int64; else None."""
         text = str(self.values.get(key, ""))
         is_whole = text.isascii() and text.isdecimal() and len(text) < DIGITS
         return int(text) if is_whole else None
@@ -36,12 +36,12 @@ class Diagnosis:
 
 @dataclass(frozen=True)
 class Ports:
-    """How a session reaches the world.
+    """Functions of the node for a session.
 
     Attributes
     ----------
     publish : callable (output, fields)
-        Publish the fields of a message on one of the node's outputs, named by one word.
+        Publish the fields of a message on a named output of the node.
     say : callable (level, line)
         Write one line to the log.
     now_s : callable
@@ -49,9 +49,9 @@ class Ports:
     now_ns : callable
         The clock that stamps messages, integer ns.
     cpu_s : callable
-        Seconds that a processor has worked for this thread.
+        CPU seconds of this thread.
     wall_ns : callable
-        The clock by which the middleware states when it received a message, integer ns.
+        The clock of the middleware's reception times, integer ns.
     """
 
     publish: Callable[[str, dict[str, Any]], None]

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From the bytes that a node receives to its session: to the journal first, then as columns.
+"""From the bytes received by a node to its session: to the journal first, then as columns.
 
-Bytes are decoded by what decodes a bag, and given to the collector in the same form: so a live
-session and its journal cannot differ. The journal keeps every encoder sample around what is
-measured and a few a minute at rest: an encoder at 1 kHz would write 15 GB a day.
+Bytes are decoded like those of a bag, and passed to the collector in the same form, so a live
+session and its journal cannot differ. The journal keeps every encoder sample around measurements
+and a few per minute at rest: an encoder at 1 kHz would write 15 GB a day.
 """
 
 import time
@@ -29,17 +29,17 @@ from selfcal_ros.topics import COMMAND_TOPIC, DETECTION_TOPIC, ENCODER_TOPIC, IN
 from selfcal_ros.units import NS_PER_S, S_PER_NS
 
 REACH_NS = LOOK_BACK_NS + 10 * NS_PER_S
-"""How long before and behind a command or a detection, by reception, every sample is kept: that far
-back from an exposure the direction of approach is looked for, and messages take their time."""
+"""Time before and after a command or a detection, by reception, for which every sample is kept: the
+range of the search for the direction of approach, plus the delay of messages."""
 APART_NS, BURST = 60 * NS_PER_S, 50
-"""Time between the samples that are kept at rest, and how many of them follow one another: they
-show that the encoder was there, how often it told its position, and steps of its clock."""
+"""Period of samples kept at rest, and number of consecutive ones: they
+show the presence of the encoder, its rate, and steps of its clock."""
 Sample = tuple[bytes, int]
 """Bytes, and the instant of reception, ns."""
 
 
 class Reception:
-    """Holds what has been received until `drain`.
+    """Hold received messages until `drain`.
 
     Parameters
     ----------
@@ -50,7 +50,7 @@ class Reception:
     say : callable (level, line)
         Writes to the log.
     refuse : callable (place, error)
-        Counts and tells what cannot be used.
+        Counts and reports unusable messages.
     """
 
     def __init__(self, session: CollectingSession, journal: JournalKeeper, *,
@@ -58,28 +58,28 @@ class Reception:
                  refuse: Callable[[str, Exception], None]) -> None:
         self.session, self.journal, self._say, self._refuse = session, journal, say, refuse
         self._waiting: list[tuple[str, bytes, int, bool]] = []
-        self._n_detections = 0  # that wait
+        self._n_detections = 0  # waiting
         self._held: list[tuple[str, bytes, int, bool]] = []
         self._resting = Resting()
         self._worker: Executor | None = None
         self._restoring: Future[TakenUp] | None = None
-        self._source = ""  # the journal that is taken up
+        self._source = ""  # the journal being resumed
         self._bad: Counter = Counter()
         self._decoders = {topic: ChannelDecoder(topic, name, (typestore(),), self._bad, told=True)
                           for topic, name in INPUT_TOPICS.items()}
 
     def open(self, worker: Executor) -> None:
-        """Open the journal; what it holds of a run that is not over is read by `worker`."""
+        """Open the journal; an unfinished run in it is read by `worker`."""
         self._worker = worker
         self.journal.open(worker)
         self._source = self.journal.looked_at
         self._advance()
 
     def _advance(self) -> None:
-        """Have the run read that is not over, once it is known that there is one."""
+        """Have the unfinished run read, once it is known that there is one."""
         try:
             files = self.journal.earlier()
-        except Exception as error:  # what has come is used, whatever becomes of the journal
+        except Exception as error:  # messages are used in any case, with or without journal
             self._refuse("journal", error)
             return
         if files and self._worker is not None:
@@ -93,12 +93,12 @@ class Reception:
 
     @property
     def may_end(self) -> bool:
-        """Whether what has come, what waits included, may complete the view that is measured."""
+        """Whether messages so far, including waiting ones, may complete the current view."""
         return not self.restoring and self.session.expects_end(self._n_detections)
 
     @property
     def n_waiting(self) -> int:
-        """Messages that have come since the last `drain`."""
+        """Messages received since the last `drain`."""
         return len(self._waiting)
 
     def encoder(self, data: bytes, received_ns: int) -> None:
@@ -111,17 +111,17 @@ class Reception:
         self._n_detections += 1
 
     def command(self, data: bytes, is_older: bool, received_ns: int | None = None) -> None:
-        """Take a selfcal_msgs/ViewCommand as received, now unless another instant is told.
+        """Take a selfcal_msgs/ViewCommand as received, now unless another instant is given.
 
-        `is_older`: published before this node listened.
+        `is_older`: published before this node subscribed.
         """
         when_ns = time.time_ns() if received_ns is None else received_ns
         self._waiting.append((COMMAND_TOPIC, data, when_ns, is_older))
 
     def drain(self) -> bool:
-        """Write what has come to the journal, then give it to the session; tell if counts changed.
+        """Write messages to the journal, then pass them to the session; return if counts changed.
 
-        While a journal is being taken up, what comes meanwhile is written and held back.
+        While a journal is being resumed, messages are written and held back.
         """
         adopted, came, self._waiting, self._n_detections = False, self._waiting, [], 0
         waiting = self._believable(came)
@@ -129,7 +129,7 @@ class Reception:
         self._write(waiting)
         try:
             self.journal.flush()
-        except Exception as error:  # what has come is used, whatever becomes of the journal
+        except Exception as error:  # messages are used in any case, with or without journal
             self._refuse("journal", error)
         if self.restoring:
             self._held += waiting
@@ -144,10 +144,10 @@ class Reception:
 
     def _believable(self, waiting: list[tuple[str, bytes, int, bool]],
                     ) -> list[tuple[str, bytes, int, bool]]:
-        """Return what is not stamped in the future of this node; the rest is counted and told.
+        """Return messages not stamped in the future of this node; the rest is counted and reported.
 
-        It is not in the journal either: it would hide what is stamped later by a clock that is
-        right, and a restart would not end that.
+        Nor are they in the journal: they would hide later messages stamped by a correct clock,
+        even after a restart.
         """
         if not waiting:
             return []
@@ -169,7 +169,7 @@ class Reception:
         return [item for item, left_out in zip(waiting, refused, strict=True) if not left_out]
 
     def _write(self, waiting: list[tuple[str, bytes, int, bool]]) -> None:
-        """Hand what has come to the journal; of an encoder at rest, little."""
+        """Pass messages to the journal; only a few samples of an encoder at rest."""
         if not self.journal.is_wanted:
             return
         newest = self.session.collector.newest_command
@@ -185,11 +185,11 @@ class Reception:
                 self.journal.write(topic, data, received_ns)
 
     def _adopt(self, taken: Future[TakenUp]) -> None:
-        """Go on from what the journal held."""
+        """Continue from the content of the journal."""
         self._restoring = None
         try:
             found = taken.result()
-        except Exception as error:  # a journal that cannot be read ends nothing
+        except Exception as error:  # an unreadable journal stops nothing
             self._refuse("journal", error)
             return
         self.session.adopt(found.collector, self._source, found.steps, self.journal.away_s)
@@ -216,18 +216,18 @@ class Reception:
     def _guarded(self, place: str, take: Callable[..., None], *what: Any) -> None:
         try:
             take(*what)
-        except Exception as error:  # nothing that is received may end a node
+        except Exception as error:  # no message may end a node
             self._refuse(place, error)
 
     def diagnosis(self) -> Diagnosis:
-        """Return what is to be said of the journal."""
+        """Return the diagnosis of the journal."""
         told = self.journal.diagnosis()
         if self.restoring:
             return Diagnosis(Level.WARN, f"reading the journal {self._source}", told.values)
         return told
 
     def close(self) -> None:
-        """Take what waits, and close the journal."""
+        """Take waiting messages, and close the journal."""
         self.drain()
         for sample in self._resting.end():
             self.journal.write(ENCODER_TOPIC, *sample)
@@ -235,26 +235,26 @@ class Reception:
 
 
 class Resting:
-    """Holds the newest samples back while nothing is measured."""
+    """Hold back the newest samples while nothing is measured."""
 
     def __init__(self) -> None:
         self._held: deque[Sample] = deque()
         self._until_ns: int | None = None  # all is kept up to here
-        self._burst_ns: int | None = None  # begin of the newest burst that was kept at rest
+        self._burst_ns: int | None = None  # begin of the newest burst kept at rest
         self._rest_of_burst = 0
 
     def wake(self, received_ns: int) -> list[Sample]:
-        """Take note of a command or a detection; return what was held back, oldest first."""
+        """Record a command or a detection; return the held samples, oldest first."""
         self._until_ns = received_ns + REACH_NS
         return self.end()
 
     def end(self) -> list[Sample]:
-        """Return what is held back, oldest first, and hold it no more."""
+        """Return and release the held samples, oldest first."""
         held, self._held = self._held, deque()
         return [*held]
 
     def sample(self, data: bytes, received_ns: int, *, measuring: bool) -> list[Sample]:
-        """Take a sample; return those that are to be kept now, oldest first."""
+        """Take a sample; return those to be kept now, oldest first."""
         if measuring or (self._until_ns is not None and received_ns <= self._until_ns):
             return [*self.end(), (data, received_ns)]
         self._held.append((data, received_ns))
@@ -266,7 +266,7 @@ class Resting:
         return kept
 
     def _is_kept(self, received_ns: int) -> bool:
-        """Return whether a sample is kept that is too old to be of use."""
+        """Return whether to keep a sample that is too old to be needed."""
         if self._burst_ns is None or abs(received_ns - self._burst_ns) >= APART_NS:
             self._burst_ns, self._rest_of_burst = received_ns, BURST
         self._rest_of_burst -= 1

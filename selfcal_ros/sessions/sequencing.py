@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The session of pose_sequencer: runs, who is missing, time-outs, redos, other sequencers."""
+"""The session of pose_sequencer: runs, missing nodes, time-outs, redos, other sequencers."""
 
 import math
 from collections.abc import Callable
@@ -26,13 +26,13 @@ from selfcal_ros.topics import COMMAND_TOPIC
 from selfcal_ros.units import NS_PER_S, S_PER_NS
 
 PATIENCE_S = 3.0
-"""Time without a sign of life after which a node is missing; it tells its health each second."""
+"""Time without health after which a node, which publishes it each second, is missing."""
 
 LATEST_NS = (1 << 31) * NS_PER_S - 1
-"""The latest stamp that a message can have."""
+"""The latest possible stamp of a message."""
 
 SET_BACK_S = 0.1
-"""How far the clock may be behind the newest command."""
+"""Largest lag of the clock behind the newest command."""
 
 
 def load_plan(path: str) -> Plan:
@@ -41,7 +41,7 @@ def load_plan(path: str) -> Plan:
 
 
 class SequencingSession:
-    """Leads through the views of a plan: stamps the commands, counts the time, yields to others.
+    """Command the views of a plan: stamps, time-outs, other sequencers.
 
     Parameters
     ----------
@@ -67,18 +67,18 @@ class SequencingSession:
         self._stall = StallWatch(settings.stall_time, ports.now_s)
         self._status: Any = None  # newest of the current view
         self._stalled = self._set_back = self._silent = ""
-        self._strayed = False  # a command of somebody else was not followed in this run
+        self._strayed = False  # another publisher's command was not followed in this run
         if self.waiting:
             self.machine.need_plan()
 
     @property
     def ended(self) -> bool:
-        """Whether no plan runs or waits."""
+        """Whether no plan is running or waiting."""
         return self.machine.state in ENDED and not self.waiting
 
     @property
     def current(self) -> View | None:
-        """The view that is being placed or measured."""
+        """The view being placed or measured."""
         busy = self.machine.state in (State.PLACING, State.MEASURING)
         return self.machine.need_plan().views[self.machine.index] if busy else None
 
@@ -87,7 +87,7 @@ class SequencingSession:
         return "" if self.current is None else self.current.name
 
     def missing(self) -> list[str]:
-        """Return who is needed for a run and is not there."""
+        """Return the missing nodes needed for a run."""
         if not self._settings.start_checks:
             return []
         collector = self.presence.of("measurement_collector")
@@ -104,7 +104,7 @@ class SequencingSession:
         return found
 
     def begin(self) -> str:
-        """Start the plan, or take up its run; wait for who is missing and say for whom."""
+        """Start the plan, or resume its run; wait for missing nodes and name them."""
         if self.machine.state not in ENDED:
             raise InputError("pose_sequencer", f"cannot start while {self.machine.state}",
                              "abort the plan first")
@@ -123,7 +123,7 @@ class SequencingSession:
         return self.act(self.machine.start)
 
     def _resume(self) -> str:
-        """Go on where the collector is in an unfinished run of this plan; "" if there is none."""
+        """Resume an unfinished run of this plan where the collector is; "" if there is none."""
         collector = self.presence.of("measurement_collector")
         plan = self.machine.need_plan()
         if not (self._settings.resume and self._fresh and collector):
@@ -136,22 +136,22 @@ class SequencingSession:
                 or stamp_ns is None or stamp_ns > LATEST_NS):
             return ""
         if told.get("placing") not in (None, placing_digest(plan.artifact, plan.views[index])):
-            return ""  # the plan has been edited: what was read is of another one
+            return ""  # the plan has been edited: the readings are of another one
         self.run_id = told["run_id"]
         command = self.machine.resume(index, Phase[phase])
-        self._send([command], stamp_ns=stamp_ns)  # as it was: it is latched anew
+        self._send([command], stamp_ns=stamp_ns)  # unchanged: it is latched again
         known = self._measured.get((plan.plan_id, self.run_id), {})
         names = ", ".join(known[number] for number in sorted(known))
         return (f"took up run {self.run_id} in view '{plan.views[index].name}', {phase}"
                 + (f"; measured already: {names}" if names else ""))
 
     def act(self, request: Callable[[], list[Command]]) -> str:
-        """Carry out a request to the state machine and say where that leads."""
+        """Pass a request to the state machine and report the result."""
         self._send(request())
         return f"{self.machine.state}: view {self.machine.index}"
 
     def give_up(self) -> str:
-        """Abort the plan that runs, or stop waiting for who is missing."""
+        """Abort the running plan, or stop waiting for missing nodes."""
         if self.waiting:
             self.waiting = False
             self._end()
@@ -159,7 +159,7 @@ class SequencingSession:
         return self.act(self.machine.abort)
 
     def take_measurement(self, message: Any) -> None:
-        """Note a view of this plan that has been measured to its end."""
+        """Record a view of this plan that has been completed."""
         plan = self.machine.plan
         if plan is None or message.plan_id != plan.plan_id or (
                 to_model.artifact_of(message) != plan.artifact):
@@ -175,7 +175,7 @@ class SequencingSession:
             views.pop(message.view_index, None)
 
     def take_command(self, message: Any) -> None:
-        """Follow a command that somebody else published."""
+        """Follow another publisher's command."""
         command = to_model.command(message)
         if _key(command) in self._own:
             return
@@ -193,16 +193,16 @@ class SequencingSession:
         said = "another publisher sends view commands: following them; abort ends that"
         if self.machine.state in ENDED:
             self._ports.say(Level.OK, said)
-        elif self.machine.state is not State.FOLLOWING:  # its own plan stops here
+        elif self.machine.state is not State.FOLLOWING:  # its own plan ends here
             self._ports.say(Level.WARN, said)
         self.machine.foreign_command()
         self.waiting = self._fresh = False
         self._end()
 
     def take_status(self, message: Any) -> None:
-        """Note how far the view is; move on when it is complete."""
+        """Record the progress of the view; continue when it is complete."""
         if to_model.stamp_ns(message) < self._commanded_ns:
-            return  # of before the command: a redone view would look complete
+            return  # from before the command: a redone view would look complete
         if message.run_id and message.run_id != self.run_id:
             return  # of another run
         expected = message.grid_expected + message.angular_expected + message.check_expected
@@ -216,7 +216,7 @@ class SequencingSession:
         self._send(moved_on)
 
     def tick(self) -> None:
-        """Do what is due by the clock."""
+        """Perform due work."""
         now = self._ports.now_s()
         if self.waiting and not self.missing():
             self.begin()
@@ -231,7 +231,7 @@ class SequencingSession:
                 self._time_out()
 
     def _tell_set_back(self) -> None:
-        """Say once that the clock is behind the last command: what comes now counts before it."""
+        """Report once that the clock is behind the last command: new commands would precede it."""
         behind_s = (self._commanded_ns - self._ports.now_ns()) * S_PER_NS
         if self.current is None or behind_s <= SET_BACK_S:
             self._set_back = ""
@@ -242,7 +242,7 @@ class SequencingSession:
             self._ports.say(Level.WARN, self._set_back)
 
     def _tell_silent(self) -> None:
-        """Say once that a companion gives no sign of life while a plan runs."""
+        """Report once that a companion is silent while a plan is running."""
         nodes = " and ".join(self.presence.silent()) if self.current is not None else ""
         line = nodes and (f"no sign of life of {nodes} for {PATIENCE_S:g} s: it hangs or has "
                           "ended; wait for it, or start it again: what was measured is kept")
@@ -277,7 +277,7 @@ class SequencingSession:
         self._send(self.machine.redo() if again else self.machine.skip())
 
     def diagnosis(self) -> Diagnosis:
-        """Return what the node says of itself."""
+        """Return the diagnosis of the node."""
         state, level = str(self.machine.state), Level.OK
         if self.waiting:
             state, level = f"waiting for {', '.join(self.missing())}", Level.WARN
@@ -296,7 +296,7 @@ class SequencingSession:
         for command in commands:
             now_ns = self._ports.now_ns()
             if not self.run_id and is_future(self._commanded_ns, now_ns):
-                self._commanded_ns = 0  # the clock was set back: a new run has its time
+                self._commanded_ns = 0  # the clock was set back: a new run uses its time
             stamp = stamp_ns or max(now_ns, self._commanded_ns + 1)
             self._strayed &= bool(self.run_id)
             self.run_id = self.run_id or str(stamp)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The session of solver: which readings are solved together, what is published and saved."""
+"""The session of solver: readings solved together, results published and saved."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -33,12 +33,12 @@ from selfcal_ros.sessions.ports import Diagnosis, Level, Ports
 from selfcal_ros.topics import COMMAND_TOPIC, MEASUREMENT_TOPIC
 
 ECHO_LENGTH = 128
-"""Characters of a string that `ros2 topic echo` shows."""
+"""Length of a string shown by `ros2 topic echo`."""
 
 
 @dataclass(frozen=True, eq=False)
 class Job:
-    """Readings to be solved, with what identifies them; handed to a worker as a whole."""
+    """Readings to be solved, with their identification; passed to a worker."""
 
     run: Run
     measurements: Measurements
@@ -50,7 +50,7 @@ class Job:
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """What solving a job gave; `problem` where the readings do not identify the stage, or worse."""
+    """Outcome of a job; `problem` if the readings do not identify the stage, or worse."""
 
     job: Job
     result: CalibrationResult | None
@@ -58,30 +58,30 @@ class Outcome:
 
 
 def solve(job: Job) -> Outcome:
-    """Solve a job; needs nothing but the job, so that it can run anywhere."""
+    """Solve a job; depends on nothing else, so it can run anywhere."""
     try:
         result = worded(calibrate(job.measurements, job.options))
         return Outcome(job, with_warnings(result, job.notes), None)
     except NotIdentifiableError as error:
         result = worded(unidentified_result(job.measurements, error.observability))
         return Outcome(job, with_warnings(result, job.notes), error)
-    except Exception as error:  # told by `take`, in the thread of the session
+    except Exception as error:  # reported by `take`, in the thread of the session
         return Outcome(job, None, error)
 
 
 @cache
 def warm_up(marks: int = 5) -> None:
-    """Solve noise, so that all that solving needs is there; once in a process.
+    """Warm up the solver with noise; once per process.
 
-    Otherwise the first solution of a session would wait for it. To be called before there are other
-    threads: threadpoolctl, when it first looks for libraries, waits for the interpreter while the
-    loader of libraries waits for it, and an import in another thread at that time is a deadlock.
-    Then once more by the thread that will solve, which has memory of its own.
+    Otherwise the first solution of a session would be slow. Call it before other threads
+    exist: threadpoolctl, when it first searches for libraries, waits for the interpreter while the
+    library loader waits for it, and an import in another thread at that time is a deadlock.
+    Then again in the solving thread, which has its own memory.
 
     Parameters
     ----------
     marks : int
-        Marks along each side of the plate, for which memory is made ready.
+        Marks per side of the plate, for which memory is prepared.
     """
     keep_freed_memory()
     calibrate(pure_noise(marks))
@@ -89,7 +89,7 @@ def warm_up(marks: int = 5) -> None:
 
 @dataclass
 class Shown:
-    """What is published now: a result, of which run, or why there is none."""
+    """Present publication: a result and its run, or why there is none."""
 
     result: CalibrationResult | None = None
     problem: Exception | None = None
@@ -100,10 +100,10 @@ class Shown:
 
 
 class SolvingSession:
-    """Hands out jobs when readings have arrived; publishes ``map``, ``markers``, ``summary``.
+    """Create jobs when readings have arrived; publish ``map``, ``markers``, ``summary``.
 
-    Readings of different runs are never solved together: the newest run counts, and what comes
-    later of an older one is left aside.
+    Readings of different runs are never solved together: the newest run counts, and later readings
+    of an older one are ignored.
 
     Parameters
     ----------
@@ -116,32 +116,32 @@ class SolvingSession:
     def __init__(self, settings: SolverSettings, ports: Ports) -> None:
         self._settings, self._ports = settings, ports
         self._messages: dict[int, Any] = {}
-        self._notes: tuple[str, ...] = ()  # on the session, of the newest message
+        self._notes: tuple[str, ...] = ()  # on the session, from the newest message
         self._run = Run()
         self._planned: dict[Run, int] = {}
-        self._ended: set[Run] = set()  # a DONE was heard
+        self._ended: set[Run] = set()  # DONE was received
         self._stale = False
         self._left_aside = 0
-        self._saved = ""  # absolute path of the map that is shown
+        self._saved = ""  # absolute path of the published map
         self.shown = Shown()
 
     @property
     def result(self) -> CalibrationResult | None:
-        """The result that is published."""
+        """The published result."""
         return self.shown.result
 
     @property
     def stale(self) -> bool:
-        """Whether something has come that no job was made of."""
+        """Whether there are readings without a job."""
         return self._stale
 
     def take_command(self, message: Any) -> None:
-        """Learn from a view command how many views are planned.
+        """Get the number of planned views from a view command.
 
         Raises
         ------
         InputError
-            If it names more views than a plan can have.
+            If it has more views than a plan can have.
         """
         if message.views_planned > MAX_VIEWS:
             raise InputError(COMMAND_TOPIC, f"a plan has at most {MAX_VIEWS} views, not "
@@ -155,19 +155,19 @@ class SolvingSession:
         tells = not self._planned_views(run) or isinstance(self.shown.problem, NoDataError)
         if run in (self._run, Run(self._run.plan_id)) and (
                 message.views_planned > known or (ends and tells)):
-            self._stale = True  # the summary says how many views are planned, or still to come
+            self._stale = True  # the summary shows the number of planned or remaining views
 
     def _planned_views(self, run: Run) -> int:
-        """Return the number of views planned; commands that tell no run count for all of a plan."""
+        """Return the number of planned views; commands without a run count for all runs."""
         return max(self._planned.get(run, 0), self._planned.get(Run(run.plan_id), 0))
 
     def take_measurement(self, message: Any) -> None:
-        """Take the readings of a view; those of an older run are left aside.
+        """Take the readings of a view; those of an older run are ignored.
 
         Raises
         ------
         InputError
-            If the message contradicts itself, or claims what cannot be.
+            If the message is inconsistent or impossible.
         """
         check_view(to_model.view_readings(message), to_model.artifact_of(message),
                    int(message.view_index))
@@ -181,7 +181,7 @@ class SolvingSession:
                 self._left_aside += 1
                 return
             self._run, self._messages = run, {}
-        # one collector, delivered in order: its newest word on a view holds
+        # one collector, in order: its newest message on a view is valid
         self._messages[message.view_index] = message
         self._notes = to_model.notes_of(message)
         self._stale = True
@@ -206,12 +206,12 @@ class SolvingSession:
                             to_model.terms_of(newest))
 
     def next_job(self) -> Job | None:
-        """Return what is to be solved, if readings have come since the last job.
+        """Return the next job, if readings have arrived since the last one.
 
         Raises
         ------
         SelfcalError
-            If the readings cannot be used together; it is shown as the state as well.
+            If the readings cannot be used together; also shown as the state.
         """
         if not self._stale:
             return None
@@ -229,7 +229,7 @@ class SolvingSession:
         return Job(self._run, measurements, options, digest, stamp, self._notes)
 
     def take(self, outcome: Outcome) -> None:
-        """Publish what solving a job gave, unless another run has begun meanwhile."""
+        """Publish the outcome of a job, unless another run has begun meanwhile."""
         job = outcome.job
         if job.run != self._run:
             return
@@ -244,7 +244,7 @@ class SolvingSession:
             self._save_by_itself(outcome.result)
 
     def _take_none(self, outcome: Outcome) -> None:
-        """Show why readings gave no result; raise it unless views to come may change that."""
+        """Show why there is no result; raise it unless remaining views may change this."""
         job = outcome.job
         self.shown = Shown(None, outcome.problem, job.run, len(job.measurements.views),
                            job.stamp_ns, "")
@@ -257,7 +257,7 @@ class SolvingSession:
             path = run_file(self._settings.save_path, self.shown.run.run_id)
             write_json(path, result_to_dict(created_now(result)))
             self._saved = str(path)
-        except InputError as error:  # the map itself is good, and save_map may go elsewhere
+        except InputError as error:  # the map itself is good, and save_map may use another path
             self._ports.say(Level.ERROR, f"save_path: {error}")
 
     def _publish(self, result: CalibrationResult) -> None:
@@ -279,15 +279,15 @@ class SolvingSession:
             **summary_numbers(result),
             "advice": [*advice, *result.warnings], "causes": [
                 cause.text for cause in result.verdict.causes], **verdict})
-        if shown.problem is None:  # last: pictures take their time
+        if shown.problem is None:  # last, as pictures are slow
             self._ports.publish("markers", {"error_map": result.error_map,
                                             "stamp_ns": shown.stamp_ns})
 
     def _unfinished(self) -> bool:
-        """Return whether views to come may bring what is missing.
+        """Return whether remaining views may help.
 
-        Lines without a single grid mark are taken for a beginning until DONE: readings may arrive
-        before any command, and where all come shuffled those of lines may be the first of each
+        Lines without any grid mark are taken as a beginning until DONE: readings may arrive
+        before any command, and shuffled ones may begin with the lines of each
         view.
         """
         run, problem = self.shown.run, self.shown.problem
@@ -308,16 +308,16 @@ class SolvingSession:
         return state_sentence(self.shown.result)
 
     def digest(self) -> str:
-        """Return the fingerprint of the readings behind the published map; "" = of none."""
+        """Return the fingerprint of the readings behind the published map; "" = none."""
         return "" if self._stale else self.shown.digest
 
     def save(self, path: str) -> tuple[str, str]:
-        """Write the result that is shown; return a line that says so, and the absolute path.
+        """Write the published result; return a line for the log, and the absolute path.
 
         Raises
         ------
         SelfcalError
-            If there is no map, or `path` lies outside of the folder for results.
+            If there is no map, or `path` is outside the folder for results.
         """
         if self.shown.problem is not None:
             raise self.shown.problem
@@ -333,7 +333,7 @@ class SolvingSession:
         return line + (f"; WARNING: {newer}" if newer else ""), str(target)
 
     def _newer(self, runs: Iterable[Run]) -> str:
-        """Return what is to be said of a run that is newer than the one shown; "" without one."""
+        """Return a note on a run that is newer than the published one; "" if none."""
         now_ns, shown = self._ports.now_ns(), begun_ns(self.shown.run.run_id)
         later = [(begun, run) for run in runs if (begun := begun_ns(run.run_id))
                  and shown and begun > shown and not begins_in_future(run, now_ns)]
@@ -344,7 +344,7 @@ class SolvingSession:
                 "its readings has come; the health of measurement_collector says why")
 
     def load(self, path: str) -> str:
-        """Publish the map of a RESULT.json and say so."""
+        """Publish the map of a RESULT.json and log it."""
         result = read_result(path)
         self.shown = Shown(result, run=Run(result.plan_id, result.run_id),
                            views_done=len(result.views))
@@ -353,10 +353,10 @@ class SolvingSession:
         return f"loaded {path}: plan {result.plan_id}"
 
     def diagnosis(self) -> Diagnosis:
-        """Return what the node says of itself."""
+        """Return the diagnosis of the node."""
         shown = self.shown
         known = shown.result is not None or shown.problem is not None
-        newer = self._newer(self._ended)  # one that goes on may yet send its readings
+        newer = self._newer(self._ended)  # a running one may still send its readings
         fine = (shown.problem is None or self._unfinished()) and (
             shown.problem is not None or shown.result is None or is_qualified(shown.result))
         state = self._state() if known else "waiting for views"
@@ -368,7 +368,7 @@ class SolvingSession:
 
 
 def short(sentence: str) -> str:
-    """Return a sentence without the clauses at its end that `ros2 topic echo` would cut into."""
+    """Return a sentence without trailing clauses that `ros2 topic echo` would truncate."""
     if len(sentence) <= ECHO_LENGTH:
         return sentence
     head = sentence[:ECHO_LENGTH]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a person who watches a cell wants to see, gathered from its topics as plain values."""
+"""State of a cell for display, collected from its topics as plain values."""
 
 import math
 from collections.abc import Iterable
@@ -21,15 +21,15 @@ from selfcal_ros.units import ARCSEC_PER_RAD, MM_PER_M, UM_PER_M
 
 PATIENCE_S = 3.0
 NODES = ("measurement_collector", "pose_sequencer", "solver")
-"""Nodes that a calibration needs; others are shown when they tell something."""
+"""Nodes needed for a calibration; others are shown if heard."""
 MOST_SITES = 41
-"""Signs a side of the pictures; of a larger plate one stands for 2 x 2, 3 x 3, ... marks."""
+"""Cells per side of the pictures; for a larger plate each represents 2 x 2, 3 x 3, ... marks."""
 MOST_ENTRIES = 200
-"""Entries of a list that are shown: as many as a ViewStatus may name missing marks."""
+"""Entries of a list that are shown: as many as the missing marks in a ViewStatus."""
 
 
 class Watch:
-    """Keeps the newest word of everybody, and makes one picture of it.
+    """Keep the newest messages, and combine them into one picture.
 
     Parameters
     ----------
@@ -42,29 +42,29 @@ class Watch:
         self._seen: set[str] = set(NODES)
         self._command: Any = None
         self._status: Any = None
-        self._measured: Any = None  # the command that it belongs to
+        self._measured: Any = None  # its command
         self._summary: Any = None
         self._map: Any = None
 
     def take_health(self, node: str, diagnosis: Diagnosis) -> None:
-        """Take what a node says of itself."""
+        """Take the health of a node."""
         self._seen.add(node)
         self._presence.take(node, diagnosis)
 
     def take_command(self, message: Any) -> None:
-        """Take a view command; the newest by its stamp counts."""
+        """Take a view command; the newest by stamp is used."""
         if self._command is None or to_model.stamp_ns(message) >= to_model.stamp_ns(self._command):
             self._command = message
 
     def take_status(self, message: Any) -> None:
-        """Take how far a view is; that of the commanded view counts."""
+        """Take the progress of a view; that of the commanded view is used."""
         command = self._command
         if command is None or (message.plan_id, message.view_index) == (
                 command.plan_id, command.view_index):
             self._status, self._measured = message, command
 
     def take_summary(self, message: Any) -> None:
-        """Take where the calibration stands."""
+        """Take the summary of the calibration."""
         self._summary = message
 
     def take_map(self, message: Any) -> None:
@@ -72,7 +72,7 @@ class Watch:
         self._map = message
 
     def picture(self) -> dict[str, Any]:
-        """Return everything as values that JSON knows."""
+        """Return everything as JSON values."""
         return {"health": {node: self._health(node) for node in sorted(self._seen)},
                 "command": self._commanded(), "view": self._view(),
                 "summary": self._summed(), "map": self._mapped()}
@@ -99,7 +99,7 @@ class Watch:
         status, command = self._status, self._command
         if status is None or (status.run_id and command is not None and command.run_id
                               and status.run_id != command.run_id):
-            return None  # nothing of this run is measured yet
+            return None  # nothing measured in this run yet
         plate, step = self._plate()
         return {
             "view_name": printable(status.view_name), "complete": bool(status.complete),
@@ -115,7 +115,7 @@ class Watch:
             "plate": plate, "plate_step": step}
 
     def _plate(self) -> tuple[list[str], int]:
-        """Return the plate as `plate_picture` does; empty where the command tells none."""
+        """Return the plate as in `plate_picture`; empty if the command has none."""
         command, status = self._measured, self._status
         try:
             artifact = to_model.artifact_of(command)
@@ -124,7 +124,7 @@ class Watch:
                                map(int, status.missing_n[:MOST_ENTRIES]), strict=False))
             return plate_picture(artifact, view, missing,
                                  status.grid_expected - status.grid_done, MOST_SITES)
-        except Exception:  # a picture is no place for the faults of a command
+        except Exception:  # faults of a command are not reported here
             return [], 1
 
     def _summed(self) -> dict[str, Any] | None:
@@ -139,16 +139,16 @@ class Watch:
             "run_id": printable(summary.run_id)}
 
     def _mapped(self) -> dict[str, Any] | None:
-        """Return |G| in um by site, rows from the top; None where unknown.
+        """Return |G| in um by site, rows from the top; None if unknown.
 
-        Of a larger map each number is the largest of its sites, None where one of them is unknown.
+        For a larger map each number is the largest of its sites, None if one of them is unknown.
         """
         message = self._map
         if message is None:
             return None
         try:
             error_map = to_model.error_map(message)
-        except Exception:  # the solver's own health tells of it
+        except Exception:  # reported in the solver's health
             return None
         with np.errstate(over="ignore"):
             size = np.hypot(error_map.gx, error_map.gy) * UM_PER_M
@@ -170,23 +170,23 @@ def _finite(value: float) -> float | None:
 
 def plate_picture(artifact: Artifact, view: View, missing: Iterable[tuple[int, int]],
                   n_missing: int, most: int) -> tuple[list[str], int]:
-    """Return the plate in its own frame, top line first, and how many marks a side are one sign.
+    """Return the plate in its own frame, top line first, and the number of marks per cell side.
 
-    ``o`` read, ``.`` missing, ``?`` not told which, blank: not in this view. Of several marks the
-    worst shows. There are no lines where nothing can be told.
+    ``o`` read, ``.`` missing, ``?`` unknown, blank: not in this view. The worst of several marks
+    is shown. Empty if nothing is known.
 
     Parameters
     ----------
     artifact : Artifact
         The plate.
     view : View
-        How it lies.
+        Its pose.
     missing : iterable of (m, n)
         The first missing marks, in the order of m, then n.
     n_missing : int
-        How many are missing; the named ones may be fewer.
+        Number of missing marks, possibly more than `missing`.
     most : int
-        Signs a side at most.
+        Largest number of cells per side.
     """
     (m_low, m_high), (n_low, n_high) = mark_range(artifact, view)
     named = sorted(missing)
@@ -197,7 +197,7 @@ def plate_picture(artifact: Artifact, view: View, missing: Iterable[tuple[int, i
         (half[0], m_low, m_high), (half[1], n_low, n_high)))
     inside = (m <= m_last)[:, None] & (n <= n_last)[None, :]
     signs = np.where(inside, "o", " ")
-    if n_missing > len(named):  # what lies behind the last named one is not told
+    if n_missing > len(named):  # marks after the last named one are unknown
         last = named[-1]
         behind = (m_last > last[0])[:, None] | ((m_last == last[0])[:, None]
                                                 & (n_last > last[1])[None, :])

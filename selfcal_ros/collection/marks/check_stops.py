@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Check stops: which readings of a mark were taken with the stage deliberately off it.
+"""Check stops: readings of a mark with the stage deliberately off it.
 
-The place of the stage relative to the site of a mark is the deviation less the offset, whichever
-moves. Nothing says which readings are check stops but where the stage stood: about a check offset
-from where it mostly stands for that mark, along one axis.
+The position of the stage relative to the site of a mark is deviation minus offset, in either
+sense. Check stops are recognised by the position of the stage: about a check offset
+from its usual position at that mark, along one axis.
 """
 
 import numpy as np
@@ -13,30 +13,30 @@ from selfcal_ros.model.readings import ViewReadings
 from selfcal_ros.model.view import View
 
 SCATTER = 1 / 12
-"""Scatter of the ordinary stops, in check offsets, above which no stop can be told to be aside."""
+"""Scatter of the ordinary stops, in check offsets, above which check stops are not recognised."""
 QUARTILE = 0.4506241100243562
 """Lower quartile of the difference of two normal variables of standard deviation 1."""
 LOOKED_AT = 2000
-"""Marks of as many readings at most of which the scatter is taken."""
+"""Largest number of marks per number of readings used for the scatter."""
 
 
 def stage_aside(key: np.ndarray, place_m: np.ndarray, offset_m: float) -> np.ndarray | None:
-    """Return how far off its usual place at its mark the stage stood, of check stops alone.
+    """Return the distance of the stage from its usual position at the mark, for check stops.
 
     Parameters
     ----------
     key : int array (n,)
-        Number of the mark of each reading.
+        Index of the mark of each reading.
     place_m : float array (2, n)
-        Where the stage stood, m, along x and y.
+        Position of the stage, m, along x and y.
     offset_m : float
-        How far check stops are off, m.
+        Distance of check stops, m.
 
     Returns
     -------
     float array (2, n) or None
-        Along the axis of the check stop, m; 0 along the other and for ordinary stops. None where
-        ordinary stops scatter so much that they cannot be told from check stops.
+        Along the axis of the check stop, m; 0 along the other and for ordinary stops. None if
+        ordinary stops scatter too much to be distinguished from check stops.
     """
     if _scatter(key, place_m) > SCATTER * offset_m:
         return None
@@ -48,8 +48,8 @@ def stage_aside(key: np.ndarray, place_m: np.ndarray, offset_m: float) -> np.nda
 def _scatter(key: np.ndarray, place_m: np.ndarray) -> float:
     """Return the standard deviation of the stops along the axis where it is smaller, m.
 
-    Of the four check stops two stand alike along each axis, which is why the lower quartile of the
-    differences of readings of a mark, and the better axis, are those of ordinary stops.
+    Two of the four check stops coincide along each axis, so the lower quartile of the
+    differences of readings of a mark, and the better axis, represent ordinary stops.
     """
     apart = [np.zeros((2, 0))]
     for group in groups_of(key):
@@ -61,7 +61,7 @@ def _scatter(key: np.ndarray, place_m: np.ndarray) -> float:
 
 
 def _medians(key: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Return the median of the values of each key, of two in the middle the lower, at each (n,)."""
+    """Return the (lower) median of the values of each key, for each element (n,)."""
     order = np.lexsort((values, key))
     _, first, inverse, count = np.unique(key[order], return_index=True, return_inverse=True,
                                          return_counts=True)
@@ -72,10 +72,10 @@ def _medians(key: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 def without_aside(key: np.ndarray, deviation_m: np.ndarray, offset_m: np.ndarray,
                   check_offset_m: float) -> tuple[np.ndarray, int]:
-    """Return deviations less what check stops show of the microscope, and how many numbers that is.
+    """Return deviations minus the microscope's error from check stops, and its parameter count.
 
-    A microscope of a wrong scale, turn or sign reads a mark differently from a check stop. That is
-    neither an outlier nor noise: the part proportional to where the stage stood is taken off, by
+    A microscope with a wrong scale, turn or sign reads a mark differently from a check stop. This
+    is neither an outlier nor noise: the part proportional to the stage position is removed, from
     the median over the check stops along each axis.
 
     Parameters
@@ -83,9 +83,9 @@ def without_aside(key: np.ndarray, deviation_m: np.ndarray, offset_m: np.ndarray
     key : int array (n,)
         Number of the mark of each reading.
     deviation_m, offset_m : float array (2, n)
-        Deviation, and offset seen, m.
+        Deviation, and measured offset, m.
     check_offset_m : float
-        How far check stops are off, m; 0 = there are none.
+        Distance of check stops, m; 0 = none.
     """
     aside = stage_aside(key, deviation_m - offset_m, check_offset_m) if check_offset_m else None
     if aside is None or not aside.any():
@@ -102,11 +102,11 @@ def without_aside(key: np.ndarray, deviation_m: np.ndarray, offset_m: np.ndarray
 
 
 def count_stops(view: View, readings: ViewReadings) -> tuple[np.ndarray, int]:
-    """Return the readings of each grid mark but its check stops, (P,), and how many are checked.
+    """Return the readings of each grid mark without check stops, (P,), and the number checked.
 
-    A mark is checked that was seen from all four sides; where the stage stood off on one side
-    alone, that was a repeat. Where ordinary stops scatter like check stops nobody can count, and
-    they show the microscope themselves: as many marks as wanted are checked.
+    A mark is checked if it was measured from all four sides; a stop on one side only counts
+    as a repeat. If ordinary stops scatter like check stops, they show the microscope's error
+    themselves: all requested marks count as checked.
     """
     visits = readings.visits
     if not view.check_marks or visits is None:

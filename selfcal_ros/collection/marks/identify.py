@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which mark was seen: by its id, or as the nearest nominal mark of the view."""
+"""Identification of marks by id, or as the nearest nominal mark of the view."""
 
 from dataclasses import dataclass, replace
 
@@ -19,14 +19,14 @@ from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.view import LatticePose, View
 
 TOO_FAR_FROM_ANY = 0.75
-"""Distance to the nearest mark, in pitches, beyond which a detection is of no mark at all."""
+"""Distance to the nearest mark, in pitches, beyond which a detection is not of a mark."""
 SURE = 0.25
-"""Largest error of a predicted place, in pitches, at which the nearest mark is the one seen:
-with an unknown offset of a quarter pitch it stays below half a pitch."""
+"""Largest error of a predicted position, in pitches, for which the nearest mark is the detected
+one: with an unknown offset of a quarter pitch it stays below half a pitch."""
 OFF_ANY_PLATE_M = 1e9
-"""Coordinate beyond which a reading is not looked at more closely."""
+"""Coordinates beyond this are clipped."""
 HALF_A_LINE = 0.45
-"""Largest rotation to reckon with, in lines, at which the nearest line is the one seen."""
+"""Largest possible rotation, in lines, for which the nearest line is the detected one."""
 
 
 @dataclass(frozen=True)
@@ -39,9 +39,9 @@ class IdentityRules:
     max_stage_distance_m: float = 0.0
 
     def stage_limit_m(self, artifact: Artifact) -> float:
-        """Return how far the stage may be from the site of the mark that it shows, m.
+        """Return the largest distance of the stage from the site of a detected mark, m.
 
-        Unless stated: half a pitch, and what the largest rotation moves the plate's rim.
+        Default: half a pitch plus the motion of the plate's rim by the largest rotation.
         """
         rim = self.max_rotation_rad * float(np.hypot(*artifact.half))
         return self.max_stage_distance_m or (0.5 + rim) * artifact.grid_pitch_m
@@ -49,10 +49,10 @@ class IdentityRules:
 
 @dataclass(frozen=True)
 class MarkAssignment:
-    """Marks behind readings: indices, deviations (rows, n), and reasons where rejected.
+    """Marks of readings: indices, deviations (rows, n), and reasons of rejection.
 
-    `residual` is the deviation without the view's own motion `rigid`; `phi_error_rad` says how
-    far its rotation may be off.
+    `residual` is the deviation without the view's own motion `rigid`; `phi_error_rad` is the
+    largest error of its rotation.
     """
 
     index: np.ndarray
@@ -68,12 +68,12 @@ def identify_grid(artifact: Artifact, view: View, reading_m: np.ndarray, *, ids:
                   stage_m: np.ndarray | None = None) -> MarkAssignment:
     """Identify grid marks and return their deviations from the nominal places of the view.
 
-    A mark at whose site the stage does not stand is rejected, and tells nothing of the others.
+    A mark is rejected if the stage is not at its site, and not used for the others.
 
     Parameters
     ----------
     artifact, view
-        The plate and how it lies.
+        The plate and its pose.
     reading_m : float array (2, n)
         Positions of the marks as read, stage frame.
     ids : int array (2, n)
@@ -83,7 +83,7 @@ def identify_grid(artifact: Artifact, view: View, reading_m: np.ndarray, *, ids:
     rules : IdentityRules
         Limits.
     stage_m : float array (2, n), optional
-        Site at which the stage stood, by its own indication; None = at the mark.
+        Indicated site of the stage; None = at the mark.
     """
     pose, pitch = view.lattice_pose(artifact), artifact.grid_pitch_m
     reasons = np.full(reading_m.shape[1], None, dtype=object)
@@ -136,7 +136,7 @@ def _at_most_two(numbers: np.ndarray) -> bool:
 
 def _astray(pose: LatticePose, marks: np.ndarray, stage_m: np.ndarray | None, artifact: Artifact,
             limit_m: float, *, among: np.ndarray) -> np.ndarray:
-    """Return which `among` marks (2, n) have the stage further from their sites than it may be."""
+    """Return which of the `among` marks (2, n) have the stage too far from their sites."""
     if stage_m is None or not among.any():
         return np.zeros(marks.shape[1], dtype=bool)
     astray = np.empty(marks.shape[1], dtype=bool)
@@ -164,11 +164,11 @@ def _nearest(pose: LatticePose, centred: np.ndarray, pitch: float, half: np.ndar
 def _settle(pose: LatticePose, centred: np.ndarray, half: np.ndarray, ids: np.ndarray,
             kinds: tuple[np.ndarray, np.ndarray], pitch: float,
             rules: IdentityRules) -> tuple[MotionEstimate, RigidFit]:
-    """Return what is known of the view's own motion: grown outwards from what is sure.
+    """Return the estimate of the view's own motion, extended outwards from unambiguous marks.
 
-    Far from the centre a misalignment in rotation may exceed half a pitch. So marks without ids
-    are used only where the motion known so far cannot confuse them: about the named marks, or
-    about the innermost one if none is named; the motion that they tell reaches further out.
+    Far from the centre a rotational misalignment may exceed half a pitch. So marks without ids
+    are used only where the motion known so far cannot confuse them: around the named marks, or
+    around the innermost one if none is named; the motion from these reaches further out.
     """
     named, free = kinds
     about = _about(pose, ids, pitch)
@@ -190,7 +190,7 @@ def _settle(pose: LatticePose, centred: np.ndarray, half: np.ndarray, ids: np.nd
 
 
 def _innermost(centred: np.ndarray, pitch: float, max_rotation_rad: float) -> MotionEstimate:
-    """Return what marks about the innermost one tell: the offset there, up to whole pitches."""
+    """Return the offset at the innermost mark from marks around it, up to whole pitches."""
     if not centred.shape[1]:
         return MotionEstimate(phi_error_rad=max_rotation_rad)
     centre = centred[:, np.argmin(np.hypot(*centred))]
@@ -204,8 +204,8 @@ def _innermost(centred: np.ndarray, pitch: float, max_rotation_rad: float) -> Mo
 def _folded(known: MotionEstimate, fit: RigidFit, pitch: float) -> tuple[MotionEstimate, RigidFit]:
     """Return the motion whose offset at the plate's centre is below half a pitch.
 
-    Marks without ids tell it only up to whole pitches, and not at all where they lie so far out
-    that the rotation does not tell what becomes of it at the centre.
+    Marks without ids determine it only up to whole pitches, and not at all if they are so far out
+    that the rotation does not give the offset at the centre.
     """
     if known.error_at(np.zeros((2, 1)))[0] > SURE * pitch:
         return replace(known, offset_error_m=float("inf")), fit
@@ -228,7 +228,7 @@ def identify_angular(artifact: Artifact, view: View, reading_rad: np.ndarray, *,
     Parameters
     ----------
     artifact, view
-        The plate and how it lies.
+        The plate and its pose.
     reading_rad : float array (n,)
         Directions of the lines as read, stage frame.
     ids : int array (n,)
@@ -238,8 +238,8 @@ def identify_angular(artifact: Artifact, view: View, reading_rad: np.ndarray, *,
     rules : IdentityRules
         Limits.
     phi_rad : float or None
-        The view's rotation where the grid marks told it. Where neither they nor ids tell it, and
-        the nearest line need not be the one seen, lines without ids are rejected.
+        The view's rotation from the grid marks. If neither they nor ids determine it, and
+        the nearest line may be wrong, lines without ids are rejected.
     """
     reasons = np.full(len(reading_rad), None, dtype=object)
     count = artifact.angular_count
@@ -268,17 +268,17 @@ def identify_angular(artifact: Artifact, view: View, reading_rad: np.ndarray, *,
 
 
 def _nearest_line_is_sure(phi_rad: float, step_rad: float, max_rotation_rad: float) -> bool:
-    """Return whether lines that are off by `phi_rad` from the nearest can be no others.
+    """Return whether lines that are off by `phi_rad` are certainly the nearest ones.
 
-    Lines tell a rotation only up to whole steps. What is seen is the truth if every rotation
-    to reckon with stays below half a step, and what is seen is one to reckon with.
+    Lines determine a rotation only up to whole steps. The apparent rotation is the true one if
+    every possible rotation is below half a step, and the apparent one is possible.
     """
     return (max_rotation_rad <= HALF_A_LINE * step_rad
             and abs(phi_rad) <= max(max_rotation_rad, step_rad / 4))
 
 
 def _middle(angles_rad: np.ndarray, period_rad: float) -> float:
-    """Return the median of angles on a circle of a given period, within half of it about 0."""
+    """Return the median of angles on a circle of a given period, within half a period about 0."""
     if not len(angles_rad):
         return 0.0
     turn = 2 * np.pi / period_rad
@@ -289,7 +289,7 @@ def _middle(angles_rad: np.ndarray, period_rad: float) -> float:
 
 
 def wrap(angle_rad: np.ndarray) -> np.ndarray:
-    """Return angles wrapped to (-pi, pi]; those already there keep their bits."""
+    """Return angles wrapped to (-pi, pi]; angles in this range are unchanged."""
     inside = (angle_rad > -np.pi) & (angle_rad <= np.pi)
     turns = np.where(inside, 0.0, np.rint(angle_rad / (2 * np.pi)))
     return angle_rad - turns * (2 * np.pi)

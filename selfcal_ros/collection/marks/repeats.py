@@ -1,16 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """From repeats of a mark to one mean, without outliers, and to the means of its visits.
 
-Rule: a repeat is an outlier if it lies further from the median of its mark's repeats than
+Rule: a repeat is an outlier if its distance from the median of its mark's repeats exceeds
 `limit` standard deviations of one reading. The standard deviation is robust: the median of
-the absolute differences of all pairs of repeats of the view, over 0.6745 sqrt(2), so that it
-stays put while under a quarter of the pairs are spoilt. With few pairs the limit grows. Of two
-repeats that contradict each other both are outliers: neither can be believed. So are all repeats
-of a mark of which fewer than half are left: the median of a mark whose repeats are mostly
-outliers is itself an outlier, and would be kept in place of the good one.
+the absolute differences of all pairs of repeats of the view, over 0.6745 sqrt(2), stable with up
+to a quarter of bad pairs. With few pairs the limit grows. Of two contradictory repeats both are
+outliers, and so are all repeats of a mark of which fewer than half are left: the median of mostly
+bad repeats is itself an outlier, and would be kept instead of the good one.
 Of clean Gaussian readings fewer than 1 in 100,000 are rejected (test_repeats.py).
-Where most pairs agree to the bit and the others differ by whole steps of one size, the step is that
-of a sensor which resolves no finer, and a few steps are no outlier.
+If most pairs agree to the bit and the others differ by whole steps of one size, this is the
+resolution of the sensor, and a few steps are not an outlier.
 """
 
 from collections.abc import Iterator
@@ -25,11 +24,11 @@ PART = 32_768
 """Numbers that are worked on together where marks do not depend on each other: they stay in the
 cache of a processor, and take no memory beside the readings."""
 MIN_PAIRS = 12
-"""Pairs of repeats below which a view is too small to tell outliers."""
+"""Smallest number of pairs of repeats in a view to detect outliers."""
 ALL_PAIRS = 33
-"""Repeats of a mark up to which all their pairs are looked at; of more, 16 for each repeat."""
+"""Largest number of repeats of a mark with all pairs used; above, 16 per repeat."""
 STEPS = 3
-"""Steps of a sensor by which repeats may differ that otherwise agree to the bit."""
+"""Steps of a sensor by which otherwise identical repeats may differ."""
 SLOW = 5
 """Degree of the polynomial of the order of the readings that is taken out of their changes."""
 FOLLOWS = 3.0
@@ -73,8 +72,8 @@ def distances(away: np.ndarray) -> np.ndarray:
 class Means:
     """Means of marks: (c, marks) values, their counts and declared standard uncertainties.
 
-    `companions` are means of further quantities with the same weights; `outlier` is a mask over
-    the readings, those that are in no mean.
+    `companions` are means of further quantities with the same weights; `outlier` is a mask of
+    the readings that are in no mean.
     """
 
     key: np.ndarray
@@ -95,27 +94,27 @@ def reduce_repeats(key: np.ndarray, values: np.ndarray, sigma: np.ndarray, *,
     Parameters
     ----------
     key : int array (n,)
-        Number of the mark of each reading.
+        Index of the mark of each reading.
     values : float array (c, n)
-        Readings, c components, m or rad; in canonical order, so that sums have one order.
+        Readings, c components, m or rad; in canonical order, for reproducible sums.
     sigma : float array (n,)
         Declared standard uncertainty of each reading, 0 = not declared.
     limit : float
         Outlier limit in standard deviations; 0 keeps all.
     extent : float
-        Size of the positions behind the readings, m or rad: what differs by no more than their
-        rounding is no outlier, however exact the other repeats are.
+        Size of the positions behind the readings, m or rad: a difference within their rounding is
+        not an outlier, however exact the other repeats are.
     residual : float array (c, n), optional
-        The readings without the view's own motion. Where too few repeats tell the noise, it is at
-        most the scatter of these from mark to mark.
+        The readings without the view's own motion. With too few repeats for the noise, their
+        scatter between marks is its upper limit.
     steady : tuple, optional
-        Values (c, n) that tell outliers and repeatability instead of the readings, and how many
-        numbers were fitted to them; see `check_stops.without_aside`.
+        Values (c, n) used for outliers and repeatability instead of the readings, and the number
+        of parameters fitted to them; see `check_stops.without_aside`.
 
     Returns
     -------
     Means
-        Marks in rising order of key. Where all repeats of a mark declare a sigma the mean is
+        Marks in rising order of key. If all repeats of a mark declare a sigma the mean is
         weighted by 1/sigma^2. `sigma` is the pooled repeatability (NaN without repeats),
         `dof` its degrees of freedom, `outlier` a mask over the readings.
     """
@@ -136,7 +135,7 @@ def average(key: np.ndarray, values: np.ndarray, sigma: np.ndarray,
             companions: np.ndarray | None = None) -> Means:
     """Average the readings of each key; arguments as for `reduce_repeats`, none is an outlier.
 
-    `companions` (e, n) are averaged alike, and tell nothing of the repeatability.
+    `companions` (e, n) are averaged likewise, without effect on the repeatability.
     """
     marks, inverse, count = _distinct(key)
     declared = np.bincount(inverse, sigma > 0, len(marks)) == count
@@ -155,9 +154,9 @@ def average(key: np.ndarray, values: np.ndarray, sigma: np.ndarray,
 
 
 def _distinct(key: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the different keys, which of them each one is, and how often each is there.
+    """Return the distinct keys, the inverse indices, and the counts.
 
-    As `numpy.unique`; repeats of a mark mostly follow each other, so that runs of them are sorted.
+    Like `numpy.unique`; repeats of a mark are mostly consecutive, so runs of them are sorted.
     """
     begin = np.flatnonzero(np.diff(key, prepend=key[:1] - 1))
     length = np.diff(np.append(begin, len(key)))
@@ -168,7 +167,7 @@ def _distinct(key: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def _means(values: np.ndarray, weight: np.ndarray, inverse: np.ndarray,
            total: np.ndarray) -> np.ndarray:
-    """Return weighted means about each mark's first repeat: exact where repeats are equal."""
+    """Return weighted means relative to each mark's first repeat: exact if repeats are equal."""
     if not len(inverse):
         return np.zeros((len(values), 0))
     first = np.full(len(total), len(inverse))
@@ -197,8 +196,8 @@ def _outliers(key: np.ndarray, values: np.ndarray, relative: np.ndarray,
     out = np.zeros(len(key), dtype=bool)
     if pairs < MIN_PAIRS:
         return out
-    # a robust scale from n pairs scatters by about 1.2/sqrt(n): keep three of these in hand, and
-    # more where few pairs make its distribution skew
+    # a robust scale from n pairs scatters by about 1.2/sqrt(n): allow for three times this, and
+    # more for the skewed distribution of few pairs
     cut = limit * scale * (1 + 4 / np.sqrt(pairs) + 8 / pairs)
     floor = 16 * np.finfo(float).eps * max(extent, np.abs(values).max())
     if cut <= floor:
@@ -222,16 +221,16 @@ def groups_of(key: np.ndarray) -> list[np.ndarray]:
 
 
 def _parts(group: np.ndarray, width: int) -> Iterator[np.ndarray]:
-    """Yield the marks of a group in parts, for work that makes `width` numbers of each mark."""
+    """Yield the marks of a group in parts, for work with `width` numbers per mark."""
     size = max(1, PART // width)
     for start in range(0, len(group), size):
         yield group[start:start + size]
 
 
 def _sensor_step(groups: list[np.ndarray], values: np.ndarray, floor: float) -> float:
-    """Return the step in which repeats of most marks differ, 0 if there is none.
+    """Return the step by which repeats of most marks differ, 0 if there is none.
 
-    It is that of at least three marks, and three quarters of those that differ do so by one to
+    It applies to at least three marks, and three quarters of those that differ do so by one to
     `STEPS` of it.
     """
     spread = np.concatenate([np.ptp(values[:, group], axis=2).ravel() for group in groups])
@@ -245,7 +244,7 @@ def _sensor_step(groups: list[np.ndarray], values: np.ndarray, floor: float) -> 
 
 @lru_cache(64)
 def pairs_of(count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return pairs of `count` repeats: all, or of many repeats each with 16 others, evenly."""
+    """Return pairs of `count` repeats: all, or for many repeats each with 16 others, evenly."""
     if count <= ALL_PAIRS:
         return np.triu_indices(count, 1)
     lags = np.rint(np.linspace(1, count // 2, ALL_PAIRS // 2)).astype(int)
@@ -255,7 +254,7 @@ def pairs_of(count: int) -> tuple[np.ndarray, np.ndarray]:
 
 def _pair_scale(groups: list[np.ndarray], values: np.ndarray,
                 relative: np.ndarray) -> tuple[float, int]:
-    """Return the robust standard deviation of one reading, and how many pairs told it."""
+    """Return the robust standard deviation of one reading, and the number of pairs."""
     if not groups:
         return float("nan"), 0
     every = np.empty(len(values) * sum(len(group) * len(pairs_of(group.shape[1])[0])
@@ -279,24 +278,24 @@ def grid_visits(means: Means, key: np.ndarray, sigma: np.ndarray, *, stamps_ns: 
                 step_m: float = np.inf) -> GridVisits | None:
     """Return the visits behind the means of a view's grid marks; None without any.
 
-    A visit is a run of successive exposures of one mark: any other mark that was exposed in
-    between ends it, also one whose reading is an outlier, and so does a motion of the stage beyond
-    `step_m`, as from one check stop to the next. Outliers are in no visit. Deviations,
+    A visit is a run of successive exposures of one mark: it ends with an exposure of another mark,
+    also if that reading is an outlier, and with a motion of the stage beyond
+    `step_m`, as between check stops. Outliers are in no visit. Deviations,
     offsets and instants of a visit are averaged with the weights of `reduce_repeats`. The approach
-    is the one that all its exposures have in common, 0 where they differ.
+    is that of all its exposures, 0 if they differ.
 
     Parameters
     ----------
     means : Means
-        What `reduce_repeats` made of the same readings.
+        Result of `reduce_repeats` for the same readings.
     key : int array (n,)
-        Number of the mark of each reading, in the order of the stamps.
+        Index of the mark of each reading, in the order of the stamps.
     sigma : float array (n,)
         Declared standard uncertainties, m; 0 = not declared.
     stamps_ns : int64 array (n,)
         Instants of exposure.
     deviation, offset : float array (2, n)
-        Deviation and offset as seen, stage axes, m.
+        Deviation and measured offset, stage axes, m.
     approach : int8 array (2, n)
         Signs of the last motions of x and y.
     step_m : float
@@ -313,7 +312,7 @@ def grid_visits(means: Means, key: np.ndarray, sigma: np.ndarray, *, stamps_ns: 
     since = (stamps_ns - stamps_ns[first][visit]).astype(float)
     found = average(visit, deviation[:, kept], sigma[kept], np.vstack([offset[:, kept], since]))
     mark = np.searchsorted(means.key, key[first])
-    order = np.argsort(mark, kind="stable")  # the numbers of visits rise with their stamps
+    order = np.argsort(mark, kind="stable")  # visits are numbered in the order of their stamps
     offset_x, offset_y, since = found.companions[:, order]
     came_x, came_y = (
         np.where(_differs(row[kept], visit, first), 0, row[kept][first]).astype(np.int8)[order]
@@ -325,25 +324,25 @@ def grid_visits(means: Means, key: np.ndarray, sigma: np.ndarray, *, stamps_ns: 
 
 
 def _differs(values: np.ndarray, visit: np.ndarray, first: np.ndarray) -> np.ndarray:
-    """Return which visits hold more than one value, bool array (visits,)."""
+    """Return which visits have more than one value, bool array (visits,)."""
     return np.bincount(visit, values != values[first][visit], len(first)) > 0
 
 
 def repeat_motion(key: np.ndarray, place: np.ndarray, offset: np.ndarray,
                   outlier: np.ndarray) -> RepeatMotion | None:
-    """Return how the offsets of the marks follow the stage; None without repeats.
+    """Return the response of the offsets of the marks to the stage; None without repeats.
 
-    Outliers are left out unless the stage stood elsewhere too: offsets of the wrong sign or scale
-    make an outlier of every stop beside a mark. What changes slowly, as a drift that the stage
-    follows, is no response of the microscope: a polynomial is taken out, then neighbours are
+    Outliers are excluded unless the stage had moved as well: offsets of the wrong sign or scale
+    turn every stop away from a mark into an outlier. Slow changes, such as a drift that the stage
+    follows, are not a response of the microscope: a polynomial is removed, then neighbours are
     subtracted.
 
     Parameters
     ----------
     key : int array (n,)
-        Number of the mark of each reading, in the order of the stamps.
+        Index of the mark of each reading, in the order of the stamps.
     place, offset : float array (c, n)
-        Place of the optical axis over the plate, and offset of the mark from it, m or rad.
+        Position of the optical axis over the plate, and offset of the mark from it, m or rad.
     outlier : bool array (n,)
         Outliers among the repeats.
     """
@@ -363,8 +362,8 @@ def repeat_motion(key: np.ndarray, place: np.ndarray, offset: np.ndarray,
 
 
 def _about_means(key: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Return values (c, n) less the mean of their mark."""
+    """Return values (c, n) minus the mean of their mark."""
     first, count = np.zeros(key.max() + 1, dtype=int), np.bincount(key)
-    first[key[::-1]] = np.arange(len(key))[::-1]  # of equal ones the last that is set stays
-    values = values - values[:, first[key]]  # exact where repeats are equal
+    first[key[::-1]] = np.arange(len(key))[::-1]  # for equal indices the last assignment remains
+    values = values - values[:, first[key]]  # exact if repeats are equal
     return values - np.stack([np.bincount(key, row) for row in values])[:, key] / count[key]

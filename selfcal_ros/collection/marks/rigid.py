@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A view's own rotation and offset, estimated robustly to tell marks apart."""
+"""Robust estimate of a view's own rotation and offset, to identify marks."""
 
 from dataclasses import dataclass
 
@@ -8,15 +8,15 @@ import numpy as np
 from selfcal_ros.collection.marks.repeats import distances, median
 
 LARGEST_TURN_RAD = 0.2
-"""A plate turned by more than this was laid down the wrong way; it is not a misalignment."""
+"""Largest misalignment; a plate turned by more is wrongly placed."""
 EXPECTED_SCATTER = 0.03
-"""Distance of a mark from the rigid motion to reckon with while few marks tell it, in pitches."""
+"""Expected distance of a mark from the rigid motion while few marks determine it, in pitches."""
 EXPECTED_WEIGHT = 4
-"""Degrees of freedom that this expectation is worth."""
+"""Degrees of freedom of this expectation."""
 COVERAGE = 3.0
-"""Standard deviations within which the motion counts as known."""
+"""Standard deviations within which the motion is taken as known."""
 FEW_MARKS_COVERAGE = 10.0
-"""The same where the scatter itself is estimated, from as few as three marks."""
+"""The same if the scatter itself is estimated, from as few as three marks."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class Rigid:
                          turn * p[0] + one * p[1] + self.ty_m])
 
     def undo(self, q: np.ndarray) -> np.ndarray:
-        """Return the nominal positions (2, n) of marks that are read at `q`."""
+        """Return the nominal positions (2, n) of marks read at `q`."""
         turn, cosine = np.sin(self.phi_rad), np.cos(self.phi_rad)
         x, y = q[0] - self.tx_m, q[1] - self.ty_m
         return np.stack([cosine * x + turn * y, cosine * y - turn * x])
@@ -42,14 +42,14 @@ class Rigid:
 
 @dataclass(frozen=True)
 class MotionEstimate:
-    """What is known of a view's motion, and how far its prediction may be wrong.
+    """Estimate of a view's motion, and the largest error of its prediction.
 
     Attributes
     ----------
     rigid : Rigid
         The motion.
     centre_m : tuple of float
-        Nominal position where the offset is known best, about the plate centre.
+        Nominal position where the offset is known best, relative to the plate centre.
     offset_error_m : float
         Largest error of a prediction there, a mark's own scatter included.
     phi_error_rad : float
@@ -74,11 +74,11 @@ class RigidFit:
     Attributes
     ----------
     rigid : Rigid
-        The motion; without a rotation where all marks are one.
+        The motion; without rotation if all readings are of one mark.
     centre_m : tuple of float
-        Mean nominal position of the marks, about the plate centre.
+        Mean nominal position of the marks, relative to the plate centre.
     marks : int
-        Different marks behind the fit.
+        Number of distinct marks in the fit.
     power_m2 : float
         Sum of their squared distances from the centre.
     squares_m2 : float
@@ -93,17 +93,17 @@ class RigidFit:
 
     @property
     def phi_error_rad(self) -> float:
-        """How far the rotation may be off, by the scatter of the marks alone; inf below three."""
+        """Largest error of the rotation, from the scatter of the marks; inf below three."""
         if self.marks < 3 or not self.power_m2:
             return float("inf")
         return FEW_MARKS_COVERAGE * float(np.sqrt(
             self.squares_m2 / (2 * self.marks - 3) / self.power_m2))
 
     def known(self, pitch_m: float, max_rotation_rad: float) -> MotionEstimate:
-        """Return what the fit tells together with what is known beforehand.
+        """Return the estimate from the fit combined with prior knowledge.
 
-        Before any mark is read the rotation is 0 to within `max_rotation_rad`, and marks
-        scatter by `EXPECTED_SCATTER`: with few or close marks that is better than the fit.
+        A priori the rotation is 0 to within `max_rotation_rad`, and marks
+        scatter by `EXPECTED_SCATTER`: with few or close marks this is better than the fit.
         """
         expected = EXPECTED_WEIGHT * (EXPECTED_SCATTER * pitch_m) ** 2
         freedom = EXPECTED_WEIGHT + max(2 * self.marks - 3, 0)
@@ -126,7 +126,7 @@ def _through(phi_rad: float, centre: tuple[float, float], deviation: np.ndarray)
 
 
 def fit_motion(p: np.ndarray, deviation: np.ndarray) -> RigidFit:
-    """Fit a rigid motion to deviations, without those that lie far off.
+    """Fit a rigid motion to deviations, without outliers.
 
     Parameters
     ----------
@@ -148,7 +148,7 @@ def fit_motion(p: np.ndarray, deviation: np.ndarray) -> RigidFit:
     for _ in range(5):
         distance = distances(deviation - rigid.at(p))
         before, keep = keep, distance <= 3 * median(distance) + 1e-9
-        if (keep == before).all():  # the same marks give the same motion again
+        if (keep == before).all():  # the same marks give the same motion
             break
         near, read = columns_where(keep, p, deviation)
         rigid, middle, power = _least_squares(near, read)
@@ -157,7 +157,7 @@ def fit_motion(p: np.ndarray, deviation: np.ndarray) -> RigidFit:
     other = (near[:, 1:] != near[:, :-1]).any(axis=0)  # than the one before
     first = near[:, np.append(True, other)]
     marks = len(np.unique(first[0] + 1j * first[1]))
-    share = marks / keep.sum()  # repeats of a mark are no further marks
+    share = marks / keep.sum()  # repeats of a mark are not further marks
     return RigidFit(rigid, middle, marks, float(power * share), float((rest**2).sum() * share))
 
 
@@ -185,9 +185,9 @@ def _least_squares(p: np.ndarray, deviation: np.ndarray,
 
 
 def columns_where(keep: np.ndarray, *tables: np.ndarray) -> list[np.ndarray]:
-    """Return some of the columns of tables (2, n), as they are if it is all of them.
+    """Return some of the columns of tables (2, n), without a copy if all.
 
-    Ten times as fast as by the mask itself.
+    Ten times as fast as indexing by the mask.
     """
     if keep.all():
         return [*tables]
@@ -200,6 +200,6 @@ def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def _turn(sine: float) -> float:
-    # the deviation across the arm is its sine; the arm itself shortens, which tells nothing
+    # the deviation across the arm is its sine; the shortening of the arm is not used
     largest = np.sin(LARGEST_TURN_RAD)
     return float(np.arcsin(np.clip(sine, -largest, largest)))
