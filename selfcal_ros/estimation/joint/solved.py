@@ -19,6 +19,7 @@ from selfcal_ros.estimation.joint.model_fit import ModelFit
 from selfcal_ros.estimation.joint.noise import NoiseEstimate
 from selfcal_ros.estimation.lattice.maps import PHASES
 from selfcal_ros.estimation.terms.columns import TermColumns
+from selfcal_ros.estimation.terms.equations import FREE, roots_by_term
 from selfcal_ros.model.readings import GridVisits, Measurements, Sense
 from selfcal_ros.model.result import CalibrationResult, Noise
 from selfcal_ros.units import NS_PER_S
@@ -161,12 +162,6 @@ MAX_SITES = 31 * 31
 NEGLIGIBLE = 1e-3
 """Length of a factor, in units of the noise, that changes no uncertainty by a thousandth."""
 
-ROUNDING = 1e-12
-"""Relative size below which a variance is zero."""
-
-FREE = ""
-"""Name of the factors of all free terms."""
-
 ANGULAR_KEY = "angular_terms"
 """Key of each term's contribution to the standard uncertainty of the angular map, rad."""
 
@@ -199,7 +194,7 @@ def saved_terms(cover: FieldCovariance, columns: TermColumns, sense: Sense) -> d
     both = np.concatenate([maps.real.reshape(-1, maps.shape[2]),
                            maps.imag.reshape(-1, maps.shape[2])])
     factors, names = [], []
-    for name, root in _roots(cover.terms.covariance, columns):
+    for name, root in roots_by_term(cover.terms.covariance, columns):
         left, size, _ = np.linalg.svd(both @ root, full_matrices=False)
         kept = size > NEGLIGIBLE
         factors += list((left[:, kept] * size[kept]).T.reshape(-1, 2, *shape))
@@ -216,27 +211,6 @@ def rounded(values: np.ndarray) -> np.ndarray:
     digits = DIGITS - 1 - np.floor(np.log10(np.maximum(size, LEAST)))
     power = 10.0 ** np.maximum(digits, 0.0)
     return np.where(size < LEAST, 0.0, np.round(values * power) / power)
-
-
-def _roots(covariance: np.ndarray, columns: TermColumns) -> list[tuple[str, np.ndarray]]:
-    """Return roots (p, k) of parts of a covariance: of each term with a size, of the free ones.
-
-    A part is the reduction of the covariance if that term, and those before it, are
-    known: the parts add up to the covariance.
-    """
-    rest, out = covariance.copy(), []
-    sized = dict.fromkeys(c.term for c in columns.columns if np.isfinite(c.size))
-    for name in sized:
-        at = columns.rows([name])
-        values, vectors = np.linalg.eigh(rest[np.ix_(at, at)])
-        told = values > ROUNDING * max(values[-1], 0.0)
-        root = rest[:, at] @ (vectors[:, told] / np.sqrt(values[told]))
-        rest = rest - root @ root.T
-        out.append((str(name), root))
-    own = np.sqrt(np.maximum(np.diag(covariance), np.finfo(float).tiny))
-    values, vectors = np.linalg.eigh(rest / np.outer(own, own))
-    out.append((FREE, own[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))))
-    return out
 
 
 def factors_of(result: CalibrationResult) -> np.ndarray:

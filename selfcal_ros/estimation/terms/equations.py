@@ -26,6 +26,12 @@ MOVES_THE_MAP = 1e-5
 """Relative rms of the map above which an undetermined combination of columns is an unseen mode:
 rounding gives 1e-9, the smallest true ones 1e-2."""
 
+NO_VARIANCE = 1e-12
+"""Relative size below which a variance is zero."""
+
+FREE = ""
+"""Name of the part of a covariance that all free terms have together."""
+
 
 @dataclass(frozen=True, eq=False)
 class TermEquations:
@@ -298,3 +304,24 @@ def next_coefficients(equations: TermEquations, found: Score, coefficients: np.n
     """
     prior = equations.prior(sigma_m)
     return coefficients + equations.inverse(sigma_m) @ (found.total - prior * coefficients)
+
+
+def roots_by_term(covariance: np.ndarray, columns: TermColumns) -> list[tuple[str, np.ndarray]]:
+    """Return roots (p, k) of parts of a covariance: of each term with a size, of the free ones.
+
+    A part is the reduction of the covariance if that term, and those before it, are
+    known: the parts add up to the covariance.
+    """
+    rest, out = covariance.copy(), []
+    sized = dict.fromkeys(c.term for c in columns.columns if np.isfinite(c.size))
+    for name in sized:
+        at = columns.rows([name])
+        values, vectors = np.linalg.eigh(rest[np.ix_(at, at)])
+        told = values > NO_VARIANCE * max(values[-1], 0.0)
+        root = rest[:, at] @ (vectors[:, told] / np.sqrt(values[told]))
+        rest = rest - root @ root.T
+        out.append((str(name), root))
+    own = np.sqrt(np.maximum(np.diag(covariance), np.finfo(float).tiny))
+    values, vectors = np.linalg.eigh(rest / np.outer(own, own))
+    out.append((FREE, own[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))))
+    return out
