@@ -25,6 +25,7 @@ from selfcal_ros.estimation.observability.unseen import (
 )
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ThetaDatum
+from selfcal_ros.model.orders import ORDERS, parse_order
 from selfcal_ros.model.result import Observability
 from selfcal_ros.model.view import Plan, View
 
@@ -203,3 +204,73 @@ def describe_view(view: View, artifact: Artifact) -> str:
 def describe_views(views: Iterable[View], artifact: Artifact) -> list[str]:
     """Return several views in words."""
     return [describe_view(view, artifact) for view in views]
+
+
+@dataclass(frozen=True)
+class Step:
+    """A change of a plan.
+
+    Attributes
+    ----------
+    view : View or None
+        The view to add, or the one to repeat; None for a change of all views.
+    views : tuple of View
+        All views of the plan with it.
+    repeat_of : int or None
+        Index of the view to be measured more often.
+    order : str
+        The visiting order, if that is changed.
+    """
+
+    view: View | None
+    views: tuple[View, ...]
+    repeat_of: int | None = None
+    order: str = ""
+
+
+def more_views(plan: Plan) -> list[Step]:
+    """Return the views that may be added."""
+    angular = any(view.angular for view in plan.views) and plan.artifact.angular_count > 0
+    out = []
+    like = next((view for view in plan.views if view.grid), View(""))
+    for view in candidate_views(plan.artifact, angular=angular):
+        named = replace(view, name=unused_name(view.name, plan.views), repeats=unit_repeats(plan))
+        if view.grid:
+            named = replace(named, visit_order=like.visit_order, check_marks=like.check_marks,
+                            check_offset_m=like.check_offset_m)
+        out.append(Step(named, (*plan.views, named)))
+    return out
+
+
+def more_repeats(plan: Plan) -> list[Step]:
+    """Return the views that may be measured more often, each by the plan's fewest repeats."""
+    unit = unit_repeats(plan)
+    out = []
+    for index, view in enumerate(plan.views):
+        more = replace(view, repeats=view.repeats + unit)
+        out.append(Step(more, (*plan.views[:index], more, *plan.views[index + 1:]), index))
+    return out
+
+
+def other_orders(plan: Plan) -> list[Step]:
+    """Return the visiting orders, with enough repeats to complete them."""
+    steps = [Step(None, tuple(_in_order(view, order) for view in plan.views), order=order)
+             for order in ORDERS]
+    return [step for step in steps if step.views != plan.views]
+
+
+def _in_order(view: View, order: str) -> View:
+    if not view.grid:
+        return view
+    passes = parse_order(order).passes
+    return replace(view, visit_order=order, repeats=-(-view.repeats // passes) * passes)
+
+
+def unused_name(name: str, views: Iterable[View]) -> str:
+    """Return `name`, numbered if another view of the plan has it."""
+    taken = {view.name for view in views}
+    tail = 2
+    out = name
+    while out in taken:
+        out, tail = f"{name}_{tail}", tail + 1
+    return out

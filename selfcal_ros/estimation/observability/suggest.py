@@ -2,7 +2,7 @@
 """Which view to measure next, and the best plan for a given number of views."""
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import combinations_with_replacement
 from math import comb, inf
 
@@ -11,9 +11,14 @@ from selfcal_ros.estimation.blas_threads import one_thread
 from selfcal_ros.estimation.normal.systems import planned_system
 from selfcal_ros.estimation.observability.equivalent import equivalent_key
 from selfcal_ros.estimation.observability.plan_check import (
+    Step,
     candidate_views,
+    more_repeats,
+    more_views,
+    other_orders,
     smaller,
     unit_repeats,
+    unused_name,
 )
 from selfcal_ros.estimation.observability.prediction import Prediction, predict
 from selfcal_ros.estimation.observability.rank import deficiency
@@ -21,7 +26,6 @@ from selfcal_ros.estimation.observability.resistance import with_part_of_terms
 from selfcal_ros.estimation.terms.planned import Assumed, planned_equations, planned_ground
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ThetaDatum
-from selfcal_ros.model.orders import ORDERS, parse_order
 from selfcal_ros.model.terms import VISIT_TERMS, ModelTerm, TermName
 from selfcal_ros.model.view import Plan, View
 
@@ -108,28 +112,10 @@ class Search:
 
 
 @dataclass(frozen=True)
-class Suggestion:
-    """A next step and the resulting score of the plan.
+class Suggestion(Step):
+    """A next step with the resulting score of the plan."""
 
-    Attributes
-    ----------
-    view : View or None
-        The view to add, or the one to repeat; None for another visiting order.
-    score : Score
-        Of the plan with it.
-    views : tuple of View
-        All views of the plan with it.
-    repeat_of : int or None
-        Index of the view to be measured more often.
-    order : str
-        The suggested visiting order, if another.
-    """
-
-    view: View | None
-    score: Score
-    views: tuple[View, ...]
-    repeat_of: int | None = None
-    order: str = ""
+    score: Score = field(kw_only=True)
 
 
 Progress = Callable[[int, int | None], None]
@@ -193,59 +179,15 @@ def rank_next(plan: Plan, *, criterion: str = "rms", datum: ThetaDatum = ThetaDa
     def score(views: tuple[View, ...]) -> Score:
         return score_plan(replace(judged, views=views), datum, repeats=unit, against=against)
 
-    steps = [*_more_views(plan), *_more_repeats(plan)]
+    steps = [*more_views(plan), *more_repeats(plan)]
     if against is not None and against.of_order:
-        steps += _other_orders(plan)
+        steps += other_orders(plan)
     out = []
-    for number, (view, views, more) in enumerate(steps):
-        out.append(Suggestion(view, score(views), views, **more))
+    for number, step in enumerate(steps):
+        out.append(Suggestion(**vars(step), score=score(step.views)))
         progress(number + 1, len(steps))
     out.sort(key=lambda item: item.score.key(criterion))
     return score(plan.views), out
-
-
-Step = tuple[View | None, tuple[View, ...], dict]
-
-
-def _more_views(plan: Plan) -> list[Step]:
-    angular = any(view.angular for view in plan.views) and plan.artifact.angular_count > 0
-    unit = unit_repeats(plan)
-    out: list[Step] = []
-    like = next((view for view in plan.views if view.grid), View(""))
-    for view in candidate_views(plan.artifact, angular=angular):
-        named = replace(view, name=unused_name(view.name, plan.views), repeats=unit)
-        if view.grid:
-            named = replace(named, visit_order=like.visit_order, check_marks=like.check_marks,
-                            check_offset_m=like.check_offset_m)
-        out.append((named, (*plan.views, named), {}))
-    return out
-
-
-def _more_repeats(plan: Plan) -> list[Step]:
-    unit = unit_repeats(plan)
-    out: list[Step] = []
-    for index, view in enumerate(plan.views):
-        more = replace(view, repeats=view.repeats + unit)
-        out.append((more, (*plan.views[:index], more, *plan.views[index + 1:]),
-                    {"repeat_of": index}))
-    return out
-
-
-def _other_orders(plan: Plan) -> list[Step]:
-    """Return the visiting orders, with as many repeats as complete them."""
-    out: list[Step] = []
-    for order in ORDERS:
-        views = tuple(_in_order(view, order) for view in plan.views)
-        if views != plan.views:
-            out.append((None, views, {"order": order}))
-    return out
-
-
-def _in_order(view: View, order: str) -> View:
-    if not view.grid:
-        return view
-    passes = parse_order(order).passes
-    return replace(view, visit_order=order, repeats=-(-view.repeats // passes) * passes)
 
 
 @one_thread()
@@ -351,16 +293,6 @@ def _exchange(key: Callable[[tuple[int, ...]], tuple[float, ...]], n_pool: int, 
             if value(best) < value(now):
                 now, improved = best, True
     return {chosen: found for chosen, found in tried.items() if len(chosen) == free}
-
-
-def unused_name(name: str, views: Iterable[View]) -> str:
-    """Return `name`, numbered if another view of the plan has it."""
-    taken = {view.name for view in views}
-    tail = 2
-    out = name
-    while out in taken:
-        out, tail = f"{name}_{tail}", tail + 1
-    return out
 
 
 def _named(views: Iterable[View], repeats: int) -> tuple[View, ...]:

@@ -10,7 +10,7 @@ import pytest
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.normal.systems import planned_system
-from selfcal_ros.estimation.observability import suggest
+from selfcal_ros.estimation.observability import plan_check, suggest
 from selfcal_ros.estimation.observability.plan_check import (
     candidate_views,
     check_plan,
@@ -129,7 +129,8 @@ def test_suggested_views_keep_the_repeats_and_have_names_of_their_own():
 def few_candidates(monkeypatch):
     few = [view for view in candidate_views(Artifact(3, 0.01), angular=False)
            if view.name in ("0deg", "90deg", "180deg", "270deg", "0deg+x", "0deg+y", "0deg-x")]
-    monkeypatch.setattr(suggest, "candidate_views", lambda *_, **__: few)
+    for module in (suggest, plan_check):
+        monkeypatch.setattr(module, "candidate_views", lambda *_, **__: few)
     return few
 
 
