@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Any
 from selfcal_ros.cli.plan_terms import (
     add_term_options,
     assumed_of,
+    assumed_terms,
+    budget_json,
     model_of,
     sizes_of,
     terms_json,
@@ -22,6 +24,7 @@ from selfcal_ros.units import UM_PER_M
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from selfcal_ros.estimation.observability.plan_budget import PlanBudget
     from selfcal_ros.estimation.observability.prediction import Prediction
     from selfcal_ros.estimation.observability.resistance import TermCheck
     from selfcal_ros.estimation.observability.suggest import Against, Score, Suggestion
@@ -79,19 +82,25 @@ def run(args: argparse.Namespace) -> int:
 
 def _check(args: argparse.Namespace, plan: Plan) -> int:
     from selfcal_ros.errors import ExitCode
+    from selfcal_ros.estimation.observability.plan_budget import plan_budget
     from selfcal_ros.estimation.observability.plan_check import check_plan, predict_plan
     from selfcal_ros.model.error_map import ThetaDatum
+    from selfcal_ros.reporting.words.tables import plan_budget_text
 
     assumed, sizes, model = assumed_of(args), sizes_of(args), model_of(args, plan)
     plan = _repeated(plan, args.repeats)
     alone: Prediction | None = None
     joint: Prediction | None = None
     checks: Sequence[TermCheck] = ()
+    budget: PlanBudget | None = None
     with busy("judging the plan"):
         seen = check_plan(plan).observability
         if seen.identifiable:
             alone = predict_plan(plan, ThetaDatum(args.theta_datum))
             seen, joint, checks = _judge(plan, model, assumed, sizes, (seen, alone))
+        if alone is not None and seen.identifiable:
+            budget = plan_budget(plan, (*model, *assumed_terms(args.model, model)), assumed,
+                                 alone, asked=[term.name for term in model])
     if args.json:
         found = _check_json(plan, seen, alone, maps=args.map)
         unit = _averaged_m(plan, assumed) * UM_PER_M
@@ -105,6 +114,7 @@ def _check(args: argparse.Namespace, plan: Plan) -> int:
             if args.sigma is not None and joint is not None:
                 found["predicted"] |= {"rms_u_xy_um_with_terms": joint.rms_xy * unit,
                                        "max_u_xy_um_with_terms": joint.max_xy * unit}
+        found["budget"] = budget and budget_json(budget, plan, assumed)
         print(json.dumps(found | {"terms": terms_json(checks)}, indent=1))
     else:
         lines = _check_text(plan, seen, alone)
@@ -114,6 +124,7 @@ def _check(args: argparse.Namespace, plan: Plan) -> int:
             what = f"XY with {', '.join(map(str, model))}:"
             lines.append(f"  {what} rms {joint.rms_xy:.4f}   largest {joint.max_xy:.4f}")
             lines += [_in_um(what, joint, plan, assumed)] if args.sigma is not None else []
+        lines += plan_budget_text(budget, plan) if budget else []
         lines += terms_text(plan, checks, assumed) if checks else []
         lines += _map_text(alone) if args.map and alone and seen.identifiable else []
         tell("\n".join(lines))
@@ -248,23 +259,20 @@ def _suggest(args: argparse.Namespace, plan: Plan) -> int:
     with late_progress("judging plans") as progress:
         if args.views is not None:
             angular = any(view.angular for view in plan.views) and plan.artifact.angular_count > 0
-            grids = [view for view in plan.views if view.grid]
-            order = next((view.visit_order for view in grids), "")
+            like = [view for view in plan.views if view.grid] or list(plan.views)
             best, score, search = best_plan(
                 plan.artifact, args.views, angular=angular, criterion=args.criterion,
-                repeats=min(view.repeats for view in grids or plan.views), datum=datum,
-                against=against and replace(against, assumed=replace(
-                    against.assumed, order=order)), progress=progress)
+                like=replace(like[0], repeats=min(view.repeats for view in like)), datum=datum,
+                against=against, progress=progress)
         else:
             now, ranked = rank_next(plan, criterion=args.criterion, datum=datum, against=against,
                                     progress=progress)
-    # without terms and --sigma the figures are gains
+    # without terms (--against none) and --sigma the figures are gains
     told = against is not None or args.sigma is not None
     unit = _averaged_m(plan if args.views is None else best, assumed_of(args)) if told else None
     if args.views is not None:
         best = replace(best, plan_id=f"{plan.plan_id}_best{args.views}",
                        model_terms=plan.model_terms)
-        best = _checked_like(_in_order(best, order), plan)
         _show_best(args, best, (score, unit), search_text(search))
     else:
         best = replace(plan, views=ranked[0].views)
@@ -287,16 +295,6 @@ def _in_order(plan: Plan, order: str) -> Plan:
                                      for view in plan.views))
 
 
-def _checked_like(plan: Plan, other: Plan) -> Plan:
-    """Return the plan with the check stops of another plan in its views with grid marks."""
-    from dataclasses import replace
-
-    marks, offset_m = _check_stops(other)
-    return replace(plan, views=tuple(
-        replace(view, check_marks=marks, check_offset_m=offset_m) if view.grid else view
-        for view in plan.views))
-
-
 def _check_stops(plan: Plan) -> tuple[int, float]:
     """Return the number of marks checked in each view, and their distance, m."""
     return next(((view.check_marks, view.check_offset_m) for view in plan.views if view.grid),
@@ -304,14 +302,15 @@ def _check_stops(plan: Plan) -> tuple[int, float]:
 
 
 def _against(args: argparse.Namespace, plan: Plan) -> Against | None:
-    """Return the terms included in the uncertainty: the plan's own and those of --against."""
+    """Return the terms included in the uncertainty: the plan's, --against's, default ones."""
     from selfcal_ros.estimation.observability.suggest import Against
     from selfcal_ros.model.terms import ModelTerm, TermName, parse_terms
 
     found = {term.name: term for term in parse_terms(plan.model_terms, "model_terms")}
     found |= {name: ModelTerm(name, size) for name, size in sizes_of(args).items()}
-    assumed = assumed_of(args)
-    return Against(tuple(found[n] for n in TermName if n in found), assumed) if found else None
+    named = tuple(found[n] for n in TermName if n in found)
+    by_default = assumed_terms(args.against, named)
+    return Against(named, assumed_of(args), by_default) if named or by_default else None
 
 
 def _show_ranked(args: argparse.Namespace, plan: Plan, now: tuple[Score, float | None],

@@ -9,18 +9,23 @@ import re
 from typing import TYPE_CHECKING, Any
 
 from selfcal_ros.errors import InputError
-from selfcal_ros.units import M_PER, MRAD_PER_RAD, UM_PER_M
+from selfcal_ros.units import M_PER, MRAD_PER_RAD, RAD_PER, UM_PER_M
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Mapping
 
+    from selfcal_ros.estimation.observability.plan_budget import PlanBudget
     from selfcal_ros.estimation.observability.resistance import TermCheck
     from selfcal_ros.estimation.terms.planned import Assumed
     from selfcal_ros.model.terms import ModelTerm, TermName
     from selfcal_ros.model.view import Plan
 
 SIGMA = "20e-9"
-STOP_ERROR = "10e-6"
+SIGMA_THETA = "3.6arcsec"
+STOP_ERROR = "100nm"
+STAGE_ERROR = "1um"
+PLACING = "0.3deg"
+NO_TERMS = "none"
 
 
 def add_term_options(parser: argparse.ArgumentParser) -> None:
@@ -28,7 +33,7 @@ def add_term_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--against", metavar="TERM:SIZE[,...]", action="append", default=[],
                         help="size of a term against which the plan is judged, a standard "
                         "deviation in SI units; TERM is microscope, drift, plate_scale, "
-                        "plate_shape or approach")
+                        "plate_shape or approach; none: not even the terms assumed by default")
     parser.add_argument("--drift-degree", type=int, metavar="D",
                         help="degree of the polynomial of the drift of a view (default 3)")
     parser.add_argument("--order", metavar="ORDER", default="",
@@ -38,7 +43,17 @@ def add_term_options(parser: argparse.ArgumentParser) -> None:
                         "if given, uncertainties are printed in um")
     parser.add_argument("--stop-error", metavar="LENGTH", default=STOP_ERROR,
                         help="stop error of the stage relative to a mark, standard deviation per "
-                        "axis, m or with a unit (default 10 um)")
+                        f"axis, m or with a unit (default {STOP_ERROR})")
+    parser.add_argument("--stage-error", metavar="LENGTH", default=STAGE_ERROR,
+                        help="errors of stage and plate, standard deviation per axis, m or with a "
+                        f"unit (default {STAGE_ERROR}): the scale of the microscope matters to "
+                        "them")
+    parser.add_argument("--placing", metavar="ANGLE", default=PLACING,
+                        help="rotation by which plates are placed, standard deviation, rad or "
+                        f"with a unit (default {PLACING})")
+    parser.add_argument("--sigma-theta", metavar="ANGLE", default=SIGMA_THETA,
+                        help="noise of one reading of a line, rad or with a unit "
+                        f"(default {SIGMA_THETA})")
 
 
 def length_m(text: str, option: str) -> float:
@@ -49,15 +64,21 @@ def length_m(text: str, option: str) -> float:
     InputError
         If it is not a positive length.
     """
+    return _quantity(text, option, M_PER, "length")
+
+
+def _quantity(text: str, option: str, units: Mapping[str, float], what: str) -> float:
+    """Return a positive number with one of the units, the first if none is given."""
     found = re.fullmatch(r"\s*([-+.\deE]*[\d.])\s*([a-zµ]*)\s*", text)
-    unit = found[2].replace("µ", "u") or "m" if found else ""
+    plain = next(iter(units))
+    unit = found[2].replace("µ", "u") or plain if found else ""
     try:
-        value = float(found[1]) * M_PER[unit] if found else math.nan
+        value = float(found[1]) * units[unit] if found else math.nan
     except (ValueError, KeyError):
         value = math.nan
     if not 0 < value < math.inf:
-        raise InputError(option, f"'{text}' is not a positive length",
-                         "give m, or a number and one of " + ", ".join(M_PER))
+        raise InputError(option, f"'{text}' is not a positive {what}",
+                         f"give {plain}, or a number and one of " + ", ".join(units))
     return value
 
 
@@ -79,7 +100,10 @@ def assumed_of(args: argparse.Namespace) -> Assumed:
                          f"give 1 to {MAX_DRIFT_DEGREE}")
     order = str(parse_order(args.order, "--order")) if args.order else ""
     return Assumed(length_m(args.sigma or SIGMA, "--sigma"),
-                   length_m(args.stop_error, "--stop-error"), degree, order)
+                   length_m(args.stop_error, "--stop-error"), degree, order,
+                   _quantity(args.sigma_theta, "--sigma-theta", RAD_PER, "angle"),
+                   _quantity(args.placing, "--placing", RAD_PER, "angle"),
+                   length_m(args.stage_error, "--stage-error"))
 
 
 def sizes_of(args: argparse.Namespace) -> dict[TermName, float]:
@@ -92,7 +116,7 @@ def sizes_of(args: argparse.Namespace) -> dict[TermName, float]:
     """
     from selfcal_ros.model.terms import parse_terms
 
-    terms = parse_terms(args.against, "--against")
+    terms = parse_terms(_named(args.against), "--against")
     for term in terms:
         if term.free:
             raise InputError(f"--against: {term.name}", "a size is missing",
@@ -104,9 +128,57 @@ def model_of(args: argparse.Namespace, plan: Plan) -> tuple[ModelTerm, ...]:
     """Return the terms of the model: the plan's, replaced by those of ``--model``."""
     from selfcal_ros.model.terms import TermName, parse_terms
 
+    if _is_none(args.model):
+        return ()
     found = {term.name: term for terms in (parse_terms(plan.model_terms, "model_terms"),
                                            parse_terms(args.model, "--model")) for term in terms}
-    return tuple(found[name] for name in TermName if name in found)
+    return tuple(found[name] for name in TermName if name in found and found[name].size > 0)
+
+
+def _is_none(given: list[str]) -> bool:
+    """Return whether an option says that there is no term, not even a default one."""
+    return NO_TERMS in given
+
+
+def _named(given: list[str]) -> list[str]:
+    return [text for text in given if text != NO_TERMS]
+
+
+def assumed_terms(given: list[str], named: tuple[ModelTerm, ...]) -> tuple[ModelTerm, ...]:
+    """Return the terms that are assumed by default beside the named ones.
+
+    Parameters
+    ----------
+    given : list of str
+        What ``--model`` or ``--against`` says: ``none`` excludes them.
+    named : tuple of ModelTerm
+        Terms of the plan and of the option.
+    """
+    from selfcal_ros.model.terms import DEFAULT_TERMS
+
+    names = {term.name for term in named}
+    return () if _is_none(given) else tuple(
+        term for term in DEFAULT_TERMS if term.name not in names)
+
+
+def budget_json(budget: PlanBudget, plan: Plan, assumed: Assumed) -> dict[str, Any]:
+    """Return the predicted budget of a plan for programs."""
+    from selfcal_ros.reporting.words.tables import removal_text
+
+    lines = []
+    for line in budget.lines:
+        removed = budget.removals.get((line.quantity, line.component))
+        lines.append({name: getattr(line, name) for name in (
+            "quantity", "component", "kind", "u", "unit", "effect_rms", "effect_max", "source")}
+            | {"share": budget.share(line), "removal": removed and {
+                "kind": removed.kind, "effect_rms": removed.effect_rms,
+                "text": removal_text(removed, line, plan)}})
+    out: dict[str, Any] = {"sigma_m": assumed.sigma_m, "sigma_rad": assumed.sigma_rad,
+                           "lines": lines}
+    for quantity in dict.fromkeys(line.quantity for line in budget.lines):
+        out |= {f"U_{quantity}": 2 * budget.u_rms(quantity),
+                f"U_{quantity}_noise": 2 * budget.u_rms(quantity, noise_only=True)}
+    return out
 
 
 def terms_json(checks: Iterable[TermCheck]) -> list[dict[str, Any]]:
@@ -146,7 +218,7 @@ def size_text(check: TermCheck) -> str:
 
 
 def _assumptions(plan: Plan, assumed: Assumed) -> list[str]:
-    from selfcal_ros.estimation.terms.planned import MISALIGNMENT_M, MISALIGNMENT_RAD
+    from selfcal_ros.estimation.terms.planned import MISALIGNMENT_M
     from selfcal_ros.model.orders import DEFAULT_ORDER, parse_order
 
     views = [view for view in plan.views if view.grid]
@@ -156,7 +228,7 @@ def _assumptions(plan: Plan, assumed: Assumed) -> list[str]:
     lines = [f"  assumed: order {', '.join(sorted({str(o) for o in orders.values()}))}; drifts of "
              f"degree {assumed.drift_degree}; {assumed.sigma_m * UM_PER_M:.6g} µm noise of "
              "one reading;",
-             f"  plates placed within {math.degrees(MISALIGNMENT_RAD):g} deg and "
+             f"  plates placed within {math.degrees(assumed.turn_rad):g} deg and "
              f"{MISALIGNMENT_M * UM_PER_M:g} µm, stops {assumed.stop_error_m * UM_PER_M:.6g} µm "
              "off the marks, drawn with a fixed seed"]
     if cut:

@@ -3,6 +3,7 @@
 
 import contextlib
 import json
+import math
 from pathlib import Path
 
 import pytest
@@ -124,6 +125,52 @@ def test_free_terms_that_a_plan_does_not_tell_are_refused(capsys, tmp_path):
     assert "XY with plate_shape:3e-08: rms" in capsys.readouterr().out
 
 
+def test_check_shows_what_is_assumed_and_what_removes_it(capsys):
+    asked = ["plan", "check", shipped("qiao"), "--placing", "0.02deg"]
+    assert main([*asked, "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)["budget"]
+    assert (found["sigma_m"], found["sigma_rad"]) == (20e-9, pytest.approx(math.radians(1e-3)))
+    lines = {line["component"]: line for line in found["lines"]}
+    assert list(lines) == ["reading noise", "microscope", "plate_strain"]
+    microscope = lines["microscope"]
+    assert (microscope["quantity"], microscope["u"], microscope["source"]) == (
+        "xy", 0.01, "default")
+    assert 0.05 < microscope["share"] < 0.5 and sum(
+        line["share"] for line in lines.values()) == pytest.approx(1)
+    assert microscope["removal"]["kind"] == "check_stops"
+    assert microscope["removal"]["effect_rms"] < 0.2 * microscope["effect_rms"]
+    assert found["U_xy"] == pytest.approx(2 * math.hypot(*(
+        line["effect_rms"] for line in lines.values())))
+    assert found["U_xy_noise"] == pytest.approx(2 * lines["reading noise"]["effect_rms"])
+    assert main(asked) == 0
+    text = capsys.readouterr().out
+    assert "%  add check_stops: {marks: 5, offset: 2e-05}: " in text
+    assert "without what is assumed 35.6 nm" in text
+    assert main([*asked, "--model", "none", "--json"]) == 0
+    assert [line["component"] for line in json.loads(capsys.readouterr().out)["budget"][
+        "lines"]] == ["reading noise"]
+    # what the plan declares takes the place of the default; lines have a budget of their own
+    assert main(["plan", "check", shipped("hu_repeated"), "--json", "--sigma-theta", "0.04arcsec",
+                 "--model", "plate_strain:3e-7"]) == 0
+    lines = {(line["quantity"], line["component"]): line for line in json.loads(
+        capsys.readouterr().out)["budget"]["lines"]}
+    strain, circle = lines["xy", "plate_strain"], lines["theta", "line_eccentricity"]
+    assert (strain["source"], strain["removal"]["kind"]) == ("declared", "certificate")
+    assert strain["removal"]["text"].startswith("declare a smaller plate_strain:SIZE")
+    assert (circle["source"], circle["unit"]) == ("default", "rad") and circle["share"] > 0.9
+
+
+def test_check_stops_are_a_next_step_where_the_microscope_costs_most(capsys, tmp_path):
+    out = tmp_path / "next.yaml"
+    assert main(["plan", "suggest", shipped("qiao"), "--placing", "0.02deg", "--stage-error",
+                 "10um", "--sigma", "1nm", "--json", "-o", str(out)]) == 0
+    first = json.loads(capsys.readouterr().out)["suggestions"][0]
+    assert first["text"] == "add check_stops: {marks: 5, offset: 2e-05}"
+    assert (first["view"], first["visit_order"]) == (None, None)
+    plan = plan_from_dict(read_yaml(out), "next")
+    assert {(view.check_marks, view.check_offset_m) for view in plan.views} == {(5, 20e-6)}
+
+
 def test_an_order_that_is_cut_off_is_said(capsys):
     assert main(["plan", "check", shipped("hu_repeated"), "--order", "x_back_y_back"]) == 0
     assert ("  the order x_back_y_back needs a multiple of 4 repeats: it is truncated in the views "
@@ -138,6 +185,10 @@ def test_an_order_that_is_cut_off_is_said(capsys):
      "and one of m, mm, um, nm"),
     (["--sigma=-1nm"], "--sigma: '-1nm' is not a positive length"),
     (["--stop-error", "0"], "--stop-error: '0' is not a positive length"),
+    (["--stage-error=-1nm"], "--stage-error: '-1nm' is not a positive length"),
+    (["--sigma-theta", "3 turns"], "--sigma-theta: '3 turns' is not a positive angle; give rad, "
+     "or a number and one of rad, mrad, urad, deg, arcsec"),
+    (["--placing", "0"], "--placing: '0' is not a positive angle"),
     (["--drift-degree", "10"], "--drift-degree: 10 is not a degree of a drift; give 1 to 9"),
     (["--drift-degree", "0"], "--drift-degree: 0 is not a degree of a drift; give 1 to 9"),
     (["--order", "spiral"], "--order: 'spiral' is not a visiting order"),
@@ -158,7 +209,8 @@ def test_lengths_with_and_without_a_unit(text):
 
 def test_suggest_next_views(capsys, tmp_path):
     out = tmp_path / "next.yaml"
-    assert main(["plan", "suggest", shipped("qiao"), "--json", "--top", "2", "-o", str(out)]) == 0
+    assert main(["plan", "suggest", shipped("qiao"), "--json", "--top", "2", "-o", str(out),
+                 "--against", "none"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert len(found["suggestions"]) == 2
     assert found["now"]["rms_gain_xy"] == pytest.approx(0.890, abs=5e-4)
@@ -209,10 +261,14 @@ def test_the_best_plan_is_judged_as_it_is_written(capsys, tmp_path):
     assert best["deficiency"] == 0
     assert {view["repeats"] for view in best["views"]} == {4}
     assert main(["plan", "check", str(out), "--json", "--sigma", "20nm"]) == 0
-    found = json.loads(capsys.readouterr().out)["predicted"]
-    for name in ("rms", "max"):
-        assert best[f"{name}_gain_xy"] == pytest.approx(found[f"{name}_gain_xy_with_terms"])
-        assert best[f"u_{name}_m"] == pytest.approx(found[f"{name}_u_xy_um_with_terms"] * 1e-6)
+    found = json.loads(capsys.readouterr().out)
+    assert best["u_rms_m"] == pytest.approx(found["budget"]["U_xy"] / 2)
+    # by default the terms that are assumed of every measurement count, too
+    of_model = found["predicted"]["rms_u_xy_um_with_terms"] * 1e-6
+    assert best["u_rms_m"] > 1.0001 * of_model
+    assert main(["plan", "suggest", str(plan), "--views", "4", "--json", "--against",
+                 "none"]) == 0
+    assert json.loads(capsys.readouterr().out)["u_rms_m"] < 1.0001 * of_model
 
 
 def test_suggest_does_not_write_over_its_plan(capsys, tmp_path):
@@ -231,7 +287,8 @@ def test_suggest_the_best_plan(capsys, tmp_path):
     assert main(["plan", "check", str(out), "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert found["predicted"]["rms_gain_xy"] == pytest.approx(0.890, abs=5e-4)
-    assert main(["plan", "suggest", shipped("qiao"), "--views", "3", "--json"]) == 0
+    assert main(["plan", "suggest", shipped("qiao"), "--views", "3", "--json", "--against",
+                 "none"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert len(found["views"]) == 3
     assert found["rms_gain_xy"] == pytest.approx(0.890, abs=5e-4)

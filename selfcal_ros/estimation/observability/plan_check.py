@@ -38,6 +38,9 @@ NARROW = 5
 PROXY_SIZE = 101
 """Field on which the uncertainty of a larger field is predicted."""
 
+CHECK_MARKS, CHECK_OFFSET_M = 5, 20e-6
+"""Suggested check stops: marks per view, and their distance, m."""
+
 MAX_CURES = 5
 """Largest number of sets of views proposed."""
 
@@ -234,12 +237,18 @@ def more_views(plan: Plan) -> list[Step]:
     out = []
     like = next((view for view in plan.views if view.grid), View(""))
     for view in candidate_views(plan.artifact, angular=angular):
-        named = replace(view, name=unused_name(view.name, plan.views), repeats=unit_repeats(plan))
-        if view.grid:
-            named = replace(named, visit_order=like.visit_order, check_marks=like.check_marks,
-                            check_offset_m=like.check_offset_m)
+        named = measured_like(replace(view, name=unused_name(view.name, plan.views)),
+                              replace(like, repeats=unit_repeats(plan)))
         out.append(Step(named, (*plan.views, named)))
     return out
+
+
+def measured_like(view: View, like: View) -> View:
+    """Return a view with the repeats, and in its marks the visiting order, of another one."""
+    view = replace(view, repeats=like.repeats)
+    return view if not view.grid else replace(
+        view, visit_order=like.visit_order, check_marks=like.check_marks,
+        check_offset_m=like.check_offset_m)
 
 
 def more_repeats(plan: Plan) -> list[Step]:
@@ -257,6 +266,15 @@ def other_orders(plan: Plan) -> list[Step]:
     steps = [Step(None, tuple(_in_order(view, order) for view in plan.views), order=order)
              for order in ORDERS]
     return [step for step in steps if step.views != plan.views]
+
+
+def check_stops(plan: Plan) -> list[Step]:
+    """Return the step to check stops, if the plan has none."""
+    if any(view.check_marks for view in plan.views):
+        return []
+    return [Step(None, tuple(
+        replace(view, check_marks=CHECK_MARKS, check_offset_m=CHECK_OFFSET_M) if view.grid
+        else view for view in plan.views))]
 
 
 def _in_order(view: View, order: str) -> View:

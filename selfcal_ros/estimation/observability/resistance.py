@@ -230,9 +230,12 @@ def with_part_of_terms(alone: Prediction, terms: TermEquations, repeats: int) ->
         Repeats of the averaged reading whose noise is the unit.
     """
     spread, shape = terms.inverse(terms.noise_m) * repeats, alone.ux.shape
-    more = [np.einsum("sp,pq,sq->s", part, spread, part, optimize=True).reshape(shape)
-            for part in (terms.maps.real, terms.maps.imag)]
-    return replace(alone, ux=np.sqrt(alone.ux**2 + more[0]), uy=np.sqrt(alone.uy**2 + more[1]))
+    x, y, lines = (np.einsum("sp,pq,sq->s", part, spread, part, optimize=True)
+                   for part in (terms.maps.real, terms.maps.imag, terms.turned))
+    u_theta = np.sqrt(alone.u_theta**2 + terms.line_weight * lines) if (
+        len(alone.u_theta)) else alone.u_theta
+    return replace(alone, ux=np.sqrt(alone.ux**2 + x.reshape(shape)),
+                   uy=np.sqrt(alone.uy**2 + y.reshape(shape)), u_theta=u_theta)
 
 
 def check_terms(planned: PlannedTerms, sizes: Mapping[TermName, float],

@@ -13,6 +13,8 @@ from selfcal_ros.estimation.observability.equivalent import equivalent_key
 from selfcal_ros.estimation.observability.plan_check import (
     Step,
     candidate_views,
+    check_stops,
+    measured_like,
     more_repeats,
     more_views,
     other_orders,
@@ -79,10 +81,36 @@ class Against:
 
     A size is prior knowledge of a term, whether or not the readings determine it better; modes
     of the stage hidden by a free term count as a deficiency.
+
+    Attributes
+    ----------
+    terms : tuple of ModelTerm
+        Terms of the plan and those asked for.
+    assumed : Assumed
+        Noise, offsets, visiting order.
+    by_default : tuple of ModelTerm
+        Terms with sizes that are assumed of every measurement.
     """
 
     terms: tuple[ModelTerm, ...]
     assumed: Assumed = Assumed()
+    by_default: tuple[ModelTerm, ...] = ()
+
+    @property
+    def every(self) -> tuple[ModelTerm, ...]:
+        """All terms."""
+        return (*self.terms, *self.by_default)
+
+    @property
+    def of_microscope(self) -> bool:
+        """Whether check stops may help."""
+        return TermName.MICROSCOPE in [term.name for term in self.every]
+
+    @property
+    def of_views(self) -> "Against":
+        """Without the default terms that no choice of views determines."""
+        return replace(self, by_default=tuple(
+            term for term in self.by_default if term.name not in VISIT_TERMS))
 
     @property
     def of_visits(self) -> bool:
@@ -139,9 +167,9 @@ def score_plan(plan: Plan, datum: ThetaDatum = ThetaDatum.ZERO_MEAN, *,
         return Score(unseen, inf, inf, inf)
     repeats = repeats or unit_repeats(plan)
     found: Prediction = predict(system, plan.artifact, datum, repeats=repeats)
-    if against is not None and against.terms:
+    if against is not None and against.every:
         ground = planned_ground(plan.artifact, plan.views, system, against.assumed)
-        terms = planned_equations(system, ground, against.terms, against.assumed)
+        terms = planned_equations(system, ground, against.every, against.assumed)
         hidden = terms.unseen(terms.free).shape[1]
         if hidden:
             return Score(hidden, inf, inf, inf, of_terms=True)
@@ -182,6 +210,8 @@ def rank_next(plan: Plan, *, criterion: str = "rms", datum: ThetaDatum = ThetaDa
     steps = [*more_views(plan), *more_repeats(plan)]
     if against is not None and against.of_order:
         steps += other_orders(plan)
+    if against is not None and against.of_microscope:
+        steps += check_stops(plan)
     out = []
     for number, step in enumerate(steps):
         out.append(Suggestion(**vars(step), score=score(step.views)))
@@ -192,7 +222,7 @@ def rank_next(plan: Plan, *, criterion: str = "rms", datum: ThetaDatum = ThetaDa
 
 @one_thread()
 def best_plan(artifact: Artifact, n_views: int, *, angular: bool, criterion: str = "rms",
-              repeats: int = 1, datum: ThetaDatum = ThetaDatum.ZERO_MEAN,
+              like: View | None = None, datum: ThetaDatum = ThetaDatum.ZERO_MEAN,
               against: Against | None = None,
               progress: Progress = no_progress) -> tuple[Plan, Score, Search]:
     """Return the best plan of `n_views` views among the candidates, its score, and the search.
@@ -200,7 +230,8 @@ def best_plan(artifact: Artifact, n_views: int, *, angular: bool, criterion: str
     The first view is the one without a turn: turning all views together only renames the marks.
     With angular lines one view is the turn by one line. Up to EXHAUSTIVE plans are all tried, more
     are searched by greedy choice and exchange of single views until no exchange helps. Of
-    mirror-image plans only one is computed; lines decide between the best.
+    mirror-image plans only one is computed; lines decide between the best. Repeats, visiting order
+    and check stops are those of the view `like`.
 
     Raises
     ------
@@ -211,11 +242,12 @@ def best_plan(artifact: Artifact, n_views: int, *, angular: bool, criterion: str
     if n_views < 3 + fixed:
         raise InputError("--views", f"{n_views} views cannot identify the stage",
                          f"give {3 + fixed} or more")
-    candidates = candidate_views(artifact, angular=angular)
+    like = like or View("")
+    candidates = [measured_like(view, like) for view in candidate_views(artifact, angular=angular)]
     pool = [view for view in candidates if view.grid]
     whole = Plan("best", artifact, ())
     small = smaller(whole, SEARCH_SIZE) if max(artifact.shape) > SEARCH_SIZE else whole
-    searched = _Searched(small, pool, repeats, criterion, against, progress)
+    searched = _Searched(small, pool, criterion, against, progress)
     tried, how = _search(searched, n_views - 1 - fixed)
     if small is not whole:
         how = replace(how, size=SEARCH_SIZE)
@@ -223,7 +255,7 @@ def best_plan(artifact: Artifact, n_views: int, *, angular: bool, criterion: str
 
     def with_lines(chosen: tuple[int, ...]) -> Plan:
         views = (pool[0], *(pool[i] for i in chosen), *(candidates[-1:] if angular else []))
-        return replace(judged, views=_named(views, repeats))
+        return replace(judged, views=_named(views))
 
     finalists = sorted(tried, key=lambda chosen: (tried[chosen], chosen))
     ties = sum(tried[chosen] == tried[finalists[0]] for chosen in finalists)
@@ -236,9 +268,9 @@ def best_plan(artifact: Artifact, n_views: int, *, angular: bool, criterion: str
 class _Searched:
     """Keys of plans by their grid marks alone; one for mirror-image plans."""
 
-    def __init__(self, field: Plan, pool: list[View], repeats: int, criterion: str,
+    def __init__(self, field: Plan, pool: list[View], criterion: str,
                  against: Against | None, progress: Progress) -> None:
-        self.field, self.repeats, self.criterion = field, repeats, criterion
+        self.field, self.criterion = field, criterion
         self.against, self.progress = against, progress
         self.pool = [replace(view, angular=False) for view in pool]
         self._known: dict[tuple, tuple[float, ...]] = {}
@@ -254,8 +286,9 @@ class _Searched:
         same = (tuple(sorted(chosen)) if self.one_by_one
                 else equivalent_key(self.field.artifact, views))
         if same not in self._known:
-            plan = replace(self.field, views=_named(views, self.repeats))
-            self._known[same] = score_plan(plan, against=self.against).key(self.criterion)
+            plan = replace(self.field, views=_named(views))
+            against = self.against and self.against.of_views
+            self._known[same] = score_plan(plan, against=against).key(self.criterion)
             self.progress(len(self._known), None)
         return self._known[same]
 
@@ -295,8 +328,8 @@ def _exchange(key: Callable[[tuple[int, ...]], tuple[float, ...]], n_pool: int, 
     return {chosen: found for chosen, found in tried.items() if len(chosen) == free}
 
 
-def _named(views: Iterable[View], repeats: int) -> tuple[View, ...]:
+def _named(views: Iterable[View]) -> tuple[View, ...]:
     out: list[View] = []
     for view in views:
-        out.append(replace(view, name=unused_name(view.name, out), repeats=repeats))
+        out.append(replace(view, name=unused_name(view.name, out)))
     return tuple(out)

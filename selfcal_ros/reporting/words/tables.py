@@ -5,15 +5,22 @@ from typing import Any
 
 import numpy as np
 
-from selfcal_ros.estimation.observability.plan_check import describe_view
-from selfcal_ros.estimation.observability.suggest import Search, Suggestion
+from selfcal_ros.estimation.observability.plan_budget import PlanBudget, Removal
+from selfcal_ros.estimation.observability.plan_check import (
+    CHECK_MARKS,
+    CHECK_OFFSET_M,
+    Step,
+    describe_view,
+)
+from selfcal_ros.estimation.observability.suggest import Search
 from selfcal_ros.estimation.quality.validation import HeldOut
 from selfcal_ros.estimation.verdict.uncertainty import Budget
 from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.model.verdict import Finding
+from selfcal_ros.model.terms import TermName
+from selfcal_ros.model.verdict import BudgetLine, Finding
 from selfcal_ros.model.view import Plan, View
 from selfcal_ros.reporting.words.findings import held_out_text, line_text, sentence_of
-from selfcal_ros.units import ARCSEC_PER_RAD, UM_PER_M
+from selfcal_ros.units import ARCSEC_PER_RAD, NM_PER_M, UM_PER_M, URAD_PER_RAD
 
 
 def why_text(why: Finding | None, artifact: Artifact) -> str:
@@ -103,16 +110,52 @@ def dof_text(dof: float) -> str:
     return f"{dof:.0f}" if dof < COUNTED_DOF else "many"
 
 
-def step_text(step: Suggestion, plan: Plan) -> str:
-    """Return what a suggestion asks for.
+_CERTIFICATES: dict[str, str] = {
+    TermName.MICROSCOPE: "declare the microscope (--microscope), from a certificate of its scale",
+    TermName.PLATE_STRAIN: "declare a smaller plate_strain:SIZE, from support and temperature",
+    TermName.LINE_ECCENTRICITY: "declare a smaller line_eccentricity:SIZE, from a certificate"}
+"""What removes a line of a plan's budget that no change of the plan removes."""
+
+
+def plan_budget_text(budget: PlanBudget, plan: Plan) -> list[str]:
+    """Return the budget that a plan promises as a table, with what removes each line."""
+    out = ["predicted uncertainty budget (standard uncertainty, rms):"]
+    for quantity, name, factor, unit in (("xy", "XY, one coordinate", NM_PER_M, "nm"),
+                                         ("theta", "theta", URAD_PER_RAD, "µrad")):
+        lines = [line for line in budget.lines if line.quantity == quantity]
+        for line in lines:
+            found = budget.removals.get((quantity, line.component))
+            out.append(f"  {name if line is lines[0] else '':20}{line.component:18}"
+                       f"{line.effect_rms * factor:9.3g} {unit}{100 * budget.share(line):5.0f} %"
+                       + ("" if found is None else f"  {removal_text(found, line, plan)}"))
+        if lines:
+            whole, noise = (2 * factor * budget.u_rms(quantity, noise_only=only)
+                            for only in (False, True))
+            out.append(f"  {'':20}U (k = 2) {whole:17.3g} {unit}; without what is assumed "
+                       f"{noise:.3g} {unit}")
+    return out
+
+
+def removal_text(found: Removal, line: BudgetLine, plan: Plan) -> str:
+    """Return what removes a line of a plan's budget, and what is left of it."""
+    if found.step is None:
+        return _CERTIFICATES.get(line.component, f"declare a smaller {line.component}:SIZE")
+    factor, unit = (NM_PER_M, "nm") if line.quantity == "xy" else (URAD_PER_RAD, "µrad")
+    return f"{step_text(found.step, plan)}: {found.effect_rms * factor:.3g} {unit}"
+
+
+def step_text(step: Step, plan: Plan) -> str:
+    """Return what a change of a plan asks for.
 
     Parameters
     ----------
-    step : Suggestion
-        One of `rank_next`.
+    step : Step
+        The change, such as a suggestion of `rank_next`.
     plan : Plan
-        The plan that it is a next step of.
+        The plan before it.
     """
+    if step.view is None and not step.order:
+        return f"add check_stops: {{marks: {CHECK_MARKS}, offset: {CHECK_OFFSET_M:g}}}"
     if step.view is None:
         pairs = {(old.repeats, new.repeats)
                  for old, new in zip(plan.views, step.views, strict=True)}

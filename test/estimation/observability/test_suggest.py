@@ -155,7 +155,7 @@ def test_exchange_finds_what_trying_all_finds(monkeypatch, few_candidates):
 
 
 def test_best_plan_measures_the_angular_map_too():
-    plan, score, _ = best_plan(Artifact(3, 0.01, 24), 4, angular=True, repeats=5)
+    plan, score, _ = best_plan(Artifact(3, 0.01, 24), 4, angular=True, like=View("", repeats=5))
     assert check_plan(plan).observability.identifiable
     assert plan.views[-1].grid is False and {view.repeats for view in plan.views} == {5}
     assert np.isfinite(score.rms_theta) and score.rms_theta > 0
