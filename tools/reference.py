@@ -93,7 +93,7 @@ RESULT = {
     "input": "file and sha256 of the bag", "solver": "how the equations were solved",
     "covariance_terms": "terms and factors (r, 2, N, N), for the exact comparison of results; "
                         "up to 31 × 31 sites, and not with `--model none`",
-    "angular_terms": "contribution of each term to the standard uncertainty of the angular map, "
+    "angular_terms": "contribution of each term or cause to the uncertainty of the angular map, "
                      "rad",
     "residuals": "views: view, dx, dy (m, [i][j] by mark, stage axes), dtheta (rad), course "
                  "{time_s, dx, dy, count} over the view's time"}

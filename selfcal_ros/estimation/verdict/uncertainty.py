@@ -86,6 +86,12 @@ def enlarged(result: CalibrationResult, effects: Iterable[Effect]) -> Calibratio
         factors = [rounded(effect.xy / result.noise.sigma_xy).tolist() for effect in effects]
         extra[KEY] = {"terms": [*kept["terms"], *(effect.name for effect in effects)],
                       "factors": [*kept["factors"], *factors]}
+    turned = dict(extra.get(ANGULAR_KEY, {}))
+    for effect in effects:
+        if effect.theta.any():
+            turned[effect.name] = np.hypot(turned.get(effect.name, 0.0), effect.theta).tolist()
+    if turned:
+        extra[ANGULAR_KEY] = turned
     emap = replace(emap, u_gx=np.sqrt(emap.u_gx**2 + power[0]),
                    u_gy=np.sqrt(emap.u_gy**2 + power[1]), u_g_theta=u_theta)
     return replace(result, error_map=emap, extra=extra)

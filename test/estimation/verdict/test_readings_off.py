@@ -81,6 +81,11 @@ def test_a_line_that_is_off_in_one_view_is_named():
     assert cause.text.startswith(f"a reading of line 5 in view 'rot90' that is off by "
                                  f"{-cause.size * 180 * 3600 / np.pi:.1f} ± ")
     assert (cause.view, cause.mark) == ("rot90", (5,))
+    lines = {line.component: line for line in bad.budget if line.quantity == "theta"}
+    assert (lines["effect reading"].value, lines["effect reading"].u) == (cause.size, cause.u)
+    assert lines["effect reading"].effect_rms == pytest.approx(item.u_rms)
+    nodes = [line.effect_rms**2 for name, line in lines.items() if name != "interpolation"]
+    assert sum(nodes) == pytest.approx(np.mean(bad.error_map.u_g_theta**2))
 
 
 def test_the_remedy_that_is_named_mends_it():
