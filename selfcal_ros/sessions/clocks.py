@@ -188,27 +188,27 @@ class RunWatch:
             self._hidden = command
 
     def lines(self, newest: Command | None, strays: tuple[Command, ...],
-              now_ns: int) -> list[str]:
-        """Return problems with remedies, one line each."""
-        found = []
+              now_ns: int) -> dict[str, str]:
+        """Return a line for each problem, with its remedy, by the kind of problem."""
+        found = {}
         if newest is not None and is_future(newest.stamp_ns, now_ns):
-            found.append(
+            found["set back"] = (
                 f"the newest view command is stamped {(newest.stamp_ns - now_ns) * S_PER_NS:.0f} s "
                 "ahead of this machine's clock, which was set back: no later run is shown; restart "
                 "measurement_collector, which leaves such a run aside, and start the plan again")
         elif newest is not None and 0 < now_ns < newest.stamp_ns - NS_PER_S:
-            found.append(
+            found["ahead"] = (
                 f"the newest view command is stamped {(newest.stamp_ns - now_ns) * S_PER_NS:.1f} s "
                 "ahead of this machine's clock: detections until then count before it; synchronise "
                 "the clocks")
         if self._hidden is not None and newest is not None:
             behind = (newest.stamp_ns - self._hidden.stamp_ns) * S_PER_NS
-            found.append(
+            found[f"hidden {self._hidden.run_id} {newest.run_id}"] = (
                 f"run {self._hidden.run_id} is not shown: it began {behind:.3g} s before the last "
                 f"view command of run {newest.run_id}, by its stamps; abort it, synchronise the "
                 "clocks, and start it again")
         if strays:
-            found.append(
+            found["strays"] = (
                 f"{len(strays)} view command{'s' * (len(strays) > 1)} of plan "
                 f"'{strays[-1].plan_id}' came within a run that goes on, of no run that has begun, "
                 "and changed nothing: find who published them")

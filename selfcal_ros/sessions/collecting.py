@@ -59,7 +59,7 @@ class CollectingSession:
         self._checks = CellChecks(ports.say)
         self._noted: list[str] = []  # notes on clocks in the readings sent last
         self._clock = ClockWatch(settings.clock_limit)
-        self._runs, self._run_lines = RunWatch(), list[str]()
+        self._runs, self._run_lines = RunWatch(), dict[str, str]()
         self._encoder_rate = Rate(ports.now_s)
         self._encoder_s = float("-inf")
         self._noise: tuple[float, float] = (math.nan, math.nan)
@@ -274,9 +274,8 @@ class CollectingSession:
         """Log once why a run is not shown; in the health while it applies."""
         lines = self._runs.lines(self.collector.newest_command, self.collector.timeline.strays,
                                  self.now_ns)
-        for line in lines:
-            # durations change
-            if line.partition(":")[2] not in [told.partition(":")[2] for told in self._run_lines]:
+        for fault, line in lines.items():
+            if fault not in self._run_lines:  # durations change
                 self._ports.say(Level.WARN, line)
         self._run_lines = lines
 
@@ -321,7 +320,8 @@ class CollectingSession:
             **{f"rejected {reason}": n for reason, n in sorted(self._rejected.items())}})
         lines = self._findings or advice(self._rejected)
         found = Diagnosis(Level.WARN if lines else Level.OK, "; ".join(lines))
-        runs = Diagnosis(Level.WARN if self._run_lines else Level.OK, "; ".join(self._run_lines))
+        runs = Diagnosis(Level.WARN if self._run_lines else Level.OK,
+                         "; ".join(self._run_lines.values()))
         stepped = Diagnosis(Level.WARN if self._stepped else Level.OK, "; ".join(self._stepped))
         return merged(main, [
             runs, self._checks.diagnosis(), found, self._clock.diagnosis(), stepped,

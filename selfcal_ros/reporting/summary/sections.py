@@ -45,7 +45,7 @@ class Section:
 
 def all_sections(result: CalibrationResult,
                  truth: Mapping[str, np.ndarray] | None = None) -> list[Section]:
-    """Return the sections of a summary in the order in which a person reads them."""
+    """Return the sections of a summary in reading order."""
     sections = [verdict_section(result), measurement_section(result), views_section(result),
                 error_section(result), terms_section(result), noise_section(result.noise)]
     if truth is not None:
@@ -75,7 +75,7 @@ _TITLES = {Grade.GOOD: "Verdict", Grade.ENLARGED: "Verdict: GOOD WITHIN AN ENLAR
 
 
 def terms_section(result: CalibrationResult) -> Section:
-    """Return what was estimated beside the map: the terms of the model."""
+    """Return the estimates of the terms of the model."""
     rows = []
     for term in result.model.terms:
         if term.source == "default" and term.size_used is None:
@@ -157,12 +157,17 @@ def pose_text(rotation_rad: float, translation_m: tuple[float, float], artifact:
     return f"{math.degrees(rotation_rad):.6g}° ({x}, {y})"
 
 
-def place_text(emap: ErrorMap, site: tuple[int, int] | None) -> str:
-    """Return a site and its position as ``at x 40 mm, y -20 mm (site 4, -2)``."""
+def position_text(emap: ErrorMap, site: tuple[int, int] | None) -> str:
+    """Return the position of a site as ``at x 40 mm, y -20 mm``; empty for None."""
     if site is None:
         return ""
     x, y = (f"{index * emap.artifact.grid_pitch_m * MM_PER_M:.6g}" for index in site)
-    return f"at x {x} mm, y {y} mm (site {site[0]}, {site[1]})"
+    return f"at x {x} mm, y {y} mm"
+
+
+def place_text(emap: ErrorMap, site: tuple[int, int] | None) -> str:
+    """Return a site and its position as ``at x 40 mm, y -20 mm (site 4, -2)``."""
+    return "" if site is None else f"{position_text(emap, site)} (site {site[0]}, {site[1]})"
 
 
 def error_section(result: CalibrationResult) -> Section:
@@ -278,7 +283,7 @@ def rejected_section(result: CalibrationResult) -> Section:
 
 
 def attention_section(result: CalibrationResult) -> Section:
-    """Return unseen modes, advice and warnings: what a person should act on."""
+    """Return unseen modes, advice and warnings, which require action."""
     seen = result.observability
     lines = [f"unseen mode: {printable(mode)}" for mode in seen.modes]
     lines += [f"advice: {printable(advice)}" for advice in seen.advice]
@@ -299,7 +304,7 @@ def arcsec(value_rad: float) -> str:
 
 
 def state_sentence(result: CalibrationResult) -> str:
-    """Return where the calibration stands, in one sentence that a person understands."""
+    """Return the state of a calibration in one sentence."""
     seen, figures = result.observability, map_figures(result.error_map)
     if not seen.identifiable:
         advice = f"; {printable(seen.advice[0])}" if seen.advice else ""
@@ -324,7 +329,7 @@ def _map_clause(result: CalibrationResult, figures: MapFigures) -> str:
     k = result.noise.k_xy
     known = (f"every site known to ±{um(k * figures.max_u_m)} or better (k={k:.3g})"
              if math.isfinite(figures.max_u_m) else "uncertainty not known")
-    where = place_text(result.error_map, figures.max_site).partition(" (")[0]
+    where = position_text(result.error_map, figures.max_site)
     return f"{text}: largest error {um(figures.max_error_m)} {where}, {known}"
 
 
