@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A calibration in one screen of text: numbers, their form, sections."""
+"""Summary of a calibration on one screen: key figures, number formats, sections."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Numbers, names and tables as a person reads them: significant digits, alignment, ASCII."""
+"""Formatting of numbers, names and tables: significant digits, alignment, ASCII."""
 
 import math
 import re

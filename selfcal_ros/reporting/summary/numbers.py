@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The few numbers that describe an error map, and its comparison with a known truth."""
+"""Key figures of an error map, and of its comparison with a known truth."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ NAN = float("nan")
 
 @dataclass(frozen=True)
 class MapFigures:
-    """What a person asks of an error map, SI units, NaN where not known.
+    """Key figures of an error map, SI units, NaN where unknown.
 
     Attributes
     ----------
@@ -53,7 +53,7 @@ class MapFigures:
 
 @dataclass(frozen=True)
 class TruthFigures:
-    """Map minus truth after the datum difference is removed, SI units, NaN where not known.
+    """Map minus truth without the datum difference, SI units, NaN where unknown.
 
     `largest_m` is the longest difference vector, `site` where, `rms_m` per axis. `rms_in_u`
     and `largest_in_u` are in units of the predicted standard uncertainty; `within_2u` is the
@@ -119,7 +119,7 @@ def _site(emap: ErrorMap, index: tuple[int, ...] | None) -> tuple[int, int] | No
 
 
 def truth_figures(emap: ErrorMap, truth: Mapping[str, np.ndarray]) -> TruthFigures:
-    """Return how far `emap` lies from `truth`, after removing the datum difference.
+    """Return the difference of `emap` and `truth`, after removing the datum difference.
 
     Translation, rotation and magnification of the difference (Hu eq. 5) and a constant angle
     are seen by no view and are removed by least squares. The angles are weighted by 1/u², so

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What was found, in sentences for people: estimation gives it as data in SI units."""
+"""Sentences and tables for people, made from findings, budgets and validations (SI units)."""

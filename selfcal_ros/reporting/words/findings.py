@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 from selfcal_ros.estimation.verdict.uncertainty import INTERPOLATION
 from selfcal_ros.model.result import CalibrationResult, Noise
-from selfcal_ros.model.terms import UNITS, TermName
+from selfcal_ros.model.terms import TermName
 from selfcal_ros.model.verdict import BudgetLine, Cause, Finding, Grade, Remedy, Verdict
 from selfcal_ros.units import (
     ARCSEC_PER_RAD,
@@ -27,7 +27,7 @@ NAMED = 5
 
 
 class Unit(NamedTuple):
-    """How a person reads a quantity: how many of the unit are one in SI, and its name."""
+    """Display unit of a quantity: factor from SI, and name."""
 
     per_si: float
     name: str
@@ -36,9 +36,6 @@ class Unit(NamedTuple):
 UM, RATIO = Unit(UM_PER_M, "µm"), Unit(PPM_PER_ONE, "µm/m")
 MRAD, PERCENT = Unit(MRAD_PER_RAD, "mrad"), Unit(100.0, "%")
 ARCSEC, URAD = Unit(ARCSEC_PER_RAD, "arcsec"), Unit(URAD_PER_RAD, "µrad")
-
-_OF_SIZES = {TermName.MICROSCOPE: MRAD, TermName.LINE_ECCENTRICITY: URAD, TermName.ROTATION: URAD}
-"""Unit in which a person reads the coefficients of a term; by the SI unit for the others."""
 
 
 def unit_of(name: str, si: str) -> Unit:
@@ -57,11 +54,11 @@ def plus_minus(found: Finding, unit: Unit, times: float = 1.0) -> str:
     Parameters
     ----------
     found : Finding
-        What was found.
+        Finding with size and u.
     unit : Unit
-        In which it is read.
+        Display unit.
     times : float
-        How many times the size is told.
+        Factor of the size.
     """
     value, u = (times * unit.per_si * each for each in (abs(found.size), found.u))
     digits = 3
@@ -303,7 +300,7 @@ def what_it_is(cause: Cause) -> str:
 
 def _larger_term(cause: Cause, given: float) -> str:
     name = TermName(cause.name)
-    unit = _OF_SIZES.get(name, RATIO if UNITS[name] == "m/m" else UM)
+    unit = unit_of(name, cause.unit)
     ratio = cause.size / given
     where = f" in view '{cause.view}'" if cause.view else ""
     return (f"a term '{name}' as large as {cause.size * unit.per_si:.3g} {unit.name}{where}, "

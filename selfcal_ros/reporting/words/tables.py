@@ -24,7 +24,7 @@ from selfcal_ros.units import ARCSEC_PER_RAD, NM_PER_M, UM_PER_M, URAD_PER_RAD
 
 
 def why_text(why: Finding | None, artifact: Artifact) -> str:
-    """Return why nothing could be predicted, or why it is not judged; empty for None."""
+    """Return why nothing could be predicted, or why there is no limit; empty for None."""
     if why is None or why.name != "rest_not_identified":
         return "" if why is None else sentence_of(why)
     more = "no single further view would change that"
@@ -45,7 +45,7 @@ def validation_json(found: list[HeldOut], artifact: Artifact) -> list[dict[str, 
 
 
 def validation_text(found: list[HeldOut], artifact: Artifact) -> list[str]:
-    """Return one line a held-out set, µm and arcsec."""
+    """Return one line for each held-out set, µm and arcsec."""
     lines = []
     for item in found:
         name, why = held_out_text(item.view, item.tenth), why_text(item.why, artifact)
@@ -73,7 +73,7 @@ def _limit_text(item: HeldOut, why: str) -> str:
 
 
 COUNTED_DOF = 1e5
-"""Degrees of freedom above which a number of them says nothing more."""
+"""Degrees of freedom from which on they are shown as ``many``."""
 
 _QUANTITIES = {
     ("xy", False): "XY, one coordinate at the nodes of the map",
@@ -83,7 +83,7 @@ _QUANTITIES = {
 
 
 def quantity_text(budget: Budget) -> str:
-    """Return what a budget is of."""
+    """Return the quantity of a budget."""
     return _QUANTITIES[budget.quantity, budget.anywhere]
 
 

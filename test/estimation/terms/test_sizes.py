@@ -106,7 +106,7 @@ def test_the_statistic_is_what_the_size_adds_to_the_sum_of_squares():
 
 @pytest.mark.parametrize(("term", "unit"), [
     ("plate_scale:1e-8", "µm/m"), ("plate_shape:1e-9", "µm"), ("drift:1e-9", "µm"),
-    ("microscope:1e-6", "mrad"), ("approach:1e-10", "µm")])
+    ("microscope:1e-6", "µm/m"), ("approach:1e-10", "µm")])
 def test_a_calibration_with_a_contradicted_size_says_so_and_its_u_is_honest(term, unit):
     name, _, given = term.partition(":")
     truth, readings = measured(4, {name: 5 * SIZES[name]})
