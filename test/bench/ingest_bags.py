@@ -16,11 +16,10 @@ from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 from mcap.records import Channel, ChunkIndex, Footer, Header, Schema, Statistics
 
-from selfcal_ros.bagio.schemas import build, typestore
+from selfcal_ros.bagio.schemas import build, fields_of, typestore
 from selfcal_ros.collection.inputs import Command, Detection, EncoderSample, Kind, Phase
 from selfcal_ros.messages import from_model
 from selfcal_ros.messages.cdr import layout_of
-from selfcal_ros.messages.to_model import JOINT_STATE, MARK_DETECTION
 from selfcal_ros.topics import COMMAND_TOPIC, DETECTION_TOPIC, ENCODER_TOPIC, INPUT_TOPICS
 
 START_NS = 1_700_000_000_000_000_000
@@ -88,7 +87,7 @@ def recording(plan, measurements, *, repeats: int, visit_ns: int, encoder_ns: in
         np.concatenate(stamps), tuple(np.concatenate(part) for part in zip(*knots, strict=True)))
 
 
-def _rows(event, fields, topic: str, channel: int, stamps: np.ndarray) -> tuple:
+def _rows(event, topic: str, channel: int, stamps: np.ndarray) -> tuple:
     """Return a table of message records like that of `event`, and where their payloads begin."""
     make = from_model.joint_state if topic == ENCODER_TOPIC else from_model.detection
     name = INPUT_TOPICS[topic]
@@ -96,7 +95,7 @@ def _rows(event, fields, topic: str, channel: int, stamps: np.ndarray) -> tuple:
     if "effort" in values:  # pybag-sdk cannot read a message that ends in an empty sequence
         values |= {"effort": [0.0] * len(event.names)}
     payload = bytes(typestore().serialize_cdr(build(typestore(), name, values), name))
-    layout = layout_of(fields, payload)
+    layout = layout_of(fields_of(typestore(), name), payload)
     size = FRONT.itemsize + len(payload)
     formats = [(code if count is None else (code, (count,)), FRONT.itemsize + at)
                for code, at, count in layout.values.values()]
@@ -115,7 +114,7 @@ def _rows(event, fields, topic: str, channel: int, stamps: np.ndarray) -> tuple:
 def encoder_rows(part: Recording, stamps: np.ndarray, channel: int) -> np.ndarray:
     """Return the records of the encoder's samples at some stamps."""
     zero = (0.0,) * 3
-    rows = _rows(EncoderSample(0, ("x", "y", "theta"), zero, zero), JOINT_STATE, ENCODER_TOPIC,
+    rows = _rows(EncoderSample(0, ("x", "y", "theta"), zero, zero), ENCODER_TOPIC,
                  channel, stamps)
     t, *axes = part.knots
     for axis, values in enumerate(axes):
@@ -129,7 +128,7 @@ def encoder_rows(part: Recording, stamps: np.ndarray, channel: int) -> np.ndarra
 def detection_rows(part: Recording, chosen: slice, channel: int) -> np.ndarray:
     """Return the records of some detections."""
     columns = {name: values[chosen] for name, values in part.detections.items()}
-    rows = _rows(Detection(0, Kind.GRID, True, 0, 0, 0, 0.0, 0.0, 0.0, 0.0, 0.9), MARK_DETECTION,
+    rows = _rows(Detection(0, Kind.GRID, True, 0, 0, 0, 0.0, 0.0, 0.0, 0.0, 0.9),
                  DETECTION_TOPIC, channel, columns["stamp"])
     rows["m"], rows["n"] = columns["m"], columns["n"]
     rows["offset_x"], rows["offset_y"] = columns["x"], columns["y"]

@@ -272,7 +272,7 @@ runpy.run_path({demo!r}, run_name="__main__")
 
 
 @pytest.mark.parametrize("module, who", [
-    ("selfcal_ros.simulation.bag", "demo"), ("selfcal_ros.cli.processes", "selfcal")])
+    ("selfcal_ros.bagio.offline", "demo"), ("selfcal_ros.cli.processes", "selfcal")])
 def test_a_demo_that_is_interrupted_is_one_line(group, module, who):
     code, _, err = ended(group.start("-c", INTERRUPTED_DEMO.format(
         modules=(module,), demo=str(Path(__file__).parents[2] / "tools/demo.py"))))

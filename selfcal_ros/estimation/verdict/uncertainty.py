@@ -268,7 +268,7 @@ def _dof(noise: Noise, kind: str) -> float:
     """Return the degrees of freedom of the noise behind the map; infinite if it is declared."""
     dof = getattr(noise, f"dof_{kind}")
     if dof > 0:
-        return dof
+        return float(dof)
     sigma = getattr(noise, f"sigma_{kind}")  # results of version 0.1 do not have them
     return next((getattr(noise, f"dof_{kind}_{way}") or np.inf for way in ("repeats", "residuals")
                  if getattr(noise, f"sigma_{kind}_{way}") == sigma), np.inf)
