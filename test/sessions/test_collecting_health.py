@@ -10,6 +10,7 @@ import pytest
 
 from selfcal_ros.bagio.offline import collect_bag
 from selfcal_ros.bagio.writer import BagWriter
+from selfcal_ros.collection.clock_steps import Step
 from selfcal_ros.collection.inputs import Command, Detection, EncoderSample, Phase
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.model.result import with_input
@@ -105,6 +106,56 @@ def test_a_view_is_published_when_it_is_complete_and_again_only_when_it_changes(
     desk.session.tick()
     assert len(desk.hands.of("measurement")) == 1
     assert [name for name, _ in desk.hands.published][-2:] == ["status", "status"]
+
+
+def test_which_views_a_status_is_of():
+    """The view that is measured, each that is not complete, and the last one when it is over."""
+    desk, events = Desk(), events_of(small_plan("0, 90, tx", repeats=1))[:-1]  # no DONE
+    places = [n for n, event in enumerate(events) if isinstance(event, Command)
+              and event.phase == Phase.PLACE]
+    views = [events[begin:end] for begin, end in zip(places, [*places[1:], None], strict=True)]
+    views[1].remove(next(event for event in views[1] if isinstance(event, Detection)))
+    views.append([replace(event, stamp_ns=event.stamp_ns + 10 * 10**9) for event in views[0]])
+    told = []
+    for view in views:
+        desk.feed(view, run_id="1")
+        desk.hands.pass_time(1)
+        desk.session.tick()
+        told.append([fields["view_index"] for fields in desk.hands.of("status")])
+        desk.hands.published.clear()
+    assert told == [[0], [1], [1, 2], [1, 3], [0, 1, 3]]
+
+
+def test_a_step_that_is_found_behind_the_readings_is_sent_with_them_once():
+    desk, events = Desk(), events_of(small_plan("0", repeats=1))
+    sample = next(event for event in reversed(events) if isinstance(event, EncoderSample))
+    desk.feed(events)
+    desk.session.tick()
+    desk.hands.published.clear()
+    desk.session._clock.steps["stage/joint_states"] = [Step(sample.stamp_ns, 10**9)]
+    for _ in range(2):
+        desk.session.take_encoder(encoder_block(sample))
+        desk.hands.pass_time(1)
+        desk.session.tick()
+    [sent] = desk.hands.of("measurement")
+    [note] = sent["session_notes"]
+    assert "the clock that stamps stage/joint_states stepped ahead by 1 s" in note
+
+
+@pytest.mark.parametrize("spoilt, lines", [
+    (1, ["view '0': 1 detection rejected as sigma_out_of_range: their sigma is"]),
+    (1000, ["74 of 74 detections were rejected as sigma_out_of_range: their sigma is"])])
+def test_what_would_correct_rejections_is_said_once_when_a_view_is_over(spoilt, lines):
+    desk, events = Desk(), events_of(small_plan("0, 0", repeats=1))
+    marks = [n for n, event in enumerate(events) if isinstance(event, Detection)]
+    for n in marks[:spoilt]:
+        events[n] = replace(events[n], sigma=1e4)
+    for part in (events, events[-3:]):
+        desk.feed(part)
+        desk.hands.pass_time(1)
+        desk.session.tick()
+    said = [line for line in desk.hands.lines(Level.WARN) if "sigma_out_of_range" in line]
+    assert [text[:len(line)] for text, line in zip(said, lines, strict=True)] == lines
 
 
 def test_every_message_of_a_run_names_it():
