@@ -11,8 +11,7 @@ from selfcal_ros.collection.settings.nodes import RecorderSettings
 from selfcal_ros.errors import InputError
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes.base import SelfcalNode
-from selfcal_ros.nodes.encoder_input import EncoderInput
-from selfcal_ros.nodes.publishers import kept_names, offered
+from selfcal_ros.nodes.names import EncoderInput, kept_names, offered
 from selfcal_ros.nodes.running import run
 from selfcal_ros.sessions.ports import Diagnosis, Level
 

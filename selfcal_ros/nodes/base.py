@@ -6,18 +6,17 @@ from collections.abc import Callable
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.clock import Clock, ClockType
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.publisher import Publisher
 from rclpy.timer import Timer
 
-from selfcal_ros.collection.settings.parameter import BARE_Y, Settings
+from selfcal_ros.collection.settings.parameter import BARE_Y, Parameter, Settings
 from selfcal_ros.errors import InputError, printable
 from selfcal_ros.nodes.callbacks import WithInfo
-from selfcal_ros.nodes.descriptors import descriptor
 from selfcal_ros.nodes.filling import fill, status_of
-from selfcal_ros.nodes.names import HEALTH, Topic, private
-from selfcal_ros.nodes.publishers import mismatched, others_publishing
+from selfcal_ros.nodes.names import HEALTH, Topic, mismatched, others_publishing, private
 from selfcal_ros.nodes.services import Answering
 from selfcal_ros.sessions.clocks import RosTime
 from selfcal_ros.sessions.health import Losses, Refusals, merged
@@ -169,3 +168,20 @@ class SelfcalNode[S: Settings](NodeBase[S]):
     def __init__(self, kind: type[S], **kwargs: Any) -> None:
         super().__init__(kind.NODE, **kwargs)
         self.prepare(kind)
+
+
+def descriptor(parameter: Parameter) -> ParameterDescriptor:
+    """Return the descriptor of a parameter, read-only while the node runs."""
+    unit = f" [{parameter.unit}]" if parameter.unit else ""
+    described = ParameterDescriptor(description=parameter.description + unit, read_only=True)
+    if parameter.choices:
+        described.additional_constraints = "one of " + ", ".join(parameter.choices)
+    low, high = parameter.low, parameter.high
+    if low is None or high is None:
+        return described
+    if isinstance(parameter.default, float):
+        described.floating_point_range = [FloatingPointRange(
+            from_value=float(low), to_value=float(high))]
+    else:
+        described.integer_range = [IntegerRange(from_value=int(low), to_value=int(high), step=1)]
+    return described

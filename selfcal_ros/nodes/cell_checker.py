@@ -19,7 +19,7 @@ from selfcal_ros.errors import ExitCode, InputError
 from selfcal_ros.model.view import Plan
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes.base import SelfcalNode
-from selfcal_ros.nodes.encoder_input import EncoderInput
+from selfcal_ros.nodes.names import EncoderInput
 from selfcal_ros.nodes.running import run
 from selfcal_ros.sessions.cell_check import CellCheck
 from selfcal_ros.sessions.ports import Level

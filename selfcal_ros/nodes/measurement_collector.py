@@ -13,10 +13,9 @@ from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.errors import InputError
 from selfcal_ros.memory import keep_freed_memory
 from selfcal_ros.nodes import names
-from selfcal_ros.nodes.encoder_input import EncoderInput
 from selfcal_ros.nodes.managed import WhileConfigured, stop
+from selfcal_ros.nodes.names import EncoderInput, kept_names, offered
 from selfcal_ros.nodes.polling import ByTheClock, PollingNode, wake
-from selfcal_ros.nodes.publishers import kept_names, offered
 from selfcal_ros.nodes.running import run
 from selfcal_ros.sessions.collecting import CollectingSession
 from selfcal_ros.sessions.health import merged

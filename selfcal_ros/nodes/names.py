@@ -1,23 +1,30 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Every topic with its message type and QoS; names are declared in `topics`."""
+"""Every topic with its message type and QoS, and what other nodes publish on it.
 
+Names are declared in `topics`.
+"""
+
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from selfcal_msgs.msg import (
-    CalibrationSummary,
-    ErrorMap,
-    MarkDetection,
-    ViewCommand,
-    ViewMeasurement,
-    ViewStatus,
+from rclpy.node import Node
+from rclpy.qos import (
+    DurabilityPolicy,
+    QoSCompatibility,
+    QoSProfile,
+    ReliabilityPolicy,
+    qos_check_compatible,
 )
+from selfcal_msgs import msg
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String, UInt64MultiArray
 from visualization_msgs.msg import MarkerArray
 
 from selfcal_ros import topics
+from selfcal_ros.sessions.ports import Diagnosis, Level
+from selfcal_ros.topics import qos_profile
 
 
 @dataclass(frozen=True)
@@ -41,15 +48,15 @@ ENCODER = Topic(topics.ENCODER_TOPIC, JointState, _qos(5000))
 ENCODER_BEST_EFFORT = Topic(topics.ENCODER_TOPIC, JointState, _qos(5000, reliable=False))
 # corrected positions of earlier, displaced samples are useless
 ENCODER_NEWEST = Topic(topics.ENCODER_TOPIC, JointState, _qos(100, reliable=False))
-DETECTIONS = Topic(topics.DETECTION_TOPIC, MarkDetection, _qos(5000))
-COMMAND = Topic(topics.COMMAND_TOPIC, ViewCommand, _qos(256, latched=True))
-NEWEST_COMMAND = Topic(topics.COMMAND_TOPIC, ViewCommand, _qos(1, latched=True))
+DETECTIONS = Topic(topics.DETECTION_TOPIC, msg.MarkDetection, _qos(5000))
+COMMAND = Topic(topics.COMMAND_TOPIC, msg.ViewCommand, _qos(256, latched=True))
+NEWEST_COMMAND = Topic(topics.COMMAND_TOPIC, msg.ViewCommand, _qos(1, latched=True))
 """Offered by a sequencer: a late cell acts on the first command that it receives."""
-STATUS = Topic(topics.STATUS_TOPIC, ViewStatus, _qos(64, latched=True))
-STATUS_AS_IT_COMES = Topic(topics.STATUS_TOPIC, ViewStatus, _qos(64))
-MEASUREMENT = Topic(topics.MEASUREMENT_TOPIC, ViewMeasurement, _qos(64, latched=True))
-ERROR_MAP = Topic(topics.ERROR_MAP_TOPIC, ErrorMap, _qos(1, latched=True))
-SUMMARY = Topic(topics.SUMMARY_TOPIC, CalibrationSummary, _qos(1, latched=True))
+STATUS = Topic(topics.STATUS_TOPIC, msg.ViewStatus, _qos(64, latched=True))
+STATUS_AS_IT_COMES = Topic(topics.STATUS_TOPIC, msg.ViewStatus, _qos(64))
+MEASUREMENT = Topic(topics.MEASUREMENT_TOPIC, msg.ViewMeasurement, _qos(64, latched=True))
+ERROR_MAP = Topic(topics.ERROR_MAP_TOPIC, msg.ErrorMap, _qos(1, latched=True))
+SUMMARY = Topic(topics.SUMMARY_TOPIC, msg.CalibrationSummary, _qos(1, latched=True))
 MAP_MARKERS = Topic(topics.MAP_MARKERS_TOPIC, MarkerArray, _qos(1, latched=True))
 CORRECTED = Topic(topics.CORRECTED_TOPIC, JointState, _qos(100, reliable=False))
 
@@ -73,3 +80,82 @@ def private(topic: Topic) -> Topic:
 
 INPUTS = (ENCODER, DETECTIONS, COMMAND)
 RESULTS = (STATUS, MEASUREMENT, ERROR_MAP, SUMMARY, CORRECTED)
+
+
+def mismatched(node: Node, heard_on: Mapping[str, Topic]) -> Diagnosis:
+    """Name the publishers whose quality of service keeps their messages from this node."""
+    found = []
+    for name, topic in heard_on.items():
+        for offer in node.get_publishers_info_by_topic(name):
+            verdict, reason = qos_check_compatible(offer.qos_profile, topic.qos)
+            if verdict == QoSCompatibility.ERROR:
+                why = reason.removeprefix("ERROR: ").rstrip(";. ")
+                found.append(f"{topic.name}: nothing is heard of {_name(offer)} ({why}); offer "
+                             "what docs/ros2.md lists")
+    return Diagnosis(Level.ERROR if found else Level.OK, "; ".join(found))
+
+
+def others_publishing(node: Node, topics: Iterable[str]) -> Diagnosis:
+    """Name all publishers of a topic that has more than one."""
+    found = []
+    for topic in topics:
+        offers = node.get_publishers_info_by_topic(node.resolve_topic_name(topic))
+        if len(offers) > 1:
+            found.append(f"{topic} has {len(offers)} publishers: "
+                         f"{', '.join(sorted(map(_name, offers)))}; one is right")
+    return Diagnosis(Level.WARN if found else Level.OK, "; ".join(found))
+
+
+def kept_names(node: Node, topic: Topic) -> tuple[str, str]:
+    """Return the name of `topic` in a bag, and the name that it is remapped to, if any.
+
+    Readers of a bag expect the names of the contract, after a namespace.
+    """
+    own, heard = f"{node.get_namespace().rstrip('/')}/{topic.name}", node.resolve_topic_name(
+        topic.name)
+    return own, heard if heard != own else ""
+
+
+def offered(topic: Topic) -> dict:
+    """Return the quality of service of a topic in the format of rosbag2."""
+    return qos_profile(reliable=topic.qos.reliability == ReliabilityPolicy.RELIABLE,
+                       transient_local=topic.qos.durability == DurabilityPolicy.TRANSIENT_LOCAL,
+                       depth=topic.qos.depth)
+
+
+def _name(offer: Any) -> str:
+    return f"{offer.node_namespace.rstrip('/')}/{offer.node_name}"
+
+
+class EncoderInput:
+    """Subscribe reliably if all publishers of the encoder are reliable, else with best effort.
+
+    Checked ten times a second: a driver may appear late, or return with another offer.
+    """
+
+    def __init__(self, node: Any, callback: Callable[[Any], None], **kwargs: Any) -> None:
+        self._node, self._callback, self._kwargs = node, callback, kwargs
+        self._name = node.resolve_topic_name(ENCODER.name)
+        self._topic: Topic | None = None
+        self._subscription: Any = None
+        self._match()
+        node.own(self, EncoderInput.close)
+        node.every(0.1, self._match)
+
+    def _match(self) -> None:
+        offers = self._node.get_publishers_info_by_topic(self._name)
+        if not offers:
+            return
+        reliable = all(o.qos_profile.reliability == ReliabilityPolicy.RELIABLE for o in offers)
+        topic = ENCODER if reliable else ENCODER_BEST_EFFORT
+        if topic is self._topic:
+            return
+        self.close()
+        self._topic = topic
+        self._subscription = self._node.subscribe(topic, self._callback, **self._kwargs)
+
+    def close(self) -> None:
+        """End the subscription."""
+        if self._subscription is not None:
+            self._node.destroy_subscription(self._subscription)
+        self._subscription = None

@@ -10,8 +10,8 @@ from selfcal_msgs.srv import LoadMap, SaveMap
 
 from selfcal_ros.collection.settings.nodes import SolverSettings
 from selfcal_ros.nodes import names
+from selfcal_ros.nodes.filling import map_markers
 from selfcal_ros.nodes.managed import ManagedNode, WhileConfigured, stop
-from selfcal_ros.nodes.markers import map_markers
 from selfcal_ros.nodes.running import run
 from selfcal_ros.sessions.ports import Diagnosis
 from selfcal_ros.sessions.solving import Outcome, SolvingSession, solve, warm_up

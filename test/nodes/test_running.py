@@ -37,9 +37,9 @@ def test_what_a_node_has_loaded_is_not_gone_through_while_it_works(monkeypatch, 
 HANGING = """
 import os, signal, time
 from rclpy.task import Future
-from selfcal_ros.nodes import stopping
-stopping.ENDS_S = 0.5
-stopping.complete_on_signal(Future())
+from selfcal_ros.nodes import running
+running.ENDS_S = 0.5
+running.complete_on_signal(Future())
 def hang():
     os.kill(os.getpid(), signal.SIGTERM)
     while True:
