@@ -7,6 +7,8 @@ Names are relative: a namespace is put in front.
 ENCODER_TOPIC = "stage/joint_states"
 DETECTION_TOPIC = "stage/mark_detections"
 CORRECTED_TOPIC = "stage/corrected_joint_states"
+MOTION_TOPIC = "stage/command"
+CORRECTED_MOTION_TOPIC = "stage/corrected_command"
 COMMAND_TOPIC = "selfcal/view_command"
 STATUS_TOPIC = "selfcal/view_status"
 MEASUREMENT_TOPIC = "selfcal/view_measurement"

@@ -1,11 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""compensator: true positions from indicated ones with the calibrated error map."""
+"""compensator: true positions from indicated ones, and commands, with the calibrated error map."""
 
 import sys
 from typing import Any
 
+from selfcal_msgs.srv import Correct
+
 from selfcal_ros.collection.settings.nodes import CompensatorSettings
 from selfcal_ros.nodes import names
+from selfcal_ros.nodes.filling import fill
 from selfcal_ros.nodes.managed import ManagedNode, WhileConfigured
 from selfcal_ros.nodes.polling import ByTheClock
 from selfcal_ros.nodes.running import run
@@ -14,7 +17,10 @@ from selfcal_ros.sessions.ports import Diagnosis
 
 
 class CompensatorNode(ManagedNode[CompensatorSettings]):
-    """Publish stage/corrected_joint_states: each sample without the stage's error."""
+    """Publish samples without the stage's error, and commands with it.
+
+    The topics are stage/corrected_joint_states and stage/corrected_command.
+    """
 
     session = WhileConfigured[CompensatingSession]()
     _input = WhileConfigured[ByTheClock]()
@@ -27,7 +33,8 @@ class CompensatorNode(ManagedNode[CompensatorSettings]):
         """Create the session, with the map of a file if named."""
         self.session = CompensatingSession(self.settings, self.ports(lambda *_: None))
         self._corrected = self.publisher(names.CORRECTED)
-        self.alone_on += [names.CORRECTED.name]
+        self._commands = self.publisher(names.CORRECTED_MOTION)
+        self.alone_on += [names.CORRECTED.name, names.CORRECTED_MOTION.name]
 
     def activate(self) -> None:
         """Subscribe to the maps and to the encoder."""
@@ -36,12 +43,24 @@ class CompensatorNode(ManagedNode[CompensatorSettings]):
         self._input = ByTheClock(names.ENCODER.name, self.session.receive,
                                  self.guarded(self._on_samples, names.ENCODER.name))
         self._encoder = self.subscribe(names.ENCODER_NEWEST, self._input, raw=True)
+        self.subscribe(names.MOTION, self._on_command, raw=True)
+        self.service(Correct, "~/correct", self._correct)
 
     def _on_samples(self) -> None:
         """Correct waiting samples: called for the first one, which takes the others."""
         with self._encoder.handle:
             missing = self._input.empty(self._encoder, names.ENCODER_NEWEST.qos.depth)
         self.session.correct_waiting(missing.lost, self._corrected.publish)
+
+    def _on_command(self, data: bytes) -> None:
+        corrected = self.session.command(data)
+        if corrected is not None:
+            self._commands.publish(corrected)
+
+    def _correct(self, request: Any, response: Any) -> str:
+        answer = self.session.answer(request.x, request.y, request.theta, inverse=request.inverse)
+        fill(response, answer)
+        return self.session.source
 
     def diagnose_session(self) -> Diagnosis:
         """Return the diagnosis of the session."""

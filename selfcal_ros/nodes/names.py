@@ -59,6 +59,9 @@ ERROR_MAP = Topic(topics.ERROR_MAP_TOPIC, msg.ErrorMap, _qos(1, latched=True))
 SUMMARY = Topic(topics.SUMMARY_TOPIC, msg.CalibrationSummary, _qos(1, latched=True))
 MAP_MARKERS = Topic(topics.MAP_MARKERS_TOPIC, MarkerArray, _qos(1, latched=True))
 CORRECTED = Topic(topics.CORRECTED_TOPIC, JointState, _qos(100, reliable=False))
+MOTION = Topic(topics.MOTION_TOPIC, JointState, _qos(1000))
+"""Commanded positions of the stage: each counts, none is displaced by newer ones."""
+CORRECTED_MOTION = Topic(topics.CORRECTED_MOTION_TOPIC, JointState, _qos(1000))
 
 # below the node's own name (~/)
 HEALTH = Topic("health", DiagnosticStatus, _qos(1, latched=True))

@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The session of compensator: selection of the map, and correction of samples."""
+"""The session of compensator: selection of the map, correction of samples and of commands."""
 
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from statistics import median
 from typing import Any
+
+import numpy as np
 
 from selfcal_ros.collection.settings.nodes import CompensatorSettings
 from selfcal_ros.compensation.compensator import Compensator
@@ -45,11 +47,12 @@ class CompensatingSession:
     def __init__(self, settings: CompensatorSettings, ports: Ports) -> None:
         self._settings, self._ports = settings, ports
         self.compensator: Compensator | None = None
-        self.counts = {"corrected": 0, "without_map": 0, "refused": 0, "skipped": 0}
+        self.counts = {"corrected": 0, "without_map": 0, "refused": 0, "skipped": 0,
+                       "commands": 0, "commands_refused": 0}
         self._waiting: list[tuple[bytes, int]] = []
         self._editor = PositionEditor()
         self._ages_s: list[float] = []  # of samples corrected since the last diagnosis
-        self._skipped = 0  # since then
+        self._skipped = self._commands_refused = 0  # since then
         self._map: Any = None  # newest message of each, until evaluated together
         self._summary: Any = None
         self._waits = ""
@@ -149,38 +152,100 @@ class CompensatingSession:
         if self.compensator is None:
             self.counts["without_map"] += 1
             return None
-        corrected = self._corrected(names, positions)
-        if corrected is None or not all(map(math.isfinite, corrected.values())):
-            # Outside the field with outside=refuse, next to an unknown site or line, or no
-            # position at all.
+        use = self.compensator
+        corrected = self._corrected(names, positions, (use.correct_point, use.correct_angle))
+        if corrected is None:
             self.counts["refused"] += 1
             return None
         self.counts["corrected"] += 1
-        return [corrected.get(index, position) for index, position in enumerate(positions)]
+        return corrected
+
+    def command(self, data: bytes) -> bytes | None:
+        """Return a commanded sensor_msgs/JointState with x, y and theta corrected.
+
+        None if it must not be passed on: without a map, damaged, where the map is unknown, or with
+        x or y alone, whose correction depends on the other.
+        """
+        sample, use, corrected = self._editor.read(data), self.compensator, None
+        if sample is not None and use is not None and (
+                (self._settings.joint_x in sample[0]) == (self._settings.joint_y in sample[0])):
+            corrected = self._corrected(*sample, (use.command, use.command_theta))
+        if corrected is None:
+            self.counts["commands_refused"] += 1
+            self._commands_refused += 1
+            return None
+        self.counts["commands"] += 1
+        return self._editor.replaced(data, corrected)
 
     def _corrected(self, names: Sequence[str], positions: Sequence[float],
-                   ) -> dict[int, float] | None:
-        """Return the corrected positions by index of the joint."""
+                   by: tuple[Callable[[float, float], tuple], Callable[[float], Any]],
+                   ) -> list[float] | None:
+        """Return the positions of all joints with the stage's corrected; None if unknown.
+
+        That is: outside the field with outside=refuse, next to an unknown site or line, or no
+        position at all.
+
+        Parameters
+        ----------
+        names, positions : sequence
+            Joints and their positions.
+        by : tuple of callable
+            Correction of (x, y) and of theta.
+        """
         if len(positions) != len(names):
             return None
         place = {name: index for index, name in enumerate(names)}
         joints = (self._settings.joint_x, self._settings.joint_y, self._settings.joint_theta)
         x, y, theta = map(place.get, joints)
-        if not all(abs(positions[index]) <= FARTHEST  # nor NaN
-                   for index in (x, y, theta) if index is not None):
+        stage = [index for index in (x, y, theta) if index is not None]
+        if self.compensator is None or not all(
+                abs(positions[index]) <= FARTHEST for index in stage):  # nor NaN
             return None
-        corrected: dict[int, float] = {}
-        if self.compensator is None:
-            return None
+        corrected = list(positions)
         try:
             if x is not None and y is not None:
-                corrected[x], corrected[y] = self.compensator.correct_point(
-                    positions[x], positions[y])
+                corrected[x], corrected[y] = map(float, by[0](positions[x], positions[y]))
             if theta is not None and self.compensator.has_theta:
-                corrected[theta] = self.compensator.correct_angle(positions[theta])
+                corrected[theta] = float(by[1](positions[theta]))
         except InputError:
             return None
-        return corrected
+        return corrected if all(math.isfinite(corrected[index]) for index in stage) else None
+
+    def answer(self, x: Sequence[float], y: Sequence[float], theta: Sequence[float], *,
+               inverse: bool) -> dict[str, np.ndarray]:
+        """Return the fields of the answer to a selfcal_msgs/Correct request.
+
+        Raises
+        ------
+        InputError
+            If there is no map, the request is not as many positions of each axis, or the map does
+            not know one of them.
+        """
+        use = self.compensator
+        if use is None:
+            raise InputError("compensator", f"no error map yet{self._waits and ': '}{self._waits}",
+                             "calibrate, or name one with the parameter map")
+        points = [np.asarray(axis, dtype=float) for axis in (x, y, theta)]
+        if len(points[0]) != len(points[1]) or len(points[2]) not in (0, len(points[0])):
+            raise InputError("request", f"{len(x)} x, {len(y)} y and {len(theta)} theta",
+                             "give as many of each; theta may be empty")
+        if not all((np.abs(axis) <= FARTHEST).all() for axis in points):
+            raise InputError("request", "a position is not a number", "give m and rad")
+        found = [*(use.correct if inverse else use.command)(*points[:2]), points[2]]
+        at = found if inverse else points  # u belongs to the map at true positions
+        u = [*use.uncertainty(at[0], at[1]), points[2]]
+        if len(theta):
+            found[2] = (use.correct_theta if inverse else use.command_theta)(points[2])
+            u[2] = use.uncertainty_theta(found[2] if inverse else points[2])
+        if not all(np.isfinite(axis).all() for axis in found):
+            raise InputError("request", "a position lies next to an unknown site or line",
+                             "leave it out, or measure the site")
+        return dict(zip(("x", "y", "theta", "u_x", "u_y", "u_theta"), [*found, *u], strict=True))
+
+    @property
+    def source(self) -> str:
+        """The map in use, in words."""
+        return f"corrected by the map of {self._used}"
 
     def diagnosis(self) -> Diagnosis:
         """Return the diagnosis of the node, and of its timing since the last call."""
@@ -194,6 +259,10 @@ class CompensatingSession:
         if skipped:
             lines.append(f"{skipped} samples skipped since the last status: newer ones had come "
                          "before they could be corrected, or they were lost on the way")
+        refused, self._commands_refused = self._commands_refused, 0
+        if refused:
+            lines.append(f"{refused} commands refused since the last status and not passed on: no "
+                         "map, no complete position, or a place that the map does not know")
         if oldest > limit:
             lines.append(f"a corrected position was {oldest * MS_PER_S:.1f} ms old when it was "
                          f"published, max_age is {limit * MS_PER_S:g} ms")

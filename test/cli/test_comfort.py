@@ -32,8 +32,9 @@ def bag(tmp_path_factory):
 
 @pytest.mark.parametrize(("words", "message"), [
     ("solv x", "selfcal: VERB 'solv' is unknown; did you mean 'solve'?; see selfcal --help"),
-    ("", "selfcal: VERB is missing: one of batch, cal, call, cell, diff, monitor, plan, plot, "
-     "replay, report, reproduce, simulate, solve, step-diagonal, table, up; see selfcal --help"),
+    ("", "selfcal: VERB is missing: one of apply, batch, cal, call, cell, diff, monitor, plan, "
+     "plot, replay, report, reproduce, simulate, solve, step-diagonal, table, up; see selfcal "
+     "--help"),
     ("plan", "selfcal plan: check|suggest is missing; see selfcal plan --help"),
     ("solve", "selfcal solve: BAG is missing; see selfcal solve --help"),
     ("solve b --methd joint", "selfcal solve: the option --methd is unknown; did you mean "
@@ -266,7 +267,8 @@ def test_a_word_that_is_no_verb_is_answered_from_all_verbs(word):
 
 RUNS = {
     "solve": "solve BAG -o s.json", "batch": "batch BAG -o batch", "diff": "diff S S",
-    "report": "report R", "plot": "plot R -o t.svg", "table": "table R -o t.csv",
+    "apply": "apply R POINTS -o a.csv", "report": "report R", "plot": "plot R -o t.svg",
+    "table": "table R -o t.csv",
     "plan check": "plan check PLAN",
     "plan suggest": "plan suggest PLAN", "simulate": "simulate SIM -o made",
     "reproduce": "reproduce hu --draws 2", "cal export": "cal export R -o f.cal",
@@ -285,8 +287,9 @@ def test_every_verb_prints_one_json_object(bag, tmp_path, capsys, monkeypatch):
     root = Path(__file__).parents[2]
     write_json("r.json", result_to_dict(known_result(5, 8)[0]))
     places = {"BAG": bag, "R": "r.json", "S": "s.json", "PLAN": bag.parent / "plan.yaml",
-              "SIM": bag.parent / "simulation.yaml",
+              "SIM": bag.parent / "simulation.yaml", "POINTS": "p.csv",
               "DATA": root / "config/step_diagonal/case_study.csv"}
+    Path("p.csv").write_text("x,y\n0,0\n")
     assert set(RUNS) | NEEDS_NODES == set(LEAVES)
     for name, line in RUNS.items():
         words = [str(places.get(word, word)) for word in line.split()]

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
+from selfcal_msgs.srv import Correct
 
 from selfcal_ros.compensation.compensator import Compensator
 from selfcal_ros.messages import from_model
@@ -96,6 +97,38 @@ def test_joints_are_found_by_name_and_others_pass_unchanged(graph, tmp_path):
     assert list(answer.position) == [7.0, y, x]
 
 
+def test_every_command_comes_back_in_order_with_the_error_added(graph, tmp_path):
+    graph.node(CompensatorNode, map=map_file(tmp_path))
+    heard, publisher = graph.listen(names.CORRECTED_MOTION), graph.publisher(names.MOTION)
+    count = 3 * KEEPS_UP  # more than the newest of the samples
+    for number in range(count):
+        message = sample(0.0001 * number, 0.005, 0.4)
+        message.header.stamp.nanosec = number
+        publisher.publish(message)
+    graph.until(lambda: len(heard) == count, "all of them")
+    reference = Compensator(MAP)
+    for number, answer in enumerate(heard):
+        assert answer.header.stamp.nanosec == number
+        x, y = reference.command(0.0001 * number, 0.005)
+        assert list(answer.position) == [x, y, reference.command_theta(0.4)]
+
+
+def test_the_service_answers_with_commands_their_u_and_the_way_back(graph, tmp_path):
+    node = graph.node(CompensatorNode)
+    none = graph.call(Correct, "compensator/correct", x=[0.01], y=[0.0])
+    assert (none.success, none.error_code) == (False, 2) and not len(none.x)
+    assert none.message.startswith("compensator: no error map yet; calibrate, or name one")
+    node.session._load_file(map_file(tmp_path))
+    there = graph.call(Correct, "compensator/correct", x=[0.01, -0.013], y=[0.0, 0.004])
+    assert there.success and there.message.endswith("map.json, plan demo")
+    x, y = Compensator(MAP).command([0.01, -0.013], [0.0, 0.004])
+    assert (list(there.x), list(there.y), list(there.theta)) == (list(x), list(y), [])
+    u_x, u_y = Compensator(MAP).uncertainty([0.01, -0.013], [0.0, 0.004])
+    assert (list(there.u_x), list(there.u_y)) == (list(u_x), list(u_y))
+    back = graph.call(Correct, "compensator/correct", x=there.x, y=there.y, inverse=True)
+    np.testing.assert_allclose(back.x, [0.01, -0.013], rtol=0, atol=1e-15)
+
+
 @pytest.mark.parametrize("count", [KEEPS_UP + 40, 3 * names.ENCODER_NEWEST.qos.depth])
 def test_after_a_standstill_the_newest_sample_comes_first(graph, tmp_path, count):
     """Nothing runs while these are published; of the larger number most are displaced."""
@@ -113,7 +146,7 @@ def test_after_a_standstill_the_newest_sample_comes_first(graph, tmp_path, count
     publisher.publish(sample(0.02, 0.0, 0.0))
     graph.until(lambda: len(heard) == 3, "the answer to one that comes alone")
     assert node.session.counts == {"corrected": 3, "without_map": 0, "refused": 0,
-                                   "skipped": count - 1}
+                                   "skipped": count - 1, "commands": 0, "commands_refused": 0}
 
 
 @pytest.mark.usefixtures("quick_beat")

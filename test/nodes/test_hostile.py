@@ -67,6 +67,7 @@ def good():
         return next(e for e in events if isinstance(e, kind))
     return [
         (names.ENCODER, from_model.joint_state(event(EncoderSample), "stage")),
+        (names.MOTION, from_model.joint_state(event(EncoderSample), "stage")),
         (names.DETECTIONS, from_model.detection(event(Detection), "stage")),
         (names.COMMAND, from_model.command(
             next(e for e in events if isinstance(e, Command) and e.phase == 1), "stage")),

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from selfcal_ros.bagio.schemas import build, typestore
+from selfcal_ros.compensation.compensator import Compensator
 from selfcal_ros.errors import InputError
 from selfcal_ros.messages import from_model
 from selfcal_ros.model.artifact import Artifact
@@ -50,6 +51,84 @@ class Desk:
 @pytest.fixture
 def desk():
     return Desk()
+
+
+def use(desk, error_map=ONE) -> Compensator:
+    desk.session.take_map(map_of(error_map))
+    desk.session.take_summary(summary_of())
+    return Compensator(error_map)
+
+
+def commanded(desk, names, position) -> list[float] | None:
+    """Send a command through the session; return the positions that it passes on."""
+    message = build(typestore(), "sensor_msgs/msg/JointState", {
+        "header": from_model.header(5, "stage"), "name": list(names), "effort": [],
+        "position": list(position), "velocity": [0.5] * len(names)})
+    data = bytes(typestore().serialize_cdr(message, "sensor_msgs/msg/JointState"))
+    out = desk.session.command(data)
+    if out is None:
+        return None
+    back = typestore().deserialize_cdr(out, "sensor_msgs/msg/JointState")
+    assert (back.header, back.name) == (message.header, message.name)
+    assert list(back.velocity) == [0.5] * len(names)
+    return list(back.position)
+
+
+def test_a_command_gets_the_error_added_and_all_else_stays(desk):
+    by = use(desk)
+    x, y = by.command(0.01, -0.013)
+    assert commanded(desk, ["z", "y", "x", "theta"], [7.0, -0.013, 0.01, 0.4]) == [
+        7.0, y, x, by.command_theta(0.4)]
+    assert abs(x - 0.01) > 1e-9 and desk.session.correct(NAMES, [float(x), float(y), 0.0])[0] == (
+        pytest.approx(0.01, abs=1e-15))
+    assert commanded(desk, ["theta"], [0.4]) == [by.command_theta(0.4)]
+    assert commanded(desk, ["z"], [3.0]) == [3.0]
+    assert desk.session.counts["commands"] == 3
+
+
+@pytest.mark.parametrize("names, position", [
+    (["x"], [0.01]), (["y", "theta"], [0.01, 0.0]), (NAMES, [math.nan, 0.0, 0.0]),
+    (NAMES, [0.0, 2e12, 0.0]), (NAMES, [-0.02, -0.02, 0.0])])
+def test_a_command_that_cannot_be_corrected_is_not_passed_on(desk, names, position):
+    use(desk, random_map(Artifact(5, 0.01, 8), 3, unknown=((0, 0),)))
+    assert commanded(desk, names, position) is None
+    assert desk.session.command(b"damaged") is None
+    told = desk.session.diagnosis()
+    assert told.level == Level.WARN and "2 commands refused since the last status" in told.message
+    assert told.values["commands_refused"] == 2
+    assert desk.session.diagnosis().level == Level.OK  # told once
+
+
+def test_no_command_passes_without_a_map(desk):
+    assert commanded(desk, NAMES, [0.0, 0.0, 0.0]) is None
+
+
+@pytest.mark.parametrize("inverse", [False, True])
+def test_a_request_is_answered_with_corrections_and_u(desk, inverse):
+    by = use(desk)
+    x, y, theta = [0.01, 0.003], [-0.02, 0.0], [0.5, -0.5]
+    found = desk.session.answer(x, y, theta, inverse=inverse)
+    wanted = by.correct(x, y) if inverse else by.command(x, y)
+    np.testing.assert_array_equal([found["x"], found["y"]], wanted)
+    turned = by.correct_theta(theta) if inverse else by.command_theta(theta)
+    np.testing.assert_array_equal(found["theta"], turned)
+    np.testing.assert_array_equal([found["u_x"], found["u_y"]],
+                                  by.uncertainty(*(wanted if inverse else (x, y))))
+    np.testing.assert_array_equal(found["u_theta"],
+                                  by.uncertainty_theta(turned if inverse else theta))
+    assert len(desk.session.answer(x, y, [], inverse=inverse)["theta"]) == 0
+
+
+@pytest.mark.parametrize("x, y, theta, message", [
+    ([0.0], [], [], "1 x, 0 y and 0 theta"), ([0.0], [0.0], [0.0, 1.0], "1 x, 1 y and 2 theta"),
+    ([math.nan], [0.0], [], "a position is not a number"),
+    ([-0.02], [-0.02], [], "next to an unknown site")])
+def test_a_request_that_cannot_be_met_is_refused_as_a_whole(desk, x, y, theta, message):
+    with pytest.raises(InputError, match="no error map yet"):
+        desk.session.answer([0.0], [0.0], [], inverse=False)
+    use(desk, random_map(Artifact(5, 0.01, 8), 3, unknown=((0, 0),)))
+    with pytest.raises(InputError, match=message):
+        desk.session.answer(x, y, theta, inverse=False)
 
 
 @pytest.mark.parametrize("order", [1, -1])

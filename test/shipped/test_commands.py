@@ -11,7 +11,8 @@ from selfcal_ros.cli.main import build_parser, main
 from test.support.pages import PAGES, ROOT, code_lines
 
 COMMAND = re.compile(r"^ *(?:\.venv/bin/)?(selfcal [a-z][^\n`]*?)(?: *# ?(.*))?$", re.M)
-FILE = re.compile(r"```yaml\n# (\w+\.yaml)\n(.*?)```", re.S)
+FILES = (re.compile(r"```yaml\n# (\w+\.yaml)\n(.*?)```", re.S),
+         re.compile(r"```\w+ (\w+\.\w+)\n(.*?)```", re.S))
 ONLY_PARSED = {
     "up": "needs a terminal", "monitor": "needs a cell", "call": "needs a cell",
     "replay": "run by test/nodes/test_replay.py", "batch": "run by the tests of batch",
@@ -58,7 +59,7 @@ def desk(tmp_path, monkeypatch):
 @pytest.mark.parametrize("page", PAGES, ids=lambda path: path.name)
 def test_commands_run(page, desk, capsys):
     text = page.read_text()
-    for name, content in FILE.findall(text):
+    for name, content in (found for kind in FILES for found in kind.findall(text)):
         (desk / name).write_text(content)
     run = [(command, code) for command, code in commands(text) if not parsed_alone(command)]
     if any("RESULT.json" in command for command, _ in run):

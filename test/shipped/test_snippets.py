@@ -35,7 +35,7 @@ def run(tmp_path, monkeypatch):
 
 def test_every_page_with_python_is_run_here():
     assert {page.name for page in PAGES if "```python" in page.read_text()} == {
-        "bags.md", "cal.md", "estimation.md"}
+        "apply.md", "bags.md", "cal.md", "estimation.md"}
 
 
 def test_estimation(run):
@@ -52,6 +52,13 @@ def test_cal(run, tmp_path):
     found = run("cal.md", x_positions=x, y_positions=x[::-1])
     assert all(np.isfinite(values).all() and values.shape == x.shape
                for values in found["corrections"].values())
+
+
+def test_apply(run):
+    assert main(["solve", str(ROOT / "bags/hu_noise"), "--quiet", "-o", "RESULT.json"]) == 0
+    found = run("apply.md")
+    np.testing.assert_allclose((found["x_true"], found["y_true"]), (0.01, -0.005), atol=1e-15)
+    assert found["covariance"].shape == (4, 4) and found["qualified"]
 
 
 def test_bags(run, tmp_path):

@@ -1,0 +1,38 @@
+#!/usr/bin/env python3
+# SPDX-License-Identifier: Apache-2.0
+"""Use a calibrated stage in your own program: commands, true positions, a distance with its U.
+
+Run it with ``.venv/bin/python examples/correct.py RESULT.json``.
+"""
+
+import sys
+
+import numpy as np
+
+from selfcal_ros.apply import load
+
+
+def main(path: str) -> None:
+    """Print commands for three points, the way back, and the distance of two points."""
+    stage = load(path)
+    x = np.array([-0.01, 0.0, 0.01])  # where the stage has to be, m
+    y = np.array([0.01, 0.0, -0.005])
+
+    x_command, y_command = stage.command(x, y)
+    u_x, u_y = stage.uncertainty(x, y)
+    for row in zip(x, y, x_command, y_command, u_x, u_y, strict=True):
+        print("be at {:+.6f} {:+.6f} m: command {:+.9f} {:+.9f} m, u {:.1e} {:.1e} m".format(*row))
+
+    x_true, y_true = stage.correct(x_command, y_command)
+    print(f"and back: off by at most {np.hypot(x_true - x, y_true - y).max():.0e} m")
+
+    dx, dy = x[2] - x[0], y[2] - y[0]  # the distance from the first point to the last
+    length = np.hypot(dx, dy)
+    along = np.array([-dx, 0, dx, -dy, 0, dy]) / length  # its change with each Gx, then each Gy
+    u_length = np.sqrt(along @ stage.covariance(x, y) @ along)
+    k = stage.result.noise.k_xy
+    print(f"distance {length:.9f} m, U {k * u_length:.1e} m (k = {k:.2f}, 95.45 %)")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])

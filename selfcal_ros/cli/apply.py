@@ -1,0 +1,114 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``selfcal apply``: commands for true positions, or true positions of indicated ones."""
+
+import argparse
+from typing import TYPE_CHECKING
+
+from selfcal_ros.cli.terminal import add_json, file_of, say
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from selfcal_ros.apply import StageMap
+
+HELP = "correct a table of positions: commands for true positions, or the inverse"
+AXES = ("x", "y", "theta")
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the verb."""
+    parser.add_argument("result", metavar="RESULT.json", help="result that `selfcal solve` wrote")
+    parser.add_argument("points", metavar="POINTS.csv",
+                        help="columns x,y or x,y,theta in m and rad, stage frame")
+    parser.add_argument("-o", "--output", metavar="OUT.csv", required=True,
+                        help="table to write: the points, the corrected ones, and their standard "
+                             "uncertainties (empty = unknown); - = stdout")
+    parser.add_argument("--inverse", action="store_true",
+                        help="the points are indicated positions: give the true ones")
+    parser.add_argument("--method", choices=("bilinear", "bicubic"), default="bilinear",
+                        help="interpolation between the nodes (default bilinear)")
+    parser.add_argument("--outside", choices=("clamp", "refuse"), default="clamp",
+                        help="outside the field take the error of its edge, or refuse (default "
+                             "clamp)")
+    add_json(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Read result and points, write the corrected points.
+
+    A result that is not qualified ends with code 5 and the reason on stderr, as in `solve`.
+    """
+    import sys
+
+    from selfcal_ros.apply import load
+    from selfcal_ros.cli.terminal import exit_code
+    from selfcal_ros.files import check_outputs, read_text, write_text
+
+    check_outputs([args.result, args.points], [file_of(args)])
+    stage = load(args.result, method=args.method, outside=args.outside)
+    points = read_points(read_text(args.points), args.points)
+    text, unknown, outside = corrected(stage, points, inverse=args.inverse)
+    if args.output == "-":
+        say(args, text.removesuffix("\n"), {"csv": text})
+    else:
+        write_text(args.output, text)
+        say(args, f"written: {args.output}, {len(points)} points",
+            {"written": args.output, "points": len(points), "unknown": unknown,
+             "outside": outside})
+    for count, what in ((outside, "outside the field, corrected as the nearest point of its edge"),
+                        (unknown, "next to unknown sites or lines, left empty")):
+        if count:
+            print(f"selfcal apply: points {what}: {count}", file=sys.stderr)
+    return exit_code(stage.result)
+
+
+def read_points(text: str, where: str) -> "np.ndarray":
+    """Return the points of a table x,y[,theta], (P, 2 or 3).
+
+    Raises
+    ------
+    InputError
+        For another header, or a line that is not as many finite numbers.
+    """
+    import numpy as np
+
+    from selfcal_ros.errors import InputError
+    from selfcal_ros.files import csv_cells
+
+    rows = [(number, csv_cells(line, f"{where}:{number}"))
+            for number, line in enumerate(text.splitlines(), 1) if line.strip(", ")]
+    head = [cell.lower() for cell in rows[0][1]] if rows else []
+    if head not in (list(AXES), list(AXES[:2])):
+        raise InputError(f"{where}:1", "the header is not x,y or x,y,theta",
+                         "name the columns; positions in m and rad")
+    points = np.empty((len(rows) - 1, len(head)))
+    for index, (number, cells) in enumerate(rows[1:]):
+        try:
+            points[index] = list(map(float, cells)) if len(cells) == len(head) else np.nan
+        except ValueError:
+            points[index] = np.nan
+        if not np.abs(points[index]).max() < 1e12:
+            raise InputError(f"{where}:{number}", f"not {len(head)} positions",
+                             f"give {','.join(head)} in m and rad")
+    if not len(points):
+        raise InputError(where, "it has no points", "give at least one")
+    return points
+
+
+def corrected(stage: "StageMap", points: "np.ndarray", *, inverse: bool) -> tuple[str, int, int]:
+    """Return the table of corrected points, and how many are unknown and outside the field."""
+    import numpy as np
+
+    names, what = AXES[:points.shape[1]], "true" if inverse else "command"
+    x, y, *theta = points.T
+    found = list(stage.correct(x, y) if inverse else stage.command(x, y))
+    at = found if inverse else [x, y]  # u is that of the map at the true position
+    u = list(stage.uncertainty(at[0], at[1]))
+    if theta:
+        found.append((stage.correct_theta if inverse else stage.command_theta)(theta[0]))
+        u.append(stage.uncertainty_theta(found[2] if inverse else theta[0]))
+    rows = np.column_stack([points, *found, *u])
+    head = [*names, *(f"{name}_{what}" for name in names), *(f"u_{name}" for name in names)]
+    lines = [",".join("" if cell != cell else repr(cell) for cell in row) for row in rows.tolist()]
+    unknown = int(np.isnan(found).any(axis=0).sum())
+    return "\n".join([",".join(head), *lines]) + "\n", unknown, int((~stage.inside(x, y)).sum())

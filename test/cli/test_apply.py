@@ -1,0 +1,101 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``selfcal apply``: a table of positions through the map."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from selfcal_ros.cli.main import main
+from selfcal_ros.compensation.compensator import Compensator
+from selfcal_ros.files import write_json
+from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.result import result_to_dict
+from selfcal_ros.model.verdict import Grade, Verdict
+from test.support.maps import random_map, result_of
+
+MAP = random_map(Artifact(5, 0.01, 8), 3, unknown=((0, 0),))
+POINTS = "x,y,theta\n0.01,-0.02,0.5\n0.0033,0.0071,-2\n0.05,0.0,0\n-0.02,-0.02,1\n"
+
+
+@pytest.fixture
+def desk(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    write_json("R.json", result_to_dict(result_of(MAP)))
+    (tmp_path / "p.csv").write_text(POINTS)
+    return tmp_path
+
+
+def table(path) -> tuple[list[str], np.ndarray]:
+    head, *rows = path.read_text().splitlines()
+    return head.split(","), np.array([[float(cell or "nan") for cell in row.split(",")]
+                                      for row in rows])
+
+
+@pytest.mark.parametrize("inverse", [False, True])
+def test_each_point_is_followed_by_its_correction_and_u(desk, capsys, inverse):
+    assert main(["apply", "R.json", "p.csv", "-o", "o.csv", *["--inverse"] * inverse]) == 0
+    head, rows = table(desk / "o.csv")
+    end = "true" if inverse else "command"
+    assert head == ["x", "y", "theta", f"x_{end}", f"y_{end}", f"theta_{end}",
+                    "u_x", "u_y", "u_theta"]
+    x, y, theta = rows[:, :3].T
+    use = Compensator(MAP)
+    wanted = use.correct(x, y) if inverse else use.command(x, y)
+    np.testing.assert_array_equal(rows[:, 3:5].T, wanted)
+    turned = use.correct_theta(theta) if inverse else use.command_theta(theta)
+    np.testing.assert_array_equal(rows[:, 5], turned)
+    at = wanted if inverse else (x, y)
+    np.testing.assert_array_equal(rows[:, 6:8].T, use.uncertainty(*at))
+    np.testing.assert_array_equal(rows[:, 8], use.uncertainty_theta(turned if inverse else theta))
+    out, err = capsys.readouterr()
+    assert out == "written: o.csv, 4 points\n"
+    assert err.splitlines() == [
+        "selfcal apply: points outside the field, corrected as the nearest point of its edge: 1",
+        "selfcal apply: points next to unknown sites or lines, left empty: 1"]
+
+
+def test_there_and_back_is_where_it_was(desk):
+    (desk / "p.csv").write_text("X, Y\n0.011,-0.017\n")
+    assert main(["apply", "R.json", "p.csv", "-o", "there.csv"]) == 0
+    (x, y), = table(desk / "there.csv")[1][:, 2:4]
+    (desk / "q.csv").write_text(f"x,y\n{float(x)!r},{float(y)!r}\n")
+    assert main(["apply", "R.json", "q.csv", "-o", "back.csv", "--inverse"]) == 0
+    np.testing.assert_allclose(table(desk / "back.csv")[1][0, 2:4], (0.011, -0.017), rtol=0,
+                               atol=1e-16)
+
+
+def test_stdout_json_and_bicubic(desk, capsys):
+    write_json("R.json", result_to_dict(result_of(random_map(Artifact(5, 0.01, 8), 3))))
+    assert main(["apply", "R.json", "p.csv", "-o", "-", "--json", "--method", "bicubic"]) == 0
+    text = json.loads(capsys.readouterr().out)["csv"]
+    (desk / "o.csv").write_text(text)
+    use = Compensator(random_map(Artifact(5, 0.01, 8), 3), method="bicubic")
+    rows = table(desk / "o.csv")[1]
+    np.testing.assert_array_equal(rows[:, 3:5].T, use.command(*rows[:, :2].T))
+
+
+@pytest.mark.parametrize(("text", "message"), [
+    ("", "p.csv:1: the header is not x,y or x,y,theta"),
+    ("a,b\n1,2\n", "p.csv:1: the header is not x,y or x,y,theta"),
+    ("x,y\n", "p.csv: it has no points"),
+    ("x,y\n1,2,3\n", "p.csv:2: not 2 positions; give x,y in m and rad"),
+    ("x,y\n\n1,nan\n", "p.csv:3: not 2 positions"), ("x,y\n1,inf\n", "p.csv:2: not 2 positions"),
+    ("x,y\n1,z\n", "p.csv:2: not 2 positions")])
+def test_a_bad_table_is_one_line(desk, capsys, text, message):
+    (desk / "p.csv").write_text(text)
+    assert main(["apply", "R.json", "p.csv", "-o", "o.csv"]) == 2
+    err = capsys.readouterr().err
+    assert err.startswith(f"selfcal apply: {message}") and err.count("\n") == 1
+    assert not (desk / "o.csv").exists()
+
+
+def test_outside_refused_and_not_qualified(desk, capsys):
+    assert main(["apply", "R.json", "p.csv", "-o", "o.csv", "--outside", "refuse"]) == 2
+    assert "outside of the calibrated field" in capsys.readouterr().err
+    doubt = replace(result_of(MAP), verdict=Verdict(
+        Grade.NOT_QUALIFIED, sentence="Not qualified: too noisy."))
+    write_json("R.json", result_to_dict(doubt))
+    assert main(["apply", "R.json", "p.csv", "-o", "o.csv"]) == 5
+    assert "too noisy" in capsys.readouterr().err and (desk / "o.csv").exists()

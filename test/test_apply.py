@@ -1,0 +1,114 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A calibrated stage in a program of one's own: commands, inverse, covariance of points."""
+
+import runpy
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from selfcal_ros import apply
+from selfcal_ros.apply import StageMap, load
+from selfcal_ros.errors import ExitCode, InputError, NotIdentifiableError
+from selfcal_ros.estimation.api import calibrate
+from selfcal_ros.estimation.comparison.covariance import xy_covariance
+from selfcal_ros.files import write_json
+from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.result import result_to_dict
+from selfcal_ros.reporting.words.findings import worded
+from test.support.maps import random_map, result_of
+from test.support.sessions import collected, events_of, small_plan
+
+EXAMPLE = Path(__file__).parents[1] / "examples/correct.py"
+
+
+@pytest.fixture(scope="module")
+def result():
+    """A calibration of 5 x 5 marks, 10 mm apart."""
+    return worded(calibrate(collected(events_of(small_plan("0, 90, 180, tx")))[1]))
+
+
+@pytest.fixture(scope="module")
+def file(result, tmp_path_factory):
+    path = tmp_path_factory.mktemp("map") / "R.json"
+    write_json(path, result_to_dict(result))
+    return str(path)
+
+
+def test_the_command_is_plus_the_error_and_correct_is_its_inverse(file, result):
+    stage, pitch = load(file), result.artifact.grid_pitch_m
+    x, y = stage.command(pitch, -2 * pitch)
+    assert float(x) == pitch + result.error_map.gx[3, 0] and abs(x - pitch) > 1e-9
+    assert float(y) == -2 * pitch + result.error_map.gy[3, 0]
+    np.testing.assert_allclose(stage.correct(x, y), (pitch, -2 * pitch), rtol=0, atol=1e-15)
+
+
+def test_at_the_nodes_the_covariance_has_the_variances_of_the_map(file, result):
+    emap, plate = result.error_map, result.artifact
+    found = load(file).covariance(plate.x_m, plate.y_m)
+    np.testing.assert_allclose(np.sqrt(np.diag(found)),
+                               [*emap.u_gx.ravel(), *emap.u_gy.ravel()], rtol=1e-9)
+    np.testing.assert_allclose(found, xy_covariance(result, emap.valid)[0], rtol=0,
+                               atol=1e-9 * found.max())
+
+
+def test_between_the_nodes_it_is_that_of_the_interpolated_error(file, result):
+    """Against draws of the whole map, each interpolated by the compensator itself."""
+    emap, plate = result.error_map, result.artifact
+    full = xy_covariance(result, emap.valid)[0]
+    rng = np.random.default_rng(1)
+    draws = rng.multivariate_normal(np.zeros(len(full)), full, 20_000, method="eigh")
+    pitch = plate.grid_pitch_m
+    x, y = np.array([0.3, -1.9, 2.0, 0.0]) * pitch, np.array([0.8, 1.2, -0.5, 7.0]) * pitch
+    basis = []
+    for unit in np.eye(len(full)):  # the compensator is linear in the sites
+        gx, gy = unit.reshape(2, *plate.shape) * 1e-9
+        basis.append(np.concatenate(
+            StageMap(result_of(replace(emap, gx=gx, gy=gy))).error(x, y)) / 1e-9)
+    wanted = np.cov((draws @ np.array(basis)).T)
+    found = load(file).covariance(x, y)
+    np.testing.assert_allclose(found, wanted, rtol=0, atol=0.05 * found.max())
+    assert (np.sqrt(np.diag(found)) <= (1 + 1e-9) * np.concatenate(
+        load(file).uncertainty(x, y))).all()  # the bound of `uncertainty` holds
+
+
+def test_neighbours_share_their_uncertainty(file, result):
+    stage, pitch = load(file), result.artifact.grid_pitch_m
+    x, y = np.array([0.4, 0.6]) * pitch, np.zeros(2)
+    cover = stage.covariance(x, y)
+    along = np.array([-1, 1, 0, 0])
+    assert along @ cover @ along < 0.5 * (cover[0, 0] + cover[1, 1])
+
+
+def test_what_has_no_covariance_is_refused(file, monkeypatch):
+    stage = load(file)
+    with pytest.raises(InputError, match="a position is not a number"):
+        stage.covariance(np.nan, 0.0)
+    monkeypatch.setattr(apply, "MAX_POINTS", 3)
+    with pytest.raises(InputError, match="4 points; give at most 3"):
+        stage.covariance(np.zeros(4), 0.0)
+    with pytest.raises(InputError, match="does not contain the correlations"):
+        StageMap(result_of(random_map(Artifact(5, 0.01), 1))).covariance(0.0, 0.0)
+    holed = StageMap(result_of(random_map(Artifact(5, 0.01), 1, unknown=((2, 2),))))
+    with pytest.raises(InputError, match="next to an unknown site"):
+        holed.covariance(0.001, 0.0)
+    with pytest.raises(InputError, match="outside of the calibrated field"):
+        load(file, outside="refuse").covariance(1.0, 0.0)
+
+
+def test_a_map_that_is_not_identified_is_no_stage(result):
+    unseen = replace(result, observability=replace(result.observability, identifiable=False))
+    with pytest.raises(NotIdentifiableError) as raised:
+        StageMap(unseen)
+    assert raised.value.exit_code is ExitCode.NOT_IDENTIFIABLE
+
+
+def test_the_example_runs(file, capsys, monkeypatch):
+    monkeypatch.setattr(sys, "argv", [str(EXAMPLE), file])
+    runpy.run_path(str(EXAMPLE), run_name="__main__")
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 5 and lines[3] in [f"and back: off by at most {e} m" for e in (
+        "0e+00", "2e-18", "3e-18", "4e-18")]
+    assert lines[4].startswith("distance 0.025000000 m, U ")
