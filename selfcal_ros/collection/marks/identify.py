@@ -16,7 +16,8 @@ from selfcal_ros.collection.marks.rigid import (
     fit_motion,
 )
 from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.model.view import LatticePose, View
+from selfcal_ros.model.pose import LatticePose
+from selfcal_ros.model.view import View
 
 TOO_FAR_FROM_ANY = 0.75
 """Distance to the nearest mark, in pitches, beyond which a detection is not of a mark."""

@@ -16,7 +16,7 @@ import numpy as np
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import ViewReadings
 from selfcal_ros.model.result import ArtifactMap
-from selfcal_ros.model.view import LatticePose
+from selfcal_ros.model.pose import LatticePose
 
 PHASES = np.array([1, 1j, -1, -1j])
 """i^q for q = 0..3, exact."""

@@ -10,7 +10,8 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.lattice.maps import PHASES
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Measurements, ViewReadings
-from selfcal_ros.model.view import LatticePose, View
+from selfcal_ros.model.pose import LatticePose
+from selfcal_ros.model.view import View
 
 
 @dataclass(frozen=True, eq=False)

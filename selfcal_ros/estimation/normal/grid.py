@@ -20,7 +20,7 @@ from selfcal_ros.estimation.lattice.connectivity import (
 from selfcal_ros.estimation.lattice.maps import PHASES, LatticeViews, rigid_parameters
 from selfcal_ros.estimation.multifrontal.dissection import fold
 from selfcal_ros.estimation.multifrontal.factor import Factor
-from selfcal_ros.model.view import LatticePose
+from selfcal_ros.model.pose import LatticePose
 
 
 class GridSystem:

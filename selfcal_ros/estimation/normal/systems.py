@@ -15,7 +15,8 @@ from selfcal_ros.estimation.normal.angular import AngularSystem
 from selfcal_ros.estimation.normal.equations import NormalEquations
 from selfcal_ros.estimation.normal.grid import GridSystem
 from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.model.view import LatticePose, View
+from selfcal_ros.model.pose import LatticePose
+from selfcal_ros.model.view import View
 
 CACHED = 16
 CACHED_READINGS = 4_000_000

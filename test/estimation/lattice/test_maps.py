@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from selfcal_ros.estimation.lattice.maps import LatticeViews
-from selfcal_ros.model.view import LatticePose
+from selfcal_ros.model.pose import LatticePose
 
 TURNS = [np.array(rows) for rows in ([[1, 0], [0, 1]], [[0, -1], [1, 0]], [[-1, 0], [0, -1]],
                                      [[0, 1], [-1, 0]])]

@@ -6,7 +6,7 @@ import pytest
 
 from selfcal_ros.estimation.multifrontal import dissection
 from selfcal_ros.estimation.normal.grid import GridSystem
-from selfcal_ros.model.view import LatticePose
+from selfcal_ros.model.pose import LatticePose
 
 SETS = [((0, 0, 0), (1, 0, 0), (0, 1, 0)), ((0, 0, 0), (2, 0, 0), (3, 1, -1)),
         ((0, 0, 0), (0, 1, 0), (0, 0, 2)), ((1, 0, 0), (2, 1, 0), (3, 0, 0), (0, 0, 0))]

@@ -12,7 +12,7 @@ from selfcal_ros.estimation.normal.equations import NormalEquations
 from selfcal_ros.estimation.normal.grid import GridSystem
 from selfcal_ros.estimation.observability.rank import plan_observability
 from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.model.view import LatticePose
+from selfcal_ros.model.pose import LatticePose
 from selfcal_ros.simulation.truth import random_truth, simulate_measurements
 from test.support.lattice_plans import plan_of
 

@@ -16,7 +16,7 @@ from selfcal_ros.estimation.terms.projection import (
     reduce_lines,
 )
 from selfcal_ros.estimation.terms.shapes import NO_LINES, shapes_of
-from selfcal_ros.model.view import LatticePose
+from selfcal_ros.model.pose import LatticePose
 
 POSES = ((0, 0, 0), (1, 0, 0), (0, 1, 0), (2, 0, -1))
 SHAPE = (5, 7)

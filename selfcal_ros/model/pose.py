@@ -1,0 +1,88 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Poses of the plate on the stage."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from selfcal_ros.model.artifact import Artifact
+
+
+@dataclass(frozen=True)
+class LatticePose:
+    """A plate pose in whole steps of the lattice.
+
+    Attributes
+    ----------
+    quarter_turns : int or None
+        q in 0..3, counter-clockwise; None if the turn is not a whole quarter.
+    shift : tuple of int
+        (a, b), translation along stage x and y in pitches.
+    turn_lines : int or None
+        s in 0..K-1, the total turn in angular lines; None on a plate without lines.
+    """
+
+    quarter_turns: int | None
+    shift: tuple[int, int]
+    turn_lines: int | None
+
+    @property
+    def q(self) -> int:
+        """Quarter turns of a pose in which grid marks are on sites.
+
+        Raises
+        ------
+        ValueError
+            If the turn is not a whole quarter.
+        """
+        if self.quarter_turns is None:
+            raise ValueError("a grid mark lies on a site only after whole quarter turns")
+        return self.quarter_turns
+
+    @property
+    def a(self) -> int:
+        """Shift along stage x, pitches."""
+        return self.shift[0]
+
+    @property
+    def b(self) -> int:
+        """Shift along stage y, pitches."""
+        return self.shift[1]
+
+    @property
+    def s(self) -> int:
+        """Turn in angular lines of a plate that has lines.
+
+        Raises
+        ------
+        ValueError
+            If the plate has none.
+        """
+        if self.turn_lines is None:
+            raise ValueError("the turn is counted in lines only on a plate with angular lines")
+        return self.turn_lines
+
+    def site_of(self, m: np.ndarray, n: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the site (i, j) of mark (m, n): R^q (m, n) + (a, b).
+
+        Raises
+        ------
+        ValueError
+            If the turn is not a whole quarter.
+        """
+        x, y = ((m, n), (-n, m), (-m, -n), (n, -m))[self.q]
+        return x + self.a, y + self.b
+
+    def marks_in_field(self, artifact: Artifact) -> tuple[np.ndarray, np.ndarray]:
+        """Return the marks inside the field of the stage and their sites, int arrays (2, V)."""
+        marks = np.stack([artifact.m.ravel(), artifact.n.ravel()])
+        sites = np.stack(self.site_of(*marks))
+        inside = (np.abs(sites) <= np.array(artifact.half)[:, None]).all(axis=0)
+        return marks[:, inside], sites[:, inside]
+
+    def n_in_field(self, artifact: Artifact) -> int:
+        """Return the number of marks inside the field of the stage."""
+        plate = artifact.half[::-1] if self.q % 2 else artifact.half
+        return math.prod(max(0, min(h, s + p) - max(-h, s - p) + 1) for h, s, p in zip(
+            artifact.half, self.shift, plate, strict=True))
