@@ -2,7 +2,9 @@
 """The artifact plate: a grid of marks and a circle of angular lines."""
 
 from dataclasses import dataclass
+from enum import StrEnum
 from functools import cached_property
+from math import ceil
 
 import numpy as np
 
@@ -10,13 +12,46 @@ from selfcal_ros.errors import InputError
 
 MAX_GRID_SIZE = 1001
 MAX_ANGULAR_COUNT = 1_000_000
+DEFAULT_NODES = 51
+"""Largest number of nodes along one side of a map that nobody asked for."""
 PITCH_RANGE_M = (1e-7, 1.0)
 """Valid distances between marks."""
 
 
+class Interpolation(StrEnum):
+    """Interpolation of the stage's error between the nodes of its map."""
+
+    BILINEAR = "bilinear"
+    BICUBIC = "bicubic"
+
+
+@dataclass(frozen=True)
+class MapGrid:
+    """Nodes of the error map where they are not the sites of the plate's lattice.
+
+    Attributes
+    ----------
+    size : int
+        Number of nodes along x; odd. The map is square unless `size_y` is given.
+    pitch_m : float
+        Distance between neighbouring nodes, m.
+    interpolation : Interpolation
+        Between the nodes.
+    size_y : int
+        Number of nodes along y; 0 means `size`.
+    """
+
+    size: int
+    pitch_m: float
+    interpolation: Interpolation = Interpolation.BICUBIC
+    size_y: int = 0
+
+
 @dataclass(frozen=True)
 class Artifact:
-    """Nominal geometry of the plate, which is also the lattice of the stage's field.
+    """Nominal geometry of the plate, and the grid of the stage's map.
+
+    Unless `map_grid` is given, the map has its nodes on the plate's lattice.
 
     Attributes
     ----------
@@ -28,6 +63,8 @@ class Artifact:
         K, number of angular lines; a multiple of 4, or 0 for a plate without them.
     grid_size_y : int
         Number of marks along y; 0 means `grid_size`.
+    map_grid : MapGrid, optional
+        Nodes of the error map, for views whose marks do not lie on the lattice.
 
     Raises
     ------
@@ -39,6 +76,7 @@ class Artifact:
     grid_pitch_m: float
     angular_count: int = 0
     grid_size_y: int = 0
+    map_grid: MapGrid | None = None
 
     def __post_init__(self) -> None:
         """Refuse sizes without a centre mark and counts without a quarter turn."""
@@ -56,6 +94,21 @@ class Artifact:
         if self.angular_count % 4 or not 0 <= self.angular_count <= MAX_ANGULAR_COUNT:
             raise InputError("artifact angular_count", f"{self.angular_count} is not a multiple "
                              "of 4", "give 0 for a plate without angular lines")
+        if self.map_grid is not None:
+            Artifact(self.map_grid.size, self.map_grid.pitch_m, 0, self.map_grid.size_y)
+
+    @cached_property
+    def field(self) -> "Artifact":
+        """Lattice of the error map: that of the plate unless `map_grid` is given."""
+        grid = self.map_grid
+        return self if grid is None else Artifact(
+            grid.size, grid.pitch_m, self.angular_count, grid.size_y)
+
+    @property
+    def field_half_m(self) -> tuple[float, float]:
+        """Largest x and y of the stage's field, m."""
+        return self.field.half[0] * self.field.grid_pitch_m, (
+            self.field.half[1] * self.field.grid_pitch_m)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -91,3 +144,19 @@ class Artifact:
     def theta_rad(self) -> np.ndarray:
         """Nominal angle of every line in rad, (K,), from 0 counter-clockwise."""
         return np.arange(self.angular_count) * (2 * np.pi / max(self.angular_count, 1))
+
+
+def default_map_grid(artifact: Artifact) -> MapGrid:
+    """Return the map's nodes for views off the lattice, where a plan does not give them.
+
+    They span the field of the plate; along its longer side there are three quarters as many nodes
+    as marks, at least five if there are as many marks, at most `DEFAULT_NODES`. With as many nodes
+    as marks the readings hardly determine the outermost ones.
+    """
+    longer = max(artifact.half)
+    cells = max(int(0.75 * (2 * longer + 1) - 1) // 2 * 2, min(4, 2 * longer))
+    cells = min(cells, DEFAULT_NODES - 1)
+    pitch_m = 2 * longer * artifact.grid_pitch_m / cells
+    sides = [max(2 * ceil(cells * half / (2 * longer) - 1e-9) + 1, 3) for half in artifact.half]
+    return MapGrid(sides[0], pitch_m, Interpolation.BICUBIC,
+                   sides[1] if sides[1] != sides[0] else 0)

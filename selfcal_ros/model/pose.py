@@ -3,10 +3,14 @@
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from selfcal_ros.model.artifact import Artifact
+
+EDGE = 1e-9
+"""Distance beyond the edge of the field that is rounding, in pitches."""
 
 
 @dataclass(frozen=True)
@@ -86,3 +90,37 @@ class LatticePose:
         plate = artifact.half[::-1] if self.q % 2 else artifact.half
         return math.prod(max(0, min(h, s + p) - max(-h, s - p) + 1) for h, s, p in zip(
             artifact.half, self.shift, plate, strict=True))
+
+
+@dataclass(frozen=True)
+class Pose:
+    """A plate pose anywhere on the stage.
+
+    Attributes
+    ----------
+    turn_rad : float
+        Counter-clockwise, rad.
+    shift_m : tuple of float
+        Position of the plate's centre along stage x and y, m.
+    """
+
+    turn_rad: float
+    shift_m: tuple[float, float]
+
+    @cached_property
+    def phase(self) -> complex:
+        """exp(i turn), exact for quarter turns."""
+        quarters = self.turn_rad / (math.pi / 2)
+        if abs(quarters - round(quarters)) < 1e-12:
+            return (1, 1j, -1, -1j)[round(quarters) % 4]
+        return complex(math.cos(self.turn_rad), math.sin(self.turn_rad))
+
+    def places(self, artifact: Artifact, m: np.ndarray, n: np.ndarray) -> np.ndarray:
+        """Return the nominal places of marks on the stage, x + iy, complex, m."""
+        return self.phase * (m + 1j * n) * artifact.grid_pitch_m + complex(*self.shift_m)
+
+    def in_field(self, artifact: Artifact) -> np.ndarray:
+        """Return the marks of the plate that lie in the stage's field, bool (nx, ny)."""
+        places, (hx, hy) = self.places(artifact, artifact.m, artifact.n), artifact.field_half_m
+        rounding = EDGE * artifact.grid_pitch_m
+        return (np.abs(places.real) <= hx + rounding) & (np.abs(places.imag) <= hy + rounding)

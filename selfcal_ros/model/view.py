@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from selfcal_ros.errors import InputError, known_are
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.orders import parse_order
-from selfcal_ros.model.pose import LatticePose
+from selfcal_ros.model.pose import LatticePose, Pose
 from selfcal_ros.model.terms import TermName, parse_terms
 
 LATTICE_TOLERANCE = 1e-3
@@ -79,6 +79,11 @@ class View:
         if self.check_marks > there:
             raise InputError(where, f"{self.check_marks} marks are wanted, {there} lie in the "
                              "field", "ask for fewer marks")
+
+    @property
+    def pose(self) -> Pose:
+        """Nominal pose of the plate, on the lattice or off it."""
+        return Pose(self.rotation_rad, self.translation_m)
 
     def lattice_pose(self, artifact: Artifact) -> LatticePose:
         """Return the pose in whole steps of the artifact's lattice.
