@@ -45,6 +45,11 @@ class LatticePose:
         return self.quarter_turns
 
     @property
+    def phase(self) -> complex:
+        """i^q: the factor from the plate frame to the stage frame, exact."""
+        return (1, 1j, -1, -1j)[self.q]
+
+    @property
     def a(self) -> int:
         """Shift along stage x, pitches."""
         return self.shift[0]

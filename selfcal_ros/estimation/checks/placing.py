@@ -16,8 +16,8 @@ import numpy as np
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.model.readings import Measurements, ViewReadings
 from selfcal_ros.model.pose import LatticePose
+from selfcal_ros.model.readings import Measurements, ViewReadings
 
 QUARTERS = np.array([1, 1j, -1, -1j])
 WINDOW = 3

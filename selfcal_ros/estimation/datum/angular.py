@@ -84,7 +84,7 @@ def _conditions(system: NormalEquations, datum: ThetaDatum, sense: Sense,
     flipped = sense is Sense.PLATE_MOVES
     if datum is ThetaDatum.XY_AXES and system.angular.n_views:
         sites = system.known_sites[::-1, ::-1] if flipped else system.known_sites
-        slopes = slope_rows(system.grid.views.z * half_width_m, sites)
+        slopes = slope_rows(system.grid.views.z_sites * half_width_m, sites)
         lines = np.arange(4) * (n_lines // 4)
         rows = np.zeros((4, n_lines))
         rows[np.arange(4), lines] = 1.0

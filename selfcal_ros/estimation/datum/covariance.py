@@ -61,7 +61,7 @@ def scale_datum(system: NormalEquations, reference: ReferenceLength,
     grid, n = system.grid, 3 * system.grid.n_views
     u = reference.u_relative * half_width_m
     if reference.kind is not ReferenceKind.ARTIFACT:
-        rows = _slope(grid.views.z, system.known_sites, reference.kind)
+        rows = _slope(grid.views.z_sites, system.known_sites, reference.kind)
         basis = system.gauge.orthonormal
         rows = rows - basis @ np.real(basis.conj().T @ rows)
         return ScaleDatum(-rows, np.zeros(n), 0.0, u)
@@ -79,7 +79,7 @@ def scale_of(system: NormalEquations, reference: ReferenceLength, *, field: np.n
     """Return c for a map and a plate in their datum, m at the unit of position."""
     value = reference.relative_error * half_width_m
     if reference.kind is not ReferenceKind.ARTIFACT:
-        rows = _slope(system.grid.views.z, system.known_sites, reference.kind)
+        rows = _slope(system.grid.views.z_sites, system.known_sites, reference.kind)
         return value - float(np.real(rows.conj() @ field.ravel()))
     dual = Gauge(system.grid.views.z, system.known_marks, scale=True).dual(3)
     return float(np.real(np.vdot(dual, plate))) - value
@@ -180,7 +180,7 @@ class FieldCovariance:
         moved = np.zeros((self.system.grid.response.shape[1], len(rows)))
         grown = np.zeros(len(rows))
         if self.scale is not None:
-            grown = np.real(self.system.grid.views.z.ravel().conj() @ flat)
+            grown = np.real(self.system.grid.views.z_sites.ravel().conj() @ flat)
             out = out + self.scale.rows[:, None] * grown
             moved, extra = np.outer(self.scale.parameters, grown), self._u2 * np.outer(grown, grown)
         answer = np.real(self.system.grid.response.conj().T @ out) - moved
@@ -220,7 +220,7 @@ class FieldCovariance:
         n = 3 * self.system.grid.n_views
         grown = np.real(self.scale.rows.conj() @ self.terms.fields) + (
             self.scale.parameters @ self.terms.parameters[:n]) + self._of_marks
-        return maps + np.outer(self.system.grid.views.z.ravel(), grown)
+        return maps + np.outer(self.system.grid.views.z_sites.ravel(), grown)
 
     def diagonal(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the variances of Gx and Gy at every site, (nx, ny) each; NaN if unknown."""
@@ -237,7 +237,7 @@ class FieldCovariance:
             value += np.einsum("sp,sp->s", f @ self.terms.covariance, f)
             value += np.einsum("sk,kl,sl->s", b, inner, b) - 2 * np.einsum("sk,sk->s", b, s)
             if with_scale is not None:
-                z = part(grid.views.z.ravel())
+                z = part(grid.views.z_sites.ravel())
                 value += 2 * z * part(with_scale) + z**2 * of_scale
             out.append(np.where(self.system.known_sites, np.maximum(value, 0.0).reshape(
                 grid.views.shape), np.nan))

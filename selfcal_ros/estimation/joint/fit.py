@@ -97,7 +97,7 @@ def fit(problem: Problem, y: np.ndarray, theta: AngularPart | None = None) -> Jo
     if problem.reference is not None:
         grown = scale_of(system, problem.reference, field=field, plate=plate,
                          half_width_m=length)
-        field, plate = field + grown * grid.views.z, plate - grown * grid.views.z
+        field, plate = field + grown * grid.views.z_sites, plate - grown * grid.views.z
         parameters = parameters + grown * system.rigid[3]
     field, plate = grid.free_parts_small(field, plate)
     xy = raw.xy or grid_noise(problem, residuals)

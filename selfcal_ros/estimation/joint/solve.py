@@ -32,7 +32,6 @@ from selfcal_ros.estimation.joint.solved import (
     noise_of,
     saved_terms,
 )
-from selfcal_ros.estimation.lattice.maps import PHASES
 from selfcal_ros.estimation.lattice.readings import angular_data, grid_data
 from selfcal_ros.estimation.normal.equations import MAX_DIRECT_SITES, NormalEquations
 from selfcal_ros.estimation.normal.systems import system_for
@@ -286,7 +285,7 @@ def _views(measurements: Measurements, problem: Problem, found: JointFit) -> tup
     offset: dict[int, complex] = {}
     for row, i in enumerate(system.grid_index):
         phi[i] = values[3 * row] + problem.turn_rad[row] * problem.half_width_m
-        turn = PHASES[problem.grid.poses[row].q] * np.exp(1j * problem.turn_rad[row])
+        turn = problem.grid.poses[row].phase * np.exp(1j * problem.turn_rad[row])
         offset[i] = turn * complex(*values[3 * row + 1:3 * row + 3])
     nan = complex(np.nan, np.nan)
     return tuple(

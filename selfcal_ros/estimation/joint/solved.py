@@ -17,7 +17,6 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.datum.covariance import FieldCovariance
 from selfcal_ros.estimation.joint.model_fit import ModelFit
 from selfcal_ros.estimation.joint.noise import NoiseEstimate
-from selfcal_ros.estimation.lattice.maps import PHASES
 from selfcal_ros.estimation.terms.columns import TermColumns
 from selfcal_ros.estimation.terms.equations import FREE, roots_by_term
 from selfcal_ros.model.readings import GridVisits, Measurements, Sense
@@ -128,7 +127,7 @@ def _at_visits(model: ModelFit, row: int) -> np.ndarray:
 def _to_stage(model: ModelFit, row: int) -> complex:
     """Return the factor from the frame of a grid view's readings to the stage frame."""
     problem = model.problem
-    return complex(PHASES[problem.grid.poses[row].q] / problem.frames[row])
+    return complex(problem.grid.poses[row].phase / problem.frames[row])
 
 
 def _course(visits: GridVisits, rest: np.ndarray, start_ns: int) -> dict[str, np.ndarray]:

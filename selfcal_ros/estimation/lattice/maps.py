@@ -9,14 +9,15 @@ R(phi) = exp(i phi).
 """
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 
 from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.pose import LatticePose
 from selfcal_ros.model.readings import ViewReadings
 from selfcal_ros.model.result import ArtifactMap
-from selfcal_ros.model.pose import LatticePose
+from selfcal_ros.model.view import View
 
 PHASES = np.array([1, 1j, -1, -1j])
 """i^q for q = 0..3, exact."""
@@ -89,6 +90,31 @@ class LatticeViews:
                 else:
                     out = max(out, max(abs(p.a), abs(p.b)) + max(abs(r.a), abs(r.b)))
         return out
+
+    @property
+    def plate_shape(self) -> tuple[int, int]:
+        """Marks along x and y."""
+        return self.shape
+
+    @property
+    def plate_half(self) -> tuple[int, int]:
+        """Largest m and n."""
+        return self.half
+
+    @cached_property
+    def phases(self) -> np.ndarray:
+        """i^q of every view, exact, complex (views,)."""
+        return np.array([pose.phase for pose in self.poses], dtype=complex)
+
+    @cached_property
+    def shifts(self) -> np.ndarray:
+        """Position of the plate's centre in every view, in pitches, complex (views,)."""
+        return np.array([pose.a + 1j * pose.b for pose in self.poses], dtype=complex)
+
+    @cached_property
+    def z_sites(self) -> np.ndarray:
+        """Site positions in the unit, complex (nx, ny)."""
+        return self.z
 
     @cached_property
     def z(self) -> np.ndarray:
@@ -197,24 +223,29 @@ def rigid_parameters(views: LatticeViews) -> np.ndarray:
     changes no reading (method eq. 3.1).
     """
     out = np.zeros((7, len(views.poses), 3))
-    for v, pose in enumerate(views.poses):
-        back = PHASES[-pose.q % 4]
-        shift = back * (pose.a + 1j * pose.b) / views.unit
+    for v, back in enumerate(views.phases.conj()):
+        shift = back * views.shifts[v] / views.unit
         taus = (-back, -1j * back, -1j * shift, -shift, -1, -1j, 0)
         out[:, v, 0] = (0, 0, -1, 0, 0, 0, -1)
         out[:, v, 1], out[:, v, 2] = np.real(taus), np.imag(taus)
     return out
 
 
+@lru_cache(maxsize=1024)
+def pose_of(view: View, artifact: Artifact) -> LatticePose:
+    """Return the pose of a view as the maps take it; InputError as `View.lattice_pose`."""
+    return view.lattice_pose(artifact)
+
+
 def turned_marks(view: ViewReadings, artifact: Artifact) -> np.ndarray:
     """Return R^q m of the marks read, from the plate's centre, complex (P,), stage frame, m."""
-    turn = PHASES[view.view.lattice_pose(artifact).q]
+    turn = pose_of(view.view, artifact).phase
     return turn * (view.m + 1j * view.n) * artifact.grid_pitch_m
 
 
 def turned_plate(view: ViewReadings, artifact: Artifact, plate: ArtifactMap) -> np.ndarray:
     """Return R^q A of the marks read, complex (P,), stage frame, m; NaN where unknown."""
-    turn = PHASES[view.view.lattice_pose(artifact).q]
+    turn = pose_of(view.view, artifact).phase
     at = view.m + artifact.half[0], view.n + artifact.half[1]
     return turn * (plate.ax[at] + 1j * plate.ay[at])
 

@@ -2,16 +2,14 @@
 """Readings on the lattice, in a canonical form that does not depend on their order."""
 
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 
 from selfcal_ros.errors import InputError
-from selfcal_ros.estimation.lattice.maps import PHASES
+from selfcal_ros.estimation.lattice.maps import pose_of
 from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.model.readings import Measurements, ViewReadings
 from selfcal_ros.model.pose import LatticePose
-from selfcal_ros.model.view import View
+from selfcal_ros.model.readings import Measurements, ViewReadings
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +71,7 @@ def grid_data(measurements: Measurements) -> GridData:
                              "give one value a mark")
         if not (np.isfinite(readings.dx).all() and np.isfinite(readings.dy).all()):
             raise InputError(where, "a deviation is not a finite number", "remove the mark")
-        values = (readings.dx + 1j * readings.dy) * PHASES[-pose.q % 4]
+        values = (readings.dx + 1j * readings.dy) * pose.phase.conjugate()
         _place(y[row].reshape(-1), weight[row].reshape(-1), flat, values=values,
                count=readings.count, where=where)
         ones.append((flat, readings.count, readings.u))
@@ -92,7 +90,7 @@ def angular_data(measurements: Measurements) -> AngularData:
     for row, i in enumerate(index):
         readings = measurements.views[i]
         where = f"view '{readings.view.name}' angular readings"
-        turn = _pose_of(readings.view, artifact).turn_lines
+        turn = pose_of(readings.view, artifact).turn_lines
         k = np.asarray(readings.k)
         if turn is None or k.min() < 0 or k.max() >= artifact.angular_count:
             raise InputError(where, "a line that the plate does not have",
@@ -105,13 +103,8 @@ def angular_data(measurements: Measurements) -> AngularData:
     return AngularData(index, tuple(turns), y, weight, sigma)
 
 
-@lru_cache(maxsize=1024)
-def _pose_of(view: View, artifact: Artifact) -> LatticePose:
-    return view.lattice_pose(artifact)
-
-
 def _grid_pose(readings: ViewReadings, artifact: Artifact) -> LatticePose:
-    pose = _pose_of(readings.view, artifact)
+    pose = pose_of(readings.view, artifact)
     if pose.quarter_turns is None:
         raise InputError(f"view '{readings.view.name}'", "grid marks were read at a turn that is "
                          "not a multiple of 90 deg", "turn by a multiple of 90 deg")

@@ -217,7 +217,7 @@ class NormalEquations:
         known = (parts.of_site >= 0) & ~parts.balanced[parts.of_site]
         if np.any(np.abs(hidden) > 1e-6) and known.any():
             moved = self.grid.response @ hidden
-            gauge = Gauge(self.grid.views.z, known.reshape(self.grid.views.shape), scale=True)
+            gauge = Gauge(self.grid.views.z_sites, known.reshape(self.grid.views.shape), scale=True)
             for column in moved.T:
                 field = column.reshape(self.grid.views.shape)
                 residual = gauge.remove(field, gauge.parts(field)).ravel()
@@ -276,7 +276,7 @@ class NormalEquations:
     @cached_property
     def gauge(self) -> Gauge:
         """Datum of the stage."""
-        return Gauge(self.grid.views.z, self.known_sites, scale=True)
+        return Gauge(self.grid.views.z_sites, self.known_sites, scale=True)
 
     @cached_property
     def plate_gauge(self) -> Gauge:

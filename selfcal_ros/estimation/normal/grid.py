@@ -6,6 +6,7 @@ it is exact and local. The remaining equations couple the stage error G at the s
 visits, and three numbers per view (phi, Re tau, Im tau), which are eliminated last.
 """
 
+import math
 from functools import cached_property
 from itertools import combinations
 
@@ -53,6 +54,11 @@ class GridSystem:
     @property
     def n_sites(self) -> int:
         """Number of sites of the field."""
+        return math.prod(self.views.shape)
+
+    @property
+    def n_marks(self) -> int:
+        """Number of marks of the plate."""
         return self.weight[0].size
 
     @property
@@ -71,7 +77,7 @@ class GridSystem:
     def components(self) -> Components:
         """Components of the graph of sites and marks."""
         site, mark, q = self.edges
-        return components(site, mark, q, n_sites=self.n_sites, n_marks=self.n_sites,
+        return components(site, mark, q, n_sites=self.n_sites, n_marks=self.n_marks,
                           turning=self._find_turning_site())
 
     @cached_property
@@ -84,7 +90,7 @@ class GridSystem:
         """Sites that depend on unchecked readings, bool (nx, ny)."""
         site, mark, _ = self.edges
         return rest_on_one(site, mark, n_sites=self.n_sites,
-                           n_marks=self.n_sites).reshape(self.views.shape)
+                           n_marks=self.n_marks).reshape(self.views.shape)
 
     def _find_turning_site(self) -> int:
         """Return a site visited by one mark in two turns, which closes a path; -1 = none."""
@@ -125,13 +131,13 @@ class GridSystem:
     @cached_property
     def shapes(self) -> np.ndarray:
         """Effect of phi and Re tau of a view on its readings: i z and 1, complex (2, nx, ny)."""
-        return np.stack([1j * self.views.z, np.ones(self.views.shape)])
+        return np.stack([1j * self.views.z, np.ones(self.views.plate_shape)])
 
     @cached_property
     def columns(self) -> np.ndarray:
         """Coupling of sites to phi and tau, complex (2 views, sites), plate eliminated."""
         meant = self.relative_weight[:, None] * self.shapes
-        out = np.zeros_like(meant)
+        out = np.zeros((self.n_views, 2, *self.views.shape), dtype=complex)
         for v, weight in enumerate(self.weight):
             part = meant * -weight
             part[v] += weight * self.shapes

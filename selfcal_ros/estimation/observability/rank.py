@@ -47,8 +47,13 @@ def identifies(artifact: Artifact, views: Sequence[View]) -> bool:
 
 def deficiency(system: NormalEquations) -> int:
     """Return the number of undetermined parameters of map, plate and misalignments."""
-    rank = system.rank_grid + DATUM_ROWS
-    return 4 * system.grid.n_sites + 3 * system.grid.n_views - rank + angular_deficiency(system)
+    return unknowns_of(system) - system.rank_grid - DATUM_ROWS + angular_deficiency(system)
+
+
+def unknowns_of(system: NormalEquations) -> int:
+    """Return the number of parameters of map, plate and misalignments."""
+    grid = system.grid
+    return 2 * (grid.n_sites + grid.n_marks) + 3 * grid.n_views
 
 
 def full_observability(system: NormalEquations, artifact: Artifact,
@@ -64,9 +69,8 @@ def full_observability(system: NormalEquations, artifact: Artifact,
     views : iterable of View
         The views behind the readings, for the advice.
     """
-    unknowns = 4 * system.grid.n_sites + 3 * system.grid.n_views
     unseen = deficiency(system)
-    return Observability(system.rank_grid + DATUM_ROWS, unknowns, unseen, unseen == 0,
+    return Observability(system.rank_grid + DATUM_ROWS, unknowns_of(system), unseen, unseen == 0,
                          advice=advice_for(artifact, views) if unseen else ())
 
 

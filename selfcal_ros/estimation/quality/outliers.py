@@ -21,7 +21,6 @@ from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.blas_threads import one_thread
 from selfcal_ros.estimation.checks.wiring import check_wiring
 from selfcal_ros.estimation.joint.solve import fit_joint
-from selfcal_ros.estimation.lattice.maps import PHASES
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.quality.residuals import ROUNDING, Residuals, noisy_views, residuals_of
 from selfcal_ros.estimation.quality.slip import Slip, find_slip, likelier_term, split_view
@@ -274,7 +273,7 @@ def _worst(residuals: Residuals, measurements: Measurements) -> dict[Key, Remove
         if above > (1 + TIED) * ratio[v, i, j]:
             continue
         taken |= {node: float(ratio[v, i, j]) for node in nodes if node not in taken}
-        index, (hx, hy) = problem.grid.index[v], grid.views.half
+        index, (hx, hy) = problem.grid.index[v], grid.views.plate_half
         mark = (int(i) - hx, int(j) - hy)
         found[index, "grid", mark] = Removed(
             measurements.views[index].view.name, "grid", mark, float(np.sqrt(ratio[v, i, j])),
@@ -334,7 +333,7 @@ def _agrees(residuals: Residuals, key: Key) -> bool:
     index, kind, mark = key
     at: tuple[int, ...]
     if kind == "grid":
-        hx, hy = residuals.problem.system.grid.views.half
+        hx, hy = residuals.problem.system.grid.views.plate_half
         at = (residuals.problem.grid.index.index(index), mark[0] + hx, mark[1] + hy)
     else:
         at = (residuals.problem.angular.index.index(index), *mark)
@@ -362,6 +361,6 @@ def _flattened(measurements: Measurements, options: Options) -> Measurements:
         view = views[index]
         marks = problem.system.grid.views.z * problem.half_width_m
         flat = model.y[row] + 1j * problem.turn_rad[row] * marks
-        linear = flat[view.m + hx, view.n + hy] * PHASES[problem.grid.poses[row].q]
+        linear = flat[view.m + hx, view.n + hy] * problem.grid.poses[row].phase
         views[index] = replace(view, dx=linear.real, dy=linear.imag, visits=None)
     return replace(measurements, views=tuple(views))

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.special import fdtri
 
 from selfcal_ros.estimation.joint.model_fit import ModelFit, equations_of
-from selfcal_ros.estimation.lattice.maps import PHASES, LatticeViews
+from selfcal_ros.estimation.lattice.maps import LatticeViews
 from selfcal_ros.estimation.lattice.readings import GridData, grid_data
 from selfcal_ros.estimation.terms.columns import term_columns
 from selfcal_ros.estimation.terms.equations import LEAST_NOISE_M
@@ -129,7 +129,7 @@ def of_terms(model: ModelFit, held: HeldReadings, index: int,
         return np.zeros(len(view_marks[0]), dtype=complex)
     row = held.grid.index.index(index)
     plate = np.tensordot(model.coefficients, held.columns[:, row], axes=1)
-    return plate[view_marks] * PHASES[held.grid.poses[row].q]
+    return plate[view_marks] * held.grid.poses[row].phase
 
 
 def of_line_terms(model: ModelFit, index: int, k: np.ndarray) -> np.ndarray:

@@ -21,7 +21,6 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.joint.fit import JointFit, fit
 from selfcal_ros.estimation.joint.problem import Problem
 from selfcal_ros.estimation.joint.solve import prepare
-from selfcal_ros.estimation.lattice.maps import PHASES
 from selfcal_ros.estimation.normal.equations import (
     NormalEquations,
     angular_residuals,
@@ -147,7 +146,7 @@ def exact_leverage(system: NormalEquations) -> tuple[np.ndarray, np.ndarray]:
     grid = system.grid
     inverse = grid.factor.solve(np.eye(grid.n_sites, dtype=complex))
     index = np.maximum(grid.views.site_index, 0)
-    turns = PHASES[[-pose.q % 4 for pose in grid.views.poses]]
+    turns = grid.views.phases.conj()
     variance = np.zeros(grid.weight.shape)
     for v in range(grid.n_views):
         part = -grid.relative_weight * turns[:, None, None]

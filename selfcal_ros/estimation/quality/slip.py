@@ -19,7 +19,6 @@ from selfcal_ros.errors import NotIdentifiableError
 from selfcal_ros.estimation.joint.fit import JointFit, fit
 from selfcal_ros.estimation.joint.problem import Problem
 from selfcal_ros.estimation.joint.solve import fit_joint, prepare
-from selfcal_ros.estimation.lattice.maps import PHASES
 from selfcal_ros.estimation.normal.equations import grid_residuals
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.quality.residuals import Residuals
@@ -132,7 +131,7 @@ def find_slip(residuals: Residuals, sigma_m: float, measurements: Measurements,
                 gain = _explained(residuals, clipped, v, axis, place)
                 if gain is not None and gain / sigma_m**2 >= chdtri(3, SLIP_LEVEL):
                     found.append(SlipPlace(measurements.views[i].view.name, i, "mn"[axis],
-                                           int(place) - grid.views.half[axis],
+                                           int(place) - grid.views.plate_half[axis],
                                            gain / sigma_m**2))
     found.sort(key=lambda slip: -slip.chi2)
     return _best(found[:TRIED], measurements, options)
@@ -176,7 +175,7 @@ def _size(slip: SlipPlace, fitted: JointFit, problem: Problem) -> tuple[float, f
     row = problem.grid.index.index(slip.index)
     before, after = fitted.parameters[:3 * problem.system.grid.n_views].reshape(-1, 3)[row:row + 2]
     phi, re, im = after - before
-    t = PHASES[problem.grid.poses[row].q] * complex(re, im)
+    t = problem.grid.poses[row].phase * complex(re, im)
     return float(t.real), float(t.imag), float(phi / problem.half_width_m)
 
 
@@ -249,7 +248,7 @@ def likelier_term(measurements: Measurements, options: Options, slip: Slip) -> C
     problem = model.problem
     row = problem.grid.index.index(slip.index)
     ground = problem.ground
-    placed = PlacedSlip(slip_at_line(ground, row, slip, PHASES[-problem.grid.poses[row].q % 4]),
+    placed = PlacedSlip(slip_at_line(ground, row, slip, problem.grid.poses[row].phase.conjugate()),
                         row, 2 * MAX_PLACES)
     found = find_explanations(model, slips=True, readings=False, placed=placed)
     if not found or found[0].name == SLIP:

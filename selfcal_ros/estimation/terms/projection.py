@@ -99,11 +99,11 @@ def reduce_anew(grid: GridSystem, shapes: Shapes, before: ReducedColumns,
 def _marks_eliminated(grid: GridSystem, shapes: Shapes
                       ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return s (sites, q), inner products (q, q) and the coupling to the views (2 views, q)."""
-    n, marks = grid.n_views, grid.n_sites
+    n, marks = grid.n_views, grid.n_marks
     weight, part = (array.reshape(n, marks) for array in (grid.weight, grid.relative_weight))
     to_views = grid.shapes.reshape(2, marks).conj()
     means: np.ndarray = np.zeros((shapes.n, marks), dtype=complex)
-    sites: np.ndarray = np.zeros((shapes.n, *shapes.lattice), dtype=complex)
+    sites: np.ndarray = np.zeros((shapes.n, *grid.views.shape), dtype=complex)
     inner: np.ndarray = np.zeros((shapes.n, shapes.n), dtype=complex)
     asked: np.ndarray = np.zeros((n, 2, shapes.n), dtype=complex)
     for v, (rows, values) in enumerate(zip(shapes.rows, shapes.values, strict=True)):
@@ -111,15 +111,15 @@ def _marks_eliminated(grid: GridSystem, shapes: Shapes
         means[rows] += values * part[v]
         inner[rows[:, None], rows] += values.conj() @ weighted.T
         asked[v][:, rows] += to_views @ weighted.T
-        here = np.zeros((len(rows), *shapes.lattice), dtype=complex)
-        grid.views.add_scattered(here, v, weighted.reshape(here.shape))
+        here = np.zeros((len(rows), *grid.views.shape), dtype=complex)
+        grid.views.add_scattered(here, v, weighted.reshape(len(rows), *shapes.lattice))
         sites[rows] += here
     # minus the mean of each mark, which all views share
     inner -= (means * weight.sum(axis=0)).conj() @ means.T
     asked -= (to_views * weight[:, None]) @ means.T
     for v in range(n):
-        grid.views.add_scattered(sites, v, (means * -weight[v]).reshape(sites.shape))
-    return (np.ascontiguousarray(sites.reshape(shapes.n, marks).T), inner,
+        grid.views.add_scattered(sites, v, (means * -weight[v]).reshape(-1, *shapes.lattice))
+    return (np.ascontiguousarray(sites.reshape(shapes.n, grid.n_sites).T), inner,
             asked.reshape(2 * n, shapes.n))
 
 

@@ -11,7 +11,6 @@ from functools import cached_property
 import numpy as np
 
 from selfcal_ros.errors import InputError
-from selfcal_ros.estimation.lattice.maps import PHASES
 from selfcal_ros.estimation.lattice.readings import GridData
 from selfcal_ros.model.readings import GridVisits, Measurements, Sense, ViewReadings
 
@@ -99,7 +98,7 @@ def _visits_of(view: ViewReadings, grid: GridData, row: int) -> ViewVisits | Non
     own = _own_weights(visits, mark, grid.y[row].size)
     total = np.bincount(mark, own, grid.y[row].size)
     weight = own / total[mark] * grid.weight[row].reshape(-1)[mark]
-    phase = PHASES[-grid.poses[row].q % 4]
+    phase = grid.poses[row].phase.conjugate()
     return ViewVisits(mark, weight, (visits.dx + 1j * visits.dy) * phase,
                       view_time(visits.stamp_ns), visits.offset_x + 1j * visits.offset_y,
                       visits.approach_x.astype(float), visits.approach_y.astype(float), phase)

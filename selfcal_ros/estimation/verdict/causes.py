@@ -119,7 +119,7 @@ def scatter_of_views(model: ModelFit, measurements: Measurements
         view, visits = measurements.views[index], model.problem.ground.visits[row]
         sigma, dof = view.sigma_xy, float(view.dof_xy)
         if visits is not None and visits.repeated and known:
-            n_marks = model.problem.system.grid.n_sites
+            n_marks = model.problem.system.grid.n_marks
             rest = visits.about_means((visits.y - known[row])[None], n_marks)[0]
             dof = 2.0 * (len(visits.mark) - len(np.unique(visits.mark)))
             sigma = float(np.sqrt(visits.weight @ abs(rest) ** 2 / dof))

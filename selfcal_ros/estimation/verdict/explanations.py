@@ -18,7 +18,6 @@ import numpy as np
 from scipy.special import fdtrc
 
 from selfcal_ros.estimation.joint.model_fit import ModelFit, equations_of, squares
-from selfcal_ros.estimation.lattice.maps import PHASES
 from selfcal_ros.estimation.terms.columns import Column, TermColumns, joined, term_columns
 from selfcal_ros.estimation.terms.equations import Score, TermEquations, score
 from selfcal_ros.estimation.terms.ground import Ground, without_noise
@@ -323,7 +322,7 @@ def _with(ground: Ground, before: tuple[TermColumns, list[Group]], columns: Term
 
 def _with_readings(model: ModelFit, ground: Ground, columns: TermColumns,
                    groups: list[Group]) -> tuple[TermColumns, list[Group]]:
-    phases = PHASES[[-pose.q % 4 for pose in model.problem.grid.poses]]
+    phases = model.problem.system.grid.views.phases.conj()
     single, suspects = reading_columns(ground, model.found.residuals, phases)
     return _with(ground, (columns, groups), single, [
         Group(READING, s.rows, s.view, places=int(np.count_nonzero(ground.weight)), mark=s.mark)
