@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from functools import cached_property
 from math import ceil
+from typing import Any
 
 import numpy as np
 
@@ -144,6 +145,25 @@ class Artifact:
     def theta_rad(self) -> np.ndarray:
         """Nominal angle of every line in rad, (K,), from 0 counter-clockwise."""
         return np.arange(self.angular_count) * (2 * np.pi / max(self.angular_count, 1))
+
+
+def map_grid_to_dict(grid: MapGrid) -> dict[str, Any]:
+    """Return the JSON form of a map's grid: the keys of ``map`` in PLAN.yaml."""
+    return {"grid_size": grid.size, "grid_pitch": grid.pitch_m,
+            "interpolation": str(grid.interpolation),
+            **({"grid_size_y": grid.size_y} if grid.size_y else {})}
+
+
+def map_grid_from_dict(data: dict[str, Any]) -> MapGrid:
+    """Return the grid of `map_grid_to_dict`.
+
+    Raises
+    ------
+    KeyError, ValueError
+        If a key is missing, or the interpolation is unknown.
+    """
+    return MapGrid(data["grid_size"], float(data["grid_pitch"]),
+                   Interpolation(data["interpolation"]), data.get("grid_size_y", 0))
 
 
 def default_map_grid(artifact: Artifact) -> MapGrid:

@@ -129,3 +129,35 @@ class Pose:
         places, (hx, hy) = self.places(artifact, artifact.m, artifact.n), artifact.field_half_m
         rounding = EDGE * artifact.grid_pitch_m
         return (np.abs(places.real) <= hx + rounding) & (np.abs(places.imag) <= hy + rounding)
+
+
+@dataclass(frozen=True)
+class PlacedPose:
+    """The pose of a view, with the plate and the map's grid that it belongs to.
+
+    Attributes
+    ----------
+    artifact : Artifact
+        The plate, with `map_grid`.
+    pose : Pose
+        Where it lies.
+    turn_lines : int or None
+        Its turn in angular lines; None where it is not a whole number of them.
+    """
+
+    artifact: Artifact
+    pose: Pose
+    turn_lines: int | None
+
+    @property
+    def phase(self) -> complex:
+        """exp(i turn): the factor from the plate frame to the stage frame."""
+        return self.pose.phase
+
+    @cached_property
+    def places_m(self) -> np.ndarray:
+        """Nominal places of the marks, complex (nx, ny), m."""
+        return self.pose.places(self.artifact, self.artifact.m, self.artifact.n)
+
+
+AnyPose = LatticePose | PlacedPose

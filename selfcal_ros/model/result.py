@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from selfcal_ros.errors import InputError
-from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.artifact import Artifact, map_grid_from_dict, map_grid_to_dict
 from selfcal_ros.model.error_map import ErrorMap, ThetaDatum
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.verdict import BudgetLine, Finding, Grade, ModelResult, Provenance, Verdict
@@ -173,11 +173,17 @@ class CalibrationResult:
     run_id: str = ""
     findings: tuple[Finding, ...] = ()
     budget: tuple[BudgetLine, ...] = ()
+    placed_plate: Artifact | None = None
 
     @property
     def artifact(self) -> Artifact:
-        """The plate."""
+        """Lattice of the error map: that of the plate unless the map has a grid of its own."""
         return self.error_map.artifact
+
+    @property
+    def plate(self) -> Artifact:
+        """The plate, with the grid of the map if that has its own."""
+        return self.placed_plate or self.error_map.artifact
 
     @property
     def has_uncertainty(self) -> bool:
@@ -207,17 +213,19 @@ def unidentified_result(measurements: Measurements, observability: Observability
                         ) -> CalibrationResult:
     """Return the result of a plan that does not identify the stage, with unknown maps."""
     artifact = measurements.artifact
-    grid, circle = np.full(artifact.shape, np.nan), np.full(artifact.angular_count, np.nan)
+    grid, circle = np.full(artifact.field.shape, np.nan), np.full(artifact.angular_count, np.nan)
+    plate = np.full(artifact.shape, np.nan)
     nan = float("nan")
     views = tuple(ViewResult(v.view.name, v.view.rotation_rad, *v.view.translation_m, nan, nan, nan,
                              v.used, sum(v.rejected.values())) for v in measurements.views)
     return CalibrationResult(
         measurements.plan_id,
-        ErrorMap(artifact, grid, grid, grid, grid, circle, circle, nan, nan),
-        ArtifactMap(grid, grid, circle), views, observability, Noise(nan, nan),
+        ErrorMap(artifact.field, grid, grid, grid, grid, circle, circle, nan, nan),
+        ArtifactMap(plate, plate, circle), views, observability, Noise(nan, nan),
         measurements.all_rejected(), sense=str(measurements.sense),
         verdict=Verdict(Grade.NOT_QUALIFIED, (Finding("not_identified"),)),
-        run_id=measurements.run_id)
+        run_id=measurements.run_id,
+        placed_plate=artifact if artifact.map_grid else None)
 
 
 def result_to_dict(result: CalibrationResult) -> dict[str, Any]:
@@ -228,7 +236,7 @@ def result_to_dict(result: CalibrationResult) -> dict[str, Any]:
     ValueError
         If it has no sentences: call `selfcal_ros.reporting.words.findings.worded` first.
     """
-    emap, amap, artifact = result.error_map, result.artifact_map, result.artifact
+    emap, amap, artifact = result.error_map, result.artifact_map, result.plate
     return {
         "schema": SCHEMA,
         "plan_id": result.plan_id,
@@ -239,6 +247,7 @@ def result_to_dict(result: CalibrationResult) -> dict[str, Any]:
                      **({"grid_size_y": artifact.grid_size_y} if artifact.grid_size_y else {}),
                      **{key: plain(getattr(amap, key))
                         for key in ("magnification", "u_magnification")}},
+        **({"map": map_grid_to_dict(artifact.map_grid)} if artifact.map_grid else {}),
         "run_id": result.run_id,
         "verdict": plain(verdict_to_dict(result.verdict)),
         "model": plain(model_to_dict(result.model)),
@@ -273,7 +282,7 @@ _MAP_ARRAYS = ("gx", "gy", "u_gx", "u_gy", "g_theta", "u_g_theta")
 _KNOWN = {"schema", "run_id", "verdict", "model", "reference", "provenance", "dof",
           "coverage_factor", "plan_id", "method", "measurement_sense", "artifact", "views",
           "error_map", "artifact_map", "observability", "noise", "rejected", "warnings", "findings",
-          "budget", "input"}
+          "budget", "input", "map"}
 
 
 def plain(value: Any) -> Any:
@@ -314,12 +323,13 @@ def result_from_dict(data: object, where: str) -> CalibrationResult:
 def _parse(data: dict) -> CalibrationResult:
     raw = data["artifact"]
     artifact = Artifact(raw["grid_size"], float(raw["grid_pitch"]), raw["angular_count"],
-                        raw.get("grid_size_y", 0))
+                        raw.get("grid_size_y", 0),
+                        map_grid_from_dict(data["map"]) if "map" in data else None)
     emap, amap = data["error_map"], data["artifact_map"]
-    shapes: dict[str, tuple[int, ...]] = dict.fromkeys(_MAP_ARRAYS[:4], artifact.shape)
+    shapes: dict[str, tuple[int, ...]] = dict.fromkeys(_MAP_ARRAYS[:4], artifact.field.shape)
     shapes |= dict.fromkeys(_MAP_ARRAYS[4:], (artifact.angular_count,))
     error_map = ErrorMap(
-        artifact, **{key: _array(emap[key], shape, key) for key, shape in shapes.items()},
+        artifact.field, **{key: _array(emap[key], shape, key) for key, shape in shapes.items()},
         nonorthogonality=_number(emap["nonorthogonality"]),
         scale_difference=_number(emap["scale_difference"]),
         datum_theta=ThetaDatum(emap["datum_theta"]))
@@ -348,7 +358,7 @@ def _parse(data: dict) -> CalibrationResult:
         model_from_dict(data.get("model")), reference_from_dict(data.get("reference")),
         provenance_from_dict(data.get("provenance")), _of(str, data.get("run_id", "")),
         tuple(map(finding_from_dict, data.get("findings", []))),
-        budget_from_dict(data.get("budget", [])))
+        budget_from_dict(data.get("budget", [])), artifact if artifact.map_grid else None)
 
 
 def _view(v: dict) -> ViewResult:

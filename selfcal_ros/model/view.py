@@ -85,6 +85,19 @@ class View:
         """Nominal pose of the plate, on the lattice or off it."""
         return Pose(self.rotation_rad, self.translation_m)
 
+    def turn_lines(self, artifact: Artifact) -> int | None:
+        """Return the turn in angular lines; None on a plate without lines.
+
+        Raises
+        ------
+        InputError
+            If the turn is not a whole number of lines.
+        """
+        if not artifact.angular_count:
+            return None
+        turn = self.rotation_rad * artifact.angular_count / (2 * math.pi)
+        return _whole(turn, f"view '{self.name}' rotation", "angular line") % artifact.angular_count
+
     def lattice_pose(self, artifact: Artifact) -> LatticePose:
         """Return the pose in whole steps of the artifact's lattice.
 
@@ -109,11 +122,8 @@ class View:
             raise InputError(where, f"grid marks cannot be measured at a turn of "
                              f"{math.degrees(self.rotation_rad):.6g} deg",
                              "turn by a multiple of 90 deg or set grid to false")
-        lines = None
-        if artifact.angular_count:
-            turn = self.rotation_rad * artifact.angular_count / (2 * math.pi)
-            lines = _whole(turn, f"{where} rotation", "angular line") % artifact.angular_count
-        elif quarter is None:
+        lines = self.turn_lines(artifact)
+        if lines is None and quarter is None:
             raise InputError(where, "a turn that is not a quarter needs angular lines",
                              "turn by a multiple of 90 deg")
         return LatticePose(quarter, (shift[0], shift[1]), lines)

@@ -15,9 +15,9 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.datum.covariance import FieldCovariance, scale_datum
 from selfcal_ros.estimation.joint.problem import bounded_ratio
 from selfcal_ros.estimation.joint.solved import KEY, MAX_SITES, factors_of
+from selfcal_ros.estimation.lattice.maps import in_field, pose_of
 from selfcal_ros.estimation.law.solve import law_covariance
 from selfcal_ros.estimation.normal.equations import NormalEquations
-from selfcal_ros.estimation.normal.grid import GridSystem
 from selfcal_ros.estimation.normal.systems import Marks, planned_system, system_of
 from selfcal_ros.estimation.observability.prediction import theta_matrix
 from selfcal_ros.estimation.observability.rank import deficiency
@@ -179,15 +179,14 @@ def _read_system(result: CalibrationResult) -> NormalEquations:
     grid, lines = [], []
     for index, v in enumerate(result.views):
         in_grid, of_grid = _is_read(v.read_grid), f"view '{v.name}', read.grid"
-        pose = View(v.name, v.rotation, (v.translation_x, v.translation_y),
-                    in_grid).lattice_pose(artifact)
+        pose = pose_of(View(v.name, v.rotation, (v.translation_x, v.translation_y), in_grid,
+                            _is_read(v.read_angular)), artifact)
         field = np.ones(artifact.angular_count)
         weight = _weights(v.read_angular, field, f"view '{v.name}', read.angular")
         if weight.any():
-            lines.append((index, pose.s, weight))
+            lines.append((index, pose.turn_lines or 0, weight))
         if in_grid:
-            field = GridSystem((pose,), np.zeros((1, *artifact.shape))).views.in_field[0]
-            grid.append((index, pose, _weights(v.read_grid, field, of_grid)))
+            grid.append((index, pose, _weights(v.read_grid, in_field(pose, artifact), of_grid)))
     angular = np.array([weight for *_, weight in lines]).reshape(len(lines),
                                                                 artifact.angular_count)
     return system_of(

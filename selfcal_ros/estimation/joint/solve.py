@@ -151,7 +151,8 @@ def _solved(measurements: Measurements, options: Options, *, model: ModelFit,
         extra={"solver": found.solver, **kept, **kept_residuals(measurements, model)},
         run_id=measurements.run_id,
         model=ModelResult("rigid" if problem.rigid else "linear", term_results(
-            model, {term.name for term in options.terms})))
+            model, {term.name for term in options.terms})),
+        placed_plate=measurements.artifact if measurements.artifact.map_grid else None)
     return Solved(result, found.xy, found.theta, model, axes)
 
 
@@ -257,7 +258,7 @@ def _error_map(measurements: Measurements, options: Options, *, model: ModelFit,
         field, u_x, u_y = -field[::-1, ::-1], u_x[::-1, ::-1], u_y[::-1, ::-1]
         back = -np.arange(len(g_theta)) % max(len(g_theta), 1)
         g_theta, u_theta = -g_theta[back], u_theta[back]
-    return ErrorMap(measurements.artifact, field.real.copy(), field.imag.copy(), u_x, u_y,
+    return ErrorMap(measurements.artifact.field, field.real.copy(), field.imag.copy(), u_x, u_y,
                     g_theta, u_theta, o / length, r / length,
                     problem.conditions.datum), closure, kept
 

@@ -10,14 +10,18 @@ R(phi) = exp(i phi).
 
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.model.pose import LatticePose
+from selfcal_ros.model.pose import AnyPose, LatticePose, PlacedPose
 from selfcal_ros.model.readings import ViewReadings
 from selfcal_ros.model.result import ArtifactMap
 from selfcal_ros.model.view import View
+
+if TYPE_CHECKING:
+    from selfcal_ros.estimation.lattice.placed import PlacedViews  # splines
 
 PHASES = np.array([1, 1j, -1, -1j])
 """i^q for q = 0..3, exact."""
@@ -232,9 +236,32 @@ def rigid_parameters(views: LatticeViews) -> np.ndarray:
 
 
 @lru_cache(maxsize=1024)
-def pose_of(view: View, artifact: Artifact) -> LatticePose:
-    """Return the pose of a view as the maps take it; InputError as `View.lattice_pose`."""
-    return view.lattice_pose(artifact)
+def pose_of(view: View, artifact: Artifact) -> AnyPose:
+    """Return the pose of a view as the maps take it.
+
+    On the lattice unless the artifact has a grid of the map; InputError as `View.lattice_pose`.
+    """
+    if artifact.map_grid is None:
+        return view.lattice_pose(artifact)
+    lines = view.turn_lines(artifact) if view.angular and artifact.angular_count else None
+    return PlacedPose(artifact, view.pose, lines)
+
+
+def maps_of(shape: tuple[int, int], poses: tuple[AnyPose, ...]) -> "LatticeViews | PlacedViews":
+    """Return the maps of views of a plate with `shape` marks."""
+    placed = tuple(pose for pose in poses if isinstance(pose, PlacedPose))
+    if placed:
+        from selfcal_ros.estimation.lattice.placed import PlacedViews  # splines
+
+        return PlacedViews(placed)
+    return LatticeViews(shape, tuple(pose for pose in poses if isinstance(pose, LatticePose)))
+
+
+def in_field(pose: AnyPose, artifact: Artifact) -> np.ndarray:
+    """Return the marks of a view that lie in the field, bool (nx, ny)."""
+    if isinstance(pose, PlacedPose):
+        return pose.pose.in_field(artifact)
+    return LatticeViews(artifact.shape, (pose,)).in_field[0]
 
 
 def turned_marks(view: ViewReadings, artifact: Artifact) -> np.ndarray:

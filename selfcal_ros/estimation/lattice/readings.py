@@ -6,9 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from selfcal_ros.errors import InputError
-from selfcal_ros.estimation.lattice.maps import pose_of
+from selfcal_ros.estimation.lattice.maps import in_field, pose_of
 from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.model.pose import LatticePose
+from selfcal_ros.model.pose import AnyPose, LatticePose
 from selfcal_ros.model.readings import Measurements, ViewReadings
 
 
@@ -20,7 +20,7 @@ class GridData:
     ----------
     index : tuple of int
         Position in `Measurements.views` of every grid view.
-    poses : tuple of LatticePose
+    poses : tuple of LatticePose or PlacedPose
         Their poses.
     y : complex array (views, nx, ny)
         Deviations turned into the plate frame, m; 0 where not read.
@@ -31,7 +31,7 @@ class GridData:
     """
 
     index: tuple[int, ...]
-    poses: tuple[LatticePose, ...]
+    poses: tuple[AnyPose, ...]
     y: np.ndarray
     weight: np.ndarray
     sigma_declared: float
@@ -103,29 +103,29 @@ def angular_data(measurements: Measurements) -> AngularData:
     return AngularData(index, tuple(turns), y, weight, sigma)
 
 
-def _grid_pose(readings: ViewReadings, artifact: Artifact) -> LatticePose:
+def _grid_pose(readings: ViewReadings, artifact: Artifact) -> AnyPose:
     pose = pose_of(readings.view, artifact)
-    if pose.quarter_turns is None:
+    if isinstance(pose, LatticePose) and pose.quarter_turns is None:
         raise InputError(f"view '{readings.view.name}'", "grid marks were read at a turn that is "
                          "not a multiple of 90 deg", "turn by a multiple of 90 deg")
     return pose
 
 
-def _flat_marks(readings: ViewReadings, artifact: Artifact, pose: LatticePose, *,
+def _flat_marks(readings: ViewReadings, artifact: Artifact, pose: AnyPose, *,
                 where: str) -> np.ndarray:
     """Return the flat index of every mark read, checked for plate and field."""
     (hx, hy), m, n = artifact.half, np.asarray(readings.m), np.asarray(readings.n)
     if m.shape != n.shape:
         raise InputError(where, "m and n differ in length", "give one value a mark")
-    i, j = pose.site_of(m, n)
-    for name, a, la, b, lb in (("off the plate", m, hx, n, hy),
-                               ("off the stage's field", i, hx, j, hy)):
-        bad = (np.maximum(a, -a) > la) | (np.maximum(b, -b) > lb)
+    off_plate = (np.maximum(m, -m) > hx) | (np.maximum(n, -n) > hy)
+    flat = np.where(off_plate, 0, (m + hx) * artifact.shape[1] + (n + hy))
+    off_field = ~in_field(pose, artifact).reshape(-1)[flat]
+    for name, bad in (("off the plate", off_plate), ("off the stage's field", off_field)):
         if bad.any():
             k = int(np.argmax(bad))
             raise InputError(where, f"mark ({m[k]}, {n[k]}) lies {name}",
                              "check the view's pose and the plate's size")
-    return (m + hx) * artifact.shape[1] + (n + hy)
+    return flat
 
 
 def _place(y: np.ndarray, weight: np.ndarray, flat: np.ndarray, *, values: np.ndarray,

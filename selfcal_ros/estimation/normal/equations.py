@@ -225,6 +225,14 @@ class NormalEquations:
         return known.reshape(self.grid.views.shape)
 
     @property
+    def loose_modes(self) -> np.ndarray:
+        """Badly determined fields, complex (modes, nx, ny): none on a lattice.
+
+        There fields are either determined or not.
+        """
+        return np.zeros((0, *self.grid.views.shape), dtype=complex)
+
+    @property
     def unchecked_sites(self) -> np.ndarray:
         """Known sites that depend on unchecked readings, bool (nx, ny)."""
         return self.grid.unchecked & self.known_sites

@@ -10,12 +10,13 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
+from selfcal_ros.estimation.lattice.maps import in_field, pose_of
 from selfcal_ros.estimation.lattice.readings import AngularData, GridData
 from selfcal_ros.estimation.normal.angular import AngularSystem
 from selfcal_ros.estimation.normal.equations import NormalEquations
 from selfcal_ros.estimation.normal.grid import GridSystem
 from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.model.pose import LatticePose
+from selfcal_ros.model.pose import AnyPose, LatticePose, PlacedPose
 from selfcal_ros.model.view import View
 
 CACHED = 16
@@ -52,7 +53,7 @@ def system_for(grid: GridData, angular: AngularData) -> NormalEquations:
                      Marks(angular.turns, angular.weight, angular.index))
 
 
-def system_of(grid: Marks[LatticePose], angular: Marks[int]) -> NormalEquations:
+def system_of(grid: Marks[AnyPose], angular: Marks[int]) -> NormalEquations:
     """Return the system of marks that were read, from the cache if present."""
     digest = hashlib.blake2b(grid.weight, digest_size=16)
     digest.update(angular.weight)
@@ -62,14 +63,25 @@ def system_of(grid: Marks[LatticePose], angular: Marks[int]) -> NormalEquations:
         if key in _cache:
             _cache.move_to_end(key)
             return _cache[key]
-    system = NormalEquations(GridSystem(grid.poses, grid.weight),
-                             AngularSystem(angular.poses, angular.weight), grid.index,
-                             angular.index)
+    system = _equations(grid, angular)
     with _lock:
         _cache[key] = system
         while len(_cache) > 1 and (len(_cache) > CACHED or _cached_readings() > CACHED_READINGS):
             _cache.popitem(last=False)
     return system
+
+
+def _equations(grid: Marks[AnyPose], angular: Marks[int], *,
+               rank_only: bool = False) -> NormalEquations:
+    lines = AngularSystem(angular.poses, angular.weight)
+    placed = tuple(pose for pose in grid.poses if isinstance(pose, PlacedPose))
+    if placed:
+        from selfcal_ros.estimation.normal.placed import PlacedEquations, PlacedSystem  # splines
+
+        return PlacedEquations(PlacedSystem(placed, grid.weight), lines, grid.index, angular.index)
+    poses = tuple(pose for pose in grid.poses if isinstance(pose, LatticePose))
+    return NormalEquations(GridSystem(poses, grid.weight), lines, grid.index, angular.index,
+                           rank_only=rank_only)
 
 
 def _cached_readings() -> int:
@@ -96,17 +108,17 @@ def planned_system(artifact: Artifact, views: Sequence[View], *,
         Whether only the rank is needed.
     """
     grid_views = [(i, v) for i, v in enumerate(views) if v.grid]
-    poses = tuple(view.lattice_pose(artifact) for _, view in grid_views)
+    poses = tuple(pose_of(view, artifact) for _, view in grid_views)
     angular = [(i, v) for i, v in enumerate(views) if v.angular and artifact.angular_count]
-    turns = tuple(v.lattice_pose(artifact).s for _, v in angular)
-    empty = np.zeros((len(poses), *artifact.shape))
-    field = GridSystem(poses, empty).views.in_field
-    repeats = np.array([v.repeats for _, v in grid_views], dtype=float)
+    turns = tuple(pose_of(v, artifact).turn_lines or 0 for _, v in angular)
+    field = np.array([in_field(pose, artifact) for pose in poses])
+    weight = field.reshape(len(poses), *artifact.shape) * np.array(
+        [v.repeats for _, v in grid_views], dtype=float)[:, None, None]
     lines = np.array([v.repeats for _, v in angular], dtype=float)
-    return NormalEquations(
-        GridSystem(poses, field * repeats[:, None, None]),
-        AngularSystem(turns, np.ones((len(turns), artifact.angular_count)) * lines[:, None]),
-        tuple(i for i, _ in grid_views), tuple(i for i, _ in angular), rank_only=rank_only)
+    return _equations(
+        Marks(poses, weight, tuple(i for i, _ in grid_views)),
+        Marks(turns, np.ones((len(turns), artifact.angular_count)) * lines[:, None],
+              tuple(i for i, _ in angular)), rank_only=rank_only)
 
 
 class Memo[Key, Value]:

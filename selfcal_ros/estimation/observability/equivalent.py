@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Plans that are mirror images or rotations of each other, with the same uncertainty."""
 
+import math
 from collections.abc import Iterable
 from itertools import product
 
@@ -24,15 +25,16 @@ def equivalent_key(artifact: Artifact, views: Iterable[View]) -> tuple:
     views : iterable of View
         Views of grid marks.
     """
-    poses = [view.lattice_pose(artifact) for view in views]
-    steps = [(pose.quarter_turns or 0, complex(*pose.shift)) for pose in poses]
+    poses = [view.pose for view in views]
+    steps = [(round(pose.turn_rad / (math.pi / 2), 9) % 4, complex(
+        *(round(shift / artifact.grid_pitch_m, 6) for shift in pose.shift_m))) for pose in poses]
     turns = range(0, 4, 1 if artifact.shape[0] == artifact.shape[1] else 2)
     forms = list(product((False, True), turns, turns))
     return min(tuple(sorted(_moved(q, shift, *form) for q, shift in steps)) for form in forms)
 
 
-def _moved(q: int, shift: complex, mirror: bool, stage: int,
-           plate: int) -> tuple[int, float, float]:
+def _moved(q: float, shift: complex, mirror: bool, stage: int,
+           plate: int) -> tuple[float, float, float]:
     if mirror:
         q, shift = -q, shift.conjugate()
     shift = shift * TURNS[stage]

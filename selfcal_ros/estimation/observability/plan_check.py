@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Whether a plan identifies the stage, its unseen modes, and the views that would remove them."""
 
+import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from itertools import combinations, islice
-from math import pi
 
 from selfcal_ros.estimation.blas_threads import one_thread
 from selfcal_ros.estimation.normal.equations import NormalEquations
@@ -20,10 +20,11 @@ from selfcal_ros.estimation.observability.unseen import (
     angular_families,
     component_family,
     known_families,
+    loose_family,
     unread_marks,
     unvisited_family,
 )
-from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.artifact import Artifact, default_map_grid
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.orders import ORDERS, parse_order
 from selfcal_ros.model.result import Observability
@@ -118,8 +119,9 @@ def unseen_modes(system: NormalEquations) -> tuple[UnseenMode, ...]:
     """Return the unseen families of a set of readings, the named ones first."""
     grid = system.grid
     families = known_families(system) if grid.n_views > 1 else []
-    families += [family for family in (component_family(system), unvisited_family(grid),
-                                       unread_marks(grid)) if family is not None]
+    families += [family for family in (
+        loose_family(system), component_family(system), unvisited_family(grid),
+        unread_marks(grid)) if family is not None]
     return (*families, *angular_families(system))
 
 
@@ -135,11 +137,12 @@ def candidate_views(artifact: Artifact, *, angular: bool) -> list[View]:
     """
     pitch = artifact.grid_pitch_m
     names = {(0, 0): "", (1, 0): "+x", (0, 1): "+y", (-1, 0): "-x", (0, -1): "-y"}
-    views = [View(f"{90 * q}deg{name}", q * pi / 2, (a * pitch, b * pitch), True, angular)
+    views = [View(f"{90 * q}deg{name}", q * math.pi / 2, (a * pitch, b * pitch), True, angular)
              for (a, b), name in names.items() for q in range(4)
              if q % 2 == 0 or artifact.shape[0] == artifact.shape[1] or (a, b) == (0, 0)]
     if angular and artifact.angular_count:
-        views.append(View("one_line", 2 * pi / artifact.angular_count, (0.0, 0.0), False, True))
+        line = 2 * math.pi / artifact.angular_count
+        views.append(View("one_line", line, (0.0, 0.0), False, True))
     return views
 
 
@@ -179,28 +182,32 @@ def smaller(plan: Plan, size: int) -> Plan:
     The field keeps its proportions, on which the uncertainty of a long field depends, and is
     large enough for the plan's own shifts.
     """
-    reach = [max(map(abs, view.lattice_pose(plan.artifact).shift)) for view in plan.views]
-    room = 2 * max(reach, default=0) + 3  # a plan to be searched has no views yet
+    reach = [max(map(abs, view.translation_m)) / plan.artifact.grid_pitch_m for view in plan.views]
+    room = 2 * round(max(reach, default=0)) + 3  # a plan to be searched has no views yet
     part = min(1.0, max(size, room) / max(plan.artifact.shape))
     nx, ny = (max(2 * round((n * part - 1) / 2) + 1, min(n, max(room, NARROW)))
               for n in plan.artifact.shape)
-    return replace(plan, artifact=Artifact(nx, plan.artifact.grid_pitch_m,
-                                           plan.artifact.angular_count, 0 if nx == ny else ny))
+    plate = Artifact(nx, plan.artifact.grid_pitch_m, plan.artifact.angular_count,
+                     0 if nx == ny else ny)
+    grid = plan.artifact.map_grid
+    return replace(plan, artifact=plate if grid is None else replace(plate, map_grid=replace(
+        default_map_grid(plate), interpolation=grid.interpolation)))
 
 
 def describe_view(view: View, artifact: Artifact) -> str:
     """Return a view in words: turn, shift in pitches, kind of marks, repeats."""
-    pose = view.lattice_pose(artifact)
-    if pose.quarter_turns is None or not view.grid:
-        lines = pose.turn_lines or 0
+    turn = math.degrees(view.rotation_rad) % 360
+    if not view.grid:
+        lines = view.turn_lines(artifact) or 0
         what = (f"an angular view turned by {lines} line{'s' * (lines != 1)} "
                 f"({360 * lines / artifact.angular_count:g} deg)")
-    elif pose.quarter_turns:
-        what = f"a view turned by {90 * pose.quarter_turns} deg"
+    elif 1e-6 < turn < 360 - 1e-6:
+        what = f"a view turned by {turn:.6g} deg"
     else:
         what = "a view without turn"
-    a, b = pose.shift
-    shifted = [f"{step:+d} pitch along {axis}" for step, axis in ((a, "X"), (b, "Y")) if step]
+    steps = [round(shift / artifact.grid_pitch_m, 3) + 0.0 for shift in view.translation_m]
+    shifted = [f"{step:+g} pitch along {axis}" for step, axis in zip(steps, "XY", strict=True)
+               if step]
     return what + (" and shifted by " + " and ".join(shifted) if shifted else "")
 
 

@@ -39,6 +39,8 @@ def identifies(artifact: Artifact, views: Sequence[View]) -> bool:
     For searches: no advice, and no matrix if the count of components already says no.
     """
     system = planned_system(artifact, views, rank_only=True)
+    if artifact.map_grid is not None:
+        return _nodes_known(system)
     parts = system.grid.components
     if parts.balanced.any() or min(parts.of_site.min(), parts.of_mark.min()) < 0:
         return False
@@ -69,6 +71,8 @@ def full_observability(system: NormalEquations, artifact: Artifact,
     views : iterable of View
         The views behind the readings, for the advice.
     """
+    if artifact.map_grid is not None:
+        return _placed_observability(system, artifact, tuple(views))
     unseen = deficiency(system)
     return Observability(system.rank_grid + DATUM_ROWS, unknowns_of(system), unseen, unseen == 0,
                          advice=advice_for(artifact, views) if unseen else ())
@@ -124,7 +128,7 @@ def _measured_observability(system: NormalEquations, artifact: Artifact,
     full = full_observability(system, artifact, read)
     if full.identifiable:
         return full
-    if not identifies(artifact, read):
+    if artifact.map_grid is not None or not identifies(artifact, read):
         return full
     sites, lines = system.known_sites, system.known_lines
     if sites.mean() < DETERMINED or (len(lines) and lines.mean() < DETERMINED):
@@ -134,6 +138,29 @@ def _measured_observability(system: NormalEquations, artifact: Artifact,
     kept = 2 * int(sites.sum() + system.known_marks.sum())
     kept += int(system.known_views[:3 * system.grid.n_views].sum())
     return Observability(kept, kept, 0, True)
+
+
+def _nodes_known(system: NormalEquations) -> bool:
+    """Return whether views at any pose determine at least half of the map's nodes, and the lines.
+
+    Nothing separates the modes that they determine badly from those that they do not determine, so
+    that each node counts by its uncertainty (method, views at any pose).
+    """
+    return bool(not system.unseen.shape[1] and system.known_sites.mean() >= DETERMINED
+                and angular_deficiency(system) == 0)
+
+
+def _placed_observability(system: NormalEquations, artifact: Artifact,
+                          views: tuple[View, ...]) -> Observability:
+    known, grid = int(system.known_sites.sum()), system.grid
+    if _nodes_known(system):
+        kept = 2 * (known + int(system.known_marks.sum())) + 3 * grid.n_views
+        return Observability(kept, kept, 0, True)
+    missing = len(system.loose_modes) or 2 * (grid.n_sites - known)
+    missing += angular_deficiency(system)
+    advice = advice_for(artifact, views) if known < DETERMINED * grid.n_sites else ()
+    return Observability(unknowns_of(system) - missing, unknowns_of(system), max(missing, 1), False,
+                         advice=advice)
 
 
 def _as_read(system: NormalEquations, views: tuple[View, ...]) -> tuple[View, ...]:
@@ -147,14 +174,15 @@ def _as_read(system: NormalEquations, views: tuple[View, ...]) -> tuple[View, ..
 def advice_for(artifact: Artifact, views: Iterable[View]) -> tuple[str, ...]:
     """Return advice on the missing views of a deficient plan: a quarter turn, a shift, a line."""
     views = tuple(views)
-    poses = [view.lattice_pose(artifact) for view in views if view.grid]
+    poses = [view.pose for view in views if view.grid]
     advice = []
-    if len({(pose.quarter_turns or 0) % 2 for pose in poses}) < 2:
+    if len({round((pose.turn_rad / math.pi) % 1, 6) % 1 for pose in poses}) < 2:
         advice.append("add a view turned by 90 deg")
-    if len({pose.shift for pose in poses}) < 2:
+    if len({(round(x / artifact.grid_pitch_m, 3), round(y / artifact.grid_pitch_m, 3))
+            for x, y in (pose.shift_m for pose in poses)}) < 2:
         advice.append("add a view shifted by one pitch along X")
     if any(view.angular for view in views) and artifact.angular_count:
-        turns = [v.lattice_pose(artifact).turn_lines or 0 for v in views if v.angular]
+        turns = [v.turn_lines(artifact) or 0 for v in views if v.angular]
         if _common_step([turn - turns[0] for turn in turns], artifact.angular_count) > 1:
             advice.append(f"add an angular view turned by one line "
                           f"({360 / artifact.angular_count:g} deg)")
@@ -164,6 +192,9 @@ def advice_for(artifact: Artifact, views: Iterable[View]) -> tuple[str, ...]:
 def _tried(artifact: Artifact, views: tuple[View, ...]) -> tuple[str, ...]:
     """Return the first single view, by trial, that cures the plan."""
     pitch = artifact.grid_pitch_m
+    if artifact.map_grid is not None:
+        return ("add views turned by 90 deg and shifted by about one pitch, or give the map "
+                "fewer nodes",)
     for name, turn, shift in (("shifted by one pitch along Y", 0.0, (0.0, pitch)),
                               ("shifted by one pitch along X", 0.0, (pitch, 0.0)),
                               ("turned by 90 deg", math.pi / 2, (0.0, 0.0)),

@@ -67,7 +67,7 @@ def is_unseen(system: NormalEquations, field: np.ndarray) -> bool:
 
 def known_families(system: NormalEquations) -> list[UnseenMode]:
     """Return the unseen fields among the named ones."""
-    z = system.grid.views.z
+    z = system.grid.views.z_sites
     x, y = z.real, z.imag
     named = [
         ("non-orthogonality", "non-orthogonality of the axes: Gx = O y, Gy = O x", y + 1j * x),
@@ -81,16 +81,25 @@ def known_families(system: NormalEquations) -> list[UnseenMode]:
             if is_unseen(system, field)]
 
 
+def loose_family(system: NormalEquations) -> UnseenMode | None:
+    """Return the fields that views at any pose leave undetermined, None if there are none."""
+    modes = system.loose_modes
+    if not len(modes):
+        return None
+    return UnseenMode("undetermined fields", f"{len(modes)} fields with a standard uncertainty "
+                      "beyond ten readings' noise", as_map(modes[0]))
+
+
 def component_family(system: NormalEquations) -> UnseenMode | None:
     """Return the family of vectors left free by balanced components, None if one spans all."""
     grid = system.grid
-    parts, phase = grid.components, grid.free_turns[0]
+    parts = grid.components
     free = np.flatnonzero(parts.balanced)
     seen = parts.of_site >= 0
     if len(free) < 2 and not (len(free) == 1 and len(parts.balanced) > 1):
         return None
     label = np.where(seen & np.isin(parts.of_site, free), parts.of_site, -1)
-    label = label.reshape(grid.views.shape)
+    label, phase = label.reshape(grid.views.shape), grid.free_turns[0]
     signs = np.where(label >= 0, phase.reshape(label.shape), 0)
     name, text = _shape_of(grid, label, signs, n=len(free))
     # the example: one component against the rest

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.special import fdtri
 
 from selfcal_ros.estimation.joint.model_fit import ModelFit, equations_of
-from selfcal_ros.estimation.lattice.maps import LatticeViews
+from selfcal_ros.estimation.lattice.maps import maps_of
 from selfcal_ros.estimation.lattice.readings import GridData, grid_data
 from selfcal_ros.estimation.terms.columns import term_columns
 from selfcal_ros.estimation.terms.equations import LEAST_NOISE_M
@@ -190,7 +190,7 @@ def prediction_limit(model: ModelFit, held: HeldReadings, known: np.ndarray,
     fields, parameters, coefficients = _fitted(model, noise, rng)
     own = noise_of(rng, (n, *weight.shape), weight)
     own_terms = rng.standard_normal((len(held.own), n)) / max(model.found.xy.sigma, LEAST_NOISE_M)
-    views = LatticeViews(grid.views.shape, held.grid.poses)
+    views = maps_of(grid.views.plate_shape, held.grid.poses)
     unknown = [None if fitted >= 0 else ViewMisalignment(views.z, known[row])
                for row, fitted in enumerate(held.rows)]
     squares = np.zeros(n)

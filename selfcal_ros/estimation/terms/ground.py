@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from selfcal_ros.estimation.lattice.maps import LatticeViews
+from selfcal_ros.estimation.lattice.maps import maps_of
 from selfcal_ros.estimation.lattice.readings import GridData
 from selfcal_ros.estimation.terms.visits import ViewVisits, approach_sign, visits_of
 from selfcal_ros.model.readings import Measurements
@@ -60,7 +60,7 @@ def ground_of(measurements: Measurements, grid: GridData, half_width_m: float) -
     """Return the ground of a measurement whose grid readings are `grid`."""
     lines = [v for v in measurements.views if len(v.k)]
     shared = tuple(row for row, view in enumerate(lines) if len(view.m))
-    z = LatticeViews(grid.y.shape[1:], grid.poses).z
+    z = maps_of(grid.y.shape[1:], grid.poses).z
     names = tuple(measurements.views[i].view.name for i in grid.index)
     return Ground(z, half_width_m, grid.weight, visits_of(measurements, grid), names,
                   approach_sign(measurements.sense), tuple(view.view.name for view in lines),

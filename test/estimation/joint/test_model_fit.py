@@ -13,8 +13,8 @@ from selfcal_ros.estimation.joint.problem import own_rotations
 from selfcal_ros.estimation.joint.solve import prepare
 from selfcal_ros.estimation.normal.grid import GridSystem
 from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.model.terms import parse_terms
 from selfcal_ros.model.pose import LatticePose
+from selfcal_ros.model.terms import parse_terms
 from selfcal_ros.model.view import Plan, View
 from selfcal_ros.simulation.truth import random_truth, simulate_measurements
 from test.support.lattice_plans import plan_of

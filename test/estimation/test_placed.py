@@ -1,0 +1,108 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Calibration from views at any pose: exact, as dense, as the lattice, and covered by U."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from selfcal_ros.errors import NotIdentifiableError
+from selfcal_ros.estimation.api import calibrate
+from selfcal_ros.estimation.options import Options
+from selfcal_ros.model.artifact import Interpolation, MapGrid
+from selfcal_ros.model.readings import Sense
+from selfcal_ros.model.result import result_from_dict, result_to_dict
+from selfcal_ros.reporting.words.findings import worded
+from test.support.placed import SIX, THREE, dense, error_in_datum, plate, readings
+
+BARE = Options(assumed=())
+LINEAR = Options(assumed=(), misalignment_model="linear")
+COUNT = 40
+
+
+@pytest.mark.parametrize("how", ["bilinear", "bicubic"])
+def test_readings_without_noise_give_the_truth(how):
+    """Finite rotations included: the sign of each turn and shift matters to every node."""
+    found, truth = readings(plate(11, 7, how), SIX, np.random.default_rng(1), sigma=0.0)
+    emap = calibrate(found, BARE).error_map
+    assert emap.valid.all()
+    assert np.abs(error_in_datum(emap, truth)).max() < 1e-14
+
+
+def test_the_dense_solution_is_the_same():
+    """Map and uncertainty, from a matrix of all readings and unknowns."""
+    found, _ = readings(plate(7, 5), SIX, np.random.default_rng(2), linear=True)
+    result = calibrate(found, LINEAR)
+    field, u = dense(found)
+    assert np.stack([result.error_map.gx, result.error_map.gy]) == pytest.approx(field, abs=1e-15)
+    assert np.stack([result.error_map.u_gx, result.error_map.u_gy]) == pytest.approx(
+        u * result.noise.sigma_xy, rel=1e-6)
+
+
+def test_on_the_lattice_the_map_is_that_of_the_lattice():
+    """The same readings, the map's grid that of the plate: the other solver's map and u."""
+    poses = ((0, (0, 0)), (90, (0, 0)), (0, (1, 0)), (180, (0, 1)))
+    placed, _ = readings(plate(7, 7), poses, np.random.default_rng(3))
+    one = calibrate(placed, BARE).error_map
+    other = calibrate(replace(placed, artifact=replace(placed.artifact, map_grid=None)),
+                      BARE).error_map
+    assert one.gx == pytest.approx(other.gx, abs=1e-14)
+    assert one.gy == pytest.approx(other.gy, abs=1e-14)
+    assert one.u_gx == pytest.approx(other.u_gx, rel=1e-6)
+
+
+def test_what_moves_turns_the_map():
+    """The plate moves: G(X) = -H(-X), nodes and all."""
+    found, _ = readings(plate(11, 7), SIX, np.random.default_rng(4))
+    stage = calibrate(found, BARE).error_map
+    moved = calibrate(replace(found, sense=Sense.PLATE_MOVES), BARE).error_map
+    assert moved.gx == pytest.approx(-stage.gx[::-1, ::-1], abs=1e-18)
+
+
+@pytest.mark.parametrize(("poses", "how"), [(SIX, "bicubic"), (SIX, "bilinear"),
+                                            (THREE, "bicubic")])
+def test_errors_lie_in_u(poses, how):
+    """z of all nodes over many sessions, and the part inside of U."""
+    squares, inside, number = 0.0, 0, 0
+    for seed in range(COUNT):
+        found, truth = readings(plate(11, 7, how), poses, np.random.default_rng(seed))
+        result = calibrate(found, BARE)
+        assert result.verdict.qualified
+        known = result.error_map.valid
+        z = error_in_datum(result.error_map, truth) / np.stack(
+            [result.error_map.u_gx, result.error_map.u_gy])
+        squares += float((z[:, known] ** 2).sum())
+        inside += int((np.abs(z[:, known]) < result.noise.k_xy).sum())
+        number += 2 * int(known.sum())
+    assert np.sqrt(squares / number) == pytest.approx(1.0, abs=0.06)
+    assert inside / number == pytest.approx(0.9545, abs=0.02)
+
+
+@pytest.mark.parametrize("poses", [((0, (0, 0)), (37, (0, 0))), ((0, (0, 0)), (180, (1.3, 0.4)))])
+def test_turns_alone_and_half_turns_are_refused(poses):
+    found, _ = readings(plate(11, 7), poses, np.random.default_rng(5))
+    with pytest.raises(NotIdentifiableError, match="do not identify"):
+        calibrate(found, BARE)
+
+
+def test_nodes_that_no_reading_tells_are_unknown():
+    """A map larger than what the plate covers: the nodes outside are NaN, those inside exact."""
+    artifact = plate(11, 7)
+    wide = replace(artifact, map_grid=replace(artifact.map_grid, size=9))
+    found, truth = readings(wide, SIX, np.random.default_rng(6), sigma=0.0)
+    emap = calibrate(found, BARE).error_map
+    assert not emap.valid[0, 0] and emap.valid[2:7, 2:7].all()
+    assert np.nanmax(np.abs(error_in_datum(emap, truth))) < 1e-11
+
+
+def test_a_result_keeps_plate_and_map_apart():
+    """RESULT.json has the plate, its error, and the grid of the map; both are read back."""
+    found, _ = readings(plate(11, 7), SIX, np.random.default_rng(7))
+    result = calibrate(found, BARE)
+    data = result_to_dict(worded(result))
+    assert data["map"] == {"grid_size": 7, "grid_pitch": pytest.approx(1 / 60),
+                           "interpolation": "bicubic"}
+    again = result_from_dict(data, "RESULT.json")
+    assert again.plate == found.artifact and again.artifact == found.artifact.field
+    assert again.plate.map_grid == MapGrid(7, 0.1 / 6, Interpolation.BICUBIC)
+    assert again.artifact_map.ax.shape == (11, 11) and again.error_map.gx.shape == (7, 7)
