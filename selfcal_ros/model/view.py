@@ -4,11 +4,12 @@
 import math
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 from selfcal_ros.errors import InputError, known_are
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.orders import parse_order
-from selfcal_ros.model.pose import LatticePose, Pose
+from selfcal_ros.model.pose import AnyPose, LatticePose, PlacedPose, Pose
 from selfcal_ros.model.terms import TermName, parse_terms
 
 LATTICE_TOLERANCE = 1e-3
@@ -134,6 +135,21 @@ def _whole(value: float, where: str, unit: str) -> int:
         raise InputError(where, f"{value:.6g} is not a whole number of {unit} steps",
                          "place the plate on the lattice")
     return round(value)
+
+
+@lru_cache(maxsize=1024)
+def pose_of(view: View, artifact: Artifact) -> AnyPose:
+    """Return the pose of a view on the lattice, or anywhere if the map has its own grid.
+
+    Raises
+    ------
+    InputError
+        As `View.lattice_pose` and `View.turn_lines`.
+    """
+    if artifact.map_grid is None:
+        return view.lattice_pose(artifact)
+    lines = view.turn_lines(artifact) if view.angular and artifact.angular_count else None
+    return PlacedPose(artifact, view.pose, lines)
 
 
 @dataclass(frozen=True)

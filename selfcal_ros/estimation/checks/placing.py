@@ -18,6 +18,7 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.pose import LatticePose
 from selfcal_ros.model.readings import Measurements, ViewReadings
+from selfcal_ros.model.view import pose_of
 
 QUARTERS = np.array([1, 1j, -1, -1j])
 WINDOW = 3
@@ -121,8 +122,8 @@ def other_poses(pose: LatticePose) -> Iterator[LatticePose]:
 
 def _seen(artifact: Artifact, view: ViewReadings) -> _Seen | None:
     """Return the readings of a view in the window; None if too few, or without a grid."""
-    pose = view.view.lattice_pose(artifact)
-    if pose.quarter_turns is None or not len(view.m):
+    pose = pose_of(view.view, artifact)
+    if not isinstance(pose, LatticePose) or pose.quarter_turns is None or not len(view.m):
         return None
     i, j = pose.site_of(view.m, view.n)
     inside = (np.abs(i) <= WINDOW) & (np.abs(j) <= WINDOW)

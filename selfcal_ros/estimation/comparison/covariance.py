@@ -15,7 +15,7 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.datum.covariance import FieldCovariance, scale_datum
 from selfcal_ros.estimation.joint.problem import bounded_ratio
 from selfcal_ros.estimation.joint.solved import KEY, MAX_SITES, factors_of
-from selfcal_ros.estimation.lattice.maps import in_field, pose_of
+from selfcal_ros.estimation.lattice.maps import in_field
 from selfcal_ros.estimation.law.solve import law_covariance
 from selfcal_ros.estimation.normal.equations import NormalEquations
 from selfcal_ros.estimation.normal.systems import Marks, planned_system, system_of
@@ -24,7 +24,7 @@ from selfcal_ros.estimation.observability.rank import deficiency
 from selfcal_ros.estimation.options import ReferenceLength
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.result import CalibrationResult
-from selfcal_ros.model.view import View
+from selfcal_ros.model.view import View, pose_of
 
 MAX_LINES = 1024
 """Largest number of lines for a full covariance matrix."""
@@ -97,7 +97,7 @@ def first_order_u(result: CalibrationResult) -> tuple[float, float]:
     system = _system(result)
     if system is None:
         return float("nan"), float("nan")
-    length = result.artifact.grid_pitch_m * max(result.artifact.half)
+    length = result.plate.grid_pitch_m * max(result.plate.half)
     if tells_what_was_read(result):
         variance = np.diag(_exact_field(result, system).of(system.gauge.shear))
         shear = system.gauge.shear[:, ::-1, ::-1] if _flipped(result) else system.gauge.shear
@@ -145,7 +145,7 @@ def _field(system: NormalEquations) -> FieldCovariance:
 def _exact_field(result: CalibrationResult, system: NormalEquations) -> FieldCovariance:
     """Return the covariance of the map for unit noise, without terms of the model."""
     noise = result.noise
-    length = result.artifact.grid_pitch_m * max(result.artifact.half)
+    length = result.plate.grid_pitch_m * max(result.plate.half)
     inverse = system.inverse(bounded_ratio(system, noise.sigma_xy, noise.sigma_theta, length)
                              if system.angular.n_views else 1.0)
     scale = None
@@ -169,13 +169,13 @@ def _system(result: CalibrationResult) -> NormalEquations | None:
     views = _views(result)
     if not any(view.grid for view in views):
         return None
-    system = planned_system(result.artifact, views)
+    system = planned_system(result.plate, views)
     return None if deficiency(system) else system
 
 
 def _read_system(result: CalibrationResult) -> NormalEquations:
     """Return the system of the weights in a result."""
-    artifact = result.artifact
+    artifact = result.plate
     grid, lines = [], []
     for index, v in enumerate(result.views):
         in_grid, of_grid = _is_read(v.read_grid), f"view '{v.name}', read.grid"

@@ -9,7 +9,7 @@ R(phi) = exp(i phi).
 """
 
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,7 +18,7 @@ from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.pose import AnyPose, LatticePose, PlacedPose
 from selfcal_ros.model.readings import ViewReadings
 from selfcal_ros.model.result import ArtifactMap
-from selfcal_ros.model.view import View
+from selfcal_ros.model.view import pose_of
 
 if TYPE_CHECKING:
     from selfcal_ros.estimation.lattice.placed import PlacedViews  # splines
@@ -233,18 +233,6 @@ def rigid_parameters(views: LatticeViews) -> np.ndarray:
         out[:, v, 0] = (0, 0, -1, 0, 0, 0, -1)
         out[:, v, 1], out[:, v, 2] = np.real(taus), np.imag(taus)
     return out
-
-
-@lru_cache(maxsize=1024)
-def pose_of(view: View, artifact: Artifact) -> AnyPose:
-    """Return the pose of a view as the maps take it.
-
-    On the lattice unless the artifact has a grid of the map; InputError as `View.lattice_pose`.
-    """
-    if artifact.map_grid is None:
-        return view.lattice_pose(artifact)
-    lines = view.turn_lines(artifact) if view.angular and artifact.angular_count else None
-    return PlacedPose(artifact, view.pose, lines)
 
 
 def maps_of(shape: tuple[int, int], poses: tuple[AnyPose, ...]) -> "LatticeViews | PlacedViews":

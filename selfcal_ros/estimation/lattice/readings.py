@@ -6,10 +6,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from selfcal_ros.errors import InputError
-from selfcal_ros.estimation.lattice.maps import in_field, pose_of
+from selfcal_ros.estimation.lattice.maps import in_field
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.pose import AnyPose, LatticePose
 from selfcal_ros.model.readings import Measurements, ViewReadings
+from selfcal_ros.model.view import pose_of
 
 
 @dataclass(frozen=True, eq=False)

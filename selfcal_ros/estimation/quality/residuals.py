@@ -133,7 +133,7 @@ def residuals_of(measurements: Measurements, options: Options) -> Residuals:
     system = problem.system
     found = replace(fit(problem, problem.grid.y), residuals=grid_residuals(system, problem.grid.y),
                     residuals_theta=angular_residuals(system, problem.angular.y))
-    if system.grid.n_sites <= EXACT_SITES:
+    if system.grid.n_sites <= EXACT_SITES and measurements.artifact.map_grid is None:
         redundancy, skew = exact_leverage(system)
     else:
         redundancy = drawn_redundancy(system)

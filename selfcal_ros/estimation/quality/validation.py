@@ -22,6 +22,7 @@ from selfcal_ros.estimation.joint.model_fit import ModelFit
 from selfcal_ros.estimation.joint.solve import solve_joint
 from selfcal_ros.estimation.joint.solved import Solved
 from selfcal_ros.estimation.lattice.maps import (
+    maps_of,
     rotation_excess,
     turned_marks,
     turned_plate,
@@ -47,7 +48,7 @@ from selfcal_ros.model.readings import Measurements, Sense, ViewReadings, subset
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.statistics import rms
 from selfcal_ros.model.verdict import Finding, Grade
-from selfcal_ros.model.view import Plan
+from selfcal_ros.model.view import Plan, pose_of
 
 MAX_FOLDS = 10
 
@@ -212,12 +213,12 @@ def _rest_not_identified(kept: Measurements, held: Measurements) -> Finding:
     """Return the finding that the rest does not identify the stage, with a view to be added."""
     views = tuple(replace(v.view, grid=bool(len(v.m)), angular=bool(len(v.k)))
                   for v in kept.views if len(v.m) or len(v.k))
-    gone = {v.view.lattice_pose(held.artifact) for v in held.views if len(v.m) or len(v.k)}
+    gone = {pose_of(v.view, held.artifact) for v in held.views if len(v.m) or len(v.k)}
     plan = Plan("", kept.artifact, views)
     if max(kept.artifact.shape) > FULL_SIZE and views:
         plan = smaller(plan, SEARCH_SIZE)
     for more in candidate_views(plan.artifact, angular=any(view.angular for view in views)):
-        if more.lattice_pose(plan.artifact) not in gone and identifies(
+        if pose_of(more, plan.artifact) not in gone and identifies(
                 plan.artifact, (*plan.views, more)):
             return Finding("rest_not_identified", details={"add": {
                 "rotation": more.rotation_rad, "translation_x": more.translation_m[0],
@@ -252,7 +253,8 @@ def prediction_errors(measurements: Measurements, result: CalibrationResult, ind
     if len(view.k):
         sign = -1 if measurements.sense is Sense.PLATE_MOVES else 1
         count = measurements.artifact.angular_count
-        site = sign * (view.k + view.view.lattice_pose(measurements.artifact).s) % count
+        turn = pose_of(view.view, measurements.artifact).turn_lines or 0
+        site = sign * (view.k + turn) % count
         theta = (view.dtheta - sign * result.error_map.g_theta[site]
                  - result.artifact_map.a_theta[view.k])
         phi = known.phi
@@ -268,10 +270,13 @@ def _grid_errors(measurements: Measurements, result: CalibrationResult,
     if not len(view.m):
         return np.zeros(0, dtype=complex)
     artifact, emap = measurements.artifact, result.error_map
-    i, j = view.view.lattice_pose(artifact).site_of(view.m, view.n)
-    sign = -1 if measurements.sense is Sense.PLATE_MOVES else 1
-    at = sign * i + artifact.half[0], sign * j + artifact.half[1]
-    return (view.dx + 1j * view.dy - sign * (emap.gx[at] + 1j * emap.gy[at])
+    field = emap.gx + 1j * emap.gy
+    if measurements.sense is Sense.PLATE_MOVES:
+        field = -field[::-1, ::-1]
+    pose = pose_of(view.view, artifact)
+    at_marks = pose.phase * maps_of(artifact.shape, (pose,)).gather(field)[0]
+    at = view.m + artifact.half[0], view.n + artifact.half[1]
+    return (view.dx + 1j * view.dy - at_marks[at]
             - turned_plate(view, artifact, result.artifact_map))
 
 

@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 
 from selfcal_ros.compensation.cells import bicubic_cells, bilinear_cells
-from selfcal_ros.estimation.lattice.maps import LatticeViews, pose_of
+from selfcal_ros.estimation.lattice.maps import LatticeViews
 from selfcal_ros.estimation.lattice.placed import PlacedViews
 from selfcal_ros.estimation.lattice.splines import MapSpline
 from selfcal_ros.model.artifact import Artifact, Interpolation, MapGrid
-from selfcal_ros.model.view import View
+from selfcal_ros.model.view import View, pose_of
 from test.support.placed import SIX, plate
 
 CELLS = {"bilinear": bilinear_cells, "bicubic": bicubic_cells}
