@@ -29,10 +29,9 @@ if TYPE_CHECKING:
     from selfcal_ros.estimation.observability.resistance import TermCheck
     from selfcal_ros.estimation.observability.suggest import Against, Score, Suggestion
     from selfcal_ros.estimation.terms.planned import Assumed
-    from selfcal_ros.model.artifact import Artifact
     from selfcal_ros.model.result import Observability
     from selfcal_ros.model.terms import ModelTerm, TermName
-    from selfcal_ros.model.view import Plan, View
+    from selfcal_ros.model.view import Plan
 
 HELP = "check a plan of views before it is measured, or suggest views"
 
@@ -197,7 +196,7 @@ def _check_text(plan: Plan, seen: Observability, predicted: Prediction | None) -
 
 
 def _check_stops_text(plan: Plan) -> str:
-    marks, offset_m = _check_stops(plan)
+    marks, offset_m = plan.check_stops
     if not marks:
         return ("no check stops: only stop errors and turns of the plate show scale, turn and sign "
                 "of the microscope; add check_stops: {marks: 5, offset: 20e-6}")
@@ -243,8 +242,9 @@ def _suggest(args: argparse.Namespace, plan: Plan) -> int:
 
     from selfcal_ros.errors import ExitCode, InputError
     from selfcal_ros.estimation.observability.suggest import best_plan, rank_next
-    from selfcal_ros.files import check_outputs
+    from selfcal_ros.files import check_outputs, write_yaml
     from selfcal_ros.model.error_map import ThetaDatum
+    from selfcal_ros.model.view import plan_to_dict
     from selfcal_ros.reporting.words.tables import search_text
 
     if args.top is not None and args.views is not None:
@@ -278,7 +278,7 @@ def _suggest(args: argparse.Namespace, plan: Plan) -> int:
         best = replace(plan, views=ranked[0].views)
         _show_ranked(args, plan, (now, unit), ranked[:shown])
     if args.output:
-        _write_plan(args.output, best)
+        write_yaml(args.output, plan_to_dict(best))
     return int(ExitCode.DONE)
 
 
@@ -293,12 +293,6 @@ def _in_order(plan: Plan, order: str) -> Plan:
     order = str(parse_order(order, "--order"))
     return replace(plan, views=tuple(replace(view, visit_order=order) if view.grid else view
                                      for view in plan.views))
-
-
-def _check_stops(plan: Plan) -> tuple[int, float]:
-    """Return the number of marks checked in each view, and their distance, m."""
-    return next(((view.check_marks, view.check_offset_m) for view in plan.views if view.grid),
-                (0, 0.0))
 
 
 def _against(args: argparse.Namespace, plan: Plan) -> Against | None:
@@ -316,6 +310,7 @@ def _against(args: argparse.Namespace, plan: Plan) -> Against | None:
 def _show_ranked(args: argparse.Namespace, plan: Plan, now: tuple[Score, float | None],
                  ranked: Sequence[Suggestion]) -> None:
     """Print the next steps; `now`: score of the plan and the noise of an averaged reading, m."""
+    from selfcal_ros.model.view import view_to_dict
     from selfcal_ros.reporting.words.tables import step_text
 
     unit = now[1]
@@ -335,6 +330,8 @@ def _show_ranked(args: argparse.Namespace, plan: Plan, now: tuple[Score, float |
 
 def _show_best(args: argparse.Namespace, best: Plan, score: tuple[Score, float | None],
                how: str) -> None:
+    from selfcal_ros.model.view import view_to_dict
+
     views = [view_to_dict(view, best.artifact) for view in best.views]
     if args.json:
         print(json.dumps({"plan_id": best.plan_id, "criterion": args.criterion, "views": views,
@@ -368,27 +365,3 @@ def _score_text(score: Score, noise_m: float | None) -> str:
         unit = noise_m * UM_PER_M
         return f"u XY rms {score.rms_xy * unit:.5f} µm  max {score.max_xy * unit:.5f} µm{theta}"
     return f"XY rms {score.rms_xy:.3f}  max {score.max_xy:.3f}{theta}"
-
-
-def view_to_dict(view: View, artifact: Artifact) -> dict[str, Any]:
-    """Return a view in the format of PLAN.yaml."""
-    a, b = view.lattice_pose(artifact).shift
-    order = {"visit_order": view.visit_order} if view.visit_order else {}
-    return {"name": view.name, "rotation_deg": round(math.degrees(view.rotation_rad), 9),
-            "translation_pitch": [a, b], "grid": view.grid, "angular": view.angular,
-            "repeats": view.repeats, **order}
-
-
-def _write_plan(path: str, plan: Plan) -> None:
-    from selfcal_ros.files import write_yaml
-
-    artifact = plan.artifact
-    plate = {"grid_size": artifact.grid_size, "grid_pitch": artifact.grid_pitch_m,
-             "angular_count": artifact.angular_count}
-    if artifact.grid_size_y:
-        plate["grid_size_y"] = artifact.grid_size_y
-    marks, offset_m = _check_stops(plan)
-    write_yaml(path, {"plan_id": plan.plan_id, "artifact": plate,
-                      "views": [view_to_dict(view, artifact) for view in plan.views],
-                      **({"check_stops": {"marks": marks, "offset": offset_m}} if marks else {}),
-                      **({"model_terms": list(plan.model_terms)} if plan.model_terms else {})})

@@ -5,6 +5,7 @@ import math
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import Any
 
 from selfcal_ros.errors import InputError, known_are
 from selfcal_ros.model.artifact import Artifact
@@ -173,6 +174,12 @@ class Plan:
     views: tuple[View, ...]
     model_terms: tuple[str, ...] = ()
 
+    @property
+    def check_stops(self) -> tuple[int, float]:
+        """Number of marks checked in each view with grid marks, and their distance, m."""
+        return next(((view.check_marks, view.check_offset_m) for view in self.views if view.grid),
+                    (0, 0.0))
+
 
 def plan_from_dict(data: object, where: str) -> Plan:
     """Return the plan in a PLAN.yaml mapping.
@@ -291,6 +298,29 @@ def _view_from_dict(data: object, where: str, artifact: Artifact, order: str) ->
                 raw["grid"], raw["angular"], raw["repeats"], _order(raw["visit_order"], where))
     view.lattice_pose(artifact)
     return view
+
+
+def view_to_dict(view: View, artifact: Artifact) -> dict[str, Any]:
+    """Return a view in the format of PLAN.yaml."""
+    a, b = view.lattice_pose(artifact).shift
+    order = {"visit_order": view.visit_order} if view.visit_order else {}
+    return {"name": view.name, "rotation_deg": round(math.degrees(view.rotation_rad), 9),
+            "translation_pitch": [a, b], "grid": view.grid, "angular": view.angular,
+            "repeats": view.repeats, **order}
+
+
+def plan_to_dict(plan: Plan) -> dict[str, Any]:
+    """Return a plan in the format of PLAN.yaml."""
+    artifact = plan.artifact
+    plate = {"grid_size": artifact.grid_size, "grid_pitch": artifact.grid_pitch_m,
+             "angular_count": artifact.angular_count}
+    if artifact.grid_size_y:
+        plate["grid_size_y"] = artifact.grid_size_y
+    marks, offset_m = plan.check_stops
+    return {"plan_id": plan.plan_id, "artifact": plate,
+            "views": [view_to_dict(view, artifact) for view in plan.views],
+            **({"check_stops": {"marks": marks, "offset": offset_m}} if marks else {}),
+            **({"model_terms": list(plan.model_terms)} if plan.model_terms else {})}
 
 
 def _fields(data: object, where: str, required: dict, optional: dict | None = None) -> dict:
