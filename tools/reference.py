@@ -42,6 +42,13 @@ PLAN = {
                    "deliberately off them (docs/cell.md); default: none",
     "check_stops.marks": "how many marks",
     "check_stops.offset": "distance of the stage from the mark, m; at most a quarter of the pitch",
+    "map": "nodes of the error map where they are not the sites of the plate's lattice "
+           "(docs/identifiability.md); default: those sites, or for views off the lattice three "
+           "quarters as many nodes as marks over the same field",
+    "map.grid_size": "nodes along x; odd",
+    "map.grid_pitch": "distance between neighbouring nodes, m; default: the nodes span the plate",
+    "map.interpolation": "between the nodes: bilinear or bicubic; default bicubic",
+    "map.grid_size_y": "nodes along y if the map is not square; default: as along x",
     "artifact.grid_size": "N, marks along x; odd, 3 to 1001",
     "artifact.grid_pitch": "distance between neighbouring marks, m",
     "artifact.angular_count": "K, angular lines; a multiple of 4, 0 without lines",
@@ -50,8 +57,10 @@ PLAN = {
     "views[].rotation_deg": "nominal turn, counter-clockwise, degrees; default 0",
     "views[].translation_pitch": "[a, b], nominal shift along stage x and y in pitches; "
                                  "default [0, 0]",
-    "views[].grid": "whether grid marks are measured; needs quarter turns; default true",
-    "views[].angular": "whether angular lines are measured; default: true if the plate has some",
+    "views[].translation_mm": "the same in mm",
+    "views[].grid": "whether grid marks are measured; default true",
+    "views[].angular": "whether angular lines are measured; needs a turn by whole lines; default: "
+                       "true if the plate has some and the turn is such a turn",
     "views[].repeats": "number of times that every mark is measured; default 1",
     "views[].visit_order": "order of the grid marks in this view"}
 RESULT = {
@@ -124,7 +133,7 @@ def plan_keys() -> list[str]:
         "grid_size": 3, "grid_pitch": 0.01, "angular_count": 0}, "views": [{"name": "a"}]}
     strange = {"?": 1}
     return [*known_keys(whole | strange),
-            *(f"{part}.{key}" for part in ("microscope", "check_stops")
+            *(f"{part}.{key}" for part in ("map", "microscope", "check_stops")
               for key in known_keys(whole | {part: strange})),
             *(f"artifact.{key}" for key in known_keys(whole | {
                 "artifact": whole["artifact"] | strange})),

@@ -96,7 +96,11 @@ class Artifact:
             raise InputError("artifact angular_count", f"{self.angular_count} is not a multiple "
                              "of 4", "give 0 for a plate without angular lines")
         if self.map_grid is not None:
-            Artifact(self.map_grid.size, self.map_grid.pitch_m, 0, self.map_grid.size_y)
+            try:
+                Artifact(self.map_grid.size, self.map_grid.pitch_m, 0, self.map_grid.size_y)
+            except InputError as error:
+                raise InputError(error.where.replace("artifact", "map"), error.what,
+                                 "give the map an odd number of nodes, its pitch in m") from error
 
     @cached_property
     def field(self) -> "Artifact":

@@ -2,19 +2,91 @@
 """Poses of the plate on the stage."""
 
 import math
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 
+from selfcal_ros.errors import InputError
 from selfcal_ros.model.artifact import Artifact
 
+LATTICE_TOLERANCE = 1e-3
+"""Largest distance of a commanded pose from the lattice, in pitches or lines."""
+OFF = "lattice, or give the map nodes of its own (map_grid_size, map_grid_pitch)"
+"""End of the remedy for poses off the lattice."""
 EDGE = 1e-9
 """Distance beyond the edge of the field that is rounding, in pitches."""
 
 
+class StagePose(ABC):
+    """A pose of the plate in pitches: of a site (x, y) on the stage, of a mark (m, n) on the plate.
+
+    Attributes
+    ----------
+    shift : tuple
+        Position of the plate's centre along stage x and y, pitches.
+    turn_lines : int or None
+        s in 0..K-1, the total turn in angular lines; None if it is no whole number of them.
+    """
+
+    shift: tuple[float, float]
+    turn_lines: int | None
+
+    @abstractmethod
+    def turned(self, m: np.ndarray, n: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return a vector of the plate frame in the stage frame."""
+
+    @abstractmethod
+    def turned_back(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return a vector of the stage frame in the plate frame."""
+
+    @abstractmethod
+    def beyond_field(self, site: np.ndarray, artifact: Artifact) -> np.ndarray:
+        """Return which sites (2, ...) lie beyond the field of the stage, bool (...)."""
+
+    @abstractmethod
+    def mark_rows(self, artifact: Artifact) -> tuple[np.ndarray, np.ndarray]:
+        """Return the first n in the field for each m, and the number of marks, int arrays (nx,)."""
+
+    @property
+    def s(self) -> int:
+        """Turn in angular lines of a plate that has lines.
+
+        Raises
+        ------
+        ValueError
+            If the plate has none.
+        """
+        if self.turn_lines is None:
+            raise ValueError("the turn is counted in lines only on a plate with angular lines")
+        return self.turn_lines
+
+    def site_of(self, m: np.ndarray, n: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the site (x, y) of mark (m, n): R (m, n) + shift.
+
+        Raises
+        ------
+        ValueError
+            On the lattice, if the turn is not a whole quarter.
+        """
+        x, y = self.turned(m, n)
+        return x + self.shift[0], y + self.shift[1]
+
+    def marks_in_field(self, artifact: Artifact) -> tuple[np.ndarray, np.ndarray]:
+        """Return the marks inside the field of the stage and their sites, arrays (2, V)."""
+        marks = np.stack([artifact.m.ravel(), artifact.n.ravel()])
+        sites = np.stack(self.site_of(*marks))
+        inside = ~self.beyond_field(sites, artifact)
+        return marks[:, inside], sites[:, inside]
+
+    def n_in_field(self, artifact: Artifact) -> int:
+        """Return the number of marks inside the field of the stage."""
+        return int(self.mark_rows(artifact)[1].sum())
+
+
 @dataclass(frozen=True)
-class LatticePose:
+class LatticePose(StagePose):
     """A plate pose in whole steps of the lattice.
 
     Attributes
@@ -59,42 +131,74 @@ class LatticePose:
         """Shift along stage y, pitches."""
         return self.shift[1]
 
-    @property
-    def s(self) -> int:
-        """Turn in angular lines of a plate that has lines.
+    def turned(self, m: np.ndarray, n: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return a vector of the plate frame in the stage frame: R^q (m, n)."""
+        return ((m, n), (-n, m), (-m, -n), (n, -m))[self.q]
 
-        Raises
-        ------
-        ValueError
-            If the plate has none.
+    def turned_back(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return a vector of the stage frame in the plate frame: R^-q (x, y)."""
+        return ((x, y), (y, -x), (-x, -y), (-y, x))[self.q]
+
+    def beyond_field(self, site: np.ndarray, artifact: Artifact) -> np.ndarray:
+        """Return which sites (2, ...) lie beyond the plate's lattice on the stage, bool (...)."""
+        (x, y), (hx, hy) = np.abs(site), artifact.half
+        return (x > hx) | (y > hy)
+
+    def mark_rows(self, artifact: Artifact) -> tuple[np.ndarray, np.ndarray]:
+        """Return the first n in the field for each m, and the number of marks, int arrays (nx,)."""
+        hx, hy = artifact.half
+        x, y = (-hx - self.a, hx - self.a), (-hy - self.b, hy - self.b)  # of R^q (m, n)
+        minus_x, minus_y = (-x[1], -x[0]), (-y[1], -y[0])
+        m, n = ((x, y), (y, minus_x), (minus_x, minus_y), (minus_y, x))[self.q]
+        first, row = max(n[0], -hy), artifact.m[:, 0]
+        count = max(min(n[1], hy) - first + 1, 0)
+        return np.full(len(row), first), np.where((row >= m[0]) & (row <= m[1]), count, 0)
+
+
+@dataclass(frozen=True)
+class PlacedPose(StagePose):
+    """A plate pose anywhere on the stage, for a map with nodes of its own.
+
+    Attributes
+    ----------
+    phase : complex
+        exp(i turn), exact for quarter turns.
+    shift, turn_lines
+        As in `StagePose`.
+    """
+
+    phase: complex
+    shift: tuple[float, float]
+    turn_lines: int | None
+
+    def turned(self, m: np.ndarray, n: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return a vector of the plate frame in the stage frame."""
+        cosine, sine = self.phase.real, self.phase.imag
+        return cosine * m - sine * n, sine * m + cosine * n
+
+    def turned_back(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return a vector of the stage frame in the plate frame."""
+        cosine, sine = self.phase.real, self.phase.imag
+        return cosine * x + sine * y, cosine * y - sine * x
+
+    def beyond_field(self, site: np.ndarray, artifact: Artifact) -> np.ndarray:
+        """Return which sites (2, ...) lie beyond the nodes of the map, bool (...)."""
+        reach_x, reach_y = (half / artifact.grid_pitch_m + EDGE for half in artifact.field_half_m)
+        x, y = np.abs(site)
+        return (x > reach_x) | (y > reach_y)
+
+    def mark_rows(self, artifact: Artifact) -> tuple[np.ndarray, np.ndarray]:
+        """Return the first n in the field for each m, and the number of marks, int arrays (nx,).
+
+        The field is convex: the marks of a row in it follow each other.
         """
-        if self.turn_lines is None:
-            raise ValueError("the turn is counted in lines only on a plate with angular lines")
-        return self.turn_lines
+        return _placed_rows(self, artifact)
 
-    def site_of(self, m: np.ndarray, n: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the site (i, j) of mark (m, n): R^q (m, n) + (a, b).
 
-        Raises
-        ------
-        ValueError
-            If the turn is not a whole quarter.
-        """
-        x, y = ((m, n), (-n, m), (-m, -n), (n, -m))[self.q]
-        return x + self.a, y + self.b
-
-    def marks_in_field(self, artifact: Artifact) -> tuple[np.ndarray, np.ndarray]:
-        """Return the marks inside the field of the stage and their sites, int arrays (2, V)."""
-        marks = np.stack([artifact.m.ravel(), artifact.n.ravel()])
-        sites = np.stack(self.site_of(*marks))
-        inside = (np.abs(sites) <= np.array(artifact.half)[:, None]).all(axis=0)
-        return marks[:, inside], sites[:, inside]
-
-    def n_in_field(self, artifact: Artifact) -> int:
-        """Return the number of marks inside the field of the stage."""
-        plate = artifact.half[::-1] if self.q % 2 else artifact.half
-        return math.prod(max(0, min(h, s + p) - max(-h, s - p) + 1) for h, s, p in zip(
-            artifact.half, self.shift, plate, strict=True))
+@lru_cache(64)
+def _placed_rows(pose: PlacedPose, artifact: Artifact) -> tuple[np.ndarray, np.ndarray]:
+    inside = ~pose.beyond_field(np.stack(pose.site_of(artifact.m, artifact.n)), artifact)
+    return inside.argmax(axis=1) - artifact.half[1], inside.sum(axis=1)
 
 
 @dataclass(frozen=True)
@@ -131,33 +235,14 @@ class Pose:
         return (np.abs(places.real) <= hx + rounding) & (np.abs(places.imag) <= hy + rounding)
 
 
-@dataclass(frozen=True)
-class PlacedPose:
-    """The pose of a view, with the plate and the map's grid that it belongs to.
-
-    Attributes
-    ----------
-    artifact : Artifact
-        The plate, with `map_grid`.
-    pose : Pose
-        Where it lies.
-    turn_lines : int or None
-        Its turn in angular lines; None where it is not a whole number of them.
-    """
-
-    artifact: Artifact
-    pose: Pose
-    turn_lines: int | None
-
-    @property
-    def phase(self) -> complex:
-        """exp(i turn): the factor from the plate frame to the stage frame."""
-        return self.pose.phase
-
-    @cached_property
-    def places_m(self) -> np.ndarray:
-        """Nominal places of the marks, complex (nx, ny), m."""
-        return self.pose.places(self.artifact, self.artifact.m, self.artifact.n)
+def nearest_step(value: float) -> int | None:
+    """Return the whole number that a value is meant to be; None if it is not near one."""
+    return round(value) if abs(value - round(value)) <= LATTICE_TOLERANCE else None
 
 
-AnyPose = LatticePose | PlacedPose
+def whole_steps(value: float, where: str, unit: str, remedy: str) -> int:
+    """Return the whole number that a value is meant to be; InputError if it is not near one."""
+    whole = nearest_step(value)
+    if whole is None:
+        raise InputError(where, f"{value:.6g} is not a whole number of {unit} steps", remedy)
+    return whole

@@ -4,17 +4,22 @@
 import math
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from typing import Any
 
 from selfcal_ros.errors import InputError, known_are
-from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.artifact import Artifact, Interpolation, MapGrid, default_map_grid
 from selfcal_ros.model.orders import parse_order
-from selfcal_ros.model.pose import AnyPose, LatticePose, PlacedPose, Pose
+from selfcal_ros.model.pose import (
+    OFF,
+    LatticePose,
+    PlacedPose,
+    Pose,
+    StagePose,
+    nearest_step,
+    whole_steps,
+)
 from selfcal_ros.model.terms import TermName, parse_terms
-
-LATTICE_TOLERANCE = 1e-3
-"""Largest distance of a commanded pose from the lattice, in pitches or lines."""
+from selfcal_ros.units import MM_PER_M
 
 MAX_VIEWS = 1000
 """Largest number of views of a plan."""
@@ -77,7 +82,7 @@ class View:
         if self.check_offset_m > most:
             raise InputError(where, f"{self.check_offset_m:g} m is more than a quarter of the "
                              "pitch", f"stop at most {most:g} m off the mark; 20e-6 is usual")
-        there = self.lattice_pose(artifact).n_in_field(artifact) if self.grid else 0
+        there = self.on_stage(artifact).n_in_field(artifact) if self.grid else 0
         if self.check_marks > there:
             raise InputError(where, f"{self.check_marks} marks are wanted, {there} lie in the "
                              "field", "ask for fewer marks")
@@ -87,18 +92,20 @@ class View:
         """Nominal pose of the plate, on the lattice or off it."""
         return Pose(self.rotation_rad, self.translation_m)
 
-    def turn_lines(self, artifact: Artifact) -> int | None:
-        """Return the turn in angular lines; None on a plate without lines.
+    def on_stage(self, artifact: Artifact) -> StagePose:
+        """Return the pose in pitches; on the lattice unless the map has nodes of its own.
 
         Raises
         ------
         InputError
-            If the turn is not a whole number of lines.
+            As `lattice_pose`; if the map has nodes of its own, only if the pose is not finite, is
+            beyond every field, or has lines to be measured and is no whole number of them.
         """
-        if not artifact.angular_count:
-            return None
-        turn = self.rotation_rad * artifact.angular_count / (2 * math.pi)
-        return _whole(turn, f"view '{self.name}' rotation", "angular line") % artifact.angular_count
+        if artifact.map_grid is None:
+            return self.lattice_pose(artifact)
+        shift = self._pitches(artifact)
+        lines = self._lines(artifact) if self.angular and artifact.angular_count else None
+        return PlacedPose(self.pose.phase, shift, lines)
 
     def lattice_pose(self, artifact: Artifact) -> LatticePose:
         """Return the pose in whole steps of the artifact's lattice.
@@ -110,47 +117,44 @@ class View:
             not a whole quarter.
         """
         where = f"view '{self.name}'"
-        steps = [value / artifact.grid_pitch_m for value in self.translation_m]
-        shift = [_whole(step, f"{where} translation", "pitch") for step in steps]
-        if max(abs(step) for step in shift) > MAX_SHIFT:
-            raise InputError(f"{where} translation", f"{max(shift, key=abs)} pitches are beyond "
-                             "every field", "is it in mm? give the translation in metres")
-        if not math.isfinite(self.rotation_rad):
-            raise InputError(f"{where} rotation", f"{self.rotation_rad} is not an angle",
-                             "give a finite turn")
-        turns = self.rotation_rad / (math.pi / 2)
-        quarter = round(turns) % 4 if abs(turns - round(turns)) <= LATTICE_TOLERANCE else None
+        a, b = (whole_steps(step, f"{where} translation", "pitch", f"place the plate on the {OFF}")
+                for step in self._pitches(artifact))
+        quarter = nearest_step(self.rotation_rad / (math.pi / 2))
         if self.grid and quarter is None:
             raise InputError(where, f"grid marks cannot be measured at a turn of "
                              f"{math.degrees(self.rotation_rad):.6g} deg",
-                             "turn by a multiple of 90 deg or set grid to false")
-        lines = self.turn_lines(artifact)
+                             f"turn by 90 deg, set grid to false, or place it on the {OFF}")
+        lines = self._lines(artifact) if artifact.angular_count else None
         if lines is None and quarter is None:
             raise InputError(where, "a turn that is not a quarter needs angular lines",
                              "turn by a multiple of 90 deg")
-        return LatticePose(quarter, (shift[0], shift[1]), lines)
+        return LatticePose(None if quarter is None else quarter % 4, (a, b), lines)
 
+    def is_on_lattice(self, artifact: Artifact) -> bool:
+        """Return whether the grid marks, if any are wanted, lie on the artifact's lattice."""
+        steps = (*self._pitches(artifact), self.rotation_rad / (math.pi / 2))
+        return not self.grid or all(nearest_step(step) is not None for step in steps)
 
-def _whole(value: float, where: str, unit: str) -> int:
-    if not math.isfinite(value) or abs(value - round(value)) > LATTICE_TOLERANCE:
-        raise InputError(where, f"{value:.6g} is not a whole number of {unit} steps",
-                         "place the plate on the lattice")
-    return round(value)
+    def _pitches(self, artifact: Artifact) -> tuple[float, float]:
+        """Return the translation in pitches; InputError unless the pose is finite."""
+        where = f"view '{self.name}'"
+        if not all(map(math.isfinite, self.translation_m)):
+            raise InputError(f"{where} translation", f"{self.translation_m} are not two lengths",
+                             "give a finite translation")
+        if not math.isfinite(self.rotation_rad):
+            raise InputError(f"{where} rotation", f"{self.rotation_rad} is not an angle",
+                             "give a finite turn")
+        a, b = (value / artifact.grid_pitch_m for value in self.translation_m)
+        if max(abs(a), abs(b)) > MAX_SHIFT + 0.5:
+            raise InputError(f"{where} translation", f"{max(a, b, key=abs):.6g} pitches are beyond "
+                             "every field", "is it in mm? give the translation in metres")
+        return a, b
 
-
-@lru_cache(maxsize=1024)
-def pose_of(view: View, artifact: Artifact) -> AnyPose:
-    """Return the pose of a view on the lattice, or anywhere if the map has its own grid.
-
-    Raises
-    ------
-    InputError
-        As `View.lattice_pose` and `View.turn_lines`.
-    """
-    if artifact.map_grid is None:
-        return view.lattice_pose(artifact)
-    lines = view.turn_lines(artifact) if view.angular and artifact.angular_count else None
-    return PlacedPose(artifact, view.pose, lines)
+    def _lines(self, artifact: Artifact) -> int:
+        """Return the turn in angular lines, 0..K-1."""
+        turn = self.rotation_rad * artifact.angular_count / (2 * math.pi)
+        return whole_steps(turn, f"view '{self.name}' rotation", "angular line",
+                           "turn by whole lines, or set angular to false") % artifact.angular_count
 
 
 @dataclass(frozen=True)
@@ -189,7 +193,10 @@ def plan_from_dict(data: object, where: str) -> Plan:
     data : object
         Parsed YAML: ``plan_id``, ``artifact {grid_size, grid_pitch, angular_count}`` (m),
         ``views [{name, rotation_deg, translation_pitch, grid, angular, repeats, visit_order}]``,
-        ``visit_order``, for views without their own, ``model_terms``,
+        with ``translation_mm`` instead of ``translation_pitch``,
+        ``visit_order``, for views without their own, ``map {grid_size, grid_pitch,
+        interpolation, grid_size_y}``, the nodes of the map where they are not the plate's sites
+        (default for views off the lattice: `default_map_grid`), ``model_terms``,
         a list of ``TERM`` or ``TERM:SIZE``, ``check_stops {marks, offset}`` (m) of all views
         with grid marks, and ``microscope {scale_u, rotation_u, shear_u}``, standard uncertainties
         of the microscope.
@@ -199,12 +206,12 @@ def plan_from_dict(data: object, where: str) -> Plan:
     Raises
     ------
     InputError
-        For a missing or unknown key, a wrong type, an unknown visiting order or term, or a pose
-        off the lattice.
+        For a missing or unknown key, a wrong type, an unknown visiting order or term, or an
+        impossible pose.
     """
     fields = _fields(data, where, {"plan_id": str, "artifact": dict, "views": list},
                      {"visit_order": (str, ""), "model_terms": (list, []),
-                      "check_stops": (dict, {}), "microscope": (dict, {})})
+                      "check_stops": (dict, {}), "microscope": (dict, {}), "map": (dict, {})})
     raw = _fields(fields["artifact"], f"{where}: artifact",
                   {"grid_size": int, "grid_pitch": float, "angular_count": int},
                   {"grid_size_y": (int, 0)})
@@ -215,9 +222,13 @@ def plan_from_dict(data: object, where: str) -> Plan:
         raise InputError(f"{where}: views", f"{len(fields['views'])} views are more than "
                          f"{MAX_VIEWS}", "measure fewer views")
     checks = _checks(fields["check_stops"], f"{where}: check_stops")
-    views = tuple(_with_checks(_view_from_dict(view, f"{where}: views[{index}]", artifact, order),
-                               *checks, artifact, where)
+    views = tuple(_view_from_dict(view, f"{where}: views[{index}]", artifact, order)
                   for index, view in enumerate(fields["views"]))
+    grid = _map_grid(fields["map"], artifact, f"{where}: map")
+    if grid is None and not all(view.is_on_lattice(artifact) for view in views):
+        grid = default_map_grid(artifact)
+    artifact = replace(artifact, map_grid=grid)
+    views = tuple(_with_checks(view, *checks, artifact, where) for view in views)
     if not views:
         raise InputError(where, "the plan has no views", "add at least one view")
     names: set[str] = set()
@@ -229,6 +240,22 @@ def plan_from_dict(data: object, where: str) -> Plan:
     terms = _terms(fields["model_terms"], where)
     return Plan(fields["plan_id"], artifact, views, _with_microscope(
         terms, fields["microscope"], f"{where}: microscope"))
+
+
+def _map_grid(data: dict, artifact: Artifact, where: str) -> MapGrid | None:
+    """Return the nodes of the map; None if the plan does not give them."""
+    if not data:
+        return None
+    raw = _fields(data, where, {"grid_size": int}, {
+        "grid_pitch": (float, 0.0), "interpolation": (str, str(Interpolation.BICUBIC)),
+        "grid_size_y": (int, 0)})
+    if raw["interpolation"] not in list(Interpolation):
+        raise InputError(f"{where}: interpolation", f"'{raw['interpolation']}' is not known",
+                         f"use one of {', '.join(Interpolation)}")
+    sizes = raw["grid_size"], raw["grid_size_y"] or raw["grid_size"]
+    spans = max(half / max(size // 2, 1) for half, size in zip(artifact.half, sizes, strict=True))
+    return MapGrid(sizes[0], raw["grid_pitch"] or spans * artifact.grid_pitch_m,
+                   Interpolation(raw["interpolation"]), raw["grid_size_y"])
 
 
 def _with_microscope(terms: tuple[str, ...], raw: dict, where: str) -> tuple[str, ...]:
@@ -263,7 +290,8 @@ def _checks(data: dict, where: str) -> tuple[int, float]:
 
 
 def _with_checks(view: View, marks: int, offset_m: float, artifact: Artifact, where: str) -> View:
-    """Return the view with check stops if it has grid marks."""
+    """Return the view with check stops if it has grid marks; InputError for an impossible pose."""
+    view.on_stage(artifact)
     if not view.grid:
         return view
     checked = replace(view, check_marks=marks, check_offset_m=offset_m)
@@ -280,33 +308,46 @@ def _order(text: str, where: str) -> str:
 
 def _view_from_dict(data: object, where: str, artifact: Artifact, order: str) -> View:
     raw = _fields(data, where, {"name": str},
-                  {"rotation_deg": (float, 0.0), "translation_pitch": (list, [0, 0]),
-                   "grid": (bool, True), "angular": (bool, artifact.angular_count > 0),
+                  {"rotation_deg": (float, 0.0), "translation_pitch": (list, None),
+                   "translation_mm": (list, None), "grid": (bool, True), "angular": (bool, None),
                    "repeats": (int, 1), "visit_order": (str, order)})
-    shift = raw["translation_pitch"]
-    if len(shift) != 2 or not all(isinstance(s, int | float) for s in shift):
-        raise InputError(f"{where}: translation_pitch", "not two numbers", "give [a, b]")
+    a, b = _translation_m(raw, where, artifact)
     if raw["repeats"] < 1:
         raise InputError(f"{where}: repeats", f"{raw['repeats']} is not positive", "give 1 or more")
     if raw["angular"] and not artifact.angular_count:
         raise InputError(where, "angular marks are wanted but the plate has none",
                          "set angular to false")
+    turn = math.radians(raw["rotation_deg"])
+    if raw["angular"] is None:  # between two lines only grid marks can be read
+        lines = turn * artifact.angular_count / (2 * math.pi)
+        raw["angular"] = artifact.angular_count > 0 and (
+            not raw["grid"] or not math.isfinite(lines) or nearest_step(lines) is not None)
     if not (raw["grid"] or raw["angular"]):
         raise InputError(where, "neither grid nor angular marks are wanted", "set one to true")
-    view = View(raw["name"], math.radians(raw["rotation_deg"]),
-                (shift[0] * artifact.grid_pitch_m, shift[1] * artifact.grid_pitch_m),
-                raw["grid"], raw["angular"], raw["repeats"], _order(raw["visit_order"], where))
-    view.lattice_pose(artifact)
-    return view
+    return View(raw["name"], turn, (a, b), raw["grid"], raw["angular"], raw["repeats"],
+                _order(raw["visit_order"], where))
+
+
+def _translation_m(raw: dict, where: str, artifact: Artifact) -> tuple[float, float]:
+    """Return the translation of a view in PLAN.yaml, m; (0, 0) if it has none."""
+    given = [key for key in ("translation_pitch", "translation_mm") if raw[key] is not None]
+    if len(given) > 1:
+        raise InputError(where, f"{' and '.join(given)} are given", "leave one of them out")
+    shift = raw[given[0]] if given else [0, 0]
+    if len(shift) != 2 or not all(isinstance(s, int | float) for s in shift):
+        raise InputError(f"{where}: {given[0]}", "not two numbers", "give [a, b]")
+    if given == ["translation_mm"]:
+        return shift[0] / MM_PER_M, shift[1] / MM_PER_M
+    return shift[0] * artifact.grid_pitch_m, shift[1] * artifact.grid_pitch_m
 
 
 def view_to_dict(view: View, artifact: Artifact) -> dict[str, Any]:
     """Return a view in the format of PLAN.yaml."""
-    a, b = view.lattice_pose(artifact).shift
+    shift = view.on_stage(artifact).shift
     order = {"visit_order": view.visit_order} if view.visit_order else {}
     return {"name": view.name, "rotation_deg": round(math.degrees(view.rotation_rad), 9),
-            "translation_pitch": [a, b], "grid": view.grid, "angular": view.angular,
-            "repeats": view.repeats, **order}
+            "translation_pitch": [round(step, 9) for step in shift], "grid": view.grid,
+            "angular": view.angular, "repeats": view.repeats, **order}
 
 
 def plan_to_dict(plan: Plan) -> dict[str, Any]:
@@ -316,8 +357,12 @@ def plan_to_dict(plan: Plan) -> dict[str, Any]:
              "angular_count": artifact.angular_count}
     if artifact.grid_size_y:
         plate["grid_size_y"] = artifact.grid_size_y
+    grid = artifact.map_grid
+    nodes = {} if grid is None else {"map": {
+        "grid_size": grid.size, "grid_pitch": grid.pitch_m,
+        "interpolation": str(grid.interpolation), "grid_size_y": grid.size_y}}
     marks, offset_m = plan.check_stops
-    return {"plan_id": plan.plan_id, "artifact": plate,
+    return {"plan_id": plan.plan_id, "artifact": plate, **nodes,
             "views": [view_to_dict(view, artifact) for view in plan.views],
             **({"check_stops": {"marks": marks, "offset": offset_m}} if marks else {}),
             **({"model_terms": list(plan.model_terms)} if plan.model_terms else {})}

@@ -2,9 +2,12 @@
 """Poses off the lattice, and the grid of the map that they need."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.artifact import Artifact, Interpolation, MapGrid, default_map_grid
@@ -65,3 +68,49 @@ def test_maps_of_even_size_are_refused() -> None:
     """The map needs a node at the centre, as the plate a mark."""
     with pytest.raises(InputError, match="odd number"):
         Artifact(11, 10e-3, map_grid=MapGrid(6, 10e-3))
+
+
+TURNS = st.sampled_from([0.0, 37.0, 45.0, 90.0, -90.0, 180.0, 211.0, 1e-4])
+
+
+@given(st.integers(1, 4), st.integers(1, 4), TURNS, st.floats(-6, 6), st.floats(-6, 6),
+       st.sampled_from([3, 5, 9]))
+def test_marks_in_the_field_of_a_map_are_counted_by_rows(hx, hy, turn, a, b, nodes):
+    """The same marks as in `Pose.in_field`, row by row."""
+    plate = Artifact(2 * hx + 1, 0.01, 0, 2 * hy + 1, MapGrid(nodes, 0.012))
+    view = View("v", math.radians(turn), (a * 0.01, b * 0.01))
+    inside, pose = view.pose.in_field(plate), view.on_stage(plate)
+    first, count = pose.mark_rows(plate)
+    rows = (plate.n >= first[:, None]) & (plate.n < (first + count)[:, None])
+    np.testing.assert_array_equal(rows, inside)
+    assert pose.n_in_field(plate) == inside.sum()
+    marks, sites = pose.marks_in_field(plate)
+    np.testing.assert_array_equal(marks, [plate.m[inside], plate.n[inside]])
+    places = view.pose.places(plate, *marks) / 0.01
+    np.testing.assert_allclose(sites, [places.real, places.imag], rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("degrees", [0, 90, 180, 270, 37])
+def test_turning_back_undoes_a_turn(degrees):
+    """And a turn goes counter-clockwise."""
+    for plate in (PLATE, replace(PLATE, map_grid=MapGrid(7, 0.01))):
+        if degrees % 90 and plate is PLATE:
+            continue
+        pose = View("v", math.radians(degrees)).on_stage(plate)
+        turned = np.array(pose.turned(np.array(2.0), np.array(-3.0)))
+        want = (2 - 3j) * np.exp(1j * math.radians(degrees))
+        np.testing.assert_allclose(turned, [want.real, want.imag], atol=1e-12)
+        np.testing.assert_allclose(pose.turned_back(*turned), [2, -3], atol=1e-12)
+
+
+@pytest.mark.parametrize(("view", "message"), [
+    (View("v", math.nan), "view 'v' rotation: nan is not an angle; give a finite turn"),
+    (View("v", 0.0, (math.inf, 0.0)), "view 'v' translation: (inf, 0.0) are not two lengths; give"),
+    (View("v", 0.0, (0.0, -2e3)), "view 'v' translation: -200000 pitches are beyond every field"),
+    (View("v", 0.1), "view 'v' rotation: 0.381972 is not a whole number of angular line steps")])
+def test_poses_that_no_map_allows(view, message):
+    """Not finite, far beyond every field, or between two lines that are to be read."""
+    plate = Artifact(11, 0.01, 24, map_grid=MapGrid(7, 0.01))
+    with pytest.raises(InputError) as caught:
+        view.on_stage(plate)
+    assert str(caught.value).startswith(message)

@@ -2,13 +2,14 @@
 """Plates, views and plans: poses in whole steps, and what a PLAN.yaml may say."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from selfcal_ros.errors import InputError
-from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.model.view import View, plan_from_dict
+from selfcal_ros.model.artifact import Artifact, Interpolation, MapGrid, default_map_grid
+from selfcal_ros.model.view import View, plan_from_dict, plan_to_dict
 
 PLATE = Artifact(11, 0.01, 24)
 PLAN = {"plan_id": "p", "artifact": {"grid_size": 11, "grid_pitch": 0.01, "angular_count": 24},
@@ -53,12 +54,12 @@ def test_marks_have_no_sites_between_quarter_turns():
 @pytest.mark.parametrize(("view", "plate", "message"), [
     (View("v", 0.0, (0.005, 0.0)), PLATE,
      "view 'v' translation: 0.5 is not a whole number of pitch steps; place the plate on the"),
-    (View("v", 0.0, (math.nan, 0.0)), PLATE, "view 'v' translation: nan is not a whole number"),
-    (View("v", 0.0, (0.0, math.inf)), PLATE, "view 'v' translation: inf is not a whole number"),
+    (View("v", 0.0, (math.nan, 0.0)), PLATE, "view 'v' translation: (nan, 0.0) are not two length"),
+    (View("v", 0.0, (0.0, math.inf)), PLATE, "view 'v' translation: (0.0, inf) are not two length"),
     (View("v", math.nan), PLATE, "view 'v' rotation: nan is not an angle; give a finite turn"),
     (View("v", -math.inf), PLATE, "view 'v' rotation: -inf is not an angle; give a finite turn"),
     (View("v", math.radians(15)), PLATE,
-     "view 'v': grid marks cannot be measured at a turn of 15 deg; turn by a multiple of 90 deg"),
+     "view 'v': grid marks cannot be measured at a turn of 15 deg; turn by 90 deg, set grid to"),
     (View("v", math.radians(7), grid=False), PLATE,
      "view 'v' rotation: 0.466667 is not a whole number of angular line steps"),
     (View("v", math.radians(15), grid=False), Artifact(11, 0.01),
@@ -137,10 +138,25 @@ def test_a_plan_with_its_defaults_and_with_all_its_keys():
     (plan_with({"rotation_deg": "90"}), "f: views[0]: rotation_deg: '90' is not of type float"),
     (plan_with({"rotation_deg": math.nan}), "view 'a' rotation: nan is not an angle"),
     (plan_with({"rotation_deg": math.inf}), "view 'a' rotation: inf is not an angle"),
-    (plan_with({"rotation_deg": 1}), "view 'a': grid marks cannot be measured at a turn of 1 deg"),
+    (plan_with({"rotation_deg": 1, "angular": True}), "view 'a' rotation: 0.0666667 is not a whole "
+     "number of angular line steps; turn by whole lines, or set angular to false"),
+    (plan_with({"rotation_deg": 1, "grid": False}), "view 'a' rotation: 0.0666667 is not a whole "),
     (plan_with({"translation_pitch": [1]}), "f: views[0]: translation_pitch: not two numbers; "),
     (plan_with({"translation_pitch": ["1", 0]}), "f: views[0]: translation_pitch: not two number"),
-    (plan_with({"translation_pitch": [0.5, 0]}), "view 'a' translation: 0.5 is not a whole number"),
+    (plan_with({"translation_pitch": [0.5, 0], "grid": False}),
+     "view 'a' translation: 0.5 is not a whole number of pitch steps; place the plate on the latt"),
+    (plan_with({"translation_pitch": [2e5, 0]}), "view 'a' translation: 200000 pitches are beyond"),
+    (plan_with({"translation_mm": [-2e9, 0.5]}), "view 'a' translation: -2e+08 pitches are beyond"),
+    (plan_with({"translation_mm": [1, math.nan]}), "view 'a' translation: (0.001, nan) are not tw"),
+    (plan_with({"translation_mm": [1]}), "f: views[0]: translation_mm: not two numbers; give"),
+    (plan_with({"translation_mm": [1, 0], "translation_pitch": [1, 0]}),
+     "f: views[0]: translation_pitch and translation_mm are given; leave one of them out"),
+    (plan_with(map={"grid_size": 6}), "map grid_size: 6 is not an odd number from 3 to 1001; give"),
+    (plan_with(map={"grid_size": 7, "grid_size_y": 4}), "map grid_size_y: 4 is not an odd number"),
+    (plan_with(map={"grid_size": 7, "grid_pitch": -0.1}), "map grid_pitch: -0.1 m is not a length"),
+    (plan_with(map={"grid_pitch": 0.01}), "f: map: the key 'grid_size' is missing; add it"),
+    (plan_with(map={"grid_size": 7, "interpolation": "cubic"}),
+     "f: map: interpolation: 'cubic' is not known; use one of bilinear, bicubic"),
     (plan_with({"repeats": 0}), "f: views[0]: repeats: 0 is not positive; give 1 or more"),
     (plan_with(visit_order="spiral"), "f: visit_order: 'spiral' is not a visiting order; use "),
     (plan_with(visit_order=1), "f: visit_order: 1 is not of type str"),
@@ -154,6 +170,40 @@ def test_plans_that_are_refused(data, message):
     with pytest.raises(InputError) as caught:
         plan_from_dict(data, "f")
     assert str(caught.value).startswith(message)
+
+
+def test_views_off_the_lattice_get_a_map_of_their_own():
+    """Lines are read where a line lies on a line; a plan on the lattice stays as it is."""
+    plan = plan_from_dict(plan_with(views=[
+        {"name": "a"}, {"name": "b", "rotation_deg": 37, "translation_mm": [13, -7]},
+        {"name": "c", "translation_pitch": [1.3, -0.7]}, {"name": "d", "rotation_deg": 30}]), "f")
+    assert plan.artifact == replace(PLATE, map_grid=default_map_grid(PLATE))
+    assert [view.angular for view in plan.views] == [True, False, True, True]
+    assert plan.views[1].translation_m == (0.013, -0.007)
+    pose = plan.views[2].on_stage(plan.artifact)
+    assert pose.shift == pytest.approx((1.3, -0.7), abs=1e-12) and pose.s == 0
+    assert plan.views[3].on_stage(plan.artifact).s == 2
+    assert plan_from_dict(plan_with({"translation_mm": [-20, 30]}), "f") == plan_from_dict(
+        plan_with({"translation_pitch": [-2, 3]}), "f")
+
+
+@pytest.mark.parametrize(("grid", "want"), [
+    ({"grid_size": 7}, MapGrid(7, 0.1 / 6)),
+    ({"grid_size": 5, "grid_pitch": 0.02}, MapGrid(5, 0.02)),
+    ({"grid_size": 7, "grid_size_y": 5, "interpolation": "bilinear"},
+     MapGrid(7, 0.025, Interpolation.BILINEAR, 5))])
+def test_the_nodes_of_a_map_span_the_plate_unless_their_pitch_is_given(grid, want):
+    """Also of a plan on the lattice."""
+    assert plan_from_dict(plan_with(map=grid), "f").artifact.map_grid == want
+
+
+def test_a_plan_off_the_lattice_is_written_as_it_is_read():
+    plan = plan_from_dict(plan_with(views=[
+        {"name": "a"}, {"name": "b", "rotation_deg": -37.25, "translation_pitch": [1.3, -0.7],
+                        "repeats": 3}], map={"grid_size": 7, "interpolation": "bilinear"}), "f")
+    written = plan_to_dict(plan)
+    assert written["views"][1]["translation_pitch"] == [1.3, -0.7]
+    assert plan_from_dict(written, "f") == plan
 
 
 def test_check_stops_hold_for_all_views_with_grid_marks():

@@ -18,7 +18,6 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.pose import LatticePose
 from selfcal_ros.model.readings import Measurements, ViewReadings
-from selfcal_ros.model.view import pose_of
 
 QUARTERS = np.array([1, 1j, -1, -1j])
 WINDOW = 3
@@ -122,7 +121,7 @@ def other_poses(pose: LatticePose) -> Iterator[LatticePose]:
 
 def _seen(artifact: Artifact, view: ViewReadings) -> _Seen | None:
     """Return the readings of a view in the window; None if too few, or without a grid."""
-    pose = pose_of(view.view, artifact)
+    pose = view.view.on_stage(artifact)
     if not isinstance(pose, LatticePose) or pose.quarter_turns is None or not len(view.m):
         return None
     i, j = pose.site_of(view.m, view.n)

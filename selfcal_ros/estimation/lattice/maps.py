@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from selfcal_ros.estimation.lattice.poses import AnyPose, MapPose, pose_of
 from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.model.pose import AnyPose, LatticePose, PlacedPose
+from selfcal_ros.model.pose import LatticePose
 from selfcal_ros.model.readings import ViewReadings
 from selfcal_ros.model.result import ArtifactMap
-from selfcal_ros.model.view import pose_of
 
 if TYPE_CHECKING:
     from selfcal_ros.estimation.lattice.placed import PlacedViews  # splines
@@ -237,19 +237,12 @@ def rigid_parameters(views: LatticeViews) -> np.ndarray:
 
 def maps_of(shape: tuple[int, int], poses: tuple[AnyPose, ...]) -> "LatticeViews | PlacedViews":
     """Return the maps of views of a plate with `shape` marks."""
-    placed = tuple(pose for pose in poses if isinstance(pose, PlacedPose))
+    placed = tuple(pose for pose in poses if isinstance(pose, MapPose))
     if placed:
         from selfcal_ros.estimation.lattice.placed import PlacedViews  # splines
 
         return PlacedViews(placed)
     return LatticeViews(shape, tuple(pose for pose in poses if isinstance(pose, LatticePose)))
-
-
-def in_field(pose: AnyPose, artifact: Artifact) -> np.ndarray:
-    """Return the marks of a view that lie in the field, bool (nx, ny)."""
-    if isinstance(pose, PlacedPose):
-        return pose.pose.in_field(artifact)
-    return LatticeViews(artifact.shape, (pose,)).in_field[0]
 
 
 def turned_marks(view: ViewReadings, artifact: Artifact) -> np.ndarray:

@@ -13,9 +13,10 @@ from functools import cached_property
 import numpy as np
 from scipy.sparse import csr_matrix
 
+from selfcal_ros.estimation.lattice.poses import MapPose
 from selfcal_ros.estimation.lattice.splines import MapSpline
 from selfcal_ros.model.artifact import Interpolation
-from selfcal_ros.model.pose import EDGE, PlacedPose
+from selfcal_ros.model.pose import EDGE
 
 
 class PlacedViews:
@@ -23,11 +24,11 @@ class PlacedViews:
 
     Parameters
     ----------
-    poses : tuple of PlacedPose
+    poses : tuple of MapPose
         One per view, all of one plate.
     """
 
-    def __init__(self, poses: tuple[PlacedPose, ...]) -> None:
+    def __init__(self, poses: tuple[MapPose, ...]) -> None:
         artifact = poses[0].artifact
         field, grid = artifact.field, artifact.map_grid
         self.poses, self.artifact = poses, artifact
@@ -44,8 +45,7 @@ class PlacedViews:
     @cached_property
     def shifts(self) -> np.ndarray:
         """Position of the plate's centre in every view, in pitches, complex (views,)."""
-        return np.array([complex(*pose.pose.shift_m) for pose in self.poses]) / (
-            self.artifact.grid_pitch_m)
+        return np.array([complex(*pose.pose.shift) for pose in self.poses])
 
     @cached_property
     def z(self) -> np.ndarray:
@@ -61,14 +61,14 @@ class PlacedViews:
     @cached_property
     def in_field(self) -> np.ndarray:
         """Marks inside the field, bool (views, nx, ny)."""
-        return np.array([pose.pose.in_field(self.artifact) for pose in self.poses])
+        return np.array([pose.in_field for pose in self.poses])
 
     @cached_property
     def rows(self) -> tuple[csr_matrix, ...]:
         """Rows of each view's marks on the spline's coefficients, real (marks, nodes); 0 off it."""
-        return tuple(self.spline.rows(pose.places_m.ravel()).multiply(
-            inside.reshape(-1, 1)).tocsr() for pose, inside in zip(
-                self.poses, self.in_field, strict=True))
+        pitch_m = self.artifact.grid_pitch_m
+        return tuple(self.spline.rows((x + 1j * y).ravel() * pitch_m).multiply(
+            pose.in_field.reshape(-1, 1)).tocsr() for pose in self.poses for x, y in [pose.sites])
 
     def gather(self, field: np.ndarray) -> np.ndarray:
         """Return e^(-i alpha) G(X_v(m)), complex (..., views, nx, ny); 0 off the field."""
@@ -92,8 +92,9 @@ class PlacedViews:
     @cached_property
     def _at(self) -> tuple[np.ndarray, np.ndarray]:
         """Places of the marks in the pitch of the map from its first node, (views, nx, ny) each."""
-        at = np.array([pose.places_m for pose in self.poses]) / self.artifact.field.grid_pitch_m
-        return at.real + self.half[0], at.imag + self.half[1]
+        step = self.artifact.grid_pitch_m / self.artifact.field.grid_pitch_m
+        x, y = np.array([pose.sites for pose in self.poses]).swapaxes(0, 1) * step
+        return x + self.half[0], y + self.half[1]
 
     @cached_property
     def site_index(self) -> np.ndarray:

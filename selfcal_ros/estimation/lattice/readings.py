@@ -6,11 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from selfcal_ros.errors import InputError
-from selfcal_ros.estimation.lattice.maps import in_field
+from selfcal_ros.estimation.lattice.poses import AnyPose, in_field, pose_of
 from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.model.pose import AnyPose, LatticePose
+from selfcal_ros.model.pose import LatticePose
 from selfcal_ros.model.readings import Measurements, ViewReadings
-from selfcal_ros.model.view import pose_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,7 +20,7 @@ class GridData:
     ----------
     index : tuple of int
         Position in `Measurements.views` of every grid view.
-    poses : tuple of LatticePose or PlacedPose
+    poses : tuple of LatticePose or MapPose
         Their poses.
     y : complex array (views, nx, ny)
         Deviations turned into the plate frame, m; 0 where not read.

@@ -17,9 +17,9 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.lattice.connectivity import Components
 from selfcal_ros.estimation.lattice.gauge import Gauge
 from selfcal_ros.estimation.lattice.placed import PlacedViews
+from selfcal_ros.estimation.lattice.poses import MapPose
 from selfcal_ros.estimation.normal.equations import NormalEquations
 from selfcal_ros.estimation.normal.grid import GridSystem
-from selfcal_ros.model.pose import PlacedPose
 
 KNOWN = 3.0
 """Largest standard uncertainty of a known node, in units of the noise of one reading."""
@@ -84,7 +84,7 @@ class PlacedSystem(GridSystem):
 
     Parameters
     ----------
-    poses : tuple of PlacedPose
+    poses : tuple of MapPose
         One per view.
     weight : float array (views, nx, ny)
         Weight of each reading; 0 = not read.
@@ -97,7 +97,7 @@ class PlacedSystem(GridSystem):
 
     views: PlacedViews  # type: ignore[assignment]
 
-    def __init__(self, poses: tuple[PlacedPose, ...], weight: np.ndarray) -> None:
+    def __init__(self, poses: tuple[MapPose, ...], weight: np.ndarray) -> None:
         super().__init__((), weight)
         self.views = PlacedViews(poses)
 

@@ -10,14 +10,14 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from selfcal_ros.estimation.lattice.maps import in_field
+from selfcal_ros.estimation.lattice.poses import AnyPose, MapPose, in_field, pose_of
 from selfcal_ros.estimation.lattice.readings import AngularData, GridData
 from selfcal_ros.estimation.normal.angular import AngularSystem
 from selfcal_ros.estimation.normal.equations import NormalEquations
 from selfcal_ros.estimation.normal.grid import GridSystem
 from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.model.pose import AnyPose, LatticePose, PlacedPose
-from selfcal_ros.model.view import View, pose_of
+from selfcal_ros.model.pose import LatticePose
+from selfcal_ros.model.view import View
 
 CACHED = 16
 CACHED_READINGS = 4_000_000
@@ -74,7 +74,7 @@ def system_of(grid: Marks[AnyPose], angular: Marks[int]) -> NormalEquations:
 def _equations(grid: Marks[AnyPose], angular: Marks[int], *,
                rank_only: bool = False) -> NormalEquations:
     lines = AngularSystem(angular.poses, angular.weight)
-    placed = tuple(pose for pose in grid.poses if isinstance(pose, PlacedPose))
+    placed = tuple(pose for pose in grid.poses if isinstance(pose, MapPose))
     if placed:
         from selfcal_ros.estimation.normal.placed import PlacedEquations, PlacedSystem  # splines
 

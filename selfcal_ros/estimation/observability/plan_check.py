@@ -198,7 +198,7 @@ def describe_view(view: View, artifact: Artifact) -> str:
     """Return a view in words: turn, shift in pitches, kind of marks, repeats."""
     turn = math.degrees(view.rotation_rad) % 360
     if not view.grid:
-        lines = view.turn_lines(artifact) or 0
+        lines = view.on_stage(artifact).turn_lines or 0
         what = (f"an angular view turned by {lines} line{'s' * (lines != 1)} "
                 f"({360 * lines / artifact.angular_count:g} deg)")
     elif 1e-6 < turn < 360 - 1e-6:

@@ -182,7 +182,7 @@ def advice_for(artifact: Artifact, views: Iterable[View]) -> tuple[str, ...]:
             for x, y in (pose.shift_m for pose in poses)}) < 2:
         advice.append("add a view shifted by one pitch along X")
     if any(view.angular for view in views) and artifact.angular_count:
-        turns = [v.turn_lines(artifact) or 0 for v in views if v.angular]
+        turns = [v.on_stage(artifact).turn_lines or 0 for v in views if v.angular]
         if _common_step([turn - turns[0] for turn in turns], artifact.angular_count) > 1:
             advice.append(f"add an angular view turned by one line "
                           f"({360 / artifact.angular_count:g} deg)")

@@ -27,6 +27,7 @@ from selfcal_ros.estimation.lattice.maps import (
     turned_marks,
     turned_plate,
 )
+from selfcal_ros.estimation.lattice.poses import pose_of
 from selfcal_ros.estimation.observability.plan_check import (
     candidate_views,
     smaller,
@@ -48,7 +49,7 @@ from selfcal_ros.model.readings import Measurements, Sense, ViewReadings, subset
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.statistics import rms
 from selfcal_ros.model.verdict import Finding, Grade
-from selfcal_ros.model.view import Plan, pose_of
+from selfcal_ros.model.view import Plan
 
 MAX_FOLDS = 10
 

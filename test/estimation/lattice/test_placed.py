@@ -7,9 +7,10 @@ import pytest
 from selfcal_ros.compensation.cells import bicubic_cells, bilinear_cells
 from selfcal_ros.estimation.lattice.maps import LatticeViews
 from selfcal_ros.estimation.lattice.placed import PlacedViews
+from selfcal_ros.estimation.lattice.poses import pose_of
 from selfcal_ros.estimation.lattice.splines import MapSpline
 from selfcal_ros.model.artifact import Artifact, Interpolation, MapGrid
-from selfcal_ros.model.view import View, pose_of
+from selfcal_ros.model.view import View
 from test.support.placed import SIX, plate
 
 CELLS = {"bilinear": bilinear_cells, "bicubic": bicubic_cells}
