@@ -14,7 +14,8 @@ PASSES = {"there_and_back": 2, "x_then_y": 2, "x_back_y_back": 4}
 """Number of passes after which an order repeats; default one."""
 PLATE_SUFFIX = "@plate"
 """Suffix for lines of the plate's marks: the same marks in the same order in every view. Without
-it lines are those of the stage's sites: the same sites in the same order in every view."""
+it lines are those of the stage's sites: the same sites in the same order in every view. Where the
+map has nodes of its own the lines are always the plate's."""
 DEFAULT_ORDER = "serpentine"
 """Order of a cell if none is specified."""
 

@@ -13,7 +13,7 @@ from selfcal_ros.model.artifact import Artifact
 
 LATTICE_TOLERANCE = 1e-3
 """Largest distance of a commanded pose from the lattice, in pitches or lines."""
-OFF = "lattice, or give the map nodes of its own (map_grid_size, map_grid_pitch)"
+OFF = "lattice, or give the map nodes of its own (map in PLAN.yaml, map_grid_size in a command)"
 """End of the remedy for poses off the lattice."""
 EDGE = 1e-9
 """Distance beyond the edge of the field that is rounding, in pitches."""

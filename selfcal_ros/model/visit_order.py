@@ -24,8 +24,8 @@ class VisitSequence:
     ----------
     m, n : int array (V,)
         The mark visited, plate frame.
-    i, j : int array (V,)
-        Its site, stage frame.
+    i, j : int or float array (V,)
+        Its site, stage frame, pitches.
     count : int array (V,)
         Exposures of the visit.
     pass_number : int array (V,)
@@ -75,7 +75,7 @@ def visit_sequence(artifact: Artifact, view: View, *, order: str = "", consecuti
     Raises
     ------
     InputError
-        For an unknown order, or a view off the lattice.
+        For an unknown order, or an impossible pose.
     ValueError
         For a random order without `rng`.
     """
@@ -83,9 +83,10 @@ def visit_sequence(artifact: Artifact, view: View, *, order: str = "", consecuti
     if not view.grid:
         m, n, i, j, count, index = np.zeros((6, 0), dtype=int)
         return VisitSequence(m, n, i, j, count, index, np.zeros(0), np.zeros((2, 0)))
-    marks, sites = view.lattice_pose(artifact).marks_in_field(artifact)
+    marks, sites = view.on_stage(artifact).marks_in_field(artifact)
     n_passes = 1 if consecutive else view.repeats
-    passes = _passes(chosen, marks if chosen.of_plate else sites, n_passes, rng)
+    of_plate = chosen.of_plate or artifact.map_grid is not None  # no lines of sites off the lattice
+    passes = _passes(chosen, marks if of_plate else sites, n_passes, rng)
     return _visits(marks, sites, passes, together=view.repeats if consecutive else 1, view=view)
 
 

@@ -45,6 +45,8 @@ def marks_below(truth: Truth, index: int, view: View, marks: tuple[np.ndarray, n
                 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the marks found where `marks` would be if the plate were placed as commanded.
 
+    If it is placed off its lattice, those are the nearest ones.
+
     Returns
     -------
     m, n : int arrays (V,)
@@ -53,9 +55,9 @@ def marks_below(truth: Truth, index: int, view: View, marks: tuple[np.ndarray, n
         Whether the plate has a mark there; `m` and `n` are 0 if not.
     """
     artifact = truth.artifact
-    lies = truth.placed_as(index, view).lattice_pose(artifact)
-    site = np.stack(view.lattice_pose(artifact).site_of(*marks))
-    m, n = rotate(-lies.q, site - np.array([[lies.a], [lies.b]]))
+    lies = truth.placed_as(index, view).on_stage(artifact)
+    x, y = view.on_stage(artifact).site_of(*marks)
+    m, n = np.rint(lies.turned_back(x - lies.shift[0], y - lies.shift[1])).astype(int)
     hx, hy = artifact.half
     there = (np.abs(m) <= hx) & (np.abs(n) <= hy)
     return m * there, n * there, there
@@ -65,9 +67,9 @@ def mark_places(truth: Truth, index: int, view: View,
                 marks: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """Return true and nominal positions of marks in the stage frame at the beginning of a view.
 
-    The plate is rotated about its centre, by the view's quarter turns, by its misalignment and by
-    its tilt, and its centre is placed at the view's translation plus the offset. If the
-    optical axis is not normal to the stage a mark appears shifted according to its height.
+    The plate is rotated about its centre, by the view's turn, by its misalignment and by its tilt,
+    and its centre is placed at the view's translation plus the offset. If the optical axis is not
+    normal to the stage a mark appears shifted according to its height.
 
     Returns
     -------
@@ -75,10 +77,10 @@ def mark_places(truth: Truth, index: int, view: View,
         True and nominal position, m.
     """
     m, n = marks
-    pose, pitch = view.lattice_pose(truth.artifact), truth.artifact.grid_pitch_m
+    pose, pitch = view.on_stage(truth.artifact), truth.artifact.grid_pitch_m
     site = np.stack(pose.site_of(m, n)) * pitch
-    arm = rotate(pose.q, np.stack([m, n]) * pitch)
-    error = rotate(pose.q, plate_displacement(truth, index, m, n))
+    arm = np.stack(pose.turned(*np.stack([m, n]) * pitch))
+    error = np.stack(pose.turned(*plate_displacement(truth, index, m, n)))
     phi = truth.phi_rad[index]
     if truth.linear:
         away = phi * rotate(1, arm) + error
@@ -205,9 +207,9 @@ def line_directions(truth: Truth, index: int, view: View,
     count = truth.artifact.angular_count
     if not count:
         return np.zeros(0), np.zeros(0), np.zeros(0, dtype=int)
-    turn = (np.arange(count) + view.lattice_pose(truth.artifact).s) % count
+    turn = (np.arange(count) + view.on_stage(truth.artifact).s) % count
     nominal = turn * (2 * np.pi / count)
-    lies = truth.placed_as(index, view).lattice_pose(truth.artifact).s
+    lies = truth.placed_as(index, view).on_stage(truth.artifact).s
     line = (turn - lies) % count
     direction = nominal + (truth.a_theta[line] + truth.phi_rad[index])
     if len(truth.line_eccentricity_rad):

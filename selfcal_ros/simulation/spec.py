@@ -14,7 +14,7 @@ from selfcal_ros.collection.settings.parameter import Parameter
 from selfcal_ros.errors import InputError, known_are
 from selfcal_ros.files import read_yaml
 from selfcal_ros.model.readings import Sense
-from selfcal_ros.model.view import Plan, View, plan_from_dict
+from selfcal_ros.model.view import Plan, View, plan_from_dict, plan_to_dict
 from selfcal_ros.simulation.cell import Event, plan_events
 from selfcal_ros.simulation.exposures import CellSettings
 from selfcal_ros.simulation.machine import (
@@ -316,16 +316,19 @@ def _placed(views: Any, plan: Plan, where: str) -> tuple[View | None, ...]:
     """Return the actual poses of the named views; empty if none."""
     if not views:
         return ()
-    plate = plan.artifact
+    written = plan_to_dict(plan)
     lies = {view.name: view for view in plan_from_dict(
-        {"plan_id": plan.plan_id, "views": views, "artifact": {
-            "grid_size": plate.grid_size, "grid_pitch": plate.grid_pitch_m,
-            "angular_count": plate.angular_count, "grid_size_y": plate.grid_size_y}}, where).views}
+        {key: written[key] for key in ("plan_id", "artifact", "map") if key in written}
+        | {"views": views}, where).views}
     names = [view.name for view in plan.views]
     for name in lies:
         if name not in names:
             raise InputError(where, f"the plan has no view '{name}'", known_are(name, names))
-    return tuple(lies.get(name) for name in names)
+    placed = [replace(lies[view.name], grid=view.grid, angular=view.angular)
+              if view.name in lies else None for view in plan.views]
+    for lie in filter(None, placed):
+        lie.on_stage(plan.artifact)
+    return tuple(placed)
 
 
 def _mapping(data: Any, where: str, known: tuple[str, ...]) -> dict:

@@ -38,16 +38,15 @@ def grid_deviation(truth: Truth, index: int, view: View, *,
     """
     artifact = truth.artifact
     place, site = physics.mark_places(truth, index, view, physics.all_marks(artifact))
-    node = np.rint(site / artifact.grid_pitch_m).astype(int)
-    inside = (np.abs(node) <= np.array(artifact.half)[:, None]).all(axis=0)
-    sign = -1 if sense is Sense.PLATE_MOVES else 1
-    # stage error at the site, as `physics.stage_error` at a node
-    i, j = sign * node
-    out = np.full_like(site, np.nan)
-    hx, hy = artifact.half
-    out[:, inside] = (place - site)[:, inside] + sign * (
-        truth.g[:, i[inside] + hx, j[inside] + hy]
-        + physics.stage_bending(truth, (sign * site)[:, inside], index))
+    pose, sign = view.on_stage(artifact), -1 if sense is Sense.PLATE_MOVES else 1
+    inside = ~pose.beyond_field(np.stack(pose.site_of(*physics.all_marks(artifact))), artifact)
+    out, stop = np.full_like(site, np.nan), sign * site[:, inside]
+    if artifact.map_grid is None:  # at a node, without the rounding of `stage_error`
+        i, j = np.rint(stop / artifact.grid_pitch_m).astype(int) + np.array(artifact.half)[:, None]
+        error = truth.g[:, i, j] + physics.stage_bending(truth, stop, index)
+    else:
+        error = physics.stage_error(truth, stop, index)
+    out[:, inside] = (place - site)[:, inside] + sign * error
     return out.reshape(2, *artifact.shape)
 
 
@@ -225,7 +224,7 @@ def _grid(readings: ViewReadings, truth: Truth, found: GridExposures, *, setting
 def _angular(readings: ViewReadings, truth: Truth, found: AngularExposures, *, sense: Sense,
              lost: np.ndarray) -> ViewReadings:
     count = truth.artifact.angular_count
-    turn = readings.view.lattice_pose(truth.artifact).s
+    turn = readings.view.on_stage(truth.artifact).s
     nominal = (found.k + turn) % count * (2 * np.pi / count)
     kept = ~lost[found.k]
     lines, line = np.unique(found.k[kept], return_inverse=True)

@@ -10,10 +10,11 @@ from math import asin, pi
 import numpy as np
 import pytest
 
-from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.artifact import Artifact, Interpolation, MapGrid
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.view import Plan, View
-from selfcal_ros.simulation.exposures import CellSettings, flicker_noise, quantised
+from selfcal_ros.model.visit_order import visit_sequence
+from selfcal_ros.simulation.exposures import CellSettings, flicker_noise, grid_exposures, quantised
 from selfcal_ros.simulation.machine import Spread, Truth, random_truth
 from selfcal_ros.simulation.physics import encoder_error, stage_error
 from selfcal_ros.simulation.truth import angular_deviation, grid_deviation, simulate_measurements
@@ -36,7 +37,7 @@ def measured(truth, sense=Sense.MICROSCOPE_MOVES, *, view=None, **settings):
     view = view or View("v")
     how = CellSettings(sense, **{"servo_sigma_m": 0.0, "servo_sigma_rad": 0.0,
                                  "visit_order": "raster", **settings})
-    plan = Plan("p", PLATE, (view,))
+    plan = Plan("p", truth.artifact, (view,))
     return simulate_measurements(truth, plan, np.random.default_rng(1), settings=how).views[0]
 
 
@@ -357,3 +358,65 @@ def test_a_rotary_encoder_that_owes_nothing_to_the_axes():
     moved = draws[0].g_theta - draws[1].g_theta
     assert np.ptp(np.delete(moved, [0, 6, 12, 18])) < 1e-18  # one constant, but on the axes
     assert np.abs(np.diff(moved[::6])).min() > 1e-6
+
+
+TURN = asin(0.6)
+PLACED = replace(PLATE, map_grid=MapGrid(3, 0.1, Interpolation.BILINEAR))
+ASKEW = View("askew", TURN, (0.02, -0.01), angular=False)
+"""Mark (1, 0) lies at (0.08, 0.06) + (0.02, -0.01) = (0.1, 0.05), (0, 1) at (-0.04, 0.07)."""
+
+
+@SENSES
+def test_a_plate_lies_at_any_turn_and_shift(sense):
+    truth = truth_with(artifact=PLACED, a=at(1, 0, 0.001, 0.002), t_m=one_view(3 * UM, -4 * UM))
+    found = measured(truth, sense, view=ASKEW)
+    # the corners are off the field: (1, 1) at (0.04, 0.13), (-1, 1) at (-0.12, 0)
+    assert list(zip(found.m, found.n, strict=True)) == [(-1, 0), (0, -1), (0, 0), (0, 1), (1, 0)]
+    assert deviation(found, 0, 1) == pytest.approx([3 * UM, -4 * UM])
+    # 0.8 * 1 - 0.6 * 2, 0.6 * 1 + 0.8 * 2 mm
+    assert deviation(found, 1, 0) == pytest.approx([-0.4e-3 + 3 * UM, 2.2e-3 - 4 * UM])
+    turned = measured(replace(truth, a=at(0, 0, 0, 0), t_m=one_view(0, 0),
+                              phi_rad=np.array([PHI])), sense, view=ASKEW)
+    # (0.08, 0.06) comes to (0.06, 0.08): the cosine is 0.96, the sine 0.28
+    assert deviation(turned, 1, 0) == pytest.approx([-0.02, 0.02], rel=1e-12)
+
+
+def test_between_nodes_the_stage_is_off_by_their_means():
+    """Mark (1, 0) of the askew plate lies half way between the nodes (0.1, 0) and (0.1, 0.1)."""
+    truth = truth_with(artifact=PLACED, g=at(1, 0, 2 * UM, -6 * UM) + at(1, 1, 4 * UM, 0.0))
+    assert deviation(measured(truth, view=ASKEW), 1, 0) == pytest.approx([3 * UM, -3 * UM])
+    # under a fixed microscope the stage stands at (-0.1, -0.05), and the mark is seen less
+    assert deviation(measured(truth, Sense.PLATE_MOVES, view=ASKEW), 1, 0) == pytest.approx(
+        [0, 0], abs=1e-17)
+    truth = replace(truth, g=at(-1, -1, 2 * UM, -6 * UM))
+    assert deviation(measured(truth, Sense.PLATE_MOVES, view=ASKEW), 1, 0) == pytest.approx(
+        [-1 * UM, 3 * UM])
+
+
+@SENSES
+def test_without_visits_a_placed_plate_reads_the_same(sense):
+    truth = random_truth(PLACED, 1, np.random.default_rng(3), Spread(correlation_pitches=2.0))
+    found, v = measured(truth, sense, view=ASKEW), grid_deviation(truth, 0, ASKEW, sense=sense)
+    read = np.isfinite(v[0])
+    np.testing.assert_allclose(v[:, read], [found.dx, found.dy], rtol=0, atol=1e-17)
+
+
+def test_the_rows_of_a_placed_plate_are_visited_one_after_the_other():
+    """Of the plate: lines of the stage's sites there are none."""
+    visits = visit_sequence(PLACED, ASKEW, order="serpentine")
+    assert list(zip(visits.m, visits.n, strict=True)) == [
+        (-1, 0), (0, 1), (0, 0), (0, -1), (1, 0)]
+    np.testing.assert_allclose([visits.i[-1], visits.j[-1]], [1.0, 0.5])
+
+
+def test_of_a_plate_placed_askew_the_nearest_marks_are_found():
+    """It lies 5 mm aside and 0.1 rad further than commanded: no mark moves by half a pitch."""
+    truth = truth_with(artifact=PLACED, placed=(View("x", TURN + 0.1, (0.025, -0.01),
+                                                            angular=False),))
+    visits = grid_exposures(truth, 0, ASKEW, settings=CellSettings(servo_sigma_m=0.0),
+                            rng=np.random.default_rng(0))
+    np.testing.assert_array_equal(visits.mark, [visits.visits.m, visits.visits.n])
+    assert visits.there.all()
+    place = truth.placed[0].pose.places(PLACED, *visits.mark) - ASKEW.pose.places(
+        PLACED, *visits.mark)
+    np.testing.assert_allclose(visits.offset, [place.real, place.imag], atol=1e-15)

@@ -9,6 +9,7 @@ import yaml
 
 from selfcal_ros.collection.settings.nodes import NODE_PARAMETERS
 from selfcal_ros.errors import InputError
+from selfcal_ros.model.artifact import MapGrid
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.simulation.exposures import CellSettings
 from selfcal_ros.simulation.machine import Spread
@@ -133,6 +134,19 @@ def test_a_plate_lies_otherwise_than_its_view_says(tmp_path):
     assert simulation(tmp_path, {"plan": PLAN}).run()[0].placed == ()
 
 
+def test_a_plate_lies_off_the_lattice_only_where_its_map_has_nodes_of_its_own(tmp_path):
+    askew = {"plan": PLAN, "placed": [{"name": "b", "rotation_deg": 91, "angular": False}]}
+    with pytest.raises(InputError, match="view 'b': grid marks cannot be measured at a turn of 91"):
+        simulation(tmp_path, askew)
+    askew["plan"] = PLAN | {"map": {"grid_size": 3}}
+    with pytest.raises(InputError, match=r"rotation: 1[.]01111 is not a whole number of ang"):
+        simulation(tmp_path, askew)
+    askew["plan"]["views"] = [{"name": "b", "angular": False}]
+    truth = simulation(tmp_path, askew).run()[0]
+    assert truth.placed[0].rotation_rad == np.deg2rad(91)
+    assert truth.artifact.map_grid == MapGrid(3, 0.02)
+
+
 @pytest.mark.parametrize(("data", "message"), [
     ("[1]", ": not a mapping; see docs/simulate.md"),
     ({}, ": the key 'plan' is missing; name a PLAN.yaml"),
@@ -150,7 +164,8 @@ def test_a_plate_lies_otherwise_than_its_view_says(tmp_path):
     ({"plan": PLAN, "placed": {"b": {}}}, ": placed: views: {'b': {}} is not of type list; correct "
      "the value"),
     ({"plan": PLAN, "placed": [{"name": "b", "turn": 90}]}, ": placed: views[0]: turn: unknown "
-     "key; known are name, rotation_deg, translation_pitch, grid, angular, repeats, visit_order"),
+     "key; known are name, rotation_deg, translation_pitch, translation_mm, grid, angular, "
+     "repeats, visit_order"),
     ({"plan": PLAN, "cell": {"visit_order": "spiral"}}, ": simulated cell: visit_order: 'spiral' "
      "is not a visiting order; use one of raster, serpentine, there_and_back, x_then_y, "
      "x_back_y_back, random, if need be with @plate"),
