@@ -69,7 +69,7 @@ def test_a_map_against_itself():
 def test_maps_of_the_same_marks_share_their_equations_and_others_do_not(monkeypatch):
     made = []
     monkeypatch.setattr(systems, "NormalEquations",
-                        lambda *given: made.append(given) or NormalEquations(*given))
+                        lambda *given, **kw: made.append(given) or NormalEquations(*given, **kw))
     systems.clear_cache()
     compare(A, B)
     assert len(made) == 1
