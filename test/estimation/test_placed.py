@@ -62,7 +62,11 @@ def test_what_moves_turns_the_map():
 @pytest.mark.parametrize(("poses", "how"), [(SIX, "bicubic"), (SIX, "bilinear"),
                                             (THREE, "bicubic")])
 def test_errors_lie_in_u(poses, how):
-    """z of all nodes over many sessions, and the part inside of U."""
+    """z of all nodes over many sessions, and the part inside of U.
+
+    The lack of fit of a map that suffices is an estimate of zero, and never below it: z is
+    somewhat less than 1.
+    """
     squares, inside, number = 0.0, 0, 0
     for seed in range(COUNT):
         found, truth = readings(plate(11, 7, how), poses, np.random.default_rng(seed))
@@ -74,8 +78,8 @@ def test_errors_lie_in_u(poses, how):
         squares += float((z[:, known] ** 2).sum())
         inside += int((np.abs(z[:, known]) < result.noise.k_xy).sum())
         number += 2 * int(known.sum())
-    assert np.sqrt(squares / number) == pytest.approx(1.0, abs=0.06)
-    assert inside / number == pytest.approx(0.9545, abs=0.02)
+    assert 0.85 < np.sqrt(squares / number) < 1.05
+    assert 0.94 < inside / number < 0.985
 
 
 @pytest.mark.parametrize("poses", [((0, (0, 0)), (37, (0, 0))), ((0, (0, 0)), (180, (1.3, 0.4)))])
@@ -106,3 +110,40 @@ def test_a_result_keeps_plate_and_map_apart():
     assert again.plate == found.artifact and again.artifact == found.artifact.field
     assert again.plate.map_grid == MapGrid(7, 0.1 / 6, Interpolation.BICUBIC)
     assert again.artifact_map.ax.shape == (11, 11) and again.error_map.gx.shape == (7, 7)
+
+
+def waves(rng, length):
+    """Return a stage error that varies over `length` pitches, 1 um: smooth, and no spline."""
+    k, at = rng.normal(size=(2, 150, 2)) / length / 10e-3, rng.uniform(0, 2 * np.pi, (2, 150))
+
+    def stage(z):
+        x, y = (np.cos(np.multiply.outer(z.real, along) + np.multiply.outer(z.imag, across)
+                       + start).sum(axis=-1) for (along, across), start in zip(
+                           k.swapaxes(1, 2), at, strict=True))
+        return 1e-6 * np.sqrt(2 / 150) * (x + 1j * y)
+    return stage
+
+
+@pytest.mark.parametrize(("length", "rough"), [(6, False), (2, True)])
+def test_a_map_that_does_not_suffice_is_contradicted_and_covers(length, rough):
+    """The lack of fit is in U at the nodes, whether the test fails or not."""
+    inside, contradicted = [], 0
+    for seed in range(12):
+        rng = np.random.default_rng([seed, length])
+        found, truth = readings(plate(11, 7), SIX, rng, sigma=0.1e-6, stage=waves(rng, length))
+        result = calibrate(found, BARE)
+        u = np.stack([result.error_map.u_gx, result.error_map.u_gy])
+        error = error_in_datum(result.error_map, truth)
+        inside.append(np.mean(np.abs(error) < result.noise.k_xy * u))
+        assert "effect roughness" in [line.component for line in result.budget] or not rough
+        contradicted += "roughness" in [cause.name for cause in result.verdict.causes]
+        assert (result.verdict.grade == "enlarged") == rough
+    assert contradicted == (12 if rough else 0)
+    assert 0.93 < np.mean(inside) <= 1.0
+
+
+def test_no_noise_and_no_roughness_is_no_lack():
+    found, _ = readings(plate(11, 7), SIX, np.random.default_rng(1), sigma=0.0)
+    result = calibrate(found, BARE)
+    assert result.verdict.grade == "good" and not result.verdict.causes
+    assert result.error_map.u_gx.max() < 1e-13

@@ -26,16 +26,19 @@ class PlacedViews:
     ----------
     poses : tuple of MapPose
         One per view, all of one plate.
+    spline : MapSpline, optional
+        Of the map; by default the one through its nodes.
     """
 
-    def __init__(self, poses: tuple[MapPose, ...]) -> None:
+    def __init__(self, poses: tuple[MapPose, ...], spline: MapSpline | None = None) -> None:
         artifact = poses[0].artifact
-        field, grid = artifact.field, artifact.map_grid
+        grid = artifact.map_grid
         self.poses, self.artifact = poses, artifact
-        self.shape, self.half = field.shape, field.half
+        self.spline = spline or MapSpline.of(
+            artifact.field, grid.interpolation if grid else Interpolation.BICUBIC)
+        self.shape, self.half = self.spline.shape, artifact.field.half
         self.plate_shape, self.plate_half = artifact.shape, artifact.half
         self.unit = max(artifact.half)
-        self.spline = MapSpline(field, grid.interpolation if grid else Interpolation.BICUBIC)
 
     @cached_property
     def phases(self) -> np.ndarray:
@@ -55,8 +58,7 @@ class PlacedViews:
     @cached_property
     def z_sites(self) -> np.ndarray:
         """Node positions in the unit, complex (cx, cy)."""
-        field = self.artifact.field
-        return (field.x_m + 1j * field.y_m) / (self.unit * self.artifact.grid_pitch_m)
+        return self.spline.places_m / (self.unit * self.artifact.grid_pitch_m)
 
     @cached_property
     def in_field(self) -> np.ndarray:

@@ -17,36 +17,52 @@ from scipy.sparse import csr_matrix
 from selfcal_ros.model.artifact import Artifact, Interpolation
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Axis:
-    """The spline along one axis: nodes at -half, ..., half, one apart."""
+    """The spline along one axis, in pitches of the map.
 
-    half: int
-    interpolation: Interpolation
+    Attributes
+    ----------
+    knots : float array
+        Its knots; the first and the last come `degree` + 1 times.
+    degree : int
+        Degree of the polynomials.
+    nodes : float array (n,)
+        Where the unknowns are: places of node values, or of the coefficients of a refined spline.
+    by_nodes : bool
+        Whether the unknowns are values at the nodes, or the coefficients themselves.
+    """
 
-    @property
-    def nodes(self) -> np.ndarray:
-        """Positions of the nodes, (n,)."""
-        return np.arange(-self.half, self.half + 1.0)
+    knots: np.ndarray
+    degree: int
+    nodes: np.ndarray
+    by_nodes: bool = True
 
-    @property
-    def degree(self) -> int:
-        """Degree of the polynomials; three nodes have a parabola."""
-        return 1 if self.interpolation is Interpolation.BILINEAR else min(3, 2 * self.half)
-
-    @cached_property
-    def _knots(self) -> np.ndarray:
-        nodes, end = self.nodes, self.degree + 1
+    @classmethod
+    def through(cls, half: int, interpolation: Interpolation) -> "Axis":
+        """Return the spline through nodes at -half, ..., half; three of them have a parabola."""
+        nodes = np.arange(-half, half + 1.0)
+        degree = 1 if interpolation is Interpolation.BILINEAR else min(3, 2 * half)
         # not-a-knot: the second and the last but one node are no knots of a cubic
-        inner = nodes[1:-1] if self.degree == 1 else nodes[2:-2] if self.degree == 3 else nodes[:0]
-        return np.concatenate([nodes[:1].repeat(end), inner, nodes[-1:].repeat(end)])
+        inner = {1: nodes[1:-1], 2: nodes[:0], 3: nodes[2:-2]}[degree]
+        ends = nodes[[0, -1]].repeat(degree + 1)
+        return cls(np.sort(np.concatenate([ends, inner])), degree, nodes)
+
+    @property
+    def refined(self) -> "Axis":
+        """The spline with a further knot in the middle of each interval: it contains this one."""
+        each = np.unique(self.knots)
+        knots = np.sort(np.concatenate([self.knots, (each[:-1] + each[1:]) / 2]))
+        nodes = np.array([knots[i + 1:i + self.degree + 1].mean()
+                          for i in range(len(knots) - self.degree - 1)])
+        return Axis(knots, self.degree, nodes, by_nodes=False)
 
     def rows(self, at: np.ndarray, slope: int = 0) -> tuple[np.ndarray, np.ndarray]:
         """Return the B-splines at places: their values, and the index of the first, (P, degree+1).
 
         With `slope` 1 their derivatives.
         """
-        knots, k = self._knots, self.degree
+        knots, k = self.knots, self.degree
         cell = np.clip(np.searchsorted(knots, at, "right") - 1, k, len(knots) - k - 2)
         first = cell[:, None] - k + np.arange(k + 1)
         if not slope:
@@ -64,26 +80,49 @@ class Axis:
     @cached_property
     def from_nodes(self) -> np.ndarray:
         """Coefficients for a unit at each node, (n, n)."""
+        if not self.by_nodes:
+            return np.eye(len(self.nodes))
         values, first = self.rows(self.nodes)
         dense = np.zeros((len(self.nodes), len(self.nodes)))
         np.put_along_axis(dense, first, values, axis=1)
         return np.linalg.inv(dense)
 
 
+@dataclass(frozen=True, eq=False)
 class MapSpline:
     """The spline of a map.
 
-    Parameters
+    Attributes
     ----------
-    field : Artifact
-        Lattice of its nodes.
-    interpolation : Interpolation
-        Between them.
+    axes : tuple of Axis
+        Along x and y.
+    pitch_m : float
+        Unit of their nodes, m.
     """
 
-    def __init__(self, field: Artifact, interpolation: Interpolation) -> None:
-        self.shape, self.pitch_m = field.shape, field.grid_pitch_m
-        self.axes = tuple(Axis(half, interpolation) for half in field.half)
+    axes: tuple[Axis, Axis]
+    pitch_m: float
+
+    @classmethod
+    def of(cls, field: Artifact, interpolation: Interpolation) -> "MapSpline":
+        """Return the spline through the nodes of a lattice."""
+        x, y = (Axis.through(half, interpolation) for half in field.half)
+        return cls((x, y), field.grid_pitch_m)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Unknowns along x and y."""
+        return len(self.axes[0].nodes), len(self.axes[1].nodes)
+
+    @property
+    def refined(self) -> "MapSpline":
+        """The spline with twice as many intervals along each axis: it contains this one."""
+        return MapSpline((self.axes[0].refined, self.axes[1].refined), self.pitch_m)
+
+    @property
+    def places_m(self) -> np.ndarray:
+        """Places of the unknowns on the stage, complex (nx, ny), m."""
+        return (self.axes[0].nodes[:, None] + 1j * self.axes[1].nodes) * self.pitch_m
 
     def rows(self, places_m: np.ndarray, slope: tuple[int, int] = (0, 0)) -> csr_matrix:
         """Return the rows of places on the coefficients, real (P, nodes).

@@ -11,13 +11,14 @@ from functools import cached_property
 
 import numpy as np
 from scipy.linalg import lapack
-from scipy.sparse import csr_matrix, diags
+from scipy.sparse import csr_matrix, diags, identity
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.lattice.connectivity import Components
 from selfcal_ros.estimation.lattice.gauge import Gauge
 from selfcal_ros.estimation.lattice.placed import PlacedViews
 from selfcal_ros.estimation.lattice.poses import MapPose
+from selfcal_ros.estimation.lattice.splines import MapSpline
 from selfcal_ros.estimation.normal.equations import NormalEquations
 from selfcal_ros.estimation.normal.grid import GridSystem
 
@@ -88,6 +89,8 @@ class PlacedSystem(GridSystem):
         One per view.
     weight : float array (views, nx, ny)
         Weight of each reading; 0 = not read.
+    spline : MapSpline, optional
+        Of the map, if it is not the one through its nodes.
 
     Raises
     ------
@@ -97,9 +100,10 @@ class PlacedSystem(GridSystem):
 
     views: PlacedViews  # type: ignore[assignment]
 
-    def __init__(self, poses: tuple[MapPose, ...], weight: np.ndarray) -> None:
+    def __init__(self, poses: tuple[MapPose, ...], weight: np.ndarray,
+                 spline: MapSpline | None = None) -> None:
         super().__init__((), weight)
-        self.views = PlacedViews(poses)
+        self.views = PlacedViews(poses, spline)
 
     @cached_property
     def components(self) -> Components:
@@ -130,8 +134,13 @@ class PlacedSystem(GridSystem):
             meant = meant + diags(part.ravel() * phase.conjugate()) @ rows
         total = diags(self.weight.sum(axis=0).ravel())
         out = self.views.spline.on_nodes((own - meant.conj().T @ total @ meant).toarray())
-        out[np.diag_indices(n)] += VAGUE * self.weight.sum() / n
+        out[np.diag_indices(n)] += self.vague
         return out
+
+    @property
+    def vague(self) -> float:
+        """Information added to every node: too little to change a known one."""
+        return float(VAGUE * self.weight.sum() / self.n_sites)
 
     @cached_property
     def factor(self) -> DenseFactor:  # type: ignore[override]
@@ -166,9 +175,37 @@ class PlacedEquations(NormalEquations):
         for _ in range(2):
             if known.sum() < 3:
                 return np.zeros(views.shape, dtype=bool)
-            largest = self._variance(Gauge(views.z_sites, known, scale=True), inverse)
+            rigid = Gauge(views.z_sites, known, scale=True).orthonormal
+            nodes = identity(self.grid.n_sites, format="csr")
+            largest = np.maximum(*self.variance(nodes, rigid, inverse))
             known = some & (largest.reshape(views.shape) < KNOWN**2)
         return known
+
+    def variance(self, rows: csr_matrix, rigid: np.ndarray,
+                 inverse: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the variances of Gx and Gy at places, in a datum over these places, unit noise.
+
+        Parameters
+        ----------
+        rows : sparse matrix (P, n)
+            From the unknowns of the map to the places.
+        rigid : complex array (P, 4)
+            Orthonormal datum modes at the places (real inner product).
+        inverse : float array (size, size)
+            Covariance of the misalignments.
+        """
+        n = 3 * self.grid.n_views
+        solved = rows @ self.grid.factor.inverse
+        response, own = rows @ self.grid.response, inverse[:n, :n]
+        spread = solved @ (rows.T @ rigid) + response @ (
+            own @ np.real(response.conj().T @ rigid))
+        inner = np.real(rigid.conj().T @ spread)
+        common, out = np.asarray(rows.multiply(solved.real).sum(axis=1)).ravel(), []
+        for part in (np.real, np.imag):
+            b, s, y = part(rigid), part(spread), part(response)
+            out.append(common + np.einsum("pa,pa->p", y @ own, y)
+                       + np.einsum("pk,pk->p", b @ inner - 2 * s, b))
+        return out[0], out[1]
 
     @cached_property
     def loose_modes(self) -> np.ndarray:
@@ -191,20 +228,6 @@ class PlacedEquations(NormalEquations):
         values, vectors = np.linalg.eigh(cover)
         loose = vectors[:, values > LOOSE**2][:, ::-1]
         return (loose[:n] + 1j * loose[n:]).T.reshape(-1, *views.shape)
-
-    def _variance(self, gauge: Gauge, inverse: np.ndarray) -> np.ndarray:
-        """Return the larger variance of Gx and Gy at every node in a datum, unit noise, (n,)."""
-        n = 3 * self.grid.n_views
-        basis, response, own = gauge.orthonormal, self.grid.response, inverse[:n, :n]
-        spread = self.grid.factor.solve(np.ascontiguousarray(basis))
-        spread = spread + response @ (own @ np.real(response.conj().T @ basis))
-        inner = np.real(basis.conj().T @ spread)
-        parts = []
-        for part in (np.real, np.imag):
-            b, s, y = part(basis), part(spread), part(response)
-            parts.append(np.einsum("sa,ab,sb->s", y, own, y, optimize=True) + np.einsum(
-                "sk,sk->s", b @ inner - 2 * s, b))
-        return self.grid.factor.inverse_diagonal() + np.maximum(*parts)
 
     @cached_property
     def known_marks(self) -> np.ndarray:

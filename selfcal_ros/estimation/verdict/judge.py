@@ -24,6 +24,7 @@ from selfcal_ros.estimation.joint.solve import fit_joint, solve_joint
 from selfcal_ros.estimation.joint.solved import Solved
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.terms.equations import free_inverse
+from selfcal_ros.estimation.verdict.roughness import NAME as LACK_OF_FIT
 from selfcal_ros.estimation.verdict.search import ALWAYS_SITES, search_causes
 from selfcal_ros.estimation.verdict.uncertainty import (
     budget_lines,
@@ -84,7 +85,9 @@ def judged(solved: Solved, measurements: Measurements, options: Options) -> Cali
              Grade.ENLARGED if bounded and not failed and result.has_uncertainty else
              Grade.NOT_QUALIFIED)
     verdict = Verdict(grade, (*failed, *noises), searched.causes,
-                      enlargements(result, searched.terms, searched.effects))
+                      enlargements(result, searched.terms, [
+                          effect for effect in searched.effects if effect.name != LACK_OF_FIT
+                          or LACK_OF_FIT in [cause.name for cause in searched.causes]]))
     result = replace(
         result, verdict=verdict, findings=(*result.findings, *_visits_findings(checked)),
         provenance=provenance_of(measurements, options))

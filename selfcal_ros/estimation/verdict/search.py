@@ -37,6 +37,7 @@ from selfcal_ros.estimation.verdict.explanations import (
 )
 from selfcal_ros.estimation.verdict.fault_columns import READING
 from selfcal_ros.estimation.verdict.off_sites import off_sites_cause
+from selfcal_ros.estimation.verdict.roughness import adequacy_of
 from selfcal_ros.estimation.verdict.uncertainty import (
     Effect,
     difference,
@@ -147,6 +148,10 @@ def search_causes(solved: Solved, measurements: Measurements, options: Options, 
         found.bounded = False
         if TermName.ROTATION not in [cause.name for cause in causes]:
             causes.append(turned)
+    rough = adequacy_of(_model(solved))
+    if rough is not None:
+        found.effects.append(rough.effect(solved.result))
+        causes += [rough.cause] if rough.cause else []
     if place is not None:
         causes = [place.cause, *causes] if place.shown else [*causes, place.cause]
         found.effects.append(effect_of_field(

@@ -129,6 +129,9 @@ _CAUSES: dict[str, Words] = {
     "off_sites": lambda c, of: (
         f"a stage that stood {of['away'] * MM_PER_M:.3g} mm off the sites, where its error differs "
         f"by {plus_minus(c, UM)}"),
+    "roughness": lambda c, of: (
+        f"a stage rougher than the {of['nodes'][0]} x {of['nodes'][1]} nodes of its map follow, "
+        f"by {c.size * UM_PER_M:.3g} µm (rms)"),
     "noise": lambda c, of: (
         f"{c.size:.2f} times as much noise in view '{c.view}' as in the others")}
 
@@ -146,6 +149,7 @@ _ACTIONS = {
                        "the lines' offsets",
     "reading": "solve with --robust, or measure it again",
     "off_sites": "place the plate closer to its nominal pose, or send the stage to the sites",
+    "roughness": "give the map more nodes (map in the plan), and views at other turns and shifts",
     "noise": "measure the view again, and look for a source of vibration"}
 """What to do about a cause besides what was tried on the readings."""
 

@@ -25,7 +25,7 @@ def views_of(artifact: Artifact, poses) -> PlacedViews:
 @pytest.mark.parametrize(("nx", "ny"), [(3, 3), (5, 3), (7, 9)])
 def test_the_spline_is_that_of_the_compensator(how, nx, ny):
     rng = np.random.default_rng(1)
-    spline = MapSpline(Artifact(nx, 2e-3, 0, ny), Interpolation(how))
+    spline = MapSpline.of(Artifact(nx, 2e-3, 0, ny), Interpolation(how))
     field = rng.normal(size=(2, nx, ny))
     at = rng.uniform(-1, 1, (2, 50)) * [[nx // 2], [ny // 2]]
     x, y = CELLS[how](field).at(at[0] + nx // 2, at[1] + ny // 2)
@@ -37,7 +37,7 @@ def test_the_spline_is_that_of_the_compensator(how, nx, ny):
 def test_slopes_are_those_of_the_values(how):
     """Beyond the edge the spline goes on straight."""
     rng = np.random.default_rng(2)
-    spline = MapSpline(Artifact(7, 2e-3), Interpolation(how))
+    spline = MapSpline.of(Artifact(7, 2e-3), Interpolation(how))
     field = spline.coefficients(rng.normal(size=(7, 7))).ravel()
     at = 2e-3 * (rng.uniform(-2.9, 2.9, 30) + 1j * rng.uniform(-3.3, 3.3, 30))
     step = 1e-9

@@ -1,0 +1,143 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Whether the nodes of a map suffice for the stage, and what they leave out.
+
+Between its nodes a map is a spline, and a stage that is rougher has more than that. A spline with
+twice as many intervals contains the map's; with the same readings it must not fit significantly
+better (F-test of its further coefficients). What both differ by beyond their noise is the lack of
+fit, a part of the uncertainty at the nodes and between them.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import csr_matrix
+from scipy.special import fdtrc
+
+from selfcal_ros.estimation.joint.model_fit import ModelFit
+from selfcal_ros.estimation.lattice.gauge import Gauge
+from selfcal_ros.estimation.normal.angular import AngularSystem
+from selfcal_ros.estimation.normal.equations import grid_residuals
+from selfcal_ros.estimation.normal.placed import PlacedEquations, PlacedSystem
+from selfcal_ros.estimation.verdict.uncertainty import Effect
+from selfcal_ros.model.result import CalibrationResult
+from selfcal_ros.model.verdict import Cause
+
+NAME = "roughness"
+"""Name of the cause, and of the effect."""
+
+LEVEL = 1e-3
+"""Probability that a map that suffices fails the test."""
+
+MAX_COEFFICIENTS = 31 * 31
+"""Largest refined spline that is fitted: a second of one processor."""
+
+NOISE_FREE_M = 1e-13
+"""Noise that is rounding, m: a map that leaves no more than that suffices."""
+
+
+@dataclass(frozen=True)
+class Adequacy:
+    """The test of a map's nodes.
+
+    Attributes
+    ----------
+    p : float
+        Probability of such an improvement by chance.
+    lack_m : float
+        Standard uncertainty from the lack of fit, one coordinate, m.
+    coefficients : float
+        Further coefficients that the readings determine.
+    nodes : tuple of int
+        Nodes of the map along x and y.
+    """
+
+    p: float
+    lack_m: float
+    coefficients: float
+    nodes: tuple[int, int]
+
+    def effect(self, result: CalibrationResult) -> Effect:
+        """Return the lack of fit as an effect on every known node.
+
+        Its sign changes from node to node: the datum takes nothing of it out.
+        """
+        emap = result.error_map
+        sign = 1 - 2 * (np.indices(emap.gx.shape).sum(axis=0) % 2)
+        each = np.where(emap.valid, sign * self.lack_m, 0.0)
+        return Effect(NAME, np.stack([each, each]), np.zeros(len(emap.g_theta)))
+
+    @property
+    def cause(self) -> Cause | None:
+        """The cause `roughness`, if the map does not suffice."""
+        if not self.p < LEVEL:
+            return None
+        return Cause(NAME, self.lack_m, 0.0, "m", self.p, effect_rms=self.lack_m,
+                     effect_max=self.lack_m, details={"nodes": list(self.nodes)})
+
+
+def adequacy_of(model: ModelFit) -> Adequacy | None:
+    """Return the test of the map of a fit; None on the lattice, or for a map that is too large.
+
+    Parameters
+    ----------
+    model : ModelFit
+        A fit; finite rotations and terms are taken off its readings.
+    """
+    system = model.problem.system
+    if not isinstance(system, PlacedEquations):
+        return None
+    grid = system.grid
+    finer = grid.views.spline.refined
+    if finer.shape[0] * finer.shape[1] > MAX_COEFFICIENTS:
+        return None
+    fine = PlacedEquations(PlacedSystem(grid.views.poses, grid.weight, finer),
+                           AngularSystem((), np.zeros((0, 0))), system.grid_index, ())
+    parts = [(one, _effective(one), _squares(one, model.y)) for one in (fine, system)]
+    (_, n_fine, rest), (_, n_coarse, before) = parts
+    readings = 2 * grid.n_readings - 2 * int(grid.mark_read.sum()) - (3 * grid.n_views - 7)
+    more, dof = n_fine - n_coarse, readings - n_fine
+    if dof < 1 or more < 1:
+        return None
+    sigma_m = float(np.sqrt(rest / dof))
+    if sigma_m < NOISE_FREE_M:  # there is no F of rounding
+        p = 1.0 if before < 4 * readings * NOISE_FREE_M**2 else 0.0
+    else:
+        p = float(fdtrc(more, dof, max(before - rest, 0.0) / more / (rest / dof)))
+    return Adequacy(p, _lack(fine, system, model.y, sigma_m), more, grid.views.shape)
+
+
+def _effective(system: PlacedEquations) -> float:
+    """Return the real coefficients of the map that the readings determine."""
+    factor, n = system.grid.factor, system.grid.n_sites
+    return 2 * (n - system.grid.vague * float(factor.inverse_diagonal().sum()))
+
+
+def _squares(system: PlacedEquations, y: np.ndarray) -> float:
+    return float((system.grid.weight * np.abs(grid_residuals(system, y)) ** 2).sum())
+
+
+def _lack(fine: PlacedEquations, coarse: PlacedEquations, y: np.ndarray, sigma_m: float) -> float:
+    """Return the rms difference of two maps of the same readings beyond their noise, m.
+
+    One coordinate, over the nodes and the middles between them where the map is known.
+    """
+    views = coarse.grid.views
+    x, j = (np.arange(-half, half + 0.25, 0.5) for half in views.half)
+    at = ((x[:, None] + 1j * j) * views.spline.pitch_m).ravel()
+    known = views.spline.rows(at) @ views.spline.coefficients(
+        (~coarse.known_sites).astype(float)).ravel()
+    at = at[np.abs(known) < 1e-6] if not coarse.known_sites.all() else at
+    rigid = Gauge(at / abs(at).max(), np.ones(len(at), dtype=bool), scale=True).orthonormal
+    values, powers = [], []
+    for system in (fine, coarse):
+        spline = system.grid.views.spline
+        rows = spline.rows(at)
+        by_nodes = csr_matrix(spline.adjoint(rows.toarray().reshape(
+            len(at), *spline.shape)).reshape(len(at), -1)) if system is coarse else rows
+        free, d = system.grid.reduced(y)
+        field = by_nodes @ (free - system.grid.response @ (system.grid_inverse @ d))
+        values.append(field - rigid @ np.real(rigid.conj().T @ field))
+        powers.append(sum(part.mean() for part in system.variance(
+            by_nodes, rigid, system.grid_inverse)))
+    square = float((np.abs(values[0] - values[1]) ** 2).mean())
+    return float(np.sqrt(max(square - sigma_m**2 * (powers[0] - powers[1]), 0.0) / 2))
