@@ -7,7 +7,7 @@ valid only if the laser is along the nominal diagonals and the mirror perpendicu
 Goto, Matsubara) uses measured linear errors and treats laser and mirror as unknown.
 """
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -31,9 +31,10 @@ from selfcal_ros.laser.data import (
     turn_to_first_step,
 )
 from selfcal_ros.laser.noise import reading_covariance, reading_noise
-from selfcal_ros.laser.published_equations import Erratum, solve_diagonal
+from selfcal_ros.laser.published_equations import solve_diagonal
 from selfcal_ros.model.statistics import rms
 
+JACOBIAN_STEP_M = 1e-7
 EQUAL_RELATIVE = 1e-12
 """Readings closer than this are equal."""
 
@@ -73,26 +74,21 @@ def block_gain(data: StepDiagonal) -> np.ndarray:
     return np.linalg.pinv(weighted) * weights[:, :, None, :]
 
 
-def solve_blocks(data: StepDiagonal, readings_m: np.ndarray, gain: np.ndarray,
-                 errata: Collection[Erratum] = ()) -> np.ndarray:
+def solve_blocks(data: StepDiagonal, readings_m: np.ndarray, gain: np.ndarray) -> np.ndarray:
     """Return the errors (D, n, D) from eq. 1 block by block, rotated to the first X step."""
-    if Erratum.EQ1_ROWS in errata:
-        readings_m = readings_m.copy()
-        readings_m[:, 1] = readings_m[::-1, 1]
+    # The printed matrix has the rows of R_y,pp and R_y,np exchanged.
     vectors = np.einsum("jick,kji->jic", gain, readings_m)
     return turn_to_first_step(vectors) - step_vectors(data.steps_m, np.zeros_like(vectors))
 
 
 @one_thread()
-def identify_wang(data: StepDiagonal, *, errata: Collection[Erratum] = ()) -> StepDiagonalResult:
+def identify_wang(data: StepDiagonal) -> StepDiagonalResult:
     """Identify all errors from the readings alone, assuming the nominal laser directions.
 
     Parameters
     ----------
     data : StepDiagonal
         All diagonals; linear errors are not used.
-    errata : collection of Erratum
-        Errors of the printed equations to restore, for comparison.
 
     Returns
     -------
@@ -108,11 +104,11 @@ def identify_wang(data: StepDiagonal, *, errata: Collection[Erratum] = ()) -> St
         raise InputError("diagonals", f"only {', '.join(data.diagonals)} measured",
                          "the conventional formulation needs every diagonal; measure the others")
     readings, gain = data.readings_m, block_gain(data)
-    errors = solve_blocks(data, readings, gain, errata)
+    errors = solve_blocks(data, readings, gain)
     covariance = None
     noise = reading_noise(data)
     if noise.dof:
-        jac = jacobian(lambda r: solve_blocks(data, r, gain, errata), readings)
+        jac = jacobian(lambda r: solve_blocks(data, r, gain), readings)
         covariance = jac @ reading_covariance(data, noise) @ jac.T
     return StepDiagonalResult(data.steps_m, errors, covariance, Method.CONVENTIONAL,
                               Form.PRINTED, {}, Closure(residual_rms_m=_residual(data, readings)))
@@ -128,7 +124,7 @@ def _residual(data: StepDiagonal, readings_m: np.ndarray) -> float | None:
 
 
 def jacobian(function: Callable[[np.ndarray], np.ndarray], x: np.ndarray,
-             step_m: float = 1e-7) -> np.ndarray:
+             ) -> np.ndarray:
     """Return d function / d x by central differences, (outputs, inputs) in C order.
 
     The formulations are linear except for terms of (error / step)^2, so the differences are
@@ -137,15 +133,14 @@ def jacobian(function: Callable[[np.ndarray], np.ndarray], x: np.ndarray,
     columns = []
     for index in range(x.size):
         shift = np.zeros(x.size)
-        shift[index] = step_m
+        shift[index] = JACOBIAN_STEP_M
         up, down = (function(x + sign * shift.reshape(x.shape)) for sign in (1, -1))
-        columns.append((up - down).ravel() / (2 * step_m))
+        columns.append((up - down).ravel() / (2 * JACOBIAN_STEP_M))
     return np.array(columns).T
 
 
 @one_thread()
-def identify_ibaraki(data: StepDiagonal, *, form: Form = Form.EXACT,
-                 errata: Collection[Erratum] = ()) -> StepDiagonalResult:
+def identify_ibaraki(data: StepDiagonal, *, form: Form = Form.EXACT) -> StepDiagonalResult:
     """Identify the transverse errors from the readings and the measured linear errors.
 
     Parameters
@@ -155,8 +150,6 @@ def identify_ibaraki(data: StepDiagonal, *, form: Form = Form.EXACT,
     form : Form
         ``exact`` is valid for any constant mirror tilt; the other forms follow the paper's
         equations, 2D only, and take the mean of the diagonals.
-    errata : collection of Erratum
-        Errors of the printed equations to restore; not with ``exact``, which does not use them.
 
     Raises
     ------
@@ -168,7 +161,7 @@ def identify_ibaraki(data: StepDiagonal, *, form: Form = Form.EXACT,
     check_lengths(data)
     lengths = length_closure(data) or (None, None)
     if form is not Form.EXACT:
-        return _paper(data, form, errata, lengths)
+        return _paper(data, form, lengths)
     found = adjust(data)
     mirror = {name: np.arctan(tilt).tolist()
               for name, tilt in zip(data.diagonals, found.tilt, strict=True)}
@@ -183,11 +176,11 @@ def identify_ibaraki(data: StepDiagonal, *, form: Form = Form.EXACT,
         Method.NEW, form, mirror, Closure(lengths[0], lengths[1], between, u_between, residual))
 
 
-def _paper(data: StepDiagonal, form: Form, errata: Collection[Erratum],
+def _paper(data: StepDiagonal, form: Form,
            lengths: tuple[float | None, float | None]) -> StepDiagonalResult:
     """Return the mean of the diagonals by the paper's own equations."""
     def solve(readings: np.ndarray, linear: np.ndarray) -> np.ndarray:
-        return solve_diagonal(data, readings, linear, form=form, errata=errata)
+        return solve_diagonal(data, readings, linear, form=form)
 
     readings, linear = data.readings_m, data.linear_mean_m
     alone = solve(readings, linear)

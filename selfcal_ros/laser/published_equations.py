@@ -6,24 +6,10 @@ p = Ex(y) the transverse errors. The np diagonal is the pp diagonal of the mirro
 machine (X reversed): only v and p change sign.
 """
 
-from collections.abc import Collection
-from enum import StrEnum
-
 import numpy as np
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.laser.data import Form, StepDiagonal
-
-
-class Erratum(StrEnum):
-    """Errors of the printed equations, which can be restored to see their effect."""
-
-    EQ1_ROWS = "eq1"
-    """The rows for R_y,pp and R_y,np are exchanged."""
-    EQ4_SIGN = "eq4"
-    """A minus sign that contradicts the geometry of its figure."""
-    EQ6_LENGTH = "eq6"
-    """Sine and cosine exchanged: the result is a length of about b."""
 
 
 def eq3(r: np.ndarray, u: np.ndarray, q: np.ndarray) -> np.ndarray:
@@ -35,8 +21,7 @@ def eq3(r: np.ndarray, u: np.ndarray, q: np.ndarray) -> np.ndarray:
     return np.sqrt(r**2 - q**2) - u
 
 
-def eq4(u_first: float, half_r_less_delta: float, alpha_2: float,
-        errata: Collection[Erratum] = ()) -> float:
+def eq4(u_first: float, half_r_less_delta: float, alpha_2: float) -> float:
     """Return sin(alpha), the mirror's angle to the laser, from the first block (eq. 4).
 
     Parameters
@@ -47,11 +32,9 @@ def eq4(u_first: float, half_r_less_delta: float, alpha_2: float,
         R/2 - delta(1), which is R_x of the first block.
     alpha_2 : float
         Angle of the mirror to the Y axis; pi/4 if a = b.
-    errata : collection of Erratum
-        `Erratum.EQ4_SIGN` restores the printed minus sign.
     """
-    sign = -1.0 if Erratum.EQ4_SIGN in errata else 1.0
-    return float(sign * u_first * np.cos(alpha_2) / half_r_less_delta)
+    # Printed with a minus sign that contradicts the geometry of its figure.
+    return float(u_first * np.cos(alpha_2) / half_r_less_delta)
 
 
 def eq5_printed(delta: np.ndarray, sin_alpha: float, alpha_2: float) -> np.ndarray:
@@ -67,17 +50,15 @@ def eq5_exact(r_x: np.ndarray, u: np.ndarray, sin_alpha: float, alpha_2: float) 
     return (r_x * sin_alpha - u * np.cos(alpha_2)) / np.sin(alpha_2)
 
 
-def eq6(p_0: np.ndarray, v: np.ndarray, u: np.ndarray, q: np.ndarray, *,
-        errata: Collection[Erratum] = ()) -> np.ndarray:
+def eq6(p_0: np.ndarray, v: np.ndarray, u: np.ndarray, q: np.ndarray) -> np.ndarray:
     """Return Ex(y) after the modification by Ey(x) (eq. 6, corrected)."""
     gamma = np.arctan2(v, u)
-    if Erratum.EQ6_LENGTH in errata:
-        return q * np.cos(gamma) + p_0 * np.sin(gamma)
+    # Printed with sine and cosine exchanged, which gives a length of about b.
     return p_0 * np.cos(gamma) - q * np.sin(gamma)
 
 
 def solve_diagonal(data: StepDiagonal, readings_m: np.ndarray, linear_m: np.ndarray, *,
-                   form: Form, errata: Collection[Erratum] = ()) -> np.ndarray:
+                   form: Form) -> np.ndarray:
     """Return the errors (K, D, n, D) from eqs. 3 to 6 for every diagonal separately.
 
     Parameters
@@ -90,8 +71,6 @@ def solve_diagonal(data: StepDiagonal, readings_m: np.ndarray, linear_m: np.ndar
         Ex(x) and Ey(y).
     form : Form
         ``printed`` uses eq. 5 as printed, ``stepwise`` its exact form.
-    errata : collection of Erratum
-        Errors of the printed equations to restore.
     """
     if data.dim != 2:
         raise InputError(f"form {form}", "the source gives its equations in 2D only",
@@ -103,12 +82,12 @@ def solve_diagonal(data: StepDiagonal, readings_m: np.ndarray, linear_m: np.ndar
     for k, (r_x, r_y) in enumerate(readings_m):
         r = r_x + r_y
         delta = r / 2 - r_x
-        sin_alpha = eq4(u[0], r[0] / 2 - delta[0], alpha_2, errata)
+        sin_alpha = eq4(u[0], r[0] / 2 - delta[0], alpha_2)
         if form is Form.PRINTED:
             v = eq5_printed(delta, sin_alpha, alpha_2)
         else:
             v = eq5_exact(r_x, u, sin_alpha, alpha_2)
-        p = eq6(eq3(r, u, q), v, u, q, errata=errata)
+        p = eq6(eq3(r, u, q), v, u, q)
         reversal = data.signs[k].prod()
         errors[k, 0] = np.stack([linear_m[0], reversal * v], axis=-1)
         errors[k, 1] = np.stack([reversal * p, linear_m[1]], axis=-1)
