@@ -13,8 +13,7 @@ from selfcal_ros.units import ARCSEC_PER_RAD, UM_PER_M, URAD_PER_RAD
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from selfcal_ros.estimation.comparison.maps import LaserDifference, MapDifference
-    from selfcal_ros.estimation.comparison.significance import Significance
+    from selfcal_ros.estimation.comparison.maps import LaserDifference, MapDifference, Significance
     from selfcal_ros.model.result import CalibrationResult
 
 HELP = "compare two results after removing the datum difference"

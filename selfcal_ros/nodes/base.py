@@ -19,8 +19,7 @@ from selfcal_ros.nodes.filling import fill, status_of
 from selfcal_ros.nodes.names import HEALTH, Topic, mismatched, others_publishing, private
 from selfcal_ros.nodes.services import Answering
 from selfcal_ros.sessions.clocks import RosTime
-from selfcal_ros.sessions.health import Losses, Refusals, merged
-from selfcal_ros.sessions.ports import Diagnosis, Level, Ports
+from selfcal_ros.sessions.health import Diagnosis, Level, Losses, Ports, Refusals, merged
 
 BEAT_S = 1.0  # between two health messages
 

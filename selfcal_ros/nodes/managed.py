@@ -13,7 +13,7 @@ from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackRet
 from selfcal_ros.collection.settings.parameter import ManagedSettings
 from selfcal_ros.errors import SelfcalError, first_line
 from selfcal_ros.nodes.base import NodeBase
-from selfcal_ros.sessions.ports import Diagnosis, Level
+from selfcal_ros.sessions.health import Diagnosis, Level
 
 
 class WhileConfigured[T]:

@@ -10,7 +10,7 @@ import numpy as np
 from selfcal_ros.collection.clock_steps import Step, StepWatch
 from selfcal_ros.collection.inputs import MAX_AHEAD_NS, Command, begun_ns
 from selfcal_ros.collection.timeline import begins_run
-from selfcal_ros.sessions.ports import Diagnosis, Level
+from selfcal_ros.sessions.health import Diagnosis, Level
 from selfcal_ros.units import NS_PER_S, S_PER_NS
 
 LIVE_NS = NS_PER_S

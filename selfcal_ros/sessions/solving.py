@@ -28,8 +28,8 @@ from selfcal_ros.reporting.summary.numbers import summary_numbers
 from selfcal_ros.reporting.summary.sections import state_sentence
 from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.sessions.clocks import Run, begins_in_future, supersedes
+from selfcal_ros.sessions.health import Diagnosis, Level, Ports
 from selfcal_ros.sessions.map_files import is_qualified, read_result, result_file, run_file
-from selfcal_ros.sessions.ports import Diagnosis, Level, Ports
 from selfcal_ros.topics import COMMAND_TOPIC, MEASUREMENT_TOPIC
 
 ECHO_LENGTH = 128

@@ -5,9 +5,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from selfcal_ros.errors import InputError, NotIdentifiableError
-from selfcal_ros.laser.closure import check_lengths
 from selfcal_ros.laser.data import DIAGONALS, Form, StepDiagonal
 from selfcal_ros.laser.identify import identify_ibaraki, identify_wang
+from selfcal_ros.laser.noise import check_lengths
 from selfcal_ros.laser.profiles import squareness, straightness
 from selfcal_ros.laser.simulation.measure import (
     LaserNoise,

@@ -12,7 +12,7 @@ from selfcal_ros.collection.sequencer import State
 from selfcal_ros.errors import InputError
 from selfcal_ros.messages import from_model
 from selfcal_ros.sessions.collecting import CollectingSession
-from selfcal_ros.sessions.ports import Diagnosis, Level
+from selfcal_ros.sessions.health import Diagnosis, Level
 from selfcal_ros.sessions.sequencing import PATIENCE_S, SequencingSession
 from test.support.ports import START_NS, Hands, message, settings_of
 from test.support.sessions import plan_file, small_plan

@@ -17,8 +17,8 @@ from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.messages import from_model, to_model
 from selfcal_ros.model.terms import DEFAULT_TERMS
 from selfcal_ros.sessions.clocks import Run, supersedes
+from selfcal_ros.sessions.health import Level
 from selfcal_ros.sessions.map_files import plan_file_name, read_result, result_file
-from selfcal_ros.sessions.ports import Level
 from selfcal_ros.sessions.solving import SolvingSession, solve
 from test.support.ports import START_NS, Hands, message, settings_of
 from test.support.sessions import collected, events_of, small_plan

@@ -13,7 +13,7 @@ import pytest
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.view import Plan, View
-from selfcal_ros.simulation.exposures import CellSettings, flicker_noise, quantised
+from selfcal_ros.simulation.cell import CellSettings, flicker_noise, quantised
 from selfcal_ros.simulation.machine import Spread, Truth, random_truth
 from selfcal_ros.simulation.physics import encoder_error, stage_error
 from selfcal_ros.simulation.truth import angular_deviation, grid_deviation, simulate_measurements

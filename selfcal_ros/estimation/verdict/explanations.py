@@ -22,7 +22,7 @@ from selfcal_ros.estimation.lattice.maps import PHASES
 from selfcal_ros.estimation.terms.columns import Column, TermColumns, joined, term_columns
 from selfcal_ros.estimation.terms.equations import Score, TermEquations, score
 from selfcal_ros.estimation.terms.ground import Ground, without_noise
-from selfcal_ros.estimation.verdict.fault_columns import (
+from selfcal_ros.estimation.verdict.off_sites import (
     READING,
     SLIP,
     reading_columns,
