@@ -6,7 +6,12 @@ from collections.abc import Callable
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
-from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rcl_interfaces.msg import (
+    FloatingPointRange,
+    IntegerRange,
+    ParameterDescriptor,
+    ParameterType,
+)
 from rclpy.clock import Clock, ClockType
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.publisher import Publisher
@@ -45,6 +50,9 @@ class NodeBase[S: Settings](Answering):
         self._heard_on: dict[str, Topic] = {}
         try:
             self._take_parameters(kind)
+            self.set_descriptor("use_sim_time", ParameterDescriptor(
+                type=ParameterType.PARAMETER_BOOL, read_only=True,
+                description="take the time of stamps from /clock"))
         except InputError:
             self.destroy_node()  # otherwise its name stays in the graph until garbage collection
             raise

@@ -113,7 +113,7 @@ class RosTime:
     """
 
     NOTHING = ("use_sim_time is set and nothing is heard on /clock: what this node stamps is "
-               "stamped 0; play the bag with --clock, or set use_sim_time to false")
+               "stamped 0; play the bag with --clock, or start the node without use_sim_time")
 
     def __init__(self, say: Callable[[Level, str], None]) -> None:
         self._say = say
