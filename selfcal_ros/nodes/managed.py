@@ -113,6 +113,9 @@ class ManagedNode[S: ManagedSettings](NodeBase[S], LifecycleNode):
         """Return the state of the node if not active, else the diagnosis of the session."""
         if self.state == "active":
             return self.diagnose_session()
+        if self.state == "finalized":
+            return Diagnosis(Level.ERROR, "finalized: shut down by a request, for good; end this "
+                             "process and start the node again")
         if self.problem is not None:
             return Diagnosis(Level.ERROR, f"{self.state}: {first_line(self.problem)}")
         return Diagnosis(Level.WARN, f"{self.state}: a managed node that waits to be activated")
