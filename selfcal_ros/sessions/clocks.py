@@ -154,10 +154,10 @@ class Run:
 def supersedes(new: Run, current: Run) -> bool:
     """Return whether messages of run `new` replace those of `current`.
 
-    The later run wins; if the beginning of one is unknown, the one received last.
+    The later run wins. One whose beginning is unknown never replaces one whose beginning is known.
     """
     begun, before = begun_ns(new.run_id), begun_ns(current.run_id)
-    return begun is None or before is None or begun > before
+    return before is None or (begun is not None and begun > before)
 
 
 def is_future(stamp_ns: int, now_ns: int) -> bool:

@@ -202,7 +202,7 @@ class SequencingSession:
         """Record the progress of the view; continue when it is complete."""
         if to_model.stamp_ns(message) < self._commanded_ns:
             return  # from before the command: a redone view would look complete
-        if message.run_id and message.run_id != self.run_id:
+        if message.run_id != self.run_id:
             return  # of another run
         expected = message.grid_expected + message.angular_expected + message.check_expected
         if message.view_index == self.machine.index and expected:

@@ -178,6 +178,10 @@ class SolvingSession:
         if run != self._run:
             if self._messages and not (supersedes(run, self._run)
                                        or begins_in_future(self._run, now_ns)):
+                if begun_ns(run.run_id) is None:
+                    raise InputError(MEASUREMENT_TOPIC, "readings of a run that does not say when "
+                                     f"it began, while run {self._run.run_id} is known: not used",
+                                     "let the commands carry run_id, or restart the solver")
                 self._left_aside += 1
                 return
             self._run, self._messages = run, {}

@@ -111,7 +111,7 @@ def test_a_status_counts_from_the_stamp_of_the_newest_command(measuring, age_ns,
 
 
 @pytest.mark.parametrize("fields, moves", [
-    ({}, True), ({"run_id": "1"}, False), ({"run_id": ""}, True), ({"plan_id": "other"}, False),
+    ({}, True), ({"run_id": "1"}, False), ({"run_id": ""}, False), ({"plan_id": "other"}, False),
     ({"view_index": 1}, False), ({"complete": False}, False)])
 def test_only_the_current_view_of_this_run_moves_it_on(measuring, fields, moves):
     measuring.status(**({"complete": True} | fields))
