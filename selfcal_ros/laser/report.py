@@ -23,7 +23,7 @@ from selfcal_ros.laser.profiles import (
     straightness,
     u_profile_m,
 )
-from selfcal_ros.model.result import plain
+from selfcal_ros.model.json_form import plain
 from selfcal_ros.reporting.figures.drawing import SERIES, Drawing
 from selfcal_ros.reporting.figures.parts import Curve, chart, legend, titled
 from selfcal_ros.units import M_PER_MM, MM_PER_M, UM_PER_M, UM_PER_MM
