@@ -21,7 +21,7 @@ from selfcal_ros.nodes.compensator import CompensatorNode
 from selfcal_ros.nodes.measurement_collector import MeasurementCollector
 from selfcal_ros.nodes.pose_sequencer import PoseSequencer
 from selfcal_ros.nodes.solver import Solver
-from selfcal_ros.sessions.ports import Diagnosis, Level
+from selfcal_ros.sessions.health import Diagnosis, Level
 from test.support.sessions import decoded, plan_file, small_plan
 
 MANAGED = {"measurement_collector": MeasurementCollector, "pose_sequencer": PoseSequencer,
