@@ -14,7 +14,7 @@ from selfcal_ros.files import write_text
 from selfcal_ros.model.result import result_to_dict
 from selfcal_ros.model.view import plan_from_dict
 from selfcal_ros.simulation import spec
-from selfcal_ros.simulation.exposures import CellSettings
+from selfcal_ros.simulation.cell import CellSettings
 from selfcal_ros.simulation.machine import Spread
 from selfcal_ros.simulation.spec import Faults
 

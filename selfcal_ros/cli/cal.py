@@ -264,7 +264,7 @@ def _verify(args: argparse.Namespace) -> int:
 
 
 def _numbers(found: "Verification") -> dict:
-    from selfcal_ros.model.result import plain
+    from selfcal_ros.model.json_form import plain
 
     return plain({r.place: {"points": r.position.shape[1],
                             "before": {"rms": r.rms("before"), "max": r.largest("before")},

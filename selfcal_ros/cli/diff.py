@@ -13,8 +13,7 @@ from selfcal_ros.units import ARCSEC_PER_RAD, UM_PER_M, URAD_PER_RAD
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from selfcal_ros.estimation.comparison.maps import LaserDifference, MapDifference
-    from selfcal_ros.estimation.comparison.significance import Significance
+    from selfcal_ros.estimation.comparison.maps import LaserDifference, MapDifference, Significance
     from selfcal_ros.model.result import CalibrationResult
 
 HELP = "compare two results after removing the datum difference"
@@ -70,7 +69,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _grades(results: Sequence[CalibrationResult]) -> dict[str, Any]:
     """Return grade and enlargements of the results A and B."""
-    from selfcal_ros.model.result import plain
+    from selfcal_ros.model.json_form import plain
 
     named = dict(zip("ab", (result.verdict for result in results), strict=False))
     return plain({"grade": {name: str(verdict.grade) for name, verdict in named.items()},
@@ -89,7 +88,7 @@ def _grades_text(results: Sequence[CalibrationResult]) -> list[str]:
 def _json(found: MapDifference) -> dict[str, Any]:
     from dataclasses import asdict
 
-    from selfcal_ros.model.result import plain
+    from selfcal_ros.model.json_form import plain
 
     return plain({
         "significant": found.significant,
@@ -153,7 +152,7 @@ def _verdict_text(found: MapDifference) -> str:
 
 
 def _laser_json(rows: Sequence[LaserDifference]) -> dict[str, Any]:
-    from selfcal_ros.model.result import plain
+    from selfcal_ros.model.json_form import plain
 
     return plain({row.name: {"map": row.of_map, "laser": row.of_laser,
                              "difference": row.difference, "u": row.u, "p": row.p}

@@ -160,7 +160,7 @@ def _judge(plan: Plan, model: tuple[ModelTerm, ...], assumed: Assumed,
 
 def _check_json(plan: Plan, seen: Observability, predicted: Prediction | None, *,
                 maps: bool) -> dict[str, Any]:
-    from selfcal_ros.model.result import plain
+    from selfcal_ros.model.json_form import plain
 
     out = {"plan_id": plan.plan_id, "rank": seen.rank, "unknowns": seen.unknowns,
            "deficiency": seen.deficiency, "identifiable": seen.identifiable,

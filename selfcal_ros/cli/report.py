@@ -32,7 +32,7 @@ def run(args: argparse.Namespace) -> int:
     from selfcal_ros.aerotech.report import table_chapter
     from selfcal_ros.files import check_outputs, read_json
     from selfcal_ros.model.result import result_from_dict
-    from selfcal_ros.reporting.extras import ABOUT
+    from selfcal_ros.reporting.chapters import ABOUT
     from selfcal_ros.reporting.report import check_name, write_report
     from selfcal_ros.reporting.summary.format import can_print_symbols
     from selfcal_ros.reporting.summary.sections import summary_text

@@ -78,7 +78,7 @@ def run(args: argparse.Namespace) -> int:
     from selfcal_ros.laser.data import Form, Method
     from selfcal_ros.laser.identify import EQUAL_READINGS, Choice, identify, readings_are_equal
     from selfcal_ros.laser.profiles import ReferenceLine
-    from selfcal_ros.laser.result_json import outcome, summary
+    from selfcal_ros.laser.report import outcome, summary
 
     _check_outputs(args)
     if args.sensitivity:
@@ -99,7 +99,7 @@ def run(args: argparse.Namespace) -> int:
     for warning in result["warnings"]:
         print(f"selfcal step-diagonal: warning: {warning}", file=sys.stderr)
     if args.plot:
-        from selfcal_ros.laser.figures import profiles_figure
+        from selfcal_ros.laser.report import profiles_figure
         from selfcal_ros.reporting.figures.paper import save_picture
         save_picture(profiles_figure(found, data), args.plot)
     if args.cal:
@@ -190,7 +190,7 @@ def _sensitivity(args: argparse.Namespace) -> int:
     with busy("simulating faults"):
         rows = sensitivity(machine, rng)
     if args.plot:
-        from selfcal_ros.laser.figures import sensitivity_figure
+        from selfcal_ros.laser.report import sensitivity_figure
         from selfcal_ros.reporting.figures.paper import save_picture
         save_picture(sensitivity_figure(sweep(machine, rng)), args.plot)
     table = {"machine": "case study, 6 blocks of 10 mm x 10 mm", "rows": rows}

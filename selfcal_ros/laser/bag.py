@@ -42,7 +42,7 @@ class SeriesTopics:
     laser_field : str
         Field of the distance (``a.b`` for nested ones), or the joint's name in a JointState; empty
         = default of the type.
-    laser_unit_m, position_unit_m : float
+    laser_unit_m : float
         Metres in a unit of the values.
     """
 
@@ -51,7 +51,6 @@ class SeriesTopics:
     joints: tuple[str, ...] = ("x", "y")
     laser_field: str = ""
     laser_unit_m: float = 1.0
-    position_unit_m: float = 1.0
 
 
 def read_series(path: Path, topics: SeriesTopics) -> tuple[Series, list[str]]:
@@ -99,8 +98,7 @@ def read_series(path: Path, topics: SeriesTopics) -> tuple[Series, list[str]]:
                      "of logging, the other topic at its stamps: both clocks must agree")
     laser_ns, laser = _sorted(found[topics.laser])
     position_ns, positions = _sorted(found[topics.position])
-    return Series(laser_ns, laser * topics.laser_unit_m, position_ns,
-                  positions * topics.position_unit_m), notes
+    return Series(laser_ns, laser * topics.laser_unit_m, position_ns, positions), notes
 
 
 def _match(topic: str, wanted: dict[str, Callable]) -> str | None:

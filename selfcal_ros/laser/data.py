@@ -137,12 +137,6 @@ class StepDiagonal:
                              "formulation")
         return np.nanmean(self.linear_m, axis=0)
 
-    @property
-    def nominal_m(self) -> np.ndarray:
-        """Readings of a perfect machine with a perfect set-up, (D,): step_j^2 / diagonal."""
-        steps = np.array(self.steps_m)
-        return steps**2 / np.linalg.norm(steps)
-
     def pick(self, diagonals: Sequence[str]) -> "StepDiagonal":
         """Return the same measurement with only some of its diagonals.
 

@@ -5,9 +5,14 @@ The conventional one (Wang; eqs. 1 and 2 of the source) uses the nominal laser d
 valid only if the laser is along the nominal diagonals and the mirror perpendicular to it.
 *Erratum*: eq. 1 is printed with its rows for R_y,pp and R_y,np exchanged. The new one (Ibaraki,
 Goto, Matsubara) uses measured linear errors and treats laser and mirror as unknown.
+
+Of the second, the paper's own eqs. 3 to 6 treat one diagonal at a time, in 2D: u = a + Ex(x),
+q = b + Ey(y) are the measured step lengths of a block, v = Ey(x) and p = Ex(y) the transverse
+errors. The np diagonal is the pp diagonal of the mirror image of the machine (X reversed): only v
+and p change sign.
 """
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,12 +20,6 @@ import numpy as np
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.blas_threads import one_thread
 from selfcal_ros.laser.adjust import adjust
-from selfcal_ros.laser.closure import (
-    between_diagonals,
-    check_lengths,
-    length_closure,
-    propagated,
-)
 from selfcal_ros.laser.data import (
     Closure,
     Form,
@@ -30,10 +29,100 @@ from selfcal_ros.laser.data import (
     step_vectors,
     turn_to_first_step,
 )
-from selfcal_ros.laser.noise import reading_covariance, reading_noise
-from selfcal_ros.laser.published_equations import Erratum, solve_diagonal
+from selfcal_ros.laser.noise import (
+    between_diagonals,
+    check_lengths,
+    length_closure,
+    propagated,
+    reading_covariance,
+    reading_noise,
+)
 from selfcal_ros.model.statistics import rms
 
+
+def eq3(r: np.ndarray, u: np.ndarray, q: np.ndarray) -> np.ndarray:
+    """Return Ex(y) for Ey(x) = 0 from the length of the diagonal, r = R_x + R_y (eq. 3)."""
+    if np.any(r <= q):
+        block = int(np.argmax(r <= q)) + 1
+        raise InputError(f"block {block}", "the diagonal is shorter than the Y step",
+                         "check the units and the steps")
+    return np.sqrt(r**2 - q**2) - u
+
+
+def eq4(u_first: float, half_r_less_delta: float, alpha_2: float) -> float:
+    """Return sin(alpha), the mirror's angle to the laser, from the first block (eq. 4).
+
+    Parameters
+    ----------
+    u_first : float
+        a + Ex(x) of the first block.
+    half_r_less_delta : float
+        R/2 - delta(1), which is R_x of the first block.
+    alpha_2 : float
+        Angle of the mirror to the Y axis; pi/4 if a = b.
+    """
+    # Printed with a minus sign that contradicts the geometry of its figure.
+    return float(u_first * np.cos(alpha_2) / half_r_less_delta)
+
+
+def eq5_printed(delta: np.ndarray, sin_alpha: float, alpha_2: float) -> np.ndarray:
+    """Return Ey(x) of every block from the change of delta = R/2 - R_x (eq. 5, as printed).
+
+    It assumes the same Ex(x) and half diagonal in every block.
+    """
+    return -(sin_alpha / np.sin(alpha_2)) * (delta - delta[0])
+
+
+def eq5_exact(r_x: np.ndarray, u: np.ndarray, sin_alpha: float, alpha_2: float) -> np.ndarray:
+    """Return Ey(x) of every block from R_x and the linear error (exact form of eq. 5)."""
+    return (r_x * sin_alpha - u * np.cos(alpha_2)) / np.sin(alpha_2)
+
+
+def eq6(p_0: np.ndarray, v: np.ndarray, u: np.ndarray, q: np.ndarray) -> np.ndarray:
+    """Return Ex(y) after the modification by Ey(x) (eq. 6, corrected)."""
+    gamma = np.arctan2(v, u)
+    # Printed with sine and cosine exchanged, which gives a length of about b.
+    return p_0 * np.cos(gamma) - q * np.sin(gamma)
+
+
+def solve_diagonal(data: StepDiagonal, readings_m: np.ndarray, linear_m: np.ndarray, *,
+                   form: Form) -> np.ndarray:
+    """Return the errors (K, D, n, D) from eqs. 3 to 6 for every diagonal separately.
+
+    Parameters
+    ----------
+    data : StepDiagonal
+        Steps and diagonals of a 2D measurement.
+    readings_m : float array (K, 2, n)
+        Readings, positive on both diagonals.
+    linear_m : float array (2, n)
+        Ex(x) and Ey(y).
+    form : Form
+        ``printed`` uses eq. 5 as printed, ``stepwise`` its exact form.
+    """
+    if data.dim != 2:
+        raise InputError(f"form {form}", "the source gives its equations in 2D only",
+                         "use the exact form for body diagonals")
+    u, q = linear_m + np.array(data.steps_m)[:, None]
+    # The source sets pi/4 "without loss of generality", which is valid for a = b.
+    alpha_2 = float(np.arctan2(data.steps_m[1], data.steps_m[0]))
+    errors = np.zeros((len(data.diagonals), 2, data.n_blocks, 2))
+    for k, (r_x, r_y) in enumerate(readings_m):
+        r = r_x + r_y
+        delta = r / 2 - r_x
+        sin_alpha = eq4(u[0], r[0] / 2 - delta[0], alpha_2)
+        if form is Form.PRINTED:
+            v = eq5_printed(delta, sin_alpha, alpha_2)
+        else:
+            v = eq5_exact(r_x, u, sin_alpha, alpha_2)
+        p = eq6(eq3(r, u, q), v, u, q)
+        reversal = data.signs[k].prod()
+        errors[k, 0] = np.stack([linear_m[0], reversal * v], axis=-1)
+        errors[k, 1] = np.stack([reversal * p, linear_m[1]], axis=-1)
+    return errors
+
+
+JACOBIAN_STEP_M = 1e-7
 EQUAL_RELATIVE = 1e-12
 """Readings closer than this are equal."""
 
@@ -73,26 +162,21 @@ def block_gain(data: StepDiagonal) -> np.ndarray:
     return np.linalg.pinv(weighted) * weights[:, :, None, :]
 
 
-def solve_blocks(data: StepDiagonal, readings_m: np.ndarray, gain: np.ndarray,
-                 errata: Collection[Erratum] = ()) -> np.ndarray:
+def solve_blocks(data: StepDiagonal, readings_m: np.ndarray, gain: np.ndarray) -> np.ndarray:
     """Return the errors (D, n, D) from eq. 1 block by block, rotated to the first X step."""
-    if Erratum.EQ1_ROWS in errata:
-        readings_m = readings_m.copy()
-        readings_m[:, 1] = readings_m[::-1, 1]
+    # The printed matrix has the rows of R_y,pp and R_y,np exchanged.
     vectors = np.einsum("jick,kji->jic", gain, readings_m)
     return turn_to_first_step(vectors) - step_vectors(data.steps_m, np.zeros_like(vectors))
 
 
 @one_thread()
-def identify_wang(data: StepDiagonal, *, errata: Collection[Erratum] = ()) -> StepDiagonalResult:
+def identify_wang(data: StepDiagonal) -> StepDiagonalResult:
     """Identify all errors from the readings alone, assuming the nominal laser directions.
 
     Parameters
     ----------
     data : StepDiagonal
         All diagonals; linear errors are not used.
-    errata : collection of Erratum
-        Errors of the printed equations to restore, for comparison.
 
     Returns
     -------
@@ -108,11 +192,11 @@ def identify_wang(data: StepDiagonal, *, errata: Collection[Erratum] = ()) -> St
         raise InputError("diagonals", f"only {', '.join(data.diagonals)} measured",
                          "the conventional formulation needs every diagonal; measure the others")
     readings, gain = data.readings_m, block_gain(data)
-    errors = solve_blocks(data, readings, gain, errata)
+    errors = solve_blocks(data, readings, gain)
     covariance = None
     noise = reading_noise(data)
     if noise.dof:
-        jac = jacobian(lambda r: solve_blocks(data, r, gain, errata), readings)
+        jac = jacobian(lambda r: solve_blocks(data, r, gain), readings)
         covariance = jac @ reading_covariance(data, noise) @ jac.T
     return StepDiagonalResult(data.steps_m, errors, covariance, Method.CONVENTIONAL,
                               Form.PRINTED, {}, Closure(residual_rms_m=_residual(data, readings)))
@@ -128,7 +212,7 @@ def _residual(data: StepDiagonal, readings_m: np.ndarray) -> float | None:
 
 
 def jacobian(function: Callable[[np.ndarray], np.ndarray], x: np.ndarray,
-             step_m: float = 1e-7) -> np.ndarray:
+             ) -> np.ndarray:
     """Return d function / d x by central differences, (outputs, inputs) in C order.
 
     The formulations are linear except for terms of (error / step)^2, so the differences are
@@ -137,15 +221,14 @@ def jacobian(function: Callable[[np.ndarray], np.ndarray], x: np.ndarray,
     columns = []
     for index in range(x.size):
         shift = np.zeros(x.size)
-        shift[index] = step_m
+        shift[index] = JACOBIAN_STEP_M
         up, down = (function(x + sign * shift.reshape(x.shape)) for sign in (1, -1))
-        columns.append((up - down).ravel() / (2 * step_m))
+        columns.append((up - down).ravel() / (2 * JACOBIAN_STEP_M))
     return np.array(columns).T
 
 
 @one_thread()
-def identify_ibaraki(data: StepDiagonal, *, form: Form = Form.EXACT,
-                 errata: Collection[Erratum] = ()) -> StepDiagonalResult:
+def identify_ibaraki(data: StepDiagonal, *, form: Form = Form.EXACT) -> StepDiagonalResult:
     """Identify the transverse errors from the readings and the measured linear errors.
 
     Parameters
@@ -155,8 +238,6 @@ def identify_ibaraki(data: StepDiagonal, *, form: Form = Form.EXACT,
     form : Form
         ``exact`` is valid for any constant mirror tilt; the other forms follow the paper's
         equations, 2D only, and take the mean of the diagonals.
-    errata : collection of Erratum
-        Errors of the printed equations to restore; not with ``exact``, which does not use them.
 
     Raises
     ------
@@ -168,7 +249,7 @@ def identify_ibaraki(data: StepDiagonal, *, form: Form = Form.EXACT,
     check_lengths(data)
     lengths = length_closure(data) or (None, None)
     if form is not Form.EXACT:
-        return _paper(data, form, errata, lengths)
+        return _paper(data, form, lengths)
     found = adjust(data)
     mirror = {name: np.arctan(tilt).tolist()
               for name, tilt in zip(data.diagonals, found.tilt, strict=True)}
@@ -183,11 +264,11 @@ def identify_ibaraki(data: StepDiagonal, *, form: Form = Form.EXACT,
         Method.NEW, form, mirror, Closure(lengths[0], lengths[1], between, u_between, residual))
 
 
-def _paper(data: StepDiagonal, form: Form, errata: Collection[Erratum],
+def _paper(data: StepDiagonal, form: Form,
            lengths: tuple[float | None, float | None]) -> StepDiagonalResult:
     """Return the mean of the diagonals by the paper's own equations."""
     def solve(readings: np.ndarray, linear: np.ndarray) -> np.ndarray:
-        return solve_diagonal(data, readings, linear, form=form, errata=errata)
+        return solve_diagonal(data, readings, linear, form=form)
 
     readings, linear = data.readings_m, data.linear_mean_m
     alone = solve(readings, linear)

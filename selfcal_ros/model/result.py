@@ -3,31 +3,19 @@
 
 import math
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
-from numbers import Integral
 from typing import Any
 
 import numpy as np
 
 from selfcal_ros.errors import InputError
+from selfcal_ros.model import json_form
 from selfcal_ros.model.artifact import Artifact, map_grid_from_dict, map_grid_to_dict
 from selfcal_ros.model.error_map import ErrorMap, ThetaDatum
+from selfcal_ros.model.json_form import plain, read
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.verdict import BudgetLine, Finding, Grade, ModelResult, Provenance, Verdict
-from selfcal_ros.model.verdict_json import (
-    budget_from_dict,
-    finding_from_dict,
-    finding_to_dict,
-    line_to_dict,
-    model_from_dict,
-    model_to_dict,
-    provenance_from_dict,
-    provenance_to_dict,
-    reference_from_dict,
-    verdict_from_dict,
-    verdict_to_dict,
-)
 
 SCHEMA = "selfcal.result/1"
 LARGEST = 1e3
@@ -237,6 +225,7 @@ def result_to_dict(result: CalibrationResult) -> dict[str, Any]:
         If it has no sentences: call `selfcal_ros.reporting.words.findings.worded` first.
     """
     emap, amap, artifact = result.error_map, result.artifact_map, result.plate
+    made = result.provenance
     return {
         "schema": SCHEMA,
         "plan_id": result.plan_id,
@@ -249,10 +238,11 @@ def result_to_dict(result: CalibrationResult) -> dict[str, Any]:
                         for key in ("magnification", "u_magnification")}},
         **({"map": map_grid_to_dict(artifact.map_grid)} if artifact.map_grid else {}),
         "run_id": result.run_id,
-        "verdict": plain(verdict_to_dict(result.verdict)),
-        "model": plain(model_to_dict(result.model)),
+        "verdict": plain(json_form.verdict_to_dict(result.verdict)),
+        "model": plain(result.model),
         "reference": result.reference,
-        "provenance": plain(provenance_to_dict(result.provenance)),
+        "provenance": plain({"created": made.created, "duration_s": made.duration_s,
+                             "version": made.version, **made.extra}),
         "dof": plain({kind: result.noise.dof_of(kind) for kind in ("xy", "theta")}),
         "coverage_factor": plain({kind: getattr(result.noise, f"k_{kind}")
                                   for kind in ("xy", "theta")}),
@@ -267,12 +257,12 @@ def result_to_dict(result: CalibrationResult) -> dict[str, Any]:
                       "scale_difference": plain(emap.scale_difference),
                       "datum_theta": str(emap.datum_theta)},
         "artifact_map": {key: plain(getattr(amap, key)) for key in ("ax", "ay", "a_theta")},
-        "observability": plain(asdict(result.observability)),
-        "noise": plain(asdict(result.noise)),
+        "observability": plain(result.observability),
+        "noise": plain(result.noise),
         "rejected": dict(result.rejected),
         "warnings": list(result.warnings),
-        "findings": plain([finding_to_dict(found) for found in result.findings]),
-        "budget": plain([line_to_dict(line) for line in result.budget]),
+        "findings": plain([json_form.finding_to_dict(found) for found in result.findings]),
+        "budget": plain([json_form.line_to_dict(line) for line in result.budget]),
         "input": dict(result.input),
         **{key: plain(value) for key, value in result.extra.items()},
     }
@@ -283,22 +273,6 @@ _KNOWN = {"schema", "run_id", "verdict", "model", "reference", "provenance", "do
           "coverage_factor", "plan_id", "method", "measurement_sense", "artifact", "views",
           "error_map", "artifact_map", "observability", "noise", "rejected", "warnings", "findings",
           "budget", "input", "map"}
-
-
-def plain(value: Any) -> Any:
-    """Return `value` as JSON types: arrays as lists, NaN and infinities as None."""
-    if isinstance(value, np.generic):  # first, as a float64 is a float
-        return plain(value.item())
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if isinstance(value, dict):
-        return {key: plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [plain(item) for item in value]
-    if isinstance(value, np.ndarray):
-        whole = value.dtype.kind in "fiub" and bool(np.isfinite(value).all())
-        return value.tolist() if whole else plain(value.tolist())
-    return value
 
 
 def result_from_dict(data: object, where: str) -> CalibrationResult:
@@ -330,44 +304,39 @@ def _parse(data: dict) -> CalibrationResult:
     shapes |= dict.fromkeys(_MAP_ARRAYS[4:], (artifact.angular_count,))
     error_map = ErrorMap(
         artifact.field, **{key: _array(emap[key], shape, key) for key, shape in shapes.items()},
-        nonorthogonality=_number(emap["nonorthogonality"]),
-        scale_difference=_number(emap["scale_difference"]),
+        nonorthogonality=read(float, emap["nonorthogonality"]),
+        scale_difference=read(float, emap["scale_difference"]),
         datum_theta=ThetaDatum(emap["datum_theta"]))
-    seen = {**data["observability"]}
-    seen |= {key: tuple(_of(str, mode) for mode in _of(list, seen.get(key, [])))
-             for key in ("modes", "advice")}
-    seen |= {key: _of(int, seen[key]) for key in ("rank", "unknowns", "deficiency")}
-    for key in ("unchecked_sites", "unchecked_lines"):
-        seen[key] = None if seen.get(key) is None else _of(int, seen[key])
-    _of(bool, seen["identifiable"])
-    noise = {key: _number(value) for key, value in data["noise"].items()}
+    seen = read(Observability, data["observability"])
     return CalibrationResult(
-        _of(str, data["plan_id"]), error_map,
+        read(str, data["plan_id"]), error_map,
         ArtifactMap(_array(amap["ax"], artifact.shape, "ax"),
                     _array(amap["ay"], artifact.shape, "ay"),
                     _array(amap["a_theta"], (artifact.angular_count,), "a_theta"),
-                    _number(raw.get("magnification")), _number(raw.get("u_magnification"))),
-        tuple(map(_view, data["views"])), Observability(**seen), Noise(**noise),
-        {key: _of(int, value) for key, value in data["rejected"].items()},
-        {key: _of(str, value) for key, value in data["input"].items()},
-        tuple(_of(str, line) for line in _of(list, data.get("warnings", []))),
-        _of(str, data.get("method", "joint")),
-        _of(str, data.get("measurement_sense", "microscope_moves")),
+                    read(float, raw.get("magnification")), read(float, raw.get("u_magnification"))),
+        tuple(map(_view, data["views"])), seen, read(Noise, data["noise"]),
+        {key: read(int, value) for key, value in data["rejected"].items()},
+        {key: read(str, value) for key, value in data["input"].items()},
+        read(tuple[str, ...], data.get("warnings", [])),
+        read(str, data.get("method", "joint")),
+        read(str, data.get("measurement_sense", "microscope_moves")),
         {key: value for key, value in data.items() if key not in _KNOWN},
-        verdict_from_dict(data.get("verdict"), identifiable=seen["identifiable"]),
-        model_from_dict(data.get("model")), reference_from_dict(data.get("reference")),
-        provenance_from_dict(data.get("provenance")), _of(str, data.get("run_id", "")),
-        tuple(map(finding_from_dict, data.get("findings", []))),
-        budget_from_dict(data.get("budget", [])), artifact if artifact.map_grid else None)
+        json_form.verdict_from_dict(data.get("verdict"), identifiable=seen.identifiable),
+        read(ModelResult, data.get("model") or {}),
+        json_form.reference_from_dict(data.get("reference")),
+        json_form.provenance_from_dict(data.get("provenance")), read(str, data.get("run_id", "")),
+        json_form.findings_from_list(Finding, data.get("findings", [])),
+        json_form.budget_from_list(data.get("budget", [])),
+        artifact if artifact.map_grid else None)
 
 
 def _view(v: dict) -> ViewResult:
-    turn, x, y = (_number(v[key]) for key in ("rotation", "translation_x", "translation_y"))
+    turn, x, y = (read(float, v[key]) for key in ("rotation", "translation_x", "translation_y"))
     if not np.isfinite([turn, x, y]).all():
         raise ValueError(f"the pose of view {v['name']!r} is not finite")
-    phi, tx, ty = (_number(v["misalignment"][key]) for key in ("phi", "tx", "ty"))
-    return ViewResult(_of(str, v["name"]), turn, x, y, phi, tx, ty, used=_of(int, v["used"]),
-                      rejected=_of(int, v["rejected"]),
+    phi, tx, ty = (read(float, v["misalignment"][key]) for key in ("phi", "tx", "ty"))
+    return ViewResult(read(str, v["name"]), turn, x, y, phi, tx, ty, used=read(int, v["used"]),
+                      rejected=read(int, v["rejected"]),
                       read_grid=v.get("read", {}).get("grid"),
                       read_angular=v.get("read", {}).get("angular"))
 
@@ -379,18 +348,3 @@ def _array(value: Any, shape: tuple[int, ...], name: str) -> np.ndarray:
     if (np.abs(array) > LARGEST).any():
         raise ValueError(f"{name} has values beyond {LARGEST:g}")
     return array
-
-
-def _number(value: float | None) -> float:
-    if value is None:
-        return float("nan")
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise ValueError(f"{value!r} is not a number")
-    return value
-
-
-def _of(kind: type, value: Any) -> Any:
-    wanted = Integral if kind is int else kind
-    if not isinstance(value, wanted) or (kind is int and isinstance(value, bool)):
-        raise ValueError(f"{value!r} is not of type {kind.__name__}")
-    return value

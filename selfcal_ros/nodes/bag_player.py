@@ -12,7 +12,7 @@ from selfcal_ros.errors import ExitCode, InputError, SelfcalError
 from selfcal_ros.nodes.base import SelfcalNode
 from selfcal_ros.nodes.player import Player
 from selfcal_ros.nodes.running import run
-from selfcal_ros.sessions.ports import Diagnosis, Level
+from selfcal_ros.sessions.health import Diagnosis, Level
 
 STALLED_S = 2.0
 """Time after which a listener that takes no further messages is a warning."""

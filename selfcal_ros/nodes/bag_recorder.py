@@ -13,7 +13,7 @@ from selfcal_ros.nodes import names
 from selfcal_ros.nodes.base import SelfcalNode
 from selfcal_ros.nodes.names import EncoderInput, kept_names, offered
 from selfcal_ros.nodes.running import run
-from selfcal_ros.sessions.ports import Diagnosis, Level
+from selfcal_ros.sessions.health import Diagnosis, Level
 
 
 class BagRecorder(SelfcalNode[RecorderSettings]):

@@ -6,7 +6,12 @@ from collections.abc import Callable
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
-from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rcl_interfaces.msg import (
+    FloatingPointRange,
+    IntegerRange,
+    ParameterDescriptor,
+    ParameterType,
+)
 from rclpy.clock import Clock, ClockType
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.publisher import Publisher
@@ -19,8 +24,7 @@ from selfcal_ros.nodes.filling import fill, status_of
 from selfcal_ros.nodes.names import HEALTH, Topic, mismatched, others_publishing, private
 from selfcal_ros.nodes.services import Answering
 from selfcal_ros.sessions.clocks import RosTime
-from selfcal_ros.sessions.health import Losses, Refusals, merged
-from selfcal_ros.sessions.ports import Diagnosis, Level, Ports
+from selfcal_ros.sessions.health import Diagnosis, Level, Losses, Ports, Refusals, merged
 
 BEAT_S = 1.0  # between two health messages
 
@@ -46,6 +50,9 @@ class NodeBase[S: Settings](Answering):
         self._heard_on: dict[str, Topic] = {}
         try:
             self._take_parameters(kind)
+            self.set_descriptor("use_sim_time", ParameterDescriptor(
+                type=ParameterType.PARAMETER_BOOL, read_only=True,
+                description="take the time of stamps from /clock"))
         except InputError:
             self.destroy_node()  # otherwise its name stays in the graph until garbage collection
             raise

@@ -22,7 +22,7 @@ from selfcal_ros.nodes.base import SelfcalNode
 from selfcal_ros.nodes.names import EncoderInput
 from selfcal_ros.nodes.running import run
 from selfcal_ros.sessions.cell_check import CellCheck
-from selfcal_ros.sessions.ports import Level
+from selfcal_ros.sessions.health import Level
 from selfcal_ros.sessions.sequencing import load_plan
 
 

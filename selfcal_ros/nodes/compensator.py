@@ -13,7 +13,7 @@ from selfcal_ros.nodes.managed import ManagedNode, WhileConfigured
 from selfcal_ros.nodes.polling import ByTheClock
 from selfcal_ros.nodes.running import run
 from selfcal_ros.sessions.compensating import CompensatingSession
-from selfcal_ros.sessions.ports import Diagnosis
+from selfcal_ros.sessions.health import Diagnosis
 
 
 class CompensatorNode(ManagedNode[CompensatorSettings]):

@@ -13,7 +13,7 @@ from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackRet
 from selfcal_ros.collection.settings.parameter import ManagedSettings
 from selfcal_ros.errors import SelfcalError, first_line
 from selfcal_ros.nodes.base import NodeBase
-from selfcal_ros.sessions.ports import Diagnosis, Level
+from selfcal_ros.sessions.health import Diagnosis, Level
 
 
 class WhileConfigured[T]:
@@ -113,6 +113,9 @@ class ManagedNode[S: ManagedSettings](NodeBase[S], LifecycleNode):
         """Return the state of the node if not active, else the diagnosis of the session."""
         if self.state == "active":
             return self.diagnose_session()
+        if self.state == "finalized":
+            return Diagnosis(Level.ERROR, "finalized: shut down by a request, for good; end this "
+                             "process and start the node again")
         if self.problem is not None:
             return Diagnosis(Level.ERROR, f"{self.state}: {first_line(self.problem)}")
         return Diagnosis(Level.WARN, f"{self.state}: a managed node that waits to be activated")

@@ -18,9 +18,8 @@ from selfcal_ros.nodes.names import EncoderInput, kept_names, offered
 from selfcal_ros.nodes.polling import ByTheClock, PollingNode, wake
 from selfcal_ros.nodes.running import run
 from selfcal_ros.sessions.collecting import CollectingSession
-from selfcal_ros.sessions.health import merged
+from selfcal_ros.sessions.health import Diagnosis, merged
 from selfcal_ros.sessions.journal_keeper import JournalKeeper, KeptTopic
-from selfcal_ros.sessions.ports import Diagnosis
 from selfcal_ros.sessions.reception import Reception
 
 TICK_S = 0.1

@@ -23,7 +23,7 @@ from std_msgs.msg import String, UInt64MultiArray
 from visualization_msgs.msg import MarkerArray
 
 from selfcal_ros import topics
-from selfcal_ros.sessions.ports import Diagnosis, Level
+from selfcal_ros.sessions.health import Diagnosis, Level
 from selfcal_ros.topics import qos_profile
 
 

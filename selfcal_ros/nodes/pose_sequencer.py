@@ -13,7 +13,7 @@ from selfcal_ros.nodes.calibration_action import CalibrationAction
 from selfcal_ros.nodes.filling import diagnosis_of
 from selfcal_ros.nodes.managed import ManagedNode, WhileConfigured
 from selfcal_ros.nodes.running import run
-from selfcal_ros.sessions.ports import Diagnosis
+from selfcal_ros.sessions.health import Diagnosis
 from selfcal_ros.sessions.sequencing import SequencingSession
 
 COMPANIONS = ("measurement_collector", "solver")

@@ -13,7 +13,7 @@ from selfcal_ros.nodes import names
 from selfcal_ros.nodes.filling import map_markers
 from selfcal_ros.nodes.managed import ManagedNode, WhileConfigured, stop
 from selfcal_ros.nodes.running import run
-from selfcal_ros.sessions.ports import Diagnosis
+from selfcal_ros.sessions.health import Diagnosis
 from selfcal_ros.sessions.solving import Outcome, SolvingSession, solve, warm_up
 
 READY_FOR = 21

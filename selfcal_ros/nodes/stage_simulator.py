@@ -23,7 +23,7 @@ from selfcal_ros.nodes import names
 from selfcal_ros.nodes.base import SelfcalNode
 from selfcal_ros.nodes.filling import fill
 from selfcal_ros.nodes.running import run
-from selfcal_ros.sessions.ports import Diagnosis, Level
+from selfcal_ros.sessions.health import Diagnosis, Level
 from selfcal_ros.sessions.sequencing import load_plan
 from selfcal_ros.simulation.bag import event_fields, write_truth
 from selfcal_ros.simulation.cell import JOINTS, Event, view_events

@@ -1,14 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a report holds, chapter by chapter, before it becomes a page or a PDF."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
+from selfcal_ros import __version__
 from selfcal_ros.estimation.verdict.uncertainty import Budget, budgets
-from selfcal_ros.model.result import CalibrationResult
-from selfcal_ros.reporting.extras import convention_section, extra_sections, provenance_section
+from selfcal_ros.model.error_map import ThetaDatum
+from selfcal_ros.model.result import SCHEMA, CalibrationResult
 from selfcal_ros.reporting.figures.drawing import Drawing
 from selfcal_ros.reporting.figures.maps import (
     angular_map,
@@ -24,11 +27,184 @@ from selfcal_ros.reporting.figures.residuals import (
     residuals_in,
 )
 from selfcal_ros.reporting.summary import sections
-from selfcal_ros.reporting.summary.format import aligned_numbers, fixed_column, printable
+from selfcal_ros.reporting.summary.format import (
+    UNKNOWN,
+    aligned_numbers,
+    fixed_column,
+    printable,
+    significant,
+)
 from selfcal_ros.reporting.summary.sections import Section
 from selfcal_ros.reporting.words.findings import advice, line_text, unit_of, what_it_is
 from selfcal_ros.reporting.words.tables import dof_text
 from selfcal_ros.units import ARCSEC_PER_RAD, UM_PER_M
+
+MAX_ROWS = 200
+"""Longest table of a report; the rest is in the result file."""
+TITLES = {"outliers": "Marks removed or weighted down", "validation": "Held-out validation",
+          "reference": "Reference length"}
+"""Known extras, in the order in which they are reported; others follow by name."""
+DRAWN = {"residuals", "rejected_at"}
+"""Extras that are drawn, not tabulated."""
+_UNITS = (("_m", "µm", UM_PER_M), ("_rad", "arcsec", ARCSEC_PER_RAD), ("_um", "µm", 1.0),
+          ("_arcsec", "arcsec", 1.0), ("_mm", "mm", 1.0), ("_s", "s", 1.0))
+_THETA_DATUM = {
+    ThetaDatum.XY_AXES: "xy_axes: the angular errors at 0°, 90°, 180° and 270° are tied to the "
+                        "slopes of the XY error along the four half axes (Hu eqs. 9, 27)",
+    ThetaDatum.ZERO_MEAN: "zero_mean: the angular errors add up to zero",
+}
+_SENSE = {"microscope_moves": "the microscope moves over a resting plate",
+          "plate_moves": "the plate rides on the stage under a fixed microscope"}
+
+
+def extra_sections(extra: Mapping[str, Any]) -> list[Section]:
+    """Return a section for every extra that is a set of numbers or a table.
+
+    Lengths named ``*_m`` are shown in µm and angles named ``*_rad`` in arcsec. Plain arrays
+    and deeper structures have no place on paper and stay in the result file.
+    """
+    names = [*(n for n in TITLES if n in extra), *sorted(n for n in extra if n not in TITLES)]
+    names = [name for name in names if name not in DRAWN]
+    sections = [_extra_section(name, TITLES.get(name, _words(name).capitalize()), extra[name])
+                for name in names]
+    return [section for section in sections if section is not None]
+
+
+def _extra_section(name: str, title: str, value: Any) -> Section | None:
+    if isinstance(value, Mapping):
+        facts = tuple((_heading(key), _cell(key, item)) for key, item in value.items()
+                      if _is_plain(item))
+        tables = [item for item in value.values() if _is_table(item)]
+        if not facts and not tables:
+            return None
+        return Section(title, facts, *(_table(tables[0]) if tables else ((), ())))
+    if _is_table(value):
+        return Section(title, (), *_table(value))
+    if _is_plain(value) and value is not None:
+        return Section(title, ((_heading(name), _cell(name, value)),))
+    return None
+
+
+def _is_plain(value: Any) -> bool:
+    return value is None or isinstance(value, str | int | float) or (  # or a mark (m, n)
+        isinstance(value, list) and len(value) in (1, 2) and all(type(i) is int for i in value))
+
+
+def _is_table(value: Any) -> bool:
+    return (isinstance(value, Sequence) and not isinstance(value, str) and len(value) > 0
+            and all(isinstance(row, Mapping) and row for row in value))
+
+
+def _table(rows: Sequence[Mapping[str, Any]]) -> tuple[tuple, tuple]:
+    """Return the rows with a header of all their plain keys, and a note if there are too many."""
+    keys = [k for k in dict.fromkeys(key for row in rows for key in row)
+            if all(_is_plain(row.get(k)) for row in rows)
+            and any(row.get(k) not in (None, "") for row in rows)]
+    shown = rows[:MAX_ROWS]
+    columns = [_column(key, [row.get(key) for row in shown]) for key in keys]
+    table = (tuple(_heading(key) for key in keys), *zip(*columns, strict=True))
+    more = len(rows) - len(shown)
+    return table, ((f"{more} more rows are in the result file",) if more else ())
+
+
+def _column(key: str, values: list[Any]) -> list[str]:
+    """Return the cells of a column: numbers with equal decimals."""
+    if not any(isinstance(v, float) for v in values) or any(
+            isinstance(v, str | list) for v in values):
+        return [_cell(key, v) for v in values]
+    scale = _unit(key)[2]
+    numbers = [float("nan") if v is None or isinstance(v, bool) else v * scale for v in values]
+    return aligned_numbers(numbers)
+
+
+def _unit(key: str) -> tuple[str, str, float]:
+    return next(((suffix, unit, scale) for suffix, unit, scale in _UNITS
+                 if str(key).endswith(suffix)), ("", "", 1.0))
+
+
+def _words(key: str) -> str:
+    return printable(key).replace("_", " ").strip()
+
+
+def _heading(key: str) -> str:
+    suffix, unit, _ = _unit(key)
+    return _words(str(key).removesuffix(suffix)) + (f" in {unit}" if unit else "")
+
+
+def _cell(key: str, value: Any) -> str:
+    if value is None:
+        return UNKNOWN
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, list):
+        return ", ".join(map(str, value))
+    scale = _unit(key)[2]
+    if isinstance(value, float) or (isinstance(value, int) and scale != 1.0):
+        return significant(value * scale)
+    return printable(value)
+
+
+ABOUT = ("stage", "serial_number", "operator")
+"""What a report begins with, and no reading tells."""
+
+
+def heading(result: CalibrationResult, about: Mapping[str, str]) -> Section:
+    """Return what was calibrated, by whom and when; `about` before what the result knows."""
+    made = result.provenance
+    known = {**made.extra, **{key: value for key, value in about.items() if value}}
+    first, last = (str(known.get(key, "")).replace("T", " ")[:16] for key in
+                   ("first_exposure", "last_exposure"))
+    measured = f"{first} to {last.removeprefix(first[:11])} UTC"
+    return Section("Calibration", (
+        *((_words(key), printable(known.get(key) or UNKNOWN)) for key in ABOUT),
+        ("measured", measured if first else UNKNOWN),
+        ("evaluated", f"{made.created[:16].replace('T', ' ')} UTC" if made.created else UNKNOWN)))
+
+
+def convention_section(result: CalibrationResult) -> Section:
+    """Return what the numbers mean: signs, datum, sense of measurement, coverage."""
+    facts = [
+        ("error", "G = indicated − true, stage frame; add +G to a command to reach its position"),
+        ("XY datum", "no translation, rotation or magnification over the field (Hu eq. 5), "
+                     "unless a reference length sets the scale"),
+        ("O and R", "Gx = O·y + R·x + Fx, Gy = O·x − R·y + Fy (Hu eq. 6)")]
+    if result.artifact.angular_count:
+        facts.append(("θ datum", _THETA_DATUM[result.error_map.datum_theta]))
+    facts += [("sense", _SENSE.get(result.sense, printable(result.sense))),
+              ("uncertainty", "u is the standard uncertainty (k=1), U = k u the expanded one, "
+                              "k from Student's t for 95.45 % at the degrees of freedom of the "
+                              "uncertainty"),
+              ("misalignment", "φ is the turn of the plate about its centre, counter-clockwise, "
+                               "tx and ty its offset, beyond the nominal pose of the view")]
+    return Section("Conventions", tuple(facts))
+
+
+def _said(value: Any) -> str:
+    """Return a value in words; of a mapping its entries one after the other."""
+    if isinstance(value, Mapping):
+        return ", ".join(f"{printable(key)}: {printable(item)}" for key, item in value.items())
+    return printable(str(value))
+
+
+def provenance_section(result: CalibrationResult) -> Section:
+    """Return where the numbers come from: input and digest, method, software."""
+    source = result.input
+    facts = [(_words(key), printable(value)) for key, value in source.items() if value]
+    facts += [("method", {"joint": "joint least squares of all readings",
+                          "law": "Hu's closed-form law"}.get(result.method,
+                                                             printable(result.method))),
+              ("result schema", SCHEMA), ("software", f"selfcal_ros {__version__}")]
+    made = result.provenance
+    facts += [(_words(key), _said(value)) for key, value in (
+        ("created", made.created), ("solved_by", made.version and f"selfcal_ros {made.version}"),
+        ("run", result.run_id), *made.extra.items()) if value]
+    if math.isfinite(made.duration_s):
+        facts.append(("duration", f"{made.duration_s:.0f} s from the first exposure to the last"))
+    if result.reference:
+        facts += [(f"reference {_words(key)}", printable(str(value)))
+                  for key, value in result.reference.items() if value != ""]
+    return Section("Provenance", tuple(facts))
+
 
 AT_NODES = ("At the nodes: how well the map itself is known. Take it to compare two calibrations, "
             "and for positions that are nodes.")

@@ -13,8 +13,7 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.files import write_bytes, write_text
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.verdict import Grade
-from selfcal_ros.reporting.chapters import Chapter, Figure, chapters
-from selfcal_ros.reporting.extras import heading
+from selfcal_ros.reporting.chapters import Chapter, Figure, chapters, heading
 from selfcal_ros.reporting.figures.svg import css as figures_css
 from selfcal_ros.reporting.figures.svg import inline_svg
 from selfcal_ros.reporting.summary.format import numeric_columns, printable

@@ -16,7 +16,7 @@ from selfcal_ros.messages import from_model, to_model
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Measurements, RepeatMotion
 from selfcal_ros.model.view import Plan, View
-from selfcal_ros.sessions.ports import Ports
+from selfcal_ros.sessions.health import Ports
 from selfcal_ros.units import MS_PER_S, S_PER_NS
 
 PLAN_ID, MARKS, REPEATS, OFFSET_M = "cell_check", 3, 2, 20e-6

@@ -10,7 +10,7 @@ import numpy as np
 from selfcal_ros.collection.clock_steps import Step, StepWatch
 from selfcal_ros.collection.inputs import MAX_AHEAD_NS, Command, begun_ns
 from selfcal_ros.collection.timeline import begins_run
-from selfcal_ros.sessions.ports import Diagnosis, Level
+from selfcal_ros.sessions.health import Diagnosis, Level
 from selfcal_ros.units import NS_PER_S, S_PER_NS
 
 LIVE_NS = NS_PER_S
@@ -113,7 +113,7 @@ class RosTime:
     """
 
     NOTHING = ("use_sim_time is set and nothing is heard on /clock: what this node stamps is "
-               "stamped 0; play the bag with --clock, or set use_sim_time to false")
+               "stamped 0; play the bag with --clock, or start the node without use_sim_time")
 
     def __init__(self, say: Callable[[Level, str], None]) -> None:
         self._say = say
@@ -154,10 +154,10 @@ class Run:
 def supersedes(new: Run, current: Run) -> bool:
     """Return whether messages of run `new` replace those of `current`.
 
-    The later run wins; if the beginning of one is unknown, the one received last.
+    The later run wins. One whose beginning is unknown never replaces one whose beginning is known.
     """
     begun, before = begun_ns(new.run_id), begun_ns(current.run_id)
-    return begun is None or before is None or begun > before
+    return before is None or (begun is not None and begun > before)
 
 
 def is_future(stamp_ns: int, now_ns: int) -> bool:

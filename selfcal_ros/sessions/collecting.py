@@ -20,8 +20,7 @@ from selfcal_ros.messages import from_model, to_model
 from selfcal_ros.messages.to_model import EncoderBlock
 from selfcal_ros.model.readings import Measurements, placing_digest, readings_digest, session_digest
 from selfcal_ros.sessions.clocks import ClockWatch, RunWatch
-from selfcal_ros.sessions.health import CellChecks, Rate, merged
-from selfcal_ros.sessions.ports import Diagnosis, Level, Ports
+from selfcal_ros.sessions.health import CellChecks, Diagnosis, Level, Ports, Rate, merged
 from selfcal_ros.topics import DETECTION_TOPIC, ENCODER_TOPIC
 from selfcal_ros.units import MS_PER_S, NS_PER_S, S_PER_NS, UM_PER_M
 

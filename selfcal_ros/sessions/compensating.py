@@ -17,9 +17,8 @@ from selfcal_ros.messages import to_model
 from selfcal_ros.messages.to_model import PositionEditor
 from selfcal_ros.model.error_map import ErrorMap
 from selfcal_ros.model.result import result_from_dict
-from selfcal_ros.sessions.health import merged
+from selfcal_ros.sessions.health import Diagnosis, Level, Ports, merged
 from selfcal_ros.sessions.map_files import is_qualified
-from selfcal_ros.sessions.ports import Diagnosis, Level, Ports
 from selfcal_ros.units import MS_PER_S, S_PER_NS
 
 KEEPS_UP = 20

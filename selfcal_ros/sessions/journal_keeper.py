@@ -27,7 +27,7 @@ from selfcal_ros.collection.clock_steps import Step
 from selfcal_ros.collection.collector import Collector
 from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.errors import InputError
-from selfcal_ros.sessions.ports import Diagnosis, Level, Ports
+from selfcal_ros.sessions.health import Diagnosis, Level, Ports
 from selfcal_ros.topics import INPUT_TOPICS
 from selfcal_ros.units import S_PER_H
 

@@ -23,8 +23,8 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.messages.cdr import Payloads
 from selfcal_ros.messages.to_model import first_stamps_ns
 from selfcal_ros.sessions.collecting import CollectingSession
+from selfcal_ros.sessions.health import Diagnosis, Level
 from selfcal_ros.sessions.journal_keeper import JournalKeeper, TakenUp, bad_input, take_up
-from selfcal_ros.sessions.ports import Diagnosis, Level
 from selfcal_ros.topics import COMMAND_TOPIC, DETECTION_TOPIC, ENCODER_TOPIC, INPUT_TOPICS
 from selfcal_ros.units import NS_PER_S, S_PER_NS
 

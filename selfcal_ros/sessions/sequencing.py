@@ -20,8 +20,7 @@ from selfcal_ros.messages import from_model, to_model
 from selfcal_ros.model.readings import placing_digest
 from selfcal_ros.model.view import Plan, View, plan_from_dict
 from selfcal_ros.sessions.clocks import is_future
-from selfcal_ros.sessions.health import Presence, StallWatch, missing_marks
-from selfcal_ros.sessions.ports import Diagnosis, Level, Ports
+from selfcal_ros.sessions.health import Diagnosis, Level, Ports, Presence, StallWatch, missing_marks
 from selfcal_ros.topics import COMMAND_TOPIC
 from selfcal_ros.units import NS_PER_S, S_PER_NS
 
@@ -203,7 +202,7 @@ class SequencingSession:
         """Record the progress of the view; continue when it is complete."""
         if to_model.stamp_ns(message) < self._commanded_ns:
             return  # from before the command: a redone view would look complete
-        if message.run_id and message.run_id != self.run_id:
+        if message.run_id != self.run_id:
             return  # of another run
         expected = message.grid_expected + message.angular_expected + message.check_expected
         if message.view_index == self.machine.index and expected:

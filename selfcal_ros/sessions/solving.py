@@ -28,8 +28,8 @@ from selfcal_ros.reporting.summary.numbers import summary_numbers
 from selfcal_ros.reporting.summary.sections import state_sentence
 from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.sessions.clocks import Run, begins_in_future, supersedes
+from selfcal_ros.sessions.health import Diagnosis, Level, Ports
 from selfcal_ros.sessions.map_files import is_qualified, read_result, result_file, run_file
-from selfcal_ros.sessions.ports import Diagnosis, Level, Ports
 from selfcal_ros.topics import COMMAND_TOPIC, MEASUREMENT_TOPIC
 
 ECHO_LENGTH = 128
@@ -178,6 +178,10 @@ class SolvingSession:
         if run != self._run:
             if self._messages and not (supersedes(run, self._run)
                                        or begins_in_future(self._run, now_ns)):
+                if begun_ns(run.run_id) is None:
+                    raise InputError(MEASUREMENT_TOPIC, "readings of a run that does not say when "
+                                     f"it began, while run {self._run.run_id} is known: not used",
+                                     "let the commands carry run_id, or restart the solver")
                 self._left_aside += 1
                 return
             self._run, self._messages = run, {}

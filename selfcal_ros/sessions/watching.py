@@ -15,8 +15,7 @@ from selfcal_ros.errors import printable
 from selfcal_ros.messages import to_model
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.view import View
-from selfcal_ros.sessions.health import Presence
-from selfcal_ros.sessions.ports import Diagnosis, Ports
+from selfcal_ros.sessions.health import Diagnosis, Ports, Presence
 from selfcal_ros.units import ARCSEC_PER_RAD, MM_PER_M, UM_PER_M
 
 PATIENCE_S = 3.0

@@ -11,7 +11,7 @@ from selfcal_ros.collection.inputs import Command, Detection
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import write_json
 from selfcal_ros.messages import from_model
-from selfcal_ros.model.result import plain
+from selfcal_ros.model.json_form import plain
 from selfcal_ros.outputs import temporary_folder
 from selfcal_ros.simulation.cell import Event
 from selfcal_ros.simulation.spec import Simulation

@@ -1,26 +1,290 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A machine cell with known truth: its messages during the measurement of a view.
+"""A machine cell with known truth: its settings, exposures and messages during a view.
 
 The stage moves from mark to mark, dwells, and the microscope exposes in the middle of the dwell.
-The stops and the measured offsets are computed in `exposures`.
 """
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 
 from selfcal_ros.collection.inputs import Command, Detection, EncoderSample, Kind, Phase
+from selfcal_ros.errors import InputError
+from selfcal_ros.model.orders import parse_order
+from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.view import Plan, View
-from selfcal_ros.simulation.exposures import (
-    CellSettings,
-    angular_exposures,
-    grid_exposures,
-    lead_in,
-)
+from selfcal_ros.model.visit_order import VisitSequence, approach_signs, visit_sequence
+from selfcal_ros.simulation import physics
 from selfcal_ros.simulation.machine import Truth
 from selfcal_ros.units import NS_PER_S
 
-__all__ = ["JOINTS", "CellSettings", "Event", "plan_events", "view_events"]
+DWELL = 0.6
+"""Fraction of an exposure period in which the stage rests."""
+
+
+@dataclass(frozen=True)
+class CellSettings:
+    """Settings of the cell: SI units, rates in Hz, periods in s; all sizes standard deviations.
+
+    Attributes
+    ----------
+    sense : Sense
+        What moves.
+    sigma_xy_m, sigma_theta_rad : float
+        White noise of one exposure.
+    noise_ratio : float
+        Noise of y over that of x, which is `sigma_xy_m`.
+    encoder_rate_hz, exposure_period_s : float
+        Encoder samples, and the time from one exposure to the next.
+    with_ids, declare_sigma : bool
+        Whether detections name their marks, and state their noise.
+    servo_sigma_m, servo_sigma_rad : float
+        Scatter of the stage about its stop position, exposure by exposure: motion, which the
+        encoders indicate.
+    encoder_sigma_m, encoder_sigma_rad : float
+        Noise of the encoder readings, exposure by exposure, without motion.
+    visit_order : str
+        Order of the marks if a view does not specify one (`selfcal_ros.model.orders`).
+    consecutive : bool
+        All repeats of a mark consecutively, in one pass; if false, one pass per repeat.
+    stop_sigma_m, stop_sigma_rad : float
+        Stop error relative to the target, visit by visit.
+    follow_mark : bool
+        Whether the target is the actual position of the mark, not the nominal one.
+    visit_xy_m : float
+        Noise shared by all exposures of a visit.
+    flicker_xy_m, flicker_theta_rad : float
+        Noise with a spectrum of 1/f over the exposures of a view.
+    resolution_xy_m, resolution_theta_rad : float
+        Step of the published offsets; 0 = none.
+
+    Raises
+    ------
+    InputError
+        For a dwell too short for encoder samples on both sides of the exposure, or an unknown
+        order.
+    """
+
+    sense: Sense = Sense.MICROSCOPE_MOVES
+    sigma_xy_m: float = 0.0
+    sigma_theta_rad: float = 0.0
+    noise_ratio: float = 1.0
+    encoder_rate_hz: float = 500.0
+    exposure_period_s: float = 0.01
+    with_ids: bool = True
+    declare_sigma: bool = False
+    servo_sigma_m: float = 20e-9
+    servo_sigma_rad: float = 1e-7
+    encoder_sigma_m: float = 0.0
+    encoder_sigma_rad: float = 0.0
+    visit_order: str = ""
+    consecutive: bool = False
+    stop_sigma_m: float = 0.0
+    stop_sigma_rad: float = 0.0
+    follow_mark: bool = False
+    visit_xy_m: float = 0.0
+    flicker_xy_m: float = 0.0
+    flicker_theta_rad: float = 0.0
+    resolution_xy_m: float = 0.0
+    resolution_theta_rad: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Refuse impossible settings."""
+        if DWELL * self.exposure_period_s * self.encoder_rate_hz < 2.5:
+            raise InputError("simulated cell", f"{self.encoder_rate_hz:g} Hz gives fewer than "
+                             f"2.5 encoder samples in a dwell of "
+                             f"{DWELL * self.exposure_period_s:g} s",
+                             "raise encoder_rate or exposure_period")
+        if self.visit_order:
+            parse_order(self.visit_order, "simulated cell: visit_order")
+
+    @property
+    def period_ns(self) -> int:
+        """Time from one exposure to the next, ns."""
+        return round(self.exposure_period_s * NS_PER_S)
+
+    @property
+    def dwell_ns(self) -> int:
+        """Time at rest in each period, ns; the exposure is in its middle."""
+        return round(DWELL * self.period_ns)
+
+    @property
+    def exposure_ns(self) -> int:
+        """Time from the beginning of a period to its exposure, ns: between two samples."""
+        return self.dwell_ns // 2 + 1
+
+
+NO_MOTION_M = 1e-6
+"""Largest change of an axis between stops that does not take up its backlash."""
+
+
+@dataclass(frozen=True, eq=False)
+class GridExposures:
+    """Exposures of grid marks in their order.
+
+    Attributes
+    ----------
+    visits : VisitSequence
+        The visits, V of them.
+    visit : int array (E,)
+        Index of the visit of each exposure.
+    position : float array (2, E)
+        Indicated position of the stage, m.
+    offset : float array (2, E)
+        Offset published by the microscope, m.
+    mark : int array (2, V)
+        m and n of the mark found there: the visited one if the plate is placed as commanded.
+    there : bool array (V,)
+        Whether there is a mark.
+    approach : int8 array (2, V)
+        Sign of the last motion of each stage axis before the visit.
+    site : float array (2, V)
+        Nominal position of the mark in the stage frame, m.
+    """
+
+    visits: VisitSequence
+    visit: np.ndarray
+    position: np.ndarray
+    offset: np.ndarray
+    mark: np.ndarray
+    there: np.ndarray
+    approach: np.ndarray
+    site: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class AngularExposures:
+    """Exposures of angular lines in their order, (E,) each.
+
+    Attributes
+    ----------
+    k, line : int arrays
+        The line that the view expects, and the one found there.
+    position, offset : float arrays
+        Indicated angle, and the published offset, rad.
+    """
+
+    k: np.ndarray
+    line: np.ndarray
+    position: np.ndarray
+    offset: np.ndarray
+
+
+def grid_exposures(truth: Truth, index: int, view: View, *, settings: CellSettings,
+                   rng: np.random.Generator) -> GridExposures:
+    """Return the exposures of the grid marks of view `index`.
+
+    The plate drifts from the first of them to the last. The first one is approached in
+    + direction, in x and in y (`lead_in`).
+    """
+    visits = visit_sequence(truth.artifact, view, order=view.visit_order or settings.visit_order,
+                            consecutive=settings.consecutive, rng=rng)
+    visit = np.repeat(np.arange(len(visits)), visits.count)
+    size = len(visit)
+    m, n, there = physics.marks_below(truth, index, view, (visits.m, visits.n))
+    place, _ = physics.mark_places(truth, index, truth.placed_as(index, view), (m, n))
+    site = (np.stack(view.on_stage(truth.artifact).site_of(visits.m, visits.n))
+            * truth.artifact.grid_pitch_m)
+    tau = np.arange(size) / max(size - 1, 1)
+    moved = physics.drift(truth, index, tau)
+    sign = -1 if settings.sense is Sense.PLATE_MOVES else 1
+    stop = sign * site
+    if settings.follow_mark:  # the stage continues until the mark is under the microscope
+        centre = sign * (place + moved[:, np.cumsum(visits.count) - visits.count])
+        stop = centre + physics.stage_error(truth, centre, index)
+    stop = stop + _normal(rng, settings.stop_sigma_m, stop.shape) + visits.aside_m
+    came = np.concatenate([lead_in(truth, stop[:, :1]), stop], axis=1)
+    approach = np.stack([approach_signs(row, NO_MOTION_M)[1:] for row in came])
+    position = stop[:, visit] + _normal(rng, settings.servo_sigma_m, (2, size))
+    lag = ((truth.backlash_m[:, None] + truth.backlash_growth_m * tau) * approach[:, visit]
+           + _settling(truth, came, visit, settings.exposure_period_s))
+    stage = position - physics.stage_error(truth, position, index) - lag
+    offset = physics.true_offset(settings.sense, place[:, visit] + moved, stage)
+    white = _normal(rng, settings.sigma_xy_m, (2, size))
+    white *= np.array([[1.0], [settings.noise_ratio]])
+    told = (physics.seen_offset(truth, offset) + white
+            + _normal(rng, settings.visit_xy_m, (2, len(visits)))[:, visit]
+            + _flicker(rng, settings.flicker_xy_m, (2, size)))
+    indicated = position + _normal(rng, settings.encoder_sigma_m, (2, size))
+    return GridExposures(visits, visit, indicated, quantised(told, settings.resolution_xy_m),
+                         np.stack([m, n]), there, approach, site)
+
+
+def _settling(truth: Truth, came: np.ndarray, visit: np.ndarray, period_s: float,
+              ) -> np.ndarray | float:
+    """Return the settling error of the axes at each exposure, (2, E), m.
+
+    Parameters
+    ----------
+    truth
+        The truth.
+    came : float array (2, V + 1)
+        Stops of the stage, beginning with the one before the first visit.
+    visit : int array (E,)
+        Index of the visit of each exposure.
+    period_s : float
+        Time from one exposure to the next.
+    """
+    if not truth.settling_m:
+        return 0.0
+    step = np.diff(came, axis=1)
+    sign = np.where(np.abs(step) > NO_MOTION_M, np.sign(step), 0)
+    rested = np.arange(len(visit)) - np.searchsorted(visit, visit)
+    return truth.settling_m * sign[:, visit] * np.exp(-rested * period_s / truth.settling_time_s)
+
+
+def lead_in(truth: Truth, first: np.ndarray) -> np.ndarray:
+    """Return the position of an axis before the first grid mark of a view, m."""
+    return first - truth.artifact.grid_pitch_m / 2
+
+
+def angular_exposures(truth: Truth, index: int, view: View, *, settings: CellSettings,
+                      rng: np.random.Generator) -> AngularExposures:
+    """Return the exposures of the angular lines of view `index`, line by line."""
+    direction, nominal, there = physics.line_directions(truth, index, view)
+    line = np.arange(len(nominal))
+    k = (np.repeat(line, view.repeats) if settings.consecutive
+         else np.tile(line, view.repeats))
+    sign = -1 if settings.sense is Sense.PLATE_MOVES else 1
+    n_stops = len(line) if settings.consecutive else len(k)
+    stop = _normal(rng, settings.stop_sigma_rad, n_stops)
+    stop = np.repeat(stop, view.repeats) if settings.consecutive else stop
+    centre = sign * nominal
+    if settings.follow_mark:
+        centre = sign * direction + physics.encoder_error(truth, sign * direction)
+    position = centre[k] + stop + _normal(rng, settings.servo_sigma_rad, len(k))
+    stage = position - physics.encoder_error(truth, position)
+    offset = physics.true_offset(settings.sense, direction[k], stage)
+    told = (truth.line_factor * offset + _normal(rng, settings.sigma_theta_rad, len(k))
+            + _flicker(rng, settings.flicker_theta_rad, (len(k),)))
+    indicated = position + _normal(rng, settings.encoder_sigma_rad, len(k))
+    return AngularExposures(k, there[k], indicated, quantised(told, settings.resolution_theta_rad))
+
+
+def quantised(told: np.ndarray, step: float) -> np.ndarray:
+    """Return the nearest multiples of `step`; unchanged if it is 0."""
+    return np.rint(told / step) * step if step else told
+
+
+def flicker_noise(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
+    """Return noise of variance 1 along the last axis whose spectrum falls as 1/f."""
+    length = 2 * max(shape[-1], 2)  # twice as long: the part used is not periodic
+    k = np.arange(1, length // 2)
+    spectrum = np.zeros((*shape[:-1], length // 2 + 1), dtype=complex)
+    parts = rng.normal(0, 1, (2, *shape[:-1], len(k)))
+    spectrum[..., 1:-1] = (parts[0] + 1j * parts[1]) / np.sqrt(k)
+    wave = np.fft.irfft(spectrum, length) * (length / (2 * np.sqrt((1 / k).sum())))
+    return wave[..., :shape[-1]]
+
+
+def _flicker(rng: np.random.Generator, sigma: float, shape: tuple[int, ...]) -> np.ndarray | float:
+    return sigma * flicker_noise(rng, shape) if sigma and shape[-1] else 0.0
+
+
+def _normal(rng: np.random.Generator, sigma: float, shape: tuple[int, ...] | int) -> np.ndarray:
+    return rng.normal(0, sigma, shape) if sigma else np.zeros(shape)
+
 
 JOINTS = ("x", "y", "theta")
 

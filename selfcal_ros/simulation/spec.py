@@ -15,8 +15,7 @@ from selfcal_ros.errors import InputError, known_are
 from selfcal_ros.files import read_yaml
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.view import Plan, View, plan_from_dict, plan_to_dict
-from selfcal_ros.simulation.cell import Event, plan_events
-from selfcal_ros.simulation.exposures import CellSettings
+from selfcal_ros.simulation.cell import CellSettings, Event, plan_events
 from selfcal_ros.simulation.machine import (
     AXES,
     ENCODERS,

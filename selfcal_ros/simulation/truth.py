@@ -11,7 +11,7 @@ from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import GridVisits, Measurements, Sense, ViewReadings
 from selfcal_ros.model.view import Plan, View
 from selfcal_ros.simulation import physics
-from selfcal_ros.simulation.exposures import (
+from selfcal_ros.simulation.cell import (
     AngularExposures,
     CellSettings,
     GridExposures,

@@ -64,7 +64,7 @@ def error_of(field, truth) -> float:
     """Return the largest |G - truth| in m in the datum, over the sites that are known."""
     import numpy as np
 
-    from selfcal_ros.estimation.lattice.gauge import Gauge
+    from selfcal_ros.estimation.lattice.connectivity import Gauge
 
     z = (truth.artifact.m + 1j * truth.artifact.n) / truth.artifact.half[0]
     known = np.isfinite(field).all(axis=0)

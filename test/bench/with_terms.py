@@ -16,7 +16,7 @@ from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.terms import parse_terms
 from selfcal_ros.model.view import Plan, View
-from selfcal_ros.simulation.exposures import CellSettings
+from selfcal_ros.simulation.cell import CellSettings
 from selfcal_ros.simulation.machine import Spread, random_truth
 from selfcal_ros.simulation.truth import simulate_measurements
 

@@ -15,7 +15,8 @@ from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.files import read_json, write_json
 from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.model.result import plain, result_from_dict, result_to_dict
+from selfcal_ros.model.json_form import plain
+from selfcal_ros.model.result import result_from_dict, result_to_dict
 from selfcal_ros.model.verdict import Enlargement, Grade, Verdict
 from selfcal_ros.simulation.truth import hu_plan, random_truth, simulate_measurements
 

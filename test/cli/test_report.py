@@ -142,15 +142,15 @@ ROW = {"quantity": "xy", "component": "reading noise", "type": "A", "value": 0.0
     ("reference", REFERENCE | {"relative_error": "x"}, "'x' is not a number"),
     ("reference", REFERENCE | {"u_relative": None}, "with u nan is not a relative error"),
     ("reference", REFERENCE | {"u_relative": -1.0}, "with u -1.0 is not a relative error"),
-    ("reference", REFERENCE | {"certificate": 3}, "3 is not text"),
+    ("reference", REFERENCE | {"certificate": 3}, "3 is not of type str"),
     ("reference", {}, "the key 'kind' is missing"),
-    ("reference", [], "[] is not a reference"),
+    ("reference", [], "[] is not of type dict"),
     ("budget", [{"effect_rms": 1e-9}], "the key 'dof' is missing"),
-    ("budget", [ROW | {"quantity": 3}], "3 is not text"),
-    ("budget", [ROW | {"details": 3}], "3 are no details"),
+    ("budget", [ROW | {"quantity": 3}], "3 is not of type str"),
+    ("budget", [ROW | {"details": 3}], "3 is not of type dict"),
     ("budget", [ROW | {"dof": "many"}], "'many' is not a number"),
     ("budget", [ROW | {"effect_max": [1]}], "[1] is not a number"),
-    ("budget", [3], "[3] is not a list of lines"), ("budget", "x", "'x' is not a list of lines")])
+    ("budget", [3], "3 is not of type dict"), ("budget", "x", "'x' is not of type list")])
 def test_an_unusable_reference_or_budget_is_one_line(folder, monkeypatch, capsys, key, value, said):
     monkeypatch.chdir(folder)
     whole = json.loads(Path("result.json").read_text())

@@ -4,10 +4,10 @@
 import numpy as np
 import pytest
 
-from selfcal_ros.laser.closure import length_closure
 from selfcal_ros.laser.data import DIAGONALS, StepDiagonal
 from selfcal_ros.laser.identify import jacobian
 from selfcal_ros.laser.noise import (
+    length_closure,
     linear_covariance,
     linear_noise,
     reading_covariance,

@@ -8,10 +8,10 @@ import pytest
 from scipy.stats import t
 
 from selfcal_ros.laser.data import DIAGONALS, Form, Method
-from selfcal_ros.laser.figures import profiles_figure, sensitivity_figure
 from selfcal_ros.laser.identify import Choice, identify
 from selfcal_ros.laser.noise import linear_noise, reading_noise
 from selfcal_ros.laser.profiles import profile_m, u_profile_m
+from selfcal_ros.laser.report import profiles_figure, sensitivity_figure
 from selfcal_ros.laser.table import Columns, read_table
 from selfcal_ros.reporting.figures.drawing import Discs, Label
 from selfcal_ros.reporting.figures.drawing import Path as Line

@@ -5,11 +5,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from selfcal_ros.errors import InputError, NotIdentifiableError
-from selfcal_ros.laser.closure import check_lengths
 from selfcal_ros.laser.data import DIAGONALS, Form, StepDiagonal
 from selfcal_ros.laser.identify import identify_ibaraki, identify_wang
+from selfcal_ros.laser.noise import check_lengths
 from selfcal_ros.laser.profiles import squareness, straightness
-from selfcal_ros.laser.published_equations import Erratum
 from selfcal_ros.laser.simulation.measure import (
     LaserNoise,
     Measurement,
@@ -76,20 +75,6 @@ def test_eq_5_as_printed_errs_by_the_linear_errors_that_it_leaves_out():
     same = random_errors(1, np.random.default_rng(25)).repeat(6, axis=1)
     data = planar((0.01, 0.01), same, mirror_rad=(1e-3, 1e-3))
     assert np.abs(identify_ibaraki(data, form=Form.PRINTED).errors_m - same).max() < 1 * NM
-
-
-@pytest.mark.parametrize(("erratum", "at_least_m"),
-                         [(Erratum.EQ4_SIGN, 0.015), (Erratum.EQ6_LENGTH, 0.009)])
-@pytest.mark.parametrize("form", [Form.STEPWISE, Form.PRINTED])
-def test_an_erratum_put_back_is_found_out(erratum, at_least_m, form):
-    errors = random_errors(6, np.random.default_rng(26))
-    data = planar((0.01, 0.01), errors, mirror_rad=(1e-3, 1e-3)).pick(["pp"])
-    tolerance = 1 * NM if form is Form.STEPWISE else 1 * UM
-    assert np.abs(identify_ibaraki(data, form=form).errors_m - errors).max() < tolerance
-    wrong = np.abs(identify_ibaraki(data, form=form, errata=[erratum]).errors_m - errors).max()
-    # The printed eq. 5 works on differences, where the sign of eq. 4 doubles Ey(x) instead.
-    assert wrong > (at_least_m if (form, erratum) != (Form.PRINTED, Erratum.EQ4_SIGN)
-                    else 60 * NM)
 
 
 def test_the_closure_between_diagonals_is_zero_for_one_machine_and_the_difference_for_two():

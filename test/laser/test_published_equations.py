@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from selfcal_ros.errors import InputError
-from selfcal_ros.laser.published_equations import eq3
+from selfcal_ros.laser.identify import eq3
 
 
 def test_the_length_of_a_diagonal_gives_the_other_side_of_the_triangle():

@@ -6,7 +6,7 @@ import pytest
 
 from selfcal_ros.laser.data import StepDiagonal
 from selfcal_ros.laser.identify import identify_ibaraki
-from selfcal_ros.laser.result_json import outcome
+from selfcal_ros.laser.report import outcome
 from test.support.laser import planar
 
 

@@ -8,7 +8,6 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.laser.data import DIAGONALS, Method, StepDiagonal, signs_of, step_vectors
 from selfcal_ros.laser.identify import Choice, identify, identify_wang, jacobian, readings_are_equal
 from selfcal_ros.laser.profiles import squareness
-from selfcal_ros.laser.published_equations import Erratum
 from selfcal_ros.laser.simulation.measure import (
     Measurement,
     SetUp,
@@ -42,12 +41,6 @@ def test_table_1_of_the_source(case):
                                atol=0.5 * 10.0**-decimals)
 
 
-def test_table_1_needs_the_corrected_rows_of_eq_1():
-    data = planar((0.01, 0.01), one_block(*TABLE_1["c"][0]))
-    wrong = identify_wang(data, errata=[Erratum.EQ1_ROWS])
-    assert abs(wrong.errors_m[1, 0, 0] / MM - 0.1) > 0.05
-
-
 @settings(max_examples=30, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.floats(1e-3, 0.1), st.floats(1e-3, 0.1), st.integers(1, 8))
 def test_nominal_lasers_give_the_truth_for_any_steps_and_blocks(seed, a, b, n):
@@ -63,11 +56,9 @@ def test_body_diagonals_give_all_18_errors_at_nominal_lasers():
     assert found.closure.residual_rms_m < 1e-16
 
 
-def test_the_exchanged_rows_of_eq_1_change_the_sign_of_ex_y():
+def test_the_sign_of_ex_y_needs_the_corrected_rows_of_eq_1():
     errors = random_errors(4, np.random.default_rng(5))
     data = exact_nominal((0.01, 0.01), errors)
-    wrong = identify_wang(data, errata=[Erratum.EQ1_ROWS])
-    np.testing.assert_allclose(wrong.errors_m[1, :, 0], -errors[1, :, 0], atol=1e-15)
     right = identify_wang(data)
     np.testing.assert_allclose(right.errors_m[1, :, 0], errors[1, :, 0], atol=1e-15)
 

@@ -10,10 +10,10 @@ import pytest
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.json_form import plain
 from selfcal_ros.model.readings import Measurements, ViewReadings
 from selfcal_ros.model.result import (
     Observability,
-    plain,
     result_from_dict,
     result_to_dict,
     unidentified_result,

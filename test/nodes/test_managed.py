@@ -21,6 +21,7 @@ from selfcal_ros.nodes.compensator import CompensatorNode
 from selfcal_ros.nodes.measurement_collector import MeasurementCollector
 from selfcal_ros.nodes.pose_sequencer import PoseSequencer
 from selfcal_ros.nodes.solver import Solver
+from selfcal_ros.sessions.health import Diagnosis, Level
 from test.support.sessions import decoded, plan_file, small_plan
 
 MANAGED = {"measurement_collector": MeasurementCollector, "pose_sequencer": PoseSequencer,
@@ -128,13 +129,15 @@ def test_a_node_that_cannot_start_by_itself_raises(graph, tmp_path):
 
 
 def test_a_transition_that_does_not_exist_is_refused_and_ends_nothing(graph):
-    graph.node(Solver)
+    node = graph.node(Solver)
     assert state(graph, "solver") == "active"
     assert not change(graph, "solver", Transition.TRANSITION_CONFIGURE)
     assert not change(graph, "solver", 250)
     assert state(graph, "solver") == "active"
     assert change(graph, "solver", Transition.TRANSITION_ACTIVE_SHUTDOWN)
     assert state(graph, "solver") == "finalized"
+    assert node.diagnosis() == Diagnosis(Level.ERROR, "finalized: shut down by a request, for "
+                                         "good; end this process and start the node again")
 
 
 def test_an_inactive_node_says_so(graph):

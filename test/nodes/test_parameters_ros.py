@@ -122,9 +122,10 @@ def test_a_dump_of_all_parameters_is_a_file_that_a_node_takes(graph, tmp_path):
     assert {name: second.get_parameter(name).value for name in told} == told
 
 
-def test_a_parameter_cannot_be_changed_while_the_node_runs(graph):
+@pytest.mark.parametrize("name, value", [("settle_time", 2.0), ("use_sim_time", True)])
+def test_a_parameter_cannot_be_changed_while_the_node_runs(graph, name, value):
     node = graph.node(PoseSequencer)
-    [answer] = node.set_parameters([RosParameter("settle_time", value=2.0)])
+    [answer] = node.set_parameters([RosParameter(name, value=value)])
     assert not answer.successful
     assert "read-only" in answer.reason
 

@@ -21,7 +21,7 @@ from selfcal_ros.nodes import names
 from selfcal_ros.nodes.bag_player import BagPlayer
 from selfcal_ros.nodes.bag_recorder import BagRecorder
 from selfcal_ros.nodes.measurement_collector import MeasurementCollector
-from selfcal_ros.sessions.ports import Level
+from selfcal_ros.sessions.health import Level
 from test.support.sessions import decoded, small_bag
 
 

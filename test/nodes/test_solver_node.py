@@ -20,9 +20,8 @@ from selfcal_ros.model.result import result_to_dict
 from selfcal_ros.model.view import Plan
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes import solver as solver_module
-from selfcal_ros.nodes.filling import fill
+from selfcal_ros.nodes.filling import fill, map_geometry
 from selfcal_ros.nodes.solver import Solver
-from selfcal_ros.reporting.markers import map_geometry
 from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.sessions.solving import Outcome, short
 from test.support.maps import random_map, result_of

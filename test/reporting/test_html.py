@@ -12,7 +12,7 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.joint.noise import coverage_factor
 from selfcal_ros.model.result import Observability, result_from_dict, result_to_dict
 from selfcal_ros.model.verdict import Cause, Grade, Provenance, Remedy, Verdict
-from selfcal_ros.reporting.extras import MAX_ROWS, convention_section, extra_sections, heading
+from selfcal_ros.reporting.chapters import MAX_ROWS, convention_section, extra_sections, heading
 from selfcal_ros.reporting.report import report_html, write_report
 from test.support.results import html_of, known_result, with_residuals
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.reporting.markers import (
+from selfcal_ros.nodes.filling import (
     CERTAIN,
     UNCERTAIN,
     UNKNOWN,

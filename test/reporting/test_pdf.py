@@ -7,8 +7,7 @@ import pytest
 from selfcal_ros.aerotech.report import table_chapter
 from selfcal_ros.errors import InputError
 from selfcal_ros.reporting import pdf
-from selfcal_ros.reporting.chapters import Chapter
-from selfcal_ros.reporting.extras import heading
+from selfcal_ros.reporting.chapters import Chapter, heading
 from selfcal_ros.reporting.pdf import COLUMNS, _lines, report_pdf
 from selfcal_ros.reporting.report import write_report
 from selfcal_ros.reporting.summary.sections import Section

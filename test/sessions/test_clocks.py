@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 
 from selfcal_ros.sessions.clocks import ClockWatch, RosTime
-from selfcal_ros.sessions.ports import Level
+from selfcal_ros.sessions.health import Level
 
 NOTHING = ("use_sim_time is set and nothing is heard on /clock: what this node stamps is stamped "
-           "0; play the bag with --clock, or set use_sim_time to false")
+           "0; play the bag with --clock, or start the node without use_sim_time")
 
 
 def looked(*instants_ns: int, simulated: bool = True):

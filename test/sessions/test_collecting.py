@@ -10,7 +10,7 @@ from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.messages import from_model
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.sessions.collecting import CollectingSession
-from selfcal_ros.sessions.ports import Level, Ports
+from selfcal_ros.sessions.health import Level, Ports
 from test.support.collecting import gathered, scene
 from test.support.ports import message
 

@@ -15,8 +15,8 @@ from selfcal_ros.collection.inputs import Command, Detection, EncoderSample, Pha
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.model.result import with_input
 from selfcal_ros.sessions.collecting import CollectingSession
+from selfcal_ros.sessions.health import Level
 from selfcal_ros.sessions.journal_keeper import take_up
-from selfcal_ros.sessions.ports import Level
 from selfcal_ros.sessions.solving import SolvingSession, solve
 from selfcal_ros.simulation.bag import event_fields
 from selfcal_ros.simulation.cell import CellSettings, plan_events

@@ -14,7 +14,7 @@ from selfcal_ros.messages import from_model
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.result import result_to_dict
 from selfcal_ros.sessions.compensating import KEEPS_UP, CompensatingSession
-from selfcal_ros.sessions.ports import Level
+from selfcal_ros.sessions.health import Level
 from test.support.maps import random_map, result_of
 from test.support.ports import START_NS, Hands, message, settings_of
 

@@ -7,8 +7,16 @@ import numpy as np
 import pytest
 
 from selfcal_ros.errors import InputError
-from selfcal_ros.sessions.health import MOST_STEPS, Losses, Presence, Rate, Refusals, merged
-from selfcal_ros.sessions.ports import Diagnosis, Level
+from selfcal_ros.sessions.health import (
+    MOST_STEPS,
+    Diagnosis,
+    Level,
+    Losses,
+    Presence,
+    Rate,
+    Refusals,
+    merged,
+)
 from test.support.ports import Hands
 
 

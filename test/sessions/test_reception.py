@@ -20,8 +20,8 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.model.readings import readings_digest
 from selfcal_ros.sessions import journal_keeper, reception
 from selfcal_ros.sessions.collecting import CollectingSession
+from selfcal_ros.sessions.health import Level
 from selfcal_ros.sessions.journal_keeper import JournalKeeper, KeptTopic
-from selfcal_ros.sessions.ports import Level
 from selfcal_ros.sessions.reception import Reception
 from selfcal_ros.topics import COMMAND_TOPIC, DETECTION_TOPIC, ENCODER_TOPIC, INPUT_TOPICS
 from test.support.bags import Foreign

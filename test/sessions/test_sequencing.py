@@ -12,7 +12,7 @@ from selfcal_ros.collection.sequencer import State
 from selfcal_ros.errors import InputError
 from selfcal_ros.messages import from_model
 from selfcal_ros.sessions.collecting import CollectingSession
-from selfcal_ros.sessions.ports import Diagnosis, Level
+from selfcal_ros.sessions.health import Diagnosis, Level
 from selfcal_ros.sessions.sequencing import PATIENCE_S, SequencingSession
 from test.support.ports import START_NS, Hands, message, settings_of
 from test.support.sessions import plan_file, small_plan
@@ -111,7 +111,7 @@ def test_a_status_counts_from_the_stamp_of_the_newest_command(measuring, age_ns,
 
 
 @pytest.mark.parametrize("fields, moves", [
-    ({}, True), ({"run_id": "1"}, False), ({"run_id": ""}, True), ({"plan_id": "other"}, False),
+    ({}, True), ({"run_id": "1"}, False), ({"run_id": ""}, False), ({"plan_id": "other"}, False),
     ({"view_index": 1}, False), ({"complete": False}, False)])
 def test_only_the_current_view_of_this_run_moves_it_on(measuring, fields, moves):
     measuring.status(**({"complete": True} | fields))

@@ -17,8 +17,8 @@ from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.messages import from_model, to_model
 from selfcal_ros.model.terms import DEFAULT_TERMS
 from selfcal_ros.sessions.clocks import Run, supersedes
+from selfcal_ros.sessions.health import Level
 from selfcal_ros.sessions.map_files import plan_file_name, read_result, result_file
-from selfcal_ros.sessions.ports import Level
 from selfcal_ros.sessions.solving import SolvingSession, solve
 from test.support.ports import START_NS, Hands, message, settings_of
 from test.support.sessions import collected, events_of, small_plan
@@ -113,11 +113,25 @@ def test_readings_of_two_runs_are_never_mixed(desk):
 @pytest.mark.parametrize("new, current, later", [
     (Run("a", "2"), Run("a", "1"), True), (Run("a", "1"), Run("a", "2"), False),
     (Run("a", "10"), Run("a", "9"), True), (Run("b", "1"), Run("a", "2"), False),
-    (Run("b"), Run("a", "2"), True), (Run("a", "2"), Run("a"), True),
-    (Run("a", "x"), Run("a", "2"), True), (Run("a", "9" * 21), Run("a", "2"), True),
+    (Run("b"), Run("a", "2"), False), (Run("a", "2"), Run("a"), True),
+    (Run("b"), Run("a"), True),
+    (Run("a", "x"), Run("a", "2"), False), (Run("a", "9" * 21), Run("a", "2"), False),
     (Run("a", "2"), Run("a", "9" * 21), True), (Run("a", "2"), Run("a", "9" * 20), False)])
 def test_the_later_run_supersedes(new, current, later):
     assert supersedes(new, current) is later
+
+
+@pytest.mark.parametrize("run_id", ["", "no stamp"])
+def test_readings_that_name_no_beginning_take_nothing_from_a_run_that_does(desk, run_id):
+    views = views_of(run_id="100")
+    desk.take(views[:2])
+    with pytest.raises(InputError, match="a run that does not say when it began, while run 100"):
+        desk.take(views_of(seed=6, run_id=run_id)[:1])
+    desk.take(views[2:])
+    last = desk.hands.of("map")[-1]
+    _, measurements, _ = collected(events_of(PLAN))
+    np.testing.assert_array_equal(last["gx"], calibrate(measurements).error_map.gx.ravel())
+    assert last["run_id"] == "100"
 
 
 def test_what_arrives_while_a_job_runs_is_solved_next_and_a_newer_run_discards_it(desk):

@@ -10,7 +10,7 @@ import pytest
 from selfcal_ros.collection.inputs import Command, Phase
 from selfcal_ros.messages import from_model
 from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.sessions.ports import Diagnosis, Level
+from selfcal_ros.sessions.health import Diagnosis, Level
 from selfcal_ros.sessions.watching import Watch
 from test.support.maps import random_map, result_of
 from test.support.plans import plan_of

@@ -15,8 +15,7 @@ import pytest
 from selfcal_ros.collection.inputs import Detection, Kind
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.view import Plan, View
-from selfcal_ros.simulation.cell import plan_events
-from selfcal_ros.simulation.exposures import CellSettings
+from selfcal_ros.simulation.cell import CellSettings, plan_events
 from selfcal_ros.simulation.machine import AXES, Spread, random_truth
 from test.simulation.test_physics import (
     PLATE,

@@ -14,7 +14,7 @@ from selfcal_ros.model.artifact import Artifact, Interpolation, MapGrid
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.view import Plan, View
 from selfcal_ros.model.visit_order import visit_sequence
-from selfcal_ros.simulation.exposures import CellSettings, flicker_noise, grid_exposures, quantised
+from selfcal_ros.simulation.cell import CellSettings, flicker_noise, grid_exposures, quantised
 from selfcal_ros.simulation.machine import Spread, Truth, random_truth
 from selfcal_ros.simulation.physics import encoder_error, stage_error
 from selfcal_ros.simulation.truth import angular_deviation, grid_deviation, simulate_measurements

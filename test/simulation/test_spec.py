@@ -11,7 +11,7 @@ from selfcal_ros.collection.settings.nodes import NODE_PARAMETERS
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.artifact import MapGrid
 from selfcal_ros.model.readings import Sense
-from selfcal_ros.simulation.exposures import CellSettings
+from selfcal_ros.simulation.cell import CellSettings
 from selfcal_ros.simulation.machine import Spread
 from selfcal_ros.simulation.spec import (
     CELL,

@@ -10,7 +10,7 @@ import pytest
 from selfcal_ros.estimation.datum.modes import datum_modes, remove_modes
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Sense
-from selfcal_ros.simulation.exposures import CellSettings
+from selfcal_ros.simulation.cell import CellSettings
 from selfcal_ros.simulation.machine import _stage
 from selfcal_ros.simulation.physics import encoder_error, stage_error
 from selfcal_ros.simulation.truth import (

@@ -8,8 +8,7 @@ import pytest
 
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.view import View
-from selfcal_ros.simulation.cell import plan_events
-from selfcal_ros.simulation.exposures import CellSettings
+from selfcal_ros.simulation.cell import CellSettings, plan_events
 from selfcal_ros.simulation.machine import Spread, random_truth
 from selfcal_ros.simulation.truth import simulate_measurements
 from test.support.collecting import START_NS, collect

@@ -64,6 +64,10 @@ def readings(artifact: Artifact, poses, rng, *, sigma=20e-9, size=1e-6, turn=3e-
 
     nodes = artifact.field.x_m + 1j * artifact.field.y_m
     field = size * complex_normal(artifact.field.shape) if stage is None else stage(nodes)
+    if stage is None:  # a stage that turns as a whole turns the offsets seen: of second order
+        x, y = remove_modes(np.stack([field.real, field.imag]),
+                            datum_modes(artifact.field, scale=True))
+        field = x + 1j * y
     plate_error, views = size * complex_normal(artifact.shape), []
     for number, (degrees, pitches) in enumerate(poses):
         view = View(f"view {number}", np.radians(degrees),

@@ -4,7 +4,7 @@
 
 from selfcal_ros.bagio.schemas import build, typestore
 from selfcal_ros.collection.settings.nodes import NODE_SETTINGS, Settings
-from selfcal_ros.sessions.ports import Level, Ports
+from selfcal_ros.sessions.health import Level, Ports
 
 START_NS = 1_700_000_000_000_000_000
 

@@ -15,8 +15,7 @@ from selfcal_ros.model.result import (
     Observability,
     ViewResult,
 )
-from selfcal_ros.reporting.chapters import Chapter, chapters
-from selfcal_ros.reporting.extras import heading
+from selfcal_ros.reporting.chapters import Chapter, chapters, heading
 from selfcal_ros.reporting.report import report_html
 from selfcal_ros.reporting.summary.numbers import truth_arrays
 from selfcal_ros.simulation.truth import hu_plan, random_truth

@@ -8,7 +8,7 @@ import numpy as np
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.view import Plan, View
-from selfcal_ros.simulation.exposures import CellSettings
+from selfcal_ros.simulation.cell import CellSettings
 from selfcal_ros.simulation.machine import Spread
 from tools.reality.cases import SIGMA_RAD, Case, checked
 

@@ -15,7 +15,7 @@ from functools import cached_property
 import numpy as np
 
 from selfcal_ros.estimation.datum.angular import Conditions
-from selfcal_ros.estimation.lattice.gauge import Gauge
+from selfcal_ros.estimation.lattice.connectivity import Gauge
 from selfcal_ros.estimation.normal.equations import NormalEquations
 from selfcal_ros.estimation.options import ReferenceKind, ReferenceLength
 

@@ -117,7 +117,7 @@ def fit(problem: Problem, y: np.ndarray, theta: AngularPart | None = None) -> Jo
 
 
 def _iterated(problem: Problem, y: np.ndarray, theta: AngularPart) -> FreeNetworkSolution:
-    from selfcal_ros.estimation.joint.iterated import solve_iterated  # scipy.fft, for large fields
+    from selfcal_ros.estimation.joint.pcg import solve_iterated  # scipy.fft, for large fields
 
     return solve_iterated(problem, y, theta)
 

@@ -18,7 +18,7 @@ from selfcal_ros.errors import NotSettledError
 from selfcal_ros.estimation.datum.covariance import TermSpread
 from selfcal_ros.estimation.joint.fit import JointFit, angular_part, fit
 from selfcal_ros.estimation.joint.problem import ROUNDING, Problem, grid_dof, sigma_of
-from selfcal_ros.estimation.lattice.gauge import Gauge
+from selfcal_ros.estimation.lattice.connectivity import Gauge
 from selfcal_ros.estimation.terms.columns import TermColumns, made_anew, term_columns
 from selfcal_ros.estimation.terms.equations import (
     Sums,

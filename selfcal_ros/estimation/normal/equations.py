@@ -5,7 +5,7 @@ from functools import cached_property
 
 import numpy as np
 
-from selfcal_ros.estimation.lattice.gauge import Gauge
+from selfcal_ros.estimation.lattice.connectivity import Gauge
 from selfcal_ros.estimation.normal.angular import AngularSystem
 from selfcal_ros.estimation.normal.grid import GridSystem
 

@@ -14,8 +14,7 @@ from scipy.linalg import lapack
 from scipy.sparse import csr_matrix, diags, identity
 
 from selfcal_ros.errors import InputError
-from selfcal_ros.estimation.lattice.connectivity import Components
-from selfcal_ros.estimation.lattice.gauge import Gauge
+from selfcal_ros.estimation.lattice.connectivity import Components, Gauge
 from selfcal_ros.estimation.lattice.placed import PlacedViews
 from selfcal_ros.estimation.lattice.poses import MapPose
 from selfcal_ros.estimation.lattice.splines import MapSpline

@@ -9,7 +9,6 @@ from math import comb, inf
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.blas_threads import one_thread
 from selfcal_ros.estimation.normal.systems import planned_system
-from selfcal_ros.estimation.observability.equivalent import equivalent_key
 from selfcal_ros.estimation.observability.plan_check import (
     Step,
     candidate_views,
@@ -25,6 +24,7 @@ from selfcal_ros.estimation.observability.plan_check import (
 from selfcal_ros.estimation.observability.prediction import Prediction, predict
 from selfcal_ros.estimation.observability.rank import deficiency
 from selfcal_ros.estimation.observability.resistance import with_part_of_terms
+from selfcal_ros.estimation.observability.unseen import equivalent_key
 from selfcal_ros.estimation.terms.planned import Assumed, planned_equations, planned_ground
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ThetaDatum

@@ -6,7 +6,10 @@ readings turns leaves a vector free; and undetermined combinations of misalignme
 fields.
 """
 
+import math
+from collections.abc import Iterable
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 
@@ -14,6 +17,8 @@ from selfcal_ros.estimation.lattice.connectivity import Components
 from selfcal_ros.estimation.lattice.maps import PHASES
 from selfcal_ros.estimation.normal.equations import NormalEquations, pseudo_inverse
 from selfcal_ros.estimation.normal.grid import GridSystem
+from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.view import View
 
 MATCH = 1e-9
 """Largest relative residual sum of squares of an unseen field."""
@@ -203,3 +208,36 @@ def as_map(field: np.ndarray) -> np.ndarray:
     """Return a complex field (nx, ny) as (2, nx, ny), largest value 1."""
     both = np.stack([field.real, field.imag]).astype(float)
     return both / max(float(abs(both).max()), np.finfo(float).tiny)
+
+
+TURNS = (1, 1j, -1, -1j)
+
+
+def equivalent_key(artifact: Artifact, views: Iterable[View]) -> tuple:
+    """Return a key that is the same for equivalent plans, from their turns and shifts.
+
+    Turning stage and plate together renames sites and marks; so does mirroring both; turning the
+    plate in all views renames the marks. A field that is not square has half of these symmetries.
+    The uncertainty of XY is the same; that of theta need not be.
+
+    Parameters
+    ----------
+    artifact : Artifact
+        The plate.
+    views : iterable of View
+        Views of grid marks.
+    """
+    poses = [view.pose for view in views]
+    steps = [(round(pose.turn_rad / (math.pi / 2), 9) % 4, complex(
+        *(round(shift / artifact.grid_pitch_m, 6) for shift in pose.shift_m))) for pose in poses]
+    turns = range(0, 4, 1 if artifact.shape[0] == artifact.shape[1] else 2)
+    forms = list(product((False, True), turns, turns))
+    return min(tuple(sorted(_moved(q, shift, *form) for q, shift in steps)) for form in forms)
+
+
+def _moved(q: float, shift: complex, mirror: bool, stage: int,
+           plate: int) -> tuple[float, float, float]:
+    if mirror:
+        q, shift = -q, shift.conjugate()
+    shift = shift * TURNS[stage]
+    return (q + plate) % 4, shift.real + 0.0, shift.imag + 0.0

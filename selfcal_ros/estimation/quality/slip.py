@@ -27,7 +27,7 @@ from selfcal_ros.estimation.terms.ground import Ground
 from selfcal_ros.estimation.terms.shapes import shapes_of
 from selfcal_ros.estimation.verdict.causes import cause_of
 from selfcal_ros.estimation.verdict.explanations import PlacedSlip, find_explanations
-from selfcal_ros.estimation.verdict.fault_columns import SLIP
+from selfcal_ros.estimation.verdict.off_sites import SLIP
 from selfcal_ros.model.readings import Measurements, ViewReadings
 from selfcal_ros.model.verdict import Cause, Finding
 

@@ -17,7 +17,7 @@ from selfcal_ros.estimation.normal.equations import angular_residuals
 from selfcal_ros.estimation.terms.ground import Ground
 from selfcal_ros.estimation.terms.sizes import SizeTest
 from selfcal_ros.estimation.verdict.explanations import FLOOR_M, LEVEL, Explanation
-from selfcal_ros.estimation.verdict.fault_columns import MOST, READING, SLIP
+from selfcal_ros.estimation.verdict.off_sites import MOST, READING, SLIP
 from selfcal_ros.estimation.verdict.uncertainty import Effect
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Measurements

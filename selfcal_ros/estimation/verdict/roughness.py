@@ -14,7 +14,7 @@ from scipy.sparse import csr_matrix
 from scipy.special import fdtrc
 
 from selfcal_ros.estimation.joint.model_fit import ModelFit
-from selfcal_ros.estimation.lattice.gauge import Gauge
+from selfcal_ros.estimation.lattice.connectivity import Gauge
 from selfcal_ros.estimation.normal.angular import AngularSystem
 from selfcal_ros.estimation.normal.equations import grid_residuals
 from selfcal_ros.estimation.normal.placed import PlacedEquations, PlacedSystem

@@ -35,8 +35,7 @@ from selfcal_ros.estimation.verdict.explanations import (
     Explanation,
     find_explanations,
 )
-from selfcal_ros.estimation.verdict.fault_columns import READING
-from selfcal_ros.estimation.verdict.off_sites import off_sites_cause
+from selfcal_ros.estimation.verdict.off_sites import READING, off_sites_cause
 from selfcal_ros.estimation.verdict.roughness import adequacy_of
 from selfcal_ros.estimation.verdict.uncertainty import (
     Effect,

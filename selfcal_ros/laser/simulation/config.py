@@ -10,7 +10,7 @@ import numpy as np
 from selfcal_ros.errors import InputError, known_are
 from selfcal_ros.laser.data import DIAGONALS, MAX_BLOCKS, Closure, StepDiagonalResult
 from selfcal_ros.laser.profiles import ReferenceLine, name_of
-from selfcal_ros.laser.result_json import geometry
+from selfcal_ros.laser.report import geometry
 from selfcal_ros.laser.simulation.measure import (
     LaserNoise,
     Measurement,

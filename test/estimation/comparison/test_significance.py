@@ -10,8 +10,7 @@ from scipy.stats import binom, chi2, norm
 from scipy.stats import f as f_distribution
 
 from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.estimation.comparison.maps import compare
-from selfcal_ros.estimation.comparison.significance import LEVEL, significance
+from selfcal_ros.estimation.comparison.maps import LEVEL, compare, significance
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.result import result_from_dict, result_to_dict

@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from selfcal_ros.estimation.lattice.gauge import Gauge
+from selfcal_ros.estimation.lattice.connectivity import Gauge
 
 SHAPE = (5, 9)
 

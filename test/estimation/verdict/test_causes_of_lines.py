@@ -17,7 +17,7 @@ from selfcal_ros.model.terms import ModelTerm, TermName, parse_terms
 from selfcal_ros.model.verdict import Grade, Remedy
 from selfcal_ros.model.view import Plan, View
 from selfcal_ros.reporting.words.findings import worded
-from selfcal_ros.simulation.exposures import CellSettings
+from selfcal_ros.simulation.cell import CellSettings
 from selfcal_ros.simulation.machine import Spread, random_truth
 from selfcal_ros.simulation.truth import hu_plan, simulate_measurements
 from test.support.options import BARE, bare

@@ -19,7 +19,7 @@ from selfcal_ros.model.result import result_from_dict, result_to_dict
 from selfcal_ros.model.terms import parse_terms
 from selfcal_ros.reporting.chapters import chapters
 from selfcal_ros.reporting.summary.sections import error_section, state_sentence
-from selfcal_ros.simulation.exposures import CellSettings
+from selfcal_ros.simulation.cell import CellSettings
 from selfcal_ros.simulation.machine import Spread, random_truth
 from selfcal_ros.simulation.truth import hu_plan, simulate_measurements
 from test.support.options import bare

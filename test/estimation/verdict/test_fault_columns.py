@@ -6,9 +6,9 @@ import pytest
 
 from selfcal_ros.estimation.lattice.readings import grid_data
 from selfcal_ros.estimation.terms.ground import ground_of
-from selfcal_ros.estimation.verdict.fault_columns import slip_columns
+from selfcal_ros.estimation.verdict.off_sites import slip_columns
 from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.simulation.exposures import CellSettings
+from selfcal_ros.simulation.cell import CellSettings
 from selfcal_ros.simulation.truth import random_truth, simulate_measurements
 from test.support.lattice_plans import plan_of
 

@@ -11,7 +11,7 @@ from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.verdict import Grade
 from selfcal_ros.reporting.words.findings import worded
-from selfcal_ros.simulation.exposures import CellSettings
+from selfcal_ros.simulation.cell import CellSettings
 from selfcal_ros.simulation.machine import Spread, random_truth
 from selfcal_ros.simulation.truth import hu_plan, simulate_measurements
 from test.support.options import bare
