@@ -7,46 +7,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from selfcal_ros.aerotech.evaluate import CalEvaluator
-from selfcal_ros.aerotech.machine import MachineFrame, SimulatedController
+from selfcal_ros.aerotech.machine import SimulatedController, setup_of
 from selfcal_ros.aerotech.model import Table
 from selfcal_ros.compensation.compensator import Compensator
+from selfcal_ros.compensation.frame import MachineFrame
+from selfcal_ros.compensation.residual import Residual, residual_of
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.error_map import ErrorMap
-
-
-@dataclass(frozen=True, eq=False)
-class Residual:
-    """Residuals true - commanded before and after, without their common shift.
-
-    The zero bias of the controller, and the home position itself, move all positions by one
-    constant; the calibration does not determine this constant (datum), so it is removed.
-
-    Attributes
-    ----------
-    place : str
-        "sites", "between" or "lines".
-    position : float array (axes, P)
-        Commanded positions, m or rad.
-    before, after : float array (axes, P)
-        Residuals without their mean, m or rad.
-    shift_before, shift_after : float array (axes,)
-        The means that were removed.
-    """
-
-    place: str
-    position: np.ndarray
-    before: np.ndarray
-    after: np.ndarray
-    shift_before: np.ndarray
-    shift_after: np.ndarray
-
-    def rms(self, which: str) -> float:
-        """Return the root mean square of the residual vectors `which`: before or after."""
-        return float(np.sqrt(np.mean(np.sum(np.square(getattr(self, which)), axis=0))))
-
-    def largest(self, which: str) -> float:
-        """Return the length of the largest residual vector `which`: before or after."""
-        return float(np.sqrt(np.max(np.sum(np.square(getattr(self, which)), axis=0))))
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,11 +62,11 @@ def verify_tables(error_map: ErrorMap, tables: Sequence[Table],
     sites = between = lines = None
     if xy:
         plane = _without_theta(error_map)
-        evaluator = CalEvaluator(xy, frame.setup())
+        evaluator = CalEvaluator(xy, setup_of(frame))
         sites = _at_sites(plane, frame, evaluator)
         between = _between_sites(plane, frame, evaluator) if plane.valid.all() else None
     if theta:
-        lines = _at_lines(error_map, frame, CalEvaluator(theta, frame.setup()))
+        lines = _at_lines(error_map, frame, CalEvaluator(theta, setup_of(frame)))
     return Verification(frame, sites, between, lines)
 
 
@@ -114,7 +81,7 @@ def _at_sites(error_map: ErrorMap, frame: MachineFrame, evaluator: CalEvaluator)
     points = np.stack([artifact.x_m[known], artifact.y_m[known]])
     stage = Compensator(error_map)
     moves = [SimulatedController(stage, frame, tables).move for tables in (None, evaluator)]
-    return _residual("sites", points, [np.stack(move(*points)) for move in moves])
+    return residual_of("sites", points, [np.stack(move(*points)) for move in moves])
 
 
 def _between_sites(error_map: ErrorMap, frame: MachineFrame, evaluator: CalEvaluator) -> Residual:
@@ -123,7 +90,7 @@ def _between_sites(error_map: ErrorMap, frame: MachineFrame, evaluator: CalEvalu
                         for along in (artifact.x_m, artifact.y_m)])
     stage = Compensator(error_map, method="bicubic")
     moves = [SimulatedController(stage, frame, tables).move for tables in (None, evaluator)]
-    return _residual("between", centres, [np.stack(move(*centres)) for move in moves])
+    return residual_of("between", centres, [np.stack(move(*centres)) for move in moves])
 
 
 def _at_lines(error_map: ErrorMap, frame: MachineFrame, evaluator: CalEvaluator) -> Residual:
@@ -132,16 +99,4 @@ def _at_lines(error_map: ErrorMap, frame: MachineFrame, evaluator: CalEvaluator)
         raise InputError("error map", "it knows no angular line", "leave out the theta axis")
     stage = Compensator(error_map)
     turns = [SimulatedController(stage, frame, tables).turn for tables in (None, evaluator)]
-    return _residual("lines", angles[None], [turn(angles)[None] for turn in turns])
-
-
-def _residual(place: str, position: np.ndarray, reached: list[np.ndarray]) -> Residual:
-    residuals = [true - position for true in reached]
-    # A known site next to an unknown one cannot be inverted exactly: omit it.
-    known = np.isfinite(residuals).all(axis=(0, 1))
-    if not known.any():
-        raise InputError("error map", "no site can be verified", "measure more sites")
-    residuals = [residual[:, known] for residual in residuals]
-    shifts = [residual.mean(axis=1) for residual in residuals]
-    before, after = (r - s[:, None] for r, s in zip(residuals, shifts, strict=True))
-    return Residual(place, position[:, known], before, after, *shifts)
+    return residual_of("lines", angles[None], [turn(angles)[None] for turn in turns])

@@ -123,8 +123,8 @@ def _described(table: "Table1D | Table2D") -> dict:
 
 def _evaluate(args: argparse.Namespace) -> int:
     from selfcal_ros.aerotech.evaluate import CalEvaluator
-    from selfcal_ros.aerotech.machine import frame_from_comments
     from selfcal_ros.aerotech.read import load_cal
+    from selfcal_ros.compensation.frame import frame_from_comments
 
     cal = load_cal(args.file)
     frame = frame_from_comments(cal.comments)
@@ -198,6 +198,7 @@ def _export(args: argparse.Namespace) -> int:
     from selfcal_ros.aerotech import export
     from selfcal_ros.aerotech.write import cal_text, refuse_existing, write_cal
     from selfcal_ros.cli.terminal import exit_code
+    from selfcal_ros.compensation.export import fill_unknown, provenance
     from selfcal_ros.files import check_outputs
 
     result, frame = read_result(args.result), frame_of(args)
@@ -209,9 +210,9 @@ def _export(args: argparse.Namespace) -> int:
                                    result.observability)
     filled = 0
     if args.fill:
-        error_map, filled = export.fill_unknown(result.error_map)
+        error_map, filled = fill_unknown(result.error_map)
         result = replace(result, error_map=error_map)
-    comments = export.provenance(result, frame, filled=filled)
+    comments = provenance(result, frame, filled=filled)
     texts = {args.output: cal_text([export.table_xy(result.error_map, frame)],
                                    comments=comments, decimals=export.DECIMALS)}
     if frame.theta_axis is not None:
@@ -240,10 +241,10 @@ def _export(args: argparse.Namespace) -> int:
 
 
 def _verify(args: argparse.Namespace) -> int:
-    from selfcal_ros.aerotech.machine import MachineFrame, frame_from_comments
     from selfcal_ros.aerotech.model import Table2D
     from selfcal_ros.aerotech.read import load_cal
     from selfcal_ros.aerotech.verify import verify_tables
+    from selfcal_ros.compensation.frame import MachineFrame, frame_from_comments
 
     result, cal = read_result(args.result), load_cal(args.file)
     base = frame_from_comments(cal.comments)

@@ -19,7 +19,7 @@ from selfcal_ros.units import M_PER, M_PER_UM, UM_PER_M
 
 if TYPE_CHECKING:
     from selfcal_ros.aerotech.lines import AxisCorrection
-    from selfcal_ros.aerotech.machine import MachineFrame
+    from selfcal_ros.compensation.frame import MachineFrame
     from selfcal_ros.model.result import CalibrationResult
 
 Axis = Literal["x", "y"]
@@ -113,7 +113,7 @@ def frame_of(args: argparse.Namespace, base: "MachineFrame | None" = None) -> "M
     """Return the frame described by the options, with `base` as default."""
     from dataclasses import replace
 
-    from selfcal_ros.aerotech.machine import UNITS_M, MachineFrame
+    from selfcal_ros.compensation.frame import UNITS_M, MachineFrame
 
     base = base or MachineFrame()
     changes: dict[str, Any] = {
@@ -204,7 +204,7 @@ def _frame(args: argparse.Namespace) -> "MachineFrame":
 
 def _orthogonality(args: argparse.Namespace) -> int:
     from selfcal_ros.aerotech import lines as cal_lines
-    from selfcal_ros.aerotech.machine import UNITS_M
+    from selfcal_ros.compensation.frame import UNITS_M
 
     frame = _frame(args)
     other: Axis = "y" if args.along == "x" else "x"
@@ -287,10 +287,11 @@ def _deliver(args: argparse.Namespace, line: "AxisCorrection", frame: "MachineFr
     from datetime import UTC, datetime
 
     from selfcal_ros import __version__
-    from selfcal_ros.aerotech.export import DECIMALS, verdict_lines
+    from selfcal_ros.aerotech.export import DECIMALS
     from selfcal_ros.aerotech.lines import line_table
     from selfcal_ros.aerotech.write import cal_text, write_cal
     from selfcal_ros.cli.terminal import exit_code
+    from selfcal_ros.compensation.export import verdict_lines
     from selfcal_ros.files import check_outputs
 
     source = args.source or f"{args.measured} over {args.over}, travel {args.travel}"

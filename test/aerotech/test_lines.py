@@ -14,9 +14,10 @@ from selfcal_ros.aerotech.lines import (
     orthogonality,
     without_slope,
 )
-from selfcal_ros.aerotech.machine import MachineFrame, SimulatedController
+from selfcal_ros.aerotech.machine import SimulatedController
 from selfcal_ros.aerotech.verify import verify_tables
 from selfcal_ros.compensation.compensator import Compensator
+from selfcal_ros.compensation.frame import MachineFrame
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.artifact import Artifact
 from test.support.maps import first_order, random_map

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from scipy.stats import t as student
 
-from selfcal_ros.aerotech.export import provenance
-from selfcal_ros.aerotech.machine import MachineFrame
+from selfcal_ros.compensation.export import provenance
+from selfcal_ros.compensation.frame import MachineFrame
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.options import ReferenceLength
 from selfcal_ros.estimation.verdict.uncertainty import budgets
