@@ -84,7 +84,8 @@ def in_unit(texts: list[str] | None, unit: str, *, rotary: Container[int] = ()) 
     return found
 
 
-def add_frame(parser: argparse.ArgumentParser, *, theta: bool, default: bool = True) -> None:
+def add_frame(parser: argparse.ArgumentParser, *, theta: bool, default: bool = True,
+              units: tuple[str, ...] = ("m", "mm", "um")) -> None:
     """Add the options that relate the controller's axes to the stage frame."""
     group = parser.add_argument_group(
         "machine", "" if default else "default: from the comments of FILE.cal, else columns "
@@ -93,8 +94,9 @@ def add_frame(parser: argparse.ArgumentParser, *, theta: bool, default: bool = T
                        help="index of the x axis, from 1")
     group.add_argument("--y-axis", type=int, metavar="N", default=2 if default else None,
                        help="index of the y axis")
-    group.add_argument("--unit", choices=("m", "mm", "um"), default="mm" if default else None,
-                       help="primary unit of the linear axes (default mm)")
+    group.add_argument("--unit", choices=units, default="mm" if default and "in" not in units else
+                       None, help="unit of the linear axes (default mm"
+                       + (", kmotion in)" if "in" in units else ")"))
     for axis, unit in (("x", "primary unit"), ("y", "primary unit"), ("theta", "deg")):
         if axis == "theta" and not theta:
             continue
@@ -113,13 +115,13 @@ def frame_of(args: argparse.Namespace, base: "MachineFrame | None" = None) -> "M
     """Return the frame described by the options, with `base` as default."""
     from dataclasses import replace
 
-    from selfcal_ros.compensation.frame import UNITS_M, MachineFrame
+    from selfcal_ros.compensation.frame import LENGTHS_M, MachineFrame
 
     base = base or MachineFrame()
     changes: dict[str, Any] = {
         name: getattr(args, name) for name in ("x_axis", "y_axis", "theta_axis", "unit")
         if getattr(args, name, None) is not None}
-    unit_m = UNITS_M[changes.get("unit", base.unit)]
+    unit_m = LENGTHS_M[changes.get("unit", base.unit)]
     for name in ("x", "y", "theta"):
         home = getattr(args, f"home_{name}", None)
         if home is not None and not math.isfinite(home):

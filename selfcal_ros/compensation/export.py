@@ -91,7 +91,7 @@ def provenance(result: CalibrationResult, frame: MachineFrame, *, filled: int = 
             for term in result.model.terms),
         *_reference_lines(result),
         f"datum: no translation, rotation, magnification; theta: {emap.datum_theta}",
-        "correction = + (indicated - true), added to the command; zero at home by the controller",
+        "correction = + (indicated - true), added to the command",
         frame.comment(),
     ]
     if filled:

@@ -10,10 +10,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from selfcal_ros.errors import InputError
-from selfcal_ros.units import M_PER
+from selfcal_ros.units import M_PER, M_PER_INCH
 
 UNITS_M = {name: M_PER[name] for name in ("m", "mm", "um")}
 """Primary units of linear axes; the primary unit of a rotary axis is the degree."""
+LENGTHS_M = {**UNITS_M, "in": M_PER_INCH}
+"""Units of lengths of all controllers."""
 _MARK = "machine: "
 
 
@@ -26,7 +28,7 @@ class MachineFrame:
     x_axis, y_axis, theta_axis : int or None
         One-based indices.
     unit : str
-        Primary unit of x and y: m, mm or um.
+        Primary unit of x and y: m, mm, um or in.
     home_x_m, home_y_m, home_theta_rad : float
         Position of the controller's zero in the stage frame.
     reverse_x, reverse_y, reverse_theta : bool
@@ -49,8 +51,8 @@ class MachineFrame:
 
     def __post_init__(self) -> None:
         """Refuse an unknown unit, axes that are not distinct, and values that are not numbers."""
-        if self.unit not in UNITS_M:
-            raise InputError("unit", f"'{self.unit}' is not a primary unit", "take m, mm or um")
+        if self.unit not in LENGTHS_M:
+            raise InputError("unit", f"'{self.unit}' is not a primary unit", "take m, mm, um or in")
         axes = [a for a in (self.x_axis, self.y_axis, self.theta_axis) if a is not None]
         if len(set(axes)) < len(axes):
             raise InputError("axes", f"the indices {axes} are not distinct",
@@ -65,7 +67,7 @@ class MachineFrame:
     @property
     def unit_m(self) -> float:
         """Metres in a primary unit of x and y."""
-        return UNITS_M[self.unit]
+        return LENGTHS_M[self.unit]
 
     @property
     def sign_x(self) -> float:
@@ -122,7 +124,7 @@ def frame_from_comments(comments: Sequence[str]) -> MachineFrame | None:
         return None
     words = dict(re.findall(r"([a-z-]+)(?:=(\S+))?", line[len(_MARK):]))
     try:
-        unit_m = UNITS_M[words.get("unit", "mm")]
+        unit_m = LENGTHS_M[words.get("unit", "mm")]
         theta = words.get("theta-axis")
         counts = words.get("theta-counts-per-unit")
         return MachineFrame(
