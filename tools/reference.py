@@ -157,9 +157,9 @@ def sim_rows() -> Iterator[tuple[str, ...]]:
             ("truth", spec.TRUTH, Spread()), ("physics", spec.PHYSICS, Spread()),
             ("noise", spec.NOISE, CellSettings()), ("cell", spec.CELL, CellSettings()),
             ("faults", spec.FAULTS, Faults())):
-        for key, (field, limits) in section.items():
-            yield (f"`{name}.{key}`", value(getattr(defaults, field)), bounds(limits),
-                   str(limits.get("unit", "")))
+        for key, p in section.items():
+            default = getattr(defaults, spec.field_of(key, type(defaults)))
+            yield f"`{name}.{key}`", value(default), bounds(vars(p)), p.unit
 
 
 def value(item: Any) -> str:

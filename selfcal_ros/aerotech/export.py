@@ -5,22 +5,13 @@ The correction that makes a commanded position true is c = +G = indicated - true
 section 1). Columns of the 2D table run along x, rows along y.
 """
 
-from dataclasses import replace
-from datetime import UTC, datetime
-
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.linalg import spsolve
 
-from selfcal_ros import __version__
-from selfcal_ros.aerotech.machine import MachineFrame
 from selfcal_ros.aerotech.model import Table1D, Table2D, Unit, UnitWord
+from selfcal_ros.compensation.frame import MachineFrame
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.error_map import ErrorMap
-from selfcal_ros.model.result import CalibrationResult
-from selfcal_ros.model.statistics import rms
-from selfcal_ros.model.verdict import Grade
-from selfcal_ros.units import ARCSEC_PER_DEG, M_PER_UM, RAD_PER_ARCSEC, UM_PER_M
+from selfcal_ros.units import ARCSEC_PER_DEG, M_PER_UM, RAD_PER_ARCSEC
 
 DECIMALS = 5
 """Digits of a correction in um: rounding stays below 0.005 nm."""
@@ -101,114 +92,3 @@ def table_theta(error_map: ErrorMap, frame: MachineFrame) -> Table1D:
         pos_unit=PRIMARY, cor_unit=Unit(UnitWord.PRIMARY, ARCSEC_PER_DEG),
         offset=tidy(sign * (np.rad2deg(frame.home_theta_rad) - first)),
         rollover=tidy(360 * counts) if counts else None)
-
-
-def fill_unknown(error_map: ErrorMap) -> tuple[ErrorMap, int]:
-    """Return the map with each unknown site set to the mean of its neighbours, and their number.
-
-    Raises
-    ------
-    InputError
-        If no site is known.
-    """
-    unknown = ~error_map.valid
-    if unknown.all():
-        raise InputError("error map", "no site is known", "calibrate first")
-    number = np.full(unknown.shape, -1)
-    number[unknown] = np.arange(unknown.sum())
-    rows, columns, weights = [], [], []
-    right = np.zeros((2, unknown.sum()))
-    for shift in ((0, 1), (0, -1), (1, 0), (-1, 0)):
-        here, there = _neighbours(shift, unknown.shape)
-        row = number[here]
-        take = row >= 0
-        rows.append(row[take])
-        columns.append(row[take])
-        weights.append(np.ones(take.sum()))
-        free = take & (number[there] >= 0)
-        rows.append(row[free])
-        columns.append(number[there][free])
-        weights.append(-np.ones(free.sum()))
-        known = take & (number[there] < 0)
-        for out, field in zip(right, (error_map.gx, error_map.gy), strict=True):
-            np.add.at(out, row[known], field[there][known])
-    gx, gy = error_map.gx.copy(), error_map.gy.copy()
-    if unknown.any():
-        place = np.concatenate(rows), np.concatenate(columns)
-        matrix = coo_array((np.concatenate(weights), place), shape=(right.shape[1],) * 2).tocsc()
-        gx[unknown], gy[unknown] = (np.atleast_1d(spsolve(matrix, side)) for side in right)
-    return replace(error_map, gx=gx, gy=gy), int(unknown.sum())
-
-
-def _neighbours(shift: tuple[int, int], shape: tuple[int, int]) -> tuple[tuple, tuple]:
-    """Return slices of the sites that have a neighbour at `shift`, and of that neighbour."""
-    here, there = [], []
-    for step, size in zip(shift, shape, strict=True):
-        here.append(slice(max(0, -step), size - max(0, step)))
-        there.append(slice(max(0, step), size - max(0, -step)))
-    return tuple(here), tuple(there)
-
-
-def provenance(result: CalibrationResult, frame: MachineFrame, *, filled: int = 0,
-               now: datetime | None = None) -> list[str]:
-    """Return comments with the origin and conventions of a table.
-
-    Parameters
-    ----------
-    result : CalibrationResult
-        The calibration.
-    frame : MachineFrame
-        Axes of the machine, for `selfcal cal verify`.
-    filled : int
-        Number of unknown sites that were filled.
-    now : datetime, optional
-        Date of the export, UTC.
-    """
-    emap, source = result.error_map, result.input
-    lines = [
-        f"written by selfcal {__version__} on {(now or datetime.now(UTC)):%Y-%m-%dT%H:%M:%SZ}",
-        f"plan: {result.plan_id}; sense: {result.sense}; method: {result.method}",
-        f"bag: {source.get('file', 'unknown')}; sha256: {source.get('sha256', 'unknown')}",
-        *verdict_lines(result),
-        _uncertainty_line(result),
-        f"model: {result.model.misalignment} misalignments" + "".join(
-            f", {term.name}" + ("" if term.size is None else f":{term.size:g}")
-            for term in result.model.terms),
-        *_reference_lines(result),
-        f"datum: no translation, rotation, magnification; theta: {emap.datum_theta}",
-        "correction = + (indicated - true), added to the command; zero at home by the controller",
-        frame.comment(),
-    ]
-    if filled:
-        lines.append(f"{filled} sites were not measured: mean of their neighbours")
-    return lines
-
-
-def _uncertainty_line(result: CalibrationResult) -> str:
-    if not result.has_uncertainty:
-        return "uncertainty: not computed"
-    u = np.stack([result.error_map.u_gx, result.error_map.u_gy])
-    return (f"standard uncertainty of the corrections (k=1): {rms(u) * UM_PER_M:.3g} um rms; U: "
-            f"k = {result.noise.k_xy:.3g} for 95.45 %")
-
-
-def verdict_lines(result: CalibrationResult) -> list[str]:
-    """Return the verdict, with the reasons if not qualified."""
-    verdict, when = result.verdict, result.provenance.extra.get("last_exposure", "")
-    lines = [f"measured until {when}"] if when else []
-    if verdict.grade is Grade.GOOD:
-        return [*lines, "verdict: good, the readings agree with the model"]
-    if verdict.grade is Grade.ENLARGED:
-        return [*lines, "verdict: good within an enlarged uncertainty",
-                *(f"because: {reason}" for reason in verdict.reasons)]
-    return [*lines, "verdict: NOT QUALIFIED, the readings contradict the model",
-            *(f"because: {reason}" for reason in verdict.reasons)]
-
-
-def _reference_lines(result: CalibrationResult) -> list[str]:
-    reference = result.reference
-    if not reference:
-        return ["reference length: none, the scale is a convention"]
-    certificate = reference.get("certificate") or "no certificate named"
-    return [f"reference length: {reference['kind']}, relative error {reference['relative_error']:g}"
-            f", u {reference['u_relative']:g} ({certificate})"]

@@ -15,8 +15,8 @@ import numpy as np
 from selfcal_ros.aerotech.export import DECIMALS, PRIMARY, micrometres, tidy
 from selfcal_ros.aerotech.header import ArgumentFault
 from selfcal_ros.aerotech.header import number as plain_number
-from selfcal_ros.aerotech.machine import UNITS_M, MachineFrame
 from selfcal_ros.aerotech.model import Table1D
+from selfcal_ros.compensation.frame import UNITS_M, MachineFrame
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import csv_cells
 from selfcal_ros.model.error_map import ErrorMap

@@ -1,184 +1,37 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The controller's axes in the stage frame, and a simulated controller to test tables."""
-
-import math
-import re
-from collections.abc import Sequence
-from dataclasses import dataclass
+"""Tables on a simulated controller, and its settings."""
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from selfcal_ros.aerotech.evaluate import AxisSetup, CalEvaluator, MachineSetup
 from selfcal_ros.compensation.compensator import Compensator
-from selfcal_ros.errors import InputError
-from selfcal_ros.units import M_PER
-
-UNITS_M = {name: M_PER[name] for name in ("m", "mm", "um")}
-"""Primary units of linear axes; the primary unit of a rotary axis is the degree."""
-_MARK = "machine: "
+from selfcal_ros.compensation.frame import MachineFrame
+from selfcal_ros.compensation.residual import Correction
 
 
-@dataclass(frozen=True)
-class MachineFrame:
-    """The controller's axes: their indices, unit, home positions and encoder directions.
-
-    Attributes
-    ----------
-    x_axis, y_axis, theta_axis : int or None
-        One-based indices.
-    unit : str
-        Primary unit of x and y: m, mm or um.
-    home_x_m, home_y_m, home_theta_rad : float
-        Position of the controller's zero in the stage frame.
-    reverse_x, reverse_y, reverse_theta : bool
-        Whether the encoder counts opposite to the stage frame.
-    theta_counts_per_unit : float or None
-        Encoder counts per degree.
-    """
-
-    x_axis: int = 1
-    y_axis: int = 2
-    theta_axis: int | None = None
-    unit: str = "mm"
-    home_x_m: float = 0.0
-    home_y_m: float = 0.0
-    home_theta_rad: float = 0.0
-    reverse_x: bool = False
-    reverse_y: bool = False
-    reverse_theta: bool = False
-    theta_counts_per_unit: float | None = None
-
-    def __post_init__(self) -> None:
-        """Refuse an unknown unit, axes that are not distinct, and values that are not numbers."""
-        if self.unit not in UNITS_M:
-            raise InputError("unit", f"'{self.unit}' is not a primary unit", "take m, mm or um")
-        axes = [a for a in (self.x_axis, self.y_axis, self.theta_axis) if a is not None]
-        if len(set(axes)) < len(axes):
-            raise InputError("axes", f"the indices {axes} are not distinct",
-                             "give each axis its own index")
-        for value in (self.home_x_m, self.home_y_m, self.home_theta_rad):
-            if not math.isfinite(value):
-                raise InputError("home position", f"{value} is not a position", "give a number")
-        if self.theta_counts_per_unit is not None and not 0 < self.theta_counts_per_unit < math.inf:
-            raise InputError("counts per degree", f"{self.theta_counts_per_unit} is not a positive "
-                             "number", "give the encoder counts in a degree of theta")
-
-    @property
-    def unit_m(self) -> float:
-        """Metres in a primary unit of x and y."""
-        return UNITS_M[self.unit]
-
-    @property
-    def sign_x(self) -> float:
-        """+1 or -1: encoder direction of x in the stage frame."""
-        return -1.0 if self.reverse_x else 1.0
-
-    @property
-    def sign_y(self) -> float:
-        """+1 or -1: encoder direction of y in the stage frame."""
-        return -1.0 if self.reverse_y else 1.0
-
-    @property
-    def sign_theta(self) -> float:
-        """+1 or -1: encoder direction of theta in the stage frame."""
-        return -1.0 if self.reverse_theta else 1.0
-
-    def setup(self) -> MachineSetup:
-        """Return the controller's settings for these axes."""
-        if self.theta_axis is None or self.theta_counts_per_unit is None:
-            return MachineSetup()
-        return MachineSetup({self.theta_axis: AxisSetup(self.theta_counts_per_unit)})
-
-    def to_machine(self, x_m: ArrayLike, y_m: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
-        """Return controller positions, primary units, of stage positions in m."""
-        return (self.sign_x * (np.asarray(x_m) - self.home_x_m) / self.unit_m,
-                self.sign_y * (np.asarray(y_m) - self.home_y_m) / self.unit_m)
-
-    def from_machine(self, px: ArrayLike, py: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
-        """Return stage positions in m of controller positions in primary units."""
-        return (self.sign_x * np.asarray(px) * self.unit_m + self.home_x_m,
-                self.sign_y * np.asarray(py) * self.unit_m + self.home_y_m)
-
-    def theta_to_machine(self, theta_rad: ArrayLike) -> np.ndarray:
-        """Return controller positions, deg, of stage angles in rad."""
-        return self.sign_theta * np.rad2deg(np.asarray(theta_rad) - self.home_theta_rad)
-
-    def theta_from_machine(self, position_deg: ArrayLike) -> np.ndarray:
-        """Return stage angles in rad of controller positions in deg."""
-        return self.sign_theta * np.deg2rad(position_deg) + self.home_theta_rad
-
-    def comment(self) -> str:
-        """Return the frame as a comment of a calibration file."""
-        words = [f"x-axis={self.x_axis}", f"y-axis={self.y_axis}", f"unit={self.unit}",
-                 f"home-x={self.home_x_m / self.unit_m:.15g}",
-                 f"home-y={self.home_y_m / self.unit_m:.15g}"]
-        words += [f"reverse-{name}" for name in ("x", "y", "theta")
-                  if getattr(self, f"reverse_{name}")]
-        if self.theta_axis is not None:
-            words += [f"theta-axis={self.theta_axis}",
-                      f"home-theta={math.degrees(self.home_theta_rad):.15g}"]
-        if self.theta_counts_per_unit is not None:
-            words.append(f"theta-counts-per-unit={self.theta_counts_per_unit:.17g}")
-        return _MARK + " ".join(words)
+def setup_of(frame: MachineFrame) -> MachineSetup:
+    """Return the controller's settings for the axes of a frame."""
+    if frame.theta_axis is None or frame.theta_counts_per_unit is None:
+        return MachineSetup()
+    return MachineSetup({frame.theta_axis: AxisSetup(frame.theta_counts_per_unit)})
 
 
-def frame_from_comments(comments: Sequence[str]) -> MachineFrame | None:
-    """Return the frame that `MachineFrame.comment` wrote into a file, or None."""
-    line = next((c for c in comments if c.startswith(_MARK)), None)
-    if line is None:
-        return None
-    words = dict(re.findall(r"([a-z-]+)(?:=(\S+))?", line[len(_MARK):]))
-    try:
-        unit_m = UNITS_M[words.get("unit", "mm")]
-        theta = words.get("theta-axis")
-        counts = words.get("theta-counts-per-unit")
-        return MachineFrame(
-            int(words["x-axis"]), int(words["y-axis"]), int(theta) if theta else None,
-            words.get("unit", "mm"), float(words.get("home-x", 0)) * unit_m,
-            float(words.get("home-y", 0)) * unit_m,
-            math.radians(float(words.get("home-theta", 0))), "reverse-x" in words,
-            "reverse-y" in words, "reverse-theta" in words, float(counts) if counts else None)
-    except (KeyError, ValueError):
-        return None
+def plane_correction(tables: CalEvaluator, frame: MachineFrame) -> Correction:
+    """Return what loaded tables add to x and y."""
+    def correct(px: np.ndarray, py: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        add = tables.corrections({frame.x_axis: px, frame.y_axis: py})
+        none = np.zeros(np.shape(px))
+        return add.get(frame.x_axis, none), add.get(frame.y_axis, none)
+    return correct
 
 
-class SimulatedController:
-    """A controller with tables loaded that drives a stage with a known error.
-
-    The command is a position in the stage frame. The controller looks up the correction at the
-    commanded position, adds it, and drives until the encoder shows the sum; the true
-    position of the stage follows from its error G = indicated - true.
-
-    Parameters
-    ----------
-    stage : Compensator
-        The stage's error, including between its sites.
-    frame : MachineFrame
-        Wiring of the axes.
-    tables : CalEvaluator or None
-        Loaded tables; None: nothing.
-    """
-
-    def __init__(self, stage: Compensator, frame: MachineFrame,
-                 tables: CalEvaluator | None = None) -> None:
-        self._stage, self._frame, self._tables = stage, frame, tables
-
-    def move(self, x_m: ArrayLike, y_m: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
-        """Return the true position, m, after a command to `x_m`, `y_m`."""
-        frame = self._frame
-        px, py = frame.to_machine(x_m, y_m)
-        if self._tables is not None:
-            add = self._tables.corrections({frame.x_axis: px, frame.y_axis: py})
-            px, py = px + add.get(frame.x_axis, 0.0), py + add.get(frame.y_axis, 0.0)
-        return self._stage.correct(*frame.from_machine(px, py))
-
-    def turn(self, theta_rad: ArrayLike) -> np.ndarray:
-        """Return the true angle, rad, after a command to `theta_rad`."""
-        frame = self._frame
-        position = frame.theta_to_machine(theta_rad)
-        if self._tables is not None:
-            axis = frame.theta_axis
-            add = self._tables.corrections({} if axis is None else {axis: position})
-            position = position + (0.0 if axis is None else add.get(axis, 0.0))
-        return self._stage.correct_theta(frame.theta_from_machine(position))
+def turned(stage: Compensator, frame: MachineFrame, theta_rad: ArrayLike,
+           tables: CalEvaluator | None = None) -> np.ndarray:
+    """Return the true angle, rad, after a command to `theta_rad`, as `reached` for theta."""
+    position = frame.theta_to_machine(theta_rad)
+    if tables is not None:
+        axis = frame.theta_axis
+        add = tables.corrections({} if axis is None else {axis: position})
+        position = position + (0.0 if axis is None else add.get(axis, 0.0))
+    return stage.correct_theta(frame.theta_from_machine(position))

@@ -4,8 +4,9 @@
 import numpy as np
 
 from selfcal_ros.aerotech.export import table_xy
-from selfcal_ros.aerotech.machine import MachineFrame
-from selfcal_ros.aerotech.verify import Residual, Verification, verify_tables
+from selfcal_ros.aerotech.verify import Verification, verify_tables
+from selfcal_ros.compensation.frame import MachineFrame
+from selfcal_ros.compensation.residual import Residual
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.reporting.chapters import Chapter, Figure
 from selfcal_ros.reporting.figures.drawing import Drawing

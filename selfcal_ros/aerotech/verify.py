@@ -2,51 +2,18 @@
 """Residuals of a simulated controller with loaded tables."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from selfcal_ros.aerotech.evaluate import CalEvaluator
-from selfcal_ros.aerotech.machine import MachineFrame, SimulatedController
+from selfcal_ros.aerotech.machine import plane_correction, setup_of, turned
 from selfcal_ros.aerotech.model import Table
 from selfcal_ros.compensation.compensator import Compensator
+from selfcal_ros.compensation.frame import MachineFrame
+from selfcal_ros.compensation.residual import Correction, Residual, plane_residuals, residual_of
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.error_map import ErrorMap
-
-
-@dataclass(frozen=True, eq=False)
-class Residual:
-    """Residuals true - commanded before and after, without their common shift.
-
-    The zero bias of the controller, and the home position itself, move all positions by one
-    constant; the calibration does not determine this constant (datum), so it is removed.
-
-    Attributes
-    ----------
-    place : str
-        "sites", "between" or "lines".
-    position : float array (axes, P)
-        Commanded positions, m or rad.
-    before, after : float array (axes, P)
-        Residuals without their mean, m or rad.
-    shift_before, shift_after : float array (axes,)
-        The means that were removed.
-    """
-
-    place: str
-    position: np.ndarray
-    before: np.ndarray
-    after: np.ndarray
-    shift_before: np.ndarray
-    shift_after: np.ndarray
-
-    def rms(self, which: str) -> float:
-        """Return the root mean square of the residual vectors `which`: before or after."""
-        return float(np.sqrt(np.mean(np.sum(np.square(getattr(self, which)), axis=0))))
-
-    def largest(self, which: str) -> float:
-        """Return the length of the largest residual vector `which`: before or after."""
-        return float(np.sqrt(np.max(np.sum(np.square(getattr(self, which)), axis=0))))
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,13 +37,11 @@ class Verification:
                    for r in (self.sites, self.lines) if r is not None)
 
 
-def verify_tables(error_map: ErrorMap, tables: Sequence[Table],
-                  frame: MachineFrame) -> Verification:
+def verify_tables(error_map: ErrorMap, tables: Sequence[Table], frame: MachineFrame,
+                  active: Correction | None = None) -> Verification:
     """Return the residuals of a stage with this error map and `tables`.
 
-    At the sites the map is the truth. Between them the truth is unknown: it is substituted by the
-    cubic spline through the sites at the centres of the cells, so that the residual there is
-    the error of the controller's linear interpolation.
+    `active` is the table that was loaded during the calibration, if any; see `plane_residuals`.
 
     Raises
     ------
@@ -94,36 +59,12 @@ def verify_tables(error_map: ErrorMap, tables: Sequence[Table],
                              f"y={frame.y_axis}, theta={frame.theta_axis or 'none'})")
     sites = between = lines = None
     if xy:
-        plane = _without_theta(error_map)
-        evaluator = CalEvaluator(xy, frame.setup())
-        sites = _at_sites(plane, frame, evaluator)
-        between = _between_sites(plane, frame, evaluator) if plane.valid.all() else None
+        evaluator = CalEvaluator(xy, setup_of(frame))
+        sites, *rest = plane_residuals(error_map, frame, plane_correction(evaluator, frame), active)
+        between = rest[0] if rest else None
     if theta:
-        lines = _at_lines(error_map, frame, CalEvaluator(theta, frame.setup()))
+        lines = _at_lines(error_map, frame, CalEvaluator(theta, setup_of(frame)))
     return Verification(frame, sites, between, lines)
-
-
-def _without_theta(error_map: ErrorMap) -> ErrorMap:
-    none = np.zeros(0)
-    return replace(error_map, artifact=replace(error_map.artifact, angular_count=0), g_theta=none,
-                   u_g_theta=none)
-
-
-def _at_sites(error_map: ErrorMap, frame: MachineFrame, evaluator: CalEvaluator) -> Residual:
-    artifact, known = error_map.artifact, error_map.valid
-    points = np.stack([artifact.x_m[known], artifact.y_m[known]])
-    stage = Compensator(error_map)
-    moves = [SimulatedController(stage, frame, tables).move for tables in (None, evaluator)]
-    return _residual("sites", points, [np.stack(move(*points)) for move in moves])
-
-
-def _between_sites(error_map: ErrorMap, frame: MachineFrame, evaluator: CalEvaluator) -> Residual:
-    artifact = error_map.artifact
-    centres = np.stack([along[:-1, :-1].ravel() + artifact.grid_pitch_m / 2
-                        for along in (artifact.x_m, artifact.y_m)])
-    stage = Compensator(error_map, method="bicubic")
-    moves = [SimulatedController(stage, frame, tables).move for tables in (None, evaluator)]
-    return _residual("between", centres, [np.stack(move(*centres)) for move in moves])
 
 
 def _at_lines(error_map: ErrorMap, frame: MachineFrame, evaluator: CalEvaluator) -> Residual:
@@ -131,17 +72,5 @@ def _at_lines(error_map: ErrorMap, frame: MachineFrame, evaluator: CalEvaluator)
     if not len(angles):
         raise InputError("error map", "it knows no angular line", "leave out the theta axis")
     stage = Compensator(error_map)
-    turns = [SimulatedController(stage, frame, tables).turn for tables in (None, evaluator)]
-    return _residual("lines", angles[None], [turn(angles)[None] for turn in turns])
-
-
-def _residual(place: str, position: np.ndarray, reached: list[np.ndarray]) -> Residual:
-    residuals = [true - position for true in reached]
-    # A known site next to an unknown one cannot be inverted exactly: omit it.
-    known = np.isfinite(residuals).all(axis=(0, 1))
-    if not known.any():
-        raise InputError("error map", "no site can be verified", "measure more sites")
-    residuals = [residual[:, known] for residual in residuals]
-    shifts = [residual.mean(axis=1) for residual in residuals]
-    before, after = (r - s[:, None] for r, s in zip(residuals, shifts, strict=True))
-    return Residual(place, position[:, known], before, after, *shifts)
+    return residual_of("lines", angles[None], [turned(stage, frame, angles, tables)[None]
+                                               for tables in (None, evaluator)])

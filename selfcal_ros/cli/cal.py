@@ -25,7 +25,9 @@ from selfcal_ros.units import M_PER_UM, RAD_PER_ARCSEC
 if TYPE_CHECKING:
     from selfcal_ros.aerotech.evaluate import MachineSetup
     from selfcal_ros.aerotech.model import Table1D, Table2D
-    from selfcal_ros.aerotech.verify import Verification
+    from selfcal_ros.compensation.frame import MachineFrame
+    from selfcal_ros.compensation.residual import Correction, Residual
+    from selfcal_ros.model.result import CalibrationResult
 
 HELP = "read, check, evaluate, write and verify calibration files of Aerotech controllers"
 SCANNER_BITS = 16
@@ -123,8 +125,8 @@ def _described(table: "Table1D | Table2D") -> dict:
 
 def _evaluate(args: argparse.Namespace) -> int:
     from selfcal_ros.aerotech.evaluate import CalEvaluator
-    from selfcal_ros.aerotech.machine import frame_from_comments
     from selfcal_ros.aerotech.read import load_cal
+    from selfcal_ros.compensation.frame import frame_from_comments
 
     cal = load_cal(args.file)
     frame = frame_from_comments(cal.comments)
@@ -177,6 +179,8 @@ def add_maps(group: argparse._SubParsersAction) -> None:
                              "(default: FILE_theta.cal)")
     export.add_argument("--fill", action="store_true",
                         help="set unknown sites to the mean of their neighbours")
+    export.add_argument("--onto", metavar="ACTIVE.cal", help="table of x and y that was loaded "
+                        "during the calibration: the new one replaces it")
     export.add_argument("--force", action="store_true",
                         help="replace existing files; the old ones are kept with their date")
     add_json(export)
@@ -186,6 +190,8 @@ def add_maps(group: argparse._SubParsersAction) -> None:
                                              "and after a file is loaded, um")
     verify.add_argument("result", metavar="RESULT.json")
     verify.add_argument("file", metavar="FILE.cal")
+    verify.add_argument("--onto", metavar="ACTIVE.cal",
+                        help="table that was loaded during the calibration")
     verify.add_argument("--plot", metavar="F.png", help="draw it (png, svg or pdf)")
     verify.add_argument("--json", action="store_true", help="print as JSON, m and rad")
     add_frame(verify, theta=True, default=False)
@@ -193,26 +199,23 @@ def add_maps(group: argparse._SubParsersAction) -> None:
 
 
 def _export(args: argparse.Namespace) -> int:
-    from dataclasses import replace
-
     from selfcal_ros.aerotech import export
     from selfcal_ros.aerotech.write import cal_text, refuse_existing, write_cal
     from selfcal_ros.cli.terminal import exit_code
+    from selfcal_ros.compensation.export import provenance
+    from selfcal_ros.compensation.residual import combined
     from selfcal_ros.files import check_outputs
 
-    result, frame = read_result(args.result), frame_of(args)
+    frame = frame_of(args)
     if args.theta_output and frame.theta_axis is None:
         raise InputError("--theta-output", "no theta table is written", "name --theta-axis")
-    if not result.observability.identifiable:
-        raise NotIdentifiableError(f"{args.result}: the measured plan does not identify the stage; "
-                                   "measure the missing views",
-                                   result.observability)
-    filled = 0
-    if args.fill:
-        error_map, filled = export.fill_unknown(result.error_map)
-        result = replace(result, error_map=error_map)
-    comments = export.provenance(result, frame, filled=filled)
-    texts = {args.output: cal_text([export.table_xy(result.error_map, frame)],
+    result, filled = ready(args)
+    comments = [*provenance(result, frame, filled=filled), "zero at home by the controller"]
+    error_map, active = result.error_map, _active(args, frame)
+    if active is not None:
+        error_map = combined(error_map, frame, active)
+        comments.append("replaces the table that was loaded during the calibration")
+    texts = {args.output: cal_text([export.table_xy(error_map, frame)],
                                    comments=comments, decimals=export.DECIMALS)}
     if frame.theta_axis is not None:
         target = Path(args.output)
@@ -222,7 +225,7 @@ def _export(args: argparse.Namespace) -> int:
         table = export.table_theta(result.error_map, frame)
         texts[beside] = cal_text([table], comments=comments,
                                  decimals=export.theta_decimals(result.error_map))
-    check_outputs([args.result], texts)
+    check_outputs([args.result, args.onto], texts)
     refuse_existing(list(texts), force=args.force)
     lines, files = [], []
     for path, text in texts.items():
@@ -231,19 +234,58 @@ def _export(args: argparse.Namespace) -> int:
         lines.append(f"{path}: {kind}" + (f"; the old file is {backup}" if backup else ""))
         files.append({"file": path, "kind": kind, "old_file": backup and str(backup)})
     say(args, "\n".join(lines), {"files": files, "filled": filled})
-    if filled:
-        print(f"selfcal cal: {filled} unknown sites filled from their neighbours", file=sys.stderr)
     if frame.theta_axis is not None and frame.theta_counts_per_unit is None:
         print("selfcal cal: the theta table covers one turn either way and does not roll over;"
               f" --counts-per-unit {frame.theta_axis}=COUNTS makes it roll over", file=sys.stderr)
     return exit_code(result)
 
 
+def ready(args: argparse.Namespace) -> tuple["CalibrationResult", int]:
+    """Return the result to export, its gaps filled if requested, and their number.
+
+    Raises
+    ------
+    NotIdentifiableError
+        If the measured plan does not identify the stage.
+    """
+    from dataclasses import replace
+
+    from selfcal_ros.compensation.export import fill_unknown
+
+    result, filled = read_result(args.result), 0
+    if not result.observability.identifiable:
+        raise NotIdentifiableError(f"{args.result}: the measured plan does not identify the stage; "
+                                   "measure the missing views",
+                                   result.observability)
+    if args.fill:
+        error_map, filled = fill_unknown(result.error_map)
+        result = replace(result, error_map=error_map)
+        if filled:
+            print(f"selfcal {args.verb}: {filled} unknown sites filled from their neighbours",
+                  file=sys.stderr)
+    return result, filled
+
+
+def _active(args: argparse.Namespace, frame: "MachineFrame") -> "Correction | None":
+    """Return the correction by the file of ``--onto``."""
+    from selfcal_ros.aerotech.evaluate import CalEvaluator
+    from selfcal_ros.aerotech.machine import plane_correction, setup_of
+    from selfcal_ros.aerotech.read import load_cal
+
+    if args.onto is None:
+        return None
+    tables = CalEvaluator(load_cal(args.onto).tables, setup_of(frame))
+    if not {*tables.inputs, *tables.outputs} <= {frame.x_axis, frame.y_axis}:
+        raise InputError(args.onto, f"it is for axes {[*tables.inputs, *tables.outputs]}",
+                         "name its axes with --x-axis and --y-axis; theta is not combined")
+    return plane_correction(tables, frame)
+
+
 def _verify(args: argparse.Namespace) -> int:
-    from selfcal_ros.aerotech.machine import MachineFrame, frame_from_comments
     from selfcal_ros.aerotech.model import Table2D
     from selfcal_ros.aerotech.read import load_cal
     from selfcal_ros.aerotech.verify import verify_tables
+    from selfcal_ros.compensation.frame import MachineFrame, frame_from_comments
 
     result, cal = read_result(args.result), load_cal(args.file)
     base = frame_from_comments(cal.comments)
@@ -251,8 +293,8 @@ def _verify(args: argparse.Namespace) -> int:
         base = MachineFrame(cal.tables[0].column_axis, cal.tables[0].row_axis)
     frame = frame_of(args, base)
     with busy("simulating the controller"):
-        found = verify_tables(result.error_map, cal.tables, frame)
-    say(args, _text(found), _numbers(found))
+        found = verify_tables(result.error_map, cal.tables, frame, _active(args, frame))
+    say(args, residual_text(found.residuals), figures_of(found.residuals))
     if args.plot:
         from selfcal_ros.aerotech.report import controller_figure
         from selfcal_ros.reporting.figures.paper import save_picture
@@ -263,20 +305,21 @@ def _verify(args: argparse.Namespace) -> int:
     return int(ExitCode.DONE)
 
 
-def _numbers(found: "Verification") -> dict:
+def figures_of(residuals: "list[Residual]") -> dict:
+    """Return the residuals as data, m and rad."""
     from selfcal_ros.model.json_form import plain
 
     return plain({r.place: {"points": r.position.shape[1],
                             "before": {"rms": r.rms("before"), "max": r.largest("before")},
                             "after": {"rms": r.rms("after"), "max": r.largest("after")},
-                            "shift_after": r.shift_after} for r in found.residuals})
+                            "shift_after": r.shift_after} for r in residuals})
 
 
-def _text(found: "Verification") -> str:
+def residual_text(residuals: "list[Residual]") -> str:
     """Return the residuals as a small table: µm, and arcsec for angular lines."""
     lines = ["residual true - commanded, without its constant shift         before          after"]
     names = {"sites": "sites", "between": "cell centres (cubic stage)", "lines": "angular lines"}
-    for r in found.residuals:
+    for r in residuals:
         unit, scale = ("arcsec", RAD_PER_ARCSEC) if r.place == "lines" else ("µm", M_PER_UM)
         for what, value in (("rms", r.rms), ("max", r.largest)):
             name = f"{r.position.shape[1]} {names[r.place]}, {what}, {unit}"

@@ -19,7 +19,7 @@ from selfcal_ros.units import M_PER, M_PER_UM, UM_PER_M
 
 if TYPE_CHECKING:
     from selfcal_ros.aerotech.lines import AxisCorrection
-    from selfcal_ros.aerotech.machine import MachineFrame
+    from selfcal_ros.compensation.frame import MachineFrame
     from selfcal_ros.model.result import CalibrationResult
 
 Axis = Literal["x", "y"]
@@ -84,7 +84,8 @@ def in_unit(texts: list[str] | None, unit: str, *, rotary: Container[int] = ()) 
     return found
 
 
-def add_frame(parser: argparse.ArgumentParser, *, theta: bool, default: bool = True) -> None:
+def add_frame(parser: argparse.ArgumentParser, *, theta: bool, default: bool = True,
+              units: tuple[str, ...] = ("m", "mm", "um")) -> None:
     """Add the options that relate the controller's axes to the stage frame."""
     group = parser.add_argument_group(
         "machine", "" if default else "default: from the comments of FILE.cal, else columns "
@@ -93,8 +94,9 @@ def add_frame(parser: argparse.ArgumentParser, *, theta: bool, default: bool = T
                        help="index of the x axis, from 1")
     group.add_argument("--y-axis", type=int, metavar="N", default=2 if default else None,
                        help="index of the y axis")
-    group.add_argument("--unit", choices=("m", "mm", "um"), default="mm" if default else None,
-                       help="primary unit of the linear axes (default mm)")
+    group.add_argument("--unit", choices=units, default="mm" if default and "in" not in units else
+                       None, help="unit of the linear axes (default mm"
+                       + (", kmotion in)" if "in" in units else ")"))
     for axis, unit in (("x", "primary unit"), ("y", "primary unit"), ("theta", "deg")):
         if axis == "theta" and not theta:
             continue
@@ -113,13 +115,13 @@ def frame_of(args: argparse.Namespace, base: "MachineFrame | None" = None) -> "M
     """Return the frame described by the options, with `base` as default."""
     from dataclasses import replace
 
-    from selfcal_ros.aerotech.machine import UNITS_M, MachineFrame
+    from selfcal_ros.compensation.frame import LENGTHS_M, MachineFrame
 
     base = base or MachineFrame()
     changes: dict[str, Any] = {
         name: getattr(args, name) for name in ("x_axis", "y_axis", "theta_axis", "unit")
         if getattr(args, name, None) is not None}
-    unit_m = UNITS_M[changes.get("unit", base.unit)]
+    unit_m = LENGTHS_M[changes.get("unit", base.unit)]
     for name in ("x", "y", "theta"):
         home = getattr(args, f"home_{name}", None)
         if home is not None and not math.isfinite(home):
@@ -204,7 +206,7 @@ def _frame(args: argparse.Namespace) -> "MachineFrame":
 
 def _orthogonality(args: argparse.Namespace) -> int:
     from selfcal_ros.aerotech import lines as cal_lines
-    from selfcal_ros.aerotech.machine import UNITS_M
+    from selfcal_ros.compensation.frame import UNITS_M
 
     frame = _frame(args)
     other: Axis = "y" if args.along == "x" else "x"
@@ -287,10 +289,11 @@ def _deliver(args: argparse.Namespace, line: "AxisCorrection", frame: "MachineFr
     from datetime import UTC, datetime
 
     from selfcal_ros import __version__
-    from selfcal_ros.aerotech.export import DECIMALS, verdict_lines
+    from selfcal_ros.aerotech.export import DECIMALS
     from selfcal_ros.aerotech.lines import line_table
     from selfcal_ros.aerotech.write import cal_text, write_cal
     from selfcal_ros.cli.terminal import exit_code
+    from selfcal_ros.compensation.export import verdict_lines
     from selfcal_ros.files import check_outputs
 
     source = args.source or f"{args.measured} over {args.over}, travel {args.travel}"

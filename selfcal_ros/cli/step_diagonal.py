@@ -13,8 +13,8 @@ from selfcal_ros.errors import ExitCode, InputError
 from selfcal_ros.units import M_PER, M_PER_MM, M_PER_UM
 
 if TYPE_CHECKING:
-    from selfcal_ros.aerotech.machine import MachineFrame
     from selfcal_ros.aerotech.model import Table1D
+    from selfcal_ros.compensation.frame import MachineFrame
     from selfcal_ros.laser.data import StepDiagonal, StepDiagonalResult
 
 HELP = "identify linear, straightness and squareness errors from a laser step-diagonal measurement"

@@ -39,16 +39,16 @@ class CellSettings:
         Encoder samples, and the time from one exposure to the next.
     with_ids, declare_sigma : bool
         Whether detections name their marks, and state their noise.
-    servo_sigma_m, servo_sigma_rad : float
+    servo_sigma_m, servo_sigma_theta_rad : float
         Scatter of the stage about its stop position, exposure by exposure: motion, which the
         encoders indicate.
-    encoder_sigma_m, encoder_sigma_rad : float
+    encoder_sigma_m, encoder_sigma_theta_rad : float
         Noise of the encoder readings, exposure by exposure, without motion.
     visit_order : str
         Order of the marks if a view does not specify one (`selfcal_ros.model.orders`).
     consecutive : bool
         All repeats of a mark consecutively, in one pass; if false, one pass per repeat.
-    stop_sigma_m, stop_sigma_rad : float
+    stop_sigma_m, stop_sigma_theta_rad : float
         Stop error relative to the target, visit by visit.
     follow_mark : bool
         Whether the target is the actual position of the mark, not the nominal one.
@@ -75,13 +75,13 @@ class CellSettings:
     with_ids: bool = True
     declare_sigma: bool = False
     servo_sigma_m: float = 20e-9
-    servo_sigma_rad: float = 1e-7
+    servo_sigma_theta_rad: float = 1e-7
     encoder_sigma_m: float = 0.0
-    encoder_sigma_rad: float = 0.0
+    encoder_sigma_theta_rad: float = 0.0
     visit_order: str = ""
     consecutive: bool = False
     stop_sigma_m: float = 0.0
-    stop_sigma_rad: float = 0.0
+    stop_sigma_theta_rad: float = 0.0
     follow_mark: bool = False
     visit_xy_m: float = 0.0
     flicker_xy_m: float = 0.0
@@ -248,17 +248,17 @@ def angular_exposures(truth: Truth, index: int, view: View, *, settings: CellSet
          else np.tile(line, view.repeats))
     sign = -1 if settings.sense is Sense.PLATE_MOVES else 1
     n_stops = len(line) if settings.consecutive else len(k)
-    stop = _normal(rng, settings.stop_sigma_rad, n_stops)
+    stop = _normal(rng, settings.stop_sigma_theta_rad, n_stops)
     stop = np.repeat(stop, view.repeats) if settings.consecutive else stop
     centre = sign * nominal
     if settings.follow_mark:
         centre = sign * direction + physics.encoder_error(truth, sign * direction)
-    position = centre[k] + stop + _normal(rng, settings.servo_sigma_rad, len(k))
+    position = centre[k] + stop + _normal(rng, settings.servo_sigma_theta_rad, len(k))
     stage = position - physics.encoder_error(truth, position)
     offset = physics.true_offset(settings.sense, direction[k], stage)
     told = (truth.line_factor * offset + _normal(rng, settings.sigma_theta_rad, len(k))
             + _flicker(rng, settings.flicker_theta_rad, (len(k),)))
-    indicated = position + _normal(rng, settings.encoder_sigma_rad, len(k))
+    indicated = position + _normal(rng, settings.encoder_sigma_theta_rad, len(k))
     return AngularExposures(k, there[k], indicated, quantised(told, settings.resolution_theta_rad))
 
 

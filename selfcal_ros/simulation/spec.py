@@ -3,27 +3,20 @@
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from selfcal_ros.collection.inputs import Detection, EncoderSample, Kind
+from selfcal_ros.collection.settings.nodes import SimulatorSettings
 from selfcal_ros.collection.settings.parameter import Parameter
 from selfcal_ros.errors import InputError, known_are
 from selfcal_ros.files import read_yaml
-from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.view import Plan, View, plan_from_dict, plan_to_dict
 from selfcal_ros.simulation.cell import CellSettings, Event, plan_events
-from selfcal_ros.simulation.machine import (
-    AXES,
-    ENCODERS,
-    ROTATIONS,
-    Spread,
-    Truth,
-    random_truth,
-)
+from selfcal_ros.simulation.machine import Spread, Truth, random_truth
 from selfcal_ros.units import M_PER_UM, NS_PER_S, RAD_PER_MRAD
 
 PARTS = ("lost", "outliers", "low_score", "not_finite", "unknown_mark", "duplicated")
@@ -141,73 +134,47 @@ def _one_fault(event: Detection, name: str, rng: np.random.Generator) -> list[Ev
                     offset_y=event.offset_y + size * M_PER_UM * np.sin(angle))]
 
 
-Bounds = dict[str, Any]
-"""Unit, limits and choices of a key, as in `Parameter`."""
-
-Section = dict[str, tuple[str, Bounds]]
-"""Key -> field of the dataclass, and its bounds; type and default are the field's."""
-
-PART: Bounds = {"low": 0.0, "high": 1.0}
-LENGTH: Bounds = {"unit": "m", "low": 0.0, "high": 1e-3}
-ANGLE: Bounds = {"unit": "rad", "low": 0.0, "high": 0.1}
-TIME: Bounds = {"unit": "s", "low": 0.0, "high": 3600.0}
+UNITS = ("", "_m", "_rad", "_s", "_hz", "_pitches")
+"""Endings of the fields of a dataclass, which the keys of a file do not have."""
 LAST_START_S = 2.1e9
 """Largest start time: stamps are 32 bit seconds, with room for the longest recording."""
 
-RATIO: Bounds = {"unit": "m/m", "low": 0.0, "high": 0.1}
-SIGNED_RATIO = RATIO | {"low": -0.1}
-FACTOR: Bounds = {"low": -100.0, "high": 100.0}
+Section = dict[str, Parameter]
+"""Key -> its unit, limits and choices; the default is that of the field."""
 
-TRUTH: Section = {
-    "g": ("g_m", LENGTH), "a": ("a_m", LENGTH), "g_theta": ("g_theta_rad", ANGLE),
-    "a_theta": ("a_theta_rad", ANGLE), "phi": ("phi_rad", ANGLE), "t": ("t_m", LENGTH),
-    "correlation": ("correlation_pitches", {"unit": "pitches", "low": 0.0, "high": 1000.0}),
-    "phi_common": ("phi_common_rad", ANGLE), "t_common": ("t_common_m", LENGTH),
-    "encoder": ("encoder", {"choices": ENCODERS}), "rotation": ("rotation", {"choices": ROTATIONS})}
-NOISE: Section = {
-    "sigma_xy": ("sigma_xy_m", LENGTH), "sigma_theta": ("sigma_theta_rad", ANGLE),
-    "noise_ratio": ("noise_ratio", {"low": 0.0, "high": 100.0}),
-    "visit_xy": ("visit_xy_m", LENGTH), "flicker_xy": ("flicker_xy_m", LENGTH),
-    "flicker_theta": ("flicker_theta_rad", ANGLE), "resolution_xy": ("resolution_xy_m", LENGTH),
-    "resolution_theta": ("resolution_theta_rad", ANGLE)}
-CELL: Section = {
-    "sense": ("sense", {"choices": tuple(str(sense) for sense in Sense)}),
-    "encoder_rate": ("encoder_rate_hz", {"unit": "Hz", "low": 1.0, "high": 10000.0}),
-    "exposure_period": ("exposure_period_s", {"unit": "s", "low": 0.001, "high": 10.0}),
-    "with_ids": ("with_ids", {}), "declare_sigma": ("declare_sigma", {}),
-    "servo_sigma": ("servo_sigma_m", LENGTH), "servo_sigma_theta": ("servo_sigma_rad", ANGLE),
-    "encoder_sigma": ("encoder_sigma_m", LENGTH),
-    "encoder_sigma_theta": ("encoder_sigma_rad", ANGLE),
-    "stop_sigma": ("stop_sigma_m", LENGTH), "stop_sigma_theta": ("stop_sigma_rad", ANGLE),
-    "follow_mark": ("follow_mark", {}), "visit_order": ("visit_order", {}),
-    "consecutive": ("consecutive", {})}
-PHYSICS: Section = {
-    "microscope_scale": ("microscope_scale", SIGNED_RATIO),
-    "microscope_stretch": ("microscope_stretch", SIGNED_RATIO),
-    "microscope_rotation": ("microscope_rotation_rad", ANGLE | {"low": -0.1}),
-    "microscope_shear": ("microscope_shear", SIGNED_RATIO),
-    "microscope_axes": ("microscope_axes", {"choices": tuple(AXES)}),
-    "microscope_pixels": ("microscope_pixels", FACTOR), "line_factor": ("line_factor", FACTOR),
-    "microscope_distortion": ("microscope_distortion", SIGNED_RATIO),
-    "microscope_field": ("microscope_field_m", LENGTH | {"low": 1e-6}),
-    "optical_tilt_x": ("optical_tilt_x_rad", ANGLE | {"low": -0.1}),
-    "optical_tilt_y": ("optical_tilt_y_rad", ANGLE | {"low": -0.1}),
-    "backlash_x": ("backlash_x_m", LENGTH | {"low": -1e-3}),
-    "backlash_y": ("backlash_y_m", LENGTH | {"low": -1e-3}),
-    "backlash_growth": ("backlash_growth_m", LENGTH | {"low": -1e-3}),
-    "settling": ("settling_m", LENGTH | {"low": -1e-3}),
-    "settling_time": ("settling_time_s", {"unit": "s", "low": 1e-6, "high": 3600.0}),
-    "stage_bend": ("stage_bend_m", LENGTH),
-    "plate_scale": ("plate_scale", RATIO), "plate_shape": ("plate_shape_m", LENGTH),
-    "plate_strain": ("plate_strain", RATIO), "plate_tilt": ("plate_tilt_rad", ANGLE),
-    "plate_bow": ("plate_bow_m", LENGTH | {"low": -1e-3}),
-    "line_eccentricity": ("line_eccentricity_rad", ANGLE),
-    "pitch_error": ("pitch_error", SIGNED_RATIO),
-    **{f"drift_{name}": (f"drift_{name}_m", LENGTH)
-       for name in ("linear", "quadratic", "cubic", "walk")}}
-FAULTS: Section = {name: (name, PART) for name in PARTS} | {
-    key: (f"{key.removesuffix('_s')}_s", TIME)
-    for key in ("delay", "clock_step", "encoder_gap", "delay_s", "clock_step_s", "encoder_gap_s")}
+_NODE: Section = {parameter.name: parameter for parameter in SimulatorSettings.parameters()}
+"""The keys that are parameters of stage_simulator as well."""
+
+
+def _keys(*names: str, unit: str = "", high: float = 1.0) -> Section:
+    return {name: Parameter(name, 0.0, "", unit, 0.0, high) for name in names}
+
+
+def field_of(key: str, kind: type) -> str:
+    """Return the field of a dataclass that a key sets: the key with a unit; "" if none."""
+    names = {item.name for item in fields(kind)}
+    return next((key.removesuffix("_s") + unit for unit in UNITS
+                 if key.removesuffix("_s") + unit in names), "")
+
+
+TRUTH: Section = (
+    _keys("g", "a", "t", "t_common", unit="m", high=1e-3)
+    | _keys("g_theta", "a_theta", "phi", "phi_common", unit="rad", high=0.1)
+    | _keys("correlation", unit="pitches", high=1000.0)
+    | {name: _NODE[name] for name in ("encoder", "rotation")})
+NOISE: Section = {name: _NODE[name] for name in (
+    "sigma_xy", "sigma_theta", "noise_ratio", "visit_xy", "flicker_xy", "flicker_theta",
+    "resolution_xy", "resolution_theta")}
+CELL: Section = {"sense": replace(_NODE["measurement_sense"], name="sense")} | {
+    name: _NODE[name] for name in (
+        "encoder_rate", "exposure_period", "with_ids", "declare_sigma", "servo_sigma",
+        "servo_sigma_theta", "encoder_sigma", "encoder_sigma_theta", "stop_sigma",
+        "stop_sigma_theta", "follow_mark", "visit_order", "consecutive")}
+PHYSICS: Section = {name: parameter for name, parameter in _NODE.items()
+                    if name not in TRUTH and field_of(name, Spread)}
+FAULTS: Section = _keys(*PARTS) | {
+    f"{name}{unit}": Parameter(f"{name}{unit}", 0.0, "", "s", 0.0, 3600.0)
+    for unit in ("", "_s") for name in ("delay", "clock_step", "encoder_gap")}
 TOP = (
     Parameter("seed", 0, "of truth, noise and faults", low=0, high=2**61),
     Parameter("noise_seed", 0, "of all that a new measurement of the machine changes", low=0,
@@ -298,10 +265,9 @@ def spread_of(values: Mapping[str, Any]) -> Spread:
     return Spread(**_fields_of(values, TRUTH | PHYSICS, Spread()))
 
 
-def _fields_of(values: Mapping[str, Any], keys: Mapping[str, tuple], defaults: Any,
-               ) -> dict[str, Any]:
-    return {name: type(getattr(defaults, name))(values[key])
-            for key, (name, _) in keys.items() if key in values}
+def _fields_of(values: Mapping[str, Any], keys: Section, defaults: Any) -> dict[str, Any]:
+    found = {key: field_of(key, type(defaults)) for key in keys if key in values}
+    return {name: type(getattr(defaults, name))(values[key]) for key, name in found.items()}
 
 
 def _plan(plan: Any, path: Path) -> Plan:
@@ -343,11 +309,8 @@ def _section(data: Any, where: str, keys: Section, defaults: Any) -> dict:
     """Return field -> value of a section, each of the type of its default and within bounds."""
     out: dict[str, Any] = {}
     for key, value in _mapping(data, where, tuple(keys)).items():
-        name, bounds = keys[key]
+        name = field_of(key, type(defaults))
         if name in out:
             raise InputError(f"{where}: {key}", "given twice", "remove one")
-        default = getattr(defaults, name)
-        kind = next(kind for kind in (str, float, bool) if isinstance(default, kind))
-        value = Parameter(key, kind(default), "", **bounds).check(value, where)
-        out[name] = type(default)(value)
+        out[name] = type(getattr(defaults, name))(keys[key].check(value, where))
     return out

@@ -85,7 +85,7 @@ def simulate_measurements(truth: Truth, plan: Plan, rng: np.random.Generator, *,
     truth = truth if linear is None else replace(truth, linear=linear)
     if visits or settings or truth.by_visit:
         settings = settings or CellSettings(sense, sigma_m, sigma_theta_rad, servo_sigma_m=0.0,
-                                            servo_sigma_rad=0.0)
+                                            servo_sigma_theta_rad=0.0)
         return _by_visit(truth, plan, rng, settings=settings, missing=missing)
     views = tuple(_simulate_view(truth, (index, view), rng, sigma=(sigma_m, sigma_theta_rad),
                                  sense=sense, missing=missing)

@@ -6,24 +6,15 @@ import numpy as np
 import pytest
 
 from selfcal_ros.aerotech.evaluate import CalEvaluator
-from selfcal_ros.aerotech.export import (
-    DECIMALS,
-    fill_unknown,
-    provenance,
-    table_theta,
-    table_xy,
-    theta_decimals,
-)
-from selfcal_ros.aerotech.machine import (
-    MachineFrame,
-    SimulatedController,
-    frame_from_comments,
-)
+from selfcal_ros.aerotech.export import DECIMALS, table_theta, table_xy, theta_decimals
+from selfcal_ros.aerotech.machine import setup_of, turned
 from selfcal_ros.aerotech.model import same_table
 from selfcal_ros.aerotech.read import parse_cal
 from selfcal_ros.aerotech.verify import verify_tables
 from selfcal_ros.aerotech.write import cal_text
 from selfcal_ros.compensation.compensator import Compensator
+from selfcal_ros.compensation.export import fill_unknown, provenance
+from selfcal_ros.compensation.frame import MachineFrame, frame_from_comments
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.model.artifact import Artifact
@@ -168,11 +159,11 @@ def test_theta_rolls_over_for_ever_with_counts_and_covers_two_turns_without():
     emap = random_map(ARTIFACT, 5)
     for counts, turns in ((1000.0, (-5, 0, 1, 40)), (None, (-1, 0))):
         frame = MachineFrame(1, 2, 3, theta_counts_per_unit=counts)
-        machine = SimulatedController(
-            Compensator(emap), frame, CalEvaluator([table_theta(emap, frame)], frame.setup()))
-        base = machine.turn(ARTIFACT.theta_rad)
+        tables = CalEvaluator([table_theta(emap, frame)], setup_of(frame))
+        base = turned(Compensator(emap), frame, ARTIFACT.theta_rad, tables)
         for turn in turns:
-            reached = machine.turn(ARTIFACT.theta_rad + 2 * np.pi * turn) - 2 * np.pi * turn
+            reached = turned(Compensator(emap), frame, ARTIFACT.theta_rad + 2 * np.pi * turn,
+                             tables) - 2 * np.pi * turn
             np.testing.assert_allclose(reached, base, rtol=0, atol=1e-11)
 
 

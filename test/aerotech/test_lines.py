@@ -14,9 +14,11 @@ from selfcal_ros.aerotech.lines import (
     orthogonality,
     without_slope,
 )
-from selfcal_ros.aerotech.machine import MachineFrame, SimulatedController
+from selfcal_ros.aerotech.machine import plane_correction
 from selfcal_ros.aerotech.verify import verify_tables
 from selfcal_ros.compensation.compensator import Compensator
+from selfcal_ros.compensation.frame import MachineFrame
+from selfcal_ros.compensation.residual import reached
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.artifact import Artifact
 from test.support.maps import first_order, random_map
@@ -120,19 +122,18 @@ def test_orthogonality_of_a_map_makes_the_axes_square(frame, along):
     emap = smooth_map(lambda x, y: o * y, lambda x, y: o * x)
     other = "y" if along == "x" else "x"
     table = line_table(map_orthogonality(emap, along), frame, along=along, corrected=other)
-    machine = SimulatedController(Compensator(emap), frame, CalEvaluator([table]))
+    loaded = plane_correction(CalEvaluator([table]), frame)
 
-    def angle(loaded):
+    def angle(correct):
         """Angle between the true paths of the two axes, rad."""
         ends = np.array([[0.02, 0], [-0.02, 0], [0, 0.02], [0, -0.02]]).T
-        x, y = loaded.move(*ends)
+        x, y = reached(Compensator(emap), frame, ends, correct=correct)
         ax, ay = x[0] - x[1], y[0] - y[1]
         bx, by = x[2] - x[3], y[2] - y[3]
         return np.arctan2(ax * by - ay * bx, ax * bx + ay * by)
 
-    assert angle(SimulatedController(Compensator(emap), frame)) - np.pi / 2 == pytest.approx(
-        2 * o, rel=1e-3)
-    assert angle(machine) == pytest.approx(np.pi / 2, abs=1e-8)
+    assert angle(None) - np.pi / 2 == pytest.approx(2 * o, rel=1e-3)
+    assert angle(loaded) == pytest.approx(np.pi / 2, abs=1e-8)
 
 
 def test_measured_errors_are_opposed():

@@ -9,11 +9,13 @@ import pytest
 from selfcal_ros.aerotech.evaluate import AxisSetup, CalEvaluator, MachineSetup
 from selfcal_ros.aerotech.export import DECIMALS, table_theta, table_xy, theta_decimals
 from selfcal_ros.aerotech.lines import AxisCorrection, line_table
-from selfcal_ros.aerotech.machine import MachineFrame, SimulatedController, frame_from_comments
+from selfcal_ros.aerotech.machine import plane_correction, setup_of
 from selfcal_ros.aerotech.model import Unit, UnitWord
 from selfcal_ros.aerotech.read import parse_cal, refuse_errors
 from selfcal_ros.aerotech.write import cal_text
 from selfcal_ros.compensation.compensator import Compensator
+from selfcal_ros.compensation.frame import MachineFrame, frame_from_comments
+from selfcal_ros.compensation.residual import reached
 from selfcal_ros.model.artifact import Artifact
 from test.support.maps import random_map
 from test.support.slow_cal import slow_2d
@@ -73,10 +75,11 @@ def test_a_table_is_the_map_less_its_value_at_home(seed):
         for axis, value in zip(table.outputs, slow, strict=True):
             assert value == pytest.approx(found[axis][k], abs=1e-14 / METRES[frame.unit])
     # The controller stands where it was told to but for the bias, to first order in the slope.
-    reached = np.array(SimulatedController(compensator, frame, evaluator).move(*places))
+    stood = np.array(reached(compensator, frame, places,
+                             correct=plane_correction(evaluator, frame)))
     within = np.abs(places).max(axis=0) < 0.9 * min(np.abs(places[:, 40:]).max(axis=1))
     slope = 4 * np.abs([error_map.gx, error_map.gy]).max() / error_map.artifact.grid_pitch_m
-    np.testing.assert_allclose((reached - places)[:, within], (-bias[:, None] + 0 * places)[
+    np.testing.assert_allclose((stood - places)[:, within], (-bias[:, None] + 0 * places)[
         :, within], rtol=0, atol=ROUNDING_M + 2 * slope * np.abs(bias).max() + 1e-17)
 
 
@@ -87,7 +90,7 @@ def test_a_theta_table_is_the_map_less_its_value_at_home(seed):
     turns = 2 if frame.theta_counts_per_unit is None else 30
     theta = np.append(np.linspace(-1, 1, 101) * turns * np.pi, error_map.artifact.theta_rad)
     compensator = Compensator(error_map)
-    found = CalEvaluator(cal.tables, frame.setup()).corrections(
+    found = CalEvaluator(cal.tables, setup_of(frame)).corrections(
         {frame.theta_axis: frame.theta_to_machine(theta)})[frame.theta_axis]
     want = compensator.error_theta(theta) - compensator.error_theta(frame.home_theta_rad)
     np.testing.assert_allclose(frame.sign_theta * np.deg2rad(found), want, rtol=0, atol=4.9e-11)

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from selfcal_ros.aerotech.export import table_theta, table_xy
-from selfcal_ros.aerotech.machine import MachineFrame
 from selfcal_ros.aerotech.verify import verify_tables
+from selfcal_ros.compensation.frame import MachineFrame
 from selfcal_ros.model.artifact import Artifact
 from test.support.maps import random_map
 

@@ -33,7 +33,8 @@ def readings(size: int) -> Measurements:
     rng = np.random.default_rng(size)
     truth = random_truth(plan.artifact, len(views), rng,
                          Spread(encoder="independent", rotation="finite"))
-    cell = CellSettings(sigma_xy_m=20e-9, stop_sigma_m=20e-6, servo_sigma_m=0, servo_sigma_rad=0)
+    cell = CellSettings(sigma_xy_m=20e-9, stop_sigma_m=20e-6, servo_sigma_m=0,
+                        servo_sigma_theta_rad=0)
     return simulate_measurements(truth, plan, rng, settings=cell, visits=True)
 
 

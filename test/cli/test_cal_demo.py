@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from selfcal_ros.aerotech.machine import frame_from_comments
 from selfcal_ros.aerotech.read import load_cal
 from selfcal_ros.aerotech.verify import verify_tables
 from selfcal_ros.bagio.offline import read_truth
 from selfcal_ros.cli.main import main
+from selfcal_ros.compensation.frame import frame_from_comments
 from selfcal_ros.files import read_json
 from selfcal_ros.model.result import result_from_dict
 

@@ -32,9 +32,9 @@ def bag(tmp_path_factory):
 
 @pytest.mark.parametrize(("words", "message"), [
     ("solv x", "selfcal: VERB 'solv' is unknown; did you mean 'solve'?; see selfcal --help"),
-    ("", "selfcal: VERB is missing: one of apply, batch, cal, call, cell, diff, monitor, plan, "
-     "plot, replay, report, reproduce, simulate, solve, step-diagonal, table, up; see selfcal "
-     "--help"),
+    ("", "selfcal: VERB is missing: one of apply, batch, cal, call, cell, diff, export, monitor, "
+     "plan, plot, replay, report, reproduce, simulate, solve, step-diagonal, table, up; see "
+     "selfcal --help"),
     ("plan", "selfcal plan: check|suggest is missing; see selfcal plan --help"),
     ("solve", "selfcal solve: BAG is missing; see selfcal solve --help"),
     ("solve b --methd joint", "selfcal solve: the option --methd is unknown; did you mean "
@@ -273,7 +273,8 @@ RUNS = {
     "plan suggest": "plan suggest PLAN", "simulate": "simulate SIM -o made",
     "reproduce": "reproduce hu --draws 2", "cal export": "cal export R -o f.cal",
     "cal check": "cal check f.cal", "cal eval": "cal eval f.cal --position 1=1 --position 2=2",
-    "cal verify": "cal verify R f.cal", "cal accuracy": "cal accuracy R",
+    "export": "export siemens R -o f.ini", "cal verify": "cal verify R f.cal",
+    "cal accuracy": "cal accuracy R",
     "cal straightness": "cal straightness R -o s.cal",
     "cal orthogonality": "cal orthogonality --measured 5um --over 200mm --travel 300mm",
     "step-diagonal": "step-diagonal DATA --method new -o d.json"}

@@ -39,7 +39,8 @@ def lost_marks(events, **parameters):
 
 @pytest.mark.parametrize("sense", list(Sense))
 def test_the_readings_are_the_deviations_of_the_truth(sense):
-    cell = scene("0, 90, tx, 270", line=True, sense=sense, servo_sigma_m=0.0, servo_sigma_rad=0.0)
+    cell = scene("0, 90, tx, 270", line=True, sense=sense, servo_sigma_m=0.0,
+                 servo_sigma_theta_rad=0.0)
     found, progress = collect(cell.events, measurement_sense=str(sense))
     assert found.sense is sense
     assert all(item.complete and item.coverage == 1.0 for item in progress.values())

@@ -102,8 +102,9 @@ def session(phi_deg, *, with_ids=False, **parameters):
     phi = truth.phi_rad.copy()
     phi[-1] = np.deg2rad(phi_deg)
     truth = replace(truth, phi_rad=phi)
-    events = plan_events(truth, plan, settings=CellSettings(with_ids=with_ids, servo_sigma_rad=0.0),
-                         rng=np.random.default_rng(2), start_ns=START_NS)
+    cell = CellSettings(with_ids=with_ids, servo_sigma_theta_rad=0.0)
+    events = plan_events(truth, plan, settings=cell, rng=np.random.default_rng(2),
+                         start_ns=START_NS)
     return truth, plan, collect(events, **parameters)[0]
 
 

@@ -3,8 +3,9 @@ import numpy as np
 import pytest
 
 from selfcal_ros.aerotech.evaluate import CalEvaluator
-from selfcal_ros.aerotech.machine import MachineFrame
+from selfcal_ros.aerotech.machine import setup_of
 from selfcal_ros.cli.step_diagonal import correction_tables
+from selfcal_ros.compensation.frame import MachineFrame
 from selfcal_ros.errors import InputError
 from selfcal_ros.laser.identify import identify_ibaraki, identify_wang
 from selfcal_ros.laser.profiles import (
@@ -38,7 +39,7 @@ def measured(machine, noise=None):
 def test_a_corrected_machine_is_straight_square_and_true(frame):
     machine = case_study_machine()
     found = identify_ibaraki(measured(machine))
-    tables = CalEvaluator(correction_tables(found, frame), frame.setup())
+    tables = CalEvaluator(correction_tables(found, frame), setup_of(frame))
     place = np.arange(7) * 0.01
     x, y = (grid.ravel() for grid in np.meshgrid(place, place, indexing="ij"))
     # E = Px(x) + Px(y), Py(x) + Py(y): what the steps of the machine add up to.

@@ -28,7 +28,7 @@ def events_of(seed=1, **settings):
 @pytest.mark.parametrize("servo", [0.0, 1.0])
 def test_noise_free_messages_give_back_the_deviations(sense, servo):
     cell = scene("0, 90, 180, 270, tx, -ty", size=11, count=24, line=True, sense=sense,
-                 servo_sigma_m=servo * 2e-8, servo_sigma_rad=servo * 1e-7)
+                 servo_sigma_m=servo * 2e-8, servo_sigma_theta_rad=servo * 1e-7)
     found, _ = collect(cell.events, measurement_sense=str(sense))
     for index, readings in enumerate(found.views):
         angular = angular_deviation(cell.truth, index, readings.view, sense=sense)

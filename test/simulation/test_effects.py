@@ -47,8 +47,8 @@ def test_lines_are_told_with_another_sign(sense):
     truth = truth_with(phi_rad=np.array([3e-5]), line_factor=-1.0)
     np.testing.assert_allclose(measured(truth, sense).dtheta, -3e-5, rtol=1e-10)
     # what the encoder says is as it is: only offsets are told wrongly
-    stops = measured(truth_with(line_factor=-1.0), sense, servo_sigma_rad=1e-6)
-    still = measured(truth_with(), sense, servo_sigma_rad=1e-6)
+    stops = measured(truth_with(line_factor=-1.0), sense, servo_sigma_theta_rad=1e-6)
+    still = measured(truth_with(), sense, servo_sigma_theta_rad=1e-6)
     np.testing.assert_allclose(still.dtheta, 0, atol=1e-15)
     assert np.abs(stops.dtheta).max() > 1e-6
 
@@ -179,7 +179,7 @@ def test_servo_scatter_is_motion_and_noise_of_the_encoder_is_none(sense):
     reads = measured(truth, sense, view=view, encoder_sigma_m=1 * UM).visits
     assert np.ptp(reads.offset_x) < 1e-15
     assert (sign * reads.dx).std() == pytest.approx(1 * UM, rel=0.05)
-    lines = measured(truth, sense, view=view, encoder_sigma_rad=1e-6)
+    lines = measured(truth, sense, view=view, encoder_sigma_theta_rad=1e-6)
     assert lines.sigma_theta == pytest.approx(1e-6, rel=0.05)
 
 

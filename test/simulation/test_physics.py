@@ -35,7 +35,7 @@ def truth_with(**fields):
 def measured(truth, sense=Sense.MICROSCOPE_MOVES, *, view=None, **settings):
     """Return the readings of one view in raster order without noise."""
     view = view or View("v")
-    how = CellSettings(sense, **{"servo_sigma_m": 0.0, "servo_sigma_rad": 0.0,
+    how = CellSettings(sense, **{"servo_sigma_m": 0.0, "servo_sigma_theta_rad": 0.0,
                                  "visit_order": "raster", **settings})
     plan = Plan("p", truth.artifact, (view,))
     return simulate_measurements(truth, plan, np.random.default_rng(1), settings=how).views[0]

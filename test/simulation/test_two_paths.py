@@ -20,7 +20,7 @@ EVERYTHING = Spread(rotation="finite", encoder="independent", microscope_scale=5
                     drift_quadratic_m=1e-7, drift_cubic_m=1e-7, drift_walk_m=1e-7)
 CASES = {
     "plain": (Spread(rotation="finite"), {}),
-    "everything": (EVERYTHING, {"stop_sigma_m": 3e-5, "stop_sigma_rad": 1e-5,
+    "everything": (EVERYTHING, {"stop_sigma_m": 3e-5, "stop_sigma_theta_rad": 1e-5,
                                 "visit_order": "x_back_y_back", "resolution_xy_m": 1e-9,
                                 "flicker_xy_m": 1e-8, "visit_xy_m": 1e-8}),
     "consecutive": (EVERYTHING, {"consecutive": True, "visit_order": "random",
@@ -30,7 +30,7 @@ CASES = {
                microscope_distortion=1e-3, optical_tilt_x_rad=5e-3, backlash_growth_m=3e-8,
                settling_m=1e-8, stage_bend_m=1e-8, plate_strain=1e-6, plate_tilt_rad=1e-3,
                plate_bow_m=5e-6, line_eccentricity_rad=1e-5, phi_common_rad=1e-3),
-        {"noise_ratio": 0.25, "encoder_sigma_m": 2e-8, "encoder_sigma_rad": 1e-7}),
+        {"noise_ratio": 0.25, "encoder_sigma_m": 2e-8, "encoder_sigma_theta_rad": 1e-7}),
     "followed": (EVERYTHING, {"follow_mark": True, "visit_order": "there_and_back@plate"})}
 
 

@@ -23,7 +23,7 @@ ARTIFACT = Artifact(11, 0.01, 24)
 SIGMA_M, SIGMA_RAD = 20e-9, np.deg2rad(0.001)
 MODEL = Spread(encoder="independent", rotation="finite")
 SETTINGS = CellSettings(sigma_xy_m=SIGMA_M, sigma_theta_rad=SIGMA_RAD, servo_sigma_m=0.0,
-                        servo_sigma_rad=0.0)
+                        servo_sigma_theta_rad=0.0)
 
 
 Change = Callable[[Truth, np.random.Generator], Truth]

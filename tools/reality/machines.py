@@ -22,7 +22,7 @@ from tools.reality.cases import (
     resistant,
 )
 
-SERVO = replace(SETTINGS, servo_sigma_m=20e-9, servo_sigma_rad=1e-7)
+SERVO = replace(SETTINGS, servo_sigma_m=20e-9, servo_sigma_theta_rad=1e-7)
 """A stage that scatters about its stops as far as its encoders tell."""
 WITHOUT_LINES = Artifact(ARTIFACT.grid_size, ARTIFACT.grid_pitch_m, 0)
 
@@ -36,7 +36,7 @@ def machine_cases() -> list[Case]:
 def _checked() -> list[Case]:
     """Return cases with check stops, which tell the microscope."""
     stops = {"plan": checked(hu())}
-    still = replace(SERVO, servo_sigma_m=0.0, servo_sigma_rad=0.0)
+    still = replace(SERVO, servo_sigma_m=0.0, servo_sigma_theta_rad=0.0)
     bare = {"plan": checked(hu_plan(WITHOUT_LINES, 5))}
     return [
         _case("check stops: nothing", more=stops),
@@ -72,7 +72,7 @@ def _case(name: str, phi_deg: float = 0.03, *, settings: CellSettings = SERVO,
 
 
 def _wired() -> list[Case]:
-    still = replace(SERVO, servo_sigma_m=0.0, servo_sigma_rad=0.0)
+    still = replace(SERVO, servo_sigma_m=0.0, servo_sigma_theta_rad=0.0)
     moved = replace(SERVO, sense=Sense.PLATE_MOVES)
     bare = {"plan": hu_plan(WITHOUT_LINES, 5)}
     other = {"microscope_axes": "-x-y", "line_factor": -1.0}
@@ -203,7 +203,7 @@ def slipping(size_m: float) -> Change:
 
 
 def _exact() -> list[Case]:
-    exact = CellSettings(servo_sigma_m=0.0, servo_sigma_rad=0.0)
+    exact = CellSettings(servo_sigma_m=0.0, servo_sigma_theta_rad=0.0)
     five = {"plan": resistant()}
     return [_case("nothing, and no noise", settings=exact),
             _case("nothing, and no noise, five views", settings=exact, more=five)]

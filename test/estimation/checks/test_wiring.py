@@ -166,7 +166,7 @@ def test_the_probability_is_that_of_student_or_a_little_more(dof):
 
 def measured_session(spoilt, *, sense, with_ids, text="0, 90, tx", **how):
     cell = scene(text, repeats=5, line=True, sense=sense, with_ids=with_ids, sigma_xy_m=10 * NM,
-                 servo_sigma_m=60 * NM, sigma_theta_rad=1e-6, servo_sigma_rad=6e-6, **how)
+                 servo_sigma_m=60 * NM, sigma_theta_rad=1e-6, servo_sigma_theta_rad=6e-6, **how)
     cell.detections = [spoilt(d) for d in cell.detections]
     return collect(cell.events, measurement_sense=str(sense))[0]
 

@@ -20,7 +20,7 @@ from test.support.dense_fit import DenseFit
 
 PITCH = 0.01
 DEGREE = 2
-QUIET = {"servo_sigma_m": 0.0, "servo_sigma_rad": 0.0, "stop_sigma_m": 20e-6}
+QUIET = {"servo_sigma_m": 0.0, "servo_sigma_theta_rad": 0.0, "stop_sigma_m": 20e-6}
 MODELS = {
     "none": "",
     "assumed": ",".join(map(str, DEFAULT_TERMS)),

@@ -46,7 +46,7 @@ def plan_of(size=5, repeats=4, order="x_back_y_back", lines=0):
 
 def settings(sigma_m=0.0, sense=Sense.MICROSCOPE_MOVES, **more):
     return CellSettings(sense, sigma_m, stop_sigma_m=20e-6, servo_sigma_m=0.0,
-                        servo_sigma_rad=0.0, **more)
+                        servo_sigma_theta_rad=0.0, **more)
 
 
 def measured(plan, spread=MACHINE, *, seed=3, change=None, **how):

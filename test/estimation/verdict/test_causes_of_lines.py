@@ -32,7 +32,7 @@ def truth_and_readings(seed, sigma_rad, *, repeats=2, spread=None, **how):
     plan, rng = hu_plan(ARTIFACT, repeats), np.random.default_rng(seed)
     truth = random_truth(ARTIFACT, len(plan.views), rng, spread or Spread(rotation="finite"))
     settings = CellSettings(sigma_xy_m=2e-8, sigma_theta_rad=sigma_rad, servo_sigma_m=0.0,
-                            servo_sigma_rad=0.0, **how)
+                            servo_sigma_theta_rad=0.0, **how)
     return truth, simulate_measurements(truth, plan, rng, settings=settings, visits=True)
 
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from scipy.stats import t as student
 
-from selfcal_ros.aerotech.export import provenance
-from selfcal_ros.aerotech.machine import MachineFrame
+from selfcal_ros.compensation.export import provenance
+from selfcal_ros.compensation.frame import MachineFrame
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.options import ReferenceLength
 from selfcal_ros.estimation.verdict.uncertainty import budgets
@@ -25,7 +25,7 @@ from selfcal_ros.simulation.truth import hu_plan, simulate_measurements
 from test.support.options import bare
 
 SETTINGS = CellSettings(sigma_xy_m=20e-9, sigma_theta_rad=2e-5, servo_sigma_m=0.0,
-                        servo_sigma_rad=0.0, stop_sigma_m=20e-6)
+                        servo_sigma_theta_rad=0.0, stop_sigma_m=20e-6)
 REFERENCE = ReferenceLength("artifact", 0.0, 3e-6)
 
 

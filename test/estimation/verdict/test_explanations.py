@@ -26,7 +26,7 @@ OPTIONS = bare(datum_theta="zero_mean", misalignment_model="rigid")
 """Nothing is assumed: what is wrong has to be found."""
 CLEAN = Spread(encoder="independent", rotation="finite")
 SETTINGS = CellSettings(sigma_xy_m=20e-9, sigma_theta_rad=2e-5, servo_sigma_m=0.0,
-                        servo_sigma_rad=0.0)
+                        servo_sigma_theta_rad=0.0)
 
 
 def plan_of(order="x_back_y_back", repeats=4):

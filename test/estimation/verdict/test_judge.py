@@ -80,7 +80,7 @@ def offsets_of(stop_sigma_m):
     plan, rng = hu_plan(Artifact(7, 0.01, 24), 5), np.random.default_rng(3)
     spread = Spread(encoder="independent", rotation="finite", phi_rad=1e-7)
     settings = CellSettings(sigma_xy_m=20e-9, sigma_theta_rad=2e-5, servo_sigma_m=0.0,
-                            servo_sigma_rad=0.0, stop_sigma_m=stop_sigma_m)
+                            servo_sigma_theta_rad=0.0, stop_sigma_m=stop_sigma_m)
     return simulate_measurements(random_truth(plan.artifact, 4, rng, spread), plan, rng,
                                  settings=settings, visits=True)
 

@@ -18,7 +18,7 @@ from test.support.options import bare
 from test.support.results import covered
 
 SETTINGS = CellSettings(sigma_xy_m=20e-9, sigma_theta_rad=2e-5, servo_sigma_m=0.0,
-                        servo_sigma_rad=0.0)
+                        servo_sigma_theta_rad=0.0)
 FLAT = Spread(encoder="independent", rotation="finite", phi_rad=1e-7)
 LINEAR = [bare(method="law"), bare(misalignment_model="linear")]
 NAMES = ["law", "linear"]

@@ -1,0 +1,86 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``selfcal export``: the map of a result as the table of a controller."""
+
+import argparse
+from typing import TYPE_CHECKING
+
+from selfcal_ros.cli.terminal import add_json, say
+
+if TYPE_CHECKING:
+    from selfcal_ros.controllers.grid import Wiring
+
+HELP = "write the map of a result as the table of a controller"
+FORMATS = ("kmotion", "pmac", "beckhoff", "linuxcnc", "siemens")
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the verb."""
+    from selfcal_ros.cli.cal_lines import add_frame
+
+    add = parser.add_argument
+    add("format", choices=FORMATS, metavar="|".join(FORMATS), help="the controller")
+    add("result", metavar="RESULT.json", help="result that `selfcal solve` wrote")
+    add("-o", "--output", metavar="FILE", required=True,
+        help="table; beckhoff and linuxcnc: FILE_x and FILE_y, the ending after that")
+    add("--verify", action="store_true",
+        help="print the residual of a simulated controller before and after")
+    add("--onto", metavar="ACTIVE", nargs="+", action="extend",
+        help="table that was loaded during the calibration (of x and y where there are two): "
+             "the new one replaces it")
+    add("--negate", action="store_true",
+        help="the controller subtracts the table (beckhoff, siemens: their documents do not say)")
+    add("--integers", action="store_true", help="beckhoff before V3.1.3132 / V4.29")
+    add("--fill", action="store_true", help="set unknown sites to the mean of their neighbours")
+    add("--force", action="store_true",
+        help="replace existing files; the old ones are kept with their date")
+    add_json(parser)
+    add_frame(parser, theta=False, units=("m", "mm", "um", "in"))
+    add("--counts-per-unit", action="append", metavar="AXIS=COUNTS",
+        help="pmac: encoder counts per unit, for both motors")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Read the result, write the files; code 5 and the reason if it is not qualified."""
+    from selfcal_ros.aerotech.write import refuse_existing, write_cal
+    from selfcal_ros.cli.cal import figures_of, ready, residual_text
+    from selfcal_ros.cli.terminal import exit_code
+    from selfcal_ros.controllers.export import export, loaded
+    from selfcal_ros.controllers.grid import Source
+    from selfcal_ros.files import check_outputs, read_text
+
+    wiring = _wiring(args)
+    result, filled = ready(args)
+    active = None
+    if args.onto:
+        active = loaded(args.format, [Source(read_text(path), path) for path in args.onto], wiring)
+    made = export(args.format, result, wiring, args.output, active=active, filled=filled)
+    check_outputs([args.result, *(args.onto or ())], made.files)
+    refuse_existing(list(made.files), force=args.force)
+    backups = {path: write_cal(path, text, force=args.force) for path, text in made.files.items()}
+    lines = [path + (f"; the old file is {backup}" if backup else "")
+             for path, backup in backups.items()]
+    if args.verify:
+        lines.append(residual_text(made.residuals))
+    say(args, "\n".join(lines), {
+        "files": [{"file": path, "old_file": backup and str(backup)}
+                  for path, backup in backups.items()],
+        "filled": filled, "residuals": figures_of(made.residuals)})
+    return exit_code(result)
+
+
+def _wiring(args: argparse.Namespace) -> "Wiring":
+    from selfcal_ros.cli.cal_lines import frame_of, numbers
+    from selfcal_ros.controllers.export import FORMATS
+    from selfcal_ros.controllers.grid import Wiring
+    from selfcal_ros.errors import InputError
+
+    given, args.counts_per_unit = args.counts_per_unit, None
+    args.unit = args.unit or FORMATS[args.format].unit
+    frame = frame_of(args)
+    counts = numbers(given, "--counts-per-unit", positive=True)
+    axes = (frame.x_axis, frame.y_axis)
+    if counts and set(counts) != set(axes):
+        raise InputError("--counts-per-unit", f"it is given for {sorted(counts)}",
+                         f"give it for {axes[0]} and {axes[1]}")
+    return Wiring(frame, (counts[axes[0]], counts[axes[1]]) if counts else None, args.negate,
+                  args.integers)

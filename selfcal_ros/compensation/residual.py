@@ -1,0 +1,134 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A simulated controller with loaded tables, and the residuals that it leaves.
+
+The command is a position in the stage frame. The controller looks up the correction at the
+commanded position, adds it, and drives until the encoder shows the sum; the true position of the
+stage follows from its error G = indicated - true.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from selfcal_ros.compensation.compensator import Compensator
+from selfcal_ros.compensation.frame import MachineFrame
+from selfcal_ros.errors import InputError
+from selfcal_ros.model.error_map import ErrorMap
+
+Correction = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
+"""What a controller adds to commanded positions x, y; all in the unit of its frame."""
+SETTLED = 60
+"""Iterations that remove an active table; its slope is below a quarter."""
+
+
+@dataclass(frozen=True, eq=False)
+class Residual:
+    """Residuals true - commanded before and after, without their common shift.
+
+    The zero bias of the controller, and the home position itself, move all positions by one
+    constant; the calibration does not determine this constant (datum), so it is removed.
+
+    Attributes
+    ----------
+    place : str
+        "sites", "between" or "lines".
+    position : float array (axes, P)
+        Commanded positions, m or rad.
+    before, after : float array (axes, P)
+        Residuals without their mean, m or rad.
+    shift_before, shift_after : float array (axes,)
+        The means that were removed.
+    """
+
+    place: str
+    position: np.ndarray
+    before: np.ndarray
+    after: np.ndarray
+    shift_before: np.ndarray
+    shift_after: np.ndarray
+
+    def rms(self, which: str) -> float:
+        """Return the root mean square of the residual vectors `which`: before or after."""
+        return float(np.sqrt(np.mean(np.sum(np.square(getattr(self, which)), axis=0))))
+
+    def largest(self, which: str) -> float:
+        """Return the length of the largest residual vector `which`: before or after."""
+        return float(np.sqrt(np.max(np.sum(np.square(getattr(self, which)), axis=0))))
+
+
+def residual_of(place: str, position: np.ndarray, reached: list[np.ndarray]) -> Residual:
+    """Return the residuals from the positions reached before and after, (axes, P) each."""
+    residuals = [true - position for true in reached]
+    # A known site next to an unknown one cannot be inverted exactly: omit it.
+    known = np.isfinite(residuals).all(axis=(0, 1))
+    if not known.any():
+        raise InputError("error map", "no site can be verified", "measure more sites")
+    residuals = [residual[:, known] for residual in residuals]
+    shifts = [residual.mean(axis=1) for residual in residuals]
+    before, after = (r - s[:, None] for r, s in zip(residuals, shifts, strict=True))
+    return Residual(place, position[:, known], before, after, *shifts)
+
+
+def reached(stage: Compensator, frame: MachineFrame, command: tuple[ArrayLike, ArrayLike], *,
+            correct: Correction | None = None, active: Correction | None = None,
+            ) -> tuple[np.ndarray, np.ndarray]:
+    """Return the true positions, m, after commands in the stage frame.
+
+    Parameters
+    ----------
+    stage : Compensator
+        The stage's error, including between its sites.
+    frame : MachineFrame
+        Wiring of the axes.
+    command : tuple of float array
+        Commanded x and y, m.
+    correct : Correction, optional
+        The loaded table; without it the machine is as it was when it was calibrated.
+    active : Correction, optional
+        The table that was loaded during the calibration and that `correct` replaces.
+    """
+    px, py = frame.to_machine(*command)
+    if correct is not None:
+        cx, cy = correct(px, py)
+        px, py = px + cx, py + cy
+        if active is not None:  # what the controller showed with the former table at this place
+            ex, ey = px, py
+            for _ in range(SETTLED):
+                cx, cy = active(px, py)
+                px, py = ex - cx, ey - cy
+    return stage.correct(*frame.from_machine(px, py))
+
+
+def plane_residuals(error_map: ErrorMap, frame: MachineFrame, correct: Correction,
+                    active: Correction | None = None) -> list[Residual]:
+    """Return the residuals at the sites and, if all are known, between them.
+
+    At the sites the map is the truth. Between them the truth is unknown: it is substituted by the
+    cubic spline through the sites at the centres of the cells, so that the residual there is
+    the error of the controller's interpolation.
+    """
+    plate, known = error_map.artifact, error_map.valid
+    plane = replace(error_map, artifact=replace(plate, angular_count=0), g_theta=np.zeros(0),
+                    u_g_theta=np.zeros(0))
+    places = [("sites", np.stack([plate.x_m[known], plate.y_m[known]]), Compensator(plane))]
+    if known.all():
+        centres = np.stack([along[:-1, :-1].ravel() + plate.grid_pitch_m / 2
+                            for along in (plate.x_m, plate.y_m)])
+        places.append(("between", centres, Compensator(plane, method="bicubic")))
+    return [residual_of(name, points, [np.stack(reached(
+        stage, frame, (points[0], points[1]), correct=table, active=active))
+        for table in (None, correct)]) for name, points, stage in places]
+
+
+def combined(error_map: ErrorMap, frame: MachineFrame, active: Correction) -> ErrorMap:
+    """Return the map for the table that replaces `active`, loaded during the calibration.
+
+    To be at p the controller then has to show p + G(p); with the former table this meant
+    p + G(p) + c(p + G(p)) on the encoder, so the new correction is G(p) + c(p + G(p)).
+    """
+    plate = error_map.artifact
+    cx, cy = active(*frame.to_machine(plate.x_m + error_map.gx, plate.y_m + error_map.gy))
+    return replace(error_map, gx=error_map.gx + frame.sign_x * cx * frame.unit_m,
+                   gy=error_map.gy + frame.sign_y * cy * frame.unit_m)

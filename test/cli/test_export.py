@@ -1,0 +1,134 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``selfcal export``: tables of other controllers, from the command line."""
+
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from selfcal_ros.cli import export
+from selfcal_ros.cli.main import main
+from selfcal_ros.controllers.export import FORMATS
+from selfcal_ros.files import write_json
+from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.result import result_to_dict
+from selfcal_ros.model.verdict import Grade, Verdict
+from test.support.maps import random_map, result_of
+
+MAP = random_map(Artifact(5, 0.01), 3)
+PMAC = "--counts-per-unit 1=2000000 --counts-per-unit 2=2000000"
+
+
+@pytest.fixture(autouse=True)
+def desk(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    write_json("R.json", result_to_dict(result_of(MAP)))
+
+
+def run(line: str) -> int:
+    return main(["export", *line.split()])
+
+
+def test_the_verb_knows_the_formats_without_loading_them():
+    assert tuple(FORMATS) == export.FORMATS
+
+
+@pytest.mark.parametrize(("name", "files"), [
+    ("kmotion", ["t.txt"]), ("pmac", ["t.txt"]), ("beckhoff", ["t_x.txt", "t_y.txt"]),
+    ("linuxcnc", ["t_x.txt", "t_y.txt"]), ("siemens", ["t.txt"])])
+def test_files_are_written_tried_and_not_overwritten(capsys, name, files):
+    line = f"{name} R.json -o t.txt --verify " + PMAC * (name == "pmac")
+    assert run(line) == 0
+    out = capsys.readouterr().out.splitlines()
+    assert out[:len(files)] == files and all(Path(file).is_file() for file in files)
+    assert out[len(files)].startswith("residual true - commanded") and len(out) == len(files) + 7
+    before, after = map(float, out[len(files) + 1].split()[-2:])
+    assert before > 0.1 and after < (0.0001 if (len(files) == 1 and name != "siemens")
+                                     or name == "beckhoff" else 0.99 * before)
+    assert run(line) == 2
+    assert "the file exists" in capsys.readouterr().err
+    assert run(line + " --force --json") == 0
+    found = json.loads(capsys.readouterr().out)
+    assert [entry["file"] for entry in found["files"]] == files
+    assert all(Path(entry["old_file"]).is_file() for entry in found["files"])
+    assert found["residuals"]["sites"]["after"]["rms"] == pytest.approx(1e-6 * after, abs=1e-12)
+
+
+def test_kmotion_is_in_inches_unless_told_otherwise(capsys):
+    assert run("kmotion R.json -o inch.txt") == run("kmotion R.json -o mm.txt --unit mm") == 0
+    first = [float(line.split(",")[0]) for line in (
+        Path("inch.txt").read_text().splitlines()[2], Path("mm.txt").read_text().splitlines()[2])]
+    assert first == [pytest.approx(-20 / 25.4), -20]
+
+
+def test_onto_combines_with_the_active_table(capsys):
+    assert run("kmotion R.json -o old.txt --unit mm") == 0
+    assert run("kmotion R.json -o new.txt --unit mm --onto old.txt") == 0
+    old, new = (Path(name).read_text().splitlines()[3 + 12] for name in ("old.txt", "new.txt"))
+    assert old.startswith("2,2,") and new.startswith("2,2,")
+    g = [1e3 * MAP.gx[2, 2], 1e3 * MAP.gy[2, 2]]
+    for column, value in zip((2, 3), g, strict=True):
+        assert float(old.split(",")[column]) == pytest.approx(value, abs=1e-7)
+        assert float(new.split(",")[column]) == pytest.approx(2 * value, abs=1e-6)
+    assert run("kmotion R.json -o new.txt --onto R.json --unit mm --force") == 2
+    assert re.fullmatch(r"selfcal export: R.json:1: .*\n", capsys.readouterr().err)
+
+
+@pytest.mark.parametrize(("line", "message"), [
+    ("kmotion R.json -o t.txt --negate", "--negate: the sense of kmotion is known; leave it out"),
+    ("siemens R.json -o t.txt --integers", "--integers: siemens needs none"),
+    ("pmac R.json -o t.txt --counts-per-unit 1=5", "--counts-per-unit: it is given for [1]"),
+    ("pmac R.json -o t.txt", "--counts-per-unit: PMAC's tables are in counts"),
+    ("kmotion R.json -o R.json", "R.json: would be written over"),
+    ("linuxcnc R.json -o t.txt --onto a", "a: no such file"),
+    ("siemens R.json -o t.txt --y-axis 1", "axes: the indices [1, 1] are not distinct")])
+def test_what_is_not_possible_is_one_line(capsys, line, message):
+    assert run(line) == 2
+    err = capsys.readouterr().err
+    assert err.startswith(f"selfcal export: {message}") and err.count("\n") == 1
+    assert not Path("t.txt").exists()
+
+
+def test_integers_are_for_the_old_controller():
+    assert run("beckhoff R.json -o t.lis --integers") == 0
+    values = re.findall(r"correction (\S+)$", Path("t_x.lis").read_text(), re.M)
+    assert len(values) == 25 and all(re.fullmatch(r"-?\d+", value) for value in values)
+    assert int(values[12]) == round(MAP.gx[2, 2] / 1e-7)
+
+
+def test_holes_are_filled_on_request_and_the_file_says_so(capsys):
+    write_json("R.json", result_to_dict(result_of(random_map(Artifact(5, 0.01), 3,
+                                                             unknown=((1, 1),)))))
+    assert run("siemens R.json -o t.txt") == 2
+    assert "1 sites are unknown" in capsys.readouterr().err
+    assert run("siemens R.json -o t.txt --fill") == 0
+    assert capsys.readouterr().err == "selfcal export: 1 unknown sites filled from their " \
+        "neighbours\n"
+    assert "1 sites were not measured" in Path("t.txt").read_text()
+
+
+def test_not_qualified_is_code_5_and_not_identified_code_3(capsys):
+    found = result_of(MAP)
+    write_json("R.json", result_to_dict(replace(found, verdict=Verdict(
+        Grade.NOT_QUALIFIED, sentence="Not qualified: too noisy.", reasons=("too noisy",)))))
+    assert run("kmotion R.json -o t.txt") == 5
+    assert "too noisy" in capsys.readouterr().err and "NOT QUALIFIED" in Path("t.txt").read_text()
+    write_json("R.json", result_to_dict(replace(found, observability=replace(
+        found.observability, identifiable=False))))
+    assert run("kmotion R.json -o u.txt") == 3 and not Path("u.txt").exists()
+
+
+def test_cal_export_combines_too(capsys):
+    assert main(["cal", "export", "R.json", "-o", "old.cal"]) == 0
+    assert main(["cal", "export", "R.json", "-o", "new.cal", "--onto", "old.cal"]) == 0
+    assert "replaces the table" in Path("new.cal").read_text()
+    capsys.readouterr()
+    assert main(["cal", "verify", "R.json", "new.cal", "--onto", "old.cal", "--json"]) == 0
+    sites = json.loads(capsys.readouterr().out)["sites"]
+    assert sites["after"]["max"] < 1e-10 < 1e-7 < sites["before"]["max"]
+    assert main(["cal", "verify", "R.json", "new.cal", "--json"]) == 2  # twice the correction
+    words = ["R.json", "-o", "n.cal", "--onto", "old.cal", "--y-axis", "3"]
+    assert main(["cal", "export", *words]) == 2
+    assert "it is for axes" in capsys.readouterr().err
