@@ -17,7 +17,6 @@ from selfcal_ros.collection.marks.identify import IdentityRules
 from selfcal_ros.estimation.checks.placing import Misplaced, other_poses, said
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Sense, ViewReadings
-from selfcal_ros.model.view import View
 from selfcal_ros.units import NS_PER_S
 
 MOST = 0.5
@@ -320,8 +319,8 @@ class Seen:
         """Return the actual pose of a view's plate, if its marks match another pose."""
         ((_, readings),) = views.items()
         table, view = self.table[rows], readings.view
-        if not _on_lattice(self.artifact, view):
-            return ""
+        if not view.grid or self.artifact.map_grid is not None:
+            return ""  # off the lattice other poses are too many to try
         stage, limit = self.exposures.at(table["stamp"]), self.rules.stage_limit_m(self.artifact)
         where = np.stack([stage.x.position, stage.y.position])
         where *= -1 if self.sense is Sense.PLATE_MOVES else 1
@@ -349,16 +348,12 @@ class Seen:
         parts = [np.zeros((4, 0))]
         for index, readings in views.items():
             here = good & (view_of == index)
-            if here.any() and _on_lattice(self.artifact, readings.view):
-                pose = readings.view.lattice_pose(self.artifact)
+            if here.any() and readings.view.grid:
+                pose = readings.view.on_stage(self.artifact)
                 site = np.stack(pose.site_of(table["m"][here], table["n"][here])) * pitch
                 parts.append(np.concatenate([where[:, here], site]))
         both = np.concatenate(parts, axis=1)
         return both[:2], both[2:]
-
-
-def _on_lattice(artifact: Artifact, view: View) -> bool:
-    return view.grid and view.lattice_pose(artifact).quarter_turns is not None
 
 
 def _span(stamps_ns: Iterable[int]) -> Span:

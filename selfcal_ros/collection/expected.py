@@ -23,27 +23,20 @@ class Missing:
     k: tuple[int, ...] = ()
 
 
-def mark_range(artifact: Artifact, view: View) -> tuple[tuple[int, int], tuple[int, int]]:
-    """Return the smallest and largest m, and n, of the grid marks in the field in a view.
+def mark_rows(artifact: Artifact, view: View) -> tuple[np.ndarray, np.ndarray]:
+    """Return the first n expected for each m, and the number of marks, int arrays (nx,).
 
-    The field is the lattice of the stage; the range is empty (largest below smallest) if the
-    view has no grid marks or all are outside.
+    Expected are the marks in the field of the stage, none in a view without grid marks.
     """
-    pose = view.lattice_pose(artifact)
-    if not view.grid or pose.quarter_turns is None:
-        return (0, -1), (0, -1)
-    (hx, hy), (a, b) = artifact.half, pose.shift
-    x, y = (-hx - a, hx - a), (-hy - b, hy - b)  # of R^q (m, n)
-    minus_x, minus_y = (-x[1], -x[0]), (-y[1], -y[0])
-    m, n = ((x, y), (y, minus_x), (minus_x, minus_y), (minus_y, x))[pose.quarter_turns]
-    return (max(m[0], -hx), min(m[1], hx)), (max(n[0], -hy), min(n[1], hy))
+    if not view.grid:
+        nothing = np.zeros(artifact.shape[0], dtype=int)
+        return nothing, nothing
+    return view.on_stage(artifact).mark_rows(artifact)
 
 
 def expected_marks(artifact: Artifact, view: View) -> tuple[int, int]:
     """Return the numbers of grid marks and angular lines to be read in a view."""
-    (m_low, m_high), (n_low, n_high) = mark_range(artifact, view)
-    grid = max(m_high - m_low + 1, 0) * max(n_high - n_low + 1, 0)
-    return grid, artifact.angular_count if view.angular else 0
+    return int(mark_rows(artifact, view)[1].sum()), artifact.angular_count if view.angular else 0
 
 
 def read_enough(view: View, readings: ViewReadings,
@@ -72,15 +65,17 @@ def _tried(view: View, readings: ViewReadings) -> list[tuple[np.ndarray, np.ndar
 def missing_marks(artifact: Artifact, view: View, readings: ViewReadings,
                   min_repeats: int = 0) -> Missing:
     """Return the first marks, in the order of (m, n) and of k, not read often enough."""
-    (m_low, _), (n_low, n_high) = mark_range(artifact, view)
+    first, count = mark_rows(artifact, view)
     grid, angular = expected_marks(artifact, view)
-    width = max(n_high - n_low + 1, 1)
+    end = np.cumsum(count)
+    of_zero = end - count - first  # number of the mark n = 0 of each row
     done, done_theta = read_enough(view, readings, min_repeats)
-    number = (readings.m[done] - m_low) * width + readings.n[done] - n_low
-    number = first_missing(np.sort(number), grid)
+    row = readings.m[done] + artifact.half[0]
+    number = first_missing(np.sort(of_zero[row] + readings.n[done]), grid)
+    row = np.searchsorted(end, number, "right")
     lines = first_missing(np.sort(readings.k[done_theta]), angular)
-    return Missing(tuple((m_low + number // width).tolist()),
-                   tuple((n_low + number % width).tolist()), tuple(lines.tolist()))
+    return Missing(tuple((row - artifact.half[0]).tolist()),
+                   tuple((number - of_zero[row]).tolist()), tuple(lines.tolist()))
 
 
 def first_missing(done: np.ndarray, total: int) -> np.ndarray:

@@ -137,7 +137,7 @@ def begun_ns(run_id: str) -> int | None:
 def check_command(command: Command) -> None:
     """Raise InputError for an impossible command.
 
-    It has a pose off the lattice, asks for no marks, or contains an absurd number.
+    It has an impossible pose, asks for no marks, or contains an absurd number.
     """
     where = f"view command {command.view_index}"
     if not 0 <= command.view_index <= MAX_VIEWS or not 0 <= command.views_planned <= MAX_VIEWS:
@@ -154,7 +154,7 @@ def check_command(command: Command) -> None:
         raise InputError(where, "neither grid nor angular marks are wanted", "set one to true")
     if not 1 <= command.view.repeats <= MAX_REPEATS:
         raise InputError(where, f"{command.view.repeats} repeats", f"ask for 1 to {MAX_REPEATS}")
-    command.view.lattice_pose(command.artifact)
+    command.view.on_stage(command.artifact)
     command.view.require_check_stops(command.artifact)
 
 
@@ -163,7 +163,7 @@ def check_view(readings: ViewReadings, artifact: Artifact, view_index: int) -> N
     where = f"{MEASUREMENT_TOPIC} of '{readings.view.name}'"
     if not 0 <= view_index <= MAX_VIEWS:
         raise InputError(where, f"a plan has at most {MAX_VIEWS} views", "correct the view_index")
-    readings.view.lattice_pose(artifact)
+    readings.view.on_stage(artifact)
     for name, index, least, most in (
             ("m", readings.m, -artifact.half[0], artifact.half[0]),
             ("n", readings.n, -artifact.half[1], artifact.half[1]),

@@ -150,7 +150,7 @@ class LatticePose(StagePose):
         x, y = (-hx - self.a, hx - self.a), (-hy - self.b, hy - self.b)  # of R^q (m, n)
         minus_x, minus_y = (-x[1], -x[0]), (-y[1], -y[0])
         m, n = ((x, y), (y, minus_x), (minus_x, minus_y), (minus_y, x))[self.q]
-        first, row = max(n[0], -hy), artifact.m[:, 0]
+        first, row = max(n[0], -hy), np.arange(-hx, hx + 1)
         count = max(min(n[1], hy) - first + 1, 0)
         return np.full(len(row), first), np.where((row >= m[0]) & (row <= m[1]), count, 0)
 

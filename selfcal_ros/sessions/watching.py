@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from selfcal_ros.collection.expected import mark_range
+from selfcal_ros.collection.expected import mark_rows
 from selfcal_ros.collection.inputs import Phase
 from selfcal_ros.errors import printable
 from selfcal_ros.messages import to_model
@@ -187,27 +187,18 @@ def plate_picture(artifact: Artifact, view: View, missing: Iterable[tuple[int, i
     most : int
         Largest number of cells per side.
     """
-    (m_low, m_high), (n_low, n_high) = mark_range(artifact, view)
+    first, count = mark_rows(artifact, view)
     named = sorted(missing)
-    if m_high < m_low or n_high < n_low or (n_missing > 0 and not named):
+    if not count.any() or (n_missing > 0 and not named):
         return [], 1
-    half, step = artifact.half, max(1, ceil(max(artifact.shape) / most))
-    (m, m_last), (n, n_last) = (_blocks(h, low, high, step) for h, low, high in (
-        (half[0], m_low, m_high), (half[1], n_low, n_high)))
-    inside = (m <= m_last)[:, None] & (n <= n_last)[None, :]
-    signs = np.where(inside, "o", " ")
+    (hx, hy), step = artifact.half, max(1, ceil(max(artifact.shape) / most))
+    m, n = np.arange(-hx, hx + 1)[:, None], np.arange(-hy, hy + 1)
+    signs = ((n >= first[:, None]) & (n < (first + count)[:, None])).astype(np.int8)
     if n_missing > len(named):  # marks after the last named one are unknown
-        last = named[-1]
-        behind = (m_last > last[0])[:, None] | ((m_last == last[0])[:, None]
-                                                & (n_last > last[1])[None, :])
-        signs[inside & behind] = "?"
-    for mark in named:
-        if m_low <= mark[0] <= m_high and n_low <= mark[1] <= n_high:
-            signs[(mark[0] + half[0]) // step, (mark[1] + half[1]) // step] = "."
-    return ["".join(row) for row in signs.T[::-1]], step
-
-
-def _blocks(half: int, low: int, high: int, step: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return first and last index of each block of `step` from -half, cut to low..high."""
-    first = np.arange(-half, half + 1, step)
-    return np.maximum(first, low), np.minimum(first + step - 1, high)
+        signs[(signs > 0) & ((m > named[-1][0]) | ((m == named[-1][0]) & (n > named[-1][1])))] = 2
+    for i, j in named:
+        if abs(i) <= hx and abs(j) <= hy and signs[i + hx, j + hy]:
+            signs[i + hx, j + hy] = 3
+    for axis in (0, 1):
+        signs = np.maximum.reduceat(signs, np.arange(0, signs.shape[axis], step), axis=axis)
+    return ["".join(row) for row in np.array(list(" o?."))[signs].T[::-1]], step

@@ -9,7 +9,9 @@ import pytest
 from selfcal_ros.collection.collector import view_progress
 from selfcal_ros.collection.inputs import Command, Detection, EncoderSample
 from selfcal_ros.collection.marks.check_stops import stage_aside, without_aside
+from selfcal_ros.model.artifact import MapGrid
 from selfcal_ros.model.readings import Sense
+from selfcal_ros.model.view import View
 from selfcal_ros.simulation.cell import CellSettings, plan_events
 from selfcal_ros.simulation.truth import random_truth
 from test.support.collecting import START_NS, Scene, collect, gathered
@@ -19,12 +21,16 @@ OFFSET = 20e-6
 NOISE = 20e-9
 ORDINARY = 25
 MARKS = 5
+PLACED = 37
 FIRST = 2 * ORDINARY  # check stop: after two of three repeats
 
 
 def checked(*, repeats=3, microscope=((0, 0), (0, 0)), turn=0, **settings):
     """Return the scene of one view of 25 marks, 5 of them checked."""
     plan = plan_of("90" if turn else "0", 5, repeats=repeats)
+    if turn == PLACED:  # the map reaches beyond the corners of the plate
+        plate = replace(plan.artifact, map_grid=MapGrid(5, 0.02))
+        plan = replace(plan, artifact=plate, views=(View("37", np.deg2rad(37), repeats=repeats),))
     view = replace(plan.views[0], check_marks=MARKS, check_offset_m=OFFSET)
     plan, rng = replace(plan, views=(view,)), np.random.default_rng(4)
     truth = random_truth(plan.artifact, 1, rng)
@@ -41,7 +47,7 @@ def progress_of(scene, **parameters):
 
 
 @pytest.mark.parametrize("sense", list(Sense))
-@pytest.mark.parametrize("turn", [0, 1])
+@pytest.mark.parametrize("turn", [0, 1, PLACED])
 def test_check_stops_are_visits_with_the_opposite_offset(sense, turn):
     scene = checked(sense=sense, turn=turn, with_ids=False)
     readings, progress = progress_of(scene, measurement_sense=str(sense))

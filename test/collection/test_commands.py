@@ -11,7 +11,7 @@ from selfcal_ros.model.artifact import Artifact
 from test.support.collecting import collect, gathered, scene, table
 
 ODD = [
-    ({"translation_m": (1e17, 0.0)}, {}, "view '0' translation: 10000000000000000000 pitches are "
+    ({"translation_m": (1e17, 0.0)}, {}, "view '0' translation: 1e+19 pitches are "
      "beyond every field; is it in mm? give the translation in metres"),
     ({"translation_m": (0.0, -1e300)}, {}, "view '0' translation: -"),
     ({"grid": False, "angular": False}, {},

@@ -10,6 +10,7 @@ from selfcal_ros.collection.diagnosis import Evidence, diagnose, main_reason
 from selfcal_ros.collection.inputs import REMEDY, Reason
 from selfcal_ros.model.readings import Sense
 from test.support.collecting import gathered, scene
+from test.support.plans import placed_plan
 
 S = 1_000_000_000
 
@@ -83,6 +84,13 @@ def test_positions_that_are_not_what_they_should_be(change, text):
     found = findings(with_positions(scene(count=0, servo_sigma_m=0.0), change))[None]
     assert text in found
     assert "of 25 detections were rejected as stage_not_at_mark" in found
+
+
+def test_a_placed_plate_is_diagnosed_as_one_on_the_lattice():
+    cell = scene(placed_plan(5), servo_sigma_m=0.0)
+    assert findings(cell.events) == {}
+    found = findings(with_positions(cell, lambda x, y: (-x, y)))[None]
+    assert found.endswith("x is indicated with the wrong sign; turn the sign of x")
 
 
 def test_mm_are_named_though_the_stage_seems_to_jump():

@@ -11,13 +11,14 @@ from hypothesis import strategies as st
 
 from selfcal_ros.collection.expected import (
     NAMED_AT_MOST,
+    Missing,
     expected_marks,
     first_missing,
-    mark_range,
+    mark_rows,
     missing_marks,
 )
 from selfcal_ros.collection.inputs import Kind
-from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.artifact import Artifact, MapGrid
 from selfcal_ros.model.readings import ViewReadings
 from selfcal_ros.model.view import View
 from test.support.collecting import collect, scene
@@ -33,9 +34,24 @@ def test_the_marks_in_the_field_are_those_whose_sites_are_sites(hx, hy, turn, a,
     inside = (abs(i) <= hx) & (abs(j) <= hy)
     assert expected_marks(plate, view) == (inside.sum(), 0)
     assert view.lattice_pose(plate).n_in_field(plate) == inside.sum()
-    (m_low, m_high), (n_low, n_high) = mark_range(plate, view)
-    ranged = (plate.m >= m_low) & (plate.m <= m_high) & (plate.n >= n_low) & (plate.n <= n_high)
-    np.testing.assert_array_equal(ranged, inside)
+    first, count = mark_rows(plate, view)
+    rows = (plate.n >= first[:, None]) & (plate.n < (first + count)[:, None])
+    np.testing.assert_array_equal(rows, inside)
+    assert not mark_rows(plate, replace(view, grid=False))[1].any()
+
+
+@given(st.floats(0, 7), st.floats(-4, 4), st.floats(-4, 4), st.integers(0, 2**25 - 1))
+def test_missing_marks_of_a_placed_plate_are_named(turn, a, b, read):
+    """Of the marks in the field some were read."""
+    plate = Artifact(5, 0.01, 0, 0, MapGrid(3, 0.02))
+    view = View("v", turn, (a * 0.01, b * 0.01), angular=False)
+    inside = view.pose.in_field(plate)
+    done = inside & (read >> np.arange(25) & 1 > 0).reshape(5, 5)
+    missing = missing_marks(plate, view, ViewReadings(
+        view, plate.m[done], plate.n[done], count=np.ones(done.sum(), dtype=int)))
+    lost = inside & ~done
+    assert missing == Missing(tuple(plate.m[lost].tolist()), tuple(plate.n[lost].tolist()))
+    assert expected_marks(plate, view) == (inside.sum(), 0)
 
 
 @given(st.sets(st.integers(0, 300)), st.integers(0, 600))

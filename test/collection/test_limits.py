@@ -40,7 +40,7 @@ def session():
 
 @pytest.mark.parametrize(("changes", "reason"), [
     ({"translation_x": 1e300}, "pitches are beyond every field; is it in mm?"),
-    ({"translation_y": float("nan")}, "nan is not a whole number of pitch steps"),
+    ({"translation_y": float("nan")}, "(0.0, nan) are not two lengths; give a finite"),
     ({"rotation": float("inf")}, "inf is not an angle"),
     ({"view_index": 2**31}, "a plan has at most 1000 views; correct the view_index"),
     ({"grid_size": 3}, "m goes beyond -1 to 1; correct the publisher"),

@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """The plate as characters: drawn by hand, by blocks against the marks that each stands for."""
 
+from math import pi
+
 import pytest
 
-from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.artifact import Artifact, MapGrid
 from selfcal_ros.model.view import View
 from selfcal_ros.sessions.watching import plate_picture
 
@@ -47,3 +49,16 @@ def test_of_several_marks_the_worst_shows(most, step, missing):
                   for column in range(0, 7, step)]
         expected.append("".join("." if block & set(missing) else "o" for block in blocks))
     assert lines == expected[::-1]
+
+
+def test_a_placed_plate_shows_the_marks_over_the_map():
+    """The turned and shifted plate reaches beyond the map with two corners and a side."""
+    plate = Artifact(5, 0.01, map_grid=MapGrid(3, 0.02))
+    view = View("v", pi / 4, (0.005, 0.0))
+    lines, _ = plate_picture(plate, view, [(0, -1), (1, 0)], 2, 20)
+    inside = view.pose.in_field(plate)
+    assert 9 < inside.sum() < 25
+    wanted = [["o" if inside[m + 2, n + 2] else " " for m in range(-2, 3)]
+              for n in range(2, -3, -1)]
+    wanted[3][2] = wanted[2][3] = "."
+    assert lines == ["".join(row) for row in wanted]

@@ -12,7 +12,7 @@ from selfcal_ros.simulation.cell import CellSettings, plan_events
 from selfcal_ros.simulation.machine import Spread, random_truth
 from selfcal_ros.simulation.truth import simulate_measurements
 from test.support.collecting import START_NS, collect
-from test.support.plans import plan_of
+from test.support.plans import placed_plan, plan_of
 
 EVERYTHING = Spread(rotation="finite", encoder="independent", microscope_scale=5e-3,
                     microscope_rotation_rad=2e-3, microscope_shear=1e-3, backlash_x_m=4e-8,
@@ -34,11 +34,15 @@ CASES = {
     "followed": (EVERYTHING, {"follow_mark": True, "visit_order": "there_and_back@plate"})}
 
 
+PLANS = {"on the lattice": plan_of("0, 90, -tx, 90tx", 7, size_y=5, count=8, line=True, repeats=3),
+         "placed": placed_plan(7, size_y=5, count=8, repeats=3)}
+
+
 @pytest.mark.parametrize("sense", list(Sense))
 @pytest.mark.parametrize("case", CASES)
-def test_both_give_the_same_readings_visit_by_visit(case, sense):
+@pytest.mark.parametrize("plan", PLANS.values(), ids=list(PLANS))
+def test_both_give_the_same_readings_visit_by_visit(plan, case, sense):
     spread, how = CASES[case]
-    plan = plan_of("0, 90, -tx, 90tx", 7, size_y=5, count=8, line=True, repeats=3)
     truth = random_truth(plan.artifact, len(plan.views), np.random.default_rng(2), spread)
     settings = CellSettings(sense, 2e-8, 1e-6, **how)
     direct = simulate_measurements(truth, plan, np.random.default_rng(4), settings=settings)
@@ -85,6 +89,25 @@ def test_both_read_the_marks_that_lie_there_where_they_have_no_ids():
             np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
         np.testing.assert_allclose([one.dx, one.dy], [other.dx, other.dy], atol=2e-17)
         np.testing.assert_allclose(one.dtheta, other.dtheta, atol=4e-15)
+
+
+@pytest.mark.parametrize("sense", list(Sense))
+def test_placed_plates_are_read_without_ids(sense):
+    """Turned by 17 mrad more than commanded, and 0.3 pitches beside."""
+    plan = placed_plan(11, count=24)
+    spread = Spread(phi_rad=0.017, t_m=2e-3, correlation_pitches=4.0)
+    truth = random_truth(plan.artifact, 4, np.random.default_rng(2), spread)
+    settings = CellSettings(sense, 2e-8, 1e-6, with_ids=False)
+    direct = simulate_measurements(truth, plan, np.random.default_rng(4), settings=settings)
+    events = plan_events(truth, plan, settings=settings, rng=np.random.default_rng(4),
+                         start_ns=START_NS)
+    collected, progress = collect(events, measurement_sense=str(sense), outlier_limit=0.0)
+    assert collected.all_rejected() == {}
+    assert all(found.complete for found in progress.values())
+    for one, other in zip(direct.views, collected.views, strict=True):
+        for name in ("m", "n", "count", "k", "count_theta"):
+            np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+        np.testing.assert_allclose([one.dx, one.dy], [other.dx, other.dy], atol=2e-17)
 
 
 def assert_same_visits(one, other):

@@ -47,10 +47,11 @@ class Scene:
         self.detections[index] = replace(self.detections[index], **fields)
 
 
-def scene(text: str = "0", *, size: int = 5, count: int = 8, line: bool = False, repeats: int = 1,
-          seed: int = 3, **settings: Any) -> Scene:
-    """Return the messages of a plan such as '0, 90, tx' on a stage with errors."""
-    plan = plan_of(text, size, count=count, line=line, repeats=repeats)
+def scene(text: str | Plan = "0", *, size: int = 5, count: int = 8, line: bool = False,
+          repeats: int = 1, seed: int = 3, **settings: Any) -> Scene:
+    """Return the messages of a plan, or of one such as '0, 90, tx', on a stage with errors."""
+    plan = text if isinstance(text, Plan) else plan_of(text, size, count=count, line=line,
+                                                       repeats=repeats)
     rng = np.random.default_rng(seed)
     truth = random_truth(plan.artifact, len(plan.views), rng)
     events = list(plan_events(truth, plan, settings=CellSettings(**settings), rng=rng,

@@ -4,7 +4,7 @@
 from math import pi
 
 from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.model.view import Plan, View
+from selfcal_ros.model.view import Plan, View, plan_from_dict
 
 POSES = {"0": (0, 0, 0), "90": (1, 0, 0), "180": (2, 0, 0), "270": (3, 0, 0), "tx": (0, 1, 0),
          "+tx": (0, 1, 0), "-tx": (0, -1, 0), "ty": (0, 0, 1), "-ty": (0, 0, -1),
@@ -43,3 +43,17 @@ def plan_of(text: str, size: int = 5, *, count: int = 0, size_y: int = 0, line: 
     if line:
         views.append(View("line", 2 * pi / count, (0.0, 0.0), False, True, repeats))
     return Plan(text, artifact, tuple(views))
+
+
+def placed_plan(size: int = 7, *, size_y: int = 0, count: int = 0, repeats: int = 1) -> Plan:
+    """Return a plan of the views 0, 90, 37 deg and (1.3, -0.7) pitches, half a pitch.
+
+    Lines are read in all views but the one at 37 deg.
+    """
+    return plan_from_dict({
+        "plan_id": "placed", "artifact": {"grid_size": size, "grid_pitch": 0.01,
+                                          "angular_count": count, "grid_size_y": size_y},
+        "views": [{"name": name, "rotation_deg": turn, "translation_pitch": shift,
+                   "repeats": repeats} for name, turn, shift in (
+                       ("0", 0, [0, 0]), ("90", 90, [0, 0]), ("37", 37, [1.3, -0.7]),
+                       ("half", 0, [0.5, 0]))]}, "plan")

@@ -16,7 +16,7 @@ from selfcal_ros.collection.marks.rigid import (
     fit_motion,
 )
 from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.model.pose import LatticePose
+from selfcal_ros.model.pose import LatticePose, StagePose
 from selfcal_ros.model.view import View
 
 TOO_FAR_FROM_ANY = 0.75
@@ -86,9 +86,9 @@ def identify_grid(artifact: Artifact, view: View, reading_m: np.ndarray, *, ids:
     stage_m : float array (2, n), optional
         Indicated site of the stage; None = at the mark.
     """
-    pose, pitch = view.lattice_pose(artifact), artifact.grid_pitch_m
+    pose, pitch = view.on_stage(artifact), artifact.grid_pitch_m
     reasons = np.full(reading_m.shape[1], None, dtype=object)
-    if not view.grid or pose.quarter_turns is None:
+    if not view.grid:
         reasons[:] = Reason.NOT_IN_VIEW
         return MarkAssignment(ids, np.zeros(reading_m.shape), np.zeros(reading_m.shape), reasons,
                           Rigid())
@@ -113,7 +113,7 @@ def identify_grid(artifact: Artifact, view: View, reading_m: np.ndarray, *, ids:
         far[free] = (distance > reach) & ~unsure[free]
     site = np.stack(pose.site_of(marks[0], marks[1]))
     deviation = reading_m - site * pitch
-    about = (site - np.array(pose.shift)[:, None]) * pitch
+    about = _about(pose, marks, pitch)
     limit = min(rules.max_deviation_m, pitch / 4)
     number = marks[0] * (2 * artifact.half[1] + 1) + marks[1]
     if _at_most_two(number[~far & ~ambiguous & ~unsure]):
@@ -125,7 +125,7 @@ def identify_grid(artifact: Artifact, view: View, reading_m: np.ndarray, *, ids:
     reasons[astray] = Reason.NOT_AT_MARK
     reasons[ambiguous] = Reason.AMBIGUOUS
     reasons[unsure] = Reason.ROTATION
-    reasons[(np.abs(site) > half).any(axis=0) & ~unsure] = Reason.NOT_IN_VIEW
+    reasons[pose.beyond_field(site, artifact) & ~unsure] = Reason.NOT_IN_VIEW
     reasons[named_unknown] = Reason.UNKNOWN_MARK
     return MarkAssignment(marks, deviation, residual, reasons, rigid, fit.phi_error_rad)
 
@@ -135,7 +135,7 @@ def _at_most_two(numbers: np.ndarray) -> bool:
     return not len(numbers) or bool(((numbers == numbers.min()) | (numbers == numbers.max())).all())
 
 
-def _astray(pose: LatticePose, marks: np.ndarray, stage_m: np.ndarray | None, artifact: Artifact,
+def _astray(pose: StagePose, marks: np.ndarray, stage_m: np.ndarray | None, artifact: Artifact,
             limit_m: float, *, among: np.ndarray) -> np.ndarray:
     """Return which of the `among` marks (2, n) have the stage too far from their sites."""
     if stage_m is None or not among.any():
@@ -149,12 +149,11 @@ def _astray(pose: LatticePose, marks: np.ndarray, stage_m: np.ndarray | None, ar
     return astray & among
 
 
-def _nearest(pose: LatticePose, centred: np.ndarray, pitch: float, half: np.ndarray,
+def _nearest(pose: StagePose, centred: np.ndarray, pitch: float, half: np.ndarray,
              ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return nearest mark (2, n), distance ratio to the second nearest, and distance in m."""
     step = centred / pitch
-    back = type(pose)((4 - pose.q) % 4, (0, 0), None)
-    plate = np.stack(back.site_of(step[0], step[1]))
+    plate = np.stack(pose.turned_back(step[0], step[1]))
     mark = np.clip(np.rint(plate), -half, half)
     away = np.abs(plate - mark)
     first = distances(away)
@@ -162,7 +161,7 @@ def _nearest(pose: LatticePose, centred: np.ndarray, pitch: float, half: np.ndar
     return mark.astype(np.int64), first / np.maximum(second, 1e-12), first * pitch
 
 
-def _settle(pose: LatticePose, centred: np.ndarray, half: np.ndarray, ids: np.ndarray,
+def _settle(pose: StagePose, centred: np.ndarray, half: np.ndarray, ids: np.ndarray,
             kinds: tuple[np.ndarray, np.ndarray], pitch: float,
             rules: IdentityRules) -> tuple[MotionEstimate, RigidFit]:
     """Return the estimate of the view's own motion, extended outwards from unambiguous marks.
@@ -175,7 +174,7 @@ def _settle(pose: LatticePose, centred: np.ndarray, half: np.ndarray, ids: np.nd
     about = _about(pose, ids, pitch)
     use, fit = named, fit_motion(*columns_where(named, about, centred - about))
     known = (fit.known(pitch, rules.max_rotation_rad) if named.any() else
-             _innermost(centred[:, free], pitch, rules.max_rotation_rad))
+             _innermost(_rows(pose), centred[:, free], pitch, rules.max_rotation_rad))
     while free.any():
         nominal = known.rigid.undo(centred)
         nearest, ratio, _ = _nearest(pose, nominal, pitch, half)
@@ -187,22 +186,30 @@ def _settle(pose: LatticePose, centred: np.ndarray, half: np.ndarray, ids: np.nd
         about = _about(pose, mark, pitch)
         fit = fit_motion(*columns_where(use, about, centred - about))
         known = fit.known(pitch, rules.max_rotation_rad)
-    return (known, fit) if named.any() else _folded(known, fit, pitch)
+    return (known, fit) if named.any() else _folded(_rows(pose), known, fit, pitch)
 
 
-def _innermost(centred: np.ndarray, pitch: float, max_rotation_rad: float) -> MotionEstimate:
+def _rows(pose: StagePose) -> StagePose:
+    """Return the pose as far as rows of marks turn with it: on the lattice not at all."""
+    return LatticePose(0, (0, 0), None) if isinstance(pose, LatticePose) else pose
+
+
+def _innermost(rows: StagePose, centred: np.ndarray, pitch: float,
+               max_rotation_rad: float) -> MotionEstimate:
     """Return the offset at the innermost mark from marks around it, up to whole pitches."""
     if not centred.shape[1]:
         return MotionEstimate(phi_error_rad=max_rotation_rad)
     centre = centred[:, np.argmin(np.hypot(*centred))]
     near = np.hypot(*(centred - centre[:, None])) * max_rotation_rad <= SURE * pitch
-    offset = [_middle(row * (2 * np.pi / pitch), 2 * np.pi) * pitch / (2 * np.pi)
-              for row in centred[:, near]]
-    return MotionEstimate(Rigid(0.0, *offset), (float(centre[0]), float(centre[1])), 0.0,
+    offset = np.array([_middle(row * (2 * np.pi / pitch), 2 * np.pi) * pitch / (2 * np.pi)
+                       for row in rows.turned_back(*centred[:, near])])
+    x, y = map(float, rows.turned(*offset))
+    return MotionEstimate(Rigid(0.0, x, y), (float(centre[0]), float(centre[1])), 0.0,
                           max_rotation_rad)
 
 
-def _folded(known: MotionEstimate, fit: RigidFit, pitch: float) -> tuple[MotionEstimate, RigidFit]:
+def _folded(rows: StagePose, known: MotionEstimate, fit: RigidFit,
+            pitch: float) -> tuple[MotionEstimate, RigidFit]:
     """Return the motion whose offset at the plate's centre is below half a pitch.
 
     Marks without ids determine it only up to whole pitches, and not at all if they are so far out
@@ -210,15 +217,15 @@ def _folded(known: MotionEstimate, fit: RigidFit, pitch: float) -> tuple[MotionE
     """
     if known.error_at(np.zeros((2, 1)))[0] > SURE * pitch:
         return replace(known, offset_error_m=float("inf")), fit
-    shift = np.rint(np.array([known.rigid.tx_m, known.rigid.ty_m]) / pitch) * pitch
-    moved = [replace(rigid, tx_m=rigid.tx_m - float(shift[0]), ty_m=rigid.ty_m - float(shift[1]))
+    offset = rows.turned_back(*np.array([known.rigid.tx_m, known.rigid.ty_m]))
+    x, y = map(float, rows.turned(*np.rint(np.array(offset) / pitch) * pitch))
+    moved = [replace(rigid, tx_m=rigid.tx_m - x, ty_m=rigid.ty_m - y)
              for rigid in (known.rigid, fit.rigid)]
     return replace(known, rigid=moved[0]), replace(fit, rigid=moved[1])
 
 
-def _about(pose: LatticePose, marks: np.ndarray, pitch: float) -> np.ndarray:
-    site = np.stack(pose.site_of(marks[0], marks[1]))
-    return (site - np.array(pose.shift)[:, None]) * pitch
+def _about(pose: StagePose, marks: np.ndarray, pitch: float) -> np.ndarray:
+    return np.stack(pose.turned(marks[0], marks[1])) * pitch
 
 
 def identify_angular(artifact: Artifact, view: View, reading_rad: np.ndarray, *, ids: np.ndarray,
@@ -249,7 +256,7 @@ def identify_angular(artifact: Artifact, view: View, reading_rad: np.ndarray, *,
         return MarkAssignment(np.zeros(len(ids), int), np.zeros(len(ids)), np.zeros(len(ids)),
                           reasons, Rigid())
     step = 2 * np.pi / count
-    base = view.lattice_pose(artifact).s
+    base = view.on_stage(artifact).s
     known = has_id & (ids >= 0) & (ids < count)
     told = phi_rad is not None or known.any()
     if phi_rad is None:
