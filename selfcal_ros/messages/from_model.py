@@ -48,6 +48,15 @@ def _artifact(artifact: Artifact) -> Fields:
             "angular_count": artifact.angular_count, "grid_size_y": artifact.grid_size_y}
 
 
+def _map_grid(artifact: Artifact | None) -> Fields:
+    """Return the fields of the map's nodes; zeros where they are the sites of the plate."""
+    grid = artifact.map_grid if artifact else None
+    return {"map_grid_size": grid.size if grid else 0,
+            "map_grid_size_y": grid.size_y if grid else 0,
+            "map_grid_pitch": grid.pitch_m if grid else 0.0,
+            "map_interpolation": str(grid.interpolation) if grid else ""}
+
+
 def _view(view: View) -> Fields:
     return {"view_name": view.name, "rotation": view.rotation_rad,
             "translation_x": view.translation_m[0], "translation_y": view.translation_m[1],
@@ -64,7 +73,7 @@ def command(c: Command, frame_id: str) -> Fields:
             "visit_order": c.view.visit_order if c.view else "", "run_id": c.run_id,
             "model_terms": list(c.model_terms),
             "check_marks": c.view.check_marks if c.view else 0,
-            "check_offset": c.view.check_offset_m if c.view else 0.0}
+            "check_offset": c.view.check_offset_m if c.view else 0.0, **_map_grid(c.artifact)}
 
 
 def view_status(progress: ViewProgress, plan_id: str, stamp_ns: int, frame_id: str, *,
@@ -104,7 +113,8 @@ def view_measurement(progress: ViewProgress, measurements: Measurements, stamp_n
         **_rejected(measurements.rejected, "session_reject"),
         **_visits(readings.visits), **_motion("motion", readings.motion),
         **_motion("motion_theta", readings.motion_theta), "run_id": measurements.run_id,
-        "model_terms": list(measurements.model_terms), "session_notes": list(notes)}
+        "model_terms": list(measurements.model_terms), "session_notes": list(notes),
+        **_map_grid(measurements.artifact)}
 
 
 def _visits(visits: GridVisits | None) -> Fields:

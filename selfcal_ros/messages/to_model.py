@@ -26,7 +26,7 @@ from selfcal_ros.messages.cdr import (
     Payloads,
     layout_of,
 )
-from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.artifact import Artifact, Interpolation, MapGrid
 from selfcal_ros.model.error_map import ErrorMap, ThetaDatum
 from selfcal_ros.model.orders import parse_order
 from selfcal_ros.model.readings import GridVisits, RepeatMotion, Sense, ViewReadings
@@ -113,7 +113,21 @@ def notes_of(message: Any) -> tuple[str, ...]:
 def artifact_of(message: Any) -> Artifact:
     """Return the plate of a ViewCommand, ViewMeasurement or ErrorMap."""
     return Artifact(int(message.grid_size), float(message.grid_pitch),
-                    int(message.angular_count), int(getattr(message, "grid_size_y", 0)))
+                    int(message.angular_count), int(getattr(message, "grid_size_y", 0)),
+                    _map_grid_of(message))
+
+
+def _map_grid_of(message: Any) -> MapGrid | None:
+    """Return the nodes of the map; None if they are the sites of the plate, as in old bags."""
+    size = int(getattr(message, "map_grid_size", 0))
+    if not size:
+        return None
+    name = str(getattr(message, "map_interpolation", "")) or Interpolation.BICUBIC
+    if name not in list(Interpolation):
+        raise InputError("map_interpolation", f"{name!r} is not known",
+                         f"use one of {', '.join(Interpolation)}")
+    return MapGrid(size, float(getattr(message, "map_grid_pitch", 0.0)), Interpolation(name),
+                   int(getattr(message, "map_grid_size_y", 0)))
 
 
 def view_of(message: Any, *, repeats: int, grid: bool, angular: bool) -> View:

@@ -303,11 +303,13 @@ def _digest(readings: ViewReadings) -> str:
 
 
 def placing_digest(artifact: Artifact, view: View) -> str:
-    """Return a short digest of a plate and of the pose and marks of a view, without names."""
+    """Return a short digest of a plate with its map, and of pose and marks of a view, unnamed."""
     numbers = (*artifact.shape, artifact.grid_pitch_m, artifact.angular_count, view.rotation_rad,
                *view.translation_m, view.grid, view.angular, view.repeats,
                view.check_marks, view.check_offset_m)
     text = ",".join(float(number).hex() for number in numbers)
+    if artifact.map_grid is not None:
+        text += repr(artifact.map_grid)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 

@@ -15,7 +15,7 @@ from selfcal_ros.collection.inputs import Command, Detection, EncoderSample, Pha
 from selfcal_ros.collection.timeline import Timeline
 from selfcal_ros.errors import InputError
 from selfcal_ros.messages import from_model, to_model
-from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.artifact import Artifact, Interpolation, MapGrid
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.orders import ORDERS
 from selfcal_ros.model.readings import (
@@ -42,7 +42,10 @@ SAMPLES = st.lists(st.tuples(TEXTS, FLOATS, FLOATS), max_size=4).flatmap(
         st.just(tuple(row[i] for row in rows)) for i in range(3))))
 ARTIFACTS = st.builds(Artifact, st.integers(1, 50).map(lambda h: 2 * h + 1),
                       st.floats(1e-7, 1.0), st.integers(0, 90).map(lambda q: 4 * q),
-                      st.integers(0, 50).map(lambda h: 2 * h + 1 if h else 0))
+                      st.integers(0, 50).map(lambda h: 2 * h + 1 if h else 0),
+                      st.none() | st.builds(MapGrid, st.integers(1, 50).map(lambda h: 2 * h + 1),
+                                            st.floats(1e-7, 1.0), st.sampled_from(Interpolation),
+                                            st.sampled_from([0, 3, 21])))
 VIEWS = st.builds(View, TEXTS, FLOATS, st.tuples(FLOATS, FLOATS), st.booleans(), st.booleans(),
                   st.integers(1, 2**32 - 1))
 ORDER_TEXTS = st.sampled_from(["", *ORDERS]) | st.sampled_from(ORDERS).map(lambda o: o + "@plate")
@@ -87,7 +90,8 @@ def test_commands_come_back(event):
 def test_a_message_of_somebody_else_is_what_it_says(event):
     """The contract's fields by name, filled by another hand: no two are swapped both ways."""
     if isinstance(event, Command):
-        event = replace(event, views_planned=0, artifact=replace(event.artifact, grid_size_y=0),
+        event = replace(event, views_planned=0, artifact=replace(
+            event.artifact, grid_size_y=0, map_grid=None),
                         view=replace(event.view, visit_order="", check_marks=0,
                                      check_offset_m=0.0))
     topic, typename, message = contract_message(contract_types(), event)
@@ -105,24 +109,32 @@ def test_fields_of_a_detection_by_name():
         "offset_theta": -7e-3, "sigma": 8e-8, "score": 0.5}
 
 
+PLATE = Artifact(5, 0.0125, 8, 7, MapGrid(9, 0.02, Interpolation.BILINEAR, 11))
+MAP_FIELDS = {"map_grid_size": 9, "map_grid_size_y": 11, "map_grid_pitch": 0.02,
+              "map_interpolation": "bilinear"}
+
+
 def test_fields_of_a_command_by_name():
     view = View("turned", math.pi / 2, (0.01, -0.02), True, False, 7, "x_then_y", 3, 2e-5)
     made = from_model.command(Command(STAMP_NS, Phase.MEASURE, "p", 3, view,
-                                       Artifact(5, 0.0125, 8, 7), 9,
-                                       model_terms=("drift:1e-08",)), "f")
+                                       PLATE, 9, model_terms=("drift:1e-08",)), "f")
     del made["header"]
     assert made == {
         "phase": 1, "plan_id": "p", "view_index": 3, "view_name": "turned",
         "rotation": math.pi / 2, "translation_x": 0.01, "translation_y": -0.02, "grid": True,
         "angular": False, "repeats": 7, "grid_size": 5, "grid_pitch": 0.0125, "angular_count": 8,
         "grid_size_y": 7, "views_planned": 9, "visit_order": "x_then_y", "run_id": "",
-        "model_terms": ["drift:1e-08"], "check_marks": 3, "check_offset": 2e-5}
+        "model_terms": ["drift:1e-08"], "check_marks": 3, "check_offset": 2e-5, **MAP_FIELDS}
 
 
 @pytest.mark.parametrize(("changes", "message"), [
     ({"phase": 4}, "selfcal/view_command: unknown phase 4; use PLACE, MEASURE, DONE or ABORT"),
     ({"grid_size": 4}, "artifact grid_size: 4 is not an odd number"),
     ({"grid_pitch": math.nan}, "artifact grid_pitch: nan m is not a length"),
+    ({"map_grid_size": 4, "map_grid_pitch": 0.1}, "map grid_size: 4 is not an odd number"),
+    ({"map_grid_size": 5}, "map grid_pitch: 0.0 m is not a length; give the map an odd number"),
+    ({"map_grid_size": 5, "map_grid_pitch": 0.1, "map_interpolation": "cubic"},
+     "map_interpolation: 'cubic' is not known; use one of bilinear, bicubic"),
     ({"header": from_model.header(-1, "f")},
      "selfcal/view_command: the stamp lies before 1970; set the clock")])
 def test_commands_that_cannot_be_used(changes, message):
@@ -204,10 +216,15 @@ READ = ViewReadings(
     np.array([9]), np.array([1e-5]), 1.1e-8, 1.2e-6, 13, 14, 15, {"low_score": 16},
     VISITS, motion=RepeatMotion(1e-15 * np.arange(16.0).reshape(4, 4), 21),
     motion_theta=RepeatMotion(1e-12 * np.array([[1.0, 2.0], [3.0, 4.0]]), 22))
-MEASURED = Measurements("p", Artifact(5, 0.01, 8, 7), (READ,), Sense.PLATE_MOVES, {"other": 17},
-                        "77", ("approach",))
+MEASURED = Measurements("p", replace(PLATE, grid_pitch_m=0.01), (READ,), Sense.PLATE_MOVES,
+                        {"other": 17}, "77", ("approach",))
 PROGRESS = ViewProgress(18, replace(READ.view, check_marks=4, check_offset_m=2e-5), 19, 20, 21, 22,
                         READ, 23, check_done=23)
+
+
+def test_the_plate_and_the_map_of_a_measurement_come_back():
+    there = from_model.view_measurement(PROGRESS, MEASURED, STAMP_NS, "f")
+    assert to_model.artifact_of(through_cdr("ViewMeasurement", there)) == MEASURED.artifact
 
 
 def test_the_visits_of_a_view_survive_the_message():
@@ -245,7 +262,8 @@ def test_fields_of_a_view_measurement_by_name():
         "detections_used": 15, "reject_reasons": ["low_score"], "reject_counts": [16],
         "measurement_sense": "plate_moves", "session_reject_reasons": ["other"],
         "session_reject_counts": [17], "run_id": "77", "sigma_visit": 9e-9, "dof_visit": 6,
-        "model_terms": ["approach"], "session_notes": [], "dof_motion": 21, "dof_motion_theta": 22}
+        "model_terms": ["approach"], "session_notes": [], "dof_motion": 21, "dof_motion_theta": 22,
+        **MAP_FIELDS}
 
 
 def test_fields_of_a_view_status_by_name():
@@ -358,6 +376,7 @@ def test_a_field_that_is_not_given_is_an_error():
 
 def test_a_command_without_a_view_names_no_plate_and_asks_for_nothing():
     made = from_model.command(Command(STAMP_NS, Phase.DONE, "p", 3), "stage")
-    for name in ("grid_size", "grid_pitch", "angular_count", "grid_size_y", "repeats"):
+    for name in ("grid_size", "grid_pitch", "angular_count", "grid_size_y", "repeats",
+                 "map_grid_size", "map_grid_size_y", "map_grid_pitch"):
         assert made[name] == 0, name
     assert (made["grid"], made["angular"], made["visit_order"]) == (False, False, "")
