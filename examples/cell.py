@@ -72,19 +72,24 @@ class Machine:
 def grid_sites(view: ViewCommand) -> Iterator[tuple[int, int, Position]]:
     """Yield the marks (m, n) of a view with the stage position at which each is seen.
 
-    Mark (m, n) lies on the site R^q (m, n) + (a, b). A view includes the marks whose site is in
-    the field, which is as large as the plate: one that is shifted by one pitch has a row less.
+    Mark (m, n) lies where the turn and the translation of the plate bring it. A view includes the
+    marks in the field, which is as large as the plate (one that is shifted by one pitch has a row
+    less), or as the map where the command gives its nodes.
     """
     hx = (view.grid_size - 1) // 2
     hy = ((view.grid_size_y or view.grid_size) - 1) // 2  # 0: the plate is square
-    quarter = round(view.rotation / (math.pi / 2)) % 4
-    a, b = (round(t / view.grid_pitch) for t in (view.translation_x, view.translation_y))
+    reach_x, reach_y = hx * view.grid_pitch, hy * view.grid_pitch
+    if view.map_grid_size:
+        reach_x = (view.map_grid_size - 1) / 2 * view.map_grid_pitch
+        reach_y = ((view.map_grid_size_y or view.map_grid_size) - 1) / 2 * view.map_grid_pitch
+    rounding = 1e-9 * view.grid_pitch
+    cosine, sine = math.cos(view.rotation), math.sin(view.rotation)
     for m in range(-hx, hx + 1):
         for n in range(-hy, hy + 1):
-            i, j = ((m, n), (-n, m), (-m, -n), (n, -m))[quarter]
-            i, j = i + a, j + b
-            if abs(i) <= hx and abs(j) <= hy:
-                yield m, n, (i * view.grid_pitch, j * view.grid_pitch, 0.0)
+            x = (cosine * m - sine * n) * view.grid_pitch + view.translation_x
+            y = (sine * m + cosine * n) * view.grid_pitch + view.translation_y
+            if abs(x) <= reach_x + rounding and abs(y) <= reach_y + rounding:
+                yield m, n, (x, y, 0.0)
 
 
 REVISIT_TICKS = 500

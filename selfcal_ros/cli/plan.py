@@ -19,7 +19,7 @@ from selfcal_ros.cli.plan_terms import (
     terms_text,
 )
 from selfcal_ros.cli.terminal import busy, late_progress, tell
-from selfcal_ros.units import UM_PER_M
+from selfcal_ros.units import MM_PER_M, UM_PER_M
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -180,6 +180,7 @@ def _check_text(plan: Plan, seen: Observability, predicted: Prediction | None) -
     artifact = plan.artifact
     lines = [f"plan {plan.plan_id}: {len(plan.views)} views of {artifact.shape[0]} x "
              f"{artifact.shape[1]} marks, {artifact.angular_count} angular lines",
+             *_nodes_text(plan),
              f"rank {seen.rank} of {seen.unknowns} unknowns, {seen.deficiency} unseen modes"]
     if predicted is None or not seen.identifiable:
         lines += ["the plan does not identify the stage; unseen are:"]
@@ -193,6 +194,13 @@ def _check_text(plan: Plan, seen: Observability, predicted: Prediction | None) -
         lines.append(f"  theta  rms {predicted.rms_theta:.4f}")
     note = field_note(predicted, plan)
     return [*lines, *([f"  ({note})"] if note else []), _check_stops_text(plan)]
+
+
+def _nodes_text(plan: Plan) -> list[str]:
+    """Return the nodes of a map that is not on the plate's lattice, in a line."""
+    grid, (nx, ny) = plan.artifact.map_grid, plan.artifact.field.shape
+    return [] if grid is None else [f"map of {nx} x {ny} nodes, {grid.pitch_m * MM_PER_M:.6g} mm "
+                                    f"apart, {grid.interpolation} between them"]
 
 
 def _check_stops_text(plan: Plan) -> str:
@@ -214,7 +222,7 @@ def _unchecked_text(seen: Observability) -> list[str]:
 def field_note(predicted: Prediction, plan: Plan) -> str:
     """Return a note if a prediction is not for the plan's own field, else an empty string."""
     nx, ny = predicted.ux.shape
-    return "" if (nx, ny) == plan.artifact.shape else (
+    return "" if (nx, ny) == plan.artifact.field.shape else (
         f"predicted for a field of {nx} x {ny} sites; XY is about 5 % larger for each doubling of "
         "the field")
 

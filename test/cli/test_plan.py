@@ -308,7 +308,8 @@ def test_bad_arguments(arguments, message, capsys):
 
 def test_bad_plans_name_the_place(tmp_path, capsys):
     data = yaml.safe_load(Path(shipped("hu")).read_text())
-    data["views"][1]["rotation_deg"] = 45
+    data["views"][1]["rotation_deg"] = 46
+    data["views"][1]["angular"] = True
     path = tmp_path / "off.yaml"
     path.write_text(yaml.safe_dump(data))
     assert main(["plan", "check", str(path)]) == 2

@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 from selfcal_msgs.msg import ViewCommand
 
-from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.collection.inputs import Command, Phase
+from selfcal_ros.messages import from_model
+from selfcal_ros.model.artifact import Artifact, MapGrid
 from selfcal_ros.model.view import View
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes.measurement_collector import MeasurementCollector
@@ -94,6 +96,19 @@ def test_marks_of_a_rectangular_plate(view):
     found = {(m, n): p[:2] for m, n, p in example().grid_sites(command)}
     assert found.keys() == wanted.keys()
     assert all(found[mark] == pytest.approx(wanted[mark]) for mark in wanted)
+
+
+def test_marks_of_a_plate_off_the_lattice():
+    """Over a map that is smaller than the plate in x, and larger in y."""
+    plate = Artifact(5, 0.01, map_grid=MapGrid(3, 0.015, size_y=5))
+    view = View("", np.deg2rad(37), (0.013, -0.007))
+    fields = from_model.command(Command(0, Phase.MEASURE, "p", 0, view, plate), "stage")
+    del fields["header"]
+    found = {(m, n): complex(*p[:2]) for m, n, p in example().grid_sites(ViewCommand(**fields))}
+    inside = view.pose.in_field(plate)
+    marks = list(zip(plate.m[inside].tolist(), plate.n[inside].tolist(), strict=True))
+    assert list(found) == marks
+    np.testing.assert_allclose([*found.values()], view.pose.places(plate, plate.m, plate.n)[inside])
 
 
 def test_a_command_latched_anew_is_not_carried_out_again(graph):

@@ -30,6 +30,7 @@ from selfcal_ros.estimation.terms.projection import (
 )
 from selfcal_ros.estimation.terms.visits import ViewVisits
 from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.pose import LatticePose
 from selfcal_ros.model.terms import DRIFT_DEGREE, OF_PLATE, ModelTerm
 from selfcal_ros.model.view import View
 from selfcal_ros.model.visit_order import VisitSequence, approach_signs, visit_sequence
@@ -123,9 +124,12 @@ def _visits(artifact: Artifact, view: View, assumed: Assumed, rng: np.random.Gen
     sites = (found.i + 1j * found.j) * artifact.grid_pitch_m
     aside = found.aside_m[0] + 1j * found.aside_m[1]
     stops = assumed.stop_error_m * (rng.normal(size=n) + 1j * rng.normal(size=n))
-    (hx, hy), phase = artifact.half, PHASES[-view.lattice_pose(artifact).q % 4]
+    (hx, hy), pose = artifact.half, view.on_stage(artifact)
+    phase = PHASES[-pose.q % 4] if isinstance(pose, LatticePose) else view.pose.phase.conjugate()
     mark = (found.m + hx) * artifact.shape[1] + found.n + hy
-    stage, plate = errors[0, found.i + hx, found.j + hy], errors[1].ravel()[mark] / phase
+    i, j = (np.clip(np.rint(at), -h, h).astype(int) + h  # the nearest, off the lattice
+            for at, h in ((found.i, hx), (found.j, hy)))
+    stage, plate = errors[0, i, j], errors[1].ravel()[mark] / phase
     arm = (found.m + 1j * found.n) * artifact.grid_pitch_m / phase
     offset = np.expm1(1j * turn) * arm + complex(x, y) + plate - stage - stops - aside
     # the sense of measurement does not matter: the stage's motion and its part of a reading

@@ -35,7 +35,11 @@ def plan_figure(artifact: Artifact, views: Sequence[View]) -> Drawing:
     Marks beyond the field of the stage are hollow: no view reads them.
     """
     drawing = titled("views", "How the plate lies in every view")
-    reach = [(half + 2.6) * artifact.grid_pitch_m * MM_PER_M for half in artifact.half]
+    margin = 2.6 * artifact.grid_pitch_m
+    reach = [(half + margin) * MM_PER_M for half in artifact.field_half_m]
+    if artifact.map_grid is not None:  # the corners may reach far beyond the field
+        corners = np.abs([_places_mm(view, *_corners(artifact)) for view in views])
+        reach = np.maximum(reach, corners.max(axis=(0, 2)) + margin / 2 * MM_PER_M).tolist()
     titles = [f"{view.name}: {pose_text(view.rotation_rad, view.translation_m, artifact)}"
               for view in views]
     for frame, view in zip(panels(drawing, titles, reach), views, strict=True):
@@ -53,30 +57,42 @@ def plan_figure(artifact: Artifact, views: Sequence[View]) -> Drawing:
 
 
 def views_in(result: CalibrationResult) -> list[View]:
-    """Return the views of a result, as far as it knows them: grids are read after quarter turns."""
+    """Return the views of a result, as far as it knows them.
+
+    On the lattice grids are read after quarter turns; else the offset of such a view is known.
+    """
+    placed = result.artifact.map_grid is not None
     return [View(view.name, view.rotation, (view.translation_x, view.translation_y),
-                 abs(math.remainder(view.rotation, math.pi / 2)) < 1e-6)
+                 math.isfinite(view.tx) if placed else
+                 abs(math.remainder(view.rotation, math.pi / 2)) < 1e-6, angular=False)
             for view in result.views]
+
+
+def _corners(artifact: Artifact) -> np.ndarray:
+    """Return the outline of the plate, plate frame, (2, 5), m."""
+    half = np.array(artifact.half)[:, None]
+    return np.array([[1, 1, -1, -1, 1], [1, -1, -1, 1, 1]]) * (half + 0.6) * artifact.grid_pitch_m
 
 
 def _plate(frame: Frame, view: View, artifact: Artifact) -> None:
     drawing, pitch = frame.drawing, artifact.grid_pitch_m
     half = np.array(artifact.half)[:, None]
-    field = ((half[:, 0] + 0.3) * pitch * MM_PER_M).tolist()
+    field = [(reach + 0.3 * pitch) * MM_PER_M for reach in artifact.field_half_m]
     low, high = frame.at(-field[0], -field[1]), frame.at(*field)
     drawing.box(low[0], high[1], high[0] - low[0], low[1] - high[1], fill="e2")
-    corners = np.array([[1, 1, -1, -1, 1], [1, -1, -1, 1, 1]]) * (half + 0.6) * pitch
-    drawing.line(_at(frame, _places_mm(view, *corners)), stroke="truth", width=1.6)
+    drawing.line(_at(frame, _places_mm(view, *_corners(artifact))), stroke="truth", width=1.6)
     sites = thinned(artifact, MAX_ARROWS)
     place = _places_mm(view, artifact.x_m[sites], artifact.y_m[sites])
     if view.grid:
-        on = (np.abs(place[0]) < field[0]) & (np.abs(place[1]) < field[1])
+        pose = view.on_stage(artifact)
+        on = ~pose.beyond_field(np.stack(pose.site_of(artifact.m[sites], artifact.n[sites])),
+                                artifact)
         drawing.discs(_at(frame, place[:, on]), 1.4, fill="ink")
         drawing.discs(_at(frame, place[:, ~on]), 1.6, stroke="bad")
     else:
         drawing.discs(_at(frame, place.reshape(2, -1)), 1.0, fill="soft")
     if view.check_marks:
-        there = view.lattice_pose(artifact).marks_in_field(artifact)[1]
+        there = pose.marks_in_field(artifact)[1]
         for x, y in _at(frame, there[:, check_marks(there, view.check_marks)] * pitch * MM_PER_M):
             drawing.lines([[(x - 6, y), (x + 6, y)], [(x, y - 6), (x, y + 6)]], stroke="c0",
                           width=1.6)
@@ -145,7 +161,7 @@ def rejected_map(result: CalibrationResult) -> Drawing | None:
     if not names:
         return None
     artifact = result.artifact
-    field = [(half + 0.5) * artifact.grid_pitch_m * MM_PER_M for half in artifact.half]
+    field = [(half + 0.5 * artifact.grid_pitch_m) * MM_PER_M for half in artifact.field_half_m]
     reach = [half + 1.2 * artifact.grid_pitch_m * MM_PER_M for half in field]
     colours = {reason: f"c{i % SERIES}" for i, (reason, _) in enumerate(
         Counter(row[1] for row in found).most_common())}

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.artifact import Artifact, MapGrid
 from selfcal_ros.model.verdict import ModelResult, TermEstimate, TermResult
 from selfcal_ros.model.view import View
 from selfcal_ros.reporting.figures.drawing import (
@@ -307,10 +307,10 @@ def test_courses_need_times_and_show_a_rise_upwards():
     assert courses(found[1:], 1e-8) is None
 
 
-def turned(rotation_deg, shift=(0.0, 0.0), **more):
+def turned(rotation_deg, shift=(0.0, 0.0), grid=None, **more):
     """Return the figure of one view of a plate of 5 x 9 marks, and the middle of its panel."""
     view = View("v", math.radians(rotation_deg), shift, **more)
-    drawing = plan_figure(Artifact(5, 0.01, 24, 9), [view])
+    drawing = plan_figure(Artifact(5, 0.01, 24, 9, grid), [view])
     frame = next(item.lines[0] for item in drawing.items if isinstance(item, Path)
                  and item.stroke == "soft" and len(item.lines[0]) == 5)
     return drawing, np.mean(frame[:4], axis=0)
@@ -337,6 +337,27 @@ def test_the_arrow_leads_the_corner_of_a_turned_plate_the_way_it_is_turned(rotat
     assert (across < 0).all() if sense == "left" else (across > 0).all()
     head, = heads(drawing)
     np.testing.assert_allclose(head[0] - middle, way[-1])
+
+
+def test_a_plate_off_the_lattice_is_drawn_within_its_panel():
+    """Turned by 37 deg over a map of 30 x 60 mm: what lies beyond the nodes is hollow."""
+    grid = MapGrid(3, 0.015, size_y=5)
+    view = View("v", math.radians(37), (0.013, -0.007), angular=False)
+    drawing, middle = turned(37, view.translation_m, grid, angular=False, check_marks=1,
+                             check_offset_m=2e-5)
+    hollow, = (item for item in drawing.items if isinstance(item, Discs) and item.stroke == "bad")
+    read, = (item for item in drawing.items if isinstance(item, Discs) and item.fill == "ink")
+    inside = view.pose.in_field(Artifact(5, 0.01, 24, 9, grid))
+    assert (len(read.centres), len(hollow.centres)) == (inside.sum(), (~inside).sum())
+    frame = next(np.array(item.lines[0]) for item in drawing.items if isinstance(item, Path)
+                 and item.stroke == "soft" and len(item.lines[0]) == 5)
+    plate = next(np.array(item.lines[0]) for item in drawing.items if isinstance(item, Path)
+                 and item.stroke == "truth" and len(item.lines[0]) == 5)
+    assert (frame.min(axis=0) < plate.min(axis=0)).all()
+    assert (plate.max(axis=0) < frame.max(axis=0)).all()
+    places = view.pose.places(Artifact(5, 0.01), 0, 0)
+    assert np.sign(np.mean(plate[:4], axis=0) - middle).tolist() == [
+        np.sign(places.real), -np.sign(places.imag)]  # pixels grow downwards
 
 
 def test_a_plate_that_is_not_turned_has_no_arrow_and_marks_off_the_field_are_hollow():
