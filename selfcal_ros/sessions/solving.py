@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from functools import cache
 from typing import Any
 
-from selfcal_ros.collection.inputs import Phase, begun_ns, check_plate, check_view
+from selfcal_ros.collection.inputs import Phase, begun_ns, check_command, check_plate, check_view
 from selfcal_ros.collection.settings.estimator import solver_options
 from selfcal_ros.collection.settings.nodes import SolverSettings
 from selfcal_ros.errors import InputError, NoDataError, NotIdentifiableError, SelfcalError
@@ -22,7 +22,6 @@ from selfcal_ros.model.result import (
     unidentified_result,
     with_warnings,
 )
-from selfcal_ros.model.view import MAX_VIEWS
 from selfcal_ros.reporting.summary.format import counted
 from selfcal_ros.reporting.summary.numbers import summary_numbers
 from selfcal_ros.reporting.summary.sections import state_sentence
@@ -30,7 +29,7 @@ from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.sessions.clocks import Run, begins_in_future, supersedes
 from selfcal_ros.sessions.health import Diagnosis, Level, Ports
 from selfcal_ros.sessions.map_files import is_qualified, read_result, result_file, run_file
-from selfcal_ros.topics import COMMAND_TOPIC, MEASUREMENT_TOPIC
+from selfcal_ros.topics import MEASUREMENT_TOPIC
 
 ECHO_LENGTH = 128
 """Length of a string shown by `ros2 topic echo`."""
@@ -141,20 +140,19 @@ class SolvingSession:
         Raises
         ------
         InputError
-            If it has more views than a plan can have.
+            If the collector refuses it as well.
         """
-        if message.views_planned > MAX_VIEWS:
-            raise InputError(COMMAND_TOPIC, f"a plan has at most {MAX_VIEWS} views, not "
-                             f"{message.views_planned}", "correct views_planned")
-        run = Run(message.plan_id, message.run_id)
+        command = to_model.command(message)
+        check_command(command)
+        run = Run(command.plan_id, command.run_id)
         known = self._planned.get(run, 0)
-        self._planned[run] = max(known, message.views_planned)
-        ends = message.phase == Phase.DONE and run not in self._ended
+        self._planned[run] = max(known, command.views_planned)
+        ends = command.phase == Phase.DONE and run not in self._ended
         if ends:
             self._ended.add(run)
         tells = not self._planned_views(run) or isinstance(self.shown.problem, NoDataError)
         if run in (self._run, Run(self._run.plan_id)) and (
-                message.views_planned > known or (ends and tells)):
+                command.views_planned > known or (ends and tells)):
             self._stale = True  # the summary shows the number of planned or remaining views
 
     def _planned_views(self, run: Run) -> int:
