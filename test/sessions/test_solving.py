@@ -428,7 +428,7 @@ def test_memory_that_is_freed_is_kept_for_the_next_solution():
     done = subprocess.run([sys.executable, "-c", FAULTS], capture_output=True, text=True,
                           check=True)
     before, after = map(int, done.stdout.split())
-    assert before > 5000 > 100 > after
+    assert before > 1000 > 100 > after  # how many depends on the free end of the heap
 
 
 NOW = START_NS
