@@ -14,14 +14,8 @@ from selfcal_ros.estimation.api import Options, calibrate, pure_noise
 from selfcal_ros.files import write_json
 from selfcal_ros.memory import keep_freed_memory
 from selfcal_ros.messages import from_model, to_model
+from selfcal_ros.model import result as results
 from selfcal_ros.model.readings import Measurements, readings_digest, session_digest
-from selfcal_ros.model.result import (
-    CalibrationResult,
-    created_now,
-    result_to_dict,
-    unidentified_result,
-    with_warnings,
-)
 from selfcal_ros.reporting.summary.format import counted
 from selfcal_ros.reporting.summary.numbers import summary_numbers
 from selfcal_ros.reporting.summary.sections import state_sentence
@@ -52,7 +46,7 @@ class Outcome:
     """Outcome of a job; `problem` if the readings do not identify the stage, or worse."""
 
     job: Job
-    result: CalibrationResult | None
+    result: results.CalibrationResult | None
     problem: Exception | None
 
 
@@ -60,10 +54,10 @@ def solve(job: Job) -> Outcome:
     """Solve a job; depends on nothing else, so it can run anywhere."""
     try:
         result = worded(calibrate(job.measurements, job.options))
-        return Outcome(job, with_warnings(result, job.notes), None)
+        return Outcome(job, results.with_warnings(result, job.notes), None)
     except NotIdentifiableError as error:
-        result = worded(unidentified_result(job.measurements, error.observability))
-        return Outcome(job, with_warnings(result, job.notes), error)
+        result = worded(results.unidentified_result(job.measurements, error.observability))
+        return Outcome(job, results.with_warnings(result, job.notes), error)
     except Exception as error:  # reported by `take`, in the thread of the session
         return Outcome(job, None, error)
 
@@ -90,7 +84,7 @@ def warm_up(marks: int = 5) -> None:
 class Shown:
     """Present publication: a result and its run, or why there is none."""
 
-    result: CalibrationResult | None = None
+    result: results.CalibrationResult | None = None
     problem: Exception | None = None
     run: Run = field(default_factory=Run)
     views_done: int = 0
@@ -125,7 +119,7 @@ class SolvingSession:
         self.shown = Shown()
 
     @property
-    def result(self) -> CalibrationResult | None:
+    def result(self) -> results.CalibrationResult | None:
         """The published result."""
         return self.shown.result
 
@@ -254,15 +248,15 @@ class SolvingSession:
             raise outcome.problem or ValueError("neither a result nor a problem")
         self._ports.say(Level.OK, self._state())
 
-    def _save_by_itself(self, result: CalibrationResult) -> None:
+    def _save_by_itself(self, result: results.CalibrationResult) -> None:
         try:
             path = run_file(self._settings.save_path, self.shown.run.run_id)
-            write_json(path, result_to_dict(created_now(result)))
+            write_json(path, results.result_to_dict(results.created_now(result)))
             self._saved = str(path)
         except InputError as error:  # the map itself is good, and save_map may use another path
             self._ports.say(Level.ERROR, f"save_path: {error}")
 
-    def _publish(self, result: CalibrationResult) -> None:
+    def _publish(self, result: results.CalibrationResult) -> None:
         shown, frame_id = self.shown, self._settings.frame_id
         run = shown.run
         verdict = {"qualified": is_qualified(result), "run_id": run.run_id,
@@ -326,7 +320,7 @@ class SolvingSession:
         if self.shown.result is None:
             raise NoDataError("solver", "there is no map yet", "measure the views of the plan")
         target = result_file(path, self._settings.result_folder)
-        write_json(target, result_to_dict(created_now(self.shown.result)))
+        write_json(target, results.result_to_dict(results.created_now(self.shown.result)))
         self._saved = str(target)
         run = self.shown.run
         named = f"plan '{run.plan_id}'" + (f", run {run.run_id}" if run.run_id else "")

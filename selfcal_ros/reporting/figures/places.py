@@ -12,17 +12,8 @@ from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.result import CalibrationResult, ViewResult
 from selfcal_ros.model.view import View
 from selfcal_ros.model.visit_order import check_marks
+from selfcal_ros.reporting.figures import parts
 from selfcal_ros.reporting.figures.drawing import SERIES, Drawing, Frame, Point
-from selfcal_ros.reporting.figures.parts import (
-    MAX_ARROWS,
-    WIDTH,
-    curved_arrow,
-    legend,
-    panels,
-    text_width,
-    thinned,
-    titled,
-)
 from selfcal_ros.reporting.figures.residuals import places_mm
 from selfcal_ros.reporting.summary.format import printable
 from selfcal_ros.reporting.summary.sections import pose_text
@@ -34,11 +25,11 @@ def plan_figure(artifact: Artifact, views: Sequence[View]) -> Drawing:
 
     Marks beyond the field of the stage are hollow: no view reads them.
     """
-    drawing = titled("views", "How the plate lies in every view")
+    drawing = parts.titled("views", "How the plate lies in every view")
     reach = [(half + 2.6) * artifact.grid_pitch_m * MM_PER_M for half in artifact.half]
     titles = [f"{view.name}: {pose_text(view.rotation_rad, view.translation_m, artifact)}"
               for view in views]
-    for frame, view in zip(panels(drawing, titles, reach), views, strict=True):
+    for frame, view in zip(parts.panels(drawing, titles, reach), views, strict=True):
         _plate(frame, view, artifact)
         frame.border()
     said = ["shaded: field; dot: corner (h, h) of the plate; arrow: its turn",
@@ -67,7 +58,7 @@ def _plate(frame: Frame, view: View, artifact: Artifact) -> None:
     drawing.box(low[0], high[1], high[0] - low[0], low[1] - high[1], fill="e2")
     corners = np.array([[1, 1, -1, -1, 1], [1, -1, -1, 1, 1]]) * (half + 0.6) * pitch
     drawing.line(_at(frame, _places_mm(view, *corners)), stroke="truth", width=1.6)
-    sites = thinned(artifact, MAX_ARROWS)
+    sites = parts.thinned(artifact, parts.MAX_ARROWS)
     place = _places_mm(view, artifact.x_m[sites], artifact.y_m[sites])
     if view.grid:
         on = (np.abs(place[0]) < field[0]) & (np.abs(place[1]) < field[1])
@@ -85,7 +76,7 @@ def _plate(frame: Frame, view: View, artifact: Artifact) -> None:
         inside = 0.72 * half * pitch
         arc = np.hstack([_places_mm(replace(view, rotation_rad=float(angle)), *inside)
                          for angle in np.linspace(0.0, view.rotation_rad, 61)])
-        curved_arrow(drawing, _at(frame, arc), colour="truth")
+        parts.curved_arrow(drawing, _at(frame, arc), colour="truth")
 
 
 def _places_mm(view: View, x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
@@ -149,8 +140,8 @@ def rejected_map(result: CalibrationResult) -> Drawing | None:
     reach = [half + 1.2 * artifact.grid_pitch_m * MM_PER_M for half in field]
     colours = {reason: f"c{i % SERIES}" for i, (reason, _) in enumerate(
         Counter(row[1] for row in found).most_common())}
-    drawing = titled("rejected", "Rejected grid readings, where they happened")
-    for title, frame in zip(names, panels(drawing, names, reach), strict=True):
+    drawing = parts.titled("rejected", "Rejected grid readings, where they happened")
+    for title, frame in zip(names, parts.panels(drawing, names, reach), strict=True):
         low, high = frame.at(-field[0], -field[1]), frame.at(*field)
         drawing.box(low[0], high[1], high[0] - low[0], low[1] - high[1], fill="card")
         for reason, colour in colours.items():
@@ -169,9 +160,9 @@ def _legend(drawing: Drawing, entries: dict[str, tuple[str, int]]) -> None:
     x, y = 46.0, drawing.height + 14
     for reason, (colour, count) in entries.items():
         words = f"{printable(reason).replace('_', ' ')} ({count})"
-        width = 26 + text_width(words, 12)
-        if x + width > WIDTH and x > 46:
+        width = 26 + parts.text_width(words, 12)
+        if x + width > parts.WIDTH and x > 46:
             x, y = 46.0, y + 18
-        legend(drawing, [(colour, words)], (x, y))
+        parts.legend(drawing, [(colour, words)], (x, y))
         x += width
     drawing.height = y + 10
