@@ -16,20 +16,14 @@ from rosbags.typesys.store import Typestore
 
 from selfcal_ros.bagio.schemas import OWN, fields_of, own_message, same_layout, typestore
 from selfcal_ros.collection.inputs import DETECTION
+from selfcal_ros.messages import to_model
 from selfcal_ros.messages.cdr import LITTLE, MAX_LENGTH, ColumnDecoder, Columns, Payloads, layout_of
-from selfcal_ros.messages.to_model import (
-    EncoderBlock,
-    detection,
-    detection_table,
-    encoder_block,
-    encoder_sample,
-)
 from selfcal_ros.topics import DETECTION_TOPIC, ENCODER_TOPIC, INPUT_TOPICS
 
-Input = EncoderBlock | np.ndarray | object
+Input = to_model.EncoderBlock | np.ndarray | object
 """Encoder samples, a table of detections, or a command as rosbags has it."""
-BLOCKS: dict[str, Callable[[Columns], Input]] = {ENCODER_TOPIC: encoder_block,
-                                                 DETECTION_TOPIC: detection_table}
+BLOCKS: dict[str, Callable[[Columns], Input]] = {ENCODER_TOPIC: to_model.encoder_block,
+                                                 DETECTION_TOPIC: to_model.detection_table}
 """What many messages of a topic become at once."""
 PADDING = 3
 """Bytes after the last field that belong to it where lengths identify the definition."""
@@ -163,12 +157,12 @@ class Waiting:
 def _block(role: str, message: Any) -> Input:
     """Return a single decoded message as a block of one; a command unchanged."""
     if role == ENCODER_TOPIC:
-        sample = encoder_sample(message)
+        sample = to_model.encoder_sample(message)
         velocities = np.array([sample.velocities], dtype=float) if sample.velocities else None
-        return EncoderBlock(np.array([sample.stamp_ns]), sample.names,
-                            np.array([sample.positions], dtype=float), velocities)
+        return to_model.EncoderBlock(np.array([sample.stamp_ns]), sample.names,
+                                     np.array([sample.positions], dtype=float), velocities)
     if role == DETECTION_TOPIC:
-        d = detection(message)
+        d = to_model.detection(message)
         return np.array([(d.stamp_ns, d.kind, d.has_id, d.m, d.n, d.k, d.offset_x, d.offset_y,
                           d.offset_theta, d.sigma, d.score)], dtype=DETECTION)
     return message

@@ -22,25 +22,17 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, ChunkIndex, McapRecord, Message, Schema
 from mcap.stream_reader import CRCValidationError, breakup_chunk
 
-from selfcal_ros.bagio.mcap_salvage import (
-    FREE,
-    HEAD,
-    MESSAGE_FRONT,
-    ZSTD,
-    lz4_chunk,
-    parsed,
-    zstd_chunk,
-)
+from selfcal_ros.bagio import mcap_salvage
 from selfcal_ros.messages.cdr import Payloads
 
-FRONT = HEAD.size + MESSAGE_FRONT
+FRONT = mcap_salvage.HEAD.size + mcap_salvage.MESSAGE_FRONT
 """Bytes of a message record before its payload."""
 FRONT_TYPE = np.dtype({
     "names": ["length", "channel", "sequence", "log_time", "publish_time"],
     "formats": ["<u8", "<u2", "<u4", "<u8", "<u8"], "offsets": [1, 9, 11, 15, 23],
     "itemsize": FRONT})
 HEAD_TYPE = np.dtype({"names": ["opcode", "length"], "formats": ["u1", "<u8"],
-                      "offsets": [0, 1], "itemsize": HEAD.size})
+                      "offsets": [0, 1], "itemsize": mcap_salvage.HEAD.size})
 PATIENCE, MAX_PATIENCE = 3, 1024
 """Messages after which repeating lengths are searched for; grows if there are none."""
 MAX_PERIOD = 64
@@ -89,12 +81,12 @@ class Block:
     def compressed(self) -> np.ndarray:
         """Return the messages that begin like a zstd frame, int64 (k,)."""
         payloads = self.payloads
-        long = np.flatnonzero(payloads.length >= len(ZSTD))
+        long = np.flatnonzero(payloads.length >= len(mcap_salvage.ZSTD))
         if not len(long):
             return long
-        first = np.ndarray((len(payloads.data) - len(ZSTD) + 1,), "V4", payloads.data,
+        first = np.ndarray((len(payloads.data) - len(mcap_salvage.ZSTD) + 1,), "V4", payloads.data,
                            strides=(1,))[payloads.start[long]].view("<u4")
-        return long[first == int.from_bytes(ZSTD, "little")]
+        return long[first == int.from_bytes(mcap_salvage.ZSTD, "little")]
 
     def messages(self) -> Iterator[Message]:
         """Yield each message separately."""
@@ -124,7 +116,7 @@ def message_block(data: bytes, at: int) -> tuple[Block, int]:
         return Block(np.zeros(0, dtype=FRONT_TYPE), Payloads(data, start, start)), end
     fronts = np.ndarray((len(data) - FRONT + 1,), f"V{FRONT}", data, strides=(1,))[start].view(
         FRONT_TYPE)
-    length = fronts["length"].astype(np.int64) - MESSAGE_FRONT
+    length = fronts["length"].astype(np.int64) - mcap_salvage.MESSAGE_FRONT
     return Block(fronts, Payloads(data, start + FRONT, length)), end
 
 
@@ -154,9 +146,9 @@ class _Places:
         data, size, single = self.data, len(self.data), self.single
         waited, patience = 0, PATIENCE
         while at + FRONT <= size:
-            opcode, length = HEAD.unpack_from(data, at)
-            end = at + HEAD.size + length
-            if opcode != Opcode.MESSAGE or length < MESSAGE_FRONT or end > size:
+            opcode, length = mcap_salvage.HEAD.unpack_from(data, at)
+            end = at + mcap_salvage.HEAD.size + length
+            if opcode != Opcode.MESSAGE or length < mcap_salvage.MESSAGE_FRONT or end > size:
                 break
             single.append(at)
             at = end
@@ -180,7 +172,7 @@ class _Places:
                 heads = np.ndarray((count,), HEAD_TYPE, self.data, at + found * stride + offset,
                                    (stride,))
                 good &= (heads["opcode"] == Opcode.MESSAGE) & (heads["length"]
-                                                               == size - HEAD.size)
+                                                               == size - mcap_salvage.HEAD.size)
             step = count if good.all() else int(good.argmin())
             found += step
             if step < count:
@@ -214,9 +206,9 @@ def chunk_items(chunk: Chunk) -> list[Block | Schema | Channel]:
     """
     data = chunk.data
     if chunk.compression == "zstd":
-        data = zstd_chunk(data, chunk.uncompressed_size)
+        data = mcap_salvage.zstd_chunk(data, chunk.uncompressed_size)
     elif chunk.compression == "lz4":
-        data = lz4_chunk(data, chunk.uncompressed_size)
+        data = mcap_salvage.lz4_chunk(data, chunk.uncompressed_size)
     if chunk.uncompressed_crc and zlib.crc32(data) != chunk.uncompressed_crc:
         raise CRCValidationError(chunk.uncompressed_crc, zlib.crc32(data), chunk)
     try:
@@ -236,12 +228,12 @@ def _items(data: bytes) -> list[Block | Schema | Channel]:
             items.append(block)
         if at == len(data):
             break
-        opcode, length = HEAD.unpack_from(data, at)
-        start, at = at + HEAD.size, at + HEAD.size + length
+        opcode, length = mcap_salvage.HEAD.unpack_from(data, at)
+        start, at = at + mcap_salvage.HEAD.size, at + mcap_salvage.HEAD.size + length
         if at > len(data) or opcode == Opcode.MESSAGE:
             raise ValueError("a record does not fit into its chunk")
         if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-            record, used = parsed(opcode, data[start:at])
+            record, used = mcap_salvage.parsed(opcode, data[start:at])
             if used != length:
                 raise ValueError("the length of a record is wrong")
             if isinstance(record, Schema | Channel):
@@ -311,7 +303,7 @@ def _content(file: BinaryIO) -> bytes:
     opcode, length, start, _, crc, magic = END.unpack(tail)
     if (opcode, length, magic) != (Opcode.FOOTER, FOOTER_SIZE, MAGIC) or not crc or not start:
         raise ValueError("no summary with a checksum")
-    if not 0 < size - END.size - start <= FREE:
+    if not 0 < size - END.size - start <= mcap_salvage.FREE:
         raise ValueError("no summary of a sensible size")
     file.seek(start)
     summary = file.read(size - END.size - start)
@@ -323,8 +315,8 @@ def _content(file: BinaryIO) -> bytes:
 def _parsed(content: bytes) -> Summary:
     summary, at = Summary(), 0
     while at < len(content):
-        opcode, length = HEAD.unpack_from(content, at)
-        at += HEAD.size
+        opcode, length = mcap_salvage.HEAD.unpack_from(content, at)
+        at += mcap_salvage.HEAD.size
         body = ReadDataStream(io.BytesIO(content[at:at + length]))
         if opcode == Opcode.SCHEMA:
             schema = Schema.read(body)

@@ -20,26 +20,7 @@ import zstandard
 from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, McapRecord, Message, Schema, Statistics
 
-from selfcal_ros.bagio.mcap_chunk import (
-    FRONT,
-    MAGIC,
-    Block,
-    block_of,
-    chunk_items,
-    gathered,
-    read_summary,
-    stretch,
-)
-from selfcal_ros.bagio.mcap_salvage import (
-    HEAD,
-    TooLargeError,
-    declarations,
-    front_of_chunk,
-    next_record,
-    parsed,
-    plain_file,
-    zstd_message,
-)
+from selfcal_ros.bagio import mcap_chunk, mcap_salvage
 from selfcal_ros.errors import InputError, first_line
 from selfcal_ros.messages.cdr import Payloads
 
@@ -94,7 +75,7 @@ class McapStream:
             for message in block.messages():
                 yield self.channels[message.channel_id], message
 
-    def blocks(self) -> Iterator[Block]:
+    def blocks(self) -> Iterator[mcap_chunk.Block]:
         """Yield all readable messages of declared channels in blocks.
 
         Declarations between two blocks are in `schemas` and `channels` when the second one
@@ -106,9 +87,9 @@ class McapStream:
             If the file is empty, not an MCAP file, or cannot be read.
         """
         try:
-            with plain_file(self.path, self.lost) as file:
-                head = file.read(len(MAGIC))
-                if head != MAGIC:
+            with mcap_salvage.plain_file(self.path, self.lost) as file:
+                head = file.read(len(mcap_chunk.MAGIC))
+                if head != mcap_chunk.MAGIC:
                     raise self._refusal(head + file.read(len(SQLITE)))
                 self._size = file.seek(0, 2)
                 self._look_ahead(file)
@@ -137,20 +118,20 @@ class McapStream:
         """Determine the chunks that can be skipped; their declarations are also in the summary."""
         if self.wanted is None:
             return
-        summary = read_summary(file)
+        summary = mcap_chunk.read_summary(file)
         self._needless = summary.needless(self.wanted)
         if self._needless:
             self.schemas, self.channels = summary.schemas, summary.channels
 
-    def _records(self, file: BinaryIO) -> Iterator[Block]:
+    def _records(self, file: BinaryIO) -> Iterator[mcap_chunk.Block]:
         """Go from record to record; records that begin before `sure` have been read."""
         size = self._size
-        at = sure = clean = len(MAGIC)
+        at = sure = clean = len(mcap_chunk.MAGIC)
         data_ended = passed = False
         while True:
-            block, end = stretch(file, at, size)
+            block, end = mcap_chunk.stretch(file, at, size)
             if block is not None:
-                sure, clean = at + int(block.payloads.start[-1]) - FRONT, end
+                sure, clean = at + int(block.payloads.start[-1]) - mcap_chunk.FRONT, end
                 at = end
                 yield from self._take(block)
                 continue
@@ -177,7 +158,7 @@ class McapStream:
             if opcode in CHECKED:  # only the record after a message confirms its length
                 sure, clean = at if opcode == Opcode.MESSAGE else end, end
             if passed and opcode == Opcode.MESSAGE_INDEX:
-                self._n_read += (end - at - HEAD.size - INDEX.size) // INDEX_ENTRY
+                self._n_read += (end - at - mcap_salvage.HEAD.size - INDEX.size) // INDEX_ENTRY
             at = end
             if isinstance(record, Chunk):
                 self._chunked, passed = True, False
@@ -185,10 +166,10 @@ class McapStream:
             elif record is not None:
                 yield from self._take(record)
 
-    def _chunk(self, file: BinaryIO, chunk: Chunk, position: int) -> Iterator[Block]:
+    def _chunk(self, file: BinaryIO, chunk: Chunk, position: int) -> Iterator[mcap_chunk.Block]:
         try:
-            items = chunk_items(chunk)
-        except TooLargeError as error:
+            items = mcap_chunk.chunk_items(chunk)
+        except mcap_salvage.TooLargeError as error:
             self.lost.append(f"the chunk that ends at byte {position} was not read: {error}")
             self._declare(file)
             return
@@ -200,7 +181,7 @@ class McapStream:
         for item in items:
             yield from self._take(item)
 
-    def _take(self, item: McapRecord | Block) -> Iterator[Block]:
+    def _take(self, item: McapRecord | mcap_chunk.Block) -> Iterator[mcap_chunk.Block]:
         if isinstance(item, Schema):
             self.schemas[item.id] = item
         elif isinstance(item, Channel):
@@ -208,14 +189,14 @@ class McapStream:
         elif isinstance(item, Statistics):
             self._n_written = item.message_count
         elif isinstance(item, Message):
-            yield from self._take(block_of([item]))
-        elif isinstance(item, Block):
+            yield from self._take(mcap_chunk.block_of([item]))
+        elif isinstance(item, mcap_chunk.Block):
             self._n_read += len(item)
             block = self._decompressed(self._declared(item))
             if len(block):
                 yield block
 
-    def _declared(self, block: Block) -> Block:
+    def _declared(self, block: mcap_chunk.Block) -> mcap_chunk.Block:
         """Return the messages of declared channels; the others are counted."""
         missing = [number for number in block.channels() if number not in self.channels]
         if not missing:
@@ -224,7 +205,7 @@ class McapStream:
             self._undeclared[number] += int((block.fronts["channel"] == number).sum())
         return block[~np.isin(block.fronts["channel"], missing)]
 
-    def _decompressed(self, block: Block) -> Block:
+    def _decompressed(self, block: mcap_chunk.Block) -> mcap_chunk.Block:
         """Return the messages with payloads compressed by rosbag2 decompressed.
 
         A payload that cannot be decompressed is unchanged: decoding it will fail, too.
@@ -237,14 +218,14 @@ class McapStream:
         payloads = list(block.payloads)
         for number in packed:
             try:
-                payloads[number] = zstd_message(payloads[number])
-            except TooLargeError:
+                payloads[number] = mcap_salvage.zstd_message(payloads[number])
+            except mcap_salvage.TooLargeError:
                 topic = self.channels[int(block.fronts["channel"][number])].topic
                 self._too_large[topic] += 1
                 keep[number] = False
             except zstandard.ZstdError:
                 pass
-        return Block(block.fronts, Payloads.joined(payloads))[keep]
+        return mcap_chunk.Block(block.fronts, Payloads.joined(payloads))[keep]
 
     def _say_end(self, file: BinaryIO, data_ended: bool) -> None:
         self.lost.append(
@@ -263,24 +244,24 @@ class McapStream:
     def _found(self, file: BinaryIO, start: int) -> int:
         """Return where reading can continue after `start`."""
         with mmap(file.fileno(), self._size, access=ACCESS_READ) as data:
-            return next_record(data, start, None if self._chunked else self.channels)
+            return mcap_salvage.next_record(data, start, None if self._chunked else self.channels)
 
     def _declare(self, file: BinaryIO) -> None:
         """Take declarations of the lost part from the summary."""
         with mmap(file.fileno(), self._size, access=ACCESS_READ) as data:
-            for record in declarations(data):
+            for record in mcap_salvage.declarations(data):
                 if isinstance(record, Schema):
                     self.schemas.setdefault(record.id, record)
                 else:
                     self.channels.setdefault(record.id, record)
 
     def _salvage(self, file: BinaryIO, start: int,
-                 error: Exception) -> Iterator[Block]:
+                 error: Exception) -> Iterator[mcap_chunk.Block]:
         """Yield the readable part of the record at `start`, and report the rest."""
         stop, size = self._found(file, start), self._size
         file.seek(start)
         count = 0
-        for item in gathered(list(front_of_chunk(file.read(stop - start)))):
+        for item in mcap_chunk.gathered(list(mcap_salvage.front_of_chunk(file.read(stop - start)))):
             self._chunked = True
             for block in self._take(item):
                 count += len(block)
@@ -303,28 +284,30 @@ def _is_chunk(file: BinaryIO, at: int, end: int | None) -> bool:
     """Return whether there is a chunk of the indexed length at `at`."""
     if end is None:
         return False
+    head = mcap_salvage.HEAD
     file.seek(at)
-    return file.read(HEAD.size) == HEAD.pack(Opcode.CHUNK, end - at - HEAD.size)
+    return file.read(head.size) == head.pack(Opcode.CHUNK, end - at - head.size)
 
 
 def _record(file: BinaryIO, at: int, size: int) -> tuple[int, McapRecord | None, int]:
     """Return opcode, content (None if not needed) and end of the record at `at`."""
     file.seek(at)
-    head = file.read(HEAD.size)
-    if len(head) < HEAD.size:
+    head = file.read(mcap_salvage.HEAD.size)
+    if len(head) < mcap_salvage.HEAD.size:
         raise _Cut
-    opcode, length = HEAD.unpack(head)
+    opcode, length = mcap_salvage.HEAD.unpack(head)
     if not (0 < opcode <= max(Opcode) or opcode >= 0x80):  # the range of private records
         raise ValueError(f"no record has the opcode {opcode}")
-    if at + HEAD.size + length > size:
+    if at + mcap_salvage.HEAD.size + length > size:
         raise _Cut
     if opcode >= 0x80 or opcode == Opcode.ATTACHMENT:
-        return opcode, None, at + HEAD.size + length
+        return opcode, None, at + mcap_salvage.HEAD.size + length
     if opcode == Opcode.MESSAGE_INDEX:
         if INDEX.unpack(file.read(INDEX.size))[1] != length - INDEX.size:
             raise ValueError("the length of a message index is wrong")
-        return opcode, None, at + HEAD.size + length
+        return opcode, None, at + mcap_salvage.HEAD.size + length
     body = file.read(length)
-    record, used = parsed(opcode, body)
+    record, used = mcap_salvage.parsed(opcode, body)
     # a chunk ends where its records do, even if the length before it says more
-    return opcode, record, at + HEAD.size + (used if opcode == Opcode.CHUNK else length)
+    size = used if opcode == Opcode.CHUNK else length
+    return opcode, record, at + mcap_salvage.HEAD.size + size

@@ -13,38 +13,21 @@ from pathlib import Path
 from typing import Any
 
 from selfcal_ros.bagio.offline import bag_input, collect_bag
-from selfcal_ros.batch.folder import (
-    PER,
-    RECORDS,
-    RESULTS,
-    SCHEMA,
-    Job,
-    Record,
-    is_whole,
-    read_record,
-    stat_of,
-)
+from selfcal_ros.batch import folder
 from selfcal_ros.collection.reduce import with_places
 from selfcal_ros.collection.settings.estimator import solver_options
 from selfcal_ros.errors import ExitCode, NotIdentifiableError, SelfcalError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.files import write_json
+from selfcal_ros.model import result as results
 from selfcal_ros.model.json_form import finding_to_dict, plain
 from selfcal_ros.model.readings import Measurements
-from selfcal_ros.model.result import (
-    CalibrationResult,
-    Observability,
-    created_now,
-    result_to_dict,
-    unidentified_result,
-    with_input,
-)
 from selfcal_ros.reporting.summary.numbers import summary_numbers
 from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.units import ARCSEC_PER_RAD, PPM_PER_ONE, UM_PER_M
 
 
-def run_job(job: Job) -> Record:
+def run_job(job: folder.Job) -> folder.Record:
     """Return the record of a bag: the existing one if allowed, or that of a new solution.
 
     An unusable bag has a record, too, with the exit code and the line of `selfcal
@@ -55,41 +38,42 @@ def run_job(job: Job) -> Record:
     InputError
         If the folder of the batch cannot be written.
     """
-    record: Record = {"schema": SCHEMA, "bag": os.path.realpath(job.bag),
-                      "settings": job.settings.digest()}
+    record: folder.Record = {"schema": folder.SCHEMA, "bag": os.path.realpath(job.bag),
+                             "settings": job.settings.digest()}
     try:
         source = bag_input(job.bag)
-        record["files"] = stat_of(job.bag)
+        record["files"] = folder.stat_of(job.bag)
     except SelfcalError as error:
         return record | _without_result(error)
     key = hashlib.sha256(f"{source['sha256']} {record['settings']}".encode()).hexdigest()[:24]
-    path = job.folder / RECORDS / f"{key}.json"
-    kept = None if job.redo else read_record(path)
-    if kept is not None and is_whole(job.folder, kept):
+    path = job.folder / folder.RECORDS / f"{key}.json"
+    kept = None if job.redo else folder.read_record(path)
+    if kept is not None and folder.is_whole(job.folder, kept):
         if not Path(kept["bag"]).exists():  # it was moved
             write_json(path, kept | record)
         return kept | record
     record |= {"key": key, "sha256": source["sha256"]}
-    result: CalibrationResult | None = None
+    result: results.CalibrationResult | None = None
     try:
         result, problem = solved(job, source)
         record |= _with_result(result) if problem is None else _without_result(problem)
     except SelfcalError as error:
         record |= _without_result(error)
     if result is not None:
-        record["result"] = f"{RESULTS}/{key}.json"
-        write_json(job.folder / record["result"], result_to_dict(created_now(result)))
+        record["result"] = f"{folder.RESULTS}/{key}.json"
+        data = results.result_to_dict(results.created_now(result))
+        write_json(job.folder / record["result"], data)
     write_json(path, record)
     return record
 
 
-def solved(job: Job, source: dict[str, str],
-           ) -> tuple[CalibrationResult, NotIdentifiableError | None]:
+def solved(job: folder.Job, source: dict[str, str],
+           ) -> tuple[results.CalibrationResult, NotIdentifiableError | None]:
     """Return the result of a bag, as from `selfcal solve`, and the reason if it has no map."""
     settings = job.settings
     session = collect_bag(job.bag, settings.collector, namespace=settings.namespace)
     options = solver_options(settings.solver, session.measurements)
-    solve: Callable[[Measurements, Any], CalibrationResult] = calibrate
+    solve: Callable[[Measurements, Any], results.CalibrationResult] = calibrate
     if settings.robust:
         from selfcal_ros.estimation.quality.outliers import robust_calibrate  # scipy.optimize
         solve = robust_calibrate
@@ -98,18 +82,18 @@ def solved(job: Job, source: dict[str, str],
         result = worded(with_places(solve(session.measurements, options),
                                     session.measurements.views))
     except NotIdentifiableError as error:
-        if not isinstance(error.observability, Observability):
+        if not isinstance(error.observability, results.Observability):
             raise
-        result = worded(unidentified_result(session.measurements, error.observability))
+        result = worded(results.unidentified_result(session.measurements, error.observability))
         problem = error
-    return with_input(result, source, session.lost), problem
+    return results.with_input(result, source, session.lost), problem
 
 
-def _without_result(error: SelfcalError) -> Record:
+def _without_result(error: SelfcalError) -> folder.Record:
     return {"exit_code": int(error.exit_code), "message": str(error), "qualified": None}
 
 
-def _with_result(result: CalibrationResult) -> Record:
+def _with_result(result: results.CalibrationResult) -> folder.Record:
     good, artifact = result.verdict.qualified, result.artifact
     return {
         "exit_code": int(ExitCode.DONE if good else ExitCode.NOT_QUALIFIED), "qualified": good,
@@ -121,7 +105,7 @@ def _with_result(result: CalibrationResult) -> Record:
         "quantities": quantities(result)}
 
 
-def quantities(result: CalibrationResult) -> dict[str, float | None]:
+def quantities(result: results.CalibrationResult) -> dict[str, float | None]:
     """Return name -> value; the unit is the end of the name, None = unknown.
 
     Terms of the model shared by all views are included by their components, in SI units.
@@ -139,6 +123,6 @@ def quantities(result: CalibrationResult) -> dict[str, float | None]:
     for term in result.model.terms:
         for estimate in term.estimates:
             if not estimate.view:
-                unit = estimate.unit.replace("/", PER)
+                unit = estimate.unit.replace("/", folder.PER)
                 found[f"{term.name}_{estimate.component}_{unit}".replace(" ", "_")] = estimate.value
     return {name: value if math.isfinite(value) else None for name, value in found.items()}

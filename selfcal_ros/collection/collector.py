@@ -11,18 +11,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from selfcal_ros.collection import inputs
 from selfcal_ros.collection.diagnosis import EncoderFacts, Finding, Seen
 from selfcal_ros.collection.encoder import NEVER, JointTrack, TrackLimits
 from selfcal_ros.collection.expected import ViewProgress, expected_marks, read_enough
 from selfcal_ros.collection.exposures import Exposures, Tracks
-from selfcal_ros.collection.inputs import (
-    DETECTION,
-    Command,
-    Detection,
-    EncoderSample,
-    Reason,
-    check_command,
-)
 from selfcal_ros.collection.marks.check_stops import count_stops
 from selfcal_ros.collection.marks.identify import IdentityRules
 from selfcal_ros.collection.reduce import Rules
@@ -83,20 +76,20 @@ class Collector:
         self._views = ViewCache(self._rules)
         self._single: list[tuple] = []  # detections added one by one
         self._unsettled = 0
-        self._commands: dict[Command, None] = {}
+        self._commands: dict[inputs.Command, None] = {}
         self._rejected_input: Counter = Counter()
         self._timeline: Timeline | None = None
-        self._newest: Command | None = None
+        self._newest: inputs.Command | None = None
         self._foreign: dict[str, None] = {}  # unknown joint names
         self._seen: Seen | None = None
         self.received = {"encoder": 0, "detection": 0, "command": 0}
 
-    def add_encoder(self, sample: EncoderSample) -> None:
+    def add_encoder(self, sample: inputs.EncoderSample) -> None:
         """Take one encoder message; an unusable one is counted under its reason."""
         self.received["encoder"] += 1
         velocities = sample.velocities or (math.nan,) * len(sample.positions)
         if not len(sample.names) == len(sample.positions) == len(velocities):
-            self._rejected_input[Reason.ENCODER_MALFORMED] += 1
+            self._rejected_input[inputs.Reason.ENCODER_MALFORMED] += 1
             return
         known, finite = False, True
         for name, position, speed in zip(sample.names, sample.positions, velocities, strict=True):
@@ -109,9 +102,9 @@ class Collector:
             else:
                 finite = False
         if not finite:
-            self._rejected_input[Reason.ENCODER_NOT_FINITE] += 1
+            self._rejected_input[inputs.Reason.ENCODER_NOT_FINITE] += 1
         if not known:
-            self._rejected_input[Reason.ENCODER_UNKNOWN_JOINT] += 1
+            self._rejected_input[inputs.Reason.ENCODER_UNKNOWN_JOINT] += 1
         self._grow(1)
 
     def add_encoder_block(self, stamps_ns: np.ndarray, names: Sequence[str], positions: np.ndarray,
@@ -134,7 +127,7 @@ class Collector:
         speeds = None if velocities is None or not velocities.shape[1] else velocities
         if positions.shape[1] != len(names) or (
                 speeds is not None and speeds.shape[1] != len(names)):
-            self._rejected_input[Reason.ENCODER_MALFORMED] += count
+            self._rejected_input[inputs.Reason.ENCODER_MALFORMED] += count
             return
         finite, known = np.ones(count, dtype=bool), False
         for column, name in enumerate(names):
@@ -147,9 +140,9 @@ class Collector:
             joint.store.add_block(stamps_ns[good], positions[good, column],
                                   None if speeds is None else speeds[good, column])
         if not finite.all():
-            self._rejected_input[Reason.ENCODER_NOT_FINITE] += int((~finite).sum())
+            self._rejected_input[inputs.Reason.ENCODER_NOT_FINITE] += int((~finite).sum())
         if not known and count:
-            self._rejected_input[Reason.ENCODER_UNKNOWN_JOINT] += count
+            self._rejected_input[inputs.Reason.ENCODER_UNKNOWN_JOINT] += count
         self._grow(count)
 
     def _joint(self, name: str) -> JointTrack | None:
@@ -160,7 +153,7 @@ class Collector:
             self._foreign[name] = None
         return None
 
-    def add_detection(self, d: Detection) -> None:
+    def add_detection(self, d: inputs.Detection) -> None:
         """Take one detection."""
         self.received["detection"] += 1
         self._single.append((d.stamp_ns, d.kind, d.has_id, d.m, d.n, d.k, d.offset_x,
@@ -180,30 +173,30 @@ class Collector:
 
     def _settle(self) -> None:
         if self._single:
-            self._views.append(np.array(self._single, dtype=DETECTION))
+            self._views.append(np.array(self._single, dtype=inputs.DETECTION))
             self._single = []
         self._views.changed_at(self._exposures.update(self._views.new_stamps()))
         self._unsettled = 0
 
-    def add_command(self, command: Command) -> None:
+    def add_command(self, command: inputs.Command) -> None:
         """Take one view command; an unusable one raises InputError."""
-        check_command(command)
+        inputs.check_command(command)
         self.received["command"] += 1
         if command not in self._commands:
             self._commands[command] = None
             self._timeline = self._newest = None
 
-    def refuse(self, kind: str, reason: Reason, count: int = 1) -> None:
+    def refuse(self, kind: str, reason: inputs.Reason, count: int = 1) -> None:
         """Count unused messages: encoder, detection or command."""
         self.received[kind] += count
         self._rejected_input[reason] += count
 
-    def knows(self, command: Command) -> bool:
+    def knows(self, command: inputs.Command) -> bool:
         """Return whether a command has been received before."""
         return command in self._commands
 
     @property
-    def newest_command(self) -> Command | None:
+    def newest_command(self) -> inputs.Command | None:
         """The command with the latest stamp, the last received of equal ones; no stray."""
         if self._newest is None and self._commands:
             kept = set(without_strays(self._commands))

@@ -36,6 +36,8 @@ dominate the map."""
 MAX_AHEAD_NS = 60 * NS_PER_S
 """Largest lead of a stamp over the clock of the receiving node: beyond, it would hide
 later messages stamped by a correct clock."""
+MAX_TEXT = 8192
+"""Largest length of the texts that name a plan and a run: nodes keep them."""
 MAX_EXPOSURES = 5_000_000
 """Largest number of exposures of a view in the simulated cell: 240 MB."""
 DETECTION = np.dtype([
@@ -142,6 +144,9 @@ def check_command(command: Command) -> None:
     where = f"view command {command.view_index}"
     if not 0 <= command.view_index <= MAX_VIEWS or not 0 <= command.views_planned <= MAX_VIEWS:
         raise InputError(where, f"a plan has at most {MAX_VIEWS} views", "correct the view_index")
+    if len(command.plan_id) + len(command.run_id) > MAX_TEXT:
+        raise InputError(where, f"plan_id and run_id are longer than {MAX_TEXT} characters",
+                         "shorten plan_id; let run_id be a stamp")
     begun = begun_ns(command.run_id)
     if begun is not None and begun > command.stamp_ns:
         raise InputError(where, f"its run {command.run_id} begins after its own stamp",

@@ -14,13 +14,8 @@ import numpy as np
 from selfcal_ros.collection.encoder import GOOD, MOVING, REASONS
 from selfcal_ros.collection.exposures import Exposures, JointAt
 from selfcal_ros.collection.inputs import LARGEST_OFFSET, Kind, Reason, good_sigmas
+from selfcal_ros.collection.marks import identify
 from selfcal_ros.collection.marks.check_stops import without_aside
-from selfcal_ros.collection.marks.identify import (
-    IdentityRules,
-    identify_angular,
-    identify_grid,
-    wrap,
-)
 from selfcal_ros.collection.marks.repeats import Means, grid_visits, reduce_repeats, repeat_motion
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import RejectedPlaces, Sense, ViewReadings
@@ -33,7 +28,7 @@ class Rules:
     """All settings for the conversion of detections to readings."""
 
     sense: Sense
-    identity: IdentityRules
+    identity: identify.IdentityRules
     min_score: float
     outlier_limit: float
 
@@ -182,7 +177,7 @@ def _grid_marks(artifact: Artifact, view: View, d: np.ndarray, *, exposures: Exp
     position = np.stack([stage.x.position, stage.y.position])
     why = _reasons((stage.x, stage.y), (stage.theta,))
     d, (position, approach) = _keep(d, why, rejected, position, stage.approach, places=places)
-    found = identify_grid(
+    found = identify.identify_grid(
         artifact, view, _reading(rules.sense, position, np.stack([d["ox"], d["oy"]])),
         ids=np.stack([d["m"], d["n"]]), has_id=d["has_id"], rules=rules.identity,
         stage_m=_reading(rules.sense, position, 0.0))
@@ -232,14 +227,15 @@ def _reduce_angular(artifact: Artifact, view: View, d: np.ndarray, exposures: Ex
     # an offset beyond half a turn is invalid, though it may wrap to a small one
     why[(why == None) & (np.abs(d["ot"]) > np.pi)] = Reason.TOO_FAR  # noqa: E711
     d, (theta,) = _keep(d, why, rejected, stage.theta.position)
-    found = identify_angular(artifact, view, _reading(rules.sense, theta, d["ot"]), ids=d["k"],
-                             has_id=d["has_id"], rules=rules.identity, phi_rad=phi)
+    found = identify.identify_angular(
+        artifact, view, _reading(rules.sense, theta, d["ot"]), ids=d["k"], has_id=d["has_id"],
+        rules=rules.identity, phi_rad=phi)
     d, (k, v, rest) = _keep(d, found.reasons, rejected, found.index, found.deviation,
                             found.residual)
     means = reduce_repeats(k, v[None], d["sigma"], limit=rules.outlier_limit,
                            extent=4 * np.pi, residual=rest[None])
     _count(rejected, Reason.OUTLIER, means.outlier)
-    place = wrap(v - d["ot"])  # of the axis relative to the line, without full turns
+    place = identify.wrap(v - d["ot"])  # of the axis relative to the line, without full turns
     motion = repeat_motion(k, place[None], d["ot"][None], means.outlier)
     return {"k": means.key.astype(np.int64), "dtheta": means.mean[0], "count_theta": means.count,
             "u_theta": means.u, "sigma_theta": means.sigma, "dof_theta": means.dof,

@@ -18,14 +18,7 @@ import numpy as np
 
 from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.files import csv_cells, read_text, write_text
-from selfcal_ros.laser.data import (
-    AXES,
-    DIAGONALS,
-    MAX_BLOCKS,
-    StepDiagonal,
-    check_linear,
-    check_reading,
-)
+from selfcal_ros.laser import data as laser_data
 from selfcal_ros.laser.profiles import name_of
 from selfcal_ros.units import M_PER_MM
 
@@ -54,7 +47,7 @@ class Columns:
     def readings(self) -> list[str]:
         """Names of the reading columns, diagonal by diagonal."""
         return [f"r{axis}_{name}" for name in self.diagonals
-                for axis in AXES[:len(self.steps_m)]]
+                for axis in laser_data.AXES[:len(self.steps_m)]]
 
     @property
     def errors(self) -> list[str]:
@@ -62,7 +55,8 @@ class Columns:
         return [name_of(j, j) for j in range(len(self.steps_m))] if self.linear else []
 
 
-def read_table(path: str | os.PathLike, columns: Columns) -> tuple[StepDiagonal, list[str]]:
+def read_table(path: str | os.PathLike,
+               columns: Columns) -> tuple[laser_data.StepDiagonal, list[str]]:
     """Return the measurement in a CSV file, and warnings.
 
     Raises
@@ -76,7 +70,8 @@ def read_table(path: str | os.PathLike, columns: Columns) -> tuple[StepDiagonal,
     header = _header(path, rows, columns)
     known = {BLOCK, *columns.readings, *columns.errors}
     known |= {name_of(j, j) for j in range(3)}
-    known |= {f"r{axis}_{name}" for dim in DIAGONALS for name in DIAGONALS[dim] for axis in AXES}
+    known |= {f"r{axis}_{name}" for names in laser_data.DIAGONALS.values() for name in names
+              for axis in laser_data.AXES}
     ignored = [name for name in header if name not in known]
     warnings = [f"{path}: column '{name}' is not used" for name in ignored]
     cells: dict[int, list[tuple[np.ndarray, np.ndarray]]] = {}
@@ -97,7 +92,7 @@ def read_table(path: str | os.PathLike, columns: Columns) -> tuple[StepDiagonal,
 def dimension_of(path: str | os.PathLike) -> int:
     """Return 3 if the table has columns of body diagonals, otherwise 2."""
     header = _rows(path)[0][1]
-    return 3 if any(f"rx_{name}" in header for name in DIAGONALS[3]) else 2
+    return 3 if any(f"rx_{name}" in header for name in laser_data.DIAGONALS[3]) else 2
 
 
 def _rows(path: str | os.PathLike) -> list[tuple[int, list[str]]]:
@@ -149,7 +144,7 @@ def _listed(names: Sequence[str]) -> str:
 
 def _block(text: str, where: str) -> int:
     number = _number(text, where)
-    if number != round(number) or not 0 <= number <= MAX_BLOCKS:
+    if number != round(number) or not 0 <= number <= laser_data.MAX_BLOCKS:
         raise InputError(where, f"'{text}' is not a block number", "number the blocks 1, 2, 3, ...")
     return int(number)
 
@@ -179,13 +174,13 @@ def _values(named: dict[str, str], columns: Columns, where: str) -> tuple[np.nda
             continue
         place = f"{where}: {name}"
         readings[k, j] = _number(named[name], place) * M_PER_MM
-        check_reading(readings[k, j], nominal[j], place)
+        laser_data.check_reading(readings[k, j], nominal[j], place)
     linear = np.full(len(steps), np.nan)
     for index, name in enumerate(columns.errors):
         if named[name]:
             place = f"{where}: {name}"
             linear[index] = _number(named[name], place) * M_PER_MM
-            check_linear(linear[index], steps[index], place)
+            laser_data.check_linear(linear[index], steps[index], place)
     return readings, linear
 
 
@@ -207,7 +202,7 @@ def _in_order(cells: dict[int, list], path: str | os.PathLike) -> list[list]:
     return [cells[block] for block in sorted(cells)]
 
 
-def _assemble(blocks: list[list], columns: Columns) -> StepDiagonal:
+def _assemble(blocks: list[list], columns: Columns) -> laser_data.StepDiagonal:
     repeats, dim = max(map(len, blocks)), len(columns.steps_m)
     samples = np.full((repeats, len(columns.diagonals), dim, len(blocks)), np.nan)
     linear = np.full((repeats, dim, len(blocks)), np.nan)
@@ -215,11 +210,11 @@ def _assemble(blocks: list[list], columns: Columns) -> StepDiagonal:
         for repeat, (readings, errors) in enumerate(rows):
             samples[repeat, :, :, i] = readings
             linear[repeat, :, i] = errors
-    return StepDiagonal(columns.steps_m, columns.diagonals, samples,
-                        linear if columns.linear else None)
+    return laser_data.StepDiagonal(columns.steps_m, columns.diagonals, samples,
+                                   linear if columns.linear else None)
 
 
-def table_text(data: StepDiagonal, comments: Sequence[str] = ()) -> str:
+def table_text(data: laser_data.StepDiagonal, comments: Sequence[str] = ()) -> str:
     """Return a measurement as CSV text, mm, to 0.01 nm."""
     linear = data.linear_m
     columns = Columns(data.steps_m, data.diagonals, linear is not None)
@@ -246,7 +241,7 @@ def _row(of_block: np.ndarray, repeat: int) -> list[float]:
     return [math.nan] * of_block[0].size
 
 
-def write_table(path: str | os.PathLike, data: StepDiagonal,
+def write_table(path: str | os.PathLike, data: laser_data.StepDiagonal,
                 comments: Sequence[str] = ()) -> None:
     """Write a measurement as a CSV file, with comment lines at the top."""
     write_text(path, table_text(data, comments))

@@ -16,16 +16,7 @@ import numpy as np
 
 from selfcal_ros.collection.inputs import DETECTION, Command, Detection, EncoderSample, Phase
 from selfcal_ros.errors import InputError, printable
-from selfcal_ros.messages.cdr import (
-    MAX_KNOWN,
-    MAX_LENGTH,
-    SEQUENCE,
-    TEXT,
-    Columns,
-    Field,
-    Payloads,
-    layout_of,
-)
+from selfcal_ros.messages import cdr
 from selfcal_ros.model.artifact import Artifact, Interpolation, MapGrid
 from selfcal_ros.model.error_map import ErrorMap, ThetaDatum
 from selfcal_ros.model.orders import parse_order
@@ -40,11 +31,11 @@ _VISITS = (("mark", "mark", np.int64), ("dx", "dx", float), ("dy", "dy", float),
            ("count", "count", np.int64), ("stamp", "stamp_ns", np.int64),
            ("offset_x", "offset_x", float), ("offset_y", "offset_y", float),
            ("approach_x", "approach_x", np.int8), ("approach_y", "approach_y", np.int8))
-TIME = (Field("sec", "i4"), Field("nanosec", "u4"))
-HEADER = (Field("stamp", TIME), Field("frame_id", TEXT))
+TIME = (cdr.Field("sec", "i4"), cdr.Field("nanosec", "u4"))
+HEADER = (cdr.Field("stamp", TIME), cdr.Field("frame_id", cdr.TEXT))
 JOINT_STATE = (
-    Field("header", HEADER), Field("name", TEXT, SEQUENCE), Field("position", "f8", SEQUENCE),
-    Field("velocity", "f8", SEQUENCE), Field("effort", "f8", SEQUENCE))
+    cdr.Field("header", HEADER), cdr.Field("name", cdr.TEXT, cdr.SEQUENCE),
+    *(cdr.Field(name, "f8", cdr.SEQUENCE) for name in ("position", "velocity", "effort")))
 """Fields of sensor_msgs/msg/JointState."""
 STAMP_END = 12
 """Bytes of the encapsulation, and of the stamp after it."""
@@ -290,7 +281,7 @@ class PositionEditor:
     """
 
     def __init__(self) -> None:
-        self._known: deque[_Positions] = deque(maxlen=MAX_KNOWN)
+        self._known: deque[_Positions] = deque(maxlen=cdr.MAX_KNOWN)
 
     def read(self, data: bytes) -> tuple[tuple[str, ...], tuple[float, ...]] | None:
         """Return names and positions; None if the message is damaged or too long."""
@@ -311,7 +302,7 @@ class PositionEditor:
             if len(data) == known.length and int.from_bytes(data) & known.mask == known.value:
                 self._known.rotate(-number)
                 return True
-        layout = layout_of(JOINT_STATE, data) if len(data) <= MAX_LENGTH else None
+        layout = cdr.layout_of(JOINT_STATE, data) if len(data) <= cdr.MAX_LENGTH else None
         if layout is None:
             return False
         code, at, count = layout.values["position"]
@@ -333,13 +324,13 @@ class _Positions(NamedTuple):
     at: int
 
 
-def stamps_ns(group: Columns) -> np.ndarray:
+def stamps_ns(group: cdr.Columns) -> np.ndarray:
     """Return the stamps in the headers of messages, integer ns."""
     seconds = group["header.stamp.sec"].astype(np.int64)
     return seconds * NS_PER_S + group["header.stamp.nanosec"]
 
 
-def first_stamps_ns(messages: Payloads) -> tuple[np.ndarray, np.ndarray]:
+def first_stamps_ns(messages: cdr.Payloads) -> tuple[np.ndarray, np.ndarray]:
     """Return the stamps of messages that begin with a header, if long enough for one.
 
     Returns
@@ -360,14 +351,14 @@ def first_stamps_ns(messages: Payloads) -> tuple[np.ndarray, np.ndarray]:
     return second * NS_PER_S + np.where(is_little, little["nanosec"], big["nanosec"]), there
 
 
-def encoder_block(group: Columns) -> EncoderBlock:
+def encoder_block(group: cdr.Columns) -> EncoderBlock:
     """Return the samples in messages of sensor_msgs/JointState."""
     velocities = group["velocity"] if "velocity" in group else np.zeros((len(group), 0))
     return EncoderBlock(stamps_ns(group), group.layout.texts["name"], group["position"],
                         velocities if velocities.shape[1] else None)
 
 
-def detection_table(group: Columns) -> np.ndarray:
+def detection_table(group: cdr.Columns) -> np.ndarray:
     """Return messages of selfcal_msgs/MarkDetection as a table of `collection.inputs.DETECTION`."""
     table = np.empty(len(group), dtype=DETECTION)
     table["stamp"] = stamps_ns(group)

@@ -9,13 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from selfcal_ros.collection.inputs import (
-    Command,
-    Detection,
-    EncoderSample,
-    Phase,
-    check_simulated,
-)
+from selfcal_ros.collection import inputs
 from selfcal_ros.collection.settings.nodes import SimulatorSettings
 from selfcal_ros.messages import to_model
 from selfcal_ros.model.view import Plan, View
@@ -50,7 +44,7 @@ class StageSimulator(SelfcalNode[SimulatorSettings]):
         self._events: Iterator[Event] = iter(())
         self._next: Event | None = None
         self._idle_stamp = 0
-        self._command: Command | None = None  # the view that is being measured
+        self._command: inputs.Command | None = None  # the view that is being measured
         self._acted: set[int] = set()  # stamps of commands
         self._free_ns = 0  # stamp from which it is idle
         self._encoder = self.publisher(names.ENCODER)
@@ -70,7 +64,7 @@ class StageSimulator(SelfcalNode[SimulatorSettings]):
             return  # latched again by a restarted sequencer
         self._acted.add(command.stamp_ns)
         self._next, self._events, self._command = None, iter(()), None
-        if command.phase == Phase.MEASURE:
+        if command.phase == inputs.Phase.MEASURE:
             self._measure(command)
 
     def _on_status(self, message: Any) -> None:
@@ -87,12 +81,13 @@ class StageSimulator(SelfcalNode[SimulatorSettings]):
             self._measure(replace(command, view=view))
         elif missing:
             self._measure(replace(command, view=replace(view, check_marks=0, check_offset_m=0.0)))
-            self._events = (event for event in self._events if not isinstance(event, Detection)
+            self._events = (event for event in self._events
+                            if not isinstance(event, inputs.Detection)
                             or not event.has_id  # unknown which one: all of them
                             or (event.k if event.kind else (event.m, event.n)) in missing)
 
-    def _measure(self, command: Command) -> None:
-        check_simulated(command)
+    def _measure(self, command: inputs.Command) -> None:
+        inputs.check_simulated(command)
         self._command = self._command or command
         plan = self._plan_with(command)
         if self.truth is None or self.truth.artifact != plan.artifact:
@@ -108,7 +103,7 @@ class StageSimulator(SelfcalNode[SimulatorSettings]):
                                    rng=self._rng, start_ns=start_ns)
         self._next = next(self._events, None)
 
-    def _plan_with(self, command: Command) -> Plan:
+    def _plan_with(self, command: inputs.Command) -> Plan:
         """Return the plan with the commanded view inserted; commands describe themselves."""
         known = self._plan.views if self._plan else ()
         count = max(len(known), command.view_index + 1)
@@ -131,11 +126,11 @@ class StageSimulator(SelfcalNode[SimulatorSettings]):
         step = round(1e10 / self.settings.encoder_rate)
         if now_ns - self._idle_stamp >= step:
             self._idle_stamp = now_ns
-            self._publish(EncoderSample(now_ns, JOINTS, (0.0, 0.0, 0.0)))
+            self._publish(inputs.EncoderSample(now_ns, JOINTS, (0.0, 0.0, 0.0)))
 
     def _publish(self, event: Event) -> None:
         _, fields = event_fields(event, self.settings.frame_id)
-        is_detection = isinstance(event, Detection)
+        is_detection = isinstance(event, inputs.Detection)
         self._sent["detection_sent" if is_detection else "encoder_sent"] += 1
         if is_detection:
             self._detection.publish(fill(names.DETECTIONS.type(), fields))

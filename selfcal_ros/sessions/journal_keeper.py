@@ -12,15 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
-from selfcal_ros.bagio.journal import (
-    Claim,
-    Journal,
-    claim,
-    newest,
-    resume,
-    start,
-    unfinished,
-)
+from selfcal_ros.bagio import journal as journals
 from selfcal_ros.bagio.offline import block_handlers
 from selfcal_ros.bagio.reader import BagReader
 from selfcal_ros.collection.clock_steps import Step
@@ -113,13 +105,13 @@ class Looked:
         Why it cannot even be read.
     """
 
-    journal: Journal | None = None
+    journal: journals.Journal | None = None
     files: list[Path] = field(default_factory=list)
     error: InputError | None = None
     problem: InputError | None = None
 
 
-def look_through(found: Claim | None, folder: str, left: Path | None = None) -> Looked:
+def look_through(found: journals.Claim | None, folder: str, left: Path | None = None) -> Looked:
     """Read the newest journal of `folder`, which may take long.
 
     Parameters
@@ -139,7 +131,7 @@ def look_through(found: Claim | None, folder: str, left: Path | None = None) -> 
     except InputError as reason:
         error = reason
     try:
-        return Looked(None, unfinished(folder, left), error)
+        return Looked(None, journals.unfinished(folder, left), error)
     except InputError as problem:
         return Looked(None, [], error, problem)
 
@@ -166,9 +158,9 @@ class JournalKeeper:
         self._folder, self._topics, self._ports = folder, topics, ports
         self._lag_limit_s = settings.journal_lag_limit
         self._max_age_s = settings.journal_max_age
-        self._journal: Journal | None = None
+        self._journal: journals.Journal | None = None
         self._looking: Future[Looked] | None = None
-        self._claim: Claim | None = None
+        self._claim: journals.Claim | None = None
         self.looked_at = ""  # being read
         self.away_s = 0.0  # since that was last written
         self._left_ago_s: float | None = None  # of a run too old to be resumed
@@ -206,12 +198,12 @@ class JournalKeeper:
             return
         self._claim, left = None, None
         try:
-            known = newest(self._folder)
+            known = journals.newest(self._folder)
             self.away_s = known[1] if known is not None else 0.0
             if known is not None and known[1] > self._max_age_s:
                 left, self._left_ago_s = known
             else:
-                self._claim = claim(self._folder)
+                self._claim = journals.claim(self._folder)
             if self._claim is None:
                 self._open(None)
             if self._claim is None and left is None:
@@ -268,9 +260,9 @@ class JournalKeeper:
         if looked.problem is not None:
             self._ports.say(Level.WARN, f"{looked.problem}; the run is not taken up")
 
-    def _open(self, journal: Journal | None) -> None:
+    def _open(self, journal: journals.Journal | None) -> None:
         """Continue a journal, or start one."""
-        journal = journal or start(self._folder, self._ports.now_ns())
+        journal = journal or journals.start(self._folder, self._ports.now_ns())
         with ExitStack() as undo:
             undo.callback(_given_up, journal)
             for topic, typename in INPUT_TOPICS.items():
@@ -308,7 +300,7 @@ class JournalKeeper:
                 and self._ports.now_s() >= self._tried_s + RETRY_S):
             self._tried_s = self._ports.now_s()
             # an older journal gets only later messages: the session has its content
-            self._open(resume(self._folder) if self._goes_on else None)
+            self._open(journals.resume(self._folder) if self._goes_on else None)
 
     def _is_written(self) -> None:
         """Report that a failure is over, after some time without one."""
@@ -356,7 +348,7 @@ class JournalKeeper:
             "journal_lost": self.lost})
 
 
-def _given_up(journal: Journal) -> None:
+def _given_up(journal: journals.Journal) -> None:
     with suppress(InputError):
         journal.close()
 

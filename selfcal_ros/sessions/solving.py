@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from functools import cache
 from typing import Any
 
-from selfcal_ros.collection.inputs import Phase, begun_ns, check_plate, check_view
+from selfcal_ros.collection.inputs import Phase, begun_ns, check_command, check_plate, check_view
 from selfcal_ros.collection.settings.estimator import solver_options
 from selfcal_ros.collection.settings.nodes import SolverSettings
 from selfcal_ros.errors import InputError, NoDataError, NotIdentifiableError, SelfcalError
@@ -14,15 +14,8 @@ from selfcal_ros.estimation.api import Options, calibrate, pure_noise
 from selfcal_ros.files import write_json
 from selfcal_ros.memory import keep_freed_memory
 from selfcal_ros.messages import from_model, to_model
+from selfcal_ros.model import result as results
 from selfcal_ros.model.readings import Measurements, readings_digest, session_digest
-from selfcal_ros.model.result import (
-    CalibrationResult,
-    created_now,
-    result_to_dict,
-    unidentified_result,
-    with_warnings,
-)
-from selfcal_ros.model.view import MAX_VIEWS
 from selfcal_ros.reporting.summary.format import counted
 from selfcal_ros.reporting.summary.numbers import summary_numbers
 from selfcal_ros.reporting.summary.sections import state_sentence
@@ -30,7 +23,7 @@ from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.sessions.clocks import Run, begins_in_future, supersedes
 from selfcal_ros.sessions.health import Diagnosis, Level, Ports
 from selfcal_ros.sessions.map_files import is_qualified, read_result, result_file, run_file
-from selfcal_ros.topics import COMMAND_TOPIC, MEASUREMENT_TOPIC
+from selfcal_ros.topics import MEASUREMENT_TOPIC
 
 ECHO_LENGTH = 128
 """Length of a string shown by `ros2 topic echo`."""
@@ -53,7 +46,7 @@ class Outcome:
     """Outcome of a job; `problem` if the readings do not identify the stage, or worse."""
 
     job: Job
-    result: CalibrationResult | None
+    result: results.CalibrationResult | None
     problem: Exception | None
 
 
@@ -61,10 +54,10 @@ def solve(job: Job) -> Outcome:
     """Solve a job; depends on nothing else, so it can run anywhere."""
     try:
         result = worded(calibrate(job.measurements, job.options))
-        return Outcome(job, with_warnings(result, job.notes), None)
+        return Outcome(job, results.with_warnings(result, job.notes), None)
     except NotIdentifiableError as error:
-        result = worded(unidentified_result(job.measurements, error.observability))
-        return Outcome(job, with_warnings(result, job.notes), error)
+        result = worded(results.unidentified_result(job.measurements, error.observability))
+        return Outcome(job, results.with_warnings(result, job.notes), error)
     except Exception as error:  # reported by `take`, in the thread of the session
         return Outcome(job, None, error)
 
@@ -91,7 +84,7 @@ def warm_up(marks: int = 5) -> None:
 class Shown:
     """Present publication: a result and its run, or why there is none."""
 
-    result: CalibrationResult | None = None
+    result: results.CalibrationResult | None = None
     problem: Exception | None = None
     run: Run = field(default_factory=Run)
     views_done: int = 0
@@ -126,7 +119,7 @@ class SolvingSession:
         self.shown = Shown()
 
     @property
-    def result(self) -> CalibrationResult | None:
+    def result(self) -> results.CalibrationResult | None:
         """The published result."""
         return self.shown.result
 
@@ -141,20 +134,19 @@ class SolvingSession:
         Raises
         ------
         InputError
-            If it has more views than a plan can have.
+            If the collector refuses it as well.
         """
-        if message.views_planned > MAX_VIEWS:
-            raise InputError(COMMAND_TOPIC, f"a plan has at most {MAX_VIEWS} views, not "
-                             f"{message.views_planned}", "correct views_planned")
-        run = Run(message.plan_id, message.run_id)
+        command = to_model.command(message)
+        check_command(command)
+        run = Run(command.plan_id, command.run_id)
         known = self._planned.get(run, 0)
-        self._planned[run] = max(known, message.views_planned)
-        ends = message.phase == Phase.DONE and run not in self._ended
+        self._planned[run] = max(known, command.views_planned)
+        ends = command.phase == Phase.DONE and run not in self._ended
         if ends:
             self._ended.add(run)
         tells = not self._planned_views(run) or isinstance(self.shown.problem, NoDataError)
         if run in (self._run, Run(self._run.plan_id)) and (
-                message.views_planned > known or (ends and tells)):
+                command.views_planned > known or (ends and tells)):
             self._stale = True  # the summary shows the number of planned or remaining views
 
     def _planned_views(self, run: Run) -> int:
@@ -256,15 +248,15 @@ class SolvingSession:
             raise outcome.problem or ValueError("neither a result nor a problem")
         self._ports.say(Level.OK, self._state())
 
-    def _save_by_itself(self, result: CalibrationResult) -> None:
+    def _save_by_itself(self, result: results.CalibrationResult) -> None:
         try:
             path = run_file(self._settings.save_path, self.shown.run.run_id)
-            write_json(path, result_to_dict(created_now(result)))
+            write_json(path, results.result_to_dict(results.created_now(result)))
             self._saved = str(path)
         except InputError as error:  # the map itself is good, and save_map may use another path
             self._ports.say(Level.ERROR, f"save_path: {error}")
 
-    def _publish(self, result: CalibrationResult) -> None:
+    def _publish(self, result: results.CalibrationResult) -> None:
         shown, frame_id = self.shown, self._settings.frame_id
         run = shown.run
         verdict = {"qualified": is_qualified(result), "run_id": run.run_id,
@@ -328,7 +320,7 @@ class SolvingSession:
         if self.shown.result is None:
             raise NoDataError("solver", "there is no map yet", "measure the views of the plan")
         target = result_file(path, self._settings.result_folder)
-        write_json(target, result_to_dict(created_now(self.shown.result)))
+        write_json(target, results.result_to_dict(results.created_now(self.shown.result)))
         self._saved = str(target)
         run = self.shown.run
         named = f"plan '{run.plan_id}'" + (f", run {run.run_id}" if run.run_id else "")

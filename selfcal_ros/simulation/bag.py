@@ -5,6 +5,7 @@ from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 
+from selfcal_ros import topics
 from selfcal_ros.bagio.offline import TRUTH_FILE
 from selfcal_ros.bagio.writer import BagWriter
 from selfcal_ros.collection.inputs import Command, Detection
@@ -16,18 +17,11 @@ from selfcal_ros.outputs import temporary_folder
 from selfcal_ros.simulation.cell import Event
 from selfcal_ros.simulation.spec import Simulation
 from selfcal_ros.simulation.truth import Truth
-from selfcal_ros.topics import (
-    COMMAND_TOPIC,
-    DETECTION_TOPIC,
-    ENCODER_TOPIC,
-    INPUT_TOPICS,
-    qos_profile,
-)
 
 QOS = {
-    ENCODER_TOPIC: qos_profile(reliable=True, transient_local=False, depth=1000),
-    DETECTION_TOPIC: qos_profile(reliable=True, transient_local=False, depth=1000),
-    COMMAND_TOPIC: qos_profile(reliable=True, transient_local=True, depth=64),
+    topics.ENCODER_TOPIC: topics.qos_profile(reliable=True, transient_local=False, depth=1000),
+    topics.DETECTION_TOPIC: topics.qos_profile(reliable=True, transient_local=False, depth=1000),
+    topics.COMMAND_TOPIC: topics.qos_profile(reliable=True, transient_local=True, depth=64),
 }
 
 
@@ -61,7 +55,7 @@ def _write(simulation: Simulation, path: Path,
            progress: Callable[[int, int], None]) -> dict[str, int]:
     truth, arrivals, ledger = simulation.run()
     with BagWriter(path, simulation.compression) as writer:
-        for topic, typename in INPUT_TOPICS.items():
+        for topic, typename in topics.INPUT_TOPICS.items():
             writer.add_topic(f"/{topic}", typename, [QOS[topic]])
         for number, (arrival_ns, event) in enumerate(arrivals):
             topic, fields = event_fields(event, "stage")
@@ -77,10 +71,10 @@ def _write(simulation: Simulation, path: Path,
 def event_fields(event: Event, frame_id: str) -> tuple[str, from_model.Fields]:
     """Return topic and fields of a simulated message."""
     if isinstance(event, Command):
-        return COMMAND_TOPIC, from_model.command(event, frame_id)
+        return topics.COMMAND_TOPIC, from_model.command(event, frame_id)
     if isinstance(event, Detection):
-        return DETECTION_TOPIC, from_model.detection(event, frame_id)
-    return ENCODER_TOPIC, from_model.joint_state(event, frame_id)
+        return topics.DETECTION_TOPIC, from_model.detection(event, frame_id)
+    return topics.ENCODER_TOPIC, from_model.joint_state(event, frame_id)
 
 
 def write_truth(path: Path, truth: Truth, **more: object) -> None:

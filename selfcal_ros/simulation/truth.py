@@ -10,14 +10,7 @@ from selfcal_ros.collection.marks.repeats import repeat_motion
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import GridVisits, Measurements, Sense, ViewReadings
 from selfcal_ros.model.view import Plan, View
-from selfcal_ros.simulation import physics
-from selfcal_ros.simulation.cell import (
-    AngularExposures,
-    CellSettings,
-    GridExposures,
-    angular_exposures,
-    grid_exposures,
-)
+from selfcal_ros.simulation import cell, physics
 from selfcal_ros.simulation.machine import Spread, Truth, random_truth
 from selfcal_ros.simulation.physics import rotate
 
@@ -62,7 +55,7 @@ def simulate_measurements(truth: Truth, plan: Plan, rng: np.random.Generator, *,
                           sigma_m: float = 0.0, sigma_theta_rad: float = 0.0,
                           sense: Sense = Sense.MICROSCOPE_MOVES, missing: float = 0.0,
                           linear: bool | None = None, visits: bool = False,
-                          settings: CellSettings | None = None) -> Measurements:
+                          settings: cell.CellSettings | None = None) -> Measurements:
     """Return the readings of all views, with noise and missing marks.
 
     Parameters
@@ -84,8 +77,8 @@ def simulate_measurements(truth: Truth, plan: Plan, rng: np.random.Generator, *,
     """
     truth = truth if linear is None else replace(truth, linear=linear)
     if visits or settings or truth.by_visit:
-        settings = settings or CellSettings(sense, sigma_m, sigma_theta_rad, servo_sigma_m=0.0,
-                                            servo_sigma_theta_rad=0.0)
+        settings = settings or cell.CellSettings(sense, sigma_m, sigma_theta_rad, servo_sigma_m=0.0,
+                                                 servo_sigma_theta_rad=0.0)
         return _by_visit(truth, plan, rng, settings=settings, missing=missing)
     views = tuple(_simulate_view(truth, (index, view), rng, sigma=(sigma_m, sigma_theta_rad),
                                  sense=sense, missing=missing)
@@ -93,7 +86,7 @@ def simulate_measurements(truth: Truth, plan: Plan, rng: np.random.Generator, *,
     return Measurements(plan.plan_id, plan.artifact, views, sense)
 
 
-def _by_visit(truth: Truth, plan: Plan, rng: np.random.Generator, *, settings: CellSettings,
+def _by_visit(truth: Truth, plan: Plan, rng: np.random.Generator, *, settings: cell.CellSettings,
               missing: float) -> Measurements:
     views, start_ns = [], FIRST_STAMP_NS
     for item in enumerate(plan.views):
@@ -143,7 +136,7 @@ def hu_plan(artifact: Artifact, repeats: int = 1, plan_id: str = "hu") -> Plan:
 
 
 def measured_view(truth: Truth, item: tuple[int, View], rng: np.random.Generator, *,
-                  settings: CellSettings, missing: float, start_ns: int) -> ViewReadings:
+                  settings: cell.CellSettings, missing: float, start_ns: int) -> ViewReadings:
     """Return the readings of a view, with its visits, as from the collector.
 
     Marks are those that the view expects, as for detections without ids.
@@ -166,11 +159,11 @@ def measured_view(truth: Truth, item: tuple[int, View], rng: np.random.Generator
     index, view = item
     readings = ViewReadings(view)
     if view.grid:
-        exposures = grid_exposures(truth, index, view, settings=settings, rng=rng)
+        exposures = cell.grid_exposures(truth, index, view, settings=settings, rng=rng)
         readings = _grid(readings, truth, exposures, settings=settings,
                          lost=_lost(rng, missing, truth.artifact.shape), start_ns=start_ns)
     if view.angular and truth.artifact.angular_count:
-        found = angular_exposures(truth, index, view, settings=settings, rng=rng)
+        found = cell.angular_exposures(truth, index, view, settings=settings, rng=rng)
         readings = _angular(readings, truth, found, sense=settings.sense,
                             lost=_lost(rng, missing, truth.artifact.angular_count))
     return replace(readings, used=int(readings.count.sum() + readings.count_theta.sum()))
@@ -180,15 +173,15 @@ def _lost(rng: np.random.Generator, missing: float, shape: tuple[int, ...] | int
     return rng.random(shape) < missing if missing else np.zeros(shape, dtype=bool)
 
 
-def _read(sense: Sense, found: GridExposures | AngularExposures) -> np.ndarray:
+def _read(sense: Sense, found: cell.GridExposures | cell.AngularExposures) -> np.ndarray:
     """Return the positions of marks as read by encoder and microscope."""
     if sense is Sense.PLATE_MOVES:
         return found.offset - found.position
     return found.position + found.offset
 
 
-def _grid(readings: ViewReadings, truth: Truth, found: GridExposures, *, settings: CellSettings,
-          lost: np.ndarray, start_ns: int) -> ViewReadings:
+def _grid(readings: ViewReadings, truth: Truth, found: cell.GridExposures, *,
+          settings: cell.CellSettings, lost: np.ndarray, start_ns: int) -> ViewReadings:
     visits, (hx, hy) = found.visits, truth.artifact.half
     kept = ~lost[visits.m + hx, visits.n + hy] & found.there
     key = (visits.m + hx) * (2 * hy + 1) + visits.n + hy
@@ -221,7 +214,7 @@ def _grid(readings: ViewReadings, truth: Truth, found: GridExposures, *, setting
                           approach[1], sigma_m=sigma_visit, dof=dof_visit))
 
 
-def _angular(readings: ViewReadings, truth: Truth, found: AngularExposures, *, sense: Sense,
+def _angular(readings: ViewReadings, truth: Truth, found: cell.AngularExposures, *, sense: Sense,
              lost: np.ndarray) -> ViewReadings:
     count = truth.artifact.angular_count
     turn = readings.view.on_stage(truth.artifact).s

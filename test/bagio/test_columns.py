@@ -10,7 +10,7 @@ from mcap.records import Channel, Message, Schema
 from mcap.stream_reader import breakup_chunk
 from mcap.writer import CompressionType, Writer
 
-from selfcal_ros.bagio import mcap_chunk, mcap_stream
+from selfcal_ros.bagio import mcap_chunk, mcap_salvage
 from selfcal_ros.bagio.channels import ENOUGH
 from selfcal_ros.bagio.mcap_chunk import Block, chunk_items
 from selfcal_ros.bagio.reader import BagReader
@@ -180,7 +180,7 @@ CHUNKS = [[("/camera", 5)], [("/stage/joint_states", 7), ("/camera", 2)], [("/ca
 def opened(monkeypatch):
     """Count the chunks that are looked into."""
     seen = []
-    monkeypatch.setattr(mcap_stream, "chunk_items", lambda chunk: seen.append(1)
+    monkeypatch.setattr(mcap_chunk, "chunk_items", lambda chunk: seen.append(1)
                         or chunk_items(chunk))
     return seen
 
@@ -214,7 +214,7 @@ def test_a_chunk_that_is_passed_but_cut_short_is_found_out(tmp_path, opened):
     data = path.read_bytes()
     reader = BagReader(path, namespace="")
     with path.open("rb") as file:
-        passed = mcap_stream.read_summary(file).needless(lambda topic: "joint" in topic)
+        passed = mcap_chunk.read_summary(file).needless(lambda topic: "joint" in topic)
     (place, end), *_ = passed.items()
     assert len(passed) == 3 and data[place] == Opcode.CHUNK
     path.write_bytes(data[:place + 1] + struct.pack("<Q", end - place) + data[place + 9:])
@@ -295,8 +295,8 @@ def test_records_between_messages_keep_their_place():
 def test_runs_are_taken_at_once(monkeypatch):
     data = b"".join(message(1, bytes(20)) for _ in range(5000))
     singles = []
-    unpack = mcap_chunk.HEAD.unpack_from
-    monkeypatch.setattr(mcap_chunk, "HEAD", type("Head", (), {
+    unpack = mcap_salvage.HEAD.unpack_from
+    monkeypatch.setattr(mcap_salvage, "HEAD", type("Head", (), {
         "size": 9, "unpack_from": staticmethod(lambda d, at: singles.append(at) or unpack(d, at))}))
     [block] = chunk_items(FakeChunk(data))
     assert len(block) == 5000
@@ -323,8 +323,8 @@ def test_lengths_that_come_again_are_taken_at_once(monkeypatch, pattern):
     lengths[3000] += 1  # one visit is another: the rest is found again
     data = b"".join(message(1, bytes([i % 251]) * length) for i, length in enumerate(lengths))
     looked = []
-    unpack = mcap_chunk.HEAD.unpack_from
-    monkeypatch.setattr(mcap_chunk, "HEAD", type("Head", (), {
+    unpack = mcap_salvage.HEAD.unpack_from
+    monkeypatch.setattr(mcap_salvage, "HEAD", type("Head", (), {
         "size": 9, "unpack_from": staticmethod(lambda d, at: looked.append(at) or unpack(d, at))}))
     [block] = chunk_items(FakeChunk(data))
     assert block.payloads.length.tolist() == lengths

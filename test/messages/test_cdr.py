@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from selfcal_ros.bagio.schemas import fields_of, typestore
-from selfcal_ros.messages import cdr, to_model
+from selfcal_ros.messages import cdr
 from selfcal_ros.messages.cdr import ColumnDecoder, Payloads, layout_of
 from selfcal_ros.messages.to_model import (
     JOINT_STATE,
@@ -270,7 +270,7 @@ def test_an_editor_keeps_the_layouts_of_several_publishers_apart(monkeypatch):
             assert (name, position) == (("x", "y", "theta")[number], number)
             assert editor.replaced(message, [9.0]) == as_cdr(joint_state(
                 number, names=[name], positions=[9.0]))
-        monkeypatch.setattr(to_model, "layout_of", None)  # each is walked once
+        monkeypatch.setattr(cdr, "layout_of", None)  # each is walked once
     monkeypatch.undo()
     for i in range(cdr.MAX_KNOWN + 9):
         editor.read(as_cdr(joint_state(0, frame=f"{i:04d}")))

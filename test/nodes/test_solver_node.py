@@ -12,6 +12,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from selfcal_msgs.srv import LoadMap, SaveMap
 from visualization_msgs.msg import Marker
 
+from selfcal_ros.collection.inputs import Command, Phase
 from selfcal_ros.errors import ExitCode, NotSettledError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.messages import from_model, to_model
@@ -313,7 +314,8 @@ def test_a_loaded_map_is_not_said_to_come_from_the_readings(solve, graph, tmp_pa
 
 
 def command_of(plan_id: str, views_planned: int):
-    return names.COMMAND.type(plan_id=plan_id, views_planned=views_planned)
+    return fill(names.COMMAND.type(), from_model.command(Command(
+        1, Phase.MEASURE, plan_id, 0, PLAN.views[0], PLAN.artifact, views_planned), "stage"))
 
 
 @pytest.mark.usefixtures("quick_beat")

@@ -18,7 +18,7 @@ from selfcal_ros.bagio.reader import BagReader
 from selfcal_ros.collection.inputs import Command, Detection, EncoderSample, Phase
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.readings import readings_digest
-from selfcal_ros.sessions import journal_keeper, reception
+from selfcal_ros.sessions import reception
 from selfcal_ros.sessions.collecting import CollectingSession
 from selfcal_ros.sessions.health import Level
 from selfcal_ros.sessions.journal_keeper import JournalKeeper, KeptTopic
@@ -427,7 +427,7 @@ class Locked:
         def refused(folder):
             self.asked += 1
             raise reason
-        monkeypatch.setattr(journal_keeper, "resume", refused)
+        monkeypatch.setattr(journal, "resume", refused)
 
 
 @pytest.mark.parametrize(("reason", "in_health", "refused"), [

@@ -68,3 +68,12 @@ def test_no_name_is_newer_than_the_floor(library):
                     {alias.name for alias in node.names} if isinstance(node, ast.ImportFrom)
                     else set())
             assert not used & TOO_NEW[library], f"{path}:{node.lineno}: {used} came with {library}"
+
+
+def test_least_squares_name_their_cut():
+    """NumPy 1.26 warns of another default where there is no `rcond`."""
+    calls = [(file.name, node.lineno, {keyword.arg for keyword in node.keywords})
+             for file in CODE for node in ast.walk(ast.parse(file.read_text()))
+             if isinstance(node, ast.Call) and ast.unparse(node.func) == "np.linalg.lstsq"]
+    assert calls
+    assert [call[:2] for call in calls if "rcond" not in call[2]] == []

@@ -34,11 +34,14 @@ MARKS = {TermName.PLATE_SCALE: ("scale",), TermName.PLATE_STRAIN: ("scale", "str
 
 
 class DenseFit:
-    """The solution of all readings for known noises of one reading, (m, rad)."""
+    """The solution of all readings for known noises of one reading, (m, rad).
+
+    `shared`: part of the variance that may be noise of the indicated position.
+    """
 
     def __init__(self, readings: Measurements, terms: tuple[ModelTerm, ...], sigma, *,
-                 degree=3, rigid=False):
-        self.readings, self.sigma, self.rigid = readings, sigma, rigid
+                 degree=3, rigid=False, shared=1.0):
+        self.readings, self.sigma, self.rigid, self.shared = readings, sigma, rigid, shared
         self.artifact = readings.artifact
         (self.hx, self.hy), self.pitch = self.artifact.half, self.artifact.grid_pitch_m
         self.n, self.K = int(np.prod(self.artifact.shape)), self.artifact.angular_count
@@ -196,11 +199,27 @@ class DenseFit:
         prior = np.zeros((sized.sum(), len(p)))
         prior[np.arange(len(prior)), np.arange(len(p))[self.b][sized]] = 1 / self.size[sized]
         held = self._datum(np.unique(self.site)) / (EXACTLY * self.sigma[0])
-        solve = inverse_of(np.concatenate([self.design, prior, held]))
-        self.p = p + solve @ np.concatenate([rest, -prior @ p, -held @ p])
+        solve = self._solved(np.concatenate([self.design, prior, held]), held)
+        known = np.concatenate([rest, -prior @ p, -held @ p])
+        self.p = p + solve[:, :len(known)] @ known
         self.covariance = solve @ solve.T
         left, n = self._values - self._predicted(self.p), len(self.y)
         self.left = left[:n] + 1j * left[n:2 * n]
+
+    def _solved(self, rows, held):
+        """Pseudo-inverse of rows where noise of the position may feign a scale of the microscope.
+
+        Changes of the readings that add up to 1 with the columns of scale or stretch, and to 0 with
+        all others, are unknowns of the size 2 `shared` visits (method eq. 7.11).
+        """
+        feigned = [at for at, (term, _, part) in enumerate(self.keys, self.b.start)
+                   if term == TermName.MICROSCOPE and part in ("scale", "stretch")]
+        changes = inverse_of(np.concatenate([self.design, held]))[feigned, :len(self.design)].T
+        more = np.zeros((len(rows) + len(feigned), len(feigned)))
+        more[:len(changes)] = changes
+        more[len(rows):] = np.eye(len(feigned)) / (2 * len(self.y) * self.shared)
+        rows = np.concatenate([rows, np.zeros((len(feigned), rows.shape[1]))])
+        return inverse_of(np.concatenate([rows, more], axis=1))[:len(self.p)]
 
     @property
     def squares(self):

@@ -17,6 +17,12 @@ TURNS = [np.array(rows) for rows in ([[1, 0], [0, 1]], [[0, -1], [1, 0]], [[-1, 
                                      [[0, 1], [-1, 0]])]
 
 
+def _inverse(matrix):
+    """Return the pseudo-inverse of a matrix whose columns have unlike units."""
+    norm = np.linalg.norm(matrix, axis=0)
+    return np.linalg.pinv(matrix / norm, rcond=1e-11) / norm[:, None]
+
+
 class Dense:
     """Every visit of a plan as two rows of one matrix, in the stage frame, for unit noise."""
 
@@ -155,8 +161,22 @@ class Dense:
 
     def _solver(self, terms):
         design = self.design(terms)
-        norm = np.linalg.norm(design, axis=0)
-        return np.linalg.pinv(design / norm, rcond=1e-11) / norm[:, None], design
+        feigned = self._feigned(terms)
+        more = np.zeros((len(design) + len(feigned.T), len(feigned.T)))
+        more[:len(feigned)] = feigned
+        more[len(design):] = np.eye(len(feigned.T)) / (SIGMA * len(self.weight))
+        rows = np.vstack([design, np.zeros((len(feigned.T), design.shape[1]))])
+        return _inverse(np.hstack([rows, more]))[:design.shape[1]], design
+
+    def _feigned(self, terms):
+        """Changes of the readings that only scale or stretch of a microscope has (7.11)."""
+        whole = self.design([ModelTerm(term.name) for term in terms])
+        at, found = self.base.shape[1], []
+        for term in terms:
+            if term.name is TermName.MICROSCOPE:
+                found = [at, at + 2]
+            at += self.columns(term.name, free=True).shape[1]
+        return _inverse(whole)[found].T
 
     def gain(self, terms):
         """Root mean square of the standard uncertainty for unit noise of one reading."""
@@ -178,7 +198,8 @@ class Dense:
     def power(self, terms, name, size, level, draws=300):
         """Mean over drawn coefficients of the power of the noncentral F-test."""
         free = [ModelTerm(term.name) for term in terms]
-        solve, before = self.solver(free)
+        before = self.design(free)
+        solve = self._once(("plain", *free), lambda: _inverse(before))
         column = self.root[:, None] * self.columns(name, free=False)
         left = column - before @ (solve @ column)
         rank_before = self._once(("rank", *free), lambda: self._rank(before))

@@ -357,7 +357,8 @@ def repeat_motion(key: np.ndarray, place: np.ndarray, offset: np.ndarray,
     about = np.concatenate([_about_means(key, place), _about_means(key, offset)])
     slow = _about_means(key, np.polynomial.legendre.legvander(
         np.linspace(-1, 1, len(key)), SLOW)[:, 1:].T)
-    change = np.diff(about - np.linalg.lstsq(slow @ slow.T, slow @ about.T)[0].T @ slow)
+    trend = np.linalg.lstsq(slow @ slow.T, slow @ about.T, rcond=None)[0]
+    change = np.diff(about - trend.T @ slow)
     return RepeatMotion(change @ change.T / 2, 2 * free // 3)  # neighbours share a reading
 
 

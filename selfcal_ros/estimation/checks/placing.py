@@ -136,7 +136,8 @@ def _sizes(views: list[_Seen], sigma: float) -> tuple[float, float]:
     total, free = 0.0, 0
     for seen in views:
         motion = _motion(seen)
-        rest = seen.deviation - motion @ np.linalg.lstsq(motion, seen.deviation)[0]
+        lies = np.linalg.lstsq(motion, seen.deviation, rcond=None)[0]
+        rest = seen.deviation - motion @ lies
         total, free = total + float(np.sum(np.abs(rest) ** 2)), free + len(rest) - FREE
     share = np.concatenate([1 / seen.count for seen in views]).mean()
     return sigma * float(np.sqrt(share)), float(np.sqrt(total / (2 * max(free, 1))))

@@ -171,8 +171,9 @@ class PlannedTerms:
         """Return rms and largest effect of the term on the map."""
         every, others = self.every, self._others(name)
         term, model = every.rows([name]), rows_of(every.columns, others)
-        inverse = with_terms(every, others).inverse(self.assumed.sigma_m)
-        taken = inverse @ every.information[np.ix_(model, term)]
+        beside = with_terms(every, others)
+        taken = beside.inverse(self.assumed.sigma_m) @ beside.unbiased_sums(
+            every.information[np.ix_(model, term)])
         fields = every.maps[:, term] - every.maps[:, model] @ taken
         known = every.system.known_sites.ravel()
         spread = size * np.sqrt(np.stack([(fields.real**2).sum(axis=1),
@@ -203,7 +204,8 @@ class PlannedTerms:
         others = rows_of(every.columns,
                          [ModelTerm(TermName(n)) for n in {c.term for c in beside.columns.columns}])
         cross = every.information[np.ix_(others, term)]
-        rest = every.information[np.ix_(term, term)] - cross.T @ beside.inverse(0.0) @ cross
+        rest = every.information[np.ix_(term, term)] - cross.T @ beside.inverse(
+            0.0) @ beside.unbiased_sums(cross)
         norm = every.norm[term]
         scaled = np.linalg.eigvalsh(rest / np.outer(norm, norm))
         rank = int((scaled > every.limit(term)).sum())

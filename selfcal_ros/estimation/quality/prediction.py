@@ -250,6 +250,8 @@ def _fitted(model: ModelFit, noise: np.ndarray, rng: np.random.Generator
     values, vectors = np.linalg.eigh(now.columns.within.gram)
     within = vectors * np.sqrt(np.maximum(values, 0.0))
     right += within @ rng.standard_normal((now.n, len(noise)))
+    feigned = np.sqrt(now.position_noise)[:, None]
+    right = now.unbiased_sums(right + feigned * rng.standard_normal((now.n, len(noise))))
     # a term with a size is not 0: its estimate minus its value is drawn
     prior = np.where(now.free, 0.0, found.xy.sigma / now.columns.size)
     right -= prior[:, None] * rng.standard_normal((now.n, len(noise)))

@@ -149,6 +149,38 @@ class TermEquations:
         """Return which coefficients belong to the terms `names`, bool (p,)."""
         return self.columns.rows(names)
 
+    @cached_property
+    def position_noise(self) -> np.ndarray:
+        """Variance of the right-hand sides due to noise of the indicated position, (p,).
+
+        For unit noise. If all noise is that of the position, each coordinate of a reading adds its
+        variance to the right-hand sides of scale and stretch (method eq. 7.11).
+        """
+        count = 2 * self.system.grid.n_readings + self.columns.within.dof
+        feigned = [column.term == TermName.MICROSCOPE and column.component in ("scale", "stretch")
+                   for column in self.columns.columns]
+        return (self.noise_m * count) ** 2 * np.array(feigned, dtype=float)
+
+    @cached_property
+    def _mixed(self) -> np.ndarray:
+        """(K + D)^-1 D of method eq. 7.11, (p, p)."""
+        scale = np.hypot(self.norm, np.sqrt(self.position_noise))
+        matrix = (self.information + np.diag(self.position_noise)) / np.outer(scale, scale)
+        inverse = np.linalg.pinv(matrix, hermitian=True, rcond=1e-14)
+        return inverse / np.outer(scale, scale) * self.position_noise
+
+    @cached_property
+    def unbiased(self) -> np.ndarray:
+        """Information if any part of the noise may be that of the position, (p, p)."""
+        noise = self.position_noise
+        if not noise.any():
+            return self.information
+        return self.information - np.diag(noise) + noise[:, None] * self._mixed
+
+    def unbiased_sums(self, right: np.ndarray) -> np.ndarray:
+        """Return right-hand sides (p,) that belong to `unbiased`."""
+        return right - self._mixed.T @ right if self.position_noise.any() else right
+
     def prior(self, sigma_m: float) -> np.ndarray:
         """Return the information from each size, for unit noise, (p,); 0 of free ones.
 
@@ -171,7 +203,7 @@ class TermEquations:
         """
         # a sized coefficient in units of its size, a free one in those of its column
         scale = np.where(self.free, 1 / self.norm, self.columns.size)
-        matrix = self.information * np.outer(scale, scale)
+        matrix = self.unbiased * np.outer(scale, scale)
         matrix[np.diag_indices(len(scale))] += self.prior(sigma_m) * scale**2
         hold = self.untold(self.free)
         # sized coefficients may be determined far better than free ones in these units; the
@@ -303,7 +335,8 @@ def next_coefficients(equations: TermEquations, found: Score, coefficients: np.n
         Noise of one grid reading, m.
     """
     prior = equations.prior(sigma_m)
-    return coefficients + equations.inverse(sigma_m) @ (found.total - prior * coefficients)
+    return coefficients + equations.inverse(sigma_m) @ (
+        equations.unbiased_sums(found.total) - prior * coefficients)
 
 
 def roots_by_term(covariance: np.ndarray, columns: TermColumns) -> list[tuple[str, np.ndarray]]:

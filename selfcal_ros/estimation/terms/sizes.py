@@ -124,11 +124,11 @@ def _told(equations: TermEquations, right: np.ndarray, rows: np.ndarray, sigma_m
     rest = ~rows
     prior = np.where(rest, np.sqrt(equations.prior(sigma_m)), 0.0)
     norm = np.hypot(equations.norm, prior)
-    scaled = equations.information / np.outer(norm, norm) + np.diag((prior / norm) ** 2)
+    scaled = equations.unbiased / np.outer(norm, norm) + np.diag((prior / norm) ** 2)
     hidden = equations.untold(equations.free & rest)[rest]
     held = np.linalg.pinv(scaled[np.ix_(rest, rest)] + hidden @ hidden.T, hermitian=True,
                           rcond=1e-14) - hidden @ hidden.T
-    couple, scores = scaled[np.ix_(rows, rest)] @ held, right / norm
+    couple, scores = scaled[np.ix_(rows, rest)] @ held, equations.unbiased_sums(right) / norm
     told_by = scaled[np.ix_(rows, rows)] - couple @ scaled[np.ix_(rest, rows)]
     size, vectors = np.linalg.eigh((told_by + told_by.T) / 2)
     told = size > equations.limit(rows)

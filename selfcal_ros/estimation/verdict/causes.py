@@ -34,9 +34,6 @@ NOISY = 1.5
 SURE = 3.0
 """Ratio of a rotation to its standard uncertainty above which the readings determine its view."""
 
-FAR = 5.0
-"""Coefficient, in sizes of its term, that contradicts the size even where no test determines it."""
-
 CHECKED = 1e-6
 """Smallest share of a reading's error in its own residual: the part that other readings check."""
 
@@ -73,23 +70,6 @@ def fitted_term(model: ModelFit, name: str, p: float = 1.0, *, whole: bool = Tru
     columns = tuple(compress(equations.columns.columns, rows))
     found = Explanation(str(name), columns, model.coefficients[rows], covariance, p, whole, 0.0)
     return found.with_effect(equations, np.where(rows, model.coefficients, 0.0))
-
-
-def far_from_sizes(model: ModelFit) -> list[Cause]:
-    """Return the terms whose estimate lies far beyond their size, although no test can tell.
-
-    Noise of the encoders looks like a scale of the microscope: its part in the scatter of the
-    offsets is not known, and its effect on the fit cannot be bounded.
-    """
-    if model.equations is None:
-        return []
-    columns = model.equations.columns
-    beyond = np.abs(model.coefficients) / np.maximum(columns.size, np.finfo(float).tiny)
-    worst: dict[str, float] = {}
-    for column, ratio in zip(columns.columns, beyond, strict=True):
-        worst[column.term] = max(worst.get(column.term, 0.0), float(ratio))
-    return [cause_of(fitted_term(model, name, math.erfc(ratio / math.sqrt(2)), whole=False),
-                     model.problem.ground) for name, ratio in worst.items() if ratio > FAR]
 
 
 def size_cause(test: SizeTest, estimates: Iterable[TermEstimate]) -> Cause:

@@ -135,7 +135,7 @@ class Candidates:
     @cached_property
     def _scaled(self) -> np.ndarray:
         """Information on the coefficients of columns scaled to unit length, (p, p)."""
-        information = self.equations.information + np.diag(self.prior)
+        information = self.equations.unbiased + np.diag(self.prior)
         return information / np.outer(self._norm, self._norm)
 
     @cached_property
@@ -144,7 +144,7 @@ class Candidates:
 
     @cached_property
     def _total(self) -> np.ndarray:
-        return self.right.total - self.prior * self.taken
+        return self.equations.unbiased_sums(self.right.total) - self.prior * self.taken
 
     @cached_property
     def everything(self) -> tuple[float, float]:

@@ -22,7 +22,6 @@ from selfcal_ros.estimation.verdict.causes import (
     SURE,
     cause_of,
     effect_of_line,
-    far_from_sizes,
     fitted_term,
     line_cause,
     noisier_views,
@@ -138,12 +137,8 @@ def search_causes(solved: Solved, measurements: Measurements, options: Options, 
     plausible = all(test.allowed <= PLAUSIBLE.get(test.name, np.inf) for test in tests)
     alike = TermName.ROTATION in raised and _as_a_microscope(found, measurements, options)
     causes = [*(cause for cause in raised.values() if cause is not None), *found.causes]
-    far = [cause for cause in far_from_sizes(_model(solved))
-           if cause.name not in (*raised, *found.joined)]
-    if far:
-        found.bounded = False
-        causes.extend(far)
-    if (turned := turned_too_far(_model(solved), solved.result, measurements)) is not None:
+    turned = turned_too_far(_model(solved), solved.result, measurements)
+    if turned is not None:
         found.bounded = False
         if TermName.ROTATION not in [cause.name for cause in causes]:
             causes.append(turned)
@@ -162,15 +157,20 @@ def search_causes(solved: Solved, measurements: Measurements, options: Options, 
         return out
     tried = out.terms and plausible and not alike
     model = _best_model(out, measurements, options) if tried else None
-    return replace(out, causes=tuple(_advised(cause, model, out.terms) for cause in causes))
+    faulty = (TermName.DRIFT, READING, *([TermName.ROTATION] if turned else []))
+    return replace(out, causes=tuple(_advised(cause, model, out.terms, faulty) for cause in causes))
 
 
-def _advised(cause: Cause, model: str | None, terms: Collection[str]) -> Cause:
-    """Return a cause with its remedies: a model that was tried, a view to measure again."""
+def _advised(cause: Cause, model: str | None, terms: Collection[str],
+             faulty: Collection[str]) -> Cause:
+    """Return a cause with its remedies: a model that was tried, a view to measure again.
+
+    Measuring again does not remove the causes `faulty`.
+    """
     remedies = []
     if model is not None and cause.name in terms:
         remedies.append(Remedy("model", model))
-    if cause.view and cause.name not in (TermName.DRIFT, READING):
+    if cause.view and cause.name not in faulty:
         remedies.append(Remedy("view", cause.view))
     return replace(cause, remedies=tuple(remedies))
 

@@ -11,14 +11,7 @@ from selfcal_ros.errors import InputError, known_are
 from selfcal_ros.laser.data import DIAGONALS, MAX_BLOCKS, Closure, StepDiagonalResult
 from selfcal_ros.laser.profiles import ReferenceLine, name_of
 from selfcal_ros.laser.report import geometry
-from selfcal_ros.laser.simulation.measure import (
-    LaserNoise,
-    Measurement,
-    SetUp,
-    StepMachine,
-    case_study_machine,
-    random_machine,
-)
+from selfcal_ros.laser.simulation import measure
 from selfcal_ros.units import M_PER_MM, M_PER_NM, M_PER_UM, ONE_PER_PPM, RAD_PER_MRAD, RAD_PER_URAD
 
 MAX_REPEATS = 1000
@@ -30,8 +23,8 @@ LARGEST = 1e9
 class LaserSimulation:
     """Content of a file: machine, measurement, and the generator after drawing the machine."""
 
-    machine: StepMachine
-    measurement: Measurement
+    machine: measure.StepMachine
+    measurement: measure.Measurement
     rng: np.random.Generator
 
 
@@ -68,15 +61,15 @@ def simulation_from_dict(data: object, where: str) -> LaserSimulation:
     distance_m, reading_m, linear_m = (
         _number(noise.get(key, 0), f"{where}: noise: {key}", positive=True) * M_PER_NM
         for key in ("distance_nm", "reading_nm", "linear_nm"))
-    return LaserSimulation(machine, Measurement(
+    return LaserSimulation(machine, measure.Measurement(
         {name: _setup(raw, f"{where}: setups: {name}", machine.dim)
          for name, raw in setups.items()},
-        LaserNoise(distance_m, reading_m, linear_m, repeats)), rng)
+        measure.LaserNoise(distance_m, reading_m, linear_m, repeats)), rng)
 
 
-def _machine(raw: object, where: str, rng: np.random.Generator) -> StepMachine:
+def _machine(raw: object, where: str, rng: np.random.Generator) -> measure.StepMachine:
     if raw == "case_study":
-        return case_study_machine()
+        return measure.case_study_machine()
     kinds = [name_of(j, c) for j in range(3) for c in range(3)]
     raw = _mapping(raw, where, ("steps_mm", "blocks", "sigma_um", "stacked", "turns_urad", *kinds))
     steps = tuple(np.array(_numbers(raw.get("steps_mm"), f"{where}: steps_mm", (2, 3))) * M_PER_MM)
@@ -91,12 +84,12 @@ def _machine(raw: object, where: str, rng: np.random.Generator) -> StepMachine:
     else:
         blocks = _count(raw.get("blocks", 6), f"{where}: blocks", MAX_BLOCKS)
         sigma = _number(raw.get("sigma_um", 0.1), f"{where}: sigma_um", positive=True) * M_PER_UM
-        errors = random_machine(steps, blocks, rng, sigma_m=sigma).errors_m
+        errors = measure.random_machine(steps, blocks, rng, sigma_m=sigma).errors_m
     stacked = raw.get("stacked", False)
     if not isinstance(stacked, bool):
         raise InputError(f"{where}: stacked", f"{stacked!r} is neither true nor false", "give one")
     turns = _turns(raw.get("turns_urad", {}), f"{where}: turns_urad", errors.shape)
-    return StepMachine(steps, errors, turns, stacked)
+    return measure.StepMachine(steps, errors, turns, stacked)
 
 
 def _errors(raw: Mapping, where: str, dim: int) -> np.ndarray:
@@ -132,7 +125,7 @@ def _turns(raw: object, where: str, shape: tuple[int, int, int]) -> np.ndarray |
     return turns * RAD_PER_URAD
 
 
-def _setup(raw: object, where: str, dim: int) -> SetUp:
+def _setup(raw: object, where: str, dim: int) -> measure.SetUp:
     raw = _mapping(raw, where, ("laser_mrad", "mirror_mrad", "to_machine", "abbe_mm", "scale_ppm"))
     laser_rad, mirror_rad = (
         tuple(np.array(_numbers(raw.get(key, [0.0] * (dim - 1)), f"{where}: {key}", (dim - 1,)))
@@ -144,7 +137,7 @@ def _setup(raw: object, where: str, dim: int) -> SetUp:
     abbe_mm = _numbers(raw.get("abbe_mm", [0, 0, 0]), f"{where}: abbe_mm", (3,))
     x, y, z = np.array(abbe_mm) * M_PER_MM
     scale = _number(raw.get("scale_ppm", 0.0), f"{where}: scale_ppm") * ONE_PER_PPM
-    return SetUp(laser_rad, mirror_rad, to_machine, (x, y, z), scale)
+    return measure.SetUp(laser_rad, mirror_rad, to_machine, (x, y, z), scale)
 
 
 def _mapping(data: object, where: str, known: tuple[str, ...]) -> dict[str, Any]:
@@ -178,7 +171,7 @@ def _count(value: object, where: str, most: int) -> int:
     return value
 
 
-def truth_of(machine: StepMachine) -> dict[str, Any]:
+def truth_of(machine: measure.StepMachine) -> dict[str, Any]:
     """Return the result of a perfect identification of a machine, mm, in the datum of results."""
     truth = StepDiagonalResult(machine.steps_m, machine.truth_m(), None, "", "", {}, Closure())
     errors = {name_of(j, c): (truth.errors_m[j, :, c] / M_PER_MM).tolist()

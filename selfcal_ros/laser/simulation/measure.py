@@ -10,13 +10,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from selfcal_ros.laser.data import (
-    DIAGONALS,
-    StepDiagonal,
-    signs_of,
-    step_vectors,
-    turn_to_first_step,
-)
+from selfcal_ros.laser import data
 
 _Z = np.array([0.0, 0.0, 1.0])
 
@@ -54,7 +48,7 @@ class StepMachine:
 
     def truth_m(self) -> np.ndarray:
         """Return the errors rotated so that the first X step has no transverse error, m."""
-        turned = turn_to_first_step(step_vectors(self.steps_m, self.errors_m))
+        turned = data.turn_to_first_step(data.step_vectors(self.steps_m, self.errors_m))
         return turned - np.diag(self.steps_m)[:, None, :]
 
 
@@ -114,7 +108,7 @@ class Measurement:
 
 
 def simulate_step_diagonal(machine: StepMachine, measurement: Measurement,
-                           rng: np.random.Generator) -> StepDiagonal:
+                           rng: np.random.Generator) -> data.StepDiagonal:
     """Return the readings and linear errors of the measurement.
 
     Parameters
@@ -126,7 +120,7 @@ def simulate_step_diagonal(machine: StepMachine, measurement: Measurement,
     rng : numpy.random.Generator
         Source of the noise.
     """
-    names, noise = DIAGONALS[machine.dim], measurement.noise
+    names, noise = data.DIAGONALS[machine.dim], measurement.noise
     n = machine.n_blocks
     samples = np.empty((noise.repeats, len(names), machine.dim, n))
     for k, name in enumerate(names):
@@ -138,7 +132,7 @@ def simulate_step_diagonal(machine: StepMachine, measurement: Measurement,
     linear = np.array([machine.errors_m[j, :, j] for j in range(machine.dim)])
     shape = (noise.repeats, machine.dim, n + 1)
     linear = linear + np.diff(rng.normal(0, noise.linear_m, shape), axis=-1)
-    return StepDiagonal(machine.steps_m, names, samples, linear)
+    return data.StepDiagonal(machine.steps_m, names, samples, linear)
 
 
 def trace(machine: StepMachine, name: str, setup: SetUp) -> tuple[np.ndarray, np.ndarray]:
@@ -151,9 +145,9 @@ def trace(machine: StepMachine, name: str, setup: SetUp) -> tuple[np.ndarray, np
     distances : float array (D*n + 1,)
         Laser distance before the first and after every step, m; growing along the diagonal.
     """
-    signs = signs_of([name])[0]
+    signs = data.signs_of([name])[0]
     vectors = np.zeros((machine.dim, machine.n_blocks, 3))
-    vectors[:, :, :machine.dim] = step_vectors(machine.steps_m, machine.errors_m)
+    vectors[:, :, :machine.dim] = data.step_vectors(machine.steps_m, machine.errors_m)
     turns = (np.zeros(vectors.shape) if machine.turns_rad is None else machine.turns_rad)
     order, centres, angles = [], [np.zeros(3)], [np.zeros(3)]
     carried = np.zeros((machine.dim + 1, 3))  # turn of the axes before axis j

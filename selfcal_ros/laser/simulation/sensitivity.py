@@ -9,17 +9,12 @@ import numpy as np
 from selfcal_ros.laser.data import DIAGONALS, Closure, Method, StepDiagonal, StepDiagonalResult
 from selfcal_ros.laser.identify import Choice, identify
 from selfcal_ros.laser.profiles import squareness, straightness
-from selfcal_ros.laser.simulation.measure import (
-    LaserNoise,
-    Measurement,
-    SetUp,
-    StepMachine,
-    simulate_step_diagonal,
-)
+from selfcal_ros.laser.simulation import measure
 from selfcal_ros.units import UM_PER_M
 
 PP, NP = DIAGONALS[2]
 NOISE_DRAWS = 30
+Broken = tuple[measure.StepMachine, measure.Measurement]
 SWEEP = tuple(10.0 ** np.arange(-5, -1.9, 0.5))
 """Angles of a sweep, rad."""
 
@@ -45,7 +40,7 @@ class Fault:
     name: str
     size: float
     unit: str
-    apply: Callable[[StepMachine, float], tuple[StepMachine, Measurement]]
+    apply: Callable[[measure.StepMachine, float], Broken]
     random: bool = False
 
 
@@ -69,58 +64,58 @@ class Effect:
     straightness_m: float
 
 
-def _setup_fault(name: str, make: Callable[[float], tuple[SetUp, SetUp]]) -> Fault:
-    def apply(machine: StepMachine, size: float) -> tuple[StepMachine, Measurement]:
+def _setup_fault(name: str, make: Callable[[float], tuple[measure.SetUp, measure.SetUp]]) -> Fault:
+    def apply(machine: measure.StepMachine, size: float) -> Broken:
         pp, other = make(size)
-        return machine, Measurement({PP: pp, NP: other})
+        return machine, measure.Measurement({PP: pp, NP: other})
 
     return Fault(name, 1e-3, "rad", apply)
 
 
 def _yaw(axis: int, *, wavy: bool = False, abbe_m: float = 0.0, stacked: bool = False) -> Callable:
     """Return a fault of an axis that turns by `size` in every block, or back and forth."""
-    def apply(machine: StepMachine, size: float) -> tuple[StepMachine, Measurement]:
+    def apply(machine: measure.StepMachine, size: float) -> Broken:
         turns = np.zeros((machine.dim, machine.n_blocks, 3))
         turns[axis, :, 2] = size * ((-1.0) ** np.arange(machine.n_blocks) if wavy else 1.0)
-        spot = SetUp(abbe_m=(-abbe_m / np.sqrt(2), abbe_m / np.sqrt(2), 0.0))
+        spot = measure.SetUp(abbe_m=(-abbe_m / np.sqrt(2), abbe_m / np.sqrt(2), 0.0))
         return (replace(machine, turns_rad=turns, stacked=stacked),
-                Measurement({PP: spot, NP: spot}))
+                measure.Measurement({PP: spot, NP: spot}))
 
     return apply
 
 
-def _noise(make: Callable[[float], LaserNoise]) -> Callable:
-    return lambda machine, size: (machine, Measurement({}, make(size)))
+def _noise(make: Callable[[float], measure.LaserNoise]) -> Callable:
+    return lambda machine, size: (machine, measure.Measurement({}, make(size)))
 
 
 FAULTS = (
     Fault("none: laser along the machine's own diagonal", 0.0, "",
-          lambda machine, _: (machine, Measurement())),
+          lambda machine, _: (machine, measure.Measurement())),
     Fault("none: laser along the nominal diagonal", 0.0, "", lambda machine, _: (
-        machine, Measurement(dict.fromkeys((PP, NP), SetUp(to_machine=False))))),
-    _setup_fault("mirror off, pp", lambda s: (SetUp(mirror_rad=(s,)), SetUp())),
-    _setup_fault("mirror off, pp and np equally", lambda s: (SetUp(mirror_rad=(s,)),) * 2),
-    _setup_fault("laser off, pp", lambda s: (SetUp(laser_rad=(s,)), SetUp())),
-    _setup_fault("laser off, pp and np equally", lambda s: (SetUp(laser_rad=(s,)),) * 2),
+        machine, measure.Measurement(dict.fromkeys((PP, NP), measure.SetUp(to_machine=False))))),
+    _setup_fault("mirror off, pp", lambda s: (measure.SetUp(mirror_rad=(s,)), measure.SetUp())),
+    _setup_fault("mirror off, pp and np equally", lambda s: (measure.SetUp(mirror_rad=(s,)),) * 2),
+    _setup_fault("laser off, pp", lambda s: (measure.SetUp(laser_rad=(s,)), measure.SetUp())),
+    _setup_fault("laser off, pp and np equally", lambda s: (measure.SetUp(laser_rad=(s,)),) * 2),
     _setup_fault("laser and mirror off, pp",
-                 lambda s: (SetUp(laser_rad=(s,), mirror_rad=(s,)), SetUp())),
+                 lambda s: (measure.SetUp(laser_rad=(s,), mirror_rad=(s,)), measure.SetUp())),
     _setup_fault("laser and mirror off, pp and np equally",
-                 lambda s: (SetUp(laser_rad=(s,), mirror_rad=(s,)),) * 2),
+                 lambda s: (measure.SetUp(laser_rad=(s,), mirror_rad=(s,)),) * 2),
     Fault("X turns steadily, per block", 1e-6, "rad", _yaw(0)),
     Fault("X turns back and forth, per block", 1e-6, "rad", _yaw(0, wavy=True)),
     Fault("Y turns steadily, per block", 1e-6, "rad", _yaw(1)),
     Fault("X turns and carries Y, per block", 1e-6, "rad", _yaw(0, stacked=True)),
     Fault("X turns steadily, beam 10 mm off the point", 1e-6, "rad", _yaw(0, abbe_m=0.01)),
     Fault("unit of length of the laser, pp", 1e-7, "relative", lambda machine, size: (
-        machine, Measurement({PP: SetUp(scale=size)}))),
+        machine, measure.Measurement({PP: measure.SetUp(scale=size)}))),
     Fault("noise of a laser distance, 3 repeats", 10e-9, "m",
-          _noise(lambda size: LaserNoise(distance_m=size, repeats=3)), random=True),
+          _noise(lambda size: measure.LaserNoise(distance_m=size, repeats=3)), random=True),
     Fault("noise of the linear measurement, 3 repeats", 10e-9, "m",
-          _noise(lambda size: LaserNoise(linear_m=size, repeats=3)), random=True),
+          _noise(lambda size: measure.LaserNoise(linear_m=size, repeats=3)), random=True),
 )
 
 
-def effect(machine: StepMachine, data: StepDiagonal, method: Method) -> Effect:
+def effect(machine: measure.StepMachine, data: StepDiagonal, method: Method) -> Effect:
     """Return the errors of one identification relative to the truth."""
     found = identify(data, Choice(method, allow_equal=True))
     truth = StepDiagonalResult(machine.steps_m, machine.truth_m(), None, "", "", {}, Closure())
@@ -132,32 +127,32 @@ def effect(machine: StepMachine, data: StepDiagonal, method: Method) -> Effect:
                   abs(squareness(found).value - squareness(truth).value), max(straight))
 
 
-def effect_of(fault: Fault, size: float, machine: StepMachine, *, method: Method,
+def effect_of(fault: Fault, size: float, machine: measure.StepMachine, *, method: Method,
               rng: np.random.Generator) -> Effect:
     """Return the effect of a fault of a given size; for a random one the rms over draws."""
     broken, measurement = fault.apply(machine, size)
-    draws = [effect(broken, simulate_step_diagonal(broken, measurement, rng), method)
+    draws = [effect(broken, measure.simulate_step_diagonal(broken, measurement, rng), method)
              for _ in range(NOISE_DRAWS if fault.random else 1)]
     table = np.array([[d.linear_m, d.transverse_m, d.squareness_m, d.straightness_m]
                       for d in draws])
     return Effect(*np.sqrt(np.mean(table**2, axis=0)).tolist())
 
 
-def sensitivity(machine: StepMachine, rng: np.random.Generator) -> list[dict]:
+def sensitivity(machine: measure.StepMachine, rng: np.random.Generator) -> list[dict]:
     """Return one row per fault: its size and the effects on both formulations, m."""
     return [{"fault": fault.name, "size": fault.size, "unit": fault.unit,
              **{method: vars(found) for method, found in
                 _both(fault, fault.size, machine, rng).items()}} for fault in FAULTS]
 
 
-def sweep(machine: StepMachine, rng: np.random.Generator) -> list[dict]:
+def sweep(machine: measure.StepMachine, rng: np.random.Generator) -> list[dict]:
     """Return the effects of the faults of laser and mirror over angles, for a plot."""
     chosen = [fault for fault in FAULTS if fault.unit == "rad" and fault.size == 1e-3]
     return [{"fault": fault.name, "size": list(SWEEP), **_columns(
         [_both(fault, size, machine, rng) for size in SWEEP])} for fault in chosen]
 
 
-def _both(fault: Fault, size: float, machine: StepMachine,
+def _both(fault: Fault, size: float, machine: measure.StepMachine,
           rng: np.random.Generator) -> dict[str, Effect]:
     """Return the effect on each formulation, from the same draws."""
     seed = int(rng.integers(2**63))

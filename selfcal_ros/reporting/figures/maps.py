@@ -11,32 +11,8 @@ import numpy as np
 from selfcal_ros import __version__
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.result import CalibrationResult
-from selfcal_ros.reporting.figures.drawing import (
-    TICK,
-    Drawing,
-    Frame,
-    Point,
-    round_ticks,
-    tick_text,
-)
-from selfcal_ros.reporting.figures.parts import (
-    MAX_ARROWS,
-    WIDTH,
-    Scale,
-    arrow_key,
-    arrows,
-    cells,
-    enlargement,
-    legend,
-    map_frame,
-    ordinal,
-    range_scale,
-    round_end,
-    scale_bar,
-    shortened,
-    thinned,
-    titled,
-)
+from selfcal_ros.reporting.figures import drawing as draw
+from selfcal_ros.reporting.figures import parts
 from selfcal_ros.reporting.summary.format import UNKNOWN, significant
 from selfcal_ros.reporting.summary.numbers import truth_arrays
 from selfcal_ros.reporting.summary.sections import state_sentence
@@ -48,7 +24,7 @@ LEFT, TOP, SIDE = 58.0, 40.0, 336.0
 MAX_SPOTS = 31
 """Sites along a side up to which a pointer shows their values."""
 
-CENTRE: Point = (240.0, 232.0)
+CENTRE: draw.Point = (240.0, 232.0)
 ZERO, ROOM = 112.0, 66.0
 """Radius of the circle of no error, and of the largest error above it; pixels."""
 
@@ -60,7 +36,7 @@ SCALE_AT = math.radians(22.5)
 
 
 def map_picture(result: CalibrationResult,
-                truth: Mapping[str, np.ndarray] | None = None) -> Drawing:
+                truth: Mapping[str, np.ndarray] | None = None) -> draw.Drawing:
     """Return the map as one picture: verdict, vectors, angular error, and where it comes from.
 
     Raises
@@ -69,81 +45,83 @@ def map_picture(result: CalibrationResult,
         If `truth` does not fit the map.
     """
     truth = truth_arrays(result.error_map, truth)
-    parts = [error_map(result, truth)]
+    pictures = [error_map(result, truth)]
     if result.artifact.angular_count:
-        parts.append(angular_map(result, truth))
+        pictures.append(angular_map(result, truth))
     margin, top = 28.0, 30.0
-    drawing = Drawing("map", state_sentence(result), margin + len(parts) * (WIDTH + margin), 0)
-    for line in wrap(state_sentence(result), 52 * len(parts)):
+    width = margin + len(pictures) * (parts.WIDTH + margin)
+    drawing = draw.Drawing("map", state_sentence(result), width, 0)
+    for line in wrap(state_sentence(result), 52 * len(pictures)):
         drawing.label(drawing.width / 2, top, line, size=13, anchor="middle", bold=True)
         top += 18
-    for column, part in enumerate(parts):
-        drawing.add(part, margin + column * (WIDTH + margin), top)
-    drawing.height = top + max(part.height for part in parts) + 44
+    for column, part in enumerate(pictures):
+        drawing.add(part, margin + column * (parts.WIDTH + margin), top)
+    drawing.height = top + max(part.height for part in pictures) + 44
     drawing.label(margin, drawing.height - 14, _origin(result), size=10, colour="soft")
     return drawing
 
 
 def _origin(result: CalibrationResult) -> str:
     source = os.path.basename(str(result.input.get("file", "")))
-    parts = [f"plan {shortened(result.plan_id, 60)}", f"method {shortened(result.method, 20)}",
+    words = [f"plan {parts.shortened(result.plan_id, 60)}",
+             f"method {parts.shortened(result.method, 20)}",
              f"θ datum {result.error_map.datum_theta}" if result.artifact.angular_count else "",
-             f"input {shortened(source, 60)}" if source else "", f"selfcal {__version__}"]
-    return "  ·  ".join(part for part in parts if part)
+             f"input {parts.shortened(source, 60)}" if source else "", f"selfcal {__version__}"]
+    return "  ·  ".join(word for word in words if word)
 
 
 def error_map(result: CalibrationResult,
-              truth: Mapping[str, np.ndarray] | None = None) -> Drawing:
+              truth: Mapping[str, np.ndarray] | None = None) -> draw.Drawing:
     """Return the vectors of G over their length, U around their heads, a known truth beneath."""
     emap, artifact, k = result.error_map, result.artifact, result.noise.k_xy
-    sites = thinned(artifact, MAX_ARROWS)
+    sites = parts.thinned(artifact, parts.MAX_ARROWS)
     step = sites[0].step or 1
     length = np.hypot(emap.gx, emap.gy)
     U = np.stack([emap.u_gx, emap.u_gy]) * k
-    factor = enlargement(np.fmax(length, U.max(axis=0)), step * artifact.grid_pitch_m)
+    factor = parts.enlargement(np.fmax(length, U.max(axis=0)), step * artifact.grid_pitch_m)
 
-    def shown(parts: Iterable[np.ndarray], scale: float = 1.0) -> np.ndarray:
-        return np.stack([part[sites].ravel() for part in parts]) * scale
+    def shown(along: Iterable[np.ndarray], scale: float = 1.0) -> np.ndarray:
+        return np.stack([part[sites].ravel() for part in along]) * scale
 
     at = shown((artifact.x_m, artifact.y_m), MM_PER_M)
     around = shown(U, factor * MM_PER_M)
     fields = [shown(np.where(emap.valid, g[key], np.nan) for key in ("gx", "gy"))
               for g in (vars(emap), truth) if g is not None]
     tips = [at + field * factor * MM_PER_M for field in fields]
-    drawing = titled("error-map", "Error of the stage, G = indicated − true")
+    drawing = parts.titled("error-map", "Error of the stage, G = indicated − true")
     frame = _frame(drawing, artifact, [np.abs(tip) + np.nan_to_num(around) for tip in tips])
-    scale = Scale("e", 0.0, round_end(length * UM_PER_M))
-    cells(frame, artifact, length * UM_PER_M, scale)
+    scale = parts.Scale("e", 0.0, parts.round_end(length * UM_PER_M))
+    parts.cells(frame, artifact, length * UM_PER_M, scale)
     entries = [("ink", "measured")]
     if truth is not None:
-        arrows(frame, at, fields[1], factor, colour="truth", width=3.4, heads=False)
+        parts.arrows(frame, at, fields[1], factor, colour="truth", width=3.4, heads=False)
         entries.append(("truth", "known truth"))
     if _ellipses(frame, tips[0], around):
         entries.append(("band", f"U, k = {k:.3g}"))
-    arrows(frame, at, fields[0], factor)
+    parts.arrows(frame, at, fields[0], factor)
     frame.axes(x_label="stage x in mm", y_label="stage y in mm")
     left, top, width, height = frame.box
-    scale_bar(drawing, scale, (left + width + 16, top, 14.0, height))
+    parts.scale_bar(drawing, scale, (left + width + 16, top, 14.0, height))
     _spots(frame, result)
-    arrow_key(frame, factor, (LEFT, top + height + 58))
-    thin = "" if step == 1 else f", every {ordinal(step)} site"
+    parts.arrow_key(frame, factor, (LEFT, top + height + 58))
+    thin = "" if step == 1 else f", every {parts.ordinal(step)} site"
     drawing.label(LEFT + 130, top + height + 62, f"vectors enlarged {factor:,.0f} ×{thin}"
                   if emap.valid.any() else "not one site is known")
-    legend(drawing, entries, (LEFT, top + height + 82))
+    parts.legend(drawing, entries, (LEFT, top + height + 82))
     drawing.height = top + height + 92
     return drawing
 
 
-def _frame(drawing: Drawing, artifact: Artifact, ends_mm: list[np.ndarray]) -> Frame:
+def _frame(drawing: draw.Drawing, artifact: Artifact, ends_mm: list[np.ndarray]) -> draw.Frame:
     """Return the frame of a map that also holds places (2, P), up to four pitches off the field."""
     pitch = artifact.grid_pitch_m * MM_PER_M
     x, y = (min(max((half + 0.5) * pitch, float(np.nanmax(ends, initial=0.0)) + 0.2 * pitch),
                 (half + 4) * pitch)
             for half, ends in zip(artifact.half, np.concatenate(ends_mm, axis=1), strict=True))
-    return Frame(drawing, (LEFT, TOP, SIDE, SIDE * y / x), (-x, x), (-y, y))
+    return draw.Frame(drawing, (LEFT, TOP, SIDE, SIDE * y / x), (-x, x), (-y, y))
 
 
-def _ellipses(frame: Frame, tips_mm: np.ndarray, u_mm: np.ndarray) -> bool:
+def _ellipses(frame: draw.Frame, tips_mm: np.ndarray, u_mm: np.ndarray) -> bool:
     """Draw U (2, P) around the heads (2, P); return whether it is large enough to be seen."""
     known = np.isfinite(u_mm + tips_mm).all(axis=0)
     radii = (u_mm * np.array([[frame.per_x], [frame.per_y]]))[:, known]
@@ -154,7 +132,7 @@ def _ellipses(frame: Frame, tips_mm: np.ndarray, u_mm: np.ndarray) -> bool:
     return True
 
 
-def _spots(frame: Frame, result: CalibrationResult) -> None:
+def _spots(frame: draw.Frame, result: CalibrationResult) -> None:
     """Show a pointer the values of each site of a field that is not too large."""
     emap, artifact, k = result.error_map, result.artifact, result.noise.k_xy
     if max(artifact.shape) > MAX_SPOTS:
@@ -169,18 +147,19 @@ def _spots(frame: Frame, result: CalibrationResult) -> None:
         frame.drawing.spot(*frame.at(x, y), radius, f"x {x:.6g} mm, y {y:.6g} mm: {words}")
 
 
-def component_maps(result: CalibrationResult) -> Drawing:
+def component_maps(result: CalibrationResult) -> draw.Drawing:
     """Return Gx and Gy at one scale, and below the expanded uncertainty of both at its own."""
     emap, k = result.error_map, result.noise.k_xy
     errors = np.stack([emap.gx, emap.gy]) * UM_PER_M
     u = np.where(emap.valid, np.stack([emap.u_gx, emap.u_gy]), np.nan) * k * UM_PER_M
-    end, side, gap, left, top = round_end(errors), 158.0, 44.0, 44.0, 50.0
-    drawing = titled("components", f"Components of the error, and their U with k = {k:.3g}")
-    for names, pair, scale in ((("Gx", "Gy"), errors, Scale("d", -end, end)),
-                               (("U(Gx)", "U(Gy)"), u, range_scale("v", u))):
+    end, side, gap, left, top = parts.round_end(errors), 158.0, 44.0, 44.0, 50.0
+    drawing = parts.titled("components", f"Components of the error, and their U with k = {k:.3g}")
+    for names, pair, scale in ((("Gx", "Gy"), errors, parts.Scale("d", -end, end)),
+                               (("U(Gx)", "U(Gy)"), u, parts.range_scale("v", u))):
         for column, (name, values) in enumerate(zip(names, pair, strict=True)):
-            frame = map_frame(drawing, result.artifact, (left + column * (side + gap), top, side))
-            cells(frame, result.artifact, values, scale)
+            box = (left + column * (side + gap), top, side)
+            frame = parts.map_frame(drawing, result.artifact, box)
+            parts.cells(frame, result.artifact, values, scale)
             frame.axes(ticks=(4, 4), x_label="mm" if name.startswith("U") else "")
             uniform = scale.low == scale.high
             drawing.label(frame.box[0], top - 7, name, bold=True)
@@ -189,21 +168,21 @@ def component_maps(result: CalibrationResult) -> Drawing:
                               f"{significant(scale.high)} µm everywhere"
                               if np.isfinite(values).any() else "not known", anchor="middle")
         if not uniform:
-            scale_bar(drawing, scale, (left + 2 * side + gap + 14, top, 12.0, frame.box[3]))
+            parts.scale_bar(drawing, scale, (left + 2 * side + gap + 14, top, 12.0, frame.box[3]))
         top += frame.box[3] + 56
     drawing.height = top - 8
     return drawing
 
 
 def angular_map(result: CalibrationResult,
-                truth: Mapping[str, np.ndarray] | None = None) -> Drawing:
+                truth: Mapping[str, np.ndarray] | None = None) -> draw.Drawing:
     """Return the angular error around the circle, with its expanded uncertainty as a band."""
     emap, k = result.error_map, result.noise.k_theta
     error, u = emap.g_theta * ARCSEC_PER_RAD, emap.u_g_theta * k * ARCSEC_PER_RAD
     true = None if truth is None or truth.get("g_theta") is None else np.asarray(
         truth["g_theta"]) * ARCSEC_PER_RAD
-    drawing = titled("angular-map", "Error in θ in arcsec, outwards = counter-clockwise",
-                     CENTRE[1] + 230)
+    drawing = parts.titled("angular-map", "Error in θ in arcsec, outwards = counter-clockwise",
+                           CENTRE[1] + 230)
     curves = [np.abs(error) + np.nan_to_num(u)] + ([] if true is None else [np.abs(true)])
     known = np.concatenate(curves)
     known = known[np.isfinite(known)]
@@ -226,21 +205,21 @@ def angular_map(result: CalibrationResult,
                          f"line {i}, {math.degrees(angles[i]):.6g}°: {significant(error[i])} ± "
                          f"{significant(u[i])} arcsec (k = {k:.3g})")
     _scale(drawing, span)
-    legend(drawing, entries, (90, CENTRE[1] + 220))
+    parts.legend(drawing, entries, (90, CENTRE[1] + 220))
     return drawing
 
 
-def _at(angle: float, value: float, span: float) -> Point:
+def _at(angle: float, value: float, span: float) -> draw.Point:
     radius = ZERO + ROOM * max(min(value / span, 1.2), -1.2)
     return CENTRE[0] + radius * math.cos(angle), CENTRE[1] - radius * math.sin(angle)
 
 
-def _ring(value: float, span: float) -> list[Point]:
+def _ring(value: float, span: float) -> list[draw.Point]:
     return [_at(math.radians(degrees), value, span) for degrees in range(0, 361, 5)]
 
 
-def _rings(drawing: Drawing, span: float) -> None:
-    for value in round_ticks(-span, span, 4):
+def _rings(drawing: draw.Drawing, span: float) -> None:
+    for value in draw.round_ticks(-span, span, 4):
         drawing.line(_ring(value, span), stroke="line")
     drawing.line(_ring(0.0, span), stroke="soft", dash=(5, 4))
     for degrees in range(0, 360, 45):
@@ -248,16 +227,16 @@ def _rings(drawing: Drawing, span: float) -> None:
         drawing.line([_at(angle, -span, span), _at(angle, span, span)], stroke="line")
         outside = ZERO + ROOM + 16
         drawing.label(CENTRE[0] + outside * math.cos(angle),
-                      CENTRE[1] - outside * math.sin(angle) + 4, f"{degrees}°", size=TICK,
+                      CENTRE[1] - outside * math.sin(angle) + 4, f"{degrees}°", size=draw.TICK,
                       anchor="middle", colour="soft")
 
 
-def _scale(drawing: Drawing, span: float) -> None:
-    for value in round_ticks(-span, span, 4):
+def _scale(drawing: draw.Drawing, span: float) -> None:
+    for value in draw.round_ticks(-span, span, 4):
         x, y = _at(SCALE_AT, value, span)
-        words = ("+" if value > 0 else "") + tick_text(value)
+        words = ("+" if value > 0 else "") + draw.tick_text(value)
         drawing.box(x - 3.4 * len(words), y - 7, 6.8 * len(words), 14, fill="paper")
-        drawing.label(x, y + 4, words, size=TICK, anchor="middle")
+        drawing.label(x, y + 4, words, size=draw.TICK, anchor="middle")
 
 
 def _between(known: np.ndarray) -> list[tuple[int, int]]:
@@ -266,13 +245,13 @@ def _between(known: np.ndarray) -> list[tuple[int, int]]:
     return [(i, (i + 1) % count) for i in range(count) if known[i] and known[(i + 1) % count]]
 
 
-def _curve(drawing: Drawing, angles: np.ndarray, values: np.ndarray, span: float, *,
+def _curve(drawing: draw.Drawing, angles: np.ndarray, values: np.ndarray, span: float, *,
            colour: str, width: float) -> None:
     drawing.lines([[_at(angles[k], values[k], span) for k in pair]
                    for pair in _between(np.isfinite(values))], stroke=colour, width=width)
 
 
-def _band(drawing: Drawing, angles: np.ndarray, error: np.ndarray, u: np.ndarray,
+def _band(drawing: draw.Drawing, angles: np.ndarray, error: np.ndarray, u: np.ndarray,
           span: float) -> None:
     drawing.shapes([[_at(angles[k], error[k] + side * u[k], span)
                      for k, side in ((i, 1), (j, 1), (j, -1), (i, -1))]

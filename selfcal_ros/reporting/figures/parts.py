@@ -10,18 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.reporting.figures.drawing import (
-    LEVELS,
-    SIDES,
-    TICK,
-    Drawing,
-    Frame,
-    Point,
-    round_down,
-    round_step,
-    round_ticks,
-    tick_text,
-)
+from selfcal_ros.reporting.figures import drawing as draw
 from selfcal_ros.reporting.summary.format import significant
 from selfcal_ros.units import MM_PER_M, UM_PER_M
 
@@ -43,21 +32,22 @@ class Scale(NamedTuple):
     high: float
 
 
-def titled(name: str, title: str, height: float = 0.0) -> Drawing:
+def titled(name: str, title: str, height: float = 0.0) -> draw.Drawing:
     """Return an empty figure with its title."""
-    drawing = Drawing(name, title, WIDTH, height)
+    drawing = draw.Drawing(name, title, WIDTH, height)
     drawing.label(0, 16, title, size=13, bold=True)
     return drawing
 
 
-def map_frame(drawing: Drawing, artifact: Artifact, box: tuple[float, float, float]) -> Frame:
+def map_frame(drawing: draw.Drawing, artifact: Artifact,
+              box: tuple[float, float, float]) -> draw.Frame:
     """Return a frame of the field in mm with half a cell of margin.
 
     `box` is left, top and width in pixels; the height follows from the shape of the plate.
     """
     left, top, width = box
     x, y = ((half + 0.5) * artifact.grid_pitch_m * MM_PER_M for half in artifact.half)
-    return Frame(drawing, (left, top, width, width * y / x), (-x, x), (-y, y))
+    return draw.Frame(drawing, (left, top, width, width * y / x), (-x, x), (-y, y))
 
 
 def thinned(artifact: Artifact, most: int) -> tuple[slice, slice]:
@@ -67,14 +57,14 @@ def thinned(artifact: Artifact, most: int) -> tuple[slice, slice]:
     return slice(half_x % step, None, step), slice(half_y % step, None, step)
 
 
-def cells(frame: Frame, artifact: Artifact, values: np.ndarray, scale: Scale) -> None:
+def cells(frame: draw.Frame, artifact: Artifact, values: np.ndarray, scale: Scale) -> None:
     """Colour the cell of every site; unknown sites take the colour of nothing."""
     sites = thinned(artifact, MAX_CELLS)
     step = sites[0].step or 1
     level = levels(values[sites], scale)
     x, y = (along[sites] * MM_PER_M for along in (artifact.x_m, artifact.y_m))
     half = 0.5 * step * artifact.grid_pitch_m * MM_PER_M
-    outlines: dict[int, list[tuple[Point, ...]]] = {}
+    outlines: dict[int, list[tuple[draw.Point, ...]]] = {}
     for i in range(level.shape[0]):
         for _, run in groupby(range(level.shape[1]), level[i].__getitem__):
             alike = list(run)
@@ -88,7 +78,7 @@ def cells(frame: Frame, artifact: Artifact, values: np.ndarray, scale: Scale) ->
         frame.drawing.shapes(outlines[found], fill="none" if found < 0 else f"{scale.ramp}{found}")
 
 
-def _clipped(frame: Frame, point: Point) -> Point:
+def _clipped(frame: draw.Frame, point: draw.Point) -> draw.Point:
     left, top, width, height = frame.box
     return (min(max(point[0], left), left + width), min(max(point[1], top), top + height))
 
@@ -98,33 +88,33 @@ def levels(values: np.ndarray, scale: Scale) -> np.ndarray:
 
     Of a scale with equal ends it is the middle one.
     """
-    top = 2 * SIDES if scale.ramp == "d" else LEVELS - 1
+    top = 2 * draw.SIDES if scale.ramp == "d" else draw.LEVELS - 1
     with np.errstate(invalid="ignore", over="ignore"):
         offset, span = np.asarray(values) - scale.low, scale.high - scale.low
         part = np.clip(offset / span if span else 0.4 + 0 * offset, 0, 1)
-        step = np.rint(part * top) if scale.ramp == "d" else np.floor(part * LEVELS)
+        step = np.rint(part * top) if scale.ramp == "d" else np.floor(part * draw.LEVELS)
     return np.where(np.isfinite(part), np.minimum(step, top), -1).astype(int)
 
 
-def scale_bar(drawing: Drawing, scale: Scale, box: tuple[float, float, float, float],
+def scale_bar(drawing: draw.Drawing, scale: Scale, box: tuple[float, float, float, float],
               unit: str = "µm") -> None:
     """Draw the colours of a scale from bottom to top with round numbers to the right of it."""
     left, top, width, height = box
-    count = 2 * SIDES + 1 if scale.ramp == "d" else LEVELS
+    count = 2 * draw.SIDES + 1 if scale.ramp == "d" else draw.LEVELS
     each = height / count
     for step in range(count):
         drawing.box(left, top + height - (step + 1) * each, width, each,
                     fill=f"{scale.ramp}{step}")
     drawing.box(*box, stroke="soft")
     inset = each / 2 if scale.ramp == "d" else 0.0  # its outer steps are centred on the ends
-    frame = Frame(drawing, (left, top + inset, width, height - 2 * inset), (0.0, 1.0),
-                  (scale.low, scale.high))
-    for value in round_ticks(scale.low, scale.high, 5):
+    frame = draw.Frame(drawing, (left, top + inset, width, height - 2 * inset), (0.0, 1.0),
+                       (scale.low, scale.high))
+    for value in draw.round_ticks(scale.low, scale.high, 5):
         y = frame.at(0, value)[1]
         drawing.line([(left + width, y), (left + width + 3, y)], stroke="soft")
-        drawing.label(left + width + 6, y + 0.35 * TICK, tick_text(value), size=TICK,
+        drawing.label(left + width + 6, y + 0.35 * draw.TICK, draw.tick_text(value), size=draw.TICK,
                       colour="soft")
-    drawing.label(left + width / 2, top - 7, unit, size=TICK, anchor="middle", colour="soft")
+    drawing.label(left + width / 2, top - 7, unit, size=draw.TICK, anchor="middle", colour="soft")
 
 
 def round_end(values: np.ndarray) -> float:
@@ -133,7 +123,7 @@ def round_end(values: np.ndarray) -> float:
     largest = float(known.max()) if known.size else 0.0
     if largest <= 0:
         return 1.0
-    step = round_step(largest, 5) / 2
+    step = draw.round_step(largest, 5) / 2
     return step * math.ceil(largest / step - 1e-9)
 
 
@@ -146,7 +136,7 @@ def range_scale(ramp: str, values: np.ndarray) -> Scale:
     low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 0.0)
     if high - low <= 0.01 * high:
         return Scale(ramp, high, high)
-    step = round_step(high - low, 5) / 2
+    step = draw.round_step(high - low, 5) / 2
     return Scale(ramp, step * math.floor(low / step + 1e-9), step * math.ceil(high / step - 1e-9))
 
 
@@ -159,10 +149,10 @@ def enlargement(lengths_m: np.ndarray, spacing_m: float) -> float:
     factor = 1.2 * spacing_m / typical
     if not math.isfinite(factor):
         return 1.0
-    return round_down(factor)
+    return draw.round_down(factor)
 
 
-def arrows(frame: Frame, xy_mm: np.ndarray, vectors_m: np.ndarray, factor: float, *,
+def arrows(frame: draw.Frame, xy_mm: np.ndarray, vectors_m: np.ndarray, factor: float, *,
            colour: str = "ink", width: float = 1.2, heads: bool = True) -> None:
     """Draw vectors (2, P) from places (2, P), enlarged by `factor`; unknown ones are left out."""
     shafts, tips = [], []
@@ -181,7 +171,8 @@ def arrows(frame: Frame, xy_mm: np.ndarray, vectors_m: np.ndarray, factor: float
     frame.drawing.shapes(tips, fill=colour)
 
 
-def _head(start: Point, end: Point, length: float, width: float) -> tuple[Point, ...]:
+def _head(start: draw.Point, end: draw.Point, length: float,
+          width: float) -> tuple[draw.Point, ...]:
     """Return the outline of an arrow's head."""
     size = min(3.2 + 1.8 * width, 0.6 * length)
     ux, uy = (end[0] - start[0]) / length, (end[1] - start[1]) / length
@@ -191,31 +182,31 @@ def _head(start: Point, end: Point, length: float, width: float) -> tuple[Point,
             (back[0] + uy * side, back[1] - ux * side))
 
 
-def curved_arrow(drawing: Drawing, way: Sequence[Point], *, colour: str) -> None:
+def curved_arrow(drawing: draw.Drawing, way: Sequence[draw.Point], *, colour: str) -> None:
     """Draw a line through points with a head at its end."""
     back = next((point for point in reversed(way) if math.dist(point, way[-1]) >= 9), way[0])
     drawing.line(way, stroke=colour, width=1.4)
     drawing.shapes([_head(back, way[-1], math.dist(back, way[-1]), 3.0)], fill=colour)
 
 
-def arrow_key(frame: Frame, factor: float, at: Point) -> None:
+def arrow_key(frame: draw.Frame, factor: float, at: draw.Point) -> None:
     """Draw an arrow of a round length at the pixel `at` and say how long it is."""
     per_unit = factor * MM_PER_M / UM_PER_M * frame.per_x
-    value = round_down(46.0 / per_unit) if per_unit > 0 else 1.0
+    value = draw.round_down(46.0 / per_unit) if per_unit > 0 else 1.0
     end = at[0] + value * per_unit, at[1]
     frame.drawing.lines([(at, end)], width=1.4)
     frame.drawing.shapes([_head(at, end, value * per_unit, 1.4)], fill="ink")
-    frame.drawing.label(end[0] + 6, at[1] + 4, f"{significant(value, 1)} µm", size=TICK + 1)
+    frame.drawing.label(end[0] + 6, at[1] + 4, f"{significant(value, 1)} µm", size=draw.TICK + 1)
 
 
-def legend(drawing: Drawing, entries: Sequence[tuple[str, str]], at: Point, *,
+def legend(drawing: draw.Drawing, entries: Sequence[tuple[str, str]], at: draw.Point, *,
            gap: float = 14.0) -> None:
     """Write (colour, words) in a row with a dot of the colour before each."""
     x, y = at
     for colour, words in entries:
         drawing.discs([(x + 4, y - 4)], 4.0, fill=colour)
-        drawing.label(x + 12, y, words, size=TICK + 1)
-        x += 12 + text_width(words, TICK + 1) + gap
+        drawing.label(x + 12, y, words, size=draw.TICK + 1)
+        x += 12 + text_width(words, draw.TICK + 1) + gap
 
 
 def text_width(words: str, size: float) -> float:
@@ -229,8 +220,8 @@ def ordinal(number: int) -> str:
     return f"{number}{'th' if teen else {1: 'st', 2: 'nd', 3: 'rd'}.get(number % 10, 'th')}"
 
 
-def panels(drawing: Drawing, titles: Sequence[str], reach_mm: Sequence[float],
-           below: float = 50.0) -> list[Frame]:
+def panels(drawing: draw.Drawing, titles: Sequence[str], reach_mm: Sequence[float],
+           below: float = 50.0) -> list[draw.Frame]:
     """Return two titled frames of the field a row; the drawing grows, with room below each row."""
     side, gap, left, top = 186.0, 42.0, 46.0, 48.0
     height = side * reach_mm[1] / reach_mm[0]
@@ -238,7 +229,8 @@ def panels(drawing: Drawing, titles: Sequence[str], reach_mm: Sequence[float],
     for number, title in enumerate(titles):
         box = (left + number % 2 * (side + gap), top + number // 2 * (height + below), side, height)
         drawing.label(box[0], box[1] - 6, shortened(title, 26), bold=True)
-        out.append(Frame(drawing, box, (-reach_mm[0], reach_mm[0]), (-reach_mm[1], reach_mm[1])))
+        spans = [(-reach, reach) for reach in reach_mm]
+        out.append(draw.Frame(drawing, box, spans[0], spans[1]))
     drawing.height = top + -(-len(titles) // 2) * (height + below) - 26
     return out
 
@@ -262,14 +254,14 @@ class Curve:
     band: bool = False
 
 
-def chart(drawing: Drawing, box: tuple[float, float, float, float], curves: Sequence[Curve], *,
+def chart(drawing: draw.Drawing, box: tuple[float, float, float, float], curves: Sequence[Curve], *,
           title: str = "", labels: tuple[str, str] = ("", ""), log: bool = False,
           x: tuple[float, float] | None = None, y: tuple[float, float] | None = None) -> None:
     """Draw curves over x and y, which hold all of them unless given; `log` = both logarithmic."""
     scaled = [replace(c, x=np.log10(c.x), y=np.log10(c.y)) for c in curves] if log else curves
     reach = [c.y + side * (0.0 if c.U is None else c.U) for c in scaled for side in (-1, 1)]
-    frame = Frame(drawing, box, x or _span([c.x for c in scaled], 0.04), y or _span(reach, 0.06),
-                  log)
+    frame = draw.Frame(drawing, box, x or _span([c.x for c in scaled], 0.04),
+                       y or _span(reach, 0.06), log)
     drawing.label(box[0], box[1] - 7, title, bold=True)
     for curve in scaled:
         low, high = ([frame.at(*point) for point in zip(curve.x, curve.y + side * (

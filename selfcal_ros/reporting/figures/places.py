@@ -12,17 +12,8 @@ from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.result import CalibrationResult, ViewResult
 from selfcal_ros.model.view import View
 from selfcal_ros.model.visit_order import check_marks
+from selfcal_ros.reporting.figures import parts
 from selfcal_ros.reporting.figures.drawing import SERIES, Drawing, Frame, Point
-from selfcal_ros.reporting.figures.parts import (
-    MAX_ARROWS,
-    WIDTH,
-    curved_arrow,
-    legend,
-    panels,
-    text_width,
-    thinned,
-    titled,
-)
 from selfcal_ros.reporting.figures.residuals import places_mm
 from selfcal_ros.reporting.summary.format import printable
 from selfcal_ros.reporting.summary.sections import pose_text
@@ -34,7 +25,7 @@ def plan_figure(artifact: Artifact, views: Sequence[View]) -> Drawing:
 
     Marks beyond the field of the stage are hollow: no view reads them.
     """
-    drawing = titled("views", "How the plate lies in every view")
+    drawing = parts.titled("views", "How the plate lies in every view")
     margin = 2.6 * artifact.grid_pitch_m
     reach = [(half + margin) * MM_PER_M for half in artifact.field_half_m]
     if artifact.map_grid is not None:  # the corners may reach far beyond the field
@@ -42,7 +33,7 @@ def plan_figure(artifact: Artifact, views: Sequence[View]) -> Drawing:
         reach = np.maximum(reach, corners.max(axis=(0, 2)) + margin / 2 * MM_PER_M).tolist()
     titles = [f"{view.name}: {pose_text(view.rotation_rad, view.translation_m, artifact)}"
               for view in views]
-    for frame, view in zip(panels(drawing, titles, reach), views, strict=True):
+    for frame, view in zip(parts.panels(drawing, titles, reach), views, strict=True):
         _plate(frame, view, artifact)
         frame.border()
     said = ["shaded: field; dot: corner (h, h) of the plate; arrow: its turn",
@@ -81,7 +72,7 @@ def _plate(frame: Frame, view: View, artifact: Artifact) -> None:
     low, high = frame.at(-field[0], -field[1]), frame.at(*field)
     drawing.box(low[0], high[1], high[0] - low[0], low[1] - high[1], fill="e2")
     drawing.line(_at(frame, _places_mm(view, *_corners(artifact))), stroke="truth", width=1.6)
-    sites = thinned(artifact, MAX_ARROWS)
+    sites = parts.thinned(artifact, parts.MAX_ARROWS)
     place = _places_mm(view, artifact.x_m[sites], artifact.y_m[sites])
     if view.grid:
         pose = view.on_stage(artifact)
@@ -101,7 +92,7 @@ def _plate(frame: Frame, view: View, artifact: Artifact) -> None:
         inside = 0.72 * half * pitch
         arc = np.hstack([_places_mm(replace(view, rotation_rad=float(angle)), *inside)
                          for angle in np.linspace(0.0, view.rotation_rad, 61)])
-        curved_arrow(drawing, _at(frame, arc), colour="truth")
+        parts.curved_arrow(drawing, _at(frame, arc), colour="truth")
 
 
 def _places_mm(view: View, x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
@@ -165,8 +156,8 @@ def rejected_map(result: CalibrationResult) -> Drawing | None:
     reach = [half + 1.2 * artifact.grid_pitch_m * MM_PER_M for half in field]
     colours = {reason: f"c{i % SERIES}" for i, (reason, _) in enumerate(
         Counter(row[1] for row in found).most_common())}
-    drawing = titled("rejected", "Rejected grid readings, where they happened")
-    for title, frame in zip(names, panels(drawing, names, reach), strict=True):
+    drawing = parts.titled("rejected", "Rejected grid readings, where they happened")
+    for title, frame in zip(names, parts.panels(drawing, names, reach), strict=True):
         low, high = frame.at(-field[0], -field[1]), frame.at(*field)
         drawing.box(low[0], high[1], high[0] - low[0], low[1] - high[1], fill="card")
         for reason, colour in colours.items():
@@ -185,9 +176,9 @@ def _legend(drawing: Drawing, entries: dict[str, tuple[str, int]]) -> None:
     x, y = 46.0, drawing.height + 14
     for reason, (colour, count) in entries.items():
         words = f"{printable(reason).replace('_', ' ')} ({count})"
-        width = 26 + text_width(words, 12)
-        if x + width > WIDTH and x > 46:
+        width = 26 + parts.text_width(words, 12)
+        if x + width > parts.WIDTH and x > 46:
             x, y = 46.0, y + 18
-        legend(drawing, [(colour, words)], (x, y))
+        parts.legend(drawing, [(colour, words)], (x, y))
         x += width
     drawing.height = y + 10

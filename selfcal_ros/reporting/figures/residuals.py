@@ -12,20 +12,8 @@ from scipy.special import ndtri
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.result import CalibrationResult, ViewResult
 from selfcal_ros.model.statistics import rms
+from selfcal_ros.reporting.figures import parts
 from selfcal_ros.reporting.figures.drawing import SERIES, Drawing, Frame, span_of
-from selfcal_ros.reporting.figures.parts import (
-    MAX_ARROWS,
-    Curve,
-    arrow_key,
-    arrows,
-    chart,
-    enlargement,
-    legend,
-    panels,
-    shortened,
-    thinned,
-    titled,
-)
 from selfcal_ros.reporting.summary.format import significant
 from selfcal_ros.units import ARCSEC_PER_RAD, MM_PER_M, UM_PER_M
 
@@ -110,19 +98,19 @@ def residual_maps(result: CalibrationResult, found: Sequence[ViewResiduals]) -> 
     if not views:
         return None
     artifact = result.artifact
-    sites = thinned(artifact, MAX_ARROWS)
-    factor = enlargement(np.concatenate([np.hypot(*v.xy_m).ravel() for v in views]),
-                         (sites[0].step or 1) * artifact.grid_pitch_m)
-    drawing = titled("residual-maps", "Residuals of the grid readings by view")
+    sites = parts.thinned(artifact, parts.MAX_ARROWS)
+    factor = parts.enlargement(np.concatenate([np.hypot(*v.xy_m).ravel() for v in views]),
+                               (sites[0].step or 1) * artifact.grid_pitch_m)
+    drawing = parts.titled("residual-maps", "Residuals of the grid readings by view")
     reach = [max(float(np.abs(v.places_mm(artifact)[axis]).max()) for v in views)
              + 1.3 * artifact.grid_pitch_m * MM_PER_M for axis in (0, 1)]
-    frames = panels(drawing, [v.view.name for v in views], reach)
+    frames = parts.panels(drawing, [v.view.name for v in views], reach)
     for view, frame in zip(views, frames, strict=True):
         frame.axes(ticks=(4, 4))
         at = view.places_mm(artifact)[:, *sites].reshape(2, -1)
-        arrows(frame, at, view.xy_m[:, *sites].reshape(2, -1), factor, width=0.9)
+        parts.arrows(frame, at, view.xy_m[:, *sites].reshape(2, -1), factor, width=0.9)
     y = drawing.height + 18
-    arrow_key(frames[0], factor, (46, y))
+    parts.arrow_key(frames[0], factor, (46, y))
     drawing.label(150, y + 4, f"enlarged {factor:,.0f} ×; axes in mm")
     drawing.height = y + 16
     return drawing
@@ -154,14 +142,14 @@ def distributions(found: Sequence[ViewResiduals], kind: str) -> Drawing | None:
     if not rows:
         return None
     what = "grid" if xy else "angular"
-    drawing = titled(f"distributions-{kind}", f"Distribution of the {what} residuals by view",
-                     44 + 148.0 * len(rows))
+    drawing = parts.titled(f"distributions-{kind}", f"Distribution of the {what} residuals by view",
+                           44 + 148.0 * len(rows))
     end = 1.05 * span_of(np.concatenate([values for _, values in rows]).tolist())
     for number, (name, values) in enumerate(rows):
         top = 50.0 + 148 * number
         last = number == len(rows) - 1
         size = rms(values)
-        drawing.label(46, top - 7, shortened(name, 24), bold=True)
+        drawing.label(46, top - 7, parts.shortened(name, 24), bold=True)
         drawing.label(472, top - 7, f"{len(values)} residuals, rms {significant(size)} {unit}",
                       size=11, anchor="end", colour="soft")
         _histogram(drawing, values, size, (46, top, 190, 96), end).axes(
@@ -222,7 +210,7 @@ def courses(found: Sequence[ViewResiduals], sigma_m: float) -> Drawing | None:
     views = [v for v in found if v.course.shape[1] > 1]
     if not views:
         return None
-    drawing = titled("courses", "Mean residuals over the time of each view, µm")
+    drawing = parts.titled("courses", "Mean residuals over the time of each view, µm")
     bands = [2 * sigma_m * UM_PER_M / np.sqrt(np.maximum(v.course[3], 1)) for v in views]
     end = 1.1 * max(span_of((v.course[1:3] * UM_PER_M).ravel().tolist() + band.tolist())
                     for v, band in zip(views, bands, strict=True))
@@ -231,15 +219,16 @@ def courses(found: Sequence[ViewResiduals], sigma_m: float) -> Drawing | None:
         t = view.course[0] - view.course[0, 0]
         minutes = t[-1] > 180
         t = t / (60 if minutes else 1)
-        expected = [Curve(t, np.zeros(len(t)), "band", 0.0, U=band, band=True)]
-        chart(drawing, (52, top, 420, 84), [
+        expected = [parts.Curve(t, np.zeros(len(t)), "band", 0.0, U=band, band=True)]
+        parts.chart(drawing, (52, top, 420, 84), [
             *(expected if np.isfinite(band).all() else []),
-            *(Curve(t, view.course[axis] * UM_PER_M, f"c{axis - 1}") for axis in (1, 2))],
-            title=shortened(view.view.name, 40), x=(0.0, float(t[-1]) or 1.0), y=(-end, end))
+            *(parts.Curve(t, view.course[axis] * UM_PER_M, f"c{axis - 1}") for axis in (1, 2))],
+            title=parts.shortened(view.view.name, 40), x=(0.0, float(t[-1]) or 1.0), y=(-end, end))
         drawing.label(472, top - 7, "time in min" if minutes else "time in s", size=11,
                       colour="soft", anchor="end")
         top += 84 + 46
-    legend(drawing, [("c0", "x"), ("c1", "y"), ("band", "95 % of random noise")], (52, top - 14))
+    parts.legend(drawing, [("c0", "x"), ("c1", "y"), ("band", "95 % of random noise")],
+                 (52, top - 14))
     drawing.height = top - 4
     return drawing
 
@@ -260,18 +249,18 @@ def drift_found(result: CalibrationResult) -> Drawing | None:
     if not paths:
         return None
     names = list(dict.fromkeys(view for view, _ in paths))
-    drawing = titled("drift", "Drift found in each view, µm")
+    drawing = parts.titled("drift", "Drift found in each view, µm")
     end = 1.1 * span_of(np.concatenate(list(paths.values())).tolist())
-    chart(drawing, (58, 34, 414, 190), [
-        Curve(np.array([0.0, 1.0]), np.zeros(2), "line", 1.0),
-        *(Curve((tau + 1) / 2, paths[name, axis], f"c{number % SERIES}", 1.8, dash)
+    parts.chart(drawing, (58, 34, 414, 190), [
+        parts.Curve(np.array([0.0, 1.0]), np.zeros(2), "line", 1.0),
+        *(parts.Curve((tau + 1) / 2, paths[name, axis], f"c{number % SERIES}", 1.8, dash)
           for number, name in enumerate(names) for axis, dash in (("x", ()), ("y", (5, 3)))
           if (name, axis) in paths)],
         x=(0.0, 1.0), y=(-end, end), labels=("part of the view's time", ""))
     y = 34 + 190 + 62.0
     for first in range(0, len(names), 3):
-        legend(drawing, [(f"c{(first + i) % SERIES}", shortened(name, 16)) for i, name in
-                         enumerate(names[first:first + 3])], (46, y))
+        parts.legend(drawing, [(f"c{i % SERIES}", parts.shortened(name, 16)) for i, name in
+                               list(enumerate(names))[first:first + 3]], (46, y))
         y += 18
     drawing.label(46, y, "solid: along x, dashed: along y", colour="soft")
     drawing.height = y + 10

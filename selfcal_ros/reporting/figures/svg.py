@@ -5,17 +5,7 @@ import math
 from collections.abc import Iterable
 from html import escape
 
-from selfcal_ros.reporting.figures.drawing import (
-    Discs,
-    Drawing,
-    Item,
-    Label,
-    Path,
-    Point,
-    Spot,
-    classes_css,
-    variables_css,
-)
+from selfcal_ros.reporting.figures import drawing as draw
 from selfcal_ros.reporting.summary.format import printable
 
 FONT = 'system-ui, "Segoe UI", "DejaVu Sans", sans-serif'
@@ -28,60 +18,60 @@ FIGURE_CSS = (f"svg.figure {{ display: block; width: 100%; height: auto; font-fa
 
 def css() -> str:
     """Return the rules that every figure needs, colours included."""
-    return variables_css() + FIGURE_CSS + classes_css()
+    return draw.variables_css() + FIGURE_CSS + draw.classes_css()
 
 
-def inline_svg(drawing: Drawing) -> str:
+def inline_svg(drawing: draw.Drawing) -> str:
     """Return a drawing for a page that has the rules of `css`."""
     return _svg(drawing, "")
 
 
-def svg_file(drawing: Drawing) -> str:
+def svg_file(drawing: draw.Drawing) -> str:
     """Return a drawing as a file that follows the reader's setting of light or dark."""
-    style = "".join((variables_css("svg"), FIGURE_CSS, classes_css()))
+    style = "".join((draw.variables_css("svg"), FIGURE_CSS, draw.classes_css()))
     sheet = f'<rect class="f-paper" width="{_n(drawing.width)}" height="{_n(drawing.height)}"/>'
     return _svg(drawing, f"<style>{style}</style>{sheet}\n",
                 f' xmlns="http://www.w3.org/2000/svg" width="{_n(drawing.width)}" '
                 f'height="{_n(drawing.height)}"') + "\n"
 
 
-def _svg(drawing: Drawing, before: str, attributes: str = "") -> str:
+def _svg(drawing: draw.Drawing, before: str, attributes: str = "") -> str:
     body = "\n".join(map(_item, drawing.items))
     return (f'<svg{attributes} class="figure" role="img" '
             f'aria-label="{escape(printable(drawing.says))}" '
             f'viewBox="0 0 {_n(drawing.width)} {_n(drawing.height)}">\n{before}{body}\n</svg>')
 
 
-def _item(item: Item) -> str:
-    if isinstance(item, Label):
+def _item(item: draw.Item) -> str:
+    if isinstance(item, draw.Label):
         return _label(item)
-    if isinstance(item, Spot):
+    if isinstance(item, draw.Spot):
         return (f'<circle class="spot" cx="{_n(item.at[0])}" cy="{_n(item.at[1])}" '
                 f'r="{_n(item.radius)}"><title>{escape(printable(item.title))}</title></circle>')
     look = " ".join(name for name in (item.fill and f"f-{item.fill}",
                                       item.stroke and f"s-{item.stroke}") if name)
     more = _look(item)
-    if isinstance(item, Discs):
+    if isinstance(item, draw.Discs):
         return "".join(f'<ellipse class="{look}" cx="{_n(x)}" cy="{_n(y)}" rx="{_n(rx)}" '
                        f'ry="{_n(ry)}"{more}/>'
                        for (x, y), (rx, ry) in zip(item.centres, item.radii, strict=True))
     return f'<path class="{look}" d="{_d(item.lines, closed=bool(item.fill))}"{more}/>'
 
 
-def _look(item: Path | Discs) -> str:
+def _look(item: draw.Path | draw.Discs) -> str:
     more = f' stroke-width="{_n(item.width)}"' if item.stroke and item.width != 1 else ""
-    if isinstance(item, Path) and item.dash:
+    if isinstance(item, draw.Path) and item.dash:
         more += f' stroke-dasharray="{" ".join(map(_n, item.dash))}"'
     return more + (f' fill-opacity="{_n(item.opacity)}"' if item.opacity != 1 else "")
 
 
-def _d(lines: Iterable[tuple[Point, ...]], *, closed: bool) -> str:
+def _d(lines: Iterable[tuple[draw.Point, ...]], *, closed: bool) -> str:
     """Return path data."""
     return "".join("M" + "L".join(f"{_n(x)} {_n(y)}" for x, y in line) + "Z" * closed
                    for line in lines)
 
 
-def _label(label: Label) -> str:
+def _label(label: draw.Label) -> str:
     x, y = label.at
     look = f"f-{label.colour}" + (" b" if label.bold else "")
     anchor = "" if label.anchor == "start" else f' text-anchor="{label.anchor}"'

@@ -5,13 +5,8 @@ from typing import Any
 
 import numpy as np
 
+from selfcal_ros.estimation.observability import plan_check
 from selfcal_ros.estimation.observability.plan_budget import PlanBudget, Removal
-from selfcal_ros.estimation.observability.plan_check import (
-    CHECK_MARKS,
-    CHECK_OFFSET_M,
-    Step,
-    describe_view,
-)
 from selfcal_ros.estimation.observability.suggest import Search
 from selfcal_ros.estimation.quality.validation import HeldOut
 from selfcal_ros.estimation.verdict.uncertainty import Budget
@@ -31,7 +26,7 @@ def why_text(why: Finding | None, artifact: Artifact) -> str:
     if add := (why.details or {}).get("add"):
         view = View("", add["rotation"], (add["translation_x"], add["translation_y"]),
                     add["grid"], add["angular"])
-        more = f"with {describe_view(view, artifact)} measured as well it could be"
+        more = f"with {plan_check.describe_view(view, artifact)} measured as well it could be"
     return f"cannot be held out: the rest does not identify the stage; {more}"
 
 
@@ -144,7 +139,7 @@ def removal_text(found: Removal, line: BudgetLine, plan: Plan) -> str:
     return f"{step_text(found.step, plan)}: {found.effect_rms * factor:.3g} {unit}"
 
 
-def step_text(step: Step, plan: Plan) -> str:
+def step_text(step: plan_check.Step, plan: Plan) -> str:
     """Return what a change of a plan asks for.
 
     Parameters
@@ -155,14 +150,15 @@ def step_text(step: Step, plan: Plan) -> str:
         The plan before it.
     """
     if step.view is None and not step.order:
-        return f"add check_stops: {{marks: {CHECK_MARKS}, offset: {CHECK_OFFSET_M:g}}}"
+        return (f"add check_stops: {{marks: {plan_check.CHECK_MARKS}, "
+                f"offset: {plan_check.CHECK_OFFSET_M:g}}}")
     if step.view is None:
         pairs = {(old.repeats, new.repeats)
                  for old, new in zip(plan.views, step.views, strict=True)}
         return f"visit the marks in the order {step.order}" + "".join(
             f", {new} repeats for {old}" for old, new in sorted(pairs) if new != old)
     if step.repeat_of is None:
-        return "add " + describe_view(step.view, plan.artifact)
+        return "add " + plan_check.describe_view(step.view, plan.artifact)
     before = plan.views[step.repeat_of]
     return f"measure view '{before.name}' {step.view.repeats} times, not {before.repeats}"
 

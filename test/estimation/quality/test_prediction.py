@@ -85,7 +85,8 @@ def test_each_draw_is_predicted_as_such_readings_are(monkeypatch, of_view):
     size, fit = len(model.equations.columns.columns), model.problem.system.grid
     draws = np.random.default_rng(0)
     noise = noise_of(draws, (4, *fit.weight.shape), fit.weight)
-    draws.standard_normal((2, size, 4))  # of visits within marks, and of sizes: not used here
+    # of visits within marks, of the position and of sizes: not used here
+    draws.standard_normal((3, size, 4))
     own = noise_of(draws, (4, *weight.shape), weight)
     everywhere = grid_data(readings)
     squares = []
@@ -96,5 +97,5 @@ def test_each_draw_is_predicted_as_such_readings_are(monkeypatch, of_view):
         again = with_values(readings, UNIT_M * values, everywhere)
         found = validation.validate(again, options, folds=1)
         squares.append((found[number].rms_m / UNIT_M) ** 2)
-    assert limit.mean == pytest.approx(np.mean(squares), rel=1e-5)
-    assert limit.dof == pytest.approx(2 * np.mean(squares)**2 / np.var(squares, ddof=1), rel=1e-5)
+    assert limit.mean == pytest.approx(np.mean(squares), rel=1e-4)
+    assert limit.dof == pytest.approx(2 * np.mean(squares)**2 / np.var(squares, ddof=1), rel=1e-4)

@@ -75,8 +75,11 @@ def both(readings, model, **how):
     result = calibrate(readings, Options(terms=terms, causes=False, uncertainty=True,
                                          drift_degree=DEGREE, **{"assumed": (), **how}))
     assert all(term.size_used is None for term in result.model.terms)  # none is contradicted
-    dense = DenseFit(readings, terms, (result.noise.sigma_xy, result.noise.sigma_theta),
-                     degree=DEGREE, rigid=result.model.misalignment == "rigid")
+    noise = result.noise
+    least = min(noise.sigma_xy_repeats, noise.sigma_xy_residuals)
+    dense = DenseFit(readings, terms, (noise.sigma_xy, noise.sigma_theta), degree=DEGREE,
+                     rigid=result.model.misalignment == "rigid",
+                     shared=least / noise.sigma_xy)
     return result, dense
 
 

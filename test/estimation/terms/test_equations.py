@@ -22,7 +22,8 @@ def equations(columns, size, whole, *, taken=()):
     left[:, taken] *= 1e-16
     own = SimpleNamespace(
         n=len(size), free=np.isinf(size), columns=SimpleNamespace(size=size),
-        information=left.T @ left, norm=whole * np.sqrt((columns**2).sum(axis=0)),
+        information=left.T @ left, unbiased=left.T @ left,
+        norm=whole * np.sqrt((columns**2).sum(axis=0)),
         limit=lambda _: 1e-9)
     own.untold = lambda rows: TermEquations.untold(own, rows)
     own.prior = lambda sigma_m: TermEquations.prior(own, sigma_m)

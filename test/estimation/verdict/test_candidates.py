@@ -19,11 +19,16 @@ FOUND = np.array([6.0, -8.0, 0.0])
 """What each takes off the readings, times its length: squares of 6, 8 and 0."""
 
 
+def unchanged(right: np.ndarray) -> np.ndarray:
+    """Return the right-hand sides of columns that no noise of the position feigns."""
+    return right
+
+
 def pool(sums: Sums) -> Candidates:
     """Return the columns, with `sums` of squares left before any of them is held."""
     gram = np.diag(LENGTHS**2)
-    equations = SimpleNamespace(information=gram, norm=LENGTHS, limit=lambda rows: 1e-9,
-                                projected=SimpleNamespace(gram=gram))
+    equations = SimpleNamespace(unbiased=gram, unbiased_sums=unchanged, norm=LENGTHS,
+                                limit=lambda rows: 1e-9, projected=SimpleNamespace(gram=gram))
     return Candidates(equations, Score(FOUND * LENGTHS, np.zeros(3), sums), np.zeros(3),
                       np.zeros(3))
 
@@ -79,7 +84,8 @@ def test_sets_of_all_sizes_are_each_as_a_dense_solution_has_them():
     readings[:, 5] = readings[:, 0] + readings[:, 2]
     marks, left = readings[:8], rng.normal(size=12)
     equations = SimpleNamespace(
-        information=readings.T @ readings, norm=np.sqrt((readings**2).sum(axis=0)),
+        unbiased=readings.T @ readings, unbiased_sums=unchanged,
+        norm=np.sqrt((readings**2).sum(axis=0)),
         limit=lambda rows: 1e-9, projected=SimpleNamespace(gram=marks.T @ marks))
     pools = Candidates(equations, Score(marks.T @ left[:8], readings[8:].T @ left[8:], Sums(
         float(left[:8] @ left[:8]), 8, float(left[8:] @ left[8:]), 4)), np.zeros(6), np.zeros(6))
@@ -110,7 +116,8 @@ def test_terms_of_the_model_stay_within_what_their_sizes_allow():
                                 np.concatenate([y, np.zeros(2)]), rcond=None)[0]
     left = y - columns @ taken
     equations = SimpleNamespace(
-        information=columns.T @ columns, norm=np.sqrt((columns**2).sum(axis=0)),
+        unbiased=columns.T @ columns, unbiased_sums=unchanged,
+        norm=np.sqrt((columns**2).sum(axis=0)),
         limit=lambda rows: 1e-9, projected=SimpleNamespace(gram=columns.T @ columns))
     pool = Candidates(equations, Score(columns.T @ left, np.zeros(4), Sums(
         float(left @ left), 30, float("nan"), 0)), prior, taken)
@@ -126,7 +133,8 @@ def test_at_most_four_causes_are_named_the_likeliest_first():
     """Six terms of one column each, at right angles; each takes more off than the one before."""
     names = ["a", "b", "c", "d", "e", "f"]
     equations = SimpleNamespace(
-        information=np.eye(6), norm=np.ones(6), limit=lambda rows: 1e-9, maps=np.zeros((4, 6)),
+        unbiased=np.eye(6), unbiased_sums=unchanged,
+        norm=np.ones(6), limit=lambda rows: 1e-9, maps=np.zeros((4, 6)),
         turned=np.zeros((3, 6)), projected=SimpleNamespace(gram=np.eye(6)),
         system=SimpleNamespace(known_sites=np.ones(4), known_lines=np.ones(3)),
         columns=SimpleNamespace(columns=tuple(names)))
