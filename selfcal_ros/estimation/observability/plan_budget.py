@@ -116,10 +116,11 @@ def plan_budget(plan: Plan, terms: Sequence[ModelTerm], assumed: Assumed,
             ("theta", assumed.sigma_rad, "rad", alone.u_theta))):
         if not gains.size:
             continue
-        noise = gains**2 * sigma**2 / n + (0.0 if free is None else free[at])
+        known = np.isfinite(gains)
+        noise = (gains**2 * sigma**2 / n + (0.0 if free is None else free[at]))[known]
         lines.append(_line(quantity, NOISE, noise, u=sigma, unit=unit, source="readings"))
         for term in terms:
-            effect = effects[term.name][at] if term.name in effects else np.zeros(1)
+            effect = effects[term.name][at][known] if term.name in effects else np.zeros(1)
             if effect.mean() > NEGLIGIBLE * noise.mean():
                 source = "declared" if term.name in declared else "default"
                 lines.append(_line(quantity, str(term.name), effect, u=term.size,
