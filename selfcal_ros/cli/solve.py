@@ -224,9 +224,9 @@ def _validated(args: argparse.Namespace, measurements: Any, options: Any,
         found = validate(used, options)
         result = judged_by(result, found)
         result = replace(result, extra={
-            **result.extra, "validation": validation_json(found, result.artifact)})
+            **result.extra, "validation": validation_json(found, result.plate)})
         lines += ["", "held-out readings:", *(f"  {line}" for line in validation_text(
-            found, result.artifact))]
+            found, result.plate))]
     return result, lines
 
 

@@ -249,7 +249,7 @@ def chapters(result: CalibrationResult, truth: Mapping[str, np.ndarray] | None,
         _causes(result), _maps(result, truth), _uncertainty(result), *more,
         _residuals(result), _rejected(result),
         Chapter("Measurement", _figures(
-            (plan_figure(result.artifact, views_in(result)) if result.views else None,
+            (plan_figure(result.plate, views_in(result)) if result.views else None,
              "The plate as the plan lays it; the arrow leads the corner from where it is without a "
              "turn.")), (sections.measurement_section(result), sections.views_section(result))),
         Chapter("Details", sections=tuple(extra_sections(result.extra))),

@@ -2,8 +2,10 @@
 """A simulation written as a bag, with its truth."""
 
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
+
+import numpy as np
 
 from selfcal_ros import topics
 from selfcal_ros.bagio.offline import TRUTH_FILE
@@ -15,6 +17,7 @@ from selfcal_ros.messages import from_model
 from selfcal_ros.model.json_form import plain
 from selfcal_ros.outputs import temporary_folder
 from selfcal_ros.simulation.cell import Event
+from selfcal_ros.simulation.physics import stage_error
 from selfcal_ros.simulation.spec import Simulation
 from selfcal_ros.simulation.truth import Truth
 
@@ -78,15 +81,20 @@ def event_fields(event: Event, frame_id: str) -> tuple[str, from_model.Fields]:
 
 
 def write_truth(path: Path, truth: Truth, **more: object) -> None:
-    """Write the known truth.
+    """Write the known truth, that of the stage at the nodes of its map.
 
     gx, gy, ax, ay (m), g_theta, a_theta (rad); of each view phi (rad), t, drift, drift_walk,
     plate_shape, stage_bend (m), plate_scale, plate_strain, plate_tilt and line_eccentricity (rad),
     empty if none; rotation, microscope, backlash (m); placed, the actual poses of
     views that are not placed as commanded.
     """
+    g = truth.g
+    if truth.artifact.map_grid is not None:
+        nodes, still = truth.artifact.field, replace(truth, stage_bend_m=truth.stage_bend_m[:0])
+        places = np.stack([nodes.x_m.ravel(), nodes.y_m.ravel()])
+        g = stage_error(still, places).reshape(2, *nodes.shape)
     write_json(path, plain({
-        "gx": truth.g[0], "gy": truth.g[1], "g_theta": truth.g_theta, "ax": truth.a[0],
+        "gx": g[0], "gy": g[1], "g_theta": truth.g_theta, "ax": truth.a[0],
         "ay": truth.a[1], "a_theta": truth.a_theta, "phi": truth.phi_rad, "t": truth.t_m,
         "rotation": "linear" if truth.linear else "finite", "microscope": truth.microscope,
         "backlash": truth.backlash_m, "plate_scale": truth.plate_scale,

@@ -124,7 +124,8 @@ def search_causes(solved: Solved, measurements: Measurements, options: Options, 
     if options.causes is False or solved.model is None or not solved.model.problem.direct:
         return SearchResult(solved)
     sizes = [test for test in solved.model.sizes if test.contradicted]
-    place = off_sites_cause(solved.model, solved.result.error_map, LEVEL)
+    place = None if measurements.artifact.map_grid else off_sites_cause(
+        solved.model, solved.result.error_map, LEVEL)
     failed = failed or bool(sizes or place)
     found = _Search(solved)
     n_sites = solved.model.problem.system.grid.n_sites

@@ -52,7 +52,7 @@ def views_in(result: CalibrationResult) -> list[View]:
 
     On the lattice grids are read after quarter turns; else the offset of such a view is known.
     """
-    placed = result.artifact.map_grid is not None
+    placed = result.plate.map_grid is not None
     return [View(view.name, view.rotation, (view.translation_x, view.translation_y),
                  math.isfinite(view.tx) if placed else
                  abs(math.remainder(view.rotation, math.pi / 2)) < 1e-6, angular=False)
@@ -140,7 +140,7 @@ def _number(value: object) -> bool:
 def _marked(result: CalibrationResult, view: ViewResult, mark: object) -> list[Place]:
     if not isinstance(mark, list) or len(mark) != 2 or not all(map(_number, mark)):
         return []
-    m, n = (np.array(part * result.artifact.grid_pitch_m) for part in mark)
+    m, n = (np.array(part * result.plate.grid_pitch_m) for part in mark)
     x, y = places_mm(view.rotation, (view.translation_x, view.translation_y), m, n)
     return [(view.name, "outlier_among_views", float(x), float(y))]
 
@@ -151,7 +151,7 @@ def rejected_map(result: CalibrationResult) -> Drawing | None:
     names = [view.name for view in result.views if any(view.name == row[0] for row in found)]
     if not names:
         return None
-    artifact = result.artifact
+    artifact = result.plate
     field = [(half + 0.5 * artifact.grid_pitch_m) * MM_PER_M for half in artifact.field_half_m]
     reach = [half + 1.2 * artifact.grid_pitch_m * MM_PER_M for half in field]
     colours = {reason: f"c{i % SERIES}" for i, (reason, _) in enumerate(

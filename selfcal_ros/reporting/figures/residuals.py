@@ -63,7 +63,7 @@ def residuals_in(result: CalibrationResult) -> list[ViewResiduals]:
     rows = kept.get("views") if isinstance(kept, dict) else None
     if not isinstance(rows, list) or len(rows) != len(result.views):
         return []
-    shape, lines = result.artifact.shape, (result.artifact.angular_count,)
+    shape, lines = result.plate.shape, (result.plate.angular_count,)
     found = []
     for view, row in zip(result.views, rows, strict=True):
         part = row if isinstance(row, dict) else {}
@@ -97,7 +97,7 @@ def residual_maps(result: CalibrationResult, found: Sequence[ViewResiduals]) -> 
     views = [v for v in found if np.isfinite(v.xy_m).any()]
     if not views:
         return None
-    artifact = result.artifact
+    artifact = result.plate
     sites = parts.thinned(artifact, parts.MAX_ARROWS)
     factor = parts.enlargement(np.concatenate([np.hypot(*v.xy_m).ravel() for v in views]),
                                (sites[0].step or 1) * artifact.grid_pitch_m)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.artifact import Artifact, MapGrid
 from selfcal_ros.model.error_map import ErrorMap
 from selfcal_ros.model.result import CalibrationResult, Noise, ViewResult
 from selfcal_ros.model.verdict import Grade, Verdict
@@ -95,9 +95,14 @@ def terms_section(result: CalibrationResult) -> Section:
     return Section("Terms of the model", table=(header, *rows))
 
 
+def _nodes(grid: MapGrid, shape: tuple[int, int]) -> str:
+    return (f"{shape[0]} × {shape[1]} nodes, pitch {grid.pitch_m * MM_PER_M:.6g} mm, "
+            f"{grid.interpolation}")
+
+
 def measurement_section(result: CalibrationResult) -> Section:
     """Return plan, plate, method and input."""
-    artifact = result.artifact
+    artifact = result.plate
     (nx, ny), pitch = artifact.shape, artifact.grid_pitch_m * MM_PER_M
     plate = (f"{nx} × {ny} marks, pitch {pitch:.6g} mm, "
              f"field {(nx - 1) * pitch:.6g} × {(ny - 1) * pitch:.6g} mm, "
@@ -107,6 +112,8 @@ def measurement_section(result: CalibrationResult) -> Section:
     views = f"{counted(len(result.views), 'view')}, {views_done(result)} measured"
     facts = [("plan", f"{printable(result.plan_id) or UNKNOWN}: {views}"),
              ("plate", plate),
+             *([("map", _nodes(artifact.map_grid, artifact.field.shape))]
+               if artifact.map_grid else []),
              ("method", f"{printable(result.method)}, {printable(result.sense).replace('_', ' ')}, "
               f"{result.model.misalignment} misalignments"),
              ("identifiable", f"{'yes' if seen.identifiable else 'NO'} (rank {seen.rank} of "
@@ -137,7 +144,7 @@ def views_done(result: CalibrationResult) -> int:
 
 def views_section(result: CalibrationResult) -> Section:
     """Return the table of views: nominal pose, misalignment, detections."""
-    artifact, views = result.artifact, result.views
+    artifact, views = result.plate, result.views
     columns = [[printable(v.name) for v in views],
                [pose_text(v.rotation, (v.translation_x, v.translation_y), artifact)
                 for v in views],
