@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
-from selfcal_ros.aerotech.model import Findings, Kind, Unit, UnitWord
+from selfcal_ros.aerotech.model import CalFindings, Kind, Unit, UnitWord
 
 LIMIT = 1e15
 """Largest valid length, angle or count."""
@@ -165,7 +165,7 @@ class Header:
     broken: bool = False
 
 
-def read_header(kind: Kind, heads: list[tuple[int, str]], findings: Findings) -> Header:
+def read_header(kind: Kind, heads: list[tuple[int, str]], findings: CalFindings) -> Header:
     """Return the arguments on the start lines `heads` (line number, text after the token)."""
     header = Header(kind, heads[0][0])
     for index, (line, text) in enumerate(heads):
@@ -188,7 +188,7 @@ def read_header(kind: Kind, heads: list[tuple[int, str]], findings: Findings) ->
     return header
 
 
-def _keyword(header: Header, line: int, name: str, findings: Findings) -> str | None:
+def _keyword(header: Header, line: int, name: str, findings: CalFindings) -> str | None:
     """Return the strict spelling of a keyword of this kind of table, or None with an error."""
     strict = name.upper()
     if strict in ALIASES:
@@ -207,7 +207,7 @@ def _keyword(header: Header, line: int, name: str, findings: Findings) -> str | 
     return None
 
 
-def _argument(header: Header, place: tuple[int, str], text: str, findings: Findings) -> None:
+def _argument(header: Header, place: tuple[int, str], text: str, findings: CalFindings) -> None:
     line, name = place
     strict = _keyword(header, line, name, findings)
     if strict is None:
@@ -228,7 +228,7 @@ def _argument(header: Header, place: tuple[int, str], text: str, findings: Findi
     _set(header, (line, strict), (keyword.field, value), findings)
 
 
-def _tolerances(line: int, strict: str, argument: tuple[str, Any], findings: Findings) -> None:
+def _tolerances(line: int, strict: str, argument: tuple[str, Any], findings: CalFindings) -> None:
     text, value = argument
     if isinstance(value, Unit):
         word = text.partition("/")[0]
@@ -243,7 +243,7 @@ def _tolerances(line: int, strict: str, argument: tuple[str, Any], findings: Fin
         findings.tolerated(line, "a serial number without quotes", 'write SERIALNUMBER="..."')
 
 
-def _flag(header: Header, line: int, word: str, findings: Findings) -> None:
+def _flag(header: Header, line: int, word: str, findings: CalFindings) -> None:
     if word.startswith("/"):
         header.broken = True
         findings.error(line, "white space before the / of a unit",
@@ -261,7 +261,7 @@ def _flag(header: Header, line: int, word: str, findings: Findings) -> None:
 
 
 def _set(header: Header, place: tuple[int, str], item: tuple[str, Any],
-         findings: Findings) -> None:
+         findings: CalFindings) -> None:
     (line, strict), (name, value) = place, item
     if name in header.values and header.values[name] != value:
         header.broken = True
@@ -274,7 +274,7 @@ def _set(header: Header, place: tuple[int, str], item: tuple[str, Any],
 
 
 def _positional(header: Header, place: tuple[int, int], words: list[str],
-                findings: Findings) -> None:
+                findings: CalFindings) -> None:
     index, line = place
     names = POSITIONAL[header.kind]
     if index > 0:

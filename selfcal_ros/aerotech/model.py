@@ -31,7 +31,7 @@ class Severity(StrEnum):
 
 
 @dataclass(frozen=True, order=True)
-class Finding:
+class CalFinding:
     """A finding in a file: line, problem and remedy.
 
     Attributes
@@ -243,7 +243,7 @@ class CalFile:
         File name, for messages.
     tables : tuple of Table
         Tables that could be read, in their order.
-    findings : tuple of Finding
+    findings : tuple of CalFinding
         Sorted by line.
     comments : tuple of str
         Comments before the first table, without their mark.
@@ -251,10 +251,10 @@ class CalFile:
 
     where: str
     tables: tuple[Table, ...]
-    findings: tuple[Finding, ...] = ()
+    findings: tuple[CalFinding, ...] = ()
     comments: tuple[str, ...] = ()
 
-    def of(self, severity: Severity) -> list[Finding]:
+    def of(self, severity: Severity) -> list[CalFinding]:
         """Return the findings of one severity."""
         return [finding for finding in self.findings if finding.severity is severity]
 
@@ -276,20 +276,20 @@ class TooManyFindings(Exception):
     """Raised to stop reading an unusable file."""
 
 
-class Findings:
+class CalFindings:
     """Collect findings: each kind of tolerance once with its count, the others up to a limit."""
 
     def __init__(self) -> None:
-        self._listed: list[Finding] = []
+        self._listed: list[CalFinding] = []
         self._tolerated: dict[tuple[str, str], list[int]] = {}
 
     def error(self, line: int, what: str, remedy: str) -> None:
         """Record an error: the file must not be loaded."""
-        self._add(Finding(line, Severity.ERROR, what, remedy))
+        self._add(CalFinding(line, Severity.ERROR, what, remedy))
 
     def warning(self, line: int, what: str, remedy: str) -> None:
         """Record legal content that was probably not intended."""
-        self._add(Finding(line, Severity.WARNING, what, remedy))
+        self._add(CalFinding(line, Severity.WARNING, what, remedy))
 
     def tolerated(self, line: int, what: str, remedy: str) -> None:
         """Record an unambiguous deviation from the strict form."""
@@ -297,25 +297,25 @@ class Findings:
 
     def stop(self, line: int, what: str, remedy: str) -> None:
         """Record an error and stop reading."""
-        self._listed.append(Finding(line, Severity.ERROR, what, remedy))
+        self._listed.append(CalFinding(line, Severity.ERROR, what, remedy))
         raise TooManyFindings
 
-    def sorted(self) -> tuple[Finding, ...]:
+    def sorted(self) -> tuple[CalFinding, ...]:
         """Return all findings by line."""
         out = list(self._listed)
         for (what, remedy), lines in self._tolerated.items():
             more = f" (and in {len(lines) - 1} more lines)" if len(lines) > 1 else ""
-            out.append(Finding(lines[0], Severity.TOLERATED, what + more, remedy))
+            out.append(CalFinding(lines[0], Severity.TOLERATED, what + more, remedy))
         return tuple(sorted(out, key=lambda finding: finding.line))
 
-    def _add(self, finding: Finding) -> None:
+    def _add(self, finding: CalFinding) -> None:
         self._listed.append(finding)
         if len(self._listed) >= MAX_FINDINGS:
             self.stop(finding.line, f"reading stopped after {MAX_FINDINGS} findings",
                       "correct the first ones")
 
 
-def decode(data: bytes, findings: Findings) -> tuple[list[str], set[int]]:
+def decode(data: bytes, findings: CalFindings) -> tuple[list[str], set[int]]:
     """Return the lines of a file without line ends, and the numbers of those not in UTF-8.
 
     A byte order mark and CRLF are tolerated, UTF-16 is an error. Lines that are not UTF-8 are
@@ -346,7 +346,7 @@ def decode(data: bytes, findings: Findings) -> tuple[list[str], set[int]]:
     return lines, odd
 
 
-def _split(text: str, findings: Findings) -> list[str]:
+def _split(text: str, findings: CalFindings) -> list[str]:
     if "\r" in text:
         line = text.count("\n", 0, text.index("\r")) + 1
         findings.tolerated(line, "lines end with CR or CRLF", "the strict form ends lines with LF")

@@ -11,7 +11,7 @@ import numpy as np
 from selfcal_ros.aerotech.header import LIMIT, ArgumentFault, Header, number, read_header, short
 from selfcal_ros.aerotech.model import (
     CalFile,
-    Findings,
+    CalFindings,
     Kind,
     Severity,
     Table,
@@ -56,7 +56,7 @@ class _Reader:
     """The state of reading: tables so far, and the open one."""
 
     def __init__(self) -> None:
-        self.findings = Findings()
+        self.findings = CalFindings()
         self.tables: list[Table] = []
         self.comments: list[str] = []
         self.first_start = 0
@@ -208,7 +208,7 @@ class _Reader:
             self.tables.append(made)
 
 
-def _numbers(table: _Open, findings: Findings) -> np.ndarray | None:
+def _numbers(table: _Open, findings: CalFindings) -> np.ndarray | None:
     """Return the values of a table, or None with a finding."""
     if not table.words:
         findings.error(table.heads[-1][0], "the table has no correction values",
@@ -233,7 +233,7 @@ def _numbers(table: _Open, findings: Findings) -> np.ndarray | None:
 
 
 def _table_1d(header: Header, values: np.ndarray | None, layout: tuple[list[int], list[int]],
-              findings: Findings) -> Table1D | None:
+              findings: CalFindings) -> Table1D | None:
     if "sample_dist" not in header.values and not header.broken:
         findings.error(header.line, "SAMPLEDIST is missing",
                        "give the distance between entries: SAMPLEDIST=...")
@@ -249,7 +249,7 @@ def _table_1d(header: Header, values: np.ndarray | None, layout: tuple[list[int]
 
 
 def _table_2d(header: Header, values: np.ndarray | None, layout: tuple[list[int], list[int]],
-              findings: Findings) -> Table2D | None:
+              findings: CalFindings) -> Table2D | None:
     if header.broken:
         return None
     *axes, sample_row, sample_col, n_columns = header.positional
@@ -268,7 +268,7 @@ def _table_2d(header: Header, values: np.ndarray | None, layout: tuple[list[int]
 
 
 def _rows_are_whole(columns: int, outputs: int, layout: tuple[list[int], list[int]],
-                    findings: Findings) -> bool:
+                    findings: CalFindings) -> bool:
     """Return whether the lines form whole rows; a finding names a line that does not."""
     width = columns * outputs
     want = f"a row has {columns} columns of {outputs} values = {width}"

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from selfcal_ros.aerotech.header import LIMIT, SMALLEST
-from selfcal_ros.aerotech.model import Findings, Kind, Table, Table1D, Table2D, UnitWord
+from selfcal_ros.aerotech.model import CalFindings, Kind, Table, Table1D, Table2D, UnitWord
 
 MAX_AXIS = 32
 MAX_1D_TABLES = 100
@@ -32,7 +32,7 @@ class Gi4:
         return 2.0 ** self.bits / 64
 
 
-def check_tables(tables: Sequence[Table], findings: Findings, *, gi4: Gi4 | None = None) -> None:
+def check_tables(tables: Sequence[Table], findings: CalFindings, *, gi4: Gi4 | None = None) -> None:
     """Add a finding for every rule broken by the tables of one file."""
     for table in tables:
         check_table(table, findings, gi4=gi4)
@@ -41,7 +41,7 @@ def check_tables(tables: Sequence[Table], findings: Findings, *, gi4: Gi4 | None
     check_counts(tables, findings)
 
 
-def check_table(table: Table, findings: Findings, *, gi4: Gi4 | None = None) -> None:
+def check_table(table: Table, findings: CalFindings, *, gi4: Gi4 | None = None) -> None:
     """Add a finding for every rule broken by one table."""
     if not np.all(np.abs(table.values) <= LIMIT):
         findings.error(table.line, "values that are not finite, or too large",
@@ -57,7 +57,7 @@ def check_table(table: Table, findings: Findings, *, gi4: Gi4 | None = None) -> 
             _galvo(table, findings, gi4)
 
 
-def _axes(table: Table, findings: Findings) -> None:
+def _axes(table: Table, findings: CalFindings) -> None:
     for axis in {*table.inputs, *table.outputs}:
         if not 1 <= axis <= MAX_AXIS:
             remedy = ("indices in calibration files count from 1" if axis == 0 else
@@ -65,20 +65,20 @@ def _axes(table: Table, findings: Findings) -> None:
             findings.error(table.line, f"axis {axis} is not in 1..{MAX_AXIS}", remedy)
 
 
-def _distance(table: Table, name: str, value: float, findings: Findings) -> None:
+def _distance(table: Table, name: str, value: float, findings: CalFindings) -> None:
     if abs(value) < SMALLEST:
         findings.error(table.lines.get(name, table.line), f"{name.replace('_', ' ')} is zero",
                        "give the distance between entries")
 
 
-def _rollover(table: Table, name: str, findings: Findings) -> None:
+def _rollover(table: Table, name: str, findings: CalFindings) -> None:
     value = getattr(table, name)
     if value is not None and value < SMALLEST:
         findings.error(table.lines.get(name, table.line), "the rollover is not positive",
                        "give the counts of one turn")
 
 
-def _table_1d(table: Table1D, findings: Findings) -> None:
+def _table_1d(table: Table1D, findings: CalFindings) -> None:
     _distance(table, "sample_dist", table.sample_dist, findings)
     _rollover(table, "rollover", findings)
 
@@ -114,7 +114,7 @@ def _span(distance: float, offset: float, count: int) -> tuple[float, float]:
     return min(ends), max(ends)
 
 
-def _table_2d(table: Table2D, findings: Findings) -> None:
+def _table_2d(table: Table2D, findings: CalFindings) -> None:
     for end, axis in (("row", "row axis"), ("col", "column axis")):
         _distance(table, f"sample_{end}", getattr(table, f"sample_{end}"), findings)
         _rollover(table, f"rollover_{end}", findings)
@@ -140,7 +140,7 @@ def _table_2d(table: Table2D, findings: Findings) -> None:
                          "add CORUNIT")
 
 
-def _galvo(table: Table2D, findings: Findings, gi4: Gi4 | None) -> None:
+def _galvo(table: Table2D, findings: CalFindings, gi4: Gi4 | None) -> None:
     rows, columns = table.values.shape[:2]
     line = table.line
     if table.column_axis != table.outputs[0]:
@@ -162,7 +162,7 @@ def _galvo(table: Table2D, findings: Findings, gi4: Gi4 | None) -> None:
         _gi4(table, findings, gi4)
 
 
-def _gi4(table: Table2D, findings: Findings, gi4: Gi4) -> None:
+def _gi4(table: Table2D, findings: CalFindings, gi4: Gi4) -> None:
     rows, columns = table.values.shape[:2]
     if (rows, columns) != (GI4_SIDE, GI4_SIDE):
         findings.error(table.line, f"{rows} rows and {columns} columns for a GI4",
@@ -179,13 +179,13 @@ def _gi4(table: Table2D, findings: Findings, gi4: Gi4) -> None:
                            f"a protocol of {gi4.bits} bits needs {want:.9g}, 1/64 of its range")
 
 
-def mixed_kinds(line: int, kinds: tuple[Kind, Kind], findings: Findings) -> None:
+def mixed_kinds(line: int, kinds: tuple[Kind, Kind], findings: CalFindings) -> None:
     """Record a table of another kind than the first one of its file."""
     findings.error(line, f"a {kinds[0]} table in a file of {kinds[1]} tables",
                    "put each kind into a file of its own")
 
 
-def check_counts(tables: Sequence[Table], findings: Findings) -> None:
+def check_counts(tables: Sequence[Table], findings: CalFindings) -> None:
     """Add a finding for every exceeded limit on the number of tables."""
     limits = {Kind.ONE_D: MAX_1D_TABLES, Kind.TWO_D: MAX_2D_TABLES}
     for kind, limit in limits.items():

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from selfcal_ros.aerotech.header import KEYWORDS
-from selfcal_ros.aerotech.model import CalFile, Findings, Table, Table1D, Unit, same_table
+from selfcal_ros.aerotech.model import CalFile, CalFindings, Table, Table1D, Unit, same_table
 from selfcal_ros.aerotech.read import parse_cal, refuse_errors
 from selfcal_ros.aerotech.rules import check_tables
 from selfcal_ros.errors import InputError
@@ -42,7 +42,7 @@ def cal_text(tables: Sequence[Table], *, comments: Sequence[str] = (),
     InputError
         If the tables break a rule of the format, or cannot be expressed in it.
     """
-    findings = Findings()
+    findings = CalFindings()
     check_tables(tables, findings)
     if not tables:
         raise InputError("calibration file", "it has no tables", "give at least one")

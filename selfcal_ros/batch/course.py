@@ -16,14 +16,14 @@ from scipy import stats
 
 FEWEST = 8
 """Smallest number of values for a test."""
-LEVEL = 0.05
+COURSE_LEVEL = 0.05
 """Fraction of stable batches with a false alarm, all quantities together."""
 ORDERS = 9999
 """Number of random orders for the probability of a change."""
 SEED = 20240229
 
 
-class Finding(StrEnum):
+class CourseKind(StrEnum):
     """Kinds of findings."""
 
     NONE = "none"
@@ -51,7 +51,7 @@ class Course:
     adjusted_p : float
         Probability of the finding (else the smaller one), corrected for all tests of a series
         (Benjamini, Hochberg).
-    finding : Finding
+    finding : CourseKind
         The significant finding; of two the one with smaller residuals.
     """
 
@@ -63,7 +63,7 @@ class Course:
     before: float
     after: float
     adjusted_p: float = 1.0
-    finding: Finding = Finding.NONE
+    finding: CourseKind = CourseKind.NONE
     last_before: int = 0
 
 
@@ -148,16 +148,16 @@ def _adjusted(p: Sequence[float]) -> np.ndarray:
 
 def _judged(course: Course, adjusted: np.ndarray, days: np.ndarray,
             values: np.ndarray) -> Course:
-    finding = Finding.NONE
-    if adjusted.min() <= LEVEL:
-        finding = _of_both(course, days, values) if adjusted.max() <= LEVEL else (
-            Finding.TREND if adjusted[0] <= LEVEL else Finding.CHANGE)
-    counted = {Finding.TREND: adjusted[0], Finding.CHANGE: adjusted[1]}
+    finding = CourseKind.NONE
+    if adjusted.min() <= COURSE_LEVEL:
+        finding = _of_both(course, days, values) if adjusted.max() <= COURSE_LEVEL else (
+            CourseKind.TREND if adjusted[0] <= COURSE_LEVEL else CourseKind.CHANGE)
+    counted = {CourseKind.TREND: adjusted[0], CourseKind.CHANGE: adjusted[1]}
     return replace(course, adjusted_p=float(counted.get(finding, adjusted.min())),
                    finding=finding)
 
 
-def _of_both(course: Course, days: np.ndarray, values: np.ndarray) -> Finding:
+def _of_both(course: Course, days: np.ndarray, values: np.ndarray) -> CourseKind:
     """Return the better of a line and a step (BIC of Laplace errors, 2 and 3 unknowns)."""
     known = np.isfinite(values)
     t, x, n = days[known], values[known], int(known.sum())
@@ -168,4 +168,4 @@ def _of_both(course: Course, days: np.ndarray, values: np.ndarray) -> Finding:
     tiny = np.finfo(float).tiny
     line_bic, step_bic = (n * np.log(max(size, tiny)) + k * np.log(n) / 2
                           for size, k in zip(sizes, (2, 3), strict=True))
-    return Finding.TREND if line_bic <= step_bic else Finding.CHANGE
+    return CourseKind.TREND if line_bic <= step_bic else CourseKind.CHANGE

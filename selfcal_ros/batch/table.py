@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from selfcal_ros.batch.course import FEWEST, Course, Finding, courses
+from selfcal_ros.batch.course import FEWEST, Course, CourseKind, courses
 from selfcal_ros.batch.folder import PER, SCHEMA, Record
 from selfcal_ros.errors import printable
 from selfcal_ros.reporting.figures.drawing import TICK, Drawing, Frame
@@ -25,7 +25,7 @@ STYLE = "td.text { text-align: left; min-width: 14rem; } td.bad { color: var(--b
 
 
 @dataclass(frozen=True)
-class Series:
+class PlanHistory:
     """Bags of one plan and plate with known times, and the courses of their quantities.
 
     Attributes
@@ -52,12 +52,12 @@ class Series:
     def sentences(self) -> list[str]:
         """Return the findings, one line each."""
         return [self._sentence(name, course) for name, course in self.courses.items()
-                if course.finding is not Finding.NONE]
+                if course.finding is not CourseKind.NONE]
 
     def _sentence(self, name: str, course: Course) -> str:
         text, unit = described(name)
         p = f"p = {course.adjusted_p:.2g}"
-        if course.finding is Finding.TREND:
+        if course.finding is CourseKind.TREND:
             slope, low, high = course.slope_per_day
             return (f"{text}: trend of {slope:+.3g} {unit} a day (95 %: {low:+.3g} to "
                     f"{high:+.3g}), {p}")
@@ -72,7 +72,7 @@ def in_time(records: Sequence[Record]) -> list[Record]:
                                           str(r.get("first_exposure")), r["bag"]))
 
 
-def series_of(records: Sequence[Record]) -> list[Series]:
+def series_of(records: Sequence[Record]) -> list[PlanHistory]:
     """Return the series of a batch: bags of different plans or plates are never mixed."""
     groups: dict[tuple, dict[str, Record]] = {}
     for record in in_time(records):
@@ -82,13 +82,13 @@ def series_of(records: Sequence[Record]) -> list[Series]:
     return [_series(group[0], list(found.values())) for group, found in groups.items()]
 
 
-def _series(plan_id: str, records: list[Record]) -> Series:
+def _series(plan_id: str, records: list[Record]) -> PlanHistory:
     times = np.array([_time_s(record) for record in records])
     days = (times - times[0]) / S_PER_DAY
     names = dict.fromkeys(name for record in records for name in record["quantities"])
     table = {name: np.array([record["quantities"].get(name) for record in records], dtype=float)
              for name in names}
-    return Series(plan_id, tuple(records), days, courses(days, table))
+    return PlanHistory(plan_id, tuple(records), days, courses(days, table))
 
 
 def _time_s(record: Record) -> float | None:
@@ -118,7 +118,7 @@ def _field(value: Any) -> Any:
     return "" if value is None else str(value).lower() if isinstance(value, bool) else value
 
 
-def batch_json(records: Sequence[Record], found: Sequence[Series], done_before: int) -> dict:
+def batch_json(records: Sequence[Record], found: Sequence[PlanHistory], done_before: int) -> dict:
     """Return the whole batch as one JSON object, docs/batch.md."""
     counts = {name: sum(code == r["exit_code"] for r in records) for name, code in (
         ("qualified", 0), ("not_qualified", 5))}
@@ -133,7 +133,7 @@ def batch_json(records: Sequence[Record], found: Sequence[Series], done_before: 
                             for name, course in series.courses.items()}} for series in found]}
 
 
-def _course_json(series: Series, course: Course) -> dict:
+def _course_json(series: PlanHistory, course: Course) -> dict:
     changed = [series.records[i]["first_exposure"] for i in
                (course.last_before, course.change)] if course.change else None
     return {"n": course.n, "finding": str(course.finding), "adjusted_p": course.adjusted_p,
@@ -142,7 +142,7 @@ def _course_json(series: Series, course: Course) -> dict:
             "before": course.before, "after": course.after}
 
 
-def summary_lines(records: Sequence[Record], found: Sequence[Series],
+def summary_lines(records: Sequence[Record], found: Sequence[PlanHistory],
                   done_before: int) -> list[str]:
     """Return a summary of a batch, in lines."""
     good = sum(record["exit_code"] == 0 for record in records)
@@ -159,7 +159,7 @@ def summary_lines(records: Sequence[Record], found: Sequence[Series],
     return lines
 
 
-def page_html(records: Sequence[Record], found: Sequence[Series], lines: Sequence[str]) -> str:
+def page_html(records: Sequence[Record], found: Sequence[PlanHistory], lines: Sequence[str]) -> str:
     """Return the page; `lines` are those of `summary_lines`; all text is escaped."""
     good = bool(records) and all(record["exit_code"] == 0 for record in records)
     head, *said = lines
@@ -202,7 +202,7 @@ def _number(value: Any) -> str:
     return "" if value is None else f"{value:.4g}"
 
 
-def _figure(series: Series, name: str, course: Course) -> str:
+def _figure(series: PlanHistory, name: str, course: Course) -> str:
     """Return a plot of values over time with the finding: a line, or a step at the change."""
     text, unit = described(name)
     caption = f"{text}{', ' * bool(unit)}{unit}"
@@ -225,12 +225,12 @@ def _figure(series: Series, name: str, course: Course) -> str:
             drawing.discs([frame.at(day, value)], 3.0,
                           fill="bad" if record["exit_code"] else "good")
             drawing.spot(*frame.at(day, value), 6, f"{record['bag']}: {value:.6g} {unit}")
-    if course.finding is Finding.TREND:
+    if course.finding is CourseKind.TREND:
         slope = course.slope_per_day[0]
         offset = float(np.nanmedian(values - slope * days))
         drawing.line([frame.at(day, offset + slope * day) for day in (days[0], days[-1])],
                      width=1.5)
-    elif course.finding is Finding.CHANGE:
+    elif course.finding is CourseKind.CHANGE:
         middle = (days[course.last_before] + days[course.change]) / 2
         drawing.line([frame.at(middle, end) for end in frame.y], stroke="bad", dash=(4, 3))
         for ends, mean in (((days[0], middle), course.before), ((middle, days[-1]), course.after)):

@@ -96,7 +96,7 @@ def add_frame(parser: argparse.ArgumentParser, *, theta: bool, default: bool = T
                        help="index of the y axis")
     group.add_argument("--unit", choices=units, default="mm" if default and "in" not in units else
                        None, help="unit of the linear axes (default mm"
-                       + (", kmotion in)" if "in" in units else ")"))
+                       + (", kmotion in)" if {"m", "in"} <= set(units) else ")"))
     for axis, unit in (("x", "primary unit"), ("y", "primary unit"), ("theta", "deg")):
         if axis == "theta" and not theta:
             continue

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from selfcal_ros.collection import inputs
-from selfcal_ros.collection.diagnosis import EncoderFacts, Finding, Seen
+from selfcal_ros.collection.diagnosis import DetectionsSeen, EncoderFacts, RejectionFinding
 from selfcal_ros.collection.encoder import NEVER, JointTrack, TrackLimits
 from selfcal_ros.collection.expected import ViewProgress, expected_marks, read_enough
 from selfcal_ros.collection.exposures import Exposures, Tracks
@@ -81,7 +81,7 @@ class Collector:
         self._timeline: Timeline | None = None
         self._newest: inputs.Command | None = None
         self._foreign: dict[str, None] = {}  # unknown joint names
-        self._seen: Seen | None = None
+        self._seen: DetectionsSeen | None = None
         self.received = {"encoder": 0, "detection": 0, "command": 0}
 
     def add_encoder(self, sample: inputs.EncoderSample) -> None:
@@ -242,9 +242,9 @@ class Collector:
         readings, loose = self._views.readings(timeline, self._exposures)
         loose.update({str(reason): count for reason, count in self._rejected_input.items()})
         stamps = [command.stamp_ns for command in self._commands]
-        self._seen = Seen(self._views.table, self._views.view_of, self._exposures, self._facts,
-                          (min(stamps), max(stamps)), timeline.artifact, self._rules.identity,
-                          self.sense)
+        self._seen = DetectionsSeen(
+            self._views.table, self._views.view_of, self._exposures, self._facts,
+            (min(stamps), max(stamps)), timeline.artifact, self._rules.identity, self.sense)
         progress = {index: view_progress(timeline, index, found, self._min_repeats)
                     for index, found in readings.items()}
         return Measurements(timeline.plan_id, timeline.artifact, tuple(readings.values()),
@@ -252,7 +252,7 @@ class Collector:
                             timeline.model_terms), progress
 
     def findings(self, measurements: Measurements,
-                 progress: dict[int, ViewProgress]) -> dict[int | None, Finding]:
+                 progress: dict[int, ViewProgress]) -> dict[int | None, RejectionFinding]:
         """Return why most detections of the session (key None), or of single views, were rejected.
 
         `measurements` and `progress` are the last result of `collect`.

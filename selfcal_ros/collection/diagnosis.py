@@ -81,7 +81,7 @@ class Evidence:
 
 
 @dataclass(frozen=True)
-class Finding:
+class RejectionFinding:
     """A reason for which most detections were rejected: counts, cause and remedy."""
 
     reason: str
@@ -108,7 +108,7 @@ def main_reason(rejected: Mapping[str, int], used: int) -> tuple[str, int, int] 
     return (reason, bad[reason], total) if bad[reason] > MOST * total else None
 
 
-def diagnose(evidence: Evidence) -> Finding | None:
+def diagnose(evidence: Evidence) -> RejectionFinding | None:
     """Return why most of the detections were rejected; None if no reason dominates."""
     found = main_reason(evidence.rejected, evidence.used)
     if found is None:
@@ -121,7 +121,7 @@ def diagnose(evidence: Evidence) -> Finding | None:
         cause = _command_clock(evidence)
     elif reason in PLACED:
         cause = evidence.lies or _stage(evidence)
-    return Finding(reason, count, total, cause or REMEDY[Reason(reason)])
+    return RejectionFinding(reason, count, total, cause or REMEDY[Reason(reason)])
 
 
 def _joints(e: Evidence) -> str | None:
@@ -242,7 +242,7 @@ class EncoderFacts:
 
 
 @dataclass(frozen=True)
-class Seen:
+class DetectionsSeen:
     """All detections of a session with the stage at their exposures.
 
     Attributes
@@ -275,7 +275,7 @@ class Seen:
     sense: Sense
 
     def findings(self, views: Mapping[int, ViewReadings], loose: Mapping[str, int],
-                 ) -> dict[int | None, Finding]:
+                 ) -> dict[int | None, RejectionFinding]:
         """Return why most detections of the session (key None), or of single views, were rejected.
 
         Parameters
@@ -297,8 +297,8 @@ class Seen:
                  for index, readings in views.items()}
         return {index: finding for index, finding in found.items() if finding is not None}
 
-    def _finding(self, rejected: Mapping[str, int], used: int,
-                 views: Mapping[int, ViewReadings], *, whole: bool = False) -> Finding | None:
+    def _finding(self, rejected: Mapping[str, int], used: int, views: Mapping[int, ViewReadings], *,
+                 whole: bool = False) -> RejectionFinding | None:
         if main_reason(rejected, used) is None:
             return None
         here = np.isin(self.view_of, list(views))

@@ -61,10 +61,10 @@ class JointTrack:
         """Add one sample; `speed` is NaN if unknown."""
         self.store.add(stamp_ns, position, speed)
 
-    def between(self, start_ns: int, end_ns: int) -> "Series":
+    def between(self, start_ns: int, end_ns: int) -> "JointSamples":
         """Return the samples relevant to exposures from `start_ns` to `end_ns`."""
         half_gap = self.limits.max_gap_ns // 2
-        return Series(self.limits, self.store.near(max(start_ns, NEVER + half_gap) - half_gap,
+        return JointSamples(self.limits, self.store.near(max(start_ns, NEVER + half_gap) - half_gap,
                                                    min(end_ns, EVER - half_gap) + half_gap,
                                                    DEPTH + 2))
 
@@ -77,7 +77,7 @@ class JointTrack:
         return float(np.median(np.diff(t)) / NS_PER_S) if len(t) > 1 else float("nan")
 
     def query(self, stamps_ns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return `Series.query` of all samples, with reasons instead of codes."""
+        """Return `JointSamples.query` of all samples, with reasons instead of codes."""
         positions, codes = self._all().query(stamps_ns)
         return positions, REASONS[codes]
 
@@ -90,11 +90,11 @@ class JointTrack:
                  threshold: float) -> np.ndarray:
         """Return the sign of the last motion before each exposure, int8 array (Q,); 0 = unknown.
 
-        Arguments as for `Series.approach`.
+        Arguments as for `JointSamples.approach`.
         """
         return filled(self._all().approach(stamps_ns, positions, threshold=threshold))
 
-    def _all(self) -> "Series":
+    def _all(self) -> "JointSamples":
         return self.between(NEVER, EVER)
 
 
@@ -105,7 +105,7 @@ def filled(approach: np.ndarray) -> np.ndarray:
     return np.where(out == AS_BEFORE, 0, out).astype(np.int8)
 
 
-class Series:
+class JointSamples:
     """Samples of one joint in the order of their stamps, each stamp once."""
 
     def __init__(self, limits: TrackLimits, samples: Samples) -> None:

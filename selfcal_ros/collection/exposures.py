@@ -14,8 +14,8 @@ from selfcal_ros.collection.encoder import (
     EVER,
     LOOK_BACK_NS,
     NEVER,
+    JointSamples,
     JointTrack,
-    Series,
     filled,
 )
 from selfcal_ros.collection.samples import NO_STAMPS, GrowingColumns, GrowingTable
@@ -217,7 +217,7 @@ class Exposures:
             joint["first"][here], joint["last"][here] = series.decided_by(
                 stamps, since if linear else None)
 
-    def _motions(self, series: Series, index: np.ndarray, position: np.ndarray) -> np.ndarray:
+    def _motions(self, series: JointSamples, index: np.ndarray, position: np.ndarray) -> np.ndarray:
         stamps, first = self._stamps.rows, index[0]
         if first == 0:
             return series.approach(stamps[index], position, threshold=self._threshold_m)

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tables of other controllers than Aerotech's."""
+"""Tables of other controllers than Aerotech's, and corrected G-code."""

@@ -17,7 +17,7 @@ from selfcal_ros.bagio.mcap_stream import McapStream
 from selfcal_ros.bagio.reader import BagReader
 from selfcal_ros.bagio.schemas import store_of_schema
 from selfcal_ros.errors import InputError, NoDataError
-from selfcal_ros.laser.zigzag import Series
+from selfcal_ros.laser.zigzag import Recording
 from selfcal_ros.messages.to_model import stamp_ns
 
 FIELDS = {"std_msgs/msg/Float64": "data", "std_msgs/msg/Float32": "data",
@@ -53,7 +53,7 @@ class SeriesTopics:
     laser_unit_m: float = 1.0
 
 
-def read_series(path: Path, topics: SeriesTopics) -> tuple[Series, list[str]]:
+def read_series(path: Path, topics: SeriesTopics) -> tuple[Recording, list[str]]:
     """Return the recording in a bag, and notes about it.
 
     Raises
@@ -98,7 +98,7 @@ def read_series(path: Path, topics: SeriesTopics) -> tuple[Series, list[str]]:
                      "of logging, the other topic at its stamps: both clocks must agree")
     laser_ns, laser = _sorted(found[topics.laser])
     position_ns, positions = _sorted(found[topics.position])
-    return Series(laser_ns, laser * topics.laser_unit_m, position_ns, positions), notes
+    return Recording(laser_ns, laser * topics.laser_unit_m, position_ns, positions), notes
 
 
 def _match(topic: str, wanted: dict[str, Callable]) -> str | None:

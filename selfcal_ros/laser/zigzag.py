@@ -54,7 +54,7 @@ class CutRule:
 
 
 @dataclass(frozen=True, eq=False)
-class Series:
+class Recording:
     """A recording: stamps in ns, ascending; values in m.
 
     Attributes
@@ -112,7 +112,7 @@ class Cut:
     notes: tuple[str, ...] = field(default=())
 
 
-def cut_zigzag(series: Series, rule: CutRule) -> Cut:
+def cut_zigzag(series: Recording, rule: CutRule) -> Cut:
     """Cut a recording into blocks.
 
     Raises
@@ -160,7 +160,7 @@ def cut_zigzag(series: Series, rule: CutRule) -> Cut:
                {name: len(runs[name]) for name in sorted(runs)}, tuple(notes))
 
 
-def _check(series: Series, rule: CutRule) -> None:
+def _check(series: Recording, rule: CutRule) -> None:
     if series.position_m.ndim != 2 or series.position_m.shape[1] != len(rule.steps_m):
         raise InputError("positions", f"{series.position_m.shape} where "
                          f"{len(rule.steps_m)} axes are wanted", "name one joint for each step")
@@ -181,7 +181,7 @@ def _check(series: Series, rule: CutRule) -> None:
         raise InputError("laser_sign", f"{rule.laser_sign} is not a sign", "give 1 or -1")
 
 
-def find_rests(series: Series, rule: CutRule) -> list[Rest]:
+def find_rests(series: Recording, rule: CutRule) -> list[Rest]:
     """Return the rests of a recording in their order, each with its mean laser distance.
 
     A rest is a longest interval of samples within the tolerance. Rests
@@ -220,7 +220,7 @@ def _end_of_rest(positions: np.ndarray, known: tuple[int, int], tolerance_m: flo
     return end
 
 
-def _mean_laser(series: Series, between_ns: tuple[int, int],
+def _mean_laser(series: Recording, between_ns: tuple[int, int],
                 rule: CutRule) -> tuple[float, int] | None:
     """Return the mean distance of a rest without its ends, and the number of ignored samples.
 

@@ -31,7 +31,7 @@ NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS)
 
 
 @dataclass(frozen=True)
-class TakenUp:
+class ResumedRun:
     """Content of a resumed journal: a collector with its messages, and losses.
 
     `steps` are clock steps, by topic.
@@ -42,7 +42,7 @@ class TakenUp:
     steps: dict[str, list[Step]] = field(default_factory=dict)
 
 
-def take_up(files: list[Path], settings: CollectorSettings) -> TakenUp:
+def take_up(files: list[Path], settings: CollectorSettings) -> ResumedRun:
     """Return a collector with the messages of a journal's files; unreadable files are lost.
 
     Parameters
@@ -75,7 +75,7 @@ def take_up(files: list[Path], settings: CollectorSettings) -> TakenUp:
             lost.append(f"the file {file.name} was not read: {error.what}")
     if len(refused) == len(files):
         raise refused[0]
-    return TakenUp(collector, tuple(lost), steps)
+    return ResumedRun(collector, tuple(lost), steps)
 
 
 class KeptTopic(NamedTuple):
@@ -90,7 +90,7 @@ class KeptTopic(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Looked:
+class JournalSearch:
     """Result of reading the newest journal.
 
     Attributes
@@ -111,7 +111,8 @@ class Looked:
     problem: InputError | None = None
 
 
-def look_through(found: journals.Claim | None, folder: str, left: Path | None = None) -> Looked:
+def search_journal(found: journals.Claim | None, folder: str,
+                   left: Path | None = None) -> JournalSearch:
     """Read the newest journal of `folder`, which may take long.
 
     Parameters
@@ -127,13 +128,13 @@ def look_through(found: journals.Claim | None, folder: str, left: Path | None = 
     try:
         journal = found.resume() if found else None
         if found:
-            return Looked(journal, journal.earlier if journal else [])
+            return JournalSearch(journal, journal.earlier if journal else [])
     except InputError as reason:
         error = reason
     try:
-        return Looked(None, journals.unfinished(folder, left), error)
+        return JournalSearch(None, journals.unfinished(folder, left), error)
     except InputError as problem:
-        return Looked(None, [], error, problem)
+        return JournalSearch(None, [], error, problem)
 
 
 class JournalKeeper:
@@ -159,7 +160,7 @@ class JournalKeeper:
         self._lag_limit_s = settings.journal_lag_limit
         self._max_age_s = settings.journal_max_age
         self._journal: journals.Journal | None = None
-        self._looking: Future[Looked] | None = None
+        self._looking: Future[JournalSearch] | None = None
         self._claim: journals.Claim | None = None
         self.looked_at = ""  # being read
         self.away_s = 0.0  # since that was last written
@@ -213,7 +214,7 @@ class JournalKeeper:
                 raise
             self._fail(error)
         self.looked_at = str(self._claim.path if self._claim else self._folder)
-        self._looking = worker.submit(look_through, self._claim, self._folder, left)
+        self._looking = worker.submit(search_journal, self._claim, self._folder, left)
 
     @property
     def holds(self) -> bool:
@@ -233,7 +234,7 @@ class JournalKeeper:
             for item in early:
                 self.write(*item)
 
-    def _take_up(self, looked: Looked) -> list[Path]:
+    def _take_up(self, looked: JournalSearch) -> list[Path]:
         """Continue the journal found, or start one; return the files of the run."""
         self._tell_problem(looked)
         try:
@@ -247,7 +248,7 @@ class JournalKeeper:
             self._goes_on = looked.files
         return looked.files
 
-    def _tell_left(self, looked: Looked) -> list[Path]:
+    def _tell_left(self, looked: JournalSearch) -> list[Path]:
         """Report that a run is too old to be resumed; return none of its files."""
         self._tell_problem(looked)
         for file in looked.files[:1]:
@@ -256,7 +257,7 @@ class JournalKeeper:
                             "'selfcal solve' reads it, a greater journal_max_age goes on with it")
         return []
 
-    def _tell_problem(self, looked: Looked) -> None:
+    def _tell_problem(self, looked: JournalSearch) -> None:
         if looked.problem is not None:
             self._ports.say(Level.WARN, f"{looked.problem}; the run is not taken up")
 

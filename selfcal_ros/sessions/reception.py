@@ -24,7 +24,7 @@ from selfcal_ros.messages.cdr import Payloads
 from selfcal_ros.messages.to_model import first_stamps_ns
 from selfcal_ros.sessions.collecting import CollectingSession
 from selfcal_ros.sessions.health import Diagnosis, Level
-from selfcal_ros.sessions.journal_keeper import JournalKeeper, TakenUp, bad_input, take_up
+from selfcal_ros.sessions.journal_keeper import JournalKeeper, ResumedRun, bad_input, take_up
 from selfcal_ros.topics import COMMAND_TOPIC, DETECTION_TOPIC, ENCODER_TOPIC, INPUT_TOPICS
 from selfcal_ros.units import NS_PER_S, S_PER_NS
 
@@ -62,7 +62,7 @@ class Reception:
         self._held: list[tuple[str, bytes, int, bool]] = []
         self._resting = Resting()
         self._worker: Executor | None = None
-        self._restoring: Future[TakenUp] | None = None
+        self._restoring: Future[ResumedRun] | None = None
         self._source = ""  # the journal being resumed
         self._bad: Counter = Counter()
         self._decoders = {topic: ChannelDecoder(topic, name, (typestore(),), self._bad, told=True)
@@ -184,7 +184,7 @@ class Reception:
             if topic != ENCODER_TOPIC:
                 self.journal.write(topic, data, received_ns)
 
-    def _adopt(self, taken: Future[TakenUp]) -> None:
+    def _adopt(self, taken: Future[ResumedRun]) -> None:
         """Continue from the content of the journal."""
         self._restoring = None
         try:

@@ -9,7 +9,15 @@ import pytest
 from scipy import stats
 
 from selfcal_ros.batch import course
-from selfcal_ros.batch.course import FEWEST, LEVEL, Finding, course_of, courses, pettitt, step_of
+from selfcal_ros.batch.course import (
+    COURSE_LEVEL,
+    FEWEST,
+    CourseKind,
+    course_of,
+    courses,
+    pettitt,
+    step_of,
+)
 
 NILE = [1120, 1160, 963, 1210, 1160, 1160, 813, 1230, 1370, 1140, 995, 935, 1110, 994, 1020, 960,
         1180, 799, 958, 1140, 1100, 1210, 1150, 1250, 1260, 1220, 1030, 1100, 774, 840, 874, 694,
@@ -29,7 +37,7 @@ def test_the_change_of_the_nile_is_found():
     assert p == pytest.approx(1e-4)  # none of 9,999 random orders comes near it
     days = 365.25 * np.arange(100)
     course = courses(days, {"flow": np.array(NILE, dtype=float)})["flow"]
-    assert (course.finding, 1871 + course.change) == (Finding.CHANGE, 1899)
+    assert (course.finding, 1871 + course.change) == (CourseKind.CHANGE, 1899)
     assert (course.before, course.after) == (median(NILE[:28]), median(NILE[28:]))
 
 
@@ -79,9 +87,9 @@ def test_clean_batches_name_nothing_as_often_as_promised():
         days = np.cumsum(draws.exponential(1.0, 20))
         table = {"a": draws.normal(size=20), "b": draws.lognormal(size=20),
                  "c": draws.integers(0, 4, 20).astype(float)}
-        alarms += any(course.finding is not Finding.NONE for course in
+        alarms += any(course.finding is not CourseKind.NONE for course in
                       courses(days, table, orders=499).values())
-    low, high = stats.binom.interval(0.9973, 400, LEVEL)
+    low, high = stats.binom.interval(0.9973, 400, COURSE_LEVEL)
     assert 0.4 * low <= alarms <= high
 
 
@@ -91,8 +99,8 @@ def test_each_test_alone_keeps_its_level():
     p = np.array([[c.p_trend, c.p_change] for c in (
         course_of(np.arange(25.0), draws.normal(size=25), draws, orders=499)
         for _ in range(400))])
-    low, high = stats.binom.interval(0.9973, 400, LEVEL)
-    for column in (p <= LEVEL).sum(axis=0):
+    low, high = stats.binom.interval(0.9973, 400, COURSE_LEVEL)
+    for column in (p <= COURSE_LEVEL).sum(axis=0):
         assert low <= column <= high
 
 
@@ -103,7 +111,7 @@ def test_a_trend_is_a_trend_and_a_change_is_a_change(sign):
     found = courses(days, {"line": noise[0] + sign * 0.02 * days, "step": noise[1] + step,
                            "rest": noise[2]})
     assert [course.finding for course in found.values()] == [
-        Finding.TREND, Finding.CHANGE, Finding.NONE]
+        CourseKind.TREND, CourseKind.CHANGE, CourseKind.NONE]
     slope, low, high = found["line"].slope_per_day
     assert low < sign * 0.02 < high and high - low < 0.02 and low <= slope <= high
     assert found["line"].adjusted_p < 1e-6  # Mann and Kendall's, not that of 9,999 orders
@@ -115,7 +123,7 @@ def test_a_trend_is_a_trend_and_a_change_is_a_change(sign):
 def test_a_wild_value_decides_nothing():
     values = rng(6).normal(size=30)
     values[29] = 1e9
-    assert courses(np.arange(30.0), {"x": values})["x"].finding is Finding.NONE
+    assert courses(np.arange(30.0), {"x": values})["x"].finding is CourseKind.NONE
 
 
 def test_values_that_are_not_known_are_passed_over():
@@ -125,10 +133,10 @@ def test_values_that_are_not_known_are_passed_over():
     assert courses(days, {"x": values})["x"].change == 20
     values[12:20] = np.nan  # nobody knows when it changed between
     course = courses(days, {"x": values})["x"]
-    assert (course.finding, course.last_before, course.change) == (Finding.CHANGE, 11, 20)
+    assert (course.finding, course.last_before, course.change) == (CourseKind.CHANGE, 11, 20)
     steady = np.where(np.arange(40) < 5, np.nan, 1.0)
     nothing = courses(days, {"x": steady})["x"]
-    assert (nothing.finding, nothing.last_before, nothing.change) == (Finding.NONE, 0, 0)
+    assert (nothing.finding, nothing.last_before, nothing.change) == (CourseKind.NONE, 0, 0)
     few = np.where(np.arange(40) < FEWEST - 1, values, np.nan)
     few[3:6] = 0.1
     assert courses(days, {"x": few}) == {}
@@ -139,5 +147,5 @@ def test_values_that_are_not_known_are_passed_over():
 def test_what_never_changes_or_has_one_time_is_nothing():
     same = courses(np.arange(20.0), {"x": np.full(20, 3.0)})["x"]
     once = courses(np.zeros(20), {"x": np.arange(20.0)})["x"]
-    assert (same.finding, once.finding) == (Finding.NONE, Finding.NONE)
+    assert (same.finding, once.finding) == (CourseKind.NONE, CourseKind.NONE)
     assert (same.p_trend, same.p_change, once.p_trend) == (1.0, 1.0, 1.0)

@@ -32,9 +32,9 @@ def bag(tmp_path_factory):
 
 @pytest.mark.parametrize(("words", "message"), [
     ("solv x", "selfcal: VERB 'solv' is unknown; did you mean 'solve'?; see selfcal --help"),
-    ("", "selfcal: VERB is missing: one of apply, batch, cal, call, cell, diff, export, monitor, "
-     "plan, plot, replay, report, reproduce, simulate, solve, step-diagonal, table, up; see "
-     "selfcal --help"),
+    ("", "selfcal: VERB is missing: one of apply, batch, cal, call, cell, diff, export, gcode, "
+     "monitor, plan, plot, replay, report, reproduce, simulate, solve, step-diagonal, table, up; "
+     "see selfcal --help"),
     ("plan", "selfcal plan: check|suggest is missing; see selfcal plan --help"),
     ("solve", "selfcal solve: BAG is missing; see selfcal solve --help"),
     ("solve b --methd joint", "selfcal solve: the option --methd is unknown; did you mean "
@@ -273,7 +273,8 @@ RUNS = {
     "plan suggest": "plan suggest PLAN", "simulate": "simulate SIM -o made",
     "reproduce": "reproduce hu --draws 2", "cal export": "cal export R -o f.cal",
     "cal check": "cal check f.cal", "cal eval": "cal eval f.cal --position 1=1 --position 2=2",
-    "export": "export siemens R -o f.ini", "cal verify": "cal verify R f.cal",
+    "export": "export siemens R -o f.ini", "gcode": "gcode NC R -o o.nc",
+    "cal verify": "cal verify R f.cal",
     "cal accuracy": "cal accuracy R",
     "cal straightness": "cal straightness R -o s.cal",
     "cal orthogonality": "cal orthogonality --measured 5um --over 200mm --travel 300mm",
@@ -288,9 +289,10 @@ def test_every_verb_prints_one_json_object(bag, tmp_path, capsys, monkeypatch):
     root = Path(__file__).parents[2]
     write_json("r.json", result_to_dict(known_result(5, 8)[0]))
     places = {"BAG": bag, "R": "r.json", "S": "s.json", "PLAN": bag.parent / "plan.yaml",
-              "SIM": bag.parent / "simulation.yaml", "POINTS": "p.csv",
+              "SIM": bag.parent / "simulation.yaml", "POINTS": "p.csv", "NC": "in.nc",
               "DATA": root / "config/step_diagonal/case_study.csv"}
     Path("p.csv").write_text("x,y\n0,0\n")
+    Path("in.nc").write_text("G0 X0 Y0\n")
     assert set(RUNS) | NEEDS_NODES == set(LEAVES)
     for name, line in RUNS.items():
         words = [str(places.get(word, word)) for word in line.split()]

@@ -4,11 +4,11 @@ import pytest
 
 from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.laser.bag import SeriesTopics, read_series
-from selfcal_ros.laser.zigzag import Series
+from selfcal_ros.laser.zigzag import Recording
 from test.support.laser_bags import EPOCH_NS, write_laser_bag
 
 TOPICS = SeriesTopics("/cell/laser", "cell/axes")
-SHORT = Series(np.arange(4) * 10**9 + 5, np.array([0.5, 0.25, 0.125, 0.0625]),
+SHORT = Recording(np.arange(4) * 10**9 + 5, np.array([0.5, 0.25, 0.125, 0.0625]),
                np.arange(3) * 10**9, np.array([[0.0, 1.0], [2.0, 3.0], [4.0, 5.0]]))
 
 
@@ -77,7 +77,7 @@ def test_a_missing_bag_is_named(tmp_path):
 
 
 def test_a_time_of_logging_beyond_all_clocks_is_named(tmp_path):
-    late = Series(SHORT.laser_ns + (2**63 - EPOCH_NS), SHORT.laser_m, SHORT.position_ns,
+    late = Recording(SHORT.laser_ns + (2**63 - EPOCH_NS), SHORT.laser_m, SHORT.position_ns,
                   SHORT.position_m)
     bag = write_laser_bag(tmp_path / "b", late, laser="std_msgs/msg/Float64")
     with pytest.raises(InputError, match=r"laser: \d+ ns is no time of logging; record"):

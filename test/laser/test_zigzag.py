@@ -15,7 +15,7 @@ from selfcal_ros.laser.simulation.measure import (
     random_machine,
     simulate_step_diagonal,
 )
-from selfcal_ros.laser.zigzag import CutRule, Series, cut_zigzag, find_rests
+from selfcal_ros.laser.zigzag import CutRule, Recording, cut_zigzag, find_rests
 from test.support.laser import recorded
 
 RULE = CutRule((0.01, 0.01))
@@ -51,7 +51,7 @@ def test_repeats_of_a_whole_recording_become_samples():
     one = recording(noise_m=10e-9)
     other = recorded(case_study_machine(), {}, rng=np.random.default_rng(5), noise_m=10e-9)
     gap = int(one.laser_ns[-1]) + 10**9
-    both = Series(np.concatenate([one.laser_ns, other.laser_ns + gap]),
+    both = Recording(np.concatenate([one.laser_ns, other.laser_ns + gap]),
                   np.concatenate([one.laser_m, other.laser_m]),
                   np.concatenate([one.position_ns, other.position_ns + gap]),
                   np.concatenate([one.position_m, other.position_m]))
@@ -80,7 +80,7 @@ def test_the_mean_of_a_rest_leaves_the_moves_out():
 def test_a_recording_of_the_diagonals_only_has_no_linear_errors():
     series = recording()
     until = 26 * 1_200_000_000
-    short = Series(series.laser_ns[series.laser_ns < until], series.laser_m[
+    short = Recording(series.laser_ns[series.laser_ns < until], series.laser_m[
         series.laser_ns < until], series.position_ns[series.position_ns < until],
         series.position_m[series.position_ns < until])
     cut = cut_zigzag(short, RULE)
@@ -185,7 +185,7 @@ def test_rests_of_creeping_axes_are_those_of_the_definition(seed, creep, jumps):
     walk = np.cumsum(rng.normal(0, creep, (300, 2)), axis=0)
     walk += np.cumsum(rng.random((300, 1)) < jumps / 300, axis=0) * 1e-5
     stamps = np.arange(300) * 20_000_000
-    series = Series(stamps, np.zeros(300), stamps, walk)
+    series = Recording(stamps, np.zeros(300), stamps, walk)
     rule = CutRule((0.01, 0.01), min_rest_s=0.2, settle_s=0.0)
     assert [rest.start_ns for rest in find_rests(series, rule)] == \
         rests_by_trying_every_start(series, rule)

@@ -13,7 +13,7 @@ from selfcal_ros.laser.simulation.measure import (
     simulate_step_diagonal,
     trace,
 )
-from selfcal_ros.laser.zigzag import Series
+from selfcal_ros.laser.zigzag import Recording
 
 MM = 1e-3
 
@@ -81,7 +81,7 @@ def scatter_of(machine, values_of):
 
 
 def recorded(machine, setups, *, rng, noise_m=0.0, extra=None):
-    """Return a recording (`Series`) of the diagonals and single axes of a simulated machine.
+    """Return a recording (`Recording`) of the diagonals and single axes of a simulated machine.
 
     Rests of 1 s at 50 Hz with moves of 0.2 s between; `extra` maps a rest's index to a function
     that spoils its positions.
@@ -115,4 +115,4 @@ def recorded(machine, setups, *, rng, noise_m=0.0, extra=None):
         leaving = share[:, 0] * 1e-3 * (ahead is not place)
         laser.append(distance + leaving + rng.normal(0, noise_m, 60))
     stamps = np.concatenate(stamps)
-    return Series(stamps + 3_000_000, np.concatenate(laser), stamps, np.concatenate(positions))
+    return Recording(stamps + 3_000_000, np.concatenate(laser), stamps, np.concatenate(positions))

@@ -22,7 +22,7 @@ import numpy as np
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.readings import Measurements, RepeatMotion
 
-LEVEL = 1e-6
+WIRING_LEVEL = 1e-6
 """Probability, over all tests, of refusing a correctly wired measurement."""
 TOLD = 1e-3
 """Probability below which a single offset is taken to follow a single axis wrongly."""
@@ -107,7 +107,7 @@ def wiring_faults(measurements: Measurements) -> list[WiringFault]:
                 if (motion := getattr(view, name)) is not None and motion.dof > 1]
         tries = (len(AXES[kind]) ** 3 + len(AXES[kind])) * (len(told) + 1)
         for view, motion in _together(told):
-            responses = _wrong(motion, AXES[kind], LEVEL / tries)
+            responses = _wrong(motion, AXES[kind], WIRING_LEVEL / tries)
             if responses:
                 found.append(WiringFault(view, kind, responses))
                 break

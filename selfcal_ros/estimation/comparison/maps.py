@@ -19,7 +19,7 @@ from selfcal_ros.model.result import CalibrationResult, Noise
 from selfcal_ros.model.statistics import MANY_DOF, rms
 from selfcal_ros.units import MM_PER_M
 
-LEVEL = 0.05
+DIFFERENCE_LEVEL = 0.05
 """Probability that maps of the same stage differ significantly, both tests together."""
 
 DRAWS = 2000
@@ -48,7 +48,7 @@ class Significance:
     largest_z : float
         Largest difference of a node on an axis (of a line) in standard uncertainties.
     z_limit : float
-        Limit exceeded with the probability LEVEL / 2 if the maps agree.
+        Limit exceeded with the probability DIFFERENCE_LEVEL / 2 if the maps agree.
     p_z : float
         Probability of such a `largest_z` if the maps agree.
     noise_dof : float
@@ -112,7 +112,7 @@ def significance(values: np.ndarray, covariances: list[tuple[np.ndarray, bool]],
     largest = float(abs(z).max())
     p_z, limit = _of_largest(largest, len(z), root, noise_dof)
     return Significance(square / dof, dof, p, correlated, largest, limit, p_z, noise_dof,
-                        min(p, p_z) < LEVEL / 2)
+                        min(p, p_z) < DIFFERENCE_LEVEL / 2)
 
 
 def _mahalanobis(z: np.ndarray, correlation: np.ndarray) -> tuple[float, float, np.ndarray]:
@@ -125,21 +125,21 @@ def _mahalanobis(z: np.ndarray, correlation: np.ndarray) -> tuple[float, float, 
 
 def _of_largest(largest: float, n: int, root: np.ndarray | None,
                 noise_dof: float) -> tuple[float, float]:
-    """Return the probability of such a |z| among n values, and the limit of LEVEL / 2.
+    """Return the probability of such a |z| among n values, and the limit of DIFFERENCE_LEVEL / 2.
 
     The number of values bounds it (Bonferroni); draws give it for correlated nodes, except
     in the far tail, where the bound is close.
     """
     dof = min(noise_dof, MANY_DOF)
     bound = min(float(2 * n * stdtr(dof, -largest)), 1.0)
-    limit = -float(stdtrit(dof, LEVEL / 4 / n))
+    limit = -float(stdtrit(dof, DIFFERENCE_LEVEL / 4 / n))
     if root is None:
         return bound, limit
     rng = np.random.default_rng(0)
     drawn = abs(root @ rng.standard_normal((root.shape[1], DRAWS))).max(axis=0)
     if noise_dof <= MANY_DOF:
         drawn = drawn / np.sqrt(rng.chisquare(noise_dof, DRAWS) / noise_dof)
-    above = int(LEVEL / 2 * (DRAWS + 1))
+    above = int(DIFFERENCE_LEVEL / 2 * (DRAWS + 1))
     p = (1 + np.count_nonzero(drawn >= largest)) / (1 + DRAWS)
     return min(bound, float(p)), min(limit, float(np.sort(drawn)[-above]))
 

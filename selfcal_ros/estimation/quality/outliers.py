@@ -6,8 +6,8 @@ largest outliers are removed, at most one for each mark and site, and the fit is
 readings contradict each other so that the largest is not unique, all of them are removed. At the
 end each removed reading is restored if it agrees with the others after all (F-test of its
 contribution to the sum of squares, at a level that n good readings, marks and lines together, fail
-with probability LEVEL). Before that a view in which the plate slipped is split, unless a term of
-the model explains the readings better.
+with probability OUTLIER_LEVEL). Before that a view in which the plate slipped is split, unless a
+term of the model explains the readings better.
 """
 
 from dataclasses import asdict, dataclass, replace
@@ -30,7 +30,7 @@ from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.terms import ModelTerm, TermName
 from selfcal_ros.model.verdict import Finding, Grade
 
-LEVEL = 0.01
+OUTLIER_LEVEL = 0.01
 """Probability that a measurement without outliers loses a reading."""
 
 MAX_ROUNDS = 60
@@ -144,7 +144,7 @@ def _listed(cleaned: OutlierScreening) -> dict[str, Any]:
         "residual_rad": item.residual if item.kind == "angular" else None,
     } for item in cleaned.removed]
     outliers = {"rule": f"removed if its squared standardised residual fails an F-test at level "
-                        f"{LEVEL}/n, for marks and lines together",
+                        f"{OUTLIER_LEVEL}/n, for marks and lines together",
                 "unchecked": cleaned.unchecked, "removed": removed}
     return {"outliers": outliers, "slips": [asdict(item) for item in cleaned.slips],
             "noisy_views": [{"view": name, "ratio": ratio} for name, ratio in cleaned.noisy]}
@@ -303,9 +303,9 @@ def _ratio(squares: np.ndarray, sigma: float) -> np.ndarray:
 
 
 def _level(residuals: Residuals) -> float:
-    """Return the level of the test of one reading: LEVEL over the number of checked readings."""
-    return LEVEL / max(np.isfinite(residuals.squares).sum()
-                       + np.isfinite(residuals.squares_theta).sum(), 1)
+    """Return the level of the test of one reading, so that all checked ones have OUTLIER_LEVEL."""
+    return OUTLIER_LEVEL / max(np.isfinite(residuals.squares).sum()
+                               + np.isfinite(residuals.squares_theta).sum(), 1)
 
 
 def _restored(measurements: Measurements, options: Options, gone: dict[Key, Removed],

@@ -10,7 +10,7 @@ from scipy.stats import binom, chi2, norm
 from scipy.stats import f as f_distribution
 
 from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.estimation.comparison.maps import LEVEL, compare, significance
+from selfcal_ros.estimation.comparison.maps import DIFFERENCE_LEVEL, compare, significance
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.result import result_from_dict, result_to_dict
@@ -69,8 +69,8 @@ def test_the_largest_of_independent_values_has_its_own_distribution():
         found = significance(values, [(cover, full), (0 * cover, full)], np.zeros((n, 0)), KNOWN)
         assert found.largest_z == pytest.approx(z)
         assert found.p_z == pytest.approx(exact, rel=0.15)
-        assert found.z_limit == pytest.approx(norm.isf((1 - (1 - LEVEL / 2) ** (1 / n)) / 2),
-                                              rel=0.05)
+        p = (1 - (1 - DIFFERENCE_LEVEL / 2) ** (1 / n)) / 2
+        assert found.z_limit == pytest.approx(norm.isf(p), rel=0.05)
         assert not found.significant
     values[7] = -6
     found = significance(values, [(np.eye(n), True), (0 * np.eye(n), True)], np.zeros((n, 0)),
@@ -84,7 +84,7 @@ def test_values_that_move_together_count_once():
     found = significance(np.full(n, 2.0), [(cover, True), (0 * cover, True)], np.zeros((n, 0)),
                          KNOWN)
     assert found.p_z == pytest.approx(2 * norm.sf(2.0), abs=0.015)
-    assert found.z_limit == pytest.approx(norm.isf(LEVEL / 4), rel=0.12)
+    assert found.z_limit == pytest.approx(norm.isf(DIFFERENCE_LEVEL / 4), rel=0.12)
 
 
 PLAIN = Options(datum_theta="zero_mean", misalignment_model="linear", causes=False)
@@ -105,7 +105,8 @@ def test_missing_marks_do_not_make_maps_differ():
         assert sum(value < 0.05 for value in p) <= binom.ppf(0.999, len(found), 0.05)
         assert sum(value < 0.5 for value in p) >= binom.ppf(0.001, len(found), 0.5)
     assert all(item.xy.correlated for item in found)
-    assert sum(bool(item.significant) for item in found) <= binom.ppf(0.999, len(found), LEVEL)
+    significant = sum(bool(item.significant) for item in found)
+    assert significant <= binom.ppf(0.999, len(found), DIFFERENCE_LEVEL)
 
 
 def test_one_node_that_moved_is_found():
@@ -118,7 +119,7 @@ def test_one_node_that_moved_is_found():
         moved[at] += 8 * emap.u_gx[at]
         found = compare(a, replace(b, error_map=replace(emap, gx=moved)))
         caught += found.significant
-        if found.xy.p_z < LEVEL / 2:
+        if found.xy.p_z < DIFFERENCE_LEVEL / 2:
             z = abs(np.stack([found.dx, found.dy]))
             assert found.xy.largest_z > found.xy.z_limit and z.max() == found.max_m
     assert caught >= 18

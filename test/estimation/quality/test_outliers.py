@@ -115,7 +115,7 @@ def test_good_readings_stay(monkeypatch):
     a thousand at a rate of 30 %, five times in six at 66 %, as of three such tests in one.
     Never is a slip or a noisy view seen.
     """
-    monkeypatch.setattr("selfcal_ros.estimation.quality.outliers.LEVEL", 0.3)
+    monkeypatch.setattr("selfcal_ros.estimation.quality.outliers.OUTLIER_LEVEL", 0.3)
     plan, lost = hu_plan(Artifact(5, 0.01, 8)), 0
     for seed in range(30):
         rng = np.random.default_rng(seed)

@@ -1,0 +1,59 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``selfcal gcode``: a program for a controller without tables, corrected."""
+
+import argparse
+
+from selfcal_ros.cli.terminal import STDOUT, add_json, file_of, say
+
+HELP = "correct a G-code program: for controllers without tables"
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the verb."""
+    from selfcal_ros.cli.cal_lines import add_frame
+
+    add = parser.add_argument
+    add("program", metavar="IN", help="G-code")
+    add("result", metavar="RESULT.json", help="result that `selfcal solve` wrote")
+    add("-o", "--output", metavar="OUT", required=True, help="program to write; - = stdout")
+    add("--tolerance", type=float, default=1.0, metavar="UM",
+        help="largest distance of the corrected path from the programmed one, um (default 1)")
+    add("--decimals", type=int, default=5, metavar="N",
+        help="of coordinates in mm, one more in inches (default 5)")
+    add("--fill", action="store_true", help="set unknown sites to the mean of their neighbours")
+    add_json(parser)
+    add_frame(parser, theta=False, units=("mm", "in"))
+
+
+def run(args: argparse.Namespace) -> int:
+    """Read program and result, write the program; code 5 and the reason if not qualified."""
+    from dataclasses import replace
+
+    from selfcal_ros.cli.cal import ready
+    from selfcal_ros.cli.cal_lines import frame_of
+    from selfcal_ros.cli.terminal import exit_code
+    from selfcal_ros.controllers.gcode import Rewriter, corrected_program
+    from selfcal_ros.controllers.grid import Wiring, wanted
+    from selfcal_ros.errors import InputError
+    from selfcal_ros.files import check_outputs, read_text, write_text
+    from selfcal_ros.units import M_PER_UM
+
+    if not 0.001 <= args.tolerance <= 1e4 or not 1 <= args.decimals <= 9:
+        raise InputError("--tolerance, --decimals", f"{args.tolerance} um, {args.decimals}",
+                         "give 0.001 to 10000 um and 1 to 9 decimals")
+    unit = args.unit = args.unit or "mm"
+    frame = replace(frame_of(args), unit="m")
+    check_outputs([args.program, args.result], [file_of(args)])
+    result, filled = ready(args)
+    plate = result.artifact
+    rewriter = Rewriter(
+        wanted(result.error_map, Wiring(frame)), tolerance_m=args.tolerance * M_PER_UM,
+        step_m=plate.grid_pitch_m / 32, unit=unit, decimals=args.decimals)
+    made = corrected_program(read_text(args.program), args.program, rewriter)
+    if args.output == STDOUT:
+        say(args, made.text.removesuffix("\n"), {"program": made.text})
+    else:
+        write_text(args.output, made.text)
+        say(args, f"written: {args.output}, {made.moves} moves as {made.pieces}", {
+            "written": args.output, "moves": made.moves, "pieces": made.pieces, "filled": filled})
+    return exit_code(result)
