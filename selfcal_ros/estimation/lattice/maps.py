@@ -235,7 +235,11 @@ def rigid_parameters(views: LatticeViews) -> np.ndarray:
     return out
 
 
-def maps_of(shape: tuple[int, int], poses: tuple[AnyPose, ...]) -> "LatticeViews | PlacedViews":
+type AnyViews = LatticeViews | PlacedViews
+"""The maps of the grid views of one calibration."""
+
+
+def maps_of(shape: tuple[int, int], poses: tuple[AnyPose, ...]) -> AnyViews:
     """Return the maps of views of a plate with `shape` marks."""
     placed = tuple(pose for pose in poses if isinstance(pose, MapPose))
     if placed:

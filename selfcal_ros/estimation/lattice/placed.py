@@ -92,7 +92,7 @@ class PlacedViews:
         return self.spline.adjoint(np.broadcast_to(total, self.z_sites.size).reshape(self.shape))
 
     @cached_property
-    def _at(self) -> tuple[np.ndarray, np.ndarray]:
+    def from_corner(self) -> tuple[np.ndarray, np.ndarray]:
         """Places of the marks in the pitch of the map from its first node, (views, nx, ny) each."""
         step = self.artifact.grid_pitch_m / self.artifact.field.grid_pitch_m
         x, y = np.array([pose.sites for pose in self.poses]).swapaxes(0, 1) * step
@@ -102,12 +102,12 @@ class PlacedViews:
     def site_index(self) -> np.ndarray:
         """Flat index of the node nearest to every mark, int (views, nx, ny); -1 off the field."""
         i, j = (np.clip(np.rint(part).astype(int), 0, size - 1)
-                for part, size in zip(self._at, self.shape, strict=True))
+                for part, size in zip(self.from_corner, self.shape, strict=True))
         return np.where(self.in_field, i * self.shape[1] + j, -1)
 
     def near(self, nodes: np.ndarray) -> np.ndarray:
         """Return the marks whose cell of the map has only `nodes` as corners, (views, nx, ny)."""
         i, j = (np.clip(np.floor(part + EDGE).astype(int), 0, size - 2)
-                for part, size in zip(self._at, self.shape, strict=True))
+                for part, size in zip(self.from_corner, self.shape, strict=True))
         return self.in_field & (nodes[i, j] & nodes[i + 1, j] & nodes[i, j + 1]
                                 & nodes[i + 1, j + 1])

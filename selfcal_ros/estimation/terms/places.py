@@ -1,0 +1,222 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where the stage stood at the readings, and what its error is there (method eq. 7.10).
+
+A reading has the stage error of the place where the stage truly stands, and the linear equations
+give it that of the mark's site. Between the sites the error is the bicubic spline that
+`selfcal_ros.compensation.compensator` uses, and beyond the outermost sites its continuation.
+Everything is in the frame of the equations.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from selfcal_ros.compensation.cells import Cells, bicubic_cells, bilinear_cells
+from selfcal_ros.estimation.lattice.maps import AnyViews, LatticeViews, maps_of
+from selfcal_ros.estimation.lattice.readings import GridData
+from selfcal_ros.estimation.terms.ground import Ground
+from selfcal_ros.model.readings import Measurements
+from selfcal_ros.model.statistics import rms
+
+AT_SITES = 1e-5
+"""Distance from the sites, in pitches, at which the stage stands at them: even where its error is a
+micrometre, it is 10 pm off there."""
+
+STEP = 1e-3
+"""Half the distance, in pitches, over which slopes are taken."""
+
+
+@dataclass(frozen=True, eq=False)
+class StagePlaces:
+    """Places of the stage at the readings of the grid views.
+
+    Attributes
+    ----------
+    views : LatticeViews or PlacedViews
+        Marks and sites of the views.
+    pitch_m : float
+        Distance of neighbouring sites, m.
+    known : bool array (nx, ny)
+        Sites whose error is known.
+    at : tuple of int arrays (P,)
+        View, row and column of the readings whose place, and the error of whose site, is known.
+    away_m : complex array (P,)
+        Indicated position of the stage less the site of the mark, mean of the visits, m.
+    marks : tuple of int array (V,) or None
+        Mark of each visit of each view; None where visits are not known.
+    about_m : tuple of complex array (V,) or None
+        Indicated position at each visit less the mean of its mark, m.
+    """
+
+    views: AnyViews
+    pitch_m: float
+    known: np.ndarray
+    at: tuple[np.ndarray, ...]
+    away_m: np.ndarray
+    marks: tuple[np.ndarray | None, ...]
+    about_m: tuple[np.ndarray | None, ...]
+
+    @cached_property
+    def site(self) -> np.ndarray:
+        """Site of the mark of each reading, (P,)."""
+        return self.views.site_index[self.at]
+
+    @cached_property
+    def distance(self) -> float:
+        """How far the stage stood off the sites, in pitches (rms)."""
+        return rms(np.abs(self.away_m)) / self.pitch_m
+
+    @cached_property
+    def nominal(self) -> tuple[np.ndarray, np.ndarray]:
+        """Nominal place of the mark of each reading, in pitches from the first node, (P,) each."""
+        if isinstance(self.views, LatticeViews):
+            return np.divmod(self.site, self.known.shape[1])
+        s, t = self.views.from_corner
+        return s[self.at], t[self.at]
+
+    def moved(self, field: np.ndarray, near: np.ndarray | None = None, *,
+              local: bool = False) -> np.ndarray:
+        """Return the stage error where the stage stood less that at the site, (P,), m.
+
+        Parameters
+        ----------
+        field : complex array (nx, ny)
+            Stage error at the sites, m.
+        near : complex array (P,), optional
+            Stage error where the stage stood, as far as it is known: the true place is the
+            indicated one less it. That at the site without it.
+        local : bool
+            Whether the spline has the slopes between neighbours.
+        """
+        filled = _filled(field, self.known)
+        at_site = self._at_nominal(filled)
+        x, y = self._cells(filled, local=local).beyond(
+            *self._place(at_site if near is None else near))
+        return x + 1j * y - at_site
+
+    def _at_nominal(self, field: np.ndarray) -> np.ndarray:
+        """Return a field at the nominal place of each reading, (P,)."""
+        if isinstance(self.views, LatticeViews):
+            return field.reshape(-1)[self.site]
+        x, y = self._cells(field).beyond(*self.nominal)
+        return x + 1j * y
+
+    def errors(self, field: np.ndarray, moved: np.ndarray | None = None) -> np.ndarray:
+        """Return the stage error where the stage stood, (P,), m, given that at the sites."""
+        at_site = self._at_nominal(_filled(field, self.known))
+        return at_site + (self.moved(field) if moved is None else moved)
+
+    def changes(self, moved: np.ndarray, turn_rad: np.ndarray) -> np.ndarray:
+        """Return what differences of the stage error do to the readings, (views, nx, ny), m.
+
+        Parameters
+        ----------
+        moved : complex array (P,)
+            Differences, frame of the equations, m.
+        turn_rad : float array (views,)
+            Angle by which the frame of each view's readings is turned.
+        """
+        out = np.zeros((len(self.about_m), *self.views.plate_shape), dtype=complex)
+        out[self.at] = moved * self._phase(turn_rad)[self.at[0]]
+        return out
+
+    def about(self, field: np.ndarray, near: np.ndarray,
+              turn_rad: np.ndarray) -> list[np.ndarray | float]:
+        """Return what visits of each view have more than the mean of their mark, (V,), m.
+
+        By the slopes of the stage error where the stage stood; arguments as in `moved`, `changes`.
+        """
+        cells, (s, t) = self._cells(_filled(field, self.known)), self._place(near)
+        slopes = np.zeros((2, len(self.about_m), *self.views.plate_shape), dtype=complex)
+        for slope, (a, b) in zip(slopes, ((STEP, 0.0), (0.0, STEP)), strict=True):
+            x, y = (cells.beyond(s + a, t + b) - cells.beyond(s - a, t - b)) / (2 * STEP)
+            slope[self.at] = (x + 1j * y) / self.pitch_m
+        out: list[np.ndarray | float] = []
+        for row, (away, marks) in enumerate(zip(self.about_m, self.marks, strict=True)):
+            if away is None:
+                out.append(0.0)
+                continue
+            along_x, along_y = slopes[:, row].reshape(2, -1)[:, marks]
+            out.append((along_x * away.real + along_y * away.imag) * self._phase(turn_rad)[row])
+        return out
+
+    def _place(self, error: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return where the stage truly stood, in pitches from the corner of the field, (P,)."""
+        away = (self.away_m - error) / self.pitch_m
+        i, j = self.nominal
+        return i + away.real, j + away.imag
+
+    def _cells(self, field: np.ndarray, *, local: bool = False) -> Cells:
+        """Return the interpolant of a field between the nodes of the map."""
+        both = np.stack([field.real, field.imag])
+        if not isinstance(self.views, LatticeViews) and self.views.spline.axes[0].degree == 1:
+            return bilinear_cells(both)
+        return bicubic_cells(both, local=local)
+
+    def _phase(self, turn_rad: np.ndarray) -> np.ndarray:
+        """Return the factor of each view from the stage frame to that of its readings."""
+        return self.views.phases.conj() * np.exp(-1j * turn_rad)
+
+
+def _filled(field: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Return a field with unknown sites on straight lines through known ones of row and column."""
+    if known.all():
+        return field
+    rows_first, columns_first = _along_both(field, known), _along_both(field.T, known.T).T
+    return (rows_first + columns_first) / 2
+
+
+def _along_both(field: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Return a field filled along rows and columns with two known sites, then with one."""
+    for least in (2, 2, 1, 1):
+        field, known = field.copy(), known.copy()
+        for row in np.flatnonzero((known.sum(axis=1) >= least) & ~known.all(axis=1)):
+            at, left = np.flatnonzero(known[row]), np.flatnonzero(~known[row])
+            above = np.clip(np.searchsorted(at, left), min(1, len(at) - 1), len(at) - 1)
+            a, b = at[above - 1], at[above]
+            slope = (field[row, b] - field[row, a]) / np.maximum(b - a, 1)
+            field[row, left] = field[row, a] + (left - a) * slope
+            known[row] = True
+        field, known = field.T, known.T
+    return field
+
+
+def places_of(measurements: Measurements, grid: GridData, ground: Ground,
+              known: np.ndarray) -> StagePlaces | None:
+    """Return where the stage stood; None where it stood at the sites, or no visit tells.
+
+    Parameters
+    ----------
+    measurements : Measurements
+        The readings.
+    grid, ground : GridData, Ground
+        What is made of them.
+    known : bool array (nx, ny)
+        Sites whose error is known.
+    """
+    views = maps_of(grid.y.shape[1:], grid.poses)
+    away = np.zeros(grid.y.shape, dtype=complex)
+    told = np.zeros(away.shape, dtype=bool)
+    marks: list[np.ndarray | None] = []
+    about: list[np.ndarray | None] = []
+    for row, (index, visits) in enumerate(zip(grid.index, ground.visits, strict=True)):
+        found = measurements.views[index].visits
+        if visits is None or found is None:
+            marks.append(None)
+            about.append(None)
+            continue
+        stood = found.dx - found.offset_x + 1j * (found.dy - found.offset_y)
+        mean = visits.means(stood[None], grid.y[0].size)[0]
+        away[row], told[row].reshape(-1)[visits.mark] = mean.reshape(grid.y.shape[1:]), True
+        marks.append(visits.mark)
+        about.append(stood - mean[visits.mark])
+    if isinstance(views, LatticeViews):
+        told &= known.reshape(-1)[views.site_index] & (grid.weight > 0)
+        pitch_m = ground.half_width_m / views.unit
+    else:
+        told, pitch_m = told & views.near(known) & (grid.weight > 0), views.spline.pitch_m
+    if not np.abs(away[told]).max(initial=0.0) > AT_SITES * pitch_m:
+        return None
+    return StagePlaces(views, pitch_m, known, np.nonzero(told), away[told], tuple(marks),
+                       tuple(about))
