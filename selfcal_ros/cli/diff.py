@@ -26,6 +26,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
                         "`selfcal step-diagonal`: then squareness and scale are compared")
     parser.add_argument("--keep-scale", action="store_true",
                         help="keep the magnification: both maps have a reference length")
+    parser.add_argument("--plot", metavar="FILE.png|.svg|.pdf",
+                        help="draw both maps and their difference side by side")
     parser.add_argument("--json", action="store_true", help="print JSON")
 
 
@@ -34,15 +36,18 @@ def run(args: argparse.Namespace) -> int:
     from selfcal_ros.cli.terminal import say_unless_qualified
     from selfcal_ros.errors import ExitCode, InputError
     from selfcal_ros.estimation.comparison.maps import compare, compare_with_laser
-    from selfcal_ros.files import read_json
+    from selfcal_ros.files import check_outputs, read_json
     from selfcal_ros.model.result import result_from_dict
 
+    check_outputs([args.a, args.b], [args.plot])
     first, second = read_json(args.a), read_json(args.b)
     a = result_from_dict(first, args.a)
     if isinstance(second, dict) and "ex_x" in second:
         if args.keep_scale:
             raise InputError("--keep-scale", f"for {args.b} squareness and scale difference are "
                              "compared, not the magnification", "omit it")
+        if args.plot:
+            raise InputError("--plot", f"{args.b} has no map", "name two RESULT.json")
         rows = compare_with_laser(a, second, args.b)
         say(args, "\n".join([_laser_text(rows), *_grades_text([a])]),
             {**_laser_json(rows), **_grades([a])})
@@ -57,6 +62,13 @@ def run(args: argparse.Namespace) -> int:
                                  "omit it, or solve with --reference")
     with busy("comparing"):
         found = compare(a, b, keep_scale=args.keep_scale, names=(args.a, args.b))
+    if args.plot:
+        from selfcal_ros.reporting.figures.maps import difference_picture
+        from selfcal_ros.reporting.figures.paper import save_picture
+
+        save_picture(difference_picture(a, b, {
+            "gx": found.dx, "gy": found.dy, "g_theta": found.d_theta}, _verdict_text(found)),
+            args.plot)
     say(args, _text(found, _grades_text([a, b])), {**_json(found), **_grades([a, b])})
     datums = [result.error_map.datum_theta for result in (a, b)]
     if datums[0] != datums[1] and not args.json and found.theta is not None:

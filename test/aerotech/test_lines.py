@@ -154,7 +154,8 @@ def test_measured_errors_are_opposed():
     ("position,error\n1,2\n2\n", "d.csv:3: not two numbers"),
     ("position,error\n1,nan\n2,0\n", "d.csv:2: not two numbers"),
     ("position,error\n1,1\n1,2\n", "not equidistant between 1 and 1"),
-    ("position,error\n1,1\n2,2\n4,0\n", "not equidistant between")])
+    ("position,error\n1,1\n2,2\n4,0\n", "not equidistant between"),
+    ("position,error\n1,1\n2,2\n4,0\n7,1\n", "not equidistant between 1 and 2")])
 def test_measured_errors_without_sense(text, message):
     with pytest.raises(InputError, match=message):
         measured_line(text, "d.csv", 1e-3)

@@ -120,6 +120,17 @@ def test_a_trend_is_a_trend_and_a_change_is_a_change(sign):
     assert found["step"].after - found["step"].before == pytest.approx(sign * 1.0, abs=0.1)
 
 
+@pytest.mark.parametrize(("trend", "change", "kind"), [
+    (0.01, 0.2, CourseKind.TREND), (0.2, 0.01, CourseKind.CHANGE),
+    (0.01, 0.01, CourseKind.CHANGE), (0.2, 0.2, CourseKind.NONE)])
+def test_the_form_of_the_values_decides_only_between_two_significant_tests(
+        monkeypatch, trend, change, kind):
+    monkeypatch.setattr(course, "_adjusted", lambda p: np.array([[trend, change]]))
+    step = np.repeat([0.0, 1.0], FEWEST)
+    [found] = courses(np.arange(2.0 * FEWEST), {"step": step}, orders=99).values()
+    assert found.finding is kind
+
+
 def test_a_wild_value_decides_nothing():
     values = rng(6).normal(size=30)
     values[29] = 1e9

@@ -12,12 +12,15 @@ import pytest
 
 from selfcal_ros.cli.main import main
 from selfcal_ros.estimation.api import calibrate
+from selfcal_ros.estimation.comparison.maps import compare
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.files import read_json, write_json
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.json_form import plain
 from selfcal_ros.model.result import result_from_dict, result_to_dict
 from selfcal_ros.model.verdict import Enlargement, Grade, Verdict
+from selfcal_ros.reporting.figures import maps, paper
+from selfcal_ros.reporting.figures.drawing import Drawing
 from selfcal_ros.simulation.truth import hu_plan, random_truth, simulate_measurements
 
 
@@ -36,6 +39,32 @@ def files(tmp_path):
         out.append(str(tmp_path / f"{seed}.json"))
         write_json(out[-1], result_to_dict(result))
     return out
+
+
+def test_both_maps_and_their_difference_are_drawn(files, tmp_path, capsys, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(paper, "save_picture", lambda picture, path: drawn.append(picture))
+    assert main(["diff", *files, "--plot", str(tmp_path / "d.svg")]) == 0
+    [picture] = drawn
+    text = [item.text for item in picture.items if hasattr(item, "text")]
+    assert picture.says == "verdict: not significant, the maps agree within their uncertainties"
+    assert [line for line in text if line in ("A", "B, in the datum of A", "B − A")] == [
+        "A", "B, in the datum of A", "B − A"]
+    assert "B − A in θ in arcsec, outwards = counter-clockwise" in text
+    a, b = (result_from_dict(read_json(file), file) for file in files)
+    found = compare(a, b)
+    difference = {"gx": found.dx, "gy": found.dy, "g_theta": found.d_theta}
+    shown = []
+    monkeypatch.setattr(maps, "error_map", lambda result, **_: shown.append(result) or Drawing(
+        "", "", 10, 10))
+    maps.difference_picture(a, b, difference, "")
+    of_a, of_b, of_both = (result.error_map for result in shown)
+    np.testing.assert_array_equal(of_a.gx, a.error_map.gx)
+    assert np.abs(of_b.gx - a.error_map.gx).max() < 1e-7  # without the micrometre of the datum
+    np.testing.assert_array_equal(of_both.gy, found.dy)
+    np.testing.assert_array_equal(of_both.u_gx, np.hypot(a.error_map.u_gx, b.error_map.u_gx))
+    assert main(["diff", *files, "--plot", files[0]]) == 2
+    assert "would be written over" in capsys.readouterr().err
 
 
 def test_two_results_as_text_and_as_json(files, capsys):

@@ -4,7 +4,9 @@
 import math
 import os
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from textwrap import wrap
+from typing import Any
 
 import numpy as np
 
@@ -48,16 +50,54 @@ def map_picture(result: CalibrationResult,
     pictures = [error_map(result, truth)]
     if result.artifact.angular_count:
         pictures.append(angular_map(result, truth))
+    return _beside(pictures, state_sentence(result), _origin(result))
+
+
+def difference_picture(a: CalibrationResult, b: CalibrationResult,
+                       difference: Mapping[str, Any], verdict: str) -> draw.Drawing:
+    """Return two maps and their difference side by side, each at its own scale.
+
+    Parameters
+    ----------
+    a, b : CalibrationResult
+        Calibrations on the same lattice.
+    difference : mapping
+        B minus A without the datum difference: gx, gy in m, g_theta in rad. B is drawn as A plus
+        this, which is B in the datum of A; U of the difference is that of both, independent.
+    verdict : str
+        Heading.
+    """
+    first, other = a.error_map, b.error_map
+    noise = replace(a.noise, k_xy=max(a.noise.k_xy, b.noise.k_xy),
+                    k_theta=max(a.noise.k_theta, b.noise.k_theta))
+    names = ("gx", "gy", "g_theta")
+    of_b = replace(b, error_map=replace(other, **{
+        name: getattr(first, name) + difference[name] for name in names}))
+    of_both = replace(a, noise=noise, error_map=replace(first, **difference, **{
+        f"u_{name}": np.hypot(*(getattr(emap, f"u_{name}") for emap in (first, other)))
+        for name in names}))
+    shown = [("A", a), ("B, in the datum of A", of_b), ("B − A", of_both)]
+    pictures = [error_map(result, title=title) for title, result in shown]
+    if np.isfinite(difference["g_theta"]).any():
+        pictures.append(angular_map(of_both, title="B − A in θ in arcsec, outwards = "
+                                    "counter-clockwise"))
+    return _beside(pictures, verdict, f"A: {_origin(a)}", f"B: {_origin(b)}")
+
+
+def _beside(pictures: list[draw.Drawing], heading: str, *foot: str) -> draw.Drawing:
+    """Return pictures side by side below a heading, with lines on their origin."""
     margin, top = 28.0, 30.0
     width = margin + len(pictures) * (parts.WIDTH + margin)
-    drawing = draw.Drawing("map", state_sentence(result), width, 0)
-    for line in wrap(state_sentence(result), 52 * len(pictures)):
+    drawing = draw.Drawing("map", heading, width, 0)
+    for line in wrap(heading, 52 * len(pictures)):
         drawing.label(drawing.width / 2, top, line, size=13, anchor="middle", bold=True)
         top += 18
     for column, part in enumerate(pictures):
         drawing.add(part, margin + column * (parts.WIDTH + margin), top)
     drawing.height = top + max(part.height for part in pictures) + 44
-    drawing.label(margin, drawing.height - 14, _origin(result), size=10, colour="soft")
+    for number, line in enumerate(foot):
+        drawing.height += 14 * (number > 0)
+        drawing.label(margin, drawing.height - 14, line, size=10, colour="soft")
     return drawing
 
 
@@ -70,8 +110,8 @@ def _origin(result: CalibrationResult) -> str:
     return "  ·  ".join(word for word in words if word)
 
 
-def error_map(result: CalibrationResult,
-              truth: Mapping[str, np.ndarray] | None = None) -> draw.Drawing:
+def error_map(result: CalibrationResult, truth: Mapping[str, np.ndarray] | None = None, *,
+              title: str = "Error of the stage, G = indicated − true") -> draw.Drawing:
     """Return the vectors of G over their length, U around their heads, a known truth beneath."""
     emap, artifact, k = result.error_map, result.artifact, result.noise.k_xy
     sites = parts.thinned(artifact, parts.MAX_ARROWS)
@@ -88,7 +128,7 @@ def error_map(result: CalibrationResult,
     fields = [shown(np.where(emap.valid, g[key], np.nan) for key in ("gx", "gy"))
               for g in (vars(emap), truth) if g is not None]
     tips = [at + field * factor * MM_PER_M for field in fields]
-    drawing = parts.titled("error-map", "Error of the stage, G = indicated − true")
+    drawing = parts.titled("error-map", title)
     frame = _frame(drawing, artifact, [np.abs(tip) + np.nan_to_num(around) for tip in tips])
     scale = parts.Scale("e", 0.0, parts.round_end(length * UM_PER_M))
     parts.cells(frame, artifact, length * UM_PER_M, scale)
@@ -174,15 +214,15 @@ def component_maps(result: CalibrationResult) -> draw.Drawing:
     return drawing
 
 
-def angular_map(result: CalibrationResult,
-                truth: Mapping[str, np.ndarray] | None = None) -> draw.Drawing:
+def angular_map(result: CalibrationResult, truth: Mapping[str, np.ndarray] | None = None, *,
+                title: str = "Error in θ in arcsec, outwards = counter-clockwise",
+                ) -> draw.Drawing:
     """Return the angular error around the circle, with its expanded uncertainty as a band."""
     emap, k = result.error_map, result.noise.k_theta
     error, u = emap.g_theta * ARCSEC_PER_RAD, emap.u_g_theta * k * ARCSEC_PER_RAD
     true = None if truth is None or truth.get("g_theta") is None else np.asarray(
         truth["g_theta"]) * ARCSEC_PER_RAD
-    drawing = parts.titled("angular-map", "Error in θ in arcsec, outwards = counter-clockwise",
-                           CENTRE[1] + 230)
+    drawing = parts.titled("angular-map", title, CENTRE[1] + 230)
     curves = [np.abs(error) + np.nan_to_num(u)] + ([] if true is None else [np.abs(true)])
     known = np.concatenate(curves)
     known = known[np.isfinite(known)]

@@ -73,6 +73,12 @@ def test_what_is_no_fault_has_no_size():
     assert all(fault.size and fault.unit for fault in FAULTS if fault not in none)
 
 
+def test_random_faults_are_repeated_as_often_as_their_names_say():
+    repeats = [fault.apply(case_study_machine(), fault.size)[1].noise.repeats
+               for fault in FAULTS if fault.random]
+    assert repeats == [3, 3]
+
+
 def test_the_table_has_a_line_for_every_row():
     values = dict.fromkeys(("linear_m", "transverse_m", "squareness_m", "straightness_m"), 1e-6)
     rows = [{"fault": "mirror off", "size": 1e-3, "unit": "rad", "conventional": values,
