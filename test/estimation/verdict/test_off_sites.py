@@ -210,7 +210,7 @@ def test_the_law_which_takes_the_sites_for_the_places_is_told_so():
     truth = random_truth(plan.artifact, 4, rng, Spread(
         t_m=1e-3, phi_rad=1e-5, correlation_pitches=4, rotation="linear"))
     cell = CellSettings(sigma_xy_m=SIGMA_M, sigma_theta_rad=1e-6, servo_sigma_m=0.0,
-                        servo_sigma_rad=0.0, follow_mark=True)
+                        servo_sigma_theta_rad=0.0, follow_mark=True)
     made = simulate_measurements(truth, plan, rng, settings=cell)
     law, joint = (calibrate(made, bare(method=method)) for method in ("law", "joint"))
     assert joint.verdict.qualified and not law.verdict.qualified
