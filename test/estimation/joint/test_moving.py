@@ -33,7 +33,8 @@ def measured(plan, seed=1, *, t_m=1e-3, sense=Sense.MICROSCOPE_MOVES, length=4.0
     rng = np.random.default_rng(seed)
     truth = random_truth(plan.artifact, len(plan.views), rng, Spread(
         g_m=g_m, t_m=t_m, phi_rad=5e-4, correlation_pitches=length))
-    settings = CellSettings(sense, sigma_m, 2e-5, servo_sigma_m=0.0, servo_sigma_theta_rad=0.0, **cell)
+    settings = CellSettings(sense, sigma_m, 2e-5, servo_sigma_m=0.0, servo_sigma_theta_rad=0.0,
+                            **cell)
     return truth, simulate_measurements(truth, plan, rng, settings=settings, missing=missing)
 
 
