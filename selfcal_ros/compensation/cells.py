@@ -26,14 +26,18 @@ SNAP = 1e-9
 """Distance to a node, in pitches, below which a position is taken to be on it."""
 
 
-def cubic_pieces(values: np.ndarray, *, periodic: bool = False) -> np.ndarray:
+def cubic_pieces(values: np.ndarray, *, periodic: bool = False,
+                 local: bool = False) -> np.ndarray:
     """Return the cubic spline through `values` (n, ...) one apart, (4, intervals, ...).
 
     Coefficients of 1, u, u^2, u^3 with u from 0 to 1 in each interval. Not-a-knot ends; a parabola
     through three values. A periodic spline has n intervals, the last of which leads to the first
-    value.
+    value. A local one has the slopes of parabolas through three neighbours (Catmull and Rom).
     """
-    slope = _slopes_of_circle(values) if periodic else _slopes(values)
+    if periodic:
+        slope = _slopes_of_circle(values)
+    else:
+        slope = np.gradient(values, axis=0, edge_order=2) if local else _slopes(values)
     if periodic:
         values, slope = (np.concatenate([rows, rows[:1]]) for rows in (values, slope))
     low, left, right, step = values[:-1], slope[:-1], slope[1:], np.diff(values, axis=0)
@@ -132,6 +136,19 @@ class Cells:
                 out[unknown] = _known_corners(field, (i[unknown], j[unknown]),
                                               (u[unknown], v[unknown]))
         return first, second
+
+    def beyond(self, s: np.ndarray, t: np.ndarray) -> np.ndarray:
+        """Return both fields at grid coordinates `s`, `t` (P,), not clamped, (2, P).
+
+        The polynomials of the outermost cells go on beyond the grid. All nodes are to be known.
+        """
+        out = np.empty((2, len(s)))
+        for start in range(0, len(s), self.block):
+            part = slice(start, start + self.block)
+            i, j = (np.clip(np.floor(w[part]), 0, size - 2).astype(np.int64)
+                    for w, size in zip((s, t), self.shape, strict=True))
+            out[:, part] = self._polynomials(self._rows(i, j), s[part] - i, t[part] - j)
+        return out
 
     def solve_in_cell(self, s: np.ndarray, t: np.ndarray, scale: float,
                       ) -> tuple[np.ndarray, np.ndarray]:
@@ -271,13 +288,13 @@ def bilinear_cells(fields: np.ndarray) -> Cells:
     return _cells(c, 2, fields)
 
 
-def bicubic_cells(fields: np.ndarray) -> Cells:
+def bicubic_cells(fields: np.ndarray, *, local: bool = False) -> Cells:
     """Return the interpolating bicubic spline of `fields` (2, nx, ny), without NaN.
 
-    Not-a-knot ends; along a direction of three nodes that spline is a parabola.
+    See `cubic_pieces`.
     """
-    along_x = cubic_pieces(fields.swapaxes(0, 1))  # p, i, field, j
-    both = cubic_pieces(along_x.transpose(3, 0, 1, 2))  # q, j, p, i, field
+    along_x = cubic_pieces(fields.swapaxes(0, 1), local=local)  # p, i, field, j
+    both = cubic_pieces(along_x.transpose(3, 0, 1, 2), local=local)  # q, j, p, i, field
     return _cells(both.transpose(4, 3, 1, 2, 0), 4, fields)
 
 

@@ -89,6 +89,9 @@ class Options:
         Terms with sizes that apply unless `terms` names them: lines of type B of the budget
         (GUM 4.3). Empty: all of them are known to be zero. Linear models assume none: strain would
         absorb the finite rotations that they omit.
+    at_places : bool
+        Whether readings have the stage error of the place where the stage stood, or that of the
+        site of their mark.
     magnification_limit : float
         Difference of the scales of plate and encoders, m/m, beyond which there is a warning.
 
@@ -108,6 +111,7 @@ class Options:
     causes: bool | None = None
     terms_from: str = ""
     assumed: tuple[ModelTerm, ...] = DEFAULT_TERMS
+    at_places: bool = True
     magnification_limit: float = 1e-4
 
     def __post_init__(self) -> None:

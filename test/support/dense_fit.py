@@ -10,6 +10,7 @@ from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 from scipy.special import eval_legendre
 
 from selfcal_ros.model.readings import Measurements, Sense
@@ -20,6 +21,9 @@ STEP = 1e-5
 
 STEPS = 6
 """In which finite turns and offsets without their noise are found to rounding."""
+
+PLACE_STEPS = 12
+"""In which the stage error where the stage stood is found to a thousandth of its uncertainty."""
 
 EXACTLY = 1e-4
 """Part of the noise to which the map is held in its datum. Without finite turns no reading tells
@@ -36,11 +40,13 @@ MARKS = {TermName.PLATE_SCALE: ("scale",), TermName.PLATE_STRAIN: ("scale", "str
 class DenseFit:
     """The solution of all readings for known noises of one reading, (m, rad).
 
-    `shared`: part of the variance that may be noise of the indicated position.
+    `shared`: part of the variance that may be noise of the indicated position. With `places` each
+    visit has the stage error of the place where the stage stood, and the equations are those of the
+    sites all the same.
     """
 
     def __init__(self, readings: Measurements, terms: tuple[ModelTerm, ...], sigma, *,
-                 degree=3, rigid=False, shared=1.0):
+                 degree=3, rigid=False, shared=1.0, places=True):
         self.readings, self.sigma, self.rigid, self.shared = readings, sigma, rigid, shared
         self.artifact = readings.artifact
         (self.hx, self.hy), self.pitch = self.artifact.half, self.artifact.grid_pitch_m
@@ -55,7 +61,9 @@ class DenseFit:
             slice(*pair) for pair in pairwise(ends))
         self.offset, self.p = self.seen, np.zeros(ends[-1])
         magnified = any(term == TermName.MICROSCOPE for term, *_ in self.keys)
-        for _ in range(STEPS if magnified or rigid else 1):
+        self.places = places
+        self.steps = PLACE_STEPS if places else STEPS if magnified or rigid else 1
+        for _ in range(self.steps):
             self._columns = self._of_coefficients()
             self._step()
             # the noise of a reading is in the offset that was seen as well (method, terms)
@@ -116,6 +124,8 @@ class DenseFit:
         at = np.rint(self.sign * np.stack([place.real, place.imag]) / self.pitch).astype(int)
         self.site = (at[0] + self.hx) * self.artifact.shape[1] + at[1] + self.hy
         self.y, self.visit_weight = found["y"], found["weight"].astype(float)
+        # offset = mark - stage, or mark + stage where the stage carries the plate along
+        self.stage = self.sign * (place + self.y - self.seen)
 
     def _lines(self):
         """Every line of every view, one behind another."""
@@ -129,7 +139,20 @@ class DenseFit:
                          for view in self.readings.views])
         self.line_site = self.sign * (self.k + turn[self.line_view]) % max(self.K, 1)
 
-    def _predicted(self, p):
+    def _of_stage(self, g):
+        """The stage error at every visit: where the stage truly stood, or at the site."""
+        error = g[self.site]
+        if not self.places:
+            return error
+        field = g.reshape(self.artifact.shape)
+        for _ in range(3):  # true = indicated - error
+            true = (self.stage - error) / self.pitch
+            along = (CubicSpline(np.arange(size), np.eye(size))(part + half) for size, part, half
+                     in zip(field.shape, (true.real, true.imag), (self.hx, self.hy), strict=True))
+            error = np.einsum("vi,vj,ij->v", *along, field)
+        return error
+
+    def _predicted(self, p, at_sites=False):
         """What the model says of all readings: visits along x, along y, lines."""
         g, a = (part[:self.n] + 1j * part[self.n:] for part in (p[self.g], p[self.a]))
         phi, x, y = p[self.pose].reshape(-1, 3).T
@@ -141,7 +164,7 @@ class DenseFit:
             moved = turn * (self.z + body) + t - quarter * self.z
         else:
             moved = quarter * (body + 1j * phi[self.view] * self.z) + t
-        moved = moved + added + self.sign * g[self.site]
+        moved = moved + added + self.sign * (g[self.site] if at_sites else self._of_stage(g))
         lines = self.sign * p[self.gt][self.line_site] + p[self.at][self.k] + phi[self.line_view]
         return np.concatenate([moved.real, moved.imag, lines + turned])
 
@@ -186,10 +209,10 @@ class DenseFit:
     def _values(self):
         return np.concatenate([self.y.real, self.y.imag, self.line_y])
 
-    def _design(self, p):
+    def _design(self, p, at_sites=True):
         unit = STEP * np.eye(len(p))
-        return np.array([(self._predicted(p + h) - self._predicted(p - h)) / (2 * STEP)
-                         for h in unit]).T
+        return np.array([(self._predicted(p + h, at_sites) - self._predicted(p - h, at_sites))
+                         / (2 * STEP) for h in unit]).T
 
     def _step(self):
         """Take a step to the least squares; keep unknowns, covariance and what is left."""
@@ -202,9 +225,16 @@ class DenseFit:
         solve = self._solved(np.concatenate([self.design, prior, held]), held)
         known = np.concatenate([rest, -prior @ p, -held @ p])
         self.p = p + solve[:, :len(known)] @ known
-        self.covariance = solve @ solve.T
+        self.covariance, self._solve = solve @ solve.T, solve
         left, n = self._values - self._predicted(self.p), len(self.y)
         self.left = left[:n] + 1j * left[n:2 * n]
+
+    def with_places_in_covariance(self):
+        """Let the covariance be that of the equations of the sites for readings at the places."""
+        here = self._root[:, None] * self._design(self.p, at_sites=False)
+        more = self._solve[:, :len(here)] @ (here - self.design)
+        spread = np.linalg.inv(np.eye(len(self.p)) + more)
+        self.covariance = spread @ self.covariance @ spread.T
 
     def _solved(self, rows, held):
         """Pseudo-inverse of rows where noise of the position may feign a scale of the microscope.

@@ -17,6 +17,7 @@ import numpy as np
 from selfcal_ros.errors import NotSettledError
 from selfcal_ros.estimation.datum.covariance import TermSpread
 from selfcal_ros.estimation.joint.fit import JointFit, angular_part, fit
+from selfcal_ros.estimation.joint.moving import Moving
 from selfcal_ros.estimation.joint.problem import ROUNDING, Problem, grid_dof, sigma_of
 from selfcal_ros.estimation.lattice.connectivity import Gauge
 from selfcal_ros.estimation.terms.columns import TermColumns, made_anew, term_columns
@@ -182,7 +183,7 @@ def _settled(problem: Problem, check: Callable[[TermEquations], None]) -> ModelF
     state = _State(problem)
     if state.equations is not None:
         check(state.equations)
-    if not (problem.rigid or problem.terms):
+    if not (problem.rigid or problem.terms or problem.moves):
         return state.finished()
     before = np.inf
     for number in range(MAX_STEPS):
@@ -223,6 +224,7 @@ class _State:
     def __init__(self, problem: Problem) -> None:
         self.problem, self.steps, self.theta = problem, 0, angular_part(problem)
         self.lines_read = problem.angular.y
+        self.moving = Moving(problem)
         self.y = problem.grid.y
         self.found = fit(problem, self.y, self.theta)
         self.offset_steps = OFFSET_STEPS
@@ -246,20 +248,23 @@ class _State:
     def _refresh(self, equations: TermEquations, reduced: ReducedColumns) -> None:
         """Set up what has changed of the equations: the offsets' columns, or weights."""
         columns = equations.columns
-        if self.microscope is not None and 0 < self.steps <= self.offset_steps:
-            columns = self._freed_of_noise(self.microscope, columns)
-            reduced = reduce_anew(self.problem.system.grid, columns.shapes, reduced,
-                                  columns.rows([TermName.MICROSCOPE]))
+        if 0 < self.steps <= self.offset_steps and (self.microscope or self.problem.moves):
+            columns = self._anew(columns)
+            if self.microscope is not None:
+                reduced = reduce_anew(self.problem.system.grid, columns.shapes, reduced,
+                                      columns.rows([TermName.MICROSCOPE]))
         elif not self._stale(equations):
             return
         self._linearise(columns, reduced)
 
-    def _freed_of_noise(self, microscope: ModelTerm, before: TermColumns) -> TermColumns:
-        """Return the columns with offsets that are freed anew from the noise of the residuals."""
-        ground = without_noise(self.problem.ground, self.found.residuals,
+    def _anew(self, before: TermColumns) -> TermColumns:
+        """Return the columns with the visits, and offsets free of their noise, as they are now."""
+        ground = without_noise(self.moving.ground(self.found), self.found.residuals,
                                before.at_visits(self.coefficients))
-        columns = made_anew(ground, microscope, before)
-        rows = columns.rows([microscope.name])
+        columns = made_anew(ground, self.microscope, before, moved=self.problem.moves)
+        if self.microscope is None:
+            return columns
+        rows = columns.rows([TermName.MICROSCOPE])
         effect = columns.shapes.combined(self.coefficients, rows) - before.shapes.combined(
             self.coefficients, rows)
         largest = max(float(np.abs(self.found.parameters).max()), self.problem.largest_turn_m)
@@ -280,7 +285,7 @@ class _State:
 
         The smaller of the two. Misalignments may move by rounding for ever where nothing depends
         on them: all rotations together, that of a view of lines alone. What is taken off the
-        readings may where the misalignments take it up.
+        readings may where the misalignments take it up; not so what places of the stage change.
         """
         parameters, y = self.found.parameters, self.y
         if self.equations is not None and self.reduced is not None:
@@ -288,11 +293,14 @@ class _State:
         self.steps += 1
         if self.equations is not None:
             self._solve_terms(self.equations)
-        self.y = np.where(self.problem.system.grid.read,
-                          self.problem.grid.y - self._excess() - self._of_terms(), 0.0)
+        elif self.problem.moves:
+            self.problem = replace(self.problem, repeats_xy=self.moving.repeats(self.found))
+        taken = self.moving.taken(self.found.field)
+        self.y = np.where(self.problem.system.grid.read, self.problem.grid.y - self._excess()
+                          - self._of_terms() - taken, 0.0)
         self.found = fit(self.problem, self.y, self.theta)
-        return float(min(np.abs(self.found.parameters - parameters).max(),
-                         np.abs(self.y - y).max()))
+        least = min(np.abs(self.found.parameters - parameters).max(), np.abs(self.y - y).max())
+        return float(max(least, self.moving.change))
 
     def within_noise(self, change: float, part: float) -> bool:
         """Return whether a change of the misalignments is below a part of their uncertainty."""
@@ -307,8 +315,9 @@ class _State:
         if equations is not None and reduced is not None and self._stale(equations):
             self._linearise(equations.columns, reduced)
         self.sums = self._sums()
-        return ModelFit(self.problem, self.found, self.equations, self.coefficients, self.sums,
-                        self.y, self.reduced)
+        problem = replace(self.problem, ground=self.moving.ground(self.found))
+        return ModelFit(problem, self.found, self.equations, self.coefficients, self.sums, self.y,
+                        self.reduced)
 
     def _solve_terms(self, equations: TermEquations) -> None:
         now = score(equations, self.found.both_residuals, squares(self.problem, self.found),

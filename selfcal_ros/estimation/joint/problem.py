@@ -18,6 +18,7 @@ from selfcal_ros.estimation.normal.grid import GridSystem
 from selfcal_ros.estimation.options import ReferenceLength
 from selfcal_ros.estimation.terms.equations import LEAST_NOISE_M
 from selfcal_ros.estimation.terms.ground import Ground
+from selfcal_ros.estimation.terms.places import StagePlaces
 from selfcal_ros.estimation.terms.visits import between_visits
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.terms import DRIFT_DEGREE, ModelTerm
@@ -72,6 +73,10 @@ class Problem:
         Degrees of freedom that terms take from the readings of lines.
     turn_rad : float array (grid views,)
         Angle by which the frame of each view's readings is turned, see `turned`.
+    places : StagePlaces, optional
+        Where the stage stood; None where that is not known.
+    at_places : bool
+        Whether readings have the stage error of that place, or that of the site of their mark.
     """
 
     system: NormalEquations
@@ -90,6 +95,13 @@ class Problem:
     residuals_xy: tuple[float, float] | None = None
     dof_lines: float = 0.0
     turn_rad: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    places: StagePlaces | None = None
+    at_places: bool = True
+
+    @property
+    def moves(self) -> bool:
+        """Whether readings have the stage error of places other than the sites."""
+        return self.at_places and self.places is not None
 
     @property
     def largest_turn_m(self) -> float:

@@ -24,6 +24,7 @@ from selfcal_ros.estimation.datum.covariance import (
 )
 from selfcal_ros.estimation.joint.fit import JointFit
 from selfcal_ros.estimation.joint.model_fit import ModelFit, fit_model
+from selfcal_ros.estimation.joint.moving import noise_gain
 from selfcal_ros.estimation.joint.problem import Problem, repeats_of, turned
 from selfcal_ros.estimation.joint.solved import (
     Solved,
@@ -42,6 +43,7 @@ from selfcal_ros.estimation.options import Options, ReferenceKind, ReferenceLeng
 from selfcal_ros.estimation.terms.equations import LEAST_NOISE_M
 from selfcal_ros.estimation.terms.ground import ground_of
 from selfcal_ros.estimation.terms.identifiable import require_terms_told
+from selfcal_ros.estimation.terms.places import places_of
 from selfcal_ros.estimation.terms.visits import check_visits
 from selfcal_ros.model.error_map import ErrorMap, ThetaDatum
 from selfcal_ros.model.readings import Measurements, Sense
@@ -77,18 +79,24 @@ def fit_joint(measurements: Measurements, options: Options) -> ModelFit:
 
 def _fitted(measurements: Measurements,
             options: Options) -> tuple[ModelFit, Observability, bool]:
-    """Return the fit, what the readings determine, and if it has all that is assumed."""
+    """Return the fit, what the readings determine, and if it has all that is assumed.
+
+    Where that does not converge with the places of the stage readings count for their sites, and
+    then less is assumed.
+    """
     of_visits = tuple(term for term in options.assumed if term.name in VISIT_TERMS)
-    for assumed in (options.assumed, of_visits, ()):
+    failed: NotSettledError | None = None
+    for assumed in dict.fromkeys((options.assumed, of_visits, ())):
         problem, seen = prepare(measurements, replace(options, assumed=assumed))
-        try:
-            model = fit_model(problem, partial(require_terms_told, seen=seen))
-        except NotSettledError:
-            if assumed:
+        for at_places in ((True, False) if problem.moves else (False,)):
+            try:
+                model = fit_model(replace(problem, at_places=at_places),
+                                  partial(require_terms_told, seen=seen))
+            except NotSettledError as error:
+                failed = error
                 continue
-            raise
-        return model, seen, assumed == options.assumed
-    raise AssertionError("the last one has no assumption")
+            return model, seen, assumed == options.assumed and at_places == problem.moves
+    raise failed or AssertionError("something was tried")
 
 
 def prepare(measurements: Measurements, options: Options) -> tuple[Problem, Observability]:
@@ -127,7 +135,9 @@ def prepare(measurements: Measurements, options: Options) -> tuple[Problem, Obse
             ground.with_lines if term.name is TermName.ROTATION else angular.index))
     problem = Problem(
         system, grid, angular, *repeats_of(measurements), half_width_m, conditions, direct,
-        ground, options.reference, rigid, terms, options.drift_degree)
+        ground, options.reference, rigid, terms, options.drift_degree,
+        places=places_of(measurements, grid, ground, system.known_sites),
+        at_places=options.at_places)
     return turned(problem) if problem.rigid else replace(
         problem, turn_rad=np.zeros(len(grid.index))), seen
 
@@ -240,7 +250,8 @@ def _error_map(measurements: Measurements, options: Options, *, model: ModelFit,
         scale = (scale_datum(system, options.reference, length) if options.reference else None)
         cover = FieldCovariance(system, found.inverse, scale, found.xy.sigma, model.spread)
         if wanted:
-            u_x, u_y = (np.sqrt(v) * found.xy.sigma for v in cover.diagonal())
+            gain = noise_gain(problem, found) * found.xy.sigma
+            u_x, u_y = (np.sqrt(v) * gain for v in cover.diagonal())
         if wanted and model.equations is not None:
             kept = saved_terms(cover, model.equations.columns, measurements.sense)
             kept |= angular_terms(cover, model.equations.columns, found.xy.sigma,

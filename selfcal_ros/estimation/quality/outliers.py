@@ -352,8 +352,9 @@ def _findings(removed: tuple[Removed, ...], noisy: tuple[tuple[str, float], ...]
 
 
 def _flattened(measurements: Measurements, options: Options) -> Measurements:
-    """Return the readings minus the effects of finite rotations and terms."""
-    if options.misalignment_model == "linear" and not options.terms:
+    """Return the readings minus the effects of finite rotations, terms and stage positions."""
+    seen = any(view.visits is not None for view in measurements.views)
+    if options.misalignment_model == "linear" and not (options.terms or seen):
         return measurements
     model = fit_joint(measurements, options)
     problem = model.problem

@@ -22,6 +22,7 @@ from selfcal_ros.estimation.lattice.readings import GridData, grid_data
 from selfcal_ros.estimation.terms.columns import term_columns
 from selfcal_ros.estimation.terms.equations import LEAST_NOISE_M
 from selfcal_ros.estimation.terms.ground import Ground, ground_of
+from selfcal_ros.estimation.terms.places import places_of
 from selfcal_ros.estimation.terms.projection import reduce_columns
 from selfcal_ros.estimation.terms.shapes import shapes_in_full
 from selfcal_ros.estimation.terms.visits import ViewVisits
@@ -63,12 +64,15 @@ class HeldReadings:
     own : complex array (q, views, nx, ny)
         Effect on them of one standard deviation of each coefficient with a size that belongs to a
         view that was not fitted, plate frame, m.
+    moved : complex array (views, nx, ny)
+        Effect on them of the stage's distance from the sites, plate frame, m.
     """
 
     grid: GridData
     columns: np.ndarray
     rows: tuple[int, ...]
     own: np.ndarray
+    moved: np.ndarray
 
 
 def held_readings(model: ModelFit, kept: Measurements, held: Measurements) -> HeldReadings:
@@ -76,12 +80,17 @@ def held_readings(model: ModelFit, kept: Measurements, held: Measurements) -> He
     problem, grid = model.problem, grid_data(held)
     rows = tuple(problem.grid.index.index(i) if i in problem.grid.index else -1
                  for i in grid.index)
+    ground = ground_of(held, grid, problem.half_width_m)
+    places = places_of(held, grid, ground, problem.system.known_sites)
+    moved: np.ndarray = np.zeros(grid.y.shape, dtype=complex)
+    if problem.moves and places is not None:
+        moved = places.changes(places.moved(model.found.field), np.zeros(len(grid.index)))
     equations = model.equations
     n = 0 if equations is None else equations.n
     out: np.ndarray = np.zeros((n, *grid.y.shape), dtype=complex)
     own = [out[:0]]
     if equations is not None:
-        ground = _in_time_of(ground_of(held, grid, problem.half_width_m), grid, kept, held)
+        ground = _in_time_of(ground, grid, kept, held)
         made = term_columns(ground, problem.terms, problem.drift_degree)
         at = {(c.term, c.view, c.component): k for k, c in enumerate(equations.columns.columns)}
         for column, block in zip(made.columns, made.grid, strict=True):
@@ -93,7 +102,7 @@ def held_readings(model: ModelFit, kept: Measurements, held: Measurements) -> He
                 own.append(np.where(np.isfinite(column.size), column.size, 0.0) * block[None])
             elif (key := (column.term, row, column.component)) in at:
                 out[at[key]] += block
-    return HeldReadings(grid, out, rows, np.concatenate(own))
+    return HeldReadings(grid, out, rows, np.concatenate(own), moved)
 
 
 def _in_time_of(ground: Ground, grid: GridData, kept: Measurements, held: Measurements) -> Ground:
@@ -112,7 +121,9 @@ def _in_time_of(ground: Ground, grid: GridData, kept: Measurements, held: Measur
 
 def of_terms(model: ModelFit, held: HeldReadings, index: int,
              view_marks: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
-    """Return the effect of the terms on the held readings of a view, complex (P,), stage frame.
+    """Return the effect of terms and stage positions on the held readings of a view, stage frame.
+
+    Complex (P,).
 
     Parameters
     ----------
@@ -125,10 +136,10 @@ def of_terms(model: ModelFit, held: HeldReadings, index: int,
     view_marks : tuple of int array (P,)
         Lattice indices of its marks, from 0.
     """
-    if model.equations is None or index not in held.grid.index:
+    if index not in held.grid.index:
         return np.zeros(len(view_marks[0]), dtype=complex)
     row = held.grid.index.index(index)
-    plate = np.tensordot(model.coefficients, held.columns[:, row], axes=1)
+    plate = held.moved[row] + np.tensordot(model.coefficients, held.columns[:, row], axes=1)
     return plate[view_marks] * PHASES[held.grid.poses[row].q]
 
 

@@ -23,7 +23,7 @@ from scipy.special import eval_legendre
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.terms.ground import Ground
 from selfcal_ros.estimation.terms.shapes import NO_LINES, LineColumns, Shapes, shapes_of
-from selfcal_ros.estimation.terms.visits import ViewVisits
+from selfcal_ros.estimation.terms.visits import ViewVisits, squares_within
 from selfcal_ros.model.terms import OF_LINES, UNITS, VISIT_TERMS, ModelTerm, TermName
 
 Seen = list[list[np.ndarray | None]]
@@ -197,29 +197,35 @@ def term_columns(ground: Ground, terms: Iterable[ModelTerm], degree: int) -> Ter
     return made.done(ground)
 
 
-def made_anew(ground: Ground, term: ModelTerm, before: TermColumns) -> TermColumns:
+def made_anew(ground: Ground, term: ModelTerm | None, before: TermColumns, *,
+              moved: bool = False) -> TermColumns:
     """Return columns of which those of one shared term of the visits are of another ground.
 
     Parameters
     ----------
     ground : Ground
-        With the same readings as before, but other offsets or signs of approach.
-    term : ModelTerm
-        The term, one that all views share: its columns are made anew.
+        With other offsets or signs of approach.
+    term : ModelTerm, optional
+        One that all views share: its columns are made anew.
     before : TermColumns
         Columns of all terms.
+    moved : bool
+        Whether visits differ from the means of their marks otherwise than before.
     """
-    fresh = Made()
-    _shared_columns(fresh, ground, term)
-    changed = before.shapes.of_column[before.rows([term.name])]
-    # the shape of each new column takes the place of that of the same column before
-    own = dict(zip(fresh.of_column, changed.tolist(), strict=True))
-    at = list(before.at)
+    fresh, at = Made(), list(before.at)
+    own: dict[int, int] = {}
+    if term is not None:
+        _shared_columns(fresh, ground, term)
+        changed = before.shapes.of_column[before.rows([term.name])]
+        # the shape of each new column takes the place of that of the same column before
+        own = dict(zip(fresh.of_column, changed.tolist(), strict=True))
     for shape, number in own.items():
         at[number] = fresh.at[shape]
     shapes = before.shapes.replaced(list(own.values()), [fresh.means[shape] for shape in own])
-    within = _within_anew(ground, at, shapes, before=before.within,
-                          changed=np.array(sorted(own.values()), dtype=int))
+    changed = np.arange(shapes.n) if moved else np.array(sorted(own.values()), dtype=int)
+    total = squares_within(ground.visits) if moved else before.within.total
+    within = _within_anew(ground, at, shapes, before=replace(before.within, total=total),
+                          changed=changed)
     return TermColumns(before.columns, shapes, within, at, before.lines)
 
 
@@ -363,30 +369,23 @@ def _line_columns(made: Made, ground: Ground, term: ModelTerm) -> None:
 
 
 def _within(ground: Ground, at: Seen, shapes: Shapes) -> WithinMarks:
-    total, dof, n = 0.0, 0, len(shapes.unit)
-    for visits in ground.visits:
-        if visits is not None and visits.repeated:
-            rest = visits.about_means(visits.y[None], ground.z.size)[0]
-            total += float(visits.weight @ abs(rest) ** 2)
-            dof += 2 * (len(visits.mark) - len(np.unique(visits.mark)))
-    nothing = WithinMarks(np.zeros((n, n)), np.zeros(n), total, dof)
+    n = len(shapes.unit)
+    dof = sum(2 * (len(visits.mark) - len(np.unique(visits.mark)))
+              for visits in ground.visits if visits is not None and visits.repeated)
+    nothing = WithinMarks(np.zeros((n, n)), np.zeros(n), squares_within(ground.visits), dof)
     return _within_anew(ground, at, shapes, before=nothing, changed=np.arange(shapes.n))
 
 
 def _within_anew(ground: Ground, at: Seen, shapes: Shapes, *, before: WithinMarks,
                  changed: np.ndarray) -> WithinMarks:
     """Return what the means hide, the products of the shapes `changed` set up anew."""
-    if not any(visits is not None and visits.repeated for visits in ground.visits):
-        return before
     inner: np.ndarray = np.zeros((shapes.n, shapes.n), dtype=complex)
     against: np.ndarray = np.zeros(shapes.n, dtype=complex)
     for view, visits in enumerate(ground.visits):
-        if visits is None or not visits.repeated:
+        mine = [k for k in changed if at[k][view] is not None]
+        if visits is None or not (visits.repeated and mine):
             continue
         here = [k for k in range(shapes.n) if at[k][view] is not None]
-        mine = [k for k in changed if at[k][view] is not None]
-        if not mine:
-            continue
         # about the means of their marks: then those of the others drop out
         moved = visits.about_means(np.array([at[k][view] for k in mine]), ground.z.size)
         weighted = np.conj(moved) * visits.weight

@@ -5,6 +5,7 @@ For the map, the mean over the visits of a mark is as good as the visits themsel
 the visits of one mark about their mean determines terms that differ between them, and the noise.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -76,6 +77,16 @@ class ViewVisits:
         if not self.repeated:
             return np.zeros_like(values, dtype=complex)
         return values - self.means(values, n_marks)[:, self.mark]
+
+
+def squares_within(visits: Iterable[ViewVisits | None]) -> float:
+    """Return the weighted squares of deviations about the means of their marks, m^2."""
+    total = 0.0
+    for view in visits:
+        if view is not None and view.repeated:
+            rest = view.about_means(view.y[None], 1 + int(view.mark.max()))[0]
+            total += float(view.weight @ np.abs(rest) ** 2)
+    return total
 
 
 def approach_sign(sense: Sense) -> int:

@@ -111,7 +111,8 @@ def checked_by(solved: Solved, measurements: Measurements, options: Options, *,
         return solved
     try:
         linear = solved if solved.model is not None else solve_joint(
-            measurements, replace(options, method="joint", misalignment_model="linear"))
+            measurements, replace(options, method="joint", misalignment_model="linear",
+                                  at_places=False))  # as the law has them
         rigid = linear if not failed else solve_joint(
             measurements, replace(options, method="joint", misalignment_model="rigid"))
     except InputError:

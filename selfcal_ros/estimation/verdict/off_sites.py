@@ -1,14 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether the stage stood so far off the sites that the map describes other positions.
+"""Whether the stage stood so far off the sites that its error there is not known.
 
-A reading contains the stage error where the stage stood, but counts for the site of the mark
-(method eq. 7.10). If all views are displaced alike, residuals do not show it; but deviation and
-offset of a visit, with the map, give the distance of the stage from the site.
+A reading contains the stage error at the position of the stage (method eq. 7.10), and the map gives
+it between its sites by a spline. Two splines through the sites differ if the stage is rough from
+site to site, and the maps with them; a solution that takes the sites for the positions misses the
+whole difference. If all views are displaced alike, residuals show neither.
 """
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -126,6 +127,10 @@ LEAST_U_M = 1e-10
 """Smallest standard uncertainty of the map in these tests: finite rotations of a stage that is
 rotated relative to its datum leave as much."""
 
+ROUGH = 2.5
+"""Ratio of the error of the spline to its difference from a spline with slopes from neighbours,
+for a stage whose errors at neighbouring sites are independent; smaller for smoother stages."""
+
 SHOWN = 0.9
 """Ratio of residuals without the change to those with it below which residuals show it as well."""
 
@@ -134,6 +139,10 @@ RMS_MATTERS = 0.5
 
 NODE_MATTERS = 2.0
 """Effect on a coordinate of a node, in its standard uncertainty, above which it is a cause."""
+
+
+DRAWS = 16
+"""Draws of noise from which the effect of the map's noise is computed."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,14 +154,17 @@ class OffSites:
     cause : Cause
         The cause.
     moved : complex array (nx, ny)
-        Bound of the effect on the map along x and y, frame of the equations, m.
+        Effect on the map along x and y, frame of the equations, m.
     shown : bool
         Whether residuals show it as well.
+    bounded : bool
+        Whether the effect is smaller than the uncertainty that it enlarges.
     """
 
     cause: Cause
     moved: np.ndarray
     shown: bool
+    bounded: bool
 
 
 def off_sites_cause(model: ModelFit, error_map: ErrorMap, level: float) -> OffSites | None:
@@ -167,57 +179,71 @@ def off_sites_cause(model: ModelFit, error_map: ErrorMap, level: float) -> OffSi
     level : float
         Level of the test against the noise of the map.
     """
+    problem, places = model.problem, model.problem.places
+    if places is None:
+        return None
     u = np.maximum(_uncertainty(model, error_map), LEAST_U_M)
-    known = model.problem.system.known_sites
-    field = np.where(known, model.found.field, np.nan)
-    away, changed = _at_visits(model, field)
+    known = problem.system.known_sites
+    there = places.errors(model.found.field)
+    changed = places.changes(_missed(model, model.found.field, there), problem.turn_rad)
     if not rms(_parts(changed)) > SMALL * rms(u):
         return None
-    before, at_sites = model.found.xy.residuals, fit(model.problem, model.y - changed)
-    if at_sites.xy.residuals < before:  # displacements cause part of the noise
-        u = u * (at_sites.xy.residuals / before)
-    moved = _parts(model.found.field - at_sites.field)
-    ratio = np.where(known, np.abs(moved) / u, np.nan)
-    if not (rms(ratio) > RMS_MATTERS or np.nanmax(ratio) > NODE_MATTERS):
+    before, other = model.found.xy.residuals, fit(problem, model.y - changed)
+    if other.xy.residuals < before:  # part of the residual noise is this effect
+        u = u * (other.xy.residuals / before)
+    moved = np.where(known, model.found.field - other.field, 0.0)
+    ratio = np.where(known, np.abs(_parts(moved)) / u, 0.0)
+    if not (rms(ratio[:, known]) > RMS_MATTERS or ratio.max() > NODE_MATTERS):
         return None
-    noise = np.maximum(_noise(u, _pitch_m(model), (rms(away.real), rms(away.imag))), ROUNDING_M)
-    effect = np.where(np.isfinite(ratio), np.abs(moved), 0.0)
-    most = float(np.nanmax(effect / noise, initial=0.0))
-    p = effect.size * math.erfc(most / math.sqrt(2))
+    noise = np.maximum(_noise(model, there, u), ROUNDING_M)
+    effect = np.abs(_parts(moved))
+    p = effect.size * math.erfc(float((effect / noise).max()) / math.sqrt(2))
     if p >= level:
         return None
     worst = np.unravel_index(int(effect.argmax()), effect.shape)
-    shown = bool(at_sites.xy.residuals < SHOWN * before)
     cause = Cause(OFF_SITES, float(effect[worst]), float(noise[worst]), "m", p,
-                  details={"away": rms(np.abs(away))}, effect_rms=rms(effect),
+                  details={"away": places.distance * places.pitch_m}, effect_rms=rms(effect),
                   effect_max=float(effect[worst]))
-    bound = _between(np.where(known, model.found.field, np.nan), _pitch_m(model), away)
-    return OffSites(cause, np.where(known, bound, 0.0), shown)
+    return OffSites(cause, moved, bool(other.xy.residuals < SHOWN * before),
+                 rms(ratio[:, known]) < model.found.xy.k)
 
 
-def _between(field: np.ndarray, pitch_m: float, away: np.ndarray) -> np.ndarray:
-    """Return the largest change of the error at that distance from the sites, complex (nx, ny).
+def _missed(model: ModelFit, field: np.ndarray, there: np.ndarray) -> np.ndarray:
+    """Return the part of a field at the positions of the stage that a solution omits, (P,), m.
 
-    The slopes on the two sides of a site may differ: the steeper one counts.
+    Parameters
+    ----------
+    model : ModelFit
+        The solution.
+    field : complex array (nx, ny)
+        Stage error at the sites, m.
+    there : complex array (P,)
+        Stage error of the solution at the positions of the stage.
     """
-    total = np.zeros((2, *field.shape))
-    for axis, distance in ((0, rms(away.real)), (1, rms(away.imag))):
-        step = np.abs(_parts(np.diff(field, axis=axis)))
-        pad = [(0, 0)] * 3
-        pad[axis + 1] = (1, 1)
-        both = np.pad(np.nan_to_num(step), pad)
-        sides = np.stack([np.take(both, range(field.shape[axis]), axis=axis + 1),
-                          np.take(both, range(1, field.shape[axis] + 1), axis=axis + 1)])
-        total += sides.max(axis=0) * distance / pitch_m
-    return total[0] + 1j * total[1]
+    places: Any = model.problem.places
+    smooth = places.moved(field, there)
+    return ROUGH * (places.moved(field, there, local=True) - smooth) if model.problem.moves \
+        else smooth
+
+
+def _noise(model: ModelFit, there: np.ndarray, u: np.ndarray) -> np.ndarray:
+    """Return the standard deviation of `_missed` at each site for noise u of the nodes, m.
+
+    Both (2, nx, ny).
+    """
+    places: Any = model.problem.places
+    rng, at = np.random.default_rng(0), places.site
+    total, n_sites = np.zeros((2, u[0].size)), u[0].size
+    for _ in range(DRAWS):
+        drawn = rng.normal(0, u)
+        missed = _missed(model, drawn[0] + 1j * drawn[1], there)
+        total += [np.bincount(at, part**2, n_sites) for part in _parts(missed)]
+    return np.sqrt(total / (DRAWS * np.maximum(np.bincount(at, minlength=n_sites), 1))
+                   ).reshape(u.shape)
 
 
 def _parts(field: np.ndarray) -> np.ndarray:
     return np.stack([field.real, field.imag])
-
-
-def _pitch_m(model: ModelFit) -> float:
-    return model.problem.half_width_m / model.problem.system.grid.views.unit
 
 
 def _uncertainty(model: ModelFit, error_map: ErrorMap) -> np.ndarray:
@@ -228,51 +254,5 @@ def _uncertainty(model: ModelFit, error_map: ErrorMap) -> np.ndarray:
     u, grid = np.stack([error_map.u_gx, error_map.u_gy]), model.problem.system.grid
     if not np.isfinite(u).any():
         return np.full_like(u, model.found.xy.sigma / math.sqrt(grid.weight[grid.read].mean()))
+    u = np.nan_to_num(u, nan=rms(u))
     return u if model.problem.ground.indicated > 0 else u[:, ::-1, ::-1]  # method eq. 1.6
-
-
-def _slopes(field: np.ndarray, pitch_m: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the slopes of a field along x and y, 0 where a neighbour is unknown.
-
-    Central differences inside, one-sided ones at the border.
-    """
-    along_x, along_y = np.gradient(field, pitch_m)
-    return np.nan_to_num(along_x), np.nan_to_num(along_y)
-
-
-def _noise(u: np.ndarray, pitch_m: float, away_m: tuple[float, float]) -> np.ndarray:
-    """Return the noise of slopes times distances, (2, nx, ny), m."""
-    total = np.zeros_like(u)
-    for axis, away in zip((1, 2), away_m, strict=True):
-        square = np.moveaxis(u**2, axis, 0)
-        of_slope = np.empty_like(square)
-        of_slope[1:-1] = (square[2:] + square[:-2]) / 4
-        of_slope[0], of_slope[-1] = square[0] + square[1], square[-1] + square[-2]
-        total += np.moveaxis(of_slope, 0, axis) * (away / pitch_m) ** 2
-    return np.sqrt(total)
-
-
-def _at_visits(model: ModelFit, field: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the distances of the stage from the sites, and their effect on the readings.
-
-    Complex, m: distances of all visits, stage frame, and effects on the means of the marks, plate
-    frame, (views, nx, ny).
-    """
-    grid = model.problem.system.grid
-    along_x, along_y = (slope.reshape(-1) for slope in _slopes(field, _pitch_m(model)))
-    error = np.nan_to_num(field).reshape(-1)
-    changed, distances = np.zeros_like(model.y), [np.zeros(1, dtype=complex)]
-    for view, visits in enumerate(model.problem.ground.visits):
-        if visits is None:
-            continue
-        site = grid.views.site_index[view].reshape(-1)[visits.mark]
-        # the deviation as it was read, without the rotation of the frame
-        turn = model.problem.turn_rad[view]
-        mark = grid.views.z.reshape(-1)[visits.mark] * model.problem.half_width_m
-        read = visits.y / visits.phase + mark * -np.expm1(-1j * turn) / visits.phase
-        away = read - visits.offset - error[site]  # indicated less true
-        change = away.real * along_x[site] + away.imag * along_y[site]
-        mean = visits.means((change * visits.phase)[None], grid.n_sites)[0]
-        changed[view] = np.where(grid.read[view], mean.reshape(grid.views.shape), 0.0)
-        distances.append(away)
-    return np.concatenate(distances), changed

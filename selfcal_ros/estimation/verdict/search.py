@@ -120,14 +120,15 @@ def search_causes(solved: Solved, measurements: Measurements, options: Options, 
     advise : bool
         Whether remedies are tried.
     """
-    if options.causes is False or solved.model is None or not solved.model.problem.direct:
+    if options.causes is False or solved.model is None:
         return SearchResult(solved)
     sizes = [test for test in solved.model.sizes if test.contradicted]
     place = off_sites_cause(solved.model, solved.result.error_map, LEVEL)
     failed = failed or bool(sizes or place)
     found = _Search(solved)
-    n_sites = solved.model.problem.system.grid.n_sites
-    if is_searched(n_sites, options, failed=failed) and solved.xy.sigma > LEAST_NOISE_M:
+    system, direct = solved.model.problem.system, solved.model.problem.direct
+    if direct and solved.xy.sigma > LEAST_NOISE_M and is_searched(
+            system.grid.n_sites, options, failed=failed):
         _search(found, measurements, options, failed=failed)
     solved, tests = found.solved, _model(found.solved).sizes
     raised = {str(test.name): _raised_cause(solved, test) for test in tests
@@ -146,6 +147,7 @@ def search_causes(solved: Solved, measurements: Measurements, options: Options, 
         found.effects.append(effect_of_field(
             place.cause.name, place.moved, measurements.sense,
             np.zeros(measurements.artifact.angular_count)))
+        found.bounded &= place.bounded
     out = SearchResult(_from_readings(solved, found.joined), tuple(causes), tuple(found.effects),
                        (*names, *found.joined), found.bounded and plausible)
     if not advise or not causes:

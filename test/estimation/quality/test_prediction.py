@@ -69,7 +69,8 @@ def test_each_draw_is_predicted_as_such_readings_are(monkeypatch, of_view):
         plan.artifact, len(plan.views), rng), plan, rng, linear=True, sigma_m=UNIT_M, visits=True),
         rng)
     terms = [ModelTerm(TermName.MICROSCOPE), *[ModelTerm(TermName.DRIFT)] * of_view]
-    options = bare(misalignment_model="linear", terms=tuple(terms), drift_degree=1)
+    options = bare(misalignment_model="linear", terms=tuple(terms), drift_degree=1,
+                   at_places=False)
     seen = []
 
     def judged(model: ModelFit, held: HeldReadings, known: np.ndarray,

@@ -78,8 +78,8 @@ def both(readings, model, **how):
     noise = result.noise
     least = min(noise.sigma_xy_repeats, noise.sigma_xy_residuals)
     dense = DenseFit(readings, terms, (noise.sigma_xy, noise.sigma_theta), degree=DEGREE,
-                     rigid=result.model.misalignment == "rigid",
-                     shared=least / noise.sigma_xy)
+                     rigid=result.model.misalignment == "rigid", shared=least / noise.sigma_xy,
+                     places=how.get("at_places", True))
     return result, dense
 
 
@@ -126,7 +126,7 @@ def test_nothing_more_is_assumed_of_a_linear_model(model):
 @pytest.mark.parametrize("model", ["assumed", "sized", "mixed"])
 def test_with_marks_and_lines_missing(model, sense):
     require_same(*both(measured("lines", model, sense, missing=0.15), model,
-                       misalignment_model="linear"))
+                       misalignment_model="linear", at_places=False))
 
 
 @pytest.mark.parametrize("sense", Sense)
@@ -140,3 +140,30 @@ def test_in_the_datum_of_the_axes(model, sense):
 @pytest.mark.parametrize("model", ["none", "assumed"])
 def test_plates_that_turn_by_finite_angles(model, sense):
     require_same(*both(measured("lines", model, sense, rotation="finite"), model), of_u=0.03)
+
+
+def maps_of(result):
+    emap = result.error_map
+    return np.stack([emap.gx, emap.gy]), np.stack([emap.u_gx, emap.u_gy])
+
+
+@pytest.mark.parametrize("sense", Sense)
+@pytest.mark.parametrize("model", ["linear", "rigid"])
+def test_a_stage_that_stands_a_tenth_of_a_pitch_off_the_sites(model, sense):
+    """Its error is taken where it stood, and u is that of readings there."""
+    plan, rng = PLANS["lines"], np.random.default_rng(3)
+    truth = random_truth(plan.artifact, len(plan.views), rng, Spread(
+        rotation="linear" if model == "linear" else "finite", t_m=1e-3))
+    settings = CellSettings(sense, 20e-9, 2e-6, follow_mark=True, **QUIET)
+    readings = simulate_measurements(truth, plan, rng, visits=True, settings=settings)
+    result, dense = both(readings, "none", misalignment_model=model)
+    at_sites, _ = both(readings, "none", misalignment_model=model, at_places=False)
+    dense.with_places_in_covariance()
+    wanted, spread = dense.grid(np.isfinite(result.error_map.gx))
+    (found, u), (other, u_other) = maps_of(result), maps_of(at_sites)
+    assert np.abs((found - wanted) / u).max() < 0.03
+    assert np.abs(other - wanted).max() > 3 * u.max()
+    np.testing.assert_allclose(u, spread, rtol=0.1)
+    assert np.sqrt(np.mean((u / spread) ** 2)) == pytest.approx(1, abs=0.01)
+    same_noise = at_sites.noise.sigma_xy / result.noise.sigma_xy
+    assert np.sqrt(np.mean((u / u_other) ** 2)) * same_noise == pytest.approx(1.054, abs=0.01)

@@ -1,0 +1,199 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where the stage stood at the readings, and what its error is there (method eq. 7.10).
+
+A reading has the stage error of the place where the stage truly stands, and the linear equations
+give it that of the mark's site. Between the sites the error is the bicubic spline that
+`selfcal_ros.compensation.compensator` uses, and beyond the outermost sites its continuation.
+Everything is in the frame of the equations.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from selfcal_ros.compensation.cells import Cells, bicubic_cells
+from selfcal_ros.estimation.lattice.maps import PHASES, LatticeViews
+from selfcal_ros.estimation.lattice.readings import GridData
+from selfcal_ros.estimation.terms.ground import Ground
+from selfcal_ros.model.readings import Measurements
+from selfcal_ros.model.statistics import rms
+
+AT_SITES = 1e-5
+"""Distance from the sites, in pitches, at which the stage stands at them: even where its error is a
+micrometre, it is 10 pm off there."""
+
+STEP = 1e-3
+"""Half the distance, in pitches, over which slopes are taken."""
+
+
+@dataclass(frozen=True, eq=False)
+class StagePlaces:
+    """Places of the stage at the readings of the grid views.
+
+    Attributes
+    ----------
+    views : LatticeViews
+        Marks and sites of the views.
+    pitch_m : float
+        Distance of neighbouring sites, m.
+    known : bool array (nx, ny)
+        Sites whose error is known.
+    at : tuple of int arrays (P,)
+        View, row and column of the readings whose place, and the error of whose site, is known.
+    away_m : complex array (P,)
+        Indicated position of the stage less the site of the mark, mean of the visits, m.
+    marks : tuple of int array (V,) or None
+        Mark of each visit of each view; None where visits are not known.
+    about_m : tuple of complex array (V,) or None
+        Indicated position at each visit less the mean of its mark, m.
+    """
+
+    views: LatticeViews
+    pitch_m: float
+    known: np.ndarray
+    at: tuple[np.ndarray, ...]
+    away_m: np.ndarray
+    marks: tuple[np.ndarray | None, ...]
+    about_m: tuple[np.ndarray | None, ...]
+
+    @cached_property
+    def site(self) -> np.ndarray:
+        """Site of the mark of each reading, (P,)."""
+        return self.views.site_index[self.at]
+
+    @cached_property
+    def distance(self) -> float:
+        """How far the stage stood off the sites, in pitches (rms)."""
+        return rms(np.abs(self.away_m)) / self.pitch_m
+
+    def moved(self, field: np.ndarray, near: np.ndarray | None = None, *,
+              local: bool = False) -> np.ndarray:
+        """Return the stage error where the stage stood less that at the site, (P,), m.
+
+        Parameters
+        ----------
+        field : complex array (nx, ny)
+            Stage error at the sites, m.
+        near : complex array (P,), optional
+            Stage error where the stage stood, as far as it is known: the true place is the
+            indicated one less it. That at the site without it.
+        local : bool
+            Whether the spline has the slopes between neighbours.
+        """
+        filled = _filled(field, self.known)
+        at_site = filled.reshape(-1)[self.site]
+        x, y = _cells(filled, local=local).beyond(*self._place(at_site if near is None else near))
+        return x + 1j * y - at_site
+
+    def errors(self, field: np.ndarray, moved: np.ndarray | None = None) -> np.ndarray:
+        """Return the stage error where the stage stood, (P,), m, given that at the sites."""
+        return field.reshape(-1)[self.site] + (self.moved(field) if moved is None else moved)
+
+    def changes(self, moved: np.ndarray, turn_rad: np.ndarray) -> np.ndarray:
+        """Return what differences of the stage error do to the readings, (views, nx, ny), m.
+
+        Parameters
+        ----------
+        moved : complex array (P,)
+            Differences, frame of the equations, m.
+        turn_rad : float array (views,)
+            Angle by which the frame of each view's readings is turned.
+        """
+        out = np.zeros((len(self.about_m), *self.known.shape), dtype=complex)
+        out[self.at] = moved * self._phase(turn_rad)[self.at[0]]
+        return out
+
+    def about(self, field: np.ndarray, near: np.ndarray,
+              turn_rad: np.ndarray) -> list[np.ndarray | float]:
+        """Return what visits of each view have more than the mean of their mark, (V,), m.
+
+        By the slopes of the stage error where the stage stood; arguments as in `moved`, `changes`.
+        """
+        cells, (s, t) = _cells(_filled(field, self.known)), self._place(near)
+        slopes = np.zeros((2, len(self.about_m), *self.known.shape), dtype=complex)
+        for slope, (a, b) in zip(slopes, ((STEP, 0.0), (0.0, STEP)), strict=True):
+            x, y = (cells.beyond(s + a, t + b) - cells.beyond(s - a, t - b)) / (2 * STEP)
+            slope[self.at] = (x + 1j * y) / self.pitch_m
+        out: list[np.ndarray | float] = []
+        for row, (away, marks) in enumerate(zip(self.about_m, self.marks, strict=True)):
+            if away is None:
+                out.append(0.0)
+                continue
+            along_x, along_y = slopes[:, row].reshape(2, -1)[:, marks]
+            out.append((along_x * away.real + along_y * away.imag) * self._phase(turn_rad)[row])
+        return out
+
+    def _place(self, error: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return where the stage truly stood, in pitches from the corner of the field, (P,)."""
+        away = (self.away_m - error) / self.pitch_m
+        i, j = np.divmod(self.site, self.known.shape[1])
+        return i + away.real, j + away.imag
+
+    def _phase(self, turn_rad: np.ndarray) -> np.ndarray:
+        """Return the factor of each view from the stage frame to that of its readings."""
+        return PHASES[[-pose.q % 4 for pose in self.views.poses]] * np.exp(-1j * turn_rad)
+
+
+def _cells(field: np.ndarray, *, local: bool = False) -> Cells:
+    return bicubic_cells(np.stack([field.real, field.imag]), local=local)
+
+
+def _filled(field: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Return a field with unknown sites on straight lines through known ones of row and column."""
+    if known.all():
+        return field
+    rows_first, columns_first = _along_both(field, known), _along_both(field.T, known.T).T
+    return (rows_first + columns_first) / 2
+
+
+def _along_both(field: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Return a field filled along rows and columns with two known sites, then with one."""
+    for least in (2, 2, 1, 1):
+        field, known = field.copy(), known.copy()
+        for row in np.flatnonzero((known.sum(axis=1) >= least) & ~known.all(axis=1)):
+            at, left = np.flatnonzero(known[row]), np.flatnonzero(~known[row])
+            above = np.clip(np.searchsorted(at, left), min(1, len(at) - 1), len(at) - 1)
+            a, b = at[above - 1], at[above]
+            slope = (field[row, b] - field[row, a]) / np.maximum(b - a, 1)
+            field[row, left] = field[row, a] + (left - a) * slope
+            known[row] = True
+        field, known = field.T, known.T
+    return field
+
+
+def places_of(measurements: Measurements, grid: GridData, ground: Ground,
+              known: np.ndarray) -> StagePlaces | None:
+    """Return where the stage stood; None where it stood at the sites, or no visit tells.
+
+    Parameters
+    ----------
+    measurements : Measurements
+        The readings.
+    grid, ground : GridData, Ground
+        What is made of them.
+    known : bool array (nx, ny)
+        Sites whose error is known.
+    """
+    views = LatticeViews(known.shape, grid.poses)
+    away = np.zeros(grid.y.shape, dtype=complex)
+    told = np.zeros(away.shape, dtype=bool)
+    marks: list[np.ndarray | None] = []
+    about: list[np.ndarray | None] = []
+    for row, (index, visits) in enumerate(zip(grid.index, ground.visits, strict=True)):
+        found = measurements.views[index].visits
+        if visits is None or found is None:
+            marks.append(None)
+            about.append(None)
+            continue
+        stood = found.dx - found.offset_x + 1j * (found.dy - found.offset_y)
+        mean = visits.means(stood[None], known.size)[0]
+        away[row], told[row].reshape(-1)[visits.mark] = mean.reshape(known.shape), True
+        marks.append(visits.mark)
+        about.append(stood - mean[visits.mark])
+    told &= known.reshape(-1)[views.site_index] & (grid.weight > 0)
+    pitch_m = ground.half_width_m / views.unit
+    if not np.abs(away[told]).max(initial=0.0) > AT_SITES * pitch_m:
+        return None
+    return StagePlaces(views, pitch_m, known, np.nonzero(told), away[told], tuple(marks),
+                       tuple(about))
