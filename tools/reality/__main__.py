@@ -25,6 +25,7 @@ SHOWN = {
     "of the other sign": "with the wrong sign",
     "stage that never scatters": "stage without scatter",
     "laid by hand": "placed by hand", "after each laying down": "after each placement",
+    "marks that lie 1 mm beside": "marks 1 mm away from",
     "marks that lie 2 mm beside": "marks 2 mm away from", "alike in": "the same in",
     "beside white noise": "plus white noise",
     "declared 800 µm/m wrong": "declared wrong by 800 µm/m",

@@ -153,7 +153,11 @@ def _stages() -> list[Case]:
         _case("stage follows marks that lie 2 mm beside their sites",
               settings=replace(SERVO, follow_mark=True), t_m=2e-3),
         _case("stage follows marks that lie 2 mm beside their sites, alike in all views",
-              settings=replace(SERVO, follow_mark=True), t_common_m=2e-3)]
+              settings=replace(SERVO, follow_mark=True), t_common_m=2e-3),
+        *(_case(f"stage correlated over {length:g} pitches follows marks that lie {1e3 * away_m:g} "
+                "mm beside their sites", settings=replace(SERVO, follow_mark=True), t_m=away_m,
+                correlation_pitches=length)
+          for length, away_m in ((4, 1e-3), (4, 2e-3), (2, 2e-3)))]
 
 
 def _noises() -> list[Case]:
