@@ -26,12 +26,14 @@ def main(path: str) -> None:
     x_true, y_true = stage.correct(x_command, y_command)
     print(f"and back: off by at most {np.hypot(x_true - x, y_true - y).max():.0e} m")
 
-    dx, dy = x[2] - x[0], y[2] - y[0]  # the distance from the first point to the last
-    length = np.hypot(dx, dy)
-    along = np.array([-dx, 0, dx, -dy, 0, dy]) / length  # its change with each Gx, then each Gy
-    u_length = np.sqrt(along @ stage.covariance(x, y) @ along)
+    error, u = stage.length_error((x[0], y[0]), (x[2], y[2]))  # the first point to the last
     k = stage.result.noise.k_xy
-    print(f"distance {length:.9f} m, U {k * u_length:.1e} m (k = {k:.2f}, 95.45 %)")
+    print(f"distance {np.hypot(x[2] - x[0], y[2] - y[0]):.6f} m is indicated {error[0]:+.1e} m "
+          f"too long, U {k * u[0]:.1e} m (k = {k:.2f}, 95.45 %)")
+
+    gradient = np.array([1 / 3, 1 / 3, 1 / 3, 0, 0, 0])  # the mean of Gx at the three points
+    u_mean = np.sqrt(gradient @ stage.covariance(x, y) @ gradient)
+    print(f"mean error in x {(x_command - x).mean():+.1e} m, U {k * u_mean:.1e} m")
 
 
 if __name__ == "__main__":

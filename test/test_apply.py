@@ -82,10 +82,46 @@ def test_neighbours_share_their_uncertainty(file, result):
     assert along @ cover @ along < 0.5 * (cover[0, 0] + cover[1, 1])
 
 
+def test_the_error_of_a_distance_is_that_of_its_ends(file, result):
+    emap, plate = result.error_map, result.artifact
+    (x1, y1), (x2, y2) = ((plate.x_m[i], plate.y_m[i]) for i in ((1, 1), (4, 2)))
+    error, u = load(file).length_error((x1, y1), (x2, y2))
+    d = np.array([x2 - x1, y2 - y1])
+    g = np.array([field[4, 2] - field[1, 1] for field in (emap.gx, emap.gy)])
+    assert error == pytest.approx([d @ g / np.hypot(*d)], abs=1e-11) and abs(error[0]) > 1e-8
+    full, known = xy_covariance(result, emap.valid)[0], np.zeros((2, 2, *plate.shape))
+    for axis in (0, 1):
+        known[axis, axis, 4, 2], known[axis, axis, 1, 1] = 1, -1
+    row = (d / np.hypot(*d)) @ known.reshape(2, -1)
+    assert u == pytest.approx([np.sqrt(row @ full @ row)], rel=1e-9)
+
+
+def test_a_line_over_the_length_covers_every_distance_of_the_field(file, result):
+    stage, plate = load(file), result.artifact
+    a, b = stage.length_uncertainty()
+    i, j = np.triu_indices(25, 1)
+    x, y = plate.x_m.ravel(), plate.y_m.ravel()
+    length = np.hypot(x[j] - x[i], y[j] - y[i])
+    U = result.noise.k_xy * stage.length_error((x[i], y[i]), (x[j], y[j]))[1]
+    margin = a + b * length - U
+    assert margin.min() > -1e-7 * U.max() and margin.min() < 1e-3 * U.max()
+    assert a > 0 <= b and a + b * length.max() < 2 * U.max()
+
+
+def test_many_distances_are_evaluated_in_parts(file, monkeypatch):
+    rng = np.random.default_rng(2)
+    ends = rng.uniform(-0.02, 0.02, (4, 40))
+    whole = load(file).length_error(ends[:2], ends[2:])
+    monkeypatch.setattr(apply, "MAX_POINTS", 14)
+    np.testing.assert_allclose(load(file).length_error(ends[:2], ends[2:]), whole, rtol=1e-9)
+    with pytest.raises(InputError, match="its ends coincide"):
+        load(file).length_error((0.0, 0.0), (0.0, 0.0))
+
+
 def test_what_has_no_covariance_is_refused(file, monkeypatch):
     stage = load(file)
     with pytest.raises(InputError, match="a position is not a number"):
-        stage.covariance(np.nan, 0.0)
+        stage.covariance([np.nan, 0.0], 0.0)
     monkeypatch.setattr(apply, "MAX_POINTS", 3)
     with pytest.raises(InputError, match="4 points; give at most 3"):
         stage.covariance(np.zeros(4), 0.0)
@@ -109,6 +145,7 @@ def test_the_example_runs(file, capsys, monkeypatch):
     monkeypatch.setattr(sys, "argv", [str(EXAMPLE), file])
     runpy.run_path(str(EXAMPLE), run_name="__main__")
     lines = capsys.readouterr().out.splitlines()
-    assert len(lines) == 5 and lines[3] in [f"and back: off by at most {e} m" for e in (
+    assert len(lines) == 6 and lines[3] in [f"and back: off by at most {e} m" for e in (
         "0e+00", "2e-18", "3e-18", "4e-18")]
-    assert lines[4].startswith("distance 0.025000000 m, U ")
+    assert lines[4].startswith("distance 0.025000 m is indicated ")
+    assert lines[5].startswith("mean error in x ")

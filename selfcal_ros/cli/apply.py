@@ -13,13 +13,15 @@ if TYPE_CHECKING:
 
 HELP = "correct a table of positions: commands for true positions, or the inverse"
 AXES = ("x", "y", "theta")
+ENDS = ("x1", "y1", "x2", "y2")
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the verb."""
     parser.add_argument("result", metavar="RESULT.json", help="result that `selfcal solve` wrote")
     parser.add_argument("points", metavar="POINTS.csv",
-                        help="columns x,y or x,y,theta in m and rad, stage frame")
+                        help="columns x,y or x,y,theta in m and rad, stage frame; x1,y1,x2,y2: "
+                             "the error of the distance between two points")
     parser.add_argument("-o", "--output", metavar="OUT.csv", required=True,
                         help="table to write: the points, the corrected ones, and their standard "
                              "uncertainties (empty = unknown); - = stdout")
@@ -47,7 +49,10 @@ def run(args: argparse.Namespace) -> int:
     check_outputs([args.result, args.points], [file_of(args)])
     stage = load(args.result, method=args.method, outside=args.outside)
     points = read_points(read_text(args.points), args.points)
-    text, unknown, outside = corrected(stage, points, inverse=args.inverse)
+    if points.shape[1] == len(ENDS):
+        text, unknown, outside = distances(stage, points, inverse=args.inverse)
+    else:
+        text, unknown, outside = corrected(stage, points, inverse=args.inverse)
     if args.output == "-":
         say(args, text.removesuffix("\n"), {"csv": text})
     else:
@@ -63,7 +68,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def read_points(text: str, where: str) -> "np.ndarray":
-    """Return the points of a table x,y[,theta], (P, 2 or 3).
+    """Return the points of a table x,y[,theta] or x1,y1,x2,y2, (P, 2 to 4).
 
     Raises
     ------
@@ -78,8 +83,8 @@ def read_points(text: str, where: str) -> "np.ndarray":
     rows = [(number, csv_cells(line, f"{where}:{number}"))
             for number, line in enumerate(text.splitlines(), 1) if line.strip(", ")]
     head = [cell.lower() for cell in rows[0][1]] if rows else []
-    if head not in (list(AXES), list(AXES[:2])):
-        raise InputError(f"{where}:1", "the header is not x,y or x,y,theta",
+    if tuple(head) not in (AXES, AXES[:2], ENDS):
+        raise InputError(f"{where}:1", "the header is not x,y or x,y,theta or x1,y1,x2,y2",
                          "name the columns; positions in m and rad")
     points = np.empty((len(rows) - 1, len(head)))
     for index, (number, cells) in enumerate(rows[1:]):
@@ -112,3 +117,27 @@ def corrected(stage: "StageMap", points: "np.ndarray", *, inverse: bool) -> tupl
     lines = [",".join("" if cell != cell else repr(cell) for cell in row) for row in rows.tolist()]
     unknown = int(np.isnan(found).any(axis=0).sum())
     return "\n".join([",".join(head), *lines]) + "\n", unknown, int((~stage.inside(x, y)).sum())
+
+
+def distances(stage: "StageMap", points: "np.ndarray", *, inverse: bool) -> tuple[str, int, int]:
+    """Return the table of distances with their errors, as `corrected`; and a line over length."""
+    import sys
+
+    import numpy as np
+
+    from selfcal_ros.errors import InputError
+    from selfcal_ros.units import UM_PER_M
+
+    if inverse:
+        raise InputError("--inverse", "the ends of distances are true positions", "leave it out")
+    x1, y1, x2, y2 = points.T
+    error, u = stage.length_error((x1, y1), (x2, y2))
+    rows = np.column_stack([points, np.hypot(x2 - x1, y2 - y1), error, u]).tolist()
+    a, b = stage.length_uncertainty()
+    print(f"selfcal apply: in the whole field U of a distance L is at most {a * UM_PER_M:.3g} um + "
+          f"{b * UM_PER_M:.3g} um/m L (k = {stage.result.noise.k_xy:.3g}, 95.45 %)",
+          file=sys.stderr)
+    outside = ~(stage.inside(x1, y1) & stage.inside(x2, y2))
+    lines = [",".join(map(repr, row)) for row in rows]
+    return ("\n".join([",".join([*ENDS, "length", "error", "u"]), *lines]) + "\n", 0,
+            int(outside.sum()))

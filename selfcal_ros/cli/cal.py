@@ -9,15 +9,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from selfcal_ros.cli.cal_lines import (
-    add_frame,
-    add_line_tables,
-    frame_of,
-    in_unit,
-    numbers,
-    pairs,
-    read_result,
-)
+from selfcal_ros.cli import cal_lines
 from selfcal_ros.cli.terminal import add_json, busy, say
 from selfcal_ros.errors import ExitCode, InputError, NotIdentifiableError
 from selfcal_ros.units import M_PER_UM, RAD_PER_ARCSEC
@@ -36,7 +28,7 @@ SCANNER_BITS = 16
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the sub-verbs."""
     group = parser.add_subparsers(dest="sub_verb", metavar="WHAT", required=True)
-    for add in (add_files, add_maps, add_line_tables):
+    for add in (add_files, add_maps, cal_lines.add_line_tables):
         add(group)
 
 
@@ -135,7 +127,8 @@ def _evaluate(args: argparse.Namespace) -> int:
               for axis in table.inputs}
     if frame is not None and frame.theta_axis is not None:
         rotary.add(frame.theta_axis)
-    positions = numbers(in_unit(args.position, unit, rotary=rotary), "--position")
+    given = cal_lines.in_unit(args.position, unit, rotary=rotary)
+    positions = cal_lines.numbers(given, "--position")
     if not positions:
         raise InputError("--position", "no position given", "write --position 1=10.5")
     corrections = CalEvaluator(cal.tables, _setup(args)).corrections(positions)
@@ -148,20 +141,16 @@ def _setup(args: argparse.Namespace) -> "MachineSetup":
 
     if args.temperature is not None and not math.isfinite(args.temperature):
         raise InputError("--temperature", f"{args.temperature} is not a temperature", "give degC")
-    directions = pairs(args.home_direction, "--home-direction")
+    directions = cal_lines.pairs(args.home_direction, "--home-direction")
     for axis, word in directions.items():
         if word not in ("CW", "CCW"):
             raise InputError("--home-direction", f"'{word}' is not a home direction",
                              f"write {axis}=CW or {axis}=CCW")
-    found: dict[str, dict[int, Any]] = {
-        "counts_per_unit": numbers(args.counts_per_unit, "--counts-per-unit", positive=True),
-        "counts_per_secondary": numbers(args.counts_per_secondary, "--counts-per-secondary",
-                                        positive=True),
-        "home_direction": directions,
-        "home_offset": numbers(args.home_offset, "--home-offset"),
-        "absolute_feedback_offset": numbers(args.absolute_feedback_offset,
-                                            "--absolute-feedback-offset"),
-    }
+    found: dict[str, dict[int, Any]] = {name: cal_lines.numbers(
+        getattr(args, name), f"--{name.replace('_', '-')}", positive=name.startswith("counts"))
+        for name in ("counts_per_unit", "counts_per_secondary", "home_offset",
+                     "absolute_feedback_offset")}
+    found["home_direction"] = directions
     axes: set[int] = set().union(*found.values())
     return MachineSetup({axis: AxisSetup(**{name: values.get(axis)
                                             for name, values in found.items()})
@@ -184,7 +173,7 @@ def add_maps(group: argparse._SubParsersAction) -> None:
     export.add_argument("--force", action="store_true",
                         help="replace existing files; the old ones are kept with their date")
     add_json(export)
-    add_frame(export, theta=True)
+    cal_lines.add_frame(export, theta=True)
     export.set_defaults(run_sub_verb=_export)
     verify = group.add_parser("verify", help="print the residual of a simulated controller before "
                                              "and after a file is loaded, um")
@@ -194,7 +183,7 @@ def add_maps(group: argparse._SubParsersAction) -> None:
                         help="table that was loaded during the calibration")
     verify.add_argument("--plot", metavar="F.png", help="draw it (png, svg or pdf)")
     verify.add_argument("--json", action="store_true", help="print as JSON, m and rad")
-    add_frame(verify, theta=True, default=False)
+    cal_lines.add_frame(verify, theta=True, default=False)
     verify.set_defaults(run_sub_verb=_verify)
 
 
@@ -206,7 +195,7 @@ def _export(args: argparse.Namespace) -> int:
     from selfcal_ros.compensation.residual import combined
     from selfcal_ros.files import check_outputs
 
-    frame = frame_of(args)
+    frame = cal_lines.frame_of(args)
     if args.theta_output and frame.theta_axis is None:
         raise InputError("--theta-output", "no theta table is written", "name --theta-axis")
     result, filled = ready(args)
@@ -252,7 +241,7 @@ def ready(args: argparse.Namespace) -> tuple["CalibrationResult", int]:
 
     from selfcal_ros.compensation.export import fill_unknown
 
-    result, filled = read_result(args.result), 0
+    result, filled = cal_lines.read_result(args.result), 0
     if not result.observability.identifiable:
         raise NotIdentifiableError(f"{args.result}: the measured plan does not identify the stage; "
                                    "measure the missing views",
@@ -287,11 +276,11 @@ def _verify(args: argparse.Namespace) -> int:
     from selfcal_ros.aerotech.verify import verify_tables
     from selfcal_ros.compensation.frame import MachineFrame, frame_from_comments
 
-    result, cal = read_result(args.result), load_cal(args.file)
+    result, cal = cal_lines.read_result(args.result), load_cal(args.file)
     base = frame_from_comments(cal.comments)
     if base is None and isinstance(cal.tables[0], Table2D):
         base = MachineFrame(cal.tables[0].column_axis, cal.tables[0].row_axis)
-    frame = frame_of(args, base)
+    frame = cal_lines.frame_of(args, base)
     with busy("simulating the controller"):
         found = verify_tables(result.error_map, cal.tables, frame, _active(args, frame))
     say(args, residual_text(found.residuals), figures_of(found.residuals))

@@ -8,16 +8,7 @@ import json
 import math
 from typing import TYPE_CHECKING, Any
 
-from selfcal_ros.cli.plan_terms import (
-    add_term_options,
-    assumed_of,
-    assumed_terms,
-    budget_json,
-    model_of,
-    sizes_of,
-    terms_json,
-    terms_text,
-)
+from selfcal_ros.cli import plan_terms
 from selfcal_ros.cli.terminal import busy, late_progress, tell
 from selfcal_ros.units import MM_PER_M, UM_PER_M
 
@@ -51,7 +42,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         sub.add_argument("--theta-datum", choices=("xy_axes", "zero_mean"), default="zero_mean",
                          help="convention of the angular map (default zero_mean)")
         sub.add_argument("--json", action="store_true", help="print JSON")
-        add_term_options(sub)
+        plan_terms.add_term_options(sub)
     check.add_argument("--map", action="store_true",
                        help="also print the predicted uncertainty at every site")
     check.add_argument("--model", metavar="TERM[:SIZE][,...]", action="append", default=[],
@@ -86,7 +77,8 @@ def _check(args: argparse.Namespace, plan: Plan) -> int:
     from selfcal_ros.model.error_map import ThetaDatum
     from selfcal_ros.reporting.words.tables import plan_budget_text
 
-    assumed, sizes, model = assumed_of(args), sizes_of(args), model_of(args, plan)
+    assumed, sizes = plan_terms.assumed_of(args), plan_terms.sizes_of(args)
+    model = plan_terms.model_of(args, plan)
     plan = _repeated(plan, args.repeats)
     alone: Prediction | None = None
     joint: Prediction | None = None
@@ -98,8 +90,8 @@ def _check(args: argparse.Namespace, plan: Plan) -> int:
             alone = predict_plan(plan, ThetaDatum(args.theta_datum))
             seen, joint, checks = _judge(plan, model, assumed, sizes, (seen, alone))
         if alone is not None and seen.identifiable:
-            budget = plan_budget(plan, (*model, *assumed_terms(args.model, model)), assumed,
-                                 alone, asked=[term.name for term in model])
+            terms = (*model, *plan_terms.assumed_terms(args.model, model))
+            budget = plan_budget(plan, terms, assumed, alone, asked=[term.name for term in model])
     if args.json:
         found = _check_json(plan, seen, alone, maps=args.map)
         unit = _averaged_m(plan, assumed) * UM_PER_M
@@ -113,8 +105,8 @@ def _check(args: argparse.Namespace, plan: Plan) -> int:
             if args.sigma is not None and joint is not None:
                 found["predicted"] |= {"rms_u_xy_um_with_terms": joint.rms_xy * unit,
                                        "max_u_xy_um_with_terms": joint.max_xy * unit}
-        found["budget"] = budget and budget_json(budget, plan, assumed)
-        print(json.dumps(found | {"terms": terms_json(checks)}, indent=1))
+        found["budget"] = budget and plan_terms.budget_json(budget, plan, assumed)
+        print(json.dumps(found | {"terms": plan_terms.terms_json(checks)}, indent=1))
     else:
         lines = _check_text(plan, seen, alone)
         if alone is not None and args.sigma is not None:
@@ -124,7 +116,7 @@ def _check(args: argparse.Namespace, plan: Plan) -> int:
             lines.append(f"  {what} rms {joint.rms_xy:.4f}   largest {joint.max_xy:.4f}")
             lines += [_in_um(what, joint, plan, assumed)] if args.sigma is not None else []
         lines += plan_budget_text(budget, plan) if budget else []
-        lines += terms_text(plan, checks, assumed) if checks else []
+        lines += plan_terms.terms_text(plan, checks, assumed) if checks else []
         lines += _map_text(alone) if args.map and alone and seen.identifiable else []
         tell("\n".join(lines))
     return int(ExitCode.DONE if seen.identifiable else ExitCode.NOT_IDENTIFIABLE)
@@ -277,7 +269,8 @@ def _suggest(args: argparse.Namespace, plan: Plan) -> int:
                                     progress=progress)
     # without terms (--against none) and --sigma the figures are gains
     told = against is not None or args.sigma is not None
-    unit = _averaged_m(plan if args.views is None else best, assumed_of(args)) if told else None
+    judged = plan if args.views is None else best
+    unit = _averaged_m(judged, plan_terms.assumed_of(args)) if told else None
     if args.views is not None:
         best = replace(best, plan_id=f"{plan.plan_id}_best{args.views}",
                        model_terms=plan.model_terms)
@@ -309,10 +302,10 @@ def _against(args: argparse.Namespace, plan: Plan) -> Against | None:
     from selfcal_ros.model.terms import ModelTerm, TermName, parse_terms
 
     found = {term.name: term for term in parse_terms(plan.model_terms, "model_terms")}
-    found |= {name: ModelTerm(name, size) for name, size in sizes_of(args).items()}
+    found |= {name: ModelTerm(name, size) for name, size in plan_terms.sizes_of(args).items()}
     named = tuple(found[n] for n in TermName if n in found)
-    by_default = assumed_terms(args.against, named)
-    return Against(named, assumed_of(args), by_default) if named or by_default else None
+    by_default = plan_terms.assumed_terms(args.against, named)
+    return Against(named, plan_terms.assumed_of(args), by_default) if named or by_default else None
 
 
 def _show_ranked(args: argparse.Namespace, plan: Plan, now: tuple[Score, float | None],

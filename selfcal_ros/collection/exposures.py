@@ -10,14 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from selfcal_ros.collection.encoder import (
-    EVER,
-    LOOK_BACK_NS,
-    NEVER,
-    JointSamples,
-    JointTrack,
-    filled,
-)
+from selfcal_ros.collection import encoder
 from selfcal_ros.collection.samples import NO_STAMPS, GrowingColumns, GrowingTable
 
 MOST_SAMPLES = 300_000
@@ -36,11 +29,11 @@ N_LINEAR = 2
 class Tracks:
     """Encoder samples of the three joints."""
 
-    x: JointTrack
-    y: JointTrack
-    theta: JointTrack
+    x: encoder.JointTrack
+    y: encoder.JointTrack
+    theta: encoder.JointTrack
 
-    def __iter__(self) -> Iterator[JointTrack]:
+    def __iter__(self) -> Iterator[encoder.JointTrack]:
         """Yield the joints in their order."""
         return iter((self.x, self.y, self.theta))
 
@@ -162,7 +155,7 @@ class Exposures:
         due[behind] = True  # the time since the previous exposure has changed
         self._stamps.insert(at, stamps_ns)
         for joint in self._joints:
-            joint.insert(at, {"first": NEVER, "last": EVER, "approach": NEW})
+            joint.insert(at, {"first": encoder.NEVER, "last": encoder.EVER, "approach": NEW})
         if not len(behind):  # usual case, faster
             return np.append(due, np.ones(len(at), dtype=bool))
         return np.insert(due, at, True)
@@ -193,8 +186,9 @@ class Exposures:
     def _since(self, index: np.ndarray) -> np.ndarray:
         """Return the beginning of the search for a motion before each instant."""
         stamps = self._stamps.rows
-        earliest = np.maximum(stamps[index], NEVER + LOOK_BACK_NS) - LOOK_BACK_NS
-        before = np.where(index > 0, stamps[np.maximum(index - 1, 0)], NEVER)
+        look_back = encoder.LOOK_BACK_NS
+        earliest = np.maximum(stamps[index], encoder.NEVER + look_back) - look_back
+        before = np.where(index > 0, stamps[np.maximum(index - 1, 0)], encoder.NEVER)
         return np.maximum(before, earliest)
 
     def _window(self, group: np.ndarray) -> tuple[int, int]:
@@ -217,7 +211,8 @@ class Exposures:
             joint["first"][here], joint["last"][here] = series.decided_by(
                 stamps, since if linear else None)
 
-    def _motions(self, series: JointSamples, index: np.ndarray, position: np.ndarray) -> np.ndarray:
+    def _motions(self, series: encoder.JointSamples, index: np.ndarray,
+                 position: np.ndarray) -> np.ndarray:
         stamps, first = self._stamps.rows, index[0]
         if first == 0:
             return series.approach(stamps[index], position, threshold=self._threshold_m)
@@ -235,7 +230,7 @@ class Exposures:
         for joint in self._joints[:N_LINEAR]:
             old = joint["approach"][start:]
             before = joint["approach"][start - 1:start] if start else np.zeros(1, dtype=np.int8)
-            found = filled(np.concatenate([before, joint["motion"][start:]]))[1:]
+            found = encoder.filled(np.concatenate([before, joint["motion"][start:]]))[1:]
             known = old != NEW
             changed |= found != old
             joint["approach"][start:] = found

@@ -121,7 +121,7 @@ def export(name: str, result: CalibrationResult, wiring: Wiring, output: str, *,
     Raises
     ------
     InputError
-        If the format cannot hold the map, or the files make the machine worse.
+        If an option does not fit the format, or the map has unknown sites.
     """
     form, frame, emap = FORMATS[name], wiring.frame, result.error_map
     if wiring.negate and not form.sign_is_implied:
@@ -142,9 +142,6 @@ def export(name: str, result: CalibrationResult, wiring: Wiring, output: str, *,
             for line in comments]
     files = {names[part]: "\n".join([*lines, "", *head] if form.comments_last
                                     else [*head, *lines]) + "\n" for part, lines in texts.items()}
-    if residuals[0].rms("after") > (1 + 1e-6) * residuals[0].rms("before"):
-        raise InputError(output, "the table would make the machine worse", "the format cannot "
-                         "hold this map: see docs/controllers.md")
     return Exported(files, residuals)
 
 

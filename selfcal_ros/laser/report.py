@@ -7,22 +7,9 @@ from typing import Any
 import numpy as np
 
 from selfcal_ros.estimation.joint.noise import coverage_factor
+from selfcal_ros.laser import profiles
 from selfcal_ros.laser.data import AXES, Method, StepDiagonal, StepDiagonalResult
 from selfcal_ros.laser.noise import linear_noise, reading_noise
-from selfcal_ros.laser.profiles import (
-    ReferenceLine,
-    Value,
-    axis_pairs,
-    map_equivalent,
-    name_of,
-    positions_m,
-    profile_m,
-    slope,
-    squareness,
-    squareness_rad,
-    straightness,
-    u_profile_m,
-)
 from selfcal_ros.model.json_form import plain
 from selfcal_ros.reporting.figures.drawing import SERIES, Drawing
 from selfcal_ros.reporting.figures.parts import Curve, chart, legend, titled
@@ -40,7 +27,7 @@ CONVENTION = {
 
 
 def outcome(found: StepDiagonalResult, data: StepDiagonal, *,
-            line: ReferenceLine = ReferenceLine.LEAST_SQUARES,
+            line: profiles.ReferenceLine = profiles.ReferenceLine.LEAST_SQUARES,
             warnings: Sequence[str] = ()) -> dict[str, Any]:
     """Return the JSON form of a result, lengths in mm.
 
@@ -60,18 +47,19 @@ def outcome(found: StepDiagonalResult, data: StepDiagonal, *,
     out |= {"unit": "mm", "line": str(line), "n_blocks": found.n_blocks,
             "diagonals": list(data.diagonals), "n_repeats": int(data.counts.max()),
             **{f"step_{AXES[j]}": step / M_PER_MM for j, step in enumerate(found.steps_m)}}
-    out |= {name_of(j, c): _mm(found.errors_m[j, :, c]) for j, c in kinds}
+    out |= {profiles.name_of(j, c): _mm(found.errors_m[j, :, c]) for j, c in kinds}
     u = found.u_errors_m
     if u is not None:
-        out |= {f"u_{name_of(j, c)}": _mm(u[j, :, c]) for j, c in kinds}
+        out |= {f"u_{profiles.name_of(j, c)}": _mm(u[j, :, c]) for j, c in kinds}
     out |= geometry(found, line)
-    out["profiles"] = {f"p{name_of(j, c)[1:]}": {
-        "position": _mm(positions_m(found, j)), "error": _mm(profile_m(found, j, c)),
-        "u": _mm_or_none(u_profile_m(found, j, c))}
+    out["profiles"] = {f"p{profiles.name_of(j, c)[1:]}": {
+        "position": _mm(profiles.positions_m(found, j)),
+        "error": _mm(profiles.profile_m(found, j, c)),
+        "u": _mm_or_none(profiles.u_profile_m(found, j, c))}
         for j, c in kinds}
-    out["scale"] = {AXES[j]: slope(found, j, j, line) for j in range(found.dim)}
+    out["scale"] = {AXES[j]: profiles.slope(found, j, j, line) for j in range(found.dim)}
     if found.dim == 2:
-        out["error_map_equivalent"] = vars(map_equivalent(found))
+        out["error_map_equivalent"] = vars(profiles.map_equivalent(found))
     out["mirror_rad"] = found.mirror_rad
     out["closure"] = _closure(found)
     readings, linear = reading_noise(data), linear_noise(data)
@@ -91,26 +79,27 @@ def _mm_or_none(values_m: np.ndarray | None) -> list | None:
     return None if values_m is None else _mm(values_m)
 
 
-def _value(prefix: str, value: Value) -> dict[str, float | None]:
+def _value(prefix: str, value: profiles.Value) -> dict[str, float | None]:
     return {prefix: value.value / M_PER_MM,
             f"u_{prefix}": None if value.u is None else value.u / M_PER_MM}
 
 
-def geometry(found: StepDiagonalResult, line: ReferenceLine) -> dict[str, Any]:
+def geometry(found: StepDiagonalResult, line: profiles.ReferenceLine) -> dict[str, Any]:
     """Return squareness and straightness, mm: in 3D one name per pair, and the short names."""
-    out: dict[str, Any] = _value("squareness", squareness(found, line=line))
-    out["squareness_rad"] = squareness_rad(found, line=line)
+    out: dict[str, Any] = _value("squareness", profiles.squareness(found, line=line))
+    out["squareness_rad"] = profiles.squareness_rad(found, line=line)
     for axis in range(2):
-        out |= _value(f"straightness_{AXES[axis]}", straightness(found, axis, 1 - axis, line))
+        out |= _value(f"straightness_{AXES[axis]}",
+                      profiles.straightness(found, axis, 1 - axis, line))
     if found.dim == 2:
         return out
-    for j, c in axis_pairs(found.dim):
-        out |= _value(f"squareness_{AXES[j]}{AXES[c]}", squareness(found, j, c, line))
+    for j, c in profiles.axis_pairs(found.dim):
+        out |= _value(f"squareness_{AXES[j]}{AXES[c]}", profiles.squareness(found, j, c, line))
     for j in range(found.dim):
         for c in range(found.dim):
             if c != j:
                 name = f"straightness_{AXES[j]}_in_{AXES[c]}"
-                out |= _value(name, straightness(found, j, c, line))
+                out |= _value(name, profiles.straightness(found, j, c, line))
     return out
 
 
@@ -183,11 +172,12 @@ def profiles_figure(found: StepDiagonalResult, data: StepDiagonal) -> Drawing:
     drawing.width, drawing.height = 240.0 * found.dim, 40.0 + 190 * found.dim
     for j in range(found.dim):
         for c in range(found.dim):
-            u = u_profile_m(found, j, c)
+            u = profiles.u_profile_m(found, j, c)
             kind = "linear" if j == c else "transverse"
             chart(drawing, (56 + 240 * c, 56 + 190 * j, 176, 110), [
-                Curve(positions_m(found, j) * MM_PER_M, profile_m(found, j, c) * UM_PER_M, "c0",
-                      dots=2.0, U=None if u is None else k * u * UM_PER_M)],
+                Curve(profiles.positions_m(found, j) * MM_PER_M,
+                      profiles.profile_m(found, j, c) * UM_PER_M, "c0", dots=2.0,
+                      U=None if u is None else k * u * UM_PER_M)],
                 title=f"P{AXES[c]}({AXES[j]}), {kind}, µm", labels=(f"{AXES[j].upper()} in mm", ""))
     return drawing
 

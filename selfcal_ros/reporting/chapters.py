@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a report holds, chapter by chapter, before it becomes a page or a PDF."""
+"""The contents of a report, chapter by chapter, for HTML and PDF alike."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -58,10 +58,10 @@ _SENSE = {"microscope_moves": "the microscope moves over a resting plate",
 
 
 def extra_sections(extra: Mapping[str, Any]) -> list[Section]:
-    """Return a section for every extra that is a set of numbers or a table.
+    """Return a section for each extra that is a set of numbers or a table.
 
     Lengths named ``*_m`` are shown in µm and angles named ``*_rad`` in arcsec. Plain arrays
-    and deeper structures have no place on paper and stay in the result file.
+    and deeper structures are only in the result file.
     """
     names = [*(n for n in TITLES if n in extra), *sorted(n for n in extra if n not in TITLES)]
     names = [name for name in names if name not in DRAWN]
@@ -96,7 +96,7 @@ def _is_table(value: Any) -> bool:
 
 
 def _table(rows: Sequence[Mapping[str, Any]]) -> tuple[tuple, tuple]:
-    """Return the rows with a header of all their plain keys, and a note if there are too many."""
+    """Return the rows below a header of all their plain keys, and a note if some are omitted."""
     keys = [k for k in dict.fromkeys(key for row in rows for key in row)
             if all(_is_plain(row.get(k)) for row in rows)
             and any(row.get(k) not in (None, "") for row in rows)]
@@ -149,7 +149,7 @@ ABOUT = ("stage", "serial_number", "operator")
 
 
 def heading(result: CalibrationResult, about: Mapping[str, str]) -> Section:
-    """Return what was calibrated, by whom and when; `about` before what the result knows."""
+    """Return what was calibrated, by whom and when; `about` overrides the result."""
     made = result.provenance
     known = {**made.extra, **{key: value for key, value in about.items() if value}}
     first, last = (str(known.get(key, "")).replace("T", " ")[:16] for key in
@@ -162,7 +162,7 @@ def heading(result: CalibrationResult, about: Mapping[str, str]) -> Section:
 
 
 def convention_section(result: CalibrationResult) -> Section:
-    """Return what the numbers mean: signs, datum, sense of measurement, coverage."""
+    """Return the conventions behind the numbers: signs, datum, sense of measurement, coverage."""
     facts = [
         ("error", "G = indicated − true, stage frame; add +G to a command to reach its position"),
         ("XY datum", "no translation, rotation or magnification over the field (Hu eq. 5), "
@@ -180,14 +180,14 @@ def convention_section(result: CalibrationResult) -> Section:
 
 
 def _said(value: Any) -> str:
-    """Return a value in words; of a mapping its entries one after the other."""
+    """Return a value as text; the entries of a mapping are listed."""
     if isinstance(value, Mapping):
         return ", ".join(f"{printable(key)}: {printable(item)}" for key, item in value.items())
     return printable(str(value))
 
 
 def provenance_section(result: CalibrationResult) -> Section:
-    """Return where the numbers come from: input and digest, method, software."""
+    """Return the provenance of the numbers: input and digest, method, software."""
     source = result.input
     facts = [(_words(key), printable(value)) for key, value in source.items() if value]
     facts += [("method", {"joint": "joint least squares of all readings",
@@ -215,7 +215,7 @@ ANYWHERE = ("Anywhere: with the error of interpolating between the nodes, which 
 
 @dataclass(frozen=True)
 class Figure:
-    """A drawing and what to read from it."""
+    """A drawing with its caption."""
 
     drawing: Drawing
     caption: str
@@ -223,7 +223,7 @@ class Figure:
 
 @dataclass(frozen=True)
 class Chapter:
-    """A part of a report: figures, then tables; `alert` marks what a person has to act on."""
+    """A part of a report: figures, then tables; `alert` means that someone must act on it."""
 
     title: str
     figures: tuple[Figure, ...] = ()
@@ -233,7 +233,7 @@ class Chapter:
 
 def chapters(result: CalibrationResult, truth: Mapping[str, np.ndarray] | None,
              more: Sequence[Chapter] = ()) -> list[Chapter]:
-    """Return the chapters of a report; those with nothing to say are left out.
+    """Return the chapters of a report without empty ones.
 
     Parameters
     ----------
@@ -266,7 +266,7 @@ def _figures(*pairs: tuple[Drawing | None, str]) -> tuple[Figure, ...]:
 
 
 def _causes(result: CalibrationResult) -> Chapter:
-    """Return why the verdict is what it is: failed tests, causes with sizes, terms."""
+    """Return the reasons for the verdict: failed tests, causes with sizes, terms."""
     verdict = result.verdict
     rows = []
     for cause in verdict.causes:
@@ -301,7 +301,7 @@ def _maps(result: CalibrationResult, truth: Mapping[str, np.ndarray] | None) -> 
 
 
 def _uncertainty(result: CalibrationResult) -> Chapter:
-    """Return both kinds of U, each with what it is for."""
+    """Return both kinds of U and their uses."""
     rows, tables = [], []
     for budget in budgets(result):
         unit, scale = ("µm", UM_PER_M) if budget.unit == "m" else ("arcsec", ARCSEC_PER_RAD)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The calibration report as a PDF: words in columns, then the figures, on A4."""
+"""The calibration report as a PDF on A4: text in columns, then the figures."""
 
 import io
 from collections.abc import Sequence
@@ -54,7 +54,7 @@ def report_pdf(result: CalibrationResult, found: Sequence[Chapter], head: Sectio
 
 
 def _lines(chapter: Chapter) -> list[Line]:
-    """Return the words of a chapter, cut to the width of a page."""
+    """Return the text of a chapter, wrapped to the width of a page."""
     lines: list[Line] = []
     for section in chapter.sections:
         lines += [("", False), (drawable(section.title or chapter.title, COLUMNS), True)]
@@ -77,7 +77,7 @@ def _section_lines(section: Section) -> list[str]:
 
 
 def _table_lines(table: tuple[tuple[str, ...], ...]) -> list[str]:
-    """Return a table in columns; those that find no room follow by name below each row."""
+    """Return a table in columns; those that do not fit are listed by name below each row."""
     if not table:
         return []
     cells = [[drawable(cell, 2000) for cell in row] for row in table]
@@ -126,7 +126,7 @@ class _Writer:
                         family=family, va="top")
 
     def _room(self, points: float) -> None:
-        """Go to the next page unless `points` are free on this one."""
+        """Start the next page unless `points` are free on this one."""
         if self._y + points > HEIGHT - MARGIN:
             self.close()
             self._begin()
@@ -148,7 +148,7 @@ class _Writer:
             self._y += LEADING + (3 if heading else 0)
 
     def figures(self, figures: list[Figure]) -> None:
-        """Put the figures two a row, each above its caption."""
+        """Put the figures two per row, each above its caption."""
         self._y = HEIGHT
         for pair in [figures[i:i + 2] for i in range(0, len(figures), 2)]:
             captions = [wrap(drawable(figure.caption), 58) for figure in pair]

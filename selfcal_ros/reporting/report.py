@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The calibration report: one HTML file that needs nothing else, or a PDF."""
+"""The calibration report as one self-contained HTML file, or as a PDF."""
 
 import os
 import re
@@ -55,7 +55,7 @@ def write_report(result: CalibrationResult, path: str | os.PathLike, *,
 
 
 def check_name(path: str | os.PathLike) -> None:
-    """Refuse a name that says neither HTML nor PDF.
+    """Refuse a file name with any other ending than .html and .pdf.
 
     Raises
     ------
@@ -138,7 +138,7 @@ SHORT = 24
 
 
 def report_html(result: CalibrationResult, found: Sequence[Chapter], head: Section) -> str:
-    """Return the report as one HTML document with inline figures and no outside resource."""
+    """Return the report as one HTML document with inline figures and no external resources."""
     good = (result.verdict.grade is Grade.GOOD and result.observability.identifiable
             and not result.warnings)
     parts = [_section(head, titled=False),
@@ -192,7 +192,7 @@ def _section(section: Section, *, titled: bool) -> str:
 
 
 def _table(table: tuple[tuple[str, ...], ...]) -> str:
-    """Return a table; columns of numbers are flush right, long words get room."""
+    """Return a table; columns of numbers are flush right, long text wraps."""
     kinds = []
     for number, column in zip(numeric_columns(table), zip(*table, strict=True), strict=True):
         longest = max(map(len, column))

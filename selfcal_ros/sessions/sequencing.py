@@ -22,13 +22,10 @@ from selfcal_ros.model.view import Plan, View, plan_from_dict
 from selfcal_ros.sessions.clocks import is_future
 from selfcal_ros.sessions.health import Diagnosis, Level, Ports, Presence, StallWatch, missing_marks
 from selfcal_ros.topics import COMMAND_TOPIC
-from selfcal_ros.units import NS_PER_S, S_PER_NS
+from selfcal_ros.units import S_PER_NS
 
 PATIENCE_S = 3.0
 """Time without health after which a node, which publishes it each second, is missing."""
-
-LATEST_NS = (1 << 31) * NS_PER_S - 1
-"""The latest possible stamp of a message."""
 
 SET_BACK_S = 0.1
 """Largest lag of the clock behind the newest command."""
@@ -132,7 +129,7 @@ class SequencingSession:
         if (told.get("plan_id") != plan.plan_id or not told.get("run_id")
                 or phase not in ("PLACE", "MEASURE") or index is None or index >= len(plan.views)
                 or told.get("view_name") != plan.views[index].name
-                or stamp_ns is None or stamp_ns > LATEST_NS):
+                or stamp_ns is None or is_future(stamp_ns, self._ports.now_ns())):
             return ""
         if told.get("placing") not in (None, placing_digest(plan.artifact, plan.views[index])):
             return ""  # the plan has been edited: the readings are of another one

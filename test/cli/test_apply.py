@@ -7,13 +7,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from selfcal_ros.apply import StageMap
 from selfcal_ros.cli.main import main
 from selfcal_ros.compensation.compensator import Compensator
+from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.files import write_json
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.result import result_to_dict
 from selfcal_ros.model.verdict import Grade, Verdict
+from selfcal_ros.reporting.words.findings import worded
 from test.support.maps import random_map, result_of
+from test.support.sessions import collected, events_of, small_plan
 
 MAP = random_map(Artifact(5, 0.01, 8), 3, unknown=((0, 0),))
 POINTS = "x,y,theta\n0.01,-0.02,0.5\n0.0033,0.0071,-2\n0.05,0.0,0\n-0.02,-0.02,1\n"
@@ -74,6 +78,23 @@ def test_stdout_json_and_bicubic(desk, capsys):
     use = Compensator(random_map(Artifact(5, 0.01, 8), 3), method="bicubic")
     rows = table(desk / "o.csv")[1]
     np.testing.assert_array_equal(rows[:, 3:5].T, use.command(*rows[:, :2].T))
+
+
+def test_distances_get_their_error_and_a_line_over_the_length(desk, capsys):
+    result = worded(calibrate(collected(events_of(small_plan("0, 90, 180, tx")))[1]))
+    write_json("R.json", result_to_dict(result))
+    (desk / "d.csv").write_text("x1,y1,x2,y2\n-0.02,0,0.02,0.01\n0,0,0,0.05\n")
+    assert main(["apply", "R.json", "d.csv", "-o", "o.csv"]) == 0
+    head, rows = table(desk / "o.csv")
+    assert head == ["x1", "y1", "x2", "y2", "length", "error", "u"]
+    error, u = StageMap(result).length_error(*rows[:, :4].T.reshape(2, 2, 2))
+    np.testing.assert_array_equal(rows[:, 4:].T, [[np.hypot(0.04, 0.01), 0.05], error, u])
+    a, b = StageMap(result).length_uncertainty()
+    line, outside = capsys.readouterr().err.splitlines()
+    assert f"U of a distance L is at most {1e6 * a:.3g} um + {1e6 * b:.3g} um/m L" in line
+    assert outside.endswith("nearest point of its edge: 1")
+    assert main(["apply", "R.json", "d.csv", "-o", "o.csv", "--inverse"]) == 2
+    assert "the ends of distances are true positions" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(("text", "message"), [

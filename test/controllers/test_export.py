@@ -10,7 +10,7 @@ from selfcal_ros.compensation.compensator import Compensator
 from selfcal_ros.compensation.frame import MachineFrame
 from selfcal_ros.compensation.residual import plane_residuals
 from selfcal_ros.controllers.export import FORMATS, export, loaded
-from selfcal_ros.controllers.grid import Source, Wiring
+from selfcal_ros.controllers.grid import Source, Wiring, fixed
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.artifact import Artifact
 from test.support.maps import random_map, result_of
@@ -103,6 +103,43 @@ def test_the_files_of_x_and_y_are_not_exchanged():
     assert list(made.files) == ["a/b_x.comp", "a/b_y.comp"]
     correct = loaded("linuxcnc", sources_of(made)[::-1], Wiring(FRAMES[0]))
     assert plane_residuals(emap, FRAMES[0], correct)[0].rms("after") > 1e-7
+
+
+def test_a_long_axis_of_linuxcnc_has_as_many_lines_as_it_may():
+    plate = Artifact(301, 1e-4, 0, 3)
+    emap = random_map(plate, 2)
+    gx = np.outer(np.sin(plate.x_m[:, 0] * 300) * 1e-6, np.ones(3))
+    made = export("linuxcnc", result_of(replace(emap, gx=gx, gy=0 * gx)), Wiring(FRAMES[0]), "o")
+    lines = [line.split() for line in made.files["o_x"].splitlines()[:256]]
+    assert (float(lines[0][0]), float(lines[255][0])) == (-15, 15)
+    assert made.files["o_x"].splitlines()[256] == "" and all(len(line) == 3 for line in lines)
+    assert made.residuals[0].largest("after") < 1e-9
+
+
+def test_digits_are_those_of_the_rounding_and_zero_has_no_sign():
+    assert [fixed(v, 1e-3) for v in (-1e-12, 1.0, -1.25)] == ["0.00000000", "1.00000000",
+                                                           "-1.25000000"]
+    assert [fixed(1.0, unit) for unit in (1.0, 1e-6, 0.0254)] == [
+        "1." + 11 * "0", "1.00000", "1.0000000000"]
+
+
+@pytest.mark.parametrize(("name", "text", "message"), [
+    ("linuxcnc", "0 0 0\n1 1\n", "file:2: '1 1' is not of the form"),
+    ("linuxcnc", "0 0 0\n1 1 1e20\n", "file:2: a number is too large"),
+    ("linuxcnc", "0 0 0\n0 1 1\n", "file: 2 lines, or positions that do not increase"),
+    ("linuxcnc", "0 0 0\n1 1 2\n", "file: forward and reverse differ"),
+    ("kmotion", "2,2\n1,1\n0,0\n0,0,1,1,0\n0,1,1,1,0\n1,0,1,1,0\n1,2,1,1,0",
+     "file:7: row 1, column 2 is not in the table"),
+    ("kmotion", "1,2\n1,1\n0,0", "file: 1 rows and 2 columns"),
+    ("kmotion", "2,2\n1,0\n0,0", "file: 2 rows and 2 columns, spacing [1.0, 0.0]"),
+    ("pmac", "#1\n5 5 5", "file:2: '5 5 5' is no part of a table"),
+    ("pmac", "DEFINE COMP 1.1,#1D,#3D,#1,9,9\n1 2 3", "file:1: motors (1, 3, 1) are not those"),
+    ("pmac", "DEFINE COMP 1.1,#1D,#2D,#1,9,9\n1 2", "file:1: 2 entries for 1.1; 3 belong")])
+def test_a_reader_names_the_line_and_what_is_wrong(name, text, message):
+    with pytest.raises(InputError) as raised:
+        loaded(name, [Source(text, "file")] * len(FORMATS[name].parts),
+               wiring_of(FRAMES[0], name))
+    assert str(raised.value).startswith(message)
 
 
 @pytest.mark.parametrize("name", ["beckhoff", "siemens"])

@@ -286,6 +286,13 @@ def test_a_move_of_one_axis_gets_the_other_as_well():
         [point[0] + x, point[1] + y], abs=1e-9)
 
 
+def test_a_circle_is_run_once():
+    out = run_program(corrected("G0 X10 Y0\nG2 X10 Y0 I-10 J0\n", um=5.0))
+    ends = np.array([points[-1] for _, points in out])
+    length = np.hypot(*np.diff(ends, axis=0).T).sum()
+    assert length == pytest.approx(2 * np.pi * 10e-3, rel=1e-2) and ends[1, 1] < ends[0, 1]
+
+
 def test_line_ends_are_kept_and_absolute_centres_understood():
     text = "G90.1\r\nG0 X0 Y0\r\nG3 X10 Y0 I5 J0\r\nG91.1\r\nG3 X0 Y0 I-5 J0"
     out = corrected(text)

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from selfcal_ros.collection.inputs import Command, Phase
+from selfcal_ros.collection.inputs import MAX_AHEAD_NS, Command, Phase
 from selfcal_ros.collection.sequencer import State
 from selfcal_ros.errors import InputError
 from selfcal_ros.messages import from_model
@@ -194,8 +194,8 @@ TOLD = READY | {"plan_id": PLAN.plan_id, "run_id": "17", "phase": "MEASURE", "vi
     (TOLD | {"view": "-1"}, {}, (PLACE, 0)),
     (TOLD | {"view": "\u0661"}, {}, (PLACE, 0)),
     (TOLD | {"view": "9" * 5000}, {}, (PLACE, 0)),
-    (TOLD | {"command_stamp": str(2**31 * 10**9 - 1)}, {}, (MEASURE, 1)),
-    (TOLD | {"command_stamp": str(2**31 * 10**9)}, {}, (PLACE, 0)),
+    (TOLD | {"command_stamp": str(START_NS + MAX_AHEAD_NS)}, {}, (MEASURE, 1)),
+    (TOLD | {"command_stamp": str(START_NS + MAX_AHEAD_NS + 1)}, {}, (PLACE, 0)),  # clock set back
     (TOLD | {"command_stamp": ""}, {}, (PLACE, 0)),
     (TOLD | {"command_stamp": "1e9"}, {}, (PLACE, 0)),
     (TOLD | {"view_name": "other"}, {}, (PLACE, 0)),

@@ -6,15 +6,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from selfcal_ros.collection.inputs import Reason
+from selfcal_ros.collection.marks import rigid as rigids
 from selfcal_ros.collection.marks.repeats import PART, distances
-from selfcal_ros.collection.marks.rigid import (
-    LARGEST_TURN_RAD,
-    MotionEstimate,
-    Rigid,
-    RigidFit,
-    columns_where,
-    fit_motion,
-)
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.pose import LatticePose, StagePose
 from selfcal_ros.model.view import View
@@ -60,7 +53,7 @@ class MarkAssignment:
     deviation: np.ndarray
     residual: np.ndarray
     reasons: np.ndarray
-    rigid: Rigid
+    rigid: rigids.Rigid
     phi_error_rad: float = float("inf")
 
 
@@ -91,7 +84,7 @@ def identify_grid(artifact: Artifact, view: View, reading_m: np.ndarray, *, ids:
     if not view.grid:
         reasons[:] = Reason.NOT_IN_VIEW
         return MarkAssignment(ids, np.zeros(reading_m.shape), np.zeros(reading_m.shape), reasons,
-                          Rigid())
+                          rigids.Rigid())
     half = np.array(artifact.half)[:, None]
     named_unknown = has_id & (np.abs(ids) > half).any(axis=0)
     marks = np.where(has_id & ~named_unknown, ids, 0)
@@ -163,7 +156,7 @@ def _nearest(pose: StagePose, centred: np.ndarray, pitch: float, half: np.ndarra
 
 def _settle(pose: StagePose, centred: np.ndarray, half: np.ndarray, ids: np.ndarray,
             kinds: tuple[np.ndarray, np.ndarray], pitch: float,
-            rules: IdentityRules) -> tuple[MotionEstimate, RigidFit]:
+            rules: IdentityRules) -> tuple[rigids.MotionEstimate, rigids.RigidFit]:
     """Return the estimate of the view's own motion, extended outwards from unambiguous marks.
 
     Far from the centre a rotational misalignment may exceed half a pitch. So marks without ids
@@ -172,7 +165,7 @@ def _settle(pose: StagePose, centred: np.ndarray, half: np.ndarray, ids: np.ndar
     """
     named, free = kinds
     about = _about(pose, ids, pitch)
-    use, fit = named, fit_motion(*columns_where(named, about, centred - about))
+    use, fit = named, rigids.fit_motion(*rigids.columns_where(named, about, centred - about))
     known = (fit.known(pitch, rules.max_rotation_rad) if named.any() else
              _innermost(_rows(pose), centred[:, free], pitch, rules.max_rotation_rad))
     while free.any():
@@ -184,7 +177,7 @@ def _settle(pose: StagePose, centred: np.ndarray, half: np.ndarray, ids: np.ndar
             break
         use, mark = wider, np.where(named, ids, nearest)
         about = _about(pose, mark, pitch)
-        fit = fit_motion(*columns_where(use, about, centred - about))
+        fit = rigids.fit_motion(*rigids.columns_where(use, about, centred - about))
         known = fit.known(pitch, rules.max_rotation_rad)
     return (known, fit) if named.any() else _folded(_rows(pose), known, fit, pitch)
 
@@ -195,21 +188,21 @@ def _rows(pose: StagePose) -> StagePose:
 
 
 def _innermost(rows: StagePose, centred: np.ndarray, pitch: float,
-               max_rotation_rad: float) -> MotionEstimate:
+               max_rotation_rad: float) -> rigids.MotionEstimate:
     """Return the offset at the innermost mark from marks around it, up to whole pitches."""
     if not centred.shape[1]:
-        return MotionEstimate(phi_error_rad=max_rotation_rad)
+        return rigids.MotionEstimate(phi_error_rad=max_rotation_rad)
     centre = centred[:, np.argmin(np.hypot(*centred))]
     near = np.hypot(*(centred - centre[:, None])) * max_rotation_rad <= SURE * pitch
     offset = np.array([_middle(row * (2 * np.pi / pitch), 2 * np.pi) * pitch / (2 * np.pi)
                        for row in rows.turned_back(*centred[:, near])])
     x, y = map(float, rows.turned(*offset))
-    return MotionEstimate(Rigid(0.0, x, y), (float(centre[0]), float(centre[1])), 0.0,
+    return rigids.MotionEstimate(rigids.Rigid(0.0, x, y), (float(centre[0]), float(centre[1])), 0.0,
                           max_rotation_rad)
 
 
-def _folded(rows: StagePose, known: MotionEstimate, fit: RigidFit,
-            pitch: float) -> tuple[MotionEstimate, RigidFit]:
+def _folded(rows: StagePose, known: rigids.MotionEstimate, fit: rigids.RigidFit,
+            pitch: float) -> tuple[rigids.MotionEstimate, rigids.RigidFit]:
     """Return the motion whose offset at the plate's centre is below half a pitch.
 
     Marks without ids determine it only up to whole pitches, and not at all if they are so far out
@@ -254,7 +247,7 @@ def identify_angular(artifact: Artifact, view: View, reading_rad: np.ndarray, *,
     if not count or not view.angular:
         reasons[:] = Reason.NOT_IN_VIEW
         return MarkAssignment(np.zeros(len(ids), int), np.zeros(len(ids)), np.zeros(len(ids)),
-                          reasons, Rigid())
+                          reasons, rigids.Rigid())
     step = 2 * np.pi / count
     base = view.on_stage(artifact).s
     known = has_id & (ids >= 0) & (ids < count)
@@ -267,12 +260,13 @@ def identify_angular(artifact: Artifact, view: View, reading_rad: np.ndarray, *,
     deviation = wrap(reading_rad - (line + base) * step)
     residual = wrap(deviation - phi_rad)
     away = np.abs(residual)
-    reasons[(away > step / 4) | (abs(phi_rad) > max(LARGEST_TURN_RAD, step / 2))] = Reason.TOO_FAR
+    turned = abs(phi_rad) > max(rigids.LARGEST_TURN_RAD, step / 2)
+    reasons[(away > step / 4) | turned] = Reason.TOO_FAR
     reasons[~has_id & (away > rules.ambiguity_ratio * (step - away))] = Reason.AMBIGUOUS
     if not told and not _nearest_line_is_sure(phi_rad, step, rules.max_rotation_rad):
         reasons[~has_id] = Reason.ROTATION
     reasons[has_id & ~known] = Reason.UNKNOWN_MARK
-    return MarkAssignment(line, deviation, residual, reasons, Rigid(phi_rad))
+    return MarkAssignment(line, deviation, residual, reasons, rigids.Rigid(phi_rad))
 
 
 def _nearest_line_is_sure(phi_rad: float, step_rad: float, max_rotation_rad: float) -> bool:

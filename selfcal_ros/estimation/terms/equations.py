@@ -164,7 +164,8 @@ class TermEquations:
     @cached_property
     def _mixed(self) -> np.ndarray:
         """(K + D)^-1 D of method eq. 7.11, (p, p)."""
-        scale = np.hypot(self.norm, np.sqrt(self.position_noise))
+        none = self.norm**2 <= np.finfo(float).tiny * 2  # an approach that is not known
+        scale = np.hypot(np.where(none, 1.0, self.norm), np.sqrt(self.position_noise))
         matrix = (self.information + np.diag(self.position_noise)) / np.outer(scale, scale)
         inverse = np.linalg.pinv(matrix, hermitian=True, rcond=1e-14)
         return inverse / np.outer(scale, scale) * self.position_noise

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A drawing in pixels: lines, shapes and words, their colours, and frames with axes."""
+"""Drawings in pixels: lines, shapes and text, their colours, and frames with axes."""
 
 import math
 from collections.abc import Iterable, Sequence
@@ -28,7 +28,7 @@ _RAMPS = {
 
 
 def _mixed(stops: tuple[str, ...], part: float) -> str:
-    """Return the colour at `part` (0 to 1) of a ramp of evenly spaced stops."""
+    """Return the colour at `part` (0 to 1) of a gradient with evenly spaced stops."""
     place = part * (len(stops) - 1)
     index = min(int(place), len(stops) - 2)
     low, high = (tuple(int(stops[i][at:at + 2], 16) for at in (1, 3, 5))
@@ -56,7 +56,7 @@ def _variables(column: int) -> str:
 
 
 def variables_css(root: str = ":root") -> str:
-    """Return the rules that define all colours as CSS variables; on paper they are light."""
+    """Return the rules that define all colours as CSS variables; print uses the light ones."""
     return (f"{root} {{ color-scheme: light dark; {_variables(0)} }}\n"
             f"@media screen and (prefers-color-scheme: dark) {{ {root} {{ {_variables(1)} }} }}\n")
 
@@ -72,7 +72,7 @@ Point = tuple[float, float]
 
 @dataclass(frozen=True)
 class Path:
-    """Lines through points, x to the right and y down; closed where they are filled.
+    """Lines through points, x to the right and y down; closed if filled.
 
     Attributes
     ----------
@@ -98,7 +98,7 @@ class Path:
 
 @dataclass(frozen=True)
 class Discs:
-    """Ellipses with axes along x and y, all of one look; `centres` and `radii` pair by pair."""
+    """Ellipses with axes along x and y in one style, from pairs of `centres` and `radii`."""
 
     centres: tuple[Point, ...]
     radii: tuple[Point, ...]
@@ -110,7 +110,7 @@ class Discs:
 
 @dataclass(frozen=True)
 class Spot:
-    """An invisible disc that tells something where a pointer rests on it."""
+    """An invisible disc with a tooltip."""
 
     at: Point
     radius: float
@@ -119,7 +119,7 @@ class Spot:
 
 @dataclass(frozen=True)
 class Label:
-    """Words. `anchor` is start, middle or end; `turned` reads upwards."""
+    """A line of text. `anchor` is start, middle or end; `turned` text reads upwards."""
 
     at: Point
     text: str
@@ -135,9 +135,9 @@ Item = Path | Discs | Spot | Label
 
 @dataclass
 class Drawing:
-    """Items on a sheet of `width` x `height` pixels, drawn in their order.
+    """Items on a sheet of `width` x `height` pixels, drawn in order.
 
-    `name` makes a file name or an anchor, `says` tells in one sentence what is to be seen.
+    `name` gives a file name or an anchor; `says` describes the drawing in one sentence.
     """
 
     name: str
@@ -153,14 +153,14 @@ class Drawing:
 
     def lines(self, lines: Iterable[Iterable[Point]], *, stroke: str = "ink",
               width: float = 1.0) -> None:
-        """Draw many lines of one look."""
+        """Draw many lines in one style."""
         together = tuple(tuple(line) for line in lines)
         if together:
             self.items.append(Path(together, stroke=stroke, width=width))
 
     def shapes(self, outlines: Iterable[Iterable[Point]], *, fill: str, stroke: str = "",
                width: float = 1.0, opacity: float = 1.0) -> None:
-        """Fill outlines of one look."""
+        """Fill outlines in one style."""
         together = tuple(tuple(outline) for outline in outlines)
         if together:
             self.items.append(Path(together, fill=fill, stroke=stroke, width=width,
@@ -174,7 +174,7 @@ class Drawing:
 
     def discs(self, centres: Sequence[Point], radii: Sequence[Point] | float, *, fill: str = "",
               stroke: str = "", width: float = 1.0, opacity: float = 1.0) -> None:
-        """Draw ellipses of one look; a single number is the radius of all."""
+        """Draw ellipses in one style; a single number is the radius of all."""
         if not len(centres):
             return
         sizes = ((float(radii), float(radii)),) * len(centres) if isinstance(
@@ -183,11 +183,11 @@ class Drawing:
 
     def label(self, x: float, y: float, text: str, *, size: float = 12.0, anchor: str = "start",
               colour: str = "ink", bold: bool = False, turned: bool = False) -> None:
-        """Write words with their baseline at (x, y)."""
+        """Write text with its baseline at (x, y)."""
         self.items.append(Label((x, y), text, size, anchor, colour, bold, turned))
 
     def spot(self, x: float, y: float, radius: float, title: str) -> None:
-        """Show words where a pointer rests."""
+        """Add a tooltip."""
         self.items.append(Spot((x, y), radius, title))
 
     def add(self, other: "Drawing", x: float, y: float) -> None:
@@ -212,7 +212,7 @@ SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 @dataclass(frozen=True)
 class Frame:
-    """A rectangle of a drawing that stands for a range of x and of y.
+    """A rectangle of a drawing that represents a range of x and y.
 
     Attributes
     ----------
@@ -233,7 +233,7 @@ class Frame:
     log: bool = False
 
     def at(self, x: float, y: float) -> Point:
-        """Return the pixel of a point, kept within ten sizes of the frame."""
+        """Return the pixel of a point, limited to ten times the size of the frame."""
         left, top, width, height = self.box
         along = (x - self.x[0]) / (self.x[1] - self.x[0])
         up = (y - self.y[0]) / (self.y[1] - self.y[0])
@@ -256,7 +256,7 @@ class Frame:
 
     def axes(self, *, x_label: str = "", y_label: str = "",
              ticks: tuple[int, int] = (5, 5)) -> None:
-        """Draw outline, ticks with numbers, and what the axes are."""
+        """Draw outline, numbered ticks, and labels of the axes."""
         left, top, width, height = self.box
         bottom = top + height
         for value, text in self._ticks(self.x, ticks[0]):
@@ -288,7 +288,7 @@ class Frame:
 def round_step(span: float, count: int) -> float:
     """Return the smallest of 1, 2, 5 times a power of ten that divides `span` into `count` or less.
 
-    1 where the span is not positive.
+    1 if the span is not positive.
     """
     if not (math.isfinite(span) and span > 0):
         return 1.0
@@ -305,18 +305,18 @@ def round_down(value: float) -> float:
 
 
 def round_ticks(low: float, high: float, count: int) -> list[float]:
-    """Return round values from `low` to `high`, about `count` of them."""
+    """Return about `count` round values from `low` to `high`."""
     step = round_step(high - low, count)
     first, last = math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9)
     return [index * step + 0.0 for index in range(first, last + 1)]
 
 
 def tick_text(value: float) -> str:
-    """Return a tick with the figures that it has, and a minus of full width."""
+    """Return the label of a tick, with a true minus sign."""
     text = f"{value:.6g}"
     return text.replace("-", "−")
 
 
 def span_of(values: Sequence[float], least: float = 0.0) -> float:
-    """Return the largest magnitude of the finite values; `least` or 1 where there is none."""
+    """Return the largest magnitude of the finite values; `least` or 1 if there is none."""
     return max((abs(v) for v in values if math.isfinite(v)), default=0.0) or least or 1.0

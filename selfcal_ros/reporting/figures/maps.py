@@ -39,7 +39,7 @@ SCALE_AT = math.radians(22.5)
 
 def map_picture(result: CalibrationResult,
                 truth: Mapping[str, np.ndarray] | None = None) -> draw.Drawing:
-    """Return the map as one picture: verdict, vectors, angular error, and where it comes from.
+    """Return the map as one picture: verdict, vectors, angular error and origin.
 
     Raises
     ------
@@ -112,7 +112,10 @@ def _origin(result: CalibrationResult) -> str:
 
 def error_map(result: CalibrationResult, truth: Mapping[str, np.ndarray] | None = None, *,
               title: str = "Error of the stage, G = indicated − true") -> draw.Drawing:
-    """Return the vectors of G over their length, U around their heads, a known truth beneath."""
+    """Return the vectors of G over their lengths in colour, with U around their heads.
+
+    A known truth is drawn beneath.
+    """
     emap, artifact, k = result.error_map, result.artifact, result.noise.k_xy
     sites = parts.thinned(artifact, parts.MAX_ARROWS)
     step = sites[0].step or 1
@@ -153,7 +156,7 @@ def error_map(result: CalibrationResult, truth: Mapping[str, np.ndarray] | None 
 
 
 def _frame(drawing: draw.Drawing, artifact: Artifact, ends_mm: list[np.ndarray]) -> draw.Frame:
-    """Return the frame of a map that also holds places (2, P), up to four pitches off the field."""
+    """Return a frame of the field and of points (2, P) up to four pitches outside of it."""
     pitch = artifact.grid_pitch_m * MM_PER_M
     x, y = (min(max((half + 0.5) * pitch, float(np.nanmax(ends, initial=0.0)) + 0.2 * pitch),
                 (half + 4) * pitch)
@@ -173,7 +176,7 @@ def _ellipses(frame: draw.Frame, tips_mm: np.ndarray, u_mm: np.ndarray) -> bool:
 
 
 def _spots(frame: draw.Frame, result: CalibrationResult) -> None:
-    """Show a pointer the values of each site of a field that is not too large."""
+    """Add tooltips with the values of each site, unless the field is too large."""
     emap, artifact, k = result.error_map, result.artifact, result.noise.k_xy
     if max(artifact.shape) > MAX_SPOTS:
         return
@@ -188,7 +191,7 @@ def _spots(frame: draw.Frame, result: CalibrationResult) -> None:
 
 
 def component_maps(result: CalibrationResult) -> draw.Drawing:
-    """Return Gx and Gy at one scale, and below the expanded uncertainty of both at its own."""
+    """Return Gx and Gy at one scale, and below them their U at a scale of its own."""
     emap, k = result.error_map, result.noise.k_xy
     errors = np.stack([emap.gx, emap.gy]) * UM_PER_M
     u = np.where(emap.valid, np.stack([emap.u_gx, emap.u_gy]), np.nan) * k * UM_PER_M
@@ -280,7 +283,7 @@ def _scale(drawing: draw.Drawing, span: float) -> None:
 
 
 def _between(known: np.ndarray) -> list[tuple[int, int]]:
-    """Return the neighbours around the circle that are both known."""
+    """Return the pairs of neighbouring lines that are both known."""
     count = len(known)
     return [(i, (i + 1) % count) for i in range(count) if known[i] and known[(i + 1) % count]]
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Drawings as pictures and on pages, in the light colours: what matplotlib is needed for."""
+"""Drawings as image files and on PDF pages, by matplotlib, in the light colours."""
 
 import io
 import os
@@ -59,7 +59,7 @@ def save_picture(drawing: Drawing, path: str | os.PathLike) -> None:
 
 
 def put(drawing: Drawing, axes: Axes, points: float) -> None:
-    """Draw on axes that have the drawing's shape.
+    """Draw on axes with the aspect ratio of the drawing.
 
     Parameters
     ----------
@@ -121,7 +121,7 @@ def _label(item: Label, axes: Axes, points: float, order: int) -> None:
 
 
 def drawable(text: object, limit: int = 300) -> str:
-    """Return `text` as one line of characters that the font has, cut at `limit`."""
+    """Return `text` as one line of characters in the font, truncated at `limit`."""
     known = _characters()
     line = "".join(c if c.isprintable() and c in known else "?" for c in str(text)[:limit + 1])
     return line if len(line) <= limit else line[:limit - 1] + "…"
@@ -129,6 +129,6 @@ def drawable(text: object, limit: int = 300) -> str:
 
 @cache
 def _characters() -> frozenset[str]:
-    """Return the characters that the font has."""
+    """Return the characters in the font."""
     font = get_font(findfont(FontProperties(family="DejaVu Sans")))
     return frozenset(chr(code) for code, glyph in font.get_charmap().items() if glyph)

@@ -25,7 +25,7 @@ MAX_ARROWS = 21
 
 
 class Scale(NamedTuple):
-    """A colour scale: its ramp (``d``: to either side of 0) and the values of its ends."""
+    """A colour scale: its gradient (``d``: diverging from 0) and the values at its ends."""
 
     ramp: str
     low: float
@@ -51,14 +51,14 @@ def map_frame(drawing: draw.Drawing, artifact: Artifact,
 
 
 def thinned(artifact: Artifact, most: int) -> tuple[slice, slice]:
-    """Return slices that leave at most `most` sites a side, the centre among them."""
+    """Return slices that keep at most `most` sites per side, including the centre."""
     step = max(1, math.ceil(max(artifact.shape) / most))
     half_x, half_y = artifact.half
     return slice(half_x % step, None, step), slice(half_y % step, None, step)
 
 
 def cells(frame: draw.Frame, artifact: Artifact, values: np.ndarray, scale: Scale) -> None:
-    """Colour the cell of every site; unknown sites take the colour of nothing."""
+    """Colour the cell of every site; unknown sites are grey."""
     sites = thinned(artifact, MAX_CELLS)
     step = sites[0].step or 1
     level = levels(values[sites], scale)
@@ -84,9 +84,9 @@ def _clipped(frame: draw.Frame, point: draw.Point) -> draw.Point:
 
 
 def levels(values: np.ndarray, scale: Scale) -> np.ndarray:
-    """Return the step of the colour scale of each value; -1 where it is not known.
+    """Return the step of the colour scale of each value; -1 if unknown.
 
-    Of a scale with equal ends it is the middle one.
+    If the ends of the scale are equal it is the middle step.
     """
     top = 2 * draw.SIDES if scale.ramp == "d" else draw.LEVELS - 1
     with np.errstate(invalid="ignore", over="ignore"):
@@ -98,7 +98,7 @@ def levels(values: np.ndarray, scale: Scale) -> np.ndarray:
 
 def scale_bar(drawing: draw.Drawing, scale: Scale, box: tuple[float, float, float, float],
               unit: str = "µm") -> None:
-    """Draw the colours of a scale from bottom to top with round numbers to the right of it."""
+    """Draw a colour bar from bottom to top, with round numbers on its right."""
     left, top, width, height = box
     count = 2 * draw.SIDES + 1 if scale.ramp == "d" else draw.LEVELS
     each = height / count
@@ -118,7 +118,7 @@ def scale_bar(drawing: draw.Drawing, scale: Scale, box: tuple[float, float, floa
 
 
 def round_end(values: np.ndarray) -> float:
-    """Return the end of a colour scale: a little round, not below the largest magnitude."""
+    """Return the end of a colour scale: a rounded number not below the largest magnitude."""
     known = np.abs(values[np.isfinite(values)])
     largest = float(known.max()) if known.size else 0.0
     if largest <= 0:
@@ -130,7 +130,7 @@ def round_end(values: np.ndarray) -> float:
 def range_scale(ramp: str, values: np.ndarray) -> Scale:
     """Return a scale from the smallest to the largest value, both ends rounded outwards.
 
-    Its ends are equal where the values are, to 1 %, or where none is known.
+    Its ends are equal if the values agree to 1 %, or if none is known.
     """
     known = values[np.isfinite(values)]
     low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 0.0)
@@ -141,7 +141,7 @@ def range_scale(ramp: str, values: np.ndarray) -> Scale:
 
 
 def enlargement(lengths_m: np.ndarray, spacing_m: float) -> float:
-    """Return the round factor that makes the longest vectors about as long as their spacing."""
+    """Return the round factor by which the longest vectors become as long as their spacing."""
     known = lengths_m[np.isfinite(lengths_m)]
     if not known.size or known.max() <= 0:
         return 1.0
@@ -154,7 +154,7 @@ def enlargement(lengths_m: np.ndarray, spacing_m: float) -> float:
 
 def arrows(frame: draw.Frame, xy_mm: np.ndarray, vectors_m: np.ndarray, factor: float, *,
            colour: str = "ink", width: float = 1.2, heads: bool = True) -> None:
-    """Draw vectors (2, P) from places (2, P), enlarged by `factor`; unknown ones are left out."""
+    """Draw vectors (2, P) at points (2, P), enlarged by `factor`, without unknown ones."""
     shafts, tips = [], []
     for x, y, gx, gy in zip(*xy_mm, *vectors_m, strict=True):
         if not (math.isfinite(gx) and math.isfinite(gy)):
@@ -183,14 +183,14 @@ def _head(start: draw.Point, end: draw.Point, length: float,
 
 
 def curved_arrow(drawing: draw.Drawing, way: Sequence[draw.Point], *, colour: str) -> None:
-    """Draw a line through points with a head at its end."""
+    """Draw a line through points that ends in an arrowhead."""
     back = next((point for point in reversed(way) if math.dist(point, way[-1]) >= 9), way[0])
     drawing.line(way, stroke=colour, width=1.4)
     drawing.shapes([_head(back, way[-1], math.dist(back, way[-1]), 3.0)], fill=colour)
 
 
 def arrow_key(frame: draw.Frame, factor: float, at: draw.Point) -> None:
-    """Draw an arrow of a round length at the pixel `at` and say how long it is."""
+    """Draw an arrow of a round length at the pixel `at`, labelled with its length."""
     per_unit = factor * MM_PER_M / UM_PER_M * frame.per_x
     value = draw.round_down(46.0 / per_unit) if per_unit > 0 else 1.0
     end = at[0] + value * per_unit, at[1]
@@ -201,7 +201,7 @@ def arrow_key(frame: draw.Frame, factor: float, at: draw.Point) -> None:
 
 def legend(drawing: draw.Drawing, entries: Sequence[tuple[str, str]], at: draw.Point, *,
            gap: float = 14.0) -> None:
-    """Write (colour, words) in a row with a dot of the colour before each."""
+    """Write texts in a row, each after a dot of its colour."""
     x, y = at
     for colour, words in entries:
         drawing.discs([(x + 4, y - 4)], 4.0, fill=colour)
@@ -210,7 +210,7 @@ def legend(drawing: draw.Drawing, entries: Sequence[tuple[str, str]], at: draw.P
 
 
 def text_width(words: str, size: float) -> float:
-    """Return about how wide words are, rather too much than too little."""
+    """Return an upper estimate of the width of text."""
     return 0.6 * size * len(words)
 
 
@@ -222,7 +222,7 @@ def ordinal(number: int) -> str:
 
 def panels(drawing: draw.Drawing, titles: Sequence[str], reach_mm: Sequence[float],
            below: float = 50.0) -> list[draw.Frame]:
-    """Return two titled frames of the field a row; the drawing grows, with room below each row."""
+    """Return titled frames of the field, two per row; the drawing grows as needed."""
     side, gap, left, top = 186.0, 42.0, 46.0, 48.0
     height = side * reach_mm[1] / reach_mm[0]
     out = []
@@ -236,13 +236,13 @@ def panels(drawing: draw.Drawing, titles: Sequence[str], reach_mm: Sequence[floa
 
 
 def shortened(words: str, most: int) -> str:
-    """Return words cut at `most` characters."""
+    """Return text truncated at `most` characters."""
     return words if len(words) <= most else words[:most - 1] + "…"
 
 
 @dataclass(frozen=True, eq=False)
 class Curve:
-    """Values over x: a line unless its width is 0, dots of a radius, ± `U` as bars or as a band."""
+    """Values over x: a line unless its width is 0, dots, and ± `U` as bars or as a band."""
 
     x: np.ndarray
     y: np.ndarray
@@ -257,7 +257,10 @@ class Curve:
 def chart(drawing: draw.Drawing, box: tuple[float, float, float, float], curves: Sequence[Curve], *,
           title: str = "", labels: tuple[str, str] = ("", ""), log: bool = False,
           x: tuple[float, float] | None = None, y: tuple[float, float] | None = None) -> None:
-    """Draw curves over x and y, which hold all of them unless given; `log` = both logarithmic."""
+    """Draw curves; x and y are ranges that include all of them unless given.
+
+    With `log` both axes are logarithmic.
+    """
     scaled = [replace(c, x=np.log10(c.x), y=np.log10(c.y)) for c in curves] if log else curves
     reach = [c.y + side * (0.0 if c.U is None else c.U) for c in scaled for side in (-1, 1)]
     frame = draw.Frame(drawing, box, x or _span([c.x for c in scaled], 0.04),
@@ -279,7 +282,7 @@ def chart(drawing: draw.Drawing, box: tuple[float, float, float, float], curves:
 
 
 def _span(values: Sequence[np.ndarray], margin: float) -> tuple[float, float]:
-    """Return a range that holds all values, with a margin at either end."""
+    """Return a range that includes all values, with a margin at either end."""
     known = np.concatenate(values)
     known = known[np.isfinite(known)]
     low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 1.0)

@@ -21,7 +21,7 @@ from selfcal_ros.units import MM_PER_M, UM_PER_M
 
 
 def plan_figure(artifact: Artifact, views: Sequence[View]) -> Drawing:
-    """Return the plate in every view: its marks, its corner and the sense of its turn, check stops.
+    """Return the plate in every view: marks, marked corner, sense of rotation, check stops.
 
     Marks beyond the field of the stage are hollow: no view reads them.
     """
@@ -146,7 +146,7 @@ def _marked(result: CalibrationResult, view: ViewResult, mark: object) -> list[P
 
 
 def rejected_map(result: CalibrationResult) -> Drawing | None:
-    """Return where readings were rejected, view by view, coloured by reason; None without any."""
+    """Return where readings were rejected in each view, coloured by reason; None if nowhere."""
     found = rejected_in(result)
     names = [view.name for view in result.views if any(view.name == row[0] for row in found)]
     if not names:
@@ -172,7 +172,7 @@ def rejected_map(result: CalibrationResult) -> Drawing | None:
 
 
 def _legend(drawing: Drawing, entries: dict[str, tuple[str, int]]) -> None:
-    """Write the reasons below, as many a row as fit."""
+    """Write the reasons below, as many per row as fit."""
     x, y = 46.0, drawing.height + 14
     for reason, (colour, count) in entries.items():
         words = f"{printable(reason).replace('_', ' ')} ({count})"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Figures of what the fit leaves of the readings: by mark, as random numbers, over time."""
+"""Figures of the residuals: by mark, as distributions, over time."""
 
 import math
 from collections.abc import Sequence
@@ -41,21 +41,21 @@ class ViewResiduals:
     theta_rad: np.ndarray
 
     def places_mm(self, artifact: Artifact) -> np.ndarray:
-        """Return where each mark lies on the stage nominally, mm, (2, nx, ny)."""
+        """Return the nominal stage position of each mark, mm, (2, nx, ny)."""
         at = self.view.translation_x, self.view.translation_y
         return places_mm(self.view.rotation, at, artifact.x_m, artifact.y_m)
 
 
 def places_mm(rotation_rad: float, translation_m: tuple[float, float], x_m: np.ndarray,
               y_m: np.ndarray) -> np.ndarray:
-    """Return where places of a plate so laid are on the stage nominally, mm, (2, ...)."""
+    """Return the nominal stage positions of points on a plate in this pose, mm, (2, ...)."""
     c, s = math.cos(rotation_rad), math.sin(rotation_rad)
     return np.stack([c * x_m - s * y_m + translation_m[0],
                      s * x_m + c * y_m + translation_m[1]]) * MM_PER_M
 
 
 def residuals_in(result: CalibrationResult) -> list[ViewResiduals]:
-    """Return the residuals in a result, view by view; empty if there are none.
+    """Return the residuals in a result by view; empty if there are none.
 
     A malformed part counts as absent.
     """
@@ -93,7 +93,7 @@ def _array(value: object, shape: tuple[int, ...]) -> np.ndarray:
 
 
 def residual_maps(result: CalibrationResult, found: Sequence[ViewResiduals]) -> Drawing | None:
-    """Return the grid residuals of every view as vectors at the marks; None without any."""
+    """Return the grid residuals of every view as vectors at the marks; None if there are none."""
     views = [v for v in found if np.isfinite(v.xy_m).any()]
     if not views:
         return None
@@ -196,16 +196,16 @@ def _normal_plot(drawing: Drawing, values: np.ndarray, size: float,
 
 
 def _some(count: int) -> list[int]:
-    """Return at most MOST_DOTS evenly spaced indices, the first and the last among them."""
+    """Return at most MOST_DOTS evenly spaced indices, including the first and the last."""
     if count <= MOST_DOTS:
         return list(range(count))
     return np.unique(np.linspace(0, count - 1, MOST_DOTS).round().astype(int)).tolist()
 
 
 def courses(found: Sequence[ViewResiduals], sigma_m: float) -> Drawing | None:
-    """Return the mean grid residuals over the time of each view; None where it is not known.
+    """Return the mean grid residuals over the time of each view; None if times are unknown.
 
-    The band holds 95 % of means of random noise of `sigma_m` (m, one reading).
+    The band contains 95 % of the means of random noise `sigma_m` (m, one reading).
     """
     views = [v for v in found if v.course.shape[1] > 1]
     if not views:
@@ -234,7 +234,7 @@ def courses(found: Sequence[ViewResiduals], sigma_m: float) -> Drawing | None:
 
 
 def drift_found(result: CalibrationResult) -> Drawing | None:
-    """Return the drift of the plate that the model's term found in each view; None without one."""
+    """Return the drift of the plate estimated in each view; None without the term."""
     term = next((t for t in result.model.terms if t.name == "drift"), None)
     if term is None or not term.estimates:
         return None

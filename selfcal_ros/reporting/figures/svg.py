@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Drawings as SVG: inline in a page whose style sheet has the colours, or as files of their own."""
+"""Drawings as SVG: inline in a page whose style sheet defines the colours, or as files."""
 
 import math
 from collections.abc import Iterable
@@ -22,12 +22,12 @@ def css() -> str:
 
 
 def inline_svg(drawing: draw.Drawing) -> str:
-    """Return a drawing for a page that has the rules of `css`."""
+    """Return a drawing for a page that includes the rules of `css`."""
     return _svg(drawing, "")
 
 
 def svg_file(drawing: draw.Drawing) -> str:
-    """Return a drawing as a file that follows the reader's setting of light or dark."""
+    """Return a drawing as a file that adapts to light and dark mode."""
     style = "".join((draw.variables_css("svg"), FIGURE_CSS, draw.classes_css()))
     sheet = f'<rect class="f-paper" width="{_n(drawing.width)}" height="{_n(drawing.height)}"/>'
     return _svg(drawing, f"<style>{style}</style>{sheet}\n",
@@ -81,7 +81,7 @@ def _label(label: draw.Label) -> str:
 
 
 def _n(value: float) -> str:
-    """Return a number with at most one decimal; what is not finite is an error of the figure."""
+    """Return a number with at most one decimal; one that is not finite is an error."""
     if not math.isfinite(value):
         raise ValueError(f"{value} in a drawing")
     text = f"{value:.1f}".rstrip("0").rstrip(".") if abs(value) >= 2 else f"{value:.2f}".rstrip(

@@ -36,7 +36,7 @@ def printable(text: object) -> str:
 def significant(value: float, digits: int = 3) -> str:
     """Return `value` with `digits` significant digits; scientific only far from 1.
 
-    NaN and infinities, which stand for what is not known, become a dash.
+    NaN and infinities, which mean unknown, become a dash.
     """
     if not math.isfinite(value):
         return UNKNOWN
@@ -57,7 +57,7 @@ def fixed(value: float, decimals: int) -> str:
 
 
 def decimals_for(values: Sequence[float], digits: int = 3) -> int:
-    """Return the decimals that show the largest of `values` with `digits` significant digits."""
+    """Return the number of decimals that gives the largest value `digits` significant digits."""
     largest = max((abs(v) for v in values if math.isfinite(v)), default=0.0)
     if largest == 0:
         return 0
@@ -65,13 +65,13 @@ def decimals_for(values: Sequence[float], digits: int = 3) -> int:
 
 
 def fixed_column(values: Sequence[float], digits: int = 3) -> list[str]:
-    """Return the values of a column with the decimals that its largest value needs."""
+    """Return the values of a column with as many decimals as its largest value needs."""
     decimals = decimals_for(values, digits)
     return [fixed(value, decimals) for value in values]
 
 
 def aligned_numbers(values: Sequence[float], digits: int = 3, *, more: int = 3) -> list[str]:
-    """Return the values of a column with equal decimals that also show the smallest of them.
+    """Return the values of a column with equal decimals that resolve even the smallest one.
 
     The largest has `digits` significant digits, and up to `more` decimals are added until the
     smallest has two; values beyond are in scientific form.
@@ -91,7 +91,7 @@ def counted(number: int, noun: str) -> str:
 
 
 def numeric_columns(table: Sequence[Sequence[str]]) -> list[bool]:
-    """Return which columns of a table with a header hold numbers, and nothing else, below it."""
+    """Return which columns of a table contain only numbers below the header."""
     return [all(_NUMBER.fullmatch(cell) for cell in column)
             for column in zip(*table[1:], strict=True)]
 

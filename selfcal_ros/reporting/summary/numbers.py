@@ -122,7 +122,7 @@ def truth_figures(emap: ErrorMap, truth: Mapping[str, np.ndarray]) -> TruthFigur
     """Return the difference of `emap` and `truth`, after removing the datum difference.
 
     Translation, rotation and magnification of the difference (Hu eq. 5) and a constant angle
-    are seen by no view and are removed by least squares. The angles are weighted by 1/u², so
+    cannot be seen in any view and are removed by least squares. The angles are weighted by 1/u², so
     that lines which the datum ties to the XY map (Hu eq. 9, small u) set the constant.
 
     Parameters
@@ -165,7 +165,7 @@ def _common(theta_rad: np.ndarray, u_rad: np.ndarray) -> float:
 
 
 def _in_units(difference: np.ndarray, u: np.ndarray) -> tuple[float, float, float]:
-    """Return rms and largest of difference/u and the share within 2; where u is positive."""
+    """Return rms and largest of difference/u and the share within 2, where u is positive."""
     usable = np.isfinite(difference) & np.isfinite(u) & (u > 0)
     ratio = difference[usable] / u[usable]
     share = float(np.mean(np.abs(ratio) <= 2)) if ratio.size else NAN

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The summary of a result: its sections, as text or for a report, and the state in one sentence."""
+"""The summary of a result: its sections as text or for a report, and one sentence on its state."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -55,7 +55,7 @@ def all_sections(result: CalibrationResult,
 
 
 def verdict_section(result: CalibrationResult) -> Section:
-    """Return the verdict with the tests that failed and their likely causes; empty if none did."""
+    """Return the verdict with failed tests and their likely causes; empty if none failed."""
     verdict = result.verdict
     notes = [printable(reason) for reason in verdict.reasons]
     notes += [f"likely cause: {printable(cause.text)} (p = {cause.p:.1g})"

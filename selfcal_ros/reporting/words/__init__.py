@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Sentences and tables for people, made from findings, budgets and validations (SI units)."""
+"""Sentences and tables for people from findings, budgets and validations (SI units)."""

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The sentence of each finding, made from its data: verdict, causes and warnings of a result.
 
-Everywhere else findings are data. Lengths are in µm, ratios in µm/m, rotations in mrad or arcsec.
+Elsewhere findings are data. Lengths are in µm, ratios in µm/m, rotations in mrad or arcsec.
 """
 
 import math
@@ -39,7 +39,7 @@ ARCSEC, URAD = Unit(ARCSEC_PER_RAD, "arcsec"), Unit(URAD_PER_RAD, "µrad")
 
 
 def unit_of(name: str, si: str) -> Unit:
-    """Return the unit of the estimates of a term, or of the size of a cause: the same everywhere.
+    """Return the display unit of the estimates of a term, or of the size of a cause.
 
     Small angles of axes and lines are in µrad, rotations of plate and microscope in mrad.
     """
@@ -49,7 +49,7 @@ def unit_of(name: str, si: str) -> Unit:
 
 
 def plus_minus(found: Finding, unit: Unit, times: float = 1.0) -> str:
-    """Return the size of a finding without its sign, two figures of its uncertainty, and the unit.
+    """Return size without sign, uncertainty with two digits, and unit of a finding.
 
     Parameters
     ----------
@@ -68,7 +68,7 @@ def plus_minus(found: Finding, unit: Unit, times: float = 1.0) -> str:
 
 
 def _either(found: Finding, positive: str, negative: str) -> str:
-    """Return one of two directions by the sign of a size."""
+    """Return one of two directions, by the sign of a size."""
     return positive if found.size >= 0 else negative
 
 
@@ -229,7 +229,7 @@ def _noise_contradicted(found: Finding, of: dict[str, Any]) -> str:
 
 
 def held_out_text(view: str, tenth: int) -> str:
-    """Return what was held out of the readings: a random tenth by its number, else a view."""
+    """Return the name of a held-out set: a random tenth by its number, or a view."""
     return f"a random tenth ({tenth})" if tenth else f"view '{view}'"
 
 
@@ -272,23 +272,23 @@ def _slip_found(found: Finding, of: dict[str, Any]) -> str:
 
 
 def remedies(cause: Cause) -> tuple[Remedy, ...]:
-    """Return the remedies of a cause: those that were tried, and the action that removes it."""
+    """Return the remedies of a cause: models and views to try, and the action that removes it."""
     if any(remedy.kind == "action" for remedy in cause.remedies):
         return cause.remedies
     return (*cause.remedies, Remedy("action", _ACTIONS[cause.name]))
 
 
 def advice(cause: Cause) -> str:
-    """Return what to do about a cause; empty where a file says it in the cause's text alone."""
+    """Return what to do about a cause; empty if a file has it only in the text of the cause."""
     return "" if cause.details is None else ", or ".join(
         f"solve with --model {remedy.value}" if remedy.kind == "model" else remedy.value
         for remedy in remedies(cause) if remedy.kind != "view")
 
 
 def what_it_is(cause: Cause) -> str:
-    """Return what a cause is, without what to do about it.
+    """Return the description of a cause without its remedies.
 
-    That is the whole text of a cause of a file that lacks its data.
+    For a cause from a file without its data this is the whole text.
     """
     try:
         if cause.details is None:
@@ -312,7 +312,7 @@ def _larger_term(cause: Cause, given: float) -> str:
 
 
 def sentence_of(found: Finding) -> str:
-    """Return the sentence of a finding; of a cause with what to do about it."""
+    """Return the sentence of a finding, for a cause with its remedies."""
     if found.name in SENTENCES:
         return SENTENCES[found.name](found, found.details or {})
     if not isinstance(found, Cause):
@@ -347,7 +347,7 @@ def line_text(line: BudgetLine) -> str:
 
 
 def worded(result: CalibrationResult) -> CalibrationResult:
-    """Return a result with the texts of its findings; one that has them stays as it is.
+    """Return a result with the texts of its findings; existing texts are kept.
 
     Parameters
     ----------

@@ -19,7 +19,7 @@ from selfcal_ros.units import ARCSEC_PER_RAD, NM_PER_M, UM_PER_M, URAD_PER_RAD
 
 
 def why_text(why: Finding | None, artifact: Artifact) -> str:
-    """Return why nothing could be predicted, or why there is no limit; empty for None."""
+    """Return why there is no prediction or no limit; empty for None."""
     if why is None or why.name != "rest_not_identified":
         return "" if why is None else sentence_of(why)
     more = "no single further view would change that"
@@ -113,7 +113,7 @@ _CERTIFICATES: dict[str, str] = {
 
 
 def plan_budget_text(budget: PlanBudget, plan: Plan) -> list[str]:
-    """Return the budget that a plan promises as a table, with what removes each line."""
+    """Return the predicted budget of a plan as a table, with what removes each line."""
     out = ["predicted uncertainty budget (standard uncertainty, rms):"]
     for quantity, name, factor, unit in (("xy", "XY, one coordinate", NM_PER_M, "nm"),
                                          ("theta", "theta", URAD_PER_RAD, "µrad")):
@@ -140,7 +140,7 @@ def removal_text(found: Removal, line: BudgetLine, plan: Plan) -> str:
 
 
 def step_text(step: plan_check.Step, plan: Plan) -> str:
-    """Return what a change of a plan asks for.
+    """Return the description of a change of a plan.
 
     Parameters
     ----------
