@@ -342,7 +342,7 @@ def _show_best(args: argparse.Namespace, best: Plan, score: tuple[Score, float |
     for view in views:
         a, b = view["translation_pitch"]
         kind = "" if view["grid"] else ", lines only"
-        tell(f"  {view['name']}: turn {view['rotation_deg']:g} deg, shift [{a}, {b}]{kind}")
+        tell(f"  {view['name']}: turn {view['rotation_deg']:g} deg, shift [{a:g}, {b:g}]{kind}")
     tell(_score_text(*score))
 
 

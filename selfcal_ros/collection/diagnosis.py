@@ -319,13 +319,13 @@ class DetectionsSeen:
         """Return the actual pose of a view's plate, if its marks match another pose."""
         ((_, readings),) = views.items()
         table, view = self.table[rows], readings.view
-        if not view.grid or self.artifact.map_grid is not None:
-            return ""  # off the lattice other poses are too many to try
+        if not view.grid:
+            return ""
         stage, limit = self.exposures.at(table["stamp"]), self.rules.stage_limit_m(self.artifact)
         where = np.stack([stage.x.position, stage.y.position])
         where *= -1 if self.sense is Sense.PLATE_MOVES else 1
         good = (table["kind"] == Kind.GRID) & table["has_id"] & np.isfinite(where).all(axis=0)
-        pose = view.lattice_pose(self.artifact)
+        pose = view.on_stage(self.artifact)
         away = []
         for other in (pose, *other_poses(pose)):
             site = np.stack(other.site_of(table["m"], table["n"])) * self.artifact.grid_pitch_m

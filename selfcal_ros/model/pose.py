@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Poses of the plate on the stage."""
 
+import cmath
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
@@ -32,6 +33,11 @@ class StagePose(ABC):
 
     shift: tuple[float, float]
     turn_lines: int | None
+
+    @property
+    @abstractmethod
+    def turn_deg(self) -> float:
+        """Turn of the plate, counter-clockwise, 0 to 360 deg."""
 
     @abstractmethod
     def turned(self, m: np.ndarray, n: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -117,6 +123,11 @@ class LatticePose(StagePose):
         return self.quarter_turns
 
     @property
+    def turn_deg(self) -> int:
+        """Turn of the plate, counter-clockwise: 0, 90, 180 or 270 deg."""
+        return 90 * self.q
+
+    @property
     def phase(self) -> complex:
         """i^q: the factor from the plate frame to the stage frame, exact."""
         return (1, 1j, -1, -1j)[self.q]
@@ -170,6 +181,11 @@ class PlacedPose(StagePose):
     phase: complex
     shift: tuple[float, float]
     turn_lines: int | None
+
+    @property
+    def turn_deg(self) -> float:
+        """Turn of the plate, counter-clockwise, 0 to 360 deg."""
+        return round(math.degrees(cmath.phase(self.phase)), 6) % 360
 
     def turned(self, m: np.ndarray, n: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return a vector of the plate frame in the stage frame."""

@@ -9,7 +9,10 @@ import pytest
 from selfcal_ros.collection.diagnosis import Evidence, diagnose, main_reason
 from selfcal_ros.collection.inputs import REMEDY, Reason
 from selfcal_ros.model.readings import Sense
-from test.support.collecting import gathered, scene
+from selfcal_ros.model.view import View
+from selfcal_ros.simulation.cell import CellSettings, plan_events
+from selfcal_ros.simulation.truth import random_truth
+from test.support.collecting import START_NS, gathered, scene
 from test.support.plans import placed_plan
 
 S = 1_000_000_000
@@ -91,6 +94,24 @@ def test_a_placed_plate_is_diagnosed_as_one_on_the_lattice():
     assert findings(cell.events) == {}
     found = findings(with_positions(cell, lambda x, y: (-x, y)))[None]
     assert found.endswith("x is indicated with the wrong sign; turn the sign of x")
+
+
+@pytest.mark.parametrize(("deg", "shift", "text"), [
+    (-37, (0.013, -0.007), "the plate lies turned by 323°, not by 37°; turn it counter-clockwise"),
+    (127, (0.013, -0.007), "the plate lies turned by 127°, not by 37°; turn it as planned and"),
+    (0, (0.013, -0.007), "the plate lies turned by 0°, not by 37°; turn it as planned and measure"),
+    (37, (0.0, 0.0), "the plate lies shifted by (+0, +0) pitches, not by (+1.3, -0.7) pitches; "),
+    (37, (-0.013, 0.007), "the plate lies shifted by (-1.3, +0.7) pitches, not by (+1.3, -0.7)")])
+def test_ids_show_how_a_placed_plate_lies(deg, shift, text):
+    """In one view; the others are placed as planned."""
+    plan = placed_plan(7)
+    lies = (None, None, View("37", np.deg2rad(deg), shift), None)
+    rng = np.random.default_rng(3)
+    truth = replace(random_truth(plan.artifact, 4, rng), placed=lies)
+    found = findings(plan_events(truth, plan, settings=CellSettings(follow_mark=True), rng=rng,
+                                 start_ns=START_NS))
+    assert list(found) == [2]
+    assert f": {text}" in found[2]
 
 
 def test_mm_are_named_though_the_stage_seems_to_jump():

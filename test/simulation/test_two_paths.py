@@ -96,7 +96,7 @@ def test_placed_plates_are_read_without_ids(sense):
     """Turned by 17 mrad more than commanded, and 0.3 pitches beside."""
     plan = placed_plan(11, count=24)
     spread = Spread(phi_rad=0.017, t_m=2e-3, correlation_pitches=4.0)
-    truth = random_truth(plan.artifact, 4, np.random.default_rng(2), spread)
+    truth = random_truth(plan.artifact, len(plan.views), np.random.default_rng(2), spread)
     settings = CellSettings(sense, 2e-8, 1e-6, with_ids=False)
     direct = simulate_measurements(truth, plan, np.random.default_rng(4), settings=settings)
     events = plan_events(truth, plan, settings=settings, rng=np.random.default_rng(4),

@@ -48,12 +48,14 @@ def plan_of(text: str, size: int = 5, *, count: int = 0, size_y: int = 0, line: 
 def placed_plan(size: int = 7, *, size_y: int = 0, count: int = 0, repeats: int = 1) -> Plan:
     """Return a plan of the views 0, 90, 37 deg and (1.3, -0.7) pitches, half a pitch.
 
-    Lines are read in all views but the one at 37 deg.
+    Lines are read in all views but the one at 37 deg, and turned by one line.
     """
+    lines = [{"name": "line", "rotation_deg": 360 / count, "grid": False,
+              "repeats": repeats}] if count else []
     return plan_from_dict({
         "plan_id": "placed", "artifact": {"grid_size": size, "grid_pitch": 0.01,
                                           "angular_count": count, "grid_size_y": size_y},
         "views": [{"name": name, "rotation_deg": turn, "translation_pitch": shift,
                    "repeats": repeats} for name, turn, shift in (
                        ("0", 0, [0, 0]), ("90", 90, [0, 0]), ("37", 37, [1.3, -0.7]),
-                       ("half", 0, [0.5, 0]))]}, "plan")
+                       ("half", 0, [0.5, 0]))] + lines}, "plan")

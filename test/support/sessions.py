@@ -16,7 +16,7 @@ from selfcal_ros.bagio.writer import BagWriter
 from selfcal_ros.collection.collector import Collector
 from selfcal_ros.collection.expected import ViewProgress
 from selfcal_ros.model.readings import Measurements
-from selfcal_ros.model.view import Plan
+from selfcal_ros.model.view import Plan, plan_to_dict
 from selfcal_ros.simulation.bag import event_fields, write_simulation
 from selfcal_ros.simulation.cell import CellSettings, Event, plan_events
 from selfcal_ros.simulation.spec import Faults, apply_faults, read_simulation
@@ -67,17 +67,8 @@ def decoded(reader: BagReader) -> Iterator[tuple[str, int, Any]]:
 
 def plan_file(folder: Path, plan: Plan) -> str:
     """Write PLAN.yaml and return its path."""
-    artifact, views = plan.artifact, []
-    for view in plan.views:
-        shift = [round(t / artifact.grid_pitch_m) for t in view.translation_m]
-        views.append({"name": view.name, "rotation_deg": float(np.degrees(view.rotation_rad)),
-                      "translation_pitch": shift, "grid": view.grid, "angular": view.angular,
-                      "repeats": view.repeats})
     path = folder / "plan.yaml"
-    path.write_text(yaml.safe_dump({
-        "plan_id": plan.plan_id, "views": views, "model_terms": list(plan.model_terms),
-        "artifact": {"grid_size": artifact.grid_size, "grid_pitch": artifact.grid_pitch_m,
-                     "angular_count": artifact.angular_count}}))
+    path.write_text(yaml.safe_dump(plan_to_dict(plan)))
     return str(path)
 
 

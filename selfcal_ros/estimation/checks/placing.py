@@ -11,12 +11,13 @@ view has a free offset, rotation, strain and bending, which are not mistaken for
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.model.pose import LatticePose
+from selfcal_ros.model.pose import LatticePose, PlacedPose, StagePose
 from selfcal_ros.model.readings import Measurements, ViewReadings
 
 QUARTERS = np.array([1, 1j, -1, -1j])
@@ -46,17 +47,17 @@ class Misplaced:
     """
 
     view: str
-    planned_deg: int
-    found_deg: int
-    planned_shift: tuple[int, int]
-    found_shift: tuple[int, int]
+    planned_deg: float
+    found_deg: float
+    planned_shift: tuple[float, float]
+    found_shift: tuple[float, float]
     gain: float = float("inf")
 
     @classmethod
-    def of(cls, view: str, planned: LatticePose, found: LatticePose,
+    def of(cls, view: str, planned: StagePose, found: StagePose,
            gain: float = float("inf")) -> "Misplaced":
         """Return the difference of two poses."""
-        return cls(view, 90 * planned.q, 90 * found.q, planned.shift, found.shift, gain)
+        return cls(view, planned.turn_deg, found.turn_deg, planned.shift, found.shift, gain)
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,15 +109,17 @@ def misplaced(measurements: Measurements) -> Misplaced | None:
     return Misplaced.of(view.name, before, pose, gain)
 
 
-def other_poses(pose: LatticePose) -> Iterator[LatticePose]:
-    """Yield other poses of a plate: turned, shifted differently, or not at all."""
+def other_poses(pose: StagePose) -> Iterator[Any]:
+    """Yield other poses of a plate, of the same kind: turned, shifted differently, not at all."""
     a, b = pose.shift
-    for q in range(4):
-        if q != pose.q:
-            yield replace(pose, quarter_turns=q)
+    if isinstance(pose, LatticePose):
+        yield from (replace(pose, quarter_turns=q) for q in range(4) if q != pose.q)
+    elif isinstance(pose, PlacedPose):
+        turns = (1, pose.phase.conjugate(), *(pose.phase * turn for turn in (1j, -1, -1j)))
+        yield from (replace(pose, phase=turn) for turn in turns if turn != pose.phase)
     beside = {(0, 0), (-a, -b), (b, a), (-b, -a), (a + 1, b), (a - 1, b), (a, b + 1), (a, b - 1)}
     for shift in sorted(beside - {pose.shift}):
-        yield replace(pose, shift=shift)
+        yield replace(pose, shift=shift)  # type: ignore[type-var]
 
 
 def _seen(artifact: Artifact, view: ViewReadings) -> _Seen | None:
@@ -184,7 +187,7 @@ def _likelihood(views: list[_Seen], noise: float, spread: float) -> tuple[float,
 def said(found: Misplaced, where: str = "") -> PlacingError:
     """Return in one line how the plate is placed, and how to continue."""
     if found.found_deg != found.planned_deg:
-        what = f"the plate lies turned by {found.found_deg}°, not by {found.planned_deg}°"
+        what = f"the plate lies turned by {found.found_deg:g}°, not by {found.planned_deg:g}°"
         wrong_way = (found.found_deg + found.planned_deg) % 360 == 0
         how = "turn it counter-clockwise" if wrong_way else "turn it as planned"
     else:
@@ -195,5 +198,5 @@ def said(found: Misplaced, where: str = "") -> PlacingError:
                         f"{how} and measure this view again, or correct its pose in the plan")
 
 
-def _pitches(shift: tuple[int, int]) -> str:
-    return f"({shift[0]:+d}, {shift[1]:+d}) pitches"
+def _pitches(shift: tuple[float, float]) -> str:
+    return f"({shift[0] + 0.0:+g}, {shift[1] + 0.0:+g}) pitches"

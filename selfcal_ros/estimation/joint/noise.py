@@ -80,9 +80,9 @@ def coverage_factor(dof: float, probability: float = COVERAGE) -> float:
 def pooled(parts: Iterable[tuple[float, float]]) -> tuple[float, float]:
     """Return the pooled standard deviation and degrees of freedom of (sigma, dof) pairs."""
     good = [(sigma, dof) for sigma, dof in parts if dof > 0 and np.isfinite(sigma)]
-    total = sum(dof for _, dof in good)
+    total = float(sum(dof for _, dof in good))
     if not total:
-        return float("nan"), 0
+        return float("nan"), 0.0
     return float(np.sqrt(sum(dof * sigma**2 for sigma, dof in good) / total)), total
 
 
@@ -104,7 +104,7 @@ def noise_estimate(repeats: tuple[float, float], residuals: tuple[float, float],
     """
     identical = repeats[1] > 0 and repeats[0] == 0 and residuals[1] > 0 and residuals[0] > floor
     base = (declared, float("inf")) if np.isfinite(declared) else (
-        (float("nan"), 0) if identical else repeats)
+        (float("nan"), 0.0) if identical else repeats)
     p = _same_noise(base, residuals, floor)
     if np.isfinite(declared) or base[1] >= MIN_REPEAT_DOF or not residuals[1]:
         chosen = base
