@@ -8,26 +8,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from selfcal_ros.aerotech import model, rules
 from selfcal_ros.aerotech.header import LIMIT, ArgumentFault, Header, number, read_header, short
-from selfcal_ros.aerotech.model import (
-    CalFile,
-    CalFindings,
-    Kind,
-    Severity,
-    Table,
-    Table1D,
-    Table2D,
-    TooManyFindings,
-    decode,
-    strip_comment,
-)
-from selfcal_ros.aerotech.rules import (
-    MAX_1D_TABLES,
-    Gi4,
-    check_counts,
-    check_table,
-    mixed_kinds,
-)
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import read_bytes
 
@@ -36,14 +18,14 @@ MAX_TABLES = 1000
 _NUMERIC = re.compile(r"[0-9eE+\-. \t]*")
 _NUMBER_FIRST = re.compile(r"[+\-.]?\d")
 _TOKEN = re.compile(r":([A-Za-z0-9_]*)")
-_STARTS = {kind.start[1:]: kind for kind in Kind}
+_STARTS = {kind.start[1:]: kind for kind in model.Kind}
 
 
 @dataclass
 class _Open:
     """A table between its first start line and its end."""
 
-    kind: Kind
+    kind: model.Kind
     heads: list[tuple[int, str]]
     words: list[str] = field(default_factory=list)
     lines: list[int] = field(default_factory=list)
@@ -56,11 +38,11 @@ class _Reader:
     """The state of reading: tables so far, and the open one."""
 
     def __init__(self) -> None:
-        self.findings = CalFindings()
-        self.tables: list[Table] = []
+        self.findings = model.CalFindings()
+        self.tables: list[model.Table] = []
         self.comments: list[str] = []
         self.first_start = 0
-        self.first_kind: Kind | None = None
+        self.first_kind: model.Kind | None = None
         self.n_tables = 0
         self.open: _Open | None = None
 
@@ -91,7 +73,7 @@ class _Reader:
 
     def _line(self, number_: int, line: str, *, odd: bool) -> None:
         """Process a line that is not just numbers."""
-        text, mark, comment = strip_comment(line)
+        text, mark, comment = model.strip_comment(line)
         text = text.strip(" \t")
         if mark and not self.first_start:
             self.comments.append(comment.strip())
@@ -145,7 +127,7 @@ class _Reader:
             self.findings.error(line, f"unknown token {short(text.split()[0])}",
                                 "known are :START, :START2D, :GALVO2D and :END")
 
-    def _start(self, line: int, kind: Kind, rest: str) -> None:
+    def _start(self, line: int, kind: model.Kind, rest: str) -> None:
         if rest and rest[0] not in " \t":
             self.findings.error(line, f"no blank after {kind.start}", "put one")
         if self.open is not None and not self.open.counts:
@@ -165,11 +147,11 @@ class _Reader:
         self.n_tables += 1
         if self.n_tables > MAX_TABLES:
             self.findings.stop(line, f"more than {MAX_TABLES} tables in the file",
-                               f"it may have {MAX_1D_TABLES}")
+                               f"it may have {rules.MAX_1D_TABLES}")
         self.first_start = self.first_start or line
         self.first_kind = self.first_kind or kind
         if kind is not self.first_kind:
-            mixed_kinds(line, (kind, self.first_kind), self.findings)
+            rules.mixed_kinds(line, (kind, self.first_kind), self.findings)
         self.open = _Open(kind, [(line, rest)])
 
     def _end(self, line: int, word: str, rest: str) -> None:
@@ -202,13 +184,13 @@ class _Reader:
         header = read_header(table.kind, table.heads, self.findings)
         header.broken |= table.broken_head
         values = _numbers(table, self.findings) if not table.broken else None
-        make = _table_1d if table.kind is Kind.ONE_D else _table_2d
+        make = _table_1d if table.kind is model.Kind.ONE_D else _table_2d
         made = make(header, values, (table.lines, table.counts), self.findings)
         if made is not None:
             self.tables.append(made)
 
 
-def _numbers(table: _Open, findings: CalFindings) -> np.ndarray | None:
+def _numbers(table: _Open, findings: model.CalFindings) -> np.ndarray | None:
     """Return the values of a table, or None with a finding."""
     if not table.words:
         findings.error(table.heads[-1][0], "the table has no correction values",
@@ -233,7 +215,7 @@ def _numbers(table: _Open, findings: CalFindings) -> np.ndarray | None:
 
 
 def _table_1d(header: Header, values: np.ndarray | None, layout: tuple[list[int], list[int]],
-              findings: CalFindings) -> Table1D | None:
+              findings: model.CalFindings) -> model.Table1D | None:
     if "sample_dist" not in header.values and not header.broken:
         findings.error(header.line, "SAMPLEDIST is missing",
                        "give the distance between entries: SAMPLEDIST=...")
@@ -244,12 +226,12 @@ def _table_1d(header: Header, values: np.ndarray | None, layout: tuple[list[int]
     if several:
         findings.tolerated(several, "several values on a line of a 1D table",
                            "write one value a line")
-    return Table1D(int(header.positional[0]), header.values.pop("sample_dist"), values,
-                   **header.values, line=header.line, lines=header.lines)
+    return model.Table1D(int(header.positional[0]), header.values.pop("sample_dist"), values,
+                         **header.values, line=header.line, lines=header.lines)
 
 
 def _table_2d(header: Header, values: np.ndarray | None, layout: tuple[list[int], list[int]],
-              findings: CalFindings) -> Table2D | None:
+              findings: model.CalFindings) -> model.Table2D | None:
     if header.broken:
         return None
     *axes, sample_row, sample_col, n_columns = header.positional
@@ -262,13 +244,14 @@ def _table_2d(header: Header, values: np.ndarray | None, layout: tuple[list[int]
         return None
     if values is None or not _rows_are_whole(columns, len(outputs), layout, findings):
         return None
-    return Table2D(row, column, outputs, sample_row, sample_col,
-                   values.reshape(-1, columns, len(outputs)), **header.values,
-                   galvo=header.kind is Kind.GALVO, line=header.line, lines=header.lines)
+    return model.Table2D(row, column, outputs, sample_row, sample_col,
+                         values.reshape(-1, columns, len(outputs)), **header.values,
+                         galvo=header.kind is model.Kind.GALVO, line=header.line,
+                         lines=header.lines)
 
 
 def _rows_are_whole(columns: int, outputs: int, layout: tuple[list[int], list[int]],
-                    findings: CalFindings) -> bool:
+                    findings: model.CalFindings) -> bool:
     """Return whether the lines form whole rows; a finding names a line that does not."""
     width = columns * outputs
     want = f"a row has {columns} columns of {outputs} values = {width}"
@@ -294,7 +277,7 @@ def _rows_are_whole(columns: int, outputs: int, layout: tuple[list[int], list[in
     return False
 
 
-def parse_cal(data: bytes, where: str, *, gi4: Gi4 | None = None) -> CalFile:
+def parse_cal(data: bytes, where: str, *, gi4: rules.Gi4 | None = None) -> model.CalFile:
     """Return the content of a calibration file from its bytes, with all findings.
 
     Parameters
@@ -307,20 +290,21 @@ def parse_cal(data: bytes, where: str, *, gi4: Gi4 | None = None) -> CalFile:
         Also check galvo tables against the restrictions of this drive.
     """
     reader = _Reader()
-    with contextlib.suppress(TooManyFindings):
-        reader.read(*decode(data, reader.findings))
+    with contextlib.suppress(model.TooManyFindings):
+        reader.read(*model.decode(data, reader.findings))
         for table in reader.tables:
-            check_table(table, reader.findings, gi4=gi4)
-        check_counts(reader.tables, reader.findings)
-    return CalFile(where, tuple(reader.tables), reader.findings.sorted(), tuple(reader.comments))
+            rules.check_table(table, reader.findings, gi4=gi4)
+        rules.check_counts(reader.tables, reader.findings)
+    return model.CalFile(where, tuple(reader.tables), reader.findings.sorted(),
+                         tuple(reader.comments))
 
 
-def read_cal(path: str | os.PathLike, *, gi4: Gi4 | None = None) -> CalFile:
+def read_cal(path: str | os.PathLike, *, gi4: rules.Gi4 | None = None) -> model.CalFile:
     """Return the content of a calibration file, with all findings; InputError if missing."""
     return parse_cal(read_bytes(path), str(path), gi4=gi4)
 
 
-def refuse_errors(cal: CalFile) -> CalFile:
+def refuse_errors(cal: model.CalFile) -> model.CalFile:
     """Return `cal` if it has no errors.
 
     Raises
@@ -328,7 +312,7 @@ def refuse_errors(cal: CalFile) -> CalFile:
     InputError
         For the first error, with its line and remedy.
     """
-    errors = cal.of(Severity.ERROR)
+    errors = cal.of(model.Severity.ERROR)
     if errors:
         first = errors[0]
         more = f" ({len(errors) - 1} more errors)" if len(errors) > 1 else ""
@@ -337,6 +321,6 @@ def refuse_errors(cal: CalFile) -> CalFile:
     return cal
 
 
-def load_cal(path: str | os.PathLike) -> CalFile:
+def load_cal(path: str | os.PathLike) -> model.CalFile:
     """Return a calibration file that a controller would accept; InputError for any other."""
     return refuse_errors(read_cal(path))

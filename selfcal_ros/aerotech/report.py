@@ -9,18 +9,8 @@ from selfcal_ros.compensation.frame import MachineFrame
 from selfcal_ros.compensation.residual import Residual
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.reporting.chapters import Chapter, Figure
+from selfcal_ros.reporting.figures import parts
 from selfcal_ros.reporting.figures.drawing import Drawing
-from selfcal_ros.reporting.figures.parts import (
-    MAX_ARROWS,
-    Curve,
-    arrow_key,
-    arrows,
-    chart,
-    enlargement,
-    legend,
-    panels,
-    titled,
-)
 from selfcal_ros.reporting.summary.format import counted, fixed_column, significant
 from selfcal_ros.reporting.summary.sections import Section
 from selfcal_ros.units import ARCSEC_PER_RAD, MM_PER_M, UM_PER_M
@@ -70,24 +60,25 @@ def _untried(why: str) -> Chapter:
 
 def controller_figure(found: Verification) -> Drawing:
     """Return the error of the controller, true − commanded, before and after at one scale."""
-    drawing = titled("before-after", "Controller: true − commanded, without its constant shift")
+    drawing = parts.titled("before-after",
+                           "Controller: true − commanded, without its constant shift")
     fields = [residual for residual in found.residuals if residual.place != "lines"]
     shown = [_shown(residual) for residual in fields]
     if fields:
         reach = (np.abs(fields[0].position).max(axis=1) * 1.2 * MM_PER_M).tolist()
-        factor = enlargement(np.concatenate([np.hypot(*residual.before) for residual in fields]),
-                             min(spacing for _, spacing in shown))
-        frames = panels(drawing, [f"{which}, {PLACES[residual.place]}" for residual in fields
-                                  for which in BEFORE_AND_AFTER], reach, 68.0)
+        lengths = np.concatenate([np.hypot(*residual.before) for residual in fields])
+        factor = parts.enlargement(lengths, min(spacing for _, spacing in shown))
+        frames = parts.panels(drawing, [f"{which}, {PLACES[residual.place]}" for residual in fields
+                                        for which in BEFORE_AND_AFTER], reach, 68.0)
         for number, frame in enumerate(frames):
             (residual, which), (take, _) = _pair(fields, number), shown[number // 2]
-            arrows(frame, residual.position[:, take] * MM_PER_M, getattr(residual, which)[:, take],
-                   factor, width=0.9)
+            parts.arrows(frame, residual.position[:, take] * MM_PER_M,
+                         getattr(residual, which)[:, take], factor, width=0.9)
             frame.axes(ticks=(4, 4))
             left, top, _, height = frame.box
             drawing.label(left, top + height + 32, _sizes(residual, which, "µm", UM_PER_M),
                           size=11, colour="soft")
-        arrow_key(frames[0], factor, (46, drawing.height + 26))
+        parts.arrow_key(frames[0], factor, (46, drawing.height + 26))
         drawing.label(150, drawing.height + 30, "one scale for all; axes in mm")
         drawing.height += 40
     if found.lines is not None:
@@ -102,7 +93,7 @@ def _pair(fields: list[Residual], number: int) -> tuple[Residual, str]:
 def _shown(residual: Residual) -> tuple[np.ndarray, float]:
     """Return every second, third, ... point along each side as a mask, and their spacing, m."""
     sides = [np.unique(side, return_inverse=True) for side in residual.position]
-    step = max(1, -(-max(len(values) for values, _ in sides) // MAX_ARROWS))
+    step = max(1, -(-max(len(values) for values, _ in sides) // parts.MAX_ARROWS))
     take = np.all([number.ravel() % step == 0 for _, number in sides], axis=0)
     spacing = min(float(np.ptp(values)) / max(len(values) - 1, 1) for values, _ in sides)
     return take, step * (spacing or 1.0)
@@ -119,11 +110,11 @@ def _draw_lines(drawing: Drawing, residual: Residual) -> None:
     """Draw the angular residuals before and after over the angle, below what there is."""
     top = max(drawing.height, 16.0) + 44
     angle = np.rad2deg(residual.position[0])
-    chart(drawing, (62, top, 410, 150), [
-        Curve(angle, getattr(residual, which)[0] * ARCSEC_PER_RAD, colour, dots=2.0)
+    parts.chart(drawing, (62, top, 410, 150), [
+        parts.Curve(angle, getattr(residual, which)[0] * ARCSEC_PER_RAD, colour, dots=2.0)
         for which, colour in zip(BEFORE_AND_AFTER, ("c5", "c1"), strict=True)],
         title=PLACES["lines"], labels=("θ in °", "arcsec"))
     for number, (which, colour) in enumerate(zip(BEFORE_AND_AFTER, ("c5", "c1"), strict=True)):
-        legend(drawing, [(colour, f"{which}: {_sizes(residual, which, 'arcsec', ARCSEC_PER_RAD)}")],
-               (62, top + 206 + 18 * number))
+        sizes = _sizes(residual, which, "arcsec", ARCSEC_PER_RAD)
+        parts.legend(drawing, [(colour, f"{which}: {sizes}")], (62, top + 206 + 18 * number))
     drawing.height = top + 236

@@ -64,9 +64,9 @@ class JointTrack:
     def between(self, start_ns: int, end_ns: int) -> "JointSamples":
         """Return the samples relevant to exposures from `start_ns` to `end_ns`."""
         half_gap = self.limits.max_gap_ns // 2
-        return JointSamples(self.limits, self.store.near(max(start_ns, NEVER + half_gap) - half_gap,
-                                                   min(end_ns, EVER - half_gap) + half_gap,
-                                                   DEPTH + 2))
+        return JointSamples(self.limits, self.store.near(
+            max(start_ns, NEVER + half_gap) - half_gap, min(end_ns, EVER - half_gap) + half_gap,
+            DEPTH + 2))
 
     def usual_step_s(self) -> float:
         """Return the median time between the last samples, NaN with fewer than two."""
@@ -75,27 +75,6 @@ class JointTrack:
             return float("nan")
         t = np.unique(self.store.near(span[1], span[1], 1000)[0])
         return float(np.median(np.diff(t)) / NS_PER_S) if len(t) > 1 else float("nan")
-
-    def query(self, stamps_ns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return `JointSamples.query` of all samples, with reasons instead of codes."""
-        positions, codes = self._all().query(stamps_ns)
-        return positions, REASONS[codes]
-
-    def moving(self, stamps_ns: np.ndarray) -> np.ndarray:
-        """Return `Reason.MOVING` where the joint is known to move, else None, from all samples."""
-        series = self._all()
-        return REASONS[np.where(series.moving(stamps_ns, series.query(stamps_ns)[1]), MOVING, GOOD)]
-
-    def approach(self, stamps_ns: np.ndarray, positions: np.ndarray, *,
-                 threshold: float) -> np.ndarray:
-        """Return the sign of the last motion before each exposure, int8 array (Q,); 0 = unknown.
-
-        Arguments as for `JointSamples.approach`.
-        """
-        return filled(self._all().approach(stamps_ns, positions, threshold=threshold))
-
-    def _all(self) -> "JointSamples":
-        return self.between(NEVER, EVER)
 
 
 def filled(approach: np.ndarray) -> np.ndarray:

@@ -113,7 +113,7 @@ class Rewriter:
                 self._forget()
             return [text]
         words = self._words(text, where)
-        values = {w.letter: float(w.code) for w in words if w.letter and w.letter not in "GM"}
+        values = {w.letter: float(w.code) for w in words if w.letter not in ("", "G", "M")}
         codes = [w.code for w in words if w.letter == "G"]
         self._refuse(codes, values, where)
         for code in codes:

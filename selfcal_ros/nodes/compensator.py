@@ -13,7 +13,6 @@ from selfcal_ros.nodes.managed import ManagedNode, WhileConfigured
 from selfcal_ros.nodes.polling import ByTheClock
 from selfcal_ros.nodes.running import run
 from selfcal_ros.sessions.compensating import CompensatingSession
-from selfcal_ros.sessions.health import Diagnosis
 
 
 class CompensatorNode(ManagedNode[CompensatorSettings]):
@@ -61,10 +60,6 @@ class CompensatorNode(ManagedNode[CompensatorSettings]):
         answer = self.session.answer(request.x, request.y, request.theta, inverse=request.inverse)
         fill(response, answer)
         return self.session.source
-
-    def diagnose_session(self) -> Diagnosis:
-        """Return the diagnosis of the session."""
-        return self.session.diagnosis()
 
 
 def main() -> None:

@@ -47,17 +47,13 @@ class ManagedNode[S: ManagedSettings](NodeBase[S], LifecycleNode):
     """A lifecycle node that reports errors in transitions and leaves nothing behind.
 
     `configure` creates session and publishers, `activate` subscriptions, services and timers.
-    Deactivated, it keeps its session and its latched messages; cleaned up,
-    nothing. An error in a transition is logged, in the health at level ERROR, and leads
-    through the state of error processing to ``unconfigured``.
-
-    Parameters
-    ----------
-    kind : type
-        The node's settings.
-    **kwargs
-        For rclpy.node.Node, e.g. parameter_overrides.
+    Deactivated, it keeps its session and its latched messages; cleaned up, nothing. An error in a
+    transition is logged, in the health at level ERROR, and leads through the state of error
+    processing to ``unconfigured``. `kind` is the class of the node's settings; the other arguments
+    are those of rclpy.node.Node.
     """
+
+    session: Any  # set by `configure`
 
     def __init__(self, kind: type[S], **kwargs: Any) -> None:
         self.problem: Exception | None = None
@@ -76,8 +72,8 @@ class ManagedNode[S: ManagedSettings](NodeBase[S], LifecycleNode):
         """Create subscriptions, services and timers."""
 
     def diagnose_session(self) -> Diagnosis:
-        """Return the diagnosis of the session; called in the state ``active`` only."""
-        return Diagnosis(Level.OK, "running")
+        """Return the diagnosis of the session, in the state ``active`` only."""
+        return self.session.diagnosis()
 
     def autostart(self) -> None:
         """Configure and activate if the parameter ``autostart`` is set; raise on failure."""

@@ -13,7 +13,6 @@ from selfcal_ros.nodes.calibration_action import CalibrationAction
 from selfcal_ros.nodes.filling import diagnosis_of
 from selfcal_ros.nodes.managed import ManagedNode, WhileConfigured
 from selfcal_ros.nodes.running import run
-from selfcal_ros.sessions.health import Diagnosis
 from selfcal_ros.sessions.sequencing import SequencingSession
 
 COMPANIONS = ("measurement_collector", "solver")
@@ -67,10 +66,6 @@ class PoseSequencer(ManagedNode[SequencerSettings]):
     def _on_timer(self) -> None:
         self.session.tick()
         self._action.tick()
-
-    def diagnose_session(self) -> Diagnosis:
-        """Return the diagnosis of the session."""
-        return self.session.diagnosis()
 
 
 def main() -> None:

@@ -13,7 +13,6 @@ from selfcal_ros.nodes import names
 from selfcal_ros.nodes.filling import map_markers
 from selfcal_ros.nodes.managed import ManagedNode, WhileConfigured, stop
 from selfcal_ros.nodes.running import run
-from selfcal_ros.sessions.health import Diagnosis
 from selfcal_ros.sessions.solving import Outcome, SolvingSession, solve, warm_up
 
 READY_FOR = 21
@@ -127,10 +126,6 @@ class Solver(ManagedNode[SolverSettings]):
     def _save(self, request: Any, response: Any) -> str:
         message, response.path = self.session.save(request.path)
         return message
-
-    def diagnose_session(self) -> Diagnosis:
-        """Return the diagnosis of the session."""
-        return self.session.diagnosis()
 
 
 def main() -> None:

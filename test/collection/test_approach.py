@@ -8,7 +8,8 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from selfcal_ros.collection.encoder import JointTrack, TrackLimits
+from selfcal_ros.collection.encoder import TrackLimits
+from test.support.encoder import JointTrack
 
 MS = 1_000_000
 LIMITS = TrackLimits(100 * MS, 1.0, 1e-9)

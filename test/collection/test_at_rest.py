@@ -7,9 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from selfcal_ros.collection.encoder import JointTrack, TrackLimits
+from selfcal_ros.collection.encoder import TrackLimits
 from selfcal_ros.collection.inputs import EncoderSample, Kind, Reason
 from test.support.collecting import collect, scene, table
+from test.support.encoder import JointTrack
 
 MS = 1_000_000
 LIMITS = TrackLimits(100 * MS, 1.0, 1e-9)

@@ -8,8 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from selfcal_ros.collection.encoder import JointTrack, TrackLimits
+from selfcal_ros.collection.encoder import TrackLimits
 from selfcal_ros.collection.inputs import Reason
+from test.support.encoder import JointTrack
 
 MS = 1_000_000
 T0 = 1_700_000_000_000_000_000

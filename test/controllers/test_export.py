@@ -58,6 +58,7 @@ def test_a_map_that_can_be_said_leaves_the_rounding_of_the_digits(name, frame):
     made = export(name, result_of(emap), wiring_of(frame, name), "out.txt")
     sites, between = made.residuals
     assert sites.rms("before") > 1e-7
+    assert sorted({*between.position[0].round(6)}) == pytest.approx(np.arange(-2.5, 3) * 0.01)
     assert sites.largest("after") < rounding(name, frame)
     linear = Compensator(emap).error(*between.position)
     cubic = Compensator(emap, method="bicubic").error(*between.position)
@@ -114,6 +115,14 @@ def test_a_long_axis_of_linuxcnc_has_as_many_lines_as_it_may():
     assert (float(lines[0][0]), float(lines[255][0])) == (-15, 15)
     assert made.files["o_x"].splitlines()[256] == "" and all(len(line) == 3 for line in lines)
     assert made.residuals[0].largest("after") < 1e-9
+
+
+@pytest.mark.parametrize(("size", "said"), [(101, []), (103, ["10609", "10609"])])
+def test_beckhoff_is_told_of_more_points_than_it_expects(size, said):
+    emap = random_map(Artifact(size, 1e-3), 1, gain=0.01)
+    texts = FORMATS["beckhoff"].write(emap, Wiring(FRAMES[0]))
+    assert [line.split()[1] for lines in texts.values() for line in lines
+            if "max_points" in line] == said
 
 
 def test_digits_are_those_of_the_rounding_and_zero_has_no_sign():

@@ -207,9 +207,9 @@ def test_words_comments_and_order_are_kept(program):
     for number, line in enumerate(program.splitlines(), 1):
         first, *more = rewriter.line(line, f"a.nc:{number}")
         arc = [w for w in words_of(line) if w in ("G2", "G3")]
-        kept = [w for w in words_of(line, "XYIJRxyijr" if re.search("[IJR]", line) and not (
-            "G81" in line or "PRINT" in line) else "XYxy")]
-        there = [w for w in words_of(first, "XYxy")]
+        kept = words_of(line, "XYIJRxyijr" if re.search("[IJR]", line) and not (
+            "G81" in line or "PRINT" in line) else "XYxy")
+        there = words_of(first, "XYxy")
         moved = {"M2"} & set(kept) if more else set()
         assert [w for w in there if w != "G1" or not arc] == [
             w for w in kept if w not in (*arc, *moved)], line

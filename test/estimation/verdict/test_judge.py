@@ -10,8 +10,9 @@ from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.joint.solve import solve_joint
 from selfcal_ros.estimation.law.solve import solve_law
 from selfcal_ros.estimation.options import Options
+from selfcal_ros.estimation.verdict import search
 from selfcal_ros.estimation.verdict.judge import judged
-from selfcal_ros.estimation.verdict.search import is_searched
+from selfcal_ros.estimation.verdict.search import is_searched, search_causes
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.terms import ModelTerm, TermName, parse_terms
@@ -73,6 +74,21 @@ def test_causes_are_looked_for_unasked_up_to_41_and_at_all_up_to_201_marks_a_sid
         beyond = is_searched(side**2 + 1, Options(causes=asked), failed=failed)
         assert beyond is (wanted and (side, asked, failed) not in (
             (41, None, False), (201, True, False), (201, None, True)))
+
+
+@pytest.mark.parametrize(("sites", "noise_m", "wanted"), [
+    (25, None, True), (24, None, False), (25, 0.0, False), (24, 0.0, False)])
+def test_a_search_needs_a_field_that_is_not_large_and_noise(
+        readings, monkeypatch, sites, noise_m, wanted):
+    searched = []
+    monkeypatch.setattr(search, "ALWAYS_SITES", sites)
+    monkeypatch.setattr(search, "_search", lambda *args, failed: searched.append(failed))
+    options = Options(misalignment_model="linear")
+    solved = solve_joint(readings, options)
+    if noise_m is not None:
+        solved = replace(solved, xy=replace(solved.xy, sigma=noise_m))
+    search_causes(solved, readings, options, failed=False)
+    assert searched == [False] * wanted
 
 
 def offsets_of(stop_sigma_m):

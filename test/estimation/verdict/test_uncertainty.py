@@ -119,5 +119,7 @@ def test_what_enlarged_an_uncertainty_is_listed_the_most_first(result):
     assert (by_name["slip"].u_max, by_name["slip"].unit) == (abs(slip.xy).max(), "m")
     assert by_name["reading"].u_rms == pytest.approx(np.sqrt(np.mean(turned.theta**2)))
     assert by_name["reading"].unit == by_name["line_eccentricity"].unit == "rad"
+    lines = np.array(result.extra["angular_terms"]["line_eccentricity"])
+    assert by_name["line_eccentricity"].u_max == pytest.approx(lines.max(), rel=1e-12)
     # a strain of 2e-7 that no reading tells bends a plate of 20 mm by 4 nm
     assert 1e-9 < by_name["plate_strain"].u_rms < 1e-8
