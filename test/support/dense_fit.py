@@ -40,14 +40,16 @@ MARKS = {TermName.PLATE_SCALE: ("scale",), TermName.PLATE_STRAIN: ("scale", "str
 class DenseFit:
     """The solution of all readings for known noises of one reading, (m, rad).
 
-    `shared`: part of the variance that may be noise of the indicated position. With `places` each
-    visit has the stage error of the place where the stage stood, and the equations are those of the
-    sites all the same.
+    `shared`: part of the variance that may be noise of the indicated position; `contrast`: part
+    by which the variance is larger along x and smaller along y, equal weights nevertheless. With
+    `places` each visit has the stage error of the place where the stage stood, and the equations
+    are those of the sites all the same.
     """
 
     def __init__(self, readings: Measurements, terms: tuple[ModelTerm, ...], sigma, *,
-                 degree=3, rigid=False, shared=1.0, places=True):
+                 degree=3, rigid=False, shared=1.0, places=True, contrast=0.0):
         self.readings, self.sigma, self.rigid, self.shared = readings, sigma, rigid, shared
+        self.contrast = contrast
         self.artifact = readings.artifact
         (self.hx, self.hy), self.pitch = self.artifact.half, self.artifact.grid_pitch_m
         self.n, self.K = int(np.prod(self.artifact.shape)), self.artifact.angular_count
@@ -225,7 +227,10 @@ class DenseFit:
         solve = self._solved(np.concatenate([self.design, prior, held]), held)
         known = np.concatenate([rest, -prior @ p, -held @ p])
         self.p = p + solve[:, :len(known)] @ known
-        self.covariance, self._solve = solve @ solve.T, solve
+        variance = np.ones(solve.shape[1])
+        variance[:len(self.y)] += self.contrast
+        variance[len(self.y):2 * len(self.y)] -= self.contrast
+        self.covariance, self._solve = (solve * variance) @ solve.T, solve
         left, n = self._values - self._predicted(self.p), len(self.y)
         self.left = left[:n] + 1j * left[n:2 * n]
 

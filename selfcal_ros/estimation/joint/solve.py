@@ -22,6 +22,7 @@ from selfcal_ros.estimation.datum.covariance import (
     scale_datum,
     scale_of,
 )
+from selfcal_ros.estimation.joint.axes import MAX_SITES, axis_contrast, axis_variances
 from selfcal_ros.estimation.joint.fit import JointFit
 from selfcal_ros.estimation.joint.model_fit import ModelFit, fit_model
 from selfcal_ros.estimation.joint.moving import noise_gain
@@ -250,8 +251,11 @@ def _error_map(measurements: Measurements, options: Options, *, model: ModelFit,
         scale = (scale_datum(system, options.reference, length) if options.reference else None)
         cover = FieldCovariance(system, found.inverse, scale, found.xy.sigma, model.spread)
         if wanted:
+            variance = np.stack(cover.diagonal())
+            if system.grid.n_sites <= MAX_SITES and (contrast := axis_contrast(model)):
+                variance = np.maximum(variance + contrast * axis_variances(model, cover), 0.0)
             gain = noise_gain(problem, found) * found.xy.sigma
-            u_x, u_y = (np.sqrt(v) * gain for v in cover.diagonal())
+            u_x, u_y = np.sqrt(variance) * gain
         if wanted and model.equations is not None:
             kept = saved_terms(cover, model.equations.columns, measurements.sense)
             kept |= angular_terms(cover, model.equations.columns, found.xy.sigma,
