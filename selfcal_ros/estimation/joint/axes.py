@@ -5,6 +5,8 @@ The estimate weights both coordinates alike. If their noises differ it remains u
 variance of each node follows from the sensitivities of the map to the readings.
 """
 
+from collections.abc import Callable
+
 import numpy as np
 from scipy.special import fdtrc
 
@@ -52,8 +54,25 @@ def axis_variances(model: ModelFit, cover: FieldCovariance) -> np.ndarray:
 
     The variance of a node is then that of equal noises plus `axis_contrast` times this.
     """
-    grid = model.problem.system.grid
     turn = _to_stage(model)[:, None, None] ** 2
+    weight = model.problem.system.grid.weight
+    return added_variances(model, cover, lambda rest: np.einsum(
+        "vij,kvij->k", weight, (turn * rest**2).real))
+
+
+def added_variances(model: ModelFit, cover: FieldCovariance,
+                    of: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+    """Return `of` the sensitivities of each coordinate of the map, (2, nx, ny).
+
+    Parameters
+    ----------
+    model, cover : ModelFit, FieldCovariance
+        The fit, and the covariance of its map.
+    of : callable
+        Sensitivities of k coordinates to the readings, over their weights, plate frame, complex
+        (k, views, nx, ny) -> k variances for unit noise.
+    """
+    grid = model.problem.system.grid
     columns = None if model.equations is None else model.equations.columns.grid
     out = np.zeros((2, grid.n_sites))
     for values, unit in zip(out, (1, 1j), strict=True):
@@ -62,8 +81,7 @@ def axis_variances(model: ModelFit, cover: FieldCovariance) -> np.ndarray:
             field, parameters, terms = cover.solved(rows.T)
             y = np.zeros(1) if columns is None else np.tensordot(terms.T, columns, axes=1)
             rest = grid.plate(-y, field.T.reshape(-1, *grid.views.shape), parameters.T)[1]
-            values[start:start + CHUNK] = np.einsum(
-                "vij,kvij->k", grid.weight, (turn * rest**2).real)
+            values[start:start + CHUNK] = of(rest)
     return out.reshape(2, *grid.views.shape)
 
 
