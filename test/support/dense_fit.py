@@ -40,14 +40,17 @@ MARKS = {TermName.PLATE_SCALE: ("scale",), TermName.PLATE_STRAIN: ("scale", "str
 class DenseFit:
     """The solution of all readings for known noises of one reading, (m, rad).
 
-    `shared`: part of the variance that may be noise of the indicated position. With `places` each
-    visit has the stage error of the place where the stage stood, and the equations are those of the
-    sites all the same.
+    `shared`: part of the variance that may be noise of the indicated position; `contrast`: part
+    by which the variance is larger along x and smaller along y, equal weights nevertheless;
+    `correlation`: of the noise of visits by their distance in time, from 1. With `places` each
+    visit has the stage error of the place where the stage stood, and the equations are those of
+    the sites all the same.
     """
 
     def __init__(self, readings: Measurements, terms: tuple[ModelTerm, ...], sigma, *,
-                 degree=3, rigid=False, shared=1.0, places=True):
+                 degree=3, rigid=False, shared=1.0, places=True, contrast=0.0, correlation=()):
         self.readings, self.sigma, self.rigid, self.shared = readings, sigma, rigid, shared
+        self.contrast, self.correlation = contrast, correlation
         self.artifact = readings.artifact
         (self.hx, self.hy), self.pitch = self.artifact.half, self.artifact.grid_pitch_m
         self.n, self.K = int(np.prod(self.artifact.shape)), self.artifact.angular_count
@@ -225,7 +228,7 @@ class DenseFit:
         solve = self._solved(np.concatenate([self.design, prior, held]), held)
         known = np.concatenate([rest, -prior @ p, -held @ p])
         self.p = p + solve[:, :len(known)] @ known
-        self.covariance, self._solve = solve @ solve.T, solve
+        self.covariance, self._solve = solve @ self._noise(solve.shape[1]) @ solve.T, solve
         left, n = self._values - self._predicted(self.p), len(self.y)
         self.left = left[:n] + 1j * left[n:2 * n]
 
@@ -235,6 +238,19 @@ class DenseFit:
         more = self._solve[:, :len(here)] @ (here - self.design)
         spread = np.linalg.inv(np.eye(len(self.p)) + more)
         self.covariance = spread @ self.covariance @ spread.T
+
+    def _noise(self, n_rows):
+        """Covariance of all rows, in units of their own noise."""
+        n, noise = len(self.y), np.eye(n_rows)
+        for start, part in ((0, self.contrast), (n, -self.contrast)):
+            noise[start:start + n, start:start + n] += part * np.eye(n)
+            for v in set(self.view):
+                order = start + np.flatnonzero(self.view == v)[np.argsort(
+                    self.tau[self.view == v], kind="stable")]
+                for lag, rho in enumerate(self.correlation, 1):
+                    noise[order[:-lag], order[lag:]] += rho
+                    noise[order[lag:], order[:-lag]] += rho
+        return noise
 
     def _solved(self, rows, held):
         """Pseudo-inverse of rows where noise of the position may feign a scale of the microscope.

@@ -16,7 +16,7 @@ from selfcal_ros.units import NM_PER_M
 from tools.reality.cases import Case
 from tools.reality.runs import GRADES, Course, Summary, every_case, once, rows
 
-HEADER = ("| effect | largest error, nm (median) | in U: XY, θ | "
+HEADER = ("| effect | largest error, nm (median) | in U: XY (x, y), θ | "
           "error / u: XY, θ | good | enlarged | not qualified | refused | wrong and accepted | "
           "first cause |\n|---|---|---|---|---|---|---|---|---|---|")
 
@@ -43,9 +43,10 @@ def row(name: str, found: Summary) -> str:
     grades = " | ".join(str(found.grades.get(grade, 0)) for grade in GRADES)
     seeds = f" (seeds {', '.join(map(str, found.wrong_seeds[:5]))})" if found.wrong else ""
     text = (f"| {name} | {found.error_m * NM_PER_M:.3g} | {100 * found.within:.1f} ± "
-            f"{200 * found.u_within:.1f} %, {100 * found.within_theta:.1f} % | {found.z_xy:.2f}, "
+            f"{200 * found.u_within:.1f} % ({100 * found.within_x:.1f}, "
+            f"{100 * found.within_y:.1f} %), {100 * found.within_theta:.1f} % | {found.z_xy:.2f}, "
             f"{found.z_theta:.2f} | {grades} | {found.wrong}{seeds} | {causes} |")
-    return text.replace("nan ± nan %", "–").replace("nan %", "–").replace("nan", "–")
+    return text.replace("nan ± nan % (nan, nan %)", "–").replace("nan %", "–").replace("nan", "–")
 
 
 def main() -> int:

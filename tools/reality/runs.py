@@ -45,8 +45,9 @@ class Run:
     """One calibration against its truth; of a refused one only `grade` and `causes` count.
 
     `error_m` is the largest error of a coordinate of the map, `within` and `within_theta` the parts
-    of the maps inside k u, `z_xy` and `z_theta` the rms of the errors over their u, `holds` whether
-    enough of both maps is inside, `causes` the names of the causes given.
+    of the maps inside k u, `within_x` and `within_y` those of Gx and Gy, `z_xy` and `z_theta` the
+    rms of the errors over their u, `holds` whether enough of both maps is inside, `causes` the
+    names of the causes given.
     """
 
     grade: str
@@ -57,6 +58,8 @@ class Run:
     z_theta: float = float("nan")
     holds: bool = True
     causes: tuple[str, ...] = ()
+    within_x: float = float("nan")
+    within_y: float = float("nan")
 
     @property
     def wrong(self) -> bool:
@@ -166,13 +169,17 @@ def compared(result: CalibrationResult | str, truth: Truth, said: tuple[str, ...
     error = remove_modes(error, datum_modes(truth.artifact, scale=True))
     theta = emap.g_theta - truth.g_theta
     theta = theta - np.nanmean(theta) if np.isfinite(theta).any() else theta
-    within, z_xy = _covered(error, np.stack([emap.u_gx, emap.u_gy]), result.noise.k_xy)
+    k = result.noise.k_xy
+    within, z_xy = _covered(error, np.stack([emap.u_gx, emap.u_gy]), k)
+    within_x, within_y = (_covered(each, u, k)[0] for each, u in zip(
+        error, (emap.u_gx, emap.u_gy), strict=True))
     within_theta, z_theta = _covered(theta, emap.u_g_theta, result.noise.k_theta)
     n_theta = int(np.isfinite(theta).sum())
     holds = not (within < limit(int(np.isfinite(error).sum()))
                  or within_theta < binom.ppf(BY_CHANCE, n_theta, COVERAGE) / max(n_theta, 1))
     return Run(grade_of(result), float(np.nanmax(np.abs(error))), within, within_theta, z_xy,
-               z_theta, holds, (*said, *(cause.name for cause in result.verdict.causes)))
+               z_theta, holds, (*said, *(cause.name for cause in result.verdict.causes)), within_x,
+               within_y)
 
 
 def limit(n_errors: int) -> float:
@@ -223,6 +230,8 @@ class Summary:
     error_m: float
     within: float
     u_within: float
+    within_x: float
+    within_y: float
     within_theta: float
     z_xy: float
     z_theta: float
@@ -238,7 +247,8 @@ def summarise(runs: list[Run], seeds: list[int]) -> Summary:
     return Summary(
         len(runs), dict(Counter(run.grade for run in runs)), len(wrong), wrong,
         float(np.median(_values(kept, "error_m"))), float(within.mean()),
-        float(within.std() / np.sqrt(len(within))), float(_values(kept, "within_theta").mean()),
+        float(within.std() / np.sqrt(len(within))), *(
+            float(_values(kept, name).mean()) for name in ("within_x", "within_y", "within_theta")),
         rms(_values(kept, "z_xy")), rms(_values(kept, "z_theta")), tuple(causes.most_common(3)))
 
 

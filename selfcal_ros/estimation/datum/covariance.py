@@ -173,24 +173,44 @@ class FieldCovariance:
         basis = self.system.gauge.orthonormal
         return rows - basis @ np.real(basis.conj().T @ rows)
 
-    def of(self, rows: np.ndarray) -> np.ndarray:
-        """Return the covariance (k, k) of functionals Re(conj(row) G), complex (k, nx, ny)."""
-        flat = rows.reshape(len(rows), -1).T
-        out, extra = self.project(flat), np.zeros((len(rows), len(rows)))
-        moved = np.zeros((self.system.grid.response.shape[1], len(rows)))
-        grown = np.zeros(len(rows))
+    def _functionals(self, flat: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Return functionals (sites, k) of G in its datum as those of the free unknowns.
+
+        Of sites (sites, k), misalignments (3 views, k) and terms (p, k), and the scale, (k,).
+        """
+        out, grown = self.project(flat), np.zeros(flat.shape[1])
         if self.scale is not None:
             grown = np.real(self.system.grid.views.z_sites.ravel().conj() @ flat)
             out = out + self.scale.rows[:, None] * grown
-            moved, extra = np.outer(self.scale.parameters, grown), self._u2 * np.outer(grown, grown)
+        moved = np.zeros((len(self._p), len(grown)))
+        if self.scale is not None:
+            moved = np.outer(self.scale.parameters, grown)
+        of_terms = np.real(self.terms.fields.conj().T @ out)
+        of_terms += self.terms.parameters[:len(moved)].T @ moved + np.outer(self._of_marks, grown)
+        return out, moved, of_terms, grown
+
+    def of(self, rows: np.ndarray) -> np.ndarray:
+        """Return the covariance (k, k) of functionals Re(conj(row) G), complex (k, nx, ny)."""
+        out, moved, of_terms, grown = self._functionals(rows.reshape(len(rows), -1).T)
         answer = np.real(self.system.grid.response.conj().T @ out) - moved
         solved = self.system.grid.factor.solve(np.ascontiguousarray(out))
-        cov = np.real(out.conj().T @ solved) + answer.T @ self._p @ answer + extra
-        n = len(moved)
-        of_terms = np.real(self.terms.fields.conj().T @ out) + self.terms.parameters[:n].T @ moved
-        of_terms += np.outer(self._of_marks, grown)
-        cov += of_terms.T @ self.terms.covariance @ of_terms
+        cov = np.real(out.conj().T @ solved) + answer.T @ self._p @ answer
+        cov += of_terms.T @ self.terms.covariance @ of_terms + self._u2 * np.outer(grown, grown)
         return (cov + cov.T) / 2
+
+    def solved(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the covariance of functionals (sites, k) with the unknowns, for unit noise.
+
+        With sites (sites, k), misalignments (3 views, k) and terms (p, k): what they make of the
+        readings are the sensitivities of the functionals, times the weights.
+        """
+        grid = self.system.grid
+        out, moved, of_terms, _ = self._functionals(rows)
+        parameters = self._p @ (moved - np.real(grid.response.conj().T @ out))
+        terms = -self.terms.covariance @ of_terms
+        field = grid.factor.solve(np.ascontiguousarray(out)) - grid.response @ parameters
+        return (field - self.terms.fields @ terms,
+                parameters - self.terms.parameters[:len(moved)] @ terms, terms)
 
     def _of_scale(self, scale: ScaleDatum) -> tuple[np.ndarray, float]:
         """Return the covariance of the scale with G in its datum (sites,), and its variance."""

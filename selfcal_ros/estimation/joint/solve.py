@@ -22,6 +22,8 @@ from selfcal_ros.estimation.datum.covariance import (
     scale_datum,
     scale_of,
 )
+from selfcal_ros.estimation.joint.axes import MAX_SITES, axis_contrast, axis_variances
+from selfcal_ros.estimation.joint.correlated import correlated_variances, time_correlation
 from selfcal_ros.estimation.joint.fit import JointFit
 from selfcal_ros.estimation.joint.model_fit import ModelFit, fit_model
 from selfcal_ros.estimation.joint.moving import noise_gain
@@ -250,8 +252,11 @@ def _error_map(measurements: Measurements, options: Options, *, model: ModelFit,
         scale = (scale_datum(system, options.reference, length) if options.reference else None)
         cover = FieldCovariance(system, found.inverse, scale, found.xy.sigma, model.spread)
         if wanted:
+            variance = np.stack(cover.diagonal())
+            if system.grid.n_sites <= MAX_SITES:
+                variance = variance + _structured(model, cover)
             gain = noise_gain(problem, found) * found.xy.sigma
-            u_x, u_y = (np.sqrt(v) * gain for v in cover.diagonal())
+            u_x, u_y = np.sqrt(np.maximum(variance, 0.0)) * gain
         if wanted and model.equations is not None:
             kept = saved_terms(cover, model.equations.columns, measurements.sense)
             kept |= angular_terms(cover, model.equations.columns, found.xy.sigma,
@@ -272,6 +277,16 @@ def _error_map(measurements: Measurements, options: Options, *, model: ModelFit,
     return ErrorMap(measurements.artifact.field, field.real.copy(), field.imag.copy(), u_x, u_y,
                     g_theta, u_theta, o / length, r / length,
                     problem.conditions.datum), closure, kept
+
+
+def _structured(model: ModelFit, cover: FieldCovariance) -> np.ndarray | float:
+    """Return what noise that is neither equal along x and y nor white adds to the variances."""
+    added: np.ndarray | float = 0.0
+    if contrast := axis_contrast(model):
+        added = contrast * axis_variances(model, cover)
+    if len(correlation := time_correlation(model)):
+        added = added + correlated_variances(model, cover, correlation)
+    return added
 
 
 def _artifact_map(model: ModelFit, options: Options) -> ArtifactMap:

@@ -1,0 +1,66 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Noise that is correlated in time, against one dense least squares and the truth."""
+
+import numpy as np
+import pytest
+
+from selfcal_ros.estimation.api import calibrate
+from selfcal_ros.estimation.joint import solve
+from selfcal_ros.estimation.joint.correlated import time_correlation
+from selfcal_ros.estimation.joint.solve import fit_joint, solve_joint
+from selfcal_ros.estimation.options import Options
+from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.readings import Sense
+from selfcal_ros.model.terms import parse_terms
+from selfcal_ros.simulation.cell import CellSettings
+from selfcal_ros.simulation.machine import Spread, random_truth
+from selfcal_ros.simulation.truth import hu_plan, simulate_measurements
+from test.support.dense_fit import DenseFit
+from test.support.results import covered
+
+SIZED = "plate_scale:1e-7,plate_shape:5e-9"
+
+
+def measured(size, seed=0, *, sense=Sense.MICROSCOPE_MOVES, slow_m=0.0):
+    plan, rng = hu_plan(Artifact(size, 0.01, 8), 5), np.random.default_rng(seed)
+    truth = random_truth(plan.artifact, len(plan.views), rng, Spread(phi_rad=5e-4))
+    settings = CellSettings(sense, 5e-9 if slow_m else 20e-9, 2e-6, flicker_xy_m=slow_m,
+                            servo_sigma_m=0.0)
+    return truth, simulate_measurements(truth, plan, rng, settings=settings, visits=True)
+
+
+@pytest.mark.parametrize("sense", Sense)
+@pytest.mark.parametrize("text", ["", SIZED])
+@pytest.mark.parametrize("correlation", [[0.6, 0.3, 0.1], [-0.4, 0.1]])
+def test_each_node_has_the_uncertainty_of_such_noise(monkeypatch, text, correlation, sense):
+    monkeypatch.setattr(solve, "time_correlation", lambda model: np.array(correlation))
+    _, readings = measured(5, sense=sense)
+    terms = parse_terms([text], "") if text else ()
+    result = solve_joint(readings, Options(terms=terms, assumed=(), causes=False,
+                                           misalignment_model="linear")).result
+    emap, noise = result.error_map, result.noise
+    dense = DenseFit(readings, terms, (noise.sigma_xy, noise.sigma_theta),
+                     correlation=correlation)
+    _, (u_x, u_y) = dense.grid(np.isfinite(emap.gx))
+    assert np.allclose(emap.u_gx, u_x, rtol=1e-6)
+    assert np.allclose(emap.u_gy, u_y, rtol=1e-6)
+
+
+def test_slow_noise_is_in_the_uncertainty(monkeypatch):
+    inside, unaware = [], []
+    for seed in range(4):
+        truth, readings = measured(11, seed, slow_m=20e-9)
+        inside.append(covered(calibrate(readings), truth.g))
+        with monkeypatch.context() as patch:
+            patch.setattr(solve, "MAX_SITES", 0)
+            unaware.append(covered(calibrate(readings), truth.g))
+    assert np.mean(inside) > max(0.93, np.mean(unaware) + 0.01)
+
+
+def test_the_correlation_is_that_of_the_noise():
+    """Slow noise alone: the correlation falls as the distance grows; white noise has none."""
+    slow = time_correlation(fit_joint(measured(11, slow_m=20e-9)[1], Options()))
+    assert len(slow) == 550 // 4  # 110 marks of the shifted view, five times
+    assert slow[0] > 0.4 and slow[0] > slow[10] > slow[100]
+    for seed in range(3):
+        assert not len(time_correlation(fit_joint(measured(7, seed)[1], Options())))
