@@ -13,7 +13,6 @@ from scipy.special import fdtrc
 from selfcal_ros.estimation.datum.covariance import FieldCovariance
 from selfcal_ros.estimation.joint.model_fit import ModelFit
 from selfcal_ros.estimation.joint.noise import F_LEVEL, MIN_REPEAT_DOF, SAME
-from selfcal_ros.estimation.lattice.maps import PHASES
 
 MAX_SITES = 51 * 51
 """Largest field in which the axes are told apart: the time grows with the square of the sites."""
@@ -34,7 +33,7 @@ def axis_contrast(model: ModelFit) -> float:
     for row, visits in enumerate(problem.ground.visits):
         if visits is not None and visits.repeated:
             y = visits.y - (known[row] if known else 0.0)
-            rest = visits.about_means(y[None], problem.system.grid.n_sites)[0] / visits.phase
+            rest = visits.about_means(y[None], problem.system.grid.n_marks)[0] / visits.phase
             squares += visits.weight @ np.stack([rest.real, rest.imag], axis=1) ** 2
             dof += len(visits.mark) - len(np.unique(visits.mark))
     if 2 * dof < MIN_REPEAT_DOF:
@@ -87,5 +86,4 @@ def added_variances(model: ModelFit, cover: FieldCovariance,
 
 def _to_stage(model: ModelFit) -> np.ndarray:
     """Return the factor from the frame of each view's readings to the stage axes, (views,)."""
-    poses = model.problem.grid.poses
-    return PHASES[[pose.q for pose in poses]] / model.problem.frames
+    return model.problem.system.grid.views.phases / model.problem.frames
