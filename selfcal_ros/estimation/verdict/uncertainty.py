@@ -82,7 +82,7 @@ def enlarged(result: CalibrationResult, effects: Iterable[Effect]) -> Calibratio
     emap, extra = result.error_map, dict(result.extra)
     power = np.sum([effect.xy**2 for effect in effects], axis=0)
     u_theta = np.sqrt(emap.u_g_theta**2 + sum(effect.theta**2 for effect in effects))
-    placed = result.artifact.map_grid is not None and emap.gx.size <= MAX_SITES
+    placed = result.plate.map_grid is not None and emap.gx.size <= MAX_SITES
     if (KEY in extra or placed) and result.noise.sigma_xy > 0:
         kept = extra.get(KEY, {"terms": [], "factors": []})
         factors = [rounded(effect.xy / result.noise.sigma_xy).tolist() for effect in effects]
