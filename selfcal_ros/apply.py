@@ -32,7 +32,7 @@ class StageMap(Compensator):
     result : CalibrationResult
         The calibration; `result.verdict` states whether it is qualified.
     method, outside : str
-        As for `Compensator`.
+        As for `Compensator`; None = that of the map, bilinear on the plate's lattice.
 
     Raises
     ------
@@ -42,12 +42,14 @@ class StageMap(Compensator):
         As `Compensator`.
     """
 
-    def __init__(self, result: CalibrationResult, *, method: Interpolation = "bilinear",
+    def __init__(self, result: CalibrationResult, *, method: Interpolation | None = None,
                  outside: Outside = "clamp") -> None:
         if not result.observability.identifiable:
             raise NotIdentifiableError("the measured plan does not identify the stage; measure "
                                        "the missing views", result.observability)
-        super().__init__(result.error_map, method=method, outside=outside)
+        grid = result.plate.map_grid
+        own: Interpolation = "bilinear" if grid is None else grid.interpolation.value
+        super().__init__(result.error_map, method=method or own, outside=outside)
         self.result = result
 
     def covariance(self, x_m: ArrayLike, y_m: ArrayLike) -> np.ndarray:
@@ -176,7 +178,7 @@ def _of_difference(cover: np.ndarray, i: np.ndarray, j: np.ndarray) -> np.ndarra
     return cover[i, i] + cover[j, j] - 2 * cover[i, j]
 
 
-def load(path: str | os.PathLike, *, method: Interpolation = "bilinear",
+def load(path: str | os.PathLike, *, method: Interpolation | None = None,
          outside: Outside = "clamp") -> StageMap:
     """Return the calibrated stage of a RESULT.json.
 

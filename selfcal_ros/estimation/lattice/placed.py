@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The maps of views at any pose: from fields over nodes to fields over marks, and back.
 
-In the plate frame the model reads, for view v turned by alpha_v (method eq. 2.4 with any turn),
+In the plate frame the model reads, for view v turned by alpha_v (method eqs. 12.1, 12.2),
     y_v(m) = e^(-i alpha_v) G(X_v(m)) + A(m) + phi_v i z(m) + tau_v,
     G(X) = sum_j w_j(X) G_j,   w real, sum w = 1,
 with G_j the error at node j. The same members as `selfcal_ros.estimation.lattice.maps.LatticeViews`

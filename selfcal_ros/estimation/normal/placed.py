@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Normal equations of views at any pose: dense, and known by their uncertainty.
+"""Normal equations of views at any pose (method eq. 12.3): dense, known by their uncertainty.
 
 A mark's row has nodes of all views at different places, so that the matrix over the nodes is
 nearly full: it is complex Hermitian, and factorised as such. No graph tells what is known. Nodes

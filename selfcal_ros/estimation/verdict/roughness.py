@@ -3,8 +3,8 @@
 
 Between its nodes a map is a spline, and a stage that is rougher has more than that. A spline with
 twice as many intervals contains the map's; with the same readings it must not fit significantly
-better (F-test of its further coefficients). What both differ by beyond their noise is the lack of
-fit, a part of the uncertainty at the nodes and between them.
+better (F-test of its further coefficients, method eq. 12.4). What both differ by beyond their noise
+is the lack of fit, a part of the uncertainty at the nodes and between them (eq. 12.5).
 """
 
 from dataclasses import dataclass
